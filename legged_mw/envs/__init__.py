@@ -1,0 +1,1 @@
+"""Environments: the MDP in torch, on top of the simulator seam."""

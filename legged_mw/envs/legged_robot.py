@@ -1,0 +1,474 @@
+"""A legged robot that follows a joystick: the whole MDP, read top to bottom. No simulator import, no address arithmetic.
+
+Everything under ``_step`` is recorded as one CUDA graph: fixed buffers, masks instead of index lists, no question to
+the host. Shapes: N environments, D joints, F feet, K reward terms. A reward is a method ``_reward_<name>``, switched on
+by a number of that name in ``cfg.rewards.scales``; it returns (N,) and only reads.
+
+Freshness: ``qpos`` and ``qvel`` and all that is computed from them are current. What comes from sensors (foot contact,
+foot position and velocity, accelerometer, joint torque) is one simulation step old and zero in a world just reset.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from legged_mw import ROOT
+from legged_mw.envs.base_task import BaseTask
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.sim.model import Ground, ModelError, Physics, RobotModel, build_model, per_joint, unknown
+from legged_mw.sim.simulation import Simulation
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.math import assign, columns, quat_rotate, quat_rotate_inverse
+
+
+class Row(NamedTuple):
+    """One row of the observation table."""
+
+    name: str
+    value: Tensor  # (N, size)
+    noise: float = 0.0  # half width of the uniform noise added to it, in the value's unit
+
+
+class LeggedRobot(BaseTask):
+    """N robots in N worlds of their own, as one vectorized environment."""
+
+    def __init__(self, cfg: LeggedRobotCfg, device: str, eager: bool = False) -> None:
+        self.cfg = cfg
+        self.robot = self._load_robot()
+        self.obs_buf = {}
+        super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
+        self.sim = Simulation(
+            self.robot.physics,
+            cfg.env.num_envs,
+            device,
+            nconmax=cfg.sim.nconmax,
+            njmax=cfg.sim.njmax,
+            deterministic=cfg.sim.deterministic,
+            eager=eager,
+        )
+        self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
+        self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
+        self._init_buffers()
+        self._init_ranges()
+        self._prepare_observations()
+        self._prepare_reward_function()
+        self._reset_all()
+
+    # ---- the step -------------------------------------------------------------------------------------------------
+
+    def _step(self) -> None:
+        clip = self.cfg.normalization.clip_actions
+        self.actions.clamp_(-clip, clip)
+        if self.cfg.perturbation.enable:
+            self._push_robots()
+        torch.add(self.default_dof_pos, self.actions, alpha=self.cfg.control.action_scale, out=self.sim.ctrl)
+        self.sim.step(self.cfg.control.decimation)
+        self._update_state()
+        self.check_termination()
+        self.compute_reward()
+        self._end_step()
+        self._sum_statistics()
+        self.reset_envs(self.reset_buf)
+        self.compute_observations()
+
+    def _update_state(self) -> None:
+        """All that termination and rewards read, computed once."""
+        self._episode_length_buf.add_(1)
+        self._refresh_base()
+        torch.gt(self.foot_contact_count, 0.0, out=self.foot_contact)
+        torch.logical_and(self.foot_contact, self.feet_air_time > 0.0, out=self.first_contact)
+        self.feet_air_time.add_(self.dt)
+        self.foot_height.copy_(self.sim.site_xpos[:, self.foot_sites, 2])
+        torch.maximum(self.swing_peak, self.foot_height, out=self.swing_peak)
+        torch.linalg.vector_norm(self.foot_vel[..., :2], dim=-1, out=self.foot_speed)
+        torch.gt(torch.linalg.vector_norm(self.commands, dim=1), self.cfg.rewards.min_command, out=self.moving)
+
+    def _refresh_base(self) -> None:
+        """Joint offsets, and velocity and gravity at the IMU, from qpos and qvel: v_imu = R^T v + w x r."""
+        torch.sub(self.dof_pos, self.default_dof_pos, out=self.dof_offset)
+        quat, lever = self.sim.qpos[:, None, 3:7], torch.linalg.cross(self.base_ang_vel, self.imu_pos)
+        in_body = quat_rotate_inverse(quat, torch.stack([self.gravity_dir, self.sim.qvel[:, :3]], dim=1))
+        self.projected_gravity.copy_(in_body[:, 0])
+        torch.add(in_body[:, 1], lever, out=self.base_lin_vel)
+        self.base_ang_vel_world.copy_(quat_rotate(quat[:, 0], self.base_ang_vel))
+
+    def _end_step(self) -> None:
+        """What the next step remembers; the reward has seen this step's values."""
+        self.feet_air_time.masked_fill_(self.foot_contact, 0.0)
+        self.swing_peak.masked_fill_(self.foot_contact, 0.0)
+        self.last_actions.copy_(self.actions)
+        if self.cfg.commands.resampling_time > 0:
+            self.command_timer.sub_(1.0)
+            self._resample_commands(self.command_timer[:, 0] <= 0.0)
+
+    # ---- termination ----------------------------------------------------------------------------------------------
+
+    def check_termination(self) -> None:
+        """Ends episodes: fallen, out of time, or broken (a state that is not finite)."""
+        speed = torch.linalg.vector_norm(self.sim.qvel, ord=math.inf, dim=1)
+        position = torch.linalg.vector_norm(self.sim.qpos, ord=math.inf, dim=1)
+        finite = (speed <= self.cfg.termination.max_speed) & (position < math.inf)  # NaN compares false
+        torch.logical_not(finite, out=self.broken)
+        max_tilt = math.radians(self.cfg.termination.max_tilt)
+        torch.logical_and(self.projected_gravity[:, 2] > -math.cos(max_tilt), finite, out=self.fell)
+        ended = torch.logical_or(self.fell, self.broken)
+        torch.logical_and(self._episode_length_buf >= self.max_episode_length, ~ended, out=self.time_out_buf)
+        torch.logical_or(ended, self.time_out_buf, out=self.reset_buf)
+
+    # ---- resets: masks, never index lists ---------------------------------------------------------------------------
+
+    def _reset_all(self) -> None:
+        self.reset_envs(torch.ones_like(self.reset_buf))
+        self.compute_observations()
+
+    def reset_envs(self, mask: Tensor) -> None:
+        """Begin a new episode in the worlds where ``mask`` (N,) is true; the others stay as they are, bit for bit."""
+        self.sim.reset(mask)
+        self._reset_robots(mask)
+        self._reset_commands(mask)
+        if self.cfg.perturbation.enable:
+            self._redraw_kicks(mask)
+        self._episode.masked_fill_(mask[:, None], 0.0)
+        self.foot_contact.masked_fill_(mask[:, None], False)
+        self._episode_length_buf.masked_fill_(mask, 0)
+        self._refresh_base()
+
+    def _reset_robots(self, mask: Tensor) -> None:
+        """Root near the origin with any heading and a small velocity, joints and servo targets at the default pose."""
+        n = self.num_envs
+        draw = torch.rand(n, 9, device=self.device).mul_(2.0).sub_(1.0).mul_(self.reset_range)  # x, y, yaw, velocities
+        half = 0.5 * draw[:, 2:3]
+        zero = torch.zeros_like(half)
+        pose = [self.init_pos[:2] + draw[:, :2], self.init_pos[2:].expand(n, 1), torch.cos(half), zero, zero, torch.sin(half)]
+        assign(self.sim.qpos, mask, torch.cat([*pose, self.default_dof_pos.expand(n, -1)], dim=1))
+        assign(self.sim.qvel[:, :6], mask, draw[:, 3:])  # the joints' velocity is zero from the reset
+        assign(self.sim.ctrl, mask, self.default_dof_pos)
+
+    # ---- commands -----------------------------------------------------------------------------------------------------
+
+    def _reset_commands(self, mask: Tensor) -> None:
+        """A new episode's command is uniform over the ranges."""
+        assign(self.commands, mask, self._uniform_commands())
+        assign(self.command_timer, mask, self._draw_timers())
+
+    def _resample_commands(self, mask: Tensor) -> None:
+        """Where a timer ended, each component keeps its value, or goes to zero, or to a new uniform value."""
+        chance = torch.rand(self.num_envs, 6, device=self.device)
+        fresh = self._uniform_commands() * (chance[:, :3] < self.keep_probability)
+        change = (chance[:, 3:] < self.cfg.commands.change_probability) & mask[:, None]
+        self.commands.copy_(torch.where(change, fresh, self.commands))
+        assign(self.command_timer, mask, self._draw_timers())
+
+    def _uniform_commands(self) -> Tensor:
+        low, high = self.command_ranges
+        return torch.lerp(low, high, torch.rand(self.num_envs, 3, device=self.device))
+
+    def _draw_timers(self) -> Tensor:
+        """Exponential, (N, 1), rounded to control steps."""
+        mean = self.cfg.commands.resampling_time / self.dt
+        return torch.empty(self.num_envs, 1, device=self.device).exponential_().mul_(mean).round_()
+
+    # ---- perturbation -------------------------------------------------------------------------------------------------
+
+    def _push_robots(self) -> None:
+        """Kick the root: after a pause, a half sine of force in a horizontal direction; then all is drawn anew."""
+        wait, steps, angle, speed = self.kick.unbind(dim=1)
+        elapsed = self.kick_clock - wait
+        self.kick_active.copy_((elapsed >= 0.0) & (elapsed < steps))
+        peak = 0.5 * self.total_mass * speed / (steps * self.dt)
+        force = torch.where(self.kick_active, torch.sin(math.pi * elapsed / steps) * peak, 0.0)
+        self.kick_force[:, 0] = force * torch.cos(angle)
+        self.kick_force[:, 1] = force * torch.sin(angle)
+        self.sim.xfrc_applied[:, self.root_body, :3] = self.kick_force
+        self.kick_clock.add_(1.0)
+        over = elapsed + 1.0 >= steps
+        self._redraw_kicks(over, keep_force=True)
+
+    def _redraw_kicks(self, mask: Tensor, keep_force: bool = False) -> None:
+        low, high = self.kick_ranges
+        draw = torch.lerp(low, high, torch.rand(self.num_envs, 4, device=self.device))
+        draw[:, :2] = (draw[:, :2] / self.dt).round_().clamp_(min=1.0)  # [control steps]
+        assign(self.kick, mask, draw)
+        self.kick_clock.masked_fill_(mask, 0.0)
+        if not keep_force:
+            self.kick_active.masked_fill_(mask, False)
+            self.kick_force.masked_fill_(mask[:, None], 0.0)
+
+    # ---- observations: this table is the only place that states the layout ------------------------------------------------
+
+    def _observation_rows(self) -> dict[str, list[Row]]:
+        """Rows of each group, in order. ``state`` is what the real robot can measure or estimate."""
+        noise = self.cfg.noise.scales
+        return {
+            "state": [
+                Row("base_lin_vel", self.base_lin_vel, noise.lin_vel),  # at the IMU, body frame [m/s]
+                Row("base_ang_vel", self.base_ang_vel, noise.ang_vel),  # gyro, body frame [rad/s]
+                Row("projected_gravity", self.projected_gravity, noise.gravity),  # direction, body frame
+                Row("dof_pos", self.dof_offset, noise.dof_pos),  # minus the default pose [rad]
+                Row("dof_vel", self.dof_vel, noise.dof_vel),  # [rad/s]
+                Row("last_actions", self.last_actions),  # a_t, clipped
+                Row("commands", self.commands),  # vx, vy [m/s], yaw rate [rad/s], body frame
+            ],
+            "privileged_state": [
+                Row("state", self.obs_buf.get("state", self.actions[:, :0])),  # the same noisy sample
+                Row("base_ang_vel", self.base_ang_vel),
+                Row("accelerometer", self.accelerometer),  # proper acceleration at the IMU [m/s^2]
+                Row("projected_gravity", self.projected_gravity),
+                Row("base_lin_vel", self.base_lin_vel),
+                Row("base_ang_vel_world", self.base_ang_vel_world),
+                Row("dof_pos", self.dof_offset),
+                Row("dof_vel", self.dof_vel),
+                Row("torques", self.torques),  # [N m]
+                Row("foot_contact", self.foot_contact),  # 0 or 1
+                Row("foot_lin_vel", self.foot_vel.flatten(1)),  # world frame [m/s]
+                Row("feet_air_time", self.feet_air_time),  # [s]
+                Row("kick_force", self.kick_force),  # on the root, world frame [N]
+                Row("kick_active", self.kick_active[:, None]),  # 0 or 1
+            ],
+        }
+
+    def compute_observations(self) -> None:
+        """Fill ``obs_buf``: each group's rows side by side, plus noise where a row has any."""
+        for group, rows in self._observation_rows().items():
+            obs = self.obs_buf[group]
+            torch.cat([row.value for row in rows], dim=1, out=obs)
+            if group in self.noise_vec:
+                obs.addcmul_(torch.empty_like(obs).uniform_(-1.0, 1.0), self.noise_vec[group])
+
+    def _prepare_observations(self) -> None:
+        """Sizes and noise vectors from the table itself."""
+        self.noise_vec: dict[str, Tensor] = {}
+        self.observation_table: dict[str, list[tuple[str, int, float]]] = {}  # group -> (name, size, noise)
+        for group in self._observation_rows():
+            rows = self._observation_rows()[group]  # again: a group may contain an earlier one
+            table = [(row.name, row.value.shape[1], row.noise * self.cfg.noise.level) for row in rows]
+            noise = [level for _, size, level in table for _ in range(size)]
+            self.observation_table[group] = table
+            self.obs_buf[group] = torch.zeros(self.num_envs, len(noise), device=self.device)
+            if any(noise):
+                self.noise_vec[group] = torch.tensor(noise, device=self.device)
+
+    # ---- reward -------------------------------------------------------------------------------------------------------
+
+    def compute_reward(self) -> None:
+        """Sum of scale * term * dt, clipped; ``termination`` is added after the clip. Broken worlds get 0."""
+        rewards = self.cfg.rewards
+        terms = torch.stack([term() for term in self._reward_terms], dim=1).mul_(self.reward_scales)
+        terms.masked_fill_(self.broken[:, None], 0.0)
+        total = terms[:, : self._num_clipped].sum(dim=1)
+        if rewards.only_positive_rewards:
+            total.clamp_(0.0, rewards.max_reward)
+        if self._num_clipped < len(self.reward_names):
+            total += terms[:, self._num_clipped]
+        self.rew_buf.copy_(total)
+        self.episode_sums.add_(terms)
+        self.episode_return.add_(total[:, None])
+        self.episode_steps.add_(1.0)
+
+    def _active_scales(self) -> dict[str, float]:
+        return {name: float(scale) for name, scale in self.cfg.to_dict()["rewards"]["scales"].items() if scale}
+
+    def _prepare_reward_function(self) -> None:
+        """Match scales to methods by name; every term is tried once, so that a mistake shows before training."""
+        scales = self._active_scales()
+        terms = {name.removeprefix("_reward_"): getattr(self, name) for name in dir(self) if name.startswith("_reward_")}
+        after_clip = [] if self.cfg.rewards.clip_termination else ["termination"]
+        self.reward_names = [n for n in scales if n not in after_clip] + [n for n in after_clip if n in scales]
+        self._num_clipped = len([n for n in scales if n not in after_clip])
+        for name in self.reward_names:
+            where = f"{type(self).__name__} (a method _reward_<name>)"
+            if name not in terms:
+                raise ConfigError(f"rewards.scales.{name} = {scales[name]:g}: {unknown('reward term', name, terms, where)}")
+            value = terms[name]()
+            if not isinstance(value, Tensor) or value.shape != (self.num_envs,):
+                got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+                raise ConfigError(f"_reward_{name} must return a tensor ({self.num_envs},), one value an environment; it returned {got}")
+        self._reward_terms = [terms[name] for name in self.reward_names]
+        self.reward_scales = torch.tensor([scales[name] for name in self.reward_names], device=self.device) * self.dt
+
+    def _reward_tracking_lin_vel(self) -> Tensor:
+        """Velocity in the plane at the IMU, body frame, as commanded. [L]"""
+        error = (self.commands[:, :2] - self.base_lin_vel[:, :2]).square().sum(dim=1)
+        return torch.exp(error / -self.cfg.rewards.tracking_sigma)
+
+    def _reward_tracking_ang_vel(self) -> Tensor:
+        """Yaw rate as commanded. [L]"""
+        error = (self.commands[:, 2] - self.base_ang_vel[:, 2]).square()
+        return torch.exp(error / -self.cfg.rewards.tracking_sigma)
+
+    def _reward_lin_vel_z(self) -> Tensor:
+        """Square of the vertical velocity at the IMU, world frame (gravity points down, hence the same square). [P]"""
+        return (self.base_lin_vel * self.projected_gravity).sum(dim=1).square()
+
+    def _reward_ang_vel_xy(self) -> Tensor:
+        """Roll and pitch rates, world frame. [P]"""
+        return self.base_ang_vel_world[:, :2].square().sum(dim=1)
+
+    def _reward_orientation(self) -> Tensor:
+        """Tilt: gravity's share in the body's plane, equal to the xy share of the body's z axis in the world. [L, P]"""
+        return self.projected_gravity[:, :2].square().sum(dim=1)
+
+    def _reward_dof_pos_limits(self) -> Tensor:
+        """What joints exceed the soft limits by [rad]. [L]"""
+        return (self.dof_pos - self.dof_pos.clamp(self.soft_lower, self.soft_upper)).abs().sum(dim=1)
+
+    def _reward_pose(self) -> Tensor:
+        """Staying near the default pose, most at the hips. [P]"""
+        return torch.exp(-(self.dof_offset.square() * self.pose_weights).sum(dim=1))
+
+    def _reward_termination(self) -> Tensor:
+        """A fall. [L, P]"""
+        return self.fell.float()
+
+    def _reward_stand_still(self) -> Tensor:
+        """Joints away from the default pose while the command is to stand. [L]"""
+        return torch.linalg.vector_norm(self.dof_offset, ord=1, dim=1).masked_fill_(self.moving, 0.0)
+
+    def _reward_torques(self) -> Tensor:
+        """2-norm plus 1-norm of the joint torques [N m]. [P]"""
+        return torch.linalg.vector_norm(self.torques, dim=1) + torch.linalg.vector_norm(self.torques, ord=1, dim=1)
+
+    def _reward_action_rate(self) -> Tensor:
+        """Change of the clipped action. [L]"""
+        return (self.actions - self.last_actions).square().sum(dim=1)
+
+    def _reward_energy(self) -> Tensor:
+        """Sum of |joint velocity * torque| [W]. [P]"""
+        return torch.linalg.vector_norm(self.dof_vel * self.torques, ord=1, dim=1)
+
+    def _reward_feet_clearance(self) -> Tensor:
+        """Feet that move fast away from the swing height. [P]"""
+        return ((self.foot_height - self.cfg.rewards.swing_height).abs() * self.foot_speed.sqrt()).sum(dim=1)
+
+    def _reward_feet_height(self) -> Tensor:
+        """At touch-down, how far the swing's peak was from the swing height, as a share of it. [P]"""
+        error = (self.swing_peak / self.cfg.rewards.swing_height - 1.0).square()
+        return (error * (self.first_contact & self.moving[:, None])).sum(dim=1)
+
+    def _reward_feet_slip(self) -> Tensor:
+        """Squared horizontal speed of feet in contact, while moving. [P]"""
+        return (self.foot_speed.square() * (self.foot_contact & self.moving[:, None])).sum(dim=1)
+
+    def _reward_feet_air_time(self) -> Tensor:
+        """At touch-down, how much longer than the minimum the foot was in the air [s], while moving. [L, P]"""
+        excess = self.feet_air_time - self.cfg.rewards.min_air_time
+        return (excess * (self.first_contact & self.moving[:, None])).sum(dim=1)
+
+    # ---- statistics: summed on the device, read once an iteration ------------------------------------------------------------
+
+    def _sum_statistics(self) -> None:
+        """Add the episodes that end in this step to the running sums. Runs before the reset."""
+        ended = torch.cat([self.episode_sums, self.episode_return, self.episode_steps], dim=1)
+        counts = torch.stack([self.reset_buf, self.fell, self.broken], dim=1)
+        self._statistics.add_(torch.cat([torch.where(self.reset_buf[:, None], ended, 0.0), counts], dim=1).sum(dim=0))
+
+    def read_statistics(self) -> dict[str, float]:
+        """Means over the episodes that ended since the last call, and counts; then start anew. Reads the device.
+
+        ``rew_<name>``: sum of scale * term * dt over the episode, before the clip, divided by the episode length in
+        seconds. ``reward``: the episode's return. ``episode_length`` [control steps]. Means are NaN if none ended.
+        """
+        *sums, episodes, fell, broken = self._statistics.tolist()
+        self._statistics.zero_()
+        *terms, total, length = [value / episodes if episodes else math.nan for value in sums]
+        per_second = self.cfg.env.episode_length_s
+        named = {f"rew_{name}": value / per_second for name, value in zip(self.reward_names, terms, strict=True)}
+        return {"reward": total, "episode_length": length, **named, "episodes": episodes, "fell": fell, "broken": broken}
+
+    # ---- robot and buffers: born here, never rebound --------------------------------------------------------------------------
+
+    def _load_robot(self) -> RobotModel:
+        cfg = self.cfg
+        if not cfg.asset.file:
+            raise ConfigError("asset.file is empty; name the robot's MJCF, e.g. 'resources/robots/go1/go1.xml'")
+        return build_model(
+            ROOT / Path(cfg.asset.file).expanduser(),  # an absolute path stays itself
+            physics=Physics(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations),
+            ground=Ground(cfg.terrain.friction, cfg.terrain.condim),
+            stiffness=cfg.control.stiffness,
+            damping=cfg.control.damping,
+            colliders=cfg.asset.colliders,
+            self_collisions=cfg.asset.self_collisions,
+            contact_geoms=cfg.asset.foot_names,
+            velocity_sites=cfg.asset.foot_names,
+            accelerometer_site=cfg.asset.imu_site,
+        )
+
+    def _init_buffers(self) -> None:
+        n, device, sim, robot = self.num_envs, self.device, self.sim, self.robot
+        spans = robot.sensors
+        self.num_feet = feet = len(self.cfg.asset.foot_names)
+        self.dof_pos, self.dof_vel = sim.qpos[:, 7:], sim.qvel[:, 6:]  # views (N, D) [rad], [rad/s]
+        self.base_ang_vel = sim.qvel[:, 3:6]  # view, body frame [rad/s]
+        self.torques = sim.actuator_force  # view (N, D) [N m]
+        self.foot_contact_count = sim.sensordata[:, spans["contact"]]  # view (N, F)
+        self.foot_vel = sim.sensordata[:, spans["linvel"]].unflatten(1, (feet, 3))  # view, world frame [m/s]
+        self.accelerometer = sim.sensordata[:, spans["accelerometer"]]  # view (N, 3) [m/s^2]
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float) -> Tensor:
+            return torch.zeros(n, *shape, dtype=dtype, device=device)
+
+        self.base_lin_vel, self.projected_gravity, self.base_ang_vel_world = zeros(3), zeros(3), zeros(3)
+        self.dof_offset = zeros(self.num_actions)  # joint position minus default [rad]
+        self.foot_height, self.foot_speed = zeros(feet), zeros(feet)  # [m], horizontal [m/s]
+        self.foot_contact, self.first_contact = zeros(feet, dtype=torch.bool), zeros(feet, dtype=torch.bool)
+        self.fell, self.broken, self.moving = (zeros(dtype=torch.bool) for _ in range(3))
+        self.commands, self.command_timer = zeros(3), zeros(1)  # vx, vy [m/s], yaw rate [rad/s]; [control steps]
+        self.kick, self.kick_clock = zeros(4), zeros()  # pause, duration [control steps], direction [rad], dv [m/s]
+        self.kick_force, self.kick_active = zeros(3), zeros(dtype=torch.bool)
+        self._init_episode_memory()
+        self._init_imu()
+        self.foot_sites = torch.tensor([robot.id("site", name) for name in self.cfg.asset.foot_names], device=device)
+        self.gravity_dir = torch.tensor([0.0, 0.0, -1.0], device=device).expand(n, 3)
+        self.total_mass = float(robot.physics.body_subtreemass[0])  # [kg]
+
+    def _init_episode_memory(self) -> None:
+        """Per-episode memory as columns of one matrix, so that a reset clears it in one go."""
+        joints, feet, terms = self.num_actions, self.num_feet, len(self._active_scales())
+        widths = {"last_actions": joints, "feet_air_time": feet, "swing_peak": feet}
+        self._episode, views = columns(
+            self.num_envs, self.device, **widths, episode_sums=terms, episode_return=1, episode_steps=1
+        )
+        for name, view in views.items():
+            setattr(self, name, view)
+        self._statistics = torch.zeros(terms + 5, device=self.device)
+
+    def _init_imu(self) -> None:
+        robot, model = self.robot, self.robot.physics
+        imu = robot.id("site", self.cfg.asset.imu_site)
+        self.root_body = robot.id("body", robot.root)
+        if model.site_bodyid[imu] != self.root_body or abs(model.site_quat[imu][0]) < 1.0 - 1e-9:
+            raise ModelError(f"asset.imu_site '{self.cfg.asset.imu_site}' must be on the root body '{robot.root}' and aligned with it")
+        self.imu_pos = torch.tensor(model.site_pos[imu], dtype=torch.float, device=self.device).expand(self.num_envs, 3)  # body frame [m]
+
+    def _init_ranges(self) -> None:
+        """Config numbers as tensors: joints' tables, reset and command ranges."""
+        cfg, names = self.cfg, self.robot.joint_names
+
+        def tensor(values: object) -> Tensor:
+            return torch.tensor(values, dtype=torch.float, device=self.device)
+
+        self.default_dof_pos = tensor(per_joint(cfg.init_state.default_joint_angles, names, "init_state.default_joint_angles"))
+        self.pose_weights = tensor(per_joint(cfg.rewards.pose_weights, names, "rewards.pose_weights"))
+        low, high = tensor(self.robot.joint_range).unbind(dim=1)
+        middle, half = (low + high) / 2, (high - low) / 2 * cfg.rewards.soft_dof_pos_limit
+        self.soft_lower, self.soft_upper = middle - half, middle + half
+        init, ranges, kick = cfg.init_state, cfg.commands.ranges, cfg.perturbation
+        self.init_pos = tensor(init.pos)
+        self.reset_range = tensor([init.pos_xy_range] * 2 + [init.yaw_range] + [init.lin_vel_range] * 3 + [init.ang_vel_range] * 3)
+        self.command_ranges = tensor([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw]).T.contiguous()  # (2, 3)
+        self.keep_probability = tensor(cfg.commands.keep_probability)
+        self.kick_ranges = tensor([kick.interval, kick.duration, [-math.pi, math.pi], kick.velocity]).T.contiguous()  # (2, 4)
+
+    # declared for readers and type checkers; columns of self._episode, (N, width)
+    last_actions: Tensor  # D
+    feet_air_time: Tensor  # F, since the last contact [s]
+    swing_peak: Tensor  # F, highest foot position since the last contact [m]
+    episode_sums: Tensor  # K, scale * term * dt summed over the episode
+    episode_return: Tensor  # 1
+    episode_steps: Tensor  # 1, since the reset; episode_length_buf may start elsewhere

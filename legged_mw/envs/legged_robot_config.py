@@ -1,0 +1,181 @@
+"""Every field of LeggedRobot and of its training, once, typed, with unit and source. Tasks override these in configs/.
+
+Sources: [P] MuJoCo Playground's Go1 joystick task and its learner settings; [L] legged_gym; [R] rsl-rl's defaults;
+[ours] with the reason. A field that turns one of our departures back into Playground's behaviour says so.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from legged_mw.utils.config import Config
+
+
+class LeggedRobotCfg(Config):
+    """The environment. Defaults are the joystick task [P]; the robot's own names and numbers are in configs/."""
+
+    class env:
+        num_envs: int = 4096  # worlds stepped together
+        episode_length_s: float = 20.0  # [s], then the episode times out [P]
+
+    class asset:
+        file: str = ""  # MJCF of the robot alone; relative to the config file, or to the repository
+        foot_names: list[str] = []  # each names a geom and a site; the order is the order in observations
+        imu_site: str = "imu"  # on the root body and aligned with it
+        colliders: list[str] = ["*"]  # geoms that touch the ground; names or patterns, of those that collide in the MJCF
+        self_collisions: bool = False  # among the colliders
+
+    class init_state:
+        pos: list[float] = [0.0, 0.0, 1.0]  # root at reset [m]
+        default_joint_angles: dict[str, float] = {}  # joint or part of its name -> [rad]; the pose of action 0
+        pos_xy_range: float = 0.5  # root x and y + U(-range, range) [m] [P]
+        yaw_range: float = 3.141592653589793  # U(-range, range) [rad] [P]
+        lin_vel_range: float = 0.5  # root velocity, world frame, each axis U(-range, range) [m/s] [P]
+        ang_vel_range: float = 0.5  # root angular velocity, body frame, each axis U(-range, range) [rad/s] [P]
+
+    class control:
+        stiffness: dict[str, float] = {}  # joint or part of its name -> position gain [N m/rad]
+        damping: dict[str, float] = {}  # joint or part of its name -> passive damping [N m s/rad]
+        action_scale: float = 0.5  # target angle = default + scale * action [rad] [P]
+        decimation: int = 5  # simulation steps a control step [P]
+
+    class commands:
+        resampling_time: float = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]
+        change_probability: float = 0.5  # that a component changes at all when the timer ends [P]
+        keep_probability: list[float] = [0.9, 0.25, 0.5]  # that a changed vx, vy, yaw rate is not zero [P]
+
+        class ranges:
+            lin_vel_x: list[float] = [-1.5, 1.5]  # [m/s] [P]
+            lin_vel_y: list[float] = [-0.8, 0.8]  # [m/s] [P]
+            ang_vel_yaw: list[float] = [-1.2, 1.2]  # [rad/s] [P]
+
+    class termination:
+        max_tilt: float = 90.0  # [deg] between the root's z axis and the vertical; beyond it, it fell [P]
+        max_speed: float = 1.0e4  # [m/s, rad/s] of any degree of freedom; beyond it the state counts as not finite [ours]
+
+    class rewards:
+        only_positive_rewards: bool = True  # clip the sum at 0: without it the robot learns to stand still [P, L]
+        clip_termination: bool = False  # True: `termination` is inside that clip, where a fall costs nothing [P]; False [L]
+        max_reward: float = 10000.0  # upper clip of the sum, a step [P]
+        tracking_sigma: float = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
+        soft_dof_pos_limit: float = 0.95  # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
+        swing_height: float = 0.1  # wanted height of a swinging foot [m] [P]
+        min_air_time: float = 0.1  # a step that lasts less is penalised [s] [P]
+        min_command: float = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]
+        pose_weights: dict[str, float] = {"": 1.0}  # joint or part of its name -> weight in `pose`
+
+        class scales:
+            """Reward terms by name: each number switches on the method _reward_<name>, 0 switches it off. All [P]."""
+
+            _open = True
+            tracking_lin_vel: float = 1.0
+            tracking_ang_vel: float = 0.5
+            lin_vel_z: float = -0.5
+            ang_vel_xy: float = -0.05
+            orientation: float = -5.0
+            dof_pos_limits: float = -1.0
+            pose: float = 0.5
+            termination: float = -1.0
+            stand_still: float = -1.0
+            torques: float = -0.0002
+            action_rate: float = -0.01
+            energy: float = -0.001
+            feet_clearance: float = -2.0
+            feet_height: float = -0.2
+            feet_slip: float = -0.1
+            feet_air_time: float = 0.1
+
+    class normalization:
+        clip_actions: float = 2.0  # the clipped action is applied, penalised, observed and exported [ours: P has no bound, and thrashes]
+
+    class noise:
+        level: float = 1.0  # multiplies every scale; 0: no noise [P]
+
+        class scales:
+            """Half width of uniform noise on a row of `state`. All [P]."""
+
+            lin_vel: float = 0.1  # [m/s]
+            ang_vel: float = 0.2  # [rad/s]
+            gravity: float = 0.05  # [-]
+            dof_pos: float = 0.03  # [rad]
+            dof_vel: float = 1.5  # [rad/s]
+
+    class perturbation:
+        """Kicks on the root: a half sine of force whose size follows a velocity change. Off by default [P]."""
+
+        enable: bool = False
+        interval: list[float] = [1.0, 3.0]  # pause between kicks [s] [P]
+        duration: list[float] = [0.05, 0.2]  # [s] [P]
+        velocity: list[float] = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
+
+    class terrain:
+        mesh_type: Literal["plane"] = "plane"
+        friction: float = 0.6  # sliding friction of the ground, which overrules the foot's [-] [P]
+        condim: int = 3  # contact dimensions: 3 is sliding without torsion [P]
+
+    class sim:
+        dt: float = 0.004  # simulation step [s] [P]
+        iterations: int = 1  # Newton iterations [P]
+        ls_iterations: int = 5  # line-search iterations [P]
+        nconmax: int = 8  # contacts a world has room for; four feet on a plane make four
+        njmax: int = 40  # constraint rows a world has room for: 12 friction + 12 limits + 4 a contact, [ours: never seen full]
+        deterministic: bool = False  # physics repeats bit for bit, slower
+
+    class viewer:
+        width: int = 1280  # [pixel]
+        height: int = 720  # [pixel]
+
+
+class LeggedRobotCfgPPO(Config):
+    """The learner. Keys below actor, critic and algorithm are rsl-rl's own and pass through untranslated."""
+
+    seed: int = 1
+
+    class runner:
+        num_steps_per_env: int = 24  # control steps a world between two updates [P]
+        max_iterations: int = 300
+        save_interval: int = 50  # [iterations] between checkpoints
+        experiment_name: str = ""  # folder below logs/; empty: the task's name
+        run_name: str = ""  # appended to the run folder's time stamp
+        logger: Literal["tensorboard", "wandb"] = "tensorboard"
+        wandb_project: str = "legged_mw"
+        matmul_precision: Literal["highest", "high"] = "high"  # of the networks on a GPU: high is TF32, highest float32
+
+    class obs_groups:
+        actor: list[str] = ["state"]
+        critic: list[str] = ["privileged_state"]
+
+    class actor:
+        class_name: str = "MLPModel"
+        hidden_dims: list[int] = [512, 256, 128]
+        activation: str = "elu"
+        obs_normalization: bool = True
+
+        class distribution_cfg:
+            class_name: str = "GaussianDistribution"
+            init_std: float = 0.6
+            std_type: Literal["scalar", "log"] = "scalar"
+            std_range: list[float] = [1e-6, 1e6]
+
+    class critic:
+        class_name: str = "MLPModel"
+        hidden_dims: list[int] = [512, 256, 128]
+        activation: str = "elu"
+        obs_normalization: bool = True
+
+    class algorithm:
+        class_name: str = "PPO"
+        num_learning_epochs: int = 5
+        num_mini_batches: int = 4
+        clip_param: float = 0.2
+        gamma: float = 0.99
+        lam: float = 0.95
+        value_loss_coef: float = 1.0
+        entropy_coef: float = 0.005
+        learning_rate: float = 1e-3
+        max_grad_norm: float = 1.0
+        optimizer: str = "adam"
+        use_clipped_value_loss: bool = True
+        schedule: Literal["adaptive", "fixed"] = "adaptive"
+        desired_kl: float = 0.01
+        normalize_advantage_per_mini_batch: bool = False

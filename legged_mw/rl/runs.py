@@ -1,0 +1,104 @@
+"""Run folders and checkpoints on disk: making, finding, writing whole, reading without running code."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from legged_mw.utils.config import ConfigError
+
+CONFIG_FILE = "config.yaml"
+
+
+def new_run(experiment: Path, run_name: str) -> Path:
+    """Make and return a run folder below ``experiment``, named by the time."""
+    stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") + (f"_{run_name}" if run_name else "")
+    for suffix in ["", *(f"_{i}" for i in range(2, 1000))]:
+        folder = experiment / (stamp + suffix)
+        try:
+            folder.mkdir(parents=True)
+            return folder
+        except FileExistsError:
+            continue
+    raise ConfigError(f"cannot make a run folder {experiment / stamp}: a thousand of that name exist")
+
+
+def runs(experiment: Path) -> list[Path]:
+    """Run folders that hold a checkpoint, oldest first by the time of their newest checkpoint."""
+    found = [folder for folder in experiment.glob("*") if folder.is_dir() and checkpoints(folder)]
+    return sorted(found, key=lambda folder: max(path.stat().st_mtime_ns for path in checkpoints(folder).values()))
+
+
+def checkpoints(run: Path) -> dict[int, Path]:
+    """Iteration -> checkpoint of a run, in rising order."""
+    found = {int(m[1]): path for path in run.glob("model_*.pt") if (m := re.fullmatch(r"model_(\d+)\.pt", path.name))}
+    return dict(sorted(found.items()))
+
+
+def find_run(experiment: Path, name: str) -> Path:
+    """The run called ``name`` below ``experiment``, a path to one, or for "-1" the one last trained."""
+    found = runs(experiment)
+    if name == "-1":
+        if not found:
+            raise ConfigError(f"no run with a checkpoint in {experiment}; train first, or name another --experiment_name")
+        return found[-1]
+    for folder in (experiment / name, Path(name).expanduser()):
+        if folder.is_dir() and checkpoints(folder):
+            return folder
+    names = [folder.name for folder in found]
+    close = difflib.get_close_matches(name, names, n=1)
+    hint = f"did you mean '{close[0]}'? " if close else ""
+    raise ConfigError(f"no run '{name}' with a checkpoint in {experiment}; {hint}there are: {', '.join(names) or 'none'}")
+
+
+def find_checkpoint(run: Path, iteration: int) -> Path:
+    """The checkpoint of ``run`` after ``iteration`` iterations, or for -1 the newest."""
+    found = checkpoints(run)
+    if not found:
+        raise ConfigError(f"no checkpoint model_<iteration>.pt in {run}")
+    if iteration == -1:
+        return list(found.values())[-1]
+    if iteration not in found:
+        raise ConfigError(f"no checkpoint {iteration} in {run}; there are: {', '.join(map(str, found))}")
+    return found[iteration]
+
+
+def save_whole(content: dict[str, Any], path: Path) -> None:
+    """Write a checkpoint so that a kill at any moment leaves either all of it or nothing."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            torch.save(content, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load_tensors(path: Path, device: str) -> dict[str, Any]:
+    """Read a checkpoint without running code from it (``weights_only``)."""
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+    except FileNotFoundError:
+        raise ConfigError(f"no checkpoint at {path}") from None
+    except Exception as error:  # a zip, pickle or tensor error, by how the file is broken
+        raise ConfigError(f"{path} is not a checkpoint that can be read: {str(error).splitlines()[0]}") from None
+    if not isinstance(content, dict) or "actor_state_dict" not in content:
+        raise ConfigError(f"{path} is not a checkpoint of this project: it has no actor_state_dict")
+    return content
+
+
+def check_fit(saved: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], path: Path, what: str) -> None:
+    """One clear line if the parameters in a checkpoint are not those of the network that config makes."""
+    for name in wanted.keys() | saved.keys():
+        here, there = wanted.get(name), saved.get(name)
+        if here is None or there is None or here.shape != there.shape:
+            shapes = ["missing" if t is None else str(tuple(t.shape)) for t in (there, here)]
+            raise ConfigError(f"{path} does not fit this task: {what} {name} is {shapes[0]} there and {shapes[1]} here")

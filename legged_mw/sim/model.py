@@ -1,0 +1,257 @@
+"""From an MJCF file to a compiled model: ground, servos and sensors are added here. Host only; nothing is stepped.
+
+The MJCF states facts of the machine (mass, geometry, joint range, armature, friction, force limit); the caller's
+numbers state choices (gains, ground, what collides, what is sensed). Every name that a choice uses must match
+something in the MJCF, and what a choice changes is recorded in ``RobotModel.overrides``.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from legged_mw.sim.scene import add_scene
+
+GROUND = "floor"  # name of the ground geom that build_model adds
+_SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+class ModelError(ValueError):
+    """A name or number asked of a model that does not fit its MJCF; the message lists what exists."""
+
+
+@dataclass(frozen=True)
+class Physics:
+    """Step and solver: written into the model's options."""
+
+    timestep: float = 0.004  # [s]
+    iterations: int = 1  # Newton iterations a substep
+    ls_iterations: int = 5  # line-search iterations a Newton iteration
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The plane z = 0. Its contact parameters win over the geom's that touches it (priority 1)."""
+
+    friction: float = 0.6  # sliding [-]
+    condim: int = 3  # 1 frictionless, 3 sliding, 4 and torsional, 6 and rolling
+
+
+@dataclass(frozen=True)
+class RobotModel:
+    """A compiled model and the tables of names that its user needs."""
+
+    physics: mujoco.MjModel  # what is stepped: no visual geoms
+    visual: mujoco.MjModel  # what is drawn: same qpos, qvel and bodies, with visual geoms
+    root: str  # name of the body that carries the free joint
+    joint_names: tuple[str, ...]  # scalar joints, in order of qpos[7:], qvel[6:] and ctrl
+    joint_range: np.ndarray  # (D, 2) [rad]
+    effort_limit: np.ndarray  # (D,) [N m]; inf where the MJCF states none
+    sensors: dict[str, slice]  # "contact", "linvel", "accelerometer" -> span of sensordata
+    overrides: list[str] = field(default_factory=list)  # what the caller's choices changed, a line each
+
+    def id(self, kind: str, name: str) -> int:
+        """Index of the ``kind`` ("body", "geom", "site") called ``name``."""
+        obj = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
+        index = mujoco.mj_name2id(self.physics, obj, name)
+        if index < 0:
+            count = getattr(self.physics, f"n{kind}")
+            names = [mujoco.mj_id2name(self.physics, obj, i) for i in range(count)]
+            raise ModelError(unknown(kind, name, [n for n in names if n], "the model"))
+        return index
+
+
+def unknown(what: str, name: str, known: Iterable[str], where: str) -> str:
+    """One line: ``name`` does not exist, the nearest name that does, and all that do."""
+    known = list(known)
+    close = difflib.get_close_matches(name, known, n=1)
+    hint = f"did you mean '{close[0]}'? " if close else ""
+    return f"no {what} '{name}' in {where}; {hint}there are: {', '.join(known) or 'none'}"
+
+
+def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str) -> list[float]:
+    """Values (D,) for ``joints`` from a table keyed by joint name or a part of it.
+
+    Raises ModelError if a joint matches no key or several, or a key matches no joint.
+    """
+    values = []
+    for joint in joints:
+        hits = [key for key in table if key in joint]
+        if len(hits) != 1:
+            raise ModelError(f"{what}: joint '{joint}' matches {hits or 'none'} of {list(table)}; exactly one key must be a part of its name")
+        values.append(float(table[hits[0]]))
+    for key in table:
+        if not any(key in joint for joint in joints):
+            raise ModelError(f"{what}: {unknown('joint', key, joints, 'the MJCF')} (a key may be a part of a joint's name)")
+    return values
+
+
+def build_model(
+    file: Path,
+    *,
+    physics: Physics,
+    ground: Ground,
+    stiffness: Mapping[str, float],  # part of joint name -> position gain [N m/rad]
+    damping: Mapping[str, float],  # part of joint name -> passive joint damping [N m s/rad]
+    colliders: Sequence[str],  # geoms that touch the ground: names or patterns with * and ?
+    self_collisions: bool,
+    contact_geoms: Sequence[str],  # sensed: number of contacts with the ground
+    velocity_sites: Sequence[str],  # sensed: linear velocity, world frame [m/s]
+    accelerometer_site: str | None,  # sensed: proper acceleration, site frame [m/s^2]
+) -> RobotModel:
+    """Compile the MJCF at ``file`` for stepping and for drawing."""
+    if not file.is_file():
+        raise ModelError(f"no MJCF at {file}")
+    try:
+        spec = mujoco.MjSpec.from_file(str(file))
+    except ValueError as error:
+        raise ModelError(f"{file.name} is not a valid MJCF: {error}") from None
+    notes: list[str] = []
+    root, joints = _find_joints(spec, file.name)
+    _set_physics(spec, physics)
+    _add_ground(spec, ground, file.name)
+    _set_collisions(spec, colliders, self_collisions, file.name, notes)
+    limits = _add_servos(spec, joints, stiffness, damping, notes)
+    _add_sensors(spec, contact_geoms, velocity_sites, accelerometer_site, file.name)
+    add_scene(spec)
+    visual = spec.compile()
+    spec.compiler.discardvisual = True
+    mj = spec.compile()
+    names = tuple(j.name for j in joints)
+    return RobotModel(
+        physics=mj,
+        visual=visual,
+        root=root,
+        joint_names=names,
+        joint_range=np.array([mj.joint(n).range for n in names]).reshape(-1, 2),
+        effort_limit=np.array(limits),
+        sensors=_sensor_spans(mj, len(contact_geoms), len(velocity_sites), accelerometer_site is not None),
+        overrides=notes,
+    )
+
+
+def _find_joints(spec: mujoco.MjSpec, where: str) -> tuple[str, list[mujoco.MjsJoint]]:
+    first, *rest = list(spec.joints) or [None]
+    if first is None or first.type != mujoco.mjtJoint.mjJNT_FREE:
+        raise ModelError(f"{where}: the first joint must be the root body's free joint; it is {first.name if first else 'missing'}")
+    for joint in rest:
+        if joint.type not in _SCALAR_JOINTS or not joint.name:
+            raise ModelError(f"{where}: joint '{joint.name}' must be a named hinge or slide joint")
+    return first.parent.name, rest
+
+
+def _set_physics(spec: mujoco.MjSpec, physics: Physics) -> None:
+    option = spec.option
+    option.timestep, option.iterations, option.ls_iterations = physics.timestep, physics.iterations, physics.ls_iterations
+    option.solver, option.cone = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtCone.mjCONE_PYRAMIDAL
+    option.integrator = mujoco.mjtIntegrator.mjINT_EULER
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    for key in list(spec.keys):
+        spec.delete(key)  # poses are the caller's choice, and a keyframe must fit the actuators added below
+
+
+def _add_ground(spec: mujoco.MjSpec, ground: Ground, where: str) -> None:
+    if any(geom.name == GROUND for geom in spec.geoms):
+        raise ModelError(f"{where} brings a geom '{GROUND}'; leave the ground to the config (section terrain)")
+    spec.worldbody.add_geom(
+        name=GROUND,
+        type=mujoco.mjtGeom.mjGEOM_PLANE,
+        size=[0, 0, 0.05],
+        material="ground",
+        contype=1,
+        conaffinity=0,
+        priority=1,
+        condim=ground.condim,
+        friction=[ground.friction, 0.005, 0.0001],
+    )
+
+
+def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisions: bool, where: str, notes: list[str]) -> None:
+    """Ground is contype 1. What may touch it has conaffinity 1; with self-collisions also bit 2 on both sides."""
+    robot = [g for g in spec.geoms if g.name != GROUND and (g.contype or g.conaffinity)]
+    named = [g.name for g in robot if g.name]
+    for pattern in colliders:
+        if not any(fnmatchcase(g.name, pattern) for g in robot):
+            raise ModelError(f"colliders: {unknown('colliding geom', pattern, named, where)}")
+    off = []
+    for geom in robot:
+        touches = any(fnmatchcase(geom.name, pattern) for pattern in colliders)
+        geom.contype = 2 if self_collisions and touches else 0
+        geom.conaffinity = (3 if self_collisions else 1) if touches else 0
+        if not touches:
+            off.append(geom.name or "unnamed")
+    if off:
+        notes.append(f"collisions off: {', '.join(off)}")
+
+
+def _add_servos(
+    spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint], stiffness: Mapping[str, float], damping: Mapping[str, float], notes: list[str]
+) -> list[float]:
+    """One position servo a joint, clamped to the joint's range and force limit; returns the force limits [N m]."""
+    limits = {j.name: float(j.actfrcrange[1]) for j in joints if j.actfrcrange[1] > j.actfrcrange[0]}
+    for actuator in list(spec.actuators):
+        if actuator.target not in limits and actuator.forcerange[1] > actuator.forcerange[0]:
+            limits[actuator.target] = float(actuator.forcerange[1])
+        notes.append(f"actuator '{actuator.name}' replaced by a position servo")
+        spec.delete(actuator)
+    names = [j.name for j in joints]
+    gains, dampings = per_joint(stiffness, names, "control.stiffness"), per_joint(damping, names, "control.damping")
+    for joint, kp, kd in zip(joints, gains, dampings, strict=True):
+        old = float(np.atleast_1d(joint.damping)[0])
+        if old != kd:
+            notes.append(f"{joint.name} damping: {old:g} -> {kd:g} N m s/rad")
+        joint.damping = np.array([kd, *np.atleast_1d(joint.damping)[1:]]) if np.ndim(joint.damping) else kd
+        servo = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        servo.set_to_position(kp)
+        notes.append(f"{joint.name} servo: kp {kp:g} N m/rad")
+        if joint.range[1] > joint.range[0]:
+            servo.ctrllimited, servo.ctrlrange = True, list(joint.range)
+        if joint.name in limits:  # on the servo and not on the joint, so that actuator_force is the clamped force
+            servo.forcelimited, servo.forcerange = True, [-limits[joint.name], limits[joint.name]]
+            joint.actfrclimited, joint.actfrcrange = False, [0.0, 0.0]
+    return [limits.get(name, float("inf")) for name in names]
+
+
+def _add_sensors(
+    spec: mujoco.MjSpec, contact_geoms: Sequence[str], velocity_sites: Sequence[str], accelerometer_site: str | None, where: str
+) -> None:
+    """In an order that makes each group one span of sensordata."""
+    geoms, sites = [g.name for g in spec.geoms if g.name], [s.name for s in spec.sites if s.name]
+    for name in contact_geoms:
+        if name not in geoms:
+            raise ModelError(unknown("geom", name, geoms, where))
+        spec.add_sensor(
+            name=f"contact/{name}",
+            type=mujoco.mjtSensor.mjSENS_CONTACT,
+            objtype=mujoco.mjtObj.mjOBJ_GEOM,
+            objname=name,
+            reftype=mujoco.mjtObj.mjOBJ_GEOM,
+            refname=GROUND,
+            intprm=[1 << mujoco.mjtConDataField.mjCONDATA_FOUND.value, 0, 1],  # data, no reduction, one slot
+        )
+    for name in [*velocity_sites, *([accelerometer_site] if accelerometer_site else [])]:
+        if name not in sites:
+            raise ModelError(unknown("site", name, sites, where))
+    site = mujoco.mjtObj.mjOBJ_SITE
+    for name in velocity_sites:
+        spec.add_sensor(name=f"linvel/{name}", type=mujoco.mjtSensor.mjSENS_FRAMELINVEL, objtype=site, objname=name)
+    if accelerometer_site:
+        spec.add_sensor(
+            name=f"accelerometer/{accelerometer_site}", type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=site, objname=accelerometer_site
+        )
+
+
+def _sensor_spans(mj: mujoco.MjModel, contacts: int, velocities: int, accelerometer: bool) -> dict[str, slice]:
+    sizes = {"contact": contacts, "linvel": 3 * velocities, "accelerometer": 3 if accelerometer else 0}
+    spans: dict[str, slice] = {}
+    start = int(mj.sensor_adr[mj.nsensor - contacts - velocities - int(accelerometer)]) if sum(sizes.values()) else 0
+    for name, size in sizes.items():
+        spans[name] = slice(start, start + size)
+        start += size
+    return spans

@@ -1,0 +1,88 @@
+"""What a picture needs and physics does not: sky, ground material, light, render quality. Host only.
+
+No geom is added here and nothing that is stepped changes; the names given are for others to refer to.
+"""
+
+from __future__ import annotations
+
+import mujoco
+
+GROUND_MATERIAL = "ground"  # for the floor or terrain geom
+_ZENITH, _HORIZON = (0.22, 0.32, 0.45), (0.56, 0.63, 0.70)
+_TILE = 0.5  # edge of one checker square [m]: a grid to judge speed and stride by
+
+
+def add_scene(spec: mujoco.MjSpec) -> None:
+    """Give ``spec`` a sky, the material "ground", one key light that follows the first body, and render settings."""
+    _add_sky(spec)
+    _add_ground_material(spec)
+    _add_light(spec)
+    _set_quality(spec)
+
+
+def _add_sky(spec: mujoco.MjSpec) -> None:
+    # the gradient runs from zenith to nadir, so the horizon is its middle; the haze has that colour, and the ground no edge
+    nadir = [2 * h - z for h, z in zip(_HORIZON, _ZENITH, strict=True)]
+    spec.add_texture(
+        name="sky",
+        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
+        rgb1=_ZENITH,
+        rgb2=nadir,
+        width=512,
+        height=3072,
+    )
+    spec.visual.rgba.haze = [*_HORIZON, 1.0]
+
+
+def _add_ground_material(spec: mujoco.MjSpec) -> None:
+    spec.add_texture(
+        name=GROUND_MATERIAL,
+        type=mujoco.mjtTexture.mjTEXTURE_2D,
+        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
+        rgb1=[0.20, 0.23, 0.27],
+        rgb2=[0.24, 0.27, 0.31],
+        mark=mujoco.mjtMark.mjMARK_EDGE,
+        markrgb=[0.34, 0.37, 0.41],
+        width=512,
+        height=512,
+    )
+    material = spec.add_material(name=GROUND_MATERIAL, specular=0.1, shininess=0.1, reflectance=0.0)
+    # one image is 2 x 2 squares and repeats by the metre, also on a plane without edges
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = GROUND_MATERIAL
+    material.texuniform, material.texrepeat = True, [0.5 / _TILE, 0.5 / _TILE]
+
+
+def _add_light(spec: mujoco.MjSpec) -> None:
+    # trackcom: the shadow map covers a few metres around the robot, wherever it walks. A directional light keeps its direction
+    body = next(iter(spec.worldbody.bodies), spec.worldbody)
+    body.add_light(
+        name="key",
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
+        pos=[1.4, -1.8, 4.0],
+        dir=[-0.35, 0.45, -1.0],
+        diffuse=[0.62, 0.61, 0.58],
+        specular=[0.35, 0.35, 0.35],
+        castshadow=True,
+    )
+    for geom in spec.geoms:
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            geom.castshadow = False  # it has nothing to shade but itself, which shows as moire
+    headlight = spec.visual.headlight
+    headlight.active = 1
+    headlight.ambient, headlight.diffuse, headlight.specular = [0.34, 0.35, 0.37], [0.26, 0.26, 0.26], [0.1, 0.1, 0.1]
+
+
+def _set_quality(spec: mujoco.MjSpec) -> None:
+    spec.stat.extent = 1.0  # [m] clipping, fog and shadow are multiples of it; computed, it would grow with the terrain
+    vis = spec.visual
+    vis.map.znear, vis.map.zfar = 0.02, 150.0  # [extent]
+    vis.map.shadowclip = 3.0  # [extent] half-width of the shadow map: 3 mm a pixel
+    vis.map.haze = 0.9
+    vis.quality.shadowsize = 2048  # 4096 halves the frame rate of software rendering and is hardly seen
+    vis.quality.offsamples = 4
+    vis.quality.numslices, vis.quality.numstacks = 40, 24
+    # 'global' is a keyword of the language
+    frame = getattr(vis, "global_", None) or getattr(vis, "global")
+    frame.offwidth, frame.offheight = 1920, 1080

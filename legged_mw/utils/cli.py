@@ -1,0 +1,125 @@
+"""What train.py and play.py share on the command line: flags, one-line errors, durations, seeds."""
+
+from __future__ import annotations
+
+import argparse
+import random
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+import torch
+
+from legged_mw.utils.config import ConfigError, load_yaml
+from legged_mw.utils.task import LoadedTask
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse, but a mistake is one line and exit code 2."""
+
+    def error(self, message: str) -> NoReturn:
+        print(f"{self.prog}: {message} (--help lists the flags)", file=sys.stderr)
+        raise SystemExit(2)
+
+
+def make_parser(description: str | None) -> Parser:
+    """A parser with the flags that both programs know, under legged_gym's names."""
+    parser = Parser(description=description, allow_abbrev=False)
+    parser.add_argument("--task", metavar="NAME", help="a task in configs/, or the path of a config file")
+    parser.add_argument("--num_envs", type=positive, metavar="N", help="worlds stepped together")
+    parser.add_argument("--seed", type=int, metavar="N", help="of everything random; -1 draws one")
+    parser.add_argument("--experiment_name", metavar="NAME", help="folder below logs/ (default: the task's name)")
+    parser.add_argument("--load_run", metavar="RUN", help="run to load: its name or path; -1 is the one last trained")
+    parser.add_argument("--checkpoint", type=int, default=-1, metavar="N", help="iteration to load; -1 is the newest")
+    parser.add_argument("--device", metavar="D", help="cuda:0, cpu, ... (default: the GPU if there is one)")
+    parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="override a config field: rewards.scales.torques=-1e-4")
+    parser.add_argument("--override", action="append", default=[], metavar="FILE", help="override config fields from a YAML file")
+    parser.add_argument("--eager", action="store_true", help="record nothing, launch every kernel: slow, for debugging")
+    return parser
+
+
+def apply_overrides(task: LoadedTask, args: argparse.Namespace) -> None:
+    """Files first, then single fields, then flags: the more specific wins."""
+    for file in args.override:
+        task.update(load_yaml(file), where=f"--override {file}")
+    for item in args.set:
+        path, equals, value = item.partition("=")
+        if not equals:
+            raise ConfigError(f"--set {item}: write it as path=value, e.g. rewards.scales.torques=-1e-4")
+        task.set(path.strip(), value.strip(), where=f"--set {item}")
+    flags = {"num_envs": "env.num_envs", "seed": "seed"}
+    flags |= {name: f"runner.{name}" for name in ("max_iterations", "experiment_name", "run_name")}
+    for flag, path in flags.items():
+        value = getattr(args, flag, None)
+        if value is not None:
+            task.set(path, value, where=f"--{flag}")
+    if task.train.seed < 0:
+        task.train.seed = random.SystemRandom().randrange(2**31)
+
+
+def pick_device(asked: str | None) -> str:
+    """The device asked for, or the best there is; a clear error for one that is not there."""
+    if asked is None:
+        return "cuda:0" if torch.cuda.is_available() else "cpu"
+    if re.fullmatch(r"cuda(:\d+)?", asked):
+        index = int(asked.partition(":")[2] or 0)
+        if index < torch.cuda.device_count():
+            return f"cuda:{index}"
+        raise ConfigError(f"--device {asked}: this machine has {torch.cuda.device_count()} CUDA devices; use --device cpu")
+    if asked != "cpu":
+        raise ConfigError(f"--device {asked}: say cpu, cuda, or cuda:<index>")
+    return asked
+
+
+def seed_everything(seed: int) -> None:
+    """Seed Python, numpy and torch on every device."""
+    random.seed(seed)
+    np.random.seed(seed % 2**32)
+    torch.manual_seed(seed)
+
+
+def positive(text: str) -> int:
+    """A whole number from 1, for argparse."""
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is not a positive number")
+    return value
+
+
+def duration(text: str) -> float:
+    """Seconds in "90", "90s", "5m" or "1.5h", for argparse."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh]?)", text)
+    if not match or float(match[1]) == 0:
+        raise argparse.ArgumentTypeError(f"'{text}' is no duration; write 90s, 5m or 1.5h")
+    return float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]]
+
+
+@contextmanager
+def one_line_errors(program: str) -> Iterator[None]:
+    """Turn mistakes of the user into one line and exit code 2; memory that runs out into advice."""
+    try:
+        yield
+    except ConfigError as error:
+        fail(program, str(error))
+    except (torch.cuda.OutOfMemoryError, RuntimeError) as error:
+        if not isinstance(error, torch.cuda.OutOfMemoryError) and "Failed to allocate" not in str(error):
+            raise
+        fail(program, f"out of memory: {str(error).splitlines()[0]}; fewer worlds need less: try half with --num_envs")
+
+
+def fail(program: str, message: str) -> NoReturn:
+    """One line on standard error, exit code 2."""
+    print(f"{program}: {message}", file=sys.stderr)
+    raise SystemExit(2)
+
+
+def shown(path: Path) -> str:
+    """A path as the user would type it."""
+    try:
+        return str(path.resolve().relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)

@@ -1,0 +1,379 @@
+"""Class-based configuration: a field is declared once, with a type, and every later word about it is checked.
+
+Here live the rule (annotated = declares, bare = overrides), the types that fields may have, and configs as YAML.
+No field of any robot, simulator or trainer lives here, nor anything that gives a number its meaning.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import inspect
+import keyword
+import os
+import re
+import sys
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping
+from numbers import Integral, Real
+from pathlib import Path
+from types import NoneType, SimpleNamespace, UnionType
+from typing import TYPE_CHECKING, Any, Literal, TypeGuard, Union, get_args, get_origin, get_type_hints
+from weakref import WeakKeyDictionary
+
+import yaml
+
+_TYPES = (int, float, bool, str, NoneType, list, tuple, dict)
+_PLAIN = None | bool | int | float | str | list | dict  # `Any` in a config: whatever YAML can hold
+_SCHEMAS: WeakKeyDictionary[type, dict[str, Any]] = WeakKeyDictionary()
+
+
+class ConfigError(TypeError):
+    """The one error of this module: which field, where that was written, what exists, what to write."""
+
+
+def _schema(cls: type) -> dict[str, Any]:
+    """Name -> type of each field, or class of each section, the parents' first; checks `cls` on first sight."""
+    if cls in _SCHEMAS:
+        return _SCHEMAS[cls]
+    known: dict[str, Any] = {}
+    for base in reversed(cls.__bases__):
+        known |= _schema(base)
+    fields = dict(known)
+    for name in dict.fromkeys([*known, *vars(cls), *inspect.get_annotations(cls)]):
+        if name.startswith("_"):
+            continue
+        try:
+            kind = _check(cls, name, known)
+        except ConfigError as error:
+            raise ConfigError(f"{_place(cls, name)}: {error}") from None
+        if kind is not None:
+            fields[name] = kind
+        if _is_section(kind):
+            _schema(kind)
+            kind.__setattr__ = _guarded_setattr  # all that is ever added to a section: it stays the user's plain class
+    return _SCHEMAS.setdefault(cls, fields)
+
+
+def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
+    """The type or section that `name` stands for in `cls`, whose parents know `known`; None for a method."""
+    path, inherited, value = f"{_path(cls)}.{name}", known.get(name), getattr(cls, name, None)
+    annotated = name in inspect.get_annotations(cls)
+    if _is_section(value) and not annotated:
+        return _check_section(cls, name, value, inherited)
+    if name not in vars(cls) and not annotated:
+        return inherited
+    if inherited is None and not annotated and (inspect.isroutine(value) or isinstance(value, property)):
+        return None
+    if _is_section(inherited):
+        raise ConfigError(f"{path} is a section, not a field; write `class {name}({_parents(cls, name)}):` and its fields below")
+    if inherited is None and any(hasattr(base, name) for base in cls.__bases__):
+        raise ConfigError(f"{path} would hide the method '{name}' of {_path(cls.__bases__[0])}; choose another name")
+    if annotated:
+        kind = _declared_type(cls, name, inherited)
+    elif inherited is None and not getattr(cls, "_open", False):
+        hint = _nearest(name, known) + (f"; {_path(cls.__bases__[0])} has: {', '.join(known)}" if known else "")
+        declaration = f"`{name}: {type(value).__name__} = {value!r}`"
+        raise ConfigError(f"{path} overrides nothing{hint}; if the field is new, declare it with a type: {declaration}")
+    else:
+        kind = float if inherited is None else inherited
+    setattr(cls, name, _fit(value, kind, path))
+    return kind
+
+
+def _check_section(cls: type, name: str, section: type, inherited: Any) -> type:
+    """`section`, if it extends every section of this name that the parents of `cls` have."""
+    path = f"{_path(cls)}.{name}"
+    if inherited is not None and not _is_section(inherited):
+        raise ConfigError(f"{path} is a field ({_show(inherited)}), not a section; write `{name} = ...`")
+    theirs = [_schema(base)[name] for base in cls.__bases__ if name in _schema(base)]
+    for dropped in theirs:
+        if not issubclass(section, dropped):
+            extends = ", ".join(_path(base) for base in section.__bases__ if base is not object) or "no section"
+            raise ConfigError(
+                f"{path} extends {extends} and so drops the fields of {_path(dropped)} ({', '.join(_schema(dropped))}); "
+                f"write `class {name}({_parents(cls, name)}):`"
+            )
+    return section
+
+
+def _declared_type(cls: type, name: str, inherited: Any) -> Any:
+    """The type that `cls` annotates `name` with: resolvable, supported, followed by a value, the same as the parents'."""
+    path, written = f"{_path(cls)}.{name}", inspect.get_annotations(cls)[name]
+    module = sys.modules.get(cls.__module__)
+    try:
+        kind = get_type_hints(SimpleNamespace(__annotations__={name: written}), vars(module) if module else {})[name]
+    except (NameError, AttributeError, SyntaxError, TypeError) as error:
+        hint = f"import what it names at the top level of module {cls.__module__}"
+        raise ConfigError(f"{path}: its type {written!r} cannot be resolved ({error}); {hint}") from None
+    if not _is_supported(kind):
+        choice = "int, float, bool, str, None, list[T], tuple[T, ...], dict[str, T], Literal[...], T | U; `class` makes a section"
+        raise ConfigError(f"{path}: type {_show(kind)} is not supported; there are {choice}")
+    if name not in vars(cls):
+        raise ConfigError(f"{path} has a type but no value; write `{name}: {_show(kind)} = ...`")
+    if inherited is not None and inherited != kind:
+        first = next(base for base in cls.__mro__[1:] if name in _schema(base))
+        raise ConfigError(f"{path} is a {_show(inherited)} in {_path(first)}, not a {_show(kind)}; to override it write `{name} = ...`")
+    return kind
+
+
+def _is_supported(kind: Any) -> bool:
+    origin, args = get_origin(kind), get_args(kind)
+    if origin is Literal:
+        return all(type(choice) in _TYPES for choice in args)
+    if origin is dict:
+        return args[0] is str and _is_supported(args[1])
+    if origin in (list, tuple, Union, UnionType):
+        return all(arm is ... or _is_supported(arm) for arm in args)
+    return kind is Any or kind in _TYPES
+
+
+def _is_section(kind: Any) -> TypeGuard[type]:
+    return isinstance(kind, type) and kind not in _TYPES
+
+
+def _path(cls: type) -> str:
+    """`Go1.rewards.scales`: the name that Python gives a nested class is the dotted path of the section."""
+    return cls.__qualname__.rpartition("<locals>.")[2]
+
+
+def _parents(cls: type, name: str) -> str:
+    return ", ".join(f"{_path(base)}.{name}" for base in cls.__bases__ if name in _schema(base))
+
+
+def _show(kind: Any) -> str:
+    return kind.__name__ if isinstance(kind, type) else str(kind).replace("typing.", "")
+
+
+def _nearest(name: str, fields: Mapping[str, Any] | Iterable[str]) -> str:
+    """`; did you mean ...?`: the nearest name here, else the same name in a section further down, else nothing."""
+    near = difflib.get_close_matches(name, fields, n=1)
+    if not near and isinstance(fields, Mapping):
+        near = [path for path in _field_paths(fields) if path.rpartition(".")[2] == name]
+    return f"; did you mean '{near[0]}'?" if near else ""
+
+
+def _field_paths(fields: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    for name, kind in fields.items():
+        yield from _field_paths(_schema(kind), f"{prefix}{name}.") if _is_section(kind) else [prefix + name]
+
+
+def _place(cls: type, name: str) -> str:
+    """`file:line` where `cls` says something of `name`. Reads the source, which is dear, but only errors ask."""
+    try:
+        lines, first = inspect.getsourcelines(cls)
+        [statement] = ast.parse(textwrap.dedent("".join(lines))).body
+        for line in getattr(statement, "body", []):
+            targets = [getattr(line, "target", None), *getattr(line, "targets", [])]
+            if name in (getattr(line, "name", None), *(getattr(target, "id", None) for target in targets)):
+                first += line.lineno - 1
+                break
+        return f"{inspect.getsourcefile(cls)}:{first}"
+    except (OSError, TypeError, SyntaxError, ValueError):  # written at a prompt, or by code
+        return f"module {cls.__module__}"
+
+
+def _fit(value: Any, kind: Any, path: str) -> Any:
+    """`value` as a `kind`: an int becomes a float where one is due, containers are copied. `path` names it in errors."""
+    origin, args = get_origin(kind) or kind, get_args(kind)
+    if _is_section(kind):
+        raise ConfigError(f"{path} is a section, not a field; set one of its fields: {', '.join(_schema(kind))}")
+    if kind is Any:
+        return _fit(value, _PLAIN, path)
+    if origin in (Union, UnionType):
+        # The value's own type goes first: 3 must stay an int in `float | int`.
+        for arm in sorted(args, key=lambda arm: (get_origin(arm) or arm) is not type(value)):
+            try:
+                return _fit(value, arm, path)
+            except ConfigError:
+                continue
+    elif origin is Literal and any(type(value) is type(choice) and value == choice for choice in args):
+        return value
+    elif origin in (list, tuple) and isinstance(value, list | tuple):
+        kinds = args if origin is tuple and args and ... not in args else (args[0] if args else Any,) * len(value)
+        if len(kinds) == len(value):
+            return origin(_fit(item, kinds[i], f"{path}[{i}]") for i, item in enumerate(value))
+    elif origin is dict and isinstance(value, Mapping):
+        of = args[1] if args else Any
+        return {_fit(key, str, f"{path}: key"): _fit(item, of, f"{path}[{key!r}]") for key, item in value.items()}
+    elif origin is float and isinstance(value, Real) and not isinstance(value, bool):
+        return float(value)
+    elif origin is int and isinstance(value, Integral) and not isinstance(value, bool):
+        return int(value)
+    elif origin in (bool, str, NoneType) and type(value) is origin:
+        return value
+    hint = _nearest(value, map(str, args)) if origin is Literal and isinstance(value, str) else ""
+    raise ConfigError(f"{path} must be {_show(kind)}, not {value!r} ({type(value).__name__}){hint}")
+
+
+def _parse(text: str, kind: Any, path: str) -> Any:
+    """`text` as a `kind`: verbatim for a str, else read as YAML, else verbatim (`run_7` for a `str | int`)."""
+    try:
+        value = text if kind is str else None if text == "None" else yaml.load(text, Loader=_Loader)
+    except yaml.YAMLError:
+        value = text
+    try:
+        return _fit(value, kind, path)
+    except ConfigError as error:
+        try:
+            return _fit(text, kind, path)
+        except ConfigError:
+            raise error from None
+
+
+def _kind(cls: type, name: str, path: str) -> Any:
+    """The type or section of `name` in an instance of `cls`."""
+    fields = _schema(cls)
+    if name in fields:
+        return fields[name]
+    is_free = name.isidentifier() and not (name.startswith("_") or keyword.iskeyword(name) or hasattr(cls, name))
+    if is_free and getattr(cls, "_open", False):
+        return float
+    owner = path.rpartition(".")[0] or _path(cls)
+    raise ConfigError(f"{path} does not exist{_nearest(name, fields)}; {owner} has: {', '.join(fields)}")
+
+
+def _guarded_setattr(self: Any, name: str, value: Any) -> None:
+    if not name.startswith("_"):
+        path = f"{_path(type(self))}.{name}"
+        value = _fit(value, _kind(type(self), name, path), path)
+    object.__setattr__(self, name, value)
+
+
+def _fill(node: Any) -> Any:
+    """Gives `node` a copy of its own of every default, in the order of declaration."""
+    cls = type(node)
+    for name, kind in _schema(cls).items():
+        default = getattr(cls, name)
+        vars(node)[name] = _fill(object.__new__(kind)) if _is_section(kind) else _fit(default, kind, f"{_path(cls)}.{name}")
+    return node
+
+
+def _plain(value: Any) -> Any:
+    if _is_section(type(value)):
+        return {name: _plain(item) for name, item in vars(value).items() if not name.startswith("_")}
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in vars(node).items():
+        if _is_section(type(value)):
+            yield from _leaves(value, f"{prefix}{name}.")
+        elif not name.startswith("_"):
+            yield prefix + name, _plain(value)
+
+
+def _edits(node: Any, values: Any, path: str = "") -> Iterator[tuple[Any, str, Any]]:
+    """(section, name, value) for every field that the nested `values` name, each checked."""
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{path or _path(type(node))} is a section and needs a mapping of its fields, not {values!r}")
+    for name, value in values.items():
+        here = f"{path}.{name}" if path else str(name)
+        kind = _kind(type(node), str(name), here)
+        if _is_section(kind):
+            yield from _edits(getattr(node, name), value, here)
+        else:
+            yield node, name, _fit(value, kind, here)
+
+
+class Config:
+    """Base of every configuration: nested plain classes are its sections, their attributes its fields.
+
+    `name: type = value` declares a field; in a subclass a bare `name = value` overrides it, and `class env(Parent.env):`
+    a section. A section with `_open = True` takes any new bare `name = number` too. All of it is checked when the class
+    statement runs, and again whenever a field is set. An instance owns a copy of every default.
+    """
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        _schema(cls)
+
+    def __init__(self) -> None:
+        _fill(self)
+
+    if not TYPE_CHECKING:  # a visible __setattr__ would tell type checkers that any name may be set
+        __setattr__ = _guarded_setattr
+
+    def to_dict(self) -> dict[str, Any]:
+        """Nested dicts, lists, numbers, strings and None, in the order of declaration: safe for YAML."""
+        return _plain(self)
+
+    def set(self, path: str, value: Any, where: str = "--set") -> None:
+        """Overrides the field at a dotted `path`; text is read by the field's type. Errors begin with `where`."""
+        node, here = self, ""
+        *sections, name = path.split(".")
+        try:
+            for section in sections:
+                here = f"{here}.{section}" if here else section
+                kind = _kind(type(node), section, here)
+                if not _is_section(kind):
+                    raise ConfigError(f"{path} does not exist: {here} is a field ({_show(kind)}), not a section; set it whole")
+                node = getattr(node, section)
+            kind = _kind(type(node), name, path)
+            vars(node)[name] = _parse(value, kind, path) if isinstance(value, str) else _fit(value, kind, path)
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from None
+
+    def update(self, values: Mapping[str, Any], where: str = "update") -> None:
+        """Overrides every field that the nested `values` name, or none if one is wrong. A dict field is replaced whole."""
+        try:
+            edits = list(_edits(self, values))
+        except ConfigError as error:
+            raise ConfigError(f"{where}: {error}") from None
+        for node, name, value in edits:
+            vars(node)[name] = value
+
+    def diff(self, other: Config) -> list[tuple[str, Any, Any]]:
+        """(dotted path, mine, theirs) of every field that differs; None stands for a field that one side lacks."""
+        mine, theirs = dict(_leaves(self)), dict(_leaves(other))
+        both = mine.keys() & theirs.keys()
+        return [(path, mine.get(path), theirs.get(path)) for path in mine | theirs if path not in both or mine[path] != theirs[path]]
+
+
+class _Loader(yaml.SafeLoader):
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        """Refuses a key written twice: plain YAML would let the second silently win."""
+        keys = [key.value for key, _ in node.value]
+        for i, (key, _) in enumerate(node.value):
+            if key.value in keys[:i]:
+                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' is written twice", key.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+class _Dumper(yaml.SafeDumper):
+    def ignore_aliases(self, data: Any) -> bool:
+        return True  # a list used twice is written twice: anchors are not for readers
+
+
+for _side in (_Loader, _Dumper):
+    # To plain YAML 1.1, 1e-4 is a string. The writer learns it too, so that it quotes a run called `1e4`.
+    _side.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789"))
+
+
+def save_yaml(path: str | os.PathLike[str], mapping: Mapping[str, Any]) -> None:
+    """Writes `mapping` whole or not at all: neither a reader nor a crash ever meets half a file."""
+    path = Path(path)
+    text = yaml.dump(dict(mapping), Dumper=_Dumper, sort_keys=False, allow_unicode=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """The mapping in a YAML file, its numbers read as people write them."""
+    try:
+        loaded = yaml.load(Path(path).read_bytes(), Loader=_Loader)
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot read this config file: {error.strerror}") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f":{mark.line + 1}" if mark else ""
+        raise ConfigError(f"{path}{line}: not valid YAML: {getattr(error, 'problem', error)}") from None
+    if not isinstance(loaded, dict):
+        raise ConfigError(f"{path}: holds {type(loaded).__name__}, not a mapping of sections and fields")
+    return loaded

@@ -1,0 +1,35 @@
+"""Batched rotations and masked writes, free of host reads. Quaternions are (w, x, y, z), unit, body to world."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
+    """The body-frame vector ``v`` (..., 3) of a body with attitude ``q`` (..., 4), in the world frame."""
+    w, u = q[..., :1], q[..., 1:]
+    t = torch.linalg.cross(u, v)
+    return torch.addcmul(v, w, t, value=2.0).add_(torch.linalg.cross(u, t), alpha=2.0)
+
+
+def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
+    """The world-frame vector ``v`` (..., 3) in the frame of a body with attitude ``q`` (..., 4)."""
+    w, u = q[..., :1], q[..., 1:]
+    t = torch.linalg.cross(u, v)
+    return torch.addcmul(v, w, t, value=-2.0).add_(torch.linalg.cross(u, t), alpha=2.0)
+
+
+def assign(dst: Tensor, mask: Tensor, src: Tensor | float) -> None:
+    """Write ``src`` into the rows of ``dst`` (N, ...) where ``mask`` (N,) is true; fixed shape, in place, NaN-safe."""
+    mask = mask.view(-1, *[1] * (dst.dim() - 1))
+    if isinstance(src, Tensor):
+        dst.copy_(torch.where(mask, src, dst))
+    else:
+        dst.masked_fill_(mask, src)
+
+
+def columns(num_rows: int, device: str, **widths: int) -> tuple[Tensor, dict[str, Tensor]]:
+    """One float matrix of zeros and a named view (N, width) of each span of its columns: cleared together, used apart."""
+    matrix = torch.zeros(num_rows, sum(widths.values()), device=device)
+    return matrix, dict(zip(widths, matrix.split(list(widths.values()), dim=1), strict=True))

@@ -1,0 +1,113 @@
+"""Finding a task: a name in ``configs/``, or the path of a config file anywhere; and its two configs as one."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import importlib.util
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from legged_mw import ROOT
+from legged_mw.utils.config import ConfigError
+
+if TYPE_CHECKING:
+    from legged_mw.envs.legged_robot import LeggedRobot
+    from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+
+
+class Task(NamedTuple):
+    """What the last line of a config file names."""
+
+    env: type[LeggedRobot]
+    cfg: type[LeggedRobotCfg]
+    train: type[LeggedRobotCfgPPO]
+
+
+class LoadedTask:
+    """A task with fresh instances of its configs: ``cfg`` for the environment, ``train`` for the learner.
+
+    The sections of both share one name space: ``set`` and ``update`` take a path or a mapping over all of them.
+    """
+
+    def __init__(self, name: str, path: Path, task: Task) -> None:
+        self.name, self.path, self.env_class = name, path, task.env
+        self.cfg, self.train = task.cfg(), task.train()
+        beside = path.resolve().parent / Path(self.cfg.asset.file).expanduser()
+        if self.cfg.asset.file and beside.is_file():
+            self.cfg.asset.file = str(beside)
+
+    def set(self, path: str, value: Any, where: str = "--set") -> None:
+        """Override one field by its dotted path; text is parsed by the field's type."""
+        section = path.split(".")[0]
+        self._owner(section, where).set(path, value, where=where)
+
+    def update(self, values: Mapping[str, Any], where: str) -> None:
+        """Override fields from a nested mapping over the sections of both configs; all of them or, on an error, none."""
+        parts: dict[int, dict[str, Any]] = {id(self.cfg): {}, id(self.train): {}}
+        for section, fields in values.items():
+            if section != "task":
+                parts[id(self._owner(section, where))][section] = fields
+        before = self.cfg.to_dict()
+        self.cfg.update(parts[id(self.cfg)], where=where)
+        try:
+            self.train.update(parts[id(self.train)], where=where)
+        except ConfigError:
+            self.cfg.update(before, where=where)
+            raise
+
+    def to_dict(self) -> dict[str, Any]:
+        """Both configs as one mapping, with the task's name: what ``config.yaml`` in a run folder holds."""
+        known = self.path.parent.resolve() == (ROOT / "configs").resolve()
+        return {"task": self.name if known else str(self.path.resolve()), **self.cfg.to_dict(), **self.train.to_dict()}
+
+    def _owner(self, section: str, where: str) -> LeggedRobotCfg | LeggedRobotCfgPPO:
+        sections = {**dict.fromkeys(self.cfg.to_dict(), self.cfg), **dict.fromkeys(self.train.to_dict(), self.train)}
+        if section not in sections:
+            close = difflib.get_close_matches(section, sections, n=1)
+            hint = f"did you mean '{close[0]}'? " if close else ""
+            raise ConfigError(f"{where}: no config section '{section}'; {hint}there are: {', '.join(sections)}")
+        return sections[section]
+
+
+def task_names() -> list[str]:
+    """Names that ``--task`` knows without a path."""
+    return sorted(path.stem for path in (ROOT / "configs").glob("*.py") if not path.stem.startswith("_"))
+
+
+def load_task(name: str) -> LoadedTask:
+    """The task called ``name`` in ``configs/``, or that of the config file at that path.
+
+    A relative ``asset.file`` is looked for beside the config file first, then in the repository.
+    """
+    path = Path(name).expanduser()
+    if path.suffix != ".py":
+        known = task_names()
+        if name not in known:
+            close = difflib.get_close_matches(name, known, n=1)
+            hint = f"did you mean '{close[0]}'? " if close else ""
+            raise ConfigError(f"no task '{name}'; {hint}tasks: {', '.join(known)}; or give the path of a config file (.py)")
+        path = ROOT / "configs" / f"{name}.py"
+    if not path.is_file():
+        raise ConfigError(f"no config file at {path.absolute()}")
+    task = getattr(_import(path), "TASK", None)
+    if not isinstance(task, Task):
+        raise ConfigError(f"{path} must end with TASK = Task(Env, Cfg, CfgPPO); its TASK is {task!r}")
+    return LoadedTask(path.stem, path, task)
+
+
+def _import(path: Path) -> ModuleType:
+    """The module of a config file; those in configs/ are ordinary imports, so that they can subclass one another."""
+    if str(ROOT) not in sys.path:
+        sys.path.insert(0, str(ROOT))
+    if path.resolve().parent == (ROOT / "configs").resolve():
+        return importlib.import_module(f"configs.{path.stem}")
+    spec = importlib.util.spec_from_file_location(f"legged_mw_task_{path.stem}", path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # annotations are resolved through it
+    spec.loader.exec_module(module)
+    return module

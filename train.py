@@ -1,0 +1,106 @@
+"""Train a task: python train.py --task go1_flat"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import threading
+import time
+from pathlib import Path
+
+import torch
+
+from legged_mw import ROOT
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.rl.runner import Runner, make_runner
+from legged_mw.rl.runs import CONFIG_FILE, find_checkpoint, find_run, new_run
+from legged_mw.utils.cli import apply_overrides, duration, fail, make_parser, one_line_errors, pick_device, positive, seed_everything, shown
+from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
+from legged_mw.envs.describe import describe
+from legged_mw.utils.task import LoadedTask, load_task, task_names
+
+
+def parse() -> argparse.Namespace:
+    parser = make_parser(__doc__)
+    parser.add_argument("--max_iterations", type=positive, metavar="N", help="train until this iteration, resumed or not")
+    parser.add_argument("--run_name", metavar="NAME", help="appended to the run folder's name")
+    parser.add_argument("--resume", action="store_true", help="go on with the last run, or the one of --load_run")
+    parser.add_argument("--headless", action="store_true", help="accepted as in legged_gym; training never opens a window")
+    parser.add_argument("--max_time", type=duration, metavar="T", help="end, after a checkpoint, after 90s, 5m, 1.5h ...")
+    parser.add_argument("--list", action="store_true", help="show the tasks and exit")
+    parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")
+    args = parser.parse_args()
+    if not (args.task or args.list):
+        parser.error(f"--task is missing; tasks: {', '.join(task_names())}")
+    return args
+
+
+def main() -> None:
+    began, args = time.time(), parse()
+    if args.list:
+        print("\n".join(f"{name:<16} {(sys.modules[type(load_task(name).cfg).__module__].__doc__ or '').splitlines()[0]}" for name in task_names()))
+        return
+    task = load_task(args.task)
+    experiment = ROOT / "logs" / (args.experiment_name or task.train.runner.experiment_name or task.name)
+    run = find_run(experiment, args.load_run or "-1") if args.resume else None
+    checkpoint = find_checkpoint(run, args.checkpoint) if run else None
+    if run:
+        task.update(load_yaml(run / CONFIG_FILE), where=shown(run / CONFIG_FILE))
+    elif args.load_run is not None or args.checkpoint != -1:
+        raise ConfigError("--load_run and --checkpoint say what to go on with: add --resume")
+    apply_overrides(task, args)
+    device = pick_device(args.device)
+    seed_everything(task.train.seed)
+    print(f"{task.name}: {task.cfg.env.num_envs} worlds on {device}; a first run compiles kernels, about a minute", flush=True)
+    env = task.env_class(task.cfg, device, eager=args.eager)
+    if args.check:
+        print(describe(env, task))
+        return
+    train(task, env, experiment, run, checkpoint, device, began + args.max_time if args.max_time else None)
+
+
+def train(
+    task: LoadedTask, env: LeggedRobot, experiment: Path, run: Path | None, checkpoint: Path | None, device: str, deadline: float | None
+) -> None:
+    runner = make_runner(env, task.train, None, device)
+    if checkpoint:
+        runner.load(str(checkpoint))
+        print(f"resuming {shown(checkpoint)}")
+    left = task.train.runner.max_iterations - runner.current_learning_iteration
+    if left <= 0:
+        raise ConfigError(
+            f"{shown(checkpoint or experiment)} has done {runner.current_learning_iteration} iterations of {task.train.runner.max_iterations}; "
+            "raise --max_iterations to go on"
+        )
+    folder = run or new_run(experiment, task.train.runner.run_name)
+    save_yaml(folder / CONFIG_FILE, task.to_dict())
+    runner.logger.log_dir = str(folder)
+    stop_on_signals(runner, deadline)
+    print(f"writing to {shown(folder)}", flush=True)
+    runner.learn(left)
+    if runner.stop:
+        print(f"stopped: {runner.stop}; go on with\n  python train.py --task {task.to_dict()['task']} --resume --load_run {folder.name}")
+    else:
+        print(f"done: {shown(folder)}; watch it with\n  python play.py --task {task.to_dict()['task']} --load_run {folder.name}")
+
+
+def stop_on_signals(runner: Runner, deadline: float | None) -> None:
+    """Ctrl-C, SIGTERM and the clock ask the runner to save and stop; a second Ctrl-C stops at once."""
+
+    def ask(number: int, _: object) -> None:
+        runner.stop = signal.Signals(number).name
+        signal.signal(number, signal.SIG_DFL)
+
+    signal.signal(signal.SIGINT, ask)
+    signal.signal(signal.SIGTERM, ask)
+    if deadline is not None:
+        timer = threading.Timer(max(0.0, deadline - time.time()), lambda: setattr(runner, "stop", "--max_time"))
+        timer.daemon = True
+        timer.start()
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1 if not torch.cuda.is_available() else torch.get_num_threads())
+    with one_line_errors("train.py"):
+        main()
