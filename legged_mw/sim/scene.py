@@ -78,11 +78,11 @@ def _set_quality(spec: mujoco.MjSpec) -> None:
     spec.stat.extent = 1.0  # [m] clipping, fog and shadow are multiples of it; computed, it would grow with the terrain
     vis = spec.visual
     vis.map.znear, vis.map.zfar = 0.02, 150.0  # [extent]
-    vis.map.shadowclip = 3.0  # [extent] half-width of the shadow map: 3 mm a pixel
+    vis.map.shadowclip = 2.0  # [extent] half-width of the shadow map: 2 mm a pixel
     vis.map.haze = 0.9
     vis.quality.shadowsize = 2048  # 4096 halves the frame rate of software rendering and is hardly seen
     vis.quality.offsamples = 4
-    vis.quality.numslices, vis.quality.numstacks = 40, 24
+    vis.quality.numslices, vis.quality.numstacks = 28, 12
     # 'global' is a keyword of the language
     frame = getattr(vis, "global_", None) or getattr(vis, "global")
     frame.offwidth, frame.offheight = 1920, 1080

@@ -23,7 +23,7 @@ from weakref import WeakKeyDictionary
 
 import yaml
 
-_TYPES = (int, float, bool, str, NoneType, list, tuple, dict)
+_TYPES = (int, float, bool, str, NoneType, list, tuple, dict, Any)
 _PLAIN = None | bool | int | float | str | list | dict  # `Any` in a config: whatever YAML can hold
 _SCHEMAS: WeakKeyDictionary[type, dict[str, Any]] = WeakKeyDictionary()
 
@@ -51,7 +51,7 @@ def _schema(cls: type) -> dict[str, Any]:
             fields[name] = kind
         if _is_section(kind):
             _schema(kind)
-            kind.__setattr__ = _guarded_setattr  # all that is ever added to a section: it stays the user's plain class
+            fields[name].__setattr__ = _guarded_setattr  # all that is ever added to a section: it stays the user's plain class
     return _SCHEMAS.setdefault(cls, fields)
 
 
@@ -125,7 +125,7 @@ def _is_supported(kind: Any) -> bool:
         return args[0] is str and _is_supported(args[1])
     if origin in (list, tuple, Union, UnionType):
         return all(arm is ... or _is_supported(arm) for arm in args)
-    return kind is Any or kind in _TYPES
+    return kind in _TYPES
 
 
 def _is_section(kind: Any) -> TypeGuard[type]:

@@ -1,0 +1,730 @@
+"""Class-based configuration: what a class may declare, what its instances accept, and what every error says."""
+
+import copy
+import importlib.util
+import math
+import os
+import pickle
+import re
+import sys
+from pathlib import Path
+from typing import Any, Literal, Optional
+
+import pytest
+import yaml
+
+from legged_mw.utils.config import Config, ConfigError, load_yaml, save_yaml
+
+
+class Base(Config):
+    seed: int = 1
+
+    class env:
+        num_envs: int = 4096
+        episode_length_s: float = 20  # an int where a float is due
+        run_name: str = ""
+        is_flat: bool = True
+        note: str | None = None
+
+    class control:
+        control_type: Literal["P", "V", "T"] = "P"
+        stiffness: dict[str, float] = {"hip": 20, "calf": 40.0}
+        limits: int | list[float] = 3
+        anything: Any = None
+
+    class commands:
+        heading: bool = False
+
+        class ranges:
+            lin_vel_x: list[float] = [-1.0, 1.0]
+            pos: tuple[float, float] = (0.0, 1.0)
+            path: tuple[int, ...] = (1, 2, 3)
+
+    class rewards:
+        tracking_sigma: float = 0.25
+
+        class scales:
+            _open = True
+            torques: float = -2e-4
+            termination: float = 0.0
+
+        def total(self) -> float:
+            return self.scales.torques + self.scales.termination  # type: ignore[attr-defined]
+
+
+class Go1(Base):
+    class env(Base.env):
+        num_envs = 8192
+
+    class rewards(Base.rewards):
+        class scales(Base.rewards.scales):
+            lin_vel_z = -2
+
+
+def says(*parts: str) -> Any:
+    """Expects a ConfigError whose text has all `parts`, in this order."""
+    return pytest.raises(ConfigError, match="(?s)" + ".*".join(re.escape(part) for part in parts))
+
+
+def line_of(text: str) -> str:
+    """`file:line` of the last line of this file that has `text`."""
+    lines = Path(__file__).read_text().splitlines()
+    return f"{Path(__file__).name}:{max(i for i, line in enumerate(lines, 1) if line.strip().startswith(text))}:"
+
+
+def load_module(tmp_path: Path, source: str, name: str) -> Any:
+    path = tmp_path / f"{name}.py"
+    path.write_text(source)
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec and spec.loader
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    finally:
+        del sys.modules[name]
+    return module
+
+
+# ---- Class statements that are right --------------------------------------------------------------------------------
+
+
+def test_overrides_and_inherited_sections() -> None:
+    cfg = Go1()
+    assert cfg.env.num_envs == 8192
+    assert cfg.env.episode_length_s == 20.0
+    assert cfg.commands.ranges.lin_vel_x == [-1.0, 1.0]
+    assert Base().env.num_envs == 4096
+    assert isinstance(cfg.env, Go1.env)
+    assert isinstance(cfg.env, Base.env)
+    assert isinstance(cfg.commands, Base.commands)
+
+
+def test_values_take_the_declared_type() -> None:
+    cfg = Go1()
+    assert type(cfg.env.episode_length_s) is float
+    assert type(cfg.control.stiffness["hip"]) is float
+    assert type(cfg.rewards.scales.lin_vel_z) is float
+    assert type(cfg.control.limits) is int
+    assert type(Base.env.episode_length_s) is float
+
+
+def test_same_declaration_again_is_fine() -> None:
+    class Again(Base):
+        class env(Base.env):
+            num_envs: int = 2
+            note: Optional[str] = "x"  # noqa: UP045
+
+    assert Again().env.num_envs == 2
+    assert Again().env.note == "x"
+
+
+def test_new_fields_and_sections_in_a_subclass() -> None:
+    class More(Go1):
+        class env(Go1.env):
+            extra: int = 3
+
+        class terrain:
+            kind: str = "flat"
+
+    assert More().env.extra == 3
+    assert More().terrain.kind == "flat"
+    assert list(More().to_dict()) == ["seed", "env", "control", "commands", "rewards", "terrain"]
+    assert list(More().to_dict()["env"])[-1] == "extra"
+
+
+def test_two_parents() -> None:
+    class Wide(Base):
+        class env(Base.env):
+            run_name = "wide"
+
+    class Both(Go1, Wide):
+        class env(Go1.env, Wide.env):
+            pass
+
+    assert (Both().env.num_envs, Both().env.run_name) == (8192, "wide")
+    with says("Neither.env extends Go1.env", "drops the fields of ", "Wide.env", "write `class env(Go1.env, Wide.env):`"):
+
+        class Neither(Go1, Wide):
+            class env(Go1.env):
+                pass
+
+
+def test_methods_and_private_names_are_not_fields() -> None:
+    class Quiet(Base):
+        _secret = 3
+
+        class env(Base.env):
+            _hidden = {1, 2}
+
+            @property
+            def twice(self) -> int:
+                return 2 * self.num_envs
+
+            @staticmethod
+            def three() -> int:
+                return 3
+
+    assert Quiet().env.twice == 8192
+    assert Quiet().env.three() == 3
+    rewards: Any = Go1().rewards
+    assert rewards.total() == pytest.approx(-2e-4)
+    assert Quiet().to_dict() == Base().to_dict()
+    cfg = Quiet()
+    cfg.env._mark = 1  # type: ignore[attr-defined]
+    assert cfg.to_dict() == Base().to_dict()
+
+
+# ---- Class statements that are wrong --------------------------------------------------------------------------------
+
+
+def test_misspelt_field() -> None:
+    with says(line_of("num_env = "), "Typo.env.num_env overrides nothing", "did you mean 'num_envs'?", "Base.env has: num_envs, episode_"):
+
+        class Typo(Base):
+            class env(Base.env):
+                run_name = "x"
+                num_env = 3
+
+
+def test_misspelt_field_suggests_the_declaration_of_a_new_one() -> None:
+    with says("New.env.zzz overrides nothing", "declare it with a type: `zzz: float = 0.5`") as caught:
+
+        class New(Base):
+            class env(Base.env):
+                zzz = 0.5
+
+    assert "did you mean" not in str(caught.value)
+
+
+def test_field_in_the_wrong_section() -> None:
+    with says("Outside.num_envs overrides nothing", "did you mean 'env.num_envs'?"):
+
+        class Outside(Base):
+            num_envs = 3
+
+
+def test_bare_name_in_a_new_section() -> None:
+    with says("Fresh.sim.dt overrides nothing; if the field is new", "`dt: float = 0.1`"):
+
+        class Fresh(Config):
+            class sim:
+                dt = 0.1
+
+
+@pytest.mark.parametrize("depth", [1, 2])
+def test_section_without_parent(depth: int) -> None:
+    if depth == 1:
+        with says(
+            "Orphan.env extends no section", "drops the fields of Go1.env (num_envs, episode_length_s,", "write `class env(Go1.env):`"
+        ):
+
+            class Orphan(Go1):
+                class env:
+                    num_envs: int = 3
+    else:
+        expected = ("Deep.rewards.scales extends no section", "Base.rewards.scales (torques,", "`class scales(Base.rewards.scales):`")
+        with says(line_of("class scales:  # orphan"), *expected):
+
+            class Deep(Base):
+                class rewards(Base.rewards):
+                    class scales:  # orphan
+                        torques: float = 1.0
+
+
+def test_section_with_the_wrong_parent() -> None:
+    with says("Wrong.env extends Base.control and so drops the fields of Base.env", "write `class env(Base.env):`"):
+
+        class Wrong(Base):
+            class env(Base.control):
+                pass
+
+
+def test_section_that_skips_a_generation() -> None:
+    with says("Skips.env extends Base.env and so drops the fields of Go1.env", "write `class env(Go1.env):`"):
+
+        class Skips(Go1):
+            class env(Base.env):
+                pass
+
+
+def test_nested_misspelt_field() -> None:
+    with says("Nested.commands.ranges.lin_vel_X overrides nothing; did you mean 'lin_vel_x'?"):
+
+        class Nested(Base):
+            class commands(Base.commands):
+                class ranges(Base.commands.ranges):
+                    lin_vel_X = [0.0, 1.0]
+
+
+def test_value_for_a_section_and_section_for_a_field() -> None:
+    with says(line_of("env = 3"), "Flat.env is a section, not a field; write `class env(Base.env):`"):
+
+        class Flat(Base):
+            env = 3
+
+    with says("Flatter.env is a section, not a field"):
+
+        class Flatter(Base):
+            env: int = 3
+
+    with says("Steep.env.num_envs is a field (int), not a section; write `num_envs = ...`"):
+
+        class Steep(Base):
+            class env(Base.env):
+                class num_envs:
+                    pass
+
+
+def test_declared_again_with_another_type() -> None:
+    with says("Other.env.num_envs is a int in Go1.env, not a float; to override it write `num_envs = ...`"):
+
+        class Other(Go1):
+            class env(Go1.env):
+                num_envs: float = 3.0
+
+
+def test_declared_without_value() -> None:
+    with says(line_of("gravity: list"), "Void.gravity has a type but no value; write `gravity: list[float] = ...`"):
+
+        class Void(Config):
+            gravity: list[float]
+
+    with says("Void2.env.num_envs has a type but no value"):
+
+        class Void2(Base):
+            class env(Base.env):
+                num_envs: int
+
+
+def test_unsupported_type() -> None:
+    with says("Odd.path: type Path is not supported; there are int, float"):
+
+        class Odd(Config):
+            path: Path = Path()
+
+    with says("Odder.path: type list[complex] is not supported"):
+
+        class Odder(Config):
+            path: list[complex] = []
+
+    with says("Oddest.path: type dict[int, str] is not supported"):
+
+        class Oddest(Config):
+            path: dict[int, str] = {}
+
+
+def test_name_of_a_method() -> None:
+    with says("Hides.update would hide the method 'update' of Config"):
+
+        class Hides(Config):
+            update: int = 3
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "text"),
+    [
+        ("env.num_envs", 3.0, "must be int, not 3.0 (float)"),
+        ("env.num_envs", True, "must be int, not True (bool)"),
+        ("env.episode_length_s", True, "must be float, not True (bool)"),
+        ("env.is_flat", 1, "must be bool, not 1 (int)"),
+        ("env.run_name", None, "must be str, not None (NoneType)"),
+        ("env.note", 3, "must be str | None, not 3 (int)"),
+        ("control.control_type", "v", "must be Literal['P', 'V', 'T'], not 'v' (str)"),
+        ("control.stiffness", {"hip": None}, "['hip'] must be float, not None (NoneType)"),
+        ("control.stiffness", {3: 1.0}, ": key must be str, not 3 (int)"),
+        ("control.stiffness", [1.0], "must be dict[str, float], not [1.0] (list)"),
+        ("control.limits", 0.5, "must be int | list[float], not 0.5 (float)"),
+        ("control.anything", {1, 2}, "must be None | bool | int | float | str | list | dict, not {1, 2} (set)"),
+        ("commands.ranges.lin_vel_x", [0.0, "1"], "[1] must be float, not '1' (str)"),
+        ("commands.ranges.pos", (1.0, 2.0, 3.0), "must be tuple[float, float], not (1.0, 2.0, 3.0) (tuple)"),
+        ("commands.ranges.path", [1, 2.5], "[1] must be int, not 2.5 (float)"),
+        ("rewards.scales.torques", "big", "must be float, not 'big' (str)"),
+        ("rewards.scales.brand_new", True, "must be float, not True (bool)"),
+        ("rewards.scales.brand_new", "1", "must be float, not '1' (str)"),
+        ("rewards.scales.brand_new", None, "must be float, not None (NoneType)"),
+    ],
+)
+def test_wrong_type_of_value(path: str, value: Any, text: str) -> None:
+    *sections, name = path.split(".")
+    bodies: list[Any] = [Base]
+    for section in sections:
+        bodies.append(getattr(bodies[-1], section))
+    body: dict[str, Any] = {name: value}
+    qualname = f"Bad.{path}"
+    for parent in reversed(bodies[1:]):
+        qualname = qualname.rpartition(".")[0]
+        body = {parent.__name__: type(parent.__name__, (parent,), {**body, "__qualname__": qualname})}
+    with says(f"Bad.{path}{text if text.startswith(('[', ':')) else ' ' + text}"):  # in the class statement
+        type("Bad", (Base,), body)
+    section_path = ".".join(sections)
+    with says(f"a.yaml: {path}", text):  # in an update
+        Base().update(nest(path, value), "a.yaml")
+    node: Any = Base()
+    for section in sections:
+        node = getattr(node, section)
+    with says(f"Base.{section_path}.{name}", text):  # in an assignment
+        setattr(node, name, value)
+
+
+def nest(path: str, value: Any) -> Any:
+    for name in reversed(path.split(".")):
+        value = {name: value}
+    return value
+
+
+def test_misspelt_choice() -> None:
+    class Choice(Config):
+        ground: Literal["plane", "terrain"] = "plane"
+
+    with says("--set: ground must be", "not 'plan' (str); did you mean 'plane'?"):
+        Choice().set("ground", "plan")
+
+
+# ---- String annotations ---------------------------------------------------------------------------------------------
+
+PARENT = """from __future__ import annotations
+from typing import Literal
+from legged_mw.utils.config import Config
+
+class Cfg(Config):
+    class env:
+        num_envs: int = 1
+        mode: Literal["a", "b"] | None = None
+        int: list[float] = [1]
+"""
+
+
+def test_string_annotations(tmp_path: Path) -> None:
+    parent = load_module(tmp_path, PARENT, "cfg_parent")
+
+    class Child(parent.Cfg):
+        class env(parent.Cfg.env):
+            mode = "b"
+            num_envs: int = 2
+
+    assert Child().to_dict() == {"env": {"num_envs": 2, "mode": "b", "int": [1.0]}}
+    with says("env.mode must be Literal['a', 'b'] | None, not 'c' (str)"):
+        Child().set("env.mode", "c")
+
+
+@pytest.mark.parametrize("annotation", ["Tensor", "list[Tensor]", "list['Tensor']", "math.nope", "int |"])
+def test_unresolvable_annotation(tmp_path: Path, annotation: str) -> None:
+    source = PARENT + f"        third: {annotation!r} = 3\n"
+    with says("cfg_bad.py:10: Cfg.env.third: its type", "cannot be resolved (", "at the top level of module cfg_bad"):
+        load_module(tmp_path, "import math\n" + source.replace("from __future__ import annotations\n", ""), "cfg_bad")
+
+
+def test_error_names_file_and_line(tmp_path: Path) -> None:
+    source = PARENT + "\nclass Go1(Cfg):\n    class env(Cfg.env):\n        '''Doc.'''\n        num_env = 3\n"
+    with says(f"{tmp_path / 'cfg_line.py'}:14: Go1.env.num_env overrides nothing"):
+        load_module(tmp_path, source, "cfg_line")
+
+
+def test_error_without_source_names_the_module() -> None:
+    code = "from legged_mw.utils.config import Config\nclass A(Config):\n    x = 1\n"
+    with says("module prompt: A.x overrides nothing"):
+        exec(code, {"__name__": "prompt"})
+
+
+# ---- Instances ------------------------------------------------------------------------------------------------------
+
+
+def test_instances_share_nothing() -> None:
+    one, two = Go1(), Go1()
+    one.commands.ranges.lin_vel_x[0] = -9.0
+    one.control.stiffness["hip"] = 9.0
+    one.env.num_envs = 9
+    assert two.to_dict() == Go1().to_dict()
+    assert Go1.commands.ranges.lin_vel_x == [-1.0, 1.0]
+    assert Base.control.stiffness == {"hip": 20.0, "calf": 40.0}
+    assert Go1.env.num_envs == 8192
+
+
+def test_a_default_is_not_the_list_it_was_written_with() -> None:
+    shared = [1.0, 2.0]
+
+    class Shares(Config):
+        x: list[float] = shared
+
+    shared.append(3.0)
+    assert Shares().x == [1.0, 2.0]
+
+
+def test_assignment_is_checked() -> None:
+    cfg = Go1()
+    with says("Go1.env.num_env does not exist; did you mean 'num_envs'?", "Go1.env has: num_envs, episode_length_s"):
+        cfg.env.num_env = 3  # type: ignore[attr-defined]
+    with says("Base.commands.ranges.pos2 does not exist; did you mean 'pos'?"):
+        cfg.commands.ranges.pos2 = 3  # type: ignore[attr-defined]
+    with says("Go1.env is a section, not a field; set one of its fields: num_envs"):
+        cfg.env = 3  # type: ignore[assignment]
+    with says("Go1.sede does not exist; did you mean 'seed'?"):
+        cfg.sede = 3  # type: ignore[attr-defined]
+    assert cfg.to_dict() == Go1().to_dict()
+    cfg.env.episode_length_s = 3
+    assert type(cfg.env.episode_length_s) is float
+    cfg.rewards.scales.brand_new = 1  # type: ignore[attr-defined]
+    assert cfg.to_dict()["rewards"]["scales"]["brand_new"] == 1.0
+
+
+def test_assigned_lists_are_copied() -> None:
+    cfg, mine = Base(), [0.0, 1.0]
+    cfg.commands.ranges.lin_vel_x = mine
+    mine[0] = 5.0
+    assert cfg.commands.ranges.lin_vel_x == [0.0, 1.0]
+
+
+def test_deepcopy_and_pickle() -> None:
+    cfg = Go1()
+    cfg.env.num_envs = 3
+    twin: Any
+    for twin in (copy.deepcopy(cfg), pickle.loads(pickle.dumps(cfg))):
+        assert twin.to_dict() == cfg.to_dict()
+        assert isinstance(twin.env, Go1.env)
+        twin.env.num_envs = 4
+        with says("Go1.env.num_env does not exist"):
+            twin.env.num_env = 4
+    assert cfg.env.num_envs == 3
+
+
+def test_to_dict_is_plain_and_in_order() -> None:
+    plain = Go1().to_dict()
+    assert list(plain) == ["seed", "env", "control", "commands", "rewards"]
+    assert list(plain["env"]) == ["num_envs", "episode_length_s", "run_name", "is_flat", "note"]
+    assert list(plain["rewards"]["scales"]) == ["torques", "termination", "lin_vel_z"]
+    assert plain["commands"]["ranges"] == {"lin_vel_x": [-1.0, 1.0], "pos": [0.0, 1.0], "path": [1, 2, 3]}
+    assert type(plain["commands"]["ranges"]["pos"]) is list
+    assert yaml.safe_load(yaml.safe_dump(plain)) == plain
+    plain["commands"]["ranges"]["lin_vel_x"][0] = 7.0
+    assert Go1().commands.ranges.lin_vel_x[0] == -1.0
+
+
+def test_numpy_numbers_become_plain() -> None:
+    np = pytest.importorskip("numpy")
+    cfg = Base()
+    cfg.env.num_envs = np.int64(3)
+    cfg.env.episode_length_s = np.float32(0.5)
+    assert (type(cfg.env.num_envs), type(cfg.env.episode_length_s)) == (int, float)
+
+
+# ---- set ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "expected"),
+    [
+        ("seed", "7", 7),
+        ("env.num_envs", "4_096", 4096),
+        ("rewards.scales.torques", "1e-4", 1e-4),
+        ("rewards.scales.torques", "-1E-4", -1e-4),
+        ("rewards.scales.torques", "3", 3.0),
+        ("rewards.scales.torques", ".5e1", 5.0),
+        ("rewards.scales.feet_slip", "-1e-2", -0.01),
+        ("env.is_flat", "false", False),
+        ("env.run_name", "1e-4", "1e-4"),
+        ("env.run_name", "null", "null"),
+        ("env.run_name", "[a: b", "[a: b"),
+        ("env.note", "null", None),
+        ("env.note", "None", None),
+        ("env.note", "3", "3"),
+        ("env.note", "a: {b", "a: {b"),
+        ("control.control_type", "T", "T"),
+        ("control.limits", "[1e-4, 2]", [1e-4, 2.0]),
+        ("control.limits", "5", 5),
+        ("control.stiffness", "{knee: 1e1, hip: 2}", {"knee": 10.0, "hip": 2.0}),
+        ("control.anything", "{a: [1, 1e-4, x]}", {"a": [1, 1e-4, "x"]}),
+        ("commands.ranges.lin_vel_x", "[-1, 1e-1]", [-1.0, 0.1]),
+        ("commands.ranges.pos", "[1, 2]", (1.0, 2.0)),
+        ("env.num_envs", 3, 3),
+    ],
+)
+def test_set(path: str, text: Any, expected: Any) -> None:
+    cfg = Base()
+    cfg.set(path, text)
+    value: Any = cfg
+    for name in path.split("."):
+        value = getattr(value, name)
+    assert value == expected
+    assert type(value) is type(expected)
+    assert [changed for changed, _, _ in cfg.diff(Base())] == [path]
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "parts"),
+    [
+        ("env.num_env", "3", ("env.num_env does not exist; did you mean 'num_envs'?", "env has: num_envs, episode")),
+        ("rewards.scale.torques", "3", ("rewards.scale does not exist; did you mean 'scales'?",)),
+        ("num_envs", "3", ("num_envs does not exist; did you mean 'env.num_envs'?", "Base has: seed, env, control")),
+        ("env", "3", ("env is a section, not a field; set one of its fields: num_envs",)),
+        ("env.num_envs.x", "3", ("env.num_envs.x does not exist: env.num_envs is a field (int), not a section",)),
+        ("control.stiffness.hip", "3", ("control.stiffness is a field (dict[str, float]), not a section; set it whole",)),
+        ("env.num_envs", "3.5", ("env.num_envs must be int, not 3.5 (float)",)),
+        ("env.num_envs", "many", ("env.num_envs must be int, not 'many' (str)",)),
+        ("env.is_flat", "1", ("env.is_flat must be bool, not 1 (int)",)),
+        ("commands.ranges.lin_vel_x", "[1, a]", ("commands.ranges.lin_vel_x[1] must be float, not 'a' (str)",)),
+        ("commands.ranges.lin_vel_x", "[1, 2", ("commands.ranges.lin_vel_x must be list[float], not '[1, 2' (str)",)),
+        ("rewards.scales.new", "abc", ("rewards.scales.new must be float, not 'abc' (str)",)),
+        ("rewards.scales._open", "0", ("rewards.scales._open does not exist",)),
+        ("rewards.scales.a-b", "0", ("rewards.scales.a-b does not exist",)),
+        ("rewards.total", "0", ("rewards.total does not exist",)),
+        ("", "0", (" does not exist; Base has: seed",)),
+        ("env.", "0", ("env. does not exist; env has: num_envs",)),
+    ],
+)
+def test_set_errors(path: str, value: Any, parts: tuple[str, ...]) -> None:
+    cfg = Base()
+    with says("--set: ", *parts) as caught:
+        cfg.set(path, value)
+    assert str(caught.value).startswith("--set: ")
+    assert cfg.diff(Base()) == []
+    with says("elsewhere: "):
+        cfg.set(path, value, where="elsewhere")
+
+
+# ---- update and diff ------------------------------------------------------------------------------------------------
+
+
+def test_update() -> None:
+    cfg = Go1()
+    values = {"seed": 3, "rewards": {"scales": {"torques": -1, "fresh": 2}}, "control": {"stiffness": {"knee": 1}}}
+    cfg.update(values, "go1.yaml")
+    assert cfg.seed == 3
+    assert cfg.control.stiffness == {"knee": 1.0}
+    assert cfg.rewards.scales.torques == -1.0
+    assert cfg.to_dict()["rewards"]["scales"] == {"torques": -1.0, "termination": 0.0, "lin_vel_z": -2.0, "fresh": 2.0}
+    values["control"]["stiffness"]["knee"] = 5  # type: ignore[index]
+    assert cfg.control.stiffness == {"knee": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("wrong", "parts"),
+    [
+        ({"env": {"num_env": 3}}, ("env.num_env does not exist; did you mean 'num_envs'?",)),
+        ({"rewords": {}}, ("rewords does not exist; did you mean 'rewards'?",)),
+        ({"rewards": 3}, ("rewards is a section and needs a mapping of its fields, not 3",)),
+        ({"rewards": {"scales": None}}, ("rewards.scales is a section and needs a mapping", "not None")),
+        ({"env": {"num_envs": "3"}}, ("env.num_envs must be int, not '3' (str)",)),
+        ({"env": {"num_envs": {"a": 1}}}, ("env.num_envs must be int, not {'a': 1} (dict)",)),
+        ({"env": {3: 1}}, ("env.3 does not exist",)),
+        ({"rewards": {"scales": {True: 1}}}, ("rewards.scales.True does not exist",)),
+        ([1], ("Base is a section and needs a mapping of its fields, not [1]",)),
+    ],
+)
+def test_update_is_all_or_nothing(wrong: Any, parts: tuple[str, ...]) -> None:
+    cfg = Base()
+    values = {"seed": 99, "env": {"episode_length_s": 1.0, **wrong.pop("env", {})}, **wrong} if isinstance(wrong, dict) else wrong
+    with says("over.yaml: ", *parts):
+        cfg.update(values, "over.yaml")
+    assert cfg.diff(Base()) == []
+
+
+def test_dict_survives_update() -> None:
+    cfg = Go1()
+    cfg.set("env.note", "x")
+    cfg.set("rewards.scales.fresh", 1)
+    twin = Go1()
+    twin.update(cfg.to_dict())
+    assert twin.to_dict() == cfg.to_dict()
+    assert twin.commands.ranges.pos == (0.0, 1.0)
+
+
+def test_diff() -> None:
+    mine, theirs = Go1(), Base()
+    theirs.env.note = "x"
+    theirs.control.stiffness = {"hip": 1.0}
+    assert mine.diff(theirs) == [
+        ("env.num_envs", 8192, 4096),
+        ("env.note", None, "x"),
+        ("control.stiffness", {"hip": 20.0, "calf": 40.0}, {"hip": 1.0}),
+        ("rewards.scales.lin_vel_z", -2.0, None),
+    ]
+    assert mine.diff(Go1()) == []
+    assert theirs.diff(mine)[-1] == ("rewards.scales.lin_vel_z", None, -2.0)
+
+
+# ---- YAML -----------------------------------------------------------------------------------------------------------
+
+
+def test_yaml_round_trip(tmp_path: Path) -> None:
+    path = tmp_path / "config.yaml"
+    mapping = {
+        "z": {"lr": 1e-4, "tiny": 1e-12, "big": 1e22, "one": 1.0, "int": 1, "inf": math.inf},
+        "a": [1e-4, None, True],
+        "names": ["1e-4", "1e5", "123e456", "null", "yes", "0x1f", "ä: b", "2024-01-01"],
+        "empty": {"list": [], "dict": {}, "str": ""},
+    }
+    save_yaml(path, mapping)
+    for loaded in (load_yaml(path), yaml.safe_load(path.read_text(encoding="utf-8"))):
+        assert loaded == mapping
+        assert list(loaded) == list(mapping)
+        assert all(type(loaded["z"][key]) is type(value) for key, value in mapping["z"].items())
+    assert os.listdir(tmp_path) == ["config.yaml"]
+
+
+def test_config_round_trip(tmp_path: Path) -> None:
+    cfg = Go1()
+    cfg.set("env.run_name", "1e4")
+    cfg.set("rewards.scales.torques", "1e-7")
+    save_yaml(tmp_path / "config.yaml", cfg.to_dict())
+    twin = Go1()
+    twin.update(load_yaml(tmp_path / "config.yaml"), "config.yaml")
+    assert twin.diff(cfg) == []
+    assert "rewards" in (tmp_path / "config.yaml").read_text()
+
+
+def test_numbers_as_people_write_them(tmp_path: Path) -> None:
+    (tmp_path / "a.yaml").write_text("a: 1e-4\nb: [-2E3, .5e+1, '1e-4', 1e, e5, 3]\n")
+    assert load_yaml(tmp_path / "a.yaml") == {"a": 1e-4, "b": [-2000.0, 5.0, "1e-4", "1e", "e5", 3]}
+
+
+def test_repeated_lists_are_written_out(tmp_path: Path) -> None:
+    shared = [1.0]
+    save_yaml(tmp_path / "a.yaml", {"x": shared, "y": shared})
+    assert "&" not in (tmp_path / "a.yaml").read_text()
+
+
+def test_save_replaces_whole_files_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "config.yaml"
+    save_yaml(path, {"a": 1})
+    with pytest.raises(yaml.YAMLError):
+        save_yaml(path, {"a": 2, "b": object()})
+    assert load_yaml(path) == {"a": 1}
+
+    def fail(*_: Any) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr(os, "replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        save_yaml(path, {"a": 2})
+    assert load_yaml(path) == {"a": 1}
+    assert os.listdir(tmp_path) == ["config.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("a: 1\nb: [1, 2\nc: 3\n", ":3: not valid YAML: "),
+        ("a: 1\n\tb: 2\n", ":2: not valid YAML: "),
+        ("env:\n  a: 1\nenv:\n  b: 2\n", ":3: not valid YAML: 'env' is written twice"),
+        ("env:\n  a: 1\n  a: 2\n", ":3: not valid YAML: 'a' is written twice"),
+        ("a: !!python/object/apply:os.getcwd []\n", ":1: not valid YAML: "),
+        ("[1, 2]\n", ": holds list, not a mapping"),
+        ("", ": holds NoneType, not a mapping"),
+    ],
+)
+def test_bad_yaml(tmp_path: Path, text: str, problem: str) -> None:
+    path = tmp_path / "over.yaml"
+    path.write_text(text)
+    with says(f"{path}{problem}"):
+        load_yaml(path)
+
+
+def test_unreadable_yaml(tmp_path: Path) -> None:
+    with says("none.yaml: cannot read this config file: No such file"):
+        load_yaml(tmp_path / "none.yaml")
+    with says("cannot read this config file: Is a directory"):
+        load_yaml(tmp_path)
+    (tmp_path / "latin.yaml").write_bytes(b"a: \xff\xfe\n")
+    with says("latin.yaml: not valid YAML"):
+        load_yaml(tmp_path / "latin.yaml")
