@@ -1,12 +1,27 @@
 """legged_gym's form - class configs, rewards by name, one readable environment - on MuJoCo-Warp, PyTorch and rsl-rl."""
 
+import ctypes
 import os
 import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 
-# rsl-rl imports GitPython, which fails on a machine without git; MuJoCo draws without a screen only if told how.
+# rsl-rl imports GitPython, which fails on a machine without git
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
-if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
-    os.environ.setdefault("MUJOCO_GL", "egl")
+
+
+def _choose_offscreen_renderer() -> None:
+    """Without a screen MuJoCo draws through EGL, or OSMesa, if told so; where it is told and the library is missing, it fails at import."""
+    if sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or "MUJOCO_GL" in os.environ:
+        return
+    for name, library in (("egl", "libEGL.so.1"), ("osmesa", "libOSMesa.so.8")):
+        try:
+            ctypes.CDLL(library)
+        except OSError:
+            continue
+        os.environ["MUJOCO_GL"] = name
+        return
+
+
+_choose_offscreen_renderer()

@@ -12,8 +12,9 @@ from pathlib import Path
 
 import legged_mw  # noqa: F401  (sets MUJOCO_GL, which mujoco reads when it is imported)
 
-import av  # isort: skip
-import mujoco  # isort: skip
+# isort: split
+import av
+import mujoco
 import numpy as np
 import pytest
 
@@ -43,9 +44,9 @@ def model() -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(ROBOT)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture  # a new one for each test: the camera remembers where the robot was
 def renderer(model: mujoco.MjModel) -> Iterator[RobotRenderer]:
-    with RobotRenderer(model, 160, 120) as robot_renderer:
+    with RobotRenderer(model, 320, 240) as robot_renderer:
         yield robot_renderer
 
 
@@ -170,7 +171,7 @@ def test_frames_are_copies_and_the_callers_model_is_untouched(model: mujoco.MjMo
     kept = first.copy()
     raised = model.qpos0 + np.eye(model.nq)[2] * 0.15
     second = renderer.frame(raised)
-    assert first.shape == (120, 160, 3) and first.dtype == np.uint8
+    assert first.shape == (240, 320, 3) and first.dtype == np.uint8
     assert np.array_equal(first, kept) and not np.array_equal(first, second)
     assert (model.vis.global_.offwidth, model.vis.quality.shadowsize) == (640, 4096)  # MuJoCo's defaults
 

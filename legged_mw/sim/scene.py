@@ -9,7 +9,7 @@ import mujoco
 
 GROUND_MATERIAL = "ground"  # for the floor or terrain geom
 _ZENITH, _HORIZON = (0.22, 0.32, 0.45), (0.56, 0.63, 0.70)
-_TILE = 0.5  # edge of one checker square [m]: a grid to judge speed and stride by
+_TILE = 0.5  # edge of one checker square [m], a thin line every second one: to judge speed and stride by
 
 
 def add_scene(spec: mujoco.MjSpec) -> None:
@@ -40,17 +40,17 @@ def _add_ground_material(spec: mujoco.MjSpec) -> None:
         name=GROUND_MATERIAL,
         type=mujoco.mjtTexture.mjTEXTURE_2D,
         builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.20, 0.23, 0.27],
-        rgb2=[0.24, 0.27, 0.31],
+        rgb1=[0.23, 0.26, 0.30],
+        rgb2=[0.28, 0.31, 0.35],
         mark=mujoco.mjtMark.mjMARK_EDGE,
-        markrgb=[0.34, 0.37, 0.41],
+        markrgb=[0.40, 0.43, 0.47],
         width=512,
         height=512,
     )
     material = spec.add_material(name=GROUND_MATERIAL, specular=0.1, shininess=0.1, reflectance=0.0)
-    # one image is 2 x 2 squares and repeats by the metre, also on a plane without edges
+    # texuniform measures in half-sizes: texrepeat 1 lays the image, 2 x 2 squares with a line around it, over 2 m
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = GROUND_MATERIAL
-    material.texuniform, material.texrepeat = True, [0.5 / _TILE, 0.5 / _TILE]
+    material.texuniform, material.texrepeat = True, [1 / _TILE, 1 / _TILE]
 
 
 def _add_light(spec: mujoco.MjSpec) -> None:
@@ -79,10 +79,8 @@ def _set_quality(spec: mujoco.MjSpec) -> None:
     vis = spec.visual
     vis.map.znear, vis.map.zfar = 0.02, 150.0  # [extent]
     vis.map.shadowclip = 2.0  # [extent] half-width of the shadow map: 2 mm a pixel
-    vis.map.haze = 0.9
-    vis.quality.shadowsize = 2048  # 4096 halves the frame rate of software rendering and is hardly seen
+    vis.map.haze = 0.9  # from a tenth of zfar on, a plane fades into the horizon; fog stays off
+    vis.quality.shadowsize = 2048  # 4096 costs a software renderer a seventh of its frames and is hardly seen
     vis.quality.offsamples = 4
-    vis.quality.numslices, vis.quality.numstacks = 28, 12
-    # 'global' is a keyword of the language
-    frame = getattr(vis, "global_", None) or getattr(vis, "global")
-    frame.offwidth, frame.offheight = 1920, 1080
+    vis.quality.numslices, vis.quality.numstacks = 28, 12  # facets of round primitives
+    vis.global_.offwidth, vis.global_.offheight = 1920, 1080  # [pixels] the largest picture, not the size of one

@@ -142,6 +142,8 @@ def _parents(cls: type, name: str) -> str:
 
 
 def _show(kind: Any) -> str:
+    if get_origin(kind) is Union:  # what Python calls Optional[...]
+        return " | ".join("None" if arm is NoneType else _show(arm) for arm in get_args(kind))
     return kind.__name__ if isinstance(kind, type) else str(kind).replace("typing.", "")
 
 

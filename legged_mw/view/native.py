@@ -17,7 +17,6 @@ from numpy.typing import ArrayLike
 
 from legged_mw.view.overlay import Puppet, draw_velocities, place_camera, set_options
 
-
 CLOSE_SECONDS = 5.0
 
 

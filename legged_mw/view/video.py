@@ -52,9 +52,12 @@ class RobotRenderer:
     def frame(self, qpos: ArrayLike, command: ArrayLike | None = None, velocity: ArrayLike | None = None) -> Frame:
         """One picture (height, width, 3), yours to keep. Velocities are (vx, vy, yaw rate) in the body frame."""
         self.puppet.pose(qpos)
-        self._renderer.update_scene(self.puppet.data, self._camera.update(), self._option)
-        draw_velocities(self._renderer.scene, self.puppet, command, velocity)
-        return self._renderer.render().copy()
+        camera, scene = self._camera.update(), self._renderer.scene
+        # MuJoCo lays an endless floor around where the camera was; told first, it lies right in the first frame too
+        mujoco.mjv_updateCamera(self.puppet.model, self.puppet.data, camera, scene)
+        self._renderer.update_scene(self.puppet.data, camera, self._option)
+        draw_velocities(scene, self.puppet, command, velocity)
+        return self._renderer.render()  # a new array each time
 
     def close(self) -> None:
         """Free the OpenGL context; again is allowed."""
