@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from rsl_rl.models import MLPModel
@@ -31,9 +31,13 @@ class Source(NamedTuple):
 
 def parse() -> argparse.Namespace:
     parser = make_parser(__doc__)
-    parser.add_argument("--command", metavar="VX,VY,YAW", help="fixed command [m/s, m/s, rad/s]; write --command=-0.5,0,0 if it starts with a minus")
+    parser.add_argument(
+        "--command", metavar="VX,VY,YAW", help="fixed command [m/s, m/s, rad/s]; write --command=-0.5,0,0 if it starts with a minus"
+    )
     parser.add_argument("--video", metavar="FILE", help="record an MP4 instead of opening a window")
-    parser.add_argument("--time", type=duration, default=None, metavar="T", help="how long to play (default: 20s of video, a window until closed)")
+    parser.add_argument(
+        "--time", type=duration, default=None, metavar="T", help="how long to play (default: 20s of video, a window until closed)"
+    )
     parser.add_argument("--eval", action="store_true", help="run the walking exam, print its table, write a JSON file")
     parser.add_argument("--export", metavar="DIR", help="write model.pt, policy.onnx and config.yaml there")
     args = parser.parse_args()
@@ -98,7 +102,7 @@ def prepare(task: LoadedTask, args: argparse.Namespace) -> None:
     apply_overrides(task, args)
 
 
-def set_of_changes(task: LoadedTask, trained: dict) -> list[tuple[str, object, object]]:
+def set_of_changes(task: LoadedTask, trained: dict[str, Any]) -> list[tuple[str, object, object]]:
     """(path, now, as trained) of every field that differs from the trained config."""
     original = load_task(task.to_dict()["task"])
     original.cfg.update(trained, where=CONFIG_FILE)

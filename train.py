@@ -12,12 +12,12 @@ from pathlib import Path
 import torch
 
 from legged_mw import ROOT
+from legged_mw.envs.describe import describe
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, find_checkpoint, find_run, new_run
-from legged_mw.utils.cli import apply_overrides, duration, fail, make_parser, one_line_errors, pick_device, positive, seed_everything, shown
+from legged_mw.utils.cli import apply_overrides, duration, make_parser, one_line_errors, pick_device, positive, seed_everything, shown
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
-from legged_mw.envs.describe import describe
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 
@@ -39,7 +39,9 @@ def parse() -> argparse.Namespace:
 def main() -> None:
     began, args = time.time(), parse()
     if args.list:
-        print("\n".join(f"{name:<16} {(sys.modules[type(load_task(name).cfg).__module__].__doc__ or '').splitlines()[0]}" for name in task_names()))
+        for name in task_names():
+            about = sys.modules[type(load_task(name).cfg).__module__].__doc__ or ""
+            print(f"{name:<16} {about.partition(chr(10))[0]}")
         return
     task = load_task(args.task)
     experiment = ROOT / "logs" / (args.experiment_name or task.train.runner.experiment_name or task.name)
@@ -69,10 +71,8 @@ def train(
         print(f"resuming {shown(checkpoint)}")
     left = task.train.runner.max_iterations - runner.current_learning_iteration
     if left <= 0:
-        raise ConfigError(
-            f"{shown(checkpoint or experiment)} has done {runner.current_learning_iteration} iterations of {task.train.runner.max_iterations}; "
-            "raise --max_iterations to go on"
-        )
+        done, wanted = runner.current_learning_iteration, task.train.runner.max_iterations
+        raise ConfigError(f"{shown(checkpoint or experiment)} has done {done} iterations of {wanted}; raise --max_iterations to go on")
     folder = run or new_run(experiment, task.train.runner.run_name)
     save_yaml(folder / CONFIG_FILE, task.to_dict())
     runner.logger.log_dir = str(folder)

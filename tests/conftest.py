@@ -1,7 +1,9 @@
-"""Shared by all tests: one torch thread, and GPU tests left out where there is no GPU."""
+"""Shared by all tests: one torch thread; tests that need a GPU or a screen are left out where there is none."""
 
 import pytest
 import torch
+
+from legged_mw.view.native import has_display
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -10,7 +12,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselect, not skip: `pytest -m gpu` on a machine without a GPU then says that nothing ran."""
-    if not torch.cuda.is_available():
-        gpu = [item for item in items if item.get_closest_marker("gpu")]
-        config.hook.pytest_deselected(items=gpu)
-        items[:] = [item for item in items if item not in gpu]
+    for mark, present in (("gpu", torch.cuda.is_available()), ("display", has_display())):
+        if not present:
+            without = [item for item in items if item.get_closest_marker(mark)]
+            config.hook.pytest_deselected(items=without)
+            items[:] = [item for item in items if item not in without]

@@ -278,7 +278,7 @@ def test_plain_python_on_macos_is_told_of_mjpython(monkeypatch: pytest.MonkeyPat
         NativeViewer(model)
 
 
-@pytest.mark.skipif(not has_display(), reason="opens a window; try `xvfb-run pytest tests/test_view.py`")
+@pytest.mark.display
 def test_window_shows_poses_and_is_gone_after_close(model: mujoco.MjModel) -> None:
     with NativeViewer(model) as viewer:
         viewer.show(model.qpos0 + np.eye(model.nq)[0], command=np.array([1.0, 0.0, 0.0]), velocity=np.array([0.8, 0.0, 0.2]))

@@ -19,6 +19,7 @@ class BaseTask(VecEnv):
     everything handed out is a copy, and everything handed in is copied.
     """
 
+    device: str
     obs_buf: dict[str, Tensor]  # group -> (N, size)
     max_episode_length: int  # [control steps]
 

@@ -37,6 +37,8 @@ class Row(NamedTuple):
 class LeggedRobot(BaseTask):
     """N robots in N worlds of their own, as one vectorized environment."""
 
+    cfg: LeggedRobotCfg
+
     def __init__(self, cfg: LeggedRobotCfg, device: str, eager: bool = False) -> None:
         self.cfg = cfg
         self.robot = self._load_robot()
@@ -431,9 +433,7 @@ class LeggedRobot(BaseTask):
         """Per-episode memory as columns of one matrix, so that a reset clears it in one go."""
         joints, feet, terms = self.num_actions, self.num_feet, len(self._active_scales())
         widths = {"last_actions": joints, "feet_air_time": feet, "swing_peak": feet}
-        self._episode, views = columns(
-            self.num_envs, self.device, **widths, episode_sums=terms, episode_return=1, episode_steps=1
-        )
+        self._episode, views = columns(self.num_envs, self.device, **widths, episode_sums=terms, episode_return=1, episode_steps=1)
         for name, view in views.items():
             setattr(self, name, view)
         self._statistics = torch.zeros(terms + 5, device=self.device)

@@ -125,7 +125,8 @@ def walks(result: dict[str, Any]) -> bool:
 
 def beats_peer(result: dict[str, Any]) -> bool:
     """At least as good on each of the peer's figures, better on the errors and the cost of transport."""
-    better = all(a < b for a, b in zip(result["error"], PEER["error"], strict=True)) and result["cost_of_transport"] < PEER["cost_of_transport"]
+    better = all(a < b for a, b in zip(result["error"], PEER["error"], strict=True))
+    better = better and result["cost_of_transport"] < PEER["cost_of_transport"]
     worst = all(a <= b for a, b in zip(result["worst"], PEER["worst"], strict=True))
     kicks = all(result["kicks"][speed] >= share for speed, share in PEER["kicks"].items())
     return better and worst and kicks and result["falls"] <= PEER["falls"] and result["drift"] <= max(EQUAL_DRIFT, PEER["drift"])

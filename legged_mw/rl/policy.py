@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import io
 import warnings
 from pathlib import Path
 from typing import Any
@@ -52,13 +51,12 @@ class ExportedPolicy(nn.Module):
 def export_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
     """Write one self-contained ONNX file: input ``obs`` (1, size), output ``actions`` (1, A)."""
     model = ExportedPolicy(policy, clip_actions).eval()
-    buffer = io.BytesIO()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter warns of its own internals
         torch.onnx.export(
             model,
             (torch.zeros(1, policy.obs_dim),),
-            buffer,
+            path,
             input_names=["obs"],
             output_names=["actions"],
             opset_version=18,
@@ -66,7 +64,6 @@ def export_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
             dynamo=True,
             verbose=False,
         )
-    path.write_bytes(buffer.getvalue())
 
 
 def act(policy: MLPModel, obs: TensorDict) -> Tensor:

@@ -46,8 +46,9 @@ class StepGraph:
             return
         torch.cuda.synchronize(stream.device)
         graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=stream), wp.ScopedStream(wp_stream, sync_enter=False):
-            wp.capture_begin(stream=wp_stream, external=True)
+        # relaxed, for warp's deterministic kernels allocate on a stream of their own while this one is captured
+        with torch.cuda.graph(graph, stream=stream, capture_error_mode="relaxed"), wp.ScopedStream(wp_stream, sync_enter=False):
+            wp.capture_begin(stream=wp_stream, external=True, capture_mode=wp.CaptureMode.RELAXED)
             try:
                 self._fn()
             finally:
@@ -65,4 +66,5 @@ def record_warp(fn: Callable[[], None], device: wp.Device) -> Callable[[], None]
     with wp.ScopedDevice(device), wp.ScopedCapture(device=device) as capture:
         fn()
     graph = capture.graph
+    assert graph is not None
     return lambda: wp.capture_launch(graph)

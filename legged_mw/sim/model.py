@@ -5,6 +5,8 @@ numbers state choices (gains, ground, what collides, what is sensed). Every name
 something in the MJCF, and what a choice changes is recorded in ``RobotModel.overrides``.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import difflib
@@ -84,7 +86,7 @@ def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str) -> l
     for joint in joints:
         hits = [key for key in table if key in joint]
         if len(hits) != 1:
-            raise ModelError(f"{what}: joint '{joint}' matches {hits or 'none'} of {list(table)}; exactly one key must be a part of its name")
+            raise ModelError(f"{what}: joint '{joint}' matches {hits or 'none'} of {list(table)}; exactly one must be a part of its name")
         values.append(float(table[hits[0]]))
     for key in table:
         if not any(key in joint for joint in joints):
@@ -122,6 +124,8 @@ def build_model(
     add_scene(spec)
     visual = spec.compile()
     spec.compiler.discardvisual = True
+    for light in list(spec.lights):
+        spec.delete(light)  # mujoco-warp would move it in every step
     mj = spec.compile()
     names = tuple(j.name for j in joints)
     return RobotModel(

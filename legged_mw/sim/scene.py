@@ -3,6 +3,8 @@
 No geom is added here and nothing that is stepped changes; the names given are for others to refer to.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import mujoco

@@ -1,5 +1,7 @@
 """mujoco-warp behind fixed torch tensors. It steps any model: nothing here knows a robot, a reward or a config."""
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import dataclasses

@@ -36,7 +36,7 @@ def make_parser(description: str | None) -> Parser:
     parser.add_argument("--load_run", metavar="RUN", help="run to load: its name or path; -1 is the one last trained")
     parser.add_argument("--checkpoint", type=int, default=-1, metavar="N", help="iteration to load; -1 is the newest")
     parser.add_argument("--device", metavar="D", help="cuda:0, cpu, ... (default: the GPU if there is one)")
-    parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="override a config field: rewards.scales.torques=-1e-4")
+    parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="override a config field: env.num_envs=64")
     parser.add_argument("--override", action="append", default=[], metavar="FILE", help="override config fields from a YAML file")
     parser.add_argument("--eager", action="store_true", help="record nothing, launch every kernel: slow, for debugging")
     return parser

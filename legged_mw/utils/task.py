@@ -106,7 +106,8 @@ def _import(path: Path) -> ModuleType:
     if path.resolve().parent == (ROOT / "configs").resolve():
         return importlib.import_module(f"configs.{path.stem}")
     spec = importlib.util.spec_from_file_location(f"legged_mw_task_{path.stem}", path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # annotations are resolved through it
     spec.loader.exec_module(module)

@@ -3,6 +3,8 @@
 Shows and listens to keys; steps no simulation. The window lives on a thread of MuJoCo's.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import os

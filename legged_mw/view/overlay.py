@@ -3,6 +3,8 @@
 Draws into a `mujoco.MjvScene` that somebody else owns; opens no window, no file and no OpenGL context.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math

@@ -3,6 +3,8 @@
 Knows nothing of windows or of who made the poses. `MUJOCO_GL` must be set before mujoco is imported; the package does it.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import contextlib
