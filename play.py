@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -90,13 +91,15 @@ def prepare(task: LoadedTask, args: argparse.Namespace) -> None:
     else:
         for path, value in {"env.num_envs": 1, "noise.level": 0.0, "perturbation.enable": False}.items():
             task.set(path, value, where="play")
-    if args.command:
+    if args.command is not None:
         try:
             command = [float(v) for v in args.command.split(",")]
-            names = zip(("lin_vel_x", "lin_vel_y", "ang_vel_yaw"), command, strict=True)
+            ranges = dict(zip(("lin_vel_x", "lin_vel_y", "ang_vel_yaw"), command, strict=True))
+            if not all(map(math.isfinite, command)):
+                raise ValueError
         except ValueError:
             raise ConfigError(f"--command {args.command}: write three numbers, vx,vy,yaw [m/s, m/s, rad/s], e.g. 0.8,0,0") from None
-        for name, value in names:
+        for name, value in ranges.items():
             task.set(f"commands.ranges.{name}", [value, value], where="--command")
         task.set("commands.resampling_time", 0.0, where="--command")
     apply_overrides(task, args)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import signal
 import sys
 import threading
@@ -52,6 +53,8 @@ def main() -> None:
     elif args.load_run is not None or args.checkpoint != -1:
         raise ConfigError("--load_run and --checkpoint say what to go on with: add --resume")
     apply_overrides(task, args)
+    if not run:
+        experiment = ROOT / "logs" / (task.train.runner.experiment_name or task.name)  # --set may have named it
     device = pick_device(args.device)
     seed_everything(task.train.seed)
     print(f"{task.name}: {task.cfg.env.num_envs} worlds on {device}; a first run compiles kernels, about a minute", flush=True)
@@ -79,10 +82,13 @@ def train(
     stop_on_signals(runner, deadline)
     print(f"writing to {shown(folder)}", flush=True)
     runner.learn(left)
+    name = task.to_dict()["task"]
+    home = ROOT / "logs" / (load_task(name).train.runner.experiment_name or task.name)
+    flags = shlex.join(["--task", name, "--load_run", folder.name if folder.parent == home else shown(folder)])
     if runner.stop:
-        print(f"stopped: {runner.stop}; go on with\n  python train.py --task {task.to_dict()['task']} --resume --load_run {folder.name}")
+        print(f"stopped: {runner.stop}; go on with\n  python train.py --resume {flags}")
     else:
-        print(f"done: {shown(folder)}; watch it with\n  python play.py --task {task.to_dict()['task']} --load_run {folder.name}")
+        print(f"done: {shown(folder)}; watch it with\n  python play.py {flags}")
 
 
 def stop_on_signals(runner: Runner, deadline: float | None) -> None:

@@ -50,7 +50,6 @@ class LeggedRobot(BaseTask):
             device,
             nconmax=cfg.sim.nconmax,
             njmax=cfg.sim.njmax,
-            deterministic=cfg.sim.deterministic,
             eager=eager,
         )
         self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
@@ -111,10 +110,11 @@ class LeggedRobot(BaseTask):
     # ---- termination ----------------------------------------------------------------------------------------------
 
     def check_termination(self) -> None:
-        """Ends episodes: fallen, out of time, or broken (a state that is not finite)."""
+        """Ends episodes: fallen, out of time, or broken (a state or an action that is not finite)."""
         speed = torch.linalg.vector_norm(self.sim.qvel, ord=math.inf, dim=1)
         position = torch.linalg.vector_norm(self.sim.qpos, ord=math.inf, dim=1)
-        finite = (speed <= self.cfg.termination.max_speed) & (position < math.inf)  # NaN compares false
+        action = torch.linalg.vector_norm(self.actions, ord=math.inf, dim=1)  # a servo swallows NaN, the reward does not
+        finite = (speed <= self.cfg.termination.max_speed) & (position < math.inf) & (action < math.inf)  # NaN compares false
         torch.logical_not(finite, out=self.broken)
         max_tilt = math.radians(self.cfg.termination.max_tilt)
         torch.logical_and(self.projected_gravity[:, 2] > -math.cos(max_tilt), finite, out=self.fell)

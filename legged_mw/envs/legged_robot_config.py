@@ -119,7 +119,6 @@ class LeggedRobotCfg(Config):
         ls_iterations: int = 5  # line-search iterations [P]
         nconmax: int = 8  # contacts a world has room for; four feet on a plane make four
         njmax: int = 40  # constraint rows a world has room for: 12 friction + 12 limits + 4 a contact, [ours: never seen full]
-        deterministic: bool = False  # physics repeats bit for bit, slower
 
     class viewer:
         width: int = 1280  # [pixel]

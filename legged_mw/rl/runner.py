@@ -102,7 +102,7 @@ class Runner(OnPolicyRunner):
         iteration = self.current_learning_iteration
         self._last_means.update({name: value for name, value in statistics.items() if not math.isnan(value)})
         means = {name: self._last_means.get(name, math.nan) for name in statistics}
-        self._action_std = float(self.alg.get_policy().output_std.mean())
+        self._action_std = float(self.alg.get_policy().output_std.detach().mean())
         speed = steps / (collect_time + learn_time)
         scalars = {f"Loss/{name}": value for name, value in losses.items()}
         scalars |= {"Loss/learning_rate": self.alg.learning_rate, "Policy/mean_std": self._action_std}
@@ -171,7 +171,10 @@ class Runner(OnPolicyRunner):
 def make_runner(env: LeggedRobot, cfg: LeggedRobotCfgPPO, log_dir: Path | None, device: str) -> Runner:
     """A runner over ``env`` from the learner's config; it writes below ``log_dir``, or nothing if that is None."""
     torch.set_float32_matmul_precision(cfg.runner.matmul_precision)
-    return Runner(env, rsl_rl_config(cfg), str(log_dir) if log_dir else None, device)
+    try:
+        return Runner(env, rsl_rl_config(cfg), str(log_dir) if log_dir else None, device)
+    except ValueError as error:  # a class, activation, optimizer or observation group that does not exist
+        raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None
 
 
 def rsl_rl_config(cfg: LeggedRobotCfgPPO) -> dict[str, Any]:

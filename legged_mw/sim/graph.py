@@ -46,9 +46,8 @@ class StepGraph:
             return
         torch.cuda.synchronize(stream.device)
         graph = torch.cuda.CUDAGraph()
-        # relaxed, for warp's deterministic kernels allocate on a stream of their own while this one is captured
-        with torch.cuda.graph(graph, stream=stream, capture_error_mode="relaxed"), wp.ScopedStream(wp_stream, sync_enter=False):
-            wp.capture_begin(stream=wp_stream, external=True, capture_mode=wp.CaptureMode.RELAXED)
+        with torch.cuda.graph(graph, stream=stream), wp.ScopedStream(wp_stream, sync_enter=False):
+            wp.capture_begin(stream=wp_stream, external=True)
             try:
                 self._fn()
             finally:

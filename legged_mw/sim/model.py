@@ -19,12 +19,13 @@ import mujoco
 import numpy as np
 
 from legged_mw.sim.scene import add_scene
+from legged_mw.utils.config import ConfigError
 
 GROUND = "floor"  # name of the ground geom that build_model adds
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
-class ModelError(ValueError):
+class ModelError(ConfigError):
     """A name or number asked of a model that does not fit its MJCF; the message lists what exists."""
 
 
@@ -113,7 +114,7 @@ def build_model(
     try:
         spec = mujoco.MjSpec.from_file(str(file))
     except ValueError as error:
-        raise ModelError(f"{file.name} is not a valid MJCF: {error}") from None
+        raise _invalid(file, error) from None
     notes: list[str] = []
     root, joints = _find_joints(spec, file.name)
     _set_physics(spec, physics)
@@ -122,7 +123,10 @@ def build_model(
     limits = _add_servos(spec, joints, stiffness, damping, notes)
     _add_sensors(spec, contact_geoms, velocity_sites, accelerometer_site, file.name)
     add_scene(spec)
-    visual = spec.compile()
+    try:
+        visual = spec.compile()
+    except ValueError as error:  # a missing mesh, a name used twice: all that parsing does not see
+        raise _invalid(file, error) from None
     spec.compiler.discardvisual = True
     for light in list(spec.lights):
         spec.delete(light)  # mujoco-warp would move it in every step
@@ -138,6 +142,10 @@ def build_model(
         sensors=_sensor_spans(mj, len(contact_geoms), len(velocity_sites), accelerometer_site is not None),
         overrides=notes,
     )
+
+
+def _invalid(file: Path, error: ValueError) -> ModelError:
+    return ModelError(f"{file.name} is not a valid MJCF: {' '.join(str(error).split())}")
 
 
 def _find_joints(spec: mujoco.MjSpec, where: str) -> tuple[str, list[mujoco.MjsJoint]]:
@@ -201,7 +209,7 @@ def _add_servos(
     limits = {j.name: float(j.actfrcrange[1]) for j in joints if j.actfrcrange[1] > j.actfrcrange[0]}
     for actuator in list(spec.actuators):
         if actuator.target not in limits and actuator.forcerange[1] > actuator.forcerange[0]:
-            limits[actuator.target] = float(actuator.forcerange[1])
+            limits[actuator.target] = float(actuator.forcerange[1] * abs(actuator.gear[0]))  # at the joint
         notes.append(f"actuator '{actuator.name}' replaced by a position servo")
         spec.delete(actuator)
     names = [j.name for j in joints]

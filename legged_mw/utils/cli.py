@@ -113,7 +113,7 @@ def one_line_errors(program: str) -> Iterator[None]:
 
 def fail(program: str, message: str) -> NoReturn:
     """One line on standard error, exit code 2."""
-    print(f"{program}: {message}", file=sys.stderr)
+    print(f"{program}: {' '.join(message.split())}", file=sys.stderr)
     raise SystemExit(2)
 
 

@@ -1,0 +1,61 @@
+"""train.py and play.py run inside the test process, with logs/ in a folder of the test's: an import costs seconds, a run does not."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import signal
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from legged_mw import ROOT
+from legged_mw.utils.cli import one_line_errors
+
+sys.path.insert(0, str(ROOT))  # the two programs are no package
+import play
+import train
+
+# A task small enough that an iteration takes milliseconds; episodes short enough that some end in each.
+SMALL = [
+    *("--task", "go1_flat", "--num_envs", "16", "--device", "cpu"),
+    *("--set", "actor.hidden_dims=[16, 16]", "--set", "critic.hidden_dims=[16, 16]"),
+    *("--set", "runner.num_steps_per_env=8", "--set", "env.episode_length_s=0.4"),
+]
+
+
+class Result(NamedTuple):
+    code: int
+    out: str
+    err: str
+
+
+def run(program: str, root: Path, *args: str) -> Result:
+    """As ``python <program>.py <args>`` would, but below ``root``; a traceback is raised, as no user should see one."""
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    module = {"train": train, "play": play}[program]
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        patch.setattr(sys, "argv", [f"{program}.py", *args])
+        patch.setattr(module, "ROOT", root)
+        try:
+            with one_line_errors(f"{program}.py"):
+                module.main()
+        except SystemExit as end:
+            assert isinstance(end.code, int)
+            code = end.code
+        finally:
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+    return Result(code, out.getvalue(), err.getvalue())
+
+
+def trained(root: Path, *args: str) -> Path:
+    """Train the small task below ``root`` and return its run folder."""
+    before = set(root.glob("logs/*/*"))
+    result = run("train", root, *SMALL, *args)
+    assert result.code == 0, result.err
+    [folder] = set(root.glob("logs/*/*")) - before
+    return folder

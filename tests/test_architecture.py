@@ -1,0 +1,119 @@
+"""The rules of the house that a reader cannot see from one file: who may import whom, and how long things may get."""
+
+from __future__ import annotations
+
+import ast
+from fnmatch import fnmatch
+
+import pytest
+
+from legged_mw import ROOT
+
+FILES = sorted(str(p.relative_to(ROOT)) for pattern in ("legged_mw/**/*.py", "configs/*.py", "*.py") for p in ROOT.glob(pattern))
+MAX_LINES, MAX_LINES_OF_THE_MDP, MAX_FUNCTION = 520, 800, 60
+# Imports run one way: train, play -> rl -> envs -> sim -> utils; configs -> envs, utils.
+ONLY_IN = {
+    "warp": ["legged_mw/sim/*"],
+    "mujoco_warp": ["legged_mw/sim/*"],
+    "rsl_rl": ["legged_mw/rl/*"],
+    "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
+    "rsl_rl.models": ["legged_mw/rl/*", "play.py"],  # the type of what it plays
+    "legged_mw.view": ["legged_mw/view/*", "play.py", "train.py"],
+    "legged_mw.eval": ["legged_mw/eval/*", "play.py", "train.py"],
+    "configs": ["configs/*"],
+    "train": [],
+    "play": [],
+}
+NEVER_IN = {
+    "legged_mw/envs/*": ["legged_mw.rl", "mujoco"],
+    "legged_mw/sim/*": ["legged_mw.envs", "legged_mw.rl", "legged_mw.utils.config", "legged_mw.utils.task"],
+    "legged_mw/utils/*": ["legged_mw.envs", "legged_mw.sim", "legged_mw.rl"],  # at run time
+}
+CONFIGS_MAY = ["legged_mw.envs", "legged_mw.utils", "configs", "math", "__future__"]  # numbers and names only
+
+
+def imports(source: str) -> set[tuple[str, bool]]:
+    """Dotted names that a file imports, anywhere in it, and whether for type checkers only."""
+    tree, found = ast.parse(source), set()
+    guarded = [n for n in ast.walk(tree) if isinstance(n, ast.If) and ast.unparse(n.test).endswith("TYPE_CHECKING")]
+    for_types = {inner for branch in guarded for statement in branch.body for inner in ast.walk(statement)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found |= {(alias.name, node in for_types) for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0 and node.module, f"relative import in line {node.lineno}"
+            found |= {(f"{node.module}.{alias.name}", node in for_types) for alias in node.names}
+    return found
+
+
+def violations(path: str, source: str) -> list[str]:
+    """Imports that ``path`` may not make."""
+
+    def within(name: str, package: str) -> bool:
+        return f"{name}.".startswith(f"{package}.")
+
+    wrong = []
+    for name, for_types in sorted(imports(source)):
+        rule = max((package for package in ONLY_IN if within(name, package)), key=len, default=None)  # the most specific
+        outside = rule is not None and not any(fnmatch(path, where) for where in ONLY_IN[rule])
+        never = any(fnmatch(path, where) and within(name, package) for where, packages in NEVER_IN.items() for package in packages)
+        if path.startswith("legged_mw/utils/") and for_types:
+            never = False
+        if path.startswith("configs/"):
+            never = not any(within(name, package) for package in CONFIGS_MAY)
+        if outside or never:
+            wrong.append(f"{path} imports {name}")
+    return wrong
+
+
+@pytest.mark.parametrize("path", FILES)
+def test_imports_run_one_way(path: str) -> None:
+    assert violations(path, (ROOT / path).read_text()) == []
+
+
+@pytest.mark.parametrize(
+    ("path", "source", "caught"),
+    [
+        ("legged_mw/envs/legged_robot.py", "import warp as wp", True),
+        ("legged_mw/envs/legged_robot.py", "def f():\n    from mujoco_warp import step", True),
+        ("legged_mw/envs/legged_robot.py", "import mujoco", True),
+        ("legged_mw/envs/legged_robot.py", "from legged_mw import rl", True),
+        ("legged_mw/envs/legged_robot.py", "from legged_mw.eval import exam", True),
+        ("legged_mw/envs/legged_robot.py", "from rsl_rl.env import VecEnv", True),
+        ("legged_mw/envs/base_task.py", "from rsl_rl.env import VecEnv", False),
+        ("legged_mw/envs/base_task.py", "from rsl_rl.models import MLPModel", True),
+        ("legged_mw/sim/graph.py", "import warp", False),
+        ("legged_mw/sim/graph.py", "import legged_mw.utils.config", True),
+        ("legged_mw/sim/graph.py", "from legged_mw.utils.math import assign", False),
+        ("legged_mw/utils/task.py", "from legged_mw.envs.legged_robot import LeggedRobot", True),
+        ("legged_mw/utils/task.py", "if TYPE_CHECKING:\n    from legged_mw.envs.legged_robot import LeggedRobot", False),
+        ("legged_mw/utils/task.py", "if TYPE_CHECKING:\n    pass\nelse:\n    import legged_mw.envs", True),
+        ("legged_mw/sim/graph.py", "if TYPE_CHECKING:\n    import legged_mw.envs", True),
+        ("legged_mw/rl/runner.py", "import rsl_rl.runners", False),
+        ("legged_mw/rl/runner.py", "from configs.go1_flat import TASK", True),
+        ("configs/go1_rough.py", "from configs.go1_flat import Go1FlatCfg", False),
+        ("configs/go1_rough.py", "from legged_mw.utils.task import Task", False),
+        ("configs/go1_rough.py", "from legged_mw.sim.model import Ground", True),
+        ("configs/go1_rough.py", "import torch", True),
+        ("train.py", "from rsl_rl.runners import OnPolicyRunner", True),
+        ("play.py", "from rsl_rl.models import MLPModel", False),
+    ],
+)
+def test_the_import_rules_themselves(path: str, source: str, caught: bool) -> None:
+    assert bool(violations(path, source)) == caught
+
+
+@pytest.mark.parametrize("path", FILES)
+def test_files_and_functions_stay_readable(path: str) -> None:
+    source = (ROOT / path).read_text()
+    limit = MAX_LINES_OF_THE_MDP if path == "legged_mw/envs/legged_robot.py" else MAX_LINES
+    assert len(source.splitlines()) < limit
+    functions = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    assert [f"{f.name}, line {f.lineno}" for f in functions if (f.end_lineno or 0) - f.lineno >= MAX_FUNCTION] == []
+    assert ast.get_docstring(ast.parse(source)), "a module docstring says what lives here"
+
+
+def test_all_files_were_looked_at() -> None:
+    assert {"legged_mw/envs/legged_robot.py", "legged_mw/sim/simulation.py", "configs/go1_flat.py", "train.py", "play.py"} <= set(FILES)
+    vague = {"helpers", "managers", "core", "common", "wrappers", "helper", "misc"}
+    assert [path for path in FILES if vague & set(path.removesuffix(".py").split("/"))] == []

@@ -1,0 +1,421 @@
+"""The command line of train.py and play.py: every mistake is one line, exit code 2, and leaves nothing behind."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from program import SMALL, Result, run, trained
+
+from legged_mw import ROOT
+from legged_mw.utils.cli import duration
+from legged_mw.utils.config import load_yaml
+
+TASK = ["--task", "go1_flat"]
+DOG = '''"""A dog of one's own: lighter, and with its own learner."""
+
+from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.utils.task import Task
+
+
+class Dog(LeggedRobot):
+    def _reward_calm(self):
+        return self.dof_vel.abs().sum(dim=1)
+
+
+class DogCfg(Go1FlatCfg):
+    class asset(Go1FlatCfg.asset):
+        file = "robot/dog.xml"
+
+    class rewards(Go1FlatCfg.rewards):
+        class scales(Go1FlatCfg.rewards.scales):
+            calm = -0.01
+
+
+class DogCfgPPO(Go1FlatCfgPPO):
+    class runner(Go1FlatCfgPPO.runner):
+        num_steps_per_env = 4
+
+    class actor(Go1FlatCfgPPO.actor):
+        hidden_dims = [8]
+
+
+TASK = Task(Dog, DogCfg, DogCfgPPO)
+'''
+
+
+def files(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+def refused(root: Path, program: str, *args: str) -> str:
+    """The one line that ``program`` ends with; nothing may have been written."""
+    before = files(root)
+    result = run(program, root, *args)
+    assert result.code == 2, result
+    assert files(root) == before
+    assert result.err.endswith("\n") and result.err.count("\n") == 1, result.err
+    assert result.err.startswith(f"{program}.py: ")
+    return result.err
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with one run of one iteration, logs/go1_flat/<time>_first."""
+    folder = tmp_path_factory.mktemp("cli")
+    trained(folder, "--max_iterations", "1", "--run_name", "first")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def first(root: Path) -> Path:
+    [folder] = (root / "logs/go1_flat").glob("*_first")
+    return folder
+
+
+# ---- mistakes that both programs know
+
+
+@pytest.mark.parametrize("program", ["train", "play"])
+@pytest.mark.parametrize(
+    ("args", "parts"),
+    [
+        ([], ("--task is missing", "tasks: go1_flat")),
+        (["--task", "go1_falt"], ("no task 'go1_falt'; did you mean 'go1_flat'?", "tasks: go1_flat", "or give the path of a config file")),
+        (["--task", "dog/dog.py"], ("no config file at ", "dog/dog.py")),
+        (
+            [*TASK, "--num_env", "4"],
+            ("unrecognized arguments: --num_env 4", "--help"),
+        ),  # no abbreviations: they would change meaning one day
+        ([*TASK, "--num_envs", "0"], ("argument --num_envs: 0 is not a positive number",)),
+        ([*TASK, "--num_envs", "many"], ("argument --num_envs: invalid positive value: 'many'",)),
+        ([*TASK, "--seed", "x"], ("argument --seed: invalid int value: 'x'",)),
+        ([*TASK, "--set", "env.num_envs"], ("--set env.num_envs: write it as path=value, e.g. rewards.scales.torques=-1e-4",)),
+        ([*TASK, "--set", "env.num_env=4"], ("--set env.num_env=4: env.num_env does not exist; did you mean 'num_envs'?",)),
+        ([*TASK, "--set", "env.num_envs=many"], ("--set env.num_envs=many: env.num_envs must be int, not 'many'",)),
+        ([*TASK, "--set", "reward.scales.pose=1"], ("no config section 'reward'; did you mean 'rewards'?", "there are: env, asset, ")),
+        ([*TASK, "--set", "env=4"], ("--set env=4: env is a section, not a field; set one of its fields: num_envs",)),
+        ([*TASK, "--set", "env.num_envs.x=4"], ("env.num_envs is a field (int), not a section",)),
+        ([*TASK, "--set", "terrain.mesh_type=plain"], ("terrain.mesh_type must be", "did you mean 'plane'?")),
+        ([*TASK, "--override", "none.yaml"], ("none.yaml: cannot read this config file: No such file",)),
+        ([*TASK, "--device", "gpu"], ("--device gpu: say cpu, cuda, or cuda:<index>",)),
+        ([*TASK, "--device", "cuda:99"], ("--device cuda:99: this machine has ", " CUDA devices; use --device cpu")),
+        ([*TASK, "--checkpoint", "last"], ("argument --checkpoint: invalid int value: 'last'",)),
+    ],
+)
+def test_mistakes(root: Path, program: str, args: list[str], parts: tuple[str, ...]) -> None:
+    line = refused(root, program, *args)
+    for part in parts:
+        assert part in line
+
+
+@pytest.mark.parametrize("program", ["train", "play"])
+@pytest.mark.parametrize(
+    ("text", "parts"),
+    [
+        ("env: {num_env: 4}", ("env.num_env does not exist; did you mean 'num_envs'?",)),
+        ("envs: {num_envs: 4}", ("no config section 'envs'; did you mean 'env'?",)),
+        ("runner: {max_iterations: soon}", ("runner.max_iterations must be int, not 'soon'",)),
+        ("env: 4", ("env is a section and needs a mapping of its fields, not 4",)),
+        ("- env", ("holds list, not a mapping of sections and fields",)),
+        ("env: {num_envs: 4", ("not valid YAML",)),
+        ("seed: 1\nseed: 2", ("'seed' is written twice",)),
+    ],
+)
+def test_override_file_mistakes(root: Path, tmp_path: Path, program: str, text: str, parts: tuple[str, ...]) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text(text)
+    line = refused(root, program, *TASK, "--override", str(file))
+    assert "mine.yaml" in line
+    for part in parts:
+        assert part in line
+
+
+def test_no_gpu(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
+    for program in ("train", "play"):
+        assert "--device cuda:0: this machine has 0 CUDA devices; use --device cpu" in refused(root, program, *TASK, "--device", "cuda:0")
+
+
+@pytest.mark.parametrize("program", ["train", "play"])
+def test_config_file_without_a_task(root: Path, tmp_path: Path, program: str) -> None:
+    file = tmp_path / "empty.py"
+    file.write_text("TASKS = 1\n")
+    assert "empty.py must end with TASK = Task(Env, Cfg, CfgPPO); its TASK is None" in refused(root, program, "--task", str(file))
+
+
+def test_config_file_with_a_mistake(root: Path, tmp_path: Path) -> None:
+    file = tmp_path / "wrong.py"
+    file.write_text(DOG.replace('file = "robot/dog.xml"', 'fiel = "robot/dog.xml"'))
+    line = refused(root, "train", "--task", str(file))
+    assert "wrong.py:15: DogCfg.asset.fiel overrides nothing; did you mean 'file'?" in line
+
+
+# ---- mistakes that show only when the robot is built
+
+
+@pytest.mark.parametrize(
+    ("item", "parts"),
+    [
+        ("asset.file=dog.xml", ("no MJCF at ", "dog.xml")),
+        ("asset.file=", ("asset.file is empty; name the robot's MJCF",)),
+        ("asset.foot_names=[FR, FL, RR, RLL]", ("no geom 'RLL' in go1.xml; did you mean 'RL'?",)),
+        ("control.stiffness={hip: 30}", ("control.stiffness: joint 'FR_thigh_joint' matches none of ['hip']",)),
+        ("init_state.default_joint_angles={joint: 0, wheel: 1}", ("init_state.default_joint_angles: no joint 'wheel'",)),
+        ("rewards.scales.torqes=-1", ("rewards.scales.torqes = -1: no reward term 'torqes'", "did you mean 'torques'?")),
+        ("actor.activation=elo", ("the learner's config does not fit rsl-rl: ", "'elo'", "'elu'")),
+        ("obs_groups.actor=[stat]", ("the learner's config does not fit rsl-rl: ", "'stat'", "'state'")),
+    ],
+)
+def test_config_that_does_not_fit_the_robot_or_the_learner(root: Path, item: str, parts: tuple[str, ...]) -> None:
+    line = refused(root, "train", *SMALL, "--set", item)
+    for part in parts:
+        assert part in line
+
+
+# ---- finding a run
+
+
+@pytest.mark.parametrize("program", ["train", "play"])
+def test_unknown_run_and_checkpoint(root: Path, first: Path, program: str) -> None:
+    more = ["--resume"] if program == "train" else []
+    line = refused(root, program, *TASK, *more, "--load_run", first.name.replace("first", "frist"))
+    assert f"did you mean '{first.name}'? there are: {first.name}" in line and "no run '" in line
+    line = refused(root, program, *TASK, *more, "--checkpoint", "7")
+    assert f"no checkpoint 7 in {first}; there are: 1" in line
+    line = refused(root, program, *TASK, *more, "--experiment_name", "elsewhere", "--load_run", "-1")
+    assert "no run with a checkpoint in " in line and "elsewhere; train first" in line
+
+
+def test_load_run_without_resume(root: Path, first: Path) -> None:
+    for flag in (["--load_run", first.name], ["--checkpoint", "1"]):
+        assert "--load_run and --checkpoint say what to go on with: add --resume" in refused(root, "train", *TASK, *flag)
+
+
+def test_nothing_to_play(tmp_path: Path) -> None:
+    assert "nothing to play: no run in " in refused(tmp_path, "play", *TASK)
+
+
+def test_run_without_its_config(root: Path, first: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "logs/go1_flat/bare"
+    folder.mkdir(parents=True)
+    shutil.copy(first / "model_1.pt", folder)
+    assert "config.yaml: cannot read this config file: No such file" in refused(tmp_path, "play", *TASK)
+    assert "config.yaml: cannot read this config file: No such file" in refused(tmp_path, "train", *TASK, "--resume")
+
+
+# ---- checkpoints that do not fit
+
+
+@pytest.mark.parametrize("program", ["train", "play"])
+def test_checkpoint_of_other_networks(root: Path, program: str) -> None:
+    more = ["--resume", "--max_iterations", "2"] if program == "train" else []
+    line = refused(root, program, *TASK, "--device", "cpu", *more, "--set", "actor.hidden_dims=[8, 16]")
+    assert "model_1.pt does not fit this task: actor mlp.0.weight is (16, 48) there and (8, 48) here" in line
+
+
+def test_critic_of_other_networks(root: Path) -> None:
+    line = refused(root, "train", *TASK, "--device", "cpu", "--resume", "--max_iterations", "2", "--set", "critic.hidden_dims=[16]")
+    assert "model_1.pt does not fit this task: critic mlp.2.weight is (16, 16) there and (1, 16) here" in line
+
+
+class Evil:
+    """Unpickling it runs code: it makes a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def __reduce__(self) -> tuple:
+        return (os.mkdir, (str(self.folder),))
+
+
+@pytest.mark.parametrize("program", ["train", "play"])
+@pytest.mark.parametrize("damage", ["cut", "empty", "text", "code", "keyless", "other"])
+def test_damaged_checkpoint(first: Path, tmp_path: Path, program: str, damage: str) -> None:
+    folder = tmp_path / "logs/go1_flat/run"
+    shutil.copytree(first, folder)
+    file, whole = folder / "model_1.pt", (first / "model_1.pt").read_bytes()
+    contents = {"code": {"actor_state_dict": Evil(tmp_path / "evil")}, "keyless": {"actor_state_dict": {}}, "other": {"weights": 3}}
+    if damage in contents:
+        torch.save(contents[damage], file)
+    else:
+        file.write_bytes({"cut": whole[: len(whole) // 2], "empty": b"", "text": b"not a model\n"}[damage])
+    more = ["--resume", "--max_iterations", "2"] if program == "train" else []
+    line = refused(tmp_path, program, *TASK, "--device", "cpu", *more)
+    said = {"other": "is not a checkpoint of this project: it has no actor_state_dict", "keyless": "does not fit this task: actor "}
+    assert f"model_1.pt {said.get(damage, 'cannot be read as a checkpoint: it is damaged, or holds more than tensors and numbers')}" in line
+    assert ("is missing there and " in line) == (damage == "keyless")
+    assert not (tmp_path / "evil").exists()
+
+
+def test_actor_alone_plays_but_does_not_resume(first: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "logs/go1_flat/run"
+    shutil.copytree(first, folder)
+    content = torch.load(folder / "model_1.pt", weights_only=True)
+    torch.save({"actor_state_dict": content["actor_state_dict"], "infos": {}}, folder / "model_1.pt")
+    line = refused(tmp_path, "train", *TASK, "--device", "cpu", "--resume", "--max_iterations", "2")
+    assert "model_1.pt holds an actor only; it can be played, but not resumed" in line
+    result = run("play", tmp_path, *TASK, "--device", "cpu", "--export", str(tmp_path / "out"))
+    assert result.code == 0 and (tmp_path / "out/policy.onnx").is_file()
+
+
+# ---- durations and commands
+
+
+@pytest.mark.parametrize(("program", "flag"), [("train", "--max_time"), ("play", "--time")])
+@pytest.mark.parametrize("text", ["soon", "0", "0s", "-5", "5d", "1h30", "5 m", "nan", ""])
+def test_no_duration(root: Path, program: str, flag: str, text: str) -> None:
+    assert f"argument {flag}: '{text}' is no duration; write 90s, 5m or 1.5h" in refused(root, program, *TASK, f"{flag}={text}")
+
+
+def test_durations() -> None:
+    assert [duration(text) for text in ("90", "90s", "5m", "1.5h", "0.5s")] == [90, 90, 300, 5400, 0.5]
+
+
+@pytest.mark.parametrize("text", ["", "fast", "1", "1,2", "1,2,3,4", "1;2;3", "0.5,,0", "nan,0,0", "0,inf,0"])
+def test_no_command(root: Path, text: str) -> None:
+    line = refused(root, "play", *TASK, f"--command={text}")
+    assert f"--command {text}: write three numbers, vx,vy,yaw [m/s, m/s, rad/s], e.g. 0.8,0,0" in line
+
+
+# ---- what is shown
+
+
+def test_list(tmp_path: Path) -> None:
+    result = run("train", tmp_path, "--list")
+    assert result.code == 0 and not files(tmp_path)
+    lines = {line.split()[0]: line for line in result.out.splitlines()}
+    assert "Unitree Go1 follows a joystick on flat ground" in lines["go1_flat"]
+    assert set(lines) == {path.stem for path in (ROOT / "configs").glob("*.py")} - {"__init__"}
+
+
+def test_check(tmp_path: Path) -> None:
+    """What the task is made of, with overrides, and nothing is written."""
+    scales = ["--set", "rewards.scales.pose=0", "--set", "rewards.scales.lin_vel_z=-0.7", "--set", "control.stiffness={joint: 20}"]
+    result = run("train", tmp_path, *SMALL, "--check", *scales, "--set", "noise.level=2")
+    assert result.code == 0 and not files(tmp_path)
+    lines = [" ".join(line.split()) for line in result.out.splitlines()]
+    for line in (
+        "go1_flat: 16 worlds on cpu; a first run compiles kernels, about a minute",
+        "observation state (48)",
+        "9 dof_pos 12 noise +-0.06",
+        "45 commands 3",
+        "observation privileged_state (123)",
+        "122 kick_active 1",
+        "actions (12), clipped at +-2, 50 Hz",
+        "lin_vel_z -0.7",
+        "FR_calf_joint -1.800 [-2.818, -0.888] 35.55",
+        "RL_calf_joint servo: kp 20 N m/rad",
+    ):
+        assert line in lines
+    assert "pose 0" not in lines and "pose 0.5" not in lines
+
+
+def test_help_lists_every_flag(tmp_path: Path) -> None:
+    for program, flags in (
+        ("train", ("--resume", "--max_time", "--list", "--check")),
+        ("play", ("--command", "--video", "--eval", "--export")),
+    ):
+        result = run(program, tmp_path, "--help")
+        assert result.code == 0
+        for flag in ("--task", "--num_envs", "--seed", "--load_run", "--checkpoint", "--set", "--override", *flags):
+            assert flag in result.out
+
+
+# ---- overrides: files, then fields, then flags
+
+
+def test_the_more_specific_wins(tmp_path: Path) -> None:
+    one, two = tmp_path / "one.yaml", tmp_path / "two.yaml"
+    one.write_text("env: {num_envs: 3, episode_length_s: 1e+0}\nrewards: {scales: {pose: 0.1, torques: -1e-3}}\nseed: 5\n")
+    two.write_text("env: {num_envs: 4}\nrewards: {scales: {pose: 0.2}}\nrunner: {num_steps_per_env: 4, max_iterations: 9}\n")
+    overrides = ["--set", "rewards.scales.pose=0.3", "--override", str(one), "--override", str(two), "--set", "env.num_envs=6"]
+    overrides += ["--set", "env.num_envs=5", "--set", "algorithm.num_mini_batches=1", "--max_iterations", "1", "--seed", "7"]
+    result = run("train", tmp_path, *TASK, "--device", "cpu", *overrides)
+    assert result.code == 0, result.err
+    [saved] = (tmp_path / "logs/go1_flat").glob("*/config.yaml")
+    config = load_yaml(saved)
+    assert config["env"] == {"num_envs": 5, "episode_length_s": 1.0}  # the last --set; the file that alone names it
+    assert config["rewards"]["scales"]["pose"] == 0.3  # a field wins over files, wherever it stands
+    assert config["rewards"]["scales"]["torques"] == -1e-3
+    assert config["runner"]["num_steps_per_env"] == 4 and config["runner"]["max_iterations"] == 1  # a flag wins over all
+    assert config["seed"] == 7 and config["task"] == "go1_flat"
+    assert "go1_flat: 5 worlds on cpu" in result.out
+
+
+def test_experiment_name_by_flag_and_by_field(tmp_path: Path) -> None:
+    """Both name the folder below logs/, and what is printed finds the run again."""
+    for name, flags in (("flag", ["--experiment_name", "flag"]), ("field", ["--set", "runner.experiment_name=field"])):
+        folder = trained(tmp_path, "--max_iterations", "1", *flags)
+        assert folder.parent == tmp_path / "logs" / name
+    result = run("train", tmp_path, *SMALL, "--max_iterations", "2", "--experiment_name", "flag", "--resume")
+    assert result.code == 0, result.err
+    hint = shlex.split(result.out.splitlines()[-1])
+    assert hint[:2] == ["python", "play.py"]
+    again = run("play", tmp_path, *hint[2:], "--device", "cpu", "--export", str(tmp_path / "out"))
+    assert again.code == 0 and "logs/flag/" in again.out.splitlines()[0] and "model_2.pt" in again.out.splitlines()[0]
+
+
+def test_play_says_what_it_changes(root: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    result = run("play", root, *TASK, "--device", "cpu", "--command=-0.5,0,0.25", "--set", "sim.ls_iterations=7", "--export", str(out))
+    assert result.code == 0, result.err
+    lines = [line.strip() for line in result.out.splitlines()]
+    changes = {line.split(": ")[0]: line.split(": ")[1] for line in lines if " -> " in line}
+    assert changes == {
+        "commands.ranges.ang_vel_yaw": "[-1.2, 1.2] -> [0.25, 0.25]",
+        "commands.ranges.lin_vel_x": "[-1.5, 1.5] -> [-0.5, -0.5]",
+        "commands.ranges.lin_vel_y": "[-0.8, 0.8] -> [0.0, 0.0]",
+        "commands.resampling_time": "5.0 -> 0.0",
+        "env.num_envs": "16 -> 1",
+        "noise.level": "1.0 -> 0.0",
+        "sim.ls_iterations": "5 -> 7",
+    }
+    assert sorted(path.name for path in out.iterdir()) == ["config.yaml", "model.pt", "policy.onnx"]
+    exported = load_yaml(out / "config.yaml")  # as trained, not as played
+    assert exported["commands"]["ranges"]["lin_vel_x"] == [-1.5, 1.5] and exported["env"]["num_envs"] == 16
+
+
+# ---- real processes: what only the programs themselves can show
+
+
+def start(program: str, folder: Path, *args: str) -> Result:
+    """``program`` started in ``folder``, as a user away from the repository does."""
+    done = subprocess.run([sys.executable, str(ROOT / f"{program}.py"), *args], cwd=folder, capture_output=True, text=True, timeout=300)
+    return Result(done.returncode, done.stdout, done.stderr)
+
+
+def test_a_mistake_in_a_real_process(tmp_path: Path) -> None:
+    result = start("train", tmp_path, "--task", "go1_falt")
+    assert (result.code, result.out) == (2, "") and not files(tmp_path)
+    assert result.err.startswith("train.py: no task 'go1_falt'; did you mean 'go1_flat'?") and result.err.count("\n") == 1
+
+
+def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path) -> None:
+    """Its MJCF is found beside it, from wherever it is started; the run plays from its saved config."""
+    home = tmp_path / "my dog"
+    (home / "robot").mkdir(parents=True)
+    (home / "dog.py").write_text(DOG)
+    mjcf = (ROOT / "resources/robots/go1/go1.xml").read_text()
+    assert 'mass="5.204"' in mjcf
+    (home / "robot/dog.xml").write_text(mjcf.replace('mass="5.204"', 'mass="4.5"'))
+    logs = str(tmp_path / "logs")  # an absolute name stays itself
+    common = ["--device", "cpu", "--experiment_name", logs]
+    result = start("train", tmp_path, "--task", "my dog/dog.py", *common, "--num_envs", "8", "--max_iterations", "1")
+    assert result.code == 0, result.err
+    assert "Learning iteration 1/1" in result.out and "rew_calm" in result.out
+    [folder] = Path(logs).iterdir()
+    config = load_yaml(folder / "config.yaml")
+    assert config["asset"]["file"] == str(home / "robot/dog.xml") and config["task"] == str(home / "dog.py")
+    video = tmp_path / "dog.mp4"
+    elsewhere = ["--video", str(video), "--time", "0.1s", "--set", "viewer.width=160", "--set", "viewer.height=120"]
+    result = run("play", tmp_path, "--task", str(home / "dog.py"), *common, *elsewhere)
+    assert result.code == 0, result.err
+    assert result.out.startswith(f"policy: {folder}/model_1.pt\n") and video.stat().st_size > 0

@@ -1,0 +1,579 @@
+"""The simulator seam: what build_model makes of an MJCF and of mistakes, and what Simulation promises about its views."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from mujoco_warp import OverflowType
+
+from legged_mw import ROOT
+from legged_mw.sim.model import GROUND, Ground, ModelError, Physics, RobotModel, build_model, per_joint
+from legged_mw.sim.simulation import Simulation
+
+GO1 = ROOT / "resources/robots/go1/go1.xml"
+FEET = ["FR", "FL", "RR", "RL"]
+JOINTS = [f"{leg}_{link}_joint" for leg in FEET for link in ("hip", "thigh", "calf")]
+POSE = [0.1, 0.9, -1.8, -0.1, 0.9, -1.8] * 2
+HOME = torch.tensor([0.0, 0.0, 0.278, 1.0, 0.0, 0.0, 0.0, *POSE])
+VIEWS = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xfrc_applied", "overflow")
+EXACT = Physics(iterations=100, ls_iterations=50)  # converged, so that figures do not depend on the solver
+
+
+def go1(**choices: Any) -> RobotModel:
+    """The Go1 as go1_flat builds it, with other choices where given."""
+    defaults: dict[str, Any] = dict(
+        physics=Physics(),
+        ground=Ground(),
+        stiffness={"joint": 35.0},
+        damping={"joint": 0.5},
+        colliders=FEET,
+        self_collisions=False,
+        contact_geoms=FEET,
+        velocity_sites=FEET,
+        accelerometer_site="imu",
+    )
+    return build_model(choices.pop("file", GO1), **{**defaults, **choices})
+
+
+LEG = """
+<body name="{0}_leg" pos="0 {1} 0">
+  <joint name="{0}_hip" axis="0 1 0" range="-1 1" damping="0.1"{2}/>
+  <geom name="{0}_shin" type="capsule" size="0.01" fromto="0 0 0 0 0 -0.2" mass="0.3"/>
+  <geom name="{0}_foot" type="sphere" size="0.02" pos="0 0 -0.2" mass="0.1"/>
+  <site name="{0}_foot" pos="0 0 -0.2"/>
+</body>"""
+
+
+def toy(folder: Path, *, root: str = "<freejoint/>", inside: str = "", world: str = "", extra: str = "", limit: str = "") -> Path:
+    """An MJCF of a box with a left and a right leg of one joint each, and whatever a test adds to it."""
+    legs = LEG.format("left", 0.1, limit) + LEG.format("right", -0.1, limit)
+    file = folder / "toy.xml"
+    file.write_text(
+        f"""<mujoco><worldbody>{world}<body name="base" pos="0 0 0.3">{root}
+        <geom name="shell" type="box" size="0.1 0.05 0.05" mass="2"/><site name="imu"/>{inside}{legs}
+        </body></worldbody>{extra}</mujoco>"""
+    )
+    return file
+
+
+def build_toy(file: Path, **choices: Any) -> RobotModel:
+    feet = ["left_foot", "right_foot"]
+    defaults: dict[str, Any] = dict(file=file, stiffness={"hip": 10.0}, damping={"hip": 0.2}, colliders=feet)
+    return go1(**{**defaults, "contact_geoms": feet, "velocity_sites": feet, **choices})
+
+
+def one_line(error: pytest.ExceptionInfo[ModelError]) -> str:
+    text = str(error.value)
+    assert "\n" not in text
+    return text
+
+
+# ---- gain tables
+
+
+def test_table_gives_each_joint_its_own_value() -> None:
+    table = {"hip": 1.0, "thigh": 2.0, "FR_calf": 3.0, "FL_calf": 4.0, "RR_calf": 5.0, "RL_calf": 6.0}
+    assert per_joint(table, JOINTS, "gains") == [1, 2, 3, 1, 2, 4, 1, 2, 5, 1, 2, 6]
+
+
+@pytest.mark.parametrize("field", ["stiffness", "damping"])
+@pytest.mark.parametrize(
+    ("table", "parts"),
+    [
+        ({"joint": 35.0, "FR_hip": 20.0}, ("'FR_hip_joint' matches ['joint', 'FR_hip']", "exactly one")),
+        ({"hip": 1.0, "thigh": 2.0}, ("'FR_calf_joint' matches none of ['hip', 'thigh']", "exactly one")),
+        ({}, ("'FR_hip_joint' matches none of []",)),
+        ({"joint": 35.0, "FR_hip_joitn": 20.0}, ("no joint 'FR_hip_joitn'", "did you mean 'FR_hip_joint'?", *JOINTS)),
+        ({"joint": 35.0, "wheel": 1.0}, ("no joint 'wheel'", "there are: FR_hip_joint", "RL_calf_joint")),
+    ],
+)
+def test_table_that_does_not_fit(field: str, table: dict[str, float], parts: tuple[str, ...]) -> None:
+    with pytest.raises(ModelError) as error:
+        go1(**{field: table})
+    text = one_line(error)
+    assert text.startswith(f"control.{field}: ")
+    for part in parts:
+        assert part in text
+
+
+# ---- names and files
+
+
+@pytest.mark.parametrize(
+    ("choice", "parts"),
+    [
+        ({"colliders": ["FR", "FL", "RR", "RLL"]}, ("no colliding geom 'RLL' in go1.xml", "did you mean 'RL'?", "trunk_box")),
+        ({"colliders": ["foot_*"]}, ("no colliding geom 'foot_*'", "there are: trunk_box", "RL_calf_2")),
+        ({"contact_geoms": ["FR", "FL", "RR", "RLL"]}, ("no geom 'RLL' in go1.xml", "did you mean 'RL'?")),
+        ({"velocity_sites": ["FR", "FLL"]}, ("no site 'FLL' in go1.xml", "did you mean 'FL'?", "head, imu")),
+        ({"accelerometer_site": "imuu"}, ("no site 'imuu' in go1.xml", "did you mean 'imu'?", "there are: head, imu, FR, FL, RR, RL")),
+    ],
+)
+def test_unknown_names(choice: dict[str, Any], parts: tuple[str, ...]) -> None:
+    with pytest.raises(ModelError) as error:
+        go1(**choice)
+    text = one_line(error)
+    for part in parts:
+        assert part in text
+
+
+def test_ids_by_name() -> None:
+    robot = go1()
+    assert (robot.root, robot.joint_names) == ("trunk", tuple(JOINTS))
+    assert robot.physics.geom(robot.id("geom", "RL")).name == "RL" and robot.physics.site(robot.id("site", "imu")).name == "imu"
+    with pytest.raises(ModelError) as error:
+        robot.id("body", "FR_hipp")
+    assert "no body 'FR_hipp' in the model; did you mean 'FR_hip'?" in one_line(error)
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="no MJCF at .*/dog.xml"):
+        go1(file=tmp_path / "dog.xml")
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("<mujoco><worldbody></mujoco>", "XML"),  # not XML
+        ("<mujoco><worldbody><geom typ='box'/></worldbody></mujoco>", "typ"),  # not MJCF
+        ("robot", ""),
+    ],
+)
+def test_file_that_is_no_mjcf(tmp_path: Path, text: str, part: str) -> None:
+    file = tmp_path / "dog.xml"
+    file.write_text(text)
+    with pytest.raises(ModelError, match="dog.xml is not a valid MJCF: ") as error:
+        go1(file=file)
+    assert part in one_line(error)
+
+
+def test_mjcf_that_cannot_be_compiled(tmp_path: Path) -> None:
+    """It parses; that a file is missing or a name is used twice comes out later."""
+    mesh = toy(tmp_path, inside='<geom type="mesh" mesh="hull"/>', extra='<asset><mesh name="hull" file="hull.stl"/></asset>')
+    with pytest.raises(ModelError, match="toy.xml is not a valid MJCF: .*hull.stl") as error:
+        build_toy(mesh)
+    one_line(error)
+    twice = toy(tmp_path, inside='<site name="imu"/>')
+    with pytest.raises(ModelError, match="toy.xml is not a valid MJCF: .*imu") as error:
+        build_toy(twice)
+    one_line(error)
+
+
+@pytest.mark.parametrize(
+    ("parts", "text"),
+    [
+        ({"root": ""}, "toy.xml: the first joint must be the root body's free joint; it is left_hip"),
+        ({"root": '<joint name="rail" type="slide"/>'}, "the first joint must be the root body's free joint; it is rail"),
+        (
+            {"inside": '<body><joint name="neck" type="ball"/><geom size="0.1"/></body>'},
+            "joint 'neck' must be a named hinge or slide joint",
+        ),
+        ({"inside": '<body><joint axis="0 0 1"/><geom size="0.1"/></body>'}, "joint '' must be a named hinge or slide joint"),
+        ({"world": '<geom name="floor" type="plane" size="0 0 1"/>'}, "toy.xml brings a geom 'floor'; leave the ground to the config"),
+    ],
+)
+def test_mjcf_that_is_not_a_robot_alone(tmp_path: Path, parts: dict[str, str], text: str) -> None:
+    with pytest.raises(ModelError) as error:
+        build_toy(toy(tmp_path, **parts))
+    assert text in one_line(error)
+
+
+def test_mjcf_without_joints(tmp_path: Path) -> None:
+    file = tmp_path / "rock.xml"
+    file.write_text('<mujoco><worldbody><body><geom size="1"/></body></worldbody></mujoco>')
+    with pytest.raises(ModelError, match="rock.xml: the first joint must be the root body's free joint; it is missing"):
+        go1(file=file)
+
+
+# ---- servos
+
+
+def test_servo_parameters() -> None:
+    gains, dampings = {"hip": 20.0, "thigh": 30.0, "calf": 40.0}, {"hip": 0.5, "thigh": 0.6, "calf": 0.7}
+    robot = go1(stiffness=gains, damping=dampings)
+    for model in (robot.physics, robot.visual):
+        assert model.nu == 12 and (model.actuator_trnid[:, 0] == range(1, 13)).all()  # servo i is joint i; joint 0 is free
+        kp, kd = [20.0, 30.0, 40.0] * 4, [0.5, 0.6, 0.7] * 4
+        assert model.actuator_gainprm[:, 0].tolist() == kp
+        assert model.actuator_biasprm[:, :3].tolist() == [[0.0, -k, 0.0] for k in kp]
+        assert (model.actuator_gear == [1, 0, 0, 0, 0, 0]).all()
+        np.testing.assert_allclose(model.dof_damping, [0.0] * 6 + kd)
+        limits = [23.7, 23.7, 35.55] * 4
+        assert model.actuator_forcelimited.all() and (model.actuator_forcerange == [[-f, f] for f in limits]).all()
+        assert model.actuator_ctrllimited.all() and (model.actuator_ctrlrange == model.jnt_range[1:]).all()
+        assert not model.jnt_actfrclimited.any()  # the servo clamps, so that actuator_force is what acts
+    assert robot.effort_limit.tolist() == limits and (robot.joint_range == robot.physics.jnt_range[1:]).all()
+    assert "FR_hip_joint servo: kp 20 N m/rad" in robot.overrides and "RL_calf_joint damping: 0.5 -> 0.7 N m s/rad" in robot.overrides
+    assert not any("hip_joint damping" in line for line in robot.overrides)  # 0.5 is what the MJCF has
+
+
+def test_servos_act_as_written() -> None:
+    """tau = clamp(kp (clamp(target) - q)), by C MuJoCo, floating; the damping is the joint's and not in tau."""
+    model = go1().physics
+    data = mujoco.MjData(model)
+    data.qpos[:7], data.qpos[7:], data.qvel[6:] = [0, 0, 1, 1, 0, 0, 0], POSE, 1.0
+    data.ctrl[:] = np.array(POSE) + [0.5, 1.0, 5.0] * 4  # fine; force too large; angle beyond the range, force then fine
+    mujoco.mj_forward(model, data)
+    np.testing.assert_allclose(data.actuator_force, [17.5, 23.7, 35 * (-0.888 + 1.8)] * 4, rtol=1e-6)
+    np.testing.assert_allclose(data.qfrc_passive[6:], -0.5, rtol=1e-6)
+
+
+def test_actuators_of_the_mjcf_are_replaced(tmp_path: Path) -> None:
+    """Their force limit is kept where the joint states none; through a gear it is the joint's that counts."""
+    motors = """<actuator>
+      <motor name="weak" joint="left_hip" forcerange="-7 7"/>
+      <position name="servo" joint="right_hip" kp="3" gear="2" forcerange="-4 4"/>
+    </actuator>"""
+    robot = build_toy(toy(tmp_path, extra=motors))
+    model = robot.physics
+    assert [model.actuator(i).name for i in range(model.nu)] == ["left_hip", "right_hip"]
+    assert model.actuator_gainprm[:, 0].tolist() == [10, 10] and (model.actuator_gear[:, 0] == 1).all()
+    assert model.actuator_forcerange.tolist() == [[-7, 7], [-8, 8]] and robot.effort_limit.tolist() == [7, 8]
+    assert {f"actuator '{name}' replaced by a position servo" for name in ("weak", "servo")} <= set(robot.overrides)
+
+
+def test_limit_of_the_joint_wins_over_the_actuators(tmp_path: Path) -> None:
+    motors = '<actuator><motor joint="left_hip" forcerange="-7 7"/></actuator>'
+    robot = build_toy(toy(tmp_path, extra=motors, limit=' actuatorfrcrange="-5 5"'))
+    assert robot.effort_limit.tolist() == [5, 5] and robot.physics.actuator_forcerange.tolist() == [[-5, 5], [-5, 5]]
+
+
+def test_no_limit_stated_is_no_limit(tmp_path: Path) -> None:
+    robot = build_toy(toy(tmp_path))
+    assert robot.effort_limit.tolist() == [math.inf, math.inf] and not robot.physics.actuator_forcelimited.any()
+
+
+# ---- the two models
+
+
+def test_physics_model_is_the_visual_one_without_looks() -> None:
+    robot = go1()
+    bare, drawn = robot.physics, robot.visual
+    assert (bare.nlight, bare.nmesh) == (0, 0) and drawn.nlight == 1 and drawn.nmesh > 0
+    kept = {bare.geom(i).name for i in range(bare.ngeom)}
+    assert all(bare.geom(i).contype or bare.geom(i).conaffinity or bare.geom(i).name == GROUND for i in range(bare.ngeom))
+    assert set(FEET) | {GROUND} <= kept and drawn.ngeom > bare.ngeom
+    assert (bare.nq, bare.nv, bare.nu, bare.nsensordata) == (drawn.nq, drawn.nv, drawn.nu, drawn.nsensordata) == (19, 18, 12, 19)
+    for field in (
+        "body_mass",
+        "body_inertia",
+        "body_ipos",
+        "body_iquat",
+        "dof_armature",
+        "dof_frictionloss",
+        "jnt_range",
+        "body_invweight0",
+    ):
+        np.testing.assert_array_equal(getattr(bare, field), getattr(drawn, field), err_msg=field)
+
+
+def test_options_are_written() -> None:
+    model = go1(physics=Physics(0.002, 3, 7), ground=Ground(0.8, 6)).physics
+    assert (model.opt.timestep, model.opt.iterations, model.opt.ls_iterations) == (0.002, 3, 7)
+    assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    floor = model.geom(GROUND)
+    assert (floor.friction[0], floor.condim[0], floor.priority[0]) == (0.8, 6, 1)
+
+
+def test_sensor_spans_after_the_mjcfs_own_sensors(tmp_path: Path) -> None:
+    own = '<sensor><gyro site="imu"/><jointpos joint="left_hip"/></sensor>'
+    robot = build_toy(toy(tmp_path, extra=own))
+    assert robot.sensors == {"contact": slice(4, 6), "linvel": slice(6, 12), "accelerometer": slice(12, 15)}
+    data = mujoco.MjData(robot.physics)
+    mujoco.mj_forward(robot.physics, data)
+    np.testing.assert_allclose(data.sensordata[robot.sensors["accelerometer"]], 0, atol=1e-9)  # falls freely
+    none = build_toy(toy(tmp_path), contact_geoms=[], velocity_sites=[], accelerometer_site=None)
+    assert none.sensors == {name: slice(0, 0) for name in ("contact", "linvel", "accelerometer")}
+
+
+# ---- who touches whom, by C MuJoCo
+
+
+def contacts(robot: RobotModel, qpos: Any) -> set[frozenset[str]]:
+    """Pairs of geoms that touch."""
+    data = mujoco.MjData(robot.physics)
+    data.qpos[:] = qpos
+    mujoco.mj_forward(robot.physics, data)
+    names = [robot.physics.geom(i).name for i in range(robot.physics.ngeom)]
+    return {frozenset(names[g] for g in data.contact[i].geom) for i in range(data.ncon)}
+
+
+# Hips turned inwards until right and left foot overlap; the trunk far up, or everything pressed into the ground.
+CROSSED = [0.45, 0.9, -1.8, -0.45, 0.9, -1.8] * 2
+HIGH, PRESSED = [0, 0, 2.0, 1, 0, 0, 0], [0, 0, 0.05, 1, 0, 0, 0]
+ON_GROUND = {frozenset({GROUND, foot}) for foot in FEET}
+
+
+def test_only_feet_touch_the_ground_and_nothing_touches_itself() -> None:
+    robot = go1()
+    assert contacts(robot, [*PRESSED, *POSE]) == ON_GROUND
+    assert contacts(robot, [*HIGH, *CROSSED]) == set()
+    assert any(line.startswith("collisions off: trunk_box, ") for line in robot.overrides)
+
+
+def test_self_collisions_are_among_the_colliders() -> None:
+    robot = go1(self_collisions=True)
+    assert contacts(robot, [*HIGH, *CROSSED]) == {frozenset({"FR", "FL"}), frozenset({"RR", "RL"})}
+    assert contacts(robot, [*PRESSED, *POSE]) == ON_GROUND
+
+
+def test_patterns_name_colliders() -> None:
+    everything = contacts(go1(colliders=["*"]), [*PRESSED, *POSE])
+    assert ON_GROUND < everything and frozenset({GROUND, "trunk_box"}) in everything
+    assert all(GROUND in pair for pair in everything)
+    assert contacts(go1(colliders=["F?", "trunk_*"], contact_geoms=[]), [*PRESSED, *POSE]) == {
+        frozenset({GROUND, name}) for name in ("FR", "FL", "trunk_box", "trunk_left", "trunk_right")
+    }
+
+
+def test_friction_of_the_ground_wins(tmp_path: Path) -> None:
+    """MuJoCo takes the larger of two frictions unless one geom has priority; the feet have 1."""
+    for ground in (Ground(0.3, 3), Ground(1.7, 1), Ground(0.6, 6)):
+        robot = go1(ground=ground)
+        data = mujoco.MjData(robot.physics)
+        data.qpos[:] = HOME
+        mujoco.mj_forward(robot.physics, data)
+        assert data.ncon == 4
+        for contact in data.contact:
+            assert contact.dim == ground.condim and contact.friction[0] == contact.friction[1] == ground.friction
+
+
+# ---- Simulation
+
+
+@pytest.fixture(scope="module")
+def robot() -> RobotModel:
+    return go1()
+
+
+def simulate(robot: RobotModel, num_envs: int = 3, **options: Any) -> Simulation:
+    """Worlds that stand in the home pose with their servos on it."""
+    sim = Simulation(robot.physics, num_envs, "cpu", **{"nconmax": 8, "njmax": 40, **options})
+    stand(sim, torch.ones(num_envs, dtype=torch.bool))
+    return sim
+
+
+def stand(sim: Simulation, mask: torch.Tensor) -> None:
+    sim.qpos[mask], sim.qvel[mask], sim.ctrl[mask] = HOME, 0.0, HOME[7:]
+
+
+def snapshot(sim: Simulation) -> dict[str, torch.Tensor]:
+    return {name: getattr(sim, name).clone() for name in VIEWS}
+
+
+def assert_same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], worlds: Any = slice(None), where: str = "") -> None:
+    """Bit for bit."""
+    for name in VIEWS:
+        assert torch.equal(a[name][worlds], b[name][worlds]), f"{name} {where}"
+
+
+def test_shapes(robot: RobotModel) -> None:
+    sim = simulate(robot, 3)
+    shapes = [(3, 19), (3, 18), (3, 12), (3, 19), (3, 12), (3, 6, 3), (3, 14, 6), (3,)]
+    assert [tuple(getattr(sim, name).shape) for name in VIEWS] == shapes
+
+
+def test_views_are_the_simulators_memory_for_life(robot: RobotModel) -> None:
+    sim = simulate(robot)
+    views = {name: getattr(sim, name) for name in VIEWS}
+    for name in VIEWS:
+        assert views[name].data_ptr() == getattr(sim._data, name).ptr, name
+    before = snapshot(sim)
+    sim.step(5)
+    sim.reset(torch.tensor([True, False, False]))
+    sim.step(5)
+    for name in VIEWS:
+        assert getattr(sim, name) is views[name] and views[name].data_ptr() == getattr(sim._data, name).ptr, name
+    changed = [name for name in VIEWS if not torch.equal(views[name], before[name])]
+    assert set(changed) >= {"qpos", "qvel", "sensordata", "actuator_force", "site_xpos", "ctrl"}
+
+
+def test_replay_equals_eager(robot: RobotModel) -> None:
+    """Recording is an optimisation: 20 steps with random targets, pushes and resets, bit for bit."""
+    recorded, eager = simulate(robot, 4), simulate(robot, 4, eager=True)
+    dice = torch.Generator().manual_seed(0)
+    resets = 0
+    for step in range(20):
+        targets = HOME[7:] + 0.3 * torch.randn(4, 12, generator=dice)
+        push, mask = 20 * torch.randn(4, 6, generator=dice), torch.rand(4, generator=dice) < 0.2
+        resets += int(mask.sum())
+        for sim in (recorded, eager):
+            sim.ctrl.copy_(targets)
+            sim.xfrc_applied[:, 1] = push
+            sim.step(5)
+        assert_same(snapshot(recorded), snapshot(eager), where=f"after step {step}")
+        for sim in (recorded, eager):
+            sim.reset(mask)
+            stand(sim, mask)
+        assert_same(snapshot(recorded), snapshot(eager), where=f"after reset {step}")
+    assert resets > 5 and recorded._recorded and not eager._recorded
+
+
+def test_reset_touches_masked_worlds_alone(robot: RobotModel) -> None:
+    sim, undisturbed = simulate(robot, 4), simulate(robot, 4)
+    mask = torch.tensor([True, False, True, False])
+    for s in (sim, undisturbed):
+        s.xfrc_applied[:, 1, 0] = 5.0
+        s.step(5)
+    before = snapshot(sim)
+    for name in ("sensordata", "actuator_force", "site_xpos", "xfrc_applied"):
+        assert (before[name].flatten(1) != 0).any(dim=1).all(), f"{name} must hold something to clear"
+    sim.reset(mask)
+    after = snapshot(sim)
+    assert_same(after, before, ~mask)
+    for name in ("sensordata", "actuator_force", "site_xpos", "xfrc_applied", "qvel", "ctrl"):
+        assert (after[name][mask] == 0).all(), name
+    assert torch.equal(after["qpos"][mask], torch.tensor(robot.physics.qpos0, dtype=torch.float).expand(2, -1))
+    for _ in range(3):  # nor is anything hidden touched: the others' future is the same
+        for s in (sim, undisturbed):
+            s.step(5)
+    assert_same(snapshot(sim), snapshot(undisturbed), ~mask)
+
+
+def test_broken_world_is_as_new_after_a_reset(robot: RobotModel) -> None:
+    """Not a NaN survives, neither in a view nor in what the solver remembers; the neighbours never notice."""
+    sim, undisturbed = simulate(robot), simulate(robot)
+    mask = torch.tensor([False, True, False])
+    sim.qpos[1], sim.qvel[1] = math.nan, math.nan
+    for s in (sim, undisturbed):
+        s.step(5)
+        s.step(5)
+    for name in ("qpos", "qvel", "sensordata", "site_xpos"):
+        assert getattr(sim, name)[1].isnan().any(), name
+    assert_same(snapshot(sim), snapshot(undisturbed), ~mask)
+    sim.reset(mask)
+    assert all(torch.isfinite(getattr(sim, name)).all() for name in VIEWS)
+    stand(sim, mask)
+    new = simulate(robot)
+    for step in range(5):
+        sim.step(5)
+        new.step(5)
+        assert_same(snapshot(sim), snapshot(new), mask, where=f"step {step}")
+    assert torch.isfinite(sim.qpos).all() and torch.isfinite(sim.sensordata).all()
+
+
+def test_sensors_are_those_of_the_last_substep(robot: RobotModel) -> None:
+    """Four of five substeps leave them out; that changes neither them nor the motion."""
+    sim, every = simulate(robot), simulate(robot)
+    for step in range(10):
+        sim.step(5)
+        for _ in range(5):
+            every.step(1)
+        assert_same(snapshot(sim), snapshot(every), where=f"step {step}")
+    before = sim.sensordata.clone()
+    sim.step(1)
+    assert not torch.equal(sim.sensordata, before)
+
+
+def test_forces_push(robot: RobotModel) -> None:
+    """xfrc_applied is a force [N] in the world frame and persists: F t / m in free flight."""
+    sim = simulate(robot)
+    sim.qpos[:, 2] = 3.0
+    sim.xfrc_applied[1, robot.id("body", "trunk"), :3] = torch.tensor([10.0, 0.0, 0.0])
+    for _ in range(5):
+        sim.step(5)
+    mass, momentum = robot.physics.body_subtreemass[0], 10.0 * 25 * robot.physics.opt.timestep
+    assert sim.qvel[1, 0] > 0.5 * momentum / mass and abs(sim.qvel[0, 0]) < 0.1 * momentum / mass  # legs swing, hence the margin
+
+
+# ---- per-world fields
+
+
+def test_fields_are_views_per_world(robot: RobotModel) -> None:
+    sim = simulate(robot, world_fields=["body_mass", "geom_friction"])
+    mass, friction = sim.field("body_mass"), sim.field("geom_friction")
+    assert mass.data_ptr() == sim._model.body_mass.ptr and mass.shape == (3, 14) and friction.shape == (3, robot.physics.ngeom, 3)
+    assert torch.equal(mass, torch.tensor(robot.physics.body_mass, dtype=torch.float).expand(3, -1))
+    np.testing.assert_allclose(friction, np.broadcast_to(robot.physics.geom_friction, friction.shape), rtol=1e-6)
+
+
+def test_heavier_robot_sags_further() -> None:
+    """And as far as C MuJoCo says, in its own world only."""
+    robot = go1(physics=EXACT)
+    trunk, extra = robot.id("body", "trunk"), torch.tensor([0.0, 3.0, 6.0])  # [kg]
+    sim = simulate(robot, world_fields=["body_mass"])
+    sim.field("body_mass")[:, trunk] += extra
+    heights = []
+    for added in extra.tolist():
+        robot.physics.body_mass[trunk] += added
+        data = mujoco.MjData(robot.physics)
+        data.qpos[:], data.ctrl[:] = HOME, HOME[7:]
+        mujoco.mj_step(robot.physics, data, 50)
+        robot.physics.body_mass[trunk] -= added
+        heights.append(data.qpos[2])
+    for _ in range(10):
+        sim.step(5)
+    assert heights[0] > heights[1] + 0.003 > heights[2] + 0.006
+    np.testing.assert_allclose(sim.qpos[:, 2], heights, atol=1e-5)
+
+
+def test_less_friction_slides_further() -> None:
+    """v^2 / (2 mu g), to a fifth: the robot is not a block, but its servos are stiff here."""
+    robot = go1(physics=EXACT, stiffness={"joint": 200.0}, damping={"joint": 1.5})
+    sim = simulate(robot, world_fields=["geom_friction"])
+    friction, speed = torch.tensor([0.6, 0.2, 0.1]), 0.5
+    for _ in range(100):  # settle
+        sim.step(5)
+    start = sim.qpos[:, 0].clone()
+    sim.field("geom_friction")[:, robot.id("geom", GROUND), 0] = friction
+    sim.qvel[:, 0] = -speed
+    for _ in range(60):
+        sim.step(5)
+    np.testing.assert_allclose(start - sim.qpos[:, 0], speed**2 / (2 * friction * 9.81), rtol=0.2)
+
+
+def test_fields_that_do_not_exist(robot: RobotModel) -> None:
+    sim = simulate(robot, 2, world_fields=["body_mass", "geom_friction"])
+    with pytest.raises(ModelError) as error:
+        sim.field("geom_fricton")
+    text = one_line(error)
+    assert "no per-world model field 'geom_fricton' in this simulation (declare it in world_fields)" in text
+    assert "did you mean 'geom_friction'?" in text and text.endswith("there are: body_mass, geom_friction")
+    with pytest.raises(
+        ModelError, match="'dof_armature' in this simulation .declare it in world_fields.*there are: body_mass, geom_friction"
+    ):
+        sim.field("dof_armature")
+    for unknown, hint in (
+        ("body_mas", "did you mean 'body_mass'?"),
+        ("body_parentid", "there are: qpos0, "),
+    ):  # the latter is shared by all
+        with pytest.raises(ModelError) as error:
+            Simulation(robot.physics, 2, "cpu", nconmax=8, njmax=40, world_fields=["body_mass", unknown])
+        assert f"no per-world model field '{unknown}' in mujoco-warp's Model; " in one_line(error) and hint in str(error.value)
+
+
+# ---- overflow
+
+
+def test_all_fits(robot: RobotModel) -> None:
+    """ "Not converged" is the plan at 1 and 5 iterations, so its two bits are no overflow."""
+    sim = simulate(robot)
+    assert sim.overflow_report() == ""
+    sim.overflow[0] |= int(OverflowType.LS_ITERATIONS)
+    for _ in range(10):
+        sim.step(5)
+    assert (sim.overflow & int(OverflowType.ITERATIONS)).all() and sim.overflow[0] & int(OverflowType.LS_ITERATIONS)
+    assert sim.overflow_report() == ""
+
+
+@pytest.mark.parametrize(
+    ("room", "advice"),
+    [
+        ({"nconmax": 1, "njmax": 4}, "raise njmax (now 4) and nconmax (now 1)"),
+        ({"nconmax": 8, "njmax": 4}, "raise njmax (now 4)"),
+        ({"nconmax": 1, "njmax": 40}, "raise nconmax (now 1)"),
+    ],
+)
+def test_what_does_not_fit_is_named(robot: RobotModel, room: dict[str, int], advice: str) -> None:
+    sim = simulate(robot, 3, **room)
+    sim.step(5)
+    report = sim.overflow_report()
+    assert report.startswith("simulator overflow (") and report.endswith(f" in 3 of 3 worlds; {advice}")
+    sim.reset(torch.ones(3, dtype=torch.bool))
+    assert not sim.overflow.any() and sim.overflow_report() == report  # a reset does not hide it

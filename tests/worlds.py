@@ -1,0 +1,69 @@
+"""What the environment's tests share: building a small one on the CPU, and looking at all of its tensors."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.utils.task import load_task
+
+QUIET = {"noise.level": 0.0, "commands.resampling_time": 0.0}  # nothing drawn within an episode
+
+
+def make_env(
+    num_envs: int, overrides: Mapping[str, Any] | None = None, *, task: str = "go1_flat", env_class: type[LeggedRobot] | None = None
+) -> LeggedRobot:
+    """A task's environment with fields overridden by their dotted path, always from the same seed."""
+    loaded = load_task(task)
+    for path, value in {"env.num_envs": num_envs, **(overrides or {})}.items():
+        loaded.set(path, value)
+    torch.manual_seed(0)
+    return (env_class or loaded.env_class)(loaded.cfg, "cpu")
+
+
+def only_scales(**wanted: float) -> dict[str, float]:
+    """Overrides that switch every reward term off but ``wanted``."""
+    names = load_task("go1_flat").cfg.to_dict()["rewards"]["scales"]
+    return {f"rewards.scales.{name}": wanted.get(name, 0.0) for name in {**names, **wanted}}
+
+
+def tensors(env: LeggedRobot) -> dict[str, Tensor]:
+    """Every tensor that ``env`` or its simulation holds, also inside dicts and lists, by its path."""
+
+    def walk(path: str, value: Any) -> Iterator[tuple[str, Tensor]]:
+        if isinstance(value, Tensor):
+            yield path, value
+        elif isinstance(value, dict):
+            for key, inner in value.items():
+                yield from walk(f"{path}.{key}", inner)
+        elif isinstance(value, list | tuple):
+            for i, inner in enumerate(value):
+                yield from walk(f"{path}.{i}", inner)
+
+    return dict(walk("env", vars(env))) | dict(walk("sim", vars(env.sim)))
+
+
+def snapshot(env: LeggedRobot) -> dict[str, Tensor]:
+    """Copies of all tensors."""
+    return {name: tensor.clone() for name, tensor in tensors(env).items()}
+
+
+def same(a: Tensor, b: Tensor) -> bool:
+    """Bit for bit, where NaN equals NaN."""
+    return a.shape == b.shape and a.dtype == b.dtype and bool(((a == b) | ((a != a) & (b != b))).all())
+
+
+def changed(env: LeggedRobot, before: Mapping[str, Tensor], worlds: Tensor | None = None) -> list[str]:
+    """Names of tensors that differ from ``before``; with ``worlds`` (bool mask), in those rows of a tensor that has a row a world."""
+    now = tensors(env)
+    assert now.keys() == before.keys()
+    n = env.num_envs
+
+    def part(tensor: Tensor) -> Tensor:
+        return tensor[worlds] if worlds is not None and tensor.dim() and tensor.shape[0] == n else tensor
+
+    return [name for name in now if not same(part(now[name]), part(before[name]))]
