@@ -37,7 +37,7 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--video", metavar="FILE", help="record an MP4 instead of opening a window")
     parser.add_argument(
-        "--time", type=duration, default=None, metavar="T", help="how long to play (default: 20s of video, a window until closed)"
+        "--time", type=duration, default=None, metavar="T", help="how long to play (default: 10s of video, a window until closed)"
     )
     parser.add_argument("--eval", action="store_true", help="run the walking exam, print its table, write a JSON file")
     parser.add_argument("--export", metavar="DIR", help="write model.pt, policy.onnx and config.yaml there")
@@ -66,8 +66,10 @@ def main() -> None:
     elif args.eval:
         grade(env, policy, source, Path.cwd() / f"{task.name}_exam.json" if source.shipped else source.folder / "exam.json")
     elif args.video or not has_display():
+        if not args.video:
+            print("no screen here (DISPLAY and WAYLAND_DISPLAY are not set): recording instead of opening a window")
         default = Path(f"{task.name}.mp4") if source.shipped else source.folder / "play.mp4"
-        record(env, policy, Path(args.video) if args.video else default, args.time or 20.0)
+        record(env, policy, Path(args.video) if args.video else default, args.time or 10.0)
     else:
         watch(env, policy, args.time)
 
@@ -102,7 +104,10 @@ def prepare(task: LoadedTask, args: argparse.Namespace) -> None:
         for name, value in ranges.items():
             task.set(f"commands.ranges.{name}", [value, value], where="--command")
         task.set("commands.resampling_time", 0.0, where="--command")
+    worlds = task.cfg.env.num_envs
     apply_overrides(task, args)
+    if args.eval and task.cfg.env.num_envs != worlds:
+        raise ConfigError(f"--eval needs its {worlds} worlds, one a command and one a kick; leave env.num_envs to it")
 
 
 def set_of_changes(task: LoadedTask, trained: dict[str, Any]) -> list[tuple[str, object, object]]:
@@ -121,11 +126,14 @@ def grade(env: LeggedRobot, policy: MLPModel, source: Source, path: Path) -> Non
 
 def record(env: LeggedRobot, policy: MLPModel, path: Path, seconds: float) -> None:
     viewer = env.cfg.viewer
+    every = max(1, round(1 / (viewer.fps * env.dt)))  # [control steps] a frame
     obs = env.get_observations()
-    with VideoWriter(path, viewer.width, viewer.height, fps=1 / env.dt) as video:
-        renderer = RobotRenderer(env.robot.visual, viewer.width, viewer.height)
-        for _ in range(round(seconds / env.dt)):
-            video.add(renderer.frame(*seen(env)))
+    print(f"recording {seconds:g} s of video to {shown(path)}; without a GPU for drawing it takes a while", flush=True)
+    size = viewer.width, viewer.height
+    with VideoWriter(path, *size, fps=1 / (every * env.dt)) as video, RobotRenderer(env.robot.visual, *size) as renderer:
+        for step in range(round(seconds / env.dt)):
+            if step % every == 0:
+                video.add(renderer.frame(*seen(env)))
             obs, *_ = env.step(act(policy, obs))
     print(f"written to {shown(path)}")
 

@@ -58,6 +58,8 @@ def main() -> None:
     device = pick_device(args.device)
     seed_everything(task.train.seed)
     print(f"{task.name}: {task.cfg.env.num_envs} worlds on {device}; a first run compiles kernels, about a minute", flush=True)
+    if device == "cpu" and task.cfg.env.num_envs > 512:
+        print("a CPU is slow at this many worlds: --num_envs 256 shows the first iterations in seconds", flush=True)
     env = task.env_class(task.cfg, device, eager=args.eager)
     if args.check:
         print(describe(env, task))

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import pytest
 
 from legged_mw import ROOT
+from legged_mw.rl.runner import Runner
 from legged_mw.utils.cli import one_line_errors
 
 sys.path.insert(0, str(ROOT))  # the two programs are no package
@@ -59,3 +60,26 @@ def trained(root: Path, *args: str) -> Path:
     assert result.code == 0, result.err
     [folder] = set(root.glob("logs/*/*")) - before
     return folder
+
+
+def files(root: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+
+
+def refused(root: Path, program: str, *args: str) -> str:
+    """The one line that ``program`` ends with; nothing may have been written."""
+    before = files(root)
+
+    def begin(*_: object) -> None:
+        raise AssertionError("it was not refused")  # and would run for minutes
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Runner, "learn", begin)
+        for name in ("record", "watch", "grade", "export"):
+            patch.setattr(play, name, begin)
+        result = run(program, root, *args)
+    assert result.code == 2, result
+    assert files(root) == before
+    assert result.err.endswith("\n") and result.err.count("\n") == 1, result.err
+    assert result.err.startswith(f"{program}.py: ")
+    return result.err

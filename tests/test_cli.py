@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from program import SMALL, Result, run, trained
+from program import SMALL, Result, files, refused, run, trained
 
 from legged_mw import ROOT
 from legged_mw.utils.cli import duration
@@ -49,21 +49,6 @@ class DogCfgPPO(Go1FlatCfgPPO):
 
 TASK = Task(Dog, DogCfg, DogCfgPPO)
 '''
-
-
-def files(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
-
-
-def refused(root: Path, program: str, *args: str) -> str:
-    """The one line that ``program`` ends with; nothing may have been written."""
-    before = files(root)
-    result = run(program, root, *args)
-    assert result.code == 2, result
-    assert files(root) == before
-    assert result.err.endswith("\n") and result.err.count("\n") == 1, result.err
-    assert result.err.startswith(f"{program}.py: ")
-    return result.err
 
 
 @pytest.fixture(scope="module")

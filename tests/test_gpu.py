@@ -16,6 +16,7 @@ DEVICE = "cuda:0"
 def make_env(eager: bool, **overrides: object) -> LeggedRobot:
     task = load_task("go1_flat")
     task.set("env.num_envs", 64)
+    task.set("perturbation.enable", False)
     for path, value in overrides.items():
         task.set(path.replace("__", "."), value)
     torch.manual_seed(3)

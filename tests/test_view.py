@@ -136,9 +136,9 @@ def test_no_encoder_says_what_was_tried(tmp_path: Path, no_program: Path, monkey
 
 
 def test_bad_video_requests(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"'walk.avi': the supported extension is \.mp4"):
+    with pytest.raises(RuntimeError, match=r"'walk.avi': the supported extension is \.mp4"):
         VideoWriter(tmp_path / "walk.avi", 320, 240, fps=50)
-    with pytest.raises(ValueError, match="321 x 240 cannot be encoded: yuv420p needs an even width"):
+    with pytest.raises(RuntimeError, match="321 x 240 cannot be encoded: yuv420p needs an even width"):
         VideoWriter(tmp_path / "walk.mp4", 321, 240, fps=50)
     with pytest.raises(ValueError, match="fps = 0"):
         VideoWriter(tmp_path / "walk.mp4", 320, 240, fps=0)
@@ -233,7 +233,7 @@ def test_missing_opengl_names_the_remedy_and_the_state() -> None:
     )
     environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")} | {"MUJOCO_GL": "glfw"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
-    assert "RuntimeError: No OpenGL context for offscreen rendering (MUJOCO_GL='glfw', DISPLAY=None)" in done.stderr
+    assert "ViewError: No OpenGL context for offscreen rendering (MUJOCO_GL='glfw', DISPLAY=None)" in done.stderr
     assert "set MUJOCO_GL=egl" in done.stderr and "MUJOCO_GL=osmesa" in done.stderr
 
 

@@ -17,9 +17,9 @@ QUIET = {"noise.level": 0.0, "commands.resampling_time": 0.0}  # nothing drawn w
 def make_env(
     num_envs: int, overrides: Mapping[str, Any] | None = None, *, task: str = "go1_flat", env_class: type[LeggedRobot] | None = None
 ) -> LeggedRobot:
-    """A task's environment with fields overridden by their dotted path, always from the same seed."""
+    """A task's environment with fields overridden by their dotted path, always from the same seed; no kicks unless asked for."""
     loaded = load_task(task)
-    for path, value in {"env.num_envs": num_envs, **(overrides or {})}.items():
+    for path, value in {"env.num_envs": num_envs, "perturbation.enable": False, **(overrides or {})}.items():
         loaded.set(path, value)
     torch.manual_seed(0)
     return (env_class or loaded.env_class)(loaded.cfg, "cpu")

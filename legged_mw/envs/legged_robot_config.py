@@ -101,9 +101,9 @@ class LeggedRobotCfg(Config):
             dof_vel: float = 1.5  # [rad/s]
 
     class perturbation:
-        """Kicks on the root: a half sine of force whose size follows a velocity change. Off by default [P]."""
+        """Kicks on the root: a half sine of force over the duration. One of dv changes the robot's velocity by dv / pi."""
 
-        enable: bool = False
+        enable: bool = False  # [P]
         interval: list[float] = [1.0, 3.0]  # pause between kicks [s] [P]
         duration: list[float] = [0.05, 0.2]  # [s] [P]
         velocity: list[float] = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
@@ -123,6 +123,7 @@ class LeggedRobotCfg(Config):
     class viewer:
         width: int = 1280  # [pixel]
         height: int = 720  # [pixel]
+        fps: int = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
 
 
 class LeggedRobotCfgPPO(Config):

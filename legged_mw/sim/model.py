@@ -19,13 +19,13 @@ import mujoco
 import numpy as np
 
 from legged_mw.sim.scene import add_scene
-from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import UserError
 
 GROUND = "floor"  # name of the ground geom that build_model adds
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
-class ModelError(ConfigError):
+class ModelError(UserError, ValueError):
     """A name or number asked of a model that does not fit its MJCF; the message lists what exists."""
 
 

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from legged_mw.utils.config import ConfigError, load_yaml
+from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import LoadedTask
 
 
@@ -103,7 +104,7 @@ def one_line_errors(program: str) -> Iterator[None]:
     """Turn mistakes of the user into one line and exit code 2; memory that runs out into advice."""
     try:
         yield
-    except ConfigError as error:
+    except UserError as error:
         fail(program, str(error))
     except (torch.cuda.OutOfMemoryError, RuntimeError) as error:
         if not isinstance(error, torch.cuda.OutOfMemoryError) and "Failed to allocate" not in str(error):

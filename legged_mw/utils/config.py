@@ -23,12 +23,14 @@ from weakref import WeakKeyDictionary
 
 import yaml
 
+from legged_mw.utils.errors import UserError
+
 _TYPES = (int, float, bool, str, NoneType, list, tuple, dict, Any)
 _PLAIN = None | bool | int | float | str | list | dict  # `Any` in a config: whatever YAML can hold
 _SCHEMAS: WeakKeyDictionary[type, dict[str, Any]] = WeakKeyDictionary()
 
 
-class ConfigError(TypeError):
+class ConfigError(UserError, TypeError):
     """The one error of this module: which field, where that was written, what exists, what to write."""
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import mujoco
 from numpy.typing import ArrayLike
 
-from legged_mw.view.overlay import Puppet, draw_velocities, place_camera, set_options
+from legged_mw.view.overlay import Puppet, ViewError, draw_velocities, place_camera, set_options
 
 CLOSE_SECONDS = 5.0
 
@@ -81,7 +81,7 @@ class NativeViewer:
 
 def _launch(model: mujoco.MjModel, data: mujoco.MjData, on_key: Callable[[int], None] | None) -> Any:
     if not has_display():
-        raise RuntimeError(
+        raise ViewError(
             "A window needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set. "
             "Use the web viewer or record a video, or log in with `ssh -X`."
         )
@@ -93,7 +93,7 @@ def _launch(model: mujoco.MjModel, data: mujoco.MjData, on_key: Callable[[int], 
         return mujoco.viewer.launch_passive(model, data, key_callback=on_key, show_left_ui=False, show_right_ui=False)
     except RuntimeError as error:
         if sys.platform == "darwin":
-            raise RuntimeError("On macOS a window needs the main thread: start with `mjpython` in place of `python`.") from error
+            raise ViewError("On macOS a window needs the main thread: start with `mjpython` in place of `python`.") from error
         raise
 
 
@@ -106,7 +106,7 @@ def _probe_window() -> None:
     thread.join()
     if opened != [True]:
         state = ", ".join(f"{name}={os.environ.get(name)!r}" for name in ("DISPLAY", "WAYLAND_DISPLAY"))
-        raise RuntimeError(f"No OpenGL window can be opened on this display ({state}). Use the web viewer or record a video.")
+        raise ViewError(f"No OpenGL window can be opened on this display ({state}). Use the web viewer or record a video.")
 
 
 def _can_open_window() -> bool:

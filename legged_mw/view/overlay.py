@@ -13,6 +13,8 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from legged_mw.utils.errors import UserError
+
 COMMAND_RGBA = (0.90, 0.38, 0.00, 1.0)  # ours: vermillion and sky blue of Okabe and Ito's palette, which the colour-blind tell apart
 VELOCITY_RGBA = (0.20, 0.62, 0.95, 1.0)
 
@@ -22,12 +24,16 @@ ARC_MAX = 1.75 * math.pi  # [rad]
 ARC_SEGMENTS = 12
 SPEED_MIN, RATE_MIN = 0.03, 0.05  # [m/s], [rad/s] below these an arrow is a speck that flickers
 AZIMUTH, ELEVATION = 130.0, -22.0  # [deg] front right of the robot, a little above it
-DISTANCE = 3.0  # [robot radius] camera to base
+DISTANCE = 2.4  # [robot radius] camera to base
 FOLLOW_XY, FOLLOW_Z = 0.12, 0.04  # share of the way to the base per frame; slower in z, so that steps do not shake the picture
 GROUPS_SHOWN = 3  # geom groups 0 ground, 1 and 2 what is meant to be seen; from 3 on collision shapes
 JUMP = 3.0  # [robot radius] a base this far from where the camera looks was reset, not walked: cut instead of a swish
 
 FloatArray = NDArray[np.float64]
+
+
+class ViewError(UserError, RuntimeError):
+    """Nothing can be shown or recorded as asked; the text says what this machine lacks and what to do."""
 
 
 class Puppet:

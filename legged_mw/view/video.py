@@ -26,7 +26,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from legged_mw.view.overlay import FollowCamera, Puppet, draw_velocities, set_options
+from legged_mw.view.overlay import FollowCamera, Puppet, ViewError, draw_velocities, set_options
 
 Frame = NDArray[np.uint8]  # (height, width, 3)
 
@@ -49,7 +49,7 @@ class RobotRenderer:
         try:
             self._renderer = mujoco.Renderer(model, height=height, width=width)
         except Exception as error:  # each OpenGL backend fails with a type of its own
-            raise RuntimeError(_no_context(error)) from error
+            raise ViewError(_no_context(error)) from error
 
     def frame(self, qpos: ArrayLike, command: ArrayLike | None = None, velocity: ArrayLike | None = None) -> Frame:
         """One picture (height, width, 3), yours to keep. Velocities are (vx, vy, yaw rate) in the body frame."""
@@ -87,9 +87,9 @@ class VideoWriter:
     def __init__(self, path: Path | str, width: int, height: int, fps: float) -> None:
         self.path = Path(path)
         if self.path.suffix.lower() != ".mp4":
-            raise ValueError(f"Cannot write {self.path.name!r}: the supported extension is .mp4 (H.264).")
+            raise ViewError(f"Cannot write {self.path.name!r}: the supported extension is .mp4 (H.264).")
         if width < 2 or height < 2 or width % 2 or height % 2:
-            raise ValueError(f"A video of {width} x {height} cannot be encoded: yuv420p needs an even width and an even height.")
+            raise ViewError(f"A video of {width} x {height} cannot be encoded: yuv420p needs an even width and an even height.")
         if not (math.isfinite(fps) and fps > 0):
             raise ValueError(f"fps = {fps}: a video needs a positive number of frames per second.")
         encoder = _choose_encoder()
@@ -113,7 +113,7 @@ class VideoWriter:
             return
         if self.frames == 0:
             self.abort()
-            raise RuntimeError(f"{self.path} was not written: no frame was added.")
+            raise ViewError(f"{self.path} was not written: no frame was added.")
         try:
             self._encoder.finish()
             os.replace(self._partial, self.path)
@@ -155,7 +155,7 @@ def _choose_encoder() -> type[_Ffmpeg] | type[_PyAv]:
         if "libx264" in av.codecs_available:
             return _PyAv
         tried.append("PyAV: built without libx264")
-    raise RuntimeError(f'No H.264 encoder ({"; ".join(tried)}). Install one: pip install "legged_mw[video]", or ffmpeg.')
+    raise ViewError(f'No H.264 encoder ({"; ".join(tried)}). Install one: pip install "legged_mw[video]", or ffmpeg.')
 
 
 class _Ffmpeg:
@@ -178,12 +178,12 @@ class _Ffmpeg:
         try:
             self._process.stdin.write(frame.data)
         except BrokenPipeError:
-            raise RuntimeError(self._failure()) from None
+            raise ViewError(self._failure()) from None
 
     def finish(self) -> None:
         self._hang_up()
         if self._process.wait() != 0:
-            raise RuntimeError(self._failure())
+            raise ViewError(self._failure())
 
     def abort(self) -> None:
         self._process.kill()

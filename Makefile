@@ -1,0 +1,33 @@
+# make train, make test: each does all set-up on a fresh machine, in a virtual environment of its own.
+#   make train ARGS="--max_iterations 5"     make test ARGS="tests/test_env.py -k reset"
+TASK ?= go1_flat
+ARGS ?=
+VENV := .venv
+BIN := $(VENV)/bin
+# the first Python on the path that this project runs on
+PYTHON ?= $(shell for p in python3.12 python3.11 python3.13 python3 python; do \
+	$$p -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null && echo $$p && break; done)
+
+.PHONY: train play test lint clean
+train: $(VENV)/ready
+	$(BIN)/python train.py --task $(TASK) $(ARGS)
+
+play: $(VENV)/ready
+	$(BIN)/python play.py --task $(TASK) $(ARGS)
+
+test: $(VENV)/ready
+	$(BIN)/python -m pytest $(ARGS)
+
+lint: $(VENV)/ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+
+clean:
+	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache
+
+$(VENV)/ready: pyproject.toml constraints.txt
+	@test -n "$(PYTHON)" || { echo "legged_mw needs Python 3.11, 3.12 or 3.13 on the PATH; or name one: make PYTHON=/path/to/python"; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[dev]"
+	touch $@
