@@ -55,7 +55,8 @@ TASK = Task(Dog, DogCfg, DogCfgPPO)
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with one run of one iteration, logs/go1_flat/<time>_first."""
     folder = tmp_path_factory.mktemp("cli")
-    trained(folder, "--max_iterations", "1", "--run_name", "first")
+    kicks = ["--set", "perturbation.enable=True"]  # which playing switches off
+    trained(folder, "--max_iterations", "1", "--run_name", "first", *kicks)
     return folder
 
 
@@ -348,24 +349,25 @@ def test_experiment_name_by_flag_and_by_field(tmp_path: Path) -> None:
     assert again.code == 0 and "logs/flag/" in again.out.splitlines()[0] and "model_2.pt" in again.out.splitlines()[0]
 
 
-def test_play_says_what_it_changes(root: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def test_play_says_what_it_changes(root: Path, first: Path, tmp_path: Path) -> None:
+    out, was = tmp_path / "out", load_yaml(first / "config.yaml")
     result = run("play", root, *TASK, "--device", "cpu", "--command=-0.5,0,0.25", "--set", "sim.ls_iterations=7", "--export", str(out))
     assert result.code == 0, result.err
     lines = [line.strip() for line in result.out.splitlines()]
     changes = {line.split(": ")[0]: line.split(": ")[1] for line in lines if " -> " in line}
+    commands = was["commands"]
     assert changes == {
-        "commands.ranges.ang_vel_yaw": "[-1.2, 1.2] -> [0.25, 0.25]",
-        "commands.ranges.lin_vel_x": "[-1.5, 1.5] -> [-0.5, -0.5]",
-        "commands.ranges.lin_vel_y": "[-0.8, 0.8] -> [0.0, 0.0]",
-        "commands.resampling_time": "5.0 -> 0.0",
+        "commands.ranges.ang_vel_yaw": f"{commands['ranges']['ang_vel_yaw']} -> [0.25, 0.25]",
+        "commands.ranges.lin_vel_x": f"{commands['ranges']['lin_vel_x']} -> [-0.5, -0.5]",
+        "commands.ranges.lin_vel_y": f"{commands['ranges']['lin_vel_y']} -> [0.0, 0.0]",
+        "commands.resampling_time": f"{commands['resampling_time']} -> 0.0",
         "env.num_envs": "16 -> 1",
-        "noise.level": "1.0 -> 0.0",
-        "sim.ls_iterations": "5 -> 7",
+        "noise.level": f"{was['noise']['level']} -> 0.0",
+        "perturbation.enable": "True -> False",
+        "sim.ls_iterations": f"{was['sim']['ls_iterations']} -> 7",
     }
     assert sorted(path.name for path in out.iterdir()) == ["config.yaml", "model.pt", "policy.onnx"]
-    exported = load_yaml(out / "config.yaml")  # as trained, not as played
-    assert exported["commands"]["ranges"]["lin_vel_x"] == [-1.5, 1.5] and exported["env"]["num_envs"] == 16
+    assert load_yaml(out / "config.yaml") == was  # as trained, not as played
 
 
 # ---- real processes: what only the programs themselves can show

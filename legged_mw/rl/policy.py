@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import logging
 import warnings
 from pathlib import Path
 from typing import Any
@@ -52,7 +53,8 @@ def export_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
     """Write one self-contained ONNX file: input ``obs`` (1, size), output ``actions`` (1, A)."""
     model = ExportedPolicy(policy, clip_actions).eval()
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter warns of its own internals
+        warnings.simplefilter("ignore")  # the exporter warns of its own internals, and logs that torchvision is missing
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         torch.onnx.export(
             model,
             (torch.zeros(1, policy.obs_dim),),
