@@ -13,6 +13,7 @@ from pathlib import Path
 import torch
 
 from legged_mw import ROOT
+from legged_mw.envs.checks import check_values
 from legged_mw.envs.describe import describe
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl.runner import Runner, make_runner
@@ -55,6 +56,7 @@ def main() -> None:
     apply_overrides(task, args)
     if not run:
         experiment = ROOT / "logs" / (task.train.runner.experiment_name or task.name)  # --set may have named it
+    check_values(task.cfg, task.train)
     device = pick_device(args.device)
     seed_everything(task.train.seed)
     print(f"{task.name}: {task.cfg.env.num_envs} worlds on {device}; a first run compiles kernels, about a minute", flush=True)
@@ -78,7 +80,8 @@ def train(
     if left <= 0:
         done, wanted = runner.current_learning_iteration, task.train.runner.max_iterations
         raise ConfigError(f"{shown(checkpoint or experiment)} has done {done} iterations of {wanted}; raise --max_iterations to go on")
-    folder = run or new_run(experiment, task.train.runner.run_name)
+    newest = run is not None and checkpoint == find_checkpoint(run, -1)
+    folder = run if run and newest else new_run(experiment, task.train.runner.run_name)  # an earlier checkpoint begins a branch
     save_yaml(folder / CONFIG_FILE, task.to_dict())
     runner.logger.log_dir = str(folder)
     stop_on_signals(runner, deadline)

@@ -208,7 +208,7 @@ def test_servo_parameters() -> None:
         assert model.actuator_forcelimited.all() and (model.actuator_forcerange == [[-f, f] for f in limits]).all()
         assert model.actuator_ctrllimited.all() and (model.actuator_ctrlrange == model.jnt_range[1:]).all()
         assert not model.jnt_actfrclimited.any()  # the servo clamps, so that actuator_force is what acts
-    assert robot.effort_limit.tolist() == limits and (robot.joint_range == robot.physics.jnt_range[1:]).all()
+    assert robot.effort_range[:, 1].tolist() == limits and (robot.joint_range == robot.physics.jnt_range[1:]).all()
     assert "FR_hip_joint servo: kp 20 N m/rad" in robot.overrides and "RL_calf_joint damping: 0.5 -> 0.7 N m s/rad" in robot.overrides
     assert not any("hip_joint damping" in line for line in robot.overrides)  # 0.5 is what the MJCF has
 
@@ -234,19 +234,19 @@ def test_actuators_of_the_mjcf_are_replaced(tmp_path: Path) -> None:
     model = robot.physics
     assert [model.actuator(i).name for i in range(model.nu)] == ["left_hip", "right_hip"]
     assert model.actuator_gainprm[:, 0].tolist() == [10, 10] and (model.actuator_gear[:, 0] == 1).all()
-    assert model.actuator_forcerange.tolist() == [[-7, 7], [-8, 8]] and robot.effort_limit.tolist() == [7, 8]
+    assert model.actuator_forcerange.tolist() == [[-7, 7], [-8, 8]] and robot.effort_range[:, 1].tolist() == [7, 8]
     assert {f"actuator '{name}' replaced by a position servo" for name in ("weak", "servo")} <= set(robot.overrides)
 
 
 def test_limit_of_the_joint_wins_over_the_actuators(tmp_path: Path) -> None:
     motors = '<actuator><motor joint="left_hip" forcerange="-7 7"/></actuator>'
     robot = build_toy(toy(tmp_path, extra=motors, limit=' actuatorfrcrange="-5 5"'))
-    assert robot.effort_limit.tolist() == [5, 5] and robot.physics.actuator_forcerange.tolist() == [[-5, 5], [-5, 5]]
+    assert robot.effort_range[:, 1].tolist() == [5, 5] and robot.physics.actuator_forcerange.tolist() == [[-5, 5], [-5, 5]]
 
 
 def test_no_limit_stated_is_no_limit(tmp_path: Path) -> None:
     robot = build_toy(toy(tmp_path))
-    assert robot.effort_limit.tolist() == [math.inf, math.inf] and not robot.physics.actuator_forcelimited.any()
+    assert robot.effort_range.tolist() == [[-math.inf, math.inf]] * 2 and not robot.physics.actuator_forcelimited.any()
 
 
 # ---- the two models

@@ -212,6 +212,31 @@ def test_an_earlier_checkpoint_can_be_resumed(copied: Path, tmp_path: Path, star
     assert_equal(starts[0].alg["actor_state_dict"], load(copied / "model_2.pt")["actor_state_dict"])
 
 
+def test_an_earlier_checkpoint_begins_a_run_of_its_own(copied: Path, tmp_path: Path) -> None:
+    """In the old folder its later checkpoints would stand, of another branch, and -1 would pick them."""
+    (copied / "model_7.pt").write_bytes((copied / "model_3.pt").read_bytes())
+    before = sorted(path.name for path in copied.iterdir())
+    result = run("train", tmp_path, "--task", "go1_flat", "--device", "cpu", "--resume", "--checkpoint", "3", "--max_iterations", "4")
+    assert result.code == 0, result.err
+    assert sorted(path.name for path in copied.iterdir()) == before
+    (branch,) = set(copied.parent.iterdir()) - {copied}
+    assert {"model_4.pt", "config.yaml"} <= {path.name for path in branch.iterdir()}
+
+
+@pytest.mark.parametrize(("schedule", "expected"), [("fixed", 0.25), ("adaptive", 0.001)])
+def test_a_fixed_learning_rate_is_the_configs_an_adaptive_one_the_checkpoints(
+    schedule: str, expected: float, env: LeggedRobot, tmp_path: Path
+) -> None:
+    task = small_task()
+    task.set("algorithm.learning_rate", 0.001)
+    make_runner(env, task.train, None, "cpu").save(str(tmp_path / "model_0.pt"))
+    task.set("algorithm.schedule", schedule)
+    task.set("algorithm.learning_rate", 0.25)
+    resumed = make_runner(env, task.train, None, "cpu")
+    resumed.load(str(tmp_path / "model_0.pt"))
+    assert resumed.alg.learning_rate == resumed.alg.optimizer.param_groups[0]["lr"] == expected
+
+
 def copy_world(source: LeggedRobot, target: LeggedRobot) -> None:
     """All that an environment remembers, the simulator's memory included."""
     for name, value in vars(source).items():

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from legged_mw import ROOT
 from legged_mw.envs.base_task import BaseTask
+from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.sim.model import Ground, ModelError, Physics, RobotModel, build_model, per_joint, unknown
 from legged_mw.sim.simulation import Simulation
@@ -40,6 +41,7 @@ class LeggedRobot(BaseTask):
     cfg: LeggedRobotCfg
 
     def __init__(self, cfg: LeggedRobotCfg, device: str, eager: bool = False) -> None:
+        check_values(cfg)
         self.cfg = cfg
         self.robot = self._load_robot()
         self.obs_buf = {}

@@ -162,6 +162,10 @@ class Runner(OnPolicyRunner):
         check_fit(content["critic_state_dict"], self.alg.critic.state_dict(), Path(path), "critic")
         if self.alg.load(content, load_cfg, strict):
             self.current_learning_iteration = content["iter"]
+        if self.alg.schedule == "fixed":  # the config's number, which the user may have changed; an adaptive rate goes on
+            self.alg.learning_rate = self.cfg["algorithm"]["learning_rate"]
+            for group in self.alg.optimizer.param_groups:
+                group["lr"] = self.alg.learning_rate
         infos = content.get("infos") or {}
         self.total_steps = infos.get("total_steps", 0)
         _set_random_state(infos.get("random_state", {}), self.device)

@@ -55,7 +55,7 @@ class RobotModel:
     root: str  # name of the body that carries the free joint
     joint_names: tuple[str, ...]  # scalar joints, in order of qpos[7:], qvel[6:] and ctrl
     joint_range: np.ndarray  # (D, 2) [rad]
-    effort_limit: np.ndarray  # (D,) [N m]; inf where the MJCF states none
+    effort_range: np.ndarray  # (D, 2) [N m]; infinite where the MJCF states none
     sensors: dict[str, slice]  # "contact", "linvel", "accelerometer" -> span of sensordata
     overrides: list[str] = field(default_factory=list)  # what the caller's choices changed, a line each
 
@@ -138,7 +138,7 @@ def build_model(
         root=root,
         joint_names=names,
         joint_range=np.array([mj.joint(n).range for n in names]).reshape(-1, 2),
-        effort_limit=np.array(limits),
+        effort_range=np.array(limits).reshape(-1, 2),
         sensors=_sensor_spans(mj, len(contact_geoms), len(velocity_sites), accelerometer_site is not None),
         overrides=notes,
     )
@@ -204,12 +204,12 @@ def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisio
 
 def _add_servos(
     spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint], stiffness: Mapping[str, float], damping: Mapping[str, float], notes: list[str]
-) -> list[float]:
-    """One position servo a joint, clamped to the joint's range and force limit; returns the force limits [N m]."""
-    limits = {j.name: float(j.actfrcrange[1]) for j in joints if j.actfrcrange[1] > j.actfrcrange[0]}
+) -> list[list[float]]:
+    """One position servo a joint, clamped to the joint's range and force range; returns the force ranges [N m]."""
+    limits = {j.name: list(j.actfrcrange) for j in joints if j.actfrcrange[1] > j.actfrcrange[0]}
     for actuator in list(spec.actuators):
         if actuator.target not in limits and actuator.forcerange[1] > actuator.forcerange[0]:
-            limits[actuator.target] = float(actuator.forcerange[1] * abs(actuator.gear[0]))  # at the joint
+            limits[actuator.target] = sorted(actuator.forcerange * actuator.gear[0])  # at the joint
         notes.append(f"actuator '{actuator.name}' replaced by a position servo")
         spec.delete(actuator)
     names = [j.name for j in joints]
@@ -225,9 +225,9 @@ def _add_servos(
         if joint.range[1] > joint.range[0]:
             servo.ctrllimited, servo.ctrlrange = True, list(joint.range)
         if joint.name in limits:  # on the servo and not on the joint, so that actuator_force is the clamped force
-            servo.forcelimited, servo.forcerange = True, [-limits[joint.name], limits[joint.name]]
+            servo.forcelimited, servo.forcerange = True, limits[joint.name]
             joint.actfrclimited, joint.actfrcrange = False, [0.0, 0.0]
-    return [limits.get(name, float("inf")) for name in names]
+    return [limits.get(name, [-float("inf"), float("inf")]) for name in names]
 
 
 def _add_sensors(

@@ -1,0 +1,59 @@
+"""Config values that no type can refuse: each rule names the field, the value and what it must be."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+from legged_mw.utils.config import Config, ConfigError
+
+if TYPE_CHECKING:
+    from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+
+Rule = tuple[str, Callable[[Any], bool]]
+
+POSITIVE: Rule = ("positive", lambda v: 0 < v < math.inf)
+NOT_NEGATIVE: Rule = ("zero or more", lambda v: 0 <= v < math.inf)
+RANGE: Rule = ("two numbers, the lower first", lambda v: len(v) == 2 and v[0] <= v[1])
+SPAN: Rule = ("two numbers above zero, the lower first", lambda v: len(v) == 2 and 0 < v[0] <= v[1])
+NAMES: Rule = ("a list with at least one name", lambda v: len(v) > 0)
+PROBABILITIES: Rule = ("three numbers from 0 to 1", lambda v: len(v) == 3 and all(0 <= p <= 1 for p in v))
+
+ENVIRONMENT: dict[str, Rule] = {
+    **dict.fromkeys(("env.num_envs", "env.episode_length_s", "control.decimation", "normalization.clip_actions"), POSITIVE),
+    **dict.fromkeys(("sim.dt", "sim.iterations", "sim.ls_iterations", "sim.nconmax", "sim.njmax"), POSITIVE),
+    **dict.fromkeys(("rewards.tracking_sigma", "rewards.swing_height", "rewards.max_reward", "termination.max_speed"), POSITIVE),
+    **dict.fromkeys(("viewer.width", "viewer.height", "viewer.fps"), POSITIVE),
+    **dict.fromkeys(("terrain.friction", "noise.level", "commands.resampling_time"), NOT_NEGATIVE),
+    **dict.fromkeys((f"commands.ranges.{name}" for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")), RANGE),
+    **dict.fromkeys(("perturbation.interval", "perturbation.duration"), SPAN),
+    "perturbation.velocity": RANGE,
+    "asset.foot_names": NAMES,
+    "asset.colliders": NAMES,
+    "commands.keep_probability": PROBABILITIES,
+    "init_state.pos": ("three numbers, x, y, z", lambda v: len(v) == 3),
+    "termination.max_tilt": ("above 0 and at most 180 degrees", lambda v: 0 < v <= 180),
+    "terrain.condim": ("1, 3, 4 or 6", lambda v: v in (1, 3, 4, 6)),
+}
+LEARNER: dict[str, Rule] = {
+    **dict.fromkeys(("runner.num_steps_per_env", "runner.max_iterations", "runner.save_interval"), POSITIVE),
+    **dict.fromkeys(("algorithm.learning_rate", "algorithm.num_learning_epochs", "algorithm.num_mini_batches"), POSITIVE),
+    "runner.run_name": ("part of a folder's name, without / or \\", lambda v: "/" not in v and "\\" not in v),
+}
+
+
+def check_values(cfg: LeggedRobotCfg, train: LeggedRobotCfgPPO | None = None) -> None:
+    """Raise ConfigError at the first value that cannot work."""
+    _check(cfg, ENVIRONMENT)
+    if train is not None:
+        _check(train, LEARNER)
+
+
+def _check(cfg: Config, rules: dict[str, Rule]) -> None:
+    for path, (wanted, holds) in rules.items():
+        value: Any = cfg
+        for name in path.split("."):
+            value = getattr(value, name)
+        if not holds(value):
+            raise ConfigError(f"{path} is {value!r}; it must be {wanted}")
