@@ -44,6 +44,9 @@ def parse() -> argparse.Namespace:
     args = parser.parse_args()
     if not args.task:
         parser.error(f"--task is missing; tasks: {', '.join(task_names())}")
+    asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag)]
+    if len(asked) > 1 or (args.eval and args.command is not None):
+        parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
     return args
 
 
@@ -52,24 +55,27 @@ def main() -> None:
     task = load_task(args.task)
     source = find_policy(task, args)
     print(f"{'shipped policy' if source.shipped else 'policy'}: {shown(source.checkpoint)}")
-    task.update(load_yaml(source.folder / CONFIG_FILE), where=shown(source.folder / CONFIG_FILE))
-    trained = task.cfg.to_dict()
+    config = source.folder / CONFIG_FILE
+    task.update_from_run(load_yaml(config), where=shown(config))
+    trained = task.to_dict()
     prepare(task, args)
-    for path, now, before in sorted(set_of_changes(task, trained)):
+    changes = changes_since(task, trained)
+    for path, (before, now) in sorted(changes.items()):
         print(f"  {path}: {before} -> {now}")
     seed_everything(task.train.seed)
     device = pick_device(args.device)
     env = task.env_class(task.cfg, device, eager=args.eager)
     policy = load_policy(source.checkpoint, env, task.train, device)
+    out = ROOT / "logs" / task.name / "shipped" if source.shipped else source.folder  # where results go
     if args.export:
-        export(task, policy, trained, Path(args.export))
+        export(trained, env, source, device, Path(args.export))
     elif args.eval:
-        grade(env, policy, source, Path.cwd() / f"{task.name}_exam.json" if source.shipped else source.folder / "exam.json")
+        overrides = {path: now for path, (_, now) in changes.items()}
+        grade(env, policy, source, overrides, out / "exam.json")
     elif args.video or not has_display():
         if not args.video:
             print("no screen here (DISPLAY and WAYLAND_DISPLAY are not set): recording instead of opening a window")
-        default = Path(f"{task.name}.mp4") if source.shipped else source.folder / "play.mp4"
-        record(env, policy, Path(args.video) if args.video else default, args.time or 10.0)
+        record(env, policy, Path(args.video) if args.video else out / "play.mp4", args.time or 10.0)
     else:
         watch(env, policy, args.time)
 
@@ -104,22 +110,24 @@ def prepare(task: LoadedTask, args: argparse.Namespace) -> None:
         for name, value in ranges.items():
             task.set(f"commands.ranges.{name}", [value, value], where="--command")
         task.set("commands.resampling_time", 0.0, where="--command")
-    worlds = task.cfg.env.num_envs
+    before = task.to_dict()
     apply_overrides(task, args)
-    if args.eval and task.cfg.env.num_envs != worlds:
-        raise ConfigError(f"--eval needs its {worlds} worlds, one a command and one a kick; leave env.num_envs to it")
+    if args.eval and (touched := exam.SETS & changes_since(task, before).keys()):
+        raise ConfigError(f"--eval sets {', '.join(sorted(touched))} itself; an exam with other values would be another exam")
 
 
-def set_of_changes(task: LoadedTask, trained: dict[str, Any]) -> list[tuple[str, object, object]]:
-    """(path, now, as trained) of every field that differs from the trained config."""
-    original = load_task(task.to_dict()["task"])
-    original.cfg.update(trained, where=CONFIG_FILE)
-    return [(path, now, before) for path, now, before in task.cfg.diff(original.cfg)]
+def changes_since(task: LoadedTask, trained: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
+    """Path -> (as trained, now) of every field of both configs that differs."""
+    original = load_task(str(task.path))
+    original.update(trained, where=CONFIG_FILE)
+    differences = [*original.cfg.diff(task.cfg), *original.train.diff(task.train)]
+    return {path: (before, now) for path, before, now in differences}
 
 
-def grade(env: LeggedRobot, policy: MLPModel, source: Source, path: Path) -> None:
+def grade(env: LeggedRobot, policy: MLPModel, source: Source, overrides: dict[str, Any], path: Path) -> None:
     result = exam.run_exam(env, lambda obs: act(policy, obs))
-    exam.save({"policy": shown(source.checkpoint), "engine": "mujoco_warp", "device": env.device, **result}, path)
+    about = {"policy": shown(source.checkpoint), "engine": "mujoco_warp", "device": env.device, "overrides": overrides}
+    exam.save({**about, **result}, path)
     print(exam.table(result))
     print(f"written to {shown(path)}")
 
@@ -155,11 +163,14 @@ def seen(env: LeggedRobot) -> tuple:
     return tuple(t.cpu().numpy() for t in (env.sim.qpos[0], env.commands[0], velocity))
 
 
-def export(task: LoadedTask, policy: MLPModel, trained: dict, folder: Path) -> None:
+def export(trained: dict[str, Any], env: LeggedRobot, source: Source, device: str, folder: Path) -> None:
+    """Write the policy as it was trained, whatever this call overrode for playing."""
+    task = load_task(str(trained["task"]))
+    task.update(trained, where=CONFIG_FILE)
+    policy = load_policy(source.checkpoint, env, task.train, device)
     folder.mkdir(parents=True, exist_ok=True)
     save_policy(policy, folder / "model.pt", {"task": task.name})
     export_onnx(policy, task.cfg.normalization.clip_actions, folder / "policy.onnx")
-    task.cfg.update(trained, where=CONFIG_FILE)
     save_yaml(folder / CONFIG_FILE, task.to_dict())
     print(f"written to {shown(folder)}: model.pt, policy.onnx, {CONFIG_FILE}")
 

@@ -50,7 +50,7 @@ def main() -> None:
     run = find_run(experiment, args.load_run or "-1") if args.resume else None
     checkpoint = find_checkpoint(run, args.checkpoint) if run else None
     if run:
-        task.update(load_yaml(run / CONFIG_FILE), where=shown(run / CONFIG_FILE))
+        task.update_from_run(load_yaml(run / CONFIG_FILE), where=shown(run / CONFIG_FILE))
     elif args.load_run is not None or args.checkpoint != -1:
         raise ConfigError("--load_run and --checkpoint say what to go on with: add --resume")
     apply_overrides(task, args)
@@ -90,7 +90,7 @@ def train(
     name = task.to_dict()["task"]
     home = ROOT / "logs" / (load_task(name).train.runner.experiment_name or task.name)
     flags = shlex.join(["--task", name, "--load_run", folder.name if folder.parent == home else shown(folder)])
-    if runner.stop:
+    if runner.stop and runner.current_learning_iteration < task.train.runner.max_iterations:
         print(f"stopped: {runner.stop}; go on with\n  python train.py --resume {flags}")
     else:
         print(f"done: {shown(folder)}; watch it with\n  python play.py {flags}")
@@ -101,6 +101,7 @@ def stop_on_signals(runner: Runner, deadline: float | None) -> None:
 
     def ask(number: int, _: object) -> None:
         runner.stop = signal.Signals(number).name
+        print(f"{runner.stop}: saving and stopping after this step; again to stop at once", flush=True)
         signal.signal(number, signal.SIG_DFL)
 
     signal.signal(signal.SIGINT, ask)

@@ -1,4 +1,4 @@
-"""Unitree Go1 follows a joystick on flat ground: MuJoCo Playground's Go1 joystick task.
+"""Unitree Go1 follows a joystick on flat ground: MuJoCo Playground's Go1 joystick task, trained with kicks.
 
 Sources: [P] MuJoCo Playground's joystick task for this robot; the machine's figures are in go1.xml.
 """

@@ -14,7 +14,7 @@ import torch
 from program import SMALL, Result, files, refused, run, trained
 
 from legged_mw import ROOT
-from legged_mw.utils.cli import duration
+from legged_mw.utils.cli import duration, one_line_errors
 from legged_mw.utils.config import load_yaml
 
 TASK = ["--task", "go1_flat"]
@@ -406,3 +406,42 @@ def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path) -> None:
     result = run("play", tmp_path, "--task", str(home / "dog.py"), *common, *elsewhere)
     assert result.code == 0, result.err
     assert result.out.startswith(f"policy: {folder}/model_1.pt\n") and video.stat().st_size > 0
+
+
+def test_export_is_the_policy_as_trained(root: Path, tmp_path: Path) -> None:
+    """What a call overrides for playing reaches neither the config nor the clamp inside the network file."""
+    files = []
+    for more in ([], ["--set", "normalization.clip_actions=0.001"]):
+        out = tmp_path / f"out{len(files)}"
+        assert run("play", root, *TASK, "--device", "cpu", "--export", str(out), *more).code == 0
+        files.append([(out / name).read_bytes() for name in ("config.yaml", "policy.onnx")])
+    assert files[0] == files[1]
+
+
+def test_a_run_of_another_task_is_refused(first: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "logs/go1_flat/other"
+    copy.mkdir(parents=True)
+    for name in ("config.yaml", "model_1.pt"):
+        (copy / name).write_bytes((first / name).read_bytes())
+    text = (copy / "config.yaml").read_text()
+    assert "task: go1_flat" in text
+    (copy / "config.yaml").write_text(text.replace("task: go1_flat", "task: /far/away/dog.py"))
+    for program, more in (("play", []), ("train", ["--resume", "--max_iterations", "2"])):
+        line = refused(tmp_path, program, *TASK, "--device", "cpu", "--load_run", "other", *more)
+        assert "is of task '/far/away/dog.py', not 'go1_flat'; say --task /far/away/dog.py" in line
+
+
+@pytest.mark.parametrize("text", ["CUDA out of memory. Tried to allocate 2 GiB", "Failed to allocate 4096 bytes on device 'cuda:0'"])
+def test_memory_that_runs_out_gives_advice(text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    def capture_ends() -> None:
+        try:
+            raise RuntimeError(text)
+        finally:
+            raise RuntimeError("capture invalidated")  # what a recording makes of it
+
+    with pytest.raises(SystemExit) as end, one_line_errors("train.py"):
+        capture_ends()
+    assert end.value.code == 2
+    assert capsys.readouterr().err == f"train.py: out of memory ({text}); fewer worlds need less: try half with --num_envs\n"
+    with pytest.raises(RuntimeError, match="something else"), one_line_errors("train.py"):
+        raise RuntimeError("something else")

@@ -631,3 +631,29 @@ def test_infinite_actions_are_clipped(quiet: LeggedRobot) -> None:
     run_a_while(quiet, 2)
     obs, _, done, _ = quiet.step(torch.full((N, 12), math.inf))
     assert not done.any() and (obs["state"][:, 33:45] == 2.0).all()
+
+
+def test_actions_with_gradients_leave_the_buffers_without(quiet: LeggedRobot) -> None:
+    actions = torch.zeros(N, 12, requires_grad=True)
+    quiet.step(actions * 2.0)
+    obs, *_ = quiet.step(torch.zeros(N, 12))
+    assert not quiet.actions.requires_grad and not obs["state"].requires_grad
+
+
+def test_model_says_what_the_config_changed(quiet: LeggedRobot) -> None:
+    notes = "\n".join(quiet.robot.overrides)
+    for line in ("option timestep: 0.002 -> 0.004", "option iterations: 100 -> 1", "option ls_iterations: 50 -> 5"):
+        assert line in notes
+    assert "ground: plane, friction 0.6, condim 3, priority 1" in notes and "keyframe 'home' dropped" in notes
+
+
+def test_camera_looks_at_the_robot_and_is_not_stepped(quiet: LeggedRobot) -> None:
+    import mujoco
+
+    visual, data = quiet.robot.visual, mujoco.MjData(quiet.robot.visual)
+    mujoco.mj_forward(visual, data)
+    camera = visual.camera("track").id
+    to_robot = data.subtree_com[quiet.root_body] - data.cam_xpos[camera]
+    looking = -data.cam_xmat[camera].reshape(3, 3)[:, 2]
+    assert to_robot @ looking > 0.99 * (to_robot @ to_robot) ** 0.5
+    assert quiet.robot.physics.ncam == 0 and quiet.robot.physics.nlight == 0

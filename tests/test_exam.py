@@ -330,6 +330,13 @@ def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     saved = json.loads((folder / "exam.json").read_text())
     assert saved["policy"].endswith("model_1.pt") and saved["engine"] == "mujoco_warp" and saved["device"] == "cpu"
     assert len(saved["commands"]) == TRACKED and saved["walks"] is False
-    for more in (["--num_envs", "4"], ["--set", "env.num_envs=200"]):
+    assert saved["overrides"]["noise.level"] == 0.0
+    for more, field in (
+        (["--num_envs", "4"], "env.num_envs"),
+        (["--set", "noise.level=1"], "noise.level"),
+        (["--set", "commands.resampling_time=5"], "commands.resampling_time"),
+    ):
         line = refused(tmp_path, "play", *SMALL[:2], "--device", "cpu", "--eval", *more)
-        assert "--eval needs its 118 worlds, one a command and one a kick; leave env.num_envs to it" in line
+        assert f"--eval sets {field} itself; an exam with other values would be another exam" in line
+    for more in (["--command", "1,0,0"], ["--video", "x.mp4"], ["--export", "x"]):
+        assert "one thing each" in refused(tmp_path, "play", *SMALL[:2], "--device", "cpu", "--eval", *more)

@@ -223,6 +223,20 @@ def test_an_earlier_checkpoint_begins_a_run_of_its_own(copied: Path, tmp_path: P
     assert {"model_4.pt", "config.yaml"} <= {path.name for path in branch.iterdir()}
 
 
+def test_a_stop_in_the_last_iteration_is_the_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else the line that resumes would be refused: nothing is left to do."""
+    update = Runner._log
+
+    def stop_after(self: Runner, *args: Any) -> None:
+        update(self, *args)
+        self.stop = "SIGTERM"
+
+    monkeypatch.setattr(Runner, "_log", stop_after)
+    result = run("train", tmp_path, *SMALL, "--max_iterations", "1")
+    assert result.code == 0, result.err
+    assert "\ndone: " in result.out and "go on with" not in result.out
+
+
 @pytest.mark.parametrize(("schedule", "expected"), [("fixed", 0.25), ("adaptive", 0.001)])
 def test_a_fixed_learning_rate_is_the_configs_an_adaptive_one_the_checkpoints(
     schedule: str, expected: float, env: LeggedRobot, tmp_path: Path

@@ -16,7 +16,7 @@ class BaseTask(VecEnv):
     """Holds the buffers that cross the border of the recorded step and runs it.
 
     Inside the step every tensor is fixed and written in place. The learner keeps references across steps, so
-    everything handed out is a copy, and everything handed in is copied.
+    all that ``step`` and ``reset`` hand out is a copy, and all that is handed in is copied.
     """
 
     device: str
@@ -45,6 +45,7 @@ class BaseTask(VecEnv):
         """Copies of the observation groups, each (N, size)."""
         return TensorDict({name: obs.clone() for name, obs in self.obs_buf.items()}, batch_size=[self.num_envs], device=self.device)
 
+    @torch.no_grad()  # actions that carry gradients must not make the fixed buffers carry them
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         """One control step with ``actions`` (N, A); returns copies of observations, reward (N,), done (N,) and time outs.
 
@@ -57,6 +58,7 @@ class BaseTask(VecEnv):
         extras = {"time_outs": self.time_out_buf.clone()}
         return self.get_observations(), self.rew_buf.clone(), self.reset_buf.clone(), extras
 
+    @torch.no_grad()
     def reset(self) -> TensorDict:
         """Begin a new episode everywhere; returns its first observations."""
         self._reset_all()

@@ -374,8 +374,8 @@ class LeggedRobot(BaseTask):
     def read_statistics(self) -> dict[str, float]:
         """Means over the episodes that ended since the last call, and counts; then start anew. Reads the device.
 
-        ``rew_<name>``: sum of scale * term * dt over the episode, before the clip, divided by the episode length in
-        seconds. ``reward``: the episode's return. ``episode_length`` [control steps]. Means are NaN if none ended.
+        ``rew_<name>``: sum of scale * term * dt over the episode, before the clip, divided by
+        ``env.episode_length_s``. ``reward``: the episode's return. ``episode_length`` [control steps]. Means are NaN if none ended.
         """
         *sums, episodes, fell, broken = self._statistics.tolist()
         self._statistics.zero_()
@@ -401,6 +401,7 @@ class LeggedRobot(BaseTask):
             contact_geoms=cfg.asset.foot_names,
             velocity_sites=cfg.asset.foot_names,
             accelerometer_site=cfg.asset.imu_site,
+            camera=cfg.viewer.camera,
         )
 
     def _init_buffers(self) -> None:

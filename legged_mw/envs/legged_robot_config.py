@@ -123,17 +123,21 @@ class LeggedRobotCfg(Config):
     class viewer:
         width: int = 1280  # [pixel]
         height: int = 720  # [pixel]
+        camera: list[float] = [0.9, -1.1, 0.6]  # place of the camera "track", from the robot, world axes [m]
         fps: int = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
 
 
 class LeggedRobotCfgPPO(Config):
-    """The learner. Keys below actor, critic and algorithm are rsl-rl's own and pass through untranslated."""
+    """The learner. Keys below actor, critic and algorithm are rsl-rl's own and pass through untranslated.
+
+    What is marked [ours] was found by measurement: docs/training.md.
+    """
 
     seed: int = 1
 
     class runner:
         num_steps_per_env: int = 24  # control steps a world between two updates [P]
-        max_iterations: int = 300
+        max_iterations: int = 300  # [ours: a robot of one's own shows something by then]
         save_interval: int = 50  # [iterations] between checkpoints
         experiment_name: str = ""  # folder below logs/; empty: the task's name
         run_name: str = ""  # appended to the run folder's time stamp
@@ -147,35 +151,35 @@ class LeggedRobotCfgPPO(Config):
 
     class actor:
         class_name: str = "MLPModel"
-        hidden_dims: list[int] = [512, 256, 128]
-        activation: str = "elu"
-        obs_normalization: bool = True
+        hidden_dims: list[int] = [512, 256, 128]  # [P]
+        activation: str = "elu"  # [P]
+        obs_normalization: bool = True  # [P]
 
         class distribution_cfg:
             class_name: str = "GaussianDistribution"
-            init_std: float = 0.6
-            std_type: Literal["scalar", "log"] = "scalar"
-            std_range: list[float] = [1e-6, 1e6]
+            init_std: float = 0.6  # [ours: from 1.0 it thrashes, from 0.4 it may stand for good]
+            std_type: Literal["scalar", "log"] = "scalar"  # [R]
+            std_range: list[float] = [1e-6, 1e6]  # [R]
 
     class critic:
         class_name: str = "MLPModel"
-        hidden_dims: list[int] = [512, 256, 128]
-        activation: str = "elu"
-        obs_normalization: bool = True
+        hidden_dims: list[int] = [512, 256, 128]  # [P]
+        activation: str = "elu"  # [P]
+        obs_normalization: bool = True  # [P]
 
     class algorithm:
         class_name: str = "PPO"
-        num_learning_epochs: int = 5
-        num_mini_batches: int = 4
-        clip_param: float = 0.2
-        gamma: float = 0.99
-        lam: float = 0.95
-        value_loss_coef: float = 1.0
-        entropy_coef: float = 0.005
-        learning_rate: float = 1e-3
-        max_grad_norm: float = 1.0
-        optimizer: str = "adam"
-        use_clipped_value_loss: bool = True
-        schedule: Literal["adaptive", "fixed"] = "adaptive"
-        desired_kl: float = 0.01
-        normalize_advantage_per_mini_batch: bool = False
+        num_learning_epochs: int = 5  # [P]
+        num_mini_batches: int = 4  # [P]
+        clip_param: float = 0.2  # [P]
+        gamma: float = 0.99  # [P]
+        lam: float = 0.95  # [P]
+        value_loss_coef: float = 1.0  # [P]
+        entropy_coef: float = 0.005  # [ours; P 0.001]
+        learning_rate: float = 1e-3  # at the start [R; P 3e-4]
+        max_grad_norm: float = 1.0  # [P]
+        optimizer: str = "adam"  # [P]
+        use_clipped_value_loss: bool = True  # [P]
+        schedule: Literal["adaptive", "fixed"] = "adaptive"  # fixed: `learning_rate` throughout [R; P fixed]
+        desired_kl: float = 0.01  # between updates, for the adaptive schedule [R]
+        normalize_advantage_per_mini_batch: bool = False  # [R]

@@ -31,8 +31,9 @@ OVERRIDES: dict[str, Any] = {
     "init_state.ang_vel_range": 0.0,
     "termination.max_tilt": 90.0,  # [deg], a fall
 }
+SETS = {*OVERRIDES, "env.num_envs"}  # what the exam decides
 SECONDS, SETTLING = 10.0, 2.0  # [s] of a tracking command, and of its start that is not counted
-KICK_COMMAND, KICK_AT, KICK_UNTIL = 0.8, 150, 300  # vx [m/s]; [control steps]
+KICK_COMMAND, KICK_AT, KICK_UNTIL = 0.8, 3.0, 6.0  # vx [m/s]; [s]
 KICK_SPEEDS, KICK_DIRECTIONS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0), 16  # [m/s]
 GRAVITY = 9.81  # [m/s^2]
 
@@ -92,7 +93,7 @@ def run_exam(env: LeggedRobot, policy: Callable[[TensorDict], Tensor]) -> dict[s
     energy = torch.stack(power)[counted].sum(dim=0) * env.dt
     stood = torch.isinf(fell_at[: len(asked)])
     ahead = commands().index((1.0, 0.0, 0.0))
-    survived = (fell_at[kicked] > KICK_UNTIL).view(len(KICK_SPEEDS), KICK_DIRECTIONS).float().mean(dim=1)
+    survived = (fell_at[kicked] > round(KICK_UNTIL / env.dt)).view(len(KICK_SPEEDS), KICK_DIRECTIONS).float().mean(dim=1)
     result = {
         "falls": int((~stood).sum()),
         "error": _figures(error[stood].mean(dim=0)) if stood.any() else None,  # None: nothing left to measure, all fell
@@ -111,7 +112,7 @@ def run_exam(env: LeggedRobot, policy: Callable[[TensorDict], Tensor]) -> dict[s
 
 def _kick(env: LeggedRobot, worlds: Tensor, step: int) -> None:
     """At its step, direction k of every kick speed: the base's horizontal velocity jumps, world frame."""
-    k = step - KICK_AT
+    k = step - round(KICK_AT / env.dt)
     if 0 <= k < KICK_DIRECTIONS:
         angle = 2 * math.pi * k / KICK_DIRECTIONS
         speed = torch.tensor(KICK_SPEEDS, device=env.device)

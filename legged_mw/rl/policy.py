@@ -8,6 +8,7 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import onnx
 import torch
 from rsl_rl.models import MLPModel
 from rsl_rl.utils import resolve_class
@@ -66,6 +67,18 @@ def export_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
             dynamo=True,
             verbose=False,
         )
+    _strip(path)
+
+
+def _strip(path: Path) -> None:
+    """Drop what the exporter notes for debugging: stack traces, with the folders of the machine that it ran on."""
+    model = onnx.load(path)
+    graph = model.graph
+    for part in (model, graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        part.doc_string = ""
+        if hasattr(part, "metadata_props"):
+            del part.metadata_props[:]
+    onnx.save(model, path)
 
 
 def act(policy: MLPModel, obs: TensorDict) -> Tensor:

@@ -107,6 +107,7 @@ def build_model(
     contact_geoms: Sequence[str],  # sensed: number of contacts with the ground
     velocity_sites: Sequence[str],  # sensed: linear velocity, world frame [m/s]
     accelerometer_site: str | None,  # sensed: proper acceleration, site frame [m/s^2]
+    camera: Sequence[float] = (0.9, -1.1, 0.6),  # place of the camera "track" relative to the robot's centre of mass [m]
 ) -> RobotModel:
     """Compile the MJCF at ``file`` for stepping and for drawing."""
     if not file.is_file():
@@ -117,12 +118,13 @@ def build_model(
         raise _invalid(file, error) from None
     notes: list[str] = []
     root, joints = _find_joints(spec, file.name)
-    _set_physics(spec, physics)
-    _add_ground(spec, ground, file.name)
+    _set_physics(spec, physics, notes)
+    _add_ground(spec, ground, file.name, notes)
     _set_collisions(spec, colliders, self_collisions, file.name, notes)
     limits = _add_servos(spec, joints, stiffness, damping, notes)
     _add_sensors(spec, contact_geoms, velocity_sites, accelerometer_site, file.name)
     add_scene(spec)
+    _add_camera(spec, root, camera)
     try:
         visual = spec.compile()
     except ValueError as error:  # a missing mesh, a name used twice: all that parsing does not see
@@ -130,6 +132,8 @@ def build_model(
     spec.compiler.discardvisual = True
     for light in list(spec.lights):
         spec.delete(light)  # mujoco-warp would move it in every step
+    for view in list(spec.cameras):
+        spec.delete(view)
     mj = spec.compile()
     names = tuple(j.name for j in joints)
     return RobotModel(
@@ -158,17 +162,27 @@ def _find_joints(spec: mujoco.MjSpec, where: str) -> tuple[str, list[mujoco.MjsJ
     return first.parent.name, rest
 
 
-def _set_physics(spec: mujoco.MjSpec, physics: Physics) -> None:
-    option = spec.option
-    option.timestep, option.iterations, option.ls_iterations = physics.timestep, physics.iterations, physics.ls_iterations
-    option.solver, option.cone = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtCone.mjCONE_PYRAMIDAL
-    option.integrator = mujoco.mjtIntegrator.mjINT_EULER
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+def _set_physics(spec: mujoco.MjSpec, physics: Physics, notes: list[str]) -> None:
+    wanted = {
+        "timestep": physics.timestep,
+        "iterations": physics.iterations,
+        "ls_iterations": physics.ls_iterations,
+        "solver": mujoco.mjtSolver.mjSOL_NEWTON,
+        "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
+        "integrator": mujoco.mjtIntegrator.mjINT_EULER,
+        "disableflags": spec.option.disableflags | mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value,
+    }
+    for name, value in wanted.items():
+        old = getattr(spec.option, name)
+        if old != value:
+            notes.append(f"option {name}: {old:g} -> {getattr(value, 'name', value)}")
+            setattr(spec.option, name, value)
     for key in list(spec.keys):
+        notes.append(f"keyframe '{key.name}' dropped")
         spec.delete(key)  # poses are the caller's choice, and a keyframe must fit the actuators added below
 
 
-def _add_ground(spec: mujoco.MjSpec, ground: Ground, where: str) -> None:
+def _add_ground(spec: mujoco.MjSpec, ground: Ground, where: str, notes: list[str]) -> None:
     if any(geom.name == GROUND for geom in spec.geoms):
         raise ModelError(f"{where} brings a geom '{GROUND}'; leave the ground to the config (section terrain)")
     spec.worldbody.add_geom(
@@ -182,6 +196,7 @@ def _add_ground(spec: mujoco.MjSpec, ground: Ground, where: str) -> None:
         condim=ground.condim,
         friction=[ground.friction, 0.005, 0.0001],
     )
+    notes.append(f"ground: plane, friction {ground.friction:g}, condim {ground.condim}, priority 1")
 
 
 def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisions: bool, where: str, notes: list[str]) -> None:
@@ -193,6 +208,9 @@ def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisio
             raise ModelError(f"colliders: {unknown('colliding geom', pattern, named, where)}")
     off = []
     for geom in robot:
+        if geom.priority > 0:
+            notes.append(f"geom '{geom.name}' priority: {geom.priority} -> 0, so that the ground's friction wins")
+            geom.priority = 0
         touches = any(fnmatchcase(geom.name, pattern) for pattern in colliders)
         geom.contype = 2 if self_collisions and touches else 0
         geom.conaffinity = (3 if self_collisions else 1) if touches else 0
@@ -200,6 +218,16 @@ def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisio
             off.append(geom.name or "unnamed")
     if off:
         notes.append(f"collisions off: {', '.join(off)}")
+
+
+def _add_camera(spec: mujoco.MjSpec, root: str, place: Sequence[float]) -> None:
+    """A camera "track" that keeps its distance and looks at the robot; for viewers, the stepped model has none."""
+    away = np.array(place, dtype=float) / np.linalg.norm(place)  # a camera looks along its -z
+    right = np.cross([0.0, 0.0, 1.0], away)
+    right /= np.linalg.norm(right)
+    quat = np.zeros(4)
+    mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(away, right), away], axis=1).ravel())
+    spec.body(root).add_camera(name="track", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=list(place), quat=quat)
 
 
 def _add_servos(

@@ -106,10 +106,13 @@ def one_line_errors(program: str) -> Iterator[None]:
         yield
     except UserError as error:
         fail(program, str(error))
-    except (torch.cuda.OutOfMemoryError, RuntimeError) as error:
-        if not isinstance(error, torch.cuda.OutOfMemoryError) and "Failed to allocate" not in str(error):
+    except RuntimeError as error:
+        first: BaseException = error
+        while first.__context__ is not None:
+            first = first.__context__  # what ran out may show as the failure of what it interrupted
+        if not re.search(r"out of memory|failed to allocate|alloc_failed", f"{first} {error}", re.IGNORECASE):
             raise
-        fail(program, f"out of memory: {str(error).splitlines()[0]}; fewer worlds need less: try half with --num_envs")
+        fail(program, f"out of memory ({str(first).splitlines()[0]}); fewer worlds need less: try half with --num_envs")
 
 
 def fail(program: str, message: str) -> NoReturn:

@@ -59,6 +59,13 @@ class LoadedTask:
             self.cfg.update(before, where=where)
             raise
 
+    def update_from_run(self, saved: Mapping[str, Any], where: str) -> None:
+        """Take over the ``config.yaml`` of a run; it must be one of this task."""
+        theirs = str(saved.get("task", self.name))
+        if Path(theirs).stem != self.name:
+            raise ConfigError(f"{where} is of task '{theirs}', not '{self.name}'; say --task {theirs}")
+        self.update(saved, where)
+
     def to_dict(self) -> dict[str, Any]:
         """Both configs as one mapping, with the task's name: what ``config.yaml`` in a run folder holds."""
         known = self.path.parent.resolve() == (ROOT / "configs").resolve()

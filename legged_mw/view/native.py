@@ -83,7 +83,7 @@ def _launch(model: mujoco.MjModel, data: mujoco.MjData, on_key: Callable[[int], 
     if not has_display():
         raise ViewError(
             "A window needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set. "
-            "Use the web viewer or record a video, or log in with `ssh -X`."
+            "Record a video with --video FILE, or log in with `ssh -X`."
         )
     if sys.platform.startswith("linux"):
         _probe_window()
@@ -106,7 +106,7 @@ def _probe_window() -> None:
     thread.join()
     if opened != [True]:
         state = ", ".join(f"{name}={os.environ.get(name)!r}" for name in ("DISPLAY", "WAYLAND_DISPLAY"))
-        raise ViewError(f"No OpenGL window can be opened on this display ({state}). Use the web viewer or record a video.")
+        raise ViewError(f"No OpenGL window can be opened on this display ({state}). Record a video with --video FILE.")
 
 
 def _can_open_window() -> bool:

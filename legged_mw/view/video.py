@@ -155,7 +155,7 @@ def _choose_encoder() -> type[_Ffmpeg] | type[_PyAv]:
         if "libx264" in av.codecs_available:
             return _PyAv
         tried.append("PyAV: built without libx264")
-    raise ViewError(f'No H.264 encoder ({"; ".join(tried)}). Install one: pip install "legged_mw[video]", or ffmpeg.')
+    raise ViewError(f"No H.264 encoder ({'; '.join(tried)}). Install one: pip install av, or ffmpeg.")
 
 
 class _Ffmpeg:

@@ -1,0 +1,52 @@
+"""The policies that ship: they load, the two formats agree, play.py finds them, and they walk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from program import run
+
+from legged_mw import ROOT
+from legged_mw.eval import exam
+from legged_mw.rl.policy import ExportedPolicy, act, load_policy
+from legged_mw.utils.config import load_yaml
+from legged_mw.utils.task import load_task
+
+POLICIES = sorted(path.parent for path in (ROOT / "resources/policies").glob("*/model.pt"))
+
+
+def test_there_is_one() -> None:
+    assert "go1_flat" in {folder.name for folder in POLICIES}
+
+
+@pytest.mark.parametrize("folder", POLICIES, ids=lambda folder: folder.name)
+def test_walks_and_both_formats_agree(folder: Path) -> None:
+    task = load_task(folder.name)
+    task.update_from_run(load_yaml(folder / "config.yaml"), where="config.yaml")
+    exam.prepare(task)
+    env = task.env_class(task.cfg, "cpu")
+    policy = load_policy(folder / "model.pt", env, task.train, "cpu")
+
+    obs = torch.randn(32, policy.obs_dim, generator=torch.Generator().manual_seed(0)) * 2.0
+    with torch.inference_mode():
+        expected = ExportedPolicy(policy, task.cfg.normalization.clip_actions)(obs)
+    for name in ("policy.onnx", "model.pt", "config.yaml"):
+        assert b"site-packages" not in (folder / name).read_bytes() and str(ROOT).encode() not in (folder / name).read_bytes()
+    session = onnxruntime.InferenceSession(folder / "policy.onnx")
+    got = np.concatenate([session.run(["actions"], {"obs": row[None].numpy()})[0] for row in obs])
+    np.testing.assert_allclose(got, expected.numpy(), atol=1e-4)  # float32 sums in another order
+
+    result = exam.run_exam(env, lambda state: act(policy, state))
+    assert result["walks"], exam.table(result)
+
+
+def test_play_takes_the_shipped_policy_where_nothing_is_trained(tmp_path: Path) -> None:
+    (tmp_path / "resources").symlink_to(ROOT / "resources")
+    result = run("play", tmp_path, "--task", "go1_flat", "--device", "cpu", "--export", str(tmp_path / "out"))
+    assert result.code == 0, result.err
+    assert result.out.startswith("shipped policy: ") and "resources/policies/go1_flat/model.pt" in result.out.splitlines()[0]
+    assert (tmp_path / "out/policy.onnx").stat().st_size > 100_000
