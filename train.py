@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 import shlex
 import signal
 import sys
@@ -101,7 +102,8 @@ def stop_on_signals(runner: Runner, deadline: float | None) -> None:
 
     def ask(number: int, _: object) -> None:
         runner.stop = signal.Signals(number).name
-        print(f"{runner.stop}: saving and stopping after this step; again to stop at once", flush=True)
+        # not print: it is not to be called while another print is interrupted
+        os.write(1, f"{runner.stop}: saving and stopping after this step; again to stop at once\n".encode())
         signal.signal(number, signal.SIG_DFL)
 
     signal.signal(signal.SIGINT, ask)
