@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import math
+from pathlib import Path
+
 import pytest
 import torch
+from learner import collect, difference, make, observations, parameters, share_experience
 from mujoco_warp import DisableBit
+from rsl_rl.algorithms import PPO
+from test_ppo import VARIANTS, update
 
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
+from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.runner import make_runner
 from legged_mw.utils.task import load_task
 
 pytestmark = pytest.mark.gpu
@@ -91,3 +100,80 @@ def test_more_iterations_are_recorded_too() -> None:
         for _ in range(6):
             _, reward, _, _ = env.step(torch.zeros(64, 12, device=DEVICE))
         assert env._graph.recorded and torch.isfinite(reward).all()
+
+
+# ---- the learner ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("settings", VARIANTS.values(), ids=VARIANTS.keys())
+def test_recorded_update_is_rsl_rls_own(settings: dict) -> None:
+    """Five updates of 20 minibatches, all but the first three replays; the stock learner gathers the experience."""
+    stock, ours = make(PPO, DEVICE, **settings), make(GraphedPPO, DEVICE, **settings)
+    assert ours.graphed and difference(parameters(stock), parameters(ours)) == 0.0
+    for seed in range(5):
+        collect(stock, DEVICE, seed=seed)
+        share_experience(stock, ours)
+        expected, got = update(stock), update(ours)
+        assert difference(parameters(stock), parameters(ours)) < 1e-4
+        assert got == pytest.approx(expected, rel=1e-3, abs=1e-5)
+        assert ours.learning_rate == pytest.approx(stock.learning_rate, rel=1e-12)
+    assert ours._minibatch_graph.recorded
+
+
+def test_checkpoints_go_both_ways_on_a_gpu(tmp_path: Path) -> None:
+    """Also from a learner that replays into one that has not recorded, and back into one that has."""
+    replaying, stock, fresh = make(GraphedPPO, DEVICE), make(PPO, DEVICE), make(GraphedPPO, DEVICE)
+    for seed in range(5):
+        collect(replaying, DEVICE, seed=seed)
+        update(replaying)
+    torch.save(replaying.save(), tmp_path / "model.pt")
+    for alg in (stock, fresh, replaying):
+        alg.load(torch.load(tmp_path / "model.pt", map_location=DEVICE, weights_only=True), None, True)
+    collect(stock, DEVICE, seed=9)
+    for alg in (fresh, replaying):
+        share_experience(stock, alg)
+    stock.storage.distribution_params[0].sub_(0.02)  # each share moves it
+    for alg in (stock, fresh, replaying):
+        for mine, other in zip(alg.storage.distribution_params, fresh.storage.distribution_params, strict=True):
+            mine.copy_(other)
+        update(alg)
+    assert difference(parameters(stock), parameters(fresh)) < 1e-4
+    assert difference(parameters(stock), parameters(replaying)) < 1e-4
+
+
+def test_iteration_never_waits_for_the_host() -> None:
+    """Rollout, returns, update and the report, once everything is recorded."""
+    runner = make_runner(make_env(eager=False), small_learner(), None, DEVICE)
+    runner.learn(5)
+    obs = runner.env.get_observations()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(2):
+            obs = runner._rollout(obs)
+            with torch.inference_mode():
+                runner.alg.compute_returns(obs)
+            losses = runner.alg.update()
+            report = runner._report(losses, (0.0, 0.0, 0.0))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert all(math.isfinite(value) for value in report.message.read()[-5:])
+
+
+def test_recorded_acting_explores() -> None:
+    """Replays draw new noise each time, of the std that the policy has now."""
+    alg = make(GraphedPPO, DEVICE)
+    obs = observations(torch.Generator().manual_seed(0), DEVICE)
+    with torch.inference_mode():
+        for _ in range(5):
+            alg.act(obs)
+        assert alg._act_graph.recorded
+        alg.actor.distribution.std_param.fill_(0.25)
+        drawn = torch.stack([alg.act(obs) for _ in range(200)])
+    assert drawn.std(dim=0).mean().item() == pytest.approx(0.25, rel=0.05)
+    assert (drawn.mean(dim=0) - alg.actor(obs)).abs().max() < 0.1
+
+
+def small_learner() -> LeggedRobotCfgPPO:
+    train = load_task("go1_flat").train
+    train.actor.hidden_dims = train.critic.hidden_dims = [32, 32]
+    return train

@@ -11,6 +11,7 @@ foot position and velocity, accelerometer, joint torque) is one simulation step 
 from __future__ import annotations
 
 import math
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ from legged_mw import ROOT
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.envs.mirror import Mirror, make_mirror
 from legged_mw.sim.model import Ground, ModelError, Physics, RobotModel, build_model, per_joint, unknown
 from legged_mw.sim.simulation import Simulation
 from legged_mw.utils.config import ConfigError
@@ -33,6 +35,7 @@ class Row(NamedTuple):
     name: str
     value: Tensor  # (N, size)
     noise: float = 0.0  # half width of the uniform noise added to it, in the value's unit
+    mirror: str | None = None  # its mirror image, left for right: a kind of envs/mirror.py, or the group that it is; None: not said
 
 
 class LeggedRobot(BaseTask):
@@ -210,29 +213,29 @@ class LeggedRobot(BaseTask):
         noise = self.cfg.noise.scales
         return {
             "state": [
-                Row("base_lin_vel", self.base_lin_vel, noise.lin_vel),  # at the IMU, body frame [m/s]
-                Row("base_ang_vel", self.base_ang_vel, noise.ang_vel),  # gyro, body frame [rad/s]
-                Row("projected_gravity", self.projected_gravity, noise.gravity),  # direction, body frame
-                Row("dof_pos", self.dof_offset, noise.dof_pos),  # minus the default pose [rad]
-                Row("dof_vel", self.dof_vel, noise.dof_vel),  # [rad/s]
-                Row("last_actions", self.last_actions),  # a_t, clipped
-                Row("commands", self.commands),  # vx, vy [m/s], yaw rate [rad/s], body frame
+                Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="polar"),  # at the IMU, body frame [m/s]
+                Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial"),  # gyro, body frame [rad/s]
+                Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar"),  # direction, body frame
+                Row("dof_pos", self.dof_offset, noise.dof_pos, mirror="joint"),  # minus the default pose [rad]
+                Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint"),  # [rad/s]
+                Row("last_actions", self.last_actions, mirror="joint"),  # a_t, clipped
+                Row("commands", self.commands, mirror="command"),  # vx, vy [m/s], yaw rate [rad/s], body frame
             ],
             "privileged_state": [
-                Row("state", self.obs_buf.get("state", self.actions[:, :0])),  # the same noisy sample
-                Row("base_ang_vel", self.base_ang_vel),
-                Row("accelerometer", self.accelerometer),  # proper acceleration at the IMU [m/s^2]
-                Row("projected_gravity", self.projected_gravity),
-                Row("base_lin_vel", self.base_lin_vel),
-                Row("base_ang_vel_world", self.base_ang_vel_world),
-                Row("dof_pos", self.dof_offset),
-                Row("dof_vel", self.dof_vel),
-                Row("torques", self.torques),  # [N m]
-                Row("foot_contact", self.foot_contact),  # 0 or 1
-                Row("foot_lin_vel", self.foot_vel.flatten(1)),  # world frame [m/s]
-                Row("feet_air_time", self.feet_air_time),  # [s]
-                Row("kick_force", self.kick_force),  # on the root, world frame [N]
-                Row("kick_active", self.kick_active[:, None]),  # 0 or 1
+                Row("state", self.obs_buf.get("state", self.actions[:, :0]), mirror="state"),  # the same noisy sample
+                Row("base_ang_vel", self.base_ang_vel, mirror="axial"),
+                Row("accelerometer", self.accelerometer, mirror="polar"),  # proper acceleration at the IMU [m/s^2]
+                Row("projected_gravity", self.projected_gravity, mirror="polar"),
+                Row("base_lin_vel", self.base_lin_vel, mirror="polar"),
+                Row("base_ang_vel_world", self.base_ang_vel_world, mirror="axial"),  # the world mirrors about its own x-z plane
+                Row("dof_pos", self.dof_offset, mirror="joint"),
+                Row("dof_vel", self.dof_vel, mirror="joint"),
+                Row("torques", self.torques, mirror="joint"),  # [N m]
+                Row("foot_contact", self.foot_contact, mirror="foot"),  # 0 or 1
+                Row("foot_lin_vel", self.foot_vel.flatten(1), mirror="foot_polar"),  # world frame [m/s]
+                Row("feet_air_time", self.feet_air_time, mirror="foot"),  # [s]
+                Row("kick_force", self.kick_force, mirror="polar"),  # on the root, world frame [N]
+                Row("kick_active", self.kick_active[:, None], mirror="scalar"),  # 0 or 1
             ],
         }
 
@@ -256,6 +259,11 @@ class LeggedRobot(BaseTask):
             self.obs_buf[group] = torch.zeros(self.num_envs, len(noise), device=self.device)
             if any(noise):
                 self.noise_vec[group] = torch.tensor(noise, device=self.device)
+
+    @cached_property
+    def mirror(self) -> Mirror:
+        """Observations and actions left for right, from the table; made when first asked for, and not for the step."""
+        return make_mirror(self)
 
     # ---- reward -------------------------------------------------------------------------------------------------------
 
@@ -371,18 +379,28 @@ class LeggedRobot(BaseTask):
         counts = torch.stack([self.reset_buf, self.fell, self.broken], dim=1)
         self._statistics.add_(torch.cat([torch.where(self.reset_buf[:, None], ended, 0.0), counts], dim=1).sum(dim=0))
 
-    def read_statistics(self) -> dict[str, float]:
-        """Means over the episodes that ended since the last call, and counts; then start anew. Reads the device.
+    def take_statistics(self) -> Tensor:
+        """The running sums (S,), which then start anew, and worlds whose simulator overflowed so far; on the device."""
+        taken = torch.cat([self._statistics, self.sim.overflowed_worlds()[None]])
+        self._statistics.zero_()
+        return taken
+
+    def name_statistics(self, taken: list[float]) -> dict[str, float]:
+        """Means over the episodes that ended, and counts, from what ``take_statistics`` gave.
 
         ``rew_<name>``: sum of scale * term * dt over the episode, before the clip, divided by
         ``env.episode_length_s``. ``reward``: the episode's return. ``episode_length`` [control steps]. Means are NaN if none ended.
         """
-        *sums, episodes, fell, broken = self._statistics.tolist()
-        self._statistics.zero_()
+        *sums, episodes, fell, broken, overflowed = taken
         *terms, total, length = [value / episodes if episodes else math.nan for value in sums]
         per_second = self.cfg.env.episode_length_s
         named = {f"rew_{name}": value / per_second for name, value in zip(self.reward_names, terms, strict=True)}
-        return {"reward": total, "episode_length": length, **named, "episodes": episodes, "fell": fell, "broken": broken}
+        counts = {"episodes": episodes, "fell": fell, "broken": broken, "overflowed": overflowed}
+        return {"reward": total, "episode_length": length, **named, **counts}
+
+    def read_statistics(self) -> dict[str, float]:
+        """Statistics since the last call, by name. Reads the device."""
+        return self.name_statistics(self.take_statistics().tolist())
 
     # ---- robot and buffers: born here, never rebound --------------------------------------------------------------------------
 

@@ -168,7 +168,7 @@ class LeggedRobotCfgPPO(Config):
         obs_normalization: bool = True  # [P]
 
     class algorithm:
-        class_name: str = "PPO"
+        class_name: str = "legged_mw.rl.ppo:GraphedPPO"  # or "PPO": rsl-rl's own, same results, slower on a GPU
         num_learning_epochs: int = 5  # [P]
         num_mini_batches: int = 4  # [P]
         clip_param: float = 0.2  # [P]
@@ -183,3 +183,10 @@ class LeggedRobotCfgPPO(Config):
         schedule: Literal["adaptive", "fixed"] = "adaptive"  # fixed: `learning_rate` throughout [R; P fixed]
         desired_kl: float = 0.01  # between updates, for the adaptive schedule [R]
         normalize_advantage_per_mini_batch: bool = False  # [R]
+
+    class symmetry:
+        """Left-right symmetry in the update, as in Mittal et al. 2024. Rows of observations say how they mirror: envs/mirror.py."""
+
+        use_data_augmentation: bool = False  # learn from the mirror image of every sample too: twice the batch [R]
+        use_mirror_loss: bool = False  # pull the mean action in the mirrored state to the mirrored mean action [R]
+        mirror_loss_coeff: float = 0.0  # weight of that pull, mean square over actions [-] [R]

@@ -11,12 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.runners import OnPolicyRunner
 from torch import Tensor
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
+from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.ranks import this_rank
+from legged_mw.rl.report import Clock, Mark, Message, Report, console_block, console_rows
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
 from legged_mw.utils.config import ConfigError
 
@@ -37,12 +41,25 @@ class Runner(OnPolicyRunner):
         self.stop: str | None = None
         self._warned_overflow = False
         self._last_means: dict[str, float] = {}
-        self._action_std = math.nan
+
+    def _configure_multi_gpu(self) -> None:
+        """rsl-rl's own (NCCL, a GPU a process); processes on a CPU talk through gloo."""
+        rank = this_rank()
+        if rank.count == 1 or self.device != "cpu":
+            super()._configure_multi_gpu()
+            return
+        self.is_distributed = True
+        self.gpu_global_rank, self.gpu_local_rank, self.gpu_world_size = rank
+        self.cfg["multi_gpu"] = {"global_rank": rank.index, "local_rank": rank.local, "world_size": rank.count}
+        torch.distributed.init_process_group("gloo", rank=rank.index, world_size=rank.count)
 
     # ---- the loop -------------------------------------------------------------------------------------------------
 
     def learn(self, num_learning_iterations: int, init_at_random_ep_len: bool = True) -> None:
-        """Run that many iterations: roll out, update, log, save. Ends early, after a checkpoint, once ``stop`` is set."""
+        """Run that many iterations: roll out, update, log, save. Ends early, after a checkpoint, once ``stop`` is set.
+
+        On a GPU an iteration is logged while the next one runs, so that the device never waits for the host.
+        """
         if init_at_random_ep_len:  # else every world would time out in the same step
             self.env.episode_length_buf = torch.randint_like(self.env.episode_length_buf, high=self.env.max_episode_length)
         obs = self.env.get_observations()
@@ -50,93 +67,109 @@ class Runner(OnPolicyRunner):
         if self.is_distributed:
             self.alg.broadcast_parameters()
         self.logger.init_logging_writer()
-        begun, first = time.time(), self.current_learning_iteration
-        last = first + num_learning_iterations
-        self.env.read_statistics()
-        while self.current_learning_iteration < last and self.stop is None:
-            start = time.time()
+        self.env.take_statistics()
+        first, clock, waiting = self.current_learning_iteration, Clock(self.device), None
+        self._last, self._begun, self._first = first + num_learning_iterations, time.time(), first
+        self._all_stop = False
+        start = clock.mark()
+        while self.current_learning_iteration < self._last and not self._must_stop():
             obs = self._rollout(obs)
-            if self.stop is not None:
+            if self._must_stop():
                 break  # an unfinished rollout is dropped
             with torch.inference_mode():
                 self.alg.compute_returns(obs)
-            statistics = self.env.read_statistics()  # the one wait for the device in an iteration's rollout
-            collected = time.time()
+            collected = clock.mark()
             losses = self.alg.update()
-            self.current_learning_iteration += 1
-            done = time.time()
-            steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
-            self.total_steps += steps
-            iteration = self.current_learning_iteration
-            left = (done - begun) / (iteration - first) * (last - iteration)
-            self._log(last, statistics, losses, steps, collected - start, done - collected, done - begun, left)
-            if iteration % self.cfg["save_interval"] == 0 and iteration < last:
+            report = self._report(losses, (start, collected, start := clock.mark()))
+            if waiting:
+                self._log(waiting)
+            waiting = report if self.device != "cpu" else self._log(report)
+            if self.current_learning_iteration % self.cfg["save_interval"] == 0 and self.current_learning_iteration < self._last:
                 self._save_checkpoint()
+        if waiting:
+            self._log(waiting)
         self._save_checkpoint()
         self.logger.stop_logging_writer()
+
+    def _must_stop(self) -> bool:
+        """Ranks stop together, one iteration after the first was asked to: each waits for the others in every update."""
+        if not self.is_distributed:
+            return self.stop is not None
+        if self._all_stop:
+            self.stop = self.stop or "another rank was asked to"
+        return self._all_stop
 
     def _rollout(self, obs: Any) -> Any:
         with torch.inference_mode():
             for _ in range(self.cfg["num_steps_per_env"]):
                 obs, rewards, dones, extras = self.env.step(self.alg.act(obs))
                 self.alg.process_env_step(obs, rewards, dones, extras)
-                if self.stop is not None:
+                if self.stop is not None and not self.is_distributed:
                     self.alg.storage.clear()
                     break
         return obs
 
     # ---- what the user sees ---------------------------------------------------------------------------------------
 
-    def _log(
-        self,
-        last: int,
-        statistics: dict[str, float],
-        losses: dict[str, float],
-        steps: int,
-        collect_time: float,
-        learn_time: float,
-        elapsed: float,
-        left: float,
-    ) -> None:
+    def _report(self, losses: dict[str, Any], marks: tuple[Mark, Mark, Mark]) -> Report:
+        """Count the iteration and send its numbers to the host, without waiting for them."""
+        self.current_learning_iteration += 1
+        steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
+        self.total_steps += steps
+        stop = torch.full((1,), float(self.stop is not None), device=self.device)
+        summed = torch.cat([self.env.take_statistics(), stop])
+        if self.is_distributed:
+            torch.distributed.all_reduce(summed)
+        own = torch.stack([torch.as_tensor(value, dtype=torch.float, device=self.device) for value in losses.values()])
+        rate = self.alg.rate if isinstance(self.alg, GraphedPPO) else torch.tensor(self.alg.learning_rate)
+        own = torch.cat([own, rate.to(own)[None], self._action_std()[None]])
+        message = Message(torch.cat([summed, own]))
+        return Report(self.current_learning_iteration, self.total_steps, steps, list(losses), message, marks)
+
+    def _action_std(self) -> Tensor:
+        """Mean standard deviation of the actions of the last rollout, ()."""
+        policy, params = self.alg.get_policy(), self.alg.storage.distribution_params
+        if isinstance(policy.distribution, GaussianDistribution) and params is not None:
+            return params[1].mean()
+        return policy.output_std.detach().mean()
+
+    def _log(self, report: Report) -> None:
         """One block on the console and one point a curve in the writer."""
-        iteration = self.current_learning_iteration
-        self._last_means.update({name: value for name, value in statistics.items() if not math.isnan(value)})
-        means = {name: self._last_means.get(name, math.nan) for name in statistics}
-        self._action_std = float(self.alg.get_policy().output_std.detach().mean())
-        speed = steps / (collect_time + learn_time)
-        scalars = {f"Loss/{name}": value for name, value in losses.items()}
-        scalars |= {"Loss/learning_rate": self.alg.learning_rate, "Policy/mean_std": self._action_std}
-        scalars |= {"Perf/total_fps": speed, "Perf/collection_time": collect_time, "Perf/learning_time": learn_time}
-        scalars |= {"Train/mean_reward": means["reward"], "Train/mean_episode_length": means["episode_length"]}
-        scalars |= {f"Episode/{name}": value for name, value in means.items() if name.startswith("rew_")}
-        scalars |= {"Episode/fell": means["fell"], "Episode/broken": means["broken"], "Train/total_steps": self.total_steps}
+        values, count = report.message.read(), len(report.losses)
+        numbers = self.env.name_statistics(values[: -count - 3])
+        self._all_stop = values[-count - 3] > 0
+        losses = dict(zip(report.losses, values[-count - 2 : -2], strict=True))
+        self._last_means.update({name: value for name, value in numbers.items() if not math.isnan(value)})
+        numbers = {name: self._last_means.get(name, math.nan) for name in numbers}
+        numbers["learning_rate"], numbers["action_std"] = values[-2:]
+        collect, learn = report.seconds()
+        speed = report.steps / (collect + learn)
         if self.logger.writer is not None:
-            for name, value in scalars.items():
+            for name, value in self._curves(numbers, losses, speed, collect, learn, report.total_steps).items():
                 if not math.isnan(value):
-                    self.logger.writer.add_scalar(name, value, iteration)
-        print(self._block(last, means, losses, speed, collect_time, learn_time, elapsed, left), flush=True)
-        self._warn_overflow()
-
-    def _block(self, last: int, means: dict, losses: dict, speed: float, collect: float, learn: float, elapsed: float, left: float) -> str:
-        rows = {
-            "Computation": f"{speed:.0f} steps/s (collection {collect:.3f} s, learning {learn:.3f} s)",
-            **{f"{name.capitalize()} loss": f"{value:.4f}" for name, value in losses.items()},
-            "Learning rate": f"{self.alg.learning_rate:.1e}",
-            "Action std": f"{self._action_std:.2f}",
-            "Mean reward": f"{means['reward']:.2f}",
-            "Mean episode length": f"{means['episode_length']:.1f}",
-            **{name: f"{value:.4f}" for name, value in means.items() if name.startswith("rew_")},
-            "Episodes ended": f"{means['episodes']:.0f} ({means['fell']:.0f} falls, {means['broken']:.0f} not finite)",
-            "Total steps": f"{self.total_steps}",
-            "Time elapsed, left": f"{timedelta(seconds=round(elapsed))}, {timedelta(seconds=round(left))}",
-        }
-        title = f" Learning iteration {self.current_learning_iteration}/{last} ".center(80, "#")
-        return "\n".join([title, *(f"{name:>32}: {text}" for name, text in rows.items())])
-
-    def _warn_overflow(self) -> None:
-        if not self._warned_overflow and (report := self.env.sim.overflow_report()):
-            print(f"WARNING: {report} (config section sim)", flush=True)
+                    self.logger.writer.add_scalar(name, value, report.iteration)
+        left = (time.time() - self._begun) / (report.iteration - self._first) * (self._last - report.iteration)
+        rows = console_rows(numbers, losses, speed, collect, learn)
+        rows["Total steps"] = f"{report.total_steps}"
+        rows["Time elapsed, left"] = ", ".join(str(timedelta(seconds=round(t))) for t in (time.time() - self._begun, left))
+        print(console_block(f"Learning iteration {report.iteration}/{self._last}", rows), flush=True)
+        if numbers["overflowed"] and not self._warned_overflow:
+            print(f"WARNING: {self.env.sim.overflow_report()} (config section sim)", flush=True)
             self._warned_overflow = True
+
+    @staticmethod
+    def _curves(
+        numbers: dict[str, float], losses: dict[str, float], speed: float, collect: float, learn: float, total_steps: int
+    ) -> dict[str, float]:
+        """Curve -> value, under rsl-rl's names where it has them."""
+        return {
+            **{f"Loss/{name}": value for name, value in losses.items()},
+            **{"Loss/learning_rate": numbers["learning_rate"], "Policy/mean_std": numbers["action_std"]},
+            **{"Perf/total_fps": speed, "Perf/collection_time": collect, "Perf/learning_time": learn},
+            **{"Train/mean_reward": numbers["reward"], "Train/mean_episode_length": numbers["episode_length"]},
+            **{f"Episode/{name}": value for name, value in numbers.items() if name.startswith("rew_")},
+            **{"Episode/fell": numbers["fell"], "Episode/broken": numbers["broken"], "Train/total_steps": total_steps},
+        }
 
     # ---- checkpoints ----------------------------------------------------------------------------------------------
 
@@ -165,10 +198,14 @@ class Runner(OnPolicyRunner):
         if self.alg.schedule == "fixed":  # the config's number, which the user may have changed; an adaptive rate goes on
             self.alg.learning_rate = self.cfg["algorithm"]["learning_rate"]
             for group in self.alg.optimizer.param_groups:
-                group["lr"] = self.alg.learning_rate
+                if not isinstance(group["lr"], Tensor):  # a recorded optimizer reads the algorithm's
+                    group["lr"] = self.alg.learning_rate
         infos = content.get("infos") or {}
         self.total_steps = infos.get("total_steps", 0)
-        _set_random_state(infos.get("random_state", {}), self.device)
+        if self.gpu_global_rank == 0:
+            _set_random_state(infos.get("random_state", {}), self.device)
+        else:  # the file holds the first rank's; the others must not draw the same
+            torch.manual_seed(hash((self.gpu_global_rank, self.total_steps, torch.initial_seed())) % 2**63)
         return infos
 
 
@@ -191,7 +228,10 @@ def rsl_rl_config(cfg: LeggedRobotCfgPPO) -> dict[str, Any]:
             raise ConfigError("runner.logger is wandb, but wandb is not installed: pip install wandb")
         logger = {"class_name": "WandbLogWriter", "project_name": runner["wandb_project"]}
     keys = ("num_steps_per_env", "save_interval", "experiment_name", "run_name")
-    algorithm = {"rnd_cfg": None, "symmetry_cfg": None, **sections.pop("algorithm")}
+    symmetry = sections.pop("symmetry")
+    mirrors = symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]
+    symmetry_cfg = {"data_augmentation_func": "legged_mw.rl.symmetry:mirror", **symmetry} if mirrors else None
+    algorithm = {"rnd_cfg": None, "symmetry_cfg": symmetry_cfg, **sections.pop("algorithm")}
     return {**sections, **{key: runner[key] for key in keys}, "algorithm": algorithm, "logger": logger, "check_for_nan": False}
 
 

@@ -98,6 +98,10 @@ class Simulation:
             raise ModelError(unknown("per-world model field", name, self._fields, "this simulation (declare it in world_fields)"))
         return self._fields[name]
 
+    def overflowed_worlds(self) -> Tensor:
+        """How many worlds did not fit since construction, float (), on the device."""
+        return ((self._overflow_seen & ~int(_EXPECTED)) != 0).sum(dtype=torch.float)
+
     def overflow_report(self) -> str:
         """What did not fit since construction, a line, or '' if all did. Reads the device: not for inside a step."""
         seen = self._overflow_seen & ~int(_EXPECTED)

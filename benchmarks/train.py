@@ -1,0 +1,126 @@
+"""How fast a task trains, and what an iteration's time is spent on: python benchmarks/train.py --num_envs 4096 16384
+
+The whole iteration is timed as training runs it (`Runner.learn`); then its parts are timed alone, in the same process:
+physics (the substeps, recorded), the rest of `env.step`, the policy (acting, storing), the update (returns, minibatches,
+normalisers). What is left of the iteration is called rest: waiting for the host, logging, the tails of kernels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import statistics
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.rl.runner import Runner, make_runner
+from legged_mw.sim.graph import StepGraph
+from legged_mw.utils.cli import apply_overrides, make_parser, pick_device, seed_everything
+from legged_mw.utils.task import load_task
+
+
+class Times(NamedTuple):
+    """Seconds an iteration."""
+
+    whole: float
+    physics: float
+    step: float  # env.step without its physics
+    policy: float
+    update: float
+
+    @property
+    def rest(self) -> float:
+        return self.whole - self.physics - self.step - self.policy - self.update
+
+
+def seconds(fn: Callable[[], object], device: str, calls: int = 1) -> float:
+    """Seconds a call, from an idle device to an idle device."""
+    synchronize(device)
+    start = time.perf_counter()
+    for _ in range(calls):
+        fn()
+    synchronize(device)
+    return (time.perf_counter() - start) / calls
+
+
+def synchronize(device: str) -> None:
+    if device != "cpu":
+        torch.cuda.synchronize()
+
+
+def physics_only(env: LeggedRobot, eager: bool) -> Callable[[], None]:
+    """The recorded substeps of one control step, from the environment's present state."""
+    graph = StepGraph(lambda: env.sim.step(env.cfg.control.decimation), env.device, eager)
+    for _ in range(4):
+        graph()
+    return graph
+
+
+def measure(runner: Runner, iterations: int, rounds: int, eager: bool) -> Times:
+    """Medians over ``rounds``, after a warm-up in which everything is recorded."""
+    env, alg, device = runner.env, runner.alg, runner.device
+    steps = runner.cfg["num_steps_per_env"]
+    with contextlib.redirect_stdout(io.StringIO()):
+        runner.learn(5)
+        whole = statistics.median(seconds(lambda: runner.learn(iterations, False), device) / iterations for _ in range(rounds))
+    parts: dict[str, list[float]] = {"step": [], "policy": [], "update": []}
+    obs = env.get_observations()
+    for _ in range(rounds):
+        with torch.inference_mode():
+            actions = alg.act(obs)
+            step = seconds(lambda actions=actions: env.step(actions), device, steps) * steps
+            result = env.step(actions)
+
+            def act_and_store(result=result) -> None:
+                alg.act(result[0])
+                alg.process_env_step(*result)
+
+            parts["policy"].append(seconds(act_and_store, device, steps) * steps)
+            obs = result[0]
+            returns = seconds(lambda: alg.compute_returns(obs), device)  # noqa: B023 (called at once)
+        parts["step"].append(step)
+        parts["update"].append(returns + seconds(alg.update, device))
+    bare = physics_only(env, eager)
+    physics = statistics.median(seconds(bare, device, steps) * steps for _ in range(rounds))
+    step, policy, update = (statistics.median(values) for values in parts.values())
+    return Times(whole, physics, step - physics, policy, update)
+
+
+def main() -> None:
+    parser = make_parser(__doc__)
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    parser.set_defaults(task="go1_flat")
+    parser.add_argument("--worlds", type=int, nargs="+", help="worlds to measure, one after the other (default: the task's)")
+    parser.add_argument("--iterations", type=int, default=10, help="in one call of learn")
+    parser.add_argument("--rounds", type=int, default=5)
+    args = parser.parse_args()
+    device = pick_device(args.device)
+    name = torch.cuda.get_device_name(device) if device != "cpu" else f"CPU, {torch.get_num_threads()} threads"
+    header = f"{'worlds':>8}{'steps/s':>12}{'iteration':>11}{'physics':>9}{'step':>8}{'policy':>8}{'update':>8}{'rest':>8}   [ms]"
+    print(f"{args.task} on {name}; torch {torch.__version__}\n{header}")
+    for worlds in args.worlds or [None]:
+        task = load_task(args.task)
+        apply_overrides(task, args)
+        if worlds is not None:
+            task.cfg.env.num_envs = worlds
+        seed_everything(task.train.seed)
+        with contextlib.redirect_stdout(io.StringIO()):
+            env = task.env_class(task.cfg, device, eager=args.eager)
+            runner = make_runner(env, task.train, None, device)
+        times = measure(runner, args.iterations, args.rounds, args.eager)
+        speed = env.num_envs * runner.cfg["num_steps_per_env"] / times.whole
+        parts = "".join(f"{1e3 * t:>{w}.1f}" for t, w in zip((*times, times.rest), (11, 9, 8, 8, 8, 8), strict=True))
+        print(f"{env.num_envs:>8}{speed:>12.0f}{parts}", flush=True)
+        del env, runner
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,310 @@
+"""rsl-rl's PPO recorded as CUDA graphs: the same keys, mathematics and checkpoints, and no question to the host.
+
+Acting, the returns and each minibatch (gather, forward, loss, backward, clipping, learning rate, Adam) are one graph
+each. A graph remembers addresses, so what rsl-rl rebinds every iteration (advantages, the normalisers' std) is copied
+into tensors that stay.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
+from rsl_rl.modules import EmpiricalNormalization
+from rsl_rl.modules.distribution import GaussianDistribution
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from legged_mw.sim.graph import StepGraph
+
+_MIN_RATE, _MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
+
+
+class GraphedPPO(PPO):
+    """PPO whose update and acting are replayed CUDA graphs.
+
+    What cannot be recorded (a CPU, a recurrent network, RND, an optimizer other than Adam or AdamW, a distribution that
+    is not Gaussian) is left to rsl-rl's own code, and a line says so. The first three minibatches of a run are real steps
+    too: nothing is warmed up on a throw-away step.
+    """
+
+    _plain_rate: float  # the learning rate where nothing is recorded
+    _rate: Tensor | None = None  # else: () float64, as precise as rsl-rl's Python number
+
+    def __init__(self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> None:
+        super().__init__(actor, critic, storage, **settings)
+        reason = self._why_stock()
+        self.graphed = reason is None
+        if reason:
+            print(f"PPO: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
+            return
+        self._adam_rate = torch.tensor(self.learning_rate, dtype=torch.float32, device=self.device)
+        self._rate = torch.tensor(self.learning_rate, dtype=torch.float64, device=self.device)
+        parameters = [*self.actor.parameters(), *self.critic.parameters()]
+        self.optimizer = type(self.optimizer)(parameters, lr=self._adam_rate, **self._adam_flags())
+        self._begin()
+
+    def _why_stock(self) -> str | None:
+        """What keeps this configuration from being recorded, or None."""
+        models = (self.actor, self.critic)
+        if not str(self.device).startswith("cuda"):
+            return f"the device is {self.device}"
+        if any(model.is_recurrent for model in models):
+            return "the networks are recurrent"
+        if self.rnd:
+            return "rnd_cfg is set"
+        return self._why_not_plain(models)
+
+    def _why_not_plain(self, models: tuple[MLPModel, MLPModel]) -> str | None:
+        if any(type(model).forward is not MLPModel.forward for model in models):
+            return "a network has a forward pass of its own"
+        if not isinstance(self.actor.distribution, GaussianDistribution):
+            return f"actions are drawn from a {type(self.actor.distribution).__name__}"
+        if type(self.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
+            return f"the optimizer is {type(self.optimizer).__name__}"
+        return None
+
+    def _adam_flags(self) -> dict[str, bool]:
+        return {"fused": True, "capturable": str(self.device).startswith("cuda")}
+
+    def _begin(self) -> None:
+        """Fixed tensors, and graphs that are not recorded yet."""
+        st, device = self.storage, self.device
+        size = st.num_envs * st.num_transitions_per_env // self.num_mini_batches
+        self._obs = TensorDict({name: value[0].clone() for name, value in st.observations.items()}, [st.num_envs], device=device)
+        self._indices = torch.zeros(size, dtype=torch.long, device=device)
+        self._advantages = torch.zeros_like(st.returns)
+        self._loss_names = ("value", "surrogate", "entropy", *(["symmetry"] if self.symmetry else []))
+        self._losses = torch.zeros(len(self._loss_names), device=device)
+        self._act_graph, self._returns_graph, self._minibatch_graph, self._normalize_graph = (
+            StepGraph(fn, str(device)) for fn in (self._act, self._compute_returns, self._minibatch, self._update_normalizers)
+        )
+
+    # ---- the rollout ----------------------------------------------------------------------------------------------
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Sampled actions (N, A); what the transition needs is noted until ``process_env_step``."""
+        if not self.graphed:
+            return super().act(obs)
+        self._obs.copy_(obs)
+        self._act_graph()
+        self.transition.observations = self._obs
+        self.transition.actions, self.transition.values, self.transition.actions_log_prob = self._acted
+        self.transition.distribution_params = self._acted_params
+        return self._acted[0].clone()
+
+    def _act(self) -> None:
+        actor = self.actor
+        self._update_distribution(self._obs)
+        mean, std = actor.output_mean, actor.output_std
+        actions = mean + std * torch.randn_like(mean)  # torch.normal would check std on the host
+        self._acted = (actions, self.critic(self._obs), actor.get_output_log_prob(actions))
+        self._acted_params = tuple(actor.output_distribution_params)
+
+    def _update_distribution(self, obs: TensorDict) -> None:
+        """The actor's forward pass without its sample."""
+        assert self.actor.distribution is not None
+        self.actor.distribution.update(self.actor.mlp(self.actor.get_latent(obs)))
+
+    def compute_returns(self, obs: TensorDict) -> None:
+        """Returns and advantages of the stored transitions, into the storage."""
+        if not self.graphed:
+            super().compute_returns(obs)
+        else:
+            self._obs.copy_(obs)
+            self._returns_graph()
+            self.storage.advantages = self._advantages
+
+    def _compute_returns(self) -> None:
+        super().compute_returns(self._obs)
+        self._advantages.copy_(self.storage.advantages)
+
+    # ---- the update -----------------------------------------------------------------------------------------------
+
+    def update(self) -> dict[str, Any]:
+        """Epochs of minibatches over the storage; returns mean losses, tensors () whose reading waits for the device."""
+        if not self.graphed:
+            return super().update()
+        size, updates = len(self._indices), self.num_learning_epochs * self.num_mini_batches
+        order = torch.randperm(size * self.num_mini_batches, device=self.device)  # one for all epochs, as in rsl-rl
+        self._losses.zero_()
+        for _ in range(self.num_learning_epochs):
+            for part in order.split(size):
+                self._indices.copy_(part)
+                self._minibatch_graph()
+        with torch.no_grad():
+            self._normalize_graph()
+        self.storage.clear()
+        return dict(zip(self._loss_names, (self._losses / updates).unbind(), strict=True))
+
+    def _minibatch(self) -> None:
+        """One gradient step on the samples ``_indices``."""
+        size, batch = len(self._indices), self._gather()
+        if self.normalize_advantage_per_mini_batch:
+            batch.advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)  # type: ignore[operator]
+        if self.symmetry:
+            self.symmetry.augment_batch(batch, size)
+        device = torch.device(self.device).type
+        with torch.autocast(device, torch.bfloat16, enabled=self.use_mixed_precision, cache_enabled=False):
+            loss, losses, kl = self._loss(batch, size)
+        self.optimizer.zero_grad()
+        loss.backward()
+        if self.is_multi_gpu:
+            self._average_over_ranks(kl)
+        if kl is not None:
+            self._adapt_rate(kl)
+        nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
+        nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+        self._losses.add_(torch.stack([value.detach().float() for value in losses]))
+
+    def _gather(self) -> RolloutStorage.Batch:
+        st = self.storage
+
+        def take(stored: Any) -> Tensor:
+            return stored.flatten(0, 1).index_select(0, self._indices)
+
+        assert st.distribution_params is not None
+        return RolloutStorage.Batch(
+            observations=TensorDict({name: take(value) for name, value in st.observations.items()}, [len(self._indices)]),
+            actions=take(st.actions),
+            values=take(st.values),
+            advantages=take(st.advantages),
+            returns=take(st.returns),
+            old_actions_log_prob=take(st.actions_log_prob),
+            old_distribution_params=tuple(take(stored) for stored in st.distribution_params),
+        )
+
+    def _loss(self, batch: Any, size: int) -> tuple[Tensor, list[Tensor], Tensor | None]:
+        """The loss, its parts by ``_loss_names``, and the KL divergence from the policy that acted (None: fixed rate)."""
+        self._update_distribution(batch.observations)
+        log_prob = self.actor.get_output_log_prob(batch.actions)
+        values = self.critic(batch.observations)
+        # of the samples themselves, not of their mirror images
+        params = tuple(param[:size] for param in self.actor.output_distribution_params)
+        entropy = self.actor.output_entropy[:size].mean()
+        kl = None
+        if self.desired_kl is not None and self.schedule == "adaptive":
+            with torch.no_grad():
+                kl = self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
+
+        advantages = batch.advantages.squeeze()
+        ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze())
+        clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
+        error = (values - batch.returns).square()
+        if self.use_clipped_value_loss:
+            clipped = batch.values + (values - batch.values).clamp(-self.clip_param, self.clip_param)
+            error = torch.max(error, (clipped - batch.returns).square())
+        value_loss = error.mean()
+        loss = surrogate + self.value_loss_coef * value_loss - self.entropy_coef * entropy
+        losses = [value_loss, surrogate, entropy]
+        if self.symmetry:
+            losses.append(self._symmetry_loss(batch, size))
+            if self.symmetry.use_mirror_loss:
+                loss = loss + self.symmetry.mirror_loss_coeff * losses[-1]
+        return loss, losses, kl
+
+    def _average_over_ranks(self, kl: Tensor | None) -> None:
+        """Gradients and KL divergence become their means over all ranks, in one message."""
+        grads = [p.grad for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
+        parts = grads if kl is None else [*grads, kl]
+        message = torch.cat([part.flatten() for part in parts])
+        torch.distributed.all_reduce(message)
+        message /= self.gpu_world_size
+        means = message.split([part.numel() for part in parts])
+        for part, mean in zip(parts, means, strict=True):
+            part.copy_(mean.view_as(part))
+
+    def _adapt_rate(self, kl: Tensor) -> None:
+        """rsl-rl's rule: slower where the policy moved more than twice as far as wanted, faster where less than half."""
+        assert self.desired_kl is not None and self._rate is not None
+        slower = (self._rate / _RATE_STEP).clamp(min=_MIN_RATE)
+        faster = (self._rate * _RATE_STEP).clamp(max=_MAX_RATE)
+        rate = torch.where((kl < self.desired_kl / 2.0) & (kl > 0.0), faster, self._rate)
+        self._rate.copy_(torch.where(kl > self.desired_kl * 2.0, slower, rate))
+        self._adam_rate.copy_(self._rate)
+
+    def _update_normalizers(self) -> None:
+        obs = self.storage.observations.flatten(0, 1)
+        for model in (self.actor, self.critic):
+            if isinstance(model.obs_normalizer, EmpiricalNormalization):
+                inputs = torch.cat([obs[group] for group in model.obs_groups], dim=-1)
+                _update_normalizer(model.obs_normalizer, inputs, self.gpu_world_size)
+
+    def _symmetry_loss(self, batch: Any, size: int) -> Tensor:
+        """How far the policy is from its own mirror image; of an augmented batch, the forward pass is already made."""
+        symmetry = self.symmetry
+        assert symmetry is not None
+        if symmetry.use_mirror_loss or not symmetry.use_data_augmentation:
+            return symmetry.compute_loss(self.actor, batch, size)
+        means = self.actor.output_mean.detach()
+        _, mirrored = symmetry.data_augmentation_func(env=symmetry.env, obs=None, actions=means[:size])
+        return nn.functional.mse_loss(means[size:], mirrored[size:])
+
+    # ---- learning rate and checkpoints: rsl-rl's own PPO reads and writes the same -----------------------------------------
+
+    @property
+    def rate(self) -> Tensor:
+        """The learning rate as a tensor (), where it is: reading it waits for nothing."""
+        return torch.tensor(self._plain_rate) if self._rate is None else self._rate
+
+    @property
+    def learning_rate(self) -> float:  # type: ignore[override]
+        """The present learning rate. Reading it waits for the device, setting it does not."""
+        return self._plain_rate if self._rate is None else float(self._rate)
+
+    @learning_rate.setter
+    def learning_rate(self, rate: float) -> None:
+        if self._rate is None:
+            self._plain_rate = float(rate)
+        else:
+            self._rate.fill_(float(rate))
+            self._adam_rate.fill_(float(rate))
+
+    def save(self) -> dict[str, Any]:
+        """The networks' and the optimizer's state, in the form that rsl-rl's own PPO writes."""
+        content = super().save()
+        if self.graphed:
+            state, groups = content["optimizer_state_dict"]["state"], content["optimizer_state_dict"]["param_groups"]
+            plain = {"lr": self.learning_rate, "fused": None, "capturable": False}
+            content["optimizer_state_dict"] = {
+                "state": {i: {**memory, "step": memory["step"].cpu()} for i, memory in state.items()},
+                "param_groups": [{**group, **plain} for group in groups],
+            }
+        return content
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Take over a checkpoint of this class or of rsl-rl's own PPO."""
+        iteration = super().load(loaded_dict, load_cfg, strict)
+        if self.graphed:
+            for group in self.optimizer.param_groups:  # Adam takes these from the file
+                group.update(lr=self._adam_rate, **self._adam_flags())
+            for memory in self.optimizer.state.values():
+                memory["step"] = memory["step"].to(self.device, torch.float32)
+            self._begin()  # Adam's memory has moved
+        return iteration
+
+
+def _update_normalizer(normalizer: EmpiricalNormalization, x: Tensor, world_size: int) -> None:
+    """rsl-rl's running mean and variance over ``x`` (B, size), in place and without its copy from the host."""
+    if not normalizer.training:
+        return
+    count = x.shape[0] * world_size
+    var, mean = torch.var_mean(x, dim=0, unbiased=False, keepdim=True)
+    if world_size > 1:  # every rank brings as many samples
+        own_mean = mean.clone()
+        torch.distributed.all_reduce(mean)
+        mean /= world_size
+        var += (own_mean - mean).square()
+        torch.distributed.all_reduce(var)
+        var /= world_size
+    normalizer.count += count
+    rate = count / normalizer.count
+    delta = mean - normalizer._mean
+    normalizer._mean += rate * delta
+    normalizer._var += rate * (var - normalizer._var + delta * (mean - normalizer._mean))
+    normalizer._std.copy_(normalizer._var.sqrt())

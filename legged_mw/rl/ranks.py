@@ -1,0 +1,78 @@
+"""One process a GPU, as torchrun starts them: who this one is, and how it leaves when another is gone."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import sys
+import threading
+from typing import NamedTuple
+
+import torch
+
+from legged_mw.utils.config import ConfigError
+
+_PATIENCE = 10.0  # [s] a step and a checkpoint take far less
+
+
+class Rank(NamedTuple):
+    """This process among those of the run."""
+
+    index: int  # over all machines; 0 writes the run folder and speaks to the user
+    local: int  # on this machine: the GPU it uses
+    count: int
+
+    @property
+    def leads(self) -> bool:
+        return self.index == 0
+
+
+def this_rank() -> Rank:
+    """From the environment that torchrun sets; alone without it."""
+    return Rank(*(int(os.environ.get(name, default)) for name, default in (("RANK", "0"), ("LOCAL_RANK", "0"), ("WORLD_SIZE", "1"))))
+
+
+def rank_device(rank: Rank, asked: str | None) -> str | None:
+    """The device this rank must use: its own GPU, or the CPU if that was asked for; alone, what was asked."""
+    if rank.count == 1 or asked == "cpu":
+        return asked
+    if asked is not None:
+        raise ConfigError(f"--device {asked}: under torchrun every process takes the GPU of its own number; leave --device out")
+    if rank.local >= torch.cuda.device_count():
+        seen = torch.cuda.device_count()
+        raise ConfigError(f"torchrun started process {rank.local} on a machine with {seen} GPUs; use --nproc_per_node={max(seen, 1)}")
+    return f"cuda:{rank.local}"
+
+
+def quiet(rank: Rank) -> None:
+    """Only the first process speaks."""
+    if not rank.leads:
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (open until the process ends)
+
+
+def leave_when_stuck(rank: Rank, patience: float = _PATIENCE) -> None:
+    """After SIGTERM, end this process if it does not end by itself: it may wait for a rank that is gone.
+
+    torchrun sends SIGTERM to the others when one dies. A process that waits for its GPU runs no Python signal handler;
+    this thread does. Call it from the main thread.
+    """
+    if rank.count == 1:
+        return
+    wake, told = socket.socketpair()
+    told.setblocking(False)
+    signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+
+    def watch() -> None:
+        while signal.SIGTERM not in wake.recv(16):
+            pass
+        threading.Event().wait(patience)
+        text = f"rank {rank.index}: still waiting for another rank {patience:g} s after SIGTERM; leaving. The last checkpoint is whole.\n"
+        os.write(2, text.encode())
+        os._exit(128 + signal.SIGTERM)
+
+    told_forever.append((wake, told))
+    threading.Thread(target=watch, daemon=True).start()
+
+
+told_forever: list[tuple[socket.socket, socket.socket]] = []  # kept: a closed socket would silence the signals

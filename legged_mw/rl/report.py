@@ -1,0 +1,85 @@
+"""One iteration's numbers on their way from the device to the user: nothing here makes the device wait."""
+
+from __future__ import annotations
+
+import time
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+Mark = torch.cuda.Event | float
+
+
+class Clock:
+    """Marks points in the device's queue of work; the seconds between two marks are known once both are reached."""
+
+    def __init__(self, device: str) -> None:
+        self._on_device = device.startswith("cuda")
+
+    def mark(self) -> Mark:
+        if not self._on_device:
+            return time.perf_counter()
+        event = torch.cuda.Event(enable_timing=True)
+        event.record()
+        return event
+
+    @staticmethod
+    def seconds(start: Mark, end: Mark) -> float:
+        if isinstance(start, torch.cuda.Event) and isinstance(end, torch.cuda.Event):
+            end.synchronize()
+            return start.elapsed_time(end) / 1e3
+        assert isinstance(start, float) and isinstance(end, float)
+        return end - start
+
+
+class Message:
+    """A vector that travels from the device to the host while both go on."""
+
+    def __init__(self, values: Tensor) -> None:
+        self._host, self._event = values, None
+        if values.is_cuda:
+            self._host = torch.empty(values.shape, dtype=values.dtype, pin_memory=True).copy_(values, non_blocking=True)
+            self._event = torch.cuda.Event()
+            self._event.record()
+
+    def read(self) -> list[float]:
+        """The numbers; waits until the device has computed them."""
+        if self._event is not None:
+            self._event.synchronize()
+        return self._host.tolist()
+
+
+class Report(NamedTuple):
+    """An iteration: what the host knows at once, and what is on its way."""
+
+    iteration: int
+    total_steps: int  # since the beginning of training, over all ranks
+    steps: int  # of this iteration, over all ranks
+    losses: list[str]
+    message: Message  # statistics of the episodes, stop flag, losses, learning rate, std of the actions
+    marks: tuple[Mark, Mark, Mark]  # begin, end of the rollout, end of the update
+
+    def seconds(self) -> tuple[float, float]:
+        """The rollout's and the update's."""
+        begin, collected, end = self.marks
+        return Clock.seconds(begin, collected), Clock.seconds(collected, end)
+
+
+def console_block(title: str, rows: dict[str, str]) -> str:
+    """A headline and a line a row, as the console shows an iteration."""
+    return "\n".join([f" {title} ".center(80, "#"), *(f"{name:>32}: {text}" for name, text in rows.items())])
+
+
+def console_rows(numbers: dict[str, float], losses: dict[str, float], speed: float, collect: float, learn: float) -> dict[str, str]:
+    """What an iteration shows of its numbers: name -> text."""
+    return {
+        "Computation": f"{speed:.0f} steps/s (collection {collect:.3f} s, learning {learn:.3f} s)",
+        **{f"{name.capitalize()} loss": f"{value:.4f}" for name, value in losses.items()},
+        "Learning rate": f"{numbers['learning_rate']:.1e}",
+        "Action std": f"{numbers['action_std']:.2f}",
+        "Mean reward": f"{numbers['reward']:.2f}",
+        "Mean episode length": f"{numbers['episode_length']:.1f}",
+        **{name: f"{value:.4f}" for name, value in numbers.items() if name.startswith("rew_")},
+        "Episodes ended": f"{numbers['episodes']:.0f} ({numbers['fell']:.0f} falls, {numbers['broken']:.0f} not finite)",
+    }

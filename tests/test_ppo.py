@@ -1,0 +1,135 @@
+"""The recorded update against rsl-rl's own: same parameters, experience and order of samples in, same parameters out."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import pytest
+import torch
+from learner import SIZES, Recordable, collect, difference, make, parameters, share_experience, turned
+from rsl_rl.algorithms import PPO
+
+from legged_mw.rl.ppo import GraphedPPO
+
+SYMMETRY = {"data_augmentation_func": turned, "use_data_augmentation": True, "env": None}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "adaptive rate": {},
+    "fixed rate": {"schedule": "fixed", "learning_rate": 3e-4},
+    "a rate that grows": {"desired_kl": 1.0},
+    "a rate that shrinks": {"desired_kl": 1e-6},
+    "plain value loss": {"use_clipped_value_loss": False},
+    "advantages by minibatch": {"normalize_advantage_per_mini_batch": True},
+    "a number of minibatches that leaves samples over": {"num_mini_batches": 5},
+    "adamw": {"optimizer": "adamw"},
+    "log std": {"distribution": {"std_type": "log", "std_range": (0.2, 1.0)}},
+    "a std of each state": {"distribution": {"class_name": "HeteroscedasticGaussianDistribution"}},
+    "symmetric samples": {"symmetry_cfg": SYMMETRY},
+    "mirror loss": {"symmetry_cfg": SYMMETRY | {"use_data_augmentation": False, "use_mirror_loss": True, "mirror_loss_coeff": 0.5}},
+    "both": {"symmetry_cfg": SYMMETRY | {"use_mirror_loss": True, "mirror_loss_coeff": 0.5}},
+}
+
+
+def update(alg: PPO, seed: int = 3) -> dict[str, float]:
+    torch.manual_seed(seed)  # both draw one permutation first
+    return {name: float(value) for name, value in alg.update().items()}
+
+
+@pytest.mark.parametrize("settings", VARIANTS.values(), ids=VARIANTS.keys())
+def test_same_parameters_as_rsl_rl(settings: dict[str, Any]) -> None:
+    """Three updates, each from new experience that the stock learner gathered."""
+    stock, ours = make(PPO, **settings), make(Recordable, **settings)
+    assert ours.graphed and difference(parameters(stock), parameters(ours)) == 0.0
+    before = parameters(ours)
+    for seed in range(3):
+        collect(stock, seed=seed)
+        share_experience(stock, ours)
+        expected, got = update(stock), update(ours)
+        assert difference(parameters(stock), parameters(ours)) < 1e-5
+        assert got == pytest.approx(expected, rel=1e-3, abs=1e-5)
+        assert ours.learning_rate == pytest.approx(stock.learning_rate, rel=1e-12)
+    assert difference(before, parameters(ours)) > 1e-2
+
+
+def test_same_rollout_as_rsl_rl() -> None:
+    """Actions, values, log probabilities, returns and advantages, from equal random numbers."""
+    stock, ours = make(PPO), make(Recordable)
+    collect(stock)
+    collect(ours)
+    for name in ("observations", "actions", "rewards", "dones", "values", "actions_log_prob", "returns", "advantages"):
+        expected, got = getattr(stock.storage, name), getattr(ours.storage, name)
+        pairs = [(expected[k], got[k]) for k in SIZES] if name == "observations" else [(expected, got)]
+        for a, b in pairs:
+            torch.testing.assert_close(a, b, rtol=1e-5, atol=1e-5, msg=lambda text, name=name: f"{name}: {text}")
+    for a, b in zip(stock.storage.distribution_params, ours.storage.distribution_params, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+@pytest.mark.parametrize("kinds", [(PPO, Recordable), (Recordable, PPO), (Recordable, Recordable)], ids=["to ours", "to stock", "ours"])
+def test_checkpoints_load_in_both_directions(kinds: tuple[type[PPO], type[PPO]]) -> None:
+    """And learning goes on as if it had not been interrupted: Adam's memory and the adapted rate come along."""
+    writer, other = (make(kind) for kind in kinds)
+    collect(writer)
+    update(writer)
+    content = writer.save()
+    assert {type(group["lr"]) for group in content["optimizer_state_dict"]["param_groups"]} == {float}
+    other.load(copy.deepcopy(content), None, True)  # as from a file
+    assert difference(parameters(writer), parameters(other)) == 0.0
+    assert other.learning_rate == writer.learning_rate != 1e-3
+    collect(writer, seed=5)
+    share_experience(writer, other)
+    update(writer)
+    update(other)
+    assert difference(parameters(writer), parameters(other)) < 1e-5
+    assert other.learning_rate == pytest.approx(writer.learning_rate)
+
+
+def test_checkpoint_is_in_the_form_of_rsl_rls_own() -> None:
+    """Entry by entry: kinds, places and shapes of all that the file holds."""
+    stock, ours = make(PPO), make(Recordable)
+    for alg in (stock, ours):
+        collect(alg)
+        update(alg)
+
+    def form(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {k: form(v) for k, v in value.items()}
+        if isinstance(value, (list, tuple)):
+            return [form(v) for v in value]
+        return (value.dtype, value.shape, value.device.type) if isinstance(value, torch.Tensor) else type(value)
+
+    assert form(ours.save()) == form(stock.save())
+
+
+def test_learning_rate_can_be_set() -> None:
+    ours = make(Recordable, schedule="fixed")
+    before = parameters(ours)
+    ours.learning_rate = 0.0
+    collect(ours)
+    update(ours)
+    trained = {k: v for k, v in parameters(ours).items() if "normalizer" not in k}
+    assert difference({k: before[k] for k in trained}, trained) == 0.0
+    assert ours.learning_rate == 0.0
+
+
+def test_what_is_not_recorded_says_why_once(capsys: pytest.CaptureFixture[str]) -> None:
+    alg = make(GraphedPPO)
+    assert not alg.graphed
+    collect(alg)
+    update(alg)
+    assert capsys.readouterr().out.count("rsl-rl's own update is used, not the recorded one: the device is cpu") == 1
+
+
+@pytest.mark.parametrize(
+    ("settings", "reason"),
+    [
+        ({"optimizer": "sgd"}, "the optimizer is SGD"),
+        ({"distribution": {"class_name": "BetaDistribution"}}, "drawn from a BetaDistribution"),
+    ],
+    ids=["sgd", "beta"],
+)
+def test_what_cannot_be_recorded_is_left_to_rsl_rl(settings: dict, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+    alg = make(Recordable, **settings)
+    assert not alg.graphed and reason in capsys.readouterr().out
+    collect(alg)
+    assert set(update(alg)) == {"value", "surrogate", "entropy"}
