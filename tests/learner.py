@@ -100,3 +100,15 @@ def parameters(alg: PPO) -> dict[str, torch.Tensor]:
 def difference(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> float:
     """Largest difference of any parameter, as a share of the parameter's own largest value."""
     return max(float((a[k].double() - b[k].double()).abs().max() / a[k].double().abs().max().clamp(min=1e-3)) for k in a)
+
+
+@torch.no_grad()
+def take_over(target: PPO, source: PPO) -> None:
+    """``target`` gets the networks, Adam's memory and the rate of ``source``, in place: what is recorded stays recorded."""
+    for which in ("actor", "critic"):
+        for mine, other in zip(getattr(target, which).state_dict().values(), getattr(source, which).state_dict().values(), strict=True):
+            mine.copy_(other)
+        for mine, other in zip(getattr(target, which).parameters(), getattr(source, which).parameters(), strict=True):
+            for name, memory in target.optimizer.state[mine].items():
+                memory.copy_(source.optimizer.state[other][name])
+    target.learning_rate = source.learning_rate

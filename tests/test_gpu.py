@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from learner import collect, difference, make, observations, parameters, share_experience
+from learner import collect, difference, make, observations, parameters, share_experience, take_over
 from mujoco_warp import DisableBit
 from rsl_rl.algorithms import PPO
 from test_ppo import VARIANTS, update
@@ -107,17 +107,18 @@ def test_more_iterations_are_recorded_too() -> None:
 
 @pytest.mark.parametrize("settings", VARIANTS.values(), ids=VARIANTS.keys())
 def test_recorded_update_is_rsl_rls_own(settings: dict) -> None:
-    """Five updates of 20 minibatches, all but the first three replays; the stock learner gathers the experience."""
+    """Each of six updates of 20 minibatches, the last three replayed, from equal states and the stock learner's experience."""
     stock, ours = make(PPO, DEVICE, **settings), make(GraphedPPO, DEVICE, **settings)
     assert ours.graphed and difference(parameters(stock), parameters(ours)) == 0.0
-    for seed in range(5):
+    for seed in range(6):
         collect(stock, DEVICE, seed=seed)
         share_experience(stock, ours)
+        take_over(ours, stock)
         expected, got = update(stock), update(ours)
         assert difference(parameters(stock), parameters(ours)) < 1e-4
         assert got == pytest.approx(expected, rel=1e-3, abs=1e-5)
         assert ours.learning_rate == pytest.approx(stock.learning_rate, rel=1e-12)
-    assert ours._minibatch_graph.recorded
+    assert ours._update_graph.recorded
 
 
 def test_checkpoints_go_both_ways_on_a_gpu(tmp_path: Path) -> None:

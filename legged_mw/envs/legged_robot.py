@@ -213,7 +213,7 @@ class LeggedRobot(BaseTask):
         noise = self.cfg.noise.scales
         return {
             "state": [
-                Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="polar"),  # at the IMU, body frame [m/s]
+                Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity"),  # at the IMU, body frame [m/s]
                 Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial"),  # gyro, body frame [rad/s]
                 Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar"),  # direction, body frame
                 Row("dof_pos", self.dof_offset, noise.dof_pos, mirror="joint"),  # minus the default pose [rad]
@@ -226,7 +226,7 @@ class LeggedRobot(BaseTask):
                 Row("base_ang_vel", self.base_ang_vel, mirror="axial"),
                 Row("accelerometer", self.accelerometer, mirror="polar"),  # proper acceleration at the IMU [m/s^2]
                 Row("projected_gravity", self.projected_gravity, mirror="polar"),
-                Row("base_lin_vel", self.base_lin_vel, mirror="polar"),
+                Row("base_lin_vel", self.base_lin_vel, mirror="imu_velocity"),
                 Row("base_ang_vel_world", self.base_ang_vel_world, mirror="axial"),  # the world mirrors about its own x-z plane
                 Row("dof_pos", self.dof_offset, mirror="joint"),
                 Row("dof_vel", self.dof_vel, mirror="joint"),

@@ -4,8 +4,10 @@ Assembled from the column ``mirror`` of the observation table, once, by who asks
 never does. The mirror is the x-z plane: of the root for what is in the body's frame, of the world for what is in the
 world's. Both are one operation, so both follow the same formula.
 
-How exact it is depends on the robot. Joints and feet are checked. An IMU beside the plane is not: its velocity in a
-mirrored motion is that of an IMU on the other side, off by 2 y times the yaw and roll rates (Go1: 0.13 m/s at 1 rad/s).
+An IMU beside the plane (Go1: 67 mm) does not change sides in the mirror. Its velocity in the mirrored motion is the
+mirrored velocity plus what the turning adds over twice that distance, which is linear in the rates: kind "imu_velocity",
+and in the same way kind "command". The accelerometer has no such formula, for want of the angular acceleration, and is
+mirrored as if it were in the plane. Joints and feet are checked; masses are not.
 """
 
 from __future__ import annotations
@@ -23,19 +25,33 @@ from legged_mw.utils.config import ConfigError
 if TYPE_CHECKING:
     from legged_mw.envs.legged_robot import LeggedRobot, Row
 
-# Of one block of columns: where each comes from, and its sign. A row holds any number of blocks, one after another.
-_Block = tuple[list[int], list[float]]
+
+class _Block(NamedTuple):
+    """Columns that mirror among themselves. A row holds any number of blocks, one after another."""
+
+    index: list[int]  # column that each is taken from
+    sign: list[float]
+    shifts: list[tuple[int, int, float]] = []  # (to, from, factor): to the mirrored column, add factor * column, not mirrored
 
 
 class Columns(NamedTuple):
-    """A signed permutation: ``mirrored = x[:, index] * sign``. Done twice it gives ``x`` back."""
+    """A signed permutation and shifts: ``x[:, index] * sign``, plus ``x[:, source] * factor`` in columns ``target``.
+
+    Done twice it gives ``x`` back.
+    """
 
     index: Tensor  # (size,) int64, column that this one is taken from
     sign: Tensor  # (size,) +1 or -1
+    target: Tensor  # (S,) int64
+    source: Tensor  # (S,) int64
+    factor: Tensor  # (S,)
 
     def __call__(self, x: Tensor) -> Tensor:
         """The mirror image of ``x`` (B, size)."""
-        return x.index_select(1, self.index) * self.sign
+        image = x.index_select(1, self.index) * self.sign
+        if len(self.target):
+            image = image.index_add(1, self.target, x.index_select(1, self.source) * self.factor)
+        return image
 
 
 class Mirror(NamedTuple):
@@ -50,47 +66,61 @@ def make_mirror(env: LeggedRobot) -> Mirror:
     partners = find_partners(env.robot, env.cfg.asset.foot_names)
     _check_pose(env, partners)
     feet = list(partners.sites)
-    joints: _Block = list(partners.joints), [float(sign) for sign in partners.signs]
+    reach = 2.0 * float(env.imu_pos[0, 1])  # [m] from the mirrored IMU to the IMU
+    joints = _Block(list(partners.joints), [float(sign) for sign in partners.signs])
     blocks: dict[str, _Block] = {
-        "scalar": ([0], [1.0]),  # the same on both sides
-        "polar": ([0, 1, 2], [1.0, -1.0, 1.0]),  # x, -y, z: a velocity, a force, a direction
-        "axial": ([0, 1, 2], [-1.0, 1.0, -1.0]),  # -x, y, -z: an angular velocity
-        "command": ([0, 1, 2], [1.0, -1.0, -1.0]),  # vx, -vy, -yaw rate
+        "scalar": _Block([0], [1.0]),  # the same on both sides
+        "polar": _Block([0, 1, 2], [1.0, -1.0, 1.0]),  # x, -y, z: a velocity, a force, a direction
+        "axial": _Block([0, 1, 2], [-1.0, 1.0, -1.0]),  # -x, y, -z: an angular velocity
+        "imu_velocity": _Block([0, 1, 2], [1.0, -1.0, 1.0]),  # of the IMU, body frame; shifted by the row "base_ang_vel" beside it
+        "command": _Block([0, 1, 2], [1.0, -1.0, -1.0], [(0, 2, reach)]),  # vx, -vy of the IMU, -yaw rate
         "joint": joints,  # a number a joint
-        "foot": (feet, [1.0] * len(feet)),  # a number a foot
-        "foot_polar": ([3 * foot + k for foot in feet for k in range(3)], [1.0, -1.0, 1.0] * len(feet)),  # a polar vector a foot
+        "foot": _Block(feet, [1.0] * len(feet)),  # a number a foot
+        "foot_polar": _Block([3 * f + k for f in feet for k in range(3)], [1.0, -1.0, 1.0] * len(feet)),  # a polar vector a foot
     }
 
     def columns(block: _Block) -> Columns:
         with torch.inference_mode(False):  # whoever asks first: the mirrored actions of a loss carry gradients
-            return Columns(torch.tensor(block[0], device=env.device), torch.tensor(block[1], device=env.device))
+            target, source, factor = zip(*block.shifts, strict=True) if block.shifts else ((), (), ())
+            places = (torch.tensor(list(where), dtype=torch.long, device=env.device) for where in (block.index, target, source))
+            numbers = (torch.tensor(list(values), dtype=torch.float, device=env.device) for values in (block.sign, factor))
+            (index, to, origin), (sign, by) = places, numbers
+            return Columns(index, sign, to, origin, by)
 
     groups: dict[str, Columns] = {}
     for group, rows in env._observation_rows().items():
-        blocks[group] = _side_by_side(group, rows, blocks)  # known from here on, to rows that contain this group
+        blocks[group] = _side_by_side(group, rows, blocks, reach)  # known from here on, to rows that contain this group
         groups[group] = columns(blocks[group])
     return Mirror(groups, columns(joints))
 
 
-def _side_by_side(group: str, rows: Sequence[Row], blocks: dict[str, _Block]) -> _Block:
+def _side_by_side(group: str, rows: Sequence[Row], blocks: dict[str, _Block], reach: float) -> _Block:
     """The block of a whole group."""
-    index: list[int] = []
-    sign: list[float] = []
+    whole = _Block([], [], [])
+    starts: dict[str, int] = {}
     for row in rows:
         where = f"observation row '{row.name}' of '{group}'"
         if row.mirror is None:
             raise ConfigError(f"{where} does not say what a mirror does to it: give its Row a mirror=...; there are: {', '.join(blocks)}")
         if row.mirror not in blocks:
             raise ConfigError(f"{where}: {unknown('mirror', row.mirror, blocks, 'its Row (a group must come before what contains it)')}")
-        block_index, block_sign = blocks[row.mirror]
-        times, rest = divmod(row.value.shape[1], len(block_index))
+        block = blocks[row.mirror]
+        times, rest = divmod(row.value.shape[1], len(block.index))
         if rest:
-            raise ConfigError(f"{where} has {row.value.shape[1]} columns; mirror='{row.mirror}' takes a multiple of {len(block_index)}")
+            raise ConfigError(f"{where} has {row.value.shape[1]} columns; mirror='{row.mirror}' takes a multiple of {len(block.index)}")
+        starts[row.name] = len(whole.index)
         for _ in range(times):
-            start = len(index)
-            index += [start + i for i in block_index]
-            sign += block_sign
-    return index, sign
+            start = len(whole.index)
+            whole.index.extend(start + i for i in block.index)
+            whole.sign.extend(block.sign)
+            whole.shifts.extend((start + to, start + source, factor) for to, source, factor in block.shifts)
+    for row in rows if reach else ():
+        if row.mirror == "imu_velocity":
+            if "base_ang_vel" not in starts:
+                raise ConfigError(f"observation row '{row.name}' of '{group}' needs the row 'base_ang_vel' beside it, to be mirrored")
+            velocity, rate = starts[row.name], starts["base_ang_vel"]
+            whole.shifts.extend([(velocity, rate + 2, reach), (velocity + 2, rate, -reach)])  # 2y wz in x, -2y wx in z
+    return whole
 
 
 def _check_pose(env: LeggedRobot, partners: Partners) -> None:

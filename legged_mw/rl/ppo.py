@@ -1,12 +1,14 @@
 """rsl-rl's PPO recorded as CUDA graphs: the same keys, mathematics and checkpoints, and no question to the host.
 
-Acting, the returns and each minibatch (gather, forward, loss, backward, clipping, learning rate, Adam) are one graph
-each. A graph remembers addresses, so what rsl-rl rebinds every iteration (advantages, the normalisers' std) is copied
-into tensors that stay.
+Acting, the returns and the whole update (all epochs and minibatches: forward, loss, backward, clipping, learning rate,
+Adam) are one graph each. A graph remembers addresses, so what rsl-rl rebinds every iteration (advantages, the
+normalisers' std) is copied into tensors that stay. Actor and critic share nothing, so they run side by side.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import torch
@@ -27,8 +29,8 @@ class GraphedPPO(PPO):
     """PPO whose update and acting are replayed CUDA graphs.
 
     What cannot be recorded (a CPU, a recurrent network, RND, an optimizer other than Adam or AdamW, a distribution that
-    is not Gaussian) is left to rsl-rl's own code, and a line says so. The first three minibatches of a run are real steps
-    too: nothing is warmed up on a throw-away step.
+    is not Gaussian) is left to rsl-rl's own code, and a line says so. The first three updates of a run are launched step by
+    step and the fourth is recorded: nothing is warmed up on a throw-away step.
     """
 
     _plain_rate: float  # the learning rate where nothing is recorded
@@ -63,6 +65,8 @@ class GraphedPPO(PPO):
             return "a network has a forward pass of its own"
         if not isinstance(self.actor.distribution, GaussianDistribution):
             return f"actions are drawn from a {type(self.actor.distribution).__name__}"
+        if not {*map(id, self.actor.parameters())}.isdisjoint(map(id, self.critic.parameters())):
+            return "the networks share parameters"
         if type(self.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
             return f"the optimizer is {type(self.optimizer).__name__}"
         return None
@@ -73,15 +77,30 @@ class GraphedPPO(PPO):
     def _begin(self) -> None:
         """Fixed tensors, and graphs that are not recorded yet."""
         st, device = self.storage, self.device
-        size = st.num_envs * st.num_transitions_per_env // self.num_mini_batches
+        self._size = st.num_envs * st.num_transitions_per_env // self.num_mini_batches  # of a minibatch
         self._obs = TensorDict({name: value[0].clone() for name, value in st.observations.items()}, [st.num_envs], device=device)
-        self._indices = torch.zeros(size, dtype=torch.long, device=device)
+        self._order = torch.zeros(self._size * self.num_mini_batches, dtype=torch.long, device=device)
         self._advantages = torch.zeros_like(st.returns)
         self._loss_names = ("value", "surrogate", "entropy", *(["symmetry"] if self.symmetry else []))
         self._losses = torch.zeros(len(self._loss_names), device=device)
-        self._act_graph, self._returns_graph, self._minibatch_graph, self._normalize_graph = (
-            StepGraph(fn, str(device)) for fn in (self._act, self._compute_returns, self._minibatch, self._update_normalizers)
+        self._side = torch.cuda.Stream(device) if str(device).startswith("cuda") else None
+        self._act_graph, self._returns_graph, self._update_graph = (
+            StepGraph(fn, str(device)) for fn in (self._act, self._compute_returns, self._update)
         )
+
+    @contextmanager
+    def _beside(self) -> Iterator[None]:
+        """What is launched inside runs beside what follows, until ``_meet``."""
+        if self._side is None:
+            yield
+            return
+        self._side.wait_stream(torch.cuda.current_stream(self._side.device))
+        with torch.cuda.stream(self._side):
+            yield
+
+    def _meet(self) -> None:
+        if self._side is not None:
+            torch.cuda.current_stream(self._side.device).wait_stream(self._side)
 
     # ---- the rollout ----------------------------------------------------------------------------------------------
 
@@ -98,11 +117,14 @@ class GraphedPPO(PPO):
 
     def _act(self) -> None:
         actor = self.actor
+        with self._beside():
+            values = self.critic(self._obs)
         self._update_distribution(self._obs)
         mean, std = actor.output_mean, actor.output_std
         actions = mean + std * torch.randn_like(mean)  # torch.normal would check std on the host
-        self._acted = (actions, self.critic(self._obs), actor.get_output_log_prob(actions))
+        self._acted = (actions, values, actor.get_output_log_prob(actions))
         self._acted_params = tuple(actor.output_distribution_params)
+        self._meet()
 
     def _update_distribution(self, obs: TensorDict) -> None:
         """The actor's forward pass without its sample."""
@@ -128,48 +150,31 @@ class GraphedPPO(PPO):
         """Epochs of minibatches over the storage; returns mean losses, tensors () whose reading waits for the device."""
         if not self.graphed:
             return super().update()
-        size, updates = len(self._indices), self.num_learning_epochs * self.num_mini_batches
-        order = torch.randperm(size * self.num_mini_batches, device=self.device)  # one for all epochs, as in rsl-rl
+        torch.randperm(len(self._order), out=self._order)  # one for all epochs, as in rsl-rl
+        self._update_graph()
+        self.storage.clear()
+        return dict(zip(self._loss_names, self._losses.clone().unbind(), strict=True))
+
+    def _update(self) -> None:
+        samples, size = self._shuffle(), self._size
         self._losses.zero_()
         for _ in range(self.num_learning_epochs):
-            for part in order.split(size):
-                self._indices.copy_(part)
-                self._minibatch_graph()
+            for start in range(0, len(self._order), size):
+                self._minibatch(_part(samples, slice(start, start + size)))
+        self._losses /= self.num_learning_epochs * self.num_mini_batches
         with torch.no_grad():
-            self._normalize_graph()
-        self.storage.clear()
-        return dict(zip(self._loss_names, (self._losses / updates).unbind(), strict=True))
+            self._update_normalizers()
 
-    def _minibatch(self) -> None:
-        """One gradient step on the samples ``_indices``."""
-        size, batch = len(self._indices), self._gather()
-        if self.normalize_advantage_per_mini_batch:
-            batch.advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)  # type: ignore[operator]
-        if self.symmetry:
-            self.symmetry.augment_batch(batch, size)
-        device = torch.device(self.device).type
-        with torch.autocast(device, torch.bfloat16, enabled=self.use_mixed_precision, cache_enabled=False):
-            loss, losses, kl = self._loss(batch, size)
-        self.optimizer.zero_grad()
-        loss.backward()
-        if self.is_multi_gpu:
-            self._average_over_ranks(kl)
-        if kl is not None:
-            self._adapt_rate(kl)
-        nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
-        nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
-        self.optimizer.step()
-        self._losses.add_(torch.stack([value.detach().float() for value in losses]))
-
-    def _gather(self) -> RolloutStorage.Batch:
+    def _shuffle(self) -> RolloutStorage.Batch:
+        """All samples in the order of this update."""
         st = self.storage
 
         def take(stored: Any) -> Tensor:
-            return stored.flatten(0, 1).index_select(0, self._indices)
+            return stored.flatten(0, 1).index_select(0, self._order)
 
         assert st.distribution_params is not None
         return RolloutStorage.Batch(
-            observations=TensorDict({name: take(value) for name, value in st.observations.items()}, [len(self._indices)]),
+            observations=TensorDict({name: take(value) for name, value in st.observations.items()}, [len(self._order)]),
             actions=take(st.actions),
             values=take(st.values),
             advantages=take(st.advantages),
@@ -178,35 +183,60 @@ class GraphedPPO(PPO):
             old_distribution_params=tuple(take(stored) for stored in st.distribution_params),
         )
 
-    def _loss(self, batch: Any, size: int) -> tuple[Tensor, list[Tensor], Tensor | None]:
-        """The loss, its parts by ``_loss_names``, and the KL divergence from the policy that acted (None: fixed rate)."""
-        self._update_distribution(batch.observations)
-        log_prob = self.actor.get_output_log_prob(batch.actions)
-        values = self.critic(batch.observations)
-        # of the samples themselves, not of their mirror images
-        params = tuple(param[:size] for param in self.actor.output_distribution_params)
-        entropy = self.actor.output_entropy[:size].mean()
-        kl = None
-        if self.desired_kl is not None and self.schedule == "adaptive":
-            with torch.no_grad():
-                kl = self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
+    def _minibatch(self, batch: RolloutStorage.Batch) -> None:
+        """One gradient step."""
+        if self.normalize_advantage_per_mini_batch:
+            batch.advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)  # type: ignore[operator]
+        if self.symmetry:
+            self.symmetry.augment_batch(batch, self._size)
+        mixed = torch.autocast(torch.device(self.device).type, torch.bfloat16, self.use_mixed_precision, cache_enabled=False)
+        self.optimizer.zero_grad()
+        with self._beside():
+            with mixed:
+                value_loss = self._value_loss(batch)
+            (self.value_loss_coef * value_loss).backward()
+        with mixed:
+            loss, parts, kl = self._policy_loss(batch)
+        loss.backward()
+        self._meet()
+        if self.is_multi_gpu:
+            self._average_over_ranks(kl)
+        if kl is not None:
+            self._adapt_rate(kl)
+        nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
+        nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+        self._losses.add_(torch.stack([value.detach().float() for value in (value_loss, *parts)]))
 
-        advantages = batch.advantages.squeeze()
-        ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze())
-        clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-        surrogate = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
+    def _value_loss(self, batch: Any) -> Tensor:
+        values = self.critic(batch.observations)
         error = (values - batch.returns).square()
         if self.use_clipped_value_loss:
             clipped = batch.values + (values - batch.values).clamp(-self.clip_param, self.clip_param)
             error = torch.max(error, (clipped - batch.returns).square())
-        value_loss = error.mean()
-        loss = surrogate + self.value_loss_coef * value_loss - self.entropy_coef * entropy
-        losses = [value_loss, surrogate, entropy]
+        return error.mean()
+
+    def _policy_loss(self, batch: Any) -> tuple[Tensor, list[Tensor], Tensor | None]:
+        """The actor's loss, its parts by ``_loss_names``, and the KL divergence from the policy that acted (None: fixed rate)."""
+        self._update_distribution(batch.observations)
+        log_prob = self.actor.get_output_log_prob(batch.actions)
+        # of the samples themselves, not of their mirror images
+        params = tuple(param[: self._size] for param in self.actor.output_distribution_params)
+        entropy = self.actor.output_entropy[: self._size].mean()
+        kl = None
+        if self.desired_kl is not None and self.schedule == "adaptive":
+            with torch.no_grad():
+                kl = self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
+        advantages = batch.advantages.squeeze()
+        ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze())
+        clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
+        surrogate = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
+        loss, parts = surrogate - self.entropy_coef * entropy, [surrogate, entropy]
         if self.symmetry:
-            losses.append(self._symmetry_loss(batch, size))
+            parts.append(self._symmetry_loss(batch))
             if self.symmetry.use_mirror_loss:
-                loss = loss + self.symmetry.mirror_loss_coeff * losses[-1]
-        return loss, losses, kl
+                loss = loss + self.symmetry.mirror_loss_coeff * parts[-1]
+        return loss, parts, kl
 
     def _average_over_ranks(self, kl: Tensor | None) -> None:
         """Gradients and KL divergence become their means over all ranks, in one message."""
@@ -235,9 +265,9 @@ class GraphedPPO(PPO):
                 inputs = torch.cat([obs[group] for group in model.obs_groups], dim=-1)
                 _update_normalizer(model.obs_normalizer, inputs, self.gpu_world_size)
 
-    def _symmetry_loss(self, batch: Any, size: int) -> Tensor:
+    def _symmetry_loss(self, batch: Any) -> Tensor:
         """How far the policy is from its own mirror image; of an augmented batch, the forward pass is already made."""
-        symmetry = self.symmetry
+        symmetry, size = self.symmetry, self._size
         assert symmetry is not None
         if symmetry.use_mirror_loss or not symmetry.use_data_augmentation:
             return symmetry.compute_loss(self.actor, batch, size)
@@ -287,6 +317,16 @@ class GraphedPPO(PPO):
                 memory["step"] = memory["step"].to(self.device, torch.float32)
             self._begin()  # Adam's memory has moved
         return iteration
+
+
+def _part(batch: RolloutStorage.Batch, samples: slice) -> RolloutStorage.Batch:
+    """Views of some samples of a batch."""
+    part = RolloutStorage.Batch()
+    for name, value in vars(batch).items():
+        if isinstance(value, (Tensor, TensorDict)):
+            setattr(part, name, value[samples])
+    part.old_distribution_params = tuple(param[samples] for param in batch.old_distribution_params or ())
+    return part
 
 
 def _update_normalizer(normalizer: EmpiricalNormalization, x: Tensor, world_size: int) -> None:

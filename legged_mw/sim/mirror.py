@@ -47,53 +47,59 @@ def find_partners(robot: RobotModel, sites: Sequence[str] = (), tolerance: float
     slides = model.jnt_type[joint_ids] == mujoco.mjtJoint.mjJNT_SLIDE
     images = np.where(slides[:, None], axes * POLAR, axes * -POLAR)  # mirrored axes
     signs = np.where(images @ axes.T < 0.0, -1, 1)  # (D, D) of the mirrored joint i along joint j
-    bend = np.linalg.norm(signs[..., None] * axes[None] - images[:, None], axis=-1)  # (D, D), about the angle [rad]
-    alike = (bend <= AXIS_TOLERANCE) & (slides[:, None] == slides[None])
-    partners = _pair("joint", robot, robot.joint_names, anchors, alike, tolerance, axes, images)
+    bends = np.linalg.norm(signs[..., None] * axes[None] - images[:, None], axis=-1)  # (D, D), about the angle [rad]
+    bends[slides[:, None] != slides[None]] = np.pi  # a hinge is no slide's partner
+    kinds = np.where(slides, "slide", "hinge")
+    partners = _pair(
+        "joint",
+        robot,
+        robot.joint_names,
+        anchors,
+        bends,
+        tolerance,
+        found=[f" with {kind} axis {_numbers(axis)}" for kind, axis in zip(kinds, axes, strict=True)],
+        wanted=[f" with {kind} axis {_numbers(axis)}" for kind, axis in zip(kinds, images, strict=True)],
+        limit=f" and {AXIS_TOLERANCE:g} rad, whichever way the axis points",
+    )
     return Partners(
         joints=partners,
         signs=tuple(int(signs[i, j]) for i, j in enumerate(partners)),
-        sites=_pair("site", robot, sites, places, np.ones((len(sites), len(sites)), dtype=bool), tolerance),
+        sites=_pair("site", robot, sites, places, np.zeros((len(sites), len(sites))), tolerance),
     )
 
 
 def _pair(
-    kind: str,
+    what: str,
     robot: RobotModel,
     names: Sequence[str],
     places: np.ndarray,  # (n, 3) [m], root frame
-    alike: np.ndarray,  # (n, n): may i and j be partners, but for their places
+    bends: np.ndarray,  # (n, n) [rad] between the mirrored axis of i and that of j
     tolerance: float,  # [m]
-    axes: np.ndarray | None = None,  # (n, 3), for the error's text
-    images: np.ndarray | None = None,  # (n, 3), mirrored axes
+    found: Sequence[str] = (),  # for the error's text: more about each, about each one's mirror image, about tolerances
+    wanted: Sequence[str] = (),
+    limit: str = "",
 ) -> tuple[int, ...]:
     """For each place the index of the nearest one to its mirror image."""
     gaps = np.linalg.norm(places[None] - (places * POLAR)[:, None], axis=-1)  # (n, n) [m]
-    fits = alike & (gaps <= tolerance)
+    fits = (bends <= AXIS_TOLERANCE) & (gaps <= tolerance)
     for i, name in enumerate(names):
         if not fits[i].any():
-            near = int(gaps[i].argmin())
-            wanted = _at(places[i] * POLAR, None if images is None else images[i])
-            found = _at(places[near], None if axes is None else axes[near])
-            limit = f"{1000 * tolerance:g} mm" + ("" if axes is None else f" and {AXIS_TOLERANCE:g} rad, whichever way the axis points")
+            near = np.lexsort((bends[i], gaps[i].round(6)))[0]  # of those at one place, the one most alike
             raise ModelError(
-                f"{kind} '{name}' has no partner on the other side: mirrored about the x-z plane of '{robot.root}' it is {wanted}; "
-                f"nearest is '{names[near]}', {found} (in the frame of '{robot.root}', all joints at zero). They must agree to "
-                f"{limit}: make the MJCF symmetric, or do without what mirrors the robot"
+                f"{what} '{name}' has no partner on the other side: mirrored about the x-z plane of '{robot.root}' it is at "
+                f"{_numbers(places[i] * POLAR)} m{wanted[i] if wanted else ''}; nearest is '{names[near]}', at {_numbers(places[near])} m"
+                f"{found[near] if found else ''} (in the frame of '{robot.root}', all joints at zero). They must agree to "
+                f"{1000 * tolerance:g} mm{limit}: make the MJCF symmetric, or do without what mirrors the robot"
             )
-    partners = np.where(fits, gaps, np.inf).argmin(axis=1) if names else np.zeros(0, dtype=int)
-    pairs: list[int] = partners.tolist()
+    pairs: list[int] = np.where(fits, gaps, np.inf).argmin(axis=1).tolist() if names else []
     for i, j in enumerate(pairs):
         if pairs[j] != i:
             raise ModelError(
-                f"{kind}s '{names[i]}' and '{names[pairs[j]]}' have the same mirror partner '{names[j]}': they lie closer together "
+                f"{what}s '{names[i]}' and '{names[pairs[j]]}' have the same mirror partner '{names[j]}': they lie closer together "
                 f"than {1000 * tolerance:g} mm and cannot be told apart; do without one of them, or without what mirrors the robot"
             )
     return tuple(pairs)
 
 
-def _at(place: np.ndarray, axis: np.ndarray | None) -> str:
-    def numbers(v: np.ndarray) -> str:
-        return "(" + ", ".join(f"{x + 0.0:g}" for x in v.round(5)) + ")"  # no -0
-
-    return f"at {numbers(place)} m" + ("" if axis is None else f" with axis {numbers(axis)}")
+def _numbers(vector: np.ndarray) -> str:
+    return "(" + ", ".join(f"{x + 0.0:g}" for x in vector.round(5)) + ")"  # no -0
