@@ -184,6 +184,12 @@ class LeggedRobotCfgPPO(Config):
         desired_kl: float = 0.01  # between updates, for the adaptive schedule [R]
         normalize_advantage_per_mini_batch: bool = False  # [R]
 
+    class anneal:
+        """What a number of `algorithm` goes to, in a straight line over max_iterations; 0: it stays [ours]."""
+
+        entropy_coef: float = 0.0
+        desired_kl: float = 0.0
+
     class symmetry:
         """Left-right symmetry in the update, as in Mittal et al. 2024. Rows of observations say how they mirror: envs/mirror.py."""
 

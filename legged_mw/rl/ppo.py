@@ -118,6 +118,7 @@ class GraphedPPO(PPO):
         self._advantages = torch.zeros_like(st.returns)
         self._loss_names = ("value", "surrogate", "entropy", *(["symmetry"] if self.symmetry else []))
         self._losses = torch.zeros(len(self._loss_names), device=device)
+        self._entropy_coef, self._desired_kl = torch.zeros((), device=device), torch.zeros((), dtype=torch.float64, device=device)
         self._side = torch.cuda.Stream(device) if str(device).startswith("cuda") else None
         self._act_graph, self._returns_graph, self._update_graph = (
             StepGraph(fn, str(device)) for fn in (self._act, self._compute_returns, self._update)
@@ -182,6 +183,8 @@ class GraphedPPO(PPO):
         if not self.graphed:
             return super().update()
         torch.randperm(len(self._order), out=self._order)  # one for all epochs, as in rsl-rl
+        self._entropy_coef.fill_(self.entropy_coef)  # these two may be changed between updates
+        self._desired_kl.fill_(self.desired_kl or 0.0)
         self._update_graph()
         self.storage.clear()
         return dict(zip(self._loss_names, self._losses.clone().unbind(), strict=True))
@@ -278,7 +281,7 @@ class GraphedPPO(PPO):
         ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze())
         clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
         surrogate = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
-        loss, parts = surrogate - self.entropy_coef * entropy, [surrogate, entropy]
+        loss, parts = surrogate - self._entropy_coef * entropy, [surrogate, entropy]
         if self.symmetry:
             parts.append(self._symmetry_loss(batch))
             if self.symmetry.use_mirror_loss:
@@ -298,11 +301,11 @@ class GraphedPPO(PPO):
 
     def _adapt_rate(self, kl: Tensor) -> None:
         """rsl-rl's rule: slower where the policy moved more than twice as far as wanted, faster where less than half."""
-        assert self.desired_kl is not None and self._rate is not None
+        assert self._rate is not None
         slower = (self._rate / _RATE_STEP).clamp(min=_MIN_RATE)
         faster = (self._rate * _RATE_STEP).clamp(max=_MAX_RATE)
-        rate = torch.where((kl < self.desired_kl / 2.0) & (kl > 0.0), faster, self._rate)
-        self._rate.copy_(torch.where(kl > self.desired_kl * 2.0, slower, rate))
+        rate = torch.where((kl < self._desired_kl / 2.0) & (kl > 0.0), faster, self._rate)
+        self._rate.copy_(torch.where(kl > self._desired_kl * 2.0, slower, rate))
         self._adam_rate.copy_(self._rate)
 
     def _update_normalizers(self) -> None:

@@ -79,6 +79,7 @@ class Runner(OnPolicyRunner):
             with torch.inference_mode():
                 self.alg.compute_returns(obs)
             collected = clock.mark()
+            self._anneal()
             losses = self.alg.update()
             report = self._report(losses, (start, collected, start := clock.mark()))
             if waiting:
@@ -90,6 +91,13 @@ class Runner(OnPolicyRunner):
             self._log(waiting)
         self._save_checkpoint()
         self.logger.stop_logging_writer()
+
+    def _anneal(self) -> None:
+        """Move what has an end value towards it, in a straight line from the first iteration to the last."""
+        done = self.current_learning_iteration / max(self._last - 1, 1)
+        for name, (begin, end) in self.cfg["anneal"].items():
+            if begin and end:
+                setattr(self.alg, name, begin + (end - begin) * done)
 
     def _must_stop(self) -> bool:
         """Ranks stop together, one iteration after the first was asked to: each waits for the others in every update."""
@@ -234,7 +242,9 @@ def rsl_rl_config(cfg: LeggedRobotCfgPPO) -> dict[str, Any]:
     mirrors = symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]
     symmetry_cfg = {"data_augmentation_func": "legged_mw.rl.symmetry:mirror", **symmetry} if mirrors else None
     algorithm = {"rnd_cfg": None, "symmetry_cfg": symmetry_cfg, **sections.pop("algorithm")}
-    return {**sections, **{key: runner[key] for key in keys}, "algorithm": algorithm, "logger": logger, "check_for_nan": False}
+    anneal = {name: (algorithm[name], end) for name, end in sections.pop("anneal").items()}
+    flat = {key: runner[key] for key in keys}
+    return {**sections, **flat, "algorithm": algorithm, "anneal": anneal, "logger": logger, "check_for_nan": False}
 
 
 def _random_state(device: str) -> dict[str, Tensor]:
