@@ -1,9 +1,10 @@
-"""Train a task: python train.py --task go1_flat"""
+"""Train a task: python train.py --task go1_flat, or on 8 GPUs: torchrun --nproc_per_node=8 train.py --task go1_flat"""
 
 from __future__ import annotations
 
 import argparse
 import os
+import re
 import shlex
 import signal
 import sys
@@ -17,10 +18,12 @@ from legged_mw import ROOT
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.describe import describe
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, find_checkpoint, find_run, new_run
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, one_line_errors, pick_device, positive, seed_everything, shown
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
+from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 
@@ -40,7 +43,8 @@ def parse() -> argparse.Namespace:
 
 
 def main() -> None:
-    began, args = time.time(), parse()
+    began, args, rank = time.time(), parse(), this_rank()
+    quiet(rank)
     if args.list:
         for name in task_names():
             about = sys.modules[type(load_task(name).cfg).__module__].__doc__ or ""
@@ -58,9 +62,12 @@ def main() -> None:
     if not run:
         experiment = ROOT / "logs" / (task.train.runner.experiment_name or task.name)  # --set may have named it
     check_values(task.cfg, task.train)
-    device = pick_device(args.device)
-    seed_everything(task.train.seed)
-    print(f"{task.name}: {task.cfg.env.num_envs} worlds on {device}; a first run compiles kernels, about a minute", flush=True)
+    device = pick_device(rank_device(rank, args.device))
+    if device != "cpu":
+        torch.cuda.set_device(device)
+    seed_everything(task.train.seed + rank.index)  # every rank its own worlds, commands and noise
+    where = device if rank.count == 1 else f"each of {rank.count} {'processes' if device == 'cpu' else 'GPUs'}"
+    print(f"{task.name}: {task.cfg.env.num_envs} worlds on {where}; a first run compiles kernels, about a minute", flush=True)
     if device == "cpu" and task.cfg.env.num_envs > 512:
         print("a CPU is slow at this many worlds: --num_envs 256 shows the first iterations in seconds", flush=True)
     env = task.env_class(task.cfg, device, eager=args.eager)
@@ -82,12 +89,17 @@ def train(
         done, wanted = runner.current_learning_iteration, task.train.runner.max_iterations
         raise ConfigError(f"{shown(checkpoint or experiment)} has done {done} iterations of {wanted}; raise --max_iterations to go on")
     newest = run is not None and checkpoint == find_checkpoint(run, -1)
+    stop_on_signals(runner, deadline)
+    rank = this_rank()
+    leave_when_stuck(rank)
+    if not rank.leads:  # one run folder, written by the first rank
+        learn_together(runner, left, rank)
+        return
     folder = run if run and newest else new_run(experiment, task.train.runner.run_name)  # an earlier checkpoint begins a branch
     save_yaml(folder / CONFIG_FILE, task.to_dict())
     runner.logger.log_dir = str(folder)
-    stop_on_signals(runner, deadline)
     print(f"writing to {shown(folder)}", flush=True)
-    runner.learn(left)
+    learn_together(runner, left, rank)
     name = task.to_dict()["task"]
     home = ROOT / "logs" / (load_task(name).train.runner.experiment_name or task.name)
     flags = shlex.join(["--task", name, "--load_run", folder.name if folder.parent == home else shown(folder)])
@@ -95,6 +107,18 @@ def train(
         print(f"stopped: {runner.stop}; go on with\n  python train.py --resume {flags}")
     else:
         print(f"done: {shown(folder)}; watch it with\n  python play.py {flags}")
+
+
+def learn_together(runner: Runner, iterations: int, rank: Rank) -> None:
+    """Learn; when another rank is lost on the way, say so in a line."""
+    try:
+        runner.learn(iterations)
+        leave_together(rank)
+    except RuntimeError as error:
+        if rank.count == 1 or not re.search(r"peer|connection|nccl|gloo|distbackend", f"{type(error).__name__} {error}", re.IGNORECASE):
+            raise
+        reason = str(error).strip().splitlines()[0]
+        raise UserError(f"rank {rank.index} lost another rank ({reason}); the last checkpoint is whole: --resume goes on from it") from None
 
 
 def stop_on_signals(runner: Runner, deadline: float | None) -> None:

@@ -4,7 +4,8 @@
     python benchmarks/compare.py --python-mjlab ~/mjlab/bin/python --python-playground ~/playground/bin/python
 
 The two are no dependencies of this project: one that is not installed is listed as that. Their pins of mujoco clash with
-ours and with each other's, so each may live in an environment of its own, named by its interpreter.
+ours and with each other's, so each may live in an environment of its own, named by its interpreter. Playground fetches
+its meshes with git when it first runs.
 
 Each framework runs its own default task and learner; only the number of worlds is set. One after the other, each in a
 process of its own, so that device memory, settings and crashes stay apart. What differs is printed under the table.
@@ -37,10 +38,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-WARM_UP = 5  # iterations, in which kernels are compiled and graphs recorded
+WARM_UP = 5  # iterations, in which kernels are compiled and graphs recorded; of Playground, two rounds
 ROUNDS = 3  # the median of which is reported
 
 
+QUIET = "mujoco-warp's messages from within kernels, one a world and step when its solver runs to the end, are off, as in legged_mw"
 TORCH_STACK = ("mujoco", "mujoco-warp", "warp-lang", "torch", "rsl-rl-lib")
 
 
@@ -73,6 +75,7 @@ class Order(NamedTuple):
     num_envs: int
     iterations: int  # a round
     device: str  # cpu or cuda:0: a child sees one GPU
+    impl: str  # Playground's physics: MJX in jax or in warp
 
 
 class Measured(NamedTuple):
@@ -103,6 +106,7 @@ def child(order: Order) -> None:
         message = next((line for line in str(error).splitlines() if line.strip()), "")
         reply = {"error": f"{type(error).__name__}: {message}"}
     print(json.dumps(reply), file=answer, flush=True)
+    os._exit(0)  # MJX in warp may hang when Python tears it down
 
 
 def measure_legged_mw(order: Order) -> Measured:
@@ -143,10 +147,10 @@ def measure_mjlab(order: Order) -> Measured:
     configure_torch_backends()
     env = ManagerBasedRlEnv(cfg=env_cfg, device=order.device)
     notes = ["no log is written, so rsl-rl's statistics, which read the device every step, are off"]
-    if int(importlib.metadata.version("mujoco-warp").partition(".")[0]) >= 4:
+    if int(importlib.metadata.version("mujoco-warp").partition(".")[0]) >= 4:  # which it does not ask for, but runs with
         env.sim.wp_model.opt.warn_overflow = 0  # else each world that needs all solver iterations prints a line from its kernel
         env.sim.create_graph()
-        notes.append("mujoco-warp 4, newer than it asks for; the kernels' messages, many lines a step there, are off")
+        notes.append(QUIET)
     wrapped = RslRlVecEnvWrapper(env, clip_actions=learner.clip_actions)
     runner = (load_runner_cls(task) or MjlabOnPolicyRunner)(wrapped, asdict(learner), None, order.device)
     sizes = {role: value.shape[1] for role, value in wrapped.get_observations().items()}
@@ -171,13 +175,12 @@ def measure_runner(
     }
     runner.learn(WARM_UP, init_at_random_ep_len=True)
     seconds = []
+    wait = torch.cuda.synchronize if gpu else lambda: None
     for _ in range(ROUNDS):
-        if gpu:
-            torch.cuda.synchronize()
+        wait()
         start = time.perf_counter()
         runner.learn(order.iterations, init_at_random_ep_len=False)
-        if gpu:
-            torch.cuda.synchronize()
+        wait()
         seconds.append((time.perf_counter() - start) / order.iterations)
     steps = cfg["num_steps_per_env"] * order.num_envs
     machine = torch.cuda.get_device_name() if gpu else cpu_name()
@@ -195,12 +198,17 @@ def measure_playground(order: Order) -> Measured:
     from mujoco_playground import registry, wrapper
     from mujoco_playground.config import locomotion_params
 
-    task = FRAMEWORKS["playground"].task
+    task, impl = FRAMEWORKS["playground"].task, order.impl
     machine = jax.devices()[0].device_kind if order.device != "cpu" else cpu_name()  # fails here without a GPU build of jax
+    notes = [f"MJX in {impl} (--playground-impl; its task says warp, its training script jax)"]
     cfg = registry.get_default_config(task)
-    impl = cfg.impl if order.device != "cpu" else "jax"  # Warp within MJX needs a GPU
     contacts = cfg.naconmax * math.ceil(order.num_envs / 8192)  # the default's buffer is for 8192 worlds
     env = registry.load(task, config=cfg, config_overrides={"impl": impl, "naconmax": contacts})
+    if impl == "warp" and hasattr(env.mjx_model.opt._impl, "warn_overflow"):
+        env._mjx_model = env.mjx_model.tree_replace({"opt._impl.warn_overflow": 0})  # as for mjlab
+        notes.append(QUIET)
+    if not hasattr(jax, "device_put_replicated"):  # jax 0.10 dropped it, brax 0.14.2 calls it once, at the start
+        jax.device_put_replicated = lambda tree, devices: jax.tree.map(lambda x: jax.numpy.stack([x] * len(devices)), tree)
     params = locomotion_params.brax_ppo_config(task, impl).to_dict()
     layers = params.pop("network_factory")
     sizes = env.observation_size
@@ -216,13 +224,11 @@ def measure_playground(order: Order) -> Measured:
     }
     rollouts = order.num_envs * max(1, params["batch_size"] * params["num_minibatches"] // order.num_envs)
     if rollouts % params["num_minibatches"]:
-        raise ValueError(
-            f"its {params['num_minibatches']} minibatches do not divide {rollouts} rollouts; take a power of two for --num_envs"
-        )
+        raise ValueError(f"{rollouts} rollouts are not {params['num_minibatches']} minibatches; take a power of two for --num_envs")
     params["batch_size"] = rollouts // params["num_minibatches"]
     steps = rollouts * params["unroll_length"]
-    marks: list[float] = []  # the first epoch compiles, each further one is a round
-    params |= {"num_envs": order.num_envs, "num_evals": 2 + ROUNDS, "num_timesteps": (1 + ROUNDS) * order.iterations * steps}
+    marks: list[float] = []  # ends of epochs: the first two compile, each further one is a round
+    params |= {"num_envs": order.num_envs, "num_evals": 3 + ROUNDS, "num_timesteps": (2 + ROUNDS) * order.iterations * steps}
     ppo.train(
         env,
         **{**params, "num_resets_per_eval": 0},
@@ -231,10 +237,9 @@ def measure_playground(order: Order) -> Measured:
         wrap_env_fn=wrapper.wrap_for_brax_training,
         progress_fn=lambda *_: marks.append(time.perf_counter()),  # called with the device idle
     )
-    seconds = [(end - start) / order.iterations for start, end in itertools.pairwise(marks)]
-    notes = [
-        f"MJX's {impl} implementation" + (", since its default, warp, needs a GPU" if impl != cfg.impl or order.device == "cpu" else ""),
-        "an update takes its default of 8192 rollouts, or one of each world where there are more",
+    seconds = [(end - start) / order.iterations for start, end in itertools.pairwise(marks[1:])]
+    notes += [
+        "an update takes its default of 8192 rollouts; beyond 8192 worlds one of each, and its buffer for contacts grows",
         "its resets of all worlds and its evaluations, now and then between updates, are left out",
     ]
     return Measured(seconds, steps, steps // params["num_minibatches"], machine, facts, notes)
@@ -320,13 +325,14 @@ def child_environment(device: str) -> dict[str, str]:
 
 def results(rows: list[Row]) -> str:
     """The table: a line a framework and number of worlds."""
-    columns = f"{'steps/s':>12}{'legged_mw / it':>16}{'[s] an iteration':>18}{'steps an iteration':>20}{'minibatch':>11}"
+    columns = f"{'steps/s':>12}{'spread':>8}{'legged_mw / it':>16}{'[s] an iteration':>18}{'steps an iteration':>20}{'minibatch':>11}"
     lines = [f"{'worlds':>8}  {'framework':<12}{columns}"]
     ours = {row.num_envs: row.speed for row in rows if row.framework == "legged_mw" and row.measured}
     for row in rows:
         if m := row.measured:
             ratio = f"{ours[row.num_envs] / row.speed:.2f}" if row.num_envs in ours else "-"
-            text = f"{row.speed:>12,.0f}{ratio:>16}{statistics.median(m.seconds):>18.4f}{m.steps:>20,}{m.minibatch:>11,}"
+            median, spread = statistics.median(m.seconds), max(m.seconds) / min(m.seconds) - 1
+            text = f"{row.speed:>12,.0f}{spread:>8.1%}{ratio:>16}{median:>18.4f}{m.steps:>20,}{m.minibatch:>11,}"
         else:
             text = f"  {textwrap.shorten(row.failure, 160)}"
         lines.append(f"{row.num_envs:>8}  {row.framework:<12}{text}")
@@ -357,6 +363,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--only", nargs="+", choices=tuple(FRAMEWORKS), default=list(FRAMEWORKS), help="frameworks to measure")
     for peer in ("mjlab", "playground"):
         parser.add_argument(f"--python-{peer}", default=sys.executable, metavar="PATH", help=f"interpreter of {peer}'s environment")
+    parser.add_argument("--playground-impl", choices=("warp", "jax"), help="its physics (default: warp; on a CPU jax, the faster one)")
     parser.add_argument("--timeout", type=float, default=1800, metavar="S", help="seconds that one measurement may take")
     parser.add_argument("--verbose", action="store_true", help="show what the frameworks print, tracebacks too")
     return parser.parse_args()
@@ -371,13 +378,12 @@ def main() -> None:
     cpu = device == "cpu"
     sizes, iterations = args.num_envs or ([16] if cpu else [4096, 16384]), args.iterations or (1 if cpu else 10)
     pythons = {"legged_mw": sys.executable, "mjlab": args.python_mjlab, "playground": args.python_playground}
-    environment = child_environment(device)
-    rows = [
-        ask(pythons[name], Order(name, num_envs, iterations, "cpu" if cpu else "cuda:0"), environment, args.timeout, args.verbose)
-        for num_envs in sizes
-        for name in FRAMEWORKS
-        if name in args.only
-    ]
+    environment, impl = child_environment(device), args.playground_impl or ("jax" if cpu else "warp")
+    rows = []
+    for num_envs in sizes:
+        for name in (name for name in FRAMEWORKS if name in args.only):
+            order = Order(name, num_envs, iterations, "cpu" if cpu else "cuda:0", impl)
+            rows.append(ask(pythons[name], order, environment, args.timeout, args.verbose))
     machines = ", ".join(dict.fromkeys(row.measured.machine for row in rows if row.measured)) or device
     print(f"Go1 on flat ground, training on {machines}: median of {ROUNDS} rounds of {iterations} iterations after a warm-up\n")
     print(results(rows), end="\n\n")

@@ -13,7 +13,7 @@ import torch
 
 from legged_mw.utils.config import ConfigError
 
-_PATIENCE = 10.0  # [s] a step and a checkpoint take far less
+_PATIENCE = 20.0  # [s] an iteration and a checkpoint take far less; torchrun kills after 30
 
 
 class Rank(NamedTuple):
@@ -49,6 +49,13 @@ def quiet(rank: Rank) -> None:
     """Only the first process speaks."""
     if not rank.leads:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (open until the process ends)
+
+
+def leave_together(rank: Rank) -> None:
+    """End the connection once every rank is done."""
+    if rank.count > 1:
+        torch.distributed.barrier()
+        torch.distributed.destroy_process_group()
 
 
 def leave_when_stuck(rank: Rank, patience: float = _PATIENCE) -> None:

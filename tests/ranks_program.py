@@ -1,0 +1,58 @@
+"""What one rank of tests/test_ranks.py does: learn a little together with the others, and write what it ended with."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import torch
+from learner import Recordable, parameters
+from rsl_rl.algorithms import PPO
+
+from legged_mw.rl.ranks import leave_together, this_rank
+from legged_mw.rl.runner import make_runner
+from legged_mw.utils.cli import seed_everything
+from legged_mw.utils.task import load_task
+
+kind, folder, dies_in = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
+rank = this_rank()
+torch.set_num_threads(1)
+task = load_task("go1_flat")
+task.cfg.env.num_envs = 8
+task.cfg.env.episode_length_s = 0.2
+task.train.actor.hidden_dims = task.train.critic.hidden_dims = [16]
+task.train.runner.save_interval = 1
+task.train.runner.num_steps_per_env = 12
+seed_everything(10 + rank.index)
+env = task.env_class(task.cfg, "cpu")
+task.train.algorithm.class_name = {"ours": "learner:Recordable", "stock": "PPO"}[kind]
+runner = make_runner(env, task.train, folder if rank.leads else None, "cpu")
+assert type(runner.alg) is {"ours": Recordable, "stock": PPO}[kind]
+act, steps = runner.alg.act, 0
+
+
+def mortal_act(obs: object) -> torch.Tensor:
+    global steps
+    steps += 1
+    if rank.index == 1 and steps > 12 * dies_in > 0:
+        os._exit(3)
+    return act(obs)  # type: ignore[arg-type]
+
+
+def update_after_a_move() -> dict[str, float]:
+    """As in learner.share_experience: else rounding decides about the first step of the adaptive rate."""
+    with torch.inference_mode():
+        runner.alg.storage.distribution_params[0].add_(0.02)  # type: ignore[index]
+    return update()
+
+
+update = runner.alg.update
+runner.alg.act, runner.alg.update = mortal_act, update_after_a_move  # type: ignore[method-assign]
+if kind == "ours" and dies_in < 0 and not rank.leads:
+    runner.stop = "asked"  # one rank alone is asked to stop
+runner.learn(3)
+end = {"parameters": parameters(runner.alg), "obs": env.get_observations()["state"], "means": runner._last_means}
+end |= {"iteration": runner.current_learning_iteration, "steps": runner.total_steps, "stop": runner.stop, "rate": runner.alg.learning_rate}
+torch.save(end, folder / f"rank{rank.index}.pt")
+leave_together(rank)

@@ -1,0 +1,95 @@
+"""benchmarks/compare.py on a CPU: a table with our figure, and a peer that is missing or broken costs a line, not the run."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from legged_mw import ROOT
+
+PROGRAM = ROOT / "benchmarks" / "compare.py"
+
+
+def compare(*args: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, str(PROGRAM), "--device", "cpu", "--num_envs", "8", "--iterations", "1", *args]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+
+
+def interpreter(path: Path, script: str) -> str:
+    """An executable file that stands in for the interpreter of a peer's environment."""
+    path.write_text(f"#!/bin/sh\n{script}\n")
+    path.chmod(0o755)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def broken(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """An environment in which mjlab is installed, but cannot be imported."""
+    folder = tmp_path_factory.mktemp("broken")
+    (folder / "mjlab").mkdir()
+    (folder / "mjlab" / "__init__.py").write_text("print('mjlab says hello')\nraise RuntimeError('no driver\\nsee the manual')\n")
+    return interpreter(folder / "python", f"PYTHONPATH='{folder}' exec '{sys.executable}' \"$@\"")
+
+
+@pytest.fixture(scope="module")
+def bare(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """An environment without any package."""
+    return interpreter(tmp_path_factory.mktemp("bare") / "python", f"exec '{sys.executable}' -I -S \"$@\"")
+
+
+def test_our_figure_beside_a_broken_and_a_missing_peer(broken: str, bare: str) -> None:
+    result = compare("--python-mjlab", broken, "--python-playground", bare)
+    assert result.returncode == 0, result.stderr
+    row = re.search(r"^ +8  legged_mw +([\d,]+) +[\d.]+% +1\.00 +([\d.]+) +192 +48$", result.stdout, re.MULTILINE)
+    assert row, result.stdout
+    speed, seconds = float(row[1].replace(",", "")), float(row[2])
+    assert speed == pytest.approx(8 * 24 / seconds, rel=0.01)
+    assert "       8  mjlab         failed: RuntimeError: no driver\n" in result.stdout
+    assert '       8  playground    not installed: pip install playground "jax[cuda12]' in result.stdout
+    for condition in ("24 steps a world", "5 epochs x 4 minibatches", "48 512 256 128", "123 512 256 128", "5 x 4 ms", "mujoco-warp 4."):
+        assert condition in result.stdout
+    assert "hello" not in result.stdout
+
+
+def test_only_what_was_asked_for_and_status_0_when_a_peer_alone_is_missing(bare: str) -> None:
+    result = compare("--only", "playground", "--python-playground", bare)
+    assert result.returncode == 0, result.stderr
+    assert "not installed" in result.stdout
+    assert not re.search(r"^ +8  (legged_mw|mjlab)", result.stdout, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    ("script", "timeout", "reason"),
+    [
+        ("echo some warning >&2; echo 'Error: it broke' >&2; exit 3", "60", "failed: Error: it broke (exit status 3)"),
+        ("kill -9 $$", "60", "failed: no word (SIGKILL)"),
+        ("exec sleep 60", "0.5", "failed: not done after 0.5 s (--timeout)"),
+    ],
+)
+def test_how_a_child_ends_is_reported(tmp_path: Path, script: str, timeout: str, reason: str) -> None:
+    result = compare("--only", "mjlab", "--timeout", timeout, "--python-mjlab", interpreter(tmp_path / "python", script))
+    assert result.returncode == 0, result.stderr
+    assert reason in result.stdout
+
+
+def test_an_interpreter_that_is_not_there(tmp_path: Path) -> None:
+    result = compare("--only", "mjlab", "--python-mjlab", str(tmp_path / "nothing"))
+    assert result.returncode == 0 and f"failed: no interpreter {tmp_path / 'nothing'} (" in result.stdout
+
+
+def test_our_own_failure_is_status_1() -> None:
+    result = compare("--only", "legged_mw", "--timeout", "0.01")
+    assert result.returncode == 1
+    assert "legged_mw     failed: not done after 0.01 s" in result.stdout
+
+
+def test_a_child_needs_no_package_to_say_what_is_missing(bare: str) -> None:
+    order = json.dumps(["mjlab", 8, 1, "cpu", "jax"])
+    result = subprocess.run([bare, str(PROGRAM), "--child", order], capture_output=True, text=True, check=True, env=dict(os.environ))
+    assert json.loads(result.stdout) == {"missing": True}

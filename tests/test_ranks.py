@@ -1,0 +1,117 @@
+"""Several processes that learn together, as torchrun starts them; on a CPU they talk through gloo."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from learner import difference
+
+from legged_mw import ROOT
+from legged_mw.rl.ranks import Rank, rank_device, this_rank
+from legged_mw.utils.config import ConfigError, load_yaml
+
+LAUNCH = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}", "OMP_NUM_THREADS": "1"}
+
+
+def launch(*words: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*LAUNCH, *words], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=300)
+
+
+def learn(kind: str, folder: Path, dies_in: int = 0) -> subprocess.CompletedProcess[str]:
+    folder.mkdir()
+    return launch(str(ROOT / "tests/ranks_program.py"), kind, str(folder), str(dies_in))
+
+
+def ends(folder: Path) -> list[dict[str, Any]]:
+    return [torch.load(folder / f"rank{i}.pt", weights_only=False) for i in (0, 1)]
+
+
+@pytest.fixture(scope="module")
+def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ranks") / "ours"
+    result = learn("ours", folder)
+    assert result.returncode == 0, result.stderr
+    assert sorted(path.name for path in folder.glob("*.pt")) == ["model_1.pt", "model_2.pt", "model_3.pt", "rank0.pt", "rank1.pt"]
+    return folder
+
+
+def test_ranks_learn_one_policy_from_worlds_of_their_own(ours: Path) -> None:
+    one, other = ends(ours)
+    assert difference(one["parameters"], other["parameters"]) == 0.0 and one["rate"] == other["rate"]
+    assert not torch.equal(one["obs"], other["obs"])
+    assert one["iteration"] == other["iteration"] == 3 and one["steps"] == other["steps"] == 2 * 3 * 12 * 8
+
+
+def test_statistics_are_of_all_ranks(ours: Path) -> None:
+    one, other = ends(ours)
+    assert one["means"] == other["means"] and one["means"]["episodes"] > 0
+
+
+def test_same_update_as_rsl_rls_own_on_two_ranks(ours: Path, tmp_path: Path) -> None:
+    """Averaged gradients, KL divergence, learning rate and normalisers. One iteration: afterwards they draw other noise."""
+    result = learn("stock", tmp_path / "stock")
+    assert result.returncode == 0, result.stderr
+    expected, got = (torch.load(folder / "model_1.pt", weights_only=True) for folder in (tmp_path / "stock", ours))
+    for name in ("actor_state_dict", "critic_state_dict"):
+        assert difference(expected[name], got[name]) < 1e-4
+    rates = [content["optimizer_state_dict"]["param_groups"][0]["lr"] for content in (expected, got)]
+    assert rates[0] == pytest.approx(rates[1], rel=1e-9)
+
+
+def test_one_asked_to_stop_stops_all(tmp_path: Path) -> None:
+    result = learn("ours", tmp_path / "asked", -1)
+    assert result.returncode == 0, result.stderr
+    one, other = ends(tmp_path / "asked")
+    assert (one["stop"], other["stop"]) == ("another rank was asked to", "asked")
+    assert one["iteration"] == other["iteration"] == 1
+
+
+def test_train_writes_one_run_folder(tmp_path: Path) -> None:
+    small = ["--num_envs", "8", "--set", "actor.hidden_dims=[16]", "--set", "critic.hidden_dims=[16]"]
+    small += ["--experiment_name", str(tmp_path / "runs"), "--max_iterations", "2", "--seed", "4"]
+    result = launch("train.py", "--task", "go1_flat", "--device", "cpu", *small)
+    assert result.returncode == 0, result.stderr
+    [folder] = (tmp_path / "runs").iterdir()
+    assert {"config.yaml", "model_2.pt"} <= {path.name for path in folder.iterdir()}
+    assert load_yaml(folder / "config.yaml")["seed"] == 4
+    assert result.stdout.count("Learning iteration 2/2") == 1
+    assert "8 worlds on each of 2 processes" in result.stdout
+    assert (
+        torch.load(folder / "model_2.pt", weights_only=True)["infos"]["total_steps"]
+        == 2 * 2 * 8 * load_yaml(folder / "config.yaml")["runner"]["num_steps_per_env"]
+    )
+
+
+def test_a_rank_that_dies_ends_the_run(tmp_path: Path) -> None:
+    """The other does not wait for ever, and what was saved can be loaded."""
+    folder = tmp_path / "dies"
+    result = learn("ours", folder, 2)
+    assert result.returncode != 0
+    assert sorted(path.name for path in folder.glob("*.pt")) == ["model_1.pt", "model_2.pt"]
+    assert torch.load(folder / "model_2.pt", weights_only=True)["iter"] == 2
+
+
+def test_rank_is_read_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("RANK", "LOCAL_RANK", "WORLD_SIZE"):
+        monkeypatch.delenv(name, raising=False)
+    assert this_rank() == Rank(0, 0, 1) and this_rank().leads
+    for name, value in (("RANK", "9"), ("LOCAL_RANK", "1"), ("WORLD_SIZE", "16")):
+        monkeypatch.setenv(name, value)
+    assert this_rank() == Rank(9, 1, 16) and not this_rank().leads
+
+
+def test_each_rank_gets_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    assert rank_device(Rank(0, 0, 1), None) is None and rank_device(Rank(0, 0, 1), "cuda:1") == "cuda:1"
+    assert rank_device(Rank(3, 1, 4), None) == "cuda:1" and rank_device(Rank(3, 1, 4), "cpu") == "cpu"
+    with pytest.raises(ConfigError, match="--device cuda:0: under torchrun every process takes the GPU of its own number"):
+        rank_device(Rank(0, 0, 2), "cuda:0")
+    with pytest.raises(ConfigError, match="process 2 on a machine with 2 GPUs; use --nproc_per_node=2"):
+        rank_device(Rank(2, 2, 3), None)
