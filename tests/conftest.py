@@ -12,7 +12,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Deselect, not skip: `pytest -m gpu` on a machine without a GPU then says that nothing ran."""
-    for mark, present in (("gpu", torch.cuda.is_available()), ("display", has_display())):
+    gpus = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    for mark, present in (("gpu", gpus > 0), ("two_gpus", gpus > 1), ("display", has_display())):
         if not present:
             without = [item for item in items if item.get_closest_marker(mark)]
             config.hook.pytest_deselected(items=without)

@@ -15,8 +15,11 @@ from legged_mw.rl.runner import make_runner
 from legged_mw.utils.cli import seed_everything
 from legged_mw.utils.task import load_task
 
-kind, folder, dies_in = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3])
+kind, folder, dies_in, on_gpus = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]), sys.argv[4:] == ["gpus"]
 rank = this_rank()
+device = f"cuda:{rank.local}" if on_gpus else "cpu"
+if on_gpus:
+    torch.cuda.set_device(device)
 torch.set_num_threads(1)
 task = load_task("go1_flat")
 task.cfg.env.num_envs = 8
@@ -25,9 +28,9 @@ task.train.actor.hidden_dims = task.train.critic.hidden_dims = [16]
 task.train.runner.save_interval = 1
 task.train.runner.num_steps_per_env = 12
 seed_everything(10 + rank.index)
-env = task.env_class(task.cfg, "cpu")
+env = task.env_class(task.cfg, device)
 task.train.algorithm.class_name = {"ours": "learner:Recordable", "stock": "PPO"}[kind]
-runner = make_runner(env, task.train, folder if rank.leads else None, "cpu")
+runner = make_runner(env, task.train, folder if rank.leads else None, device)
 assert type(runner.alg) is {"ours": Recordable, "stock": PPO}[kind]
 act, steps = runner.alg.act, 0
 
@@ -51,8 +54,8 @@ update = runner.alg.update
 runner.alg.act, runner.alg.update = mortal_act, update_after_a_move  # type: ignore[method-assign]
 if kind == "ours" and dies_in < 0 and not rank.leads:
     runner.stop = "asked"  # one rank alone is asked to stop
-runner.learn(3)
-end = {"parameters": parameters(runner.alg), "obs": env.get_observations()["state"], "means": runner._last_means}
+runner.learn(3 if not on_gpus else 8)  # on GPUs long enough to be recorded
+end = {"parameters": {k: v.cpu() for k, v in parameters(runner.alg).items()}, "obs": env.get_observations()["state"].cpu(), "means": runner._last_means}
 end |= {"iteration": runner.current_learning_iteration, "steps": runner.total_steps, "stop": runner.stop, "rate": runner.alg.learning_rate}
 torch.save(end, folder / f"rank{rank.index}.pt")
 leave_together(rank)

@@ -24,9 +24,9 @@ def launch(*words: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*LAUNCH, *words], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=300)
 
 
-def learn(kind: str, folder: Path, dies_in: int = 0) -> subprocess.CompletedProcess[str]:
+def learn(kind: str, folder: Path, dies_in: int = 0, *more: str) -> subprocess.CompletedProcess[str]:
     folder.mkdir()
-    return launch(str(ROOT / "tests/ranks_program.py"), kind, str(folder), str(dies_in))
+    return launch(str(ROOT / "tests/ranks_program.py"), kind, str(folder), str(dies_in), *more)
 
 
 def ends(folder: Path) -> list[dict[str, Any]]:
@@ -115,3 +115,24 @@ def test_each_rank_gets_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
         rank_device(Rank(0, 0, 2), "cuda:0")
     with pytest.raises(ConfigError, match="process 2 on a machine with 2 GPUs; use --nproc_per_node=2"):
         rank_device(Rank(2, 2, 3), None)
+
+
+@pytest.mark.two_gpus
+def test_two_gpus_learn_one_policy_and_the_stock_one(tmp_path: Path) -> None:
+    """Through NCCL inside the recorded update: equal on both ranks after eight iterations, and after one as rsl-rl's own."""
+    for kind in ("stock", "ours"):
+        result = learn(kind, tmp_path / kind, 0, "gpus")
+        assert result.returncode == 0, result.stderr
+    one, other = ends(tmp_path / "ours")
+    assert difference(one["parameters"], other["parameters"]) == 0.0 and one["rate"] == other["rate"]
+    assert not torch.equal(one["obs"], other["obs"]) and one["means"] == other["means"]
+    expected, got = (torch.load(tmp_path / kind / "model_1.pt", weights_only=True, map_location="cpu") for kind in ("stock", "ours"))
+    for name in ("actor_state_dict", "critic_state_dict"):
+        assert difference(expected[name], got[name]) < 1e-3
+
+
+@pytest.mark.two_gpus
+def test_on_two_gpus_a_rank_that_dies_ends_the_run(tmp_path: Path) -> None:
+    result = learn("ours", tmp_path / "dies", 6, "gpus")
+    assert result.returncode != 0
+    assert torch.load(tmp_path / "dies/model_6.pt", weights_only=True)["iter"] == 6
