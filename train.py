@@ -7,7 +7,6 @@ import os
 import re
 import shlex
 import signal
-import sys
 import threading
 import time
 from pathlib import Path
@@ -18,6 +17,7 @@ from legged_mw import ROOT
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.describe import describe
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, find_checkpoint, find_run, new_run
@@ -47,8 +47,7 @@ def main() -> None:
     quiet(rank)
     if args.list:
         for name in task_names():
-            about = sys.modules[type(load_task(name).cfg).__module__].__doc__ or ""
-            print(f"{name:<16} {about.partition(chr(10))[0]}")
+            print(f"{name:<16} {load_task(name).about}")
         return
     task = load_task(args.task)
     experiment = ROOT / "logs" / (args.experiment_name or task.train.runner.experiment_name or task.name)
@@ -113,6 +112,8 @@ def learn_together(runner: Runner, iterations: int, rank: Rank) -> None:
     """Learn; when another rank is lost on the way, say so in a line."""
     try:
         runner.learn(iterations)
+        if isinstance(runner.alg, GraphedPPO):
+            runner.alg.release()
         leave_together(rank)
     except RuntimeError as error:
         if rank.count == 1 or not re.search(r"peer|connection|nccl|gloo|distbackend", f"{type(error).__name__} {error}", re.IGNORECASE):

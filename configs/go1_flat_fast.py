@@ -7,7 +7,7 @@ from legged_mw.utils.task import Task
 
 class Go1FlatFastCfgPPO(Go1FlatCfgPPO):
     class runner(Go1FlatCfgPPO.runner):
-        max_iterations = 420  # 55 M steps
+        max_iterations = 400  # 52 M steps
         save_interval = 30
 
     class anneal(Go1FlatCfgPPO.anneal):

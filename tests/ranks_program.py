@@ -55,7 +55,11 @@ runner.alg.act, runner.alg.update = mortal_act, update_after_a_move  # type: ign
 if kind == "ours" and dies_in < 0 and not rank.leads:
     runner.stop = "asked"  # one rank alone is asked to stop
 runner.learn(3 if not on_gpus else 8)  # on GPUs long enough to be recorded
-end = {"parameters": {k: v.cpu() for k, v in parameters(runner.alg).items()}, "obs": env.get_observations()["state"].cpu(), "means": runner._last_means}
+end = {
+    "parameters": {k: v.cpu() for k, v in parameters(runner.alg).items()},
+    "obs": env.get_observations()["state"].cpu(),
+    "means": runner._last_means,
+}
 end |= {"iteration": runner.current_learning_iteration, "steps": runner.total_steps, "stop": runner.stop, "rate": runner.alg.learning_rate}
 torch.save(end, folder / f"rank{rank.index}.pt")
 leave_together(rank)

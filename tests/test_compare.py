@@ -46,13 +46,13 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> str:
 def test_our_figure_beside_a_broken_and_a_missing_peer(broken: str, bare: str) -> None:
     result = compare("--python-mjlab", broken, "--python-playground", bare)
     assert result.returncode == 0, result.stderr
-    row = re.search(r"^ +8  legged_mw +([\d,]+) +[\d.]+% +1\.00 +([\d.]+) +192 +48$", result.stdout, re.MULTILINE)
+    row = re.search(r"^ +8  legged_mw +([\d,]+) +[\d.]+% +1\.00 +([\d.]+) +128 +32$", result.stdout, re.MULTILINE)
     assert row, result.stdout
     speed, seconds = float(row[1].replace(",", "")), float(row[2])
-    assert speed == pytest.approx(8 * 24 / seconds, rel=0.01)
+    assert speed == pytest.approx(8 * 16 / seconds, rel=0.01)
     assert "       8  mjlab         failed: RuntimeError: no driver\n" in result.stdout
     assert '       8  playground    not installed: pip install playground "jax[cuda12]' in result.stdout
-    for condition in ("24 steps a world", "5 epochs x 4 minibatches", "48 512 256 128", "123 512 256 128", "5 x 4 ms", "mujoco-warp 4."):
+    for condition in ("16 steps a world", "5 epochs x 4 minibatches", "48 512 256 128", "123 512 256 128", "5 x 4 ms", "mujoco-warp 4."):
         assert condition in result.stdout
     assert "hello" not in result.stdout
 

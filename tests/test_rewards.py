@@ -11,6 +11,7 @@ from torch import Tensor
 from worlds import QUIET, changed, make_env, only_scales, snapshot
 
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 
 DT = 0.02  # [s] a control step
 SCALES = {
@@ -31,6 +32,7 @@ SCALES = {
     "feet_slip": -0.1,
     "feet_air_time": 0.1,
 }
+GO1_FLAT = SCALES | {"tracking_lin_vel": 2.0, "tracking_ang_vel": 1.0}  # our two departures
 # What the terms are in the two worlds of `paint`: 0 walks, rolled by asin 0.6; 1 is told to stand and lies on its back.
 EXPECTED = {
     # v_imu = (1.13935, 3.371245), command (1, 3): exp(-(0.13935^2 + 0.371245^2) / 0.25); (0.27213, 0.106985), command 0
@@ -115,7 +117,8 @@ def env() -> Iterator[LeggedRobot]:
 def test_every_term_has_a_figure_here_and_a_scale() -> None:
     methods = {name.removeprefix("_reward_") for name in vars(LeggedRobot) if name.startswith("_reward_")}
     assert methods == EXPECTED.keys() == SCALES.keys()
-    assert make_env(1)._active_scales() == SCALES
+    assert LeggedRobotCfg().to_dict()["rewards"]["scales"] == SCALES
+    assert make_env(1)._active_scales() == GO1_FLAT
 
 
 @pytest.mark.parametrize("name", EXPECTED)
@@ -311,12 +314,12 @@ def test_statistics_are_the_sums_of_what_step_returned() -> None:
     env = make_env(16, overrides)
     means, totals = env.read_statistics(), torch.zeros(16)
     assert means["episodes"] == 0 and math.isnan(means["reward"]) and math.isnan(means["rew_pose"])
-    terms, ages, rows, fell = torch.zeros(16, len(SCALES)), torch.zeros(16), [], 0
+    terms, ages, rows, fell = torch.zeros(16, len(GO1_FLAT)), torch.zeros(16), [], 0
     finish = env._end_step
 
     def add_terms() -> None:
         """The terms of this step by name, straight from the methods, at the moment after the reward."""
-        terms.add_(torch.stack([scale * getattr(env, f"_reward_{name}")() * DT for name, scale in SCALES.items()], dim=1))
+        terms.add_(torch.stack([scale * getattr(env, f"_reward_{name}")() * DT for name, scale in GO1_FLAT.items()], dim=1))
         finish()
 
     env._end_step = add_terms  # pyright: ignore[reportAttributeAccessIssue]
@@ -334,6 +337,6 @@ def test_statistics_are_the_sums_of_what_step_returned() -> None:
     for k, name in enumerate(SCALES):
         expected = sum(row[2][k] for row in rows) / count / 0.3  # the episode length in seconds
         assert stats[f"rew_{name}"] == pytest.approx(expected, rel=1e-3, abs=1e-6), name
-    assert stats.keys() == {"reward", "episode_length", "episodes", "fell", "broken", *(f"rew_{name}" for name in SCALES)}
+    assert stats.keys() == {"reward", "episode_length", "episodes", "fell", "broken", "overflowed", *(f"rew_{name}" for name in SCALES)}
     again = env.read_statistics()
     assert again["episodes"] == again["fell"] == 0 and math.isnan(again["episode_length"])  # reading starts anew

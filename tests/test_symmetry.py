@@ -434,7 +434,7 @@ def small_task(**symmetry: Any) -> LoadedTask:
         task.set(*item.split("=", 1))
     task.set("env.num_envs", 4)
     task.set("algorithm.class_name", "PPO")
-    for name, value in symmetry.items():
+    for name, value in {"use_data_augmentation": False, **symmetry}.items():
         task.set(f"symmetry.{name}", value)
     return task
 

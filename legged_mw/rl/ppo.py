@@ -124,6 +124,11 @@ class GraphedPPO(PPO):
             StepGraph(fn, str(device)) for fn in (self._act, self._compute_returns, self._update)
         )
 
+    def release(self) -> None:
+        """Drop what is recorded: NCCL does not close a connection that a CUDA graph still names. The next calls record anew."""
+        if self.graphed:
+            self._begin()
+
     @contextmanager
     def _beside(self) -> Iterator[None]:
         """What is launched inside runs beside what follows, until ``_meet``."""

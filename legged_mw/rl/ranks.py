@@ -52,8 +52,10 @@ def quiet(rank: Rank) -> None:
 
 
 def leave_together(rank: Rank) -> None:
-    """End the connection once every rank is done."""
+    """End the connection once every rank is done. Nothing recorded may name it any more."""
     if rank.count > 1:
+        if torch.cuda.is_initialized():
+            torch.cuda.synchronize()
         torch.distributed.barrier()
         torch.distributed.destroy_process_group()
 

@@ -33,8 +33,9 @@ class LoadedTask:
     The sections of both share one name space: ``set`` and ``update`` take a path or a mapping over all of them.
     """
 
-    def __init__(self, name: str, path: Path, task: Task) -> None:
+    def __init__(self, name: str, path: Path, task: Task, about: str = "") -> None:
         self.name, self.path, self.env_class = name, path, task.env
+        self.about = about  # the config file's first line
         self.cfg, self.train = task.cfg(), task.train()
         beside = path.resolve().parent / Path(self.cfg.asset.file).expanduser()
         if self.cfg.asset.file and beside.is_file():
@@ -100,10 +101,11 @@ def load_task(name: str) -> LoadedTask:
         path = ROOT / "configs" / f"{name}.py"
     if not path.is_file():
         raise ConfigError(f"no config file at {path.absolute()}")
-    task = getattr(_import(path), "TASK", None)
+    module = _import(path)
+    task = getattr(module, "TASK", None)
     if not isinstance(task, Task):
         raise ConfigError(f"{path} must end with TASK = Task(Env, Cfg, CfgPPO); its TASK is {task!r}")
-    return LoadedTask(path.stem, path, task)
+    return LoadedTask(path.stem, path, task, about=(module.__doc__ or "").partition("\n")[0])
 
 
 def _import(path: Path) -> ModuleType:
