@@ -10,7 +10,7 @@ import torch
 from learner import SIZES, Recordable, collect, difference, make, parameters, share_experience, turned
 from rsl_rl.algorithms import PPO
 
-from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.ppo import GraphedPPO, Linear
 
 SYMMETRY = {"data_augmentation_func": turned, "use_data_augmentation": True, "env": None}
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -133,3 +133,33 @@ def test_what_cannot_be_recorded_is_left_to_rsl_rl(settings: dict, reason: str, 
     assert not alg.graphed and reason in capsys.readouterr().out
     collect(alg)
     assert set(update(alg)) == {"value", "surrogate", "entropy"}
+
+
+@pytest.mark.parametrize("rows", [384, 7, 1])
+def test_linear_is_torchs_own(rows: int) -> None:
+    """Value and all three gradients, also for inputs that are padded with columns of zeros."""
+    torch.manual_seed(0)
+    x, weight, bias = torch.randn(rows, 5, requires_grad=True), torch.randn(3, 5, requires_grad=True), torch.randn(3, requires_grad=True)
+    padded = torch.nn.functional.pad(x.detach(), (0, 3))
+    seed = torch.randn(rows, 3)
+    expected = torch.nn.functional.linear(x, weight, bias)
+    gradients = torch.autograd.grad(expected, (x, weight, bias), seed)
+    torch.testing.assert_close(Linear.apply(x, weight, bias), expected)
+    for got, wanted in zip(torch.autograd.grad(Linear.apply(x, weight, bias), (x, weight, bias), seed), gradients, strict=True):  # type: ignore[arg-type]
+        torch.testing.assert_close(got, wanted)
+    torch.testing.assert_close(Linear.apply(padded, weight, bias), expected)
+    for got, wanted in zip(torch.autograd.grad(Linear.apply(padded, weight, bias), (weight, bias), seed), gradients[1:], strict=True):  # type: ignore[arg-type]
+        torch.testing.assert_close(got, wanted)
+
+
+def test_entropy_and_kl_target_may_change_between_updates() -> None:
+    """They are not frozen into the record: the next update uses the new values, as rsl-rl's own does."""
+    stock, ours = make(PPO), make(Recordable)
+    for alg in (stock, ours):
+        alg.entropy_coef, alg.desired_kl = 0.5, 1.0
+    collect(stock)
+    share_experience(stock, ours)
+    update(stock)
+    update(ours)
+    assert difference(parameters(stock), parameters(ours)) < 1e-5
+    assert ours.learning_rate == pytest.approx(1e-2)  # it grows to the end, since no step is far enough

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -96,6 +97,24 @@ def test_a_rank_that_dies_ends_the_run(tmp_path: Path) -> None:
     assert result.returncode != 0
     assert sorted(path.name for path in folder.glob("*.pt")) == ["model_1.pt", "model_2.pt"]
     assert torch.load(folder / "model_2.pt", weights_only=True)["iter"] == 2
+
+
+def test_a_rank_that_waits_for_a_lost_one_leaves_after_sigterm() -> None:
+    """Its own handler only notes the signal, and it would sleep for a minute; alone, nothing of that happens."""
+    program = """
+import signal, sys, time
+from legged_mw.rl.ranks import Rank, leave_when_stuck
+signal.signal(signal.SIGTERM, lambda *_: None)
+leave_when_stuck(Rank(1, 1, int(sys.argv[1])), patience=0.3)
+print("ready", flush=True)
+time.sleep(60.0 if sys.argv[1] == "2" else 3.0)
+"""
+    for count, code, said in (("2", 143, "rank 1: still waiting for another rank 0.3 s after SIGTERM; leaving."), ("1", 0, "")):
+        child = subprocess.Popen([sys.executable, "-c", program, count], env=ENVIRONMENT, stdout=-1, stderr=-1, text=True)
+        assert child.stdout is not None and child.stdout.readline() == "ready\n"
+        child.send_signal(signal.SIGTERM)
+        _, errors = child.communicate(timeout=30)
+        assert child.returncode == code and said in errors
 
 
 def test_rank_is_read_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:

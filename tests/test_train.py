@@ -496,3 +496,21 @@ def test_drawn_seed_is_saved(seeded: dict[str, Path]) -> None:
     seeds = [load_yaml(seeded[name] / "config.yaml")["seed"] for name in ("-1", "-1 again")]
     assert all(isinstance(seed, int) and seed >= 0 for seed in seeds) and seeds[0] != seeds[1]
     assert load_yaml(seeded["11"] / "config.yaml")["seed"] == 11
+
+
+# ---- annealing
+
+
+def test_numbers_go_to_their_end_in_a_straight_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Over the iterations of `learn`; one whose end is 0 stays."""
+    task, seen = small_task(), []
+    task.set("algorithm.desired_kl", 0.01)
+    task.set("algorithm.entropy_coef", 0.005)
+    task.set("anneal.desired_kl", 0.002)
+    task.set("anneal.entropy_coef", 0.0)
+    runner = make_runner(LeggedRobot(task.cfg, "cpu"), task.train, None, "cpu")
+    update = runner.alg.update
+    monkeypatch.setattr(runner.alg, "update", lambda: (seen.append((runner.alg.desired_kl, runner.alg.entropy_coef)), update())[1])
+    runner.learn(5)
+    assert [kl for kl, _ in seen] == pytest.approx([0.01, 0.008, 0.006, 0.004, 0.002])
+    assert [entropy for _, entropy in seen] == [0.005] * 5
