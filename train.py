@@ -74,6 +74,7 @@ def main() -> None:
         print(describe(env, task))
         return
     train(task, env, experiment, run, checkpoint, device, began + args.max_time if args.max_time else None)
+    leave_together(rank)
 
 
 def train(
@@ -114,7 +115,6 @@ def learn_together(runner: Runner, iterations: int, rank: Rank) -> None:
         runner.learn(iterations)
         if isinstance(runner.alg, GraphedPPO):
             runner.alg.release()
-        leave_together(rank)
     except RuntimeError as error:
         if rank.count == 1 or not re.search(r"peer|connection|nccl|gloo|distbackend", f"{type(error).__name__} {error}", re.IGNORECASE):
             raise

@@ -51,13 +51,20 @@ def quiet(rank: Rank) -> None:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (open until the process ends)
 
 
-def leave_together(rank: Rank) -> None:
-    """End the connection once every rank is done. Nothing recorded may name it any more."""
-    if rank.count > 1:
-        if torch.cuda.is_initialized():
-            torch.cuda.synchronize()
-        torch.distributed.barrier()
-        torch.distributed.destroy_process_group()
+def leave_together(rank: Rank, patience: float = _PATIENCE) -> None:
+    """End the connection once every rank is done. Nothing recorded may name it any more.
+
+    All is written by now: a connection that does not close in time is left to the end of the process, which is now.
+    """
+    if rank.count == 1:
+        return
+    sys.stdout.flush()
+    timer = threading.Timer(patience, lambda: os._exit(0))
+    timer.daemon = True
+    timer.start()
+    torch.distributed.barrier()
+    torch.distributed.destroy_process_group()
+    timer.cancel()
 
 
 def leave_when_stuck(rank: Rank, patience: float = _PATIENCE) -> None:
