@@ -40,7 +40,7 @@ ENVIRONMENT: dict[str, Rule] = {
 LEARNER: dict[str, Rule] = {
     **dict.fromkeys(("runner.num_steps_per_env", "runner.max_iterations", "runner.save_interval"), POSITIVE),
     **dict.fromkeys(("algorithm.learning_rate", "algorithm.num_learning_epochs", "algorithm.num_mini_batches"), POSITIVE),
-    "symmetry.mirror_loss_coeff": NOT_NEGATIVE,
+    **dict.fromkeys(("symmetry.mirror_loss_coeff", "anneal.entropy_coef", "anneal.desired_kl"), NOT_NEGATIVE),
     "runner.run_name": ("part of a folder's name, without / or \\", lambda v: "/" not in v and "\\" not in v),
 }
 
@@ -50,6 +50,12 @@ def check_values(cfg: LeggedRobotCfg, train: LeggedRobotCfgPPO | None = None) ->
     _check(cfg, ENVIRONMENT)
     if train is not None:
         _check(train, LEARNER)
+        samples = cfg.env.num_envs * train.runner.num_steps_per_env
+        if samples < train.algorithm.num_mini_batches:
+            raise ConfigError(
+                f"an iteration has {samples} samples ({cfg.env.num_envs} worlds x {train.runner.num_steps_per_env} steps), fewer than "
+                f"algorithm.num_mini_batches = {train.algorithm.num_mini_batches}; raise one of the former or lower the latter"
+            )
         if train.symmetry.use_mirror_loss and not train.symmetry.mirror_loss_coeff:
             raise ConfigError(
                 "symmetry.use_mirror_loss is on, but symmetry.mirror_loss_coeff is 0: set the loss's weight, or switch it off"
