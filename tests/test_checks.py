@@ -60,5 +60,6 @@ def test_fewer_samples_than_minibatches_are_named() -> None:
     task = load_task("go1_flat")
     task.set("env.num_envs", 1)
     task.set("runner.num_steps_per_env", 3)
-    with pytest.raises(ConfigError, match=r"an iteration has 3 samples \(1 worlds x 3 steps\), fewer than algorithm.num_mini_batches = 4; raise"):
+    text = r"an iteration has 3 samples \(1 worlds x 3 steps\), fewer than algorithm.num_mini_batches = 4; raise"
+    with pytest.raises(ConfigError, match=text):
         check_values(task.cfg, task.train)
