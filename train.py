@@ -54,7 +54,8 @@ def main() -> None:
     run = find_run(experiment, args.load_run or "-1") if args.resume else None
     checkpoint = find_checkpoint(run, args.checkpoint) if run else None
     if run:
-        task.update_from_run(load_yaml(run / CONFIG_FILE), where=shown(run / CONFIG_FILE))
+        for section in task.update_from_run(load_yaml(run / CONFIG_FILE), where=shown(run / CONFIG_FILE)):
+            print(f"{shown(run / CONFIG_FILE)} is older than the section {section}: left as it was then")
     elif args.load_run is not None or args.checkpoint != -1:
         raise ConfigError("--load_run and --checkpoint say what to go on with: add --resume")
     apply_overrides(task, args)
@@ -104,7 +105,8 @@ def train(
     home = ROOT / "logs" / (load_task(name).train.runner.experiment_name or task.name)
     flags = shlex.join(["--task", name, "--load_run", folder.name if folder.parent == home else shown(folder)])
     if runner.stop and runner.current_learning_iteration < task.train.runner.max_iterations:
-        print(f"stopped: {runner.stop}; go on with\n  python train.py --resume {flags}")
+        program = "python train.py" if rank.count == 1 else f"torchrun --nproc_per_node={rank.count} train.py"
+        print(f"stopped: {runner.stop}; go on with\n  {program} --resume {flags}")
     else:
         print(f"done: {shown(folder)}; watch it with\n  python play.py {flags}")
 
@@ -116,10 +118,13 @@ def learn_together(runner: Runner, iterations: int, rank: Rank) -> None:
         if isinstance(runner.alg, GraphedPPO):
             runner.alg.release()
     except RuntimeError as error:
-        if rank.count == 1 or not re.search(r"peer|connection|nccl|gloo|distbackend", f"{type(error).__name__} {error}", re.IGNORECASE):
+        lost = r"(closed|reset|aborted) by|connection (was )?(closed|reset|refused)|remote process|remoteerror"
+        if rank.count == 1 or not re.search(lost, str(error), re.IGNORECASE):
             raise
         reason = str(error).strip().splitlines()[0]
-        raise UserError(f"rank {rank.index} lost another rank ({reason}); the last checkpoint is whole: --resume goes on from it") from None
+        raise UserError(
+            f"rank {rank.index} lost another rank ({reason}); --resume goes on from the last checkpoint, if there is one"
+        ) from error
 
 
 def stop_on_signals(runner: Runner, deadline: float | None) -> None:

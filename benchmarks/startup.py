@@ -49,6 +49,10 @@ def child(task_name: str, num_envs: int | None, device: str | None, started: flo
     done("import legged_mw, load the task")
     device = pick_device(device)
     seed_everything(1)
+    if device == "cpu":
+        torch.set_num_threads(1)  # as train.py does
+    else:
+        torch.cuda.set_device(device)
     torch.zeros(1, device=device)
     warp.init()
     done("open the device")

@@ -1,4 +1,4 @@
-"""How fast a task trains, and what an iteration's time is spent on: python benchmarks/train.py --num_envs 4096 16384
+"""How fast a task trains, and what an iteration's time is spent on: python benchmarks/train.py --worlds 4096 16384
 
 The whole iteration is timed as training runs it (`Runner.learn`); then its parts are timed alone, in the same process:
 physics (the substeps, recorded), the rest of `env.step`, the policy (acting, storing), the update (returns, minibatches,
@@ -103,6 +103,10 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=5)
     args = parser.parse_args()
     device = pick_device(args.device)
+    if device == "cpu":
+        torch.set_num_threads(1)  # as train.py does
+    else:
+        torch.cuda.set_device(device)
     name = torch.cuda.get_device_name(device) if device != "cpu" else f"CPU, {torch.get_num_threads()} threads"
     header = f"{'worlds':>8}{'steps/s':>12}{'iteration':>11}{'physics':>9}{'step':>8}{'policy':>8}{'update':>8}{'rest':>8}   [ms]"
     print(f"{args.task} on {name}; torch {torch.__version__}\n{header}")

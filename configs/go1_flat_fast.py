@@ -1,4 +1,4 @@
-"""go1_flat in a minute: the same robot and task, ended when it walks (on one H200)."""
+"""go1_flat, ended after 52 M steps: less than a minute on one H200, where it walks after half of that."""
 
 from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
 from legged_mw.envs.legged_robot import LeggedRobot

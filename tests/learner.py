@@ -7,11 +7,13 @@ from typing import Any
 
 import torch
 from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
 from legged_mw.rl.ppo import GraphedPPO
 
 WORLDS, STEPS, ACTIONS = 32, 6, 4
+MODEL: type[MLPModel] = MLPModel
 SIZES = {"state": 7, "privileged_state": 11}
 
 
@@ -44,7 +46,7 @@ def make(kind: type[PPO], device: str = "cpu", distribution: dict[str, Any] | No
     distribution = {"class_name": "GaussianDistribution", "init_std": 0.7} | (distribution or {})
     if distribution["class_name"] == "BetaDistribution":
         del distribution["init_std"]
-    network = {"class_name": "MLPModel", "hidden_dims": [32, 16], "activation": "elu", "obs_normalization": True}
+    network = {"class_name": MODEL, "hidden_dims": [32, 16], "activation": "elu", "obs_normalization": True}
     cfg = {
         "obs_groups": {"actor": ["state"], "critic": ["state", "privileged_state"]},
         "actor": {**network, "distribution_cfg": distribution},

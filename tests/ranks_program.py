@@ -61,5 +61,7 @@ end = {
     "means": runner._last_means,
 }
 end |= {"iteration": runner.current_learning_iteration, "steps": runner.total_steps, "stop": runner.stop, "rate": runner.alg.learning_rate}
+if isinstance(runner.alg, Recordable):
+    runner.alg.release()
 torch.save(end, folder / f"rank{rank.index}.pt")
 leave_together(rank)

@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from legged_mw.utils.config import Config, ConfigError, load_yaml, save_yaml
+from legged_mw.utils.task import load_task
 
 
 class Base(Config):
@@ -750,3 +751,14 @@ def test_unreadable_yaml(tmp_path: Path) -> None:
     (tmp_path / "latin.yaml").write_bytes(b"a: \xff\xfe\n")
     with says("latin.yaml: not valid YAML"):
         load_yaml(tmp_path / "latin.yaml")
+
+
+def test_a_run_older_than_a_section_keeps_what_was_so_then() -> None:
+    """Not what the task says today: a resumed run must not change its learner on the way."""
+    task = load_task("go1_flat")
+    saved = task.to_dict()
+    del saved["symmetry"], saved["anneal"]
+    assert task.train.symmetry.use_data_augmentation and task.train.anneal.desired_kl
+    assert task.update_from_run(saved, where="config.yaml") == ["anneal", "symmetry"]
+    assert not task.train.symmetry.use_data_augmentation and task.train.anneal.desired_kl == 0.0
+    assert load_task("go1_flat").update_from_run(load_task("go1_flat").to_dict(), where="config.yaml") == []

@@ -5,10 +5,12 @@ from __future__ import annotations
 import copy
 from typing import Any
 
+import learner
 import pytest
 import torch
 from learner import SIZES, Recordable, collect, difference, make, parameters, share_experience, turned
 from rsl_rl.algorithms import PPO
+from rsl_rl.models import MLPModel
 
 from legged_mw.rl.ppo import GraphedPPO, Linear
 
@@ -163,3 +165,16 @@ def test_entropy_and_kl_target_may_change_between_updates() -> None:
     update(ours)
     assert difference(parameters(stock), parameters(ours)) < 1e-5
     assert ours.learning_rate == pytest.approx(1e-2)  # it grows to the end, since no step is far enough
+
+
+class Encoder(MLPModel):
+    """Learns something in a place that the recorded update would not reach."""
+
+    def get_latent(self, *args: Any, **kwargs: Any) -> torch.Tensor:
+        return super().get_latent(*args, **kwargs)
+
+
+def test_a_network_of_ones_own_is_left_to_rsl_rl(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(learner, "MODEL", Encoder)
+    assert not make(Recordable).graphed
+    assert "not the recorded one: a network is a Encoder" in capsys.readouterr().out

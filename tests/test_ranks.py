@@ -124,6 +124,8 @@ def test_rank_is_read_from_the_environment(monkeypatch: pytest.MonkeyPatch) -> N
     for name, value in (("RANK", "9"), ("LOCAL_RANK", "1"), ("WORLD_SIZE", "16")):
         monkeypatch.setenv(name, value)
     assert this_rank() == Rank(9, 1, 16) and not this_rank().leads
+    monkeypatch.delenv("WORLD_SIZE")
+    assert this_rank() == Rank(0, 0, 1)  # a RANK left over from elsewhere is no run of several
 
 
 def test_each_rank_gets_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,6 +144,7 @@ def test_two_gpus_learn_one_policy_and_the_stock_one(tmp_path: Path) -> None:
     for kind in ("stock", "ours"):
         result = learn(kind, tmp_path / kind, 0, "gpus")
         assert result.returncode == 0, result.stderr
+        assert "does not close" not in result.stderr
     one, other = ends(tmp_path / "ours")
     assert difference(one["parameters"], other["parameters"]) == 0.0 and one["rate"] == other["rate"]
     assert not torch.equal(one["obs"], other["obs"]) and one["means"] == other["means"]

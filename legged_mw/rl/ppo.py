@@ -96,9 +96,10 @@ class GraphedPPO(PPO):
         return self._why_not_plain(models)
 
     def _why_not_plain(self, models: tuple[MLPModel, MLPModel]) -> str | None:
-        if any(type(model).forward is not MLPModel.forward for model in models):
-            return "a network has a forward pass of its own"
-        if not isinstance(self.actor.distribution, GaussianDistribution):
+        for model in models:
+            if type(model) is not MLPModel:
+                return f"a network is a {type(model).__name__}"
+        if getattr(type(self.actor.distribution), "sample", None) is not GaussianDistribution.sample:
             return f"actions are drawn from a {type(self.actor.distribution).__name__}"
         if not {*map(id, self.actor.parameters())}.isdisjoint(map(id, self.critic.parameters())):
             return "the networks share parameters"

@@ -7,6 +7,7 @@ import signal
 import socket
 import sys
 import threading
+from contextlib import suppress
 from typing import NamedTuple
 
 import torch
@@ -30,7 +31,8 @@ class Rank(NamedTuple):
 
 def this_rank() -> Rank:
     """From the environment that torchrun sets; alone without it."""
-    return Rank(*(int(os.environ.get(name, default)) for name, default in (("RANK", "0"), ("LOCAL_RANK", "0"), ("WORLD_SIZE", "1"))))
+    index, local, count = (int(os.environ.get(*entry)) for entry in (("RANK", "0"), ("LOCAL_RANK", "0"), ("WORLD_SIZE", "1")))
+    return Rank(index, local, count) if count > 1 else Rank(0, 0, 1)
 
 
 def rank_device(rank: Rank, asked: str | None) -> str | None:
@@ -41,7 +43,8 @@ def rank_device(rank: Rank, asked: str | None) -> str | None:
         raise ConfigError(f"--device {asked}: under torchrun every process takes the GPU of its own number; leave --device out")
     if rank.local >= torch.cuda.device_count():
         seen = torch.cuda.device_count()
-        raise ConfigError(f"torchrun started process {rank.local} on a machine with {seen} GPUs; use --nproc_per_node={max(seen, 1)}")
+        advice = f"use --nproc_per_node={seen}" if seen else "say --device cpu to train on the CPU"
+        raise ConfigError(f"torchrun started process {rank.local} on a machine with {seen} GPUs; {advice}")
     return f"cuda:{rank.local}"
 
 
@@ -59,11 +62,17 @@ def leave_together(rank: Rank, patience: float = _PATIENCE) -> None:
     if rank.count == 1:
         return
     sys.stdout.flush()
-    timer = threading.Timer(patience, lambda: os._exit(0))
+
+    def leave() -> None:
+        os.write(2, f"rank {rank.index}: the connection to the other ranks does not close; leaving, all is written\n".encode())
+        os._exit(0)
+
+    timer = threading.Timer(patience, leave)
     timer.daemon = True
     timer.start()
-    torch.distributed.barrier()
-    torch.distributed.destroy_process_group()
+    with suppress(RuntimeError):  # another may have left already
+        torch.distributed.barrier()
+        torch.distributed.destroy_process_group()
     timer.cancel()
 
 

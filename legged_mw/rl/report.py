@@ -15,13 +15,13 @@ class Clock:
     """Marks points in the device's queue of work; the seconds between two marks are known once both are reached."""
 
     def __init__(self, device: str) -> None:
-        self._on_device = device.startswith("cuda")
+        self._device = device if device.startswith("cuda") else None
 
     def mark(self) -> Mark:
-        if not self._on_device:
+        if self._device is None:
             return time.perf_counter()
         event = torch.cuda.Event(enable_timing=True)
-        event.record()
+        event.record(torch.cuda.current_stream(self._device))
         return event
 
     @staticmethod
@@ -41,7 +41,7 @@ class Message:
         if values.is_cuda:
             self._host = torch.empty(values.shape, dtype=values.dtype, pin_memory=True).copy_(values, non_blocking=True)
             self._event = torch.cuda.Event()
-            self._event.record()
+            self._event.record(torch.cuda.current_stream(values.device))
 
     def read(self) -> list[float]:
         """The numbers; waits until the device has computed them."""

@@ -75,7 +75,8 @@ class Runner(OnPolicyRunner):
         while self.current_learning_iteration < self._last and not self._must_stop():
             obs = self._rollout(obs)
             if self._must_stop():
-                break  # an unfinished rollout is dropped
+                self.alg.storage.clear()  # an unfinished rollout is dropped
+                break
             with torch.inference_mode():
                 self.alg.compute_returns(obs)
             collected = clock.mark()
@@ -96,7 +97,7 @@ class Runner(OnPolicyRunner):
         """Move what has an end value towards it, in a straight line from the first iteration to the last."""
         done = self.current_learning_iteration / max(self._last - 1, 1)
         for name, (begin, end) in self.cfg["anneal"].items():
-            if begin and end:
+            if end and begin is not None:
                 setattr(self.alg, name, begin + (end - begin) * done)
 
     def _must_stop(self) -> bool:
@@ -113,7 +114,6 @@ class Runner(OnPolicyRunner):
                 obs, rewards, dones, extras = self.env.step(self.alg.act(obs))
                 self.alg.process_env_step(obs, rewards, dones, extras)
                 if self.stop is not None and not self.is_distributed:
-                    self.alg.storage.clear()
                     break
         return obs
 
@@ -135,7 +135,7 @@ class Runner(OnPolicyRunner):
         return Report(self.current_learning_iteration, self.total_steps, steps, list(losses), message, marks)
 
     def _action_std(self) -> Tensor:
-        """Mean standard deviation of the actions of the last rollout, ()."""
+        """Mean standard deviation of the actions of the last rollout, or of another distribution than a Gaussian as it is now, ()."""
         policy, params = self.alg.get_policy(), self.alg.storage.distribution_params
         if isinstance(policy.distribution, GaussianDistribution) and params is not None:
             return params[1].mean()
@@ -162,7 +162,8 @@ class Runner(OnPolicyRunner):
         rows["Time elapsed, left"] = ", ".join(str(timedelta(seconds=round(t))) for t in (time.time() - self._begun, left))
         print(console_block(f"Learning iteration {report.iteration}/{self._last}", rows), flush=True)
         if numbers["overflowed"] and not self._warned_overflow:
-            print(f"WARNING: {self.env.sim.overflow_report()} (config section sim)", flush=True)
+            text = self.env.sim.overflow_report() or f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks"
+            print(f"WARNING: {text} (config section sim)", flush=True)
             self._warned_overflow = True
 
     @staticmethod

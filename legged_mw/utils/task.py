@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from legged_mw import ROOT
-from legged_mw.utils.config import ConfigError
+from legged_mw.utils.config import Config, ConfigError
 
 if TYPE_CHECKING:
     from legged_mw.envs.legged_robot import LeggedRobot
@@ -60,12 +60,19 @@ class LoadedTask:
             self.cfg.update(before, where=where)
             raise
 
-    def update_from_run(self, saved: Mapping[str, Any], where: str) -> None:
-        """Take over the ``config.yaml`` of a run; it must be one of this task."""
+    def update_from_run(self, saved: Mapping[str, Any], where: str) -> list[str]:
+        """Take over the ``config.yaml`` of a run; it must be one of this task.
+
+        A learner's section that the file lacks, since it is older than the section, is what it was then: the base class's,
+        not the task's of today. Returns the names of such sections.
+        """
         theirs = str(saved.get("task", self.name))
         if Path(theirs).stem != self.name:
             raise ConfigError(f"{where} is of task '{theirs}', not '{self.name}'; say --task {theirs}")
-        self.update(saved, where)
+        base = next(kind for kind in reversed(type(self.train).__mro__) if issubclass(kind, Config) and kind is not Config)()
+        older = {name: value for name, value in base.to_dict().items() if name not in saved and isinstance(value, dict)}
+        self.update({**saved, **older}, where)
+        return list(older)
 
     def to_dict(self) -> dict[str, Any]:
         """Both configs as one mapping, with the task's name: what ``config.yaml`` in a run folder holds."""
