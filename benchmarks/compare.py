@@ -128,7 +128,8 @@ def measure_legged_mw(order: Order) -> Measured:
     cfg["num_steps_per_env"] = cfg["runner"]["num_steps_per_env"]
     sizes = {role: sum(env.obs_buf[group].shape[1] for group in groups) for role, groups in cfg["obs_groups"].items()}
     facts = {**physics_facts(env.robot.physics, task.cfg.control.decimation), "rewards": f"{len(env.reward_names)}"}
-    return measure_runner(runner, cfg, sizes, order, facts, [])
+    mirrored = "it learns from the mirror image of every sample too: twice the minibatch shown"
+    return measure_runner(runner, cfg, sizes, order, facts, [mirrored] if task.train.symmetry.use_data_augmentation else [])
 
 
 def measure_mjlab(order: Order) -> Measured:

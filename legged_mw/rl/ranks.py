@@ -15,6 +15,7 @@ import torch
 from legged_mw.utils.config import ConfigError
 
 _PATIENCE = 20.0  # [s] an iteration and a checkpoint take far less; torchrun kills after 30
+_sockets: list[tuple[socket.socket, socket.socket]] = []  # kept: a closed one would silence the signals
 
 
 class Rank(NamedTuple):
@@ -96,8 +97,5 @@ def leave_when_stuck(rank: Rank, patience: float = _PATIENCE) -> None:
         os.write(2, text.encode())
         os._exit(128 + signal.SIGTERM)
 
-    told_forever.append((wake, told))
+    _sockets.append((wake, told))
     threading.Thread(target=watch, daemon=True).start()
-
-
-told_forever: list[tuple[socket.socket, socket.socket]] = []  # kept: a closed socket would silence the signals

@@ -104,10 +104,10 @@ class Simulation:
 
     def overflow_report(self) -> str:
         """What did not fit since construction, a line, or '' if all did. Reads the device: not for inside a step."""
-        seen = self._overflow_seen & ~int(_EXPECTED)
-        worlds = int((seen != 0).sum())
+        worlds = int(self.overflowed_worlds())
         if not worlds:
             return ""
+        seen = self._overflow_seen & ~int(_EXPECTED)
         bits = [bit for bit in OverflowType if bit != OverflowType.ALL and bool((seen & int(bit)).any())]
         raise_ = []
         if OverflowType.NEFC in bits:
