@@ -64,8 +64,8 @@ class GraphedPPO(PPO):
     """PPO whose update and acting are replayed CUDA graphs.
 
     What cannot be recorded (a CPU, a network that is not a plain MLPModel or shares parameters, RND, an optimizer other
-    than Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. The first three updates of a run are launched step by
-    step and the fourth is recorded: nothing is warmed up on a throw-away step.
+    than Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. The first
+    three updates of a run are launched step by step and the fourth is recorded: nothing is warmed up on a throw-away step.
     """
 
     _plain_rate: float  # the learning rate where nothing is recorded
