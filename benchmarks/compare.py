@@ -316,12 +316,13 @@ def ask(python: str, order: Order, env: dict[str, str], timeout: float, verbose:
 
 
 def child_environment(device: str) -> dict[str, str]:
-    """A child sees the one device, whichever framework asks for it."""
+    """A child sees the one device, whichever framework asks for it, and draws nothing: a machine without OpenGL will do."""
+    base = {"MUJOCO_GL": "disable", **os.environ}
     if device == "cpu":
-        return {**os.environ, "CUDA_VISIBLE_DEVICES": "", "JAX_PLATFORMS": "cpu"}
+        return {**base, "CUDA_VISIBLE_DEVICES": "", "JAX_PLATFORMS": "cpu"}
     index = int(device.partition(":")[2])
     visible = [name for name in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if name]
-    return {**os.environ, "CUDA_VISIBLE_DEVICES": visible[index] if visible else str(index), "JAX_PLATFORMS": "cuda"}
+    return {**base, "CUDA_VISIBLE_DEVICES": visible[index] if visible else str(index), "JAX_PLATFORMS": "cuda"}
 
 
 def results(rows: list[Row]) -> str:

@@ -18,7 +18,8 @@ from legged_mw.rl.ranks import Rank, rank_device, this_rank
 from legged_mw.utils.config import ConfigError, load_yaml
 
 LAUNCH = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
-ENVIRONMENT = {**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}", "OMP_NUM_THREADS": "1"}
+_PATHS = [str(ROOT), str(ROOT / "tests"), *filter(None, [os.environ.get("PYTHONPATH")])]
+ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(_PATHS), "OMP_NUM_THREADS": "1"}
 
 
 def launch(*words: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:

@@ -72,7 +72,8 @@ def leave_together(rank: Rank, patience: float = _PATIENCE) -> None:
     timer.daemon = True
     timer.start()
     with suppress(RuntimeError):  # another may have left already
-        torch.distributed.barrier()
+        on_gpus = torch.distributed.get_backend() == "nccl"
+        torch.distributed.barrier(device_ids=[rank.local] if on_gpus else None)
         torch.distributed.destroy_process_group()
     timer.cancel()
 
