@@ -126,7 +126,7 @@ def changes_since(task: LoadedTask, trained: dict[str, Any]) -> dict[str, tuple[
 
 def grade(env: LeggedRobot, policy: MLPModel, source: Source, overrides: dict[str, Any], path: Path) -> None:
     result = exam.run_exam(env, lambda obs: act(policy, obs))
-    about = {"policy": shown(source.checkpoint), "engine": "mujoco_warp", "device": env.device, "overrides": overrides}
+    about = {"policy": shown(source.checkpoint), "engine": env.sim.engine, "device": env.device, "overrides": overrides}
     exam.save({**about, **result}, path)
     print(exam.table(result))
     print(f"written to {shown(path)}")

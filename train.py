@@ -21,10 +21,14 @@ from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, find_checkpoint, find_run, new_run
+from legged_mw.sim.simulation import pick_engine
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, one_line_errors, pick_device, positive, seed_everything, shown
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError
+from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task, task_names
+
+_STEPS_PER_CORE = 5000  # a second, in training with the section `cpu` as it is (docs/performance.md)
 
 
 def parse() -> argparse.Namespace:
@@ -59,23 +63,37 @@ def main() -> None:
     elif args.load_run is not None or args.checkpoint != -1:
         raise ConfigError("--load_run and --checkpoint say what to go on with: add --resume")
     apply_overrides(task, args)
+    device = pick_device(rank_device(rank, args.device))
+    if device == "cpu" and task.train.cpu.enable and not run:
+        task.fit_cpu(usable_cores())
+        apply_overrides(task, args)  # again: what the user says wins
     if not run:
         experiment = ROOT / "logs" / (task.train.runner.experiment_name or task.name)  # --set may have named it
     check_values(task.cfg, task.train)
-    device = pick_device(rank_device(rank, args.device))
     if device != "cpu":
         torch.cuda.set_device(device)
     seed_everything(task.train.seed + rank.index)  # every rank its own worlds, commands and noise
-    where = device if rank.count == 1 else f"each of {rank.count} {'processes' if device == 'cpu' else 'GPUs'}"
-    print(f"{task.name}: {task.cfg.env.num_envs} worlds on {where}; a first run compiles kernels, about a minute", flush=True)
-    if device == "cpu" and task.cfg.env.num_envs > 512:
-        print("a CPU is slow at this many worlds: --num_envs 256 shows the first iterations in seconds", flush=True)
+    announce(task, device, rank)
     env = task.env_class(task.cfg, device, eager=args.eager)
     if args.check:
         print(describe(env, task))
         return
     train(task, env, experiment, run, checkpoint, device, began + args.max_time if args.max_time else None)
     leave_together(rank)
+
+
+def announce(task: LoadedTask, device: str, rank: Rank) -> None:
+    """Say what is trained on what; on a CPU also how long it may take."""
+    worlds, engine = task.cfg.env.num_envs, pick_engine(task.cfg.sim.engine, device)
+    where = device if rank.count == 1 else f"each of {rank.count} {'processes' if device == 'cpu' else 'GPUs'}"
+    compiles = "; a first run compiles kernels, about a minute" if engine == "mujoco_warp" else ""
+    print(f"{task.name}: {worlds} worlds on {where}, engine {engine}{compiles}", flush=True)
+    if device != "cpu":
+        return
+    cores, runner = usable_cores(), task.train.runner
+    steps = runner.max_iterations * worlds * runner.num_steps_per_env
+    minutes = steps / (_STEPS_PER_CORE * cores) / 60
+    print(f"{cores} cores: {runner.max_iterations} iterations, {steps / 1e6:.1f} M steps, about {minutes:.0f} min", flush=True)
 
 
 def train(

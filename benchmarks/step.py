@@ -1,9 +1,10 @@
 """Environment steps a second, and as a ratio to bare physics measured in the same run.
 
     python benchmarks/step.py --num_envs 4096 16384
+    python benchmarks/step.py --device cpu --num_envs 256 1024
 
-Bare physics is mujoco-warp stepping the same model `decimation` times, all sensors on in every substep, recorded as
-one graph, nothing else. The two are timed in turns and the medians compared.
+Bare physics is the same engine stepping the same model `decimation` times, all sensors on in every substep, and nothing
+else: mujoco-warp recorded as one graph, MuJoCo's own engine in one `Batch.step`. The two are timed in turns, the medians compared.
 """
 
 from __future__ import annotations
@@ -15,19 +16,36 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import mujoco_warp as mjw
+import mujoco
 import torch
-import warp as wp
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.sim.graph import StepGraph, record_warp
+from legged_mw.sim.graph import StepGraph
+from legged_mw.sim.simulation import ENGINES, pick_engine
 from legged_mw.utils.cli import pick_device
+from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import load_task
 
 
-def bare_physics(env: LeggedRobot) -> Callable[[], None]:
-    """A recorded call of `decimation` plain steps from the environment's present state, servos at the default pose."""
+def bare_mujoco(env: LeggedRobot) -> Callable[[], None]:
+    """`decimation` plain steps of MuJoCo's own engine from the environment's present state, servos at the default pose."""
+    from mujoco.batch import Batch
+
+    batch = Batch(env.robot.physics, env.num_envs, env.cfg.sim.threads or usable_cores())
+    for name in ("qpos", "qvel"):
+        batch.bind(name)[:] = getattr(env.sim, name)
+    batch.bind("ctrl")[:] = env.default_dof_pos
+    return lambda: batch.step(nstep=env.cfg.control.decimation)
+
+
+def bare_warp(env: LeggedRobot) -> Callable[[], None]:
+    """A recorded call of `decimation` plain mujoco-warp steps, from the same state."""
+    import mujoco_warp as mjw
+    import warp as wp
+
+    from legged_mw.sim.warp_engine import record_warp
+
     device = wp.get_device(env.device)
     with wp.ScopedDevice(device):
         model = mjw.put_model(env.robot.physics)
@@ -61,15 +79,15 @@ def timed(fn: Callable[[], object], calls: int, device: str) -> float:
     return (time.perf_counter() - start) / calls
 
 
-def measure(task_name: str, num_envs: int, device: str, calls: int, rounds: int, eager: bool) -> tuple[float, float, float]:
+def measure(task_name: str, engine: str, num_envs: int, device: str, calls: int, rounds: int, eager: bool) -> tuple[float, float, float]:
     """Median seconds of the recorded step, of `env.step` with its copies, and of bare physics."""
     task = load_task(task_name)
-    task.cfg.env.num_envs = num_envs
+    task.cfg.env.num_envs, task.cfg.sim.engine = num_envs, engine
     env = task.env_class(task.cfg, device, eager=eager)
     actions = 0.3 * torch.randn(num_envs, env.num_actions, device=device)
     for _ in range(20):
         env.step(actions)
-    bare = bare_physics(env)
+    bare = bare_mujoco(env) if env.sim.engine == "mujoco" else bare_warp(env)
     graph_times, step_times, bare_times = [], [], []
     for _ in range(rounds):
         graph_times.append(timed(env._graph, calls, device))
@@ -83,16 +101,18 @@ def main() -> None:
     parser.add_argument("--task", default="go1_flat")
     parser.add_argument("--num_envs", type=int, nargs="+", default=None)
     parser.add_argument("--device", default=None)
+    parser.add_argument("--engine", choices=ENGINES, default="auto")
     parser.add_argument("--calls", type=int, default=40, help="calls a round; short, so that bare physics does not fall over")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--eager", action="store_true", help="time the step without its recording")
     args = parser.parse_args()
     device = pick_device(args.device)
-    name = torch.cuda.get_device_name(device) if device != "cpu" else f"CPU, {torch.get_num_threads()} threads"
-    print(f"{args.task} on {name}; torch {torch.__version__}, warp {wp.__version__}, mujoco-warp {mjw.__version__}")
+    name = torch.cuda.get_device_name(device) if device != "cpu" else f"CPU, {usable_cores()} cores"
+    torch.set_num_threads(1 if device == "cpu" else torch.get_num_threads())  # as train.py does
+    print(f"{args.task} on {name}, engine {pick_engine(args.engine, device)}; torch {torch.__version__}, mujoco {mujoco.__version__}")
     print(f"{'worlds':>8}{'bare [ms]':>12}{'step [ms]':>12}{'env.step [ms]':>15}{'ratio':>8}{'env.step ratio':>16}{'env steps/s':>14}")
-    for num_envs in args.num_envs or ([16, 256] if device == "cpu" else [1024, 4096, 16384]):
-        step, whole, bare = measure(args.task, num_envs, device, args.calls, args.rounds, args.eager)
+    for num_envs in args.num_envs or ([256, 1024] if device == "cpu" else [1024, 4096, 16384]):
+        step, whole, bare = measure(args.task, args.engine, num_envs, device, args.calls, args.rounds, args.eager)
         print(
             f"{num_envs:>8}{bare * 1e3:>12.2f}{step * 1e3:>12.2f}{whole * 1e3:>15.2f}"
             f"{bare / step:>8.3f}{bare / whole:>16.3f}{num_envs / whole:>14.0f}",

@@ -24,6 +24,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.cli import apply_overrides, make_parser, pick_device, seed_everything
+from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import load_task
 
 
@@ -87,7 +88,8 @@ def measure(runner: Runner, iterations: int, rounds: int, eager: bool) -> Times:
             obs = result[0]
             returns = seconds(lambda: alg.compute_returns(obs), device)  # noqa: B023 (called at once)
         parts["step"].append(step)
-        parts["update"].append(returns + seconds(alg.update, device))
+        with runner.update_threads():
+            parts["update"].append(returns + seconds(alg.update, device))
     bare = physics_only(env, eager)
     physics = statistics.median(seconds(bare, device, steps) * steps for _ in range(rounds))
     step, policy, update = (statistics.median(values) for values in parts.values())
@@ -107,11 +109,13 @@ def main() -> None:
         torch.set_num_threads(1)  # as train.py does
     else:
         torch.cuda.set_device(device)
-    name = torch.cuda.get_device_name(device) if device != "cpu" else f"CPU, {torch.get_num_threads()} threads"
+    name = torch.cuda.get_device_name(device) if device != "cpu" else f"CPU, {usable_cores()} cores"
     header = f"{'worlds':>8}{'steps/s':>12}{'iteration':>11}{'physics':>9}{'step':>8}{'policy':>8}{'update':>8}{'rest':>8}   [ms]"
     print(f"{args.task} on {name}; torch {torch.__version__}\n{header}")
     for worlds in args.worlds or [None]:
         task = load_task(args.task)
+        if device == "cpu":
+            task.fit_cpu(usable_cores())  # as train.py does
         apply_overrides(task, args)
         if worlds is not None:
             task.cfg.env.num_envs = worlds

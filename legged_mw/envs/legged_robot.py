@@ -24,9 +24,9 @@ from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.mirror import Mirror, make_mirror
 from legged_mw.sim.model import Ground, ModelError, Physics, RobotModel, build_model, per_joint, unknown
-from legged_mw.sim.simulation import Simulation
+from legged_mw.sim.simulation import make_simulation
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.math import assign, columns, quat_rotate, quat_rotate_inverse
+from legged_mw.utils.math import assign, columns, may_hold, quat_rotate, quat_rotate_inverse
 
 
 class Row(NamedTuple):
@@ -49,12 +49,14 @@ class LeggedRobot(BaseTask):
         self.robot = self._load_robot()
         self.obs_buf = {}
         super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
-        self.sim = Simulation(
+        self.sim = make_simulation(
             self.robot.physics,
             cfg.env.num_envs,
             device,
+            engine=cfg.sim.engine,
             nconmax=cfg.sim.nconmax,
             njmax=cfg.sim.njmax,
+            threads=cfg.sim.threads,
             eager=eager,
         )
         self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
@@ -78,8 +80,9 @@ class LeggedRobot(BaseTask):
         self.check_termination()
         self.compute_reward()
         self._end_step()
-        self._sum_statistics()
-        self.reset_envs(self.reset_buf)
+        if may_hold(self.reset_buf):
+            self._sum_statistics()
+            self.reset_envs(self.reset_buf)
         self.compute_observations()
 
     def _update_state(self) -> None:
@@ -91,8 +94,8 @@ class LeggedRobot(BaseTask):
         self.feet_air_time.add_(self.dt)
         self.foot_height.copy_(self.sim.site_xpos[:, self.foot_sites, 2])
         torch.maximum(self.swing_peak, self.foot_height, out=self.swing_peak)
-        torch.linalg.vector_norm(self.foot_vel[..., :2], dim=-1, out=self.foot_speed)
-        torch.gt(torch.linalg.vector_norm(self.commands, dim=1), self.cfg.rewards.min_command, out=self.moving)
+        torch.hypot(self.foot_vel[..., 0], self.foot_vel[..., 1], out=self.foot_speed)
+        torch.gt(self.commands.square().sum(dim=1), self.cfg.rewards.min_command**2, out=self.moving)
 
     def _refresh_base(self) -> None:
         """Joint offsets, and velocity and gravity at the IMU, from qpos and qvel: v_imu = R^T v + w x r."""
@@ -110,15 +113,17 @@ class LeggedRobot(BaseTask):
         self.last_actions.copy_(self.actions)
         if self.cfg.commands.resampling_time > 0:
             self.command_timer.sub_(1.0)
-            self._resample_commands(self.command_timer[:, 0] <= 0.0)
+            over = self.command_timer[:, 0] <= 0.0
+            if may_hold(over):
+                self._resample_commands(over)
 
     # ---- termination ----------------------------------------------------------------------------------------------
 
     def check_termination(self) -> None:
         """Ends episodes: fallen, out of time, or broken (a state or an action that is not finite)."""
-        speed = torch.linalg.vector_norm(self.sim.qvel, ord=math.inf, dim=1)
-        position = torch.linalg.vector_norm(self.sim.qpos, ord=math.inf, dim=1)
-        action = torch.linalg.vector_norm(self.actions, ord=math.inf, dim=1)  # a servo swallows NaN, the reward does not
+        speed = self.sim.qvel.abs().amax(dim=1)
+        position = self.sim.qpos.abs().amax(dim=1)
+        action = self.actions.abs().amax(dim=1)  # a servo swallows NaN, the reward does not
         finite = (speed <= self.cfg.termination.max_speed) & (position < math.inf) & (action < math.inf)  # NaN compares false
         torch.logical_not(finite, out=self.broken)
         max_tilt = math.radians(self.cfg.termination.max_tilt)
@@ -194,7 +199,8 @@ class LeggedRobot(BaseTask):
         self.sim.xfrc_applied[:, self.root_body, :3] = self.kick_force
         self.kick_clock.add_(1.0)
         over = elapsed + 1.0 >= steps
-        self._redraw_kicks(over, keep_force=True)
+        if may_hold(over):
+            self._redraw_kicks(over, keep_force=True)
 
     def _redraw_kicks(self, mask: Tensor, keep_force: bool = False) -> None:
         low, high = self.kick_ranges
@@ -339,11 +345,11 @@ class LeggedRobot(BaseTask):
 
     def _reward_stand_still(self) -> Tensor:
         """Joints away from the default pose while the command is to stand. [L]"""
-        return torch.linalg.vector_norm(self.dof_offset, ord=1, dim=1).masked_fill_(self.moving, 0.0)
+        return self.dof_offset.abs().sum(dim=1).masked_fill_(self.moving, 0.0)
 
     def _reward_torques(self) -> Tensor:
         """2-norm plus 1-norm of the joint torques [N m]. [P]"""
-        return torch.linalg.vector_norm(self.torques, dim=1) + torch.linalg.vector_norm(self.torques, ord=1, dim=1)
+        return self.torques.square().sum(dim=1).sqrt() + self.torques.abs().sum(dim=1)
 
     def _reward_action_rate(self) -> Tensor:
         """Change of the clipped action. [L]"""
@@ -351,7 +357,7 @@ class LeggedRobot(BaseTask):
 
     def _reward_energy(self) -> Tensor:
         """Sum of |joint velocity * torque| [W]. [P]"""
-        return torch.linalg.vector_norm(self.dof_vel * self.torques, ord=1, dim=1)
+        return (self.dof_vel * self.torques).abs().sum(dim=1)
 
     def _reward_feet_clearance(self) -> Tensor:
         """Feet that move fast away from the swing height. [P]"""

@@ -114,11 +114,13 @@ class LeggedRobotCfg(Config):
         condim: int = 3  # contact dimensions: 3 is sliding without torsion [P]
 
     class sim:
+        engine: Literal["auto", "mujoco_warp", "mujoco"] = "auto"  # auto: mujoco_warp on a GPU, MuJoCo's own on a CPU
+        threads: int = 0  # of MuJoCo's own engine; 0: one a core
         dt: float = 0.004  # simulation step [s] [P]
         iterations: int = 1  # Newton iterations [P]
         ls_iterations: int = 5  # line-search iterations [P]
-        nconmax: int = 8  # contacts a world has room for; four feet on a plane make four
-        njmax: int = 40  # constraint rows a world has room for: 12 friction + 12 limits + 4 a contact, [ours: never seen full]
+        nconmax: int = 8  # contacts a world has room for (mujoco_warp); four feet on a plane make four
+        njmax: int = 40  # constraint rows a world has room for (mujoco_warp): 12 friction, 12 limits, 4 a contact [ours: never seen full]
 
     class viewer:
         width: int = 1280  # [pixel]
@@ -189,6 +191,18 @@ class LeggedRobotCfgPPO(Config):
 
         entropy_coef: float = 0.0
         desired_kl: float = 0.0
+
+    class cpu:
+        """What train.py takes on a CPU instead, before the command line has its say [ours: docs/training.md]."""
+
+        enable: bool = True
+        envs_per_core: int = 256  # worlds; the task's own number, if that is less
+        num_steps_per_env: int = 16
+        num_learning_epochs: int = 5
+        num_mini_batches: int = 4
+        hidden_dims: list[int] = [128, 128, 128]  # of actor and critic
+        max_iterations: int = 2200
+        update_threads: int = 0  # of torch in an update; 0: one a core. Everything else of a step runs on one
 
     class symmetry:
         """Left-right symmetry in the update, as in Mittal et al. 2024. Rows of observations say how they mirror: envs/mirror.py."""

@@ -1,5 +1,7 @@
 """rsl-rl's PPO recorded as CUDA graphs: the same keys, mathematics and checkpoints, and no question to the host.
 
+On a CPU the same code runs as it is written: it prepares each minibatch once, not once an epoch.
+
 Acting, the returns and the whole update (all epochs and minibatches: forward, loss, backward, clipping, learning rate,
 Adam) are one graph each. A graph remembers addresses, so what rsl-rl rebinds every iteration (advantages, the
 normalisers' std) is copied into tensors that stay. Actor and critic share nothing, so they run side by side.
@@ -63,9 +65,10 @@ class Linear(torch.autograd.Function):
 class GraphedPPO(PPO):
     """PPO whose update and acting are replayed CUDA graphs.
 
-    What cannot be recorded (a CPU, a network that is not a plain MLPModel or shares parameters, RND, an optimizer other
+    What cannot be recorded (a network that is not a plain MLPModel or shares parameters, RND, an optimizer other
     than Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. The first
     three updates of a run are launched step by step and the fourth is recorded: nothing is warmed up on a throw-away step.
+    On a CPU nothing is recorded.
     """
 
     _plain_rate: float  # the learning rate where nothing is recorded
@@ -87,8 +90,6 @@ class GraphedPPO(PPO):
     def _why_stock(self) -> str | None:
         """What keeps this configuration from being recorded, or None."""
         models = (self.actor, self.critic)
-        if not str(self.device).startswith("cuda"):
-            return f"the device is {self.device}"
         if any(model.is_recurrent for model in models):
             return "the networks are recurrent"
         if self.rnd:

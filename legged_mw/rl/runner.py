@@ -6,6 +6,8 @@ import copy
 import importlib.util
 import math
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,7 @@ from legged_mw.rl.ranks import this_rank
 from legged_mw.rl.report import Clock, Mark, Message, Report, console_block, console_rows
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.machine import usable_cores
 
 
 class Runner(OnPolicyRunner):
@@ -81,7 +84,8 @@ class Runner(OnPolicyRunner):
                 self.alg.compute_returns(obs)
             collected = clock.mark()
             self._anneal()
-            losses = self.alg.update()
+            with self.update_threads():
+                losses = self.alg.update()
             report = self._report(losses, (start, collected, start := clock.mark()))
             if waiting:
                 self._log(waiting)
@@ -99,6 +103,17 @@ class Runner(OnPolicyRunner):
         for name, (begin, end) in self.cfg["anneal"].items():
             if end and begin is not None:
                 setattr(self.alg, name, begin + (end - begin) * done)
+
+    @contextmanager
+    def update_threads(self) -> Iterator[None]:
+        """On a CPU, an update's matrices are worth torch's threads; a step's hundreds of small operations are not."""
+        if self.device == "cpu":
+            before = torch.get_num_threads()
+            torch.set_num_threads(self.cfg["cpu"]["update_threads"] or usable_cores())
+            yield
+            torch.set_num_threads(before)
+        else:
+            yield
 
     def _must_stop(self) -> bool:
         """Ranks stop together, one iteration after the first was asked to: each waits for the others in every update."""

@@ -1,11 +1,10 @@
-"""Recording a fixed sequence of work once and replaying it: CUDA graphs on a GPU, warp's own replay on a CPU."""
+"""Recording a fixed sequence of work once and replaying it as a CUDA graph."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import torch
-import warp as wp
 
 
 class StepGraph:
@@ -35,6 +34,8 @@ class StepGraph:
 
     def _first_calls(self, stream: torch.cuda.Stream) -> None:
         """Eager while warming up, then record and replay; all on one side stream, as capture demands."""
+        import warp as wp  # a second to import, and only for a GPU
+
         current = torch.cuda.current_stream(stream.device)
         stream.wait_stream(current)
         wp_stream = wp.stream_from_torch(stream)
@@ -55,15 +56,3 @@ class StepGraph:
         self._graph = graph
         current.wait_stream(stream)
         graph.replay()
-
-
-def record_warp(fn: Callable[[], None], device: wp.Device) -> Callable[[], None]:
-    """``fn``, which only launches warp kernels, recorded on a CPU: a replay costs a tenth of the launches.
-
-    Recording runs nothing, so it costs no step.
-    """
-    with wp.ScopedDevice(device), wp.ScopedCapture(device=device) as capture:
-        fn()
-    graph = capture.graph
-    assert graph is not None
-    return lambda: wp.capture_launch(graph)

@@ -37,6 +37,7 @@ def make_parser(description: str | None) -> Parser:
     parser.add_argument("--load_run", metavar="RUN", help="run to load: its name or path; -1 is the one last trained")
     parser.add_argument("--checkpoint", type=int, default=-1, metavar="N", help="iteration to load; -1 is the newest")
     parser.add_argument("--device", metavar="D", help="cuda:0, cpu, ... (default: the GPU if there is one)")
+    parser.add_argument("--engine", metavar="E", help="physics: mujoco (CPU), mujoco_warp (GPU, or slowly CPU) or auto, the default")
     parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="override a config field: env.num_envs=64")
     parser.add_argument("--override", action="append", default=[], metavar="FILE", help="override config fields from a YAML file")
     parser.add_argument("--eager", action="store_true", help="record nothing, launch every kernel: slow, for debugging")
@@ -52,7 +53,7 @@ def apply_overrides(task: LoadedTask, args: argparse.Namespace) -> None:
         if not equals:
             raise ConfigError(f"--set {item}: write it as path=value, e.g. rewards.scales.torques=-1e-4")
         task.set(path.strip(), value.strip(), where=f"--set {item}")
-    flags = {"num_envs": "env.num_envs", "seed": "seed"}
+    flags = {"num_envs": "env.num_envs", "seed": "seed", "engine": "sim.engine"}
     flags |= {name: f"runner.{name}" for name in ("max_iterations", "experiment_name", "run_name")}
     for flag, path in flags.items():
         value = getattr(args, flag, None)

@@ -29,6 +29,11 @@ def assign(dst: Tensor, mask: Tensor, src: Tensor | float) -> None:
         dst.masked_fill_(mask, src)
 
 
+def may_hold(mask: Tensor) -> bool:
+    """False if ``mask`` is known to be true nowhere. A CPU is asked; a GPU is not, for its steps are recorded: there it is true."""
+    return mask.device.type != "cpu" or bool(mask.any())
+
+
 def columns(num_rows: int, device: str, **widths: int) -> tuple[Tensor, dict[str, Tensor]]:
     """One float matrix of zeros and a named view (N, width) of each span of its columns: cleared together, used apart."""
     matrix = torch.zeros(num_rows, sum(widths.values()), device=device)

@@ -74,6 +74,14 @@ class LoadedTask:
         self.update({**saved, **older}, where)
         return list(older)
 
+    def fit_cpu(self, cores: int) -> None:
+        """Take over what the section ``cpu`` says, for ``cores`` cores."""
+        train, few = self.train, self.train.cpu
+        self.cfg.env.num_envs = min(self.cfg.env.num_envs, few.envs_per_core * cores)
+        train.runner.num_steps_per_env, train.runner.max_iterations = few.num_steps_per_env, few.max_iterations
+        train.algorithm.num_learning_epochs, train.algorithm.num_mini_batches = few.num_learning_epochs, few.num_mini_batches
+        train.actor.hidden_dims, train.critic.hidden_dims = list(few.hidden_dims), list(few.hidden_dims)
+
     def to_dict(self) -> dict[str, Any]:
         """Both configs as one mapping, with the task's name: what ``config.yaml`` in a run folder holds."""
         known = self.path.parent.resolve() == (ROOT / "configs").resolve()

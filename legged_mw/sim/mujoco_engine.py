@@ -1,0 +1,127 @@
+"""MuJoCo's own engine, on a thread pool of the CPU, behind fixed torch tensors.
+
+It computes in float64 on rows of its own; the tensors are float32. The two meet in ``step`` and nowhere else.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import copy
+import warnings
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+import torch
+from mujoco.batch import MODEL_FIELDS, Batch, SimulationError
+from torch import Tensor
+
+from legged_mw.sim.model import ModelError, unknown
+from legged_mw.utils.machine import usable_cores
+
+_READ_AND_WRITTEN, _WRITTEN = ("qpos", "qvel"), ("ctrl", "xfrc_applied")
+_READ = ("sensordata", "actuator_force", "site_xpos")  # computed by a step
+_FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
+
+
+class MujocoSimulation:
+    """The seam on MuJoCo's own engine (``legged_mw.sim.simulation.Simulation`` says what it promises).
+
+    The same calls give the same bits, on any number of threads. A world that MuJoCo cannot step gets a ``qpos`` of NaN.
+    """
+
+    engine, device = "mujoco", "cpu"
+
+    qpos: Tensor
+    qvel: Tensor
+    ctrl: Tensor
+    sensordata: Tensor
+    actuator_force: Tensor
+    site_xpos: Tensor
+    xfrc_applied: Tensor
+
+    def __init__(self, model: mujoco.MjModel, num_envs: int, *, threads: int = 0, world_fields: Sequence[str] = ()) -> None:
+        """Allocate ``num_envs`` worlds, stepped by ``threads`` threads; 0: one a core."""
+        self.num_envs = num_envs
+        model = copy.copy(model)
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # else it resets a broken world by itself, unasked
+        _keep_quiet()
+        self._batch = Batch(model, num_envs, threads or usable_cores())
+        self._start = self._batch.state[0].copy()  # a row of state, as the model has it
+        # tensor and the engine's rows, to be copied before and after a step
+        into, out = {}, {}
+        for name in _READ_AND_WRITTEN + _WRITTEN:
+            into[name] = self._adopt(name)
+        for name in _READ:
+            out[name] = self._adopt(name)
+        self._out = [*(into[name] for name in _READ_AND_WRITTEN), *out.values()]
+        self._fields = {name: self._expand(name) for name in world_fields}
+        self._into = [*into.values(), *self._fields.values()]
+        self._cleared = [into[name][0] for name in ("qvel", *_WRITTEN)] + [tensor for tensor, _ in out.values()]
+        self._qpos0 = torch.tensor(model.qpos0, dtype=torch.float)
+
+    def step(self, substeps: int = 1) -> None:
+        for tensor, rows in self._into:
+            rows.copy_(tensor)
+        failed: np.ndarray | None = None
+        try:
+            self._batch.step(nstep=substeps)
+        except SimulationError as error:
+            failed = error.ids
+        for tensor, rows in self._out:
+            tensor.copy_(rows)
+        if failed is not None:
+            self.qpos[torch.from_numpy(failed).long()] = torch.nan
+
+    def reset(self, mask: Tensor) -> None:
+        which = mask.numpy()
+        if not which.any():
+            return
+        self._batch.state[which] = self._start  # the solver's first guess and the clock too
+        worlds = mask.nonzero()[:, 0]
+        self.qpos[worlds] = self._qpos0
+        for tensor in self._cleared:
+            tensor[worlds] = 0.0
+
+    def field(self, name: str) -> Tensor:
+        if name not in self._fields:
+            raise ModelError(unknown("per-world model field", name, self._fields, "this simulation (declare it in world_fields)"))
+        return self._fields[name][0]
+
+    def overflowed_worlds(self) -> Tensor:
+        return torch.tensor(float((self._batch.warning[:, _FULL, 1] > 0).any(axis=1).sum()))  # counts since construction
+
+    def overflow_report(self) -> str:
+        if not (worlds := int(self.overflowed_worlds())):
+            return ""
+        return f"simulator overflow in {worlds} of {self.num_envs} worlds: MuJoCo's memory is full; raise <size memory=...> in the MJCF"
+
+    def _adopt(self, name: str) -> tuple[Tensor, Tensor]:
+        """A tensor for a field of MjData, and the engine's rows of it."""
+        rows = _tensor(self._batch.bind(name))
+        tensor = rows.float()
+        setattr(self, name, tensor)
+        return tensor, rows
+
+    def _expand(self, name: str) -> tuple[Tensor, Tensor]:
+        """A tensor (N, ...) for a field of the model, and the engine's rows of it."""
+        known = [field for field in MODEL_FIELDS if getattr(getattr(self._batch.model, field, None), "dtype", None) == np.float64]
+        if name not in known:
+            raise ModelError(unknown("per-world model field", name, known, "MuJoCo's Model"))
+        rows = _tensor(self._batch.expand(name))
+        return rows.float(), rows
+
+
+def _keep_quiet() -> None:
+    """A world that breaks is the task's to count and to reset; MuJoCo would print a line and write a file of its own."""
+    config = mujoco.MjLogConfig.get()
+    config.logto_console = config.logto_file = False
+    config.set()
+
+
+def _tensor(rows: np.ndarray) -> Tensor:
+    """The same memory as a tensor."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # outputs of the engine are read-only, which torch cannot know
+        return torch.from_numpy(rows)

@@ -1,0 +1,141 @@
+"""mujoco-warp behind fixed torch tensors: every view is the simulator's own memory."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+
+import mujoco
+import mujoco_warp as mjw
+import torch
+import warp as wp
+from mujoco_warp import OverflowType
+from torch import Tensor
+
+from legged_mw.sim.model import ModelError, unknown
+
+wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it loads; a first run would drown in it
+
+_STATE = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xfrc_applied", "overflow")
+# With 1 Newton and 5 line-search iterations these two are always set: they say "not converged", which is the plan.
+_EXPECTED = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
+# From this many Newton iterations on, a conditional loop in the graph is worth its launch.
+_UNROLLED_ITERATIONS = 10
+
+
+class WarpSimulation:
+    """The seam on mujoco-warp (``legged_mw.sim.simulation.Simulation`` says what it promises)."""
+
+    engine = "mujoco_warp"
+
+    qpos: Tensor
+    qvel: Tensor
+    ctrl: Tensor
+    sensordata: Tensor
+    actuator_force: Tensor
+    site_xpos: Tensor
+    xfrc_applied: Tensor
+    overflow: Tensor  # (N,) int32, bits of mujoco_warp.OverflowType since the world's last reset
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        num_envs: int,
+        device: str,
+        *,
+        nconmax: int,
+        njmax: int,
+        world_fields: Sequence[str] = (),
+        eager: bool = False,
+    ) -> None:
+        """Allocate. On a CPU physics repeats bit for bit; on a GPU it does not: mujoco-warp 4.0.0 takes constraint rows
+        from an atomic counter, also in its deterministic mode, so sums differ in the last bit.
+        """
+        self.num_envs, self.device = num_envs, device
+        self.nconmax, self.njmax = nconmax, njmax
+        self._device = wp.get_device(device)
+        self._eager = eager or not self._device.is_cpu
+        _check_fields(world_fields)
+        with wp.ScopedDevice(self._device):
+            self._model = mjw.put_model(model, batch_sizes=dict.fromkeys(world_fields, num_envs))
+            option = self._model.opt
+            option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
+            option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
+            self._data = mjw.make_data(model, nworld=num_envs, nconmax=nconmax, njmax=njmax)
+        for name in _STATE:
+            setattr(self, name, wp.to_torch(getattr(self._data, name)))
+        self._fields = {name: wp.to_torch(getattr(self._model, name)) for name in world_fields}
+        self._overflow_seen = torch.zeros_like(self.overflow)
+        self._reset_mask = torch.zeros(num_envs, dtype=torch.bool, device=device)
+        self._reset_mask_wp = wp.from_torch(self._reset_mask)
+        self._recorded: dict[str, object] = {}
+
+    def step(self, substeps: int = 1) -> None:
+        self._run(f"step{substeps}", lambda: self._substeps(substeps))
+        torch.bitwise_or(self._overflow_seen, self.overflow, out=self._overflow_seen)
+
+    def reset(self, mask: Tensor) -> None:
+        self._reset_mask.copy_(mask)
+        self._run("reset", lambda: mjw.reset_data(self._model, self._data, reset=self._reset_mask_wp))
+        for stale in (self.actuator_force, self.site_xpos):  # reset_data leaves the dead episode's values, even NaN
+            stale.masked_fill_(mask.view(-1, *[1] * (stale.dim() - 1)), 0.0)
+
+    def field(self, name: str) -> Tensor:
+        if name not in self._fields:
+            raise ModelError(unknown("per-world model field", name, self._fields, "this simulation (declare it in world_fields)"))
+        return self._fields[name]
+
+    def overflowed_worlds(self) -> Tensor:
+        return ((self._overflow_seen & ~int(_EXPECTED)) != 0).sum(dtype=torch.float)
+
+    def overflow_report(self) -> str:
+        worlds = int(self.overflowed_worlds())
+        if not worlds:
+            return ""
+        seen = self._overflow_seen & ~int(_EXPECTED)
+        bits = [bit for bit in OverflowType if bit != OverflowType.ALL and bool((seen & int(bit)).any())]
+        raise_ = []
+        if OverflowType.NEFC in bits:
+            raise_.append(f"njmax (now {self.njmax})")
+        if {OverflowType.NARROWPHASE, OverflowType.BROADPHASE} & set(bits):
+            raise_.append(f"nconmax (now {self.nconmax})")
+        names = ", ".join(str(bit.name) for bit in bits)
+        return f"simulator overflow ({names}) in {worlds} of {self.num_envs} worlds; raise {' and '.join(raise_) or 'nconmax and njmax'}"
+
+    def _substeps(self, count: int) -> None:
+        """Sensors feed nothing back, so only the last substep computes them: same state, a tenth less work."""
+        option = self._model.opt
+        flags = option.disableflags
+        for i in range(count):
+            option.disableflags = flags if i == count - 1 else flags | mjw.DisableBit.SENSOR
+            mjw.step(self._model, self._data)
+
+    def _run(self, name: str, fn) -> None:
+        with wp.ScopedDevice(self._device):
+            if self._eager:
+                fn()
+                return
+            if name not in self._recorded:
+                self._recorded[name] = record_warp(fn, self._device)
+            self._recorded[name]()  # type: ignore[operator]
+
+
+def _check_fields(names: Sequence[str]) -> None:
+    known = [f.name for f in dataclasses.fields(mjw.Model) if getattr(f.type, "shape", ("",))[:1] == ("*",)]
+    for name in names:
+        if name not in known:
+            raise ModelError(unknown("per-world model field", name, known, "mujoco-warp's Model"))
+
+
+def record_warp(fn: Callable[[], None], device: wp.Device) -> Callable[[], None]:
+    """``fn``, which only launches warp kernels, recorded on a CPU: a replay costs a tenth of the launches.
+
+    Recording runs nothing, so it costs no step.
+    """
+    with wp.ScopedDevice(device), wp.ScopedCapture(device=device) as capture:
+        fn()
+    graph = capture.graph
+    assert graph is not None
+    return lambda: wp.capture_launch(graph)
