@@ -28,7 +28,7 @@ from legged_mw.utils.errors import UserError
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
-_STEPS_PER_CORE = 5000  # a second, in training with the section `cpu` as it is (docs/performance.md)
+_STEPS_PER_CORE = 6500  # a second, in training with the section `cpu` as it is (docs/performance.md)
 
 
 def parse() -> argparse.Namespace:

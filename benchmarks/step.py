@@ -82,7 +82,8 @@ def timed(fn: Callable[[], object], calls: int, device: str) -> float:
 def measure(task_name: str, engine: str, num_envs: int, device: str, calls: int, rounds: int, eager: bool) -> tuple[float, float, float]:
     """Median seconds of the recorded step, of `env.step` with its copies, and of bare physics."""
     task = load_task(task_name)
-    task.cfg.env.num_envs, task.cfg.sim.engine = num_envs, engine
+    task.cfg.env.num_envs = num_envs
+    task.set("sim.engine", engine)
     env = task.env_class(task.cfg, device, eager=eager)
     actions = 0.3 * torch.randn(num_envs, env.num_actions, device=device)
     for _ in range(20):

@@ -10,19 +10,9 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
-from legged_mw.rl.ppo import GraphedPPO
-
 WORLDS, STEPS, ACTIONS = 32, 6, 4
 MODEL: type[MLPModel] = MLPModel
 SIZES = {"state": 7, "privileged_state": 11}
-
-
-class Recordable(GraphedPPO):
-    """The recorded update without its records where there is no GPU: the same code, launched one by one."""
-
-    def _why_stock(self) -> str | None:
-        reason = super()._why_stock()
-        return self._why_not_plain((self.actor, self.critic)) if reason and reason.startswith("the device") else reason
 
 
 class Env:

@@ -7,9 +7,10 @@ import sys
 from pathlib import Path
 
 import torch
-from learner import Recordable, parameters
+from learner import parameters
 from rsl_rl.algorithms import PPO
 
+from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import leave_together, this_rank
 from legged_mw.rl.runner import make_runner
 from legged_mw.utils.cli import seed_everything
@@ -29,9 +30,9 @@ task.train.runner.save_interval = 1
 task.train.runner.num_steps_per_env = 12
 seed_everything(10 + rank.index)
 env = task.env_class(task.cfg, device)
-task.train.algorithm.class_name = {"ours": "learner:Recordable", "stock": "PPO"}[kind]
+task.train.algorithm.class_name = {"ours": "legged_mw.rl.ppo:GraphedPPO", "stock": "PPO"}[kind]
 runner = make_runner(env, task.train, folder if rank.leads else None, device)
-assert type(runner.alg) is {"ours": Recordable, "stock": PPO}[kind]
+assert type(runner.alg) is {"ours": GraphedPPO, "stock": PPO}[kind]
 act, steps = runner.alg.act, 0
 
 
@@ -61,7 +62,7 @@ end = {
     "means": runner._last_means,
 }
 end |= {"iteration": runner.current_learning_iteration, "steps": runner.total_steps, "stop": runner.stop, "rate": runner.alg.learning_rate}
-if isinstance(runner.alg, Recordable):
+if isinstance(runner.alg, GraphedPPO):
     runner.alg.release()
 torch.save(end, folder / f"rank{rank.index}.pt")
 leave_together(rank)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shlex
 import shutil
 import subprocess
@@ -16,6 +17,7 @@ from program import SMALL, Result, files, refused, run, trained
 from legged_mw import ROOT
 from legged_mw.utils.cli import duration, one_line_errors
 from legged_mw.utils.config import load_yaml
+from legged_mw.utils.task import load_task
 
 TASK = ["--task", "go1_flat"]
 DOG = '''"""A dog of one's own: lighter, and with its own learner."""
@@ -289,7 +291,7 @@ def test_check(tmp_path: Path) -> None:
     assert result.code == 0 and not files(tmp_path)
     lines = [" ".join(line.split()) for line in result.out.splitlines()]
     for line in (
-        "go1_flat: 16 worlds on cpu; a first run compiles kernels, about a minute",
+        "go1_flat: 16 worlds on cpu, engine mujoco",
         "observation state (48)",
         "9 dof_pos 12 noise +-0.06",
         "45 commands 3",
@@ -334,6 +336,43 @@ def test_the_more_specific_wins(tmp_path: Path) -> None:
     assert config["runner"]["num_steps_per_env"] == 4 and config["runner"]["max_iterations"] == 1  # a flag wins over all
     assert config["seed"] == 7 and config["task"] == "go1_flat"
     assert "go1_flat: 5 worlds on cpu" in result.out
+
+
+def test_a_cpu_takes_its_own_section_and_what_the_user_says_wins(tmp_path: Path) -> None:
+    asked = ["--num_envs", "5", "--max_iterations", "1", "--set", "runner.num_steps_per_env=4", "--set", "algorithm.num_mini_batches=1"]
+    asked += ["--set", "algorithm.desired_kl=0.015"]
+    result = run("train", tmp_path, *TASK, "--device", "cpu", *asked)
+    assert result.code == 0, result.err
+    assert "go1_flat: 5 worlds on cpu, engine mujoco\n" in result.out
+    assert re.search(r"^\d+ cores: 1 iterations, 0.0 M steps, about 0 min$", result.out, re.MULTILINE)
+    [saved] = (tmp_path / "logs/go1_flat").glob("*/config.yaml")
+    config, few = load_yaml(saved), load_task("go1_flat").train.cpu
+    assert config["env"]["num_envs"] == 5 and config["algorithm"]["desired_kl"] == 0.015
+    assert config["actor"]["hidden_dims"] == config["critic"]["hidden_dims"] == few.hidden_dims
+    assert config["perturbation"]["curriculum"] == few.kick_curriculum
+    assert config["commands"]["keep_probability"] == few.keep_probability
+    result = run("train", tmp_path / "off", *TASK, "--device", "cpu", *asked, "--set", "cpu.enable=false")
+    assert result.code == 0, result.err
+    [saved] = (tmp_path / "off/logs/go1_flat").glob("*/config.yaml")
+    assert load_yaml(saved)["actor"]["hidden_dims"] == load_task("go1_flat").train.actor.hidden_dims
+
+
+def test_worlds_grow_with_the_cores_up_to_the_tasks_own_number() -> None:
+    for cores, worlds in ((1, 256), (8, 2048), (64, 8192)):
+        task = load_task("go1_flat")
+        task.fit_cpu(cores)
+        assert task.cfg.env.num_envs == worlds
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--engine", "physx"], "--engine: sim.engine must be Literal['auto', 'mujoco_warp', 'mujoco'], not 'physx' (str)"),
+        (["--set", "sim.threads=-1"], "sim.threads is -1; it must be zero or more"),
+    ],
+)
+def test_engine_that_cannot_be(tmp_path: Path, words: list[str], line: str) -> None:
+    assert line in refused(tmp_path, "train", *TASK, "--device", "cpu", *words)
 
 
 def test_experiment_name_by_flag_and_by_field(tmp_path: Path) -> None:

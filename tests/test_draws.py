@@ -215,7 +215,7 @@ def test_every_kick_is_drawn_anew(history: list[Kick]) -> None:
 
 
 def test_configured_kicks_are_the_tasks() -> None:
-    """go1_flat: every 1 to 3 s, for 0.05 to 0.2 s, as in the joystick task; up to 6 m/s, which is ours."""
+    """go1_flat: every 1 to 3 s, for 0.05 to 0.2 s, as in the joystick task; up to 8 m/s, which is ours."""
     env = make_env(N, {"perturbation.enable": True})
     draws = []
     for _ in range(60):
@@ -225,7 +225,7 @@ def test_configured_kicks_are_the_tasks() -> None:
     assert (pause.min(), pause.max()) == (50.0, 150.0) and torch.equal(pause, pause.round())
     assert steps.min() in (2.0, 3.0) and steps.max() == 10.0 and torch.equal(steps, steps.round())  # 0.05 s is 2.5 steps
     assert angle.abs().max() <= math.pi + 1e-5 and angle.max() > 3.1 and angle.min() < -3.1
-    assert dv.min() >= 0.0 and dv.max() <= 6.0 and dv.max() > 5.8
+    assert dv.min() >= 0.0 and dv.max() <= 8.0 and dv.max() > 7.8
     off = make_env(2)
     for _ in range(5):
         off.step(torch.zeros(2, 12))
@@ -284,3 +284,22 @@ def momentum(env: LeggedRobot) -> Tensor:
         mujoco.mj_subtreeVel(model, data)
         rows.append(torch.tensor(data.subtree_linvel[0] * MASS, dtype=torch.float))
     return torch.stack(rows)
+
+
+def test_kicks_grow_with_what_a_world_survives() -> None:
+    """Halfway, at the end of each episode, to the share of it that was survived; the time-out counts in full."""
+    env = make_env(3, {**QUIET, "perturbation.enable": True, "perturbation.velocity": [2.0, 2.0], "perturbation.curriculum": True})
+    assert env.kick_level.tolist() == [0.0, 0.0, 0.0] and not env.kick[:, 3].any()
+    env.episode_steps[:] = torch.tensor([[0.5], [0.25], [0.75]]) * env.max_episode_length
+    env.time_out_buf[:] = torch.tensor([True, False, False])
+    env.reset_envs(torch.tensor([True, True, False]))
+    assert env.kick_level.tolist() == [0.5, 0.125, 0.0]
+    assert env.kick[:, 3].tolist() == [1.0, 0.25, 0.0]  # the pause of the third goes on
+    env.reset_envs(torch.tensor([True, True, True]))  # no step in between: nothing was survived but by the clock
+    assert env.kick_level.tolist() == [0.75, 0.0625, 0.375]
+
+
+def test_kicks_are_at_full_strength_without_the_curriculum() -> None:
+    env = make_env(4, {"perturbation.enable": True, "perturbation.velocity": [2.0, 2.0]})
+    env.reset()
+    assert env.kick[:, 3].tolist() == [2.0] * 4

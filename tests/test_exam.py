@@ -328,7 +328,7 @@ def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert "terrain.friction: 0.6 -> 0.4" in result.out and "noise.level: 1.0 -> 0.0" in result.out
     assert "falls in 22 commands" in result.out and "walks: no; beats the peer: no" in result.out
     saved = json.loads((folder / "exam.json").read_text())
-    assert saved["policy"].endswith("model_1.pt") and saved["engine"] == "mujoco_warp" and saved["device"] == "cpu"
+    assert saved["policy"].endswith("model_1.pt") and saved["engine"] == "mujoco" and saved["device"] == "cpu"
     assert len(saved["commands"]) == TRACKED and saved["walks"] is False
     assert saved["overrides"]["noise.level"] == 0.0
     for more, field in (

@@ -158,4 +158,6 @@ def test_two_gpus_learn_one_policy_and_the_stock_one(tmp_path: Path) -> None:
 def test_on_two_gpus_a_rank_that_dies_ends_the_run(tmp_path: Path) -> None:
     result = learn("ours", tmp_path / "dies", 6, "gpus")
     assert result.returncode != 0
-    assert torch.load(tmp_path / "dies/model_6.pt", weights_only=True)["iter"] == 6
+    newest = max(int(file.stem.partition("_")[2]) for file in (tmp_path / "dies").glob("model_*.pt"))
+    assert newest >= 5  # of the sixth update, the dying rank's share may still have been on its way
+    assert torch.load(tmp_path / f"dies/model_{newest}.pt", weights_only=True)["iter"] == newest

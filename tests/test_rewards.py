@@ -14,6 +14,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 
 DT = 0.02  # [s] a control step
+HAND = {**QUIET, "rewards.tracking_sigma": 0.25}  # what the figures below were worked out for
 SCALES = {
     "tracking_lin_vel": 1.0,
     "tracking_ang_vel": 0.5,
@@ -104,7 +105,7 @@ def paint(env: LeggedRobot) -> None:
 
 @pytest.fixture(scope="module")
 def env() -> Iterator[LeggedRobot]:
-    env = make_env(4, QUIET)
+    env = make_env(4, HAND)
     paint(env)
     yield env
     for name, (walking, lying) in EXPECTED.items():  # no test may have disturbed the picture
@@ -149,7 +150,7 @@ def test_settings_reach_the_terms() -> None:
         "min_command": 3.6,  # world 0 commands sqrt(1 + 9 + 2.25) = 3.5
         "pose_weights": {"": 2.0},
     }
-    env = make_env(2, {**QUIET, **{f"rewards.{name}": value for name, value in settings.items()}})
+    env = make_env(2, {**HAND, **{f"rewards.{name}": value for name, value in settings.items()}})
     paint(env)
 
     def term(name: str) -> list[float]:
@@ -168,7 +169,7 @@ def test_settings_reach_the_terms() -> None:
 
 
 def test_moving_is_the_norm_of_all_three_commands() -> None:
-    env = make_env(6, QUIET)
+    env = make_env(6, HAND)
     env.commands.copy_(
         torch.tensor([[0, 0, 0], [0.0099, 0, 0], [0.0101, 0, 0], [0, -0.0101, 0], [0, 0, -0.0101], [0.006, 0.006, 0.006]])  # norm 0.0104
     )
@@ -207,14 +208,14 @@ W, L = 0.2131431, 0.5557057
     ],
 )
 def test_clip(settings: dict[str, object], walking: float, lying: float) -> None:
-    env = make_env(2, {**QUIET, **TWO, **{f"rewards.{name}": value for name, value in settings.items()}})
+    env = make_env(2, {**HAND, **TWO, **{f"rewards.{name}": value for name, value in settings.items()}})
     paint(env)
     env.compute_reward()
     assert env.rew_buf.tolist() == pytest.approx([walking * DT, lying * DT], rel=1e-5, abs=1e-7)
 
 
 def test_reward_is_for_a_control_step_of_any_length() -> None:
-    env = make_env(2, {**QUIET, **TWO, "control.decimation": 10})
+    env = make_env(2, {**HAND, **TWO, "control.decimation": 10})
     paint(env)
     env.compute_reward()
     assert env.dt == pytest.approx(0.04) and env.max_episode_length == 500
@@ -222,7 +223,7 @@ def test_reward_is_for_a_control_step_of_any_length() -> None:
 
 
 def test_sums_of_the_episode_are_before_the_clip_and_its_return_after() -> None:
-    env = make_env(2, {**QUIET, **only_scales(torques=-0.02, tracking_lin_vel=1.0, termination=-1.0)})
+    env = make_env(2, {**HAND, **only_scales(torques=-0.02, tracking_lin_vel=1.0, termination=-1.0)})
     paint(env)
     assert env.reward_names == ["tracking_lin_vel", "torques", "termination"]  # in the config's order, what comes after the clip last
     for _ in range(2):
@@ -234,7 +235,7 @@ def test_sums_of_the_episode_are_before_the_clip_and_its_return_after() -> None:
 
 
 def test_broken_worlds_earn_nothing_whatever_their_terms() -> None:
-    env = make_env(3, {**QUIET, **TWO, "rewards.only_positive_rewards": False})
+    env = make_env(3, {**HAND, **TWO, "rewards.only_positive_rewards": False})
     paint(env)
     env.broken[1] = True
     env.torques[1] = math.nan
@@ -269,7 +270,7 @@ class FootStory:
 
 def test_first_contact_air_time_and_swing_peak() -> None:
     """FR: stance, two steps of swing, stance, swing, touch-down; FL: always down; RR: never down; RL: two contacts at once count as one."""
-    env = make_env(2, QUIET)
+    env = make_env(2, HAND)
     story = FootStory(env)
     fr = [(1, 0.02), (0, 0.05), (0, 0.09), (1, 0.03), (1, 0.04), (0, 0.01), (1, 0.02)]
     rl = [(0, 0.30), (2, 0.02), (2, 0.02), (0, 0.20), (0, 0.10), (0, 0.25), (1, 0.02)]
@@ -292,7 +293,7 @@ def test_first_contact_air_time_and_swing_peak() -> None:
 
 def test_a_landing_after_a_drop_is_one_first_contact_a_foot() -> None:
     """Through the physics: a robot let fall from 0.4 m lands once, with the air time of the fall."""
-    env = make_env(2, {**QUIET, "init_state.lin_vel_range": 0.0, "init_state.ang_vel_range": 0.0, "init_state.pos": [0.0, 0.0, 0.4]})
+    env = make_env(2, {**HAND, "init_state.lin_vel_range": 0.0, "init_state.ang_vel_range": 0.0, "init_state.pos": [0.0, 0.0, 0.4]})
     landings, times = torch.zeros(2, 4), torch.zeros(2, 4)
     for _ in range(25):
         env.actions.zero_()

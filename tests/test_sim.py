@@ -1,4 +1,4 @@
-"""The simulator seam: what build_model makes of an MJCF and of mistakes, and what Simulation promises about its views."""
+"""The simulator seam: what build_model makes of an MJCF and of mistakes, and what both engines promise about their views."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from mujoco_warp import OverflowType
 
 from legged_mw import ROOT
 from legged_mw.sim.model import GROUND, Ground, ModelError, Physics, RobotModel, build_model, per_joint
-from legged_mw.sim.simulation import Simulation
+from legged_mw.sim.simulation import EngineError, Simulation, make_simulation, pick_engine
 
 GO1 = ROOT / "resources/robots/go1/go1.xml"
 FEET = ["FR", "FL", "RR", "RL"]
 JOINTS = [f"{leg}_{link}_joint" for leg in FEET for link in ("hip", "thigh", "calf")]
 POSE = [0.1, 0.9, -1.8, -0.1, 0.9, -1.8] * 2
 HOME = torch.tensor([0.0, 0.0, 0.278, 1.0, 0.0, 0.0, 0.0, *POSE])
-VIEWS = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xfrc_applied", "overflow")
+VIEWS = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xfrc_applied")
 EXACT = Physics(iterations=100, ls_iterations=50)  # converged, so that figures do not depend on the solver
 
 
@@ -344,7 +344,7 @@ def test_friction_of_the_ground_wins(tmp_path: Path) -> None:
             assert contact.dim == ground.condim and contact.friction[0] == contact.friction[1] == ground.friction
 
 
-# ---- Simulation
+# ---- both engines
 
 
 @pytest.fixture(scope="module")
@@ -352,9 +352,14 @@ def robot() -> RobotModel:
     return go1()
 
 
-def simulate(robot: RobotModel, num_envs: int = 3, **options: Any) -> Simulation:
+@pytest.fixture(params=["mujoco_warp", "mujoco"])
+def engine(request: pytest.FixtureRequest) -> str:
+    return request.param
+
+
+def simulate(robot: RobotModel, engine: str, num_envs: int = 3, **options: Any) -> Any:
     """Worlds that stand in the home pose with their servos on it."""
-    sim = Simulation(robot.physics, num_envs, "cpu", **{"nconmax": 8, "njmax": 40, **options})
+    sim = make_simulation(robot.physics, num_envs, "cpu", engine=engine, **{"nconmax": 8, "njmax": 40, **options})
     stand(sim, torch.ones(num_envs, dtype=torch.bool))
     return sim
 
@@ -373,50 +378,59 @@ def assert_same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], worlds: 
         assert torch.equal(a[name][worlds], b[name][worlds]), f"{name} {where}"
 
 
-def test_shapes(robot: RobotModel) -> None:
-    sim = simulate(robot, 3)
-    shapes = [(3, 19), (3, 18), (3, 12), (3, 19), (3, 12), (3, 6, 3), (3, 14, 6), (3,)]
-    assert [tuple(getattr(sim, name).shape) for name in VIEWS] == shapes
-
-
-def test_views_are_the_simulators_memory_for_life(robot: RobotModel) -> None:
-    sim = simulate(robot)
-    views = {name: getattr(sim, name) for name in VIEWS}
+def assert_close(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], rtol: float = 0.0, atol: float = 0.0) -> None:
     for name in VIEWS:
-        assert views[name].data_ptr() == getattr(sim._data, name).ptr, name
-    before = snapshot(sim)
+        torch.testing.assert_close(a[name], b[name], rtol=rtol, atol=atol, msg=lambda text, name=name: f"{name}: {text}")
+
+
+def copy_state(target: Simulation, source: Simulation) -> None:
+    target.qpos.copy_(source.qpos)
+    target.qvel.copy_(source.qvel)
+
+
+def test_shapes(robot: RobotModel, engine: str) -> None:
+    sim = simulate(robot, engine)
+    shapes = [(3, 19), (3, 18), (3, 12), (3, 19), (3, 12), (3, 6, 3), (3, 14, 6)]
+    assert [tuple(getattr(sim, name).shape) for name in VIEWS] == shapes
+    assert all(getattr(sim, name).dtype == torch.float32 for name in VIEWS)
+    assert (sim.engine, sim.num_envs, sim.device) == (engine, 3, "cpu")
+
+
+def test_which_engine_steps() -> None:
+    assert [pick_engine("auto", device) for device in ("cpu", "cuda:1")] == ["mujoco", "mujoco_warp"]
+    assert pick_engine("mujoco_warp", "cpu") == "mujoco_warp"
+    with pytest.raises(EngineError, match="steps on a CPU, and the device is cuda:0; say --device cpu, or --engine mujoco_warp$"):
+        pick_engine("mujoco", "cuda:0")
+    with pytest.raises(EngineError, match="no engine 'mujoco-warp' in sim.engine; did you mean 'mujoco_warp'. there are: auto, "):
+        pick_engine("mujoco-warp", "cpu")
+
+
+def test_views_stay(robot: RobotModel, engine: str) -> None:
+    sim = simulate(robot, engine)
+    views = {name: getattr(sim, name) for name in VIEWS}
+    memory, before = {name: view.data_ptr() for name, view in views.items()}, snapshot(sim)
     sim.step(5)
     sim.reset(torch.tensor([True, False, False]))
     sim.step(5)
     for name in VIEWS:
-        assert getattr(sim, name) is views[name] and views[name].data_ptr() == getattr(sim._data, name).ptr, name
+        assert getattr(sim, name) is views[name] and views[name].data_ptr() == memory[name], name
+        if engine == "mujoco_warp":
+            assert memory[name] == getattr(sim._data, name).ptr, name  # the simulator's own
     changed = [name for name in VIEWS if not torch.equal(views[name], before[name])]
     assert set(changed) >= {"qpos", "qvel", "sensordata", "actuator_force", "site_xpos", "ctrl"}
 
 
-def test_replay_equals_eager(robot: RobotModel) -> None:
-    """Recording is an optimisation: 20 steps with random targets, pushes and resets, bit for bit."""
-    recorded, eager = simulate(robot, 4), simulate(robot, 4, eager=True)
-    dice = torch.Generator().manual_seed(0)
-    resets = 0
-    for step in range(20):
-        targets = HOME[7:] + 0.3 * torch.randn(4, 12, generator=dice)
-        push, mask = 20 * torch.randn(4, 6, generator=dice), torch.rand(4, generator=dice) < 0.2
-        resets += int(mask.sum())
-        for sim in (recorded, eager):
-            sim.ctrl.copy_(targets)
-            sim.xfrc_applied[:, 1] = push
+def test_it_repeats_bit_for_bit_on_any_number_of_threads(robot: RobotModel, engine: str) -> None:
+    one, other = simulate(robot, engine, 7, threads=1), simulate(robot, engine, 7, threads=3)
+    for step in range(10):
+        for sim in (one, other):
+            sim.ctrl[:] = HOME[7:] + 0.1 * math.sin(step) * torch.arange(7)[:, None] / 7
             sim.step(5)
-        assert_same(snapshot(recorded), snapshot(eager), where=f"after step {step}")
-        for sim in (recorded, eager):
-            sim.reset(mask)
-            stand(sim, mask)
-        assert_same(snapshot(recorded), snapshot(eager), where=f"after reset {step}")
-    assert resets > 5 and recorded._recorded and not eager._recorded
+        assert_same(snapshot(one), snapshot(other), where=f"step {step}")
 
 
-def test_reset_touches_masked_worlds_alone(robot: RobotModel) -> None:
-    sim, undisturbed = simulate(robot, 4), simulate(robot, 4)
+def test_reset_touches_masked_worlds_alone(robot: RobotModel, engine: str) -> None:
+    sim, undisturbed = simulate(robot, engine, 4), simulate(robot, engine, 4)
     mask = torch.tensor([True, False, True, False])
     for s in (sim, undisturbed):
         s.xfrc_applied[:, 1, 0] = 5.0
@@ -436,9 +450,9 @@ def test_reset_touches_masked_worlds_alone(robot: RobotModel) -> None:
     assert_same(snapshot(sim), snapshot(undisturbed), ~mask)
 
 
-def test_broken_world_is_as_new_after_a_reset(robot: RobotModel) -> None:
+def test_broken_world_is_as_new_after_a_reset(robot: RobotModel, engine: str) -> None:
     """Not a NaN survives, neither in a view nor in what the solver remembers; the neighbours never notice."""
-    sim, undisturbed = simulate(robot), simulate(robot)
+    sim, undisturbed = simulate(robot, engine), simulate(robot, engine)
     mask = torch.tensor([False, True, False])
     sim.qpos[1], sim.qvel[1] = math.nan, math.nan
     for s in (sim, undisturbed):
@@ -450,7 +464,7 @@ def test_broken_world_is_as_new_after_a_reset(robot: RobotModel) -> None:
     sim.reset(mask)
     assert all(torch.isfinite(getattr(sim, name)).all() for name in VIEWS)
     stand(sim, mask)
-    new = simulate(robot)
+    new = simulate(robot, engine)
     for step in range(5):
         sim.step(5)
         new.step(5)
@@ -458,24 +472,27 @@ def test_broken_world_is_as_new_after_a_reset(robot: RobotModel) -> None:
     assert torch.isfinite(sim.qpos).all() and torch.isfinite(sim.sensordata).all()
 
 
-def test_sensors_are_those_of_the_last_substep(robot: RobotModel) -> None:
-    """Four of five substeps leave them out; that changes neither them nor the motion."""
-    sim, every = simulate(robot), simulate(robot)
-    for step in range(10):
+def test_sensors_are_those_of_the_last_substep(robot: RobotModel, engine: str) -> None:
+    """mujoco-warp leaves them out of the other four; that changes neither them nor the motion. MuJoCo's own engine rounds to
+    float32 between calls, so there five single steps are five times as rough as one of five."""
+    close = {} if engine == "mujoco_warp" else {"rtol": 1e-3, "atol": 2e-3}
+    sim, every = simulate(robot, engine), simulate(robot, engine)
+    for _ in range(10):
         sim.step(5)
         for _ in range(5):
             every.step(1)
-        assert_same(snapshot(sim), snapshot(every), where=f"step {step}")
+        assert_close(snapshot(sim), snapshot(every), **close)
+        copy_state(every, sim)
     before = sim.sensordata.clone()
     sim.step(1)  # another number of substeps, recorded on its own
     every.step(1)
-    assert_same(snapshot(sim), snapshot(every), where="after one more")
+    assert_close(snapshot(sim), snapshot(every), **close)
     assert not torch.equal(sim.sensordata, before)
 
 
-def test_forces_push(robot: RobotModel) -> None:
+def test_forces_push(robot: RobotModel, engine: str) -> None:
     """xfrc_applied is a force [N] in the world frame and persists: F t / m in free flight."""
-    sim = simulate(robot)
+    sim = simulate(robot, engine)
     sim.qpos[:, 2] = 3.0
     sim.xfrc_applied[1, robot.id("body", "trunk"), :3] = torch.tensor([10.0, 0.0, 0.0])
     for _ in range(5):
@@ -487,19 +504,19 @@ def test_forces_push(robot: RobotModel) -> None:
 # ---- per-world fields
 
 
-def test_fields_are_views_per_world(robot: RobotModel) -> None:
-    sim = simulate(robot, world_fields=["body_mass", "geom_friction"])
+def test_fields_are_views_per_world(robot: RobotModel, engine: str) -> None:
+    sim = simulate(robot, engine, world_fields=["body_mass", "geom_friction"])
     mass, friction = sim.field("body_mass"), sim.field("geom_friction")
-    assert mass.data_ptr() == sim._model.body_mass.ptr and mass.shape == (3, 14) and friction.shape == (3, robot.physics.ngeom, 3)
+    assert mass.shape == (3, 14) and mass.dtype == torch.float32 and friction.shape == (3, robot.physics.ngeom, 3)
     assert torch.equal(mass, torch.tensor(robot.physics.body_mass, dtype=torch.float).expand(3, -1))
     np.testing.assert_allclose(friction, np.broadcast_to(robot.physics.geom_friction, friction.shape), rtol=1e-6)
 
 
-def test_heavier_robot_sags_further() -> None:
+def test_heavier_robot_sags_further(engine: str) -> None:
     """And as far as C MuJoCo says, in its own world only."""
     robot = go1(physics=EXACT)
     trunk, extra = robot.id("body", "trunk"), torch.tensor([0.0, 3.0, 6.0])  # [kg]
-    sim = simulate(robot, world_fields=["body_mass"])
+    sim = simulate(robot, engine, world_fields=["body_mass"])
     sim.field("body_mass")[:, trunk] += extra
     heights = []
     for added in extra.tolist():
@@ -515,10 +532,10 @@ def test_heavier_robot_sags_further() -> None:
     np.testing.assert_allclose(sim.qpos[:, 2], heights, atol=1e-5)
 
 
-def test_less_friction_slides_further() -> None:
+def test_less_friction_slides_further(engine: str) -> None:
     """v^2 / (2 mu g), to a fifth: the robot is not a block, but its servos are stiff here."""
     robot = go1(physics=EXACT, stiffness={"joint": 200.0}, damping={"joint": 1.5})
-    sim = simulate(robot, world_fields=["geom_friction"])
+    sim = simulate(robot, engine, world_fields=["geom_friction"])
     friction, speed = torch.tensor([0.6, 0.2, 0.1]), 0.5
     for _ in range(100):  # settle
         sim.step(5)
@@ -530,8 +547,8 @@ def test_less_friction_slides_further() -> None:
     np.testing.assert_allclose(start - sim.qpos[:, 0], speed**2 / (2 * friction * 9.81), rtol=0.2)
 
 
-def test_fields_that_do_not_exist(robot: RobotModel) -> None:
-    sim = simulate(robot, 2, world_fields=["body_mass", "geom_friction"])
+def test_fields_that_do_not_exist(robot: RobotModel, engine: str) -> None:
+    sim = simulate(robot, engine, 2, world_fields=["body_mass", "geom_friction"])
     with pytest.raises(ModelError) as error:
         sim.field("geom_fricton")
     text = one_line(error)
@@ -543,19 +560,41 @@ def test_fields_that_do_not_exist(robot: RobotModel) -> None:
         sim.field("dof_armature")
     for unknown, hint in (
         ("body_mas", "did you mean 'body_mass'?"),
-        ("body_parentid", "there are: qpos0, "),
+        ("body_parentid", " qpos0, "),
     ):  # the latter is shared by all
         with pytest.raises(ModelError) as error:
-            Simulation(robot.physics, 2, "cpu", nconmax=8, njmax=40, world_fields=["body_mass", unknown])
-        assert f"no per-world model field '{unknown}' in mujoco-warp's Model; " in one_line(error) and hint in str(error.value)
+            simulate(robot, engine, 2, world_fields=["body_mass", unknown])
+        whose = {"mujoco_warp": "mujoco-warp", "mujoco": "MuJoCo"}[engine]
+        assert f"no per-world model field '{unknown}' in {whose}'s Model; " in one_line(error) and hint in str(error.value)
 
 
-# ---- overflow
+# ---- mujoco-warp alone
+
+
+def test_replay_equals_eager(robot: RobotModel) -> None:
+    """Recording is an optimisation: 20 steps with random targets, pushes and resets, bit for bit."""
+    recorded, eager = simulate(robot, "mujoco_warp", 4), simulate(robot, "mujoco_warp", 4, eager=True)
+    dice = torch.Generator().manual_seed(0)
+    resets = 0
+    for step in range(20):
+        targets = HOME[7:] + 0.3 * torch.randn(4, 12, generator=dice)
+        push, mask = 20 * torch.randn(4, 6, generator=dice), torch.rand(4, generator=dice) < 0.2
+        resets += int(mask.sum())
+        for sim in (recorded, eager):
+            sim.ctrl.copy_(targets)
+            sim.xfrc_applied[:, 1] = push
+            sim.step(5)
+        assert_same(snapshot(recorded), snapshot(eager), where=f"after step {step}")
+        for sim in (recorded, eager):
+            sim.reset(mask)
+            stand(sim, mask)
+        assert_same(snapshot(recorded), snapshot(eager), where=f"after reset {step}")
+    assert resets > 5 and recorded._recorded and not eager._recorded
 
 
 def test_all_fits(robot: RobotModel) -> None:
     """ "Not converged" is the plan at 1 and 5 iterations, so its two bits are no overflow."""
-    sim = simulate(robot)
+    sim = simulate(robot, "mujoco_warp")
     assert sim.overflow_report() == ""
     sim.overflow[0] |= int(OverflowType.LS_ITERATIONS)
     for _ in range(10):
@@ -573,9 +612,39 @@ def test_all_fits(robot: RobotModel) -> None:
     ],
 )
 def test_what_does_not_fit_is_named(robot: RobotModel, room: dict[str, int], advice: str) -> None:
-    sim = simulate(robot, 3, **room)
+    sim = simulate(robot, "mujoco_warp", 3, **room)
     sim.step(5)
     report = sim.overflow_report()
     assert report.startswith("simulator overflow (") and report.endswith(f" in 3 of 3 worlds; {advice}")
     sim.reset(torch.ones(3, dtype=torch.bool))
     assert not sim.overflow.any() and sim.overflow_report() == report  # a reset does not hide it
+
+
+# ---- MuJoCo's own engine alone
+
+
+@pytest.mark.parametrize(
+    ("memory", "report", "stands"),
+    [
+        ("2K", "simulator overflow in 2 of 2 worlds: contacts or constraints do not fit; raise <size memory=...> in the MJCF", True),
+        ("4K", "MuJoCo could not step 2 of 2 worlds: MuJoCo raised in 2 of 2 simulations (0, 1); simulation 0: ", False),
+    ],
+)
+def test_what_does_not_fit_is_reported(tmp_path: Path, memory: str, report: str, stands: bool) -> None:
+    small = build_toy(toy(tmp_path, extra=f'<size memory="{memory}"/>'))
+    sim = make_simulation(small.physics, 2, "cpu", engine="mujoco", nconmax=8, njmax=40)
+    assert sim.overflow_report() == ""
+    sim.qpos[:, 2] = 0.2  # pressed into the ground
+    sim.step(1)
+    assert sim.overflowed_worlds() == 2.0 and sim.overflow_report().startswith(report)
+    assert "\n" not in sim.overflow_report() and bool(torch.isfinite(sim.qpos).all()) == stands
+    sim.reset(torch.ones(2, dtype=torch.bool))
+    assert torch.isfinite(sim.qpos).all() and sim.overflow_report().startswith(report)  # a reset does not hide it
+
+
+def test_a_broken_world_leaves_no_log_file(robot: RobotModel, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    sim = simulate(robot, "mujoco")
+    sim.qvel[0] = math.nan
+    sim.step(5)
+    assert sim.qpos[0].isnan().any() and list(tmp_path.iterdir()) == []

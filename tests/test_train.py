@@ -16,13 +16,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import mujoco_warp as mjw
 import numpy as np
 import onnx
 import onnxruntime
 import pytest
 import torch
-import warp as wp
 from program import SMALL, refused, run, trained
 from rsl_rl.runners import OnPolicyRunner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
@@ -258,10 +256,9 @@ def copy_world(source: LeggedRobot, target: LeggedRobot) -> None:
             getattr(target, name).copy_(value)
     for group, obs in source.obs_buf.items():
         target.obs_buf[group].copy_(obs)
-    for field in dataclasses.fields(mjw.Data):
-        array = getattr(source.sim._data, field.name)
-        if isinstance(array, wp.array):
-            wp.copy(getattr(target.sim._data, field.name), array)
+    for name in ("qpos", "qvel", "ctrl", "xfrc_applied", "sensordata", "actuator_force", "site_xpos"):
+        getattr(target.sim, name).copy_(getattr(source.sim, name))
+    target.sim._batch.state[:] = source.sim._batch.state  # type: ignore[attr-defined]
 
 
 def test_checkpoint_is_all_that_learning_needs(tmp_path: Path) -> None:

@@ -25,7 +25,7 @@ ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys(("sim.dt", "sim.iterations", "sim.ls_iterations", "sim.nconmax", "sim.njmax"), POSITIVE),
     **dict.fromkeys(("rewards.tracking_sigma", "rewards.swing_height", "rewards.max_reward", "termination.max_speed"), POSITIVE),
     **dict.fromkeys(("viewer.width", "viewer.height", "viewer.fps"), POSITIVE),
-    **dict.fromkeys(("terrain.friction", "noise.level", "commands.resampling_time"), NOT_NEGATIVE),
+    **dict.fromkeys(("terrain.friction", "noise.level", "commands.resampling_time", "sim.threads"), NOT_NEGATIVE),
     **dict.fromkeys((f"commands.ranges.{name}" for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")), RANGE),
     **dict.fromkeys(("perturbation.interval", "perturbation.duration"), SPAN),
     "perturbation.velocity": RANGE,
@@ -40,7 +40,9 @@ ENVIRONMENT: dict[str, Rule] = {
 LEARNER: dict[str, Rule] = {
     **dict.fromkeys(("runner.num_steps_per_env", "runner.max_iterations", "runner.save_interval"), POSITIVE),
     **dict.fromkeys(("algorithm.learning_rate", "algorithm.num_learning_epochs", "algorithm.num_mini_batches"), POSITIVE),
-    **dict.fromkeys(("symmetry.mirror_loss_coeff", "anneal.entropy_coef", "anneal.desired_kl"), NOT_NEGATIVE),
+    **dict.fromkeys(("cpu.envs_per_core", "cpu.num_steps_per_env", "cpu.max_iterations"), POSITIVE),
+    **dict.fromkeys(("cpu.num_learning_epochs", "cpu.num_mini_batches", "cpu.desired_kl"), POSITIVE),
+    **dict.fromkeys(("symmetry.mirror_loss_coeff", "anneal.entropy_coef", "anneal.desired_kl", "cpu.update_threads"), NOT_NEGATIVE),
     "runner.run_name": ("part of a folder's name, without / or \\", lambda v: "/" not in v and "\\" not in v),
 }
 

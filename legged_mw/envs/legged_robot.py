@@ -144,6 +144,7 @@ class LeggedRobot(BaseTask):
         self._reset_robots(mask)
         self._reset_commands(mask)
         if self.cfg.perturbation.enable:
+            self._update_kick_level(mask)
             self._redraw_kicks(mask)
         self._episode.masked_fill_(mask[:, None], 0.0)
         self.foot_contact.masked_fill_(mask[:, None], False)
@@ -206,11 +207,18 @@ class LeggedRobot(BaseTask):
         low, high = self.kick_ranges
         draw = torch.lerp(low, high, torch.rand(self.num_envs, 4, device=self.device))
         draw[:, :2] = (draw[:, :2] / self.dt).round_().clamp_(min=1.0)  # [control steps]
+        draw[:, 3] *= self.kick_level
         assign(self.kick, mask, draw)
         self.kick_clock.masked_fill_(mask, 0.0)
         if not keep_force:
             self.kick_active.masked_fill_(mask, False)
             self.kick_force.masked_fill_(mask[:, None], 0.0)
+
+    def _update_kick_level(self, mask: Tensor) -> None:
+        """With the curriculum: halfway from the level so far to the share of an episode that was survived."""
+        if self.cfg.perturbation.curriculum:
+            survived = torch.where(self.time_out_buf, 1.0, self.episode_steps[:, 0] / self.max_episode_length)
+            assign(self.kick_level, mask, 0.5 * (self.kick_level + survived))
 
     # ---- observations: this table is the only place that states the layout ------------------------------------------------
 
@@ -450,6 +458,7 @@ class LeggedRobot(BaseTask):
         self.commands, self.command_timer = zeros(3), zeros(1)  # vx, vy [m/s], yaw rate [rad/s]; [control steps]
         self.kick, self.kick_clock = zeros(4), zeros()  # pause, duration [control steps], direction [rad], dv [m/s]
         self.kick_force, self.kick_active = zeros(3), zeros(dtype=torch.bool)
+        self.kick_level = zeros().fill_(0.0 if self.cfg.perturbation.curriculum else 1.0)  # share of the range of dv that is drawn from
         self._init_episode_memory()
         self._init_imu()
         self.foot_sites = torch.tensor([robot.id("site", name) for name in self.cfg.asset.foot_names], device=device)

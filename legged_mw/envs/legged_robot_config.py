@@ -107,6 +107,7 @@ class LeggedRobotCfg(Config):
         interval: list[float] = [1.0, 3.0]  # pause between kicks [s] [P]
         duration: list[float] = [0.05, 0.2]  # [s] [P]
         velocity: list[float] = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
+        curriculum: bool = False  # a world's dv grows with the share of an episode that it survives, from 0 [ours]
 
     class terrain:
         mesh_type: Literal["plane"] = "plane"
@@ -200,8 +201,11 @@ class LeggedRobotCfgPPO(Config):
         num_steps_per_env: int = 16
         num_learning_epochs: int = 5
         num_mini_batches: int = 4
-        hidden_dims: list[int] = [128, 128, 128]  # of actor and critic
-        max_iterations: int = 2200
+        desired_kl: float = 0.02
+        hidden_dims: list[int] = [128, 64, 32]  # of actor and critic
+        max_iterations: int = 2600
+        keep_probability: list[float] = [0.7, 0.25, 0.5]  # of commands: to turn on the spot is rare otherwise, and learned last
+        kick_curriculum: bool = True  # perturbation.curriculum: the strongest kicks keep a beginner from learning to walk
         update_threads: int = 0  # of torch in an update; 0: one a core. Everything else of a step runs on one
 
     class symmetry:

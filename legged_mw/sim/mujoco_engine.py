@@ -59,20 +59,21 @@ class MujocoSimulation:
         self._fields = {name: self._expand(name) for name in world_fields}
         self._into = [*into.values(), *self._fields.values()]
         self._cleared = [into[name][0] for name in ("qvel", *_WRITTEN)] + [tensor for tensor, _ in out.values()]
+        self._failed, self._reason = np.zeros(num_envs, dtype=bool), ""  # worlds that MuJoCo ever refused to step
         self._qpos0 = torch.tensor(model.qpos0, dtype=torch.float)
 
     def step(self, substeps: int = 1) -> None:
         for tensor, rows in self._into:
             rows.copy_(tensor)
-        failed: np.ndarray | None = None
+        failed: SimulationError | None = None
         try:
             self._batch.step(nstep=substeps)
-        except SimulationError as error:
-            failed = error.ids
+        except SimulationError as error:  # the other worlds are stepped all the same
+            failed, self._failed[error.ids], self._reason = error, True, " ".join(str(error).split())
         for tensor, rows in self._out:
             tensor.copy_(rows)
         if failed is not None:
-            self.qpos[torch.from_numpy(failed).long()] = torch.nan
+            self.qpos[torch.from_numpy(failed.ids).long()] = torch.nan
 
     def reset(self, mask: Tensor) -> None:
         which = mask.numpy()
@@ -90,12 +91,19 @@ class MujocoSimulation:
         return self._fields[name][0]
 
     def overflowed_worlds(self) -> Tensor:
-        return torch.tensor(float((self._batch.warning[:, _FULL, 1] > 0).any(axis=1).sum()))  # counts since construction
+        return torch.tensor(float((self._failed | self._full()).sum()))
 
     def overflow_report(self) -> str:
-        if not (worlds := int(self.overflowed_worlds())):
-            return ""
-        return f"simulator overflow in {worlds} of {self.num_envs} worlds: MuJoCo's memory is full; raise <size memory=...> in the MJCF"
+        of = f"of {self.num_envs} worlds"
+        if self._failed.any():
+            return f"MuJoCo could not step {self._failed.sum()} {of}: {self._reason}"
+        if (full := self._full()).any():
+            return f"simulator overflow in {full.sum()} {of}: contacts or constraints do not fit; raise <size memory=...> in the MJCF"
+        return ""
+
+    def _full(self) -> np.ndarray:
+        """Worlds that ever had to leave a contact or a constraint out: MuJoCo counts since construction."""
+        return (self._batch.warning[:, _FULL, 1] > 0).any(axis=1)
 
     def _adopt(self, name: str) -> tuple[Tensor, Tensor]:
         """A tensor for a field of MjData, and the engine's rows of it."""
@@ -106,7 +114,7 @@ class MujocoSimulation:
 
     def _expand(self, name: str) -> tuple[Tensor, Tensor]:
         """A tensor (N, ...) for a field of the model, and the engine's rows of it."""
-        known = [field for field in MODEL_FIELDS if getattr(getattr(self._batch.model, field, None), "dtype", None) == np.float64]
+        known = sorted(field for field in MODEL_FIELDS if getattr(getattr(self._batch.model, field, None), "dtype", None) == np.float64)
         if name not in known:
             raise ModelError(unknown("per-world model field", name, known, "MuJoCo's Model"))
         rows = _tensor(self._batch.expand(name))
