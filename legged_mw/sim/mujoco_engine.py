@@ -22,7 +22,6 @@ from legged_mw.utils.machine import usable_cores
 
 _READ_AND_WRITTEN, _WRITTEN = ("qpos", "qvel"), ("ctrl", "xfrc_applied")
 _READ = ("sensordata", "actuator_force", "site_xpos")  # computed by a step
-_SENSORS_LAST_FROM = 512  # [worlds]; measured on two cores: 4 % faster at 1024, 4 % slower at 256
 _FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
 
@@ -49,9 +48,6 @@ class MujocoSimulation:
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # else it resets a broken world by itself, unasked
         _keep_quiet()
         self._batch = Batch(model, num_envs, threads or usable_cores())
-        # Sensors feed nothing back: in many worlds it pays to compute them in the last substep only, by a call of its own.
-        self._flags = self._batch.expand("opt.disableflags") if num_envs >= _SENSORS_LAST_FROM else None
-        self._own_flags = int(model.opt.disableflags)
         self._start = self._batch.state[0].copy()  # a row of state, as the model has it
         # tensor and the engine's rows, to be copied before and after a step
         into, out = {}, {}
@@ -69,24 +65,15 @@ class MujocoSimulation:
     def step(self, substeps: int = 1) -> None:
         for tensor, rows in self._into:
             rows.copy_(tensor)
-        first = substeps - 1 if self._flags is not None else 0
-        failed = [self._advance(first, sensors=False)] if first else []
-        failed.append(self._advance(substeps - first))
-        for tensor, rows in self._out:
-            tensor.copy_(rows)
-        for worlds in failed:
-            self.qpos[worlds] = torch.nan
-
-    def _advance(self, substeps: int, sensors: bool = True) -> Tensor:
-        """Steps of the rows; returns the worlds that MuJoCo refused to step. The others are stepped all the same."""
-        if self._flags is not None:
-            self._flags[:] = self._own_flags if sensors else self._own_flags | int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+        refused = None
         try:
             self._batch.step(nstep=substeps)
-        except SimulationError as error:
-            self._failed[error.ids], self._reason = True, " ".join(str(error).split())
-            return torch.from_numpy(error.ids).long()
-        return torch.empty(0, dtype=torch.long)
+        except SimulationError as error:  # the other worlds are stepped all the same
+            refused, self._failed[error.ids], self._reason = error.ids, True, " ".join(str(error).split())
+        for tensor, rows in self._out:
+            tensor.copy_(rows)
+        if refused is not None:
+            self.qpos[torch.from_numpy(refused).long()] = torch.nan
 
     def reset(self, mask: Tensor) -> None:
         which = mask.numpy()
