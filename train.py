@@ -67,6 +67,7 @@ def main() -> None:
     if device == "cpu" and task.train.cpu.enable and not run:
         task.fit_cpu(usable_cores())
         apply_overrides(task, args)  # again: what the user says wins
+        print("on a CPU the section cpu sets worlds, networks and learner; flags win, --set cpu.enable=false keeps the task's own")
     if not run:
         experiment = ROOT / "logs" / (task.train.runner.experiment_name or task.name)  # --set may have named it
     check_values(task.cfg, task.train)
