@@ -31,11 +31,16 @@ def child(task_name: str, num_envs: int | None, device: str | None, started: flo
 
     done("import torch")
     import mujoco
-    import mujoco_warp
-    import warp
 
-    assert mujoco and mujoco_warp and warp
-    done("import mujoco, warp, mujoco_warp")
+    assert mujoco
+    done("import mujoco")
+    if torch.cuda.is_available() and device != "cpu":  # elsewhere MuJoCo's own engine steps
+        import mujoco_warp
+        import warp
+
+        assert mujoco_warp and warp
+        warp.init()
+    done("import warp, mujoco_warp (for a GPU)")
     import rsl_rl.runners
     import tensordict
 
@@ -54,7 +59,6 @@ def child(task_name: str, num_envs: int | None, device: str | None, started: flo
     else:
         torch.cuda.set_device(device)
     torch.zeros(1, device=device)
-    warp.init()
     done("open the device")
     if num_envs:
         task.cfg.env.num_envs = num_envs
