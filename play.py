@@ -12,7 +12,7 @@ from rsl_rl.models import MLPModel
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam
+from legged_mw.eval import exam, rules
 from legged_mw.rl.policy import act, export_onnx, load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE, find_checkpoint, find_run, runs
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, one_line_errors, pick_device, seed_everything, shown
@@ -127,8 +127,8 @@ def changes_since(task: LoadedTask, trained: dict[str, Any]) -> dict[str, tuple[
 def grade(env: LeggedRobot, policy: MLPModel, source: Source, overrides: dict[str, Any], path: Path) -> None:
     result = exam.run_exam(env, lambda obs: act(policy, obs))
     about = {"policy": shown(source.checkpoint), "engine": env.sim.engine, "device": env.device, "overrides": overrides}
-    exam.save({**about, **result}, path)
-    print(exam.table(result))
+    rules.save({**about, **result}, path)
+    print(rules.table(result))
     print(f"written to {shown(path)}")
 
 

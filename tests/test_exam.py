@@ -17,7 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam
+from legged_mw.eval import exam, rules
 from legged_mw.utils.task import load_task
 
 TRACKED, KICKED = 22, 6 * 16  # worlds
@@ -25,7 +25,7 @@ WORLDS = TRACKED + KICKED
 
 
 def test_commands_are_the_22() -> None:
-    assert exam.commands() == [
+    assert rules.commands() == [
         (0, 0, 0),
         *((0.5, 0, 0), (1.0, 0, 0), (1.5, 0, 0), (-0.5, 0, 0), (-1.0, 0, 0)),
         *((0, 0.4, 0), (0, 0.8, 0), (0, -0.4, 0), (0, -0.8, 0)),
@@ -47,7 +47,7 @@ def test_prepare_leaves_nothing_to_chance() -> None:
     init = cfg.init_state
     assert (init.pos_xy_range, init.yaw_range, init.lin_vel_range, init.ang_vel_range, cfg.noise.level) == (0, 0, 0, 0, 0)
     assert cfg.perturbation.enable is False and cfg.commands.resampling_time == 0
-    assert cfg.env.episode_length_s > exam.SECONDS and cfg.env.num_envs == WORLDS
+    assert cfg.env.episode_length_s > rules.SECONDS and cfg.env.num_envs == WORLDS
 
 
 # ---- the arithmetic, with a made-up environment whose figures are known
@@ -108,7 +108,7 @@ def test_worlds_are_commanded_and_the_policy_sees_it() -> None:
 
     env = Puppet(follow)
     grade(env, policy)
-    wanted = torch.tensor([*exam.commands(), *[(0.8, 0.0, 0.0)] * KICKED])
+    wanted = torch.tensor([*rules.commands(), *[(0.8, 0.0, 0.0)] * KICKED])
     assert torch.equal(env.commands, wanted) and len(seen) == 500
     assert all(torch.equal(obs, wanted) for obs in seen)
     assert [float(action[0, 0]) for action in env.actions] == [float(i) for i in range(1, 501)]  # each acted upon once, in order
@@ -147,7 +147,7 @@ def test_errors_are_means_over_the_counted_time() -> None:
     result = grade(Puppet(script))
     assert result["error"] == pytest.approx([0.0105, 0.021, 0.0315], abs=2e-5)  # the mean of 0 .. 21 is 10.5
     assert result["worst"] == pytest.approx([0.021, 0.042, 0.063], abs=2e-5)
-    for i, (row, command) in enumerate(zip(result["commands"], exam.commands(), strict=True)):
+    for i, (row, command) in enumerate(zip(result["commands"], rules.commands(), strict=True)):
         assert row["command"] == list(command) and row["fell"] is False
         assert row["error"] == pytest.approx([0.001 * i, 0.002 * i, 0.003 * i], abs=2e-5)
 
@@ -225,7 +225,7 @@ def changed(result: dict[str, Any], path: str, value: float) -> dict[str, Any]:
 
 
 def test_walks_at_the_threshold() -> None:
-    assert exam.walks(WALKS)
+    assert rules.walks(WALKS)
 
 
 @pytest.mark.parametrize(
@@ -233,12 +233,12 @@ def test_walks_at_the_threshold() -> None:
     [("falls", 1), ("error.0", 0.0601), ("error.1", 0.0601), ("error.2", 0.1201), ("kicks.2", 0.9375), ("error.0", math.inf)],
 )
 def test_does_not_walk_past_it(path: str, value: float) -> None:
-    assert not exam.walks(changed(WALKS, path, value))
+    assert not rules.walks(changed(WALKS, path, value))
 
 
 def test_beats_the_peer_by_a_little() -> None:
-    assert exam.beats_peer(BEATS)
-    assert exam.beats_peer(changed(BEATS, "kicks.6", 1.0)) and exam.beats_peer(changed(BEATS, "drift", 0.0))
+    assert rules.beats_peer(BEATS)
+    assert rules.beats_peer(changed(BEATS, "kicks.6", 1.0)) and rules.beats_peer(changed(BEATS, "drift", 0.0))
 
 
 @pytest.mark.parametrize(
@@ -250,12 +250,12 @@ def test_beats_the_peer_by_a_little() -> None:
     ],
 )
 def test_does_not_beat_the_peer(path: str, value: float) -> None:
-    assert not exam.beats_peer(changed(BEATS, path, value))
+    assert not rules.beats_peer(changed(BEATS, path, value))
 
 
 def test_table_names_every_figure() -> None:
     result = grade(Puppet(follow))
-    text = exam.table({**result, "drift": 0.1234, "cost_of_transport": 4.56, "joint_speed": 0.789})
+    text = rules.table({**result, "drift": 0.1234, "cost_of_transport": 4.56, "joint_speed": 0.789})
     for part in ("0.1234", "4.56", "0.789", "survives kicks of 6 m/s", "worst command", "0.0007", "walks: yes; beats the peer: no"):
         assert part in text
 

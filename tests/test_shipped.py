@@ -11,7 +11,7 @@ import torch
 from program import run
 
 from legged_mw import ROOT
-from legged_mw.eval import exam
+from legged_mw.eval import exam, rules
 from legged_mw.rl.policy import ExportedPolicy, act, load_policy
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import load_task
@@ -41,7 +41,7 @@ def test_walks_and_both_formats_agree(folder: Path) -> None:
     np.testing.assert_allclose(got, expected.numpy(), atol=1e-4)  # float32 sums in another order
 
     result = exam.run_exam(env, lambda state: act(policy, state))
-    assert result["walks"], exam.table(result)
+    assert result["walks"], rules.table(result)
 
 
 def test_play_takes_the_shipped_policy_where_nothing_is_trained(tmp_path: Path) -> None:

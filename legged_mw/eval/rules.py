@@ -1,0 +1,126 @@
+"""The walking exam's rules: commands, kicks, what is measured, what passes. Plain numbers: needs numpy, neither torch nor warp.
+
+Who drives the robot through it: ``exam`` in the training environment, ``legged_mw.deploy`` on an exported policy.
+"""
+
+from __future__ import annotations
+
+import json
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+SECONDS, SETTLING = 10.0, 2.0  # [s] of a tracking command, and of its start that is not counted
+KICK_COMMAND, KICK_AT, KICK_UNTIL = 0.8, 3.0, 6.0  # vx [m/s]; [s]
+KICK_SPEEDS, KICK_DIRECTIONS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0), 16  # [m/s]
+GRAVITY = 9.81  # [m/s^2]
+
+# What the policy that ships with MuJoCo Playground for this robot scores in MuJoCo's C engine under these rules.
+PEER: dict[str, Any] = {
+    "falls": 0,
+    "error": [0.024, 0.031, 0.084],
+    "worst": [0.042, 0.063, 0.357],
+    "drift": 0.0007,
+    "kicks": {"1": 1.0, "2": 1.0, "3": 1.0, "4": 0.81, "5": 0.38, "6": 0.13},
+    "cost_of_transport": 0.86,
+}
+EQUAL_DRIFT = 0.005  # [m], below which drifts count as equal
+
+
+def commands() -> list[tuple[float, float, float]]:
+    """The 22 commands (vx, vy [m/s], yaw rate [rad/s]); the first is to stand."""
+    along = [(v, 0.0, 0.0) for v in (0.5, 1.0, 1.5, -0.5, -1.0)]
+    across = [(0.0, v, 0.0) for v in (0.4, 0.8, -0.4, -0.8)]
+    turning = [(0.0, 0.0, w) for w in (0.6, 1.2, -0.6, -1.2)]
+    return [(0.0, 0.0, 0.0), *along, *across, *turning, *product((1.0, -1.0), (0.4, -0.4), (0.6, -0.6))]
+
+
+def grade(
+    *,
+    error: NDArray[Any],
+    fell_at: NDArray[Any],
+    distance: NDArray[Any],
+    energy: NDArray[Any],
+    standing_joint_speed: float,
+    mass: float,
+    dt: float,
+) -> dict[str, Any]:
+    """The exam's result from what was measured; C commands, N = C + kick speeds * kick directions worlds, in that order.
+
+    ``error`` (C, 3): mean absolute difference to the command after settling [m/s, m/s, rad/s]. ``fell_at`` (N,): control step
+    of the first fall, or inf. ``distance`` (C,): straight line since settling [m]; ``energy`` (C,): sum of |torque * joint
+    speed| dt over the same time [J]. ``standing_joint_speed``: mean of the last second at the command to stand [rad/s].
+    ``mass`` [kg], ``dt`` a control step [s].
+    """
+    count = len(commands())
+    stood = np.isinf(fell_at[:count])
+    ahead = commands().index((1.0, 0.0, 0.0))
+    survived = (fell_at[count:] > round(KICK_UNTIL / dt)).reshape(len(KICK_SPEEDS), KICK_DIRECTIONS).mean(axis=1)
+    result = {
+        "falls": int((~stood).sum()),
+        "error": _figures(error[stood].mean(axis=0)) if stood.any() else None,  # None: nothing left to measure, all fell
+        "worst": _figures(error[stood].max(axis=0)) if stood.any() else None,
+        "drift": float(distance[0]) if stood[0] else None,
+        "joint_speed": standing_joint_speed if stood[0] else None,
+        "kicks": {f"{speed:g}": round(float(share), 4) for speed, share in zip(KICK_SPEEDS, survived, strict=True)},
+        "cost_of_transport": float(energy[ahead] / (mass * GRAVITY * distance[ahead])) if stood[ahead] else None,
+        "commands": [
+            {"command": list(c), "error": _figures(e) if ok else None, "fell": not bool(ok)}
+            for c, e, ok in zip(commands(), error, stood, strict=True)
+        ],
+    }
+    return {"walks": walks(result), "beats_peer": beats_peer(result), **result}
+
+
+def walks(result: dict[str, Any]) -> bool:
+    """No falls, small errors, every kick of 2 m/s survived."""
+    if result["falls"]:
+        return False
+    small = all(error <= most for error, most in zip(result["error"], (0.06, 0.06, 0.12), strict=True))
+    return small and result["kicks"]["2"] == 1.0
+
+
+def beats_peer(result: dict[str, Any]) -> bool:
+    """At least as good on each of the peer's figures, better on the errors and the cost of transport."""
+    if result["falls"] > PEER["falls"]:
+        return False
+    better = all(a < b for a, b in zip(result["error"], PEER["error"], strict=True))
+    better = better and result["cost_of_transport"] < PEER["cost_of_transport"]
+    worst = all(a <= b for a, b in zip(result["worst"], PEER["worst"], strict=True))
+    kicks = all(result["kicks"][speed] >= share for speed, share in PEER["kicks"].items())
+    return better and worst and kicks and result["drift"] <= max(EQUAL_DRIFT, PEER["drift"])
+
+
+def table(result: dict[str, Any]) -> str:
+    """The result beside the peer's, as text."""
+    rows = [("", "this policy", "walks at", "peer")]
+    rows.append(("falls in 22 commands", f"{result['falls']}", "0", f"{PEER['falls']}"))
+    error, worst = result["error"] or [None] * 3, result["worst"] or [None] * 3
+    for i, (name, most) in enumerate((("vx [m/s]", 0.06), ("vy [m/s]", 0.06), ("yaw rate [rad/s]", 0.12))):
+        rows.append((f"error {name}", _shown(error[i], 3), f"{most:.2f}", f"{PEER['error'][i]:.3f}"))
+        rows.append(("  worst command", _shown(worst[i], 3), "", f"{PEER['worst'][i]:.3f}"))
+    rows.append(("drift standing 8 s [m]", _shown(result["drift"], 4), "", f"{PEER['drift']:.4f}"))
+    rows.append(("joint speed standing [rad/s]", _shown(result["joint_speed"], 3), "", ""))
+    for speed, share in result["kicks"].items():
+        rows.append((f"survives kicks of {speed} m/s", f"{share:.2f}", "1.00" if speed == "2" else "", f"{PEER['kicks'][speed]:.2f}"))
+    rows.append(("cost of transport at 1 m/s", _shown(result["cost_of_transport"], 2), "", f"{PEER['cost_of_transport']:.2f}"))
+    lines = [f"{a:<30}{b:>12}{c:>10}{d:>8}" for a, b, c, d in rows]
+    verdict = f"walks: {'yes' if result['walks'] else 'no'}; beats the peer: {'yes' if result['beats_peer'] else 'no'}"
+    return "\n".join([*lines, verdict])
+
+
+def save(result: dict[str, Any], path: Path) -> None:
+    """Write the result as JSON."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+
+
+def _shown(value: float | None, digits: int) -> str:
+    return "fell" if value is None else f"{value:.{digits}f}"
+
+
+def _figures(row: NDArray[np.float64]) -> list[float]:
+    return [round(float(value), 5) for value in row]
