@@ -53,8 +53,9 @@ class BaseTask(VecEnv):
         """
         if actions.shape != self.actions.shape:
             raise ValueError(f"actions must be {tuple(self.actions.shape)} (environments, joints); got {tuple(actions.shape)}")
-        self.actions.copy_(actions)
-        self._graph()
+        with torch.inference_mode():  # the fixed buffers stay ordinary tensors; what lives for a moment is cheaper so
+            self.actions.copy_(actions)
+            self._graph()
         extras = {"time_outs": self.time_out_buf.clone()}
         return self.get_observations(), self.rew_buf.clone(), self.reset_buf.clone(), extras
 
