@@ -29,6 +29,7 @@ ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys((f"commands.ranges.{name}" for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")), RANGE),
     **dict.fromkeys(("perturbation.interval", "perturbation.duration"), SPAN),
     "perturbation.velocity": RANGE,
+    "init_state.dof_pos_range": RANGE,
     "asset.foot_names": NAMES,
     "asset.colliders": NAMES,
     "commands.keep_probability": PROBABILITIES,

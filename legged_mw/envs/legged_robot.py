@@ -11,6 +11,7 @@ foot position and velocity, accelerometer, joint torque) is one simulation step 
 from __future__ import annotations
 
 import math
+from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -36,6 +37,14 @@ class Row(NamedTuple):
     value: Tensor  # (N, size)
     noise: float = 0.0  # half width of the uniform noise added to it, in the value's unit
     mirror: str | None = None  # its mirror image, left for right: a kind of envs/mirror.py, or the group that it is; None: not said
+    scale: float | tuple[float, ...] = 1.0  # a number, or one a column; the policy sees scale * (value + noise)
+
+    def column_scales(self) -> list[float]:
+        """The scale of each column; raises ConfigError where there is not one for each."""
+        size = self.value.shape[1]
+        if isinstance(self.scale, tuple) and len(self.scale) != size:
+            raise ConfigError(f"observation row '{self.name}' has {size} columns and {len(self.scale)} scales; give one, or one a column")
+        return list(self.scale) if isinstance(self.scale, tuple) else [float(self.scale)] * size
 
 
 class LeggedRobot(BaseTask):
@@ -127,7 +136,10 @@ class LeggedRobot(BaseTask):
         finite = (speed <= self.cfg.termination.max_speed) & (position < math.inf) & (action < math.inf)  # NaN compares false
         torch.logical_not(finite, out=self.broken)
         max_tilt = math.radians(self.cfg.termination.max_tilt)
-        torch.logical_and(self.projected_gravity[:, 2] > -math.cos(max_tilt), finite, out=self.fell)
+        down = self.projected_gravity[:, 2] > -math.cos(max_tilt)
+        if len(self.terminating_contacts):
+            down |= self.contact_count[:, self.terminating_contacts].amax(dim=1) > 0.0
+        torch.logical_and(down, finite, out=self.fell)
         ended = torch.logical_or(self.fell, self.broken)
         torch.logical_and(self._episode_length_buf >= self.max_episode_length, ~ended, out=self.time_out_buf)
         torch.logical_or(ended, self.time_out_buf, out=self.reset_buf)
@@ -152,13 +164,16 @@ class LeggedRobot(BaseTask):
         self._refresh_base()
 
     def _reset_robots(self, mask: Tensor) -> None:
-        """Root near the origin with any heading and a small velocity, joints and servo targets at the default pose."""
+        """Root near the origin with any heading and a small velocity, joints and servo targets at (or near) the default pose."""
         n = self.num_envs
         draw = torch.rand(n, 9, device=self.device).mul_(2.0).sub_(1.0).mul_(self.reset_range)  # x, y, yaw, velocities
         half = 0.5 * draw[:, 2:3]
         zero = torch.zeros_like(half)
         pose = [self.init_pos[:2] + draw[:, :2], self.init_pos[2:].expand(n, 1), torch.cos(half), zero, zero, torch.sin(half)]
-        assign(self.sim.qpos, mask, torch.cat([*pose, self.default_dof_pos.expand(n, -1)], dim=1))
+        joints, (low, high) = self.default_dof_pos.expand(n, -1), self.cfg.init_state.dof_pos_range
+        if (low, high) != (1.0, 1.0):
+            joints = joints * torch.empty_like(self.dof_offset).uniform_(low, high)
+        assign(self.sim.qpos, mask, torch.cat([*pose, joints], dim=1))
         assign(self.sim.qvel[:, :6], mask, draw[:, 3:])  # the joints' velocity is zero from the reset
         assign(self.sim.ctrl, mask, self.default_dof_pos)
 
@@ -254,16 +269,19 @@ class LeggedRobot(BaseTask):
         }
 
     def compute_observations(self) -> None:
-        """Fill ``obs_buf``: each group's rows side by side, plus noise where a row has any."""
+        """Fill ``obs_buf``: each group's rows side by side, plus noise where a row has any, times scale."""
         for group, rows in self._observation_rows().items():
             obs = self.obs_buf[group]
             torch.cat([row.value for row in rows], dim=1, out=obs)
             if group in self.noise_vec:
                 obs.addcmul_(torch.empty_like(obs).uniform_(-1.0, 1.0), self.noise_vec[group])
+            if group in self.obs_scales:
+                obs.mul_(self.obs_scales[group])
 
     def _prepare_observations(self) -> None:
-        """Sizes and noise vectors from the table itself."""
+        """Sizes, noise and scale vectors from the table itself."""
         self.noise_vec: dict[str, Tensor] = {}
+        self.obs_scales: dict[str, Tensor] = {}
         self.observation_table: dict[str, list[tuple[str, int, float]]] = {}  # group -> (name, size, noise)
         for group in self._observation_rows():
             rows = self._observation_rows()[group]  # again: a group may contain an earlier one
@@ -273,6 +291,9 @@ class LeggedRobot(BaseTask):
             self.obs_buf[group] = torch.zeros(self.num_envs, len(noise), device=self.device)
             if any(noise):
                 self.noise_vec[group] = torch.tensor(noise, device=self.device)
+            scales = [scale for row in rows for scale in row.column_scales()]
+            if any(scale != 1.0 for scale in scales):
+                self.obs_scales[group] = torch.tensor(scales, device=self.device)
 
     @cached_property
     def mirror(self) -> Mirror:
@@ -385,6 +406,10 @@ class LeggedRobot(BaseTask):
         excess = self.feet_air_time - self.cfg.rewards.min_air_time
         return (excess * (self.first_contact & self.moving[:, None])).sum(dim=1)
 
+    def _reward_collision(self) -> Tensor:
+        """How many bodies touch the ground that should not: ``asset.penalize_contacts_on``. [L]"""
+        return ((self.contact_count @ self.penalized_contacts) > 0.0).sum(dim=1).float()
+
     # ---- statistics: summed on the device, read once an iteration ------------------------------------------------------------
 
     def _sum_statistics(self) -> None:
@@ -430,7 +455,7 @@ class LeggedRobot(BaseTask):
             damping=cfg.control.damping,
             colliders=cfg.asset.colliders,
             self_collisions=cfg.asset.self_collisions,
-            contact_geoms=cfg.asset.foot_names,
+            contact_geoms=[*cfg.asset.foot_names, *cfg.asset.penalize_contacts_on, *cfg.asset.terminate_after_contacts_on],
             velocity_sites=cfg.asset.foot_names,
             accelerometer_site=cfg.asset.imu_site,
             camera=cfg.viewer.camera,
@@ -443,7 +468,8 @@ class LeggedRobot(BaseTask):
         self.dof_pos, self.dof_vel = sim.qpos[:, 7:], sim.qvel[:, 6:]  # views (N, D) [rad], [rad/s]
         self.base_ang_vel = sim.qvel[:, 3:6]  # view, body frame [rad/s]
         self.torques = sim.actuator_force  # view (N, D) [N m]
-        self.foot_contact_count = sim.sensordata[:, spans["contact"]]  # view (N, F)
+        self.contact_count = sim.sensordata[:, spans["contact"]]  # view (N, C), of robot.contact_geoms with the ground; feet first
+        self.foot_contact_count = self.contact_count[:, :feet]  # view (N, F)
         self.foot_vel = sim.sensordata[:, spans["linvel"]].unflatten(1, (feet, 3))  # view, world frame [m/s]
         self.accelerometer = sim.sensordata[:, spans["accelerometer"]]  # view (N, 3) [m/s^2]
 
@@ -461,6 +487,7 @@ class LeggedRobot(BaseTask):
         self.kick_level = zeros().fill_(0.0 if self.cfg.perturbation.curriculum else 1.0)  # share of the range of dv that is drawn from
         self._init_episode_memory()
         self._init_imu()
+        self._init_contacts()
         self.foot_sites = torch.tensor([robot.id("site", name) for name in self.cfg.asset.foot_names], device=device)
         self.gravity_dir = torch.tensor([0.0, 0.0, -1.0], device=device).expand(n, 3)
         self.total_mass = float(robot.physics.body_subtreemass[0])  # [kg]
@@ -481,6 +508,31 @@ class LeggedRobot(BaseTask):
         if model.site_bodyid[imu] != self.root_body or abs(model.site_quat[imu][0]) < 1.0 - 1e-9:
             raise ModelError(f"asset.imu_site '{self.cfg.asset.imu_site}' must be on the root body '{robot.root}' and aligned with it")
         self.imu_pos = torch.tensor(model.site_pos[imu], dtype=torch.float, device=self.device).expand(self.num_envs, 3)  # body frame [m]
+
+    def _init_contacts(self) -> None:
+        """Which columns of ``contact_count`` are a fall, and (C, B) which are of which penalised body."""
+        asset, geoms, model = self.cfg.asset, self.robot.contact_geoms, self.robot.physics
+        terminating = self._contact_columns(asset.terminate_after_contacts_on, "terminate_after_contacts_on")
+        penalized = self._contact_columns(asset.penalize_contacts_on, "penalize_contacts_on")
+        if self._active_scales().get("collision") and not penalized:
+            raise ConfigError("rewards.scales.collision is on, but asset.penalize_contacts_on names nothing; name what should not touch")
+        body = {column: int(model.geom_bodyid[self.robot.id("geom", geoms[column])]) for column in penalized}
+        bodies = sorted(set(body.values()))
+        table = torch.zeros(len(geoms), len(bodies))
+        for column in penalized:
+            table[column, bodies.index(body[column])] = 1.0
+        self.penalized_contacts = table.to(self.device)
+        self.terminating_contacts = torch.tensor(terminating, dtype=torch.long, device=self.device)
+
+    def _contact_columns(self, patterns: list[str], field: str) -> list[int]:
+        """Columns of ``contact_count`` that ``patterns`` mean; each of the geoms must be one that can touch the ground."""
+        hits = [i for i, name in enumerate(self.robot.contact_geoms) if any(fnmatchcase(name, pattern) for pattern in patterns)]
+        for name in (self.robot.contact_geoms[i] for i in hits):
+            if not self.robot.physics.geom_conaffinity[self.robot.id("geom", name)]:
+                raise ConfigError(
+                    f"asset.{field}: '{name}' never touches the ground; add it to asset.colliders: {self.cfg.asset.colliders}"
+                )
+        return hits
 
     def _init_ranges(self) -> None:
         """Config numbers as tensors: joints' tables, reset and command ranges."""

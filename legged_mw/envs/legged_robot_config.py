@@ -24,10 +24,13 @@ class LeggedRobotCfg(Config):
         imu_site: str = "imu"  # on the root body and aligned with it
         colliders: list[str] = ["*"]  # geoms that touch the ground; names or patterns, of those that collide in the MJCF
         self_collisions: bool = False  # among the colliders
+        penalize_contacts_on: list[str] = []  # colliders, or patterns: `collision` counts their bodies on the ground [L]
+        terminate_after_contacts_on: list[str] = []  # likewise: to touch the ground with one of these is a fall [L]
 
     class init_state:
         pos: list[float] = [0.0, 0.0, 1.0]  # root at reset [m]
         default_joint_angles: dict[str, float] = {}  # joint or part of its name -> [rad]; the pose of action 0
+        dof_pos_range: list[float] = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
         pos_xy_range: float = 0.5  # root x and y + U(-range, range) [m] [P]
         yaw_range: float = 3.141592653589793  # U(-range, range) [rad] [P]
         lin_vel_range: float = 0.5  # root velocity, world frame, each axis U(-range, range) [m/s] [P]

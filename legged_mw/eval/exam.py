@@ -24,6 +24,7 @@ OVERRIDES: dict[str, Any] = {
     "noise.level": 0.0,
     "perturbation.enable": False,
     "commands.resampling_time": 0.0,
+    "init_state.dof_pos_range": [1.0, 1.0],
     "init_state.pos_xy_range": 0.0,
     "init_state.yaw_range": 0.0,
     "init_state.lin_vel_range": 0.0,
