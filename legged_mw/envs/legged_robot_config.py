@@ -87,6 +87,7 @@ class LeggedRobotCfg(Config):
             feet_height: float = -0.2
             feet_slip: float = -0.1
             feet_air_time: float = 0.1
+            collision: float = 0.0  # of what asset.penalize_contacts_on names [L]
 
     class normalization:
         clip_actions: float = 2.0  # the clipped action is applied, penalised, observed and exported [ours: P has no bound, and thrashes]
