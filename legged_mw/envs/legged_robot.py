@@ -22,6 +22,7 @@ from torch import Tensor
 from legged_mw import ROOT
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.checks import check_values
+from legged_mw.envs.domain_rand import DomainRand, world_fields
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.mirror import Mirror, make_mirror
 from legged_mw.sim.model import Ground, ModelError, Physics, RobotModel, build_model, per_joint, unknown
@@ -38,6 +39,7 @@ class Row(NamedTuple):
     noise: float = 0.0  # half width of the uniform noise added to it, in the value's unit
     mirror: str | None = None  # its mirror image, left for right: a kind of envs/mirror.py, or the group that it is; None: not said
     scale: float | tuple[float, ...] = 1.0  # a number, or one a column; the policy sees scale * (value + noise)
+    measured: bool = False  # comes from a sensor, so that domain_rand.observation_delay applies to it
 
     def column_scales(self) -> list[float]:
         """The scale of each column; raises ConfigError where there is not one for each."""
@@ -66,14 +68,17 @@ class LeggedRobot(BaseTask):
             nconmax=cfg.sim.nconmax,
             njmax=cfg.sim.njmax,
             threads=cfg.sim.threads,
+            world_fields=world_fields(cfg),
             eager=eager,
         )
+        self.domain_rand = DomainRand(cfg, self.robot, self.sim)
         self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
         self._init_buffers()
         self._init_ranges()
         self._prepare_observations()
         self._prepare_reward_function()
+        self.domain_rand.redraw()
         self._reset_all()
 
     # ---- the step -------------------------------------------------------------------------------------------------
@@ -83,7 +88,9 @@ class LeggedRobot(BaseTask):
         self.actions.clamp_(-clip, clip)
         if self.cfg.perturbation.enable:
             self._push_robots()
-        torch.add(self.default_dof_pos, self.actions, alpha=self.cfg.control.action_scale, out=self.sim.ctrl)
+        if self.cfg.perturbation.push:
+            self._set_velocities()
+        self._apply_actions()
         self.sim.step(self.cfg.control.decimation)
         self._update_state()
         self.check_termination()
@@ -93,6 +100,13 @@ class LeggedRobot(BaseTask):
             self._sum_statistics()
             self.reset_envs(self.reset_buf)
         self.compute_observations()
+
+    def _apply_actions(self) -> None:
+        """Servo targets from the actions, as late and as far off as ``domain_rand`` makes them."""
+        actions = self._action_delay(self.actions) if self._action_delay else self.actions
+        torch.add(self.default_dof_pos, actions, alpha=self.cfg.control.action_scale, out=self.sim.ctrl)
+        if self._encoder_offset is not None:
+            self.sim.ctrl.sub_(self._encoder_offset)
 
     def _update_state(self) -> None:
         """All that termination and rewards read, computed once."""
@@ -109,6 +123,8 @@ class LeggedRobot(BaseTask):
     def _refresh_base(self) -> None:
         """Joint offsets, and velocity and gravity at the IMU, from qpos and qvel: v_imu = R^T v + w x r."""
         torch.sub(self.dof_pos, self.default_dof_pos, out=self.dof_offset)
+        if self._encoder_offset is not None:
+            torch.add(self.dof_offset, self._encoder_offset, out=self.joint_reading)
         quat, lever = self.sim.qpos[:, None, 3:7], torch.linalg.cross(self.base_ang_vel, self.imu_pos)
         in_body = quat_rotate_inverse(quat, torch.stack([self.gravity_dir, self.sim.qvel[:, :3]], dim=1))
         self.projected_gravity.copy_(in_body[:, 0])
@@ -153,6 +169,7 @@ class LeggedRobot(BaseTask):
     def reset_envs(self, mask: Tensor) -> None:
         """Begin a new episode in the worlds where ``mask`` (N,) is true; the others stay as they are, bit for bit."""
         self.sim.reset(mask)
+        self.domain_rand.reset(mask)
         self._reset_robots(mask)
         self._reset_commands(mask)
         if self.cfg.perturbation.enable:
@@ -175,7 +192,10 @@ class LeggedRobot(BaseTask):
             joints = joints * torch.empty_like(self.dof_offset).uniform_(low, high)
         assign(self.sim.qpos, mask, torch.cat([*pose, joints], dim=1))
         assign(self.sim.qvel[:, :6], mask, draw[:, 3:])  # the joints' velocity is zero from the reset
-        assign(self.sim.ctrl, mask, self.default_dof_pos)
+        assign(self.sim.ctrl, mask, self.default_dof_pos if self._encoder_offset is None else self.default_dof_pos - self._encoder_offset)
+        for delay in (self._action_delay, self._observation_delay):
+            if delay:
+                delay.restart(mask)
 
     # ---- commands -----------------------------------------------------------------------------------------------------
 
@@ -235,6 +255,15 @@ class LeggedRobot(BaseTask):
             survived = torch.where(self.time_out_buf, 1.0, self.episode_steps[:, 0] / self.max_episode_length)
             assign(self.kick_level, mask, 0.5 * (self.kick_level + survived))
 
+    def _set_velocities(self) -> None:
+        """Push: where a clock has run down the root's horizontal velocity becomes a random one. [L]"""
+        self.push_clock.sub_(1.0)
+        due = self.push_clock <= 0.0
+        if may_hold(due):
+            speed = self.cfg.perturbation.max_push_vel
+            assign(self.sim.qvel[:, :2], due, torch.rand(self.num_envs, 2, device=self.device).mul_(2.0 * speed).sub_(speed))
+            self.push_clock.masked_fill_(due, round(self.cfg.perturbation.push_interval / self.dt))
+
     # ---- observations: this table is the only place that states the layout ------------------------------------------------
 
     def _observation_rows(self) -> dict[str, list[Row]]:
@@ -242,11 +271,11 @@ class LeggedRobot(BaseTask):
         noise = self.cfg.noise.scales
         return {
             "state": [
-                Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity"),  # at the IMU, body frame [m/s]
-                Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial"),  # gyro, body frame [rad/s]
-                Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar"),  # direction, body frame
-                Row("dof_pos", self.dof_offset, noise.dof_pos, mirror="joint"),  # minus the default pose [rad]
-                Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint"),  # [rad/s]
+                Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", measured=True),  # at the IMU, body frame [m/s]
+                Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", measured=True),  # gyro, body frame [rad/s]
+                Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar", measured=True),  # direction, body frame
+                Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", measured=True),  # minus the default pose [rad]
+                Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", measured=True),  # [rad/s]
                 Row("last_actions", self.last_actions, mirror="joint"),  # a_t, clipped
                 Row("commands", self.commands, mirror="command"),  # vx, vy [m/s], yaw rate [rad/s], body frame
             ],
@@ -265,8 +294,14 @@ class LeggedRobot(BaseTask):
                 Row("feet_air_time", self.feet_air_time, mirror="foot"),  # [s]
                 Row("kick_force", self.kick_force, mirror="polar"),  # on the root, world frame [N]
                 Row("kick_active", self.kick_active[:, None], mirror="scalar"),  # 0 or 1
+                *self._randomization_rows(),
             ],
         }
+
+    def _randomization_rows(self) -> list[Row]:
+        """What was drawn, as the critic may see it: in the config's units."""
+        rand = self.domain_rand
+        return [Row(name, value, mirror=rand.mirrors[name]) for name, value in rand.values.items() if self.cfg.domain_rand.observe]
 
     def compute_observations(self) -> None:
         """Fill ``obs_buf``: each group's rows side by side, plus noise where a row has any, times scale."""
@@ -277,6 +312,8 @@ class LeggedRobot(BaseTask):
                 obs.addcmul_(torch.empty_like(obs).uniform_(-1.0, 1.0), self.noise_vec[group])
             if group in self.obs_scales:
                 obs.mul_(self.obs_scales[group])
+            if group == "state" and self._observation_delay:
+                obs.copy_(torch.where(self._measured, self._observation_delay(obs), obs))
 
     def _prepare_observations(self) -> None:
         """Sizes, noise and scale vectors from the table itself."""
@@ -294,6 +331,9 @@ class LeggedRobot(BaseTask):
             scales = [scale for row in rows for scale in row.column_scales()]
             if any(scale != 1.0 for scale in scales):
                 self.obs_scales[group] = torch.tensor(scales, device=self.device)
+        measured = [row.measured for row in self._observation_rows()["state"] for _ in range(row.value.shape[1])]
+        self._measured = torch.tensor(measured, device=self.device)
+        self._observation_delay = self.domain_rand.delay("observation_delay", len(measured))
 
     @cached_property
     def mirror(self) -> Mirror:
@@ -478,6 +518,9 @@ class LeggedRobot(BaseTask):
 
         self.base_lin_vel, self.projected_gravity, self.base_ang_vel_world = zeros(3), zeros(3), zeros(3)
         self.dof_offset = zeros(self.num_actions)  # joint position minus default [rad]
+        self._encoder_offset = self.domain_rand.values.get("encoder_offset")
+        self.joint_reading = self.dof_offset if self._encoder_offset is None else zeros(self.num_actions)  # the same, as measured
+        self._action_delay = self.domain_rand.delay("action_delay", self.num_actions, start=0.0)
         self.foot_height, self.foot_speed = zeros(feet), zeros(feet)  # [m], horizontal [m/s]
         self.foot_contact, self.first_contact = zeros(feet, dtype=torch.bool), zeros(feet, dtype=torch.bool)
         self.fell, self.broken, self.moving = (zeros(dtype=torch.bool) for _ in range(3))
@@ -485,6 +528,8 @@ class LeggedRobot(BaseTask):
         self.kick, self.kick_clock = zeros(4), zeros()  # pause, duration [control steps], direction [rad], dv [m/s]
         self.kick_force, self.kick_active = zeros(3), zeros(dtype=torch.bool)
         self.kick_level = zeros().fill_(0.0 if self.cfg.perturbation.curriculum else 1.0)  # share of the range of dv that is drawn from
+        interval = self.cfg.perturbation.push_interval / self.dt
+        self.push_clock = zeros().uniform_(0.0, interval).round_() if self.cfg.perturbation.push else zeros()  # [control steps] to go
         self._init_episode_memory()
         self._init_imu()
         self._init_contacts()

@@ -75,6 +75,8 @@ def make_mirror(env: LeggedRobot) -> Mirror:
         "imu_velocity": _Block([0, 1, 2], [1.0, -1.0, 1.0]),  # of the IMU, body frame; shifted by the row "base_ang_vel" beside it
         "command": _Block([0, 1, 2], [1.0, -1.0, -1.0], [(0, 2, reach)]),  # vx, -vy of the IMU, -yaw rate
         "joint": joints,  # a number a joint
+        "joint_factor": _Block(joints.index, [1.0] * len(joints.index)),  # one that does not turn with the joint's axis
+        "link": _Block([0, *(1 + j for j in joints.index)], [1.0] * (1 + len(joints.index))),  # the root's, then one a joint
         "foot": _Block(feet, [1.0] * len(feet)),  # a number a foot
         "foot_polar": _Block([3 * f + k for f in feet for k in range(3)], [1.0, -1.0, 1.0] * len(feet)),  # a polar vector a foot
     }
