@@ -65,16 +65,6 @@ class LeggedGymRobot(LeggedRobot):
         error = torch.remainder(error + math.pi, 2.0 * math.pi) - math.pi
         self.commands[:, 2] = (0.5 * error).clamp(*self.cfg.commands.ranges.ang_vel_yaw)
 
-    # ---- pushes
-
-    def _push_robots(self) -> None:
-        """Every ``push_interval_s`` of an episode the root's horizontal velocity is replaced by a random one. [L]"""
-        push = self.cfg.perturbation
-        age = self.episode_length_buf
-        due = (age % math.ceil(push.push_interval_s / self.dt) == 0) & (age > 0)
-        velocity = self.sim.qvel[:, :2]
-        assign(velocity, due, torch.empty_like(velocity).uniform_(-push.max_push_vel_xy, push.max_push_vel_xy))
-
     # ---- observations
 
     def _observation_rows(self) -> dict[str, list[Row]]:
@@ -228,9 +218,9 @@ class Go1LeggedGymCfg(LeggedRobotCfg):
             dof_vel = 1.5
 
     class perturbation(LeggedRobotCfg.perturbation):
-        enable = True
-        push_interval_s: float = 15.0  # [s]
-        max_push_vel_xy: float = 1.0  # [m/s]
+        push = True
+        push_interval_s = 15.0
+        max_push_vel_xy = 1.0
 
     class terrain(LeggedRobotCfg.terrain):
         friction = 1.0

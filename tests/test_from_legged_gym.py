@@ -130,7 +130,7 @@ def test_trunk_on_the_ground_is_a_fall_and_tilt_is_not(env: Any) -> None:
     assert env.fell[:2].tolist() == [False, True] and not env.broken[:2].any()
     other = ported(2)
     other.sim.qpos[:, 2] = torch.tensor([0.05, 1.0])  # lying; in the air
-    other.sim.qpos[1, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])  # and upside down
+    other.sim.qpos[:, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])  # and upside down, legs away from the ground
     other.step(torch.zeros(2, 12))
     assert other.fell.tolist() == [True, False] == other.reset_buf.tolist()
 
@@ -227,13 +227,13 @@ def test_commands_are_redrawn_every_ten_seconds_and_never_too_small_to_walk_at()
     assert not torch.equal(env.commands[:1000], before[:1000]) and not torch.equal(env.heading[:1000], heading[:1000])
 
 
-def test_a_push_replaces_the_horizontal_velocity_after_fifteen_seconds() -> None:
-    env = ported(3, {"perturbation.enable": True})
+def test_a_push_replaces_the_horizontal_velocity_every_fifteen_seconds() -> None:
+    env = ported(3, {"perturbation.push": True})
     env.sim.qvel[:] = 5.0
-    env.episode_length_buf = torch.tensor([0, 749, 750])
+    env.push_clock.copy_(torch.tensor([750.0, 2.0, 1.0]))
     env._push_robots()
     assert (env.sim.qvel[:2] == 5.0).all() and (env.sim.qvel[2, 2:] == 5.0).all()
-    assert env.sim.qvel[2, :2].abs().max() <= 1.0
+    assert env.sim.qvel[2, :2].abs().max() <= 1.0 and env.push_clock.tolist() == [749.0, 1.0, 750.0]
 
 
 def test_joints_are_scattered_at_reset_and_the_exam_starts_without() -> None:

@@ -87,9 +87,9 @@ class LeggedRobot(BaseTask):
         clip = self.cfg.normalization.clip_actions
         self.actions.clamp_(-clip, clip)
         if self.cfg.perturbation.enable:
-            self._push_robots()
+            self._kick_robots()
         if self.cfg.perturbation.push:
-            self._set_velocities()
+            self._push_robots()
         self._apply_actions()
         self.sim.step(self.cfg.control.decimation)
         self._update_state()
@@ -221,9 +221,9 @@ class LeggedRobot(BaseTask):
         mean = self.cfg.commands.resampling_time / self.dt
         return torch.empty(self.num_envs, 1, device=self.device).exponential_().mul_(mean).round_()
 
-    # ---- perturbation -------------------------------------------------------------------------------------------------
+    # ---- perturbation: kicks and pushes ------------------------------------------------------------------------------
 
-    def _push_robots(self) -> None:
+    def _kick_robots(self) -> None:
         """Kick the root: after a pause, a half sine of force in a horizontal direction; then all is drawn anew."""
         wait, steps, angle, speed = self.kick.unbind(dim=1)
         elapsed = self.kick_clock - wait
@@ -249,20 +249,20 @@ class LeggedRobot(BaseTask):
             self.kick_active.masked_fill_(mask, False)
             self.kick_force.masked_fill_(mask[:, None], 0.0)
 
+    def _push_robots(self) -> None:
+        """Push: where a clock has run down the root's horizontal velocity becomes a random one. [L]"""
+        self.push_clock.sub_(1.0)
+        due = self.push_clock <= 0.0
+        if may_hold(due):
+            speed = self.cfg.perturbation.max_push_vel_xy
+            assign(self.sim.qvel[:, :2], due, torch.rand(self.num_envs, 2, device=self.device).mul_(2.0 * speed).sub_(speed))
+            self.push_clock.masked_fill_(due, round(self.cfg.perturbation.push_interval_s / self.dt))
+
     def _update_kick_level(self, mask: Tensor) -> None:
         """With the curriculum: halfway from the level so far to the share of an episode that was survived."""
         if self.cfg.perturbation.curriculum:
             survived = torch.where(self.time_out_buf, 1.0, self.episode_steps[:, 0] / self.max_episode_length)
             assign(self.kick_level, mask, 0.5 * (self.kick_level + survived))
-
-    def _set_velocities(self) -> None:
-        """Push: where a clock has run down the root's horizontal velocity becomes a random one. [L]"""
-        self.push_clock.sub_(1.0)
-        due = self.push_clock <= 0.0
-        if may_hold(due):
-            speed = self.cfg.perturbation.max_push_vel
-            assign(self.sim.qvel[:, :2], due, torch.rand(self.num_envs, 2, device=self.device).mul_(2.0 * speed).sub_(speed))
-            self.push_clock.masked_fill_(due, round(self.cfg.perturbation.push_interval / self.dt))
 
     # ---- observations: this table is the only place that states the layout ------------------------------------------------
 
@@ -528,7 +528,7 @@ class LeggedRobot(BaseTask):
         self.kick, self.kick_clock = zeros(4), zeros()  # pause, duration [control steps], direction [rad], dv [m/s]
         self.kick_force, self.kick_active = zeros(3), zeros(dtype=torch.bool)
         self.kick_level = zeros().fill_(0.0 if self.cfg.perturbation.curriculum else 1.0)  # share of the range of dv that is drawn from
-        interval = self.cfg.perturbation.push_interval / self.dt
+        interval = self.cfg.perturbation.push_interval_s / self.dt
         self.push_clock = zeros().uniform_(0.0, interval).round_() if self.cfg.perturbation.push else zeros()  # [control steps] to go
         self._init_episode_memory()
         self._init_imu()

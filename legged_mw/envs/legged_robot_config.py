@@ -113,8 +113,8 @@ class LeggedRobotCfg(Config):
         velocity: list[float] = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
         curriculum: bool = False  # a world's dv grows with the share of an episode that it survives, from 0 [ours]
         push: bool = False  # velocity pushes: the root's horizontal velocity becomes a random one; beside kicks or alone [L]
-        push_interval: float = 15.0  # between pushes, each world's clock its own [s] [L]
-        max_push_vel: float = 1.0  # each axis U(-max, max) [m/s] [L]
+        push_interval_s: float = 15.0  # between pushes, each world's clock its own [s] [L]
+        max_push_vel_xy: float = 1.0  # each axis U(-max, max) [m/s] [L]
 
     class domain_rand:
         """What differs between worlds. Two numbers are the ends of a uniform distribution; an empty list leaves the model's value."""
