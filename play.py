@@ -21,6 +21,14 @@ from legged_mw.utils.task import LoadedTask, load_task, task_names
 from legged_mw.view.native import NativeViewer, Pace, has_display
 from legged_mw.view.video import RobotRenderer, VideoWriter
 
+NOMINAL = {  # what playing changes in the trained config
+    "env.num_envs": 1,
+    "noise.level": 0.0,
+    "perturbation.enable": False,
+    "perturbation.push": False,
+    "domain_rand.enable": False,
+}
+
 
 class Source(NamedTuple):
     """Where a policy comes from."""
@@ -97,7 +105,7 @@ def prepare(task: LoadedTask, args: argparse.Namespace) -> None:
     if args.eval:
         exam.prepare(task)
     else:
-        for path, value in {"env.num_envs": 1, "noise.level": 0.0, "perturbation.enable": False}.items():
+        for path, value in NOMINAL.items():
             task.set(path, value, where="play")
     if args.command is not None:
         try:

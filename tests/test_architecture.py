@@ -9,7 +9,9 @@ import pytest
 
 from legged_mw import ROOT
 
-FILES = sorted(str(p.relative_to(ROOT)) for pattern in ("legged_mw/**/*.py", "configs/*.py", "*.py") for p in ROOT.glob(pattern))
+FILES = sorted(
+    str(p.relative_to(ROOT)) for pattern in ("legged_mw/**/*.py", "configs/*.py", "examples/*.py", "*.py") for p in ROOT.glob(pattern)
+)
 MAX_LINES, MAX_LINES_OF_THE_MDP, MAX_FUNCTION = 520, 800, 60
 # Imports run one way: train, play -> rl -> envs -> sim -> utils; configs -> envs, utils.
 ONLY_IN = {

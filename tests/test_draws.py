@@ -169,7 +169,7 @@ def history() -> list[Kick]:
     body = env.robot.physics.body("trunk").id
     force, active = [], []
     for _ in range(300):
-        env._push_robots()
+        env._kick_robots()
         applied = env.sim.xfrc_applied
         assert (applied[:, :body] == 0).all() and (applied[:, body + 1 :] == 0).all() and (applied[:, body, 2:] == 0).all()
         assert torch.equal(applied[:, body, :3], env.kick_force)
@@ -237,7 +237,7 @@ def test_reset_ends_a_kick_and_the_next_one_is_whole() -> None:
     env.kick.copy_(torch.tensor([2.0, 6.0, 0.5, 2.0]).expand(N, 4))
     env.kick_clock.zero_()
     for _ in range(5):  # two steps of pause, three of the kick
-        env._push_robots()
+        env._kick_robots()
     body = env.robot.physics.body("trunk").id
     assert env.kick_active.all() and (env.sim.xfrc_applied[:, body, :2].norm(dim=1) > 1.0).all()
     mask = torch.arange(N) < N // 2
@@ -249,7 +249,7 @@ def test_reset_ends_a_kick_and_the_next_one_is_whole() -> None:
     pause = env.kick[mask, 0].clone()
     assert pause.min() >= 5.0 and pause.max() > pause.min()  # new draws
     for t in range(6):  # the others finish theirs; the reset worlds wait at least five steps
-        env._push_robots()
+        env._kick_robots()
         assert torch.equal(env.kick_active[mask], pause <= t)
 
 

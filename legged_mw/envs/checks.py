@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
+from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START
+from legged_mw.sim.model import unknown
 from legged_mw.utils.config import Config, ConfigError
 
 if TYPE_CHECKING:
@@ -17,6 +19,12 @@ POSITIVE: Rule = ("positive", lambda v: 0 < v < math.inf)
 NOT_NEGATIVE: Rule = ("zero or more", lambda v: 0 <= v < math.inf)
 RANGE: Rule = ("two numbers, the lower first", lambda v: len(v) == 2 and v[0] <= v[1])
 SPAN: Rule = ("two numbers above zero, the lower first", lambda v: len(v) == 2 and 0 < v[0] <= v[1])
+MAYBE_RANGE: Rule = ("two numbers, the lower first, or an empty list", lambda v: not v or (len(v) == 2 and v[0] <= v[1]))
+FACTORS: Rule = (
+    "two numbers above zero, the lower first, or an empty list",
+    lambda v: not v or (len(v) == 2 and 0 < v[0] <= v[1]),
+)
+STEPS: Rule = ("two whole numbers from zero, the lower first, or an empty list", lambda v: not v or (len(v) == 2 and 0 <= v[0] <= v[1]))
 NAMES: Rule = ("a list with at least one name", lambda v: len(v) > 0)
 PROBABILITIES: Rule = ("three numbers from 0 to 1", lambda v: len(v) == 3 and all(0 <= p <= 1 for p in v))
 
@@ -29,6 +37,14 @@ ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys((f"commands.ranges.{name}" for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")), RANGE),
     **dict.fromkeys(("perturbation.interval", "perturbation.duration"), SPAN),
     "perturbation.velocity": RANGE,
+    "init_state.dof_pos_range": RANGE,
+    "perturbation.push_interval_s": POSITIVE,
+    "perturbation.max_push_vel_xy": NOT_NEGATIVE,
+    **dict.fromkeys((f"domain_rand.{name}" for name in ("base_mass", "base_com", "encoder_offset")), MAYBE_RANGE),
+    **dict.fromkeys((f"domain_rand.{name}" for name in ("link_mass", "armature", "stiffness", "damping", "strength")), FACTORS),
+    **dict.fromkeys((f"domain_rand.{name}" for name in ("friction", "contact_time", "frictionloss")), FACTORS),
+    **dict.fromkeys(("domain_rand.action_delay", "domain_rand.observation_delay"), STEPS),
+    "domain_rand.redraw_iterations": NOT_NEGATIVE,
     "asset.foot_names": NAMES,
     "asset.colliders": NAMES,
     "commands.keep_probability": PROBABILITIES,
@@ -51,6 +67,7 @@ LEARNER: dict[str, Rule] = {
 def check_values(cfg: LeggedRobotCfg, train: LeggedRobotCfgPPO | None = None) -> None:
     """Raise ConfigError at the first value that cannot work."""
     _check(cfg, ENVIRONMENT)
+    _check_redraws(cfg)
     if train is not None:
         _check(train, LEARNER)
         samples = cfg.env.num_envs * train.runner.num_steps_per_env
@@ -63,6 +80,20 @@ def check_values(cfg: LeggedRobotCfg, train: LeggedRobotCfgPPO | None = None) ->
             raise ConfigError(
                 "symmetry.use_mirror_loss is on, but symmetry.mirror_loss_coeff is 0: set the loss's weight, or switch it off"
             )
+
+
+def _check_redraws(cfg: LeggedRobotCfg) -> None:
+    for name in cfg.domain_rand.redraw_at_reset:
+        if name in ONLY_AT_START:
+            raise ConfigError(
+                f"domain_rand.redraw_at_reset has '{name}', which constants of the model depend on: it can be drawn at the start, "
+                "and every domain_rand.redraw_iterations"
+            )
+        if name not in KINDS:
+            raise ConfigError(f"domain_rand.redraw_at_reset: {unknown('range', name, KINDS, 'domain_rand')}")
+    for name, span in cfg.domain_rand.model_factors.items():
+        if not FACTORS[1](span):
+            raise ConfigError(f"domain_rand.model_factors.{name} is {span!r}; it must be {FACTORS[0]}")
 
 
 def _check(cfg: Config, rules: dict[str, Rule]) -> None:

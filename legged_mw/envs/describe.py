@@ -14,10 +14,12 @@ def describe(env: LeggedRobot, task: LoadedTask) -> str:
     """Observation rows, reward terms, joints, what the config changed in the model and what was overridden, as text."""
     lines: list[str] = []
     for group, rows in env.observation_table.items():
+        scales = [row.scale for row in env._observation_rows()[group]]
         lines.append(f"observation {group} ({sum(size for _, size, _ in rows)})")
         start = 0
-        for name, size, noise in rows:
-            lines.append(f"  {start:>4}  {name:<20} {size:>3}" + (f"   noise +-{noise:g}" if noise else ""))
+        for (name, size, noise), scale in zip(rows, scales, strict=True):
+            line = f"  {start:>4}  {name:<20} {size:>3}" + (f"   noise +-{noise:g}" if noise else "")
+            lines.append(line + (f"   scale {scale}" if scale != 1.0 else ""))
             start += size
     lines.append(f"actions ({env.num_actions}), clipped at +-{task.cfg.normalization.clip_actions:g}, {1 / env.dt:g} Hz")
     lines.append("reward terms (scale)")

@@ -11,6 +11,7 @@ foot position and velocity, accelerometer, joint torque) is one simulation step 
 from __future__ import annotations
 
 import math
+from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -21,6 +22,7 @@ from torch import Tensor
 from legged_mw import ROOT
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.checks import check_values
+from legged_mw.envs.domain_rand import DomainRand, world_fields
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.mirror import Mirror, make_mirror
 from legged_mw.sim.model import Ground, ModelError, Physics, RobotModel, build_model, per_joint, unknown
@@ -36,6 +38,15 @@ class Row(NamedTuple):
     value: Tensor  # (N, size)
     noise: float = 0.0  # half width of the uniform noise added to it, in the value's unit
     mirror: str | None = None  # its mirror image, left for right: a kind of envs/mirror.py, or the group that it is; None: not said
+    scale: float | tuple[float, ...] = 1.0  # a number, or one a column; the policy sees scale * (value + noise)
+    measured: bool = False  # comes from a sensor, so that domain_rand.observation_delay applies to it
+
+    def column_scales(self) -> list[float]:
+        """The scale of each column; raises ConfigError where there is not one for each."""
+        size = self.value.shape[1]
+        if isinstance(self.scale, tuple) and len(self.scale) != size:
+            raise ConfigError(f"observation row '{self.name}' has {size} columns and {len(self.scale)} scales; give one, or one a column")
+        return list(self.scale) if isinstance(self.scale, tuple) else [float(self.scale)] * size
 
 
 class LeggedRobot(BaseTask):
@@ -57,14 +68,17 @@ class LeggedRobot(BaseTask):
             nconmax=cfg.sim.nconmax,
             njmax=cfg.sim.njmax,
             threads=cfg.sim.threads,
+            world_fields=world_fields(cfg),
             eager=eager,
         )
+        self.domain_rand = DomainRand(cfg, self.robot, self.sim)
         self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
         self._init_buffers()
         self._init_ranges()
         self._prepare_observations()
         self._prepare_reward_function()
+        self.domain_rand.redraw()
         self._reset_all()
 
     # ---- the step -------------------------------------------------------------------------------------------------
@@ -73,8 +87,10 @@ class LeggedRobot(BaseTask):
         clip = self.cfg.normalization.clip_actions
         self.actions.clamp_(-clip, clip)
         if self.cfg.perturbation.enable:
+            self._kick_robots()
+        if self.cfg.perturbation.push:
             self._push_robots()
-        torch.add(self.default_dof_pos, self.actions, alpha=self.cfg.control.action_scale, out=self.sim.ctrl)
+        self._apply_actions()
         self.sim.step(self.cfg.control.decimation)
         self._update_state()
         self.check_termination()
@@ -84,6 +100,13 @@ class LeggedRobot(BaseTask):
             self._sum_statistics()
             self.reset_envs(self.reset_buf)
         self.compute_observations()
+
+    def _apply_actions(self) -> None:
+        """Servo targets from the actions, as late and as far off as ``domain_rand`` makes them."""
+        actions = self._action_delay(self.actions) if self._action_delay else self.actions
+        torch.add(self.default_dof_pos, actions, alpha=self.cfg.control.action_scale, out=self.sim.ctrl)
+        if self._encoder_offset is not None:
+            self.sim.ctrl.sub_(self._encoder_offset)
 
     def _update_state(self) -> None:
         """All that termination and rewards read, computed once."""
@@ -100,6 +123,8 @@ class LeggedRobot(BaseTask):
     def _refresh_base(self) -> None:
         """Joint offsets, and velocity and gravity at the IMU, from qpos and qvel: v_imu = R^T v + w x r."""
         torch.sub(self.dof_pos, self.default_dof_pos, out=self.dof_offset)
+        if self._encoder_offset is not None:
+            torch.add(self.dof_offset, self._encoder_offset, out=self.joint_reading)
         quat, lever = self.sim.qpos[:, None, 3:7], torch.linalg.cross(self.base_ang_vel, self.imu_pos)
         in_body = quat_rotate_inverse(quat, torch.stack([self.gravity_dir, self.sim.qvel[:, :3]], dim=1))
         self.projected_gravity.copy_(in_body[:, 0])
@@ -127,7 +152,10 @@ class LeggedRobot(BaseTask):
         finite = (speed <= self.cfg.termination.max_speed) & (position < math.inf) & (action < math.inf)  # NaN compares false
         torch.logical_not(finite, out=self.broken)
         max_tilt = math.radians(self.cfg.termination.max_tilt)
-        torch.logical_and(self.projected_gravity[:, 2] > -math.cos(max_tilt), finite, out=self.fell)
+        down = self.projected_gravity[:, 2] > -math.cos(max_tilt)
+        if len(self.terminating_contacts):
+            down |= self.contact_count[:, self.terminating_contacts].amax(dim=1) > 0.0
+        torch.logical_and(down, finite, out=self.fell)
         ended = torch.logical_or(self.fell, self.broken)
         torch.logical_and(self._episode_length_buf >= self.max_episode_length, ~ended, out=self.time_out_buf)
         torch.logical_or(ended, self.time_out_buf, out=self.reset_buf)
@@ -141,6 +169,7 @@ class LeggedRobot(BaseTask):
     def reset_envs(self, mask: Tensor) -> None:
         """Begin a new episode in the worlds where ``mask`` (N,) is true; the others stay as they are, bit for bit."""
         self.sim.reset(mask)
+        self.domain_rand.reset(mask)
         self._reset_robots(mask)
         self._reset_commands(mask)
         if self.cfg.perturbation.enable:
@@ -152,15 +181,21 @@ class LeggedRobot(BaseTask):
         self._refresh_base()
 
     def _reset_robots(self, mask: Tensor) -> None:
-        """Root near the origin with any heading and a small velocity, joints and servo targets at the default pose."""
+        """Root near the origin with any heading and a small velocity, joints and servo targets at (or near) the default pose."""
         n = self.num_envs
         draw = torch.rand(n, 9, device=self.device).mul_(2.0).sub_(1.0).mul_(self.reset_range)  # x, y, yaw, velocities
         half = 0.5 * draw[:, 2:3]
         zero = torch.zeros_like(half)
         pose = [self.init_pos[:2] + draw[:, :2], self.init_pos[2:].expand(n, 1), torch.cos(half), zero, zero, torch.sin(half)]
-        assign(self.sim.qpos, mask, torch.cat([*pose, self.default_dof_pos.expand(n, -1)], dim=1))
+        joints, (low, high) = self.default_dof_pos.expand(n, -1), self.cfg.init_state.dof_pos_range
+        if (low, high) != (1.0, 1.0):
+            joints = joints * torch.empty_like(self.dof_offset).uniform_(low, high)
+        assign(self.sim.qpos, mask, torch.cat([*pose, joints], dim=1))
         assign(self.sim.qvel[:, :6], mask, draw[:, 3:])  # the joints' velocity is zero from the reset
-        assign(self.sim.ctrl, mask, self.default_dof_pos)
+        assign(self.sim.ctrl, mask, self.default_dof_pos if self._encoder_offset is None else self.default_dof_pos - self._encoder_offset)
+        for delay in (self._action_delay, self._observation_delay):
+            if delay:
+                delay.restart(mask)
 
     # ---- commands -----------------------------------------------------------------------------------------------------
 
@@ -186,9 +221,9 @@ class LeggedRobot(BaseTask):
         mean = self.cfg.commands.resampling_time / self.dt
         return torch.empty(self.num_envs, 1, device=self.device).exponential_().mul_(mean).round_()
 
-    # ---- perturbation -------------------------------------------------------------------------------------------------
+    # ---- perturbation: kicks and pushes ------------------------------------------------------------------------------
 
-    def _push_robots(self) -> None:
+    def _kick_robots(self) -> None:
         """Kick the root: after a pause, a half sine of force in a horizontal direction; then all is drawn anew."""
         wait, steps, angle, speed = self.kick.unbind(dim=1)
         elapsed = self.kick_clock - wait
@@ -214,6 +249,15 @@ class LeggedRobot(BaseTask):
             self.kick_active.masked_fill_(mask, False)
             self.kick_force.masked_fill_(mask[:, None], 0.0)
 
+    def _push_robots(self) -> None:
+        """Push: where a clock has run down the root's horizontal velocity becomes a random one. [L]"""
+        self.push_clock.sub_(1.0)
+        due = self.push_clock <= 0.0
+        if may_hold(due):
+            speed = self.cfg.perturbation.max_push_vel_xy
+            assign(self.sim.qvel[:, :2], due, torch.rand(self.num_envs, 2, device=self.device).mul_(2.0 * speed).sub_(speed))
+            self.push_clock.masked_fill_(due, round(self.cfg.perturbation.push_interval_s / self.dt))
+
     def _update_kick_level(self, mask: Tensor) -> None:
         """With the curriculum: halfway from the level so far to the share of an episode that was survived."""
         if self.cfg.perturbation.curriculum:
@@ -227,11 +271,11 @@ class LeggedRobot(BaseTask):
         noise = self.cfg.noise.scales
         return {
             "state": [
-                Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity"),  # at the IMU, body frame [m/s]
-                Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial"),  # gyro, body frame [rad/s]
-                Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar"),  # direction, body frame
-                Row("dof_pos", self.dof_offset, noise.dof_pos, mirror="joint"),  # minus the default pose [rad]
-                Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint"),  # [rad/s]
+                Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", measured=True),  # at the IMU, body frame [m/s]
+                Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", measured=True),  # gyro, body frame [rad/s]
+                Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar", measured=True),  # direction, body frame
+                Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", measured=True),  # minus the default pose [rad]
+                Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", measured=True),  # [rad/s]
                 Row("last_actions", self.last_actions, mirror="joint"),  # a_t, clipped
                 Row("commands", self.commands, mirror="command"),  # vx, vy [m/s], yaw rate [rad/s], body frame
             ],
@@ -250,20 +294,31 @@ class LeggedRobot(BaseTask):
                 Row("feet_air_time", self.feet_air_time, mirror="foot"),  # [s]
                 Row("kick_force", self.kick_force, mirror="polar"),  # on the root, world frame [N]
                 Row("kick_active", self.kick_active[:, None], mirror="scalar"),  # 0 or 1
+                *self._randomization_rows(),
             ],
         }
 
+    def _randomization_rows(self) -> list[Row]:
+        """What was drawn, as the critic may see it: in the config's units."""
+        rand = self.domain_rand
+        return [Row(name, value, mirror=rand.mirrors[name]) for name, value in rand.values.items() if self.cfg.domain_rand.observe]
+
     def compute_observations(self) -> None:
-        """Fill ``obs_buf``: each group's rows side by side, plus noise where a row has any."""
+        """Fill ``obs_buf``: each group's rows side by side, plus noise where a row has any, times scale."""
         for group, rows in self._observation_rows().items():
             obs = self.obs_buf[group]
             torch.cat([row.value for row in rows], dim=1, out=obs)
             if group in self.noise_vec:
                 obs.addcmul_(torch.empty_like(obs).uniform_(-1.0, 1.0), self.noise_vec[group])
+            if group in self.obs_scales:
+                obs.mul_(self.obs_scales[group])
+            if group == "state" and self._observation_delay:
+                obs.copy_(torch.where(self._measured, self._observation_delay(obs), obs))
 
     def _prepare_observations(self) -> None:
-        """Sizes and noise vectors from the table itself."""
+        """Sizes, noise and scale vectors from the table itself."""
         self.noise_vec: dict[str, Tensor] = {}
+        self.obs_scales: dict[str, Tensor] = {}
         self.observation_table: dict[str, list[tuple[str, int, float]]] = {}  # group -> (name, size, noise)
         for group in self._observation_rows():
             rows = self._observation_rows()[group]  # again: a group may contain an earlier one
@@ -273,6 +328,12 @@ class LeggedRobot(BaseTask):
             self.obs_buf[group] = torch.zeros(self.num_envs, len(noise), device=self.device)
             if any(noise):
                 self.noise_vec[group] = torch.tensor(noise, device=self.device)
+            scales = [scale for row in rows for scale in row.column_scales()]
+            if any(scale != 1.0 for scale in scales):
+                self.obs_scales[group] = torch.tensor(scales, device=self.device)
+        measured = [row.measured for row in self._observation_rows()["state"] for _ in range(row.value.shape[1])]
+        self._measured = torch.tensor(measured, device=self.device)
+        self._observation_delay = self.domain_rand.delay("observation_delay", len(measured))
 
     @cached_property
     def mirror(self) -> Mirror:
@@ -385,6 +446,10 @@ class LeggedRobot(BaseTask):
         excess = self.feet_air_time - self.cfg.rewards.min_air_time
         return (excess * (self.first_contact & self.moving[:, None])).sum(dim=1)
 
+    def _reward_collision(self) -> Tensor:
+        """How many bodies touch the ground that should not: ``asset.penalize_contacts_on``. [L]"""
+        return ((self.contact_count @ self.penalized_contacts) > 0.0).sum(dim=1).float()
+
     # ---- statistics: summed on the device, read once an iteration ------------------------------------------------------------
 
     def _sum_statistics(self) -> None:
@@ -430,7 +495,7 @@ class LeggedRobot(BaseTask):
             damping=cfg.control.damping,
             colliders=cfg.asset.colliders,
             self_collisions=cfg.asset.self_collisions,
-            contact_geoms=cfg.asset.foot_names,
+            contact_geoms=[*cfg.asset.foot_names, *cfg.asset.penalize_contacts_on, *cfg.asset.terminate_after_contacts_on],
             velocity_sites=cfg.asset.foot_names,
             accelerometer_site=cfg.asset.imu_site,
             camera=cfg.viewer.camera,
@@ -443,7 +508,8 @@ class LeggedRobot(BaseTask):
         self.dof_pos, self.dof_vel = sim.qpos[:, 7:], sim.qvel[:, 6:]  # views (N, D) [rad], [rad/s]
         self.base_ang_vel = sim.qvel[:, 3:6]  # view, body frame [rad/s]
         self.torques = sim.actuator_force  # view (N, D) [N m]
-        self.foot_contact_count = sim.sensordata[:, spans["contact"]]  # view (N, F)
+        self.contact_count = sim.sensordata[:, spans["contact"]]  # view (N, C), of robot.contact_geoms with the ground; feet first
+        self.foot_contact_count = self.contact_count[:, :feet]  # view (N, F)
         self.foot_vel = sim.sensordata[:, spans["linvel"]].unflatten(1, (feet, 3))  # view, world frame [m/s]
         self.accelerometer = sim.sensordata[:, spans["accelerometer"]]  # view (N, 3) [m/s^2]
 
@@ -452,6 +518,9 @@ class LeggedRobot(BaseTask):
 
         self.base_lin_vel, self.projected_gravity, self.base_ang_vel_world = zeros(3), zeros(3), zeros(3)
         self.dof_offset = zeros(self.num_actions)  # joint position minus default [rad]
+        self._encoder_offset = self.domain_rand.values.get("encoder_offset")
+        self.joint_reading = self.dof_offset if self._encoder_offset is None else zeros(self.num_actions)  # the same, as measured
+        self._action_delay = self.domain_rand.delay("action_delay", self.num_actions, start=0.0)
         self.foot_height, self.foot_speed = zeros(feet), zeros(feet)  # [m], horizontal [m/s]
         self.foot_contact, self.first_contact = zeros(feet, dtype=torch.bool), zeros(feet, dtype=torch.bool)
         self.fell, self.broken, self.moving = (zeros(dtype=torch.bool) for _ in range(3))
@@ -459,8 +528,11 @@ class LeggedRobot(BaseTask):
         self.kick, self.kick_clock = zeros(4), zeros()  # pause, duration [control steps], direction [rad], dv [m/s]
         self.kick_force, self.kick_active = zeros(3), zeros(dtype=torch.bool)
         self.kick_level = zeros().fill_(0.0 if self.cfg.perturbation.curriculum else 1.0)  # share of the range of dv that is drawn from
+        interval = self.cfg.perturbation.push_interval_s / self.dt
+        self.push_clock = zeros().uniform_(0.0, interval).round_() if self.cfg.perturbation.push else zeros()  # [control steps] to go
         self._init_episode_memory()
         self._init_imu()
+        self._init_contacts()
         self.foot_sites = torch.tensor([robot.id("site", name) for name in self.cfg.asset.foot_names], device=device)
         self.gravity_dir = torch.tensor([0.0, 0.0, -1.0], device=device).expand(n, 3)
         self.total_mass = float(robot.physics.body_subtreemass[0])  # [kg]
@@ -481,6 +553,31 @@ class LeggedRobot(BaseTask):
         if model.site_bodyid[imu] != self.root_body or abs(model.site_quat[imu][0]) < 1.0 - 1e-9:
             raise ModelError(f"asset.imu_site '{self.cfg.asset.imu_site}' must be on the root body '{robot.root}' and aligned with it")
         self.imu_pos = torch.tensor(model.site_pos[imu], dtype=torch.float, device=self.device).expand(self.num_envs, 3)  # body frame [m]
+
+    def _init_contacts(self) -> None:
+        """Which columns of ``contact_count`` are a fall, and (C, B) which are of which penalised body."""
+        asset, geoms, model = self.cfg.asset, self.robot.contact_geoms, self.robot.physics
+        terminating = self._contact_columns(asset.terminate_after_contacts_on, "terminate_after_contacts_on")
+        penalized = self._contact_columns(asset.penalize_contacts_on, "penalize_contacts_on")
+        if self._active_scales().get("collision") and not penalized:
+            raise ConfigError("rewards.scales.collision is on, but asset.penalize_contacts_on names nothing; name what should not touch")
+        body = {column: int(model.geom_bodyid[self.robot.id("geom", geoms[column])]) for column in penalized}
+        bodies = sorted(set(body.values()))
+        table = torch.zeros(len(geoms), len(bodies))
+        for column in penalized:
+            table[column, bodies.index(body[column])] = 1.0
+        self.penalized_contacts = table.to(self.device)
+        self.terminating_contacts = torch.tensor(terminating, dtype=torch.long, device=self.device)
+
+    def _contact_columns(self, patterns: list[str], field: str) -> list[int]:
+        """Columns of ``contact_count`` that ``patterns`` mean; each of the geoms must be one that can touch the ground."""
+        hits = [i for i, name in enumerate(self.robot.contact_geoms) if any(fnmatchcase(name, pattern) for pattern in patterns)]
+        for name in (self.robot.contact_geoms[i] for i in hits):
+            if not self.robot.physics.geom_conaffinity[self.robot.id("geom", name)]:
+                raise ConfigError(
+                    f"asset.{field}: '{name}' never touches the ground; add it to asset.colliders: {self.cfg.asset.colliders}"
+                )
+        return hits
 
     def _init_ranges(self) -> None:
         """Config numbers as tensors: joints' tables, reset and command ranges."""

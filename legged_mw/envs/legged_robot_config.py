@@ -24,10 +24,13 @@ class LeggedRobotCfg(Config):
         imu_site: str = "imu"  # on the root body and aligned with it
         colliders: list[str] = ["*"]  # geoms that touch the ground; names or patterns, of those that collide in the MJCF
         self_collisions: bool = False  # among the colliders
+        penalize_contacts_on: list[str] = []  # colliders, or patterns: `collision` counts their bodies on the ground [L]
+        terminate_after_contacts_on: list[str] = []  # likewise: to touch the ground with one of these is a fall [L]
 
     class init_state:
         pos: list[float] = [0.0, 0.0, 1.0]  # root at reset [m]
         default_joint_angles: dict[str, float] = {}  # joint or part of its name -> [rad]; the pose of action 0
+        dof_pos_range: list[float] = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
         pos_xy_range: float = 0.5  # root x and y + U(-range, range) [m] [P]
         yaw_range: float = 3.141592653589793  # U(-range, range) [rad] [P]
         lin_vel_range: float = 0.5  # root velocity, world frame, each axis U(-range, range) [m/s] [P]
@@ -84,6 +87,7 @@ class LeggedRobotCfg(Config):
             feet_height: float = -0.2
             feet_slip: float = -0.1
             feet_air_time: float = 0.1
+            collision: float = 0.0  # of what asset.penalize_contacts_on names [L]
 
     class normalization:
         clip_actions: float = 2.0  # the clipped action is applied, penalised, observed and exported [ours: P has no bound, and thrashes]
@@ -108,6 +112,34 @@ class LeggedRobotCfg(Config):
         duration: list[float] = [0.05, 0.2]  # [s] [P]
         velocity: list[float] = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
         curriculum: bool = False  # a world's dv grows with the share of an episode that it survives, from 0 [ours]
+        push: bool = False  # velocity pushes: the root's horizontal velocity becomes a random one; beside kicks or alone [L]
+        push_interval_s: float = 15.0  # between pushes, each world's clock its own [s] [L]
+        max_push_vel_xy: float = 1.0  # each axis U(-max, max) [m/s] [L]
+
+    class domain_rand:
+        """What differs between worlds. Two numbers are the ends of a uniform distribution; an empty list leaves the model's value."""
+
+        enable: bool = False  # [P]
+        link_mass: list[float] = [0.9, 1.1]  # factor on each link's mass, its inertia with it [P; inertia ours]
+        base_mass: list[float] = [-1.0, 1.0]  # added to the root's [kg], its inertia in proportion [P; inertia ours]
+        base_com: list[float] = [-0.05, 0.05]  # added to the place of the root's centre of mass, each axis [m] [P]
+        armature: list[float] = [1.0, 1.05]  # factor on each joint's [P]
+        friction: list[float] = [0.4, 1.0]  # sliding friction of the ground [-] [P]
+        contact_time: list[float] = []  # time constant of the ground's contacts (solref) [s]: longer is softer, 0.02 is MuJoCo's
+        frictionloss: list[float] = [0.9, 1.1]  # factor on each joint's dry friction [P]
+        stiffness: list[float] = []  # factor on each servo's position gain
+        damping: list[float] = []  # factor on each joint's damping
+        strength: list[float] = []  # factor on each servo's force limit
+        encoder_offset: list[float] = [-0.05, 0.05]  # what each encoder reads beside the true angle [rad] [P]
+        action_delay: list[int] = []  # control steps from an action to its servo, whole numbers, both ends included
+        observation_delay: list[int] = []  # control steps that what `state` measures is old
+        model_factors: dict[str, list[float]] = {}  # any other field of the model that may differ: a factor per world on all of it
+        redraw_at_reset: list[str] = [  # anew at every reset of a world; the others once, at the start
+            *["friction", "contact_time", "frictionloss", "stiffness", "damping", "strength"],
+            *["encoder_offset", "action_delay", "observation_delay"],
+        ]
+        redraw_iterations: int = 0  # draw everything anew every so many iterations of training; 0: never
+        observe: bool = False  # rows in `privileged_state` with what was drawn
 
     class terrain:
         mesh_type: Literal["plane"] = "plane"

@@ -30,7 +30,7 @@ class _Block(NamedTuple):
     """Columns that mirror among themselves. A row holds any number of blocks, one after another."""
 
     index: list[int]  # column that each is taken from
-    sign: list[float]
+    sign: list[float]  # +1 or -1, times the ratio of the two columns' scales
     shifts: list[tuple[int, int, float]] = []  # (to, from, factor): to the mirrored column, add factor * column, not mirrored
 
 
@@ -41,7 +41,7 @@ class Columns(NamedTuple):
     """
 
     index: Tensor  # (size,) int64, column that this one is taken from
-    sign: Tensor  # (size,) +1 or -1
+    sign: Tensor  # (size,) +1 or -1, where the columns of a pair have the same scale
     target: Tensor  # (S,) int64
     source: Tensor  # (S,) int64
     factor: Tensor  # (S,)
@@ -75,6 +75,8 @@ def make_mirror(env: LeggedRobot) -> Mirror:
         "imu_velocity": _Block([0, 1, 2], [1.0, -1.0, 1.0]),  # of the IMU, body frame; shifted by the row "base_ang_vel" beside it
         "command": _Block([0, 1, 2], [1.0, -1.0, -1.0], [(0, 2, reach)]),  # vx, -vy of the IMU, -yaw rate
         "joint": joints,  # a number a joint
+        "joint_factor": _Block(joints.index, [1.0] * len(joints.index)),  # one that does not turn with the joint's axis
+        "link": _Block([0, *(1 + j for j in joints.index)], [1.0] * (1 + len(joints.index))),  # the root's, then one a joint
         "foot": _Block(feet, [1.0] * len(feet)),  # a number a foot
         "foot_polar": _Block([3 * f + k for f in feet for k in range(3)], [1.0, -1.0, 1.0] * len(feet)),  # a polar vector a foot
     }
@@ -120,7 +122,14 @@ def _side_by_side(group: str, rows: Sequence[Row], blocks: dict[str, _Block], re
                 raise ConfigError(f"observation row '{row.name}' of '{group}' needs the row 'base_ang_vel' beside it, to be mirrored")
             velocity, rate = starts[row.name], starts["base_ang_vel"]
             whole.shifts.extend([(velocity, rate + 2, reach), (velocity + 2, rate, -reach)])  # 2y wz in x, -2y wx in z
-    return whole
+    return _scaled(whole, [scale for row in rows for scale in row.column_scales()])
+
+
+def _scaled(block: _Block, scale: list[float]) -> _Block:
+    """The same mirror for columns that carry a scale each."""
+    sign = [s * scale[i] / scale[j] for i, (j, s) in enumerate(zip(block.index, block.sign, strict=True))]
+    shifts = [(to, source, factor * scale[to] / scale[source]) for to, source, factor in block.shifts]
+    return _Block(block.index, sign, shifts)
 
 
 def _check_pose(env: LeggedRobot, partners: Partners) -> None:

@@ -90,6 +90,9 @@ class Runner(OnPolicyRunner):
             if waiting:
                 self._log(waiting)
             waiting = report if self.device != "cpu" else self._log(report)
+            redraw = self.env.cfg.domain_rand.redraw_iterations
+            if redraw and self.current_learning_iteration % redraw == 0:
+                self.env.domain_rand.redraw()
             if self.current_learning_iteration % self.cfg["save_interval"] == 0 and self.current_learning_iteration < self._last:
                 self._save_checkpoint()
         if waiting:

@@ -57,6 +57,7 @@ class RobotModel:
     joint_range: np.ndarray  # (D, 2) [rad]
     effort_range: np.ndarray  # (D, 2) [N m]; infinite where the MJCF states none
     sensors: dict[str, slice]  # "contact", "linvel", "accelerometer" -> span of sensordata
+    contact_geoms: tuple[str, ...] = ()  # in order of the span "contact"
     overrides: list[str] = field(default_factory=list)  # what the caller's choices changed, a line each
 
     def id(self, kind: str, name: str) -> int:
@@ -104,7 +105,7 @@ def build_model(
     damping: Mapping[str, float],  # part of joint name -> passive joint damping [N m s/rad]
     colliders: Sequence[str],  # geoms that touch the ground: names or patterns with * and ?
     self_collisions: bool,
-    contact_geoms: Sequence[str],  # sensed: number of contacts with the ground
+    contact_geoms: Sequence[str],  # sensed: number of contacts with the ground; names or patterns, each geom once
     velocity_sites: Sequence[str],  # sensed: linear velocity, world frame [m/s]
     accelerometer_site: str | None,  # sensed: proper acceleration, site frame [m/s^2]
     camera: Sequence[float] = (0.9, -1.1, 0.6),  # place of the camera "track" relative to the robot's centre of mass [m]
@@ -122,7 +123,8 @@ def build_model(
     _add_ground(spec, ground, file.name, notes)
     _set_collisions(spec, colliders, self_collisions, file.name, notes)
     limits = _add_servos(spec, joints, stiffness, damping, notes)
-    _add_sensors(spec, contact_geoms, velocity_sites, accelerometer_site, file.name)
+    touching = _match_geoms(spec, contact_geoms, file.name)
+    _add_sensors(spec, touching, velocity_sites, accelerometer_site, file.name)
     add_scene(spec)
     _add_camera(spec, root, camera)
     try:
@@ -143,7 +145,8 @@ def build_model(
         joint_names=names,
         joint_range=np.array([mj.joint(n).range for n in names]).reshape(-1, 2),
         effort_range=np.array(limits).reshape(-1, 2),
-        sensors=_sensor_spans(mj, len(contact_geoms), len(velocity_sites), accelerometer_site is not None),
+        sensors=_sensor_spans(mj, len(touching), len(velocity_sites), accelerometer_site is not None),
+        contact_geoms=touching,
         overrides=notes,
     )
 
@@ -258,14 +261,24 @@ def _add_servos(
     return [limits.get(name, [-float("inf"), float("inf")]) for name in names]
 
 
+def _match_geoms(spec: mujoco.MjSpec, patterns: Sequence[str], where: str) -> tuple[str, ...]:
+    """Names of the geoms that ``patterns`` mean, in their order, each once."""
+    geoms = [g.name for g in spec.geoms if g.name]
+    found: dict[str, None] = {}
+    for pattern in patterns:
+        hits = [name for name in geoms if fnmatchcase(name, pattern)]
+        if not hits:
+            raise ModelError(unknown("geom", pattern, geoms, where))
+        found |= dict.fromkeys(hits)
+    return tuple(found)
+
+
 def _add_sensors(
     spec: mujoco.MjSpec, contact_geoms: Sequence[str], velocity_sites: Sequence[str], accelerometer_site: str | None, where: str
 ) -> None:
     """In an order that makes each group one span of sensordata."""
-    geoms, sites = [g.name for g in spec.geoms if g.name], [s.name for s in spec.sites if s.name]
+    sites = [s.name for s in spec.sites if s.name]
     for name in contact_geoms:
-        if name not in geoms:
-            raise ModelError(unknown("geom", name, geoms, where))
         spec.add_sensor(
             name=f"contact/{name}",
             type=mujoco.mjtSensor.mjSENS_CONTACT,

@@ -57,7 +57,8 @@ class MujocoSimulation:
             out[name] = self._adopt(name)
         self._out = [*(into[name] for name in _READ_AND_WRITTEN), *out.values()]
         self._fields = {name: self._expand(name) for name in world_fields}
-        self._into = [*into.values(), *self._fields.values()]
+        self._written = {name: tensor._version for name, (tensor, _) in self._fields.items()}
+        self._into = [*into.values()]
         self._cleared = [into[name][0] for name in ("qvel", *_WRITTEN)] + [tensor for tensor, _ in out.values()]
         self._failed, self._reason = np.zeros(num_envs, dtype=bool), ""  # worlds that MuJoCo ever refused to step
         self._qpos0 = torch.tensor(model.qpos0, dtype=torch.float)
@@ -65,6 +66,7 @@ class MujocoSimulation:
     def step(self, substeps: int = 1) -> None:
         for tensor, rows in self._into:
             rows.copy_(tensor)
+        self._write_fields()
         refused = None
         try:
             self._batch.step(nstep=substeps)
@@ -90,6 +92,10 @@ class MujocoSimulation:
             raise ModelError(unknown("per-world model field", name, self._fields, "this simulation (declare it in world_fields)"))
         return self._fields[name][0]
 
+    def set_constants(self) -> None:
+        self._write_fields()
+        self._batch.set_const()
+
     def overflowed_worlds(self) -> Tensor:
         return torch.tensor(float((self._failed | self._full()).sum()))
 
@@ -100,6 +106,13 @@ class MujocoSimulation:
         if (full := self._full()).any():
             return f"simulator overflow in {full.sum()} {of}: contacts or constraints do not fit; raise <size memory=...> in the MJCF"
         return ""
+
+    def _write_fields(self) -> None:
+        """Hand over the fields that were written since the last time; the others keep their float64 values."""
+        for name, (tensor, rows) in self._fields.items():
+            if tensor._version != self._written[name]:
+                rows.copy_(tensor)
+                self._written[name] = tensor._version
 
     def _full(self) -> np.ndarray:
         """Worlds that ever had to leave a contact or a constraint out: MuJoCo counts since construction."""

@@ -20,6 +20,11 @@ from legged_mw.utils.errors import UserError
 ENGINES = ("auto", "mujoco_warp", "mujoco")
 
 
+# Model fields that others are derived from, and those others: they need a value per world as soon as one of the former has.
+CONSTANTS_READ = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "qpos0")
+CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
+
+
 class EngineError(UserError, ValueError):
     """An engine that does not exist, or cannot step where it was asked to."""
 
@@ -57,6 +62,12 @@ class Simulation(Protocol):
 
     def field(self, name: str) -> Tensor:
         """View (N, ...) of a model field that was declared in ``world_fields``; write it in place."""
+        ...
+
+    def set_constants(self) -> None:
+        """Bring what the model derives from masses, inertias, armatures and zero angles up to date with what was written
+        into their fields, in every world. Slow, and not for inside a recorded step.
+        """
         ...
 
     def overflowed_worlds(self) -> Tensor:

@@ -15,6 +15,7 @@ from mujoco_warp import OverflowType
 from torch import Tensor
 
 from legged_mw.sim.model import ModelError, unknown
+from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ
 
 wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it loads; a first run would drown in it
 
@@ -59,7 +60,8 @@ class WarpSimulation:
         self._eager = eager or not self._device.is_cpu
         _check_fields(world_fields)
         with wp.ScopedDevice(self._device):
-            self._model = mjw.put_model(model, batch_sizes=dict.fromkeys(world_fields, num_envs))
+            derived = CONSTANTS if {*CONSTANTS_READ} & {*world_fields} else ()  # else every world silently has the first one's
+            self._model = mjw.put_model(model, batch_sizes=dict.fromkeys([*world_fields, *derived], num_envs))
             option = self._model.opt
             option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
@@ -86,6 +88,10 @@ class WarpSimulation:
         if name not in self._fields:
             raise ModelError(unknown("per-world model field", name, self._fields, "this simulation (declare it in world_fields)"))
         return self._fields[name]
+
+    def set_constants(self) -> None:
+        with wp.ScopedDevice(self._device):
+            mjw.set_const(self._model, self._data, groups=int(mjw.SetConstGroup.FIXED | mjw.SetConstGroup.INERT0))
 
     def overflowed_worlds(self) -> Tensor:
         return ((self._overflow_seen & ~int(_EXPECTED)) != 0).sum(dtype=torch.float)

@@ -1,0 +1,207 @@
+"""What differs between worlds: masses, friction, motors, encoders, delays. The config gives the ranges, KINDS what they mean.
+
+A number is drawn once, when the environment is made, or again at every reset of its world (``redraw_at_reset``). All draws
+are columns of one matrix, so that they can be read: by the critic, by a log, by who evaluates. What the model knows is
+written through the simulator's seam. A range that changes nothing does not exist: no field is allocated for it and
+nothing is computed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
+
+import torch
+from torch import Tensor
+
+from legged_mw.sim.model import GROUND, RobotModel
+from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
+from legged_mw.utils.math import assign
+
+if TYPE_CHECKING:
+    from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+
+
+class Kind(NamedTuple):
+    """What one range of the config means."""
+
+    per: str  # how many numbers a world draws: "world" one, "axis" three, "joint" D, "link" 1 + D: the root's, then each joint's
+    neutral: float | None  # that changes nothing; None: the number is itself the new value
+    mirror: str  # its mirror image, a kind of envs/mirror.py
+    fields: tuple[str, ...] = ()  # of the model, that it writes
+    whole: bool = False  # whole numbers, both ends included
+
+
+KINDS: dict[str, Kind] = {
+    "link_mass": Kind("link", 1.0, "link", ("body_mass", "body_inertia")),
+    "base_mass": Kind("world", 0.0, "scalar", ("body_mass", "body_inertia")),
+    "base_com": Kind("axis", 0.0, "polar", ("body_ipos",)),
+    "armature": Kind("joint", 1.0, "joint_factor", ("dof_armature",)),
+    "friction": Kind("world", None, "scalar", ("geom_friction",)),
+    "contact_time": Kind("world", None, "scalar", ("geom_solref",)),
+    "frictionloss": Kind("joint", 1.0, "joint_factor", ("dof_frictionloss",)),
+    "stiffness": Kind("joint", 1.0, "joint_factor", ("actuator_gainprm", "actuator_biasprm")),
+    "damping": Kind("joint", 1.0, "joint_factor", ("dof_damping",)),
+    "strength": Kind("joint", 1.0, "joint_factor", ("actuator_forcerange",)),
+    "encoder_offset": Kind("joint", 0.0, "joint"),
+    "action_delay": Kind("world", 0.0, "scalar", whole=True),
+    "observation_delay": Kind("world", 0.0, "scalar", whole=True),
+}
+# Constants of the model depend on them: derived anew at the start, never within a recorded step.
+ONLY_AT_START = tuple(name for name, kind in KINDS.items() if {*kind.fields} & {*CONSTANTS_READ})
+
+
+def active(cfg: LeggedRobotCfg) -> dict[str, tuple[Kind, float, float]]:
+    """Name -> kind, lowest, highest of all that the config randomizes: what is given and is not neutral."""
+    rand = cfg.domain_rand
+    if not rand.enable:
+        return {}
+    given = {name: (kind, getattr(rand, name)) for name, kind in KINDS.items()}
+    given |= {field: (Kind("world", 1.0, "scalar", (field,)), span) for field, span in rand.model_factors.items()}
+    return {name: (kind, span[0], span[1]) for name, (kind, span) in given.items() if span and not span[0] == span[1] == kind.neutral}
+
+
+def world_fields(cfg: LeggedRobotCfg) -> list[str]:
+    """Model fields that need a value per world."""
+    return list(dict.fromkeys(field for kind, _, _ in active(cfg).values() for field in kind.fields))
+
+
+class Delay:
+    """A value of d steps ago, each world its own d: ``delay(now)`` (N, width) once a step."""
+
+    def __init__(self, steps: Tensor, longest: int, width: int, start: float | None = None) -> None:
+        """``steps`` (N, 1), read at each call; before an episode the value was ``start``, or None: its first one."""
+        self.steps, self.start = steps, start
+        self._past = torch.zeros(len(steps), longest + 1, width, device=steps.device)
+        self._new = torch.ones(len(steps), dtype=torch.bool, device=steps.device)
+
+    def restart(self, mask: Tensor) -> None:
+        """An episode begins where ``mask`` (N,) is true."""
+        if self.start is None:
+            self._new.logical_or_(mask)
+        else:
+            assign(self._past, mask, self.start)
+
+    def __call__(self, now: Tensor) -> Tensor:
+        self._past[:, 1:] = self._past[:, :-1].clone()
+        self._past[:, 0] = now
+        if self.start is None:
+            self._past.copy_(torch.where(self._new[:, None, None], now[:, None], self._past))
+            self._new.fill_(False)
+        index = self.steps.long()[:, :, None].expand(-1, 1, now.shape[1])
+        return self._past.gather(1, index)[:, 0]
+
+
+class DomainRand:
+    """The draws of N worlds and what they write. ``values[name]`` (N, width): the numbers drawn, in the config's units."""
+
+    def __init__(self, cfg: LeggedRobotCfg, robot: RobotModel, sim: Simulation) -> None:
+        self._sim, self._mask = sim, torch.ones(sim.num_envs, dtype=torch.bool, device=sim.device)
+        kinds = active(cfg)
+        again = [name for name in kinds if name in cfg.domain_rand.redraw_at_reset]
+        order = [name for name in kinds if name not in again] + again
+        joints = len(robot.joint_names)
+        count = {"world": 1, "axis": 3, "joint": joints, "link": 1 + joints}
+        widths = [count[kinds[name][0].per] for name in order]
+        self._draws = torch.zeros(sim.num_envs, sum(widths), device=sim.device)
+        self.values: dict[str, Tensor] = dict(zip(order, self._draws.split(widths, dim=1), strict=True)) if order else {}
+        self.mirrors = {name: kinds[name][0].mirror for name in order}
+        self._first_again = sum(width for name, width in zip(order, widths, strict=True) if name not in again)
+        bounds = [list(kinds[name][1:]) for name, width in zip(order, widths, strict=True) for _ in range(width)]
+        self._low, self._high = torch.tensor(bounds or [[0.0, 0.0]], dtype=torch.float, device=sim.device).T.contiguous()
+        self._whole = {name: kinds[name][1:] for name in order if kinds[name][0].whole}
+        self._nominal = {field: sim.field(field)[:1].clone() for field in world_fields(cfg)}
+        self._root, self._ground = robot.id("body", robot.root), robot.id("geom", GROUND)
+        self._link_of_body = _links(robot).to(sim.device)
+        writers = {name: self._writer(name, field) for name in order for field in kinds[name][0].fields[:1]}
+        self._writers = list(dict.fromkeys(writers.values()))
+        self._writers_again = list(dict.fromkeys(writers[name] for name in again if name in writers))
+        self._longest = {name: int(high) for name, (_, high) in self._whole.items()}
+
+    def delay(self, name: str, width: int, start: float | None = None) -> Delay | None:
+        """The delay line of ``action_delay`` or ``observation_delay``, or None if the config has none."""
+        return Delay(self.values[name], self._longest[name], width, start) if name in self.values else None
+
+    def redraw(self) -> None:
+        """Draw everything anew in every world, and what the model derives from it. Not for inside a recorded step."""
+        self._draw(self._mask, 0)
+        for write in self._writers:
+            write(self._mask)
+        if {*self._nominal} & {*CONSTANTS_READ}:
+            self._sim.set_constants()
+
+    def reset(self, mask: Tensor) -> None:
+        """Draw anew, where ``mask`` (N,) is true, what is drawn at every reset."""
+        if self._first_again < self._draws.shape[1]:
+            self._draw(mask, self._first_again)
+            for write in self._writers_again:
+                write(mask)
+
+    def _draw(self, mask: Tensor, first: int) -> None:
+        """Uniform from column ``first`` on; whole numbers each as likely as the other."""
+        draws = self._draws[:, first:]
+        if not draws.shape[1]:
+            return
+        share = torch.rand_like(draws)
+        fresh = torch.lerp(self._low[first:], self._high[first:], share)
+        start = self._draws.shape[1] - fresh.shape[1]
+        for name, (low, high) in self._whole.items():
+            column = self.values[name].storage_offset() - start
+            if column >= 0:
+                fresh[:, column] = (low + share[:, column] * (high - low + 1)).floor_().clamp_(max=high)
+        assign(draws, mask, fresh)
+
+    # ---- what a draw writes: nominal values come from the model ------------------------------------------------------
+
+    def _writer(self, name: str, field: str) -> Callable[[Tensor], None]:
+        special = {
+            "body_mass": self._write_masses,
+            "body_ipos": self._write_com,
+            "geom_friction": self._write_friction,
+            "geom_solref": self._write_contact_time,
+            "actuator_gainprm": self._write_stiffness,
+        }
+        if name in KINDS and field in special:
+            return special[field]
+        first = self._nominal[field].shape[1] - self.values[name].shape[1] if name in KINDS else 0  # the free joint's six come first
+
+        def scale(mask: Tensor) -> None:
+            nominal, factor = self._nominal[field][:, first:], self.values[name]
+            assign(self._sim.field(field)[:, first:], mask, nominal * factor.view(*factor.shape, *[1] * (nominal.dim() - 2)))
+
+        return scale
+
+    def _write_masses(self, mask: Tensor) -> None:
+        """Inertia goes with the mass [ours]."""
+        nominal = self._nominal["body_mass"]
+        mass = nominal.expand(self._sim.num_envs, -1).clone()
+        if "link_mass" in self.values:
+            mass *= torch.nn.functional.pad(self.values["link_mass"], (0, 1), value=1.0)[:, self._link_of_body]
+        if "base_mass" in self.values:
+            mass[:, self._root] += self.values["base_mass"][:, 0]
+        ratio = torch.where(nominal > 0.0, mass / nominal.clamp(min=1e-9), 1.0)
+        assign(self._sim.field("body_mass"), mask, mass)
+        assign(self._sim.field("body_inertia"), mask, self._nominal["body_inertia"] * ratio[:, :, None])
+
+    def _write_com(self, mask: Tensor) -> None:
+        assign(self._sim.field("body_ipos")[:, self._root], mask, self._nominal["body_ipos"][:, self._root] + self.values["base_com"])
+
+    def _write_friction(self, mask: Tensor) -> None:
+        assign(self._sim.field("geom_friction")[:, self._ground, 0], mask, self.values["friction"][:, 0])
+
+    def _write_contact_time(self, mask: Tensor) -> None:
+        assign(self._sim.field("geom_solref")[:, self._ground, 0], mask, self.values["contact_time"][:, 0])
+
+    def _write_stiffness(self, mask: Tensor) -> None:
+        for field, place in (("actuator_gainprm", 0), ("actuator_biasprm", 1)):
+            assign(self._sim.field(field)[:, :, place], mask, self._nominal[field][:, :, place] * self.values["stiffness"])
+
+
+def _links(robot: RobotModel) -> Tensor:
+    """For each body, its column of "link_mass": 0 the root, 1 + j what moves with joint j; 1 + D what is not of the robot."""
+    model = robot.physics
+    weld = {int(model.body_weldid[robot.id("body", robot.root)]): 0}
+    for column, name in enumerate(robot.joint_names, start=1):
+        weld[int(model.body_weldid[model.joint(name).bodyid[0]])] = column
+    outside = 1 + len(robot.joint_names)
+    return torch.tensor([weld.get(int(w), outside) for w in model.body_weldid])
