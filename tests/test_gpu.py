@@ -47,16 +47,43 @@ def roll_out(env: LeggedRobot, actions: torch.Tensor) -> list[torch.Tensor]:
     return out
 
 
-def test_replay_equals_eager_over_100_steps() -> None:
+RANDOMIZED: dict[str, object] = {
+    "domain_rand__enable": True,
+    "domain_rand__stiffness": [0.8, 1.2],
+    "domain_rand__strength": [0.9, 1.1],
+    "domain_rand__action_delay": [0, 2],
+    "domain_rand__observation_delay": [0, 1],
+    "domain_rand__observe": True,
+    "perturbation__push": True,
+    "perturbation__push_interval_s": 0.3,
+}
+
+
+@pytest.mark.parametrize("randomized", [{}, RANDOMIZED], ids=["nominal", "randomized"])
+def test_replay_equals_eager_over_100_steps(randomized: dict[str, object]) -> None:
     """Bit for bit, with noise, kicks, falls, time outs and resets: the same random numbers are drawn in both."""
     actions = torch.randn(100, 64, 12, generator=torch.Generator().manual_seed(0)).to(DEVICE)
-    overrides = {"perturbation__enable": True, "env__episode_length_s": 1.0, "termination__max_tilt": 10.0}
+    overrides = {"perturbation__enable": True, "env__episode_length_s": 1.0, "termination__max_tilt": 10.0, **randomized}
     eager, recorded = (without_constraints(make_env(eager, **overrides)) for eager in (True, False))
     expected, got = roll_out(eager, actions), roll_out(recorded, actions)
     assert recorded._graph.recorded and not eager._graph.recorded
     assert any(done.any() for done in expected[3::5])
     for i, (a, b) in enumerate(zip(expected, got, strict=True)):
         assert torch.equal(a, b), f"step {i // 5}, output {i % 5}: largest difference {(a.float() - b.float()).abs().max():g}"
+
+
+def test_worlds_are_drawn_anew_under_a_recorded_step() -> None:
+    """What the recording reads is written in place, the constants that masses feed too."""
+    env = make_env(eager=False, **RANDOMIZED)
+    actions = torch.zeros(64, 12, device=DEVICE)
+    for _ in range(5):
+        env.step(actions)
+    mass = env.sim.field("body_mass").clone()
+    env.domain_rand.redraw()
+    _, reward, _, _ = env.step(actions)
+    assert env._graph.recorded and not torch.equal(env.sim.field("body_mass"), mass) and torch.isfinite(reward).all()
+    subtree = torch.as_tensor(env.sim._model.body_subtreemass.numpy()[:, 0])
+    torch.testing.assert_close(subtree, env.sim.field("body_mass").sum(dim=1).cpu(), rtol=1e-5, atol=0)
 
 
 def test_replay_equals_eager_with_contacts() -> None:
