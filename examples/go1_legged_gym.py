@@ -73,12 +73,12 @@ class LeggedGymRobot(LeggedRobot):
         velocities = (scale.lin_vel, scale.lin_vel, scale.ang_vel)
         return {
             "state": [
-                Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", scale=scale.lin_vel),
-                Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", scale=scale.ang_vel),
-                Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar"),
+                Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", scale=scale.lin_vel, measured=True),
+                Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", scale=scale.ang_vel, measured=True),
+                Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar", measured=True),
                 Row("commands", self.commands, mirror="command", scale=velocities),
-                Row("dof_pos", self.dof_offset, noise.dof_pos, mirror="joint", scale=scale.dof_pos),
-                Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", scale=scale.dof_vel),
+                Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", scale=scale.dof_pos, measured=True),
+                Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", scale=scale.dof_vel, measured=True),
                 Row("last_actions", self.last_actions, mirror="joint"),
             ]
         }
@@ -222,8 +222,19 @@ class Go1LeggedGymCfg(LeggedRobotCfg):
         push_interval_s = 15.0
         max_push_vel_xy = 1.0
 
+    class domain_rand(LeggedRobotCfg.domain_rand):
+        enable = True
+        friction = [0.5, 1.25]
+        # legged_gym's masses stay as they are, and it has none of these
+        base_mass = []
+        link_mass = []
+        base_com = []
+        armature = []
+        frictionloss = []
+        encoder_offset = []
+
     class terrain(LeggedRobotCfg.terrain):
-        friction = 1.0
+        friction = 1.0  # where domain_rand is off
 
     class sim(LeggedRobotCfg.sim):
         dt = 0.005
