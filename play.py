@@ -12,7 +12,7 @@ from rsl_rl.models import MLPModel
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam, rules
+from legged_mw.eval import exam, report, rules
 from legged_mw.rl.policy import act, export_onnx, load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE, find_checkpoint, find_run, runs
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, one_line_errors, pick_device, seed_everything, shown
@@ -47,7 +47,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--time", type=duration, default=None, metavar="T", help="how long to play (default: 10s of video, a window until closed)"
     )
-    parser.add_argument("--eval", action="store_true", help="run the walking exam, print its table, write a JSON file")
+    parser.add_argument("--eval", action="store_true", help="run the walking exam, print its table, write a report")
+    parser.add_argument("--compare", metavar="RUN", help="with --eval: grade this run beside it; its name or path, or 'shipped'")
     parser.add_argument("--export", metavar="DIR", help="write model.pt, policy.onnx and config.yaml there")
     args = parser.parse_args()
     if not args.task:
@@ -55,6 +56,8 @@ def parse() -> argparse.Namespace:
     asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag)]
     if len(asked) > 1 or (args.eval and args.command is not None):
         parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
+    if args.compare is not None and not args.eval:
+        parser.error("--compare grades two policies side by side: add --eval")
     return args
 
 
@@ -72,6 +75,7 @@ def main() -> None:
         print(f"  {path}: {before} -> {now}")
     seed_everything(task.train.seed)
     device = pick_device(args.device)
+    rival = find_rival(args, device) if args.compare is not None else None
     env = task.env_class(task.cfg, device, eager=args.eager)
     policy = load_policy(source.checkpoint, env, task.train, device)
     out = ROOT / "logs" / task.name / "shipped" if source.shipped else source.folder  # where results go
@@ -79,7 +83,11 @@ def main() -> None:
         export(trained, env, source, device, Path(args.export))
     elif args.eval:
         overrides = {path: now for path, (_, now) in changes.items()}
-        grade(env, policy, source, overrides, out / "exam.json")
+        columns = [grade(env, policy, source, overrides)]
+        if rival:
+            columns.append(grade(*rival))
+        report.write(out / "eval", task.name, columns)
+        print(f"written to {shown(out / 'eval' / 'report.html')}, with report.json and pictures beside it")
     elif args.video or not has_display():
         if not args.video:
             print("no screen here (DISPLAY and WAYLAND_DISPLAY are not set): recording instead of opening a window")
@@ -94,16 +102,43 @@ def find_policy(task: LoadedTask, args: argparse.Namespace) -> Source:
     if args.load_run is not None or args.checkpoint != -1 or runs(experiment):
         run = find_run(experiment, args.load_run or "-1")
         return Source(run, find_checkpoint(run, args.checkpoint), shipped=False)
-    folder = ROOT / "resources" / "policies" / task.name
-    if not (folder / "model.pt").is_file():
+    if not (shipped(task).checkpoint).is_file():
         raise ConfigError(f"nothing to play: no run in {shown(experiment)} and no policy shipped for {task.name}; train first")
+    return shipped(task)
+
+
+def shipped(task: LoadedTask) -> Source:
+    """Where the policy that ships with the task would be."""
+    folder = ROOT / "resources" / "policies" / task.name
     return Source(folder, folder / "model.pt", shipped=True)
+
+
+def find_rival(args: argparse.Namespace, device: str) -> tuple[LeggedRobot, MLPModel, Source, dict[str, Any]]:
+    """What ``--compare`` names, ready to be graded as the first policy is: by the config of its own run, with the same overrides."""
+    task = load_task(args.task)
+    if args.compare == "shipped":
+        source = shipped(task)
+        if not source.checkpoint.is_file():
+            raise ConfigError(f"--compare shipped: no policy ships with {task.name}")
+    else:
+        run = find_run(ROOT / "logs" / (args.experiment_name or task.train.runner.experiment_name or task.name), args.compare)
+        source = Source(run, find_checkpoint(run, -1), shipped=False)
+    saved = load_yaml(source.folder / CONFIG_FILE)
+    if Path(str(saved.get("task", task.name))).stem != task.name:
+        raise ConfigError(f"--compare {args.compare} is of task '{saved['task']}', not '{task.name}': two policies are graded on one task")
+    task.update_from_run(saved, where=shown(source.folder / CONFIG_FILE))
+    trained = task.to_dict()
+    prepare(task, args)
+    seed_everything(task.train.seed)
+    env = task.env_class(task.cfg, device, eager=args.eager)
+    policy = load_policy(source.checkpoint, env, task.train, device)
+    return env, policy, source, {path: now for path, (_, now) in changes_since(task, trained).items()}
 
 
 def prepare(task: LoadedTask, args: argparse.Namespace) -> None:
     """What playing changes in the trained config; the user's own overrides come last."""
     if args.eval:
-        exam.prepare(task)
+        report.prepare(task)
     else:
         for path, value in NOMINAL.items():
             task.set(path, value, where="play")
@@ -132,12 +167,13 @@ def changes_since(task: LoadedTask, trained: dict[str, Any]) -> dict[str, tuple[
     return {path: (before, now) for path, before, now in differences}
 
 
-def grade(env: LeggedRobot, policy: MLPModel, source: Source, overrides: dict[str, Any], path: Path) -> None:
-    result = exam.run_exam(env, lambda obs: act(policy, obs))
-    about = {"policy": shown(source.checkpoint), "engine": env.sim.engine, "device": env.device, "overrides": overrides}
-    rules.save({**about, **result}, path)
-    print(rules.table(result))
-    print(f"written to {shown(path)}")
+def grade(env: LeggedRobot, policy: MLPModel, source: Source, overrides: dict[str, Any]) -> report.Column:
+    """The exam and all else of a report, from one roll-out; prints the exam's table."""
+    result, figures = report.examine(env, lambda obs: act(policy, obs))
+    name = "shipped" if source.shipped else f"{source.folder.name}, {source.checkpoint.stem.removeprefix('model_')}"
+    print(f"\n{name}, {env.sim.engine} on {env.device}\n{rules.table(result)}\n")
+    about = {"policy": "/".join(source.checkpoint.parts[-3:]), "engine": env.sim.engine, "device": env.device, "overrides": overrides}
+    return report.Column(name, about, result, figures)
 
 
 def record(env: LeggedRobot, policy: MLPModel, path: Path, seconds: float) -> None:

@@ -17,6 +17,7 @@ from legged_mw import ROOT
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.describe import describe
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.eval.training import TrainingExam
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.runner import Runner, make_runner
@@ -79,7 +80,9 @@ def main() -> None:
     if args.check:
         print(describe(env, task))
         return
-    train(task, env, experiment, run, checkpoint, device, began + args.max_time if args.max_time else None)
+    wanted = rank.leads and 0 < task.train.runner.exam_interval <= task.train.runner.max_iterations
+    examine = TrainingExam(task, device, eager=args.eager) if wanted else None
+    train(task, env, examine, experiment, run, checkpoint, device, began + args.max_time if args.max_time else None)
     leave_together(rank)
 
 
@@ -98,9 +101,17 @@ def announce(task: LoadedTask, device: str, rank: Rank) -> None:
 
 
 def train(
-    task: LoadedTask, env: LeggedRobot, experiment: Path, run: Path | None, checkpoint: Path | None, device: str, deadline: float | None
+    task: LoadedTask,
+    env: LeggedRobot,
+    examine: TrainingExam | None,
+    experiment: Path,
+    run: Path | None,
+    checkpoint: Path | None,
+    device: str,
+    deadline: float | None,
 ) -> None:
     runner = make_runner(env, task.train, None, device)
+    runner.examine = examine
     if checkpoint:
         runner.load(str(checkpoint))
         print(f"resuming {shown(checkpoint)}")
@@ -120,6 +131,9 @@ def train(
     runner.logger.log_dir = str(folder)
     print(f"writing to {shown(folder)}", flush=True)
     learn_together(runner, left, rank)
+    if runner.last_exam:
+        iteration, figures = runner.last_exam
+        print(f"exam after {iteration} iterations: {', '.join(f'{figure} {value:.3f}' for figure, value in figures.items())}")
     name = task.to_dict()["task"]
     home = ROOT / "logs" / (load_task(name).train.runner.experiment_name or task.name)
     flags = shlex.join(["--task", name, "--load_run", folder.name if folder.parent == home else shown(folder)])

@@ -17,6 +17,8 @@ class Go1FlatCfg(LeggedRobotCfg):
         foot_names = ["FR", "FL", "RR", "RL"]
         imu_site = "imu"
         colliders = ["FR", "FL", "RR", "RL"]  # the feet alone touch the ground [P]
+        # Unitree's go1.urdf has 30.1 for all, at 23.7 N m; the calf's 35.55 N m are behind a lever of 1.5, which its speed pays for
+        joint_speed_limits = {"hip": 30.1, "thigh": 30.1, "calf": 20.06}  # [rad/s]
 
     class init_state(LeggedRobotCfg.init_state):
         pos = [0.0, 0.0, 0.278]  # [m] [P]

@@ -26,6 +26,7 @@ class LeggedRobotCfg(Config):
         self_collisions: bool = False  # among the colliders
         penalize_contacts_on: list[str] = []  # colliders, or patterns: `collision` counts their bodies on the ground [L]
         terminate_after_contacts_on: list[str] = []  # likewise: to touch the ground with one of these is a fall [L]
+        joint_speed_limits: dict[str, float] = {}  # joint or part of its name -> the motor's highest speed [rad/s]; for the report only
 
     class init_state:
         pos: list[float] = [0.0, 0.0, 1.0]  # root at reset [m]
@@ -174,6 +175,9 @@ class LeggedRobotCfgPPO(Config):
         num_steps_per_env: int = 24  # control steps a world between two updates [P]
         max_iterations: int = 300  # [ours: a robot of one's own shows something by then]
         save_interval: int = 50  # [iterations] between checkpoints
+        exam_interval: int = (
+            200  # [iterations] between small exams, and one at the end; 0, or more than max_iterations: none [ours: docs/grading.md]
+        )
         experiment_name: str = ""  # folder below logs/; empty: the task's name
         run_name: str = ""  # appended to the run folder's time stamp
         logger: Literal["tensorboard", "wandb"] = "tensorboard"

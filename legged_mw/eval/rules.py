@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ PEER: dict[str, Any] = {
     "kicks": {"1": 1.0, "2": 1.0, "3": 1.0, "4": 0.81, "5": 0.38, "6": 0.13},
     "cost_of_transport": 0.86,
 }
+ERROR_MARKS = (0.06, 0.06, 0.12)  # largest mean error of a policy that walks [m/s, m/s, rad/s]
 EQUAL_DRIFT = 0.005  # [m], below which drifts count as equal
 
 
@@ -79,7 +80,7 @@ def walks(result: dict[str, Any]) -> bool:
     """No falls, small errors, every kick of 2 m/s survived."""
     if result["falls"]:
         return False
-    small = all(error <= most for error, most in zip(result["error"], (0.06, 0.06, 0.12), strict=True))
+    small = all(error <= most for error, most in zip(result["error"], ERROR_MARKS, strict=True))
     return small and result["kicks"]["2"] == 1.0
 
 
@@ -94,20 +95,50 @@ def beats_peer(result: dict[str, Any]) -> bool:
     return better and worst and kicks and result["drift"] <= max(EQUAL_DRIFT, PEER["drift"])
 
 
+class Row(NamedTuple):
+    """One figure of the exam beside what walking asks and what the peer has."""
+
+    name: str
+    value: float | None  # None: it fell, there is nothing to measure
+    digits: int
+    mark: float | None = None  # what walking needs; None: anything
+    peer: float | None = None
+    more_is_better: bool = False
+
+    def shown(self, value: float | None) -> str:
+        return "fell" if value is None else f"{value:.{self.digits}f}"
+
+    def shown_mark(self) -> str:
+        return "" if self.mark is None else f"{self.mark:.{min(self.digits, 2)}f}"
+
+    def passes(self) -> bool | None:
+        """Whether the value is what walking needs; None where it needs nothing."""
+        if self.mark is None:
+            return None
+        return self.value is not None and (self.value >= self.mark if self.more_is_better else self.value <= self.mark)
+
+
+def rows(result: dict[str, Any]) -> list[Row]:
+    """The result's figures in the order of the table."""
+    listed = [Row("falls in 22 commands", result["falls"], 0, 0, PEER["falls"])]
+    error, worst = result["error"] or [None] * 3, result["worst"] or [None] * 3
+    for i, name in enumerate(("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")):
+        listed.append(Row(f"error {name}", error[i], 3, ERROR_MARKS[i], PEER["error"][i]))
+        listed.append(Row("  worst command", worst[i], 3, None, PEER["worst"][i]))
+    listed.append(Row("drift standing 8 s [m]", result["drift"], 4, None, PEER["drift"]))
+    listed.append(Row("joint speed standing [rad/s]", result["joint_speed"], 3))
+    for speed, share in result["kicks"].items():
+        listed.append(Row(f"survives kicks of {speed} m/s", share, 2, 1.0 if speed == "2" else None, PEER["kicks"][speed], True))
+    listed.append(Row("cost of transport at 1 m/s", result["cost_of_transport"], 2, None, PEER["cost_of_transport"]))
+    return listed
+
+
 def table(result: dict[str, Any]) -> str:
     """The result beside the peer's, as text."""
-    rows = [("", "this policy", "walks at", "peer")]
-    rows.append(("falls in 22 commands", f"{result['falls']}", "0", f"{PEER['falls']}"))
-    error, worst = result["error"] or [None] * 3, result["worst"] or [None] * 3
-    for i, (name, most) in enumerate((("vx [m/s]", 0.06), ("vy [m/s]", 0.06), ("yaw rate [rad/s]", 0.12))):
-        rows.append((f"error {name}", _shown(error[i], 3), f"{most:.2f}", f"{PEER['error'][i]:.3f}"))
-        rows.append(("  worst command", _shown(worst[i], 3), "", f"{PEER['worst'][i]:.3f}"))
-    rows.append(("drift standing 8 s [m]", _shown(result["drift"], 4), "", f"{PEER['drift']:.4f}"))
-    rows.append(("joint speed standing [rad/s]", _shown(result["joint_speed"], 3), "", ""))
-    for speed, share in result["kicks"].items():
-        rows.append((f"survives kicks of {speed} m/s", f"{share:.2f}", "1.00" if speed == "2" else "", f"{PEER['kicks'][speed]:.2f}"))
-    rows.append(("cost of transport at 1 m/s", _shown(result["cost_of_transport"], 2), "", f"{PEER['cost_of_transport']:.2f}"))
-    lines = [f"{a:<30}{b:>12}{c:>10}{d:>8}" for a, b, c, d in rows]
+    lines = [f"{'':<30}{'this policy':>12}{'walks at':>10}{'peer':>8}"]
+    for row in rows(result):
+        peer = "" if row.peer is None else row.shown(row.peer)
+        lines.append(f"{row.name:<30}{row.shown(row.value):>12}{row.shown_mark():>10}{peer:>8}")
     verdict = f"walks: {'yes' if result['walks'] else 'no'}; beats the peer: {'yes' if result['beats_peer'] else 'no'}"
     return "\n".join([*lines, verdict])
 
@@ -116,10 +147,6 @@ def save(result: dict[str, Any], path: Path) -> None:
     """Write the result as JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
-
-
-def _shown(value: float | None, digits: int) -> str:
-    return "fell" if value is None else f"{value:.{digits}f}"
 
 
 def _figures(row: NDArray[np.float64]) -> list[float]:

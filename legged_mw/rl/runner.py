@@ -6,7 +6,7 @@ import copy
 import importlib.util
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
 from pathlib import Path
@@ -32,7 +32,8 @@ class Runner(OnPolicyRunner):
     """Trains with rsl-rl's algorithm, storage and writers.
 
     ``current_learning_iteration`` counts finished iterations: a checkpoint ``model_100.pt`` has done 100 of them, and a
-    resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after a checkpoint.
+    resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after a checkpoint. Set ``examine``
+    to what grades a policy: it is called every ``exam_interval`` iterations and after the last, and its figures are logged.
     """
 
     env: LeggedRobot
@@ -42,6 +43,8 @@ class Runner(OnPolicyRunner):
         self.logger.git_status_repos = [str(ROOT)]
         self.total_steps = 0
         self.stop: str | None = None
+        self.examine: Callable[[Any], dict[str, float]] | None = None
+        self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
         self._warned_overflow = False
         self._last_means: dict[str, float] = {}
 
@@ -93,11 +96,17 @@ class Runner(OnPolicyRunner):
             redraw = self.env.cfg.domain_rand.redraw_iterations
             if redraw and self.current_learning_iteration % redraw == 0:
                 self.env.domain_rand.redraw()
+            if self._exam_is_due():
+                waiting = self._log(waiting) if waiting else None
+                self._examine()
+                start = clock.mark()
             if self.current_learning_iteration % self.cfg["save_interval"] == 0 and self.current_learning_iteration < self._last:
                 self._save_checkpoint()
         if waiting:
             self._log(waiting)
         self._save_checkpoint()
+        if self.examine and self.stop is None:
+            self._examine()
         self.logger.stop_logging_writer()
 
     def _anneal(self) -> None:
@@ -134,6 +143,27 @@ class Runner(OnPolicyRunner):
                 if self.stop is not None and not self.is_distributed:
                     break
         return obs
+
+    def _exam_is_due(self) -> bool:
+        """Every ``exam_interval`` iterations; the last iteration's exam waits until the last checkpoint is written."""
+        interval, done = self.cfg["exam_interval"], self.current_learning_iteration
+        return self.examine is not None and interval > 0 and done % interval == 0 and done < self._last
+
+    def _examine(self) -> None:
+        """Grade the policy as it is now; of the ranks, only the first has an exam, and the others wait in the next update."""
+        assert self.examine is not None
+        policy, begun = self.alg.get_policy(), time.time()
+        training = policy.training
+        figures = self.examine(policy.eval())
+        policy.train(training)
+        self.last_exam = self.current_learning_iteration, figures
+        if self.logger.writer is not None:
+            curves = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
+            for name, value in curves.items():
+                if not math.isnan(value):
+                    self.logger.writer.add_scalar(name, value, self.current_learning_iteration)
+        title = f"Exam after iteration {self.current_learning_iteration}/{self._last}"
+        print(console_block(title, {name: f"{value:.3f}" for name, value in figures.items()}), flush=True)
 
     # ---- what the user sees ---------------------------------------------------------------------------------------
 
@@ -256,7 +286,7 @@ def rsl_rl_config(cfg: LeggedRobotCfgPPO) -> dict[str, Any]:
         if importlib.util.find_spec("wandb") is None:
             raise ConfigError("runner.logger is wandb, but wandb is not installed: pip install wandb")
         logger = {"class_name": "WandbLogWriter", "project_name": runner["wandb_project"]}
-    keys = ("num_steps_per_env", "save_interval", "experiment_name", "run_name")
+    keys = ("num_steps_per_env", "save_interval", "exam_interval", "experiment_name", "run_name")
     symmetry = sections.pop("symmetry")
     mirrors = symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]
     symmetry_cfg = {"data_augmentation_func": "legged_mw.rl.symmetry:mirror", **symmetry} if mirrors else None

@@ -1,0 +1,219 @@
+"""Figures from a record: numpy in, plain numbers out. Nothing here knows a simulator, and nothing is drawn here.
+
+N worlds, T control steps, D joints, F feet. What fell is None, and is not part of any mean. "Settled" is what is left after
+the exam's first seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from legged_mw.eval.rollout import Record
+from legged_mw.eval.rules import GRAVITY, KICK_DIRECTIONS
+
+SATURATED = 0.98  # of the limit, from which on a torque counts as at it
+SLOW = 0.1  # [m/s], below which a cost of transport says nothing
+SHORT_SWING = 2  # [control steps] in the air that make a swing; less is a foot that chatters
+BINS = 40  # of a joint's histogram
+
+Array = NDArray[Any]
+
+
+# ---- following the command
+
+
+def tracking_errors(record: Record, settled: int, rows: int) -> list[list[list[float | None]]]:
+    """Mean absolute error of vx, vy, yaw rate over a grid of worlds: 3 x rows x columns."""
+    error = np.abs(record.signals["velocity"][settled:] - record.commands[settled:]).mean(axis=0, dtype=float)  # (N, 3)
+    error[np.isfinite(record.fell_at)] = np.nan
+    return [plain(error[:, k].reshape(rows, -1)) for k in range(3)]
+
+
+def step_response(time: Array, measured: Array, start: float, target: float) -> dict[str, float | None]:
+    """How ``measured`` (T,) goes from ``start`` to ``target``, which is commanded from time 0 on.
+
+    ``rise_time``: from 10 to 90 % of the way [s]. ``overshoot``: how far beyond the target, as a share of the way.
+    ``left``: mean difference to the target in the last half second, in the unit of what is measured.
+    """
+    way = (measured - start) / (target - start)
+    after = (time >= 0.0) & np.isfinite(way)
+    time, way = time[after], way[after]
+    if not len(time):
+        return {"rise_time": None, "overshoot": None, "left": None}
+    low, high = _first_crossing(time, way, 0.1), _first_crossing(time, way, 0.9)
+    end = way[time >= time[-1] - 0.5]
+    return {
+        "rise_time": None if low is None or high is None else high - low,
+        "overshoot": max(0.0, float(way.max()) - 1.0),
+        "left": float(np.mean(end - 1.0)) * (target - start),
+    }
+
+
+def _first_crossing(time: Array, values: Array, level: float) -> float | None:
+    """When ``values`` first reaches ``level``, between the samples."""
+    above = np.flatnonzero(values >= level)
+    if not len(above):
+        return None
+    i = int(above[0])
+    if i == 0:
+        return float(time[0])
+    share = (level - values[i - 1]) / (values[i] - values[i - 1])
+    return float(time[i - 1] + share * (time[i] - time[i - 1]))
+
+
+def responses(record: Record, axis: int, before: float, length: float) -> dict[str, Any]:
+    """One axis of the command stepping: worlds aligned at their first step, then mean, lowest and highest at each time.
+
+    ``before`` and ``length`` [s]: what is shown before and after the first step. A world that falls is left out.
+    """
+    told, moved = record.commands[:, :, axis], record.signals["velocity"][:, :, axis]
+    stood = np.flatnonzero(np.isinf(record.fell_at))
+    first, count = round(before / record.dt), round((before + length) / record.dt)
+    rows, commanded = np.full((len(told[0]), count), np.nan), np.full(count, np.nan)
+    for world in range(told.shape[1]):
+        changes = np.flatnonzero(np.diff(told[:, world])) + 1
+        if not len(changes):  # the record ended before
+            continue
+        begin = changes[0] - first
+        span = slice(begin, begin + count)
+        commanded[: len(told[span, world])] = told[span, world]
+        if world in stood:
+            rows[world, : len(moved[span, world])] = moved[span, world]
+    time = (np.arange(count) - first) * record.dt
+    seen = np.isfinite(rows).any(axis=0)
+    mean, low, high = (np.full(count, np.nan) for _ in range(3))
+    mean[seen], low[seen], high[seen] = (f(rows[:, seen], axis=0) for f in (np.nanmean, np.nanmin, np.nanmax))
+    return {
+        "time": plain(time.round(4)),
+        "commanded": plain(commanded),
+        "mean": plain(mean),
+        "low": plain(low),
+        "high": plain(high),
+        "fell": int(len(rows) - len(stood)),
+        "numbers": _each_step(time, commanded, mean),
+    }
+
+
+def _each_step(time: Array, commanded: Array, mean: Array) -> list[dict[str, Any]]:
+    """The response to each change of the command, until the next."""
+    changes = np.flatnonzero(np.nan_to_num(np.diff(commanded))) + 1
+    found = []
+    for begin, end in zip(changes, [*changes[1:], len(time)], strict=True):
+        start, target = float(commanded[begin - 1]), float(commanded[begin])
+        found.append({"from": start, "to": target, **step_response(time[begin:end] - time[begin], mean[begin:end], start, target)})
+    return found
+
+
+# ---- the gait
+
+
+def duty_factor(contact: Array) -> list[float]:
+    """Share of the time that each foot is down; ``contact`` (T, F)."""
+    return contact.mean(axis=0, dtype=float).tolist()
+
+
+def stride_frequency(contact: Array, dt: float) -> float:
+    """Strides a second, mean over the feet that step; ``contact`` (T, F). 0 if none does.
+
+    A stride is from touch-down to touch-down; a touch-down ends a swing of at least ``SHORT_SWING`` samples.
+    """
+    rates = []
+    for down in contact.T.astype(bool):
+        falls = np.flatnonzero(down[1:] & ~down[:-1]) + 1
+        swings = [i for i in falls if i >= SHORT_SWING and not down[i - SHORT_SWING : i].any()]
+        if len(swings) > 1:
+            rates.append((len(swings) - 1) / ((swings[-1] - swings[0]) * dt))
+    return float(np.mean(rates)) if rates else 0.0
+
+
+def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], shown: float) -> list[dict[str, Any]]:
+    """Of each command's world: duty factor, stride frequency, and which foot is down in the last ``shown`` seconds (F, T)."""
+    found = []
+    for world, command in enumerate(commands):
+        contact = record.signals["contact"][settled:, world]
+        fell = bool(np.isfinite(record.fell_at[world]))
+        found.append(
+            {
+                "command": list(command),
+                "duty_factor": None if fell else duty_factor(contact),
+                "stride_frequency": None if fell else stride_frequency(contact, record.dt),
+                "contact": None if fell else contact[-round(shown / record.dt) :].T.astype(int).tolist(),
+            }
+        )
+    return found
+
+
+# ---- joints
+
+
+def distribution(values: Array, low: Array, high: Array, limited: Array) -> dict[str, Any]:
+    """What ``values`` (S, D) are, joint by joint, and the share of samples outside ``low`` to ``high`` (D,).
+
+    ``limited`` (D,): where there is a limit at all.
+    """
+    if not len(values):
+        return {"low": [], "high": [], "edges": [], "density": [], "quantiles": [], "saturated": []}
+    histograms = [np.histogram(row, BINS, density=True) for row in values.T]
+    outside = ((values < low) | (values > high)).mean(axis=0)
+    return {
+        "low": [float(v) if ok else None for v, ok in zip(low, limited, strict=True)],
+        "high": [float(v) if ok else None for v, ok in zip(high, limited, strict=True)],
+        "edges": [plain(edges.round(5)) for _, edges in histograms],
+        "density": [plain(density.round(5)) for density, _ in histograms],
+        "quantiles": plain(np.quantile(values, (0.0, 0.05, 0.5, 0.95, 1.0), axis=0).T.round(5)),
+        "saturated": [float(v) if ok else None for v, ok in zip(outside, limited, strict=True)],
+    }
+
+
+def joints(record: Record, settled: int, limits: dict[str, tuple[Array, Array]]) -> dict[str, Any]:
+    """Distributions of joint position, velocity and torque over the worlds that stood; ``limits``: signal -> (low, high), (D,)."""
+    stood = np.isinf(record.fell_at)
+    found = {}
+    for name, (low, high) in limits.items():
+        values = record.signals[name][settled:, stood]
+        values = values.reshape(-1, values.shape[-1]).astype(float)
+        margin = SATURATED if name == "torque" else 1.0
+        limited = np.isfinite(low) & np.isfinite(high)
+        found[name] = {**distribution(values, low * margin, high * margin, limited), "margin": margin}
+    return found
+
+
+# ---- kicks, energy, reward
+
+
+def survival(fell_at: Array, until: int, speeds: Sequence[float]) -> list[list[bool]]:
+    """Not fallen up to step ``until``: speeds x directions."""
+    return (fell_at > until).reshape(len(speeds), KICK_DIRECTIONS).tolist()
+
+
+def transport(record: Record, settled: int) -> dict[str, list[float | None]]:
+    """Of each world: speed over ground [m/s] along a straight line, mean power [W], cost of transport [-]."""
+    power = record.signals["power"][settled:].mean(axis=0, dtype=float)
+    seconds = (len(record.signals["power"]) - settled) * record.dt
+    speed = np.linalg.norm(record.last_position - record.signals["position"][settled], axis=1) / seconds
+    cost = np.where(speed > SLOW, power / (record.mass * GRAVITY * np.maximum(speed, SLOW)), np.nan)
+    stood = np.isinf(record.fell_at)
+    return {
+        name: plain(np.where(stood, values, np.nan)) for name, values in (("speed", speed), ("power", power), ("cost_of_transport", cost))
+    }
+
+
+def reward_shares(record: Record, settled: int, names: Sequence[str]) -> dict[str, float | None]:
+    """Each term's scale * term a second, mean over the worlds that stood; ``reward`` (T, N, K) is the sum since the start."""
+    summed = record.signals["reward"][:, np.isinf(record.fell_at)].astype(float)
+    seconds = (len(summed) - 1 - settled) * record.dt
+    if not summed.shape[1] or seconds <= 0:
+        return dict.fromkeys(names)
+    return dict(zip(names, ((summed[-1] - summed[settled]) / seconds).mean(axis=0).tolist(), strict=True))
+
+
+def plain(values: Array) -> list[Any]:
+    """Nested lists as JSON knows them: what is not finite is None."""
+    if values.ndim > 1:
+        return [plain(row) for row in values]
+    return [float(v) if math.isfinite(v) else None for v in values]

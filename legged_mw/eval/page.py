@@ -1,0 +1,202 @@
+"""The report as one page: text, tables and drawn panels in, HTML out. Nothing in it is loaded from anywhere else."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+from typing import TYPE_CHECKING, Any
+
+from legged_mw.eval import rules
+from legged_mw.eval.style import CSS
+
+if TYPE_CHECKING:
+    from legged_mw.eval.plots import Section
+    from legged_mw.eval.report import Column
+
+TEXTS = {
+    "tracking": "Mean absolute error of the velocity at the IMU, body frame, over the last 8 of 10 seconds, command by command over the "
+    "range that was trained. Dark is good. The white stroke on each scale is what the exam allows on average; a cross is a fall.",
+    "steps": "Stand, then two thirds of the trained range, then the same backwards, then stand. Line: mean of eight robots that meet the "
+    "step in different phases of their gait; band: lowest and highest of them.",
+    "gait": "A bar where a foot is on the ground, the last two seconds of each command. Above: strides a second, and the share of "
+    "time that a foot is down, mean over the feet.",
+    "joints": "Where the joints are, how fast they move and what torque they need over all 22 commands. Upright strokes are limits: soft "
+    "position limits, the motors' speed, the torque that the servos are clamped to. At the right the share of samples beyond a limit "
+    "(of a torque: at 98 % of it or more), where there are any.",
+    "kicks": "The base's horizontal velocity jumps; a kick is survived if the robot has not fallen three seconds later. Rings: jumps "
+    "of 1 to 6 m/s; sectors: where it is kicked to. Full tiles were survived. Walking is at 0.8 m/s; the exam counts these.",
+    "energy": "Straight ahead and backwards. Power: sum over the joints of |torque x speed|. Cost of transport: energy over weight "
+    "times distance.",
+    "reward": "What each term adds to the reward in a second, before the clip at zero, mean over the 22 commands.",
+}
+EXAM_NOTE = (
+    "22 commands of 10 s and 96 kicks, all from rest on flat ground, without noise. A policy walks if it passes every row that has a "
+    "mark. The peer is the policy that ships with MuJoCo Playground for this robot, graded by the same rules in MuJoCo's C engine."
+)
+
+
+def html(task: str, columns: Sequence[Column], drawn: Sequence[tuple[Section, list[str]]]) -> str:
+    """The whole page."""
+    first = columns[0]
+    chapters = [_chapter(section, panels, _extra(section.name, columns)) for section, panels in drawn]
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark"><title>{escape(task)}: walking exam</title><style>{CSS}</style></head>
+<body><main>
+<header><p class="kicker">Walking exam</p><h1>{escape(task)}</h1>{_names(columns)}{_cards(first)}</header>
+<section><h2>Exam</h2><p class="lead">{EXAM_NOTE}</p>{_exam_table(columns)}</section>
+{"".join(chapters)}
+<footer>{_about(columns)}</footer>
+</main></body></html>
+"""
+
+
+def _names(columns: Sequence[Column]) -> str:
+    """Who is graded, and whether they pass; the colour is that of their curves."""
+    items, drawn = [], [column.name for column in columns if column.figures]
+    for column in columns:
+        swatch = f'<i class="swatch c{drawn.index(column.name)}"></i>' if column.figures and len(drawn) > 1 else ""
+        engine = escape(str(column.about.get("engine", "")))
+        words = [_pill("walks", column.exam["walks"]), _pill("beats the peer", column.exam["beats_peer"])]
+        items.append(f"<li>{swatch}<b>{escape(column.name)}</b> <span class='muted'>{engine}</span> {' '.join(words)}</li>")
+    return f'<ul class="names">{"".join(items)}</ul>'
+
+
+def _pill(text: str, yes: bool) -> str:
+    return f'<span class="pill {"yes" if yes else "no"}">{"&#10003;" if yes else "&#10007;"} {text if yes else f"does not: {text}"}</span>'
+
+
+def _cards(column: Column) -> str:
+    """The figures that one looks for first."""
+    result = column.exam
+    rows = {row.name.strip(): row for row in rules.rows(result) if not row.name.startswith(" ")}
+    wanted = {
+        "error vx [m/s]": ("vx error", "m/s"),
+        "error vy [m/s]": ("vy error", "m/s"),
+        "error yaw rate [rad/s]": ("yaw error", "rad/s"),
+        "falls in 22 commands": ("falls", "of 22"),
+        "survives kicks of 2 m/s": ("2 m/s kicks", "survived"),
+        "cost of transport at 1 m/s": ("cost of transport", "at 1 m/s"),
+    }
+    cards = []
+    for name, (label, unit) in wanted.items():
+        row = rows[name]
+        value = f"{row.value:.0%}" if row.more_is_better and row.value is not None else row.shown(row.value)
+        cards.append(f'<div class="card{_mood(row)}"><span>{label}</span><b>{value}</b><small>{unit}</small></div>')
+    return f'<div class="cards">{"".join(cards)}</div>'
+
+
+def _mood(row: rules.Row) -> str:
+    return {True: " pass", False: " fail", None: ""}[row.passes()]
+
+
+def _exam_table(columns: Sequence[Column]) -> str:
+    """A row a figure; from the second column on with the gap to the first."""
+    listed = [rules.rows(column.exam) for column in columns]
+    heads = "".join(f"<th>{escape(column.name)}</th>" for column in columns)
+    lines = []
+    for row, *others in zip(*listed, strict=True):
+        cells = [f'<td class="value{_mood(row)}">{row.shown(row.value)}</td>']
+        for other in others:
+            gap = "" if other.value is None or row.value is None else f"{other.value - row.value:+.{row.digits}f}"
+            cells.append(f'<td class="value{_mood(other)}">{other.shown(other.value)} <small>{gap}</small></td>')
+        peer = "" if row.peer is None else row.shown(row.peer)
+        name = escape(row.name.strip())
+        sub = ' class="sub"' if row.name.startswith(" ") else ""
+        lines.append(f"<tr{sub}><th>{name}</th>{''.join(cells)}<td>{row.shown_mark()}</td><td>{peer}</td></tr>")
+    head = f"<thead><tr><th></th>{heads}<th>walks at</th><th>peer</th></tr></thead>"
+    return f'<div class="scroll"><table class="exam">{head}<tbody>{"".join(lines)}</tbody></table></div>'
+
+
+def _chapter(section: Section, panels: list[str], extra: str) -> str:
+    figures = "".join(f"<figure>{svg}</figure>" for svg in panels)
+    kind = "wide" if section.across == 1 else f"by{section.across}"
+    text = f'<h2>{section.title}</h2><p class="lead">{TEXTS[section.name]}</p>'
+    return f'<section>{text}<div class="panels {kind}">{figures}</div>{extra}</section>'
+
+
+def _extra(name: str, columns: Sequence[Column]) -> str:
+    """The numbers that belong to a chapter's pictures."""
+    drawn = [column for column in columns if column.figures]
+    if name == "steps":
+        return _table(
+            ["", "from", "to", "10 to 90 % in [s]", "overshoot", "left at the end"], [row for c in drawn for row in _step_rows(c, drawn)]
+        )
+    if name == "gait":
+        feet = (drawn[0].figures or {})["foot_names"]
+        return _table(
+            ["vx, vy, yaw rate", "strides [1/s]", *(f"{foot} down" for foot in feet)],
+            [row for c in drawn for row in _gait_rows(c, drawn)],
+            "All commands",
+        )
+    if name == "joints":
+        joints = (drawn[0].figures or {})["joint_names"]
+        return _table(
+            ["", "position", "velocity", "torque"],
+            [row for c in drawn for row in _joint_rows(c, drawn, joints)],
+            "Share beyond the limit, joint by joint",
+        )
+    return ""
+
+
+def _step_rows(column: Column, drawn: Sequence[Column]) -> list[list[str]]:
+    rows = []
+    for axis, (name, unit) in {"vx": ("vx", "m/s"), "vy": ("vy", "m/s"), "yaw": ("yaw rate", "rad/s")}.items():
+        for number in (column.figures or {})["steps"][axis]["numbers"]:
+            rise, over, left = number["rise_time"], number["overshoot"], number["left"]
+            rows.append(
+                [
+                    f"{name} [{unit}]{_whose(column, drawn)}",
+                    f"{number['from']:g}",
+                    f"{number['to']:g}",
+                    "not reached" if rise is None else f"{rise:.2f}",
+                    "" if over is None else f"{over:.0%}",
+                    "" if left is None else f"{left:+.3f}",
+                ]
+            )
+    return rows
+
+
+def _gait_rows(column: Column, drawn: Sequence[Column]) -> list[list[str]]:
+    rows = []
+    for gait in (column.figures or {})["gait"]:
+        name = ", ".join(f"{v:g}" for v in gait["command"]) + _whose(column, drawn)
+        if gait["duty_factor"] is None:
+            rows.append([name, "fell"])
+        else:
+            rows.append([name, f"{gait['stride_frequency']:.2f}", *(f"{share:.0%}" for share in gait["duty_factor"])])
+    return rows
+
+
+def _joint_rows(column: Column, drawn: Sequence[Column], joints: list[str]) -> list[list[str]]:
+    rows = []
+    for i, joint in enumerate(joints):
+        shares = [(column.figures or {})["joints"][key]["saturated"] for key in ("dof_pos", "dof_vel", "torque")]
+        cells = ["" if not each else "no limit known" if each[i] is None else f"{each[i]:.2%}" for each in shares]
+        rows.append([joint.removesuffix("_joint") + _whose(column, drawn), *cells])
+    return rows
+
+
+def _whose(column: Column, drawn: Sequence[Column]) -> str:
+    return f", {column.name}" if len(drawn) > 1 else ""
+
+
+def _table(heads: list[str], rows: list[list[str]], folded: str = "") -> str:
+    """A table; folded away below its title if it has one."""
+    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
+    body = "".join(f"<tr><th>{escape(row[0])}</th>{''.join(f'<td>{escape(text)}</td>' for text in row[1:])}</tr>" for row in rows)
+    table = f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    return f"<details><summary>{folded}</summary>{table}</details>" if folded else table
+
+
+def _about(columns: Sequence[Column]) -> str:
+    """What was graded on what, and what was changed for it."""
+    parts = []
+    for column in columns:
+        about: dict[str, Any] = column.about
+        changed = about.get("overrides") or {}
+        listed = "".join(f"<li><code>{escape(path)}</code> {escape(str(value))}</li>" for path, value in sorted(changed.items()))
+        where = ", ".join(str(about[key]) for key in ("policy", "engine", "device") if about.get(key))
+        fields = f"<details><summary>Config fields that differ from training</summary><ul>{listed}</ul></details>" if listed else ""
+        parts.append(f"<p><b>{escape(column.name)}</b> {escape(where)}</p>{fields}")
+    return "".join(parts)

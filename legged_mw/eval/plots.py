@@ -1,0 +1,340 @@
+"""Draws the report's figures with matplotlib, each panel as an inline SVG and each section as a PNG. No numbers are made here.
+
+Every panel is a function of an Axes, so that both formats show the same. In an SVG the colours become CSS variables: the page
+decides what they are in light and in dark. Palette: Okabe and Ito's, which colour-blind readers can tell apart.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+
+from legged_mw.eval.rules import ERROR_MARKS, PEER
+
+Figures = dict[str, Any]
+Columns = list[tuple[str, Figures]]  # (name, figures) of one policy or two
+
+INK, MUTED, FAINT, PAPER = "#1b1f27", "#68707d", "#e3e6eb", "#fdfdfe"
+PAIR, GREEN = ("#0072b2", "#d55e00"), "#009e73"
+VARIABLES = {INK: "ink", MUTED: "muted", FAINT: "faint", PAPER: "paper", PAIR[0]: "first", PAIR[1]: "second", GREEN: "peer"}
+STYLE = {
+    **{"font.family": "DejaVu Sans", "font.size": 7.5, "svg.fonttype": "none", "text.color": INK, "axes.labelcolor": MUTED},
+    **{"axes.edgecolor": FAINT, "axes.linewidth": 0.8, "axes.titlesize": 8.0, "axes.titlelocation": "left", "axes.titlepad": 7.0},
+    **{"axes.titlecolor": INK, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True},
+    **{"grid.color": FAINT, "grid.linewidth": 0.6, "xtick.color": MUTED, "ytick.color": MUTED, "xtick.major.size": 0.0},
+    **{"ytick.major.size": 0.0, "xtick.major.pad": 4.0, "ytick.major.pad": 4.0, "legend.frameon": False, "legend.fontsize": 7.0},
+    **{"lines.linewidth": 1.4, "figure.facecolor": "none", "axes.facecolor": "none", "savefig.facecolor": "none"},
+}
+HEAT = "viridis"  # perceptually uniform
+MEASURES = (("vx", "m/s"), ("vy", "m/s"), ("yaw rate", "rad/s"))
+GAITS = ((0.5, 0.0, 0.0), (1.0, 0.0, 0.0), (1.5, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.8, 0.0), (0.0, 0.0, 1.2))  # that are drawn
+
+
+class Panel(NamedTuple):
+    """One pair of axes."""
+
+    draw: Callable[[Any], None]
+    width: float = 3.5  # [inch], as all sizes
+    height: float = 2.5
+    polar: bool = False
+
+
+class Section(NamedTuple):
+    """Panels that belong together: a PNG, and a chapter of the page."""
+
+    name: str
+    title: str
+    panels: list[Panel]
+    across: int = 3  # panels side by side
+
+
+def sections(columns: Columns) -> list[Section]:
+    """All that is drawn of one policy or two."""
+    kicks = [Panel(partial(_kick_curve, columns), height=2.9)]
+    for i, (name, figures) in enumerate(columns):
+        for which in ("walking", "standing"):
+            title = f"{which}{_of(name, columns)}"
+            kicks.append(Panel(partial(_kick_wheel, figures["kicks"], which, PAIR[i], title), height=2.9, polar=True))
+    chosen = [i for i, row in enumerate(columns[0][1]["gait"]) if tuple(row["command"]) in GAITS]
+    responses = [Panel(partial(_response, columns, i)) for i in range(3)]
+    strides = [Panel(partial(_gait, columns, i), height=1.75 + 0.25 * len(columns)) for i in chosen]
+    energy = [Panel(partial(_against_speed, columns, "power")), Panel(partial(_against_speed, columns, "cost_of_transport"))]
+    terms = len(columns[0][1]["reward"])
+    return [
+        Section("tracking", "Following the command", _heat_maps(columns)),
+        Section("steps", "Steps of the command", responses),
+        Section("gait", "Gait", strides),
+        Section("joints", "Joints against their limits", _joint_panels(columns)),
+        Section("kicks", "Kicks", kicks),
+        Section("energy", "Energy", energy, across=2),
+        Section("reward", "Reward", [Panel(partial(_reward, columns), width=7.2, height=0.9 + 0.21 * terms)], across=1),
+    ]
+
+
+def svgs(section: Section) -> list[str]:
+    """The section's panels as SVG for the inside of a page: no names, no links, colours as CSS variables."""
+    drawn = []
+    for i, panel in enumerate(section.panels):
+        with rc_context({**STYLE, "svg.hashsalt": f"{section.name}{i}"}):
+            figure = Figure((panel.width, panel.height), layout="constrained")
+            panel.draw(figure.add_subplot(projection="polar" if panel.polar else None))
+            buffer = io.StringIO()
+            FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
+            drawn.append(_inline(buffer.getvalue()))
+    return drawn
+
+
+def _inline(svg: str) -> str:
+    """An SVG file's content as part of an HTML page."""
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
+    svg = re.sub(r'(<(?:g|svg)\b[^>]*?) id="[^"]*"', r"\1", svg)
+    svg = re.sub(r'\s+xmlns(:\w+)?="[^"]*"', "", svg)
+    svg = re.sub(r'<svg\b[^>]*?viewBox="([^"]*)"[^>]*>', r'<svg viewBox="\1" role="img">', svg, count=1)
+    svg = re.sub(r"'DejaVu Sans'(, [^;\"]*)?", "var(--font)", svg)
+    for colour, name in VARIABLES.items():
+        svg = svg.replace(colour, f"var(--{name})")
+    return re.sub(r"(\.\d\d)\d+", r"\1", svg)  # a hundredth of a point is enough
+
+
+def write_png(section: Section, path: Path) -> None:
+    """The section's panels as one picture, on the light background."""
+    across = min(section.across, len(section.panels))
+    rows = math.ceil(len(section.panels) / across)
+    width, height = section.panels[0].width, max(panel.height for panel in section.panels)
+    with rc_context({**STYLE, "figure.facecolor": PAPER, "savefig.facecolor": PAPER}):
+        figure = Figure((across * width, rows * height + 0.4), layout="constrained")
+        figure.suptitle(section.title, x=0.012, ha="left", fontsize=11, fontweight="bold")
+        figure.get_layout_engine().set(w_pad=0.12, h_pad=0.08)  # type: ignore[union-attr]
+        for i, panel in enumerate(section.panels):
+            panel.draw(figure.add_subplot(rows, across, i + 1, projection="polar" if panel.polar else None))
+        FigureCanvasAgg(figure)
+        figure.savefig(path, dpi=130)
+
+
+def _of(name: str, columns: Columns) -> str:
+    """The policy's name for a title, where there are two."""
+    return f", {name}" if len(columns) > 1 else ""
+
+
+def _array(values: Any) -> np.ndarray:
+    """Nested lists with None as an array with NaN."""
+    return np.array(values, dtype=float)
+
+
+# ---- following the command
+
+
+def _heat_maps(columns: Columns) -> list[Panel]:
+    """Three errors over two grids, each error on one scale: up to its largest value, but at most three times the exam's mark."""
+    panels = []
+    for grid, across in (("vx_yaw", "yaw"), ("vx_vy", "vy")):
+        for name, figures in columns:
+            for k, mark in enumerate(ERROR_MARKS):
+                every = np.concatenate([_array(f["tracking"][g][k]).ravel() for _, f in columns for g in ("vx_yaw", "vx_vy")])
+                top = max(mark, min(3 * mark, float(np.nanmax(every)) if np.isfinite(every).any() else mark))
+                panels.append(Panel(partial(_heat, figures["tracking"], grid, across, k, top, _of(name, columns)), height=2.45))
+    return panels
+
+
+def _heat(tracking: Figures, grid: str, down: str, k: int, top: float, suffix: str, ax: Axes) -> None:
+    x, y, values = _array(tracking["axes"]["vx"]), _array(tracking["axes"][down]), _array(tracking[grid][k])
+    scale = Normalize(0.0, top)
+    ax.pcolormesh(_edges(x), _edges(y), values, cmap=HEAT, norm=scale, edgecolors=PAPER, linewidth=0.8)
+    for row, column in np.argwhere(~np.isfinite(values)):
+        ax.plot(x[column], y[row], marker="x", color=PAIR[1], markersize=4.5, markeredgewidth=1.2)
+    ax.grid(False)
+    ax.spines[["left", "bottom"]].set_visible(False)
+    ax.set_xticks(x[:: max(1, len(x) // 4)])
+    ax.set_yticks(y[:: max(1, len(y) // 4)])
+    name, unit = MEASURES[k]
+    ax.set_title(f"error of {name} [{unit}]{suffix}")
+    ax.set_xlabel("commanded vx [m/s]", labelpad=2)
+    ax.set_ylabel("yaw rate [rad/s]" if down == "yaw" else "vy [m/s]", labelpad=2)
+    beyond = bool((values > top).any())
+    levels, ticks = np.linspace(0.0, top, 33), [0.0, ERROR_MARKS[k], *([top] if top > 1.3 * ERROR_MARKS[k] else [])]
+    marks = {"aspect": 18, "pad": 0.03, "extend": "max" if beyond else "neither", "boundaries": levels, "ticks": ticks, "format": "%.2f"}
+    bar = ax.figure.colorbar(ScalarMappable(scale, HEAT), ax=ax, **marks)
+    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.ax.axhline(ERROR_MARKS[k], color=PAPER, linewidth=1.2)
+    bar.ax.grid(False)
+
+
+def _edges(centres: np.ndarray) -> np.ndarray:
+    """Borders of cells around their centres."""
+    half = np.diff(centres) / 2 if len(centres) > 1 else np.array([0.5])
+    return np.concatenate([[centres[0] - half[0]], centres[:-1] + half[: len(centres) - 1], [centres[-1] + half[-1]]])
+
+
+def _response(columns: Columns, k: int, ax: Axes) -> None:
+    name, unit = MEASURES[k]
+    for i, (label, figures) in enumerate(columns):
+        step = figures["steps"][("vx", "vy", "yaw")[k]]
+        time, low, high = (_array(step[key]) for key in ("time", "low", "high"))
+        ax.fill_between(time, low, high, color=PAIR[i], alpha=0.18, linewidth=0)
+        ax.plot(time, _array(step["mean"]), color=PAIR[i], label=label if len(columns) > 1 else "measured")
+        if i == 0:
+            ax.step(time, _array(step["commanded"]), where="post", color=INK, linestyle=(0, (4, 2)), linewidth=1.0, label="commanded")
+    ax.set_title(f"{name} [{unit}]")
+    ax.set_xlabel("time since the step [s]", labelpad=2)
+    ax.margins(x=0)
+    if k == 0:
+        ax.legend(loc="upper right", handlelength=1.6, borderaxespad=0.1)
+
+
+# ---- gait
+
+
+def _gait(columns: Columns, world: int, ax: Axes) -> None:
+    """A bar where a foot is down; two policies share each foot's lane."""
+    feet, count = columns[0][1]["foot_names"], len(columns)
+    height, notes = 0.62 / count, []
+    for i, (_, figures) in enumerate(columns):
+        row = figures["gait"][world]
+        if row["contact"] is None:
+            notes.append("fell")
+            continue
+        for foot, down in enumerate(row["contact"]):
+            bars = [(start * figures["dt"], length * figures["dt"]) for start, length in _runs(down)]
+            ax.broken_barh(bars, (foot - 0.31 + i * height, height * 0.94), facecolors=PAIR[i], linewidth=0)
+        notes.append(f"{row['stride_frequency']:.1f} Hz, down {np.mean(row['duty_factor']):.0%}")
+    vx, vy, yaw = columns[0][1]["gait"][world]["command"]
+    told = [f"{name} {value:g} {unit}" for (name, unit), value in zip(MEASURES, (vx, vy, yaw), strict=True) if value]
+    ax.set_title(f"{', '.join(told) or 'stand'}")
+    ax.set_title(" / ".join(notes), loc="right", color=MUTED, fontsize=7.0)
+    ax.set_yticks(range(len(feet)), feet)
+    ax.set_ylim(len(feet) - 0.5, -0.5)
+    ax.set_xlim(0.0, None)
+    ax.grid(False, axis="y")
+    ax.spines["left"].set_visible(False)
+    ax.set_xlabel("time [s]", labelpad=2)
+
+
+def _runs(down: list[int]) -> list[tuple[int, int]]:
+    """(start, length) of each stretch of ones."""
+    edges = np.flatnonzero(np.diff([0, *down, 0]))
+    return [(int(a), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+# ---- joints
+
+
+def _joint_panels(columns: Columns) -> list[Panel]:
+    height = 0.9 + 0.29 * len(columns[0][1]["joint_names"])
+    quantities = (("dof_pos", "position [rad]"), ("dof_vel", "velocity [rad/s]"), ("torque", "torque [N m]"))
+    return [Panel(partial(_joints, columns, key, label), height=height) for key, label in quantities]
+
+
+def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
+    """A hill a joint, as high as any; limits are upright strokes, the middle 90 % a line on the ground."""
+    names = [name.removesuffix("_joint") for name in columns[0][1]["joint_names"]]
+    for i, (_, figures) in enumerate(columns):
+        shown = figures["joints"][key]
+        for joint, (edges, density) in enumerate(zip(shown["edges"], shown["density"], strict=True)):
+            peak = max(density) or 1.0
+            hill = joint - 0.78 * np.array([*density, density[-1]]) / peak
+            if i == 0:
+                ax.fill_between(edges, joint, hill, step="post", color=PAIR[i], alpha=0.55, linewidth=0)
+            else:
+                ax.step(edges, hill, where="post", color=PAIR[i], linewidth=1.0)
+            for end in (shown["low"][joint], shown["high"][joint]):
+                if end is not None and i == 0:
+                    ax.plot([end, end], [joint, joint - 0.72], color=INK, linewidth=1.2)
+            share = shown["saturated"][joint]
+            if share:
+                text = f"{share:.1%}" if share >= 0.001 else "<0.1%"
+                ax.annotate(
+                    text, (1.0, joint - 0.16 - 0.38 * i), xycoords=("axes fraction", "data"), ha="right", color=PAIR[i], fontsize=6.2
+                )
+    ax.set_title(label)
+    ax.set_yticks(range(len(names)), names)
+    ax.set_ylim(len(names) - 0.6, -1.05)
+    ax.spines["left"].set_visible(False)
+    ax.margins(x=0.04)
+
+
+# ---- kicks
+
+
+def _kick_curve(columns: Columns, ax: Axes) -> None:
+    speeds = columns[0][1]["kicks"]["speeds"]
+    ax.plot(speeds, list(PEER["kicks"].values()), color=GREEN, marker="D", markersize=3.2, linewidth=1.0, label="peer, walking")
+    for i, (name, figures) in enumerate(columns):
+        for which, line in (("walking", "-"), ("standing", (0, (2, 1.5)))):
+            share = np.mean(figures["kicks"][which], axis=1)
+            label = f"{which}{_of(name, columns)}"
+            ax.plot(speeds, share, color=PAIR[i], linestyle=line, marker="o", markersize=3.2, label=label)
+    ax.set_title("share of 16 directions survived")
+    ax.set_xlabel("jump of the velocity [m/s]", labelpad=2)
+    ax.set_ylim(-0.03, 1.04)
+    ax.legend(loc="lower left", handlelength=2.2)
+
+
+def _kick_wheel(kicks: Figures, which: str, colour: str, title: str, ax: Any) -> None:
+    """A tile a kick: ring by strength, sector by direction as the robot sees it; full where it was survived."""
+    survived = np.array(kicks[which])
+    width = 2 * math.pi / survived.shape[1]
+    for ring, row in enumerate(survived):
+        for k, stood in enumerate(row):
+            ax.bar(k * width, 0.9, width * 0.95, ring + 1, color=colour if stood else FAINT, alpha=0.85 if stood else 1.0, linewidth=0)
+    ax.set_theta_zero_location("N")
+    ax.set_xticks(np.arange(4) * math.pi / 2, ["ahead", "left", "behind", "right"])
+    ax.set_yticks([])
+    ax.set_ylim(0, len(survived) + 1)
+    ax.grid(False)
+    ax.spines["polar"].set_visible(False)
+    for ring, speed in enumerate(kicks["speeds"]):
+        ax.text(math.pi / 8 * 0.5 + math.pi, ring + 1.45, f"{speed:g}", ha="center", va="center", fontsize=5.6, color=INK)
+    ax.set_title(title)
+
+
+# ---- energy, reward
+
+
+def _against_speed(columns: Columns, key: str, ax: Axes) -> None:
+    for i, (name, figures) in enumerate(columns):
+        ax.plot(figures["transport"]["vx"], _array(figures["transport"][key]), color=PAIR[i], marker="o", markersize=3.2, label=name)
+    if key == "cost_of_transport":
+        ax.plot([1.0], [PEER["cost_of_transport"]], color=GREEN, marker="D", markersize=4.5, linestyle="none", label="peer")
+    ax.set_title("mean power [W]" if key == "power" else "cost of transport [-]")
+    ax.set_xlabel("commanded vx [m/s]", labelpad=2)
+    ax.set_ylim(0.0, None)
+    if key == "cost_of_transport" or len(columns) > 1:
+        ax.legend(loc="best", handlelength=1.6)
+
+
+def _reward(columns: Columns, ax: Axes) -> None:
+    """A bar a term, the largest at the top."""
+    terms = sorted(columns[0][1]["reward"], key=lambda term: -abs(columns[0][1]["reward"][term] or 0.0))
+    height = 0.7 / len(columns)
+    for i, (name, figures) in enumerate(columns):
+        values = [figures["reward"].get(term) or 0.0 for term in terms]
+        at = np.arange(len(terms)) - 0.35 + height * (i + 0.5)
+        ax.barh(at, values, height * 0.92, color=PAIR[i], label=name)
+        for y, value in zip(at, values, strict=True):
+            side = 1 if value >= 0 else -1
+            ax.annotate(f"{value:.3g}", (value, y), (3 * side, 0), textcoords="offset points", va="center", ha="left" if side > 0 else "right",
+                        fontsize=6.2, color=MUTED)  # fmt: skip
+    ax.set_yticks(range(len(terms)), terms)
+    ax.set_ylim(len(terms) - 0.4, -0.6)
+    ax.axvline(0.0, color=MUTED, linewidth=0.8)
+    ax.grid(False, axis="y")
+    ax.spines["left"].set_visible(False)
+    ax.margins(x=0.09)
+    ax.set_title("scale times term, a second")
+    if len(columns) > 1:
+        ax.legend(loc="lower right")

@@ -1,0 +1,114 @@
+"""A report on one policy or two: rolls out, gathers the figures, writes ``report.json``, ``report.html`` and a PNG a section."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.eval import exam, figures, rules
+from legged_mw.eval.rollout import Policy, Record, Signal, roll_out
+from legged_mw.eval.trials import NAMES, STEP_HOLDS, Plan, make_plan
+from legged_mw.sim.model import per_joint
+from legged_mw.utils.task import LoadedTask
+
+GAIT_SECONDS = 2.0  # that the gait diagram shows
+BEFORE_STEP = 0.5  # [s] that a step response shows before the step
+
+SIGNALS: dict[str, Signal] = {
+    **exam.SIGNALS,
+    "contact": lambda env: env.foot_contact,  # (N, F)
+    "dof_pos": lambda env: env.dof_pos,  # (N, D) [rad]
+    "dof_vel": lambda env: env.dof_vel,  # [rad/s]
+    "torque": lambda env: env.torques,  # [N m], one simulation step old
+    "reward": lambda env: env.episode_sums,  # (N, K), scale * term * dt since the start
+}
+
+
+class Column(NamedTuple):
+    """One policy in one physics."""
+
+    name: str
+    about: dict[str, Any]  # policy, engine, device, overrides
+    exam: dict[str, Any]  # what ``rules.grade`` gives
+    figures: dict[str, Any] | None = None  # None: only the exam is known
+
+
+def prepare(task: LoadedTask) -> None:
+    """Turn ``task`` into the exam, with a world for all else that a report looks at."""
+    dt = task.cfg.sim.dt * task.cfg.control.decimation
+    exam.prepare(task, len(make_plan(task.cfg.commands.ranges, dt).cases))
+
+
+def examine(env: LeggedRobot, policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The exam's result and the report's figures, from one roll-out of an environment made from a prepared task."""
+    plan = make_plan(env.cfg.commands.ranges, env.dt)
+    record = roll_out(env, policy, plan.cases, round(exam.SECONDS / env.dt), SIGNALS, alone=exam.WORLDS)
+    return exam.grade(record.part(slice(exam.WORLDS))), gather(env, plan, record)
+
+
+def gather(env: LeggedRobot, plan: Plan, record: Record) -> dict[str, Any]:
+    """Everything that the report shows besides the exam, as plain numbers."""
+    parts = {name: record.part(worlds) for name, worlds in plan.parts.items()}
+    settled, until = round(rules.SETTLING / env.dt), round(rules.KICK_UNTIL / env.dt)
+    told, axes = parts["commands"], plan.axes
+    straight = int(np.argmin(np.abs(axes["vy"]))) * len(axes["vx"])  # the row of the grid that goes straight ahead
+    ahead = parts["vx_vy"].part(slice(straight, straight + len(axes["vx"])))
+    return {
+        "joint_names": list(env.robot.joint_names),
+        "foot_names": list(env.cfg.asset.foot_names),
+        "dt": env.dt,
+        "tracking": {
+            "axes": axes,
+            "vx_yaw": figures.tracking_errors(parts["vx_yaw"], settled, len(axes["yaw"])),
+            "vx_vy": figures.tracking_errors(parts["vx_vy"], settled, len(axes["vy"])),
+        },
+        "steps": {name: figures.responses(parts[f"step_{name}"], i, BEFORE_STEP, STEP_HOLDS[-1]) for i, name in enumerate(NAMES)},
+        "gait": figures.gaits(told, settled, rules.commands(), GAIT_SECONDS),
+        "joints": figures.joints(told, settled, joint_limits(env)),
+        "kicks": {
+            "speeds": list(rules.KICK_SPEEDS),
+            "walking": figures.survival(parts["kicks"].fell_at, until, rules.KICK_SPEEDS),
+            "standing": figures.survival(parts["standing_kicks"].fell_at, until, rules.KICK_SPEEDS),
+        },
+        "transport": {"vx": axes["vx"], **figures.transport(ahead, settled)},
+        "reward": figures.reward_shares(told, settled, env.reward_names),
+    }
+
+
+def joint_limits(env: LeggedRobot) -> dict[str, tuple[NDArray[Any], NDArray[Any]]]:
+    """Signal -> lowest and highest (D,): soft position limits, the motors' speed (infinite where not known) and torque."""
+    speeds = env.cfg.asset.joint_speed_limits
+    known = per_joint(speeds, env.robot.joint_names, "asset.joint_speed_limits") if speeds else [np.inf] * env.num_actions
+    position = torch.stack([env.soft_lower, env.soft_upper]).cpu().numpy().astype(float)
+    effort = env.robot.effort_range.T
+    return {"dof_pos": (position[0], position[1]), "dof_vel": (-np.array(known), np.array(known)), "torque": (effort[0], effort[1])}
+
+
+def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()) -> None:
+    """Write ``report.json``, a PNG a section and the self-contained ``report.html``.
+
+    The first column is what the others are held against. ``extras`` are further results of ``rules.grade`` by name, of which the
+    exam's table shows the gap to the first: the first policy in another physics, say.
+    """
+    from legged_mw.eval import page, plots  # matplotlib takes a second to import
+
+    columns = [columns[0], *(Column(name, {}, result) for name, result in extras), *columns[1:]]
+    folder.mkdir(parents=True, exist_ok=True)
+    content = {"task": task, "columns": [column._asdict() for column in columns], "peer": rules.PEER}
+    _write_text(folder / "report.json", json.dumps(content, indent=1) + "\n")
+    drawn = [column for column in columns if column.figures]
+    sections = plots.sections([(column.name, column.figures or {}) for column in drawn])
+    for section in sections:
+        plots.write_png(section, folder / f"{section.name}.png")
+    _write_text(folder / "report.html", page.html(task, columns, [(section, plots.svgs(section)) for section in sections]))
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text, encoding="utf-8")

@@ -1,0 +1,224 @@
+"""The report: its exam is the plain exam, its page needs nothing but itself, and two policies are graded alike."""
+
+from __future__ import annotations
+
+import copy
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from program import SMALL, refused, run, trained
+from tensordict import TensorDict
+
+from legged_mw import ROOT
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.eval import exam, report, rules
+from legged_mw.eval.rollout import Case, Kick, roll_out
+from legged_mw.eval.trials import make_plan
+from legged_mw.rl.policy import act, load_policy
+from legged_mw.utils.config import load_yaml
+from legged_mw.utils.task import LoadedTask, load_task
+
+SHIPPED = ROOT / "resources/policies/go1_flat"
+
+
+def shipped() -> LoadedTask:
+    task = load_task("go1_flat")
+    task.update_from_run(load_yaml(SHIPPED / "config.yaml"), where="config.yaml")
+    return task
+
+
+@pytest.fixture(scope="module")
+def both() -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """The shipped policy, 2.4 s: the plain exam's result, the report's, and the report's figures."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(exam, "SECONDS", 2.4)
+        patch.setattr(exam, "KICK_AT", 0.6)
+        task = shipped()
+        exam.prepare(task)
+        env = task.env_class(task.cfg, "cpu")
+        policy = load_policy(SHIPPED / "model.pt", env, task.train, "cpu")
+        plain = exam.run_exam(env, lambda obs: act(policy, obs))
+        report.prepare(task)
+        return plain, *report.examine(task.env_class(task.cfg, "cpu"), lambda obs: act(policy, obs))
+
+
+def test_the_reports_exam_is_the_plain_exam(both: tuple[dict[str, Any], ...]) -> None:
+    """However many worlds stand beside, to the last digit, though the robots walk and are kicked."""
+    plain, result, _ = both
+    for row in [*plain["commands"], *result["commands"]]:
+        assert row["fell"] is False
+    assert plain == result and min(plain["kicks"].values()) < 1.0
+
+
+def test_figures_of_a_policy_that_walks(both: tuple[dict[str, Any], ...]) -> None:
+    """What every part of the report must say of it, roughly: a mix-up of worlds or columns would show."""
+    _, result, figures = both
+    ahead = figures["tracking"]["axes"]["vx"].index(1.0)
+    straight, row = figures["tracking"]["axes"]["vy"].index(0.0), figures["tracking"]["vx_vy"][0]
+    walk = next(i for i, c in enumerate(rules.commands()) if c == (1.0, 0.0, 0.0))
+    assert row[straight][ahead] == pytest.approx(result["commands"][walk]["error"][0], abs=1e-5)
+    assert figures["transport"]["cost_of_transport"][ahead] == pytest.approx(result["cost_of_transport"], rel=1e-3)
+    assert all(max(max(r) for r in error) < 0.5 for error in figures["tracking"]["vx_yaw"])
+    [stand, *_], trot = figures["gait"], figures["gait"][walk]
+    assert stand["duty_factor"] == [1.0] * 4 and stand["stride_frequency"] == 0.0
+    assert all(0.3 < share < 0.8 for share in trot["duty_factor"])
+    assert figures["reward"]["tracking_lin_vel"] == pytest.approx(2.0, abs=0.2) and figures["reward"]["torques"] < 0
+    assert figures["joints"]["torque"]["high"][2] == pytest.approx(35.55 * 0.98)
+    [shares] = {len(figures["joints"][key]["saturated"]) for key in ("dof_pos", "dof_vel", "torque")}
+    assert shares == 12
+    assert [sum(row) / 16 for row in figures["kicks"]["walking"]] == pytest.approx(list(result["kicks"].values()), abs=1e-4)
+    start = figures["steps"]["vx"]["numbers"][0]
+    assert (start["from"], start["to"]) == (0.0, 1.0)
+
+
+def test_the_plan() -> None:
+    """Exam first; grids over the trained ranges; the same steps in each world, later and later."""
+    plan = make_plan(shipped().cfg.commands.ranges, 0.02)
+    assert plan.cases[: exam.WORLDS] == exam.cases(0.02)
+    assert [plan.parts[name] for name in ("commands", "kicks")] == [slice(0, 22), slice(22, 118)]
+    corner = plan.cases[plan.parts["vx_yaw"]][-1]
+    assert corner == Case(((0, (1.5, 0.0, 1.2)),)) and plan.cases[plan.parts["vx_vy"]][0] == Case(((0, (-1.5, -0.8, 0.0)),))
+    first, second, *_ = plan.cases[plan.parts["step_vy"]]
+    assert first.commands == ((0, (0, 0, 0)), (75, (0, 0.53, 0)), (200, (0, -0.53, 0)), (325, (0, 0, 0)))
+    assert [step for step, _ in second.commands] == [0, 78, 203, 328]
+    assert sum(part.stop - part.start for part in plan.parts.values()) == len(plan.cases)
+
+
+def test_commands_change_and_kicks_come_when_they_should() -> None:
+    task = load_task("go1_flat")
+    exam.prepare(task, 2)
+    env = LeggedRobot(task.cfg, "cpu")
+    cases = [Case(((0, (0.5, 0.0, 0.0)), (3, (0.0, 0.4, 0.0)))), Case(((0, (0.0, 0.0, 0.0)),), Kick(2, 1.0, 0.0))]
+    seen, speed = [], []
+
+    def policy(obs: TensorDict) -> torch.Tensor:
+        seen.append(obs["state"][0, -3:].tolist())
+        speed.append(float(env.sim.qvel[1, 0]))
+        return torch.zeros(len(obs), 12)
+
+    record = roll_out(env, policy, cases, 5, {"command": lambda env: env.commands})
+    assert seen == [[0.5, 0.0, 0.0]] * 3 + [pytest.approx([0.0, 0.4, 0.0])] * 2
+    assert record.commands[:, 0] == pytest.approx(record.signals["command"][:, 0])
+    assert abs(speed[2]) < 0.1 < 0.3 < speed[3]
+
+
+# ---- the page
+
+
+@pytest.fixture(scope="module")
+def pages(both: tuple[dict[str, Any], ...], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A report with a rival who fell at everything, and with the exam in another physics."""
+    _, result, figures = both
+    fallen, nothing = copy.deepcopy(result), copy.deepcopy(figures)
+    fallen |= {"falls": 22, "error": None, "worst": None, "drift": None, "joint_speed": None, "cost_of_transport": None, "walks": False}
+    for gait in nothing["gait"]:
+        gait |= {"duty_factor": None, "stride_frequency": None, "contact": None}
+    for grid in ("vx_yaw", "vx_vy"):
+        nothing["tracking"][grid] = [[[None] * len(row) for row in error] for error in nothing["tracking"][grid]]
+    for key in ("speed", "power", "cost_of_transport"):
+        nothing["transport"][key] = [None] * len(nothing["transport"]["vx"])
+    for shown in nothing["joints"].values():
+        shown |= {"edges": [], "density": [], "quantiles": [], "saturated": []}
+    nothing["reward"] = dict.fromkeys(nothing["reward"])
+    folder = tmp_path_factory.mktemp("eval")
+    about = {"policy": "go1_flat/a & b/model_7.pt", "engine": "mujoco", "device": "cpu", "overrides": {"noise.level": 0.0}}
+    columns = [report.Column("<first>", about, result, figures), report.Column("rival", about, fallen, nothing)]
+    other = {**result, "error": [value + 0.004 for value in result["error"]]}
+    report.write(folder, "go1_flat", columns, extras=[("by numpy", other)])
+    return folder
+
+
+def test_the_page_needs_nothing_but_itself(pages: Path) -> None:
+    html = (pages / "report.html").read_text(encoding="utf-8")
+    assert "http" not in html and "@import" not in html and "<script" not in html and "<link" not in html
+    assert re.findall(r'\b(?:src|href)="(?!#)[^"]*"', html) == [] and set(re.findall(r"url\((.)", html)) <= {"#"}
+    for path in (str(ROOT), str(Path.home()), str(pages), "site-packages"):
+        assert path not in html
+    assert html.count("<svg") == html.count("</svg>") == 33
+    assert len(html) < 4e6
+
+
+def test_the_page_shows_columns_gaps_and_verdicts(pages: Path) -> None:
+    html = (pages / "report.html").read_text(encoding="utf-8")
+    assert "&lt;first&gt;" in html and "<first>" not in html and "a &amp; b" in html
+    heads = re.findall(r"<th>(.*?)</th>", html[html.index('<table class="exam">') :])[1:6]
+    assert heads == ["&lt;first&gt;", "by numpy", "rival", "walks at", "peer"]
+    row = re.search(r"<tr><th>error vx \[m/s\]</th>.*?</tr>", html)
+    assert row is not None
+    assert row[0].count('class="value pass"') == 2 and row[0].count('class="value fail"') == 1
+    assert "<small>+0.004</small>" in row[0] and ">fell" in row[0]
+    assert "does not: walks" in html
+
+
+def test_json_holds_every_figure_and_pictures_are_there(pages: Path, both: tuple[dict[str, Any], ...]) -> None:
+    _, result, figures = both
+    saved = json.loads((pages / "report.json").read_text())
+    first, numpy, rival = saved["columns"]
+    assert first["exam"] == json.loads(json.dumps(result)) and first["figures"] == json.loads(json.dumps(figures))
+    assert numpy["name"] == "by numpy" and numpy["figures"] is None and rival["exam"]["falls"] == 22
+    assert saved["task"] == "go1_flat" and saved["peer"] == rules.PEER
+    names = {"tracking", "steps", "gait", "joints", "kicks", "energy", "reward"}
+    assert {path.stem for path in pages.glob("*.png")} == names
+    assert all(path.stat().st_size > 5000 and path.read_bytes().startswith(b"\x89PNG") for path in pages.glob("*.png"))
+
+
+# ---- --compare
+
+
+@pytest.fixture(scope="module")
+def two_runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    """A root with two runs, of which one has other networks."""
+    root = tmp_path_factory.mktemp("compare")
+    first = trained(root, "--max_iterations", "1")
+    return root, first, trained(root, "--max_iterations", "1", "--set", "actor.hidden_dims=[8]", "--run_name", "other")
+
+
+def test_compare_grades_each_by_its_own_config(two_runs: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    root, first, second = two_runs
+    monkeypatch.setattr(exam, "SECONDS", 2.1)
+    written: list[Any] = []
+    monkeypatch.setattr(report, "write", lambda folder, task, columns: written.extend([folder, task, *columns]))
+    small = ["--load_run", first.name, "--compare", second.name, "--set", "terrain.friction=0.4"]
+    result = run("play", root, *SMALL[:2], "--device", "cpu", "--eval", *small)
+    assert result.code == 0, result.err
+    folder, task, one, other = written
+    assert folder == first / "eval" and task == "go1_flat"
+    assert one.about["policy"].endswith(f"{first.name}/model_1.pt") and other.about["policy"].endswith(f"{second.name}/model_1.pt")
+    assert one.about["overrides"]["terrain.friction"] == other.about["overrides"]["terrain.friction"] == 0.4
+    assert one.exam != other.exam and one.figures.keys() == other.figures.keys()
+    assert result.out.count("falls in 22 commands") == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        ({"task": "go1_flat_fast"}, "is of task 'go1_flat_fast', not 'go1_flat': two policies are graded on one task"),
+        ({"actor": {"hidden_dims": [9]}}, "does not fit this task: actor mlp.0.weight is (8, 48) there and (9, 48) here"),
+        ({"obs_groups": {"actor": ["privileged_state"]}}, "does not fit this task: actor obs_normalizer._mean is (1, 48) there and (1, 12"),
+    ],
+)
+def test_a_rival_that_does_not_fit_is_refused(two_runs: tuple[Path, Path, Path], change: dict[str, Any], line: str) -> None:
+    root, first, second = two_runs
+    config = second / "config.yaml"
+    kept = config.read_text()
+    saved = load_yaml(config)
+    for section, value in change.items():
+        saved[section] = saved[section] | value if isinstance(value, dict) else value
+    config.write_text(json.dumps(saved))
+    try:
+        text = refused(root, "play", *SMALL[:2], "--device", "cpu", "--eval", "--load_run", first.name, "--compare", second.name)
+    finally:
+        config.write_text(kept)
+    assert line in text
+
+
+def test_compare_mistakes(two_runs: tuple[Path, Path, Path]) -> None:
+    root, *_ = two_runs
+    start = [*SMALL[:2], "--device", "cpu"]
+    assert "add --eval" in refused(root, "play", *start, "--compare", "shipped")
+    assert "no run 'nobody' with a checkpoint" in refused(root, "play", *start, "--eval", "--compare", "nobody")
+    assert "--compare shipped: no policy ships with go1_flat" in refused(root, "play", *start, "--eval", "--compare", "shipped")
