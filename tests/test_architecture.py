@@ -20,6 +20,7 @@ ONLY_IN = {
     "rsl_rl": ["legged_mw/rl/*"],
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
     "rsl_rl.models": ["legged_mw/rl/*", "play.py"],  # the type of what it plays
+    "matplotlib": ["legged_mw/eval/plots.py"],  # a second to import, and only for a report
     "legged_mw.view": ["legged_mw/view/*", "play.py", "train.py"],
     "legged_mw.eval": ["legged_mw/eval/*", "play.py", "train.py"],
     "configs": ["configs/*"],

@@ -327,10 +327,12 @@ def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert result.code == 0, result.err
     assert "terrain.friction: 0.6 -> 0.4" in result.out and "noise.level: 1.0 -> 0.0" in result.out
     assert "falls in 22 commands" in result.out and "walks: no; beats the peer: no" in result.out
-    saved = json.loads((folder / "exam.json").read_text())
-    assert saved["policy"].endswith("model_1.pt") and saved["engine"] == "mujoco" and saved["device"] == "cpu"
-    assert len(saved["commands"]) == TRACKED and saved["walks"] is False
-    assert saved["overrides"]["noise.level"] == 0.0
+    [saved] = json.loads((folder / "eval/report.json").read_text())["columns"]
+    about, graded = saved["about"], saved["exam"]
+    assert about["policy"].endswith(f"{folder.name}/model_1.pt") and about["engine"] == "mujoco" and about["device"] == "cpu"
+    assert len(graded["commands"]) == TRACKED and graded["walks"] is False
+    assert about["overrides"]["noise.level"] == 0.0 and about["overrides"]["terrain.friction"] == 0.4
+    assert folder.name in (folder / "eval/report.html").read_text(encoding="utf-8")
     for more, field in (
         (["--num_envs", "4"], "env.num_envs"),
         (["--set", "noise.level=1"], "noise.level"),

@@ -59,21 +59,24 @@ def test_a_target_that_is_not_reached_has_no_rise_time() -> None:
     assert found == {"rise_time": None, "overshoot": 0.0, "left": pytest.approx(-0.5)}
 
 
-def test_responses_are_aligned_at_the_step() -> None:
-    """Three worlds told 0, 1, 0 at times of their own, which they follow after 0.1 s; one falls and is left out."""
-    steps = 400
-    told, moved = np.zeros((steps, 3, 3)), np.zeros((steps, 3, 3))
-    for world, begin in enumerate((100, 103, 106)):
-        told[begin : begin + 100, world, 1] = 1.0
-        moved[begin + 5 : begin + 105, world, 1] = 1.0 + 0.1 * (world - 1)
-    found = figures.responses(make(3, steps, {2: 50}, velocity=moved)._replace(commands=told), axis=1, before=0.5, length=3.0)
-    assert found["fell"] == 1 and found["time"][0] == -0.5 and found["time"][25] == 0.0
-    assert found["commanded"][24:26] == [0.0, 1.0] and found["commanded"][124:126] == [1.0, 0.0]
-    assert found["mean"][29:31] == [0.0, pytest.approx(0.95)]
-    assert (found["low"][40], found["high"][40]) == (pytest.approx(0.9), 1.0)
-    there, back = found["numbers"]
-    assert (there["from"], there["to"], back["from"], back["to"]) == (0.0, 1.0, 1.0, 0.0)
-    assert there["rise_time"] == pytest.approx(0.8 * DT / 0.95) and there["left"] == pytest.approx(-0.05)
+def test_responses_to_each_step() -> None:
+    """Three worlds told 1, 0, 1 at 2 s and 4 s, which they follow after 0.1 s; one falls and is left out."""
+    told, moved = np.zeros((300, 3, 3)), np.zeros((300, 3, 3))
+    told[:100, :, 1] = told[200:, :, 1] = 1.0
+    for world in range(3):
+        moved[:105, world, 1] = moved[205:, world, 1] = 1.0 + 0.1 * (world - 1)
+    found = figures.responses(make(3, 300, {2: 50}, velocity=moved)._replace(commands=told), axis=1, begin=75)
+    assert found["fell"] == 1 and found["time"][:2] == [0.0, DT] and len(found["mean"]) == 225
+    assert found["commanded"][24:26] == [1.0, 0.0] and found["commanded"][124:126] == [0.0, 1.0]
+    assert found["mean"][29:31] == [pytest.approx(0.95), 0.0]
+    assert (found["low"][0], found["high"][0]) == (pytest.approx(0.9), 1.0)
+    stop, start = found["numbers"]
+    assert (stop["from"], stop["to"], start["from"], start["to"]) == (1.0, 0.0, 0.0, 1.0)
+    assert start["rise_time"] == pytest.approx(0.8 * DT / 0.95) and start["left"] == pytest.approx(-0.05)
+    assert (
+        figures.responses(make(3, 300, {0: 1, 1: 1, 2: 1}, velocity=moved)._replace(commands=told), 1, 75)["numbers"][0]["rise_time"]
+        is None
+    )
 
 
 # ---- gait

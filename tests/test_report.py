@@ -65,14 +65,14 @@ def test_figures_of_a_policy_that_walks(both: tuple[dict[str, Any], ...]) -> Non
     assert all(max(max(r) for r in error) < 0.5 for error in figures["tracking"]["vx_yaw"])
     [stand, *_], trot = figures["gait"], figures["gait"][walk]
     assert stand["duty_factor"] == [1.0] * 4 and stand["stride_frequency"] == 0.0
-    assert all(0.3 < share < 0.8 for share in trot["duty_factor"])
+    assert all(0.1 < share < 0.95 for share in trot["duty_factor"])
     assert figures["reward"]["tracking_lin_vel"] == pytest.approx(2.0, abs=0.2) and figures["reward"]["torques"] < 0
     assert figures["joints"]["torque"]["high"][2] == pytest.approx(35.55 * 0.98)
     [shares] = {len(figures["joints"][key]["saturated"]) for key in ("dof_pos", "dof_vel", "torque")}
     assert shares == 12
     assert [sum(row) / 16 for row in figures["kicks"]["walking"]] == pytest.approx(list(result["kicks"].values()), abs=1e-4)
-    start = figures["steps"]["vx"]["numbers"][0]
-    assert (start["from"], start["to"]) == (0.0, 1.0)
+    assert figures["steps"]["vx"]["commanded"] == [1.0] * 20 and figures["steps"]["vx"]["fell"] == 0
+    assert figures["steps"]["vx"]["mean"] == pytest.approx([1.0] * 20, abs=0.15)
 
 
 def test_the_plan() -> None:
@@ -83,8 +83,8 @@ def test_the_plan() -> None:
     corner = plan.cases[plan.parts["vx_yaw"]][-1]
     assert corner == Case(((0, (1.5, 0.0, 1.2)),)) and plan.cases[plan.parts["vx_vy"]][0] == Case(((0, (-1.5, -0.8, 0.0)),))
     first, second, *_ = plan.cases[plan.parts["step_vy"]]
-    assert first.commands == ((0, (0, 0, 0)), (75, (0, 0.53, 0)), (200, (0, -0.53, 0)), (325, (0, 0, 0)))
-    assert [step for step, _ in second.commands] == [0, 78, 203, 328]
+    assert first.commands == ((0, (0, 0, 0)), (10, (0, 0.53, 0)), (125, (0, -0.53, 0)), (250, (0, 0, 0)), (375, (0, 0.53, 0)))
+    assert [step for step, _ in second.commands] == [0, 13, 125, 250, 375]
     assert sum(part.stop - part.start for part in plan.parts.values()) == len(plan.cases)
 
 
@@ -103,7 +103,7 @@ def test_commands_change_and_kicks_come_when_they_should() -> None:
     record = roll_out(env, policy, cases, 5, {"command": lambda env: env.commands})
     assert seen == [[0.5, 0.0, 0.0]] * 3 + [pytest.approx([0.0, 0.4, 0.0])] * 2
     assert record.commands[:, 0] == pytest.approx(record.signals["command"][:, 0])
-    assert abs(speed[2]) < 0.1 < 0.3 < speed[3]
+    assert abs(speed[2]) < 0.2 < 0.5 < speed[3] - speed[2]
 
 
 # ---- the page
@@ -138,7 +138,7 @@ def test_the_page_needs_nothing_but_itself(pages: Path) -> None:
     assert re.findall(r'\b(?:src|href)="(?!#)[^"]*"', html) == [] and set(re.findall(r"url\((.)", html)) <= {"#"}
     for path in (str(ROOT), str(Path.home()), str(pages), "site-packages"):
         assert path not in html
-    assert html.count("<svg") == html.count("</svg>") == 33
+    assert html.count("<svg") == html.count("</svg>") == 32
     assert len(html) < 4e6
 
 
@@ -151,7 +151,7 @@ def test_the_page_shows_columns_gaps_and_verdicts(pages: Path) -> None:
     assert row is not None
     assert row[0].count('class="value pass"') == 2 and row[0].count('class="value fail"') == 1
     assert "<small>+0.004</small>" in row[0] and ">fell" in row[0]
-    assert "does not: walks" in html
+    assert "does not walk<" in html and "does not beat the peer" in html
 
 
 def test_json_holds_every_figure_and_pictures_are_there(pages: Path, both: tuple[dict[str, Any], ...]) -> None:

@@ -66,44 +66,31 @@ def _first_crossing(time: Array, values: Array, level: float) -> float | None:
     return float(time[i - 1] + share * (time[i] - time[i - 1]))
 
 
-def responses(record: Record, axis: int, before: float, length: float) -> dict[str, Any]:
-    """One axis of the command stepping: worlds aligned at their first step, then mean, lowest and highest at each time.
+def responses(record: Record, axis: int, begin: int) -> dict[str, Any]:
+    """Worlds that are told the same from step ``begin`` on: command, and mean, lowest and highest of one axis at each time.
 
-    ``before`` and ``length`` [s]: what is shown before and after the first step. A world that falls is left out.
+    A world that falls is left out.
     """
-    told, moved = record.commands[:, :, axis], record.signals["velocity"][:, :, axis]
-    stood = np.flatnonzero(np.isinf(record.fell_at))
-    first, count = round(before / record.dt), round((before + length) / record.dt)
-    rows, commanded = np.full((len(told[0]), count), np.nan), np.full(count, np.nan)
-    for world in range(told.shape[1]):
-        changes = np.flatnonzero(np.diff(told[:, world])) + 1
-        if not len(changes):  # the record ended before
-            continue
-        begin = changes[0] - first
-        span = slice(begin, begin + count)
-        commanded[: len(told[span, world])] = told[span, world]
-        if world in stood:
-            rows[world, : len(moved[span, world])] = moved[span, world]
-    time = (np.arange(count) - first) * record.dt
-    seen = np.isfinite(rows).any(axis=0)
-    mean, low, high = (np.full(count, np.nan) for _ in range(3))
-    mean[seen], low[seen], high[seen] = (f(rows[:, seen], axis=0) for f in (np.nanmean, np.nanmin, np.nanmax))
+    commanded, stood = record.commands[begin:, 0, axis], np.isinf(record.fell_at)
+    moved = record.signals["velocity"][begin:, stood, axis].astype(float)
+    time = np.arange(len(commanded)) * record.dt
+    mean, low, high = (f(moved, axis=1) if stood.any() else np.full(len(time), np.nan) for f in (np.mean, np.min, np.max))
     return {
         "time": plain(time.round(4)),
         "commanded": plain(commanded),
         "mean": plain(mean),
         "low": plain(low),
         "high": plain(high),
-        "fell": int(len(rows) - len(stood)),
+        "fell": int((~stood).sum()),
         "numbers": _each_step(time, commanded, mean),
     }
 
 
 def _each_step(time: Array, commanded: Array, mean: Array) -> list[dict[str, Any]]:
     """The response to each change of the command, until the next."""
-    changes = np.flatnonzero(np.nan_to_num(np.diff(commanded))) + 1
+    borders = [*(np.flatnonzero(np.diff(commanded)) + 1), len(time)]
     found = []
-    for begin, end in zip(changes, [*changes[1:], len(time)], strict=True):
+    for begin, end in zip(borders[:-1], borders[1:], strict=True):
         start, target = float(commanded[begin - 1]), float(commanded[begin])
         found.append({"from": start, "to": target, **step_response(time[begin:end] - time[begin], mean[begin:end], start, target)})
     return found

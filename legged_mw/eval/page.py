@@ -15,16 +15,17 @@ if TYPE_CHECKING:
 
 TEXTS = {
     "tracking": "Mean absolute error of the velocity at the IMU, body frame, over the last 8 of 10 seconds, command by command over the "
-    "range that was trained. Dark is good. The white stroke on each scale is what the exam allows on average; a cross is a fall.",
-    "steps": "Stand, then two thirds of the trained range, then the same backwards, then stand. Line: mean of eight robots that meet the "
-    "step in different phases of their gait; band: lowest and highest of them.",
-    "gait": "A bar where a foot is on the ground, the last two seconds of each command. Above: strides a second, and the share of "
-    "time that a foot is down, mean over the feet.",
+    "range that was trained. Dark is good. The stroke on each scale is what the exam allows on average; a cross is a fall.",
+    "steps": "Walking at two thirds of the trained range, then the same backwards, then standing, then walking again. Line: mean of eight "
+    "robots whom the steps meet in different phases of their gait; band: lowest and highest of them.",
+    "gait": "A bar where a foot is on the ground, the last two seconds of each command. Above: strides a second, and the duty factor: "
+    "the share of time that a foot is down, mean over the feet.",
     "joints": "Where the joints are, how fast they move and what torque they need over all 22 commands. Upright strokes are limits: soft "
     "position limits, the motors' speed, the torque that the servos are clamped to. At the right the share of samples beyond a limit "
     "(of a torque: at 98 % of it or more), where there are any.",
     "kicks": "The base's horizontal velocity jumps; a kick is survived if the robot has not fallen three seconds later. Rings: jumps "
-    "of 1 to 6 m/s; sectors: where it is kicked to. Full tiles were survived. Walking is at 0.8 m/s; the exam counts these.",
+    "of 1 to 6 m/s, from the inside; sectors: where it is kicked to. Coloured tiles were survived. Walking is at 0.8 m/s; the exam counts "
+    "these.",
     "energy": "Straight ahead and backwards. Power: sum over the joints of |torque x speed|. Cost of transport: energy over weight "
     "times distance.",
     "reward": "What each term adds to the reward in a second, before the clip at zero, mean over the 22 commands.",
@@ -57,13 +58,14 @@ def _names(columns: Sequence[Column]) -> str:
     for column in columns:
         swatch = f'<i class="swatch c{drawn.index(column.name)}"></i>' if column.figures and len(drawn) > 1 else ""
         engine = escape(str(column.about.get("engine", "")))
-        words = [_pill("walks", column.exam["walks"]), _pill("beats the peer", column.exam["beats_peer"])]
+        result = column.exam
+        words = [_pill("walks", "does not walk", result["walks"]), _pill("beats the peer", "does not beat the peer", result["beats_peer"])]
         items.append(f"<li>{swatch}<b>{escape(column.name)}</b> <span class='muted'>{engine}</span> {' '.join(words)}</li>")
     return f'<ul class="names">{"".join(items)}</ul>'
 
 
-def _pill(text: str, yes: bool) -> str:
-    return f'<span class="pill {"yes" if yes else "no"}">{"&#10003;" if yes else "&#10007;"} {text if yes else f"does not: {text}"}</span>'
+def _pill(good: str, bad: str, yes: bool) -> str:
+    return f'<span class="pill {"yes" if yes else "no"}">{"&#10003;" if yes else "&#10007;"} {good if yes else bad}</span>'
 
 
 def _cards(column: Column) -> str:
@@ -99,6 +101,7 @@ def _exam_table(columns: Sequence[Column]) -> str:
         cells = [f'<td class="value{_mood(row)}">{row.shown(row.value)}</td>']
         for other in others:
             gap = "" if other.value is None or row.value is None else f"{other.value - row.value:+.{row.digits}f}"
+            gap = gap if gap.strip("+-0.") else ""
             cells.append(f'<td class="value{_mood(other)}">{other.shown(other.value)} <small>{gap}</small></td>')
         peer = "" if row.peer is None else row.shown(row.peer)
         name = escape(row.name.strip())
@@ -116,37 +119,29 @@ def _chapter(section: Section, panels: list[str], extra: str) -> str:
 
 
 def _extra(name: str, columns: Sequence[Column]) -> str:
-    """The numbers that belong to a chapter's pictures."""
+    """The numbers that belong to a chapter's pictures; of two policies, row by row."""
     drawn = [column for column in columns if column.figures]
-    if name == "steps":
-        return _table(
-            ["", "from", "to", "10 to 90 % in [s]", "overshoot", "left at the end"], [row for c in drawn for row in _step_rows(c, drawn)]
-        )
-    if name == "gait":
-        feet = (drawn[0].figures or {})["foot_names"]
-        return _table(
-            ["vx, vy, yaw rate", "strides [1/s]", *(f"{foot} down" for foot in feet)],
-            [row for c in drawn for row in _gait_rows(c, drawn)],
-            "All commands",
-        )
-    if name == "joints":
-        joints = (drawn[0].figures or {})["joint_names"]
-        return _table(
-            ["", "position", "velocity", "torque"],
-            [row for c in drawn for row in _joint_rows(c, drawn, joints)],
-            "Share beyond the limit, joint by joint",
-        )
-    return ""
+    figures: dict[str, Any] = drawn[0].figures or {}
+    tables = {
+        "steps": (_step_rows, ["", "from", "to", "10 to 90 % in [s]", "overshoot", "left at the end"], ""),
+        "gait": (_gait_rows, ["vx, vy, yaw rate", "strides [1/s]", *(f"{foot} down" for foot in figures["foot_names"])], "All commands"),
+        "joints": (_joint_rows, ["", "position", "velocity", "torque"], "Share beyond the limit, joint by joint"),
+    }
+    if name not in tables:
+        return ""
+    make, heads, folded = tables[name]
+    paired = zip(*(make(column, f", {column.name}" if len(drawn) > 1 else "") for column in drawn), strict=True)
+    return _table(heads, [row for rows in paired for row in rows], folded)
 
 
-def _step_rows(column: Column, drawn: Sequence[Column]) -> list[list[str]]:
+def _step_rows(column: Column, whose: str) -> list[list[str]]:
     rows = []
     for axis, (name, unit) in {"vx": ("vx", "m/s"), "vy": ("vy", "m/s"), "yaw": ("yaw rate", "rad/s")}.items():
         for number in (column.figures or {})["steps"][axis]["numbers"]:
             rise, over, left = number["rise_time"], number["overshoot"], number["left"]
             rows.append(
                 [
-                    f"{name} [{unit}]{_whose(column, drawn)}",
+                    f"{name} [{unit}]{whose}",
                     f"{number['from']:g}",
                     f"{number['to']:g}",
                     "not reached" if rise is None else f"{rise:.2f}",
@@ -157,10 +152,10 @@ def _step_rows(column: Column, drawn: Sequence[Column]) -> list[list[str]]:
     return rows
 
 
-def _gait_rows(column: Column, drawn: Sequence[Column]) -> list[list[str]]:
+def _gait_rows(column: Column, whose: str) -> list[list[str]]:
     rows = []
     for gait in (column.figures or {})["gait"]:
-        name = ", ".join(f"{v:g}" for v in gait["command"]) + _whose(column, drawn)
+        name = ", ".join(f"{v:g}" for v in gait["command"]) + whose
         if gait["duty_factor"] is None:
             rows.append([name, "fell"])
         else:
@@ -168,17 +163,13 @@ def _gait_rows(column: Column, drawn: Sequence[Column]) -> list[list[str]]:
     return rows
 
 
-def _joint_rows(column: Column, drawn: Sequence[Column], joints: list[str]) -> list[list[str]]:
+def _joint_rows(column: Column, whose: str) -> list[list[str]]:
     rows = []
-    for i, joint in enumerate(joints):
+    for i, joint in enumerate((column.figures or {})["joint_names"]):
         shares = [(column.figures or {})["joints"][key]["saturated"] for key in ("dof_pos", "dof_vel", "torque")]
         cells = ["" if not each else "no limit known" if each[i] is None else f"{each[i]:.2%}" for each in shares]
-        rows.append([joint.removesuffix("_joint") + _whose(column, drawn), *cells])
+        rows.append([joint.removesuffix("_joint") + whose, *cells])
     return rows
-
-
-def _whose(column: Column, drawn: Sequence[Column]) -> str:
-    return f", {column.name}" if len(drawn) > 1 else ""
 
 
 def _table(heads: list[str], rows: list[list[str]], folded: str = "") -> str:

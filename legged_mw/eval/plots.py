@@ -65,8 +65,8 @@ class Section(NamedTuple):
 def sections(columns: Columns) -> list[Section]:
     """All that is drawn of one policy or two."""
     kicks = [Panel(partial(_kick_curve, columns), height=2.9)]
-    for i, (name, figures) in enumerate(columns):
-        for which in ("walking", "standing"):
+    for which in ("walking", "standing"):
+        for i, (name, figures) in enumerate(columns):
             title = f"{which}{_of(name, columns)}"
             kicks.append(Panel(partial(_kick_wheel, figures["kicks"], which, PAIR[i], title), height=2.9, polar=True))
     chosen = [i for i, row in enumerate(columns[0][1]["gait"]) if tuple(row["command"]) in GAITS]
@@ -146,7 +146,7 @@ def _heat_maps(columns: Columns) -> list[Panel]:
         for name, figures in columns:
             for k, mark in enumerate(ERROR_MARKS):
                 every = np.concatenate([_array(f["tracking"][g][k]).ravel() for _, f in columns for g in ("vx_yaw", "vx_vy")])
-                top = max(mark, min(3 * mark, float(np.nanmax(every)) if np.isfinite(every).any() else mark))
+                top = max(1.25 * mark, min(3 * mark, float(np.nanmax(every)) if np.isfinite(every).any() else mark))
                 panels.append(Panel(partial(_heat, figures["tracking"], grid, across, k, top, _of(name, columns)), height=2.45))
     return panels
 
@@ -159,16 +159,18 @@ def _heat(tracking: Figures, grid: str, down: str, k: int, top: float, suffix: s
         ax.plot(x[column], y[row], marker="x", color=PAIR[1], markersize=4.5, markeredgewidth=1.2)
     ax.grid(False)
     ax.spines[["left", "bottom"]].set_visible(False)
-    ax.set_xticks(x[:: max(1, len(x) // 4)])
-    ax.set_yticks(y[:: max(1, len(y) // 4)])
+    for axis, centres in ((ax.xaxis, x), (ax.yaxis, y)):
+        ticks = centres[:: max(1, len(centres) // 4)]
+        axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
     name, unit = MEASURES[k]
     ax.set_title(f"error of {name} [{unit}]{suffix}")
     ax.set_xlabel("commanded vx [m/s]", labelpad=2)
     ax.set_ylabel("yaw rate [rad/s]" if down == "yaw" else "vy [m/s]", labelpad=2)
     beyond = bool((values > top).any())
-    levels, ticks = np.linspace(0.0, top, 33), [0.0, ERROR_MARKS[k], *([top] if top > 1.3 * ERROR_MARKS[k] else [])]
+    levels, ticks = np.linspace(0.0, top, 33), [0.0, ERROR_MARKS[k], *([top] if top > 1.4 * ERROR_MARKS[k] else [])]
     marks = {"aspect": 18, "pad": 0.03, "extend": "max" if beyond else "neither", "boundaries": levels, "ticks": ticks, "format": "%.2f"}
     bar = ax.figure.colorbar(ScalarMappable(scale, HEAT), ax=ax, **marks)
+    bar.solids.set_edgecolor("face")  # type: ignore[union-attr]
     bar.outline.set_visible(False)  # type: ignore[operator]
     bar.ax.axhline(ERROR_MARKS[k], color=PAPER, linewidth=1.2)
     bar.ax.grid(False)
@@ -190,10 +192,10 @@ def _response(columns: Columns, k: int, ax: Axes) -> None:
         if i == 0:
             ax.step(time, _array(step["commanded"]), where="post", color=INK, linestyle=(0, (4, 2)), linewidth=1.0, label="commanded")
     ax.set_title(f"{name} [{unit}]")
-    ax.set_xlabel("time since the step [s]", labelpad=2)
+    ax.set_xlabel("time [s]", labelpad=2)
     ax.margins(x=0)
     if k == 0:
-        ax.legend(loc="upper right", handlelength=1.6, borderaxespad=0.1)
+        ax.legend(loc="lower right", handlelength=1.6)
 
 
 # ---- gait
@@ -202,20 +204,21 @@ def _response(columns: Columns, k: int, ax: Axes) -> None:
 def _gait(columns: Columns, world: int, ax: Axes) -> None:
     """A bar where a foot is down; two policies share each foot's lane."""
     feet, count = columns[0][1]["foot_names"], len(columns)
-    height, notes = 0.62 / count, []
+    height = 0.62 / count
     for i, (_, figures) in enumerate(columns):
         row = figures["gait"][world]
         if row["contact"] is None:
-            notes.append("fell")
             continue
         for foot, down in enumerate(row["contact"]):
             bars = [(start * figures["dt"], length * figures["dt"]) for start, length in _runs(down)]
             ax.broken_barh(bars, (foot - 0.31 + i * height, height * 0.94), facecolors=PAIR[i], linewidth=0)
-        notes.append(f"{row['stride_frequency']:.1f} Hz, down {np.mean(row['duty_factor']):.0%}")
     vx, vy, yaw = columns[0][1]["gait"][world]["command"]
     told = [f"{name} {value:g} {unit}" for (name, unit), value in zip(MEASURES, (vx, vy, yaw), strict=True) if value]
     ax.set_title(f"{', '.join(told) or 'stand'}")
-    ax.set_title(" / ".join(notes), loc="right", color=MUTED, fontsize=7.0)
+    rows = [figures["gait"][world] for _, figures in columns]
+    rates = " / ".join("fell" if row["contact"] is None else f"{row['stride_frequency']:.1f}" for row in rows)
+    duties = " / ".join("-" if row["contact"] is None else f"{np.mean(row['duty_factor']):.2f}" for row in rows)
+    ax.set_title(f"{rates} Hz, duty {duties}", loc="right", color=MUTED, fontsize=7.0)
     ax.set_yticks(range(len(feet)), feet)
     ax.set_ylim(len(feet) - 0.5, -0.5)
     ax.set_xlim(0.0, None)
@@ -257,9 +260,7 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
             share = shown["saturated"][joint]
             if share:
                 text = f"{share:.1%}" if share >= 0.001 else "<0.1%"
-                ax.annotate(
-                    text, (1.0, joint - 0.16 - 0.38 * i), xycoords=("axes fraction", "data"), ha="right", color=PAIR[i], fontsize=6.2
-                )
+                ax.annotate(text, (1.01, joint - 0.1 - 0.4 * i), xycoords=("axes fraction", "data"), color=PAIR[i], fontsize=6.2)
     ax.set_title(label)
     ax.set_yticks(range(len(names)), names)
     ax.set_ylim(len(names) - 0.6, -1.05)
@@ -288,17 +289,14 @@ def _kick_wheel(kicks: Figures, which: str, colour: str, title: str, ax: Any) ->
     """A tile a kick: ring by strength, sector by direction as the robot sees it; full where it was survived."""
     survived = np.array(kicks[which])
     width = 2 * math.pi / survived.shape[1]
-    for ring, row in enumerate(survived):
-        for k, stood in enumerate(row):
-            ax.bar(k * width, 0.9, width * 0.95, ring + 1, color=colour if stood else FAINT, alpha=0.85 if stood else 1.0, linewidth=0)
+    rings, sectors = np.indices(survived.shape).reshape(2, -1)
+    ax.bar(sectors * width, 0.9, width * 0.95, rings + 1, color=np.where(survived, colour, FAINT).ravel(), linewidth=0)
     ax.set_theta_zero_location("N")
     ax.set_xticks(np.arange(4) * math.pi / 2, ["ahead", "left", "behind", "right"])
     ax.set_yticks([])
     ax.set_ylim(0, len(survived) + 1)
     ax.grid(False)
     ax.spines["polar"].set_visible(False)
-    for ring, speed in enumerate(kicks["speeds"]):
-        ax.text(math.pi / 8 * 0.5 + math.pi, ring + 1.45, f"{speed:g}", ha="center", va="center", fontsize=5.6, color=INK)
     ax.set_title(title)
 
 
@@ -326,9 +324,9 @@ def _reward(columns: Columns, ax: Axes) -> None:
         at = np.arange(len(terms)) - 0.35 + height * (i + 0.5)
         ax.barh(at, values, height * 0.92, color=PAIR[i], label=name)
         for y, value in zip(at, values, strict=True):
-            side = 1 if value >= 0 else -1
-            ax.annotate(f"{value:.3g}", (value, y), (3 * side, 0), textcoords="offset points", va="center", ha="left" if side > 0 else "right",
-                        fontsize=6.2, color=MUTED)  # fmt: skip
+            side, align = (3, "left") if value >= 0 else (-3, "right")
+            text = {"textcoords": "offset points", "va": "center", "ha": align, "fontsize": 6.2, "color": MUTED}
+            ax.annotate(f"{value:.3g}", (value, y), (side, 0), **text)
     ax.set_yticks(range(len(terms)), terms)
     ax.set_ylim(len(terms) - 0.4, -0.6)
     ax.axvline(0.0, color=MUTED, linewidth=0.8)

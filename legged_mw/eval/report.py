@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exam, figures, rules
 from legged_mw.eval.rollout import Policy, Record, Signal, roll_out
-from legged_mw.eval.trials import NAMES, STEP_HOLDS, Plan, make_plan
+from legged_mw.eval.trials import NAMES, STEPS_AT, Plan, make_plan
 from legged_mw.sim.model import per_joint
 from legged_mw.utils.task import LoadedTask
 
@@ -57,7 +57,7 @@ def gather(env: LeggedRobot, plan: Plan, record: Record) -> dict[str, Any]:
     """Everything that the report shows besides the exam, as plain numbers."""
     parts = {name: record.part(worlds) for name, worlds in plan.parts.items()}
     settled, until = round(rules.SETTLING / env.dt), round(rules.KICK_UNTIL / env.dt)
-    told, axes = parts["commands"], plan.axes
+    told, axes, shown = parts["commands"], plan.axes, round((STEPS_AT[0] - BEFORE_STEP) / env.dt)
     straight = int(np.argmin(np.abs(axes["vy"]))) * len(axes["vx"])  # the row of the grid that goes straight ahead
     ahead = parts["vx_vy"].part(slice(straight, straight + len(axes["vx"])))
     return {
@@ -69,7 +69,7 @@ def gather(env: LeggedRobot, plan: Plan, record: Record) -> dict[str, Any]:
             "vx_yaw": figures.tracking_errors(parts["vx_yaw"], settled, len(axes["yaw"])),
             "vx_vy": figures.tracking_errors(parts["vx_vy"], settled, len(axes["vy"])),
         },
-        "steps": {name: figures.responses(parts[f"step_{name}"], i, BEFORE_STEP, STEP_HOLDS[-1]) for i, name in enumerate(NAMES)},
+        "steps": {name: figures.responses(parts[f"step_{name}"], i, shown) for i, name in enumerate(NAMES)},
         "gait": figures.gaits(told, settled, rules.commands(), GAIT_SECONDS),
         "joints": figures.joints(told, settled, joint_limits(env)),
         "kicks": {

@@ -24,7 +24,7 @@ section{margin:0 0 60px}
 .yes{color:var(--good);background:var(--goodbg)}.no{color:var(--bad);background:var(--badbg)}
 .cards{display:grid;grid-template-columns:repeat(auto-fit,minmax(148px,1fr));gap:12px}
 .card{background:var(--card);border-radius:10px;padding:14px 16px 12px;border-top:3px solid transparent}
-.card.pass{border-top-color:var(--peer)}.card.fail{border-top-color:var(--second)}
+.card.pass{border-top-color:var(--peer)}.card.fail{border-top-color:var(--bad)}
 .card span,.card small{display:block;color:var(--muted);font-size:13px}
 .card b{display:block;font-size:28px;line-height:1.25;font-weight:600;letter-spacing:-.02em;font-variant-numeric:tabular-nums}
 .scroll{overflow-x:auto}
@@ -33,7 +33,7 @@ th,td{padding:6px 18px 6px 0;text-align:right;white-space:nowrap;border-bottom:1
 th:first-child,td:first-child{text-align:left}
 thead th{color:var(--muted);font-weight:500;font-size:13px}
 tbody th{font-weight:450}
-.exam{min-width:620px}
+.exam{min-width:620px;width:100%;max-width:860px}
 tr.sub th{padding-left:18px;color:var(--muted)}tr.sub td{color:var(--muted)}
 td small{color:var(--muted);font-size:12px}
 td.pass::after,td.fail::after{display:inline-block;width:18px;text-align:right;font-weight:600}
@@ -41,7 +41,6 @@ td.value::after{content:"";display:inline-block;width:18px}
 td.pass::after{content:"\\2713";color:var(--good)}td.fail::after{content:"\\2717";color:var(--bad)}
 td.fail{color:var(--bad)}
 .panels{display:grid;gap:22px 20px;grid-template-columns:repeat(3,minmax(0,1fr))}
-.by2{grid-template-columns:repeat(2,minmax(0,1fr));max-width:820px}
 .wide{grid-template-columns:minmax(0,760px)}
 figure{margin:0}
 figure svg{display:block;width:100%;height:auto;overflow:visible}
@@ -52,7 +51,7 @@ footer{border-top:1px solid var(--faint);padding-top:22px;color:var(--muted);fon
 footer p{margin:0 0 4px}footer b{color:var(--ink);font-weight:600}
 code{font-family:ui-monospace,"SF Mono",Menlo,Consolas,"DejaVu Sans Mono",monospace;font-size:.92em}
 @media (max-width:900px){.panels{grid-template-columns:repeat(2,minmax(0,1fr))}.wide{grid-template-columns:1fr}}
-@media (max-width:600px){main{padding:32px 18px 48px}h1{font-size:30px}.panels,.by2{grid-template-columns:1fr}
+@media (max-width:600px){main{padding:32px 18px 48px}h1{font-size:30px}.panels{grid-template-columns:1fr}
 .cards{grid-template-columns:repeat(2,1fr)}.pill{margin:2px 6px 2px 0}th,td{padding-right:12px}}
 @media print{main{max-width:none;padding:0}section{break-inside:avoid-page}}
 """

@@ -1,0 +1,102 @@
+"""The exam during training: its figures, its curves, and that training does not notice it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from program import refused, trained
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from legged_mw.eval import rules, training
+from legged_mw.eval.rollout import Record
+from legged_mw.eval.training import TrainingExam, summary
+from legged_mw.rl.runs import checkpoints
+from legged_mw.utils.task import load_task
+
+FIGURES = ["error_vx", "error_vy", "error_yaw", "falls", "kicks_survived"]
+
+
+def test_summary() -> None:
+    """World i is off by 0.01 i, of either sign, once it settled; command 20 fell, and 4 of the 16 that were kicked."""
+    steps, worlds = 200, 38
+    off = 0.01 * np.arange(worlds)[None, :, None] * (-1.0) ** np.arange(steps)[:, None, None] * np.array([1.0, 2.0, 3.0])
+    off[:100] += 9.0
+    fell_at = np.full(worlds, math.inf)
+    fell_at[[20, 22, 23, 24, 37]] = 150
+    commands = np.ones((steps, worlds, 3))
+    found = summary(Record(0.02, 10.0, commands, fell_at, np.zeros((worlds, 2)), {"velocity": commands + off}))
+    mean = 0.01 * (sum(range(22)) - 20) / 21
+    assert found == pytest.approx(dict(zip(FIGURES, [mean, 2 * mean, 3 * mean, 1.0, 0.75], strict=True)))
+    all_fell = summary(Record(0.02, 10.0, commands, np.zeros(worlds), np.zeros((worlds, 2)), {"velocity": commands + off}))
+    assert math.isnan(all_fell["error_vx"]) and all_fell["falls"] == 22 and all_fell["kicks_survived"] == 0.0
+
+
+def test_it_grades_and_draws_nothing_of_the_trainings_randomness() -> None:
+    """Zero action stands: it follows the command to stand only, and no generator has moved."""
+    task = load_task("go1_flat")
+    task.set("terrain.friction", 0.4)  # an override of training counts in the exam
+    before = torch.get_rng_state()
+    examine = TrainingExam(task, "cpu")
+    found = examine(lambda obs: torch.zeros(len(obs), 12))
+    assert torch.equal(torch.get_rng_state(), before)
+    assert examine.env.cfg.terrain.friction == 0.4 and examine.env.num_envs == 38 and task.cfg.env.num_envs == 8192
+    assert examine.env.cfg.noise.level == 0.0 and task.cfg.noise.level == 1.0
+    wanted = np.abs(rules.commands()).mean(axis=0)
+    assert [found[name] for name in FIGURES[:3]] == pytest.approx(list(wanted), abs=0.01) and found["falls"] == 0
+    assert found["kicks_survived"] == 0.0
+    assert examine(lambda obs: torch.zeros(len(obs), 12)) == found
+
+
+def run_with(root: Path, interval: int) -> tuple[Path, dict[int, Any], dict[str, list[int]]]:
+    """Four iterations: the run's folder, its checkpoints, and each curve's iterations."""
+    options = ["--max_iterations", "4", "--set", "runner.save_interval=2", "--set", f"runner.exam_interval={interval}"]
+    folder = trained(root, *options)
+    events = EventAccumulator(str(folder))
+    events.Reload()
+    curves = {name: [point.step for point in events.Scalars(name)] for name in events.Tags()["scalars"]}
+    return folder, {n: torch.load(path, weights_only=True) for n, path in checkpoints(folder).items()}, curves
+
+
+def test_exams_are_logged_and_leave_training_as_it_was(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Networks, normalisers, optimizer, counters and random state of every checkpoint are the same bits with exams and without."""
+    monkeypatch.setattr(training, "SECONDS", 0.5)
+    monkeypatch.setattr(training, "SETTLING", 0.2)
+    _, plain, curves = run_with(tmp_path / "without", 0)
+    assert not [name for name in curves if name.startswith("Exam/")]
+    _, examined, curves = run_with(tmp_path / "with", 2)
+    assert list(plain) == list(examined) == [2, 4]
+    for n, content in plain.items():
+        assert_equal(content, examined[n], str(n))
+    for name in FIGURES:
+        assert curves[f"Exam/{name}"] == [2, 4]
+    assert curves["Perf/exam_time"] == [2, 4] and curves["Train/total_steps"] == [1, 2, 3, 4]
+
+
+def assert_equal(a: Any, b: Any, where: str) -> None:
+    """Nested dicts, lists and tensors, bit for bit."""
+    assert type(a) is type(b), where
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            assert_equal(a[key], b[key], f"{where}.{key}")
+    elif isinstance(a, list | tuple):
+        assert len(a) == len(b), where
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_equal(x, y, f"{where}[{i}]")
+    else:
+        assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, where
+
+
+def test_a_short_run_has_no_exam_and_a_negative_interval_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def begin(*_: Any, **__: Any) -> None:
+        raise AssertionError("nobody asked for an exam")
+
+    monkeypatch.setattr("train.TrainingExam", begin)
+    trained(tmp_path, "--max_iterations", "1")  # fewer than an interval
+    line = refused(tmp_path, "train", "--task", "go1_flat", "--device", "cpu", "--set", "runner.exam_interval=-1")
+    assert "runner.exam_interval is -1; it must be zero or more" in line
