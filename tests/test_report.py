@@ -77,7 +77,7 @@ def test_figures_of_a_policy_that_walks(both: tuple[dict[str, Any], ...]) -> Non
 
 def test_the_plan() -> None:
     """Exam first; grids over the trained ranges; the same steps in each world, later and later."""
-    plan = make_plan(shipped().cfg.commands.ranges, 0.02)
+    plan = make_plan(shipped().cfg, 0.02)
     assert plan.cases[: exam.WORLDS] == exam.cases(0.02)
     assert [plan.parts[name] for name in ("commands", "kicks")] == [slice(0, 22), slice(22, 118)]
     corner = plan.cases[plan.parts["vx_yaw"]][-1]

@@ -31,7 +31,7 @@ Columns = list[tuple[str, Figures]]  # (name, figures) of one policy or two
 INK, MUTED, FAINT, PAPER = "#1b1f27", "#68707d", "#e3e6eb", "#fdfdfe"
 PAIR, GREEN = ("#0072b2", "#d55e00"), "#009e73"
 VARIABLES = {INK: "ink", MUTED: "muted", FAINT: "faint", PAPER: "paper", PAIR[0]: "first", PAIR[1]: "second", GREEN: "peer"}
-STYLE = {
+STYLE: dict[Any, Any] = {
     **{"font.family": "DejaVu Sans", "font.size": 7.5, "svg.fonttype": "none", "text.color": INK, "axes.labelcolor": MUTED},
     **{"axes.edgecolor": FAINT, "axes.linewidth": 0.8, "axes.titlesize": 8.0, "axes.titlelocation": "left", "axes.titlepad": 7.0},
     **{"axes.titlecolor": INK, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True},

@@ -43,12 +43,12 @@ class Column(NamedTuple):
 def prepare(task: LoadedTask) -> None:
     """Turn ``task`` into the exam, with a world for all else that a report looks at."""
     dt = task.cfg.sim.dt * task.cfg.control.decimation
-    exam.prepare(task, len(make_plan(task.cfg.commands.ranges, dt).cases))
+    exam.prepare(task, len(make_plan(task.cfg, dt).cases))
 
 
 def examine(env: LeggedRobot, policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
     """The exam's result and the report's figures, from one roll-out of an environment made from a prepared task."""
-    plan = make_plan(env.cfg.commands.ranges, env.dt)
+    plan = make_plan(env.cfg, env.dt)
     record = roll_out(env, policy, plan.cases, round(exam.SECONDS / env.dt), SIGNALS, alone=exam.WORLDS)
     return exam.grade(record.part(slice(exam.WORLDS))), gather(env, plan, record)
 

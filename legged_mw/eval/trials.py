@@ -30,8 +30,9 @@ class Plan(NamedTuple):
     axes: dict[str, list[float]]  # vx, vy [m/s], yaw [rad/s] of the grids
 
 
-def make_plan(ranges: LeggedRobotCfg.commands.ranges, dt: float) -> Plan:
-    """All worlds of a report on a policy that was trained on commands in ``ranges``."""
+def make_plan(cfg: LeggedRobotCfg, dt: float) -> Plan:
+    """All worlds of a report on a policy that was trained with ``cfg``."""
+    ranges = cfg.commands.ranges
     limits = (ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw)
     axes = [np.unique(np.linspace(low, high, n).round(3)).tolist() for (low, high), n in zip(limits, GRID, strict=True)]
     rest = [min(max(0.0, low), high) for low, high in limits]  # zero, or the nearest to it
