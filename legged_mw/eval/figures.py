@@ -8,13 +8,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.eval.rollout import Record
 from legged_mw.eval.rules import GRAVITY, KICK_DIRECTIONS
+
+if TYPE_CHECKING:
+    from legged_mw.eval.rollout import Record
 
 SATURATED = 0.98  # of the limit, from which on a torque counts as at it
 SLOW = 0.1  # [m/s], below which a cost of transport says nothing
@@ -138,15 +140,15 @@ def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], sho
 # ---- joints
 
 
-def distribution(values: Array, low: Array, high: Array, limited: Array) -> dict[str, Any]:
-    """What ``values`` (S, D) are, joint by joint, and the share of samples outside ``low`` to ``high`` (D,).
+def distribution(values: Array, low: Array, high: Array, margin: float = 1.0) -> dict[str, Any]:
+    """What ``values`` (S, D) are, joint by joint, and the share of samples outside ``margin`` times ``low`` to ``high`` (D,).
 
-    ``limited`` (D,): where there is a limit at all.
+    An infinite limit is none, and has no share.
     """
     if not len(values):
         return {"low": [], "high": [], "edges": [], "density": [], "quantiles": [], "saturated": []}
     histograms = [np.histogram(row, BINS, density=True) for row in values.T]
-    outside = ((values < low) | (values > high)).mean(axis=0)
+    outside, limited = ((values < low * margin) | (values > high * margin)).mean(axis=0), np.isfinite(low) & np.isfinite(high)
     return {
         "low": [float(v) if ok else None for v, ok in zip(low, limited, strict=True)],
         "high": [float(v) if ok else None for v, ok in zip(high, limited, strict=True)],
@@ -164,9 +166,7 @@ def joints(record: Record, settled: int, limits: dict[str, tuple[Array, Array]])
     for name, (low, high) in limits.items():
         values = record.signals[name][settled:, stood]
         values = values.reshape(-1, values.shape[-1]).astype(float)
-        margin = SATURATED if name == "torque" else 1.0
-        limited = np.isfinite(low) & np.isfinite(high)
-        found[name] = {**distribution(values, low * margin, high * margin, limited), "margin": margin}
+        found[name] = distribution(values, low, high, SATURATED if name == "torque" else 1.0)
     return found
 
 
