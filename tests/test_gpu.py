@@ -14,6 +14,7 @@ from test_ppo import VARIANTS, update
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
+from legged_mw.eval.training import TrainingExam
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
 from legged_mw.utils.task import load_task
@@ -205,3 +206,13 @@ def small_learner() -> LeggedRobotCfgPPO:
     train = load_task("go1_flat").train
     train.actor.hidden_dims = train.critic.hidden_dims = [32, 32]
     return train
+
+
+def test_an_exam_leaves_the_gpus_generator_as_it_was() -> None:
+    """Though its environment draws random numbers inside a recorded step of its own."""
+    torch.manual_seed(7)
+    before = torch.cuda.get_rng_state(DEVICE)
+    examine = TrainingExam(load_task("go1_flat"), DEVICE)
+    found = examine(lambda obs: torch.zeros(len(obs), 12, device=DEVICE))
+    assert examine.env._graph.recorded and found["falls"] == 0
+    assert torch.equal(torch.cuda.get_rng_state(DEVICE), before)

@@ -35,7 +35,7 @@ thead th{color:var(--muted);font-weight:500;font-size:13px}
 tbody th{font-weight:450}
 .exam{min-width:620px;width:100%;max-width:860px}
 tr.sub th{padding-left:18px;color:var(--muted)}tr.sub td{color:var(--muted)}
-td small{color:var(--muted);font-size:12px}
+td small{color:var(--muted);font-size:12px;display:inline-block;min-width:50px;text-align:right}
 td.pass::after,td.fail::after{display:inline-block;width:18px;text-align:right;font-weight:600}
 td.value::after{content:"";display:inline-block;width:18px}
 td.pass::after{content:"\\2713";color:var(--good)}td.fail::after{content:"\\2717";color:var(--bad)}
