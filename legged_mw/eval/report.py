@@ -94,8 +94,8 @@ def joint_limits(env: LeggedRobot) -> dict[str, tuple[NDArray[Any], NDArray[Any]
 def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()) -> None:
     """Write ``report.json``, a PNG a section and the self-contained ``report.html``.
 
-    The first column is what the others are held against; at most two have figures. ``extras`` are further results of ``rules.grade`` by name, of which the
-    exam's table shows the gap to the first: the first policy in another physics, say.
+    The first column is what the others are held against; at most two have figures. ``extras`` are further results of
+    ``rules.grade`` by name, of which the exam's table shows the gap to the first: the first policy in another physics, say.
     """
     from legged_mw.eval import page, plots  # matplotlib takes a second to import
 
