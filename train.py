@@ -17,7 +17,7 @@ from legged_mw import ROOT
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.describe import describe
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval.training import TrainingExam
+from legged_mw.eval.training import TrainingExam, make_exam
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.runner import Runner, make_runner
@@ -81,7 +81,7 @@ def main() -> None:
         print(describe(env, task))
         return
     wanted = rank.leads and 0 < task.train.runner.exam_interval <= task.train.runner.max_iterations
-    examine = TrainingExam(task, device, eager=args.eager) if wanted else None
+    examine = make_exam(task, env, args.eager) if wanted else None
     train(task, env, examine, experiment, run, checkpoint, device, began + args.max_time if args.max_time else None)
     leave_together(rank)
 

@@ -14,7 +14,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from legged_mw.eval import rules, training
 from legged_mw.eval.rollout import Record
-from legged_mw.eval.training import TrainingExam, summary
+from legged_mw.eval.training import TrainingExam, make_exam, summary
 from legged_mw.rl.runs import checkpoints
 from legged_mw.utils.task import load_task
 
@@ -50,6 +50,18 @@ def test_it_grades_and_draws_nothing_of_the_trainings_randomness() -> None:
     assert [found[name] for name in FIGURES[:3]] == pytest.approx(list(wanted), abs=0.01) and found["falls"] == 0
     assert found["kicks_survived"] == 0.0
     assert examine(lambda obs: torch.zeros(len(obs), 12)) == found
+
+
+def test_no_exam_for_an_actor_that_sees_what_the_nominal_world_has_not(capsys: pytest.CaptureFixture[str]) -> None:
+    task = load_task("go1_flat")
+    for path, value in {"env.num_envs": 2, "domain_rand.enable": True, "domain_rand.observe": True}.items():
+        task.set(path, value)
+    env = task.env_class(task.cfg, "cpu")
+    assert make_exam(task, env) is not None  # its actor sees `state`, which is the same
+    task.set("obs_groups.actor", ["privileged_state"])
+    assert make_exam(task, env) is None
+    line = capsys.readouterr().out
+    assert line.startswith("no exam during training: the actor's observation group 'privileged_state' has 1") and line.count("\n") == 1
 
 
 def run_with(root: Path, interval: int) -> tuple[Path, dict[int, Any], dict[str, list[int]]]:
@@ -96,7 +108,7 @@ def test_a_short_run_has_no_exam_and_a_negative_interval_is_refused(tmp_path: Pa
     def begin(*_: Any, **__: Any) -> None:
         raise AssertionError("nobody asked for an exam")
 
-    monkeypatch.setattr("train.TrainingExam", begin)
+    monkeypatch.setattr("train.make_exam", begin)
     trained(tmp_path, "--max_iterations", "1")  # fewer than an interval
     line = refused(tmp_path, "train", "--task", "go1_flat", "--device", "cpu", "--set", "runner.exam_interval=-1")
     assert "runner.exam_interval is -1; it must be zero or more" in line

@@ -69,15 +69,13 @@ def roll_out(
     """
     env.reset()
     told, kicks = _commands_by_step(cases, env.device), _kicks_by_step(cases, env.device)
+    worlds, commands = told.pop(0)
+    env.commands[worlds] = commands
+    env.compute_observations()
     obs = env.get_observations()
     fell_at = torch.full((env.num_envs,), math.inf, device=env.device)
     kept: dict[str, Tensor] = {}
     for step in range(steps):
-        if step in told:
-            worlds, commands = told[step]
-            env.commands[worlds] = commands
-            env.compute_observations()
-            obs = env.get_observations()
         for name, signal in signals.items():
             value = signal(env)
             if name not in kept:
@@ -87,6 +85,9 @@ def roll_out(
         if step in kicks:
             worlds, jumps = kicks[step]
             env.sim.qvel[worlds, :2] += jumps
+        if step + 1 in told:  # this step's end observes it; to observe anew would be a step of time for what is delayed
+            worlds, commands = told[step + 1]
+            env.commands[worlds] = commands
         obs, _, dones, _ = env.step(actions)
         fell_at = torch.where(dones & (fell_at == math.inf), torch.full_like(fell_at, step), fell_at)
     return Record(

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import torch
 
+from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exam, rules
 from legged_mw.eval.rollout import Policy, Record, holding, roll_out
 from legged_mw.utils.task import LoadedTask, load_task
@@ -38,6 +39,18 @@ class TrainingExam:
         with torch.random.fork_rng(self._generators):
             record = roll_out(self.env, policy, cases, round(SECONDS / dt), {"velocity": exam.SIGNALS["velocity"]})
         return summary(record)
+
+
+def make_exam(task: LoadedTask, env: LeggedRobot, eager: bool = False) -> TrainingExam | None:
+    """The exam for a policy that trains in ``env``, or None, and a line that says why, where it could not read the nominal world."""
+    examine = TrainingExam(task, env.device, eager)
+    here, there = env.get_observations(), examine.env.get_observations()
+    for group in task.train.obs_groups.actor:
+        if group in here and here[group].shape[1] != there[group].shape[1]:  # a group that does not exist is the learner's to refuse
+            sizes = f"{there[group].shape[1]} values in the exam's nominal world and {here[group].shape[1]} in training"
+            print(f"no exam during training: the actor's observation group '{group}' has {sizes}")
+            return None
+    return examine
 
 
 def summary(record: Record) -> dict[str, float]:

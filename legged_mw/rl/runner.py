@@ -96,12 +96,11 @@ class Runner(OnPolicyRunner):
             redraw = self.env.cfg.domain_rand.redraw_iterations
             if redraw and self.current_learning_iteration % redraw == 0:
                 self.env.domain_rand.redraw()
-            if self._exam_is_due():
-                waiting = self._log(waiting) if waiting else None
-                self._examine()
-                start = clock.mark()
             if self.current_learning_iteration % self.cfg["save_interval"] == 0 and self.current_learning_iteration < self._last:
                 self._save_checkpoint()
+            if self._exam_is_due():  # what waits to be logged still does: ranks must hear of a stop in the same iteration
+                self._examine()
+                start = clock.mark()
         if waiting:
             self._log(waiting)
         self._save_checkpoint()
