@@ -15,6 +15,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from legged_mw.eval import rules, training
 from legged_mw.eval.rollout import Record
 from legged_mw.eval.training import TrainingExam, make_exam, summary
+from legged_mw.rl.runner import Runner
 from legged_mw.rl.runs import checkpoints
 from legged_mw.utils.task import load_task
 
@@ -67,7 +68,15 @@ def test_no_exam_for_an_actor_that_sees_what_the_nominal_world_has_not(capsys: p
 def run_with(root: Path, interval: int) -> tuple[Path, dict[int, Any], dict[str, list[int]]]:
     """Four iterations: the run's folder, its checkpoints, and each curve's iterations."""
     options = ["--max_iterations", "4", "--set", "runner.save_interval=2", "--set", f"runner.exam_interval={interval}"]
-    folder = trained(root, *options)
+    learn = Runner.learn
+
+    def learn_and_flush(self: Runner, *args: Any) -> None:
+        learn(self, *args)
+        self.logger.writer.flush()  # type: ignore[union-attr]  (a thread writes the curves)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Runner, "learn", learn_and_flush)
+        folder = trained(root, *options)
     events = EventAccumulator(str(folder))
     events.Reload()
     curves = {name: [point.step for point in events.Scalars(name)] for name in events.Tags()["scalars"]}
