@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from program import refused, trained
+from program import SMALL, refused, run, trained
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from legged_mw.eval import rules, training
@@ -96,6 +96,16 @@ def test_exams_are_logged_and_leave_training_as_it_was(tmp_path: Path, monkeypat
     for name in FIGURES:
         assert curves[f"Exam/{name}"] == [2, 4]
     assert curves["Perf/exam_time"] == [2, 4] and curves["Train/total_steps"] == [1, 2, 3, 4]
+
+
+def test_an_exam_that_fails_costs_the_training_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> dict[str, float]:
+        raise RuntimeError("no room for it")
+
+    monkeypatch.setattr(TrainingExam, "__call__", fail)
+    result = run("train", tmp_path, *SMALL, "--max_iterations", "4", "--set", "runner.exam_interval=1")
+    assert result.code == 0 and list(tmp_path.glob("logs/*/*/model_4.pt"))
+    assert result.out.count("WARNING: the exam failed, training goes on without: RuntimeError: no room for it") == 1
 
 
 def assert_equal(a: Any, b: Any, where: str) -> None:

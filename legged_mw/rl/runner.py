@@ -153,8 +153,14 @@ class Runner(OnPolicyRunner):
         assert self.examine is not None
         policy, begun = self.alg.get_policy(), time.time()
         training = policy.training
-        figures = self.examine(policy.eval())
-        policy.train(training)
+        try:
+            figures = self.examine(policy.eval())
+        except Exception as error:  # hours of training are not to be lost to a figure in TensorBoard
+            print(f"WARNING: the exam failed, training goes on without: {type(error).__name__}: {error}", flush=True)
+            self.examine = None
+            return
+        finally:
+            policy.train(training)
         self.last_exam = self.current_learning_iteration, figures
         if self.logger.writer is not None:
             curves = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
