@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,8 +17,8 @@ from legged_mw.rl.runs import CONFIG_FILE, find_checkpoint, find_run, runs
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, one_line_errors, pick_device, seed_everything, shown
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.task import LoadedTask, load_task, task_names
-from legged_mw.view.native import NativeViewer, Pace, has_display
-from legged_mw.view.video import RobotRenderer, VideoWriter
+from legged_mw.view import launch
+from legged_mw.view.env_stage import EnvStage
 
 NOMINAL = {  # what playing changes in the trained config
     "env.num_envs": 1,
@@ -43,10 +42,10 @@ def parse() -> argparse.Namespace:
     parser.add_argument(
         "--command", metavar="VX,VY,YAW", help="fixed command [m/s, m/s, rad/s]; write --command=-0.5,0,0 if it starts with a minus"
     )
-    parser.add_argument("--video", metavar="FILE", help="record an MP4 instead of opening a window")
     parser.add_argument(
         "--time", type=duration, default=None, metavar="T", help="how long to play (default: 10s of video, a window until closed)"
     )
+    launch.add_flags(parser)
     parser.add_argument("--eval", action="store_true", help="run the walking exam, print its table, write a report")
     parser.add_argument("--compare", metavar="RUN", help="with --eval: grade this run beside it; its name or path, or 'shipped'")
     parser.add_argument("--export", metavar="DIR", help="write model.pt, policy.onnx and config.yaml there")
@@ -58,6 +57,9 @@ def parse() -> argparse.Namespace:
         parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
     if args.compare is not None and not args.eval:
         parser.error("--compare grades two policies side by side: add --eval")
+    if args.commands and (args.eval or args.export or args.command is not None):
+        parser.error("--commands drives what is watched: it goes with neither --command nor --eval nor --export")
+    launch.check_flags(args)
     return args
 
 
@@ -69,7 +71,7 @@ def main() -> None:
     config = source.folder / CONFIG_FILE
     task.update_from_run(load_yaml(config), where=shown(config))
     trained = task.to_dict()
-    prepare(task, args)
+    limits = prepare(task, args)
     changes = changes_since(task, trained)
     for path, (before, now) in sorted(changes.items()):
         print(f"  {path}: {before} -> {now}")
@@ -88,12 +90,9 @@ def main() -> None:
             columns.append(grade(*rival))
         report.write(out / "eval", task.name, columns)
         print(f"written to {shown(out / 'eval' / 'report.html')}, with report.json and pictures beside it")
-    elif args.video or not has_display():
-        if not args.video:
-            print("no screen here (DISPLAY and WAYLAND_DISPLAY are not set): recording instead of opening a window")
-        record(env, policy, Path(args.video) if args.video else out / "play.mp4", args.time or 10.0)
     else:
-        watch(env, policy, args.time)
+        stage, viewer = EnvStage(env, lambda obs: act(policy, obs), limits), task.cfg.viewer
+        launch.watch(stage, args, out, launch.Picture(viewer.width, viewer.height, viewer.fps), title=task.name)
 
 
 def find_policy(task: LoadedTask, args: argparse.Namespace) -> Source:
@@ -135,28 +134,24 @@ def find_rival(args: argparse.Namespace, device: str) -> tuple[LeggedRobot, MLPM
     return env, policy, source, {path: now for path, (_, now) in changes_since(task, trained).items()}
 
 
-def prepare(task: LoadedTask, args: argparse.Namespace) -> None:
-    """What playing changes in the trained config; the user's own overrides come last."""
+def prepare(task: LoadedTask, args: argparse.Namespace) -> list[list[float]]:
+    """What playing changes in the trained config, the user's own overrides last; returns the command's limits (2, 3), as trained."""
     if args.eval:
         report.prepare(task)
     else:
         for path, value in NOMINAL.items():
             task.set(path, value, where="play")
-    if args.command is not None:
-        try:
-            command = [float(v) for v in args.command.split(",")]
-            ranges = dict(zip(("lin_vel_x", "lin_vel_y", "ang_vel_yaw"), command, strict=True))
-            if not all(map(math.isfinite, command)):
-                raise ValueError
-        except ValueError:
-            raise ConfigError(f"--command {args.command}: write three numbers, vx,vy,yaw [m/s, m/s, rad/s], e.g. 0.8,0,0") from None
-        for name, value in ranges.items():
-            task.set(f"commands.ranges.{name}", [value, value], where="--command")
-        task.set("commands.resampling_time", 0.0, where="--command")
     before = task.to_dict()
     apply_overrides(task, args)
     if args.eval and (touched := exam.SETS & changes_since(task, before).keys()):
         raise ConfigError(f"--eval sets {', '.join(sorted(touched))} itself; an exam with other values would be another exam")
+    ranges = task.cfg.commands.ranges
+    limits = [list(side) for side in zip(ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw, strict=True)]
+    if (command := launch.check_drive(args, limits)) is not None:
+        for name, value in zip(("lin_vel_x", "lin_vel_y", "ang_vel_yaw"), command, strict=True):
+            task.set(f"commands.ranges.{name}", [value, value], where="--command")
+        task.set("commands.resampling_time", 0.0, where="--command")
+    return limits
 
 
 def changes_since(task: LoadedTask, trained: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
@@ -174,37 +169,6 @@ def grade(env: LeggedRobot, policy: MLPModel, source: Source, overrides: dict[st
     print(f"\n{name}, {env.sim.engine} on {env.device}\n{rules.table(result)}\n")
     about = {"policy": "/".join(source.checkpoint.parts[-3:]), "engine": env.sim.engine, "device": env.device, "overrides": overrides}
     return report.Column(name, about, result, figures)
-
-
-def record(env: LeggedRobot, policy: MLPModel, path: Path, seconds: float) -> None:
-    viewer = env.cfg.viewer
-    every = max(1, round(1 / (viewer.fps * env.dt)))  # [control steps] a frame
-    obs = env.get_observations()
-    print(f"recording {seconds:g} s of video to {shown(path)}; without a GPU for drawing it takes a while", flush=True)
-    size = viewer.width, viewer.height
-    with VideoWriter(path, *size, fps=1 / (every * env.dt)) as video, RobotRenderer(env.robot.visual, *size) as renderer:
-        for step in range(round(seconds / env.dt)):
-            if step % every == 0:
-                video.add(renderer.frame(*seen(env)))
-            obs, *_ = env.step(act(policy, obs))
-    print(f"written to {shown(path)}")
-
-
-def watch(env: LeggedRobot, policy: MLPModel, seconds: float | None) -> None:
-    obs = env.get_observations()
-    with NativeViewer(env.robot.visual) as viewer:
-        pace, steps = Pace(env.dt), 0
-        while viewer.is_running() and (seconds is None or steps * env.dt < seconds):
-            viewer.show(*seen(env))
-            obs, *_ = env.step(act(policy, obs))
-            steps += 1
-            pace.wait()
-
-
-def seen(env: LeggedRobot) -> tuple:
-    """Pose, command and velocity of the first world, for a viewer."""
-    velocity = torch.cat([env.base_lin_vel[0, :2], env.base_ang_vel[0, 2:]])
-    return tuple(t.cpu().numpy() for t in (env.sim.qpos[0], env.commands[0], velocity))
 
 
 def export(trained: dict[str, Any], env: LeggedRobot, source: Source, device: str, folder: Path) -> None:

@@ -75,8 +75,8 @@ def refused(root: Path, program: str, *args: str) -> str:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Runner, "learn", begin)
-        for name in ("record", "watch", "grade", "export"):
-            patch.setattr(play, name, begin)
+        for owner, name in ((play.launch, "watch"), (play, "grade"), (play, "export")):
+            patch.setattr(owner, name, begin)
         result = run(program, root, *args)
     assert result.code == 2, result
     assert files(root) == before

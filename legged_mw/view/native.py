@@ -1,7 +1,4 @@
-"""MuJoCo's own window, fed with poses, and a clock that holds a loop to real time.
-
-Shows and listens to keys; steps no simulation. The window lives on a thread of MuJoCo's.
-"""
+"""MuJoCo's own window: shows moments, listens to keys; steps no simulation. The window lives on a thread of MuJoCo's."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -15,11 +12,17 @@ from collections.abc import Callable
 from typing import Any
 
 import mujoco
-from numpy.typing import ArrayLike
 
-from legged_mw.view.overlay import Puppet, ViewError, draw_velocities, place_camera, set_options
+from legged_mw.view.camera import CameraMan
+from legged_mw.view.drive import BINDINGS, KEY_ACTION, Pilot
+from legged_mw.view.overlay import draw, set_options
+from legged_mw.view.puppet import Cast
+from legged_mw.view.stage import Moment, ViewError
 
 CLOSE_SECONDS = 5.0
+TEXT_SECONDS = 0.25  # a change of text waits for the window to draw: 16 ms on most screens, 100 with software OpenGL
+_GLFW = {"right": 262, "left": 263, "down": 264, "up": 265, "space": 32, "backspace": 259, "enter": 257}
+KEY_CODES = {_GLFW.get(key, ord(key[0].upper())): key for key in KEY_ACTION}  # GLFW's code of a letter is its capital's ASCII
 
 
 def has_display() -> bool:
@@ -30,37 +33,47 @@ def has_display() -> bool:
 
 
 class NativeViewer:
-    """A window that shows the poses it is given. The camera follows the base; the mouse turns it.
+    """A window. The camera follows the chosen robot; the mouse turns it. Keys go to the pilot.
 
-    `on_key` is called with a GLFW key code (arrows 262 to 265, letters their ASCII capitals) on the window's thread, for
-    presses only. MuJoCo's own shortcuts see the same presses: letters and digits change what is drawn, arrows do no harm.
+    MuJoCo's own shortcuts see the same presses and would switch what is drawn (P: contact points, R: reflections ...);
+    what our keys switch is switched back before the next picture. All its other keys work as in any MuJoCo window.
     """
 
-    def __init__(self, model: mujoco.MjModel, on_key: Callable[[int], None] | None = None) -> None:
-        self.puppet = Puppet(model)
-        self._legend = False
+    def __init__(self, model: mujoco.MjModel, pilot: Pilot | None = None, count: int = 1) -> None:
+        self.cast = Cast(model, count)
         before = set(threading.enumerate())
-        self._handle: Any = _launch(model, self.puppet.data, on_key)
+        self._handle: Any = _launch(self.cast.model, self.cast.data, on_key(pilot) if pilot else None)
         self._threads = set(threading.enumerate()) - before
+        self._texts: list[tuple[int | None, int | None, str, str]] = []
+        self._text_time = 0.0
         with self._handle.lock():
             set_options(self._handle.opt)
-            camera = self._handle.cam
-            place_camera(camera, self.puppet)
-            camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-            camera.trackbodyid = self.puppet.base
+            self._camera = CameraMan(self._handle.cam, self.cast, by_hand=True)
+            ours = {chr(code) for code in KEY_CODES if code < 128}
+            self._own_flags = {i: bool(self._handle.opt.flags[i]) for i, row in enumerate(mujoco.mjVISSTRING) if row[2] in ours}
 
-    def show(self, qpos: ArrayLike, command: ArrayLike | None = None, velocity: ArrayLike | None = None) -> None:
-        """Show one pose with its arrows; (vx, vy, yaw rate) in the body frame. Does nothing once the window is closed."""
+    def show(self, moment: Moment) -> None:
+        """Show one moment. Does nothing once the window is closed."""
         if not self.is_running():
             return
-        with self._handle.lock():  # the window's thread draws from both
-            self.puppet.pose(qpos)
-            self._handle.user_scn.ngeom = 0
-            draw_velocities(self._handle.user_scn, self.puppet, command, velocity)
-        if not self._legend and not (command is None and velocity is None):
-            self._legend = True  # once: a change of text waits for the window to draw, 0.1 s with software OpenGL
-            self._handle.set_texts((None, None, "orange\nblue", "command\nvelocity"))
-        self._handle.sync()
+        handle = self._handle
+        with handle.lock():  # the window's thread draws from all of these
+            self.cast.pose(moment.qpos, moment.world)
+            handle.user_scn.ngeom = 0
+            draw(handle.user_scn, self.cast, moment)
+            self._camera.update(moment.camera, moment.world)
+            for flag, value in self._own_flags.items():
+                handle.opt.flags[flag] = value
+        self._write(moment)
+        handle.sync()
+
+    def _write(self, moment: Moment) -> None:
+        """The words, a few times a second."""
+        texts = window_texts(moment)
+        now = time.perf_counter()
+        if texts != self._texts and now - self._text_time > TEXT_SECONDS:
+            self._texts, self._text_time = texts, now
+            self._handle.set_texts(texts)
 
     def is_running(self) -> bool:
         """False once somebody closed the window."""
@@ -79,11 +92,36 @@ class NativeViewer:
         self.close()
 
 
+def on_key(pilot: Pilot) -> Callable[[int], None]:
+    """What MuJoCo's window calls with a GLFW key code, on its own thread, for presses only."""
+
+    def pressed(code: int) -> None:
+        if code in KEY_CODES:
+            pilot.press(KEY_CODES[code])
+
+    return pressed
+
+
+def window_texts(moment: Moment) -> list[tuple[int | None, int | None, str, str]]:
+    """What MuJoCo's window takes: (font, place, left column, right column) of each block of text."""
+    grid = mujoco.mjtGridPos
+    blocks: list[tuple[int | None, int | None, str, str]] = []
+    if moment.lines:
+        names, values = ("\n".join(column) for column in zip(*moment.lines, strict=True))
+        blocks.append((None, int(grid.mjGRID_TOPLEFT), names, values))
+    if moment.help:
+        keys = "\n".join(" ".join(binding.keys) for binding in BINDINGS)
+        blocks.append((None, int(grid.mjGRID_BOTTOMLEFT), keys, "\n".join(binding.text for binding in BINDINGS)))
+    else:
+        blocks.append((None, int(grid.mjGRID_BOTTOMLEFT), "orange\nblue\nh", "command\nmeasured\nkeys"))
+    return blocks
+
+
 def _launch(model: mujoco.MjModel, data: mujoco.MjData, on_key: Callable[[int], None] | None) -> Any:
     if not has_display():
         raise ViewError(
             "A window needs a display, and neither DISPLAY nor WAYLAND_DISPLAY is set. "
-            "Record a video with --video FILE, or log in with `ssh -X`."
+            "Open a web page with --viewer web, record a video with --video FILE, or log in with `ssh -X`."
         )
     if sys.platform.startswith("linux"):
         _probe_window()
@@ -106,7 +144,10 @@ def _probe_window() -> None:
     thread.join()
     if opened != [True]:
         state = ", ".join(f"{name}={os.environ.get(name)!r}" for name in ("DISPLAY", "WAYLAND_DISPLAY"))
-        raise ViewError(f"No OpenGL window can be opened on this display ({state}). Record a video with --video FILE.")
+        raise ViewError(
+            f"No OpenGL window can be opened on this display ({state}). "
+            "Open a web page with --viewer web, or record a video with --video FILE."
+        )
 
 
 def _can_open_window() -> bool:
@@ -120,20 +161,3 @@ def _can_open_window() -> bool:
     if window:
         glfw.destroy_window(window)
     return bool(window)
-
-
-class Pace:
-    """Holds a loop to one turn every `dt` seconds of real time."""
-
-    def __init__(self, dt: float) -> None:
-        self.dt = dt
-        self._next = time.perf_counter() + dt
-
-    def wait(self) -> None:
-        """Sleep until this turn is over. A late loop is not hurried afterwards: lost time stays lost."""
-        now = time.perf_counter()
-        if self._next > now:
-            time.sleep(self._next - now)
-            self._next += self.dt
-        else:
-            self._next = now + self.dt

@@ -1,14 +1,8 @@
-"""Pictures into files: an offscreen renderer that follows a robot, an MP4 writer, a contact sheet and a PNG.
+"""Frames into files: an MP4 or GIF writer, a contact sheet and a PNG. Knows nothing of robots or of who drew the frames."""
 
-Knows nothing of windows or of who made the poses. `MUJOCO_GL` must be set before mujoco is imported; the package does it.
-"""
-
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import contextlib
-import copy
 import math
 import os
 import shutil
@@ -22,81 +16,38 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import mujoco
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from legged_mw.view.overlay import FollowCamera, Puppet, ViewError, draw_velocities, set_options
+from legged_mw.view.stage import ViewError
 
 Frame = NDArray[np.uint8]  # (height, width, 3)
 
-SHADOW_MAX = 2048  # ours: edge of the shadow map [px]; 8192, found in many scenes, halves the frame rate of software OpenGL
+FORMATS = (".mp4", ".gif")
+# a palette from all frames, a dither that stands still where the picture does: small files
+PALETTE = (("split", ""), ("palettegen", "stats_mode=diff"), ("paletteuse", "dither=bayer:bayer_scale=4:diff_mode=rectangle"))
 CRF = 20  # ours: x264's constant quality; 23 is its default and smears a dark checker floor
 
 
-class RobotRenderer:
-    """Offscreen pictures of one robot from a camera that follows it. To be used from the thread that made it."""
-
-    def __init__(self, model: mujoco.MjModel, width: int = 1280, height: int = 720) -> None:
-        model = copy.copy(model)  # frame buffer and shadows are ours to set, the caller's model is not
-        model.vis.global_.offwidth, model.vis.global_.offheight = width, height
-        model.vis.quality.shadowsize = min(model.vis.quality.shadowsize, SHADOW_MAX)
-        self.puppet = Puppet(model)
-        self.width, self.height = width, height
-        self._camera = FollowCamera(self.puppet)
-        self._option = mujoco.MjvOption()
-        set_options(self._option)
-        try:
-            self._renderer = mujoco.Renderer(model, height=height, width=width)
-        except Exception as error:  # each OpenGL backend fails with a type of its own
-            raise ViewError(_no_context(error)) from error
-
-    def frame(self, qpos: ArrayLike, command: ArrayLike | None = None, velocity: ArrayLike | None = None) -> Frame:
-        """One picture (height, width, 3), yours to keep. Velocities are (vx, vy, yaw rate) in the body frame."""
-        self.puppet.pose(qpos)
-        camera, scene = self._camera.update(), self._renderer.scene
-        # MuJoCo lays an endless floor around where the camera was; told first, it lies right in the first frame too
-        mujoco.mjv_updateCamera(self.puppet.model, self.puppet.data, camera, scene)
-        self._renderer.update_scene(self.puppet.data, camera, self._option)
-        draw_velocities(scene, self.puppet, command, velocity)
-        return self._renderer.render()  # a new array each time
-
-    def close(self) -> None:
-        """Free the OpenGL context; again is allowed."""
-        self._renderer.close()
-
-    def __enter__(self) -> RobotRenderer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-def _no_context(error: Exception) -> str:
-    state = ", ".join(f"{name}={os.environ.get(name)!r}" for name in ("MUJOCO_GL", "DISPLAY"))
-    return (
-        f"No OpenGL context for offscreen rendering ({state}): {type(error).__name__}: {error}\n"
-        "Without a display set MUJOCO_GL=egl (NVIDIA driver or Mesa's libegl1) or MUJOCO_GL=osmesa (libosmesa6, slower) "
-        "in the shell, before Python starts."
-    )
-
-
 class VideoWriter:
-    """H.264 in an MP4 that browsers play. The file appears under its name when it is whole, at `close`."""
+    """H.264 in an MP4 that browsers play, or a GIF, by the name's ending. The file appears under its name when it is whole, at `close`.
+
+    A GIF is made of all its frames at once: they stay in memory until then.
+    """
 
     def __init__(self, path: Path | str, width: int, height: int, fps: float) -> None:
         self.path = Path(path)
-        if self.path.suffix.lower() != ".mp4":
-            raise ViewError(f"Cannot write {self.path.name!r}: the supported extension is .mp4 (H.264).")
-        if width < 2 or height < 2 or width % 2 or height % 2:
+        check_format(self.path)
+        gif = self.path.suffix.lower() == ".gif"
+        if not gif and (width < 2 or height < 2 or width % 2 or height % 2):
             raise ViewError(f"A video of {width} x {height} cannot be encoded: yuv420p needs an even width and an even height.")
         if not (math.isfinite(fps) and fps > 0):
             raise ValueError(f"fps = {fps}: a video needs a positive number of frames per second.")
-        encoder = _choose_encoder()
+        encoder = _choose_encoder(gif)
         self.width, self.height, self.frames = width, height, 0
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        self._partial = self.path.with_name(f".{self.path.stem}.{os.getpid()}.part.mp4")
-        self._encoder: _Ffmpeg | _PyAv | None = encoder(self._partial, width, height, Fraction(fps).limit_denominator(1001))
+        self._partial = self.path.with_name(f".{self.path.stem}.{os.getpid()}.part{self.path.suffix.lower()}")
+        self._encoder: _Ffmpeg | _PyAv | _PyAvGif | None = encoder(self._partial, width, height, Fraction(fps).limit_denominator(1001))
 
     def add(self, frame: Frame) -> None:
         """Append one frame (height, width, 3)."""
@@ -137,25 +88,31 @@ class VideoWriter:
         self.close() if kind is None else self.abort()
 
 
-def _choose_encoder() -> type[_Ffmpeg] | type[_PyAv]:
+def check_format(path: Path) -> None:
+    """ViewError if a file of this name cannot be written."""
+    if path.suffix.lower() not in FORMATS:
+        raise ViewError(f"Cannot write {path.name!r}: the supported extensions are .mp4 (H.264) and .gif.")
+
+
+def _choose_encoder(gif: bool) -> type[_Ffmpeg] | type[_PyAv] | type[_PyAvGif]:
     """`ffmpeg` on PATH, else PyAV; some builds of either come without libx264, so ask."""
-    tried = []
+    codec, tried = "gif" if gif else "libx264", []
     program = shutil.which("ffmpeg")
     if program is None:
         tried.append("ffmpeg: not on PATH")
-    elif "libx264" in subprocess.run([program, "-hide_banner", "-encoders"], capture_output=True, text=True, check=False).stdout:
+    elif codec in subprocess.run([program, "-hide_banner", "-encoders"], capture_output=True, text=True, check=False).stdout:
         return _Ffmpeg
     else:
-        tried.append(f"{program}: built without libx264")
+        tried.append(f"{program}: built without {codec}")
     try:
         import av  # an extra: heavy, and of no use to training
     except ImportError as error:
         tried.append(f"PyAV: {error}")
     else:
-        if "libx264" in av.codecs_available:
-            return _PyAv
-        tried.append("PyAV: built without libx264")
-    raise ViewError(f"No H.264 encoder ({'; '.join(tried)}). Install one: pip install av, or ffmpeg.")
+        if codec in av.codecs_available:
+            return _PyAvGif if gif else _PyAv
+        tried.append(f"PyAV: built without {codec}")
+    raise ViewError(f"No {'GIF' if gif else 'H.264'} encoder ({'; '.join(tried)}). Install one: pip install av, or ffmpeg.")
 
 
 class _Ffmpeg:
@@ -163,7 +120,12 @@ class _Ffmpeg:
 
     def __init__(self, path: Path, width: int, height: int, fps: Fraction) -> None:
         source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps), "-i", "-"]
-        target = ["-an", "-c:v", "libx264", "-crf", str(CRF), "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4", str(path)]
+        if path.suffix == ".gif":
+            split, palette, use = (f"{name}={options}" if options else name for name, options in PALETTE)
+            coding = ["-filter_complex", f"{split}[a][b];[a]{palette}[p];[b][p]{use}", "-f", "gif"]
+        else:
+            coding = ["-c:v", "libx264", "-crf", str(CRF), "-pix_fmt", "yuv420p", "-movflags", "+faststart", "-f", "mp4"]
+        target = ["-an", *coding, str(path)]
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 (lives as long as ffmpeg; a pipe nobody reads would block it when full)
         self._process = subprocess.Popen(
             ["ffmpeg", "-y", "-loglevel", "error", *source, *target],
@@ -216,6 +178,49 @@ class _PyAv:
         self._container.mux(self._stream.encode(self._av.VideoFrame.from_ndarray(frame, format="rgb24")))
 
     def finish(self) -> None:
+        self._container.mux(self._stream.encode(None))
+        self._container.close()
+
+    def abort(self) -> None:
+        self._container.close()
+
+
+class _PyAvGif:
+    """A GIF through the same libraries: a filter graph looks at all frames for the palette, then paints them in it."""
+
+    def __init__(self, path: Path, width: int, height: int, fps: Fraction) -> None:
+        import av
+
+        self._av: Any = av
+        self._container: Any = av.open(str(path), "w", format="gif")
+        self._stream: Any = self._container.add_stream("gif", rate=fps)
+        self._stream.width, self._stream.height, self._stream.pix_fmt = width, height, "pal8"
+        self._time, self._frames = 1 / fps, 0
+        self._graph: Any = self._av.filter.Graph()
+        self._source: Any = self._graph.add_buffer(width=width, height=height, format="rgb24", time_base=self._time)
+        split, palette, use = (self._graph.add(name, options) if options else self._graph.add(name) for name, options in PALETTE)
+        self._sink: Any = self._graph.add("buffersink")
+        self._source.link_to(split)
+        split.link_to(palette, 0, 0)
+        split.link_to(use, 1, 0)
+        palette.link_to(use, 0, 1)
+        use.link_to(self._sink)
+        self._graph.configure()
+
+    def write(self, frame: Frame) -> None:
+        picture = self._av.VideoFrame.from_ndarray(frame, format="rgb24")
+        picture.pts, picture.time_base = self._frames, self._time
+        self._frames += 1
+        self._source.push(picture)
+
+    def finish(self) -> None:
+        self._source.push(None)
+        while True:
+            try:
+                painted = self._sink.pull()
+            except (self._av.error.EOFError, self._av.error.BlockingIOError):
+                break
+            self._container.mux(self._stream.encode(painted))
         self._container.mux(self._stream.encode(None))
         self._container.close()
 

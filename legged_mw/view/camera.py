@@ -1,0 +1,87 @@
+"""Where the camera stands: it follows the chosen robot, walks behind it, or sees all. Moves a `mujoco.MjvCamera` of somebody else's."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+
+from legged_mw.view.puppet import Cast
+
+AZIMUTH, ELEVATION = 130.0, -22.0  # [deg] front right of the robot, a little above it
+ELEVATION_ALL = -35.0  # [deg]
+DISTANCE = 2.4  # [robot radius] camera to base
+FOLLOW_XY, FOLLOW_Z = 0.12, 0.04  # share of the way to the base per frame; slower in z, so that steps do not shake the picture
+TURN = 0.08  # share of the way to the heading per frame
+JUMP = 3.0  # [robot radius] a base this far from where the camera looks was reset, not walked: cut instead of a swish
+
+
+class CameraMan:
+    """Moves `camera`. Where a mouse can turn it (`by_hand`), it is placed once and then tracks the robot by itself."""
+
+    def __init__(self, camera: mujoco.MjvCamera, cast: Cast, by_hand: bool) -> None:
+        self.camera, self.cast, self.by_hand = camera, cast, by_hand
+        self._shot: tuple[str, int] | None = None  # what it shows: mode, world
+
+    def update(self, mode: str, world: int) -> mujoco.MjvCamera:
+        """Be where `mode` wants it: one of drive.CAMERAS."""
+        before, self._shot = self._shot, (mode, world)
+        changed = before is None or before[0] != mode
+        if mode == "all":
+            if changed or not self.by_hand:
+                self._see_all(cut=changed)
+        elif mode == "behind":
+            self._follow(world, cut=before != self._shot)
+            self._turn(math.degrees(self.cast.anchors[world].heading), cut=changed)
+        elif self.by_hand:
+            if changed:
+                self._place(world)
+                self.camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
+                self.camera.trackbodyid = self.cast.base
+        else:
+            if changed:
+                self._place(world)
+            self._follow(world, cut=changed)
+        return self.camera
+
+    def _place(self, world: int) -> None:
+        """Look at the robot from its front right, wherever it heads now."""
+        anchor, camera = self.cast.anchors[world], self.camera
+        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        camera.lookat[:] = anchor.position
+        camera.distance = DISTANCE * anchor.radius
+        camera.azimuth = math.degrees(anchor.heading) + AZIMUTH
+        camera.elevation = ELEVATION
+
+    def _follow(self, world: int, cut: bool) -> None:
+        """One frame's share of the way to the robot; all of it after a jump."""
+        camera, anchor = self.camera, self.cast.anchors[world]
+        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        gap = anchor.position - camera.lookat
+        if cut or float(np.linalg.norm(gap)) > JUMP * anchor.radius:
+            camera.lookat[:] = anchor.position
+        else:
+            camera.lookat[:] += gap * (FOLLOW_XY, FOLLOW_XY, FOLLOW_Z)
+
+    def _turn(self, azimuth: float, cut: bool) -> None:
+        camera = self.camera
+        gap = (azimuth - camera.azimuth + 180.0) % 360.0 - 180.0
+        camera.azimuth += gap if cut else gap * TURN
+        if cut:
+            camera.distance, camera.elevation = 1.3 * DISTANCE * self.cast.radius, ELEVATION
+
+    def _see_all(self, cut: bool) -> None:
+        """All robots, from the side that the first shot had."""
+        places = np.array([anchor.position for anchor in self.cast.anchors])
+        camera, middle = self.camera, (places.min(axis=0) + places.max(axis=0)) / 2
+        reach = float(np.linalg.norm(places - middle, axis=1).max()) + self.cast.radius
+        distance = max(DISTANCE * self.cast.radius, 2.2 * reach)
+        share = 1.0 if cut else FOLLOW_XY
+        camera.type = mujoco.mjtCamera.mjCAMERA_FREE
+        camera.lookat[:] += share * (middle - camera.lookat)
+        camera.distance += share * (distance - camera.distance)
+        if cut:
+            camera.azimuth, camera.elevation = AZIMUTH, ELEVATION_ALL

@@ -1,0 +1,71 @@
+"""The training environment and a policy as a stage. The one file below `view/` that knows torch and the environment."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from tensordict import TensorDict
+from torch import Tensor
+
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.view.stage import BoolArray, FloatArray
+
+
+class EnvStage:
+    """Robots of a `LeggedRobot` under `policy`; see `stage.Stage`.
+
+    The environment's step may be a recorded graph, so what a pilot changes is written into its buffers between two
+    steps, and the observations are computed anew: the policy sees a command in the step that it is given for.
+    """
+
+    def __init__(self, env: LeggedRobot, policy: Callable[[TensorDict], Tensor], limits: ArrayLike) -> None:
+        self.env, self.policy = env, policy
+        self.model, self.num_worlds, self.dt = env.robot.visual, env.num_envs, env.dt
+        self.limits: FloatArray = np.array(limits, dtype=np.float64)
+        self._obs = env.get_observations()
+
+    @torch.no_grad()
+    def step(self, commands: FloatArray | None) -> None:
+        env = self.env
+        if commands is not None:
+            env.commands.copy_(torch.as_tensor(commands, dtype=torch.float, device=env.device))
+            self._look()
+        self._obs, *_ = env.step(self.policy(self._obs))
+
+    def commands(self) -> FloatArray:
+        return _array(self.env.commands)
+
+    def velocity(self) -> FloatArray:
+        return _array(torch.cat([self.env.base_lin_vel[:, :2], self.env.base_ang_vel[:, 2:]], dim=1))
+
+    def qpos(self) -> FloatArray:
+        return _array(self.env.sim.qpos)
+
+    def contacts(self) -> BoolArray:
+        return self.env.foot_contact.cpu().numpy().copy()
+
+    def fell(self) -> BoolArray:
+        return self.env.fell.cpu().numpy().copy()
+
+    @torch.no_grad()
+    def push(self, world: int, velocity: FloatArray) -> None:
+        self.env.sim.qvel[world, :2] += torch.as_tensor(velocity, dtype=torch.float, device=self.env.device)
+
+    @torch.no_grad()
+    def reset(self, world: int) -> None:
+        mask = torch.zeros(self.num_worlds, dtype=torch.bool, device=self.env.device)
+        mask[world] = True
+        self.env.reset_envs(mask)
+        self.env.fell.masked_fill_(mask, False)
+        self._look()
+
+    def _look(self) -> None:
+        self.env.compute_observations()
+        self._obs = self.env.get_observations()
+
+
+def _array(tensor: Tensor) -> FloatArray:
+    return tensor.cpu().numpy().astype(np.float64)

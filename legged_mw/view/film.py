@@ -1,0 +1,156 @@
+"""Pictures without a screen: an offscreen renderer of a moment, and the viewer that makes a video and a contact sheet of them.
+
+`MUJOCO_GL` must be set before mujoco is imported; the package does it.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import copy
+import os
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from legged_mw.view.camera import CameraMan
+from legged_mw.view.overlay import draw, set_options
+from legged_mw.view.puppet import Cast
+from legged_mw.view.stage import Moment, ViewError
+from legged_mw.view.video import Frame, VideoWriter, contact_sheet, save_png
+
+SHADOW_MAX = 2048  # ours: edge of the shadow map [px]; 8192, found in many scenes, halves the frame rate of software OpenGL
+GEOMS_MAX = 20_000
+SHEET_FRAMES, SHEET_COLUMNS, SHEET_WIDTH = 12, 4, 400  # pictures, a row of them, the widest that one may be [px]
+GIF_FPS, GIF_WIDTH = 12.5, 640  # a GIF holds hundredths of a second; more of either and it is larger than its video is good
+
+
+class RobotRenderer:
+    """Offscreen pictures of some robots from a camera that follows one. To be used from the thread that made it."""
+
+    def __init__(self, model: mujoco.MjModel, width: int = 1280, height: int = 720, count: int = 1) -> None:
+        self.cast = Cast(copy.copy(model), count)
+        vis = self.cast.model.vis  # frame buffer and shadows are ours to set, the caller's model is not
+        vis.global_.offwidth, vis.global_.offheight = width, height
+        vis.quality.shadowsize = min(vis.quality.shadowsize, SHADOW_MAX)
+        self.width, self.height = width, height
+        self._camera = CameraMan(mujoco.MjvCamera(), self.cast, by_hand=False)
+        self._option = mujoco.MjvOption()
+        set_options(self._option)
+        try:
+            self._renderer = mujoco.Renderer(self.cast.model, height=height, width=width, max_geom=GEOMS_MAX)
+        except Exception as error:  # each OpenGL backend fails with a type of its own
+            raise ViewError(_no_context(error)) from error
+
+    def frame(self, moment: Moment) -> Frame:
+        """One picture (height, width, 3), yours to keep."""
+        self.cast.pose(moment.qpos, moment.world)
+        camera, scene = self._camera.update(moment.camera, moment.world), self._renderer.scene
+        # MuJoCo lays an endless floor around where the camera was; told first, it lies right in the first frame too
+        mujoco.mjv_updateCamera(self.cast.model, self.cast.data, camera, scene)
+        self._renderer.update_scene(self.cast.data, camera, self._option)
+        draw(scene, self.cast, moment)
+        frame = self._renderer.render()  # a new array each time
+        return self._write(frame, moment.lines) if moment.lines else frame
+
+    def _write(self, frame: Frame, lines: tuple[tuple[str, str], ...]) -> Frame:
+        """The lines over the picture that was just drawn, which has to be read again."""
+        renderer = self._renderer
+        names, values = ("\n".join(column) for column in zip(*lines, strict=True))
+        place = mujoco.mjtGridPos.mjGRID_TOPLEFT
+        mujoco.mjr_overlay(mujoco.mjtFont.mjFONT_NORMAL, place, renderer._rect, names, values, renderer._mjr_context)
+        mujoco.mjr_readPixels(frame, None, renderer._rect, renderer._mjr_context)
+        frame[:] = np.flipud(frame)
+        return frame
+
+    def close(self) -> None:
+        """Free the OpenGL context; again is allowed."""
+        self._renderer.close()
+
+    def __enter__(self) -> RobotRenderer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _no_context(error: Exception) -> str:
+    state = ", ".join(f"{name}={os.environ.get(name)!r}" for name in ("MUJOCO_GL", "DISPLAY"))
+    return (
+        f"No OpenGL context for offscreen rendering ({state}): {type(error).__name__}: {error}\n"
+        "Without a display set MUJOCO_GL=egl (NVIDIA driver or Mesa's libegl1) or MUJOCO_GL=osmesa (libosmesa6, slower) "
+        "in the shell, before Python starts."
+    )
+
+
+class Film:
+    """The viewer that writes files: `video` (MP4 or GIF), `sheet` (a PNG with pictures from all of it), or both."""
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        count: int,
+        dt: float,  # [s] between two moments
+        seconds: float,  # how long it will be, for the sheet's pictures to be spread over
+        *,
+        video: Path | None,
+        sheet: Path | None,
+        width: int = 1280,
+        height: int = 720,
+        fps: float = 25.0,
+    ) -> None:
+        self.video, self.sheet = video, sheet
+        if video is not None and video.suffix.lower() == ".gif":
+            fps, shrink = min(fps, GIF_FPS), max(1.0, width / GIF_WIDTH)
+            width, height = round(width / shrink), round(height / shrink)
+        self._every = max(1, round(1 / (fps * dt)))
+        self._shots = [index * seconds / SHEET_FRAMES for index in range(SHEET_FRAMES)] if sheet else []  # [s]
+        self._pictures: list[Frame] = []
+        self._turn = 0
+        # the files' names are refused before a context is made, and an old file stays if that fails
+        self._writer = VideoWriter(video, width, height, 1 / (self._every * dt)) if video else None
+        try:
+            self._renderer = RobotRenderer(model, width, height, count)
+        except BaseException:
+            self.abort()
+            raise
+
+    def show(self, moment: Moment) -> None:
+        """A frame, if one is due."""
+        film = self._writer is not None and self._turn % self._every == 0
+        still = len(self._pictures) < len(self._shots) and moment.time >= self._shots[len(self._pictures)] - 1e-9
+        self._turn += 1
+        if not (film or still):
+            return
+        frame = self._renderer.frame(moment)
+        if film and self._writer is not None:
+            self._writer.add(frame)
+        if still:
+            self._pictures.append(shrunk(frame, SHEET_WIDTH))
+
+    def is_running(self) -> bool:
+        """Always: nobody closes a file from outside."""
+        return True
+
+    def close(self) -> None:
+        """Finish the files; again is allowed."""
+        self._renderer.close()
+        if self._writer is not None:
+            self._writer.close()
+        if self.sheet is not None and self._pictures:
+            save_png(self.sheet, contact_sheet(self._pictures, SHEET_COLUMNS))
+            self._pictures = []
+
+    def abort(self) -> None:
+        """Drop all; an old file stays."""
+        if self._writer is not None:
+            self._writer.abort()
+
+
+def shrunk(frame: Frame, width: int) -> Frame:
+    """The frame at most `width` wide: the mean of squares of pixels."""
+    factor = -(-frame.shape[1] // width)
+    rows, columns = frame.shape[0] // factor, frame.shape[1] // factor
+    squares = frame[: rows * factor, : columns * factor].reshape(rows, factor, columns, factor, 3)
+    return squares.mean(axis=(1, 3)).astype(np.uint8)

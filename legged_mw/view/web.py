@@ -1,0 +1,198 @@
+"""A web page: MuJoCo Studio's web viewer, with our panel. Served from this process, without anything from the net.
+
+It has neither password nor encryption, so it is bound to 127.0.0.1 unless another host is asked for; from afar it is
+reached through `ssh -L`. Studio is young: what is used of it beyond its documented shape is in `_held_to`, and checked.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import getpass
+import logging
+import os
+import socket
+import sys
+import threading
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import mujoco
+
+from legged_mw.view.camera import CameraMan
+from legged_mw.view.drive import Pilot
+from legged_mw.view.overlay import draw, set_options
+from legged_mw.view.panel import Panel
+from legged_mw.view.puppet import Cast
+from legged_mw.view.stage import Moment, ViewError
+
+LOCAL = "127.0.0.1"
+FIRST_PORT = 8080
+DECOR_MAX = 1000  # geoms beside the model's that a page draws
+START_SECONDS = 20.0
+
+
+def missing() -> str | None:
+    """Why no page can be served here; None if one can."""
+    try:
+        from mujoco.studio import launch_web, web_viewer  # noqa: F401
+    except ImportError as error:
+        return f"this mujoco ({mujoco.__version__}) brings no web viewer: {error}"
+    return None
+
+
+class WebViewer:
+    """Serves the page until it is closed. `url` is where."""
+
+    def __init__(
+        self, model: mujoco.MjModel, pilot: Pilot, count: int = 1, *, host: str = LOCAL, port: int = 0, title: str = "legged_mw"
+    ) -> None:
+        if (reason := missing()) is not None:
+            raise ViewError(f"--viewer web: {reason}")
+        from mujoco.studio import launch_web, viewer_protocol
+
+        self.cast = Cast(model, count)
+        port = port or free_port(host)
+        self._face: Any = _make_face(self.cast, pilot, title)
+        config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
+        with _held_to(host):
+            self._handle: Any = launch_web.launch(config, plugins=[self._face])
+            self._wait(host, port)
+        self.url = f"http://{'localhost' if host == LOCAL else host}:{port}/"
+        self.port = port
+
+    def show(self, moment: Moment) -> None:
+        """Send one moment to whoever looks."""
+        if self.is_running():
+            self.cast.pose(moment.qpos, moment.world)
+            self._face.show(moment)
+            self._handle.sync(self.cast.model, self.cast.data)
+
+    def is_running(self) -> bool:
+        """Until `close`; a page that somebody closes may be opened again."""
+        return bool(self._handle.is_running())
+
+    def close(self) -> None:
+        """Stop serving; again is allowed."""
+        self._handle.close()
+
+    def __enter__(self) -> WebViewer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _wait(self, host: str, port: int) -> None:
+        """Until the page is served, and on no other interface than the one asked for."""
+        if not self._face.begun.wait(START_SECONDS):
+            self._handle.close()  # raises what went wrong on the viewer's thread
+            raise ViewError("--viewer web: MuJoCo's web viewer did not start")
+        bound = self._face.viewer._http_sock.getsockname()
+        if host == LOCAL and bound[0] != LOCAL:
+            self._handle.close()
+            raise ViewError(f"--viewer web: the page would be open to the network ({bound[0]}:{port}); this mujoco binds it otherwise")
+
+
+def _make_face(cast: Cast, pilot: Pilot, title: str) -> Any:
+    """Our side of Studio's viewer thread; made here, because its base class is imported only where a page is asked for."""
+    from mujoco.studio import messages, plugin
+    from mujoco.studio.dear_imgui import dear_imgui
+    from mujoco.studio.implot import implot
+
+    class Face(plugin.ViewerPlugin):
+        """What happens on the viewer's thread. An exception here would end the session, so it is said once and the picture goes on."""
+
+        def __init__(self) -> None:
+            self.begun = threading.Event()
+            self.panel = Panel(pilot, title, dear_imgui, implot)
+            self._said: set[str] = set()
+            self._scene: mujoco.MjvScene | None = None
+            self._camera: CameraMan | None = None
+
+        def show(self, moment: Moment) -> None:
+            self.panel.show(moment)
+
+        @messages.handler
+        def on_init(self, _: plugin.ViewerInitEvent) -> None:
+            self.begun.set()
+
+        @messages.handler
+        def on_model(self, event: messages.PostModelEvent) -> None:
+            if event.model.nbody < 2:  # an empty one comes first
+                return
+            set_options(self.viewer.vis_options)
+            self._scene = mujoco.MjvScene(event.model, DECOR_MAX)
+            self._camera = CameraMan(self.viewer.camera, cast, by_hand=True)
+
+        @messages.handler
+        def on_update(self, _: messages.UpdateEvent) -> None:
+            self._guard(self._update)
+
+        @messages.handler
+        def on_gui(self, _: messages.BuildGuiEvent) -> None:
+            self._guard(self.panel.build)
+
+        def _update(self) -> None:
+            moment = self.panel.moment
+            if moment is None or self._scene is None or self._camera is None:
+                return
+            self._camera.update(moment.camera, moment.world)
+            self._scene.ngeom = 0
+            draw(self._scene, cast, moment)
+            self.viewer.extra_geoms[:] = self._scene.geoms[: self._scene.ngeom]
+
+        def _guard(self, work: Callable[[], None]) -> None:
+            try:
+                work()
+            except Exception as error:  # whatever it is, the robot walks on
+                if repr(error) not in self._said:
+                    self._said.add(repr(error))
+                    traceback.print_exc(file=sys.stderr)
+
+    return Face()
+
+
+@contextmanager
+def _held_to(host: str) -> Iterator[None]:
+    """Studio binds all interfaces and has no setting for it: while it starts, its socket is bound to `host` instead. It also says less."""
+    from mujoco.studio import web_viewer
+    from mujoco.studio.web import web_server
+
+    bind = getattr(web_server, "bind_public_socket", None)
+    if bind is None:
+        raise ViewError(f"--viewer web: the page of this mujoco ({mujoco.__version__}) cannot be held to {host}")
+    logging.getLogger("WebServer").setLevel(logging.WARNING)
+    web_viewer.print = lambda *_, **__: None  # type: ignore[attr-defined]  # its banner names all interfaces
+    web_server.bind_public_socket = lambda _, port=0: bind(host, port)
+    try:
+        yield
+    finally:
+        web_server.bind_public_socket = bind
+
+
+def free_port(host: str, first: int = FIRST_PORT, count: int = 20) -> int:
+    """The first port that nobody listens on, from `first` on."""
+    for port in range(first, first + count):
+        family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                probe.bind((host, port))
+            except OSError as error:
+                if isinstance(error, socket.gaierror) or error.errno == 99:  # no such interface here
+                    raise ViewError(f"--host {host}: this machine has no such address ({error.strerror})") from None
+                continue
+            return port
+    raise ViewError(f"--viewer web: ports {first} to {first + count - 1} are all in use; name another with --port")
+
+
+def tunnel_line(port: int) -> str:
+    """What to paste into a terminal on the desk, to see the page of this machine there."""
+    user = getpass.getuser()
+    client = os.environ.get("SSH_CONNECTION", "").split()  # client's address and port, then ours as the client knows them
+    if len(client) == 4:
+        way = f"-p {client[3]} " if client[3] != "22" else ""
+        return f"ssh {way}-L {port}:{LOCAL}:{port} {user}@{client[2]}"
+    return f"ssh -L {port}:{LOCAL}:{port} {user}@{socket.gethostname()}"
