@@ -22,6 +22,7 @@ from legged_mw.view.env_stage import EnvStage
 
 NOMINAL = {  # what playing changes in the trained config
     "env.num_envs": 1,
+    "env.episode_length_s": 1e6,  # who is watched or driven walks on where training would begin a new episode
     "noise.level": 0.0,
     "perturbation.enable": False,
     "perturbation.push": False,

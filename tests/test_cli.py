@@ -400,6 +400,7 @@ def test_play_says_what_it_changes(root: Path, first: Path, tmp_path: Path) -> N
         "commands.ranges.lin_vel_x": f"{commands['ranges']['lin_vel_x']} -> [-0.5, -0.5]",
         "commands.ranges.lin_vel_y": f"{commands['ranges']['lin_vel_y']} -> [0.0, 0.0]",
         "commands.resampling_time": f"{commands['resampling_time']} -> 0.0",
+        "env.episode_length_s": "0.4 -> 1000000.0",
         "env.num_envs": "16 -> 1",
         "noise.level": f"{was['noise']['level']} -> 0.0",
         "perturbation.enable": "True -> False",

@@ -1,4 +1,4 @@
-"""Pictures, video files and what the viewers say when they cannot work. A window itself is opened only where there is a display."""
+"""Pictures, files and the window, and what the viewers say when they cannot work. A window is opened only where there is a display."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import legged_mw  # noqa: F401  (sets MUJOCO_GL, which mujoco reads when it is imported)
 
@@ -19,23 +20,37 @@ import numpy as np
 import pytest
 
 from legged_mw.view import native, video
-from legged_mw.view.native import NativeViewer, Pace, has_display
-from legged_mw.view.overlay import DISTANCE, FollowCamera, Puppet
-from legged_mw.view.video import RobotRenderer, VideoWriter, contact_sheet, save_png
+from legged_mw.view.camera import DISTANCE, CameraMan
+from legged_mw.view.drive import BINDINGS, Pilot
+from legged_mw.view.film import Film, RobotRenderer, shrunk
+from legged_mw.view.native import NativeViewer, has_display
+from legged_mw.view.overlay import draw_velocities
+from legged_mw.view.puppet import Anchor, Cast, Puppet, marionettes
+from legged_mw.view.session import Pace
+from legged_mw.view.stage import Fall, Moment
+from legged_mw.view.video import VideoWriter, contact_sheet, save_png
 
-LEG = '<body pos="{} {} 0"><joint axis="0 1 0"/><geom type="capsule" size=".02" fromto="0 0 0 0 0 -.3" group="2"/></body>'
+LEG = """<body pos="{0} {1} 0"><joint axis="0 1 0"/><geom type="capsule" size=".02" fromto="0 0 0 0 0 -.3" group="2"/>
+<geom name="foot{1}" size=".03" pos="0 0 -.3" group="2"/></body>"""
 ROBOT = f"""
 <mujoco>
+  <asset>
+    <texture name="floor" type="2d" builtin="checker" rgb1=".2 .2 .2" rgb2=".3 .3 .3" width="64" height="64"/>
+    <material name="floor" texture="floor" texuniform="true"/>
+    <mesh name="wedge" vertex="0 0 0  .1 0 0  0 .1 0  0 0 .1"/>
+  </asset>
   <worldbody>
-    <light pos="0 0 4" dir="0 0 -1"/>
-    <geom type="plane" size="0 0 .05" rgba=".2 .2 .2 1"/>
+    <geom name="floor" type="plane" size="0 0 .05" material="floor"/>
     <body name="trunk" pos="0 0 .35">
+      <light pos="0 0 4" dir="0 0 -1" mode="trackcom"/>
       <freejoint/>
       <geom type="box" size=".2 .06 .05" group="2" rgba=".6 .6 .6 1"/>
+      <geom type="mesh" mesh="wedge" pos=".15 0 .05" group="2" rgba=".2 .8 .8 1"/>
       <geom type="sphere" size=".25" group="3" rgba="1 0 0 1"/>
       {LEG.format(0.18, 0.1)} {LEG.format(0.18, -0.1)}
     </body>
   </worldbody>
+  <sensor><contact geom1="foot0.1" geom2="floor"/><contact geom1="foot-0.1" geom2="floor"/></sensor>
 </mujoco>"""
 
 
@@ -65,6 +80,13 @@ def fake_ffmpeg(folder: Path, body: str) -> None:
     lines = f'if [ "$2" = "-encoders" ]; then echo " V....D libx264"; exit; fi\nfor out; do :; done\n{body}\n'
     script.write_text(f"#!/bin/sh\nPATH=/usr/bin:/bin\n{lines}")
     script.chmod(script.stat().st_mode | stat.S_IXUSR)
+
+
+def moment(model: mujoco.MjModel, count: int = 1, **changes: Any) -> Moment:
+    """Robots that stand in their first pose and do nothing, but for `changes`."""
+    zero = np.zeros((count, 3))
+    still = Moment(0.0, np.tile(model.qpos0, (count, 1)), zero, zero, np.zeros((count, 2), dtype=bool))
+    return still._replace(**changes)
 
 
 def colour_count(frame: np.ndarray, rgb: tuple[int, int, int]) -> int:
@@ -136,7 +158,7 @@ def test_no_encoder_says_what_was_tried(tmp_path: Path, no_program: Path, monkey
 
 
 def test_bad_video_requests(tmp_path: Path) -> None:
-    with pytest.raises(RuntimeError, match=r"'walk.avi': the supported extension is \.mp4"):
+    with pytest.raises(RuntimeError, match=r"'walk.avi': the supported extensions are \.mp4 \(H.264\) and \.gif"):
         VideoWriter(tmp_path / "walk.avi", 320, 240, fps=50)
     with pytest.raises(RuntimeError, match="321 x 240 cannot be encoded: yuv420p needs an even width"):
         VideoWriter(tmp_path / "walk.mp4", 321, 240, fps=50)
@@ -163,14 +185,60 @@ def test_contact_sheet_and_png(tmp_path: Path) -> None:
         contact_sheet([], columns=3)
 
 
+def test_gif_is_an_animation_in_its_own_colours(tmp_path: Path, no_program: Path) -> None:
+    path = tmp_path / "walk.gif"
+    pictures = [np.full((40, 61, 3), (200, 20 * i, 30), dtype=np.uint8) for i in range(6)]  # odd widths are no trouble
+    with VideoWriter(path, 61, 40, fps=12.5) as writer:
+        for picture in pictures:
+            writer.add(picture)
+        assert not path.exists()
+    assert [file.name for file in path.parent.glob("*.gif")] == ["walk.gif"] and path.read_bytes()[:6] == b"GIF89a"
+    with av.open(str(path)) as container:
+        decoded = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+        assert float(container.streams.video[0].average_rate or 0) == pytest.approx(12.5)
+    assert len(decoded) == 6
+    assert all(np.abs(seen.astype(int) - drawn).mean() < 6 for seen, drawn in zip(decoded, pictures, strict=True))
+
+
+def test_gif_goes_through_ffmpeg_where_there_is_one(tmp_path: Path, no_program: Path) -> None:
+    fake_ffmpeg(no_program, 'echo "$@" > "$out"; cat > /dev/null')
+    script = no_program / "ffmpeg"
+    script.write_text(script.read_text().replace("libx264", "gif"))
+    with VideoWriter(tmp_path / "walk.gif", 320, 240, fps=12.5) as writer:
+        writer.add(frames(1)[0])
+    assert "split[a][b];[a]palettegen=stats_mode=full[p];[b][p]paletteuse=" in (tmp_path / "walk.gif").read_text()
+
+
+def test_film_writes_a_video_and_a_sheet(tmp_path: Path, model: mujoco.MjModel) -> None:
+    film = Film(model, 1, 0.02, 1.2, video=tmp_path / "a.mp4", sheet=tmp_path / "a.png", width=160, height=120, fps=25)
+    for step in range(60):
+        film.show(moment(model, time=step * 0.02))
+    film.close()
+    with av.open(str(tmp_path / "a.mp4")) as container:
+        assert len(list(container.decode(video=0))) == 30
+    with av.open(str(tmp_path / "a.png")) as container:
+        assert next(container.decode(video=0)).to_ndarray(format="rgb24").shape == (3 * 120, 4 * 160, 3)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    film = Film(model, 1, 0.02, 1.2, video=tmp_path / "a.mp4", sheet=None, width=160, height=120)
+    film.show(moment(model))
+    film.abort()
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+
+
+def test_pictures_of_a_sheet_are_shrunk_by_means() -> None:
+    frame = np.zeros((4, 6, 3), dtype=np.uint8)
+    frame[::2] = 100
+    assert shrunk(frame, 3).shape == (2, 3, 3) and (shrunk(frame, 3) == 50).all()
+    assert np.array_equal(shrunk(frame, 6), frame)
+
+
 # ---- pictures
 
 
 def test_frames_are_copies_and_the_callers_model_is_untouched(model: mujoco.MjModel, renderer: RobotRenderer) -> None:
-    first = renderer.frame(model.qpos0)
+    first = renderer.frame(moment(model))
     kept = first.copy()
-    raised = model.qpos0 + np.eye(model.nq)[2] * 0.15
-    second = renderer.frame(raised)
+    second = renderer.frame(moment(model, qpos=model.qpos0[None] + np.eye(model.nq)[2] * 0.15))
     assert first.shape == (240, 320, 3) and first.dtype == np.uint8
     assert np.array_equal(first, kept) and not np.array_equal(first, second)
     assert (model.vis.global_.offwidth, model.vis.quality.shadowsize) == (640, 4096)  # MuJoCo's defaults
@@ -178,59 +246,140 @@ def test_frames_are_copies_and_the_callers_model_is_untouched(model: mujoco.MjMo
 
 def test_both_arrows_are_drawn_and_collision_shapes_are_not(model: mujoco.MjModel, renderer: RobotRenderer) -> None:
     orange, blue, red = (255, 130, 0), (70, 215, 255), (255, 0, 0)
-    forward, turn = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0])
-    plain = renderer.frame(model.qpos0)
+    plain = renderer.frame(moment(model))
     assert [colour_count(plain, rgb) for rgb in (orange, blue, red)] == [0, 0, 0]
-    for value in (forward, turn):
-        commanded, both = renderer.frame(model.qpos0, command=value), renderer.frame(model.qpos0, command=value, velocity=value)
+    for value in ([[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]]):
+        commanded = renderer.frame(moment(model, commands=np.array(value)))
+        both = renderer.frame(moment(model, commands=np.array(value), velocity=np.array(value)))
         assert colour_count(commanded, orange) > 20 and colour_count(commanded, blue) == 0
         assert colour_count(both, orange) > 10 and colour_count(both, blue) > 10
-    assert np.array_equal(renderer.frame(model.qpos0, command=np.zeros(3)), plain)
 
 
-def test_arrow_points_along_the_body_velocity(model: mujoco.MjModel, renderer: RobotRenderer) -> None:
-    qpos = model.qpos0.copy()
-    qpos[3:7] = np.cos(np.pi / 4), 0, 0, np.sin(np.pi / 4)  # heading +y
-    renderer.frame(qpos, command=np.array([1.0, 0.0, 0.0]))
-    scene = renderer._renderer.scene
-    arrow = scene.geoms[scene.ngeom - 1]
+def test_arrow_points_along_the_body_velocity() -> None:
+    scene = mujoco.MjvScene(mujoco.MjModel.from_xml_string(ROBOT), 100)
+    draw_velocities(scene, Anchor(np.zeros(3), np.pi / 2, 0.4, 0.1), np.array([1.0, 0.0, 0.0]), np.zeros(3))  # heading +y
+    [arrow] = scene.geoms[: scene.ngeom]
     assert arrow.type == mujoco.mjtGeom.mjGEOM_ARROW
     assert np.allclose(arrow.mat[:, 2], [0, 1, 0], atol=1e-6)
 
 
+def test_feet_that_stand_and_places_of_falls_are_marked(model: mujoco.MjModel, renderer: RobotRenderer) -> None:
+    green, pink = (0, 255, 180), (220, 60, 120)
+    lifted = model.qpos0[None] + np.eye(model.nq)[2] * 0.1  # so that the discs are not inside the floor
+    assert colour_count(renderer.frame(moment(model, qpos=lifted)), green) == 0
+    one, two = (renderer.frame(moment(model, qpos=lifted, contacts=np.array([[True, both]]))) for both in (False, True))
+    assert 5 < colour_count(one, green) < colour_count(two, green)
+    fallen = renderer.frame(moment(model, falls=(Fall(0, np.array([0.0, 0.4, 0.3])),)))
+    assert colour_count(fallen, pink) > 50
+
+
+def test_words_are_written_over_the_picture(model: mujoco.MjModel, renderer: RobotRenderer) -> None:
+    plain, said = (renderer.frame(moment(model, lines=lines)) for lines in ((), (("falls", "3"),)))
+    assert np.array_equal(plain[120:], said[120:]) and (said[:40, :80] > 200).any() and not np.array_equal(plain[:40, :80], said[:40, :80])
+
+
 def test_camera_glides_after_the_base_and_cuts_after_a_jump(model: mujoco.MjModel) -> None:
-    puppet = Puppet(model)
-    follow, qpos = FollowCamera(puppet), model.qpos0.copy()
-    assert np.allclose(follow.update().lookat, puppet.position)
-    assert follow.camera.distance == pytest.approx(DISTANCE * puppet.radius)
-    assert 0.3 < puppet.radius < 0.5 and puppet.top == pytest.approx(0.05)  # group 3 does not count
+    cast, qpos = Cast(model), model.qpos0.copy()
+    follow = CameraMan(mujoco.MjvCamera(), cast, by_hand=False)
+    assert np.allclose(follow.update("follow", 0).lookat, cast.anchors[0].position)
+    assert follow.camera.distance == pytest.approx(DISTANCE * cast.radius)
+    assert 0.3 < cast.radius < 0.5 and cast.puppet.top == pytest.approx(0.15)  # group 3 does not count
     qpos[0] += 0.1
-    puppet.pose(qpos)
-    assert 0 < follow.update().lookat[0] < 0.05
+    cast.pose(qpos)
+    assert 0 < follow.update("follow", 0).lookat[0] < 0.05
     for _ in range(60):
-        follow.update()
+        follow.update("follow", 0)
     assert follow.camera.lookat[0] == pytest.approx(0.1, abs=1e-3)
     qpos[0] += 10
-    puppet.pose(qpos)
-    assert follow.update().lookat[0] == pytest.approx(10.1)
+    cast.pose(qpos)
+    assert follow.update("follow", 0).lookat[0] == pytest.approx(10.1)
+
+
+def test_camera_walks_behind_and_sees_all(model: mujoco.MjModel) -> None:
+    cast = Cast(model, 4)
+    camera = CameraMan(mujoco.MjvCamera(), cast, by_hand=False)
+    qpos = np.tile(model.qpos0, (4, 1))
+    qpos[1, 3:7] = np.cos(np.pi / 4), 0, 0, np.sin(np.pi / 4)
+    cast.pose(qpos, 1)
+    assert camera.update("behind", 1).azimuth == pytest.approx(90)  # looks along the robot's x axis
+    near = camera.camera.distance
+    camera.update("all", 1)
+    assert np.allclose(camera.camera.lookat[:2], cast.offsets[:, :2].mean(axis=0)) and camera.camera.distance > 2 * near
+
+
+def test_a_mouse_may_turn_the_camera_that_follows(model: mujoco.MjModel) -> None:
+    cast = Cast(model)
+    camera = CameraMan(mujoco.MjvCamera(), cast, by_hand=True)
+    camera.update("follow", 0)
+    assert camera.camera.type == mujoco.mjtCamera.mjCAMERA_TRACKING and camera.camera.trackbodyid == cast.base
+    camera.camera.azimuth = 17.0
+    assert camera.update("follow", 0).azimuth == 17.0
+
+
+# ---- several robots
+
+
+def test_a_marionette_looks_as_its_robot_does(model: mujoco.MjModel) -> None:
+    cast = Cast(model)
+    cast.pose(model.qpos0 + 0.2 * np.eye(model.nq)[7] + 0.3 * np.eye(model.nq)[0])
+    copy, bodies = marionettes(model, 1)
+    data = mujoco.MjData(copy)
+    data.mocap_pos[:-1], data.mocap_quat[:-1] = cast.data.xpos[bodies], cast.data.xquat[bodies]
+    data.mocap_pos[-1] = cast.anchors[0].position
+    mujoco.mj_forward(copy, data)
+    pictures = []
+    for which, state in ((model, cast.data), (copy, data)):
+        camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
+        camera.lookat[:], camera.distance, camera.elevation = [0.3, 0, 0.2], 1.2, -20
+        option.geomgroup[3] = 0
+        with mujoco.Renderer(which, 120, 160) as view:
+            view.update_scene(state, camera, option)
+            pictures.append(view.render().astype(int))
+    difference = np.abs(pictures[0] - pictures[1])
+    assert pictures[0].std() > 20 and difference.mean() < 1.5, difference.mean()
+
+
+def test_robots_stand_side_by_side_each_in_its_pose(model: mujoco.MjModel) -> None:
+    cast, qpos = Cast(model, 5), np.tile(model.qpos0, (5, 1))
+    qpos[3, :3] += (0.5, -0.2, 0.1)
+    qpos[3, 7] = 0.7
+    cast.pose(qpos, 3)
+    apart = np.linalg.norm(cast.offsets[:, None] - cast.offsets[None], axis=2) + 10 * np.eye(5)
+    assert apart.min() >= 2 * cast.radius and not cast.offsets[0].any()
+    assert np.allclose(cast.anchors[3].position, cast.offsets[3] + qpos[3, :3])
+    puppet = Puppet(model)
+    puppet.pose(qpos[3])
+    assert np.allclose(cast.data.xpos[cast.model.body("3/2").id], puppet.data.xpos[2] + cast.offsets[3])
+    assert np.allclose(cast.data.xquat[cast.model.body("3/2").id], puppet.data.xquat[2])
+    assert np.allclose(cast.data.xpos[cast.base], cast.anchors[3].position)  # what the camera tracks
+    assert cast.model.nv == 0 and cast.model.ngeom == 1 + 5 * 6  # nothing to solve; group 3 stays behind
+    contacts = np.zeros((5, 2), dtype=bool)
+    contacts[3, 1] = True
+    assert np.allclose(cast.standing(contacts), [puppet.data.geom("foot-0.1").xpos + cast.offsets[3]])
+
+
+def test_many_robots_are_in_one_picture(model: mujoco.MjModel) -> None:
+    with RobotRenderer(model, 320, 240, count=4) as several:
+        command = np.tile([1.0, 0.0, 0.0], (4, 1))
+        one = colour_count(several.frame(moment(model, 4, commands=command * [[1], [0], [0], [0]], camera="all")), (255, 130, 0))
+        four = colour_count(several.frame(moment(model, 4, commands=command, camera="all")), (255, 130, 0))
+        assert one > 5 and four > 2.5 * one
 
 
 def test_bad_poses_and_models(model: mujoco.MjModel, renderer: RobotRenderer) -> None:
     with pytest.raises(ValueError, match=r"qpos has shape \(3,\); this model has nq = 9"):
-        renderer.frame(np.zeros(3))
+        renderer.frame(moment(model, qpos=np.zeros((1, 3))))
     with pytest.raises(ValueError, match=r"qpos\[8\] is not finite"):
-        renderer.frame(np.append(model.qpos0[:-1], np.nan))
+        renderer.frame(moment(model, qpos=np.append(model.qpos0[:-1], np.nan)[None]))
     with pytest.raises(ValueError, match=r"\(vx, vy, yaw rate\), shape \(3,\); got shape \(2,\)"):
-        renderer.frame(model.qpos0, command=np.zeros(2))
+        renderer.frame(moment(model, commands=np.zeros((1, 2))))
     arm = '<mujoco><worldbody><body><joint name="elbow"/><geom size=".1"/></body></worldbody></mujoco>'
     with pytest.raises(ValueError, match="free joint, which must be the model's first joint; found 'elbow'"):
         Puppet(mujoco.MjModel.from_xml_string(arm))
 
 
 def test_missing_opengl_names_the_remedy_and_the_state() -> None:
-    code = (
-        f"import mujoco\nfrom legged_mw.view.video import RobotRenderer\nRobotRenderer(mujoco.MjModel.from_xml_string({ROBOT!r}), 64, 48)"
-    )
+    code = f"import mujoco\nfrom legged_mw.view.film import RobotRenderer\nRobotRenderer(mujoco.MjModel.from_xml_string({ROBOT!r}), 64, 48)"
     environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")} | {"MUJOCO_GL": "glfw"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert "ViewError: No OpenGL context for offscreen rendering (MUJOCO_GL='glfw', DISPLAY=None)" in done.stderr
@@ -257,7 +406,7 @@ def test_has_display_follows_the_environment(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_window_without_display_says_what_to_do(monkeypatch: pytest.MonkeyPatch, model: mujoco.MjModel) -> None:
     monkeypatch.setattr(native, "has_display", lambda: False)
-    with pytest.raises(RuntimeError, match="neither DISPLAY nor WAYLAND_DISPLAY is set.*Record a video"):
+    with pytest.raises(RuntimeError, match="neither DISPLAY nor WAYLAND_DISPLAY is set.*--viewer web, record a video"):
         NativeViewer(model)
     monkeypatch.setattr(native, "has_display", lambda: True)
     monkeypatch.setattr(native, "_can_open_window", lambda: False)
@@ -280,13 +429,44 @@ def test_plain_python_on_macos_is_told_of_mjpython(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.display
 def test_window_shows_poses_and_is_gone_after_close(model: mujoco.MjModel) -> None:
-    with NativeViewer(model) as viewer:
-        viewer.show(model.qpos0 + np.eye(model.nq)[0], command=np.array([1.0, 0.0, 0.0]), velocity=np.array([0.8, 0.0, 0.2]))
+    pilot = Pilot(np.array([[-1.0, -1, -1], [1, 1, 1]]), 2)
+    with NativeViewer(model, pilot, 2) as viewer:
+        qpos = np.tile(model.qpos0, (2, 1)) + np.eye(model.nq)[0]
+        viewer.show(moment(model, 2, qpos=qpos, commands=np.ones((2, 3)), lines=(("falls", "0"),), world=1))
         assert viewer.is_running()
-        assert viewer.puppet.position[0] == pytest.approx(1.0)
+        assert viewer.cast.anchors[0].position[0] == pytest.approx(1.0)
         assert viewer._handle.user_scn.ngeom > 2
+        flag = int(mujoco.mjtVisFlag.mjVIS_CONTACTSPLIT)  # what P switches in MuJoCo's windows
+        viewer._handle.opt.flags[flag] = 1
+        viewer.show(moment(model, 2))
+        assert viewer._handle.opt.flags[flag] == 0
     assert not viewer.is_running() and not any(thread.is_alive() for thread in viewer._threads)
-    viewer.show(model.qpos0)  # harmless: the loop that feeds a window may notice late
+    viewer.show(moment(model, 2))  # harmless: the loop that feeds a window may notice late
+
+
+def test_every_key_of_the_table_reaches_the_pilot_by_its_code() -> None:
+    asked: list[str] = []
+    pilot = Pilot(np.array([[-1.0, -1, -1], [1, 1, 1]]))
+    pilot.ask = asked.append  # pyright: ignore[reportAttributeAccessIssue]
+    pressed = native.on_key(pilot)
+    for code in (265, 264, 263, 262, ord("Q"), ord("E"), 32, ord("P"), ord("R"), 259, ord("N"), 257, ord("-"), ord("="), ord("C"), 290):
+        pressed(code)  # the last is F1, which is MuJoCo's
+    assert asked[:7] == ["forward", "back", "left", "right", "turn_left", "turn_right", "stop"]
+    assert asked[7:] == ["push", "reset", "reset", "next", "pause", "slower", "faster", "camera"]
+    assert len(native.KEY_CODES) == sum(len(binding.keys) for binding in BINDINGS)
+
+
+def test_our_keys_switch_nothing_of_mujocos_that_is_not_switched_back() -> None:
+    rendering = {row[2] for row in mujoco.mjRNDSTRING}
+    assert {chr(code) for code in native.KEY_CODES if code < 128} & rendering <= {"R"}  # reflections: no material of ours has any
+
+
+def test_window_texts_fit_mujocos_overlay(model: mujoco.MjModel) -> None:
+    blocks = native.window_texts(moment(model, lines=(("falls", "2"), ("time", "1 s")), help=True))
+    assert (blocks[0][2], blocks[0][3]) == ("falls\ntime", "2\n1 s")
+    assert all(len(text) < 500 for block in blocks for text in block[2:])  # mjMAXOVERLAY
+    assert any("push the robot" in block[3] for block in blocks)
+    assert not any("push the robot" in block[3] for block in native.window_texts(moment(model)))
 
 
 def test_pace_holds_real_time_and_does_not_hurry_after_a_delay() -> None:
@@ -305,4 +485,4 @@ def test_encoder_without_libx264_is_not_chosen(no_program: Path) -> None:
     fake_ffmpeg(no_program, "exit 1")
     script = no_program / "ffmpeg"
     script.write_text(script.read_text().replace("libx264", "mpeg4"))
-    assert video._choose_encoder() is video._PyAv
+    assert video._choose_encoder(gif=False) is video._PyAv

@@ -7,7 +7,6 @@ from __future__ import annotations
 import os
 import sys
 import threading
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -20,7 +19,7 @@ from legged_mw.view.puppet import Cast
 from legged_mw.view.stage import Moment, ViewError
 
 CLOSE_SECONDS = 5.0
-TEXT_SECONDS = 0.25  # a change of text waits for the window to draw: 16 ms on most screens, 100 with software OpenGL
+TEXT_SECONDS = 0.1  # between two changes of text
 _GLFW = {"right": 262, "left": 263, "down": 264, "up": 265, "space": 32, "backspace": 259, "enter": 257}
 KEY_CODES = {_GLFW.get(key, ord(key[0].upper())): key for key in KEY_ACTION}  # GLFW's code of a letter is its capital's ASCII
 
@@ -30,6 +29,9 @@ def has_display() -> bool:
     if not sys.platform.startswith("linux"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+Text = tuple[int | None, int | None, str, str]  # font, place, left column, right column
 
 
 class NativeViewer:
@@ -44,8 +46,7 @@ class NativeViewer:
         before = set(threading.enumerate())
         self._handle: Any = _launch(self.cast.model, self.cast.data, on_key(pilot) if pilot else None)
         self._threads = set(threading.enumerate()) - before
-        self._texts: list[tuple[int | None, int | None, str, str]] = []
-        self._text_time = 0.0
+        self._scribe = _Scribe(self._handle)
         with self._handle.lock():
             set_options(self._handle.opt)
             self._camera = CameraMan(self._handle.cam, self.cast, by_hand=True)
@@ -64,16 +65,8 @@ class NativeViewer:
             self._camera.update(moment.camera, moment.world)
             for flag, value in self._own_flags.items():
                 handle.opt.flags[flag] = value
-        self._write(moment)
+        self._scribe.texts = window_texts(moment)
         handle.sync()
-
-    def _write(self, moment: Moment) -> None:
-        """The words, a few times a second."""
-        texts = window_texts(moment)
-        now = time.perf_counter()
-        if texts != self._texts and now - self._text_time > TEXT_SECONDS:
-            self._texts, self._text_time = texts, now
-            self._handle.set_texts(texts)
 
     def is_running(self) -> bool:
         """False once somebody closed the window."""
@@ -81,6 +74,7 @@ class NativeViewer:
 
     def close(self) -> None:
         """Close the window and wait until it is gone; again is allowed."""
+        self._scribe.close()
         self._handle.close()
         for thread in self._threads:  # a process that ends while the window still closes crashes in its OpenGL driver
             thread.join(timeout=CLOSE_SECONDS)
@@ -90,6 +84,28 @@ class NativeViewer:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+class _Scribe:
+    """Writes the words on a thread of its own: a change of text waits for the window to draw, which software OpenGL does twice a second."""
+
+    def __init__(self, handle: Any) -> None:
+        self.texts: list[Text] = []  # what should stand there; replaced by the session's thread
+        self._handle, self._ended = handle, threading.Event()
+        self._thread = threading.Thread(target=self._write, daemon=True)  # a window that was closed may never answer
+        self._thread.start()
+
+    def _write(self) -> None:
+        written: list[Text] = []
+        while not self._ended.wait(TEXT_SECONDS) and self._handle.is_running():
+            texts = self.texts
+            if texts != written:
+                self._handle.set_texts(texts)
+                written = texts
+
+    def close(self) -> None:
+        self._ended.set()
+        self._thread.join(timeout=CLOSE_SECONDS)
 
 
 def on_key(pilot: Pilot) -> Callable[[int], None]:
@@ -102,18 +118,17 @@ def on_key(pilot: Pilot) -> Callable[[int], None]:
     return pressed
 
 
-def window_texts(moment: Moment) -> list[tuple[int | None, int | None, str, str]]:
-    """What MuJoCo's window takes: (font, place, left column, right column) of each block of text."""
+def window_texts(moment: Moment) -> list[Text]:
+    """What MuJoCo's window takes, block by block."""
     grid = mujoco.mjtGridPos
-    blocks: list[tuple[int | None, int | None, str, str]] = []
+    blocks: list[Text] = []
     if moment.lines:
         names, values = ("\n".join(column) for column in zip(*moment.lines, strict=True))
         blocks.append((None, int(grid.mjGRID_TOPLEFT), names, values))
     if moment.help:
         keys = "\n".join(" ".join(binding.keys) for binding in BINDINGS)
-        blocks.append((None, int(grid.mjGRID_BOTTOMLEFT), keys, "\n".join(binding.text for binding in BINDINGS)))
-    else:
-        blocks.append((None, int(grid.mjGRID_BOTTOMLEFT), "orange\nblue\nh", "command\nmeasured\nkeys"))
+        blocks.append((None, int(grid.mjGRID_TOPRIGHT), keys, "\n".join(binding.text for binding in BINDINGS)))
+    blocks.append((None, int(grid.mjGRID_BOTTOMLEFT), "orange\nblue\nh", "command\nmeasured\nkeys"))
     return blocks
 
 

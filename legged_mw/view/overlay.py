@@ -27,7 +27,7 @@ ARC_PER_RATE = 1.0  # [rad per rad/s] the turn arrow shows one second of turning
 ARC_MAX = 1.75 * math.pi  # [rad]
 ARC_SEGMENTS = 12
 SPEED_MIN, RATE_MIN = 0.03, 0.05  # [m/s], [rad/s] below these an arrow is a speck that flickers
-ROBOTS_WITH_ARROWS = 32  # more of them would be a thicket, and cost a web page its frames
+ROBOTS_WITH_ARROWS = 32  # more of them would be a thicket; a web page gets some 300 bytes a geom and picture
 
 
 def set_options(option: mujoco.MjvOption) -> None:
@@ -39,22 +39,26 @@ def set_options(option: mujoco.MjvOption) -> None:
 def draw(scene: mujoco.MjvScene, cast: Cast, moment: Moment) -> None:
     """Append all that belongs to `moment` to what `scene` holds."""
     for world in range(min(cast.count, ROBOTS_WITH_ARROWS)):
-        draw_velocities(scene, cast.anchors[world], moment.commands[world], moment.velocity[world])
+        draw_velocities(scene, cast.anchors[world], moment.commands[world], moment.velocity[world], turn=world == moment.world)
     _draw_contacts(scene, cast, moment)
     for fall in moment.falls:
         if fall.world < cast.count:
             _draw_fall(scene, fall.place + cast.offsets[fall.world], cast.radius)
 
 
-def draw_velocities(scene: mujoco.MjvScene, anchor: Anchor, command: ArrayLike, velocity: ArrayLike) -> None:
-    """Append the commanded and the measured velocity, each (vx, vy, yaw rate) in the body frame, above the trunk."""
+def draw_velocities(scene: mujoco.MjvScene, anchor: Anchor, command: ArrayLike, velocity: ArrayLike, turn: bool = True) -> None:
+    """Append the commanded and the measured velocity, each (vx, vy, yaw rate) in the body frame, above the trunk.
+
+    `turn`: the yaw rate too.
+    """
     for value, rgba, level in ((command, COMMAND_RGBA, 0.40), (velocity, VELOCITY_RGBA, 0.28)):
         array = np.asarray(value, dtype=np.float64)
         if array.shape != (3,):
             raise ValueError(f"A velocity to draw is (vx, vy, yaw rate), shape (3,); got shape {array.shape}.")
         origin = anchor.position + (0.0, 0.0, anchor.top + level * anchor.radius)
         _draw_straight(scene, anchor, origin, array, rgba)
-        _draw_turn(scene, anchor, origin, array[2], rgba)
+        if turn:
+            _draw_turn(scene, anchor, origin, array[2], rgba)
 
 
 def _draw_straight(scene: mujoco.MjvScene, anchor: Anchor, origin: FloatArray, velocity: FloatArray, rgba: tuple[float, ...]) -> None:

@@ -15,7 +15,7 @@ from legged_mw.view.overlay import COMMAND_RGBA, VELOCITY_RGBA
 from legged_mw.view.stage import Moment
 
 CURVE_SECONDS, CURVE_POINTS = 10.0, 100
-WIDTH = 330  # [px] of the panel
+WIDTH, COLUMN = 330, 90  # [px] of the panel, where its second column begins
 _KEYS = {  # ours -> ImGui's
     **{"up": "UpArrow", "down": "DownArrow", "left": "LeftArrow", "right": "RightArrow"},
     **{"space": "Space", "backspace": "Backspace", "enter": "Enter", "-": "Minus", "=": "Equal"},
@@ -49,6 +49,7 @@ class Panel:
     def __init__(self, pilot: Pilot, title: str, ui: Any, plot: Any) -> None:
         self.pilot, self.title, self.ui, self.plot = pilot, title, ui, plot
         self.curves = Curves()
+        self._folded = False
         self.moment: Moment | None = None  # the last one; replaced by the session's thread
 
     def show(self, moment: Moment) -> None:
@@ -65,8 +66,12 @@ class Panel:
         self._keys()
         ui.SetNextWindowPos(ui.Vec2(12, 12), ui.Cond.FirstUseEver)
         ui.SetNextWindowSize(ui.Vec2(WIDTH, 0), ui.Cond.FirstUseEver)
+        if self._folded:
+            ui.SetNextWindowCollapsed(True)
         try:
-            if ui.Begin(self.title)[0]:
+            opened, kept = ui.Begin(self.title, True, ui.WindowFlags.NoFocusOnAppearing)
+            self._folded = not kept  # the cross folds the panel: the session goes on, and a click on the title unfolds it
+            if opened:
                 self._numbers(moment)
                 self._sliders(moment)
                 self._buttons()
@@ -87,7 +92,12 @@ class Panel:
         ui = self.ui
         colours = {"command": COMMAND_RGBA, "measured": VELOCITY_RGBA}
         for name, value in moment.lines:
-            ui.TextColored(ui.Vec4(*colours.get(name, (0.75, 0.75, 0.75, 1.0))), f"{name:<10}{value}")
+            if name in colours:
+                ui.TextColored(ui.Vec4(*colours[name]), name)
+            else:
+                ui.Text(name)  # in the theme's colour, which may be light or dark
+            ui.SameLine(COLUMN)
+            ui.Text(value)
 
     def _sliders(self, moment: Moment) -> None:
         """The command; what is dragged is driven."""
@@ -144,7 +154,7 @@ class Panel:
         curves = [[[float(v) for v in rows[:, 1 + part + index]] for part in (3, 0)] for index in range(3)]
         for index, name in enumerate(COMPONENTS):
             low, high = (1.25 * float(limit) for limit in limits[:, index])
-            if plot.BeginPlot(f"##{name}", ui.Vec2(-1, 84), plot.Flags.CanvasOnly | plot.Flags.NoInputs):
+            if plot.BeginPlot(f"##{name}", ui.Vec2(-1, 84), int(plot.Flags.CanvasOnly) | int(plot.Flags.NoInputs)):
                 try:
                     plot.SetupAxes("", name, plot.AxisFlags.NoTickLabels, plot.AxisFlags.NoGridLines)
                     plot.SetupAxesLimits(-CURVE_SECONDS, 0.0, low, high, plot.Cond.Always)
@@ -157,4 +167,6 @@ class Panel:
         ui = self.ui
         if ui.CollapsingHeader("keys") or self.pilot.help:
             for binding in BINDINGS:
-                ui.Text(f"{' '.join(binding.keys):<14}{binding.text}")
+                ui.Text(" ".join(binding.keys))
+                ui.SameLine(COLUMN)
+                ui.Text(binding.text)

@@ -25,7 +25,7 @@ Frame = NDArray[np.uint8]  # (height, width, 3)
 
 FORMATS = (".mp4", ".gif")
 # a palette from all frames, a dither that stands still where the picture does: small files
-PALETTE = (("split", ""), ("palettegen", "stats_mode=diff"), ("paletteuse", "dither=bayer:bayer_scale=4:diff_mode=rectangle"))
+PALETTE = (("split", ""), ("palettegen", "stats_mode=full"), ("paletteuse", "dither=bayer:bayer_scale=4:diff_mode=rectangle"))
 CRF = 20  # ours: x264's constant quality; 23 is its default and smears a dark checker floor
 
 

@@ -12,25 +12,18 @@ import getpass
 import logging
 import os
 import socket
-import sys
-import threading
-import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import mujoco
 
-from legged_mw.view.camera import CameraMan
 from legged_mw.view.drive import Pilot
-from legged_mw.view.overlay import draw, set_options
-from legged_mw.view.panel import Panel
 from legged_mw.view.puppet import Cast
 from legged_mw.view.stage import Moment, ViewError
 
 LOCAL = "127.0.0.1"
 FIRST_PORT = 8080
-DECOR_MAX = 1000  # geoms beside the model's that a page draws
 START_SECONDS = 20.0
 
 
@@ -53,9 +46,11 @@ class WebViewer:
             raise ViewError(f"--viewer web: {reason}")
         from mujoco.studio import launch_web, viewer_protocol
 
+        from legged_mw.view.face import Face  # imports what a mujoco without web viewer lacks
+
         self.cast = Cast(model, count)
         port = port or free_port(host)
-        self._face: Any = _make_face(self.cast, pilot, title)
+        self._face = Face(self.cast, pilot, title)
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
         with _held_to(host):
             self._handle: Any = launch_web.launch(config, plugins=[self._face])
@@ -93,65 +88,6 @@ class WebViewer:
         if host == LOCAL and bound[0] != LOCAL:
             self._handle.close()
             raise ViewError(f"--viewer web: the page would be open to the network ({bound[0]}:{port}); this mujoco binds it otherwise")
-
-
-def _make_face(cast: Cast, pilot: Pilot, title: str) -> Any:
-    """Our side of Studio's viewer thread; made here, because its base class is imported only where a page is asked for."""
-    from mujoco.studio import messages, plugin
-    from mujoco.studio.dear_imgui import dear_imgui
-    from mujoco.studio.implot import implot
-
-    class Face(plugin.ViewerPlugin):
-        """What happens on the viewer's thread. An exception here would end the session, so it is said once and the picture goes on."""
-
-        def __init__(self) -> None:
-            self.begun = threading.Event()
-            self.panel = Panel(pilot, title, dear_imgui, implot)
-            self._said: set[str] = set()
-            self._scene: mujoco.MjvScene | None = None
-            self._camera: CameraMan | None = None
-
-        def show(self, moment: Moment) -> None:
-            self.panel.show(moment)
-
-        @messages.handler
-        def on_init(self, _: plugin.ViewerInitEvent) -> None:
-            self.begun.set()
-
-        @messages.handler
-        def on_model(self, event: messages.PostModelEvent) -> None:
-            if event.model.nbody < 2:  # an empty one comes first
-                return
-            set_options(self.viewer.vis_options)
-            self._scene = mujoco.MjvScene(event.model, DECOR_MAX)
-            self._camera = CameraMan(self.viewer.camera, cast, by_hand=True)
-
-        @messages.handler
-        def on_update(self, _: messages.UpdateEvent) -> None:
-            self._guard(self._update)
-
-        @messages.handler
-        def on_gui(self, _: messages.BuildGuiEvent) -> None:
-            self._guard(self.panel.build)
-
-        def _update(self) -> None:
-            moment = self.panel.moment
-            if moment is None or self._scene is None or self._camera is None:
-                return
-            self._camera.update(moment.camera, moment.world)
-            self._scene.ngeom = 0
-            draw(self._scene, cast, moment)
-            self.viewer.extra_geoms[:] = self._scene.geoms[: self._scene.ngeom]
-
-        def _guard(self, work: Callable[[], None]) -> None:
-            try:
-                work()
-            except Exception as error:  # whatever it is, the robot walks on
-                if repr(error) not in self._said:
-                    self._said.add(repr(error))
-                    traceback.print_exc(file=sys.stderr)
-
-    return Face()
 
 
 @contextmanager

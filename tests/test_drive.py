@@ -1,0 +1,653 @@
+"""Driving: the command and its limits, the keys, scripts, a gamepad, the loop of a session, the web panel without a browser."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import legged_mw
+
+# isort: split
+import mujoco
+import numpy as np
+import pytest
+
+from legged_mw.utils.errors import UserError
+from legged_mw.view import launch, web
+from legged_mw.view.drive import ACTIONS, BINDINGS, CAMERAS, KEY_ACTION, SPEEDS, STEPS, Pilot, help_text, outside
+from legged_mw.view.env_stage import EnvStage
+from legged_mw.view.gamepad import AXIS, BUTTON, EVENT, INITIAL, Gamepad, find_gamepad
+from legged_mw.view.panel import BUTTONS, CURVE_SECONDS, KEY_NAMES, Curves, Panel
+from legged_mw.view.script import AFTER, load_script
+from legged_mw.view.session import Session, shown
+from legged_mw.view.stage import Moment, Stage, ViewError
+from tests.worlds import make_env
+
+LIMITS = np.array([[-1.0, -0.4, -2.0], [1.5, 0.8, 2.0]])
+MODEL = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>')
+
+
+def done(pilot: Pilot, *actions: str) -> Pilot:
+    for action in actions:
+        pilot.ask(action)
+    pilot.listen()
+    return pilot
+
+
+# ---- the pilot
+
+
+def test_arrows_step_to_the_limits_and_no_further() -> None:
+    pilot = done(Pilot(LIMITS), "forward")
+    assert pilot.driving and np.allclose(pilot.command, [1.5 / STEPS, 0, 0])
+    assert np.allclose(done(pilot, *["forward"] * 9).command, [1.5, 0, 0])
+    assert np.allclose(done(pilot, *["back"] * 20, *["right"] * 20, *["turn_left"] * 20).command, [-1.0, -0.4, 2.0])
+    assert np.array_equal(done(pilot, "stop").command, np.zeros(3))
+    assert np.array_equal(done(pilot, *["left"] * 3, *["right"] * 3).command, np.zeros(3))  # exactly
+
+
+@pytest.mark.parametrize(("asked", "held"), [((9, -9, 9), (1.5, -0.4, 2.0)), ((0.3, 0.1, -0.2), (0.3, 0.1, -0.2))])
+def test_sliders_are_held_to_the_limits(asked: tuple[float, ...], held: tuple[float, ...]) -> None:
+    pilot = Pilot(LIMITS)
+    pilot.steer(asked)
+    assert not pilot.driving  # until the session's next turn
+    pilot.listen()
+    assert pilot.driving and np.allclose(pilot.command, held)
+
+
+def test_a_stick_spans_the_limits_on_both_sides() -> None:
+    pilot = Pilot(LIMITS)
+    for deflection, command in (
+        ((1, 1, 1), (1.5, 0.8, 2)),
+        ((-1, -1, -1), (-1, -0.4, -2)),
+        ((0.5, -0.5, 0), (0.75, -0.2, 0)),
+        ((7, 0, 0), (1.5, 0, 0)),
+    ):
+        pilot.stick(deflection)
+        pilot.listen()
+        assert np.allclose(pilot.command, command)
+
+
+def test_who_drives_whom() -> None:
+    pilot, own = Pilot(LIMITS, 3), np.full((3, 3), 0.1)
+    assert pilot.commands(own) is None
+    pilot.follow(own[0])
+    done(pilot, "next", "forward")
+    commands = pilot.commands(own)
+    assert commands is not None and np.allclose(commands, [[0.1] * 3, [0.4, 0.1, 0.1], [0.1] * 3])  # took over where the robot was
+    assert np.allclose(own, 0.1)
+    commands = done(pilot, "everyone").commands(own)
+    assert commands is not None and np.allclose(commands, [[0.4, 0.1, 0.1]] * 3)
+    assert done(pilot, "own").commands(own) is None
+    assert done(pilot, "next", "next").world == 0
+
+
+def test_pushes_and_resets_are_handed_out_once() -> None:
+    pilot = done(Pilot(LIMITS, 2), "push", "reset", "reset", "everyone", "push")
+    pilot.push((0.5, -0.5))
+    pilot.listen()
+    pushes = pilot.take_pushes()
+    assert [world for world, _ in pushes] == [0, 0, 1, 0, 1] and pilot.take_resets() == [0]
+    assert np.allclose([np.linalg.norm(velocity) for _, velocity in pushes[:3]], pilot.push_speed)
+    assert np.allclose(pushes[3][1], (0.5, -0.5))
+    assert pilot.take_pushes() == [] and pilot.take_resets() == []
+
+
+def test_speed_camera_pause_and_help_go_round() -> None:
+    pilot = Pilot(LIMITS)
+    assert [done(pilot, "slower").speed for _ in range(4)] == [*SPEEDS[1:], SPEEDS[-1]]
+    assert [done(pilot, "faster").speed for _ in range(4)] == [*SPEEDS[-2::-1], 1.0]
+    assert [done(pilot, "camera").camera for _ in CAMERAS] == [*CAMERAS[1:], CAMERAS[0]]
+    assert done(pilot, "pause").paused and not done(pilot, "pause").paused and done(pilot, "help").help
+
+
+def test_the_table_of_keys_is_whole() -> None:
+    keys = [key for binding in BINDINGS for key in binding.keys]
+    assert len(keys) == len(set(keys)) == len(KEY_ACTION)
+    pilot = Pilot(LIMITS, 2)
+    for action in ACTIONS:  # each has something that does it
+        done(pilot, action)
+    with pytest.raises(ValueError, match="no action 'jump'; there are: forward, back"):
+        pilot.ask("jump")
+    pilot.press("z")  # no key of ours
+    assert all(binding.text in help_text() and binding.keys[0] in help_text() for binding in BINDINGS)
+
+
+def test_keys_in_the_documentation_are_those_of_the_table() -> None:
+    text = (legged_mw.ROOT / "docs" / "playing.md").read_text()
+    for binding in BINDINGS:
+        row = next((line for line in text.splitlines() if line.startswith("|") and binding.text in line), "")
+        assert all(f"`{key}`" in row for key in binding.keys), f"docs/playing.md: {binding}"
+
+
+def test_what_was_not_trained_is_named() -> None:
+    assert outside((1.5, 0.8, -2), LIMITS) is None
+    assert outside((0, -0.5, 0), LIMITS) == "vy = -0.5 m/s is outside of what the policy was trained for, -0.4 to 0.8"
+    assert "yaw rate = nan rad/s" in str(outside((0, 0, float("nan")), LIMITS))
+
+
+# ---- scripts
+
+
+def script(folder: Path, text: str) -> Path:
+    path = folder / "drive.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_a_script_drives_in_its_time(tmp_path: Path) -> None:
+    text = "commands:\n  - {time: 0, command: [5e-1, 0, 0]}\n  - {time: 2, push: [0, 1.5]}\n  - {time: 2.0, reset: true}\n"
+    drive, pilot = load_script(script(tmp_path, text), LIMITS), Pilot(LIMITS)
+    assert drive.seconds == 2 + AFTER
+    drive.play(0.0, pilot)
+    pilot.listen()
+    assert np.allclose(pilot.command, [0.5, 0, 0]) and pilot.take_pushes() == []
+    drive.play(1.98, pilot)
+    drive.play(2.0, pilot)
+    drive.play(2.02, pilot)
+    pilot.listen()
+    assert [push.tolist() for _, push in pilot.take_pushes()] == [[0, 1.5]] and pilot.take_resets() == [0]
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("commands: []", "write one list 'commands' with at least one entry, e.g. {time: 0, command: [0.5, 0, 0]}; it has commands"),
+        ("robots: 3", "write one list 'commands' with at least one entry"),
+        ("commands: [go]", "entry 1 of commands: write {time: [s], ...} with command, push, reset; it is 'go'"),
+        ("commands: [{command: [0, 0, 0]}]", "entry 1 of commands: write {time: [s], ...}"),
+        ("commands: [{time: 0, comand: [0, 0, 0]}]", "entry 1 of commands: there is no 'comand'; there are: time, command, push, reset"),
+        ("commands: [{time: 1}]", "entry 1 of commands: nothing happens at 1 s; say command, push or reset"),
+        ("commands: [{time: soon, reset: true}]", "entry 1 of commands: time: write seconds from the start, not 'soon'"),
+        ("commands: [{time: -1, reset: true}]", "entry 1 of commands: time = -1 s is before the start"),
+        ("commands: [{time: 0, command: [1, 0]}]", "entry 1 of commands: command: write [vx, vy, yaw rate] in m/s, m/s, rad/s, not [1, 0]"),
+        ("commands: [{time: 0, command: [1, 0, .nan]}]", "entry 1 of commands: command: write [vx, vy, yaw rate]"),
+        ("commands: [{time: 0, command: [2, 0, 0]}]", "commands: vx = 2 m/s is outside of what the policy was trained for, -1 to 1.5"),
+        ("commands: [{time: 0, push: 3}]", "entry 1 of commands: push: write [vx, vy] in m/s, world frame, not 3"),
+        ("commands: [{time: 0, push: [30, 0]}]", "entry 1 of commands: a push of 30 m/s; at most 8"),
+        ("commands: [{time: 0, reset: later}]", "entry 1 of commands: reset is true or false, not 'later'"),
+        ("commands: [{time: 3, reset: true}, {time: 1, reset: true}]", "entry 2 of commands: its time 1 s is before the one above it, 3 s"),
+        ("commands: [", "not valid YAML"),
+    ],
+)
+def test_a_wrong_script_is_one_line(tmp_path: Path, text: str, part: str) -> None:
+    with pytest.raises(UserError) as error:
+        load_script(script(tmp_path, text), LIMITS)
+    assert "drive.yaml" in str(error.value) and part in str(error.value) and "\n" not in str(error.value)
+
+
+# ---- a gamepad
+
+
+@pytest.fixture
+def pad(tmp_path: Path) -> Any:
+    """A device that is a pipe: what is written to it are events."""
+    os.mkfifo(tmp_path / "js0")
+    gamepad = Gamepad(tmp_path / "js0")
+    with open(tmp_path / "js0", "wb", buffering=0) as device:
+
+        def send(kind: int, number: int, value: int) -> None:
+            device.write(EVENT.pack(0, value, kind, number))
+
+        yield SimpleNamespace(gamepad=gamepad, send=send, device=device)
+    gamepad.close()
+
+
+def test_sticks_and_buttons(pad: Any) -> None:
+    pilot = Pilot(LIMITS, 2)
+    pad.gamepad.poll(pilot)
+    pad.send(AXIS | INITIAL, 1, 100)
+    pad.gamepad.poll(pilot)
+    pilot.listen()
+    assert not pilot.driving  # nobody has touched it
+    pad.send(AXIS, 1, -32767)  # ahead
+    pad.send(AXIS, 3, 32767)  # to the right
+    pad.send(AXIS, 0, 2000)  # within the dead zone
+    pad.send(BUTTON, 3, 1)
+    pad.send(BUTTON, 3, 0)  # let go
+    pad.gamepad.poll(pilot)
+    pilot.listen()
+    assert np.allclose(pilot.command, [1.5, 0, -2]) and pilot.world == 1
+    pad.device.write(EVENT.pack(0, 0, AXIS, 1)[:5])  # half an event waits for its other half
+    pad.gamepad.poll(pilot)
+    pad.device.write(EVENT.pack(0, 0, AXIS, 1)[5:])
+    pad.gamepad.poll(pilot)
+    pilot.listen()
+    assert np.allclose(pilot.command, [0, 0, -2])
+
+
+def test_a_pad_that_is_unplugged_stops_the_robot(pad: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    pilot = Pilot(LIMITS)
+    pad.send(AXIS, 1, -32767)
+    pad.gamepad.poll(pilot)
+
+    def gone(*_: object) -> bytes:
+        raise OSError(19, "No such device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "read", gone)
+        pad.gamepad.poll(pilot)
+    pilot.listen()
+    assert np.array_equal(pilot.command, np.zeros(3))
+    pad.gamepad.poll(pilot)
+
+
+def test_finding_a_gamepad(tmp_path: Path) -> None:
+    assert find_gamepad(tmp_path) is None
+    (tmp_path / "js1").write_bytes(b"")
+    assert find_gamepad(tmp_path) == tmp_path / "js1"
+
+
+# ---- the session
+
+
+class FakeStage:
+    """Robots that do at once what they are told, and fall when `falls` says so."""
+
+    model, dt, limits = MODEL, 0.02, LIMITS
+
+    def __init__(self, num_worlds: int = 2, falls: dict[int, int] | None = None) -> None:
+        self.num_worlds, self.falls = num_worlds, falls or {}  # step -> world
+        self.steps, self.own = 0, np.full((num_worlds, 3), 0.1)
+        self.now, self.events = self.own.copy(), []
+        self.given: list[Any] = []
+
+    def step(self, commands: Any) -> None:
+        self.given.append(commands)
+        self.now = self.own.copy() if commands is None else np.array(commands)
+        self.steps += 1
+
+    def commands(self) -> Any:
+        return self.now.copy()
+
+    def velocity(self) -> Any:
+        return self.now + 0.01
+
+    def qpos(self) -> Any:
+        return np.tile([self.steps * 1.0, 0, 1, 1, 0, 0, 0], (self.num_worlds, 1))
+
+    def contacts(self) -> Any:
+        return np.ones((self.num_worlds, 4), dtype=bool)
+
+    def fell(self) -> Any:
+        return np.arange(self.num_worlds) == self.falls.get(self.steps, -1)
+
+    def push(self, world: int, velocity: Any) -> None:
+        self.events.append((self.steps, "push", world))
+
+    def reset(self, world: int) -> None:
+        self.events.append((self.steps, "reset", world))
+
+
+class FakeViewer:
+    """Keeps what it is shown; `keys` are pressed when that many moments were."""
+
+    def __init__(self, pilot: Pilot, keys: dict[int, str] | None = None, until: int = 10**6) -> None:
+        self.pilot, self.keys, self.until = pilot, keys or {}, until
+        self.moments: list[Moment] = []
+
+    def show(self, moment: Moment) -> None:
+        self.moments.append(moment)
+        if key := self.keys.get(len(self.moments)):
+            self.pilot.press(key)
+
+    def is_running(self) -> bool:
+        return len(self.moments) < self.until
+
+    def close(self) -> None: ...
+
+
+def test_a_session_does_what_the_keys_say() -> None:
+    stage: Stage = FakeStage()
+    pilot = Pilot(stage.limits, 2)
+    viewer = FakeViewer(pilot, {2: "space", 4: "up", 5: "p", 6: "n", 7: "r", 8: "o"}, until=10)
+    summary = Session(stage, viewer, pilot, real_time=False).run()
+    assert isinstance(stage, FakeStage) and stage.steps == 10 and summary.seconds == pytest.approx(0.2)
+    assert stage.given[:2] == [None, None] and stage.given[8:] == [None, None]
+    assert np.allclose(stage.given[2][0], 0) and np.allclose(stage.given[2][1], 0.1)  # the other robot goes on as it was
+    assert np.allclose(stage.given[4][0], [0.3, 0, 0])
+    assert stage.events == [(5, "push", 0), (7, "reset", 1)]
+    assert [moment.world for moment in viewer.moments] == [0] * 6 + [1] * 4
+    assert [np.allclose(moment.commands[0], 0) for moment in viewer.moments[1:4]] == [False, True, True]  # shown as it will be followed
+
+
+def test_pause_stands_still_and_slow_motion_takes_longer() -> None:
+    stage = FakeStage(1)
+    pilot = Pilot(LIMITS)
+    viewer = FakeViewer(pilot, {3: "enter", 6: "enter"}, until=10)
+    Session(stage, viewer, pilot, real_time=False).run()
+    assert stage.steps == 7 and [moment.time for moment in viewer.moments[3:6]] == [viewer.moments[3].time] * 3
+    assert ", paused" in dict(viewer.moments[4].lines)["time"]
+    done(pilot, "slower", "slower")
+    session = Session(FakeStage(1), FakeViewer(pilot, until=2), pilot)
+    session.run()
+    assert session._pace.dt == pytest.approx(0.02 / 0.25)  # of real time a step
+
+
+def test_falls_are_counted_once_and_shown_for_a_while() -> None:
+    stage, pilot = FakeStage(2, falls={3: 1, 4: 1, 50: 0}), Pilot(LIMITS, 2)
+    viewer = FakeViewer(pilot)
+    summary = Session(stage, viewer, pilot, seconds=2.5, real_time=False).run()
+    assert summary.falls == 2 and dict(viewer.moments[10].lines)["falls"] == "1"
+    [fall] = viewer.moments[3].falls
+    assert fall.world == 1 and fall.place[0] == 2.0  # where it was the step before, for it may be elsewhere since
+    assert len(viewer.moments[60].falls) == 2 and len(viewer.moments[120].falls) == 1
+
+
+def test_ctrl_c_ends_a_session_in_order(capsys: pytest.CaptureFixture[str]) -> None:
+    class Interrupted(FakeStage):
+        def step(self, commands: Any) -> None:
+            super().step(commands)
+            if self.steps == 3:
+                raise KeyboardInterrupt
+
+    pilot = Pilot(LIMITS, 2)
+    summary = Session(Interrupted(), FakeViewer(pilot), pilot, seconds=10, real_time=False).run()
+    assert summary.seconds == pytest.approx(0.04) and "stopped" in capsys.readouterr().out
+
+
+def test_the_summary_of_a_script_has_a_row_a_command(tmp_path: Path) -> None:
+    text = "commands: [{time: 0, command: [0.5, 0, 0]}, {time: 3, command: [0, 0, 1]}]"
+    pilot = Pilot(LIMITS)
+    pilot.everyone = True
+    drive = load_script(script(tmp_path, text), LIMITS)
+    summary = Session(FakeStage(2), FakeViewer(pilot), pilot, seconds=drive.seconds, real_time=False, script=drive).run()
+    assert [(round(leg.start, 2), round(leg.seconds, 2)) for leg in summary.legs] == [(0, 3), (3, 3)]
+    assert "   0.0 s   3.0 s   +0.50 +0.00 +0.00       +0.51 +0.01 +0.01" in summary.text()
+    assert shown(np.array([-0.001, 0.004, -1.5])) == "+0.00 +0.00 -1.50"
+
+
+# ---- which viewer
+
+
+def flags(*args: str) -> argparse.Namespace:
+    parser = argparse.ArgumentParser()
+    launch.add_flags(parser)
+    parser.add_argument("--time", type=float)
+    parser.add_argument("--command")
+    return parser.parse_args(args)
+
+
+@pytest.mark.parametrize(
+    ("args", "screen", "terminal", "studio", "kind", "why"),
+    [
+        ([], True, True, True, "native", "there is a screen"),
+        ([], False, True, True, "web", "no screen here"),
+        ([], False, False, True, "video", "no terminal with somebody who could open a web page"),
+        ([], False, True, False, "video", "no studio"),
+        (["--video", "a.gif"], True, True, True, "video", "a file was asked for"),
+        (["--viewer", "web"], True, True, True, "web", "as asked"),
+        (["--viewer", "none"], True, True, True, "none", "as asked"),
+    ],
+)
+def test_auto_takes_the_best_there_is_and_says_why(
+    args: list[str], screen: bool, terminal: bool, studio: bool, kind: str, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(launch, "has_display", lambda: screen)
+    monkeypatch.setattr(web, "missing", lambda: None if studio else "no studio")
+    chosen, reason = launch.choose(flags(*args), terminal)
+    assert chosen == kind and why in reason
+
+
+@pytest.mark.parametrize(
+    ("args", "part"),
+    [
+        (["--viewer", "web", "--video", "a.mp4"], "--video records and --viewer web does not: leave one of them out"),
+        (["--viewer", "none", "--sheet", "a.png"], "--sheet records and --viewer none does not"),
+        (["--video", "a.avi"], "Cannot write 'a.avi': the supported extensions are .mp4 (H.264) and .gif."),
+        (["--sheet", "a.jpg"], "Cannot write 'a.jpg': a contact sheet is a .png."),
+        (["--port", "70000"], "--port 70000: a port is a number from 1 to 65535"),
+        (["--command", "2,0,0"], "--command 2,0,0: vx = 2 m/s is outside of what the policy was trained for, -1 to 1.5; to see what"),
+        (["--command", "1,0"], "--command 1,0: write three numbers, vx,vy,yaw [m/s, m/s, rad/s], e.g. 0.8,0,0"),
+    ],
+)
+def test_flags_that_cannot_be(args: list[str], part: str) -> None:
+    with pytest.raises(UserError) as error:
+        launch.check_flags(flags(*args))
+        launch.check_drive(flags(*args), LIMITS)
+    assert part in str(error.value)
+
+
+def test_watching_without_a_viewer_ends_by_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    drive = script(tmp_path, "commands: [{time: 0, command: [0.5, 0, 0]}]")
+    summary = launch.watch(FakeStage(), flags("--viewer", "none", "--commands", str(drive)), tmp_path)
+    out = capsys.readouterr().out
+    assert summary.seconds == pytest.approx(AFTER)
+    assert "viewer: none (as asked)" in out and "3.0 s, 0 falls" in out and "+0.50 +0.00 +0.00" in out
+
+
+def test_a_batch_job_gets_a_video_and_a_sheet(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(launch, "has_display", lambda: False)
+    picture = launch.Picture(64, 48, 25)
+    launch.watch(FakeStage(), flags("--time", "0.2"), tmp_path, picture)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["play.mp4", "play.png"]
+    assert "(no screen here, and no terminal" in capsys.readouterr().out
+
+
+# ---- the web page
+
+
+def test_the_tunnel_line_names_the_machine_as_its_user_knows_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(web.getpass, "getuser", lambda: "ann")
+    monkeypatch.setenv("SSH_CONNECTION", "10.0.0.7 51000 10.0.0.9 2222")
+    assert web.tunnel_line(8081) == "ssh -p 2222 -L 8081:127.0.0.1:8081 ann@10.0.0.9"
+    monkeypatch.setenv("SSH_CONNECTION", "10.0.0.7 51000 10.0.0.9 22")
+    assert web.tunnel_line(8080) == "ssh -L 8080:127.0.0.1:8080 ann@10.0.0.9"
+    monkeypatch.delenv("SSH_CONNECTION")
+    monkeypatch.setattr(web.socket, "gethostname", lambda: "server")
+    assert web.tunnel_line(8080) == "ssh -L 8080:127.0.0.1:8080 ann@server"
+
+
+class FakeUi:
+    """ImGui as far as a panel goes: `clicked` buttons, `dragged` sliders and `pressed` keys; blocks must be closed."""
+
+    def __init__(self) -> None:
+        self.clicked: set[str] = set()
+        self.dragged: dict[str, float] = {}
+        self.pressed: set[str] = set()
+        self.typing, self.depth, self.seen = False, 0, []
+        self.ranges: dict[str, tuple[float, float]] = {}
+        self.WindowFlags = SimpleNamespace(NoFocusOnAppearing=1)
+        self.Cond = SimpleNamespace(FirstUseEver=4)
+        self.Key = SimpleNamespace(**{name: name for name in KEY_NAMES.values()})
+
+    def GetIO(self) -> Any:
+        return SimpleNamespace(WantCaptureKeyboard=self.typing)
+
+    def IsKeyPressed(self, key: str, repeat: bool) -> bool:
+        return key in self.pressed
+
+    def Begin(self, title: str, *_: Any) -> tuple[bool, bool]:
+        self.depth += 1
+        return True, True
+
+    def End(self) -> None:
+        self.depth -= 1
+
+    def SliderFloat(self, label: str, value: float, low: float, high: float, form: str) -> tuple[bool, float]:
+        self.ranges[label] = (low, high)
+        return label in self.dragged, self.dragged.get(label, value)
+
+    def Button(self, label: str, size: Any) -> bool:
+        self.seen.append(label)
+        return label.split("###")[-1] in self.clicked
+
+    def Checkbox(self, label: str, value: bool) -> tuple[bool, bool]:
+        return label in self.clicked, value
+
+    def CollapsingHeader(self, label: str) -> bool:
+        return True
+
+    def Text(self, text: str) -> None:
+        self.seen.append(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *_: None
+
+
+class FakePlot:
+    def __init__(self) -> None:
+        self.depth, self.lines = 0, []
+        self.Flags = SimpleNamespace(CanvasOnly=1, NoInputs=2)
+        self.AxisFlags = SimpleNamespace(NoTickLabels=1, NoGridLines=2)
+        self.Cond = SimpleNamespace(Always=1)
+
+    def BeginPlot(self, *_: Any) -> bool:
+        self.depth += 1
+        return True
+
+    def EndPlot(self) -> None:
+        self.depth -= 1
+
+    def PlotLine(self, label: str, xs: list[float], ys: list[float]) -> None:
+        self.lines.append((label, xs, ys))
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *_: None
+
+
+def panel(worlds: int = 2) -> tuple[Panel, FakeUi, FakePlot, Pilot]:
+    pilot, ui, plot = Pilot(LIMITS, worlds), FakeUi(), FakePlot()
+    page = Panel(pilot, "go1", ui, plot)
+    page.build()  # nothing to show yet
+    now = np.full((worlds, 3), 0.25)
+    page.show(Moment(0.0, np.zeros((worlds, 7)), now, now, np.ones((worlds, 4), dtype=bool), lines=(("falls", "3"),)))
+    return page, ui, plot, pilot
+
+
+@pytest.mark.parametrize("action", [action for row in BUTTONS for action, _ in row])
+def test_each_button_asks_for_its_action(action: str) -> None:
+    page, ui, _, pilot = panel()
+    asked: list[str] = []
+    pilot.ask = asked.append  # pyright: ignore[reportAttributeAccessIssue]
+    page.build()
+    assert asked == []
+    ui.clicked = {action}
+    page.build()
+    assert asked == [action] and ui.depth == 0
+
+
+def test_sliders_have_the_trained_limits_and_drive() -> None:
+    page, ui, _, pilot = panel()
+    page.build()
+    assert [ui.ranges[name] for name in ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")] == [tuple(LIMITS[:, i]) for i in range(3)]
+    ui.dragged = {"vy [m/s]": -0.3}
+    page.build()
+    pilot.listen()
+    assert np.allclose(pilot.command, [0.25, -0.3, 0.25])  # the others stay as the robot follows them
+    ui.dragged = {"push [m/s]": 2.5}
+    page.build()
+    assert pilot.push_speed == 2.5
+    ui.clicked = {"drive all robots"}
+    page.build()
+    pilot.listen()
+    assert pilot.everyone
+
+
+def test_keys_of_the_page_are_those_of_the_window_unless_somebody_types() -> None:
+    page, ui, _, pilot = panel()
+    ui.pressed = {"UpArrow", "N"}
+    ui.typing = True
+    page.build()
+    pilot.listen()
+    assert not pilot.driving and pilot.world == 0
+    ui.typing = False
+    page.build()
+    pilot.listen()
+    assert pilot.driving and pilot.world == 1
+
+
+def test_one_robot_has_no_next_one_and_speed_goes_round() -> None:
+    page, ui, _, pilot = panel(1)
+    ui.clicked = {"slower"}
+    for speed in (*SPEEDS[1:], SPEEDS[0]):
+        page.build()
+        pilot.listen()
+        assert pilot.speed == speed
+    assert not any("###next" in label for label in ui.seen) and "falls" in ui.seen and "3" in ui.seen
+
+
+def test_curves_are_of_the_last_seconds_and_the_panel_closes_what_it_opens() -> None:
+    page, ui, plot, _ = panel(1)
+    page.curves = Curves()
+    for step in range(2000):
+        now = np.full((1, 3), 0.001 * step)
+        page.show(Moment(step * 0.02, np.zeros((1, 7)), now, -now, np.ones((1, 4), dtype=bool)))
+    page.build()
+    assert len(plot.lines) == 6 and plot.depth == 0
+    label, times, values = plot.lines[0]
+    assert label.startswith("measured") and len(times) == 100 and -CURVE_SECONDS < times[0] < -0.95 * CURVE_SECONDS and times[-1] == 0
+    assert values[-1] == pytest.approx(-1.995, abs=0.01)
+
+    def broken(*_: Any) -> None:
+        raise RuntimeError("no plot today")
+
+    plot.SetupAxes = broken  # pyright: ignore[reportAttributeAccessIssue]
+    with pytest.raises(RuntimeError):
+        page.build()
+    assert ui.depth == 0 and plot.depth == 0
+
+
+def test_the_page_is_served_on_this_machine_alone_and_says_no_to_a_bad_host() -> None:
+    import urllib.request
+
+    from legged_mw.view.web import WebViewer
+
+    pilot = Pilot(LIMITS, 2)
+    with WebViewer(MODEL, pilot, 2) as page:
+        assert page._face.viewer._http_sock.getsockname()[0] == "127.0.0.1"
+        stage = FakeStage()
+        now = np.zeros((2, 3))
+        for _ in range(3):
+            page.show(Moment(0.0, stage.qpos(), now, now, np.ones((2, 4), dtype=bool)))
+        with urllib.request.urlopen(f"http://127.0.0.1:{page.port}/", timeout=10) as answer:
+            assert b"canvas" in answer.read()
+        with pytest.raises(OSError):  # any other address of this machine
+            urllib.request.urlopen(f"http://[::1]:{page.port}/", timeout=2)
+    assert not page.is_running()
+    with pytest.raises(ViewError, match=r"--host 203.0.113.7: this machine has no such address"):
+        WebViewer(MODEL, pilot, host="203.0.113.7")
+
+
+# ---- the environment as a stage
+
+
+def test_the_environment_follows_the_pilot() -> None:
+    env = make_env(2, {"env.episode_length_s": 100.0})
+    seen: list[Any] = []
+
+    def policy(obs: Any) -> Any:
+        seen.append(obs["state"][:, -3:].clone())
+        return env.actions * 0.0
+
+    stage: Stage = EnvStage(env, policy, LIMITS)
+    stage.step(None)
+    commands = stage.commands()
+    commands[1] = (0.5, -0.2, 0.3)
+    stage.step(commands)
+    assert np.allclose(seen[-1][1], (0.5, -0.2, 0.3)) and np.allclose(seen[-1][0], commands[0])  # in the same step, in that world alone
+    assert np.allclose(stage.commands(), commands)
+    before = stage.velocity()
+    stage.push(0, np.array([0.0, 2.0]))
+    stage.step(None)
+    after = stage.velocity()
+    assert np.linalg.norm(after[0, :2] - before[0, :2]) > 1 and np.linalg.norm(after[1, :2] - before[1, :2]) < 1
+    stage.reset(1)
+    qpos = stage.qpos()
+    assert qpos.shape == (2, stage.model.nq) and qpos.dtype == np.float64 and np.allclose(qpos[1, 2], env.init_pos[2])
+    assert stage.contacts().shape == (2, 4) and not stage.fell().any()
+    env.fell.fill_(True)
+    assert stage.fell().all()
+
+
+def test_watching_needs_no_torch() -> None:
+    """What a robot's computer has is enough: all of view/ but env_stage.py."""
+    modules = [path.stem for path in (legged_mw.ROOT / "legged_mw/view").glob("*.py") if path.stem not in ("env_stage", "__init__", "face")]
+    code = "import sys\nfor name in ('torch', 'warp', 'rsl_rl', 'mujoco_warp'): sys.modules[name] = None\nimport "
+    code += ", ".join(f"legged_mw.view.{name}" for name in modules)
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=legged_mw.ROOT)
