@@ -15,6 +15,8 @@ AZIMUTH, ELEVATION = 130.0, -22.0  # [deg] front right of the robot, a little ab
 ELEVATION_ALL = -35.0  # [deg]
 DISTANCE = 2.4  # [robot radius] camera to base
 FOLLOW_XY, FOLLOW_Z = 0.12, 0.04  # share of the way to the base per frame; slower in z, so that steps do not shake the picture
+FOLLOW_ALL = 0.04  # the same for all: slow, for robots come into reach and leave it
+REACH = 14.0  # [robot radius] how far a robot may be from the followed one and still be among all
 TURN = 0.08  # share of the way to the heading per frame
 JUMP = 3.0  # [robot radius] a base this far from where the camera looks was reset, not walked: cut instead of a swish
 
@@ -31,8 +33,7 @@ class CameraMan:
         before, self._shot = self._shot, (mode, world)
         changed = before is None or before[0] != mode
         if mode == "all":
-            if changed or not self.by_hand:
-                self._see_all(cut=changed)
+            self._see_all(world, cut=changed)
         elif mode == "behind":
             self._follow(world, cut=before != self._shot)
             self._turn(math.degrees(self.cast.anchors[world].heading), cut=changed)
@@ -73,15 +74,15 @@ class CameraMan:
         if cut:
             camera.distance, camera.elevation = 1.3 * DISTANCE * self.cast.radius, ELEVATION
 
-    def _see_all(self, cut: bool) -> None:
-        """All robots, from the side that the first shot had."""
+    def _see_all(self, world: int, cut: bool) -> None:
+        """All robots that are not out of reach of this one; they walk apart, and from too far they are specks."""
         places = np.array([anchor.position for anchor in self.cast.anchors])
-        camera, middle = self.camera, (places.min(axis=0) + places.max(axis=0)) / 2
-        reach = float(np.linalg.norm(places - middle, axis=1).max()) + self.cast.radius
-        distance = max(DISTANCE * self.cast.radius, 2.2 * reach)
-        share = 1.0 if cut else FOLLOW_XY
+        near = places[np.linalg.norm(places - places[world], axis=1) < REACH * self.cast.radius]
+        camera, middle = self.camera, (near.min(axis=0) + near.max(axis=0)) / 2
+        reach = float(np.linalg.norm(near - middle, axis=1).max()) + self.cast.radius
+        share = 1.0 if cut else FOLLOW_ALL
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         camera.lookat[:] += share * (middle - camera.lookat)
-        camera.distance += share * (distance - camera.distance)
+        camera.distance += share * (2.5 * reach - camera.distance)
         if cut:
             camera.azimuth, camera.elevation = AZIMUTH, ELEVATION_ALL

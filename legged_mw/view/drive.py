@@ -50,7 +50,7 @@ BINDINGS = (
     Binding("pause", ("enter",), "pause and go on"),
     Binding("slower", ("-",), "slow motion"),
     Binding("faster", ("=",), "back towards real time"),
-    Binding("camera", ("c",), "camera: follow, behind, all"),
+    Binding("camera", ("c",), "camera: follow, behind, all around"),
     Binding("help", ("h",), "show the keys"),
 )
 ACTIONS = tuple(binding.action for binding in BINDINGS)

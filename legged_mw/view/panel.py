@@ -154,7 +154,7 @@ class Panel:
         curves = [[[float(v) for v in rows[:, 1 + part + index]] for part in (3, 0)] for index in range(3)]
         for index, name in enumerate(COMPONENTS):
             low, high = (1.25 * float(limit) for limit in limits[:, index])
-            if plot.BeginPlot(f"##{name}", ui.Vec2(-1, 84), int(plot.Flags.CanvasOnly) | int(plot.Flags.NoInputs)):
+            if plot.BeginPlot(f"##{name}", ui.Vec2(-1, 70), int(plot.Flags.CanvasOnly) | int(plot.Flags.NoInputs)):
                 try:
                     plot.SetupAxes("", name, plot.AxisFlags.NoTickLabels, plot.AxisFlags.NoGridLines)
                     plot.SetupAxesLimits(-CURVE_SECONDS, 0.0, low, high, plot.Cond.Always)

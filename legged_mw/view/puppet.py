@@ -109,6 +109,7 @@ class Cast:
             self.model, self._bodies = marionettes(model, count)
             self.data = mujoco.MjData(self.model)
             self.base = self.model.body("focus").id
+        self.pose(np.tile(model.qpos0, (count, 1)))  # a window may draw before it is shown anything
 
     def pose(self, qpos: ArrayLike, world: int = 0) -> None:
         """Place all robots, rows of `qpos` (N, nq); lights and tracking cameras go with `world`."""
