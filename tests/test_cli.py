@@ -273,6 +273,31 @@ def test_no_command(root: Path, text: str) -> None:
     assert f"--command {text}: write three numbers, vx,vy,yaw [m/s, m/s, rad/s], e.g. 0.8,0,0" in line
 
 
+@pytest.mark.parametrize(
+    ("args", "part"),
+    [
+        (["--command=9,0,0"], "vx = 9 m/s is outside of what the policy was trained for, -1.5 to 1.5"),
+        (["--commands", "none.yaml"], "none.yaml: cannot read this config file: No such file"),
+        (["--commands", "a.yaml", "--command=0,0,0"], "it goes with neither --command nor --eval nor --export"),
+        (["--viewer", "wbe"], "argument --viewer: invalid choice: 'wbe'"),
+        (["--viewer", "web", "--video", "a.mp4"], "--video records and --viewer web does not: leave one of them out"),
+        (["--video", "a.avi"], "Cannot write 'a.avi': the supported extensions are .mp4 (H.264) and .gif."),
+    ],
+)
+def test_what_cannot_be_watched_is_refused_before_anything_runs(root: Path, args: list[str], part: str) -> None:
+    assert part in refused(root, "play", *TASK, "--device", "cpu", *args)
+
+
+def test_a_wider_range_lets_a_command_pass(root: Path, tmp_path: Path) -> None:
+    """And a script with no viewer ends by itself and says what its commands gave."""
+    drive = tmp_path / "drive.yaml"
+    drive.write_text("commands: [{time: 0, command: [9, 0, 0]}]")
+    wide = ["--set", "commands.ranges.lin_vel_x=[-9,9]", "--viewer", "none", "--time", "0.1s"]
+    result = run("play", root, *TASK, "--device", "cpu", "--commands", str(drive), *wide)
+    assert result.code == 0, result.err
+    assert "0.0 s   0.1 s   +9.00 +0.00 +0.00" in result.out
+
+
 # ---- what is shown
 
 
@@ -309,7 +334,7 @@ def test_check(tmp_path: Path) -> None:
 def test_help_lists_every_flag(tmp_path: Path) -> None:
     for program, flags in (
         ("train", ("--resume", "--max_time", "--list", "--check")),
-        ("play", ("--command", "--video", "--eval", "--export")),
+        ("play", ("--command", "--commands", "--viewer", "--video", "--sheet", "--eval", "--export")),
     ):
         result = run(program, tmp_path, "--help")
         assert result.code == 0

@@ -388,9 +388,8 @@ def flags(*args: str) -> argparse.Namespace:
 def test_auto_takes_the_best_there_is_and_says_why(
     args: list[str], screen: bool, terminal: bool, studio: bool, kind: str, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(launch, "has_display", lambda: screen)
     monkeypatch.setattr(web, "missing", lambda: None if studio else "no studio")
-    chosen, reason = launch.choose(flags(*args), terminal)
+    chosen, reason = launch.choose(flags(*args), terminal, screen)
     assert chosen == kind and why in reason
 
 
@@ -609,6 +608,8 @@ def test_the_page_is_served_on_this_machine_alone_and_says_no_to_a_bad_host() ->
             assert b"canvas" in answer.read()
         with pytest.raises(OSError):  # any other address of this machine
             urllib.request.urlopen(f"http://[::1]:{page.port}/", timeout=2)
+        with pytest.raises(ViewError, match=rf"--port {page.port} is in use on 127.0.0.1; leave it out"):
+            WebViewer(MODEL, pilot, port=page.port)
     assert not page.is_running()
     with pytest.raises(ViewError, match=r"--host 203.0.113.7: this machine has no such address"):
         WebViewer(MODEL, pilot, host="203.0.113.7")

@@ -82,13 +82,13 @@ def check_drive(args: argparse.Namespace, limits: ArrayLike) -> list[float] | No
     return command
 
 
-def choose(args: argparse.Namespace, terminal: bool) -> tuple[str, str]:
+def choose(args: argparse.Namespace, terminal: bool, screen: bool) -> tuple[str, str]:
     """The viewer to take, and why in words. A terminal has somebody at it who can open a page; a batch job must end by itself."""
     if args.viewer != "auto":
         return args.viewer, "as asked"
     if args.video or args.sheet:
         return "video", "a file was asked for"
-    if has_display():
+    if screen:
         return "native", "there is a screen"
     if not terminal:
         return "video", "no screen here, and no terminal with somebody who could open a web page"
@@ -100,7 +100,7 @@ def choose(args: argparse.Namespace, terminal: bool) -> tuple[str, str]:
 def watch(stage: Stage, args: argparse.Namespace, folder: Path, picture: Picture | None = None, title: str = "legged_mw") -> Summary:
     """Show `stage` as the flags say; files without a name go to `folder`. Prints what it chose, where to look, and what came of it."""
     script = load_script(args.commands, stage.limits) if args.commands else None
-    kind, why = choose(args, terminal=sys.stdout.isatty())
+    kind, why = choose(args, sys.stdout.isatty(), has_display())
     pilot = Pilot(stage.limits, min(stage.num_worlds, ROBOTS_SHOWN), args.camera)
     if stage.num_worlds > ROBOTS_SHOWN and kind != "none":
         print(f"{stage.num_worlds} robots, the first {ROBOTS_SHOWN} of them are shown")
@@ -111,14 +111,13 @@ def watch(stage: Stage, args: argparse.Namespace, folder: Path, picture: Picture
     session = Session(stage, viewer, pilot, seconds=seconds, real_time=kind in ("native", "web"), script=script, gamepad=gamepad)
     try:
         summary = session.run()
+        viewer.close()
     except BaseException:
-        if isinstance(viewer, Film):
-            viewer.abort()
+        (viewer.abort if isinstance(viewer, Film) else viewer.close)()
         raise
     finally:
         if gamepad is not None:
             gamepad.close()
-    viewer.close()
     if isinstance(viewer, Film):
         print(f"written to {', '.join(_shown(path) for path in (viewer.video, viewer.sheet) if path)}")
     print(summary.text() if script or kind == "none" else summary.text().splitlines()[0])
@@ -141,9 +140,10 @@ def _open(
         try:
             viewer: Viewer = NativeViewer(stage.model, pilot, count)
         except ViewError as error:
-            if args.viewer == "native" or web.missing() is not None:
+            if args.viewer == "native":
                 raise
-            kind, why = "web", f"no window could be opened: {error}"
+            kind, why = choose(args, sys.stdout.isatty(), screen=False)
+            print(f"no window: {error}")
         else:
             print(f"viewer: a window ({why}); h shows the keys")
             return viewer

@@ -8,6 +8,7 @@ reached through `ssh -L`. Studio is young: what is used of it beyond its documen
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+import errno
 import getpass
 import logging
 import os
@@ -23,7 +24,7 @@ from legged_mw.view.puppet import Cast
 from legged_mw.view.stage import Moment, ViewError
 
 LOCAL = "127.0.0.1"
-FIRST_PORT = 8080
+FIRST_PORT, PORTS = 8080, 20
 START_SECONDS = 20.0
 
 
@@ -49,7 +50,7 @@ class WebViewer:
         from legged_mw.view.face import Face  # imports what a mujoco without web viewer lacks
 
         self.cast = Cast(model, count)
-        port = port or free_port(host)
+        port = free_port(host, port)
         self._face = Face(self.cast, pilot, title)
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
         with _held_to(host):
@@ -81,8 +82,11 @@ class WebViewer:
 
     def _wait(self, host: str, port: int) -> None:
         """Until the page is served, and on no other interface than the one asked for."""
-        if not self._face.begun.wait(START_SECONDS):
-            self._handle.close()  # raises what went wrong on the viewer's thread
+        for _ in range(round(START_SECONDS / 0.1)):
+            if self._face.begun.wait(0.1) or not self._handle.is_running():  # which raises what went wrong on the viewer's thread
+                break
+        if not self._face.begun.is_set():
+            self._handle.close()
             raise ViewError("--viewer web: MuJoCo's web viewer did not start")
         bound = self._face.viewer._http_sock.getsockname()
         if host == LOCAL and bound[0] != LOCAL:
@@ -108,20 +112,24 @@ def _held_to(host: str) -> Iterator[None]:
         web_server.bind_public_socket = bind
 
 
-def free_port(host: str, first: int = FIRST_PORT, count: int = 20) -> int:
-    """The first port that nobody listens on, from `first` on."""
-    for port in range(first, first + count):
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        with socket.socket(family, socket.SOCK_STREAM) as probe:
+def free_port(host: str, port: int = 0) -> int:
+    """`port` if nobody listens on it, or the first free one from FIRST_PORT on. Raises ViewError."""
+    candidates = [port] if port else range(FIRST_PORT, FIRST_PORT + PORTS)
+    for candidate in candidates:
+        with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             try:
-                probe.bind((host, port))
+                probe.bind((host, candidate))
             except OSError as error:
-                if isinstance(error, socket.gaierror) or error.errno == 99:  # no such interface here
+                if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
                     raise ViewError(f"--host {host}: this machine has no such address ({error.strerror})") from None
+                if isinstance(error, PermissionError):
+                    raise ViewError(f"--port {candidate}: this user may not listen there; ports from 1024 on are free for all") from None
                 continue
-            return port
-    raise ViewError(f"--viewer web: ports {first} to {first + count - 1} are all in use; name another with --port")
+            return candidate
+    if port:
+        raise ViewError(f"--port {port} is in use on {host}; leave it out and the first free one from {FIRST_PORT} is taken")
+    raise ViewError(f"--viewer web: ports {FIRST_PORT} to {FIRST_PORT + PORTS - 1} are all in use; name another with --port")
 
 
 def tunnel_line(port: int) -> str:
