@@ -428,6 +428,21 @@ def test_a_batch_job_gets_a_video_and_a_sheet(tmp_path: Path, capsys: pytest.Cap
     assert "(no screen here, and no terminal" in capsys.readouterr().out
 
 
+def test_a_window_that_cannot_open_does_not_leave_a_batch_job_waiting(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise ViewError("no OpenGL on :99")
+
+    monkeypatch.setattr(launch, "has_display", lambda: True)
+    monkeypatch.setattr(launch, "NativeViewer", refuse)
+    monkeypatch.setattr("sys.stdout.isatty", lambda: False, raising=False)
+    launch.watch(FakeStage(), flags("--time", "0.1"), tmp_path, launch.Picture(64, 48))
+    assert (tmp_path / "play.mp4").exists() and "no window: no OpenGL on :99" in capsys.readouterr().out
+    with pytest.raises(ViewError, match="no OpenGL on :99"):
+        launch.watch(FakeStage(), flags("--viewer", "native"), tmp_path)
+
+
 # ---- the web page
 
 

@@ -1,1 +1,1 @@
-"""Looking at a robot: video files and windows. Numbers come in as numpy arrays; nothing here steps a simulation."""
+"""Watching and driving robots: a stage that moves, viewers that show it, a pilot. numpy, mujoco and yaml; torch in env_stage.py alone."""

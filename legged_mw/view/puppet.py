@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from legged_mw.view.stage import FloatArray
 
 GROUPS_SHOWN = 3  # geom groups 0 ground, 1 and 2 what is meant to be seen; from 3 on collision shapes
-SHADOW_MAX = 8.0  # [extent] half-width of the shadow map: at 2048 pixels a shadow's edge is then 8 mm coarse
+SHADOW_MAX, SHADOW_SIZE = 8.0, 4096  # [extent] half-width of the shadow map, [px] its edge: 4 mm a pixel at the most
 SPACING = 3.0  # [robot radius] between robots that stand side by side
 _SHAPES = {  # what a marionette can wear; skins, flexes and signed distance fields stay at home
     int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}"))
@@ -167,6 +167,7 @@ def marionettes(model: mujoco.MjModel, count: int) -> tuple[mujoco.MjModel, list
     _copy_visuals(spec, model)
     wide = math.ceil(math.sqrt(count)) * SPACING * 0.5 / max(model.stat.extent, 1e-6)
     spec.visual.map.shadowclip = min(max(model.vis.map.shadowclip, wide), SHADOW_MAX)
+    spec.visual.quality.shadowsize = max(model.vis.quality.shadowsize, SHADOW_SIZE)
     _copy_assets(spec, model)
     for body in range(model.nbody):
         if model.body_weldid[body] == 0:
