@@ -657,6 +657,9 @@ def test_the_environment_follows_the_pilot() -> None:
     qpos = stage.qpos()
     assert qpos.shape == (2, stage.model.nq) and qpos.dtype == np.float64 and np.allclose(qpos[1, 2], env.init_pos[2])
     assert stage.contacts().shape == (2, 4) and not stage.fell().any()
+    kept = stage._obs["state"].clone()  # pyright: ignore[reportAttributeAccessIssue]
+    stage.step(commands * 0.5)
+    assert np.array_equal(seen[-1], commands.astype(np.float32) * 0.5) and not np.array_equal(kept[:, -3:], seen[-1])
     env.fell.fill_(True)
     assert stage.fell().all()
 

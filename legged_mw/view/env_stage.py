@@ -18,7 +18,8 @@ class EnvStage:
     """Robots of a `LeggedRobot` under `policy`; see `stage.Stage`.
 
     The environment's step may be a recorded graph, so what a pilot changes is written into its buffers between two
-    steps, and the observations are computed anew: the policy sees a command in the step that it is given for.
+    steps. The policy sees a command in the step that it is given for: the observations' row "commands" is filled anew,
+    and that row alone, for noise and delays of the others belong to the step.
     """
 
     def __init__(self, env: LeggedRobot, policy: Callable[[TensorDict], Tensor], limits: ArrayLike) -> None:
@@ -32,7 +33,7 @@ class EnvStage:
         env = self.env
         if commands is not None:
             env.commands.copy_(torch.as_tensor(commands, dtype=torch.float, device=env.device))
-            self._look()
+            self._tell()
         self._obs, *_ = env.step(self.policy(self._obs))
 
     def commands(self) -> FloatArray:
@@ -60,11 +61,19 @@ class EnvStage:
         mask[world] = True
         self.env.reset_envs(mask)
         self.env.fell.masked_fill_(mask, False)
-        self._look()
-
-    def _look(self) -> None:
         self.env.compute_observations()
         self._obs = self.env.get_observations()
+
+    def _tell(self) -> None:
+        """Put the command into the observations at hand."""
+        for group, rows in self.env._observation_rows().items():
+            start = 0
+            for row in rows:
+                span = slice(start, start + row.value.shape[1])
+                if row.name == "commands":
+                    scale = self.env.obs_scales[group][span] if group in self.env.obs_scales else 1.0
+                    self._obs[group][:, span] = row.value * scale
+                start = span.stop
 
 
 def _array(tensor: Tensor) -> FloatArray:
