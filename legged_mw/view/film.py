@@ -22,7 +22,7 @@ from legged_mw.view.video import Frame, VideoWriter, contact_sheet, save_png
 
 SHADOW_MAX = 2048  # ours: edge of the shadow map [px]; 8192, found in many scenes, halves the frame rate of software OpenGL
 GEOMS_MAX = 20_000
-SMALL = 800  # [px] pictures up to this width get smaller letters
+TINY, SMALL = 400, 800  # [px] pictures up to these widths get smaller letters
 SHEET_FRAMES, SHEET_COLUMNS, SHEET_WIDTH = 12, 4, 320  # pictures, a row of them, the widest that one may be [px]
 GIF_FPS, GIF_WIDTH = 12.5, 640  # a GIF holds hundredths of a second; more of either and it is larger than its video is good
 
@@ -40,7 +40,8 @@ class RobotRenderer:
         self._option = mujoco.MjvOption()
         set_options(self._option)
         try:
-            font = mujoco.mjtFontScale.mjFONTSCALE_150 if width > SMALL else mujoco.mjtFontScale.mjFONTSCALE_100
+            scale = mujoco.mjtFontScale
+            font = scale.mjFONTSCALE_50 if width <= TINY else scale.mjFONTSCALE_100 if width <= SMALL else scale.mjFONTSCALE_150
             self._renderer = mujoco.Renderer(self.cast.model, height=height, width=width, max_geom=GEOMS_MAX, font_scale=font)
         except Exception as error:  # each OpenGL backend fails with a type of its own
             raise ViewError(_no_context(error)) from error

@@ -40,9 +40,10 @@ class Picture(NamedTuple):
     fps: float = 25.0  # [1/s]
 
 
-def add_flags(parser: argparse.ArgumentParser) -> None:
-    """The flags of watching and driving."""
-    parser.add_argument("--viewer", choices=VIEWERS, default="auto", help="where to show it (default: the best that this machine has)")
+def add_flags(parser: argparse.ArgumentParser, viewer: str = "auto") -> None:
+    """The flags of watching and driving; the program adds `--command` and `--time` [s] itself."""
+    best = " (auto: the best that this machine has)"
+    parser.add_argument("--viewer", choices=VIEWERS, default=viewer, help=f"where to show it, by default {viewer}{best}")
     parser.add_argument("--video", metavar="FILE", help="record an .mp4 or a .gif instead")
     parser.add_argument("--sheet", metavar="FILE.png", help="write one picture of twelve moments instead, or beside the video")
     parser.add_argument("--commands", metavar="FILE", help="drive by a YAML script of timed commands")
