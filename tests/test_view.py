@@ -358,6 +358,16 @@ def test_robots_stand_side_by_side_each_in_its_pose(model: mujoco.MjModel) -> No
     assert np.allclose(cast.standing(contacts), [puppet.data.geom("foot-0.1").xpos + cast.offsets[3]])
 
 
+def test_on_a_terrain_each_robot_stays_where_it_is() -> None:
+    terrain = '<asset><hfield name="hills" nrow="2" ncol="2" size="2 2 .5 .1" elevation="0 1 1 0"/></asset><worldbody>'
+    floor = '<geom name="floor" type="plane" size="0 0 .05" material="floor"/>'
+    ground = floor.replace("plane", "hfield").replace('size="0 0 .05"', 'hfield="hills"')
+    hills = mujoco.MjModel.from_xml_string(ROBOT.replace("<worldbody>", terrain, 1).replace(floor, ground))
+    cast = Cast(hills, 3)
+    assert not cast.offsets.any() and cast.model.nhfield == 1
+    assert np.allclose(cast.model.hfield_data, hills.hfield_data) and np.allclose(cast.model.hfield_size, hills.hfield_size)
+
+
 def test_many_robots_are_in_one_picture(model: mujoco.MjModel) -> None:
     with RobotRenderer(model, 320, 240, count=4) as several:
         command = np.tile([1.0, 0.0, 0.0], (4, 1))
