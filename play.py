@@ -12,10 +12,10 @@ from rsl_rl.models import MLPModel
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exam, report, rules
-from legged_mw.rl.policy import act, export_onnx, load_policy, save_policy
+from legged_mw.rl.policy import act, load_policy
 from legged_mw.rl.runs import CONFIG_FILE, find_checkpoint, find_run, runs
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, one_line_errors, pick_device, seed_everything, shown
-from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
+from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 from legged_mw.view import launch
 from legged_mw.view.env_stage import EnvStage
@@ -49,7 +49,9 @@ def parse() -> argparse.Namespace:
     launch.add_flags(parser)
     parser.add_argument("--eval", action="store_true", help="run the walking exam, print its table, write a report")
     parser.add_argument("--compare", metavar="RUN", help="with --eval: grade this run beside it; its name or path, or 'shipped'")
-    parser.add_argument("--export", metavar="DIR", help="write model.pt, policy.onnx and config.yaml there")
+    parser.add_argument(
+        "--export", metavar="DIR", help="write the policy as networks, contract and scene there, to deploy (docs/deploy.md)"
+    )
     args = parser.parse_args()
     if not args.task:
         parser.error(f"--task is missing; tasks: {', '.join(task_names())}")
@@ -76,15 +78,16 @@ def main() -> None:
     changes = changes_since(task, trained)
     for path, (before, now) in sorted(changes.items()):
         print(f"  {path}: {before} -> {now}")
+    if args.export:
+        export(trained, source, Path(args.export))
+        return
     seed_everything(task.train.seed)
     device = pick_device(args.device)
     rival = find_rival(args, device) if args.compare is not None else None
     env = task.env_class(task.cfg, device, eager=args.eager)
     policy = load_policy(source.checkpoint, env, task.train, device)
     out = ROOT / "logs" / task.name / "shipped" if source.shipped else source.folder  # where results go
-    if args.export:
-        export(trained, env, source, device, Path(args.export))
-    elif args.eval:
+    if args.eval:
         overrides = {path: now for path, (_, now) in changes.items()}
         columns = [grade(env, policy, source, overrides)]
         if rival:
@@ -172,16 +175,11 @@ def grade(env: LeggedRobot, policy: MLPModel, source: Source, overrides: dict[st
     return report.Column(name, about, result, figures)
 
 
-def export(trained: dict[str, Any], env: LeggedRobot, source: Source, device: str, folder: Path) -> None:
+def export(trained: dict[str, Any], source: Source, folder: Path) -> None:
     """Write the policy as it was trained, whatever this call overrode for playing."""
-    task = load_task(str(trained["task"]))
-    task.update(trained, where=CONFIG_FILE)
-    policy = load_policy(source.checkpoint, env, task.train, device)
-    folder.mkdir(parents=True, exist_ok=True)
-    save_policy(policy, folder / "model.pt", {"task": task.name})
-    export_onnx(policy, task.cfg.normalization.clip_actions, folder / "policy.onnx")
-    save_yaml(folder / CONFIG_FILE, task.to_dict())
-    print(f"written to {shown(folder)}: model.pt, policy.onnx, {CONFIG_FILE}")
+    from legged_mw.rl.export import describe, export  # onnx takes a while to import
+
+    print(describe(export(trained, source.checkpoint, folder), folder))
 
 
 if __name__ == "__main__":

@@ -142,6 +142,19 @@ def train(
         print(f"stopped: {runner.stop}; go on with\n  {program} --resume {flags}")
     else:
         print(f"done: {shown(folder)}; watch it with\n  python play.py {flags}")
+        if task.train.runner.export:
+            take_away(task, find_checkpoint(folder, -1), folder / "export", flags)
+
+
+def take_away(task: LoadedTask, checkpoint: Path, folder: Path, flags: str) -> None:
+    """Export what was trained; the training is done and saved, so that nothing may end it in an error now."""
+    try:
+        from legged_mw.rl.export import describe, export  # onnx takes a while to import
+
+        print(describe(export(task.to_dict(), checkpoint, folder), folder))
+    except Exception as error:  # whatever an exporter may throw
+        reason = " ".join(f"{error}".split()) or type(error).__name__
+        print(f"not exported: {reason}\n  once that is mended: python play.py {flags} --export {shown(folder)}")
 
 
 def learn_together(runner: Runner, iterations: int, rank: Rank) -> None:

@@ -40,6 +40,10 @@ class Row(NamedTuple):
     mirror: str | None = None  # its mirror image, left for right: a kind of envs/mirror.py, or the group that it is; None: not said
     scale: float | tuple[float, ...] = 1.0  # a number, or one a column; the policy sees scale * (value + noise)
     measured: bool = False  # comes from a sensor, so that domain_rand.observation_delay applies to it
+    # how a robot measures it, for the exported policy; the rows below are known to legged_mw/deploy/contract.py by their names
+    sensors: tuple[str, ...] = ()  # sensors of the MJCF, whose values side by side are the row
+    unit: str = ""
+    frame: str = ""
 
     def column_scales(self) -> list[float]:
         """The scale of each column; raises ConfigError where there is not one for each."""

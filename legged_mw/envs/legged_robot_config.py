@@ -182,6 +182,7 @@ class LeggedRobotCfgPPO(Config):
         run_name: str = ""  # appended to the run folder's time stamp
         logger: Literal["tensorboard", "wandb"] = "tensorboard"
         wandb_project: str = "legged_mw"
+        export: bool = True  # a finished training writes <run folder>/export/, as play.py --export does [ours]
         matmul_precision: Literal["highest", "high"] = "high"  # of the networks on a GPU: high is TF32, highest float32
 
     class obs_groups:

@@ -9,8 +9,7 @@ something in the MJCF, and what a choice changes is recorded in ``RobotModel.ove
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-import difflib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -19,7 +18,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.sim.scene import add_scene
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.errors import UserError, unknown
 
 GROUND = "floor"  # name of the ground geom that build_model adds
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -57,6 +56,7 @@ class RobotModel:
     joint_range: np.ndarray  # (D, 2) [rad]
     effort_range: np.ndarray  # (D, 2) [N m]; infinite where the MJCF states none
     sensors: dict[str, slice]  # "contact", "linvel", "accelerometer" -> span of sensordata
+    spec: mujoco.MjSpec  # what ``visual`` was compiled from: to copy, never to change
     contact_geoms: tuple[str, ...] = ()  # in order of the span "contact"
     overrides: list[str] = field(default_factory=list)  # what the caller's choices changed, a line each
 
@@ -69,14 +69,6 @@ class RobotModel:
             names = [mujoco.mj_id2name(self.physics, obj, i) for i in range(count)]
             raise ModelError(unknown(kind, name, [n for n in names if n], "the model"))
         return index
-
-
-def unknown(what: str, name: str, known: Iterable[str], where: str) -> str:
-    """One line: ``name`` does not exist, the nearest name that does, and all that do."""
-    known = list(known)
-    close = difflib.get_close_matches(name, known, n=1)
-    hint = f"did you mean '{close[0]}'? " if close else ""
-    return f"no {what} '{name}' in {where}; {hint}there are: {', '.join(known) or 'none'}"
 
 
 def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str) -> list[float]:
@@ -131,6 +123,7 @@ def build_model(
         visual = spec.compile()
     except ValueError as error:  # a missing mesh, a name used twice: all that parsing does not see
         raise _invalid(file, error) from None
+    drawn = spec.copy()
     spec.compiler.discardvisual = True
     for light in list(spec.lights):
         spec.delete(light)  # mujoco-warp would move it in every step
@@ -147,6 +140,7 @@ def build_model(
         effort_range=np.array(limits).reshape(-1, 2),
         sensors=_sensor_spans(mj, len(touching), len(velocity_sites), accelerometer_site is not None),
         contact_geoms=touching,
+        spec=drawn,
         overrides=notes,
     )
 

@@ -1,4 +1,4 @@
-"""What train.py and play.py share on the command line: flags, one-line errors, durations, seeds."""
+"""What the programs share on the command line: flags, one-line errors, durations, seeds. Imports without torch."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import NoReturn
 
 import numpy as np
-import torch
 
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import UserError
@@ -65,6 +64,8 @@ def apply_overrides(task: LoadedTask, args: argparse.Namespace) -> None:
 
 def pick_device(asked: str | None) -> str:
     """The device asked for, or the best there is; a clear error for one that is not there."""
+    import torch  # here alone: legged_mw.deploy shares this file, and runs where torch is not installed
+
     if asked is None:
         return "cuda:0" if torch.cuda.is_available() else "cpu"
     if re.fullmatch(r"cuda(:\d+)?", asked):
@@ -79,6 +80,8 @@ def pick_device(asked: str | None) -> str:
 
 def seed_everything(seed: int) -> None:
     """Seed Python, numpy and torch on every device."""
+    import torch
+
     random.seed(seed)
     np.random.seed(seed % 2**32)
     torch.manual_seed(seed)

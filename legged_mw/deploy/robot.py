@@ -1,0 +1,75 @@
+"""The seam: what a robot promises to a policy. A simulated one is in ``simulated``, one behind a network link in ``udp``.
+
+A real robot's SDK plugs in here: write one class with the three methods of ``Robot`` and hand it to ``runner.run``.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from legged_mw.deploy.contract import SENSORS, Contract, quantity_size
+from legged_mw.utils.errors import UserError
+
+Floats = NDArray[np.float64]
+
+
+class RobotError(UserError, RuntimeError):
+    """A robot that does not answer, or not as the contract wants; the text says what happened and what was done."""
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What a robot knows of itself at one moment; D joints in the contract's order, F feet. Many robots: (N, ...) each.
+
+    What no observation row of the contract needs may stay zero.
+    """
+
+    lin_vel: Floats  # (3,) of the IMU, body frame (x forward, y left, z up) [m/s]; on a real robot from a state estimator
+    ang_vel: Floats  # (3,) gyro, body frame [rad/s]
+    gravity: Floats  # (3,) direction of gravity, body frame, unit length: standing level it is (0, 0, -1)
+    joint_pos: Floats  # (D,) [rad], the angle itself: the contract's default pose is taken off later
+    joint_vel: Floats  # (D,) [rad/s]
+    joint_torque: Floats  # (D,) [N m]
+    acceleration: Floats  # (3,) of the IMU, body frame: standing level it is (0, 0, 9.81) [m/s^2]
+    foot_contact: Floats  # (F,) 1 where a foot touches the ground, else 0
+    others: Mapping[str, Floats] = field(default_factory=dict)  # rows that name sensors of their own: row -> (size,)
+
+
+QUANTITIES = tuple(f.name for f in fields(Measurement) if f.name != "others")
+
+
+def layout(contract: Contract) -> dict[str, int]:
+    """Values of each part of a measurement, the rows with sensors of their own last."""
+    own = {row.name: row.size for row in contract.rows if row.measured == SENSORS}
+    return {**{name: quantity_size(contract, name) for name in QUANTITIES}, **own}
+
+
+class Robot(ABC):
+    """One robot. ``read``, decide, ``write``, every ``contract.period`` seconds; whoever calls keeps the time.
+
+    Both calls must return well within the period. Joints are in the contract's order, whatever the machine's own is.
+    """
+
+    @abstractmethod
+    def read(self) -> Measurement:
+        """The newest measurement. Raises RobotError if there is none younger than the robot can be trusted with."""
+
+    @abstractmethod
+    def write(self, targets: Floats) -> None:
+        """Servo targets (D,) [rad] for the next period, held by position servos with the contract's stiffness and damping."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let go: joints damped and no longer servoed, links closed. Safe to call twice, and after an error."""
+
+    def __enter__(self) -> Any:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

@@ -1,0 +1,102 @@
+"""Robots in MuJoCo's C engine, from an export's ``scene.xml``: one behind the seam, or many side by side.
+
+Measurements come from MuJoCo's sensors by their names. Physics computes sensors before it moves on, so after each period
+the sensors of position and velocity are computed again, in the new state; what needs forces (torque, acceleration, contact)
+is one physics step old, as it was in training.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch, SimulationError
+from numpy.typing import NDArray
+
+from legged_mw.deploy.contract import Contract, read_scene
+from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, layout
+from legged_mw.utils.machine import usable_cores
+
+_NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # sensors of position and velocity describe the new state
+
+
+class Fleet:
+    """``count`` robots, each in a world of its own, stepped together on ``threads`` threads (0: one a core)."""
+
+    def __init__(self, folder: Path, contract: Contract, count: int = 1, threads: int = 0) -> None:
+        """Load the scene and put every robot into its first keyframe. Raises ContractError."""
+        scene = read_scene(folder, contract)
+        self.contract, self.count, self.model = contract, count, scene.model
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world counts as fallen, in silence
+        _keep_quiet()
+        self._batch = Batch(self.model, count, threads or min(usable_cores(), count))
+        self._sensors, self._layout = self._batch.bind("sensordata"), layout(contract)
+        self.qpos: Floats = self._batch.bind("qpos")  # (N, nq), a view: position [m], quaternion, joints in MuJoCo's order
+        self.qvel: Floats = self._batch.bind("qvel")  # (N, nv), a view: what is written is in force in the next step
+        self._ctrl, self._where, self._actuators = self._batch.bind("ctrl"), scene.sensordata, scene.actuators
+        self.broken: NDArray[np.bool_] = np.zeros(count, dtype=bool)  # robots that MuJoCo could not step since their reset
+        self.reset()
+
+    def read(self) -> Measurement:
+        """Measurement of every robot, (N, ...) each, in copies."""
+        values = {name: self._value(name) for name in self._layout}
+        return Measurement(**{n: values[n] for n in QUANTITIES}, others={n: v for n, v in values.items() if n not in QUANTITIES})
+
+    def write(self, targets: Floats) -> None:
+        """Step every robot by one period with servo targets (N, D) [rad]."""
+        self._ctrl[:, self._actuators] = targets
+        try:
+            self._batch.step(nstep=self.contract.decimation, stage=_NOW)
+        except SimulationError as error:  # the others are stepped all the same
+            self.broken[error.ids] = True
+
+    def fell(self) -> NDArray[np.bool_]:
+        """Robots (N,) whose z axis points below the horizon, or whose state is no longer finite."""
+        w, x, y, z = self.qpos[:, 3:7].T
+        upright = w**2 - x**2 - y**2 + z**2 >= 0.0  # NaN compares false
+        return ~upright | ~np.isfinite(self.qvel).all(axis=1) | self.broken
+
+    def reset(self, which: Any = None) -> None:
+        """Put the robots ``which`` (indices; None: all) into the first keyframe, at rest."""
+        which = np.arange(self.count) if which is None else np.asarray(which)
+        self._batch.reset(which, keyframe=0, stage=_NOW)
+        self.broken[which] = False
+
+    def limp(self) -> None:
+        """Servos off: the joints' own damping is all that is left."""
+        for name in ("actuator_gainprm", "actuator_biasprm"):
+            self._batch.expand(name)[:] = 0.0
+
+    def _value(self, name: str) -> Floats:
+        if name == "gravity":
+            return -self._sensors[:, self._where["up"]]
+        value = self._sensors[:, self._where[name]]
+        return (value > 0.0).astype(float) if name == "foot_contact" else value
+
+
+class MujocoRobot(Robot):
+    """One simulated robot behind the seam. Simulated time moves on in ``write``, by one period."""
+
+    def __init__(self, folder: Path, contract: Contract) -> None:
+        self.fleet = Fleet(folder, contract, 1, threads=1)
+
+    def read(self) -> Measurement:
+        many = self.fleet.read()
+        return Measurement(**{n: getattr(many, n)[0] for n in QUANTITIES}, others={n: v[0] for n, v in many.others.items()})
+
+    def write(self, targets: Floats) -> None:
+        self.fleet.write(np.asarray(targets).reshape(1, -1))
+
+    def close(self) -> None:
+        self.fleet.limp()
+
+
+def _keep_quiet() -> None:
+    """A world that breaks is counted; MuJoCo would print a line and write a file of its own."""
+    config = mujoco.MjLogConfig.get()
+    config.logto_console = config.logto_file = False
+    config.set()

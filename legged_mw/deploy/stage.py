@@ -1,0 +1,73 @@
+"""An export's robots as a stage: something to be watched and driven, one control step at a time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.robot import Floats
+from legged_mw.deploy.simulated import Fleet
+
+STROLL = (0.5, 0.0, 0.0)  # what a robot does that nobody commands: vx, vy [m/s], yaw rate [rad/s]; within the trained ranges
+
+
+class DeployStage:
+    """``num_worlds`` robots that follow an exported policy in MuJoCo's C engine (the viewers' protocol ``Stage``)."""
+
+    def __init__(self, folder: Path, num_worlds: int = 1, command: tuple[float, float, float] | None = None, threads: int = 0) -> None:
+        """Load the export in ``folder``; ``command`` is what is followed while nobody says otherwise."""
+        self.contract = read_contract(folder)
+        self.fleet = Fleet(folder, self.contract, num_worlds, threads)
+        self.controller = Controller(folder, self.contract, num_worlds)
+        self.model, self.num_worlds, self.dt = self.fleet.model, num_worlds, self.contract.period
+        self.limits: Floats = self.contract.command_ranges
+        own = np.clip(STROLL, *self.limits) if command is None else np.array(command)
+        self._own = np.tile(own, (num_worlds, 1))
+        self._commands = self._own.copy()
+        self._fell = np.zeros(num_worlds, dtype=bool)
+        self.measured = self.fleet.read()  # at the end of the last step
+
+    def step(self, commands: Floats | None = None) -> None:
+        """One period with ``commands`` (N, 3), or the stage's own. A robot that falls begins anew."""
+        self._commands = self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self.num_worlds, 3)
+        self.fleet.write(self.controller.act(self.measured, self._commands))
+        self._fell = self.fleet.fell()
+        if self._fell.any():
+            self.fleet.reset(np.flatnonzero(self._fell))
+            self.controller.reset(self._fell)
+        self.measured = self.fleet.read()
+
+    def commands(self) -> Floats:
+        """(N, 3) vx, vy [m/s], yaw rate [rad/s], body frame, of the last step."""
+        return self._commands.copy()
+
+    def velocity(self) -> Floats:
+        """(N, 3) vx, vy [m/s] of the IMU, yaw rate [rad/s], body frame."""
+        return np.concatenate([self.measured.lin_vel[:, :2], self.measured.ang_vel[:, 2:]], axis=1)
+
+    def qpos(self) -> Floats:
+        """(N, nq)."""
+        return self.fleet.qpos.copy()
+
+    def contacts(self) -> NDArray[np.bool_]:
+        """(N, F), in the contract's order of feet."""
+        return self.measured.foot_contact > 0.0
+
+    def fell(self) -> NDArray[np.bool_]:
+        """(N,) in the last step."""
+        return self._fell.copy()
+
+    def push(self, world: int, velocity: Any) -> None:
+        """The robot's horizontal velocity jumps by ``velocity`` (2,) [m/s, world frame]; the policy sees it a step later."""
+        self.fleet.qvel[world, :2] += velocity
+
+    def reset(self, world: int) -> None:
+        """Back to the start, at rest."""
+        self.fleet.reset([world])
+        self.controller.reset([world])
+        self.measured = self.fleet.read()

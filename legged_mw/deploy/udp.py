@@ -1,0 +1,211 @@
+"""A robot at the other end of a network link: packets, the client that is a ``Robot``, and the server that owns one.
+
+Little-endian; a header, then float64 values. Both ends read the same export: the header's digest says whether they did.
+Meant for one machine or a cable between two: nothing is encrypted, and whoever can send to the port moves the robot.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import socket
+import struct
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, RobotError, layout
+from legged_mw.utils.errors import UserError
+
+VERSION = 1
+HELLO, MEASURED, TARGETS, CLOSE, REFUSED = range(1, 6)  # kinds of packet
+_HEADER = struct.Struct("<4sBB8sI")  # "LMWR", version, kind, digest of the contract's layout, count of TARGETS sent so far
+_MAGIC, _MOST = b"LMWR", 65507  # bytes that fit into one packet
+
+
+class Packet(NamedTuple):
+    """One packet, taken apart."""
+
+    kind: int
+    digest: bytes
+    count: int
+    body: bytes
+
+
+def contract_digest(contract: Contract) -> bytes:
+    """Eight bytes that differ where joints, their order, a measurement's layout or the period differ."""
+    said = [list(contract.joints), list(contract.feet), layout(contract), contract.period]
+    return hashlib.sha256(json.dumps(said).encode()).digest()[:8]
+
+
+def pack(kind: int, digest: bytes, count: int, body: bytes = b"") -> bytes:
+    """The bytes of a packet."""
+    return _HEADER.pack(_MAGIC, VERSION, kind, digest, count) + body
+
+
+def unpack(data: bytes) -> Packet | None:
+    """A packet from its bytes; None for what is none of ours. Raises RobotError for one of another version."""
+    if len(data) < _HEADER.size or data[:4] != _MAGIC:
+        return None
+    _, version, kind, digest, count = _HEADER.unpack_from(data)
+    if version != VERSION:
+        raise RobotError(f"the other end speaks version {version} of the link, this one {VERSION}: update one of them")
+    return Packet(kind, digest, count, data[_HEADER.size :])
+
+
+def parse_address(text: str) -> tuple[str, int]:
+    """ "HOST:PORT" as what a socket wants."""
+    host, colon, port = text.rpartition(":")
+    if not colon or not port.isdigit() or not 0 < int(port) < 65536:
+        raise UserError(f"'{text}' is no address; write HOST:PORT, e.g. 127.0.0.1:9870")
+    return host or "127.0.0.1", int(port)
+
+
+class UdpRobot(Robot):
+    """The robot that a server at ``address`` owns. Every packet is answered by a measurement, or there is none: no blind step."""
+
+    def __init__(self, contract: Contract, address: tuple[str, int], timeout: float = 0.5) -> None:
+        """Say hello and take the first measurement; raises RobotError if nobody answers within ``timeout`` [s]."""
+        self._layout, self._digest, self._name = layout(contract), contract_digest(contract), f"{address[0]}:{address[1]}"
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.settimeout(timeout)
+        self._count, self._timeout, self._open = 0, timeout, True
+        try:
+            self._socket.connect(address)
+        except OSError as error:
+            raise self._lost(f"{error.strerror or error}") from None
+        self._measured = self._exchange(HELLO)
+
+    def read(self) -> Measurement:
+        return self._measured
+
+    def write(self, targets: Floats) -> None:
+        self._count += 1
+        self._measured = self._exchange(TARGETS, np.asarray(targets, dtype="<f8").tobytes())
+
+    def close(self) -> None:
+        if self._open:
+            self._open = False
+            with contextlib.suppress(OSError):  # it is gone: its server lets the joints go by itself
+                self._socket.send(pack(CLOSE, self._digest, self._count))
+            self._socket.close()
+
+    def _exchange(self, kind: int, body: bytes = b"") -> Measurement:
+        try:
+            self._socket.send(pack(kind, self._digest, self._count, body))
+            while True:
+                packet = unpack(self._socket.recv(_MOST))
+                if packet and packet.kind == REFUSED:
+                    raise self._lost(packet.body.decode("utf-8", "replace"))
+                if packet and packet.kind == MEASURED and packet.count == self._count:  # an answer to an older one is late
+                    return self._measurement(packet.body)
+        except TimeoutError:
+            raise self._lost(f"no answer within {self._timeout:g} s") from None
+        except OSError as error:
+            raise self._lost(f"{error.strerror or error}") from None
+
+    def _lost(self, why: str) -> RobotError:
+        self.close()
+        return RobotError(f"robot at {self._name}: {why}; stopped (start one with: python -m legged_mw.deploy DIR --serve {self._name})")
+
+    def _measurement(self, body: bytes) -> Measurement:
+        values = np.frombuffer(body, dtype="<f8").astype(float)
+        if len(values) != sum(self._layout.values()):
+            raise self._lost(f"a measurement of {len(values)} values came, not of {sum(self._layout.values())}")
+        parts = dict(zip(self._layout, np.split(values, np.cumsum(list(self._layout.values()))[:-1]), strict=True))
+        return Measurement(**{n: parts[n] for n in QUANTITIES}, others={n: v for n, v in parts.items() if n not in QUANTITIES})
+
+
+class UdpServer:
+    """Owns ``robot`` and does what one client at a time says. A client that falls silent costs the joints their servos."""
+
+    def __init__(self, robot: Robot, contract: Contract, address: tuple[str, int], timeout: float = 0.5) -> None:
+        """Listen at ``address`` (port 0: any free one); ``timeout`` [s] is the longest silence of a client."""
+        self._robot, self._contract, self._timeout = robot, contract, timeout
+        self._layout, self._digest, self._count = layout(contract), contract_digest(contract), 0
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        try:
+            self._socket.bind(address)
+        except OSError as error:
+            self._socket.close()
+            raise UserError(f"cannot listen at {address[0]}:{address[1]}: {error.strerror or error}") from None
+        self.address: tuple[str, int] = self._socket.getsockname()
+
+    def serve(self, say: Callable[[str], None] = print) -> str:
+        """Serve one client, from its hello until it closes or falls silent; then let the robot go. Returns why it ended."""
+        why = "interrupted"
+        try:
+            client = self._wait_for_client(say)
+            why = self._obey(client)
+        finally:
+            self._robot.close()
+            self._socket.close()
+            say(f"{why}; the joints are damped, no longer servoed")
+        return why
+
+    def _wait_for_client(self, say: Callable[[str], None]) -> tuple[str, int]:
+        """The first that says hello with the same contract."""
+        self._socket.settimeout(None)
+        while True:
+            data, sender = self._socket.recvfrom(_MOST)
+            kind, answer = self._answer(data, started=False)
+            if answer:
+                self._socket.sendto(answer, sender)
+            if kind == HELLO:
+                say(f"{sender[0]}:{sender[1]} took the robot")
+                return sender
+
+    def _obey(self, client: tuple[str, int]) -> str:
+        """Do what ``client`` says, and nobody else, until it closes or is silent for too long; returns which."""
+        heard = time.monotonic()
+        while (left := heard + self._timeout - time.monotonic()) > 0:
+            self._socket.settimeout(left)
+            try:
+                data, sender = self._socket.recvfrom(_MOST)
+            except TimeoutError:
+                break
+            if sender != client:
+                continue
+            kind, answer = self._answer(data, started=True)
+            if kind == CLOSE:
+                return f"{client[0]}:{client[1]} closed the link"
+            if kind:
+                heard = time.monotonic()
+            if answer:
+                self._socket.sendto(answer, client)
+        return f"{client[0]}:{client[1]} fell silent for {self._timeout:g} s"
+
+    def _answer(self, data: bytes, started: bool) -> tuple[int, bytes | None]:
+        """Do what a packet says; its kind, or 0 if it was refused or none of ours, and the reply."""
+        try:
+            packet = unpack(data)
+        except RobotError as error:
+            return 0, self._refuse(str(error))
+        if packet is None:
+            return 0, None
+        if packet.digest != self._digest:
+            return 0, self._refuse("its export has other joints, measurements or another period; use one export at both ends")
+        if packet.kind == TARGETS and started:
+            targets = np.frombuffer(packet.body[: len(packet.body) // 8 * 8], dtype="<f8")
+            if len(targets) != len(self._contract.joints) or not np.isfinite(targets).all():
+                return 0, self._refuse(f"targets must be {len(self._contract.joints)} finite numbers, one a joint")
+            if packet.count > self._count:  # one that came twice, or late, moves nothing
+                self._count = packet.count
+                self._robot.write(targets)
+        elif packet.kind == TARGETS:
+            return 0, self._refuse("say hello first")
+        elif packet.kind == CLOSE:
+            return CLOSE, None
+        return packet.kind, self._measured()
+
+    def _measured(self) -> bytes:
+        measured = self._robot.read()
+        parts = [measured.others[name] if name in measured.others else getattr(measured, name) for name in self._layout]
+        return pack(MEASURED, self._digest, self._count, np.concatenate(parts).astype("<f8").tobytes())
+
+    def _refuse(self, why: str) -> bytes:
+        return pack(REFUSED, self._digest, self._count, why.encode())

@@ -1,0 +1,294 @@
+"""A trained policy to take away: network files, contract, scene; compared with what was trained before anything is written.
+
+What the files mean is in ``legged_mw.deploy.contract``; nothing here is needed to run them.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import logging
+import os
+import shutil
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import onnx
+import torch
+from rsl_rl.models import MLPModel
+from torch import Tensor, nn
+
+from legged_mw.deploy.contract import CONTRACT_FILE, NETWORK_FILE, ROWS, SCENE_FILE, SENSORS, Contract, Row, digest
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.rl.policy import act, load_policy, save_policy
+from legged_mw.rl.runs import CONFIG_FILE
+from legged_mw.sim.model import per_joint
+from legged_mw.sim.standalone import standalone
+from legged_mw.utils.cli import shown
+from legged_mw.utils.config import save_yaml
+from legged_mw.utils.errors import UserError
+from legged_mw.utils.task import LoadedTask, load_task
+
+MODEL_FILE, PROGRAM_FILE = "model.pt", "policy.pt"
+FILES = (MODEL_FILE, CONFIG_FILE, NETWORK_FILE, PROGRAM_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
+INPUT, OUTPUT = "obs", "actions"
+WORLDS, STEPS = 8, 32  # of the roll-out that the files are tried on
+TOLERANCE = 1e-4  # between actions of the same observation: float32 sums in another order
+
+
+class ExportError(UserError, RuntimeError):
+    """A policy that cannot be exported; nothing was written."""
+
+
+class Exported(NamedTuple):
+    """What an export made."""
+
+    files: tuple[str, ...]
+    gap: float  # largest difference of an action to the trained policy's
+    observations: int  # that it was tried on
+    unknown: tuple[str, ...]  # observation rows that nobody said how to measure: the export cannot be deployed
+
+
+class ExportedPolicy(nn.Module):
+    """Observations (N, size) in their plain units -> clipped mean actions (N, A); the normaliser is inside."""
+
+    def __init__(self, policy: MLPModel, clip_actions: float) -> None:
+        super().__init__()
+        self.policy, self.clip_actions = copy.deepcopy(policy).cpu().as_onnx(verbose=False), clip_actions
+
+    def forward(self, obs: Tensor) -> Tensor:
+        return self.policy(obs).clamp(-self.clip_actions, self.clip_actions)
+
+
+def export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
+    """Write the policy in ``checkpoint``, trained with the config ``trained``, to ``folder``: all files, or none.
+
+    Raises ExportError, ConfigError or ModelError; an export that stands there already is then as it was.
+    """
+    task = load_task(str(trained["task"]))
+    task.update(trained, where=CONFIG_FILE)
+    config = task.to_dict()
+    with torch.random.fork_rng(devices=[]):  # trying the policy draws numbers that are not ours to draw
+        torch.manual_seed(0)
+        env = _small_env(task)
+        policy = load_policy(checkpoint, env, task.train, "cpu")
+        observations, actions = _roll_out(env, policy, task)
+    clip = task.cfg.normalization.clip_actions
+    with _all_or_nothing(folder) as new:
+        save_policy(policy, new / MODEL_FILE, {"task": task.name})
+        save_yaml(new / CONFIG_FILE, config)
+        program = trace(policy, clip)
+        save_program(program, new / PROGRAM_FILE)
+        save_onnx(program, new / NETWORK_FILE)
+        gap = max(
+            _compare(PROGRAM_FILE, _run_program(new / PROGRAM_FILE, observations), actions),
+            _compare(NETWORK_FILE, run_onnx(new / NETWORK_FILE, observations.numpy()), actions),
+        )
+        contract = make_contract(env, task, new)
+        save_yaml(new / CONTRACT_FILE, contract.to_dict())
+    return Exported(FILES, gap, len(observations), tuple(row.name for row in contract.rows if not row.measured))
+
+
+def describe(made: Exported, folder: Path) -> str:
+    """What an export made, in a line, and what stands in the way of its use."""
+    line = f"written to {shown(folder)}: {', '.join(made.files)}; actions differ from the trained policy's by {made.gap:.0e} at most"
+    if made.unknown:
+        line += (
+            f"\n  nothing says how to measure {', '.join(made.unknown)}: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)"
+        )
+    return line
+
+
+# ---- trying it out -------------------------------------------------------------------------------------------------
+
+
+def _small_env(task: LoadedTask) -> LeggedRobot:
+    """The task as trained, with noise and kicks, but small and on a CPU."""
+    task.set("env.num_envs", WORLDS, where="export")
+    task.set("sim.engine", "mujoco", where="export")
+    return task.env_class(task.cfg, "cpu", eager=True)
+
+
+def _roll_out(env: LeggedRobot, policy: MLPModel, task: LoadedTask) -> tuple[Tensor, Tensor]:
+    """Observations (B, size) of the policy walking, and its clipped actions (B, A) on them."""
+    groups, clip, seen = task.train.obs_groups.actor, task.cfg.normalization.clip_actions, []
+    obs = env.get_observations()
+    for _ in range(STEPS):
+        actions = act(policy, obs)
+        seen.append((torch.cat([obs[group] for group in groups], dim=1), actions.clamp(-clip, clip).clone()))
+        obs, *_ = env.step(actions)
+    observations, actions = (torch.cat(parts) for parts in zip(*seen, strict=True))
+    return observations, actions
+
+
+def _compare(name: str, got: np.ndarray, actions: Tensor) -> float:
+    """The largest difference; refuses a file that acts otherwise than the policy."""
+    wanted = actions.numpy()
+    gap = float(np.abs(got - wanted).max()) if got.shape == wanted.shape else float("inf")
+    if not gap <= TOLERANCE:  # NaN too
+        raise ExportError(
+            f"{name} acts otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
+            f"(at most {TOLERANCE:g} is allowed); nothing was written"
+        )
+    return gap
+
+
+def run_onnx(path: Path, observations: np.ndarray) -> np.ndarray:
+    """Actions (B, A) of the network in an ONNX file, by onnxruntime, or where it is not installed by onnx's own evaluator."""
+    try:
+        import onnxruntime
+    except ImportError:
+        from onnx.reference import ReferenceEvaluator
+
+        return np.asarray(ReferenceEvaluator(onnx.load(path)).run([OUTPUT], {INPUT: observations})[0])
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    return np.asarray(session.run([OUTPUT], {INPUT: observations})[0])
+
+
+def _run_program(path: Path, observations: Tensor) -> np.ndarray:
+    program = torch.export.load(io.BytesIO(path.read_bytes()))  # made by this process; one from elsewhere would be trusted blindly
+    with torch.inference_mode():
+        return program.module()(observations).numpy()
+
+
+# ---- files ---------------------------------------------------------------------------------------------------------
+
+
+def trace(policy: MLPModel, clip_actions: float) -> torch.export.ExportedProgram:
+    """The policy as a graph that takes any number of observations, without notes of where its code lies."""
+    example = torch.zeros(2, policy.obs_dim)
+    batch = torch.export.Dim("batch", min=1)
+    program = torch.export.export(ExportedPolicy(policy, clip_actions).eval(), (example,), dynamic_shapes={INPUT: {0: batch}})
+    for node in program.graph.nodes:
+        for note in ("stack_trace", "nn_module_stack", "source_fn_stack", "from_node", "custom"):
+            node.meta.pop(note, None)
+    return program
+
+
+def save_program(program: torch.export.ExportedProgram, path: Path) -> None:
+    """Write for ``torch.export.load``."""
+    file = io.BytesIO()  # for a path it would want the ending .pt2
+    with _quiet_exporter():
+        torch.export.save(program, file)
+    path.write_bytes(file.getvalue())
+
+
+def save_onnx(program: torch.export.ExportedProgram, path: Path) -> None:
+    """Write one self-contained ONNX file: input ``obs`` (batch, size), output ``actions`` (batch, A)."""
+    with _quiet_exporter():
+        torch.onnx.export(
+            program,
+            (),
+            path,
+            input_names=[INPUT],
+            output_names=[OUTPUT],
+            opset_version=18,
+            external_data=False,
+            dynamo=True,
+            verbose=False,
+        )
+    _strip(path)
+
+
+@contextmanager
+def _quiet_exporter() -> Iterator[None]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the exporter warns of its own internals, and logs that torchvision is missing
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
+        yield
+
+
+def _strip(path: Path) -> None:
+    """Drop what the exporter notes for debugging: stack traces, with the folders of the machine that it ran on."""
+    model = onnx.load(path)
+    graph = model.graph
+    for part in (model, graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
+        part.doc_string = ""
+        if hasattr(part, "metadata_props"):
+            del part.metadata_props[:]
+    onnx.save(model, path)
+
+
+@contextmanager
+def _all_or_nothing(folder: Path) -> Iterator[Path]:
+    """A temporary folder beside ``folder``, whose files move into place once all of them are there."""
+    if folder.exists() and not folder.is_dir():
+        raise ExportError(f"{folder} is a file; name a folder to export to")
+    new = folder.with_name(f".{folder.name}.{os.getpid()}.tmp") if folder.name else folder / f".export.{os.getpid()}.tmp"
+    try:
+        new.mkdir(parents=True)
+        yield new
+        if folder.exists():
+            for name in FILES:
+                os.replace(new / name, folder / name)
+        else:
+            os.replace(new, folder)
+    except OSError as error:
+        raise ExportError(f"cannot write an export to {folder}: {error.strerror or error}") from None
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+
+
+# ---- the contract --------------------------------------------------------------------------------------------------
+
+
+def make_contract(env: LeggedRobot, task: LoadedTask, folder: Path) -> Contract:
+    """The contract of the network that lies in ``folder``; writes the scene there."""
+    cfg, robot = task.cfg, env.robot
+    pose = per_joint(cfg.init_state.default_joint_angles, robot.joint_names, "init_state.default_joint_angles")
+    scene = standalone(
+        robot,
+        imu=cfg.asset.imu_site,
+        feet=cfg.asset.foot_names,
+        qpos=[*cfg.init_state.pos, 1.0, 0.0, 0.0, 0.0, *pose],
+        ctrl=pose,
+    )
+    (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
+    return Contract(
+        task=task.name,
+        joints=robot.joint_names,
+        default_pose=np.array(pose),
+        action_scale=cfg.control.action_scale,
+        action_clip=cfg.normalization.clip_actions,
+        stiffness=np.array(per_joint(cfg.control.stiffness, robot.joint_names, "control.stiffness")),
+        damping=np.array(per_joint(cfg.control.damping, robot.joint_names, "control.damping")),
+        period=round(env.dt, 9),
+        timestep=cfg.sim.dt,
+        decimation=cfg.control.decimation,
+        command_ranges=np.array([cfg.commands.ranges.lin_vel_x, cfg.commands.ranges.lin_vel_y, cfg.commands.ranges.ang_vel_yaw]).T,
+        rows=tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group)),
+        sensors={name: tuple(names) for name, names in scene.sensors.items()},
+        feet=tuple(cfg.asset.foot_names),
+        imu=cfg.asset.imu_site,
+        mass=round(env.total_mass, 6),
+        input=INPUT,
+        output=OUTPUT,
+        digest=digest(folder / NETWORK_FILE),
+    )
+
+
+def contract_rows(env: LeggedRobot, group: str) -> list[Row]:
+    """A group's rows with what is known of how they are measured; a row that is a group itself is written out."""
+    table, rows = env._observation_rows(), []
+    for row in table[group]:
+        if row.name in table and row.name != group:
+            rows += contract_rows(env, row.name)
+            continue
+        kind = ROWS.get(row.name)
+        measured = SENSORS if row.sensors else kind.measured if kind else ""
+        rows.append(
+            Row(
+                name=row.name,
+                size=int(row.value.shape[1]),
+                unit=row.unit or (kind.unit if kind else ""),
+                frame=row.frame or (kind.frame if kind else ""),
+                noise=row.noise * env.cfg.noise.level,
+                measured=measured,
+                sensors=tuple(row.sensors),
+            )
+        )
+    return rows

@@ -1,0 +1,139 @@
+"""A robot with its ground, servos and named sensors as one MJCF text that needs no other file. Host only; nothing is stepped.
+
+Sensors and a keyframe are added here, meshes are written out; what is stepped stays the same, which is checked.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from legged_mw.sim.model import ModelError, RobotModel
+
+HOME = "home"  # the keyframe: the pose to start in, and the servos holding it
+TOLERANCE = 1e-5  # relative, absolute below 1: MuJoCo writes MJCF with six digits
+_OPTION = ("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "tolerance", "disableflags", "enableflags", "gravity")
+_FIELDS = (
+    *("qpos0", "body_parentid", "body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos"),
+    *("jnt_type", "jnt_axis", "jnt_pos", "jnt_range", "jnt_limited", "jnt_stiffness", "jnt_solref", "jnt_solimp"),
+    *("dof_armature", "dof_damping", "dof_frictionloss", "dof_solref", "dof_solimp"),
+    *("actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange", "actuator_forcerange", "actuator_gear", "actuator_trnid"),
+)
+_CONTACT = (
+    "type",
+    "bodyid",
+    "size",
+    "pos",
+    "contype",
+    "conaffinity",
+    "condim",
+    "priority",
+    "friction",
+    "solref",
+    "solimp",
+    "margin",
+    "gap",
+)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What ``standalone`` makes."""
+
+    xml: str
+    sensors: dict[str, list[str]]  # quantity -> names of the sensors whose values, side by side, are it
+
+
+def standalone(robot: RobotModel, *, imu: str, feet: Sequence[str], qpos: Sequence[float], ctrl: Sequence[float]) -> Scene:
+    """``robot`` as MJCF text, with a sensor for all that a controller may read and ``qpos``, ``ctrl`` as keyframe "home".
+
+    Raises ModelError if the text cannot be made, or is another machine than the one that was trained.
+    """
+    spec = robot.spec.copy()
+    spec.comment = (
+        f"\n    {spec.modelname}: robot, ground, servos, sensors. Self-contained; written by legged_mw from the model that was trained.\n  "
+    )
+    sensors = _add_sensors(spec, robot.joint_names, imu, feet)
+    spec.add_key(name=HOME, qpos=list(qpos), ctrl=list(ctrl))
+    _write_out_files(spec, robot.visual)
+    try:
+        spec.compile()
+        xml = spec.to_xml()
+        model = mujoco.MjModel.from_xml_string(xml)
+    except ValueError as error:
+        raise ModelError(f"the robot cannot be written as one MJCF: {' '.join(str(error).split())}") from None
+    if wrong := differences(robot.physics, model):
+        raise ModelError(f"the robot written as one MJCF would be another machine: {', '.join(wrong)} differ from the trained model")
+    return Scene(xml, sensors)
+
+
+def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str, feet: Sequence[str]) -> dict[str, list[str]]:
+    """Name what training senses, add what it computes from the state instead."""
+    kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
+    taken = {sensor.name for sensor in spec.sensors}
+
+    def add(kind: str, name: str, sensor: mujoco.mjtSensor, obj: mujoco.mjtObj, **more: object) -> str:
+        full = f"{kind}/{name}"
+        if full not in taken:
+            spec.add_sensor(name=full, type=sensor, **{"objtype": obj, "objname": name, **more})
+        return full
+
+    site, joint = objects.mjOBJ_SITE, objects.mjOBJ_JOINT
+    # the world's z axis seen from the IMU: gravity points the other way
+    up = {"objtype": objects.mjOBJ_BODY, "objname": "world", "reftype": site, "refname": imu}
+    return {
+        "lin_vel": [add("velocimeter", imu, kinds.mjSENS_VELOCIMETER, site)],
+        "ang_vel": [add("gyro", imu, kinds.mjSENS_GYRO, site)],
+        "up": [add("up", imu, kinds.mjSENS_FRAMEZAXIS, site, **up)],
+        "acceleration": [add("accelerometer", imu, kinds.mjSENS_ACCELEROMETER, site)],
+        "joint_pos": [add("jointpos", name, kinds.mjSENS_JOINTPOS, joint) for name in joints],
+        "joint_vel": [add("jointvel", name, kinds.mjSENS_JOINTVEL, joint) for name in joints],
+        "joint_torque": [add("torque", name, kinds.mjSENS_ACTUATORFRC, objects.mjOBJ_ACTUATOR) for name in joints],
+        "foot_contact": [f"contact/{name}" for name in feet],  # training has these
+    }
+
+
+def _write_out_files(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+    """Meshes that come from files become numbers in the text; pictures are dropped, as they are only looks."""
+    for mesh in spec.meshes:
+        if mesh.file:
+            view = model.mesh(mesh.name)
+            vertices, faces = (
+                slice(view.vertadr[0], view.vertadr[0] + view.vertnum[0]),
+                slice(view.faceadr[0], view.faceadr[0] + view.facenum[0]),
+            )
+            rotation = np.zeros(9)
+            mujoco.mju_quat2Mat(rotation, model.mesh_quat[view.id])  # compiled, a mesh lies in its principal axes
+            places = model.mesh_vert[vertices] @ rotation.reshape(3, 3).T + model.mesh_pos[view.id]
+            mesh.file, mesh.scale, mesh.refpos, mesh.refquat = "", [1, 1, 1], [0, 0, 0], [1, 0, 0, 0]
+            mesh.uservert, mesh.userface = places.ravel(), model.mesh_face[faces].ravel()
+    pictures = {t.name for t in spec.textures if t.file or any(t.cubefiles)}
+    for material in spec.materials:
+        material.textures = ["" if name in pictures else name for name in material.textures]
+    for texture in [t for t in spec.textures if t.name in pictures]:
+        spec.delete(texture)
+    if files := [field.name for field in spec.hfields if field.file]:
+        raise ModelError(f"height field '{files[0]}' comes from a file; an export must stand alone, so build it from numbers")
+    spec.meshdir = spec.texturedir = ""
+
+
+def differences(trained: mujoco.MjModel, model: mujoco.MjModel) -> list[str]:
+    """Names of the physical fields in which ``model`` is another machine; visual geoms, sensors and keyframes do not count."""
+    wrong = [f"option {name}" for name in _OPTION if not _close(getattr(trained.opt, name), getattr(model.opt, name))]
+    wrong += [name for name in _FIELDS if not _close(getattr(trained, name), getattr(model, name))]
+    colliding = [np.flatnonzero(m.geom_contype | m.geom_conaffinity) for m in (trained, model)]
+    for name in _CONTACT:
+        here, there = (getattr(m, f"geom_{name}")[geoms] for m, geoms in zip((trained, model), colliding, strict=True))
+        if not _close(here, there):
+            wrong.append(f"geom_{name}")
+    return wrong
+
+
+def _close(a: object, b: object) -> bool:
+    a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
+    return a.shape == b.shape and bool(np.all(np.abs(a - b) <= TOLERANCE * np.maximum(1.0, np.abs(a))))
