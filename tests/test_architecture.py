@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import sys
 from fnmatch import fnmatch
 
 import pytest
@@ -23,7 +24,9 @@ ONLY_IN = {
     "matplotlib": ["legged_mw/eval/plots.py"],  # a second to import, and only for a report
     "legged_mw.view": ["legged_mw/view/*", "legged_mw/deploy/*", "play.py", "train.py"],
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/face.py"],  # young, and not on every platform
-    "legged_mw.eval": ["legged_mw/eval/*", "play.py", "train.py"],
+    "legged_mw.eval": ["legged_mw/eval/*", "legged_mw/deploy/*", "play.py", "train.py"],
+    "legged_mw.deploy": ["legged_mw/deploy/*", "legged_mw/rl/export.py", "legged_mw/eval/*", "play.py"],
+    "onnxruntime": ["legged_mw/deploy/*", "legged_mw/rl/export.py"],
     "configs": ["configs/*"],
     "train": [],
     "play": [],
@@ -46,6 +49,11 @@ NEVER_IN = {
 }
 MAY_ALL_THE_SAME = ["legged_mw/view/env_stage.py"]  # the environment as a stage; the rest of view/ runs where there is no torch
 CONFIGS_MAY = ["legged_mw.envs", "legged_mw.utils", "configs", "math", "__future__"]  # numbers and names only
+# What runs on a robot's computer: neither torch nor warp, nor anything of ours that needs them.
+DEPLOY_MAY = [
+    *("numpy", "mujoco", "onnxruntime", "yaml", "legged_mw.deploy", "legged_mw.view", "legged_mw.eval.rules"),
+    *("legged_mw.utils.cli", "legged_mw.utils.config", "legged_mw.utils.errors", "legged_mw.utils.machine", *sys.stdlib_module_names),
+]
 
 
 def imports(source: str) -> set[tuple[str, bool]]:
@@ -77,6 +85,8 @@ def violations(path: str, source: str) -> list[str]:
             never = False
         if path.startswith("configs/"):
             never = not any(within(name, package) for package in CONFIGS_MAY)
+        if path.startswith("legged_mw/deploy/"):
+            never = not any(within(name, package) for package in DEPLOY_MAY)
         if outside or never:
             wrong.append(f"{path} imports {name}")
     return wrong
@@ -115,6 +125,13 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/view/env_stage.py", "import torch", False),
         ("legged_mw/view/env_stage.py", "from mujoco.studio import plugin", True),
         ("legged_mw/view/panel.py", "from mujoco.studio import plugin", True),
+        ("legged_mw/deploy/runner.py", "import torch", True),
+        ("legged_mw/deploy/runner.py", "from legged_mw.eval import exam", True),
+        ("legged_mw/deploy/runner.py", "from legged_mw.eval import rules", False),
+        ("legged_mw/deploy/runner.py", "from legged_mw.sim.model import unknown", True),
+        ("legged_mw/deploy/runner.py", "import socket\nimport numpy as np\nimport mujoco", False),
+        ("legged_mw/rl/export.py", "from legged_mw.deploy.contract import Contract", False),
+        ("legged_mw/rl/runner.py", "from legged_mw.deploy.contract import Contract", True),
         ("train.py", "from rsl_rl.runners import OnPolicyRunner", True),
         ("play.py", "from rsl_rl.models import MLPModel", False),
     ],

@@ -15,6 +15,7 @@ import torch
 from program import SMALL, Result, files, refused, run, trained
 
 from legged_mw import ROOT
+from legged_mw.rl.export import FILES
 from legged_mw.utils.cli import duration, one_line_errors
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import load_task
@@ -431,7 +432,7 @@ def test_play_says_what_it_changes(root: Path, first: Path, tmp_path: Path) -> N
         "perturbation.enable": "True -> False",
         "sim.ls_iterations": f"{was['sim']['ls_iterations']} -> 7",
     }
-    assert sorted(path.name for path in out.iterdir()) == ["config.yaml", "model.pt", "policy.onnx"]
+    assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
     assert load_yaml(out / "config.yaml") == was  # as trained, not as played
 
 
@@ -479,7 +480,7 @@ def test_export_is_the_policy_as_trained(root: Path, tmp_path: Path) -> None:
     for more in ([], ["--set", "normalization.clip_actions=0.001"]):
         out = tmp_path / f"out{len(files)}"
         assert run("play", root, *TASK, "--device", "cpu", "--export", str(out), *more).code == 0
-        files.append([(out / name).read_bytes() for name in ("config.yaml", "policy.onnx")])
+        files.append([(out / name).read_bytes() for name in ("config.yaml", "policy.onnx", "policy.yaml", "scene.xml")])
     assert files[0] == files[1]
 
 

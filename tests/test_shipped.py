@@ -11,8 +11,10 @@ import torch
 from program import run
 
 from legged_mw import ROOT
+from legged_mw.deploy.contract import digest, read_contract, read_scene
 from legged_mw.eval import exam, rules
-from legged_mw.rl.policy import ExportedPolicy, act, load_policy
+from legged_mw.rl.export import FILES, ExportedPolicy
+from legged_mw.rl.policy import act, load_policy
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import load_task
 
@@ -34,11 +36,14 @@ def test_walks_and_both_formats_agree(folder: Path) -> None:
     obs = torch.randn(32, policy.obs_dim, generator=torch.Generator().manual_seed(0)) * 2.0
     with torch.inference_mode():
         expected = ExportedPolicy(policy, task.cfg.normalization.clip_actions)(obs)
-    for name in ("policy.onnx", "model.pt", "config.yaml"):
+    for name in FILES:
         assert b"site-packages" not in (folder / name).read_bytes() and str(ROOT).encode() not in (folder / name).read_bytes()
     session = onnxruntime.InferenceSession(folder / "policy.onnx")
     got = np.concatenate([session.run(["actions"], {"obs": row[None].numpy()})[0] for row in obs])
     np.testing.assert_allclose(got, expected.numpy(), atol=1e-4)  # float32 sums in another order
+
+    contract = read_contract(folder)
+    assert contract.digest == digest(folder / "policy.onnx") and read_scene(folder, contract).model.nu == env.num_actions
 
     result = exam.run_exam(env, lambda state: act(policy, state))
     assert result["walks"], rules.table(result)

@@ -28,7 +28,8 @@ from tensordict import TensorDict
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl.policy import act, export_onnx, load_policy
+from legged_mw.rl.export import save_onnx, trace
+from legged_mw.rl.policy import act, load_policy
 from legged_mw.rl.runner import Runner, make_runner, rsl_rl_config
 from legged_mw.rl.runs import checkpoints, find_checkpoint, find_run, new_run, runs
 from legged_mw.utils.config import ConfigError, load_yaml
@@ -440,14 +441,14 @@ def policy(three: Path, env: LeggedRobot) -> Any:
 def test_onnx_equals_torch(policy: Any, env: LeggedRobot, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """The normaliser and the clamp are inside: it takes raw observations and its output can go to the servos."""
     clip = env.cfg.normalization.clip_actions
-    export_onnx(policy, clip, tmp_path / "policy.onnx")
+    save_onnx(trace(policy, clip), tmp_path / "policy.onnx")
     assert not [record for record in caplog.records if record.levelno >= logging.WARNING]  # the exporter's own affairs
     assert [path.name for path in tmp_path.iterdir()] == ["policy.onnx"]
     model = onnx.load(str(tmp_path / "policy.onnx"), load_external_data=False)
     assert not any(tensor.data_location == onnx.TensorProto.EXTERNAL for tensor in model.graph.initializer)
     session = onnxruntime.InferenceSession(tmp_path / "policy.onnx", providers=["CPUExecutionProvider"])
     [taken], [given] = session.get_inputs(), session.get_outputs()
-    assert (taken.name, taken.shape, given.name, given.shape) == ("obs", [1, 48], "actions", [1, 12])
+    assert (taken.name, taken.shape, given.name, given.shape) == ("obs", ["batch", 48], "actions", ["batch", 12])
     size = torch.logspace(-1, 3, 50)[:, None]  # small ones as in life, large ones to reach the clamp
     observations = torch.randn(50, 48, generator=torch.Generator().manual_seed(0)) * size
     expected = act(policy, TensorDict({"state": observations}, batch_size=[50])).clamp(-clip, clip)
@@ -455,13 +456,14 @@ def test_onnx_equals_torch(policy: Any, env: LeggedRobot, tmp_path: Path, caplog
     clipped = np.abs(got) == clip
     assert clipped.sum() > 10 and (~clipped).sum() > 100
     np.testing.assert_allclose(got, expected, atol=1e-5)
+    np.testing.assert_allclose(session.run(["actions"], {"obs": observations.numpy()})[0], expected, atol=1e-5)
     assert (policy.obs_normalizer._mean != 0).any()  # else the normaliser would not have been tried
 
 
 def test_onnx_leaves_the_policy_alone(policy: Any, env: LeggedRobot, tmp_path: Path) -> None:
     before, obs = copy.deepcopy(policy.state_dict()), env.get_observations()
     acted = act(policy, obs)
-    export_onnx(policy, 0.01, tmp_path / "policy.onnx")
+    save_onnx(trace(policy, 0.01), tmp_path / "policy.onnx")
     assert_equal(dict(policy.state_dict()), dict(before))
     assert torch.equal(act(policy, obs), acted) and acted.abs().max() > 0.01
 

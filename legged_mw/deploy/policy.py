@@ -74,8 +74,9 @@ class Controller:
         }
         rows = []
         for row in self.contract.rows:
-            own = measurement.others.get(row.name) if row.measured == SENSORS else None
-            value = values.get(row.measured) if own is None else own
+            if row.measured == SENSORS and row.name not in measurement.others:
+                raise ContractError(f"the robot does not measure row '{row.name}': it must be in Measurement.others ({row.size} values)")
+            value = measurement.others[row.name] if row.measured == SENSORS else values.get(row.measured)
             rows.append(np.atleast_2d(getattr(measurement, row.measured) if value is None else value).astype(np.float32))
         return np.concatenate(rows, axis=1)
 

@@ -210,6 +210,10 @@ def _strip(path: Path) -> None:
         part.doc_string = ""
         if hasattr(part, "metadata_props"):
             del part.metadata_props[:]
+    for value in (*graph.input, *graph.output, *graph.value_info):
+        for dim in value.type.tensor_type.shape.dim:
+            if dim.dim_param:
+                dim.dim_param = "batch"  # the one free dimension, which the exporter names as it likes
     onnx.save(model, path)
 
 

@@ -1,0 +1,537 @@
+"""legged_mw.deploy on the shipped export: its contract, the seam, and the same walk as in the training environment."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import onnx
+import pytest
+import torch
+import yaml
+
+from legged_mw import ROOT
+from legged_mw.deploy import __main__ as program
+from legged_mw.deploy import udp
+from legged_mw.deploy.contract import Contract, read_contract, read_scene
+from legged_mw.deploy.exam import run_exam
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
+from legged_mw.deploy.runner import run
+from legged_mw.deploy.simulated import Fleet, MujocoRobot
+from legged_mw.deploy.stage import DeployStage
+from legged_mw.eval import exam, rules
+from legged_mw.rl.policy import act, load_policy
+from legged_mw.utils.cli import one_line_errors
+from legged_mw.utils.config import load_yaml
+from legged_mw.utils.errors import UserError
+from legged_mw.utils.task import load_task
+
+SHIPPED = ROOT / "resources/policies/go1_flat"
+FILES = ("policy.yaml", "policy.onnx", "scene.xml")
+AHEAD = np.array([0.8, 0.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def contract() -> Contract:
+    return read_contract(SHIPPED)
+
+
+@pytest.fixture
+def export(tmp_path: Path) -> Path:
+    """A copy to be broken."""
+    folder = tmp_path / "export"
+    folder.mkdir()
+    for name in FILES:
+        shutil.copy(SHIPPED / name, folder)
+    return folder
+
+
+def rewrite(folder: Path, change: Callable[[Any], Any]) -> None:
+    """Change what policy.yaml says."""
+    said = load_yaml(folder / "policy.yaml")
+    change(said)
+    (folder / "policy.yaml").write_text(yaml.safe_dump(said, sort_keys=False))
+
+
+def main(capsys: pytest.CaptureFixture[str], *args: str | Path) -> tuple[int, str, str]:
+    """Code, output and error of ``python -m legged_mw.deploy``, in this process."""
+    code = 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["deploy", *map(str, args)])
+        try:
+            with one_line_errors("legged_mw.deploy"):
+                program.main()
+        except SystemExit as end:
+            assert isinstance(end.code, int)
+            code = end.code
+    return code, *capsys.readouterr()
+
+
+# ---- a wrong contract: one clear line each
+
+
+def without(path: str) -> Callable[[Any], None]:
+    *outer, last = path.split(".")
+
+    def change(said: Any) -> None:
+        for key in outer:
+            said = said[key]
+        del said[last]
+
+    return change
+
+
+def put(path: str, value: Any) -> Callable[[Any], None]:
+    *outer, last = [int(key) if key.isdigit() else key for key in path.split(".")]
+
+    def change(said: Any) -> None:
+        for key in outer:
+            said = said[key]
+        said[last] = value
+
+    return change
+
+
+WRONG = [
+    (
+        lambda said: said["observation"].pop(3),
+        "does not fit policy.yaml: its input is 'obs' ['batch', 48], the contract's is 'obs' [1, 36]",
+    ),
+    (put("observation.3.size", 11), "observation row 'dof_pos' has size 11; joint_offset has 12 values on this robot"),
+    (put("observation.3.measured", "joint_ofset"), "no quantity 'joint_ofset' in what a robot measures; did you mean 'joint_offset'?"),
+    (
+        put("observation.0.measured", ""),
+        "observation row 'base_lin_vel': nothing says how it is measured, so it cannot be deployed; in the task",
+    ),
+    (put("joints.4", "FL_thihg_joint"), "no joint 'FL_thihg_joint' in scene.xml; did you mean 'FL_thigh_joint'?"),
+    (put("joints.4", "FL_hip_joint"), "policy.yaml: 'joints' is ["),
+    (
+        lambda said: [said[name].pop() for name in ("joints", "default_pose", "stiffness", "damping")],
+        "has size 12; joint_offset has 11 values",
+    ),
+    (put("default_pose", [0.0] * 11), "it must be 12 numbers, one a joint"),
+    (put("default_pose.2", "bent"), "it must be 12 numbers, one a joint"),
+    (put("stiffness.0", 20.0), "stiffness is [20., 35., 35.,"),
+    (put("robot.mass", 20.0), "robot: mass is 20., but scene.xml has 12.743"),
+    (put("format", 2), "'format' is 2; it must be 1, the one that this version reads; export the policy again"),
+    (without("format"), "policy.yaml: 'format' is missing; it must be 1"),
+    (without("action.scale"), "policy.yaml: action: 'scale' is missing; it must be a number"),
+    (put("action.clip", float("nan")), "policy.yaml: action: 'clip' is nan; it must be a number"),
+    (put("period", 0.03), "'period' is 0.03; it must be physics: timestep * decimation = 0.02"),
+    (put("network.input", "observations"), "the contract's is 'observations' [1, 48]"),
+    (put("sensors.ang_vel", ["gyro/imuu"]), "sensors of 'ang_vel': no sensor 'gyro/imuu' in scene.xml; did you mean 'gyro/imu'?"),
+    (put("sensors.ang_vel", ["gyro/imu", "up/imu"]), "the sensors of 'ang_vel' (gyro/imu, up/imu) have 6 values, not 3"),
+    (without("sensors.joint_vel"), "sensors: 'joint_vel' is missing; name the sensors of scene.xml that measure it"),
+    (put("observation", {}), "policy.yaml: 'observation' is {}; it must be a list of mappings"),
+]
+
+
+@pytest.mark.parametrize(("change", "said"), WRONG, ids=[said[:40] for _, said in WRONG])
+def test_a_wrong_contract(change: Callable[[Any], Any], said: str, export: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rewrite(export, change)
+    code, out, err = main(capsys, export)
+    assert (code, out) == (2, "") and err.startswith("legged_mw.deploy: ") and err.count("\n") == 1
+    assert said in err
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "text", "other"])
+def test_a_damaged_network(damage: str, export: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The contract knows its network by digest; a network that was broken before it was signed is refused as well."""
+    file = export / "policy.onnx"
+    whole = file.read_bytes()
+    if damage == "other":  # same shapes, another network
+        model = onnx.load_from_string(whole)
+        model.graph.initializer[0].raw_data = bytes(len(model.graph.initializer[0].raw_data))
+        file.write_bytes(model.SerializeToString())
+    else:
+        file.write_bytes({"cut": whole[: len(whole) // 2], "empty": b"", "text": b"not a network\n"}[damage])
+    code, _, err = main(capsys, export)
+    assert code == 2 and err.count("\n") == 1
+    assert "policy.onnx is not the file that policy.yaml was written for (its SHA-256 differs): it is damaged, or of another export" in err
+    if damage != "other":
+        rewrite(export, put("network.sha256", hashlib.sha256(file.read_bytes()).hexdigest()))
+        code, _, err = main(capsys, export)
+        assert (
+            code == 2 and err == "legged_mw.deploy: policy.onnx cannot be read as an ONNX network: it is damaged; export the policy again\n"
+        )
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_a_missing_file(name: str, export: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (export / name).unlink()
+    code, _, err = main(capsys, export)
+    assert code == 2 and f"no {name} in {export}; make an export with: python play.py --task <task> --export {export}" in err
+
+
+def test_broken_texts(export: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (export / "scene.xml").write_text("<mujoco><worldbody>")
+    code, _, err = main(capsys, export)
+    assert code == 2 and "scene.xml is not a valid MJCF: " in err and err.count("\n") == 1
+    (export / "policy.yaml").write_text("!!python/object/apply:os.system ['touch evil']")
+    code, _, err = main(capsys, export)
+    assert code == 2 and "not valid YAML" in err and err.count("\n") == 1 and not Path("evil").exists()
+
+
+def test_numbers_as_people_write_them(export: Path) -> None:
+    text = (export / "policy.yaml").read_text()
+    assert "scale: 0.5" in text
+    (export / "policy.yaml").write_text(text.replace("scale: 0.5", "scale: 5e-1"))
+    assert read_contract(export).action_scale == 0.5
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (("--eval", "--serve", "127.0.0.1:1"), "one thing each"),
+        (("--eval", "--command", "1,0,0"), "--eval brings its own commands"),
+        (("--command", "fast"), "--command fast: write three numbers, vx,vy,yaw"),
+        (("--command", "0,0,nan"), "--command 0,0,nan: write three numbers"),
+        (("--command", "0,1,0"), "--command 0,1,0: vy was trained from -0.8 to 0.8, and 1 is outside"),
+        (("--udp", "robot"), "'robot' is no address; write HOST:PORT, e.g. 127.0.0.1:9870"),
+        (("--time", "soon"), "'soon' is no duration"),
+    ],
+)
+def test_a_wrong_command_line(args: tuple[str, ...], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = main(capsys, SHIPPED, *args)
+    assert code == 2 and said in err and err.count("\n") == 1
+
+
+# ---- the same walk as in the training environment
+
+
+def test_walks_as_in_the_environment(contract: Contract) -> None:
+    """Observations agree to float32's rounding at first; then errors grow, as they do in a walk, but the walk is the same."""
+    task = load_task("go1_flat")
+    task.update_from_run(load_yaml(SHIPPED / "config.yaml"), where="config.yaml")
+    exam.prepare(task)
+    commands = np.array(rules.commands())
+    task.cfg.env.num_envs = len(commands)
+    env = task.env_class(task.cfg, "cpu")
+    policy = load_policy(SHIPPED / "model.pt", env, task.train, "cpu")
+    stage = DeployStage(SHIPPED, len(commands))
+    env.reset()
+    env.commands[:] = torch.tensor(commands)
+    env.compute_observations()
+    obs = env.get_observations()
+    errors: list[Floats] = []
+    for step in range(150):
+        seen = stage.controller.observe(stage.measured, commands)
+        if step < 10:
+            np.testing.assert_allclose(seen, obs["state"].numpy(), atol=1e-3)  # joint speeds are the largest, up to 20 rad/s
+            np.testing.assert_allclose(stage.qpos(), env.sim.qpos.numpy(), atol=1e-5)
+            if step:  # before the first step the environment has sensed nothing
+                np.testing.assert_allclose(stage.measured.joint_torque, env.torques.numpy(), atol=1e-2)
+                np.testing.assert_allclose(stage.measured.acceleration, env.accelerometer.numpy(), atol=5e-2)
+        theirs = np.concatenate([env.base_lin_vel[:, :2].numpy(), env.base_ang_vel[:, 2:].numpy()], axis=1)
+        errors.append(np.stack([np.abs(v - commands) for v in (theirs, stage.velocity())]))
+        obs, *_ = env.step(act(policy, obs))
+        stage.step(commands)
+    assert not stage.fell().any()
+    env_error, deploy_error = np.stack(errors)[50:].mean(axis=(0, 2))
+    np.testing.assert_allclose(env_error, deploy_error, atol=0.003)  # as docs/deploy.md says
+    assert (deploy_error < 0.06).all()
+
+
+def test_a_moved_row_is_noticed(export: Path) -> None:
+    """What the test above relies on: the order of rows matters, and the contract states it."""
+    right = DeployStage(SHIPPED)
+    rewrite(export, lambda said: said["observation"].reverse())
+    wrong = DeployStage(export)
+    for stage in (right, wrong):
+        for _ in range(50):
+            stage.step(AHEAD[None])
+    assert abs(right.velocity()[0, 0] - 0.8) < 0.15 < abs(wrong.velocity()[0, 0] - 0.8)
+
+
+def test_measurements_are_of_the_new_state(contract: Contract) -> None:
+    """Sensors of position and velocity, after a step, of a robot that is thrown about."""
+    fleet = Fleet(SHIPPED, contract, 3)
+    fleet.qpos[:, 3:7] = np.array([0.9, 0.3, 0.2, 0.1]) / np.linalg.norm([0.9, 0.3, 0.2, 0.1])
+    fleet.qpos[:, 2], fleet.qvel[:] = 1.0, np.linspace(-2, 2, 18)
+    fleet.write(np.tile(contract.default_pose, (3, 1)))
+    measured, model = fleet.read(), fleet.model
+    data = mujoco.MjData(model)
+    data.qpos, data.qvel = fleet.qpos[1], fleet.qvel[1]
+    mujoco.mj_forward(model, data)
+    rotation = data.xmat[1].reshape(3, 3)
+    np.testing.assert_allclose(measured.gravity[1], rotation.T @ [0, 0, -1], atol=1e-9)
+    np.testing.assert_allclose(measured.ang_vel[1], fleet.qvel[1, 3:6], atol=1e-9)
+    lever = np.cross(fleet.qvel[1, 3:6], model.site("imu").pos)
+    np.testing.assert_allclose(measured.lin_vel[1], rotation.T @ fleet.qvel[1, :3] + lever, atol=1e-9)
+    np.testing.assert_allclose(measured.joint_pos[1], fleet.qpos[1, 7:], atol=1e-12)
+    np.testing.assert_allclose(measured.joint_vel[1], fleet.qvel[1, 6:], atol=1e-12)
+
+
+def test_joints_may_stand_in_another_order(export: Path, contract: Contract) -> None:
+    """Names, not places: a contract with legs in another order commands and reads the right joints."""
+    order = np.roll(np.arange(12), 3)
+
+    def reorder(said: Any) -> None:
+        for name in ("joints", "default_pose", "stiffness", "damping"):
+            said[name] = [said[name][i] for i in order]
+        for name in ("joint_pos", "joint_vel", "joint_torque"):
+            said["sensors"][name] = [said["sensors"][name][i] for i in order]
+
+    rewrite(export, reorder)
+    fleets = [Fleet(SHIPPED, contract), Fleet(export, read_contract(export))]
+    targets = contract.default_pose + 0.1 * np.arange(12)
+    fleets[0].write(targets[None])
+    fleets[1].write(targets[None, order])
+    np.testing.assert_array_equal(fleets[0].qpos, fleets[1].qpos)
+    np.testing.assert_array_equal(fleets[0].read().joint_pos[:, order], fleets[1].read().joint_pos)
+
+
+# ---- the stage, for viewers and the exam
+
+
+def test_stage() -> None:
+    stage = DeployStage(SHIPPED, 3, command=(0.5, 0.0, 0.0))
+    assert stage.num_worlds == 3 and stage.dt == 0.02 and stage.qpos().shape == (3, 19)
+    np.testing.assert_array_equal(stage.limits, [[-1.5, -0.8, -1.2], [1.5, 0.8, 1.2]])
+    stage.step(None)
+    np.testing.assert_array_equal(stage.commands(), [[0.5, 0, 0]] * 3)
+    stage.step(np.array([[1.0, 0, 0], [0, 0.4, 0], [0, 0, 0.6]]))
+    assert stage.commands()[1, 1] == 0.4 and stage.contacts().shape == (3, 4) and stage.contacts().dtype == bool
+    before = stage.fleet.qvel[:, :2].copy()
+    stage.push(1, np.array([0.5, -1.0]))
+    np.testing.assert_allclose(stage.fleet.qvel[:, :2] - before, [[0, 0], [0.5, -1.0], [0, 0]])
+    stage.fleet.qpos[2, 3:7] = [0, 1, 0, 0]  # on its back
+    stage.step(None)
+    assert stage.fell().tolist() == [False, False, True]
+    assert stage.qpos()[2, 2] == 0.278 and not stage.controller.last_actions[2].any()  # begins anew
+    stage.step(None)
+    assert not stage.fell().any()
+    stage.reset(1)
+    np.testing.assert_allclose(stage.velocity()[1], 0.0)
+    assert stage.qpos()[1, 0] == 0.0 != stage.qpos()[0, 0]
+
+
+def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The first seconds of it, with every kick: written, printed, and the same on any number of threads."""
+    monkeypatch.setattr(rules, "SECONDS", 2.6)
+    monkeypatch.setattr(rules, "KICK_AT", 1.0)
+    monkeypatch.setattr(rules, "KICK_UNTIL", 2.2)
+    code, out, err = main(capsys, SHIPPED, "--eval", "--out", tmp_path / "exam.json")
+    assert code == 0, err
+    saved = json.loads((tmp_path / "exam.json").read_text())
+    assert "falls in 22 commands                     0" in out and saved["falls"] == 0 and saved["engine"] == "mujoco (deploy)"
+    assert saved["kicks"]["1"] == saved["kicks"]["2"] == 1.0 and saved["kicks"]["6"] < 1.0
+    assert all(error < 0.12 for error in saved["error"]) and 0.5 < saved["cost_of_transport"] < 1.2
+    again = run_exam(SHIPPED, threads=1)
+    assert {**saved, **again} == saved
+
+
+# ---- the seam
+
+
+class Recorder(Robot):
+    """Passes on to a robot and keeps what went through."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot, self.targets, self.closed = robot, [], 0
+        self.measured: list[Measurement] = []
+
+    def read(self) -> Measurement:
+        self.measured.append(self.robot.read())
+        return self.measured[-1]
+
+    def write(self, targets: Floats) -> None:
+        self.targets.append(np.array(targets))
+        self.robot.write(targets)
+
+    def close(self) -> None:
+        self.closed += 1
+        self.robot.close()
+
+
+def test_a_robot_walks_behind_the_seam(contract: Contract) -> None:
+    robot = Recorder(MujocoRobot(SHIPPED, contract))
+    done = run(robot, Controller(SHIPPED, contract), lambda t: AHEAD if t < 3.0 else np.array([9.0, 0, 0]), 3.0, live=False)
+    assert done.steps == 150 == len(robot.targets) and done.fell is None and robot.closed == 1
+    assert done.velocity is not None
+    np.testing.assert_allclose(done.velocity, AHEAD, atol=0.08)
+    robot.robot.fleet.write(np.tile(contract.default_pose, (1, 1)))  # type: ignore[attr-defined]  # let go: targets move nothing
+    assert not robot.robot.read().joint_torque.any()
+
+
+def test_commands_are_held_within_the_trained_ranges(contract: Contract, monkeypatch: pytest.MonkeyPatch) -> None:
+    controller, asked = Controller(SHIPPED, contract), []
+    monkeypatch.setattr(controller, "act", lambda measured, command: (asked.append(command), contract.default_pose[None])[1])
+    run(MujocoRobot(SHIPPED, contract), controller, lambda _: np.array([9.0, -9.0, 0.3]), 0.04, live=False)
+    np.testing.assert_array_equal(asked, [[1.5, -0.8, 0.3]] * 2)
+
+
+def test_a_fall_ends_the_walk(contract: Contract) -> None:
+    robot = MujocoRobot(SHIPPED, contract)
+    robot.fleet.qpos[0, 3:7] = [0, 1, 0, 0]
+    robot.fleet.write(contract.default_pose[None])
+    done = run(robot, Controller(SHIPPED, contract), lambda _: AHEAD, 1.0, live=False)
+    assert done.fell == 0.0 and done.steps == 0
+
+
+def test_what_is_not_finite_lets_the_joints_go(contract: Contract, monkeypatch: pytest.MonkeyPatch) -> None:
+    robot, controller = Recorder(MujocoRobot(SHIPPED, contract)), Controller(SHIPPED, contract)
+    monkeypatch.setattr(controller, "_network", lambda obs: np.full((1, 12), np.nan, dtype=np.float32))
+    with pytest.raises(RobotError, match="the policy's targets are not finite"):
+        run(robot, controller, lambda _: AHEAD, 1.0, live=False)
+    assert robot.closed == 1 and not robot.targets
+
+
+def test_live_keeps_time(contract: Contract, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Against a made-up clock: it sleeps until each period begins, and counts a step that begins late."""
+    clock = [0.0]
+    slept = []
+
+    def sleep(seconds: float) -> None:
+        slept.append(seconds)
+        clock[0] += seconds
+
+    class Slow(MujocoRobot):
+        def write(self, targets: Floats) -> None:
+            clock[0] += 0.05 if len(slept) == 3 else 0.005
+
+    monkeypatch.setattr("time.perf_counter", lambda: clock[0])
+    monkeypatch.setattr("time.sleep", sleep)
+    done = run(Slow(SHIPPED, contract), Controller(SHIPPED, contract), lambda _: AHEAD, 0.2)
+    assert done.steps == 10 and done.late == 2  # 35 ms and 20 ms behind; then 5 ms
+    np.testing.assert_allclose(slept[:6], [0, 0.015, 0.015, 0, 0, 0], atol=1e-9)
+
+
+# ---- the seam over UDP
+
+
+@pytest.fixture
+def served(contract: Contract) -> Iterator[tuple[udp.UdpServer, MujocoRobot, list[str]]]:
+    """A server on a thread, and what it said."""
+    said: list[str] = []
+    robot = MujocoRobot(SHIPPED, contract)
+    server = udp.UdpServer(robot, contract, ("127.0.0.1", 0), timeout=5.0)
+    thread = threading.Thread(target=server.serve, args=(said.append,), daemon=True)
+    thread.start()
+    yield server, robot, said
+    if thread.is_alive():
+        client = udp.UdpRobot(contract, server.address)
+        client.close()
+    thread.join(timeout=20)
+    assert not thread.is_alive()
+
+
+def test_the_walk_is_the_same_over_udp(served: Any, contract: Contract) -> None:
+    server, _, said = served
+    runs = []
+    for robot in (MujocoRobot(SHIPPED, contract), udp.UdpRobot(contract, server.address, timeout=5.0)):
+        recorder = Recorder(robot)
+        run(recorder, Controller(SHIPPED, contract), lambda _: AHEAD, 1.0, live=False)
+        runs.append(recorder)
+    here, there = runs
+    np.testing.assert_array_equal(here.targets, there.targets)  # bit for bit
+    np.testing.assert_array_equal([m.joint_torque for m in here.measured], [m.joint_torque for m in there.measured])
+    for _ in range(200):
+        if len(said) == 2:
+            break
+        threading.Event().wait(0.02)
+    assert said[0].endswith("took the robot") and said[1].endswith("closed the link; the joints are damped, no longer servoed")
+
+
+def test_a_silent_client_costs_the_servos(contract: Contract) -> None:
+    robot, said = MujocoRobot(SHIPPED, contract), []
+    server = udp.UdpServer(robot, contract, ("127.0.0.1", 0), timeout=0.2)
+    thread = threading.Thread(target=server.serve, args=(said.append,), daemon=True)
+    thread.start()
+    client = udp.UdpRobot(contract, server.address)
+    client.write(contract.default_pose)
+    thread.join(timeout=20)
+    assert said[-1].endswith("fell silent for 0.2 s; the joints are damped, no longer servoed")
+    robot.write(contract.default_pose)
+    assert not robot.read().joint_torque.any()
+    with pytest.raises(RobotError, match=r"robot at 127.0.0.1:\d+: .*; stopped \(start one with"):
+        client.write(contract.default_pose)
+    client.close()
+
+
+def test_nobody_answers(contract: Contract, capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
+        deaf.bind(("127.0.0.1", 0))
+        port = deaf.getsockname()[1]
+        with pytest.raises(RobotError, match=f"robot at 127.0.0.1:{port}: no answer within 0.1 s; stopped"):
+            udp.UdpRobot(contract, ("127.0.0.1", port), timeout=0.1)
+        with pytest.raises(UserError, match=f"cannot listen at 127.0.0.1:{port}: "):
+            udp.UdpServer(MujocoRobot(SHIPPED, contract), contract, ("127.0.0.1", port))
+
+
+def test_a_client_of_another_contract_is_refused(served: Any, contract: Contract, export: Path) -> None:
+    server, robot, _ = served
+    rewrite(export, put("joints", list(reversed(contract.joints))))
+    other = read_contract(export)
+    assert udp.contract_digest(other) != udp.contract_digest(contract)
+    with pytest.raises(RobotError, match="its export has other joints, measurements or another period; use one export at both ends"):
+        udp.UdpRobot(other, server.address, timeout=5.0)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as raw:
+        raw.settimeout(5.0)
+        raw.sendto(b"hello?", server.address)  # none of ours: no answer
+        packet = bytearray(udp.pack(udp.HELLO, udp.contract_digest(contract), 0))
+        packet[4] = 9
+        raw.sendto(packet, server.address)
+        answer = udp.unpack(raw.recv(1000))
+        assert answer is not None and answer.kind == udp.REFUSED and b"speaks version 9 of the link, this one 1" in answer.body
+        raw.sendto(udp.pack(udp.TARGETS, udp.contract_digest(contract), 1, bytes(96)), server.address)
+        answer = udp.unpack(raw.recv(1000))
+        assert answer is not None and answer.kind == udp.REFUSED and answer.body == b"say hello first"
+    assert robot.fleet.qpos[0, 2] == 0.278  # nobody has moved it
+
+
+def test_bad_targets_move_nothing(served: Any, contract: Contract) -> None:
+    server, robot, _ = served
+    client = udp.UdpRobot(contract, server.address, timeout=5.0)
+    with pytest.raises(RobotError, match="targets must be 12 finite numbers, one a joint"):
+        client.write(np.full(12, np.nan))
+    assert robot.fleet.qpos[0, 2] == 0.278
+
+
+# ---- where torch is not installed
+
+BLOCKED = """
+import sys
+
+class Block:
+    def find_spec(self, name, path=None, target=None):
+        if name.split('.')[0] in {'torch', 'warp', 'mujoco_warp', 'rsl_rl', 'tensordict', 'onnx', 'onnxscript', 'tensorboard'}:
+            raise ModuleNotFoundError(f'{name} is blocked', name=name)
+
+sys.meta_path.insert(0, Block())
+from legged_mw.eval import rules
+rules.SECONDS, rules.KICK_AT, rules.KICK_UNTIL = 2.1, 0.5, 1.5
+import runpy
+sys.argv = ['deploy', *sys.argv[1:]]
+runpy.run_module('legged_mw.deploy', run_name='__main__')
+"""
+
+
+def test_needs_neither_torch_nor_warp(tmp_path: Path) -> None:
+    args = [sys.executable, "-c", BLOCKED, str(SHIPPED), "--eval", "--out", str(tmp_path / "exam.json")]
+    done = subprocess.run(args, cwd=ROOT, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "falls in 22 commands                     0" in done.stdout and (tmp_path / "exam.json").is_file()
+
+
+def test_the_scene_is_read_by_plain_mujoco(contract: Contract) -> None:
+    """One file, no other; and it is where the contract's sensors and start are."""
+    model = mujoco.MjModel.from_xml_path(str(SHIPPED / "scene.xml"))
+    assert model.key(0).name == "home" and model.key(0).qpos[2] == 0.278
+    scene = read_scene(SHIPPED, contract)
+    assert sorted(np.concatenate(list(scene.sensordata.values())).tolist()) == sorted(
+        i
+        for i in range(model.nsensordata)
+        if not 4 <= i < 16  # the feet's velocities, which no contract names
+    )

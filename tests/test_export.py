@@ -1,0 +1,251 @@
+"""An export: what is in it, that it is the policy as trained, and that a failure leaves nothing behind."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from program import SMALL, files, run, trained
+from worlds import make_env
+
+from legged_mw import ROOT
+from legged_mw.deploy.contract import ROWS, ContractError, read_contract, read_scene
+from legged_mw.deploy.stage import DeployStage
+from legged_mw.envs.legged_robot import LeggedRobot, Row
+from legged_mw.rl import export as exporting
+from legged_mw.rl.export import FILES, ExportError, contract_rows, export
+from legged_mw.sim.model import ModelError
+from legged_mw.sim.standalone import differences, standalone
+from legged_mw.utils.config import load_yaml
+
+TASK = ["--task", "go1_flat", "--device", "cpu"]
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A finished training that exported by itself."""
+    root = tmp_path_factory.mktemp("root")
+    trained(root, "--max_iterations", "1", "--set", "runner.export=true")
+    return root
+
+
+@pytest.fixture(scope="module")
+def made(root: Path) -> Path:
+    [folder] = root.glob("logs/*/*/export")
+    return folder
+
+
+def arguments(made: Path) -> tuple[dict[str, Any], Path]:
+    return load_yaml(made / "config.yaml"), made / "model.pt"
+
+
+def test_a_finished_training_exports(made: Path) -> None:
+    assert sorted(path.name for path in made.iterdir()) == sorted(FILES)
+    assert load_yaml(made / "config.yaml") == load_yaml(made.parent / "config.yaml")
+    stage = DeployStage(made, 2)
+    stage.step(None)
+    assert stage.contract.task == "go1_flat" and np.isfinite(stage.qpos()).all()
+
+
+def test_no_file_says_where_it_was_made(made: Path) -> None:
+    for name in FILES:
+        content = (made / name).read_bytes()
+        if name.endswith(".pt"):
+            with zipfile.ZipFile(made / name) as archive:
+                content = b"".join(archive.read(member) for member in archive.namelist())
+        for word in (str(ROOT), str(made.parent), "site-packages", "stack_trace", ".py"):
+            assert word.encode() not in content, (name, word)
+    scene = (made / "scene.xml").read_text()
+    assert "file=" not in scene and "meshdir" not in scene
+
+
+def test_contract_states_what_was_trained(made: Path) -> None:
+    contract, env = read_contract(made), make_env(1)
+    assert contract.joints == env.robot.joint_names and contract.imu == "imu" and contract.feet == ("FR", "FL", "RR", "RL")
+    np.testing.assert_allclose(contract.default_pose, env.default_dof_pos, atol=1e-7)
+    assert (contract.action_scale, contract.action_clip, contract.period, contract.decimation) == (0.5, 2.0, 0.02, 5)
+    assert contract.mass == pytest.approx(env.total_mass, abs=1e-5) and set(contract.stiffness) == {35.0} and set(contract.damping) == {0.5}
+    np.testing.assert_allclose(contract.command_ranges, env.command_ranges)
+    assert [(row.name, row.size, row.noise) for row in contract.rows] == env.observation_table["state"]
+    assert all(row.unit and row.frame and row.measured for row in contract.rows) and contract.size == 48
+
+
+def test_scene_is_the_machine_that_was_trained(made: Path) -> None:
+    """Field by field, and in motion: dropped and thrown, it lands where the trained one does."""
+    trained_model = make_env(1).robot.physics
+    scene = mujoco.MjModel.from_xml_path(str(made / "scene.xml"))
+    assert differences(trained_model, scene) == []
+    ends = []
+    for model in (trained_model, scene):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.ctrl[:] = scene.key(0).qpos, scene.key(0).ctrl
+        data.qvel[:] = np.linspace(-1, 1, 18)
+        for _ in range(100):
+            mujoco.mj_step(model, data)
+        ends.append(data.qpos.copy())
+    np.testing.assert_allclose(*ends, atol=1e-6)
+    for name, value in (("actuator_gainprm", 36.0), ("body_mass", 3.0), ("dof_damping", 0.6)):
+        other = mujoco.MjModel.from_xml_path(str(made / "scene.xml"))
+        getattr(other, name)[-1] = value
+        assert differences(trained_model, other) == [name]
+    other.geom_friction[:, 0] = 0.9
+    assert "geom_friction" in differences(trained_model, other)
+
+
+def test_meshes_from_files_are_written_out(tmp_path: Path) -> None:
+    """A robot whose trunk is an STL file: the scene needs no file, and the mesh lies where it lay."""
+    corners = np.array([[0, 0, 0], [0.3, 0, 0], [0, 0.2, 0], [0, 0, 0.1]], dtype="<f4")
+    faces = [(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]
+    triangles = b"".join(bytes(12) + corners[list(face)].tobytes() + bytes(2) for face in faces)
+    (tmp_path / "wedge.stl").write_bytes(bytes(80) + len(faces).to_bytes(4, "little") + triangles)
+    mjcf = (ROOT / "resources/robots/go1/go1.xml").read_text()
+    mjcf = mjcf.replace("<asset>", '<asset><mesh name="wedge" file="wedge.stl" scale="1 2 1"/>', 1)
+    mjcf = mjcf.replace(
+        '<geom name="trunk_box" class="collision" type="box" size="0.125 0.04 0.057"/>',
+        '<geom name="trunk_box" type="mesh" mesh="wedge"/>',
+        1,
+    )
+    (tmp_path / "robot.xml").write_text(mjcf)
+    env = make_env(1, {"asset.file": str(tmp_path / "robot.xml"), "asset.colliders": ["FR", "FL", "RR", "RL", "trunk_box"]})
+    pose = env.default_dof_pos.tolist()
+    scene = standalone(env.robot, imu="imu", feet=["FR"], qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
+    assert "stl" not in scene.xml
+    model = mujoco.MjModel.from_xml_string(scene.xml)
+    for name in ("geom_pos", "geom_quat", "geom_size"):
+        index = model.geom("trunk_box").id, env.robot.visual.geom("trunk_box").id
+        np.testing.assert_allclose(getattr(model, name)[index[0]], getattr(env.robot.visual, name)[index[1]], atol=1e-5)
+
+
+def test_the_export_is_replaced_whole_or_not_at_all(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Foreign files in the folder stay; a failure, early or late, leaves the export that was there."""
+    out = tmp_path / "out"
+    export(*arguments(made), out)
+    (out / "README.md").write_text("mine")
+    before = files(tmp_path)
+    for name, fails in (("run_onnx", lambda path, obs: np.ones((len(obs), 12))), ("make_contract", lambda *_: 1 / 0)):
+        with monkeypatch.context() as patch:
+            patch.setattr(exporting, name, fails)
+            with pytest.raises((ExportError, ZeroDivisionError)) as error:
+                export(*arguments(made), out)
+        assert files(tmp_path) == before
+        if name == "run_onnx":
+            assert "policy.onnx acts otherwise than the trained policy: up to " in str(error.value) and "nothing was written" in str(
+                error.value
+            )
+    (out / "policy.yaml").write_text("stale")
+    export(*arguments(made), out)
+    assert files(tmp_path)["out/policy.yaml"] == before["out/policy.yaml"] and (out / "README.md").read_text() == "mine"
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ExportError, match="file is a file; name a folder to export to"):
+        export(*arguments(made), tmp_path / "file")
+
+
+def test_a_nan_is_a_mismatch() -> None:
+    actions = torch.zeros(3, 2)
+    with pytest.raises(ExportError, match="acts otherwise"):
+        exporting._compare("policy.onnx", np.full((3, 2), np.nan), actions)
+    with pytest.raises(ExportError, match="acts otherwise"):
+        exporting._compare("policy.onnx", np.zeros((1, 2)), actions)
+
+
+def test_without_onnxruntime(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """onnx's own evaluator gives the same actions."""
+    obs = torch.randn(4, 48, generator=torch.Generator().manual_seed(0)).numpy()
+    with_it = exporting.run_onnx(made / "policy.onnx", obs)
+    monkeypatch.setitem(__import__("sys").modules, "onnxruntime", None)
+    np.testing.assert_allclose(exporting.run_onnx(made / "policy.onnx", obs), with_it, atol=1e-5)
+
+
+def test_an_export_that_fails_does_not_end_a_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(*_: object) -> None:
+        raise RuntimeError("the exporter\nhas a bad day")
+
+    monkeypatch.setattr(exporting, "export", fails)
+    result = run("train", tmp_path, *SMALL, "--max_iterations", "1", "--set", "runner.export=true")
+    assert result.code == 0, result.err
+    assert (
+        "done: " in result.out
+        and "not exported: the exporter has a bad day\n  once that is mended: python play.py --task go1_flat" in result.out
+    )
+    [folder] = tmp_path.glob("logs/*/*")
+    assert (folder / "model_1.pt").is_file() and not (folder / "export").exists()
+
+
+def test_a_training_that_is_told_not_to_does_not(tmp_path: Path) -> None:
+    folder = trained(tmp_path, "--max_iterations", "1", "--set", "runner.export=false")
+    assert not (folder / "export").exists()
+
+
+# ---- rows of one's own
+
+
+class OwnRows(LeggedRobot):
+    def _observation_rows(self) -> dict[str, list[Row]]:
+        rows = super()._observation_rows()
+        sensed = self.sim.sensordata[:, self.robot.sensors["accelerometer"]]
+        rows["state"] += [Row("shake", sensed, 0.5, sensors=("accelerometer/imu",), unit="m/s^2", frame="body")]
+        rows["state"] += [Row("guess", self.feet_air_time)]
+        return rows
+
+
+def test_rows_of_ones_own() -> None:
+    """One that names its sensors can be deployed; one of an unknown name says that nobody knows."""
+    *_, shake, guess = contract_rows(make_env(1, env_class=OwnRows), "state")
+    assert (shake.measured, shake.sensors, shake.unit, shake.size, shake.noise) == ("sensors", ("accelerometer/imu",), "m/s^2", 3, 0.5)
+    assert (guess.measured, guess.unit, guess.size) == ("", "", 4)
+
+
+def test_a_group_within_a_group_is_written_out() -> None:
+    names = [row.name for row in contract_rows(make_env(1), "privileged_state")]
+    assert names[:7] == ["base_lin_vel", "base_ang_vel", "projected_gravity", "dof_pos", "dof_vel", "last_actions", "commands"]
+    assert names[7:9] == ["base_ang_vel", "accelerometer"] and {"torques", "foot_contact"} <= set(names) & set(ROWS)
+
+
+DOG = '''"""A dog that feels its shakes."""
+from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
+from legged_mw.envs.legged_robot import LeggedRobot, Row
+from legged_mw.utils.task import Task
+class Dog(LeggedRobot):
+    def _observation_rows(self):
+        rows = super()._observation_rows()
+        sensed = self.sim.sensordata[:, self.robot.sensors["accelerometer"]]
+        rows["state"] += [Row("shake", sensed, mirror="polar", sensors=("accelerometer/imu",), unit="m/s^2")]
+        if "GUESS": rows["state"] += [Row("guess", self.feet_air_time, mirror="foot")]
+        return rows
+TASK = Task(Dog, Go1FlatCfg, Go1FlatCfgPPO)
+'''
+
+
+@pytest.mark.parametrize("guess", [False, True])
+def test_a_task_with_rows_of_its_own_is_deployed_or_refused(guess: bool, tmp_path: Path) -> None:
+    (tmp_path / "dog.py").write_text(DOG.replace('"GUESS"', str(guess)))
+    result = run("train", tmp_path, "--task", str(tmp_path / "dog.py"), *SMALL[2:], "--max_iterations", "1", "--set", "runner.export=true")
+    assert result.code == 0, result.err
+    [folder] = tmp_path.glob("logs/*/*/export")
+    if guess:
+        assert "nothing says how to measure guess: legged_mw.deploy will refuse it" in result.out
+        with pytest.raises(
+            ContractError, match=r"observation row 'guess': nothing says how it is measured.* write Row\('guess', \.\.\., sensors="
+        ):
+            read_contract(folder)
+        return
+    stage = DeployStage(folder, 2)
+    assert read_scene(folder, stage.contract).sensordata["shake"].shape == (3,)
+    stage.step(None)
+    np.testing.assert_array_equal(stage.measured.others["shake"], stage.measured.acceleration)
+    assert stage.controller.observe(stage.measured, stage.commands()).shape == (2, 51)
+
+
+def test_a_picture_is_left_out_and_a_height_field_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = make_env(1)
+    robot = env.robot
+    spec = robot.spec.copy()
+    spec.add_hfield(name="hills", file="hills.png")
+    pose = env.default_dof_pos.tolist()
+    with pytest.raises(ModelError, match="height field 'hills' comes from a file; an export must stand alone"):
+        standalone(type(robot)(**{**vars(robot), "spec": spec}), imu="imu", feet=["FR"], qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
