@@ -24,7 +24,6 @@ from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
 from legged_mw.deploy import udp
 from legged_mw.deploy.contract import Contract, read_contract, read_scene
-from legged_mw.deploy.exam import run_exam
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
 from legged_mw.deploy.runner import run
@@ -292,6 +291,15 @@ def test_joints_may_stand_in_another_order(export: Path, contract: Contract) -> 
     np.testing.assert_array_equal(fleets[0].read().joint_pos[:, order], fleets[1].read().joint_pos)
 
 
+def test_threads_change_no_bit(contract: Contract) -> None:
+    fleets = [Fleet(SHIPPED, contract, 6, threads) for threads in (1, 3)]
+    for fleet in fleets:
+        for step in range(5):
+            fleet.write(contract.default_pose + 0.1 * np.sin(np.arange(72).reshape(6, 12) + step))
+    np.testing.assert_array_equal(fleets[0].qpos, fleets[1].qpos)
+    assert (fleets[0].qpos[0] != fleets[0].qpos[1]).any()
+
+
 # ---- the stage, for viewers and the exam
 
 
@@ -318,7 +326,7 @@ def test_stage() -> None:
 
 
 def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The first seconds of it, with every kick: written, printed, and the same on any number of threads."""
+    """The first seconds of it, with every kick: written and printed."""
     monkeypatch.setattr(rules, "SECONDS", 2.6)
     monkeypatch.setattr(rules, "KICK_AT", 1.0)
     monkeypatch.setattr(rules, "KICK_UNTIL", 2.2)
@@ -328,8 +336,6 @@ def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Ca
     assert "falls in 22 commands                     0" in out and saved["falls"] == 0 and saved["engine"] == "mujoco (deploy)"
     assert saved["kicks"]["1"] == saved["kicks"]["2"] == 1.0 and saved["kicks"]["6"] < 1.0
     assert all(error < 0.12 for error in saved["error"]) and 0.5 < saved["cost_of_transport"] < 1.2
-    again = run_exam(SHIPPED, threads=1)
-    assert {**saved, **again} == saved
 
 
 # ---- the seam

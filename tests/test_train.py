@@ -63,7 +63,9 @@ def three(root: Path, seen_at_start: dict[str, bool]) -> Path:
         patch.setattr(Runner, "learn", look_and_learn)
         adaptive = ["--set", "algorithm.schedule=adaptive", "--set", "algorithm.learning_rate=1e-3"]
         often = ["--max_iterations", "3", "--set", "runner.save_interval=2"]
-        return trained(root, *often, *adaptive, "--run_name", "three", "--seed", "4")
+        folder = trained(root, *often, *adaptive, "--run_name", "three", "--seed", "4")
+    assert not (folder / "export").exists()  # the tests' small task switches it off
+    return folder
 
 
 @pytest.fixture

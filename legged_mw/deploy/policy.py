@@ -55,7 +55,7 @@ class Network:
         rows = np.ascontiguousarray(obs, dtype=np.float32)
         if self._one_by_one and len(rows) != 1:
             return np.concatenate([self(row[None]) for row in rows])
-        return self._session.run([self._output], {self._input: rows})[0]
+        return np.asarray(self._session.run([self._output], {self._input: rows})[0])
 
 
 class Controller:

@@ -115,14 +115,14 @@ def _small_env(task: LoadedTask) -> LeggedRobot:
 
 def _roll_out(env: LeggedRobot, policy: MLPModel, task: LoadedTask) -> tuple[Tensor, Tensor]:
     """Observations (B, size) of the policy walking, and its clipped actions (B, A) on them."""
-    groups, clip, seen = task.train.obs_groups.actor, task.cfg.normalization.clip_actions, []
+    groups, clip = task.train.obs_groups.actor, task.cfg.normalization.clip_actions
+    seen: list[tuple[Tensor, Tensor]] = []
     obs = env.get_observations()
     for _ in range(STEPS):
         actions = act(policy, obs)
         seen.append((torch.cat([obs[group] for group in groups], dim=1), actions.clamp(-clip, clip).clone()))
         obs, *_ = env.step(actions)
-    observations, actions = (torch.cat(parts) for parts in zip(*seen, strict=True))
-    return observations, actions
+    return torch.cat([pair[0] for pair in seen]), torch.cat([pair[1] for pair in seen])
 
 
 def _compare(name: str, got: np.ndarray, actions: Tensor) -> float:
@@ -144,7 +144,8 @@ def run_onnx(path: Path, observations: np.ndarray) -> np.ndarray:
     except ImportError:
         from onnx.reference import ReferenceEvaluator
 
-        return np.asarray(ReferenceEvaluator(onnx.load(path)).run([OUTPUT], {INPUT: observations})[0])
+        [actions] = ReferenceEvaluator(onnx.load(path)).run([OUTPUT], {INPUT: observations})
+        return np.asarray(actions)
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     return np.asarray(session.run([OUTPUT], {INPUT: observations})[0])
 
