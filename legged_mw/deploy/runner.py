@@ -43,13 +43,11 @@ def run(
     low, high = controller.contract.command_ranges
     controller.reset()
     with robot:
-        begun = time.perf_counter()
+        due = time.perf_counter()
         while summary.steps * period < seconds - 1e-9:
             now = summary.steps * period
             if live:
-                behind = time.perf_counter() - begun - now
-                summary.late += behind > LATE * period
-                time.sleep(max(0.0, -behind))
+                due = _wait(due, period, summary) + period
             measured = robot.read()
             if measured.gravity[2] > 0.0:
                 summary.fell = now
@@ -65,3 +63,13 @@ def run(
     if seen:
         summary.velocity = np.mean(seen[len(seen) // 2 :], axis=0)
     return summary
+
+
+def _wait(due: float, period: float, summary: Summary) -> float:
+    """Sleep until ``due``; returns when the step really begins. A late loop is not hurried afterwards: lost time stays lost."""
+    behind = time.perf_counter() - due
+    if behind > LATE * period:
+        summary.late += 1
+        return due + behind
+    time.sleep(max(0.0, -behind))
+    return due

@@ -1,8 +1,8 @@
 """Robots in MuJoCo's C engine, from an export's ``scene.xml``: one behind the seam, or many side by side.
 
 Measurements come from MuJoCo's sensors by their names. Physics computes sensors before it moves on, so after each period
-the sensors of position and velocity are computed again, in the new state; what needs forces (torque, acceleration, contact)
-is one physics step old, as it was in training.
+the sensors of position, velocity and contact are computed again, in the new state; what needs forces (torque, acceleration)
+is one physics step old, as it was in training. There, contact was as old, too.
 """
 
 # pyright: reportAttributeAccessIssue=false
