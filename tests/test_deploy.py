@@ -338,6 +338,14 @@ def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Ca
     assert all(error < 0.12 for error in saved["error"]) and 0.5 < saved["cost_of_transport"] < 1.2
 
 
+def test_a_result_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(program, "run_exam", lambda _: {})
+    monkeypatch.setattr(rules, "table", lambda _: "the table")
+    (tmp_path / "file").write_text("")
+    code, out, err = main(capsys, SHIPPED, "--eval", "--out", tmp_path / "file/exam.json")
+    assert code == 2 and out == "the table\n" and f"cannot write {tmp_path}/file/exam.json: " in err and "say --out FILE" in err
+
+
 # ---- the seam
 
 

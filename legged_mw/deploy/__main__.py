@@ -51,8 +51,11 @@ def main() -> None:
     if args.eval:
         result = run_exam(folder)
         path = Path(args.out) if args.out else folder / RESULT_FILE
-        rules.save({"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)", **result}, path)
         print(rules.table(result))
+        try:
+            rules.save({"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)", **result}, path)
+        except OSError as error:
+            raise UserError(f"cannot write {path}: {error.strerror}; say --out FILE") from None
         print(f"written to {shown(path)}")
     elif args.serve:
         server = UdpServer(MujocoRobot(folder, contract), contract, parse_address(args.serve))
