@@ -82,8 +82,10 @@ def main() -> None:
         return
     wanted = rank.leads and 0 < task.train.runner.exam_interval <= task.train.runner.max_iterations
     examine = make_exam(task, env, args.eager) if wanted else None
-    train(task, env, examine, experiment, run, checkpoint, device, began + args.max_time if args.max_time else None)
+    finished = train(task, env, examine, experiment, run, checkpoint, device, began + args.max_time if args.max_time else None)
     leave_together(rank)
+    if finished and task.train.runner.export:
+        take_away(task, *finished)
 
 
 def announce(task: LoadedTask, device: str, rank: Rank) -> None:
@@ -109,7 +111,8 @@ def train(
     checkpoint: Path | None,
     device: str,
     deadline: float | None,
-) -> None:
+) -> tuple[Path, str] | None:
+    """Train; returns the run folder and the flags that find it again if the training is finished, on the first rank."""
     runner = make_runner(env, task.train, None, device)
     runner.examine = examine
     if checkpoint:
@@ -125,7 +128,7 @@ def train(
     leave_when_stuck(rank)
     if not rank.leads:  # one run folder, written by the first rank
         learn_together(runner, left, rank)
-        return
+        return None
     folder = run if run and newest else new_run(experiment, task.train.runner.run_name)  # an earlier checkpoint begins a branch
     save_yaml(folder / CONFIG_FILE, task.to_dict())
     runner.logger.log_dir = str(folder)
@@ -140,18 +143,18 @@ def train(
     if runner.stop and runner.current_learning_iteration < task.train.runner.max_iterations:
         program = "python train.py" if rank.count == 1 else f"torchrun --nproc_per_node={rank.count} train.py"
         print(f"stopped: {runner.stop}; go on with\n  {program} --resume {flags}")
-    else:
-        print(f"done: {shown(folder)}; watch it with\n  python play.py {flags}")
-        if task.train.runner.export:
-            take_away(task, find_checkpoint(folder, -1), folder / "export", flags)
+        return None
+    print(f"done: {shown(folder)}; watch it with\n  python play.py {flags}", flush=True)
+    return folder, flags
 
 
-def take_away(task: LoadedTask, checkpoint: Path, folder: Path, flags: str) -> None:
+def take_away(task: LoadedTask, run: Path, flags: str) -> None:
     """Export what was trained; the training is done and saved, so that nothing may end it in an error now."""
+    folder = run / "export"
     try:
         from legged_mw.rl.export import describe, export  # onnx takes a while to import
 
-        print(describe(export(task.to_dict(), checkpoint, folder), folder))
+        print(describe(export(task.to_dict(), find_checkpoint(run, -1), folder), folder))
     except Exception as error:  # whatever an exporter may throw
         reason = " ".join(f"{error}".split()) or type(error).__name__
         print(f"not exported: {reason}\n  once that is mended: python play.py {flags} --export {shown(folder)}")

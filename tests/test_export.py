@@ -150,6 +150,18 @@ def test_the_export_is_replaced_whole_or_not_at_all(made: Path, tmp_path: Path, 
         export(*arguments(made), tmp_path / "file")
 
 
+def test_a_network_that_cannot_be_traced(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that asks what its input is, and does one thing or the other."""
+
+    def forward(self: exporting.ExportedPolicy, obs: torch.Tensor) -> torch.Tensor:
+        return self.policy(obs) if obs.sum() > 0 else -self.policy(obs)
+
+    monkeypatch.setattr(exporting.ExportedPolicy, "forward", forward)
+    with pytest.raises(ExportError, match=r"the network \(MLPModel\) cannot be exported: "):
+        export(*arguments(made), tmp_path / "out")
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_nan_is_a_mismatch() -> None:
     actions = torch.zeros(3, 2)
     with pytest.raises(ExportError, match="acts otherwise"):

@@ -83,7 +83,8 @@ def test_train_writes_one_run_folder(tmp_path: Path) -> None:
     [folder] = (tmp_path / "runs").iterdir()
     assert {"config.yaml", "model_2.pt"} <= {path.name for path in folder.iterdir()}
     assert load_yaml(folder / "config.yaml")["seed"] == 4
-    assert result.stdout.count("Learning iteration 2/2") == 1
+    assert result.stdout.count("Learning iteration 2/2") == result.stdout.count("policy.onnx") == 1
+    assert (folder / "export/policy.yaml").is_file()
     assert "8 worlds on each of 2 processes" in result.stdout
     assert (
         torch.load(folder / "model_2.pt", weights_only=True)["infos"]["total_steps"]

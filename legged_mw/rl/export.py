@@ -81,9 +81,7 @@ def export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
     with _all_or_nothing(folder) as new:
         save_policy(policy, new / MODEL_FILE, {"task": task.name})
         save_yaml(new / CONFIG_FILE, config)
-        program = trace(policy, clip)
-        save_program(program, new / PROGRAM_FILE)
-        save_onnx(program, new / NETWORK_FILE)
+        _save_networks(policy, clip, new)
         gap = max(
             _compare(PROGRAM_FILE, _run_program(new / PROGRAM_FILE, observations), actions),
             _compare(NETWORK_FILE, run_onnx(new / NETWORK_FILE, observations.numpy()), actions),
@@ -154,6 +152,16 @@ def _run_program(path: Path, observations: Tensor) -> np.ndarray:
     program = torch.export.load(io.BytesIO(path.read_bytes()))  # made by this process; one from elsewhere would be trusted blindly
     with torch.inference_mode():
         return program.module()(observations).numpy()
+
+
+def _save_networks(policy: MLPModel, clip_actions: float, folder: Path) -> None:
+    try:
+        program = trace(policy, clip_actions)
+        save_program(program, folder / PROGRAM_FILE)
+        save_onnx(program, folder / NETWORK_FILE)
+    except Exception as error:  # the exporters' own, one for each thing that a network may do and they may not
+        first = next(iter(str(error).strip().splitlines()), type(error).__name__)
+        raise ExportError(f"the network ({type(policy).__name__}) cannot be exported: {first}") from error
 
 
 # ---- files ---------------------------------------------------------------------------------------------------------
