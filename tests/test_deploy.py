@@ -119,6 +119,8 @@ WRONG = [
         lambda said: [said[name].pop() for name in ("joints", "default_pose", "stiffness", "damping")],
         "has size 12; joint_offset has 11 values",
     ),
+    (put("observation.4.scale", [1.0, 2.0]), "observation[4]: 'scale' is [1.0, 2.0]; it must be 12 numbers, one a value of the row"),
+    (put("robot.falls_on", ["trunk_box"]), "sensors: 'fall_contact' is missing; name the sensors of scene.xml that measure it"),
     (put("default_pose", [0.0] * 11), "it must be 12 numbers, one a joint"),
     (put("default_pose.2", "bent"), "it must be 12 numbers, one a joint"),
     (put("stiffness.0", 20.0), "stiffness is [20., 35., 35.,"),

@@ -208,7 +208,14 @@ class OwnRows(LeggedRobot):
 def test_rows_of_ones_own() -> None:
     """One that names its sensors can be deployed; one of an unknown name says that nobody knows."""
     *_, shake, guess = contract_rows(make_env(1, env_class=OwnRows), "state")
-    assert (shake.measured, shake.sensors, shake.unit, shake.size, shake.noise) == ("sensors", ("accelerometer/imu",), "m/s^2", 3, 0.5)
+    assert (shake.measured, shake.sensors, shake.unit, shake.size, shake.noise, shake.scale) == (
+        "sensors",
+        ("accelerometer/imu",),
+        "m/s^2",
+        3,
+        0.5,
+        (1.0,),
+    )
     assert (guess.measured, guess.unit, guess.size) == ("", "", 4)
 
 
@@ -226,9 +233,13 @@ class Dog(LeggedRobot):
     def _observation_rows(self):
         rows = super()._observation_rows()
         sensed = self.sim.sensordata[:, self.robot.sensors["accelerometer"]]
-        rows["state"] += [Row("shake", sensed, mirror="polar", sensors=("accelerometer/imu",), unit="m/s^2")]
+        rows["state"] += [Row("shake", sensed, mirror="polar", sensors=("accelerometer/imu",), unit="m/s^2", scale=(0.5, 0.5, 0.1))]
         return rows
-TASK = Task(Dog, Go1FlatCfg, Go1FlatCfgPPO)
+class DogCfg(Go1FlatCfg):
+    class asset(Go1FlatCfg.asset):
+        colliders = ["FR", "FL", "RR", "RL", "trunk_*"]
+        terminate_after_contacts_on = ["trunk_*"]
+TASK = Task(Dog, DogCfg, Go1FlatCfgPPO)
 '''
 
 
@@ -241,7 +252,13 @@ def test_a_task_with_a_row_of_its_own_is_deployed(tmp_path: Path) -> None:
     assert read_scene(folder, stage.contract).sensordata["shake"].shape == (3,)
     stage.step(None)
     np.testing.assert_array_equal(stage.measured.others["shake"], stage.measured.acceleration)
-    assert stage.controller.observe(stage.measured, stage.commands()).shape == (2, 51)
+    obs = stage.controller.observe(stage.measured, stage.commands())
+    assert obs.shape == (2, 51)
+    np.testing.assert_allclose(obs[:, -3:], stage.measured.acceleration * [0.5, 0.5, 0.1], rtol=1e-6)
+    assert stage.contract.falls_on == ("trunk_box", "trunk_right", "trunk_left") and not stage.fell().any()
+    stage.fleet.qpos[1, 2] = 0.04  # with its trunk in the ground
+    stage.fleet.write(stage.contract.default_pose + np.zeros((2, 1)))
+    assert stage.fleet.fell().tolist() == [False, True]
     with pytest.raises(ContractError, match=r"the robot does not measure row 'shake': it must be in Measurement.others \(3 values\)"):
         stage.controller.observe(dataclasses.replace(stage.measured, others={}), stage.commands())
 

@@ -52,6 +52,7 @@ ROWS: dict[str, Kind] = {
 COMPUTED = ("joint_offset", "last_action", "command")  # by the controller; all else a robot measures
 # What a scene measures by sensors; "up" is the world's z axis in the IMU's frame, opposite to gravity.
 SENSED = ("lin_vel", "ang_vel", "up", "acceleration", "joint_pos", "joint_vel", "joint_torque", "foot_contact")
+FALL = "fall_contact"  # contacts of `falls_on` with the ground; only where there are such geoms
 SENSORS = "sensors"  # Row.measured of a row that names sensors of the scene
 
 
@@ -66,6 +67,7 @@ class Row:
     noise: float  # half width of the uniform noise that it was trained with, in `unit`
     measured: str  # a field of robot.Measurement, one of COMPUTED, "sensors", or "" if nobody said
     sensors: tuple[str, ...] = ()
+    scale: tuple[float, ...] = (1.0,)  # one number, or one a value: the network sees scale * value
 
 
 @dataclass(frozen=True)
@@ -86,6 +88,7 @@ class Contract:
     rows: tuple[Row, ...]
     sensors: dict[str, tuple[str, ...]]  # quantity -> sensors of the scene
     feet: tuple[str, ...]
+    falls_on: tuple[str, ...]  # geoms that must not touch the ground: if one does, it fell
     imu: str
     mass: float  # [kg] of the whole robot
     input: str  # of the network: (batch, size of all rows)
@@ -111,7 +114,7 @@ class Contract:
             "damping": self.damping.tolist(),
             "commands": dict(zip(("lowest", "highest"), self.command_ranges.tolist(), strict=True)),
             "observation": [_row_to_dict(row) for row in self.rows],
-            "robot": {"mass": self.mass, "feet": list(self.feet), "imu": self.imu},
+            "robot": {"mass": self.mass, "feet": list(self.feet), "falls_on": list(self.falls_on), "imu": self.imu},
             "physics": {"file": SCENE_FILE, "timestep": self.timestep, "decimation": self.decimation},
             "sensors": {name: list(names) for name, names in self.sensors.items()},
         }
@@ -119,6 +122,7 @@ class Contract:
 
 def _row_to_dict(row: Row) -> dict[str, Any]:
     said = {name: getattr(row, name) for name in ("name", "size", "unit", "frame", "noise", "measured")}
+    said |= {"scale": list(row.scale) if len(row.scale) > 1 else row.scale[0]}
     return {**said, "sensors": list(row.sensors)} if row.sensors else said
 
 
@@ -159,9 +163,9 @@ class _Reader:
             self.refuse(key, "text")
         return value
 
-    def texts(self, key: str) -> tuple[str, ...]:
+    def texts(self, key: str, empty: bool = False) -> tuple[str, ...]:
         value = self.values.get(key)
-        if not isinstance(value, list) or not value or not all(isinstance(item, str) for item in value):
+        if not isinstance(value, list) or not (value or empty) or not all(isinstance(item, str) for item in value):
             self.refuse(key, "a list of names")
         return tuple(value)
 
@@ -226,6 +230,7 @@ def read_contract(folder: Path) -> Contract:
         rows=tuple(_read_row(row) for row in top.sections("observation")),
         sensors={name: measured.texts(name) for name in measured.values},
         feet=robot.texts("feet"),
+        falls_on=robot.texts("falls_on", empty=True),
         imu=robot.text("imu"),
         mass=robot.above_zero("mass"),
         input=network.text("input"),
@@ -253,14 +258,22 @@ def _read_row(row: _Reader) -> Row:
         noise=row.number("noise", 0.0),
         measured=row.text("measured", empty=True),
         sensors=row.texts("sensors") if "sensors" in row.values else (),
+        scale=_read_scale(row),
     )
+
+
+def _read_scale(row: _Reader) -> tuple[float, ...]:
+    if isinstance(row.values.get("scale"), list):
+        return tuple(row.numbers("scale", row.count("size"), "value of the row").tolist())
+    return (row.number("scale"),)
 
 
 def quantity_size(contract: Contract, name: str) -> int:
     """Values of a measured quantity."""
     joints, feet = len(contract.joints), len(contract.feet)
     per_joint = ("joint_pos", "joint_offset", "joint_vel", "joint_torque", "last_action")
-    return joints if name in per_joint else feet if name == "foot_contact" else 3
+    counts = {**dict.fromkeys(per_joint, joints), "foot_contact": feet, FALL: len(contract.falls_on)}
+    return counts.get(name, 3)
 
 
 def _check_rows(contract: Contract) -> None:
@@ -306,7 +319,8 @@ def read_scene(folder: Path, contract: Contract) -> Scene:
     if model.nkey < 1:
         raise ContractError(f"{SCENE_FILE} has no keyframe; the first one says where the robot starts")
     named = {**contract.sensors, **{row.name: row.sensors for row in contract.rows if row.sensors}}
-    if missing := [name for name in SENSED if name not in contract.sensors]:
+    needed = [*SENSED, *([FALL] if contract.falls_on else [])]
+    if missing := [name for name in needed if name not in contract.sensors]:
         raise ContractError(f"{CONTRACT_FILE}: sensors: '{missing[0]}' is missing; name the sensors of {SCENE_FILE} that measure it")
     data = {name: np.concatenate([_span(model, sensor, f"'{name}'") for sensor in names]) for name, names in named.items()}
     for name, where in data.items():

@@ -77,7 +77,8 @@ class Controller:
             if row.measured == SENSORS and row.name not in measurement.others:
                 raise ContractError(f"the robot does not measure row '{row.name}': it must be in Measurement.others ({row.size} values)")
             value = measurement.others[row.name] if row.measured == SENSORS else values.get(row.measured)
-            rows.append(np.atleast_2d(getattr(measurement, row.measured) if value is None else value).astype(np.float32))
+            value = np.atleast_2d(getattr(measurement, row.measured) if value is None else value)
+            rows.append((value * np.array(row.scale)).astype(np.float32))
         return np.concatenate(rows, axis=1)
 
     def act(self, measurement: Measurement, commands: Floats) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
-from legged_mw.deploy.contract import Contract, read_scene
+from legged_mw.deploy.contract import FALL, Contract, read_scene
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, layout
 from legged_mw.utils.machine import usable_cores
 
@@ -55,10 +55,11 @@ class Fleet:
             self.broken[error.ids] = True
 
     def fell(self) -> NDArray[np.bool_]:
-        """Robots (N,) whose z axis points below the horizon, or whose state is no longer finite."""
+        """Robots (N,) whose z axis points below the horizon, that touch the ground with what must not, or whose state is not finite."""
         w, x, y, z = self.qpos[:, 3:7].T
         upright = w**2 - x**2 - y**2 + z**2 >= 0.0  # NaN compares false
-        return ~upright | ~np.isfinite(self.qvel).all(axis=1) | self.broken
+        fell = ~upright | ~np.isfinite(self.qvel).all(axis=1) | self.broken
+        return fell | (self._sensors[:, self._where[FALL]] > 0.0).any(axis=1) if FALL in self._where else fell
 
     def reset(self, which: Any = None) -> None:
         """Put the robots ``which`` (indices; None: all) into the first keyframe, at rest."""

@@ -22,7 +22,7 @@ import torch
 from rsl_rl.models import MLPModel
 from torch import Tensor, nn
 
-from legged_mw.deploy.contract import CONTRACT_FILE, NETWORK_FILE, ROWS, SCENE_FILE, SENSORS, Contract, Row, digest
+from legged_mw.deploy.contract import CONTRACT_FILE, FALL, NETWORK_FILE, ROWS, SCENE_FILE, SENSORS, Contract, Row, digest
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl.policy import act, load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE
@@ -37,7 +37,7 @@ MODEL_FILE, PROGRAM_FILE = "model.pt", "policy.pt"
 FILES = (MODEL_FILE, CONFIG_FILE, NETWORK_FILE, PROGRAM_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
 INPUT, OUTPUT = "obs", "actions"
 WORLDS, STEPS = 8, 32  # of the roll-out that the files are tried on
-TOLERANCE = 1e-4  # between actions of the same observation: float32 sums in another order
+TOLERANCE = 1e-4  # between actions of the same observation, relative above 1: float32 sums in another order
 
 
 class ExportError(UserError, RuntimeError):
@@ -126,7 +126,7 @@ def _roll_out(env: LeggedRobot, policy: MLPModel, task: LoadedTask) -> tuple[Ten
 def _compare(name: str, got: np.ndarray, actions: Tensor) -> float:
     """The largest difference; refuses a file that acts otherwise than the policy."""
     wanted = actions.numpy()
-    gap = float(np.abs(got - wanted).max()) if got.shape == wanted.shape else float("inf")
+    gap = float((np.abs(got - wanted) / np.maximum(1.0, np.abs(wanted))).max()) if got.shape == wanted.shape else float("inf")
     if not gap <= TOLERANCE:  # NaN too
         raise ExportError(
             f"{name} acts otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
@@ -260,6 +260,8 @@ def make_contract(env: LeggedRobot, task: LoadedTask, folder: Path) -> Contract:
         qpos=[*cfg.init_state.pos, 1.0, 0.0, 0.0, 0.0, *pose],
         ctrl=pose,
     )
+    falls_on = tuple(robot.contact_geoms[i] for i in env.terminating_contacts.tolist())
+    sensed = {FALL: tuple(f"contact/{name}" for name in falls_on)} if falls_on else {}
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
     return Contract(
         task=task.name,
@@ -274,8 +276,9 @@ def make_contract(env: LeggedRobot, task: LoadedTask, folder: Path) -> Contract:
         decimation=cfg.control.decimation,
         command_ranges=np.array([cfg.commands.ranges.lin_vel_x, cfg.commands.ranges.lin_vel_y, cfg.commands.ranges.ang_vel_yaw]).T,
         rows=tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group)),
-        sensors={name: tuple(names) for name, names in scene.sensors.items()},
+        sensors={**{name: tuple(names) for name, names in scene.sensors.items()}, **sensed},
         feet=tuple(cfg.asset.foot_names),
+        falls_on=falls_on,
         imu=cfg.asset.imu_site,
         mass=round(env.total_mass, 6),
         input=INPUT,
@@ -302,6 +305,7 @@ def contract_rows(env: LeggedRobot, group: str) -> list[Row]:
                 noise=row.noise * env.cfg.noise.level,
                 measured=measured,
                 sensors=tuple(row.sensors),
+                scale=tuple(row.column_scales()) if isinstance(row.scale, tuple) else (float(row.scale),),
             )
         )
     return rows
