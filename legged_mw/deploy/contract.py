@@ -122,7 +122,8 @@ class Contract:
 
 def _row_to_dict(row: Row) -> dict[str, Any]:
     said = {name: getattr(row, name) for name in ("name", "size", "unit", "frame", "noise", "measured")}
-    said |= {"scale": list(row.scale) if len(row.scale) > 1 else row.scale[0]}
+    [first, *rest] = row.scale
+    said["scale"] = [first, *rest] if rest else first
     return {**said, "sensors": list(row.sensors)} if row.sensors else said
 
 
