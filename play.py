@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import torch
@@ -16,6 +17,7 @@ from legged_mw.rl.policy import act, load_policy
 from legged_mw.rl.runs import CONFIG_FILE, find_checkpoint, find_run, runs
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, one_line_errors, pick_device, seed_everything, shown
 from legged_mw.utils.config import ConfigError, load_yaml
+from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 from legged_mw.view import launch
 from legged_mw.view.env_stage import EnvStage
@@ -92,7 +94,7 @@ def main() -> None:
         columns = [grade(env, policy, source, overrides)]
         if rival:
             columns.append(grade(*rival))
-        report.write(out / "eval", task.name, columns)
+        report.write(out / "eval", task.name, columns, elsewhere(task, source))
         print(f"written to {shown(out / 'eval' / 'report.html')}, with report.json and pictures beside it")
     else:
         stage, viewer = EnvStage(env, lambda obs: act(policy, obs), limits), task.cfg.viewer
@@ -173,6 +175,20 @@ def grade(env: LeggedRobot, policy: MLPModel, source: Source, overrides: dict[st
     print(f"\n{name}, {env.sim.engine} on {env.device}\n{rules.table(result)}\n")
     about = {"policy": "/".join(source.checkpoint.parts[-3:]), "engine": env.sim.engine, "device": env.device, "overrides": overrides}
     return report.Column(name, about, result, figures)
+
+
+def elsewhere(task: LoadedTask, source: Source) -> list[tuple[str, dict[str, Any]]]:
+    """The exam of the same policy on another physics: MuJoCo's C engine, through an export, as ``legged_mw.deploy`` runs it."""
+    from legged_mw.deploy.exam import run_exam
+    from legged_mw.rl.export import export
+
+    with TemporaryDirectory() as folder:
+        try:
+            export(task.to_dict(), source.checkpoint, Path(folder) / "export")
+            return [("the same, deployed in MuJoCo", run_exam(Path(folder) / "export"))]
+        except UserError as error:  # a row that nobody can measure, no onnxruntime
+            print(f"not graded through an export: {error}")
+            return []
 
 
 def export(trained: dict[str, Any], source: Source, folder: Path) -> None:

@@ -321,13 +321,17 @@ def test_two_exams_are_the_same_exam(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The table is printed, the figures go into the run folder; a user's own override still counts, the exam's worlds do not move."""
-    monkeypatch.setattr(exam, "SECONDS", 2.1)
+    for place in (exam, rules):  # by the environment, and by the export
+        monkeypatch.setattr(place, "SECONDS", 2.1)
     folder = trained(tmp_path, "--max_iterations", "1")
     result = run("play", tmp_path, *SMALL[:2], "--device", "cpu", "--eval", "--set", "terrain.friction=0.4")
     assert result.code == 0, result.err
     assert "terrain.friction: 0.6 -> 0.4" in result.out and "noise.level: 1.0 -> 0.0" in result.out
     assert "falls in 22 commands" in result.out and "walks: no; beats the peer: no" in result.out
-    [saved] = json.loads((folder / "eval/report.json").read_text())["columns"]
+    saved, deployed = json.loads((folder / "eval/report.json").read_text())["columns"]
+    assert deployed["name"] == "the same, deployed in MuJoCo" and deployed["exam"]["error"] == pytest.approx(
+        saved["exam"]["error"], abs=0.01
+    )
     about, graded = saved["about"], saved["exam"]
     assert about["policy"].endswith(f"{folder.name}/model_1.pt") and about["engine"] == "mujoco" and about["device"] == "cpu"
     assert len(graded["commands"]) == TRACKED and graded["walks"] is False

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from program import SMALL, refused, run, trained
+from program import SMALL, play, refused, run, trained
 from tensordict import TensorDict
 
 from legged_mw import ROOT
@@ -185,7 +185,8 @@ def test_compare_grades_each_by_its_own_config(two_runs: tuple[Path, Path, Path]
     root, first, second = two_runs
     monkeypatch.setattr(exam, "SECONDS", 2.1)
     written: list[Any] = []
-    monkeypatch.setattr(report, "write", lambda folder, task, columns: written.extend([folder, task, *columns]))
+    monkeypatch.setattr(report, "write", lambda folder, task, columns, extras: written.extend([folder, task, *columns]))
+    monkeypatch.setattr(play, "elsewhere", lambda *_: [])
     small = ["--load_run", first.name, "--compare", second.name, "--set", "terrain.friction=0.4"]
     result = run("play", root, *SMALL[:2], "--device", "cpu", "--eval", *small)
     assert result.code == 0, result.err
