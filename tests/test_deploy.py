@@ -195,11 +195,16 @@ def test_numbers_as_people_write_them(export: Path) -> None:
 @pytest.mark.parametrize(
     ("args", "said"),
     [
-        (("--eval", "--serve", "127.0.0.1:1"), "one thing each"),
-        (("--eval", "--command", "1,0,0"), "--eval brings its own commands"),
+        (("--eval", "--serve", "127.0.0.1:1"), "are one thing each"),
+        (("--eval", "--viewer", "none"), "are one thing each"),
+        (("--serve", "127.0.0.1:1", "--video", "x.mp4"), "are one thing each"),
+        (("--eval", "--command", "1,0,0"), "--eval and --commands bring their own commands"),
         (("--command", "fast"), "--command fast: write three numbers, vx,vy,yaw"),
         (("--command", "0,0,nan"), "--command 0,0,nan: write three numbers"),
-        (("--command", "0,1,0"), "--command 0,1,0: vy was trained from -0.8 to 0.8, and 1 is outside"),
+        (
+            ("--command", "0,1,0"),
+            "--command 0,1,0: vy = 1 m/s is outside of what the policy was trained for, -0.8 to 0.8; the ranges are in ",
+        ),
         (("--udp", "robot"), "'robot' is no address; write HOST:PORT, e.g. 127.0.0.1:9870"),
         (("--time", "soon"), "'soon' is no duration"),
     ],
@@ -326,6 +331,21 @@ def test_stage() -> None:
     stage.reset(1)
     np.testing.assert_allclose(stage.velocity()[1], 0.0)
     assert stage.qpos()[1, 0] == 0.0 != stage.qpos()[0, 0]
+
+
+def test_it_is_driven(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """By the viewers' own loop with nobody watching: it obeys a fixed command, and a script."""
+    code, out, err = main(capsys, SHIPPED, "--viewer", "none", "--time", "3", "--command", "0.8,0,0", "--num_envs", "2")
+    assert code == 0, err
+    [leg] = [line.split() for line in out.splitlines() if "+0.80 +0.00 +0.00" in line]
+    assert "3.0 s, 0 falls" in out and abs(float(leg[7]) - 0.8) < 0.08  # from, s, for, s, three commanded, three measured
+    (tmp_path / "script.yaml").write_text(
+        "commands: [{time: 0, command: [0.5, 0, 0]}, {time: 0.5, command: [0, 0.4, 0]}, {time: 1, reset: true}]"
+    )
+    code, out, err = main(capsys, SHIPPED, "--commands", tmp_path / "script.yaml", "--viewer", "none")
+    assert code == 0, err
+    assert "+0.50 +0.00 +0.00" in out and "+0.00 +0.40 +0.00" in out and "4.0 s, 0 falls" in out
+    assert "the ranges are in" in main(capsys, SHIPPED, "--viewer", "none", "--command", "9,0,0")[2]
 
 
 def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ STROLL = (0.5, 0.0, 0.0)  # what a robot does that nobody commands: vx, vy [m/s]
 class DeployStage:
     """``num_worlds`` robots that follow an exported policy in MuJoCo's C engine (the viewers' protocol ``Stage``)."""
 
-    def __init__(self, folder: Path, num_worlds: int = 1, command: tuple[float, float, float] | None = None, threads: int = 0) -> None:
+    def __init__(self, folder: Path, num_worlds: int = 1, command: Sequence[float] | None = None, threads: int = 0) -> None:
         """Load the export in ``folder``; ``command`` is what is followed while nobody says otherwise."""
         self.contract = read_contract(folder)
         self.fleet = Fleet(folder, self.contract, num_worlds, threads)

@@ -65,7 +65,7 @@ def check_flags(args: argparse.Namespace) -> None:
         raise FlagError(f"--port {args.port}: a port is a number from 1 to 65535")
 
 
-def check_drive(args: argparse.Namespace, limits: ArrayLike) -> list[float] | None:
+def check_drive(args: argparse.Namespace, limits: ArrayLike, advice: str = WIDEN) -> list[float] | None:
     """Refuse a `--command` or a `--commands` file that is wrong or that the policy was not trained for; the former as numbers."""
     limits = np.asarray(limits, dtype=np.float64)
     if args.commands:
@@ -79,7 +79,7 @@ def check_drive(args: argparse.Namespace, limits: ArrayLike) -> list[float] | No
     if len(command) != 3 or not np.isfinite(command).all():
         raise FlagError(f"--command {args.command}: {COMMAND_FORM}")
     if (wrong := outside(command, limits)) is not None:
-        raise FlagError(f"--command {args.command}: {wrong}; {WIDEN}")
+        raise FlagError(f"--command {args.command}: {wrong}; {advice}")
     return command
 
 
