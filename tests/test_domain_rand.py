@@ -198,6 +198,21 @@ def test_late_observations() -> None:
             assert torch.equal(seen[step][world, 33:45], env.last_actions[world]) or step < 5, "what it sent itself is not late"
 
 
+def test_setting_one_world_up_anew_leaves_the_others_observations() -> None:
+    """Also what is on its way to them."""
+    env = make_env(3, {**NOTHING, "domain_rand.observation_delay": [2, 2]})
+    walk(env, 4)
+    other = make_env(3, {**NOTHING, "domain_rand.observation_delay": [2, 2]})
+    walk(other, 4)
+    before = env.obs_buf["state"].clone()
+    env.restart(torch.tensor([False, True, False]))
+    assert same(env.obs_buf["state"][::2], before[::2]) and not torch.equal(env.obs_buf["state"][1], before[1])
+    measured = slice(3, 33)  # gyro, gravity, joints: noise is drawn anew, but what was measured before is on its way
+    for sim in (env, other):
+        sim.step(torch.zeros(3, 12))
+    assert same(env.obs_buf["state"][::2, measured], other.obs_buf["state"][::2, measured])
+
+
 def test_encoders_that_are_off() -> None:
     env = make(3, encoder_offset=[-0.05, 0.05])
     offset = env.domain_rand.values["encoder_offset"]
@@ -290,11 +305,13 @@ def test_pushes_set_the_velocity_when_their_clock_says_so() -> None:
         ("redraw_at_reset", ["frictoin"], "no range 'frictoin' in domain_rand; did you mean 'friction'"),
         ("redraw_at_reset", ["base_mass"], "'base_mass', which constants of the model depend on"),
         ("model_factors", {"geom_size": [1.0]}, "domain_rand.model_factors.geom_size is .* two numbers"),
+        ("model_factors", {"dof_armature": [1.0, 2.0]}, "model_factors.dof_armature: domain_rand.armature writes that field"),
+        ("base_mass", [-20.0, 0.0], "domain_rand.base_mass is .* the root 'trunk' has .* kg, which leaves some with none"),
     ],
 )
 def test_mistakes_are_named(path: str, value: object, message: str) -> None:
     with pytest.raises(ConfigError, match=message):
-        make_env(2, {f"domain_rand.{path}": value})
+        make_env(2, {"domain_rand.enable": True, f"domain_rand.{path}": value})
     assert "\n" not in message
 
 

@@ -437,8 +437,13 @@ def test_a_window_that_cannot_open_does_not_leave_a_batch_job_waiting(
     monkeypatch.setattr(launch, "has_display", lambda: True)
     monkeypatch.setattr(launch, "NativeViewer", refuse)
     monkeypatch.setattr("sys.stdout.isatty", lambda: False, raising=False)
-    launch.watch(FakeStage(), flags("--time", "0.1"), tmp_path, launch.Picture(64, 48))
-    assert (tmp_path / "play.mp4").exists() and "no window: no OpenGL on :99" in capsys.readouterr().out
+    monkeypatch.setattr(launch, "SECONDS", 0.1)  # nobody said how long
+    summary = launch.watch(FakeStage(), flags(), tmp_path, launch.Picture(64, 48))
+    assert (
+        summary.seconds == pytest.approx(0.1)
+        and (tmp_path / "play.mp4").exists()
+        and "no window: no OpenGL on :99" in capsys.readouterr().out
+    )
     with pytest.raises(ViewError, match="no OpenGL on :99"):
         launch.watch(FakeStage(), flags("--viewer", "native"), tmp_path)
 

@@ -97,6 +97,8 @@ def test_scene_is_the_machine_that_was_trained(made: Path) -> None:
         assert differences(trained_model, other) == [name]
     other.geom_friction[:, 0] = 0.9
     assert "geom_friction" in differences(trained_model, other)
+    other.opt.impratio, other.body_iquat[1], other.actuator_forcelimited[0] = 2.0, [0.6, 0.8, 0.0, 0.0], 0
+    assert {"option impratio", "body_iquat", "actuator_forcelimited"} <= {*differences(trained_model, other)}
 
 
 def test_meshes_from_files_are_written_out(tmp_path: Path) -> None:

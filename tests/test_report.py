@@ -15,7 +15,8 @@ from tensordict import TensorDict
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam, report, rules
+from legged_mw.eval import exam, page, report, rules
+from legged_mw.eval.report import Column
 from legged_mw.eval.rollout import Case, Kick, roll_out
 from legged_mw.eval.trials import make_plan
 from legged_mw.rl.policy import act, load_policy
@@ -227,3 +228,15 @@ def test_compare_mistakes(two_runs: tuple[Path, Path, Path]) -> None:
     assert "add --eval" in refused(root, "play", *start, "--compare", "shipped")
     assert "no run 'nobody' with a checkpoint" in refused(root, "play", *start, "--eval", "--compare", "nobody")
     assert "--compare shipped: no policy ships with go1_flat" in refused(root, "play", *start, "--eval", "--compare", "shipped")
+
+
+def test_tables_of_two_policies_with_other_ranges() -> None:
+    """One that never goes backwards has fewer steps of the command; nothing of either is lost."""
+
+    def column(name: str, changes: int) -> Column:
+        number = {"from": 0.0, "to": 1.0, "rise_time": 0.2, "overshoot": 0.1, "left": 0.0}
+        steps = {axis: {"numbers": [number] * changes} for axis in ("vx", "vy", "yaw")}
+        return Column(name, {}, {}, {"steps": steps, "foot_names": []})
+
+    table = page._extra("steps", [column("first", 2), column("second", 3)])
+    assert table.count(", first") == 6 and table.count(", second") == 9

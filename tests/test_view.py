@@ -19,6 +19,8 @@ import mujoco
 import numpy as np
 import pytest
 
+from legged_mw import ROOT
+from legged_mw.utils.task import load_task
 from legged_mw.view import native, video
 from legged_mw.view.camera import DISTANCE, CameraMan
 from legged_mw.view.drive import BINDINGS, Pilot
@@ -496,3 +498,14 @@ def test_encoder_without_libx264_is_not_chosen(no_program: Path) -> None:
     script = no_program / "ffmpeg"
     script.write_text(script.read_text().replace("libx264", "mpeg4"))
     assert video._choose_encoder(gif=False) is video._PyAv
+
+
+def test_feet_are_found_among_other_contacts() -> None:
+    """The port of legged_gym's task senses contacts of thighs, calves and trunk too; its feet come first."""
+    task = load_task(str(ROOT / "examples" / "go1_legged_gym.py"))
+    task.set("env.num_envs", 1)
+    model = task.env_class(task.cfg, "cpu").robot.visual
+    cast = Cast(model, 1)
+    assert len(cast.feet) > 4
+    cast.pose(model.qpos0[None], 0)
+    assert cast.standing(np.array([[True, False, True, False]])).shape == (2, 3)

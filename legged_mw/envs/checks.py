@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START
+from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, active
 from legged_mw.sim.model import unknown
 from legged_mw.utils.config import Config, ConfigError
 
@@ -95,6 +95,9 @@ def _check_redraws(cfg: LeggedRobotCfg) -> None:
     for name, span in cfg.domain_rand.model_factors.items():
         if not FACTORS[1](span):
             raise ConfigError(f"domain_rand.model_factors.{name} is {span!r}; it must be {FACTORS[0]}")
+        writers = [kind for kind, (what, *_) in active(cfg).items() if kind != name and name in what.fields]
+        if writers:
+            raise ConfigError(f"domain_rand.model_factors.{name}: domain_rand.{writers[0]} writes that field; leave one of them out ([])")
 
 
 def _check(cfg: Config, rules: dict[str, Rule]) -> None:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from legged_mw.sim.model import GROUND, RobotModel
 from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
+from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign
 
 if TYPE_CHECKING:
@@ -72,7 +73,7 @@ class Delay:
     def __init__(self, steps: Tensor, longest: int, width: int, start: float | None = None) -> None:
         """``steps`` (N, 1), read at each call; before an episode the value was ``start``, or None: its first one."""
         self.steps, self.start = steps, start
-        self._past = torch.zeros(len(steps), longest + 1, width, device=steps.device)
+        self.past = torch.zeros(len(steps), longest + 1, width, device=steps.device)
         self._new = torch.ones(len(steps), dtype=torch.bool, device=steps.device)
 
     def restart(self, mask: Tensor) -> None:
@@ -80,16 +81,16 @@ class Delay:
         if self.start is None:
             self._new.logical_or_(mask)
         else:
-            assign(self._past, mask, self.start)
+            assign(self.past, mask, self.start)
 
     def __call__(self, now: Tensor) -> Tensor:
-        self._past[:, 1:] = self._past[:, :-1].clone()
-        self._past[:, 0] = now
+        self.past[:, 1:] = self.past[:, :-1].clone()
+        self.past[:, 0] = now
         if self.start is None:
-            self._past.copy_(torch.where(self._new[:, None, None], now[:, None], self._past))
+            self.past.copy_(torch.where(self._new[:, None, None], now[:, None], self.past))
             self._new.fill_(False)
         index = self.steps.long()[:, :, None].expand(-1, 1, now.shape[1])
-        return self._past.gather(1, index)[:, 0]
+        return self.past.gather(1, index)[:, 0]
 
 
 class DomainRand:
@@ -109,14 +110,15 @@ class DomainRand:
         self._first_again = sum(width for name, width in zip(order, widths, strict=True) if name not in again)
         bounds = [list(kinds[name][1:]) for name, width in zip(order, widths, strict=True) for _ in range(width)]
         self._low, self._high = torch.tensor(bounds or [[0.0, 0.0]], dtype=torch.float, device=sim.device).T.contiguous()
-        self._whole = {name: kinds[name][1:] for name in order if kinds[name][0].whole}
+        self._whole = [name for name in order if kinds[name][0].whole]
         self._nominal = {field: sim.field(field)[:1].clone() for field in world_fields(cfg)}
+        _check_mass(cfg, robot)
         self._root, self._ground = robot.id("body", robot.root), robot.id("geom", GROUND)
         self._link_of_body = _links(robot).to(sim.device)
         writers = {name: self._writer(name, field) for name in order for field in kinds[name][0].fields[:1]}
         self._writers = list(dict.fromkeys(writers.values()))
         self._writers_again = list(dict.fromkeys(writers[name] for name in again if name in writers))
-        self._longest = {name: int(high) for name, (_, high) in self._whole.items()}
+        self._longest = {name: int(kinds[name][2]) for name in self._whole}
 
     def delay(self, name: str, width: int, start: float | None = None) -> Delay | None:
         """The delay line of ``action_delay`` or ``observation_delay``, or None if the config has none."""
@@ -144,11 +146,11 @@ class DomainRand:
             return
         share = torch.rand_like(draws)
         fresh = torch.lerp(self._low[first:], self._high[first:], share)
-        start = self._draws.shape[1] - fresh.shape[1]
-        for name, (low, high) in self._whole.items():
-            column = self.values[name].storage_offset() - start
-            if column >= 0:
-                fresh[:, column] = (low + share[:, column] * (high - low + 1)).floor_().clamp_(max=high)
+        for name in self._whole:
+            column = self.values[name].storage_offset()
+            if column >= first:
+                low, high = self._low[column], self._high[column]
+                fresh[:, column - first] = (low + share[:, column - first] * (high - low + 1.0)).floor_().minimum(high)
         assign(draws, mask, fresh)
 
     # ---- what a draw writes: nominal values come from the model ------------------------------------------------------
@@ -195,6 +197,15 @@ class DomainRand:
     def _write_stiffness(self, mask: Tensor) -> None:
         for field, place in (("actuator_gainprm", 0), ("actuator_biasprm", 1)):
             assign(self._sim.field(field)[:, :, place], mask, self._nominal[field][:, :, place] * self.values["stiffness"])
+
+
+def _check_mass(cfg: LeggedRobotCfg, robot: RobotModel) -> None:
+    """The lightest root that can be drawn still has a mass."""
+    kinds, nominal = active(cfg), float(robot.physics.body_mass[robot.id("body", robot.root)])
+    lightest = nominal * (kinds["link_mass"][1] if "link_mass" in kinds else 1.0) + (kinds["base_mass"][1] if "base_mass" in kinds else 0.0)
+    if lightest <= 0.0:
+        span = cfg.domain_rand.base_mass
+        raise ConfigError(f"domain_rand.base_mass is {span!r}: the root '{robot.root}' has {nominal:g} kg, which leaves some with none")
 
 
 def _links(robot: RobotModel) -> Tensor:

@@ -184,6 +184,18 @@ class LeggedRobot(BaseTask):
         self._episode_length_buf.masked_fill_(mask, 0)
         self._refresh_base()
 
+    def restart(self, mask: Tensor) -> None:
+        """A reset from outside of a step: also the first observation; what the other worlds observe stays, delays included."""
+        before = {group: obs.clone() for group, obs in self.obs_buf.items()}
+        past = self._observation_delay.past.clone() if self._observation_delay else None
+        self.reset_envs(mask)
+        self.fell.masked_fill_(mask, False)
+        self.compute_observations()
+        for group, obs in before.items():
+            assign(self.obs_buf[group], ~mask, obs)
+        if self._observation_delay and past is not None:
+            assign(self._observation_delay.past, ~mask, past)
+
     def _reset_robots(self, mask: Tensor) -> None:
         """Root near the origin with any heading and a small velocity, joints and servo targets at (or near) the default pose."""
         n = self.num_envs

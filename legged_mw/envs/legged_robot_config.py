@@ -139,7 +139,7 @@ class LeggedRobotCfg(Config):
             *["friction", "contact_time", "frictionloss", "stiffness", "damping", "strength"],
             *["encoder_offset", "action_delay", "observation_delay"],
         ]
-        redraw_iterations: int = 0  # draw everything anew every so many iterations of training; 0: never
+        redraw_iterations: int = 0  # draw everything anew every so many iterations of training, and when it is resumed; 0: never
         observe: bool = False  # rows in `privileged_state` with what was drawn
 
     class terrain:

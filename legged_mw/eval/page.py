@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from html import escape
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any
 
 from legged_mw.eval import rules
@@ -130,8 +131,8 @@ def _extra(name: str, columns: Sequence[Column]) -> str:
     if name not in tables:
         return ""
     make, heads, folded = tables[name]
-    paired = zip(*(make(column, f", {column.name}" if len(drawn) > 1 else "") for column in drawn), strict=True)
-    return _table(heads, [row for rows in paired for row in rows], folded)
+    paired = zip_longest(*(make(column, f", {column.name}" if len(drawn) > 1 else "") for column in drawn))  # ranges may differ
+    return _table(heads, [row for rows in paired for row in rows if row], folded)
 
 
 def _step_rows(column: Column, whose: str) -> list[list[str]]:

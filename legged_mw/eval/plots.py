@@ -317,7 +317,8 @@ def _against_speed(columns: Columns, key: str, ax: Axes) -> None:
 
 def _reward(columns: Columns, ax: Axes) -> None:
     """A bar a term, the largest at the top."""
-    terms = sorted(columns[0][1]["reward"], key=lambda term: -abs(columns[0][1]["reward"][term] or 0.0))
+    shares = {term: share or 0.0 for _, figures in reversed(columns) for term, share in figures["reward"].items()}  # of either
+    terms = sorted(shares, key=lambda term: -abs(shares[term]))
     height = 0.7 / len(columns)
     for i, (name, figures) in enumerate(columns):
         values = [figures["reward"].get(term) or 0.0 for term in terms]

@@ -42,8 +42,13 @@ class Column(NamedTuple):
 
 def prepare(task: LoadedTask) -> None:
     """Turn ``task`` into the exam, with a world for all else that a report looks at."""
-    dt = task.cfg.sim.dt * task.cfg.control.decimation
-    exam.prepare(task, len(make_plan(task.cfg, dt).cases))
+    exam.prepare(task)
+    make_room(task)
+
+
+def make_room(task: LoadedTask) -> None:
+    """As many worlds as the report needs; their number depends on the ranges of commands."""
+    task.cfg.env.num_envs = len(make_plan(task.cfg, task.cfg.sim.dt * task.cfg.control.decimation).cases)
 
 
 def examine(env: LeggedRobot, policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -67,6 +67,8 @@ def roll_out(
     The first ``alone`` worlds act as a batch of their own: a matrix product may round differently in a larger batch, and
     what is computed of these worlds must not depend on how many others there are.
     """
+    if len(cases) != env.num_envs:
+        raise ValueError(f"{len(cases)} cases need as many worlds; this environment has {env.num_envs}")
     env.reset()
     told, kicks = _commands_by_step(cases, env.device), _kicks_by_step(cases, env.device)
     worlds, commands = told.pop(0)

@@ -69,11 +69,20 @@ def export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
 
     Raises ExportError, ConfigError or ModelError; an export that stands there already is then as it was.
     """
+    precision = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("highest")  # training may have left less, and some CPUs take it
+    try:
+        return _export(trained, checkpoint, folder)
+    finally:
+        torch.set_float32_matmul_precision(precision)
+
+
+def _export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
     task = load_task(str(trained["task"]))
     task.update(trained, where=CONFIG_FILE)
     config = task.to_dict()
     with torch.random.fork_rng(devices=[]):  # trying the policy draws numbers that are not ours to draw
-        torch.manual_seed(0)
+        torch.default_generator.manual_seed(0)  # of the CPU alone
         env = _small_env(task)
         policy = load_policy(checkpoint, env, task.train, "cpu")
         observations, actions = _roll_out(env, policy, task)
@@ -292,6 +301,10 @@ def contract_rows(env: LeggedRobot, group: str) -> list[Row]:
     table, rows = env._observation_rows(), []
     for row in table[group]:
         if row.name in table and row.name != group:
+            if row.noise or any(scale != 1.0 for scale in row.column_scales()):
+                raise ExportError(
+                    f"observation row '{row.name}' of '{group}' is a group with a noise or scale of its own: give those to its rows"
+                )
             rows += contract_rows(env, row.name)
             continue
         kind = ROWS.get(row.name)

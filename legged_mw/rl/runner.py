@@ -151,6 +151,8 @@ class Runner(OnPolicyRunner):
     def _examine(self) -> None:
         """Grade the policy as it is now; of the ranks, only the first has an exam, and the others wait in the next update."""
         assert self.examine is not None
+        if self.device != "cpu":
+            torch.cuda.synchronize(self.device)  # what is still queued is not the exam's time
         policy, begun = self.alg.get_policy(), time.time()
         training = policy.training
         try:
@@ -262,6 +264,8 @@ class Runner(OnPolicyRunner):
             for group in self.alg.optimizer.param_groups:
                 if not isinstance(group["lr"], Tensor):  # a recorded optimizer reads the algorithm's
                     group["lr"] = self.alg.learning_rate
+        if self.env.cfg.domain_rand.redraw_iterations:  # the worlds that it was in are not in the file; the first ones it has left
+            self.env.domain_rand.redraw()
         infos = content.get("infos") or {}
         self.total_steps = infos.get("total_steps", 0)
         if self.gpu_global_rank == 0:

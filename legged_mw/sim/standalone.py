@@ -17,18 +17,33 @@ from legged_mw.sim.model import ModelError, RobotModel
 
 HOME = "home"  # the keyframe: the pose to start in, and the servos holding it
 TOLERANCE = 1e-5  # relative, absolute below 1: MuJoCo writes MJCF with six digits
-_OPTION = ("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "tolerance", "disableflags", "enableflags", "gravity")
+_OPTION = (
+    "timestep",
+    "integrator",
+    "cone",
+    "solver",
+    "iterations",
+    "ls_iterations",
+    "tolerance",
+    "disableflags",
+    "enableflags",
+    "gravity",
+    "impratio",
+)
 _FIELDS = (
-    *("qpos0", "body_parentid", "body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos"),
+    *("qpos0", "body_parentid", "body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat"),
     *("jnt_type", "jnt_axis", "jnt_pos", "jnt_range", "jnt_limited", "jnt_stiffness", "jnt_solref", "jnt_solimp"),
     *("dof_armature", "dof_damping", "dof_frictionloss", "dof_solref", "dof_solimp"),
     *("actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange", "actuator_forcerange", "actuator_gear", "actuator_trnid"),
+    *("actuator_ctrllimited", "actuator_forcelimited", "jnt_actfrclimited", "jnt_actfrcrange"),
 )
 _CONTACT = (
     "type",
     "bodyid",
     "size",
     "pos",
+    "quat",
+    "solmix",
     "contype",
     "conaffinity",
     "condim",

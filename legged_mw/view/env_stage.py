@@ -59,9 +59,7 @@ class EnvStage:
     def reset(self, world: int) -> None:
         mask = torch.zeros(self.num_worlds, dtype=torch.bool, device=self.env.device)
         mask[world] = True
-        self.env.reset_envs(mask)
-        self.env.fell.masked_fill_(mask, False)
-        self.env.compute_observations()
+        self.env.restart(mask)
         self._obs = self.env.get_observations()
 
     def _tell(self) -> None:

@@ -50,7 +50,7 @@ class Gamepad:
                 pilot.ask(BUTTONS[number])
         if moved:
             pilot.stick(self._deflection)
-        if self._file is None and self._deflection is not None and any(self._deflection):
+        if self._file is None and any(self._deflection):
             self._deflection = [0.0, 0.0, 0.0]
             pilot.ask("stop")
 

@@ -83,6 +83,13 @@ def check_drive(args: argparse.Namespace, limits: ArrayLike, advice: str = WIDEN
     return command
 
 
+def asked(args: argparse.Namespace) -> list[str]:
+    """The flags of ``add_flags`` that were given."""
+    default = {"viewer": "auto", "camera": "follow", "host": web.LOCAL, "port": 0}
+    names = ("viewer", "video", "sheet", "commands", "camera", "host", "port")
+    return [f"--{name}" for name in names if getattr(args, name) != default.get(name)]
+
+
 def choose(args: argparse.Namespace, terminal: bool, screen: bool) -> tuple[str, str]:
     """The viewer to take, and why in words. A terminal has somebody at it who can open a page; a batch job must end by itself."""
     if args.viewer != "auto":
@@ -106,8 +113,11 @@ def watch(stage: Stage, args: argparse.Namespace, folder: Path, picture: Picture
     if stage.num_worlds > ROBOTS_SHOWN and kind != "none":
         print(f"{stage.num_worlds} robots, the first {ROBOTS_SHOWN} of them are shown")
     pilot.everyone = script is not None
+    viewer: Viewer | None = None
+    if kind == "native" and (viewer := _window(stage, pilot, why, fall_back=args.viewer == "auto")) is None:
+        kind, why = choose(args, sys.stdout.isatty(), screen=False)
     seconds = args.time or (script.seconds if script else None) or (None if kind in ("native", "web") else SECONDS)
-    viewer = _open(kind, why, stage, pilot, args, folder, picture or Picture(), seconds, title)
+    viewer = viewer or _open(kind, why, stage, pilot, args, folder, picture or Picture(), seconds or SECONDS, title)
     gamepad = _gamepad() if kind in ("native", "web") else None
     session = Session(stage, viewer, pilot, seconds=seconds, real_time=kind in ("native", "web"), script=script, gamepad=gamepad)
     try:
@@ -125,6 +135,19 @@ def watch(stage: Stage, args: argparse.Namespace, folder: Path, picture: Picture
     return summary
 
 
+def _window(stage: Stage, pilot: Pilot, why: str, fall_back: bool) -> Viewer | None:
+    """MuJoCo's window; None, and why in a line, where none can be opened and something else may be taken."""
+    try:
+        viewer = NativeViewer(stage.model, pilot, pilot.num_worlds)
+    except ViewError as error:
+        if not fall_back:
+            raise
+        print(f"no window: {error}")
+        return None
+    print(f"viewer: a window ({why}); h shows the keys")
+    return viewer
+
+
 def _open(
     kind: str,
     why: str,
@@ -133,21 +156,10 @@ def _open(
     args: argparse.Namespace,
     folder: Path,
     picture: Picture,
-    seconds: float | None,
+    seconds: float,
     title: str,
 ) -> Viewer:
     count = pilot.num_worlds
-    if kind == "native":
-        try:
-            viewer: Viewer = NativeViewer(stage.model, pilot, count)
-        except ViewError as error:
-            if args.viewer == "native":
-                raise
-            kind, why = choose(args, sys.stdout.isatty(), screen=False)
-            print(f"no window: {error}")
-        else:
-            print(f"viewer: a window ({why}); h shows the keys")
-            return viewer
     if kind == "web":
         page = web.WebViewer(stage.model, pilot, count, host=args.host, port=args.port, title=title)
         print(f"viewer: a web page ({why}): {page.url}  Ctrl-C ends it")
@@ -165,7 +177,7 @@ def _open(
         video, sheet = folder / "play.mp4", folder / "play.png"
     names = " and ".join(_shown(path) for path in (video, sheet) if path)
     print(f"viewer: {seconds:g} s of {names} ({why}); without a GPU for drawing it takes a while", flush=True)
-    return Film(stage.model, count, stage.dt, seconds or SECONDS, video=video, sheet=sheet, **picture._asdict())
+    return Film(stage.model, count, stage.dt, seconds, video=video, sheet=sheet, **picture._asdict())
 
 
 class Nobody:

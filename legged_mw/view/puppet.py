@@ -129,11 +129,12 @@ class Cast:
             mujoco.mj_camlight(self.model, self.data)
 
     def standing(self, contacts: ArrayLike) -> FloatArray:
-        """Where the feet are (M, 3) that `contacts` (N, F) says touch the ground; a foot is the geom of a contact sensor."""
+        """Where the feet are (M, 3) that `contacts` (N, F) says touch the ground; they are the first geoms with a contact sensor."""
         touching = np.asarray(contacts, dtype=bool)[: self.count]
-        if touching.shape != self._feet_at.shape[:2]:
+        feet = self._feet_at[:, : touching.shape[1]]
+        if touching.shape != feet.shape[:2]:
             return np.zeros((0, 3))  # a model that does not say where its feet are
-        return self._feet_at[touching]
+        return feet[touching]
 
     def foot_radius(self) -> float:
         """Of the first foot [m]."""

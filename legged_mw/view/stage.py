@@ -50,7 +50,7 @@ class Stage(Protocol):
         ...
 
     def contacts(self) -> BoolArray:
-        """Which feet stand (N, F), in the order of the model's contact sensors."""
+        """Which feet stand (N, F), in the order of the model's first F contact sensors."""
         ...
 
     def fell(self) -> BoolArray:
