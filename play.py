@@ -107,6 +107,10 @@ def main() -> None:
 def find_policy(task: LoadedTask, args: argparse.Namespace) -> Source:
     """The run asked for, else the last run, else the policy that ships with the task."""
     experiment = ROOT / "logs" / (args.experiment_name or task.train.runner.experiment_name or task.name)
+    if args.load_run == "shipped":
+        if not shipped(task).checkpoint.is_file():
+            raise ConfigError(f"--load_run shipped: no policy ships with {task.name}")
+        return shipped(task)
     if args.load_run is not None or args.checkpoint != -1 or runs(experiment):
         run = find_run(experiment, args.load_run or "-1")
         return Source(run, find_checkpoint(run, args.checkpoint), shipped=False)

@@ -56,7 +56,15 @@ def test_overshoot_is_a_share_of_the_way(target: float) -> None:
 def test_a_target_that_is_not_reached_has_no_rise_time() -> None:
     time = np.arange(0.0, 1.0, DT)
     found = figures.step_response(time, np.full(len(time), 0.5), 0.0, 1.0)
-    assert found == {"rise_time": None, "overshoot": 0.0, "left": pytest.approx(-0.5)}
+    assert found == {"rise_time": None, "overshoot": None, "left": pytest.approx(-0.5)}
+
+
+def test_a_twitch_is_no_response() -> None:
+    """One that passes the target and comes back, and one that was not where it should begin."""
+    time = np.arange(0.0, 2.0, DT)
+    twitch = np.where((time > 0.2) & (time < 0.4), 1.2, 0.0)
+    assert figures.step_response(time, twitch, 0.0, 1.0) == {"rise_time": None, "overshoot": None, "left": pytest.approx(-1.0)}
+    assert figures.step_response(time, np.zeros(len(time)), -1.0, 0.0)["rise_time"] is None
 
 
 def test_responses_to_each_step() -> None:

@@ -509,3 +509,17 @@ def test_feet_are_found_among_other_contacts() -> None:
     assert len(cast.feet) > 4
     cast.pose(model.qpos0[None], 0)
     assert cast.standing(np.array([[True, False, True, False]])).shape == (2, 3)
+
+
+def test_a_camera_that_draws_seldom_is_where_one_that_draws_always_is(model: mujoco.MjModel) -> None:
+    """A contact sheet alone draws every twentieth frame; its robot must not have left the picture."""
+    seen = []
+    for skip in (1, 20):
+        cast = Cast(model, 1)
+        man, qpos = CameraMan(mujoco.MjvCamera(), cast, by_hand=False), np.array(model.qpos0)
+        for step in range(0, 61, skip):
+            qpos[0] = 0.02 * step  # 1 m/s at 50 frames a second
+            cast.pose(qpos[None], 0)
+            man.update("follow", 0, frames=skip)
+        seen.append(qpos[0] - man.camera.lookat[0])
+    assert 0.0 < seen[1] < seen[0] < 0.2

@@ -38,6 +38,7 @@ def run_exam(folder: Path, threads: int = 0) -> dict[str, Any]:
         distance=np.linalg.norm(stage.qpos()[:, :2] - np.stack(position)[counted][0], axis=1)[: len(asked)],
         energy=np.stack(power)[counted].sum(axis=0)[: len(asked)] * stage.dt,
         standing_joint_speed=float(np.stack(joint_speed[-round(1.0 / stage.dt) :])[:, 0].mean()),
+        seconds=(len(velocity) - counted.start) * stage.dt,
         mass=stage.contract.mass,
         dt=stage.dt,
     )

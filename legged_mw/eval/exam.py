@@ -78,6 +78,7 @@ def grade(record: Record) -> dict[str, Any]:
         distance=(away**2).sum(axis=1) ** 0.5,
         energy=power[settled:, asked].sum(axis=0, dtype=float) * record.dt,
         standing_joint_speed=float(joint_speed[-round(1.0 / record.dt) :, 0].mean()),
+        seconds=(len(velocity) - settled) * record.dt,
         mass=record.mass,
         dt=record.dt,
     )

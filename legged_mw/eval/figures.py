@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.eval.rules import GRAVITY, KICK_DIRECTIONS
+from legged_mw.eval.rules import GRAVITY, KICK_DIRECTIONS, SLOW
 
 if TYPE_CHECKING:
     from legged_mw.eval.rollout import Record
 
 SATURATED = 0.98  # of the limit, from which on a torque counts as at it
-SLOW = 0.1  # [m/s], below which a cost of transport says nothing
+STRAY = 0.3  # of a step: farther from its start or its end the robot is not there
 SHORT_SWING = 2  # [control steps] in the air that make a swing; less is a foot that chatters
 BINS = 40  # of a joint's histogram
 
@@ -39,7 +39,8 @@ def tracking_errors(record: Record, settled: int, rows: int) -> list[list[list[f
 def step_response(time: Array, measured: Array, start: float, target: float) -> dict[str, float | None]:
     """How ``measured`` (T,) goes from ``start`` to ``target``, which is commanded from time 0 on.
 
-    ``rise_time``: from 10 to 90 % of the way [s]. ``overshoot``: how far beyond the target, as a share of the way.
+    ``rise_time``: from 10 to 90 % of the way [s]. ``overshoot``: how far beyond the target, as a share of the way. Both are
+    None if it was not near the start, or does not stay near the target: a twitch is no response.
     ``left``: mean difference to the target in the last half second, in the unit of what is measured.
     """
     way = (measured - start) / (target - start)
@@ -47,12 +48,15 @@ def step_response(time: Array, measured: Array, start: float, target: float) -> 
     time, way = time[after], way[after]
     if not len(time):
         return {"rise_time": None, "overshoot": None, "left": None}
-    low, high = _first_crossing(time, way, 0.1), _first_crossing(time, way, 0.9)
     end = way[time >= time[-1] - 0.5]
+    left = float(np.mean(end - 1.0)) * (target - start)
+    if abs(way[0]) > STRAY or abs(np.mean(end) - 1.0) > STRAY:
+        return {"rise_time": None, "overshoot": None, "left": left}
+    low, high = _first_crossing(time, way, 0.1), _first_crossing(time, way, 0.9)
     return {
         "rise_time": None if low is None or high is None else high - low,
         "overshoot": max(0.0, float(way.max()) - 1.0),
-        "left": float(np.mean(end - 1.0)) * (target - start),
+        "left": left,
     }
 
 

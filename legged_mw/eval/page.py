@@ -99,11 +99,11 @@ def _exam_table(columns: Sequence[Column]) -> str:
     heads = "".join(f"<th>{escape(column.name)}</th>" for column in columns)
     lines = []
     for row, *others in zip(*listed, strict=True):
-        cells = [f'<td class="value{_mood(row)}">{row.shown(row.value)}</td>']
+        cells = [f'<td><span class="value{_mood(row)}">{row.shown(row.value)}</span></td>']
         for other in others:
             gap = "" if other.value is None or row.value is None else f"{other.value - row.value:+.{row.digits}f}"
             gap = gap if gap.strip("+-0.") else ""
-            cells.append(f'<td class="value{_mood(other)}">{other.shown(other.value)} <small>{gap}</small></td>')
+            cells.append(f'<td><span class="value{_mood(other)}">{other.shown(other.value)}</span> <small>{gap}</small></td>')
         peer = "" if row.peer is None else row.shown(row.peer)
         name = escape(row.name.strip())
         sub = ' class="sub"' if row.name.startswith(" ") else ""

@@ -282,7 +282,7 @@ def _kick_curve(columns: Columns, ax: Axes) -> None:
     ax.set_title("share of 16 directions survived")
     ax.set_xlabel("jump of the velocity [m/s]", labelpad=2)
     ax.set_ylim(-0.03, 1.04)
-    ax.legend(loc="lower left", handlelength=2.2)
+    ax.legend(loc="best", handlelength=2.2)
 
 
 def _kick_wheel(kicks: Figures, which: str, colour: str, title: str, ax: Any) -> None:
@@ -327,7 +327,7 @@ def _reward(columns: Columns, ax: Axes) -> None:
         for y, value in zip(at, values, strict=True):
             side, align = (3, "left") if value >= 0 else (-3, "right")
             text = {"textcoords": "offset points", "va": "center", "ha": align, "fontsize": 6.2, "color": MUTED}
-            ax.annotate(f"{value:.3g}", (value, y), (side, 0), **text)
+            ax.annotate(f"{value:.3g}" if abs(value) >= 5e-5 else "0", (value, y), (side, 0), **text)
     ax.set_yticks(range(len(terms)), terms)
     ax.set_ylim(len(terms) - 0.4, -0.6)
     ax.axvline(0.0, color=MUTED, linewidth=0.8)

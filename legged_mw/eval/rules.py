@@ -17,6 +17,7 @@ SECONDS, SETTLING = 10.0, 2.0  # [s] of a tracking command, and of its start tha
 KICK_COMMAND, KICK_AT, KICK_UNTIL = 0.8, 3.0, 6.0  # vx [m/s]; [s]
 KICK_SPEEDS, KICK_DIRECTIONS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0), 16  # [m/s]
 GRAVITY = 9.81  # [m/s^2]
+SLOW = 0.1  # [m/s] below which a cost of transport says nothing
 
 # What the policy that ships with MuJoCo Playground for this robot scores in MuJoCo's C engine under these rules.
 PEER: dict[str, Any] = {
@@ -46,19 +47,22 @@ def grade(
     distance: NDArray[Any],
     energy: NDArray[Any],
     standing_joint_speed: float,
+    seconds: float,
     mass: float,
     dt: float,
 ) -> dict[str, Any]:
     """The exam's result from what was measured; C commands, N = C + kick speeds * kick directions worlds, in that order.
 
     ``error`` (C, 3): mean absolute difference to the command after settling [m/s, m/s, rad/s]. ``fell_at`` (N,): control step
-    of the first fall, or inf. ``distance`` (C,): straight line since settling [m]; ``energy`` (C,): sum of |torque * joint
-    speed| dt over the same time [J]. ``standing_joint_speed``: mean of the last second at the command to stand [rad/s].
+    of the first fall, or inf. ``distance`` (C,): straight line over the ``seconds`` since settling [m];
+    ``energy`` (C,): sum of |torque * joint speed| dt over the same time [J]. ``standing_joint_speed``: mean of the last second
+    at the command to stand [rad/s].
     ``mass`` [kg], ``dt`` a control step [s].
     """
     count = len(commands())
     stood = np.isinf(fell_at[:count])
     ahead = commands().index((1.0, 0.0, 0.0))
+    moved = distance[ahead] > SLOW * seconds
     survived = (fell_at[count:] > round(KICK_UNTIL / dt)).reshape(len(KICK_SPEEDS), KICK_DIRECTIONS).mean(axis=1)
     result = {
         "falls": int((~stood).sum()),
@@ -67,7 +71,7 @@ def grade(
         "drift": float(distance[0]) if stood[0] else None,
         "joint_speed": standing_joint_speed if stood[0] else None,
         "kicks": {f"{speed:g}": round(float(share), 4) for speed, share in zip(KICK_SPEEDS, survived, strict=True)},
-        "cost_of_transport": float(energy[ahead] / (mass * GRAVITY * distance[ahead])) if stood[ahead] else None,
+        "cost_of_transport": float(energy[ahead] / (mass * GRAVITY * distance[ahead])) if stood[ahead] and moved else None,
         "commands": [
             {"command": list(c), "error": _figures(e) if ok else None, "fell": not bool(ok)}
             for c, e, ok in zip(commands(), error, stood, strict=True)
@@ -89,7 +93,7 @@ def beats_peer(result: dict[str, Any]) -> bool:
     if result["falls"] > PEER["falls"]:
         return False
     better = all(a < b for a, b in zip(result["error"], PEER["error"], strict=True))
-    better = better and result["cost_of_transport"] < PEER["cost_of_transport"]
+    better = better and result["cost_of_transport"] is not None and result["cost_of_transport"] < PEER["cost_of_transport"]
     worst = all(a <= b for a, b in zip(result["worst"], PEER["worst"], strict=True))
     kicks = all(result["kicks"][speed] >= share for speed, share in PEER["kicks"].items())
     return better and worst and kicks and result["drift"] <= max(EQUAL_DRIFT, PEER["drift"])
@@ -99,14 +103,15 @@ class Row(NamedTuple):
     """One figure of the exam beside what walking asks and what the peer has."""
 
     name: str
-    value: float | None  # None: it fell, there is nothing to measure
+    value: float | None  # None: there is nothing to measure
     digits: int
     mark: float | None = None  # what walking needs; None: anything
     peer: float | None = None
     more_is_better: bool = False
+    without: str = "fell"  # what stands for no value
 
     def shown(self, value: float | None) -> str:
-        return "fell" if value is None else f"{value:.{self.digits}f}"
+        return self.without if value is None else f"{value:.{self.digits}f}"
 
     def shown_mark(self) -> str:
         return "" if self.mark is None else f"{self.mark:.{min(self.digits, 2)}f}"
@@ -129,7 +134,7 @@ def rows(result: dict[str, Any]) -> list[Row]:
     listed.append(Row("joint speed standing [rad/s]", result["joint_speed"], 3))
     for speed, share in result["kicks"].items():
         listed.append(Row(f"survives kicks of {speed} m/s", share, 2, 1.0 if speed == "2" else None, PEER["kicks"][speed], True))
-    listed.append(Row("cost of transport at 1 m/s", result["cost_of_transport"], 2, None, PEER["cost_of_transport"]))
+    listed.append(Row("cost of transport at 1 m/s", result["cost_of_transport"], 2, None, PEER["cost_of_transport"], without="none"))
     return listed
 
 

@@ -36,10 +36,10 @@ tbody th{font-weight:450}
 .exam{min-width:620px;width:100%;max-width:860px}
 tr.sub th{padding-left:18px;color:var(--muted)}tr.sub td{color:var(--muted)}
 td small{color:var(--muted);font-size:12px;display:inline-block;min-width:50px;text-align:right}
-td.pass::after,td.fail::after{display:inline-block;width:18px;text-align:right;font-weight:600}
-td.value::after{content:"";display:inline-block;width:18px}
-td.pass::after{content:"\\2713";color:var(--good)}td.fail::after{content:"\\2717";color:var(--bad)}
-td.fail{color:var(--bad)}
+td .pass::after,td .fail::after{display:inline-block;width:18px;text-align:right;font-weight:600}
+td .value::after{content:"";display:inline-block;width:18px}
+td .pass::after{content:"\\2713";color:var(--good)}td .fail::after{content:"\\2717";color:var(--bad)}
+td .fail{color:var(--bad)}
 .panels{display:grid;gap:22px 20px;grid-template-columns:repeat(3,minmax(0,1fr))}
 .wide{grid-template-columns:minmax(0,760px)}
 figure{margin:0}

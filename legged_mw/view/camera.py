@@ -27,9 +27,11 @@ class CameraMan:
     def __init__(self, camera: mujoco.MjvCamera, cast: Cast, by_hand: bool) -> None:
         self.camera, self.cast, self.by_hand = camera, cast, by_hand
         self._shot: tuple[str, int] | None = None  # what it shows: mode, world
+        self._frames = 1.0
 
-    def update(self, mode: str, world: int) -> mujoco.MjvCamera:
-        """Be where `mode` wants it: one of drive.CAMERAS."""
+    def update(self, mode: str, world: int, frames: float = 1.0) -> mujoco.MjvCamera:
+        """Be where `mode` wants it: one of drive.CAMERAS. `frames` of a video passed since the last call, most not drawn."""
+        self._frames = frames
         before, self._shot = self._shot, (mode, world)
         changed = before is None or before[0] != mode
         if mode == "all":
@@ -65,12 +67,16 @@ class CameraMan:
         if cut or float(np.linalg.norm(gap)) > JUMP * anchor.radius:
             camera.lookat[:] = anchor.position
         else:
-            camera.lookat[:] += gap * (FOLLOW_XY, FOLLOW_XY, FOLLOW_Z)
+            camera.lookat[:] += gap * [self._share(share) for share in (FOLLOW_XY, FOLLOW_XY, FOLLOW_Z)]
+
+    def _share(self, each: float) -> float:
+        """Of the way, after ``self._frames`` steps of the share ``each``."""
+        return 1.0 - (1.0 - each) ** self._frames
 
     def _turn(self, azimuth: float, cut: bool) -> None:
         camera = self.camera
         gap = (azimuth - camera.azimuth + 180.0) % 360.0 - 180.0
-        camera.azimuth += gap if cut else gap * TURN
+        camera.azimuth += gap if cut else gap * self._share(TURN)
         if cut:
             camera.distance, camera.elevation = 1.3 * DISTANCE * self.cast.radius, ELEVATION
 
@@ -80,7 +86,7 @@ class CameraMan:
         near = places[np.linalg.norm(places - places[world], axis=1) < REACH * self.cast.radius]
         camera, middle = self.camera, (near.min(axis=0) + near.max(axis=0)) / 2
         reach = float(np.linalg.norm(near - middle, axis=1).max()) + self.cast.radius
-        share = 1.0 if cut else FOLLOW_ALL
+        share = 1.0 if cut else self._share(FOLLOW_ALL)
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         camera.lookat[:] += share * (middle - camera.lookat)
         camera.distance += share * (2.5 * reach - camera.distance)

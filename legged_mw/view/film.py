@@ -46,10 +46,10 @@ class RobotRenderer:
         except Exception as error:  # each OpenGL backend fails with a type of its own
             raise ViewError(_no_context(error)) from error
 
-    def frame(self, moment: Moment) -> Frame:
-        """One picture (height, width, 3), yours to keep."""
+    def frame(self, moment: Moment, frames: float = 1.0) -> Frame:
+        """One picture (height, width, 3), yours to keep; `frames` of a video passed since the last."""
         self.cast.pose(moment.qpos, moment.world)
-        camera, scene = self._camera.update(moment.camera, moment.world), self._renderer.scene
+        camera, scene = self._camera.update(moment.camera, moment.world, frames), self._renderer.scene
         # MuJoCo lays an endless floor around where the camera was; told first, it lies right in the first frame too
         mujoco.mjv_updateCamera(self.cast.model, self.cast.data, camera, scene)
         self._renderer.update_scene(self.cast.data, camera, self._option)
@@ -110,7 +110,7 @@ class Film:
         self._every = max(1, round(1 / (fps * dt)))
         self._shots = [index * seconds / SHEET_FRAMES for index in range(SHEET_FRAMES)] if sheet else []  # [s]
         self._pictures: list[Frame] = []
-        self._turn = 0
+        self._turn = self._drawn = 0
         # the files' names are refused before a context is made, and an old file stays if that fails
         self._writer = VideoWriter(video, width, height, 1 / (self._every * dt)) if video else None
         try:
@@ -126,7 +126,8 @@ class Film:
         self._turn += 1
         if not (film or still):
             return
-        frame = self._renderer.frame(moment)
+        frame = self._renderer.frame(moment, (self._turn - self._drawn) / self._every)
+        self._drawn = self._turn
         if film and self._writer is not None:
             self._writer.add(frame)
         if still:

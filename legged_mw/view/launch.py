@@ -19,7 +19,7 @@ from legged_mw.view.native import NativeViewer, has_display
 from legged_mw.view.script import load_script
 from legged_mw.view.session import Session, Summary
 from legged_mw.view.stage import Moment, Stage, Viewer, ViewError
-from legged_mw.view.video import check_format
+from legged_mw.view.video import check_format, no_encoder
 
 VIEWERS = ("auto", "native", "web", "video", "none")
 ROBOTS_SHOWN = 64  # of a stage that has more: a picture of all would take longer than a control step
@@ -59,6 +59,9 @@ def check_flags(args: argparse.Namespace) -> None:
         raise FlagError(f"--{files[0]} records and --viewer {args.viewer} does not: leave one of them out")
     if args.video:
         check_format(Path(args.video))
+    for name in filter(None, (args.video, args.sheet)):
+        if (taken := next(folder for folder in Path(name).absolute().parents if folder.exists())) and not taken.is_dir():
+            raise ViewError(f"Cannot write {name}: {taken} is a file, not a folder.")
     if args.sheet and Path(args.sheet).suffix.lower() != ".png":
         raise ViewError(f"Cannot write {Path(args.sheet).name!r}: a contact sheet is a .png.")
     if not 0 <= args.port < 65536:
@@ -175,6 +178,9 @@ def _open(
     video, sheet = (Path(name) if name else None for name in (args.video, args.sheet))
     if video is None and sheet is None:
         video, sheet = folder / "play.mp4", folder / "play.png"
+        if (reason := no_encoder()) is not None:  # nobody asked for a video by name
+            print(f"no video: {reason}")
+            video = None
     names = " and ".join(_shown(path) for path in (video, sheet) if path)
     print(f"viewer: {seconds:g} s of {names} ({why}); without a GPU for drawing it takes a while", flush=True)
     return Film(stage.model, count, stage.dt, seconds, video=video, sheet=sheet, **picture._asdict())

@@ -198,7 +198,7 @@ class Session:
 
     def _lines(self, command: FloatArray, velocity: FloatArray) -> tuple[tuple[str, str], ...]:
         pilot, count = self.pilot, self.stage.num_worlds
-        driver = ("you, all robots" if pilot.everyone and count > 1 else "you") if pilot.driving else "the task"
+        driver = ("you, all robots" if pilot.everyone and count > 1 else "you") if pilot.driving else "nobody: own commands"
         if self.script is not None and pilot.driving:
             driver = "the script"
         lines = [("command", shown(command)), ("measured", shown(velocity)), ("driven by", driver)]

@@ -94,6 +94,15 @@ def check_format(path: Path) -> None:
         raise ViewError(f"Cannot write {path.name!r}: the supported extensions are .mp4 (H.264) and .gif.")
 
 
+def no_encoder() -> str | None:
+    """Why no MP4 can be written here, or None."""
+    try:
+        _choose_encoder(gif=False)
+    except ViewError as error:
+        return str(error)
+    return None
+
+
 def _choose_encoder(gif: bool) -> type[_Ffmpeg] | type[_PyAv] | type[_PyAvGif]:
     """`ffmpeg` on PATH, else PyAV; some builds of either come without libx264, so ask."""
     codec, tried = "gif" if gif else "libx264", []
