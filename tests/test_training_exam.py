@@ -11,6 +11,7 @@ import pytest
 import torch
 from program import SMALL, refused, run, trained
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from test_train import assert_equal
 
 from legged_mw.eval import rules, training
 from legged_mw.eval.rollout import Record
@@ -106,21 +107,6 @@ def test_an_exam_that_fails_costs_the_training_nothing(tmp_path: Path, monkeypat
     result = run("train", tmp_path, *SMALL, "--max_iterations", "4", "--set", "runner.exam_interval=1")
     assert result.code == 0 and list(tmp_path.glob("logs/*/*/model_4.pt"))
     assert result.out.count("WARNING: the exam failed, training goes on without: RuntimeError: no room for it") == 1
-
-
-def assert_equal(a: Any, b: Any, where: str) -> None:
-    """Nested dicts, lists and tensors, bit for bit."""
-    assert type(a) is type(b), where
-    if isinstance(a, dict):
-        assert a.keys() == b.keys(), where
-        for key in a:
-            assert_equal(a[key], b[key], f"{where}.{key}")
-    elif isinstance(a, list | tuple):
-        assert len(a) == len(b), where
-        for i, (x, y) in enumerate(zip(a, b, strict=True)):
-            assert_equal(x, y, f"{where}[{i}]")
-    else:
-        assert torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b, where
 
 
 def test_a_short_run_has_no_exam_and_a_negative_interval_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
