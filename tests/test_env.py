@@ -15,7 +15,7 @@ from torch import Tensor
 from worlds import QUIET, changed, make_env, same, snapshot, tensors
 
 from legged_mw.envs.base_task import BaseTask
-from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.legged_robot import LeggedRobot, Row
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import task_names
@@ -260,6 +260,16 @@ class _Number(LeggedRobot):
 def test_mistakes_are_named(overrides: dict[str, Any], env_class: type[LeggedRobot] | None, error: type[Exception], message: str) -> None:
     with pytest.raises(error, match=message):
         make_env(3, overrides, env_class=env_class)
+
+
+def test_groups_may_have_any_name() -> None:
+    class Renamed(LeggedRobot):
+        def _observation_rows(self) -> dict[str, list[Row]]:
+            return {"senses": super()._observation_rows()["state"]}
+
+    env = make_env(2, env_class=Renamed)
+    env.step(torch.zeros(2, 12))
+    assert env.obs_buf["senses"].shape == (2, 48)
 
 
 def test_a_scale_of_zero_needs_no_method() -> None:

@@ -347,7 +347,7 @@ class LeggedRobot(BaseTask):
             scales = [scale for row in rows for scale in row.column_scales()]
             if any(scale != 1.0 for scale in scales):
                 self.obs_scales[group] = torch.tensor(scales, device=self.device)
-        measured = [row.measured for row in self._observation_rows()["state"] for _ in range(row.value.shape[1])]
+        measured = [row.measured for row in self._observation_rows().get("state", []) for _ in range(row.value.shape[1])]
         self._measured = torch.tensor(measured, device=self.device)
         self._observation_delay = self.domain_rand.delay("observation_delay", len(measured))
 

@@ -58,7 +58,7 @@ class MujocoSimulation:
         self._out = [*(into[name] for name in _READ_AND_WRITTEN), *out.values()]
         self._fields = {name: self._expand(name) for name in world_fields}
         self._written = {name: tensor._version for name, (tensor, _) in self._fields.items()}
-        self._into = [*into.values()]
+        self._into = list(into.values())
         self._cleared = [into[name][0] for name in ("qvel", *_WRITTEN)] + [tensor for tensor, _ in out.values()]
         self._failed, self._reason = np.zeros(num_envs, dtype=bool), ""  # worlds that MuJoCo ever refused to step
         self._qpos0 = torch.tensor(model.qpos0, dtype=torch.float)
