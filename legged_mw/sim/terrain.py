@@ -1,0 +1,239 @@
+"""Ground that is not flat: a grid of tiles, harder from row to row, another kind from column to column; one height field of all.
+
+Heights are made here, on the host, once; looked up on the device, in tensors of fixed shape. Nothing is stepped.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from legged_mw.sim.model import ModelError, unknown
+
+Heights = NDArray[np.float64]
+PLATFORM = 1.0  # [m] half the edge of the flat middle of a tile, where robots begin [legged_gym: 3 m in all for most, ours 2]
+
+
+@dataclass(frozen=True)
+class Terrain:
+    """A height field of ``levels`` x ``kinds`` tiles inside a flat border; x runs along levels, y along kinds.
+
+    Between its vertices it is triangles, cut along the diagonal from (row, column) to (row + 1, column + 1), as MuJoCo's.
+    """
+
+    heights: Heights  # (R, C) [m], row = +y, column = +x, vertices at the rim included
+    cell: float  # [m] between two vertices
+    corner: tuple[float, float]  # x, y of the vertex (0, 0) [m, world]
+    tile: float  # [m] edge of a tile
+    kinds: tuple[str, ...]  # of each column of tiles
+    origins: NDArray[np.float64]  # (levels, kinds, 3) the middle of each tile, on the ground [m, world]
+
+    @property
+    def levels(self) -> int:
+        return len(self.origins)
+
+    def span(self) -> tuple[float, float]:
+        """Lowest and highest point [m]."""
+        return float(self.heights.min()), float(self.heights.max())
+
+
+def make_terrain(
+    *,
+    levels: int,
+    proportions: Mapping[str, float],  # kind -> share of the columns
+    columns: int,
+    tile: float,
+    cell: float,
+    border: float,
+    seed: int,
+) -> Terrain:
+    """Build all tiles; difficulty rises from 0 in the first level to 1 in the last. Raises ModelError for what does not exist or fit."""
+    for kind in proportions:
+        if kind not in KINDS:
+            raise ModelError(unknown("kind of terrain", kind, KINDS, "terrain.proportions"))
+    n = round(tile / cell)
+    if abs(n * cell - tile) > 1e-6 or tile < 4 * PLATFORM:
+        raise ModelError(f"terrain.tile_size {tile:g} must be a whole number of cells of {cell:g} m, and at least {4 * PLATFORM:g} m")
+    kinds, rng = share_columns(proportions, columns), np.random.default_rng(seed)
+    edge = round(border / cell)
+    field = np.zeros((columns * n + 2 * edge + 1, levels * n + 2 * edge + 1))
+    origins = np.zeros((levels, columns, 3))
+    corner = (-0.5 * levels * tile - edge * cell, -0.5 * columns * tile - edge * cell)
+    for column, kind in enumerate(kinds):
+        for level in range(levels):
+            patch = KINDS[kind](_Grid(n, cell), level / max(levels - 1, 1), rng)
+            row0, col0 = edge + column * n, edge + level * n
+            field[row0 : row0 + n + 1, col0 : col0 + n + 1] = patch
+            middle = (col0 + n // 2, row0 + n // 2)
+            origins[level, column] = corner[0] + middle[0] * cell, corner[1] + middle[1] * cell, patch[n // 2, n // 2]
+    return Terrain(field, cell, corner, tile, kinds, origins)
+
+
+def share_columns(proportions: Mapping[str, float], columns: int) -> tuple[str, ...]:
+    """A kind for each column, in the order given, as near to the shares as whole columns come; each kind at least once."""
+    wanted = {kind: share for kind, share in proportions.items() if share > 0}
+    if not wanted or len(wanted) > columns:
+        raise ModelError(f"terrain: {columns} columns cannot hold {len(wanted)} kinds; every kind with a share above 0 needs one")
+    bounds = np.cumsum(list(wanted.values())) / sum(wanted.values())
+    kinds = [list(wanted)[min(int(np.searchsorted(bounds, (i + 0.5) / columns)), len(wanted) - 1)] for i in range(columns)]
+    for kind in wanted:
+        if kind not in kinds:
+            most = max(wanted, key=kinds.count)
+            kinds[len(kinds) - 1 - kinds[::-1].index(most)] = kind
+    return tuple(sorted(kinds, key=list(wanted).index))
+
+
+# ---- kinds of ground: (n + 1, n + 1) heights, flat in the middle and at zero along the rim, so that tiles fit together ----
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """The vertices of one tile."""
+
+    n: int
+    cell: float
+
+    @property
+    def distance(self) -> Heights:
+        """From the middle, the larger of |x| and |y| [m]."""
+        along = np.abs(np.arange(self.n + 1) - self.n / 2) * self.cell
+        return np.maximum(along[:, None], along[None, :])
+
+    @property
+    def half(self) -> float:
+        return 0.5 * self.n * self.cell
+
+    def zeros(self) -> Heights:
+        return np.zeros((self.n + 1, self.n + 1))
+
+    def fade(self, heights: Heights) -> Heights:
+        """``heights``, flat in the middle and, over the last 0.5 m, at zero along the rim."""
+        inside = np.clip((self.distance - PLATFORM) / 0.3, 0.0, 1.0)
+        outside = np.clip((self.half - self.distance) / 0.5, 0.0, 1.0)
+        return heights * inside * outside
+
+
+def flat(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """Nothing."""
+    return grid.zeros()
+
+
+def smooth_slope(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """A pyramid or, every second time, a pit, up to 0.4 steep [legged_gym]."""
+    rise = 0.4 * difficulty * np.clip(grid.half - 0.5 - np.maximum(grid.distance, PLATFORM), 0.0, None)
+    return rise if rng.random() < 0.5 else -rise
+
+
+def rough_slope(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """The same with 5 cm of noise on it [legged_gym]."""
+    return smooth_slope(grid, difficulty, rng) + grid.fade(_noise(grid, 0.05, 0.2, rng))
+
+
+def stairs_up(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """From a pit in the middle up to the rim, steps of 5 to 23 cm [legged_gym]."""
+    return -_stairs(grid, 0.05 + 0.18 * difficulty)
+
+
+def stairs_down(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """From the top in the middle down to the rim."""
+    return _stairs(grid, 0.05 + 0.18 * difficulty)
+
+
+def obstacles(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """Twenty blocks and holes of 5 to 25 cm, 1 to 2 m across [legged_gym]."""
+    heights, height = grid.zeros(), 0.05 + 0.2 * difficulty
+    for _ in range(20):
+        size = rng.integers(round(1.0 / grid.cell), round(2.0 / grid.cell) + 1, 2)
+        low = [int(rng.integers(0, max(grid.n + 1 - s, 1))) for s in size]
+        level = rng.choice([-height, -height / 2, height / 2, height])
+        heights[low[0] : low[0] + size[0], low[1] : low[1] + size[1]] = level
+    heights[(grid.distance <= PLATFORM) | (grid.distance > grid.half - 0.5)] = 0.0
+    return heights
+
+
+def waves(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """Sines along both axes, up to 15 cm high, 2 m long [ours]."""
+    along = np.arange(grid.n + 1) * grid.cell
+    phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+    sines = [np.sin(np.pi * along + p) for p in phase]
+    return grid.fade(0.075 * difficulty * (sines[0][:, None] + sines[1][None, :]))
+
+
+def stepping_stones(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """Square stones, 1.5 m down to 0.3 m, with gaps of one cell up to 0.2 m between them, 0.3 m deep [legged_gym; ours: less deep]."""
+    stone = max(round((1.5 - 1.2 * difficulty) / grid.cell), 2)
+    gap = max(round(0.2 * difficulty / grid.cell), 1)
+    heights = np.full((grid.n + 1, grid.n + 1), -0.3)
+    row = 0
+    while row <= grid.n:
+        start = -int(rng.integers(0, stone + gap))
+        while start <= grid.n:
+            heights[row : row + stone, max(start, 0) : max(start + stone, 0)] = 0.0
+            start += stone + gap
+        row += stone + gap
+    heights[(grid.distance <= PLATFORM) | (grid.distance > grid.half - 0.5)] = 0.0
+    return heights
+
+
+def gap(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """A ditch around the middle, one cell to 0.6 m wide, 0.5 m deep [legged_gym; ours: less wide]."""
+    width = max(0.6 * difficulty, grid.cell)
+    heights = grid.zeros()
+    heights[(grid.distance > PLATFORM + 0.5 * grid.cell) & (grid.distance < PLATFORM + width + 0.5 * grid.cell)] = -0.5
+    return heights
+
+
+def low_random(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """Random heights of 0 to 5 cm at every vertex, smaller in lower levels [MuJoCo Playground: 0 to 5 cm]."""
+    return grid.fade(0.05 * difficulty * rng.random((grid.n + 1, grid.n + 1)))
+
+
+KINDS: dict[str, Callable[[_Grid, float, np.random.Generator], Heights]] = {
+    kind.__name__: kind
+    for kind in (flat, smooth_slope, rough_slope, stairs_up, stairs_down, obstacles, waves, stepping_stones, gap, low_random)
+}
+
+
+def _stairs(grid: _Grid, height: float, width: float = 0.3) -> Heights:
+    """A pyramid of steps: from the rim inwards one step every ``width`` [m], up to the middle."""
+    count = int((grid.half - 0.5 - PLATFORM) / width + 1e-6)
+    step = np.ceil((grid.half - 0.5 - grid.distance) / width - 1e-6)
+    return height * np.clip(step, 0, count)
+
+
+def _noise(grid: _Grid, height: float, every: float, rng: np.random.Generator) -> Heights:
+    """Uniform within +-``height``, drawn every ``every`` [m], straight lines between."""
+    coarse = np.arange(0.0, 2.0 * grid.half + every, every)
+    fine = np.arange(grid.n + 1) * grid.cell
+    draws = rng.uniform(-height, height, (len(coarse), len(coarse)))
+    rows = np.stack([np.interp(fine, coarse, draws[:, i]) for i in range(len(coarse))], axis=1)
+    return np.stack([np.interp(fine, coarse, row) for row in rows])
+
+
+# ---- looking heights up, on the device ----
+
+
+class HeightMap:
+    """The heights of a ``Terrain`` on a device; a lookup is a gather of fixed shape and asks the host nothing."""
+
+    def __init__(self, terrain: Terrain, device: str) -> None:
+        self._rows, self._columns = terrain.heights.shape
+        self._heights = torch.tensor(terrain.heights, dtype=torch.float, device=device).flatten()
+        self._corner = torch.tensor(terrain.corner, dtype=torch.float, device=device)
+        self._per_cell = 1.0 / terrain.cell
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """Height [m] of the ground under ``points`` (..., 2) [m, world]; outside of the field, of its rim."""
+        place = (points - self._corner) * self._per_cell
+        u, v = place[..., 0].clamp(0.0, self._columns - 1.0), place[..., 1].clamp(0.0, self._rows - 1.0)
+        column, row = u.floor().clamp(max=self._columns - 2.0), v.floor().clamp(max=self._rows - 2.0)
+        across, along = u - column, v - row
+        here = (row * self._columns + column).long()
+        low, high = self._heights[here], self._heights[here + self._columns + 1]
+        corner = torch.where(across >= along, self._heights[here + 1], self._heights[here + self._columns])
+        return low + (corner - low) * torch.maximum(across, along) + (high - corner) * torch.minimum(across, along)
