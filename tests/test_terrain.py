@@ -51,7 +51,7 @@ def test_tiles_begin_flat_and_end_at_zero(kind: str) -> None:
 def test_stairs_are_stairs() -> None:
     ground = terrain(levels=2)
     for kind, sign in (("stairs_up", 1.0), ("stairs_down", -1.0)):
-        for level, height in ((0, 0.05), (1, 0.23)):
+        for level, height in ((0, 0.06), (1, 0.195)):
             along = tile(ground, level, kind)[40, 40:]  # from the middle outwards
             steps = np.diff(along)
             assert np.allclose(steps[steps != 0.0], sign * height) and (steps != 0.0).sum() == 8

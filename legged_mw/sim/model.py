@@ -13,12 +13,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
 from legged_mw.sim.scene import add_scene
 from legged_mw.utils.errors import UserError, unknown
+
+if TYPE_CHECKING:
+    from legged_mw.sim.terrain import Terrain
 
 GROUND = "floor"  # name of the ground geom that build_model adds
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
@@ -39,10 +43,11 @@ class Physics:
 
 @dataclass(frozen=True)
 class Ground:
-    """The plane z = 0. Its contact parameters win over the geom's that touches it (priority 1)."""
+    """The plane z = 0, or a height field. Its contact parameters win over the geom's that touches it (priority 1)."""
 
     friction: float = 0.6  # sliding [-]
     condim: int = 3  # 1 frictionless, 3 sliding, 4 and torsional, 6 and rolling
+    terrain: Terrain | None = None  # None: the plane
 
 
 @dataclass(frozen=True)
@@ -184,8 +189,7 @@ def _add_ground(spec: mujoco.MjSpec, ground: Ground, where: str, notes: list[str
         raise ModelError(f"{where} brings a geom '{GROUND}'; leave the ground to the config (section terrain)")
     spec.worldbody.add_geom(
         name=GROUND,
-        type=mujoco.mjtGeom.mjGEOM_PLANE,
-        size=[0, 0, 0.05],
+        **(_add_height_field(spec, ground.terrain) if ground.terrain else {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [0, 0, 0.05]}),
         material="ground",
         contype=1,
         conaffinity=0,
@@ -193,7 +197,22 @@ def _add_ground(spec: mujoco.MjSpec, ground: Ground, where: str, notes: list[str
         condim=ground.condim,
         friction=[ground.friction, 0.005, 0.0001],
     )
-    notes.append(f"ground: plane, friction {ground.friction:g}, condim {ground.condim}, priority 1")
+    shape = "height field of {} x {} tiles".format(*ground.terrain.origins.shape[:2]) if ground.terrain else "plane"
+    notes.append(f"ground: {shape}, friction {ground.friction:g}, condim {ground.condim}, priority 1")
+
+
+def _add_height_field(spec: mujoco.MjSpec, terrain: Terrain) -> dict[str, object]:
+    """Give ``spec`` the heights; returns what makes a geom of them."""
+    (low, high), (rows, columns) = terrain.span(), terrain.heights.shape
+    span = max(high - low, 1e-3)  # MuJoCo wants some; it scales what it is given to 0..1
+    spec.add_hfield(
+        name=GROUND,
+        size=[(columns - 1) * terrain.cell / 2, (rows - 1) * terrain.cell / 2, span, 1.0],
+        nrow=rows,
+        ncol=columns,
+        userdata=((terrain.heights - low) / span).astype(np.float32).ravel(),
+    )
+    return {"type": mujoco.mjtGeom.mjGEOM_HFIELD, "hfieldname": GROUND, "pos": [0.0, 0.0, low]}
 
 
 def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisions: bool, where: str, notes: list[str]) -> None:

@@ -9,13 +9,16 @@ is MuJoCo's own engine on a thread pool of the CPU.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import mujoco
 from torch import Tensor
 
 from legged_mw.sim.model import unknown
 from legged_mw.utils.errors import UserError
+
+if TYPE_CHECKING:
+    from legged_mw.sim.terrain import Terrain
 
 ENGINES = ("auto", "mujoco_warp", "mujoco")
 
@@ -100,9 +103,13 @@ def make_simulation(
     njmax: int,
     threads: int = 0,
     world_fields: Sequence[str] = (),
+    terrain: Terrain | None = None,
     eager: bool = False,
 ) -> Simulation:
     """Allocate ``num_envs`` worlds of ``model`` on ``device``.
+
+    ``terrain`` is what the model's height field was made from: mujoco-warp gets contacts of our own with it
+    (``sim/ground_contact.py``), MuJoCo's own engine has those of the height field.
 
     ``nconmax`` and ``njmax`` are the contacts and constraint rows a world has room for; MuJoCo's own engine allocates as it
     needs and leaves them aside. ``threads`` are those of MuJoCo's own engine, 0: one a core. ``world_fields`` names model
@@ -114,4 +121,4 @@ def make_simulation(
         return MujocoSimulation(model, num_envs, threads=threads, world_fields=world_fields)
     from legged_mw.sim.warp_engine import WarpSimulation  # importing warp takes a second: only where it steps
 
-    return WarpSimulation(model, num_envs, device, nconmax=nconmax, njmax=njmax, world_fields=world_fields, eager=eager)
+    return WarpSimulation(model, num_envs, device, nconmax=nconmax, njmax=njmax, world_fields=world_fields, terrain=terrain, eager=eager)

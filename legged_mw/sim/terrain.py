@@ -135,13 +135,13 @@ def rough_slope(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Hei
 
 
 def stairs_up(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """From a pit in the middle up to the rim, steps of 5 to 23 cm [legged_gym]."""
-    return -_stairs(grid, 0.05 + 0.18 * difficulty)
+    """From a pit in the middle up to the rim, steps of 6 to 19.5 cm, 30 cm deep [legged_gym: 5 to 23; ours: for a leg of 43 cm]."""
+    return -_stairs(grid, 0.06 + 0.135 * difficulty)
 
 
 def stairs_down(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """From the top in the middle down to the rim."""
-    return _stairs(grid, 0.05 + 0.18 * difficulty)
+    return _stairs(grid, 0.06 + 0.135 * difficulty)
 
 
 def obstacles(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:

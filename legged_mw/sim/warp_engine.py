@@ -4,8 +4,10 @@
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
 import mujoco
 import mujoco_warp as mjw
@@ -14,8 +16,11 @@ import warp as wp
 from mujoco_warp import OverflowType
 from torch import Tensor
 
-from legged_mw.sim.model import ModelError, unknown
+from legged_mw.sim.model import GROUND, ModelError, unknown
 from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ
+
+if TYPE_CHECKING:
+    from legged_mw.sim.terrain import Terrain
 
 wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it loads; a first run would drown in it
 
@@ -49,6 +54,7 @@ class WarpSimulation:
         nconmax: int,
         njmax: int,
         world_fields: Sequence[str] = (),
+        terrain: Terrain | None = None,
         eager: bool = False,
     ) -> None:
         """Allocate. On a CPU physics repeats bit for bit; on a GPU it does not: mujoco-warp 4.0.0 takes constraint rows
@@ -61,7 +67,14 @@ class WarpSimulation:
         _check_fields(world_fields)
         with wp.ScopedDevice(self._device):
             derived = CONSTANTS if {*CONSTANTS_READ} & {*world_fields} else ()  # else every world silently has the first one's
+            touch = None
+            if terrain:
+                from legged_mw.sim.ground_contact import touch_ground  # a module of kernels: only where there is such ground
+
+                touch, model = touch_ground(model, model.geom(GROUND).id, terrain), _without_collisions(model, GROUND)
             self._model = mjw.put_model(model, batch_sizes=dict.fromkeys([*world_fields, *derived], num_envs))
+            if touch:
+                self._model.callback.contactfilter = touch
             option = self._model.opt
             option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
@@ -133,6 +146,13 @@ def _check_fields(names: Sequence[str]) -> None:
     for name in names:
         if name not in known:
             raise ModelError(unknown("per-world model field", name, known, "mujoco-warp's Model"))
+
+
+def _without_collisions(model: mujoco.MjModel, geom: str) -> mujoco.MjModel:
+    """A copy of the model in which ``geom`` touches nothing."""
+    model = copy.copy(model)
+    model.geom(geom).contype, model.geom(geom).conaffinity = 0, 0
+    return model
 
 
 def record_warp(fn: Callable[[], None], device: wp.Device) -> Callable[[], None]:

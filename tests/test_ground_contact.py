@@ -1,0 +1,176 @@
+"""Contacts with a height field on mujoco-warp: where a plane would have them, as deep as the nearest triangle is, two in a corner."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from legged_mw.sim.ground_contact import probes
+from legged_mw.sim.model import GROUND, ModelError
+from legged_mw.sim.terrain import Terrain, make_terrain
+from legged_mw.sim.warp_engine import WarpSimulation
+
+RADIUS = 0.023  # [m] of a Go1's foot
+
+
+def ground(kind: str, cell: float = 0.05, levels: int = 2) -> Terrain:
+    return make_terrain(levels=levels, proportions={kind: 1.0}, columns=1, tile=4.0, cell=cell, border=1.0, seed=3)
+
+
+def ball_model(terrain: Terrain | None, shape: dict[str, Any] | None = None) -> mujoco.MjModel:
+    """A free ball, or another shape, over the ground."""
+    spec = mujoco.MjSpec()
+    spec.option.timestep = 0.004
+    floor: dict[str, Any] = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [0, 0, 0.05]}
+    if terrain:
+        low, high = terrain.span()
+        rows, columns = terrain.heights.shape
+        size = [(columns - 1) * terrain.cell / 2, (rows - 1) * terrain.cell / 2, max(high - low, 1e-3), 1.0]
+        spec.add_hfield(name="g", size=size, nrow=rows, ncol=columns, userdata=((terrain.heights - low) / size[2]).ravel())
+        floor = {"type": mujoco.mjtGeom.mjGEOM_HFIELD, "hfieldname": "g", "pos": [0, 0, low]}
+    spec.worldbody.add_geom(name=GROUND, priority=1, friction=[0.6, 0.005, 0.0001], **floor)
+    body = spec.worldbody.add_body(name="ball")
+    body.add_freejoint()
+    body.add_geom(name="ball", mass=1.0, **(shape or {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [RADIUS, 0, 0]}))
+    return spec.compile()
+
+
+def contacts(terrain: Terrain, places: np.ndarray) -> tuple[np.ndarray, ...]:
+    """World, depth [m] and normal of every contact of balls at ``places`` (N, 3)."""
+    sim = WarpSimulation(ball_model(terrain), len(places), "cpu", nconmax=4, njmax=24, terrain=terrain, eager=True)
+    sim.qpos[:, :3] = sim.qpos.new_tensor(places)
+    sim.step()
+    contact, count = sim._data.contact, int(sim._data.nacon.numpy()[0])
+    world = contact.worldid.numpy()[:count]
+    return world, contact.dist.numpy()[:count], contact.frame.numpy()[:count, 0]
+
+
+def nearest(terrain: Terrain, place: np.ndarray) -> tuple[float, np.ndarray]:
+    """Signed distance [m] of a point from the triangles around it, and the direction away from the ground; by brute force."""
+    column, row = ((place[:2] - terrain.corner) / terrain.cell).astype(int)
+    best, direction = np.inf, np.zeros(3)
+    for r in range(row - 3, row + 4):
+        for c in range(column - 3, column + 4):
+            corners = [
+                np.array(
+                    [terrain.corner[0] + (c + i) * terrain.cell, terrain.corner[1] + (r + j) * terrain.cell, terrain.heights[r + j, c + i]]
+                )
+                for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))
+            ]
+            for triangle in ((0, 1, 2), (0, 2, 3)):
+                away = place - _closest(place, *(corners[k] for k in triangle))
+                if np.linalg.norm(away) < best:
+                    best, direction = float(np.linalg.norm(away)), away
+    u, v = (place[:2] - terrain.corner) / terrain.cell - (column, row)
+    a, b = terrain.heights[row, column], terrain.heights[row + 1, column + 1]
+    side = terrain.heights[row, column + 1] if u >= v else terrain.heights[row + 1, column]
+    under = place[2] < a + (side - a) * max(u, v) + (b - side) * min(u, v)
+    return (-best if under else best), direction / best * (-1.0 if under else 1.0)
+
+
+def _closest(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """The nearest point of a triangle: inside of it, or on one of its edges."""
+    n = np.cross(b - a, c - a)
+    foot = p - n * np.dot(p - a, n) / np.dot(n, n)
+    if all(np.dot(np.cross(e - s, foot - s), n) >= 0 for s, e in ((a, b), (b, c), (c, a))):
+        return foot
+    on_edges = [s + (e - s) * np.clip(np.dot(p - s, e - s) / np.dot(e - s, e - s), 0, 1) for s, e in ((a, b), (b, c), (c, a))]
+    return min(on_edges, key=lambda q: float(np.linalg.norm(p - q)))
+
+
+def around(terrain: Terrain, count: int, low: float, high: float) -> np.ndarray:
+    """Places whose height over the ground under them is within ``low``..``high`` [m], where the ground is not flat."""
+    rng = np.random.default_rng(0)
+    flat = rng.uniform([terrain.corner[0] + 1.0, -1.9], [-terrain.corner[0] - 1.0, 1.9], (count, 2))
+    grid = ((flat - terrain.corner) / terrain.cell).astype(int)
+    return np.column_stack([flat, terrain.heights[grid[:, 1], grid[:, 0]] + rng.uniform(low, high, count)])
+
+
+@pytest.mark.parametrize("kind", ["rough_slope", "stairs_up", "obstacles", "low_random"])
+def test_a_contact_is_as_deep_as_the_nearest_triangle(kind: str) -> None:
+    terrain = ground(kind)
+    places = around(terrain, 400, -0.03, 0.04)  # centres of balls, some below the ground
+    world, depth, normal = contacts(terrain, places)
+    deepest = {w: i for i, w in sorted(enumerate(world), key=lambda pair: -depth[pair[0]])}
+    touching = 0
+    for number, place in enumerate(places):
+        distance, direction = nearest(terrain, place)
+        if distance > RADIUS + 1e-5:
+            assert number not in deepest, "a contact where nothing touches"
+        elif distance < RADIUS - 1e-5:
+            touching += 1
+            first = deepest[number]
+            assert depth[first] == pytest.approx(distance - RADIUS, abs=2e-5)
+            if abs(distance) > 2e-3:
+                assert np.dot(normal[first], direction) > 0.999
+    assert touching > 100
+
+
+def test_flat_ground_is_a_plane_with_one_contact_a_ball() -> None:
+    terrain = ground("flat")
+    places = around(terrain, 200, 0.01, 0.022)
+    world, depth, normal = contacts(terrain, places)
+    assert sorted(world) == list(range(200))
+    np.testing.assert_allclose(depth, places[world, 2] - RADIUS, atol=1e-6)
+    np.testing.assert_allclose(normal, np.tile([0.0, 0.0, 1.0], (200, 1)), atol=1e-6)
+
+
+def test_a_slope_has_no_edges_inside() -> None:
+    terrain = ground("smooth_slope")
+    places = np.column_stack([np.full(50, 3.3), np.linspace(-0.5, 0.5, 50), np.zeros(50)])  # on one side of the pyramid of level 1
+    places[:, 2] = [terrain.heights[60, round((3.3 - terrain.corner[0]) / 0.05)] + 0.022] * 50
+    world, _, normal = contacts(terrain, places)
+    assert len(world) == len(set(world)) > 0
+    assert np.ptp(normal, axis=0).max() < 1e-4, "one plane, one normal"
+
+
+def test_in_the_corner_of_a_step_there_are_two() -> None:
+    terrain = ground("stairs_up", levels=2)
+    row = terrain.heights[60, :]
+    rise = next(i for i in range(140, 190) if row[i + 1] - row[i] > 0.1)  # of level 1, going outwards
+    x, z = terrain.corner[0] + rise * 0.05, row[rise]
+    world, depth, normal = contacts(terrain, np.array([[x - 0.006, 0.0, z + 0.02], [x - 0.1, 0.0, z + 0.02]]))
+    assert sorted(world) == [0, 0, 1]
+    corner = normal[world == 0]
+    assert sorted(corner[:, 2].round(3))[-1] == 1.0 and min(corner[:, 0]) < -0.8, "the tread and the riser"
+    assert (depth < 0).all()
+
+
+def test_a_ball_rests_as_on_a_plane() -> None:
+    terrain = ground("flat")
+    heights = []
+    for field in (None, terrain):
+        sim = WarpSimulation(ball_model(field), 4, "cpu", nconmax=4, njmax=24, terrain=field, eager=True)
+        sim.qpos[:, 2], sim.qvel[:, 0] = 0.05, 0.5
+        for _ in range(100):
+            sim.step()
+        heights.append(sim.qpos.clone())
+    assert (heights[0] - heights[1]).abs().max() < 1e-5
+    assert not sim.overflow_report()
+
+
+def test_shapes_and_their_probes() -> None:
+    kinds = mujoco.mjtGeom
+    for kind, size, count in (
+        (kinds.mjGEOM_SPHERE, [0.1, 0, 0], 1),
+        (kinds.mjGEOM_CAPSULE, [0.1, 0.2, 0], 2),
+        (kinds.mjGEOM_BOX, [0.1] * 3, 8),
+    ):
+        model = ball_model(None, {"type": kind, "size": size})
+        geoms, places, radii = probes(model, 0)
+        assert geoms == [1] * count and len(places) == len(radii) == count
+    with pytest.raises(ModelError, match=r"collider 'ball' is a cylinder: on terrain mujoco_warp knows spheres, capsules and boxes"):
+        probes(ball_model(None, {"type": kinds.mjGEOM_CYLINDER, "size": [0.1, 0.1, 0]}), 0)
+
+
+def test_too_little_room_is_seen() -> None:
+    terrain = ground("flat")
+    sim = WarpSimulation(
+        ball_model(terrain, {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [0.1] * 3}), 3, "cpu", nconmax=1, njmax=24, terrain=terrain
+    )
+    sim.qpos[:, 2] = 0.099
+    sim.step()
+    assert "raise nconmax (now 1)" in sim.overflow_report()
