@@ -30,6 +30,8 @@ NOMINAL = {  # what playing changes in the trained config
     "perturbation.enable": False,
     "perturbation.push": False,
     "domain_rand.enable": False,
+    "commands.curriculum": False,
+    "terrain.curriculum": False,  # any level, anew at each reset
 }
 
 

@@ -51,6 +51,12 @@ ENVIRONMENT: dict[str, Rule] = {
     "init_state.pos": ("three numbers, x, y, z", lambda v: len(v) == 3),
     "viewer.camera": ("three numbers, not straight above or below", lambda v: len(v) == 3 and (v[0] != 0 or v[1] != 0)),
     "termination.max_tilt": ("above 0 and at most 180 degrees", lambda v: 0 < v <= 180),
+    **dict.fromkeys(("terrain.num_rows", "terrain.num_cols", "terrain.tile_size", "terrain.horizontal_scale"), POSITIVE),
+    **dict.fromkeys(("terrain.border_size", "termination.min_base_height"), NOT_NEGATIVE),
+    "terrain.difficulty": ("two numbers from 0 to 1, the lower first", lambda v: len(v) == 2 and 0 <= v[0] <= v[1] <= 1),
+    "terrain.height_scan": ("a list of groups: state, privileged_state", lambda v: {*v} <= {"state", "privileged_state"}),
+    **dict.fromkeys(("terrain.measured_points_x", "terrain.measured_points_y"), ("at least one number", lambda v: len(v) > 0)),
+    **dict.fromkeys(("commands.curriculum_start", "commands.curriculum_step"), ("above 0 and at most 1", lambda v: 0 < v <= 1)),
     "terrain.condim": ("1, 3, 4 or 6", lambda v: v in (1, 3, 4, 6)),
 }
 LEARNER: dict[str, Rule] = {

@@ -25,8 +25,10 @@ from legged_mw.envs.checks import check_values
 from legged_mw.envs.domain_rand import DomainRand, world_fields
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.mirror import Mirror, make_mirror
+from legged_mw.envs.terrain import Tiles, build_terrain
 from legged_mw.sim.model import Ground, ModelError, Physics, RobotModel, build_model, per_joint, unknown
 from legged_mw.sim.simulation import make_simulation
+from legged_mw.sim.terrain import HeightMap
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign, columns, may_hold, quat_rotate, quat_rotate_inverse
 
@@ -61,6 +63,7 @@ class LeggedRobot(BaseTask):
     def __init__(self, cfg: LeggedRobotCfg, device: str, eager: bool = False) -> None:
         check_values(cfg)
         self.cfg = cfg
+        self.terrain = build_terrain(cfg)
         self.robot = self._load_robot()
         self.obs_buf = {}
         super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
@@ -73,6 +76,7 @@ class LeggedRobot(BaseTask):
             njmax=cfg.sim.njmax,
             threads=cfg.sim.threads,
             world_fields=world_fields(cfg),
+            terrain=self.terrain,
             eager=eager,
         )
         self.domain_rand = DomainRand(cfg, self.robot, self.sim)
@@ -119,10 +123,40 @@ class LeggedRobot(BaseTask):
         torch.gt(self.foot_contact_count, 0.0, out=self.foot_contact)
         torch.logical_and(self.foot_contact, self.feet_air_time > 0.0, out=self.first_contact)
         self.feet_air_time.add_(self.dt)
-        self.foot_height.copy_(self.sim.site_xpos[:, self.foot_sites, 2])
+        self._measure_ground()
         torch.maximum(self.swing_peak, self.foot_height, out=self.swing_peak)
         torch.hypot(self.foot_vel[..., 0], self.foot_vel[..., 1], out=self.foot_speed)
         torch.gt(self.commands.square().sum(dim=1), self.cfg.rewards.min_command**2, out=self.moving)
+
+    def _measure_ground(self) -> None:
+        """Heights of feet and root above the ground under each of them, and how far the robot came."""
+        feet, root = self.sim.site_xpos[:, self.foot_sites], self.sim.qpos[:, :3]
+        if not (self.tiles and self._height_at):
+            self.foot_height.copy_(feet[..., 2])
+            self.base_height.copy_(root[:, 2])
+            return
+        points = torch.cat([feet, root[:, None]], dim=1)
+        above = points[..., 2] - self._height_at(points[..., :2])
+        self.foot_height.copy_(above[:, :-1])
+        self.base_height.copy_(above[:, -1])
+        speed = self.commands[:, :2].square().sum(dim=1, keepdim=True).sqrt()
+        along = (self.base_lin_vel[:, :2] * self.commands[:, :2]).sum(dim=1, keepdim=True) / speed.clamp(min=1e-6)
+        self.progress.addcmul_(along, (speed > self.cfg.rewards.min_command).float(), value=self.dt)
+        self.asked.add_(speed, alpha=self.dt)
+        away = (root[:, :2] - self.tiles.origins[:, :2]).abs().amax(dim=1, keepdim=True)
+        torch.maximum(self.farthest, away, out=self.farthest)
+
+    def _scan_heights(self) -> None:
+        """The height scan: how far the ground lies below where it is when the robot stands on level ground, within 1 m."""
+        root, (w, x, y, z) = self.sim.qpos[:, :3], self.sim.qpos[:, 3:7].unbind(dim=1)
+        yaw = torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        cos, sin = torch.cos(yaw)[:, None], torch.sin(yaw)[:, None]
+        px, py = self.scan_points
+        level = root[:, 2:] - self.init_pos[2]
+        if self._height_at:
+            points = torch.stack([cos * px - sin * py + root[:, :1], sin * px + cos * py + root[:, 1:2]], dim=2)
+            level = level - self._height_at(points)
+        self.height_scan.copy_(level.clamp(-1.0, 1.0).expand_as(self.height_scan))
 
     def _refresh_base(self) -> None:
         """Joint offsets, and velocity and gravity at the IMU, from qpos and qvel: v_imu = R^T v + w x r."""
@@ -159,9 +193,14 @@ class LeggedRobot(BaseTask):
         down = self.projected_gravity[:, 2] > -math.cos(max_tilt)
         if len(self.terminating_contacts):
             down |= self.contact_count[:, self.terminating_contacts].amax(dim=1) > 0.0
+        if self.cfg.termination.min_base_height:
+            down |= self.base_height < self.cfg.termination.min_base_height
         torch.logical_and(down, finite, out=self.fell)
         ended = torch.logical_or(self.fell, self.broken)
-        torch.logical_and(self._episode_length_buf >= self.max_episode_length, ~ended, out=self.time_out_buf)
+        over = self._episode_length_buf >= self.max_episode_length
+        if self.tiles:  # who walks off the terrain did nothing wrong
+            over |= (self.sim.qpos[:, :2].abs() > self.tiles.edge).any(dim=1)
+        torch.logical_and(over, ~ended, out=self.time_out_buf)
         torch.logical_or(ended, self.time_out_buf, out=self.reset_buf)
 
     # ---- resets: masks, never index lists ---------------------------------------------------------------------------
@@ -172,6 +211,10 @@ class LeggedRobot(BaseTask):
 
     def reset_envs(self, mask: Tensor) -> None:
         """Begin a new episode in the worlds where ``mask`` (N,) is true; the others stay as they are, bit for bit."""
+        if self.tiles:
+            self._update_terrain_curriculum(mask)
+        if self.cfg.commands.curriculum:
+            self._update_command_curriculum(mask)
         self.sim.reset(mask)
         self.domain_rand.reset(mask)
         self._reset_robots(mask)
@@ -202,7 +245,8 @@ class LeggedRobot(BaseTask):
         draw = torch.rand(n, 9, device=self.device).mul_(2.0).sub_(1.0).mul_(self.reset_range)  # x, y, yaw, velocities
         half = 0.5 * draw[:, 2:3]
         zero = torch.zeros_like(half)
-        pose = [self.init_pos[:2] + draw[:, :2], self.init_pos[2:].expand(n, 1), torch.cos(half), zero, zero, torch.sin(half)]
+        place = self.init_pos + self.tiles.origins if self.tiles else self.init_pos.expand(n, 3)
+        pose = [place[:, :2] + draw[:, :2], place[:, 2:], torch.cos(half), zero, zero, torch.sin(half)]
         joints, (low, high) = self.default_dof_pos.expand(n, -1), self.cfg.init_state.dof_pos_range
         if (low, high) != (1.0, 1.0):
             joints = joints * torch.empty_like(self.dof_offset).uniform_(low, high)
@@ -213,12 +257,40 @@ class LeggedRobot(BaseTask):
             if delay:
                 delay.restart(mask)
 
+    def _update_terrain_curriculum(self, mask: Tensor) -> None:
+        """One level up where the robot left its tile; one down where it covered less than half of what it was told. [L]
+
+        A robot that fell still owes what its last command would have asked until the end of the episode.
+        """
+        assert self.tiles
+        speed = self.commands[:, :2].square().sum(dim=1).sqrt()
+        left = (self.max_episode_length - self.episode_steps[:, 0]).clamp(min=0.0) * self.dt
+        asked = self.asked[:, 0] + torch.where(self.fell, speed * left, 0.0)
+        up = self.farthest[:, 0] > self.tiles.size / 2
+        down = ~up & (self.progress[:, 0] < 0.5 * asked)
+        self.tiles.promote(mask & (self.episode_steps[:, 0] > 0.0), up, down)
+
     # ---- commands -----------------------------------------------------------------------------------------------------
 
     def _reset_commands(self, mask: Tensor) -> None:
         """A new episode's command is uniform over the ranges."""
         assign(self.commands, mask, self._uniform_commands())
         assign(self.command_timer, mask, self._draw_timers())
+
+    def _update_command_curriculum(self, mask: Tensor) -> None:
+        """When as many episodes have ended as there are worlds: wider ranges, if they tracked the velocity well. [L]"""
+        share, total, count = self.command_curriculum  # each ()
+        best = self.reward_scales[self.reward_names.index("tracking_lin_vel")] * self.episode_steps[:, 0]
+        ended = mask & (self.episode_steps[:, 0] > 0.0)
+        tracked = self.episode_sums[:, self.reward_names.index("tracking_lin_vel")] / best.clamp(min=1e-9)
+        total.add_(torch.where(ended, tracked, 0.0).sum())
+        count.add_(ended.sum())
+        full = count >= self.num_envs
+        grown = full & (total > 0.8 * count)
+        share.copy_(torch.where(grown, share + self.cfg.commands.curriculum_step, share).clamp(max=1.0))
+        for memory in (total, count):
+            memory.masked_fill_(full, 0.0)
+        torch.mul(self.full_command_ranges, share, out=self.command_ranges)
 
     def _resample_commands(self, mask: Tensor) -> None:
         """Where a timer ended, each component keeps its value, or goes to zero, or to a new uniform value."""
@@ -294,6 +366,7 @@ class LeggedRobot(BaseTask):
                 Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", measured=True),  # [rad/s]
                 Row("last_actions", self.last_actions, mirror="joint"),  # a_t, clipped
                 Row("commands", self.commands, mirror="command"),  # vx, vy [m/s], yaw rate [rad/s], body frame
+                *self._height_rows("state", noise.height_scan),
             ],
             "privileged_state": [
                 Row("state", self.obs_buf.get("state", self.actions[:, :0]), mirror="state"),  # the same noisy sample
@@ -311,8 +384,14 @@ class LeggedRobot(BaseTask):
                 Row("kick_force", self.kick_force, mirror="polar"),  # on the root, world frame [N]
                 Row("kick_active", self.kick_active[:, None], mirror="scalar"),  # 0 or 1
                 *self._randomization_rows(),
+                *self._height_rows("privileged_state"),
             ],
         }
+
+    def _height_rows(self, group: str, noise: float = 0.0) -> list[Row]:
+        """The height scan [m], x by x from behind, in each from right to left; where ``terrain.height_scan`` names the group."""
+        row = Row("height_scan", self.height_scan, noise, mirror="height_scan", measured=True)
+        return [row] if group in self.cfg.terrain.height_scan else []
 
     def _randomization_rows(self) -> list[Row]:
         """What was drawn, as the critic may see it: in the config's units."""
@@ -321,6 +400,8 @@ class LeggedRobot(BaseTask):
 
     def compute_observations(self) -> None:
         """Fill ``obs_buf``: each group's rows side by side, plus noise where a row has any, times scale."""
+        if self.cfg.terrain.height_scan:
+            self._scan_heights()
         for group, rows in self._observation_rows().items():
             obs = self.obs_buf[group]
             torch.cat([row.value for row in rows], dim=1, out=obs)
@@ -475,8 +556,11 @@ class LeggedRobot(BaseTask):
         self._statistics.add_(torch.cat([torch.where(self.reset_buf[:, None], ended, 0.0), counts], dim=1).sum(dim=0))
 
     def take_statistics(self) -> Tensor:
-        """The running sums (S,), which then start anew, and worlds whose simulator overflowed so far; on the device."""
-        taken = torch.cat([self._statistics, self.sim.overflowed_worlds()[None]])
+        """The running sums, which then start anew, worlds whose simulator overflowed so far, curricula (S,); on the device."""
+        curricula = [self.tiles.statistics()] if self.tiles else []
+        if self.cfg.commands.curriculum:
+            curricula.append(torch.stack([self.command_curriculum[0], torch.ones_like(self.command_curriculum[0])]))  # a sum over ranks
+        taken = torch.cat([self._statistics, self.sim.overflowed_worlds()[None], *curricula])
         self._statistics.zero_()
         return taken
 
@@ -485,17 +569,53 @@ class LeggedRobot(BaseTask):
 
         ``rew_<name>``: sum of scale * term * dt over the episode, before the clip, divided by
         ``env.episode_length_s``. ``reward``: the episode's return. ``episode_length`` [control steps]. Means are NaN if none ended.
+        ``terrain_level``, and by kind of terrain: mean over the worlds. ``command_share``: of the ranges that commands come from.
         """
+        curricula, taken = taken[len(self._statistics) + 1 :], taken[: len(self._statistics) + 1]
         *sums, episodes, fell, broken, overflowed = taken
         *terms, total, length = [value / episodes if episodes else math.nan for value in sums]
         per_second = self.cfg.env.episode_length_s
         named = {f"rew_{name}": value / per_second for name, value in zip(self.reward_names, terms, strict=True)}
         counts = {"episodes": episodes, "fell": fell, "broken": broken, "overflowed": overflowed}
-        return {"reward": total, "episode_length": length, **named, **counts}
+        levels = {}
+        if self.tiles:
+            levels = self.tiles.name_statistics(curricula[: 2 * len(self.tiles.kinds)])
+        if self.cfg.commands.curriculum:
+            levels["command_share"] = curricula[-2] / curricula[-1]
+        return {"reward": total, "episode_length": length, **named, **counts, **levels}
 
     def read_statistics(self) -> dict[str, float]:
         """Statistics since the last call, by name. Reads the device."""
         return self.name_statistics(self.take_statistics().tolist())
+
+    # ---- what training learned about its worlds, for a checkpoint --------------------------------------------------------------
+
+    def training_state(self) -> dict[str, Tensor]:
+        """Curricula as they stand: tensors, by name."""
+        state = {"kick_level": self.kick_level} if self.cfg.perturbation.curriculum else {}
+        if self.tiles:
+            state["terrain_levels"] = self.tiles.levels
+        if self.cfg.commands.curriculum:
+            state["command_curriculum"] = self.command_curriculum
+        return {name: value.clone() for name, value in state.items()}
+
+    def load_training_state(self, state: dict[str, Tensor]) -> None:
+        """Go on from ``training_state``, and begin new episodes; for another number of worlds, what the nearest ones had."""
+
+        def spread(values: Tensor) -> Tensor:
+            values = values.to(self.device)
+            return values[torch.arange(self.num_envs, device=self.device) * len(values) // self.num_envs]
+
+        if "kick_level" in state and self.cfg.perturbation.curriculum:
+            self.kick_level.copy_(spread(state["kick_level"]))
+        if "command_curriculum" in state and self.cfg.commands.curriculum:
+            self.command_curriculum.copy_(state["command_curriculum"])
+            torch.mul(self.full_command_ranges, self.command_curriculum[0], out=self.command_ranges)
+        self._episode.zero_()  # what was under way counts for nothing
+        if "terrain_levels" in state and self.tiles:
+            self.tiles.put(spread(state["terrain_levels"]).clamp(max=self.tiles.num_levels - 1))
+        if state:
+            self._reset_all()
 
     # ---- robot and buffers: born here, never rebound --------------------------------------------------------------------------
 
@@ -506,7 +626,7 @@ class LeggedRobot(BaseTask):
         return build_model(
             ROOT / Path(cfg.asset.file).expanduser(),  # an absolute path stays itself
             physics=Physics(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations),
-            ground=Ground(cfg.terrain.friction, cfg.terrain.condim),
+            ground=Ground(cfg.terrain.friction, cfg.terrain.condim, self.terrain),
             stiffness=cfg.control.stiffness,
             damping=cfg.control.damping,
             colliders=cfg.asset.colliders,
@@ -537,7 +657,9 @@ class LeggedRobot(BaseTask):
         self._encoder_offset = self.domain_rand.values.get("encoder_offset")
         self.joint_reading = self.dof_offset if self._encoder_offset is None else zeros(self.num_actions)  # the same, as measured
         self._action_delay = self.domain_rand.delay("action_delay", self.num_actions, start=0.0)
-        self.foot_height, self.foot_speed = zeros(feet), zeros(feet)  # [m], horizontal [m/s]
+        self.foot_height, self.foot_speed = zeros(feet), zeros(feet)  # above the ground under the foot [m], horizontal [m/s]
+        self.base_height = zeros()  # of the root above the ground under it [m]
+        self._init_terrain()
         self.foot_contact, self.first_contact = zeros(feet, dtype=torch.bool), zeros(feet, dtype=torch.bool)
         self.fell, self.broken, self.moving = (zeros(dtype=torch.bool) for _ in range(3))
         self.commands, self.command_timer = zeros(3), zeros(1)  # vx, vy [m/s], yaw rate [rad/s]; [control steps]
@@ -557,10 +679,21 @@ class LeggedRobot(BaseTask):
         """Per-episode memory as columns of one matrix, so that a reset clears it in one go."""
         joints, feet, terms = self.num_actions, self.num_feet, len(self._active_scales())
         widths = {"last_actions": joints, "feet_air_time": feet, "swing_peak": feet}
+        if self.tiles:
+            widths |= {"progress": 1, "asked": 1, "farthest": 1}
         self._episode, views = columns(self.num_envs, self.device, **widths, episode_sums=terms, episode_return=1, episode_steps=1)
         for name, view in views.items():
             setattr(self, name, view)
         self._statistics = torch.zeros(terms + 5, device=self.device)
+
+    def _init_terrain(self) -> None:
+        """Tiles and heights, where there is terrain, and the height scan's points (P,) each [m]."""
+        cfg, n = self.cfg.terrain, self.num_envs
+        self.tiles = Tiles(self.cfg, self.terrain, n, self.device) if self.terrain else None
+        self._height_at = HeightMap(self.terrain, self.device) if self.terrain else None
+        grid = torch.cartesian_prod(torch.tensor(cfg.measured_points_x), torch.tensor(cfg.measured_points_y)).view(-1, 2)
+        self.scan_points = grid.to(self.device, torch.float).unbind(dim=1)
+        self.height_scan = torch.zeros(n, len(grid) if cfg.height_scan else 0, device=self.device)  # (N, P) [m]
 
     def _init_imu(self) -> None:
         robot, model = self.robot, self.robot.physics
@@ -610,7 +743,9 @@ class LeggedRobot(BaseTask):
         init, ranges, kick = cfg.init_state, cfg.commands.ranges, cfg.perturbation
         self.init_pos = tensor(init.pos)
         self.reset_range = tensor([init.pos_xy_range] * 2 + [init.yaw_range] + [init.lin_vel_range] * 3 + [init.ang_vel_range] * 3)
-        self.command_ranges = tensor([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw]).T.contiguous()  # (2, 3)
+        self.full_command_ranges = tensor([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw]).T.contiguous()  # (2, 3)
+        self.command_curriculum = tensor([cfg.commands.curriculum_start if cfg.commands.curriculum else 1.0, 0.0, 0.0])
+        self.command_ranges = self.full_command_ranges * self.command_curriculum[0]
         self.keep_probability = tensor(cfg.commands.keep_probability)
         self.kick_ranges = tensor([kick.interval, kick.duration, [-math.pi, math.pi], kick.velocity]).T.contiguous()  # (2, 4)
 
@@ -620,4 +755,7 @@ class LeggedRobot(BaseTask):
     swing_peak: Tensor  # F, highest foot position since the last contact [m]
     episode_sums: Tensor  # K, scale * term * dt summed over the episode
     episode_return: Tensor  # 1
+    progress: Tensor  # 1, along the commands [m]; only on terrain, as the two below
+    asked: Tensor  # 1, what the commands asked [m]
+    farthest: Tensor  # 1, from the middle of the tile, along x or y [m]
     episode_steps: Tensor  # 1, since the reset; episode_length_buf may start elsewhere

@@ -48,6 +48,10 @@ class LeggedRobotCfg(Config):
         change_probability: float = 0.5  # that a component changes at all when the timer ends [P]
         keep_probability: list[float] = [0.9, 0.25, 0.5]  # that a changed vx, vy, yaw rate is not zero [P]
 
+        curriculum: bool = False  # begin with a share of the ranges, and widen it while the velocity is tracked well [L]
+        curriculum_start: float = 0.4  # that share [-] [ours]
+        curriculum_step: float = 0.1  # by which it grows, where worlds' last episodes have 0.8 of the best tracking_lin_vel [L, ours]
+
         class ranges:
             lin_vel_x: list[float] = [-1.5, 1.5]  # [m/s] [P]
             lin_vel_y: list[float] = [-0.8, 0.8]  # [m/s] [P]
@@ -55,6 +59,7 @@ class LeggedRobotCfg(Config):
 
     class termination:
         max_tilt: float = 90.0  # [deg] between the root's z axis and the vertical; beyond it, it fell [P]
+        min_base_height: float = 0.0  # [m] of the root above the ground under it; lower, it fell; 0: anything [ours]
         max_speed: float = 1.0e4  # [m/s, rad/s] of any degree of freedom; beyond it the state counts as not finite [ours]
 
     class rewards:
@@ -104,6 +109,7 @@ class LeggedRobotCfg(Config):
             gravity: float = 0.05  # [-]
             dof_pos: float = 0.03  # [rad]
             dof_vel: float = 1.5  # [rad/s]
+            height_scan: float = 0.1  # [m] [L]
 
     class perturbation:
         """Kicks on the root: a half sine of force over the duration. One of dv changes the robot's velocity by dv / pi."""
@@ -143,9 +149,25 @@ class LeggedRobotCfg(Config):
         observe: bool = False  # rows in `privileged_state` with what was drawn
 
     class terrain:
-        mesh_type: Literal["plane"] = "plane"
+        mesh_type: Literal["plane", "heightfield"] = "plane"  # heightfield: a grid of tiles, all below is about it
         friction: float = 0.6  # sliding friction of the ground, which overrules the foot's [-] [P]
         condim: int = 3  # contact dimensions: 3 is sliding without torsion [P]
+        num_rows: int = 10  # levels of difficulty, along x [L]
+        num_cols: int = 20  # tiles side by side along y, each column of one kind [L]
+        tile_size: float = 8.0  # edge of a tile [m] [L]
+        horizontal_scale: float = 0.05  # between two heights [m] [ours: L 0.1 makes a step of stairs a slope of 50 degrees]
+        border_size: float = 5.0  # flat ground around all tiles; who walks over half of it begins anew, timed out [m] [L 25]
+        difficulty: list[float] = [0.0, 1.0]  # of the first and the last row, from 0 to 1 [L]
+        terrain_proportions: dict[str, float] = {  # kind (legged_mw/sim/terrain.py) -> share of the columns [ours]
+            **{"flat": 0.05, "smooth_slope": 0.1, "rough_slope": 0.15, "stairs_up": 0.25, "stairs_down": 0.15},
+            **{"obstacles": 0.15, "waves": 0.05, "low_random": 0.1},
+        }
+        seed: int = 1  # of all that is random in it
+        curriculum: bool = True  # levels by what a robot can do; False: a random one at each reset [L]
+        max_init_terrain_level: int = 5  # highest level at the start of training [L]
+        measured_points_x: list[float] = [i / 10 for i in range(-8, 9)]  # of the height scan, ahead of the root [m] [L]
+        measured_points_y: list[float] = [i / 10 for i in range(-5, 6)]  # to its left [m] [L]
+        height_scan: list[str] = []  # groups of observations that get the row: "state", "privileged_state"
 
     class sim:
         engine: Literal["auto", "mujoco_warp", "mujoco"] = "auto"  # auto: mujoco_warp on a GPU, MuJoCo's own on a CPU

@@ -78,6 +78,7 @@ def make_mirror(env: LeggedRobot) -> Mirror:
         "joint_factor": _Block(joints.index, [1.0] * len(joints.index)),  # one that does not turn with the joint's axis
         "link": _Block([0, *(1 + j for j in joints.index)], [1.0] * (1 + len(joints.index))),  # the root's, then one a joint
         "foot": _Block(feet, [1.0] * len(feet)),  # a number a foot
+        "height_scan": _height_scan(env),
         "foot_polar": _Block([3 * f + k for f in feet for k in range(3)], [1.0, -1.0, 1.0] * len(feet)),  # a polar vector a foot
     }
 
@@ -94,6 +95,17 @@ def make_mirror(env: LeggedRobot) -> Mirror:
         blocks[group] = _side_by_side(group, rows, blocks, reach)  # known from here on, to rows that contain this group
         groups[group] = columns(blocks[group])
     return Mirror(groups, columns(joints))
+
+
+def _height_scan(env: LeggedRobot) -> _Block:
+    """Points (x, y) in the order of the scan: x stays, y changes its sign."""
+    xs, ys = env.cfg.terrain.measured_points_x, env.cfg.terrain.measured_points_y
+    if env.cfg.terrain.height_scan and any(
+        abs(left + right) > 1e-6 for left, right in zip(sorted(ys), sorted(ys, reverse=True), strict=True)
+    ):
+        raise ConfigError(f"terrain.measured_points_y {ys} is not its own mirror image; make it so, or switch the section symmetry off")
+    partner = [min(range(len(ys)), key=lambda j: abs(ys[j] + y)) for y in ys]
+    return _Block([i * len(ys) + j for i in range(len(xs)) for j in partner], [1.0] * (len(xs) * len(ys)))
 
 
 def _side_by_side(group: str, rows: Sequence[Row], blocks: dict[str, _Block], reach: float) -> _Block:

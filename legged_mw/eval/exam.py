@@ -24,6 +24,8 @@ OVERRIDES: dict[str, Any] = {
     "perturbation.enable": False,
     "perturbation.push": False,
     "domain_rand.enable": False,
+    "terrain.mesh_type": "plane",
+    "commands.curriculum": False,
     "commands.resampling_time": 0.0,
     "init_state.dof_pos_range": [1.0, 1.0],
     "init_state.pos_xy_range": 0.0,

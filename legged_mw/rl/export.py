@@ -117,6 +117,7 @@ def _small_env(task: LoadedTask) -> LeggedRobot:
     """The task as trained, with noise and kicks, but small and on a CPU."""
     task.set("env.num_envs", WORLDS, where="export")
     task.set("sim.engine", "mujoco", where="export")
+    task.set("terrain.mesh_type", "plane", where="export")  # the scene is the robot's; whoever takes it away has ground of his own
     return task.env_class(task.cfg, "cpu", eager=True)
 
 

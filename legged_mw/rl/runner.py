@@ -22,7 +22,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import this_rank
-from legged_mw.rl.report import Clock, Mark, Message, Report, console_block, console_rows
+from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
@@ -233,6 +233,8 @@ class Runner(OnPolicyRunner):
             **{"Train/mean_reward": numbers["reward"], "Train/mean_episode_length": numbers["episode_length"]},
             **{f"Episode/{name}": value for name, value in numbers.items() if name.startswith("rew_")},
             **{"Episode/fell": numbers["fell"], "Episode/broken": numbers["broken"], "Train/total_steps": total_steps},
+            "Sim/overflowed_worlds": numbers["overflowed"],  # so far
+            **{f"Curriculum/{name}": value for name, value in numbers.items() if name.startswith(CURRICULA)},
         }
 
     # ---- checkpoints ----------------------------------------------------------------------------------------------
@@ -247,6 +249,7 @@ class Runner(OnPolicyRunner):
         content = self.alg.save()
         content["iter"] = self.current_learning_iteration
         content["infos"] = {**(infos or {}), "total_steps": self.total_steps, "random_state": _random_state(self.device)}
+        content["infos"]["env"] = self.env.training_state()
         save_whole(content, Path(path))
         self.logger.save_model(path, self.current_learning_iteration)
 
@@ -268,6 +271,7 @@ class Runner(OnPolicyRunner):
             self.env.domain_rand.redraw()
         infos = content.get("infos") or {}
         self.total_steps = infos.get("total_steps", 0)
+        self.env.load_training_state(infos.get("env", {}))  # before the random state: it begins episodes
         if self.gpu_global_rank == 0:
             _set_random_state(infos.get("random_state", {}), self.device)
         else:  # the file holds the first rank's; the others must not draw the same

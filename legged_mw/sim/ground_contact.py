@@ -7,7 +7,8 @@ the first, as in the corner of a step. A geom is looked at in probes, which are 
 """
 
 # pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
-# (mujoco ships no type stubs, and warp compiles what it finds written here as its own language)
+# ruff: noqa: UP018, SIM102
+# (mujoco ships no type stubs, and warp compiles what it finds written here as its own language: float() makes a variable)
 from __future__ import annotations
 
 from collections.abc import Callable

@@ -21,7 +21,7 @@ PLATFORM = 1.0  # [m] half the edge of the flat middle of a tile, where robots b
 
 @dataclass(frozen=True)
 class Terrain:
-    """A height field of ``levels`` x ``kinds`` tiles inside a flat border; x runs along levels, y along kinds.
+    """A height field of tiles, ``levels`` along x and ``len(kinds)`` along y, inside a flat border; x runs along levels, y along kinds.
 
     Between its vertices it is triangles, cut along the diagonal from (row, column) to (row + 1, column + 1), as MuJoCo's.
     """
@@ -47,18 +47,22 @@ def make_terrain(
     levels: int,
     proportions: Mapping[str, float],  # kind -> share of the columns
     columns: int,
+    difficulty: tuple[float, float] = (0.0, 1.0),  # of the first and the last level
     tile: float,
     cell: float,
     border: float,
     seed: int,
 ) -> Terrain:
-    """Build all tiles; difficulty rises from 0 in the first level to 1 in the last. Raises ModelError for what does not exist or fit."""
+    """Build all tiles; difficulty rises in equal steps from level to level. Raises ModelError for what does not exist or fit."""
     for kind in proportions:
         if kind not in KINDS:
-            raise ModelError(unknown("kind of terrain", kind, KINDS, "terrain.proportions"))
+            raise ModelError(unknown("kind of terrain", kind, KINDS, "terrain.terrain_proportions"))
     n = round(tile / cell)
     if abs(n * cell - tile) > 1e-6 or tile < 4 * PLATFORM:
-        raise ModelError(f"terrain.tile_size {tile:g} must be a whole number of cells of {cell:g} m, and at least {4 * PLATFORM:g} m")
+        raise ModelError(
+            f"terrain.tile_size {tile:g} must be a whole number of cells (terrain.horizontal_scale) of {cell:g} m, "
+            f"and at least {4 * PLATFORM:g} m"
+        )
     kinds, rng = share_columns(proportions, columns), np.random.default_rng(seed)
     edge = round(border / cell)
     field = np.zeros((columns * n + 2 * edge + 1, levels * n + 2 * edge + 1))
@@ -66,7 +70,8 @@ def make_terrain(
     corner = (-0.5 * levels * tile - edge * cell, -0.5 * columns * tile - edge * cell)
     for column, kind in enumerate(kinds):
         for level in range(levels):
-            patch = KINDS[kind](_Grid(n, cell), level / max(levels - 1, 1), rng)
+            hard = difficulty[0] + (difficulty[1] - difficulty[0]) * level / max(levels - 1, 1)
+            patch = KINDS[kind](_Grid(n, cell), hard, rng)
             row0, col0 = edge + column * n, edge + level * n
             field[row0 : row0 + n + 1, col0 : col0 + n + 1] = patch
             middle = (col0 + n // 2, row0 + n // 2)
@@ -78,7 +83,7 @@ def share_columns(proportions: Mapping[str, float], columns: int) -> tuple[str, 
     """A kind for each column, in the order given, as near to the shares as whole columns come; each kind at least once."""
     wanted = {kind: share for kind, share in proportions.items() if share > 0}
     if not wanted or len(wanted) > columns:
-        raise ModelError(f"terrain: {columns} columns cannot hold {len(wanted)} kinds; every kind with a share above 0 needs one")
+        raise ModelError(f"terrain.num_cols: {columns} columns cannot hold {len(wanted)} kinds; every kind with a share above 0 needs one")
     bounds = np.cumsum(list(wanted.values())) / sum(wanted.values())
     kinds = [list(wanted)[min(int(np.searchsorted(bounds, (i + 0.5) / columns)), len(wanted) - 1)] for i in range(columns)]
     for kind in wanted:

@@ -1,0 +1,45 @@
+"""Unitree Go1 follows a joystick over slopes, stairs and blocks, and does not see them; randomized worlds, kicks and pushes.
+
+Sources: [P] MuJoCo Playground's rough task for this robot; [L] legged_gym's terrain and curriculum; [ours] docs/terrain.md.
+"""
+
+from configs.go1_flat_dr import Go1FlatDrCfg, Go1FlatDrCfgPPO
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.utils.task import Task
+
+
+class Go1RoughCfg(Go1FlatDrCfg):
+    class terrain(Go1FlatDrCfg.terrain):
+        mesh_type = "heightfield"
+        height_scan = ["privileged_state"]  # the critic sees the ground, the robot does not
+
+    class termination(Go1FlatDrCfg.termination):
+        min_base_height = 0.12  # [m] [ours: the feet alone touch the ground, so that a trunk would sink into a step unpunished]
+
+    class sim(Go1FlatDrCfg.sim):
+        njmax = 56  # 12 friction, 12 limits, 4 a contact, two contacts a foot
+
+    class rewards(Go1FlatDrCfg.rewards):
+        tracking_sigma = 0.25  # [P]
+        swing_height = 0.15  # [m] [ours: over a step of 12 cm; P 0.1]
+
+        class scales(Go1FlatDrCfg.rewards.scales):
+            orientation = -1.0  # [P -5] [ours: on a slope the trunk tilts with the ground]
+            lin_vel_z = -0.2  # [P -0.5] [ours: stairs go up]
+            feet_clearance = -1.0  # [P -2.0] [ours]
+
+    class perturbation(Go1FlatDrCfg.perturbation):
+        velocity = [0.0, 4.0]  # [m/s] [P 3; ours: 8 in go1_flat, where nothing else trips it]
+        curriculum = True
+
+
+class Go1RoughCfgPPO(Go1FlatDrCfgPPO):
+    class runner(Go1FlatDrCfgPPO.runner):
+        num_steps_per_env = 24  # [P, L]
+        max_iterations = 1500  # [L] 295 M steps
+
+    class algorithm(Go1FlatDrCfgPPO.algorithm):
+        gamma = 0.99  # [L, P]
+
+
+TASK = Task(LeggedRobot, Go1RoughCfg, Go1RoughCfgPPO)

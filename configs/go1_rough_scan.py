@@ -1,0 +1,17 @@
+"""go1_rough with eyes: the policy sees the height of the ground on a grid around it, with noise."""
+
+from configs.go1_rough import Go1RoughCfg, Go1RoughCfgPPO
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.utils.task import Task
+
+
+class Go1RoughScanCfg(Go1RoughCfg):
+    class terrain(Go1RoughCfg.terrain):
+        height_scan = ["state", "privileged_state"]
+
+
+class Go1RoughScanCfgPPO(Go1RoughCfgPPO):
+    pass
+
+
+TASK = Task(LeggedRobot, Go1RoughScanCfg, Go1RoughScanCfgPPO)

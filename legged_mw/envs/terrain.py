@@ -1,0 +1,80 @@
+"""Which tile of the terrain each world is on, and how a world gets on to a harder one.
+
+legged_gym's game: who leaves its tile goes one level up, who covers less than half of what it was told goes one down, who
+masters the last level starts anew at a random one. Progress is measured along the command, for a robot that turns on the
+spot as it was told goes nowhere and is not to blame.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from legged_mw.sim.terrain import Terrain, make_terrain
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.math import assign
+
+if TYPE_CHECKING:
+    from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+
+
+def build_terrain(cfg: LeggedRobotCfg) -> Terrain | None:
+    """The ground that the section terrain describes; None: a plane."""
+    ground = cfg.terrain
+    if ground.mesh_type == "plane":
+        return None
+    return make_terrain(
+        levels=ground.num_rows,
+        difficulty=(ground.difficulty[0], ground.difficulty[1]),
+        proportions=ground.terrain_proportions,
+        columns=ground.num_cols,
+        tile=ground.tile_size,
+        cell=ground.horizontal_scale,
+        border=ground.border_size,
+        seed=ground.seed,
+    )
+
+
+class Tiles:
+    """The tiles of N worlds. Everything is a fixed tensor and written in place, as a recorded step needs it."""
+
+    def __init__(self, cfg: LeggedRobotCfg, terrain: Terrain, num_envs: int, device: str) -> None:
+        self.curriculum, self.size, self.num_levels = cfg.terrain.curriculum, terrain.tile, terrain.levels
+        highest = cfg.terrain.max_init_terrain_level if self.curriculum else terrain.levels - 1
+        if not 0 <= highest < terrain.levels:
+            raise ConfigError(f"terrain.max_init_terrain_level is {highest}; the levels of terrain.num_rows are 0 to {terrain.levels - 1}")
+        self.levels = torch.randint(0, highest + 1, (num_envs,), device=device)  # (N,) row of the tile
+        self.columns = torch.arange(num_envs, device=device) * len(terrain.kinds) // num_envs  # (N,), never changes
+        self._all_origins = torch.tensor(terrain.origins, dtype=torch.float, device=device)  # (levels, columns, 3)
+        self.origins = self._all_origins[self.levels, self.columns]  # (N, 3) where an episode begins [m, world]
+        tiles = torch.tensor([terrain.levels, len(terrain.kinds)], dtype=torch.float, device=device)
+        self.edge = tiles * terrain.tile / 2 + cfg.terrain.border_size / 2  # x, y [m] beyond which a robot has walked off
+        self.kinds = tuple(dict.fromkeys(terrain.kinds))
+        kind = torch.tensor([self.kinds.index(name) for name in terrain.kinds], device=device)[self.columns]
+        self._is_kind = torch.nn.functional.one_hot(kind, len(self.kinds)).float()  # (N, kinds)
+        self._count = self._is_kind.sum(dim=0)
+
+    def put(self, levels: Tensor) -> None:
+        """Put each world on the level (N,) of its column; in force from its next reset."""
+        self.levels.copy_(levels)
+        self.origins.copy_(self._all_origins[self.levels, self.columns])
+
+    def promote(self, mask: Tensor, up: Tensor, down: Tensor) -> None:
+        """New levels where ``mask`` (N,) is true: one up, one down; above the last a random one."""
+        level = self.levels + up.long() - down.long()
+        anywhere = torch.randint_like(level, self.num_levels)
+        level = torch.where(level >= self.num_levels, anywhere, level.clamp(min=0)) if self.curriculum else anywhere
+        assign(self.levels, mask, level)
+        self.origins.copy_(self._all_origins[self.levels, self.columns])
+
+    def statistics(self) -> Tensor:
+        """Sums of levels by kind, and numbers of worlds by kind (2 * kinds,); sums over ranks are meaningful."""
+        return torch.cat([self.levels.float() @ self._is_kind, self._count])
+
+    def name_statistics(self, taken: list[float]) -> dict[str, float]:
+        """Mean levels from what ``statistics`` gave: of all worlds, and by kind."""
+        sums, counts = taken[: len(self.kinds)], taken[len(self.kinds) :]
+        by_kind = {f"terrain_level/{kind}": total / count for kind, total, count in zip(self.kinds, sums, counts, strict=True) if count}
+        return {"terrain_level": sum(sums) / sum(counts), **by_kind}
