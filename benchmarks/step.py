@@ -3,8 +3,8 @@
     python benchmarks/step.py --num_envs 4096 16384
     python benchmarks/step.py --device cpu --num_envs 256 1024
 
-Bare physics is the same engine stepping the same model `decimation` times, all sensors on in every substep, and nothing
-else. mujoco-warp: recorded as one graph, from the environment's state of the moment, servos at the default pose, timed in turns
+Bare physics is the same engine stepping the same model `decimation` times on the same ground, all sensors on in every
+substep, and nothing else. mujoco-warp: recorded as one graph, from the environment's state of the moment, servos at the default pose, timed in turns
 with the environment. MuJoCo's own engine: the call of `Batch.step` inside of the environment's step, for robots that thrash and
 fall take longer to step than robots that stand. Medians are compared.
 """
@@ -49,11 +49,11 @@ def bare_warp(env: LeggedRobot) -> Callable[[], None]:
     import mujoco_warp as mjw
     import warp as wp
 
-    from legged_mw.sim.warp_engine import record_warp
+    from legged_mw.sim.warp_engine import put_model, record_warp
 
     device = wp.get_device(env.device)
     with wp.ScopedDevice(device):
-        model = mjw.put_model(env.robot.physics)
+        model = put_model(env.robot.physics, env.terrain)
         model.opt.warn_overflow, model.opt.graph_conditional = 0, False
         data = mjw.make_data(env.robot.physics, nworld=env.num_envs, nconmax=env.cfg.sim.nconmax, njmax=env.cfg.sim.njmax)
     for name in ("qpos", "qvel"):

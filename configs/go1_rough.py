@@ -29,8 +29,7 @@ class Go1RoughCfg(Go1FlatDrCfg):
             feet_clearance = -1.0  # [P -2.0] [ours]
 
     class perturbation(Go1FlatDrCfg.perturbation):
-        velocity = [0.0, 4.0]  # [m/s] [P 3; ours: 8 in go1_flat, where nothing else trips it]
-        curriculum = True
+        curriculum = True  # [ours: it has enough to learn at the start]
 
 
 class Go1RoughCfgPPO(Go1FlatDrCfgPPO):

@@ -83,6 +83,8 @@ def console_rows(numbers: dict[str, float], losses: dict[str, float], speed: flo
         "Mean reward": f"{numbers['reward']:.2f}",
         "Mean episode length": f"{numbers['episode_length']:.1f}",
         **{name: f"{value:.4f}" for name, value in numbers.items() if name.startswith("rew_")},
-        **{name.replace("_", " ").replace("/", ", ").capitalize(): f"{numbers[name]:.2f}" for name in numbers if name.startswith(CURRICULA)},
+        **{
+            name.replace("_", " ").replace("/", ", ").capitalize(): f"{numbers[name]:.2f}" for name in numbers if name.startswith(CURRICULA)
+        },
         "Episodes ended": f"{numbers['episodes']:.0f} ({numbers['fell']:.0f} falls, {numbers['broken']:.0f} not finite)",
     }

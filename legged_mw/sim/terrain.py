@@ -16,6 +16,9 @@ from torch import Tensor
 from legged_mw.sim.model import ModelError, unknown
 
 Heights = NDArray[np.float64]
+STEP = (0.06, 0.195)  # [m] of stairs at difficulty 0 and 1 [legged_gym: 0.05, 0.23; ours: for a leg of 0.43]
+BLOCK = (0.05, 0.25)  # [m] of blocks and holes [legged_gym]
+SLOPE, WAVE, NOISE, DITCH, STONE_GAP = 0.4, 0.15, 0.05, 0.6, 0.2  # at difficulty 1: [-], then [m]
 PLATFORM = 1.0  # [m] half the edge of the flat middle of a tile, where robots begin [legged_gym: 3 m in all for most, ours 2]
 
 
@@ -130,7 +133,7 @@ def flat(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
 
 def smooth_slope(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """A pyramid or, every second time, a pit, up to 0.4 steep [legged_gym]."""
-    rise = 0.4 * difficulty * np.clip(grid.half - 0.5 - np.maximum(grid.distance, PLATFORM), 0.0, None)
+    rise = SLOPE * difficulty * np.clip(grid.half - 0.5 - np.maximum(grid.distance, PLATFORM), 0.0, None)
     return rise if rng.random() < 0.5 else -rise
 
 
@@ -140,18 +143,18 @@ def rough_slope(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Hei
 
 
 def stairs_up(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """From a pit in the middle up to the rim, steps of 6 to 19.5 cm, 30 cm deep [legged_gym: 5 to 23; ours: for a leg of 43 cm]."""
-    return -_stairs(grid, 0.06 + 0.135 * difficulty)
+    """From a pit in the middle up to the rim, steps of 6 to 19.5 cm, 30 cm deep."""
+    return -_stairs(grid, _between(STEP, difficulty))
 
 
 def stairs_down(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """From the top in the middle down to the rim."""
-    return _stairs(grid, 0.06 + 0.135 * difficulty)
+    return _stairs(grid, _between(STEP, difficulty))
 
 
 def obstacles(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """Twenty blocks and holes of 5 to 25 cm, 1 to 2 m across [legged_gym]."""
-    heights, height = grid.zeros(), 0.05 + 0.2 * difficulty
+    heights, height = grid.zeros(), _between(BLOCK, difficulty)
     for _ in range(20):
         size = rng.integers(round(1.0 / grid.cell), round(2.0 / grid.cell) + 1, 2)
         low = [int(rng.integers(0, max(grid.n + 1 - s, 1))) for s in size]
@@ -166,13 +169,13 @@ def waves(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     along = np.arange(grid.n + 1) * grid.cell
     phase = rng.uniform(0.0, 2.0 * np.pi, 2)
     sines = [np.sin(np.pi * along + p) for p in phase]
-    return grid.fade(0.075 * difficulty * (sines[0][:, None] + sines[1][None, :]))
+    return grid.fade(0.5 * WAVE * difficulty * (sines[0][:, None] + sines[1][None, :]))
 
 
 def stepping_stones(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """Square stones, 1.5 m down to 0.3 m, with gaps of one cell up to 0.2 m between them, 0.3 m deep [legged_gym; ours: less deep]."""
     stone = max(round((1.5 - 1.2 * difficulty) / grid.cell), 2)
-    gap = max(round(0.2 * difficulty / grid.cell), 1)
+    gap = max(round(STONE_GAP * difficulty / grid.cell), 1)
     heights = np.full((grid.n + 1, grid.n + 1), -0.3)
     row = 0
     while row <= grid.n:
@@ -187,7 +190,7 @@ def stepping_stones(grid: _Grid, difficulty: float, rng: np.random.Generator) ->
 
 def gap(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """A ditch around the middle, one cell to 0.6 m wide, 0.5 m deep [legged_gym; ours: less wide]."""
-    width = max(0.6 * difficulty, grid.cell)
+    width = max(DITCH * difficulty, grid.cell)
     heights = grid.zeros()
     heights[(grid.distance > PLATFORM + 0.5 * grid.cell) & (grid.distance < PLATFORM + width + 0.5 * grid.cell)] = -0.5
     return heights
@@ -195,13 +198,31 @@ def gap(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
 
 def low_random(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """Random heights of 0 to 5 cm at every vertex, smaller in lower levels [MuJoCo Playground: 0 to 5 cm]."""
-    return grid.fade(0.05 * difficulty * rng.random((grid.n + 1, grid.n + 1)))
+    return grid.fade(NOISE * difficulty * rng.random((grid.n + 1, grid.n + 1)))
 
 
 KINDS: dict[str, Callable[[_Grid, float, np.random.Generator], Heights]] = {
     kind.__name__: kind
     for kind in (flat, smooth_slope, rough_slope, stairs_up, stairs_down, obstacles, waves, stepping_stones, gap, low_random)
 }
+
+
+# What makes a kind hard, for tables: name of the measure, its value at difficulty 0 and 1. A kind that is not here has none.
+MEASURES: dict[str, tuple[str, float, float]] = {
+    "smooth_slope": ("slope [%]", 0.0, 100 * SLOPE),
+    "rough_slope": ("slope [%]", 0.0, 100 * SLOPE),
+    "stairs_up": ("step [cm]", 100 * STEP[0], 100 * STEP[1]),
+    "stairs_down": ("step [cm]", 100 * STEP[0], 100 * STEP[1]),
+    "obstacles": ("height [cm]", 100 * BLOCK[0], 100 * BLOCK[1]),
+    "waves": ("height [cm]", 0.0, 200 * WAVE),
+    "stepping_stones": ("gap [cm]", 0.0, 100 * STONE_GAP),
+    "gap": ("width [cm]", 0.0, 100 * DITCH),
+    "low_random": ("height [cm]", 0.0, 100 * NOISE),
+}
+
+
+def _between(span: tuple[float, float], difficulty: float) -> float:
+    return span[0] + (span[1] - span[0]) * difficulty
 
 
 def _stairs(grid: _Grid, height: float, width: float = 0.3) -> Heights:
@@ -233,8 +254,8 @@ class HeightMap:
         self._per_cell = 1.0 / terrain.cell
 
     def __call__(self, points: Tensor) -> Tensor:
-        """Height [m] of the ground under ``points`` (..., 2) [m, world]; outside of the field, of its rim."""
-        place = (points - self._corner) * self._per_cell
+        """Height [m] of the ground under ``points`` (..., 2) [m, world]; outside of the field, of its rim; of NaN, of a corner."""
+        place = ((points - self._corner) * self._per_cell).nan_to_num(0.0)
         u, v = place[..., 0].clamp(0.0, self._columns - 1.0), place[..., 1].clamp(0.0, self._rows - 1.0)
         column, row = u.floor().clamp(max=self._columns - 2.0), v.floor().clamp(max=self._rows - 2.0)
         across, along = u - column, v - row

@@ -67,14 +67,7 @@ class WarpSimulation:
         _check_fields(world_fields)
         with wp.ScopedDevice(self._device):
             derived = CONSTANTS if {*CONSTANTS_READ} & {*world_fields} else ()  # else every world silently has the first one's
-            touch = None
-            if terrain:
-                from legged_mw.sim.ground_contact import touch_ground  # a module of kernels: only where there is such ground
-
-                touch, model = touch_ground(model, model.geom(GROUND).id, terrain), _without_collisions(model, GROUND)
-            self._model = mjw.put_model(model, batch_sizes=dict.fromkeys([*world_fields, *derived], num_envs))
-            if touch:
-                self._model.callback.contactfilter = touch
+            self._model = put_model(model, terrain, dict.fromkeys([*world_fields, *derived], num_envs))
             option = self._model.opt
             option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
@@ -148,11 +141,17 @@ def _check_fields(names: Sequence[str]) -> None:
             raise ModelError(unknown("per-world model field", name, known, "mujoco-warp's Model"))
 
 
-def _without_collisions(model: mujoco.MjModel, geom: str) -> mujoco.MjModel:
-    """A copy of the model in which ``geom`` touches nothing."""
-    model = copy.copy(model)
-    model.geom(geom).contype, model.geom(geom).conaffinity = 0, 0
-    return model
+def put_model(model: mujoco.MjModel, terrain: Terrain | None = None, batch_sizes: dict[str, int] | None = None) -> mjw.Model:
+    """The model on the current device; on ``terrain`` with contacts of our own in place of its height field's."""
+    if terrain is None:
+        return mjw.put_model(model, batch_sizes=batch_sizes)
+    from legged_mw.sim.ground_contact import touch_ground  # a module of kernels: only where there is such ground
+
+    touch, model = touch_ground(model, model.geom(GROUND).id, terrain), copy.copy(model)
+    model.geom(GROUND).contype, model.geom(GROUND).conaffinity = 0, 0
+    put = mjw.put_model(model, batch_sizes=batch_sizes)
+    put.callback.contactfilter = touch
+    return put
 
 
 def record_warp(fn: Callable[[], None], device: wp.Device) -> Callable[[], None]:
