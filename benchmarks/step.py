@@ -4,9 +4,9 @@
     python benchmarks/step.py --device cpu --num_envs 256 1024
 
 Bare physics is the same engine stepping the same model `decimation` times on the same ground, all sensors on in every
-substep, and nothing else. mujoco-warp: recorded as one graph, from the environment's state of the moment, servos at the default pose, timed in turns
-with the environment. MuJoCo's own engine: the call of `Batch.step` inside of the environment's step, for robots that thrash and
-fall take longer to step than robots that stand. Medians are compared.
+substep, and nothing else. mujoco-warp: recorded as one graph, from the environment's state of the moment, servos at the
+default pose, timed in turns with the environment. MuJoCo's own engine: the call of `Batch.step` inside of the environment's
+step, for robots that thrash and fall take longer to step than robots that stand. Medians are compared.
 """
 
 from __future__ import annotations

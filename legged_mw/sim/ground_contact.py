@@ -7,11 +7,13 @@ the first, as in the corner of a step. A geom is looked at in probes, which are 
 """
 
 # pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportGeneralTypeIssues=false, reportInvalidTypeForm=false
+# pyright: reportArgumentType=false, reportCallIssue=false, reportAssignmentType=false, reportOperatorIssue=false, reportReturnType=false
 # ruff: noqa: UP018, SIM102
 # (mujoco ships no type stubs, and warp compiles what it finds written here as its own language: float() makes a variable)
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
@@ -64,44 +66,102 @@ def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, l
 def touch_ground(model: mujoco.MjModel, ground: int, terrain: Terrain) -> Callable[[mjw.Model, mjw.Data], None]:
     """What ``Model.callback.contactfilter`` is to be, on the current device. The geom ``ground`` must not collide by itself."""
     geoms, places, radii = probes(model, ground)
-    heights = wp.array(terrain.heights, dtype=float)
-    geom, place, radius = wp.array(geoms, dtype=int), wp.array(places, dtype=wp.vec3), wp.array(radii, dtype=float)
-    corner, per_cell = wp.vec2(*terrain.corner), 1.0 / terrain.cell
+    field = _Field()
+    field.heights, field.corner, field.per_cell = wp.array(terrain.heights, dtype=float), wp.vec2(*terrain.corner), 1.0 / terrain.cell
+    spheres = _Probes()
+    spheres.geom, spheres.place, spheres.radius = (
+        wp.array(values, dtype=kind) for values, kind in ((geoms, int), (places, wp.vec3), (radii, float))
+    )
 
     def collide(m: mjw.Model, d: mjw.Data) -> None:
         wp.launch(
             _touch,
             dim=(d.nworld, len(geoms)),
-            inputs=[
-                *(heights, corner, per_cell, ground, geom, place, radius, d.geom_xpos, d.geom_xmat, d.naconmax),
-                *(m.geom_condim, m.geom_priority, m.geom_solmix, m.geom_solref, m.geom_solimp, m.geom_friction, m.geom_adhesion),
-                *(m.geom_margin, m.geom_gap),
-                *(m.pair_dim, m.pair_solref, m.pair_solreffriction, m.pair_solimp, m.pair_adhesion, m.pair_friction),
-            ],
-            outputs=[
-                *(d.contact.dist, d.contact.pos, d.contact.frame, d.contact.includemargin, d.contact.friction, d.contact.solref),
-                *(d.contact.solreffriction, d.contact.solimp, d.contact.dim, d.contact.geom, d.contact.efc_address, d.contact.worldid),
-                *(d.contact.type, d.contact.geomcollisionid, d.contact.adhesion, d.nacon),
-            ],
+            inputs=[field, spheres, ground, d.geom_xpos, d.geom_xmat, _gather(_Material, m), d.naconmax],
+            outputs=[_gather(_Contacts, d.contact), d.nacon],
         )
 
     return collide
 
 
-@wp.func
-def _vertex(heights: wp.array2d[float], corner: wp.vec2, per_cell: float, row: int, column: int) -> wp.vec3:
-    return wp.vec3(corner[0] + float(column) / per_cell, corner[1] + float(row) / per_cell, heights[row, column])
+@wp.struct
+class _Field:
+    heights: wp.array2d[float]
+    corner: wp.vec2
+    per_cell: float
+
+
+@wp.struct
+class _Probes:
+    geom: wp.array[int]
+    place: wp.array[wp.vec3]
+    radius: wp.array[float]
+
+
+@wp.struct
+class _Material:
+    """Fields of mujoco-warp's Model, under its names."""
+
+    geom_condim: wp.array[int]
+    geom_priority: wp.array[int]
+    geom_solmix: wp.array2d[float]
+    geom_solref: wp.array2d[wp.vec2]
+    geom_solimp: wp.array2d[vec5]
+    geom_friction: wp.array2d[wp.vec3]
+    geom_adhesion: wp.array2d[float]
+    geom_margin: wp.array2d[float]
+    geom_gap: wp.array2d[float]
+    pair_dim: wp.array[int]
+    pair_solref: wp.array2d[wp.vec2]
+    pair_solreffriction: wp.array2d[wp.vec2]
+    pair_solimp: wp.array2d[vec5]
+    pair_adhesion: wp.array2d[float]
+    pair_friction: wp.array2d[vec5]
+
+
+@wp.struct
+class _Contacts:
+    """Fields of mujoco-warp's Data.contact, under its names."""
+
+    dist: wp.array[float]
+    pos: wp.array[wp.vec3]
+    frame: wp.array[wp.mat33]
+    includemargin: wp.array[float]
+    friction: wp.array[vec5]
+    solref: wp.array[wp.vec2]
+    solreffriction: wp.array[wp.vec2]
+    solimp: wp.array[vec5]
+    dim: wp.array[int]
+    geom: wp.array[wp.vec2i]
+    efc_address: wp.array2d[int]
+    worldid: wp.array[int]
+    type: wp.array[int]
+    geomcollisionid: wp.array[int]
+    adhesion: wp.array[float]
+
+
+def _gather(struct: Any, source: Any) -> Any:
+    """An instance of ``struct`` whose arrays are those of ``source``; nothing is copied."""
+    gathered = struct()
+    for name in struct.vars:
+        setattr(gathered, name, getattr(source, name))
+    return gathered
 
 
 @wp.func
-def _surface(heights: wp.array2d[float], u: float, v: float) -> float:
+def _vertex(field: _Field, row: int, column: int) -> wp.vec3:
+    x, y = field.corner[0] + float(column) / field.per_cell, field.corner[1] + float(row) / field.per_cell
+    return wp.vec3(x, y, field.heights[row, column])
+
+
+@wp.func
+def _surface(field: _Field, u: float, v: float) -> float:
     """Height [m] at column u, row v: triangles, as ``terrain.HeightMap``."""
-    rows, columns = heights.shape[0], heights.shape[1]
-    column = wp.clamp(int(wp.floor(u)), 0, columns - 2)
-    row = wp.clamp(int(wp.floor(v)), 0, rows - 2)
+    column = wp.clamp(int(wp.floor(u)), 0, field.heights.shape[1] - 2)
+    row = wp.clamp(int(wp.floor(v)), 0, field.heights.shape[0] - 2)
     across, along = wp.clamp(u - float(column), 0.0, 1.0), wp.clamp(v - float(row), 0.0, 1.0)
-    low, high = heights[row, column], heights[row + 1, column + 1]
-    side = wp.where(across >= along, heights[row, column + 1], heights[row + 1, column])
+    low, high = field.heights[row, column], field.heights[row + 1, column + 1]
+    side = wp.where(across >= along, field.heights[row, column + 1], field.heights[row + 1, column])
     return low + (side - low) * wp.max(across, along) + (high - side) * wp.min(across, along)
 
 
@@ -141,70 +201,27 @@ def _over_triangle(p: wp.vec3, n: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -
     )
 
 
-@wp.kernel
-def _touch(
-    heights: wp.array2d[float],
-    corner: wp.vec2,
-    per_cell: float,
-    ground: int,
-    probe_geom: wp.array[int],
-    probe_place: wp.array[wp.vec3],
-    probe_radius: wp.array[float],
-    geom_xpos: wp.array2d[wp.vec3],
-    geom_xmat: wp.array2d[wp.mat33],
-    naconmax: int,
-    geom_condim: wp.array[int],
-    geom_priority: wp.array[int],
-    geom_solmix: wp.array2d[float],
-    geom_solref: wp.array2d[wp.vec2],
-    geom_solimp: wp.array2d[vec5],
-    geom_friction: wp.array2d[wp.vec3],
-    geom_adhesion: wp.array2d[float],
-    geom_margin: wp.array2d[float],
-    geom_gap: wp.array2d[float],
-    pair_dim: wp.array[int],
-    pair_solref: wp.array2d[wp.vec2],
-    pair_solreffriction: wp.array2d[wp.vec2],
-    pair_solimp: wp.array2d[vec5],
-    pair_adhesion: wp.array2d[float],
-    pair_friction: wp.array2d[vec5],
-    contact_dist: wp.array[float],
-    contact_pos: wp.array[wp.vec3],
-    contact_frame: wp.array[wp.mat33],
-    contact_includemargin: wp.array[float],
-    contact_friction: wp.array[vec5],
-    contact_solref: wp.array[wp.vec2],
-    contact_solreffriction: wp.array[wp.vec2],
-    contact_solimp: wp.array[vec5],
-    contact_dim: wp.array[int],
-    contact_geom: wp.array[wp.vec2i],
-    contact_efc_address: wp.array2d[int],
-    contact_worldid: wp.array[int],
-    contact_type: wp.array[int],
-    contact_geomcollisionid: wp.array[int],
-    contact_adhesion: wp.array[float],
-    nacon: wp.array[int],
-):
-    world, probe = wp.tid()
-    geom, radius = probe_geom[probe], probe_radius[probe]
-    centre = geom_xpos[world, geom] + geom_xmat[world, geom] @ probe_place[probe]
-    margins, gaps = world % geom_margin.shape[0], world % geom_gap.shape[0]
-    margin = geom_margin[margins, ground] + geom_margin[margins, geom]
-    gap = geom_gap[gaps, ground] + geom_gap[gaps, geom]
-    u, v = (centre[0] - corner[0]) * per_cell, (centre[1] - corner[1]) * per_cell
-    above = centre[2] - _surface(heights, u, v)  # [m] straight up from the ground; negative: under it
-    touching = radius + margin + gap
-    reach = wp.clamp(-above, touching, wp.max(touching, _DEEPEST)) * per_cell
-    last_row, last_column = heights.shape[0] - 2, heights.shape[1] - 2
-    row_0, row_1 = wp.clamp(int(wp.floor(v - reach)), 0, last_row), wp.clamp(int(wp.floor(v + reach)), 0, last_row)
-    column_0, column_1 = wp.clamp(int(wp.floor(u - reach)), 0, last_column), wp.clamp(int(wp.floor(u + reach)), 0, last_column)
+@wp.func
+def _around(field: _Field, u: float, v: float, reach: float) -> wp.vec4i:
+    """Cells within ``reach`` [cells] of column u, row v: first and last row, first and last column."""
+    last_row, last_column = field.heights.shape[0] - 2, field.heights.shape[1] - 2
+    return wp.vec4i(
+        wp.clamp(int(wp.floor(v - reach)), 0, last_row),
+        wp.clamp(int(wp.floor(v + reach)), 0, last_row),
+        wp.clamp(int(wp.floor(u - reach)), 0, last_column),
+        wp.clamp(int(wp.floor(u + reach)), 0, last_column),
+    )
 
+
+@wp.func
+def _nearest(field: _Field, cells: wp.vec4i, centre: wp.vec3, lowest: float) -> tuple[wp.vec3, float, wp.vec3]:
+    """The surface's nearest point, its distance [m] and its face's normal; cells that lie below ``lowest`` are left out."""
     nearest, distance, up = wp.vec3(0.0, 0.0, 0.0), float(1.0e9), wp.vec3(0.0, 0.0, 1.0)
-    for row in range(row_0, row_1 + 1):
-        for column in range(column_0, column_1 + 1):
-            a, b = _vertex(heights, corner, per_cell, row, column), _vertex(heights, corner, per_cell, row, column + 1)
-            c, d = _vertex(heights, corner, per_cell, row + 1, column), _vertex(heights, corner, per_cell, row + 1, column + 1)
-            if centre[2] - touching > wp.max(wp.max(a[2], b[2]), wp.max(c[2], d[2])):
+    for row in range(cells[0], cells[1] + 1):
+        for column in range(cells[2], cells[3] + 1):
+            a, b = _vertex(field, row, column), _vertex(field, row, column + 1)
+            c, d = _vertex(field, row + 1, column), _vertex(field, row + 1, column + 1)
+            if lowest > wp.max(wp.max(a[2], b[2]), wp.max(c[2], d[2])):
                 continue
             for half in range(2):
                 middle, end = wp.where(half == 0, b, d), wp.where(half == 0, d, c)
@@ -212,83 +229,102 @@ def _touch(
                 away = wp.length(centre - point)
                 if away < distance:
                     nearest, distance, up = point, away, wp.normalize(wp.cross(middle - a, end - a))
-    if distance > 1.0e8:
-        return
-    side = wp.where(above < 0.0, -1.0, 1.0)
-    normal = wp.where(distance > 1.0e-6, side * (centre - nearest) / wp.max(distance, 1.0e-9), up)
-    if wp.dot(normal, up) > 0.9999:
-        normal = up  # over a face: its own normal, which far from the origin is more exact than a difference of places
-    depth = side * distance - radius  # negative where it penetrates
-    if depth >= margin + gap:
-        return
-    geoms = wp.vec2i(ground, geom)
+    return nearest, distance, up
+
+
+@wp.func
+def _other_face(field: _Field, cells: wp.vec4i, centre: wp.vec3, normal: wp.vec3) -> tuple[float, wp.vec3]:
+    """Distance [m] and normal of the nearest face that turns away from ``normal`` and that the centre is right over."""
+    nearest, direction = float(1.0e9), wp.vec3(0.0, 0.0, 1.0)
+    for row in range(cells[0], cells[1] + 1):
+        for column in range(cells[2], cells[3] + 1):
+            a, b = _vertex(field, row, column), _vertex(field, row, column + 1)
+            c, d = _vertex(field, row + 1, column), _vertex(field, row + 1, column + 1)
+            for half in range(2):
+                middle, end = wp.where(half == 0, b, d), wp.where(half == 0, d, c)
+                face = wp.normalize(wp.cross(middle - a, end - a))
+                away = wp.dot(centre - a, face)
+                if wp.dot(face, normal) < _CORNER_COS and away >= 0.0 and away < nearest:
+                    if _over_triangle(centre, face, a, middle, end):
+                        nearest, direction = away, face
+    return nearest, direction
+
+
+@wp.func
+def _write(
+    world: int,
+    which: int,
+    geoms: wp.vec2i,
+    depth: float,
+    place: wp.vec3,
+    normal: wp.vec3,
+    m: _Material,
+    naconmax: int,
+    out: _Contacts,
+    nacon: wp.array[int],
+):
+    """One contact, with the parameters that MuJoCo's rules of mixing give it."""
+    # fmt: off
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
-        geom_condim,
-        geom_priority,
-        geom_solmix,
-        geom_solref,
-        geom_solimp,
-        geom_friction,
-        geom_adhesion,
-        pair_dim,
-        pair_solref,
-        pair_solreffriction,
-        pair_solimp,
-        pair_adhesion,
-        pair_friction,
-        geoms,
-        -1,
-        world,
+        m.geom_condim, m.geom_priority, m.geom_solmix, m.geom_solref, m.geom_solimp, m.geom_friction, m.geom_adhesion,
+        m.pair_dim, m.pair_solref, m.pair_solreffriction, m.pair_solimp, m.pair_adhesion, m.pair_friction,
+        geoms, -1, world,
     )
-    # the second contact: the nearest face that turns away from the first and that the probe is right over
-    second, second_normal = float(1.0e9), wp.vec3(0.0, 0.0, 1.0)
-    if above >= 0.0:  # from under the ground there is one way out, the nearest
-        for row in range(row_0, row_1 + 1):
-            for column in range(column_0, column_1 + 1):
-                a, b = _vertex(heights, corner, per_cell, row, column), _vertex(heights, corner, per_cell, row, column + 1)
-                c, d = _vertex(heights, corner, per_cell, row + 1, column), _vertex(heights, corner, per_cell, row + 1, column + 1)
-                for half in range(2):
-                    middle, end = wp.where(half == 0, b, d), wp.where(half == 0, d, c)
-                    face = wp.normalize(wp.cross(middle - a, end - a))
-                    away = wp.dot(centre - a, face)
-                    if wp.dot(face, normal) < _CORNER_COS and away >= 0.0 and away < second:
-                        if _over_triangle(centre, face, a, middle, end):
-                            second, second_normal = away, face
-    for contact in range(2):
-        if contact == 1:
-            normal, depth = second_normal, second - radius
-        if depth < margin + gap:
-            write_contact(
-                naconmax,
-                contact,
-                depth,
-                centre - normal * (radius + 0.5 * depth),
-                make_frame(normal),
-                margin,
-                gap,
-                condim,
-                friction,
-                solref,
-                solreffriction,
-                solimp,
-                adhesion,
-                geoms,
-                wp.vec2i(-1, -1),
-                world,
-                contact_dist,
-                contact_pos,
-                contact_frame,
-                contact_includemargin,
-                contact_friction,
-                contact_solref,
-                contact_solreffriction,
-                contact_solimp,
-                contact_dim,
-                contact_geom,
-                contact_efc_address,
-                contact_worldid,
-                contact_type,
-                contact_geomcollisionid,
-                contact_adhesion,
-                nacon,
-            )
+    write_contact(
+        naconmax, which, depth, place, make_frame(normal), _margin(m, geoms, world), _gap(m, geoms, world),
+        condim, friction, solref, solreffriction, solimp, adhesion, geoms, wp.vec2i(-1, -1), world,
+        out.dist, out.pos, out.frame, out.includemargin, out.friction, out.solref, out.solreffriction, out.solimp, out.dim,
+        out.geom, out.efc_address, out.worldid, out.type, out.geomcollisionid, out.adhesion, nacon,
+    )
+    # fmt: on
+
+
+@wp.func
+def _margin(m: _Material, geoms: wp.vec2i, world: int) -> float:
+    row = world % m.geom_margin.shape[0]
+    return m.geom_margin[row, geoms[0]] + m.geom_margin[row, geoms[1]]
+
+
+@wp.func
+def _gap(m: _Material, geoms: wp.vec2i, world: int) -> float:
+    row = world % m.geom_gap.shape[0]
+    return m.geom_gap[row, geoms[0]] + m.geom_gap[row, geoms[1]]
+
+
+@wp.kernel
+def _touch(
+    field: _Field,
+    probes: _Probes,
+    ground: int,
+    geom_xpos: wp.array2d[wp.vec3],
+    geom_xmat: wp.array2d[wp.mat33],
+    material: _Material,
+    naconmax: int,
+    contacts: _Contacts,
+    nacon: wp.array[int],
+):
+    world, probe = wp.tid()
+    geom, radius = probes.geom[probe], probes.radius[probe]
+    geoms = wp.vec2i(ground, geom)
+    centre = geom_xpos[world, geom] + geom_xmat[world, geom] @ probes.place[probe]
+    farthest = _margin(material, geoms, world) + _gap(material, geoms, world)  # [m] from the surface, that is still a contact
+    u, v = (centre[0] - field.corner[0]) * field.per_cell, (centre[1] - field.corner[1]) * field.per_cell
+    above = centre[2] - _surface(field, u, v)  # [m] straight up from the ground; negative: under it
+    touching = radius + farthest
+    cells = _around(field, u, v, wp.clamp(-above, touching, wp.max(touching, _DEEPEST)) * field.per_cell)
+    nearest, distance, up = _nearest(field, cells, centre, centre[2] - touching)
+    side = wp.where(above < 0.0, -1.0, 1.0)
+    depth = side * distance - radius  # [m] negative where it penetrates
+    if distance > 1.0e8 or depth >= farthest:
+        return
+    normal = up
+    if distance > 1.0e-6:
+        away = side * (centre - nearest) / distance
+        if wp.dot(away, up) < 0.9999:  # else it is over a face, whose own normal is more exact than a difference of places
+            normal = away
+    _write(world, 0, geoms, depth, centre - normal * (radius + 0.5 * depth), normal, material, naconmax, contacts, nacon)
+    if above >= 0.0:  # from under the ground there is one way out
+        other, face = _other_face(field, cells, centre, normal)
+        depth = other - radius
+        if depth < farthest:
+            _write(world, 1, geoms, depth, centre - face * (radius + 0.5 * depth), face, material, naconmax, contacts, nacon)
