@@ -600,7 +600,7 @@ class LeggedRobot(BaseTask):
         return {name: value.clone() for name, value in state.items()}
 
     def load_training_state(self, state: dict[str, Tensor]) -> None:
-        """Go on from ``training_state``, and begin new episodes; for another number of worlds, what the nearest ones had."""
+        """Go on from ``training_state``; on terrain with new episodes. For another number of worlds: what the nearest ones had."""
 
         def spread(values: Tensor) -> Tensor:
             values = values.to(self.device)
@@ -611,10 +611,9 @@ class LeggedRobot(BaseTask):
         if "command_curriculum" in state and self.cfg.commands.curriculum:
             self.command_curriculum.copy_(state["command_curriculum"])
             torch.mul(self.full_command_ranges, self.command_curriculum[0], out=self.command_ranges)
-        self._episode.zero_()  # what was under way counts for nothing
         if "terrain_levels" in state and self.tiles:
+            self._episode.zero_()  # what was under way counts for nothing
             self.tiles.put(spread(state["terrain_levels"]).clamp(max=self.tiles.num_levels - 1))
-        if state:
             self._reset_all()
 
     # ---- robot and buffers: born here, never rebound --------------------------------------------------------------------------
