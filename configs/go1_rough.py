@@ -12,6 +12,16 @@ class Go1RoughCfg(Go1FlatDrCfg):
     class terrain(Go1FlatDrCfg.terrain):
         mesh_type = "heightfield"
         height_scan = ["privileged_state"]  # the critic sees the ground, the robot does not
+        terrain_proportions = {  # [ours: stairs up are learned last]
+            "flat": 0.05,
+            "smooth_slope": 0.1,
+            "rough_slope": 0.1,
+            "stairs_up": 0.35,
+            "stairs_down": 0.15,
+            "obstacles": 0.15,
+            "waves": 0.05,
+            "low_random": 0.05,
+        }
 
     class termination(Go1FlatDrCfg.termination):
         min_base_height = 0.12  # [m] [ours: the feet alone touch the ground, so that a trunk would sink into a step unpunished]
@@ -21,6 +31,7 @@ class Go1RoughCfg(Go1FlatDrCfg):
 
     class rewards(Go1FlatDrCfg.rewards):
         tracking_sigma = 0.25  # [P]
+        pose_weights = {"hip": 1.0, "thigh": 0.5, "calf": 0.1}  # [P 1, 1, 0.1] [ours: a high step lifts the thigh]
         swing_height = 0.15  # [m] [ours: over a step of 12 cm; P 0.1]
 
         class scales(Go1FlatDrCfg.rewards.scales):
@@ -35,7 +46,7 @@ class Go1RoughCfg(Go1FlatDrCfg):
 class Go1RoughCfgPPO(Go1FlatDrCfgPPO):
     class runner(Go1FlatDrCfgPPO.runner):
         num_steps_per_env = 24  # [P, L]
-        max_iterations = 1500  # [L] 295 M steps
+        max_iterations = 2000  # 393 M steps [L 1500 of 98 k]
 
     class algorithm(Go1FlatDrCfgPPO.algorithm):
         gamma = 0.99  # [L, P]

@@ -350,7 +350,8 @@ class LeggedRobot(BaseTask):
         """With the curriculum: halfway from the level so far to the share of an episode that was survived."""
         if self.cfg.perturbation.curriculum:
             survived = torch.where(self.time_out_buf, 1.0, self.episode_steps[:, 0] / self.max_episode_length)
-            assign(self.kick_level, mask, 0.5 * (self.kick_level + survived))
+            began = self.episode_steps[:, 0] > 0.0  # a reset before the first step says nothing
+            assign(self.kick_level, mask & began, 0.5 * (self.kick_level + survived))
 
     # ---- observations: this table is the only place that states the layout ------------------------------------------------
 
