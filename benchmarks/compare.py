@@ -1,6 +1,7 @@
-"""Training throughput beside mjlab and MuJoCo Playground: whole iterations, rollout and update, of Go1 on flat ground.
+"""Training throughput beside mjlab and MuJoCo Playground: whole iterations, rollout and update, of Go1 on flat or rough ground.
 
     python benchmarks/compare.py --num_envs 4096 16384
+    python benchmarks/compare.py --num_envs 4096 --ground rough
     python benchmarks/compare.py --python-mjlab ~/mjlab/bin/python --python-playground ~/playground/bin/python
 
 The two are no dependencies of this project: one that is not installed is listed as that. Their pins of mujoco clash with
@@ -49,17 +50,22 @@ TORCH_STACK = ("mujoco", "mujoco-warp", "warp-lang", "torch", "rsl-rl-lib")
 class Framework(NamedTuple):
     package: str  # what is imported
     install: str
-    task: str
+    tasks: dict[str, str]  # by ground
     versions: tuple[str, ...]  # distributions whose versions are reported
 
 
 FRAMEWORKS = {
-    "legged_mw": Framework("legged_mw", "pip install -e .", "go1_flat", TORCH_STACK),
-    "mjlab": Framework("mjlab", "pip install mjlab", "Mjlab-Velocity-Flat-Unitree-Go1", ("mjlab", *TORCH_STACK)),
+    "legged_mw": Framework("legged_mw", "pip install -e .", {"flat": "go1_flat", "rough": "go1_rough"}, TORCH_STACK),
+    "mjlab": Framework(
+        "mjlab",
+        "pip install mjlab",
+        {"flat": "Mjlab-Velocity-Flat-Unitree-Go1", "rough": "Mjlab-Velocity-Rough-Unitree-Go1"},
+        ("mjlab", *TORCH_STACK),
+    ),
     "playground": Framework(
         "mujoco_playground",
         'pip install playground "jax[cuda12]<0.10" "mujoco-mjx[warp]"',  # brax 0.14.2 calls what jax 0.10 dropped
-        "Go1JoystickFlatTerrain",
+        {"flat": "Go1JoystickFlatTerrain", "rough": "Go1JoystickRoughTerrain"},
         ("playground", "mujoco", "mujoco-mjx", "warp-lang", "jax", "brax"),
     ),
 }
@@ -76,6 +82,7 @@ class Order(NamedTuple):
     iterations: int  # a round
     device: str  # cpu or cuda:0: a child sees one GPU
     impl: str  # Playground's physics: MJX in jax or in warp
+    ground: str = "flat"
 
 
 class Measured(NamedTuple):
@@ -119,7 +126,7 @@ def measure_legged_mw(order: Order) -> Measured:
 
     if order.device == "cpu":
         torch.set_num_threads(1)  # as train.py does
-    task = load_task(FRAMEWORKS["legged_mw"].task)
+    task = load_task(FRAMEWORKS["legged_mw"].tasks[order.ground])
     task.cfg.env.num_envs = order.num_envs
     seed_everything(task.train.seed)
     env = task.env_class(task.cfg, order.device)
@@ -141,7 +148,7 @@ def measure_mjlab(order: Order) -> Measured:
     from mjlab.tasks.registry import load_env_cfg, load_rl_cfg, load_runner_cls
     from mjlab.utils.torch import configure_torch_backends
 
-    task = FRAMEWORKS["mjlab"].task
+    task = FRAMEWORKS["mjlab"].tasks[order.ground]
     env_cfg, learner = load_env_cfg(task), load_rl_cfg(task)
     env_cfg.scene.num_envs = order.num_envs
     env_cfg.seed = learner.seed
@@ -199,7 +206,7 @@ def measure_playground(order: Order) -> Measured:
     from mujoco_playground import registry, wrapper
     from mujoco_playground.config import locomotion_params
 
-    task, impl = FRAMEWORKS["playground"].task, order.impl
+    task, impl = FRAMEWORKS["playground"].tasks[order.ground], order.impl
     machine = jax.devices()[0].device_kind if order.device != "cpu" else cpu_name()  # fails here without a GPU build of jax
     notes = [f"MJX in {impl} (--playground-impl; its task says warp, its training script jax)"]
     cfg = registry.get_default_config(task)
@@ -341,10 +348,10 @@ def results(rows: list[Row]) -> str:
     return "\n".join(lines)
 
 
-def conditions(rows: list[Row]) -> str:
+def conditions(rows: list[Row], ground: str) -> str:
     """What was measured under which conditions, a column a framework; then versions and what else differs."""
     last = {row.framework: row for row in rows if row.measured and row.versions}
-    facts = {name: {"task": FRAMEWORKS[name].task, **row.measured.facts} for name, row in last.items() if row.measured}
+    facts = {name: {"task": FRAMEWORKS[name].tasks[ground], **row.measured.facts} for name, row in last.items() if row.measured}
     keys = dict.fromkeys(key for column in facts.values() for key in column)
     lines = [f"{'':<20}" + "".join(f"{name:<34}" for name in facts)]
     lines += [f"{key:<20}" + "".join(f"{column.get(key, ''):<34}" for column in facts.values()) for key in keys]
@@ -361,6 +368,7 @@ def parse() -> argparse.Namespace:
     parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
     parser.add_argument("--num_envs", type=positive, nargs="+", metavar="N", help="worlds (default: 4096 16384; on a CPU 16)")
     parser.add_argument("--device", metavar="D", help="cuda:0, cpu, ... (default: the GPU if there is one)")
+    parser.add_argument("--ground", choices=("flat", "rough"), default="flat", help="which of each framework's tasks (default: flat)")
     parser.add_argument("--iterations", type=positive, metavar="N", help=f"in each of {ROUNDS} rounds (default: 10; on a CPU 1)")
     parser.add_argument("--only", nargs="+", choices=tuple(FRAMEWORKS), default=list(FRAMEWORKS), help="frameworks to measure")
     for peer in ("mjlab", "playground"):
@@ -384,13 +392,13 @@ def main() -> None:
     rows = []
     for num_envs in sizes:
         for name in (name for name in FRAMEWORKS if name in args.only):
-            order = Order(name, num_envs, iterations, "cpu" if cpu else "cuda:0", impl)
+            order = Order(name, num_envs, iterations, "cpu" if cpu else "cuda:0", impl, args.ground)
             rows.append(ask(pythons[name], order, environment, args.timeout, args.verbose))
     machines = ", ".join(dict.fromkeys(row.measured.machine for row in rows if row.measured)) or device
-    print(f"Go1 on flat ground, training on {machines}: median of {ROUNDS} rounds of {iterations} iterations after a warm-up\n")
+    print(f"Go1 on {args.ground} ground, training on {machines}: median of {ROUNDS} rounds of {iterations} iterations after a warm-up\n")
     print(results(rows), end="\n\n")
     if any(row.measured for row in rows):
-        print(conditions(rows))
+        print(conditions(rows, args.ground))
     sys.exit(any(row.framework == "legged_mw" and row.measured is None for row in rows))
 
 

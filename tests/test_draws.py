@@ -295,8 +295,8 @@ def test_kicks_grow_with_what_a_world_survives() -> None:
     env.reset_envs(torch.tensor([True, True, False]))
     assert env.kick_level.tolist() == [0.5, 0.125, 0.0]
     assert env.kick[:, 3].tolist() == [1.0, 0.25, 0.0]  # the pause of the third goes on
-    env.reset_envs(torch.tensor([True, True, True]))  # no step in between: nothing was survived but by the clock
-    assert env.kick_level.tolist() == [0.75, 0.0625, 0.375]
+    env.reset_envs(torch.tensor([True, True, True]))  # no step in between: two of them had no episode that says anything
+    assert env.kick_level.tolist() == [0.5, 0.125, 0.375]
 
 
 def test_kicks_are_at_full_strength_without_the_curriculum() -> None:

@@ -17,6 +17,7 @@ from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
 from legged_mw.eval.training import TrainingExam
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
+from legged_mw.sim.terrain import HeightMap
 from legged_mw.utils.task import load_task
 
 pytestmark = pytest.mark.gpu
@@ -60,7 +61,21 @@ RANDOMIZED: dict[str, object] = {
 }
 
 
-@pytest.mark.parametrize("randomized", [{}, RANDOMIZED], ids=["nominal", "randomized"])
+ROUGH: dict[str, object] = {
+    **RANDOMIZED,
+    "terrain__mesh_type": "heightfield",
+    "terrain__num_rows": 3,
+    "terrain__num_cols": 8,
+    "terrain__max_init_terrain_level": 2,
+    "terrain__height_scan": ["state", "privileged_state"],
+    "terrain__border_size": 0.0,
+    "termination__min_base_height": 0.1,
+    "commands__curriculum": True,
+    "sim__njmax": 56,
+}
+
+
+@pytest.mark.parametrize("randomized", [{}, RANDOMIZED, ROUGH], ids=["nominal", "randomized", "rough"])
 def test_replay_equals_eager_over_100_steps(randomized: dict[str, object]) -> None:
     """Bit for bit, with noise, kicks, falls, time outs and resets: the same random numbers are drawn in both."""
     actions = torch.randn(100, 64, 12, generator=torch.Generator().manual_seed(0)).to(DEVICE)
@@ -71,6 +86,56 @@ def test_replay_equals_eager_over_100_steps(randomized: dict[str, object]) -> No
     assert any(done.any() for done in expected[3::5])
     for i, (a, b) in enumerate(zip(expected, got, strict=True)):
         assert torch.equal(a, b), f"step {i // 5}, output {i % 5}: largest difference {(a.float() - b.float()).abs().max():g}"
+
+
+def test_the_ground_on_a_gpu_is_the_ground_on_a_cpu() -> None:
+    """Heights by one kernel and by tensors; contacts of robots that lie across steps and blocks, by their depth."""
+    on_gpu, on_cpu = (make_rough(device) for device in (DEVICE, "cpu"))
+    assert on_gpu.terrain and on_gpu._height_at
+    points = (torch.rand(1000, 2, generator=torch.Generator().manual_seed(0)) - 0.5) * 80.0
+    torch.testing.assert_close(on_gpu._height_at(points.to(DEVICE)).cpu(), HeightMap(on_gpu.terrain, "cpu")(points), atol=2e-5, rtol=0.0)
+    depths = []
+    for env in (on_gpu, on_cpu):
+        env.sim.qpos.copy_(on_cpu.sim.qpos.to(env.device))
+        env.sim.qpos[:, 2] -= 0.03
+        env.sim.qvel.zero_()
+        env.sim.step(1)
+        contact, count = env.sim._data.contact, int(env.sim._data.nacon.numpy()[0])  # type: ignore[attr-defined]
+        found = zip(contact.worldid.numpy()[:count], contact.geom.numpy()[:count, 1], contact.dist.numpy()[:count], strict=True)
+        depths.append(sorted((int(world), int(geom), round(float(dist), 4)) for world, geom, dist in found))
+    assert len(depths[0]) == len(depths[1]) > 100
+    assert max(abs(a[2] - b[2]) for a, b in zip(*depths, strict=True) if a[:2] == b[:2]) < 3e-4
+
+
+def make_rough(device: str) -> LeggedRobot:
+    task = load_task("go1_rough")
+    for path, value in {
+        "env.num_envs": 64,
+        "sim.engine": "mujoco_warp",
+        "domain_rand.enable": False,
+        "init_state.pos_xy_range": 3.0,
+    }.items():
+        task.set(path, value)
+    torch.manual_seed(3)
+    return task.env_class(task.cfg, device)
+
+
+def test_rough_ground_trains_without_overflow_and_resumes_on_its_levels(tmp_path: Path) -> None:
+    task = load_task("go1_rough")
+    for path, value in {"env.num_envs": 256, "runner.num_steps_per_env": 8, "terrain.num_cols": 8}.items():
+        task.set(path, value)
+    env = task.env_class(task.cfg, DEVICE)
+    runner = make_runner(env, task.train, None, DEVICE)
+    runner.learn(6, init_at_random_ep_len=True)
+    assert float(env.sim.overflowed_worlds()) == 0.0 and env.tiles
+    levels = torch.arange(256, device=DEVICE) % 7
+    env.tiles.put(levels)
+    runner.save(str(tmp_path / "model_6.pt"))
+    other = task.env_class(task.cfg, DEVICE)
+    again = make_runner(other, task.train, None, DEVICE)
+    again.load(str(tmp_path / "model_6.pt"))
+    assert other.tiles and torch.equal(other.tiles.levels, levels)
+    again.learn(1, init_at_random_ep_len=False)
 
 
 def test_worlds_are_drawn_anew_under_a_recorded_step() -> None:

@@ -7,10 +7,11 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+import torch
 
-from legged_mw.sim.ground_contact import probes
+from legged_mw.sim.ground_contact import HeightLookup, probes
 from legged_mw.sim.model import GROUND, ModelError
-from legged_mw.sim.terrain import Terrain, make_terrain
+from legged_mw.sim.terrain import HeightMap, Terrain, make_terrain
 from legged_mw.sim.warp_engine import WarpSimulation
 
 RADIUS = 0.023  # [m] of a Go1's foot
@@ -174,3 +175,12 @@ def test_too_little_room_is_seen() -> None:
     sim.qpos[:, 2] = 0.099
     sim.step()
     assert "raise nconmax (now 1)" in sim.overflow_report()
+
+
+@pytest.mark.parametrize("kind", ["rough_slope", "stairs_up"])
+def test_both_lookups_find_the_same_heights(kind: str) -> None:
+    terrain = ground(kind)
+    points = torch.rand(7, 100, 2) * 14.0 - 7.0  # some of them outside
+    torch.testing.assert_close(HeightLookup(terrain, "cpu")(points), HeightMap(terrain, "cpu")(points), atol=2e-5, rtol=0.0)
+    nothing = torch.tensor([[float("nan"), 0.0], [float("inf"), -float("inf")]])
+    assert HeightLookup(terrain, "cpu")(nothing).isfinite().all() and HeightMap(terrain, "cpu")(nothing).isfinite().all()

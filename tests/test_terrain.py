@@ -99,8 +99,8 @@ def test_a_lookup_can_be_recorded_and_holds_outside() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"proportions": {"stair_up": 1.0}}, "no kind of terrain 'stair_up' in terrain.proportions; did you mean 'stairs_up'"),
-        ({"tile": 8.05}, "terrain.tile_size 8.05 must be a whole number of cells of 0.1 m"),
+        ({"proportions": {"stair_up": 1.0}}, "no kind of terrain 'stair_up' in terrain.terrain_proportions; did you mean 'stairs_up'"),
+        ({"tile": 8.05}, "terrain.tile_size 8.05 must be a whole number of cells \\(terrain.horizontal_scale\\) of 0.1 m"),
         ({"columns": 3}, "3 columns cannot hold 10 kinds"),
     ],
 )

@@ -28,7 +28,7 @@ from legged_mw.envs.mirror import Mirror, make_mirror
 from legged_mw.envs.terrain import Tiles, build_terrain
 from legged_mw.sim.model import Ground, ModelError, Physics, RobotModel, build_model, per_joint, unknown
 from legged_mw.sim.simulation import make_simulation
-from legged_mw.sim.terrain import HeightMap
+from legged_mw.sim.terrain import make_height_map
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign, columns, may_hold, quat_rotate, quat_rotate_inverse
 
@@ -690,7 +690,7 @@ class LeggedRobot(BaseTask):
         """Tiles and heights, where there is terrain, and the height scan's points (P,) each [m]."""
         cfg, n = self.cfg.terrain, self.num_envs
         self.tiles = Tiles(self.cfg, self.terrain, n, self.device) if self.terrain else None
-        self._height_at = HeightMap(self.terrain, self.device) if self.terrain else None
+        self._height_at = make_height_map(self.terrain, self.device) if self.terrain else None
         grid = torch.cartesian_prod(torch.tensor(cfg.measured_points_x), torch.tensor(cfg.measured_points_y)).view(-1, 2)
         self.scan_points = grid.to(self.device, torch.float).unbind(dim=1)
         self.height_scan = torch.zeros(n, len(grid) if cfg.height_scan else 0, device=self.device)  # (N, P) [m]

@@ -1,4 +1,4 @@
-"""Contacts between the robot and a height field for mujoco-warp: one kernel, called where it would filter its own contacts.
+"""A height field in warp: contacts with it, in one kernel called where mujoco-warp would filter its own, and its heights.
 
 mujoco-warp 4.0.0 treats a height field as a heap of prisms: a sphere gets a contact from every triangle near it, tilted
 ones at the edges between triangles of one plane, and now and then a deep one where there is none (docs/terrain.md has the
@@ -18,10 +18,12 @@ from typing import Any
 import mujoco
 import mujoco_warp as mjw
 import numpy as np
+import torch
 import warp as wp
 from mujoco_warp._src.collision_core import contact_material_params, write_contact
 from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
+from torch import Tensor
 
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import Terrain
@@ -63,12 +65,34 @@ def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, l
     return geoms, np.array(places).reshape(-1, 3), radii
 
 
+def _field(terrain: Terrain) -> Any:
+    field = _Field()
+    field.heights, field.corner, field.per_cell = wp.array(terrain.heights, dtype=float), wp.vec2(*terrain.corner), 1.0 / terrain.cell
+    return field
+
+
+class HeightLookup:
+    """``terrain.HeightMap`` as one kernel: the contacts' own ground. For a GPU, where many small operations cost more than they do."""
+
+    def __init__(self, terrain: Terrain, device: str) -> None:
+        self._device = wp.get_device(device)
+        with wp.ScopedDevice(self._device):
+            self._field = _field(terrain)
+
+    def __call__(self, points: Tensor) -> Tensor:
+        """Height [m] of the ground under ``points`` (..., 2) [m, world]; outside of the field, of its rim."""
+        heights = torch.empty(points.shape[:-1], device=points.device)
+        places = wp.from_torch(points.reshape(-1, 2), dtype=wp.vec2)
+        wp.launch(
+            _look_up, dim=heights.numel(), inputs=[self._field, places], outputs=[wp.from_torch(heights.view(-1))], device=self._device
+        )
+        return heights
+
+
 def touch_ground(model: mujoco.MjModel, ground: int, terrain: Terrain) -> Callable[[mjw.Model, mjw.Data], None]:
     """What ``Model.callback.contactfilter`` is to be, on the current device. The geom ``ground`` must not collide by itself."""
     geoms, places, radii = probes(model, ground)
-    field = _Field()
-    field.heights, field.corner, field.per_cell = wp.array(terrain.heights, dtype=float), wp.vec2(*terrain.corner), 1.0 / terrain.cell
-    spheres = _Probes()
+    field, spheres = _field(terrain), _Probes()
     spheres.geom, spheres.place, spheres.radius = (
         wp.array(values, dtype=kind) for values, kind in ((geoms, int), (places, wp.vec3), (radii, float))
     )
@@ -156,13 +180,20 @@ def _vertex(field: _Field, row: int, column: int) -> wp.vec3:
 
 @wp.func
 def _surface(field: _Field, u: float, v: float) -> float:
-    """Height [m] at column u, row v: triangles, as ``terrain.HeightMap``."""
+    """Height [m] at column u, row v: triangles, as ``terrain.HeightMap``. What is not finite is somewhere."""
     column = wp.clamp(int(wp.floor(u)), 0, field.heights.shape[1] - 2)
     row = wp.clamp(int(wp.floor(v)), 0, field.heights.shape[0] - 2)
     across, along = wp.clamp(u - float(column), 0.0, 1.0), wp.clamp(v - float(row), 0.0, 1.0)
     low, high = field.heights[row, column], field.heights[row + 1, column + 1]
     side = wp.where(across >= along, field.heights[row, column + 1], field.heights[row + 1, column])
     return low + (side - low) * wp.max(across, along) + (high - side) * wp.min(across, along)
+
+
+@wp.kernel
+def _look_up(field: _Field, points: wp.array[wp.vec2], heights: wp.array[float]):
+    i = wp.tid()
+    place = (points[i] - field.corner) * field.per_cell
+    heights[i] = _surface(field, place[0], place[1])
 
 
 @wp.func

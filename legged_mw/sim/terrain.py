@@ -263,3 +263,12 @@ class HeightMap:
         low, high = self._heights[here], self._heights[here + self._columns + 1]
         corner = torch.where(across >= along, self._heights[here + 1], self._heights[here + self._columns])
         return low + (corner - low) * torch.maximum(across, along) + (high - corner) * torch.minimum(across, along)
+
+
+def make_height_map(terrain: Terrain, device: str) -> Callable[[Tensor], Tensor]:
+    """The lookup that is fastest on ``device``; both give the same heights."""
+    if device == "cpu":
+        return HeightMap(terrain, device)
+    from legged_mw.sim.ground_contact import HeightLookup  # importing warp takes a second: only where it pays
+
+    return HeightLookup(terrain, device)
