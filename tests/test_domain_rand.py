@@ -161,6 +161,22 @@ def test_heavier_falls_further_into_its_servos_and_weaker_too(engine: str) -> No
     assert heights[0] > heights[1] + 0.004 and heights[0] > heights[2] + 0.004
 
 
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_slide_on_lower_friction_goes_further(engine: str) -> None:
+    """The feet of robots that stand and are pushed, by Coulomb's law the further the less friction there is."""
+    env = make(6, engine, friction=[0.2, 1.0])
+    env.domain_rand.values["friction"].copy_(torch.tensor([0.2, 0.25, 0.3, 0.4, 0.6, 1.0])[:, None])
+    env.domain_rand._write_friction(torch.ones(6, dtype=torch.bool))
+    for _ in range(25):
+        env.step(torch.zeros(6, 12))
+    before = env.sim.site_xpos[:, env.foot_sites, :2].mean(dim=1)
+    env.sim.qvel[:, 0] = 1.0
+    for _ in range(25):
+        env.step(torch.zeros(6, 12))
+    slid = (env.sim.site_xpos[:, env.foot_sites, :2].mean(dim=1) - before).norm(dim=1)
+    assert (slid[:-1] > slid[1:]).all() and slid[0] > 1.5 * slid[-1], slid
+
+
 def test_delayed_actions_reach_the_servos_that_much_later() -> None:
     env = make(6, action_delay=[0, 2])
     delay = env.domain_rand.values["action_delay"][:, 0].long()
