@@ -36,8 +36,8 @@ def rough(num_envs: int = 16, task: str = "go1_rough", **changes: Any) -> Legged
 
 
 def ground_under(env: LeggedRobot, places: Tensor) -> np.ndarray:
-    """Height [m] of the compiled model's ground under places (M, 2), by MuJoCo's own rays."""
-    model = env.robot.physics
+    """Height [m] of the compiled height field under places (M, 2), by MuJoCo's own rays."""
+    model = env.robot.visual
     data, hit = mujoco.MjData(model), np.zeros(1, dtype=np.int32)
     data.qpos[2] = 100.0  # the robot out of the way
     mujoco.mj_forward(model, data)
@@ -297,3 +297,52 @@ def test_a_mistake_is_named() -> None:
     with pytest.raises(ConfigError, match=r"terrain.height_scan is \['actor'\]; it must be a list of groups"):
         rough(2, terrain__height_scan=["actor"])
     assert math.isfinite(rough(2).base_height.sum())
+
+
+# ---- MuJoCo's own engine: level pieces as boxes ------------------------------------------------------------------------
+
+
+def test_level_pieces_are_boxes_and_slopes_are_not() -> None:
+    env = rough(4, terrain__terrain_proportions={"stairs_up": 1.0, "gap": 1.0, "waves": 1.0, "low_random": 1.0})
+    model, ground = env.robot.physics, env.robot.ground_geoms()
+    boxes = [i for i in range(model.ngeom)[ground] if model.geom_type[i] == mujoco.mjtGeom.mjGEOM_BOX]
+    assert 150 < len(boxes) < 200 and ground == slice(0, 1 + len(boxes))
+    tops = model.geom_pos[boxes, 2] + model.geom_size[boxes, 2]
+    middles = torch.tensor(model.geom_pos[boxes, :2], dtype=torch.float)
+    np.testing.assert_allclose(tops, ground_under(env, middles), atol=1e-4)
+    area = 4.0 * model.geom_size[boxes, 0] * model.geom_size[boxes, 1]
+    levels_of_noise = 1  # the first level of waves and of low_random is flat: a box too
+    assert area.sum() == pytest.approx(64.0 * (4 + 4 + 2 * levels_of_noise), rel=1e-4), "each tile is covered once"
+    plain = rough(4, sim__engine="mujoco_warp")
+    assert plain.robot.ground_geoms() == slice(0, 1)
+
+
+def test_feet_on_boxes_are_felt_and_their_friction_is_the_worlds_own() -> None:
+    env = rough(
+        8,
+        terrain__terrain_proportions={"stairs_down": 1.0},
+        terrain__num_cols=1,
+        domain_rand__enable=True,
+        domain_rand__friction=[0.3, 0.9],
+        domain_rand__action_delay=[],
+    )
+    for _ in range(10):
+        env.step(STAND.expand(8, -1))
+    assert env.foot_contact.float().mean() > 0.7
+    friction = env.sim.field("geom_friction")[:, env.robot.ground_geoms(), 0]
+    torch.testing.assert_close(friction, env.domain_rand.values["friction"].expand_as(friction))
+
+
+def test_a_robot_stands_alike_on_both_engines() -> None:
+    """On tops of stairs: boxes in one, our contacts in the other."""
+    heights = []
+    for engine in ENGINES:
+        env = rough(4, sim__engine=engine, terrain__terrain_proportions={"stairs_down": 1.0}, terrain__num_cols=1, sim__iterations=30)
+        env.sim.qvel.zero_()
+        env.tiles.put(torch.tensor([0, 1, 2, 3]))  # type: ignore[union-attr]
+        env.sim.qpos[:, :3] = env.tiles.origins + torch.tensor([0.0, 0.0, 0.28])  # type: ignore[union-attr]
+        for _ in range(25):
+            env.step(STAND.expand(4, -1))
+        heights.append(env.sim.qpos[:, 2].clone())
+    torch.testing.assert_close(heights[0], heights[1], atol=1e-3, rtol=0.0)
+    assert heights[0][3] > heights[0][0] + 0.9, "a pyramid of 8 steps, 19.5 cm instead of 6"

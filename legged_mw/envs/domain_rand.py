@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import torch
 from torch import Tensor
 
-from legged_mw.sim.model import GROUND, RobotModel
+from legged_mw.sim.model import RobotModel
 from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign
@@ -113,7 +113,7 @@ class DomainRand:
         self._whole = [name for name in order if kinds[name][0].whole]
         self._nominal = {field: sim.field(field)[:1].clone() for field in world_fields(cfg)}
         _check_mass(cfg, robot)
-        self._root, self._ground = robot.id("body", robot.root), robot.id("geom", GROUND)
+        self._root, self._ground = robot.id("body", robot.root), robot.ground_geoms()
         self._link_of_body = _links(robot).to(sim.device)
         writers = {name: self._writer(name, field) for name in order for field in kinds[name][0].fields[:1]}
         self._writers = list(dict.fromkeys(writers.values()))
@@ -189,10 +189,10 @@ class DomainRand:
         assign(self._sim.field("body_ipos")[:, self._root], mask, self._nominal["body_ipos"][:, self._root] + self.values["base_com"])
 
     def _write_friction(self, mask: Tensor) -> None:
-        assign(self._sim.field("geom_friction")[:, self._ground, 0], mask, self.values["friction"][:, 0])
+        assign(self._sim.field("geom_friction")[:, self._ground, 0], mask, self.values["friction"])
 
     def _write_contact_time(self, mask: Tensor) -> None:
-        assign(self._sim.field("geom_solref")[:, self._ground, 0], mask, self.values["contact_time"][:, 0])
+        assign(self._sim.field("geom_solref")[:, self._ground, 0], mask, self.values["contact_time"])
 
     def _write_stiffness(self, mask: Tensor) -> None:
         for field, place in (("actuator_gainprm", 0), ("actuator_biasprm", 1)):

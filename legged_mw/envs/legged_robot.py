@@ -27,7 +27,7 @@ from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.mirror import Mirror, make_mirror
 from legged_mw.envs.terrain import Tiles, build_terrain
 from legged_mw.sim.model import Ground, ModelError, Physics, RobotModel, build_model, per_joint, unknown
-from legged_mw.sim.simulation import make_simulation
+from legged_mw.sim.simulation import make_simulation, pick_engine
 from legged_mw.sim.terrain import make_height_map
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign, columns, may_hold, quat_rotate, quat_rotate_inverse
@@ -64,7 +64,7 @@ class LeggedRobot(BaseTask):
         check_values(cfg)
         self.cfg = cfg
         self.terrain = build_terrain(cfg)
-        self.robot = self._load_robot()
+        self.robot = self._load_robot(pick_engine(cfg.sim.engine, device))
         self.obs_buf = {}
         super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
         self.sim = make_simulation(
@@ -619,14 +619,14 @@ class LeggedRobot(BaseTask):
 
     # ---- robot and buffers: born here, never rebound --------------------------------------------------------------------------
 
-    def _load_robot(self) -> RobotModel:
+    def _load_robot(self, engine: str) -> RobotModel:
         cfg = self.cfg
         if not cfg.asset.file:
             raise ConfigError("asset.file is empty; name the robot's MJCF, e.g. 'resources/robots/go1/go1.xml'")
         return build_model(
             ROOT / Path(cfg.asset.file).expanduser(),  # an absolute path stays itself
             physics=Physics(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations),
-            ground=Ground(cfg.terrain.friction, cfg.terrain.condim, self.terrain),
+            ground=Ground(cfg.terrain.friction, cfg.terrain.condim, self.terrain, boxes=engine == "mujoco"),
             stiffness=cfg.control.stiffness,
             damping=cfg.control.damping,
             colliders=cfg.asset.colliders,

@@ -48,6 +48,7 @@ class Ground:
     friction: float = 0.6  # sliding [-]
     condim: int = 3  # 1 frictionless, 3 sliding, 4 and torsional, 6 and rolling
     terrain: Terrain | None = None  # None: the plane
+    boxes: bool = False  # level pieces of the terrain as boxes, in what is stepped: for MuJoCo's own engine
 
 
 @dataclass(frozen=True)
@@ -64,6 +65,13 @@ class RobotModel:
     spec: mujoco.MjSpec  # what ``visual`` was compiled from: to copy, never to change
     contact_geoms: tuple[str, ...] = ()  # in order of the span "contact"
     overrides: list[str] = field(default_factory=list)  # what the caller's choices changed, a line each
+
+    def ground_geoms(self) -> slice:
+        """Indices of the geoms that are the ground: MuJoCo counts geoms body by body, and these are the world's."""
+        count = int(self.physics.body_geomnum[0])
+        names = [self.physics.geom(i).name for i in range(count)]
+        first = names.index(GROUND)
+        return slice(first, first + sum(name == GROUND or name.startswith(f"{GROUND}/") for name in names))
 
     def id(self, kind: str, name: str) -> int:
         """Index of the ``kind`` ("body", "geom", "site") called ``name``."""
@@ -134,6 +142,8 @@ def build_model(
         spec.delete(light)  # mujoco-warp would move it in every step
     for view in list(spec.cameras):
         spec.delete(view)
+    if ground.terrain and ground.boxes:
+        _replace_level_pieces(spec, ground, notes)
     mj = spec.compile()
     names = tuple(j.name for j in joints)
     return RobotModel(
@@ -213,6 +223,36 @@ def _add_height_field(spec: mujoco.MjSpec, terrain: Terrain) -> dict[str, object
         userdata=((terrain.heights - low) / span).astype(np.float32).ravel(),
     )
     return {"type": mujoco.mjtGeom.mjGEOM_HFIELD, "hfieldname": GROUND, "pos": [0.0, 0.0, low]}
+
+
+def _replace_level_pieces(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> None:
+    """Sink the height field where boxes are exact: MuJoCo gives a foot a tilted contact from every triangle near it."""
+    from legged_mw.sim.terrain import as_boxes
+
+    assert ground.terrain
+    boxes, heights = as_boxes(ground.terrain)
+    floor, bottom = spec.geom(GROUND), float(heights.min()) - 1.0
+    span = max(float(np.ptp(heights)), 1e-3)
+    spec.hfield(GROUND).userdata = ((heights - heights.min()) / span).astype(np.float32).ravel()
+    spec.hfield(GROUND).size = [*spec.hfield(GROUND).size[:2], span, 1.0]
+    floor.pos = [0.0, 0.0, float(heights.min())]
+    for number, box in enumerate(boxes):
+        low, high = np.array([*box.low, bottom]), np.array([*box.high, box.top])
+        spec.worldbody.add_geom(
+            name=f"{GROUND}/{number}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=(low + high) / 2,
+            size=(high - low) / 2,
+            contype=floor.contype,
+            conaffinity=floor.conaffinity,
+            priority=floor.priority,
+            condim=floor.condim,
+            friction=floor.friction,
+        )
+    for sensor in spec.sensors:
+        if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT and sensor.refname == GROUND:
+            sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, "world"  # every piece of the ground
+    notes.append(f"ground: {len(boxes)} boxes for its level pieces")
 
 
 def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisions: bool, where: str, notes: list[str]) -> None:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -239,6 +240,58 @@ def _noise(grid: _Grid, height: float, every: float, rng: np.random.Generator) -
     draws = rng.uniform(-height, height, (len(coarse), len(coarse)))
     rows = np.stack([np.interp(fine, coarse, draws[:, i]) for i in range(len(coarse))], axis=1)
     return np.stack([np.interp(fine, coarse, row) for row in rows])
+
+
+# ---- level pieces as boxes, for MuJoCo's own engine ----
+
+MOST_BOXES = 120  # of a tile; what needs more is no assembly of level pieces
+
+
+class Box(NamedTuple):
+    """A block of ground whose top is level."""
+
+    low: tuple[float, float]  # corner x, y [m, world]
+    high: tuple[float, float]  # the opposite one
+    top: float  # [m]
+
+
+def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights]:
+    """Tiles that are few level pieces as boxes, and the heights of all else, sunk by 1 m under the boxes.
+
+    Steps are upright there, midway between the vertices where the height field has a slope of one cell.
+    """
+    heights, boxes = terrain.heights.copy(), []
+    n = round(terrain.tile / terrain.cell)
+    edge = (heights.shape[1] - 1 - terrain.levels * n) // 2
+    for column in range(len(terrain.kinds)):
+        for level in range(terrain.levels):
+            row0, col0 = edge + column * n, edge + level * n
+            pieces = _level_pieces(np.round(terrain.heights[row0 : row0 + n + 1, col0 : col0 + n + 1], 6))
+            if len(pieces) > MOST_BOXES:
+                continue
+            for rows, columns, top in pieces:
+                x, y = ((first + np.clip([*span], 0.5, n + 0.5) - 0.5) for first, span in ((col0, columns), (row0, rows)))
+                low, high = zip(terrain.corner[0] + x * terrain.cell, terrain.corner[1] + y * terrain.cell, strict=True)
+                boxes.append(Box(low, high, top))
+            inside = heights[row0 + 1 : row0 + n, col0 + 1 : col0 + n]
+            inside[...] = inside.min() - 1.0
+    return boxes, heights
+
+
+def _level_pieces(patch: Heights) -> list[tuple[tuple[int, int], tuple[int, int], float]]:
+    """Rectangles of vertices of one height: first row and the one after the last, columns likewise, height; too many: cut short."""
+    taken = np.zeros(patch.shape, dtype=bool)
+    pieces: list[tuple[tuple[int, int], tuple[int, int], float]] = []
+    for row in range(patch.shape[0]):
+        while not taken[row].all() and len(pieces) <= MOST_BOXES:
+            first = int(np.argmin(taken[row]))
+            differs = np.flatnonzero((patch[row, first:] != patch[row, first]) | taken[row, first:])
+            last = first + int(differs[0]) if len(differs) else patch.shape[1]
+            same = ((patch[row:, first:last] == patch[row, first]) & ~taken[row:, first:last]).all(axis=1)
+            end = row + (int(np.argmin(same)) if not same.all() else len(same))
+            taken[row:end, first:last] = True
+            pieces.append(((row, end), (first, last), float(patch[row, first])))
+    return pieces
 
 
 # ---- looking heights up, on the device ----
