@@ -48,12 +48,20 @@ ROWS: dict[str, Kind] = {
     "foot_contact": Kind("foot_contact", "1", "foot; 1 where it touches the ground, else 0"),
     "last_actions": Kind("last_action", "1", "joint; clipped, 0 before the first"),
     "commands": Kind("command", "m/s, m/s, rad/s", "body; forward, left, turning left"),
+    "height_scan": Kind(
+        "height_scan",
+        "m",
+        "points on a grid around the root, which turns with its heading; how far the ground lies below where it is when "
+        "the robot stands on level ground, within 1 m; x by x from behind, in each from right to left",
+    ),
 }
 COMPUTED = ("joint_offset", "last_action", "command")  # by the controller; all else a robot measures
 # What a scene measures by sensors; "up" is the world's z axis in the IMU's frame, opposite to gravity.
 SENSED = ("lin_vel", "ang_vel", "up", "acceleration", "joint_pos", "joint_vel", "joint_torque", "foot_contact")
 FALL = "fall_contact"  # contacts of `falls_on` with the ground; only where there are such geoms
 SENSORS = "sensors"  # Row.measured of a row that names sensors of the scene
+SCAN = "height_scan"  # Row.measured of the height scan
+OWN = (SENSORS, SCAN)  # of rows that come whole, in Measurement.others, by their names
 
 
 @dataclass(frozen=True)
@@ -68,6 +76,14 @@ class Row:
     measured: str  # a field of robot.Measurement, one of COMPUTED, "sensors", or "" if nobody said
     sensors: tuple[str, ...] = ()
     scale: tuple[float, ...] = (1.0,)  # one number, or one a value: the network sees scale * value
+
+
+class HeightScan(NamedTuple):
+    """Where a height scan looks: at each x, at each y [m] from the root, ahead and to the left."""
+
+    x: tuple[float, ...]
+    y: tuple[float, ...]
+    standing: float  # [m] of the root above level ground, where the scan is zero
 
 
 @dataclass(frozen=True)
@@ -94,6 +110,7 @@ class Contract:
     input: str  # of the network: (batch, size of all rows)
     output: str  # (batch, D)
     digest: str  # SHA-256 of the network's file
+    scan: HeightScan | None = None  # where a row asks for one
 
     @property
     def size(self) -> int:
@@ -117,6 +134,7 @@ class Contract:
             "robot": {"mass": self.mass, "feet": list(self.feet), "falls_on": list(self.falls_on), "imu": self.imu},
             "physics": {"file": SCENE_FILE, "timestep": self.timestep, "decimation": self.decimation},
             "sensors": {name: list(names) for name, names in self.sensors.items()},
+            **({SCAN: {"x": list(self.scan.x), "y": list(self.scan.y), "standing": self.scan.standing}} if self.scan else {}),
         }
 
 
@@ -188,6 +206,12 @@ class _Reader:
             self.refuse(key, "above zero")
         return value
 
+    def some_numbers(self, key: str) -> tuple[float, ...]:
+        value = self.values.get(key)
+        if not isinstance(value, list) or not value or not all(map(_is_number, value)):
+            self.refuse(key, "a list of numbers")
+        return tuple(map(float, value))
+
     def numbers(self, key: str, count: int, of: str) -> np.ndarray:
         value = self.values.get(key)
         if not isinstance(value, list) or len(value) != count or not all(map(_is_number, value)):
@@ -237,6 +261,7 @@ def read_contract(folder: Path) -> Contract:
         input=network.text("input"),
         output=network.text("output"),
         digest=network.text("sha256"),
+        scan=_read_scan(top),
     )
     _check_rows(contract)
     if not math.isclose(contract.period, contract.timestep * contract.decimation, rel_tol=1e-6):
@@ -247,6 +272,14 @@ def read_contract(folder: Path) -> Contract:
             "it is damaged, or of another export; export the policy again"
         )
     return contract
+
+
+def _read_scan(top: _Reader) -> HeightScan | None:
+    """Where the height scan looks, if a row is one."""
+    if not any(row.values.get("measured") == SCAN for row in top.sections("observation")):
+        return None
+    scan = top.section(SCAN)
+    return HeightScan(scan.some_numbers("x"), scan.some_numbers("y"), scan.above_zero("standing"))
 
 
 def _read_row(row: _Reader) -> Row:
@@ -273,7 +306,8 @@ def quantity_size(contract: Contract, name: str) -> int:
     """Values of a measured quantity."""
     joints, feet = len(contract.joints), len(contract.feet)
     per_joint = ("joint_pos", "joint_offset", "joint_vel", "joint_torque", "last_action")
-    counts = {**dict.fromkeys(per_joint, joints), "foot_contact": feet, FALL: len(contract.falls_on)}
+    scan = len(contract.scan.x) * len(contract.scan.y) if contract.scan else 0
+    counts = {**dict.fromkeys(per_joint, joints), "foot_contact": feet, FALL: len(contract.falls_on), SCAN: scan}
     return counts.get(name, 3)
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.deploy.contract import CONTRACT_FILE, NETWORK_FILE, SENSORS, Contract, ContractError
+from legged_mw.deploy.contract import CONTRACT_FILE, NETWORK_FILE, OWN, Contract, ContractError
 from legged_mw.deploy.robot import Measurement
 from legged_mw.utils.errors import UserError
 
@@ -74,9 +74,9 @@ class Controller:
         }
         rows = []
         for row in self.contract.rows:
-            if row.measured == SENSORS and row.name not in measurement.others:
+            if row.measured in OWN and row.name not in measurement.others:
                 raise ContractError(f"the robot does not measure row '{row.name}': it must be in Measurement.others ({row.size} values)")
-            value = measurement.others[row.name] if row.measured == SENSORS else values.get(row.measured)
+            value = measurement.others[row.name] if row.measured in OWN else values.get(row.measured)
             value = np.atleast_2d(getattr(measurement, row.measured) if value is None else value)
             rows.append((value * np.array(row.scale)).astype(np.float32))
         return np.concatenate(rows, axis=1)

@@ -17,11 +17,14 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
-from legged_mw.deploy.contract import FALL, Contract, read_scene
+from legged_mw.deploy.contract import FALL, SCAN, Contract, read_scene
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, layout
 from legged_mw.utils.machine import usable_cores
 
 _NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # sensors of position and velocity describe the new state
+
+_GROUND_GROUP = [1, 0, 0, 0, 0, 0]  # geom groups that a height scan sees: a robot's own are others
+_ABOVE = 2.0  # [m] over the root, where its rays begin
 
 
 class Fleet:
@@ -75,8 +78,25 @@ class Fleet:
     def _value(self, name: str) -> Floats:
         if name == "gravity":
             return -self._sensors[:, self._where["up"]]
+        if any(row.name == name and row.measured == SCAN for row in self.contract.rows):
+            return self._scan()
         value = self._sensors[:, self._where[name]]
         return (value > 0.0).astype(float) if name == "foot_contact" else value
+
+    def _scan(self) -> Floats:
+        """Heights of the ground around each robot (N, points), by rays from above that see nothing of group 1 and up."""
+        assert self.contract.scan
+        xs, ys, standing = self.contract.scan
+        px, py = (grid.ravel() for grid in np.meshgrid(xs, ys, indexing="ij"))
+        root, (w, x, y, z) = self.qpos[:, :3], self.qpos[:, 3:7].T
+        yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))[:, None]
+        start = np.empty((self.count, len(px), 3))
+        start[..., 0] = root[:, :1] + np.cos(yaw) * px - np.sin(yaw) * py
+        start[..., 1] = root[:, 1:2] + np.sin(yaw) * px + np.cos(yaw) * py
+        start[..., 2] = root[:, 2:] + _ABOVE
+        distance, _ = self._batch.ray(start, [0.0, 0.0, -1.0], geomgroup=_GROUND_GROUP)
+        below = np.where(distance < 0.0, np.inf, distance - _ABOVE)  # of the root; nothing there: as deep as it gets
+        return np.clip(below - standing, -1.0, 1.0)
 
 
 class MujocoRobot(Robot):

@@ -22,7 +22,7 @@ import torch
 from rsl_rl.models import MLPModel
 from torch import Tensor, nn
 
-from legged_mw.deploy.contract import CONTRACT_FILE, FALL, NETWORK_FILE, ROWS, SCENE_FILE, SENSORS, Contract, Row, digest
+from legged_mw.deploy.contract import CONTRACT_FILE, FALL, NETWORK_FILE, ROWS, SCAN, SCENE_FILE, SENSORS, Contract, HeightScan, Row, digest
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl.policy import act, load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE
@@ -273,6 +273,8 @@ def make_contract(env: LeggedRobot, task: LoadedTask, folder: Path) -> Contract:
     falls_on = tuple(robot.contact_geoms[i] for i in env.terminating_contacts.tolist())
     sensed = {FALL: tuple(f"contact/{name}" for name in falls_on)} if falls_on else {}
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
+    rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group))
+    points = HeightScan(tuple(cfg.terrain.measured_points_x), tuple(cfg.terrain.measured_points_y), cfg.init_state.pos[2])
     return Contract(
         task=task.name,
         joints=robot.joint_names,
@@ -285,7 +287,8 @@ def make_contract(env: LeggedRobot, task: LoadedTask, folder: Path) -> Contract:
         timestep=cfg.sim.dt,
         decimation=cfg.control.decimation,
         command_ranges=np.array([cfg.commands.ranges.lin_vel_x, cfg.commands.ranges.lin_vel_y, cfg.commands.ranges.ang_vel_yaw]).T,
-        rows=tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group)),
+        rows=rows,
+        scan=points if any(row.measured == SCAN for row in rows) else None,
         sensors={**{name: tuple(names) for name, names in scene.sensors.items()}, **sensed},
         feet=tuple(cfg.asset.foot_names),
         falls_on=falls_on,
