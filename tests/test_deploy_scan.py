@@ -1,0 +1,98 @@
+"""legged_mw.deploy on a policy that sees the ground: its contract, and the same scan as in the environment."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from worlds import QUIET, make_env
+
+from legged_mw import ROOT
+from legged_mw.deploy.contract import ContractError, read_contract
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.simulated import Fleet, MujocoRobot
+from legged_mw.deploy.stage import DeployStage
+from legged_mw.deploy.udp import contract_digest
+from legged_mw.utils.config import load_yaml, save_yaml
+
+SHIPPED = ROOT / "resources/policies/go1_rough_scan"
+
+
+@pytest.fixture
+def export(tmp_path: Path) -> Path:
+    """A copy to be changed."""
+    for name in ("policy.yaml", "policy.onnx", "scene.xml"):
+        shutil.copy(SHIPPED / name, tmp_path)
+    return tmp_path
+
+
+def test_the_contract_says_where_the_scan_looks() -> None:
+    contract = read_contract(SHIPPED)
+    row = contract.rows[-1]
+    assert (row.name, row.size, row.measured, row.noise) == ("height_scan", 187, "height_scan", 0.1)
+    assert contract.scan and (len(contract.scan.x), len(contract.scan.y), contract.scan.standing) == (17, 11, 0.278)
+    assert contract.to_dict()["height_scan"] == load_yaml(SHIPPED / "policy.yaml")["height_scan"]
+    assert read_contract(ROOT / "resources/policies/go1_rough").scan is None
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda said: said.pop("height_scan"), "policy.yaml: 'height_scan' is missing; it must be a mapping"),
+        (lambda said: said["height_scan"].pop("x"), "policy.yaml: height_scan: 'x' is missing; it must be a list of numbers"),
+        (
+            lambda said: said["height_scan"]["y"].pop(),
+            "observation row 'height_scan' has size 187; height_scan has 170 values on this robot",
+        ),
+    ],
+)
+def test_a_wrong_scan_is_one_clear_line(change, message: str, export: Path) -> None:
+    said = load_yaml(export / "policy.yaml")
+    change(said)
+    save_yaml(export / "policy.yaml", said)
+    with pytest.raises(ContractError, match=re.escape(message)):
+        read_contract(export)
+
+
+def test_the_scan_is_the_environments(export: Path) -> None:
+    """Turned and tilted robots at other heights than standing, over a block that only one of them is near."""
+    env = make_env(4, {**QUIET, "terrain.mesh_type": "plane", "domain_rand.enable": False}, task="go1_rough_scan")
+    fleet = Fleet(export, read_contract(export), 4)
+    fleet.qpos[:, :3] = [[0.0, 0.0, 0.3], [5.0, -3.0, 0.2], [1.0, 1.0, 2.0], [-2.0, 0.0, 0.278]]
+    fleet.qpos[:, 3:7] = [[1, 0, 0, 0], [0.9, 0.1, 0.1, 0.4], [0.5, 0.5, 0.5, 0.5], [0, 0, 0, 1]]
+    fleet.qpos[:, 3:7] /= np.linalg.norm(fleet.qpos[:, 3:7], axis=1, keepdims=True)
+    env.sim.qpos.copy_(torch.tensor(fleet.qpos, dtype=torch.float))
+    env.compute_observations()
+    np.testing.assert_allclose(fleet.read().others["height_scan"], env.obs_buf["state"][:, -187:], atol=1e-5)
+    spec = mujoco.MjSpec.from_file(str(export / "scene.xml"))
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.5, 0.25, 0.05], pos=[0.6, 0.25, 0.05])
+    (export / "scene.xml").write_text(spec.to_xml())
+    block = Fleet(export, read_contract(export), 1)
+    block.qpos[0, :3] = [0.0, 0.0, 0.278]
+    scan = block.read().others["height_scan"].reshape(17, 11)
+    assert np.allclose(scan[9:, 6:], -0.1) and np.allclose(scan[:9], 0.0) and np.allclose(scan[:, :5], 0.0), "ahead and to the left"
+
+
+def test_where_there_is_no_ground_it_is_deep(export: Path) -> None:
+    spec = mujoco.MjSpec.from_file(str(export / "scene.xml"))
+    spec.geom("floor").size = [0.3, 0.3, 0.05]
+    (export / "scene.xml").write_text(spec.to_xml())
+    scan = Fleet(export, read_contract(export), 1).read().others["height_scan"].reshape(17, 11)
+    assert np.allclose(scan[8, 5], 0.0, atol=1e-6) and np.allclose(scan[0], 1.0) and np.allclose(scan[:, 0], 1.0)
+
+
+def test_it_walks_behind_the_seam_and_another_grid_is_another_contract() -> None:
+    stage = DeployStage(SHIPPED, 2, command=(0.6, 0.0, 0.0))
+    for _ in range(150):
+        stage.step()
+    np.testing.assert_allclose(stage.velocity(), [[0.6, 0.0, 0.0]] * 2, atol=0.12)
+    contract = read_contract(SHIPPED)
+    robot, controller = MujocoRobot(SHIPPED, contract), Controller(SHIPPED, contract)
+    measured = robot.read()
+    assert measured.others["height_scan"].shape == (187,) and controller.act(measured, np.zeros((1, 3))).shape == (1, 12)
+    assert contract_digest(contract) != contract_digest(read_contract(ROOT / "resources/policies/go1_rough"))
