@@ -96,3 +96,24 @@ def test_it_walks_behind_the_seam_and_another_grid_is_another_contract() -> None
     measured = robot.read()
     assert measured.others["height_scan"].shape == (187,) and controller.act(measured, np.zeros((1, 3))).shape == (1, 12)
     assert contract_digest(contract) != contract_digest(read_contract(ROOT / "resources/policies/go1_rough"))
+
+
+def test_among_steps_it_stands_on_boxes_and_sees_them() -> None:
+    contract = read_contract(SHIPPED)
+    fleet = Fleet(SHIPPED, contract, 1, scene_file="terrain.xml")
+    start = fleet.qpos[0].copy()
+    scan = fleet.read().others["height_scan"].reshape(17, 11)
+    assert np.abs(scan).max() < 1e-6 and start[2] < 0.0, "the middle of a pit, flat for 1 m"
+    controller = Controller(SHIPPED, contract)
+    for _ in range(300):
+        fleet.write(controller.act(fleet.read(), np.array([[0.6, 0.0, 0.0]])))
+    measured = fleet.read()
+    assert not fleet.fell()[0] and fleet.qpos[0, 2] > start[2] + 0.15, "it climbs"
+    assert measured.others["height_scan"].min() < -0.05
+
+
+def test_an_export_of_flat_ground_has_no_steps(export: Path) -> None:
+    with pytest.raises(
+        ContractError, match=r"no terrain.xml in .*; an export has one if its task was trained on ground with steps or blocks"
+    ):
+        DeployStage(export, 1, scene_file="terrain.xml")

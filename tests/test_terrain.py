@@ -11,7 +11,7 @@ import torch
 from guard import recordable
 
 from legged_mw.sim.model import ModelError
-from legged_mw.sim.terrain import KINDS, PLATFORM, HeightMap, Terrain, make_terrain, share_columns
+from legged_mw.sim.terrain import KINDS, PLATFORM, HeightMap, Terrain, as_boxes, level_kinds, make_terrain, share_columns
 
 
 def terrain(**changes: Any) -> Terrain:
@@ -107,3 +107,24 @@ def test_a_lookup_can_be_recorded_and_holds_outside() -> None:
 def test_mistakes_are_named(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ModelError, match=message):
         terrain(**changes)
+
+
+def test_level_pieces_are_told_from_slopes() -> None:
+    level = level_kinds(KINDS, 0.05)
+    assert {"flat", "stairs_up", "stairs_down", "obstacles", "gap"} <= set(level)
+    assert not {"smooth_slope", "rough_slope", "waves", "low_random"} & set(level)
+
+
+def test_boxes_cover_each_level_tile_once_and_at_its_heights() -> None:
+    ground = terrain(levels=2, proportions={"stairs_up": 1.0, "rough_slope": 1.0}, columns=2)
+    boxes, heights = as_boxes(ground)
+    area = sum((b.high[0] - b.low[0]) * (b.high[1] - b.low[1]) for b in boxes)
+    assert area == pytest.approx(2 * 64.0)
+    rng = np.random.default_rng(0)
+    look_up = HeightMap(ground, "cpu")
+    for box in boxes:
+        inside = rng.uniform(np.array(box.low) + 0.051, np.array(box.high) - 0.051, (20, 2))
+        np.testing.assert_allclose(look_up(torch.tensor(inside, dtype=torch.float)), box.top, atol=1e-5)
+    edge, n = 20, 80
+    assert (heights[edge + 1 : edge + n, edge + 1 : edge + 2 * n : n // 2] < ground.heights.min() - 0.9).any(), "sunk under the boxes"
+    np.testing.assert_array_equal(heights[edge + n :], ground.heights[edge + n :], "the slopes stay")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from legged_mw.deploy.contract import CONTRACT_FILE, Contract, read_contract
+from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, Contract, read_contract
 from legged_mw.deploy.exam import run_exam
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement
@@ -35,6 +35,7 @@ def parse() -> argparse.Namespace:
     )
     parser.add_argument("--num_envs", type=positive, default=1, metavar="N", help="robots side by side")
     parser.add_argument("--time", type=duration, metavar="T", help="how long (default: until closed; 10s of a recording or a link)")
+    parser.add_argument("--terrain", action="store_true", help=f"among the steps and blocks of {TERRAIN_FILE}, if the export has it")
     launch.add_flags(parser)
     parser.add_argument("--udp", metavar="HOST:PORT", help="drive the robot that listens there")
     parser.add_argument("--serve", metavar="HOST:PORT", help="be a simulated robot that listens there")
@@ -42,6 +43,8 @@ def parse() -> argparse.Namespace:
     watched = args.viewer != "auto" or args.video or args.sheet or args.commands
     if sum(map(bool, (args.eval, args.udp, args.serve, watched))) > 1:
         parser.error("--eval, --udp, --serve and what shows or records (--viewer, --video, --sheet, --commands) are one thing each")
+    if args.terrain and (args.eval or args.udp):
+        parser.error("--eval is on flat ground and --udp has no ground of its own: leave --terrain out")
     if args.command is not None and (args.eval or args.serve or args.commands):
         parser.error("--eval and --commands bring their own commands, and --serve takes them from its client: leave --command out")
     launch.check_flags(args)
@@ -51,12 +54,12 @@ def parse() -> argparse.Namespace:
 def main() -> None:
     args = parse()
     folder = Path(args.folder)
-    contract = read_contract(folder)
+    contract, scene_file = read_contract(folder), TERRAIN_FILE if args.terrain else SCENE_FILE
     command = launch.check_drive(args, contract.command_ranges, advice=f"the ranges are in {folder / CONTRACT_FILE}")
     if args.eval:
         examine(folder, Path(args.out) if args.out else folder / RESULT_FILE)
     elif args.serve:
-        server = UdpServer(MujocoRobot(folder, contract), contract, parse_address(args.serve))
+        server = UdpServer(MujocoRobot(folder, contract, scene_file), contract, parse_address(args.serve))
         print(f"a simulated robot for {contract.task} at {server.address[0]}:{server.address[1]}; Ctrl-C ends it", flush=True)
         with contextlib.suppress(KeyboardInterrupt):
             server.serve(lambda line: print(line, flush=True))
@@ -64,7 +67,7 @@ def main() -> None:
         wanted = np.clip(STROLL, *contract.command_ranges) if command is None else np.array(command)
         walk(folder, contract, parse_address(args.udp), wanted, args.time or WALK_SECONDS)
     else:
-        launch.watch(DeployStage(folder, args.num_envs, command), args, folder, title=contract.task)
+        launch.watch(DeployStage(folder, args.num_envs, command, scene_file=scene_file), args, folder, title=contract.task)
 
 
 def examine(folder: Path, path: Path) -> None:

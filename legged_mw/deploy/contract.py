@@ -22,6 +22,7 @@ from legged_mw.utils.errors import UserError, unknown
 
 FORMAT = 1  # raised when a reader of the old format would misread the new one
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"
+TERRAIN_FILE = "terrain.xml"  # the same robot among steps and blocks; only of policies that were trained on such ground
 
 
 class ContractError(UserError, ValueError):
@@ -342,17 +343,19 @@ class Scene:
     sensordata: dict[str, np.ndarray]  # quantity, or name of a row with sensors of its own -> indices in sensordata
 
 
-def read_scene(folder: Path, contract: Contract) -> Scene:
-    """``scene.xml`` of an export, which must be the robot that the contract speaks of."""
+def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE) -> Scene:
+    """``scene.xml`` of an export, or another ``file`` in it, which must be the robot that the contract speaks of."""
+    if not (folder / file).is_file():
+        raise ContractError(f"no {file} in {folder}; an export has one if its task was trained on ground with steps or blocks")
     try:
-        model = mujoco.MjModel.from_xml_path(str(folder / SCENE_FILE))
+        model = mujoco.MjModel.from_xml_path(str(folder / file))
     except ValueError as error:
-        raise ContractError(f"{SCENE_FILE} is not a valid MJCF: {' '.join(str(error).split())}") from None
+        raise ContractError(f"{file} is not a valid MJCF: {' '.join(str(error).split())}") from None
     joints = [_index(model, "joint", name, "joint") for name in contract.joints]
     actuators = [_index(model, "actuator", name, "servo") for name in contract.joints]
     _check_machine(model, contract, joints, actuators)
     if model.nkey < 1:
-        raise ContractError(f"{SCENE_FILE} has no keyframe; the first one says where the robot starts")
+        raise ContractError(f"{file} has no keyframe; the first one says where the robot starts")
     named = {**contract.sensors, **{row.name: row.sensors for row in contract.rows if row.sensors}}
     needed = [*SENSED, *([FALL] if contract.falls_on else [])]
     if missing := [name for name in needed if name not in contract.sensors]:

@@ -17,7 +17,7 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 from numpy.typing import NDArray
 
-from legged_mw.deploy.contract import FALL, SCAN, Contract, read_scene
+from legged_mw.deploy.contract import FALL, SCAN, SCENE_FILE, Contract, read_scene
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, layout
 from legged_mw.utils.machine import usable_cores
 
@@ -30,9 +30,9 @@ _ABOVE = 2.0  # [m] over the root, where its rays begin
 class Fleet:
     """``count`` robots, each in a world of its own, stepped together on ``threads`` threads (0: one a core)."""
 
-    def __init__(self, folder: Path, contract: Contract, count: int = 1, threads: int = 0) -> None:
+    def __init__(self, folder: Path, contract: Contract, count: int = 1, threads: int = 0, scene_file: str = SCENE_FILE) -> None:
         """Load the scene and put every robot into its first keyframe. Raises ContractError."""
-        scene = read_scene(folder, contract)
+        scene = read_scene(folder, contract, scene_file)
         self.contract, self.count, self.model = contract, count, scene.model
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world counts as fallen, in silence
         _keep_quiet()
@@ -102,8 +102,8 @@ class Fleet:
 class MujocoRobot(Robot):
     """One simulated robot behind the seam. Simulated time moves on in ``write``, by one period."""
 
-    def __init__(self, folder: Path, contract: Contract) -> None:
-        self.fleet = Fleet(folder, contract, 1, threads=1)
+    def __init__(self, folder: Path, contract: Contract, scene_file: str = SCENE_FILE) -> None:
+        self.fleet = Fleet(folder, contract, 1, threads=1, scene_file=scene_file)
 
     def read(self) -> Measurement:
         many = self.fleet.read()

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.contract import SCENE_FILE, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.simulated import Fleet
@@ -20,10 +20,12 @@ STROLL = (0.5, 0.0, 0.0)  # what a robot does that nobody commands: vx, vy [m/s]
 class DeployStage:
     """``num_worlds`` robots that follow an exported policy in MuJoCo's C engine (the viewers' protocol ``Stage``)."""
 
-    def __init__(self, folder: Path, num_worlds: int = 1, command: Sequence[float] | None = None, threads: int = 0) -> None:
+    def __init__(
+        self, folder: Path, num_worlds: int = 1, command: Sequence[float] | None = None, threads: int = 0, scene_file: str = SCENE_FILE
+    ) -> None:
         """Load the export in ``folder``; ``command`` is what is followed while nobody says otherwise."""
         self.contract = read_contract(folder)
-        self.fleet = Fleet(folder, self.contract, num_worlds, threads)
+        self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file)
         self.controller = Controller(folder, self.contract, num_worlds)
         self.model, self.num_worlds, self.dt = self.fleet.model, num_worlds, self.contract.period
         self.limits: Floats = self.contract.command_ranges

@@ -22,12 +22,26 @@ import torch
 from rsl_rl.models import MLPModel
 from torch import Tensor, nn
 
-from legged_mw.deploy.contract import CONTRACT_FILE, FALL, NETWORK_FILE, ROWS, SCAN, SCENE_FILE, SENSORS, Contract, HeightScan, Row, digest
+from legged_mw.deploy.contract import (
+    CONTRACT_FILE,
+    FALL,
+    NETWORK_FILE,
+    ROWS,
+    SCAN,
+    SCENE_FILE,
+    SENSORS,
+    TERRAIN_FILE,
+    Contract,
+    HeightScan,
+    Row,
+    digest,
+)
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl.policy import act, load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.sim.model import per_joint
-from legged_mw.sim.standalone import standalone
+from legged_mw.sim.standalone import among_steps, standalone
+from legged_mw.sim.terrain import level_kinds, make_terrain
 from legged_mw.utils.cli import shown
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import UserError
@@ -80,7 +94,7 @@ def export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
 def _export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
     task = load_task(str(trained["task"]))
     task.update(trained, where=CONFIG_FILE)
-    config = task.to_dict()
+    config, ground = task.to_dict(), task.cfg.terrain.mesh_type
     with torch.random.fork_rng(devices=[]):  # trying the policy draws numbers that are not ours to draw
         torch.default_generator.manual_seed(0)  # of the CPU alone
         env = _small_env(task)
@@ -96,8 +110,9 @@ def _export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported
             _compare(NETWORK_FILE, run_onnx(new / NETWORK_FILE, observations.numpy()), actions),
         )
         contract = make_contract(env, task, new)
+        files = (*FILES, TERRAIN_FILE) if ground != "plane" and _write_terrain(task, new) else FILES
         save_yaml(new / CONTRACT_FILE, contract.to_dict())
-    return Exported(FILES, gap, len(observations), tuple(row.name for row in contract.rows if not row.measured))
+    return Exported(files, gap, len(observations), tuple(row.name for row in contract.rows if not row.measured))
 
 
 def describe(made: Exported, folder: Path) -> str:
@@ -246,7 +261,9 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
         new.mkdir(parents=True)
         yield new
         if folder.exists():
-            for name in FILES:
+            if not (new / TERRAIN_FILE).exists():  # one of an earlier export would be another policy's
+                (folder / TERRAIN_FILE).unlink(missing_ok=True)
+            for name in [name for name in (TERRAIN_FILE, *FILES) if (new / name).exists()]:
                 os.replace(new / name, folder / name)
         else:
             os.replace(new, folder)
@@ -298,6 +315,29 @@ def make_contract(env: LeggedRobot, task: LoadedTask, folder: Path) -> Contract:
         output=OUTPUT,
         digest=digest(folder / NETWORK_FILE),
     )
+
+
+def _write_terrain(task: LoadedTask, folder: Path) -> bool:
+    """The scene among steps and blocks of the kinds that were trained, at three levels; False where there are no such kinds."""
+    cfg, ground = task.cfg.init_state, task.cfg.terrain
+    trained = [kind for kind, share in ground.terrain_proportions.items() if share > 0 and kind != "flat"]
+    kinds = level_kinds(trained, ground.horizontal_scale)
+    if not kinds:
+        return False
+    terrain = make_terrain(
+        levels=3,
+        difficulty=(0.1, 0.7),
+        proportions=dict.fromkeys(kinds, 1.0),
+        columns=len(kinds),
+        tile=ground.tile_size,
+        cell=ground.horizontal_scale,
+        border=4.0,
+        seed=ground.seed,
+    )
+    start = terrain.origins[0, kinds.index("stairs_up") if "stairs_up" in kinds else 0] + np.array(cfg.pos)
+    xml = among_steps((folder / SCENE_FILE).read_text(encoding="utf-8"), terrain, start.tolist())
+    (folder / TERRAIN_FILE).write_text(xml, encoding="utf-8")
+    return True
 
 
 def contract_rows(env: LeggedRobot, group: str) -> list[Row]:

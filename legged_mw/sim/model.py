@@ -249,10 +249,15 @@ def _replace_level_pieces(spec: mujoco.MjSpec, ground: Ground, notes: list[str])
             condim=floor.condim,
             friction=floor.friction,
         )
+    feel_all_ground(spec)
+    notes.append(f"ground: {len(boxes)} boxes for its level pieces")
+
+
+def feel_all_ground(spec: mujoco.MjSpec) -> None:
+    """Contact sensors that ask for the geom of the ground ask for all geoms of the world instead."""
     for sensor in spec.sensors:
         if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT and sensor.refname == GROUND:
-            sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, "world"  # every piece of the ground
-    notes.append(f"ground: {len(boxes)} boxes for its level pieces")
+            sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, "world"
 
 
 def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisions: bool, where: str, notes: list[str]) -> None:

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from legged_mw.sim.model import ModelError, RobotModel
+from legged_mw.sim.model import GROUND, ModelError, RobotModel, feel_all_ground
+from legged_mw.sim.terrain import Box, Terrain, as_boxes
 
 HOME = "home"  # the keyframe: the pose to start in, and the servos holding it
 TOLERANCE = 1e-5  # relative, absolute below 1: MuJoCo writes MJCF with six digits
@@ -85,6 +86,36 @@ def standalone(robot: RobotModel, *, imu: str, feet: Sequence[str], qpos: Sequen
     if wrong := differences(robot.physics, model):
         raise ModelError(f"the robot written as one MJCF would be another machine: {', '.join(wrong)} differ from the trained model")
     return Scene(xml, sensors)
+
+
+def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
+    """The scene of ``standalone`` on the level pieces of ``terrain``, as boxes; the robot starts at ``start``, x, y, z [m].
+
+    Tiles that are no such pieces (slopes, noise) stay out: as text, a height field would have some megabytes.
+    """
+    spec = mujoco.MjSpec.from_string(xml)
+    floor, (boxes, _) = spec.geom(GROUND), as_boxes(terrain)
+    x, y = (-corner for corner in terrain.corner)
+    inner_x, inner_y = terrain.levels * terrain.tile / 2, len(terrain.kinds) * terrain.tile / 2
+    border = [
+        ((-x, -y), (x, -inner_y)),
+        ((-x, inner_y), (x, y)),
+        ((-x, -inner_y), (-inner_x, inner_y)),
+        ((inner_x, -inner_y), (x, inner_y)),
+    ]
+    bottom = terrain.span()[0] - 1.0
+    for low, high, top in [*boxes, *(Box(low, high, 0.0) for low, high in border if low[0] < high[0] and low[1] < high[1])]:
+        below, above = np.array([*low, bottom]), np.array([*high, top])
+        box = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=(below + above) / 2, size=(above - below) / 2)
+        box.material = floor.material
+        for name in ("contype", "conaffinity", "priority", "condim", "friction", "solref", "solimp"):
+            setattr(box, name, getattr(floor, name))
+    floor.pos = [0.0, 0.0, bottom]
+    feel_all_ground(spec)
+    for key in spec.keys:
+        key.qpos = [*start, *list(key.qpos)[3:]]
+    spec.compile()
+    return spec.to_xml()
 
 
 def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str, feet: Sequence[str]) -> dict[str, list[str]]:

@@ -5,7 +5,7 @@ Heights are made here, on the host, once; looked up on the device, in tensors of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -276,6 +276,17 @@ def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights]:
             inside = heights[row0 + 1 : row0 + n, col0 + 1 : col0 + n]
             inside[...] = inside.min() - 1.0
     return boxes, heights
+
+
+def level_kinds(kinds: Iterable[str], cell: float) -> list[str]:
+    """Those of ``kinds`` whose tiles are all level pieces."""
+    found = []
+    for kind in kinds:
+        tiles = make_terrain(levels=3, proportions={kind: 1.0}, columns=1, tile=8.0, cell=cell, border=0.0, seed=0)
+        patches = np.split(tiles.heights[:, :-1], 3, axis=1)
+        if all(len(_level_pieces(np.round(patch, 6))) <= MOST_BOXES for patch in patches):
+            found.append(kind)
+    return found
 
 
 def _level_pieces(patch: Heights) -> list[tuple[tuple[int, int], tuple[int, int], float]]:
