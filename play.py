@@ -13,7 +13,7 @@ from rsl_rl.models import MLPModel
 from legged_mw import ROOT
 from legged_mw.envs.domain_rand import active
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam, report, rules
+from legged_mw.eval import crossing, exam, report, rules
 from legged_mw.rl.policy import act, load_policy
 from legged_mw.rl.runs import CONFIG_FILE, find_checkpoint, find_run, runs
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, one_line_errors, pick_device, seed_everything, shown
@@ -43,6 +43,16 @@ class Source(NamedTuple):
     shipped: bool
 
 
+class Candidate(NamedTuple):
+    """A policy to be graded, and the environments for it."""
+
+    source: Source
+    policy: MLPModel
+    env: LeggedRobot
+    rough: LeggedRobot | None  # the exam's rough part; None for a policy that was trained on a plane
+    overrides: dict[str, Any]  # path -> value, of what ``env`` has otherwise than training
+
+
 def parse() -> argparse.Namespace:
     parser = make_parser(__doc__)
     parser.add_argument(
@@ -52,7 +62,7 @@ def parse() -> argparse.Namespace:
         "--time", type=duration, default=None, metavar="T", help="how long to play (default: 10s of video, a window until closed)"
     )
     launch.add_flags(parser)
-    parser.add_argument("--eval", action="store_true", help="run the walking exam, print its table, write a report")
+    parser.add_argument("--eval", action="store_true", help="run the walking exam (on rough ground too), print its tables, write a report")
     parser.add_argument("--compare", metavar="RUN", help="with --eval: grade this run beside it; its name or path, or 'shipped'")
     parser.add_argument(
         "--export", metavar="DIR", help="write the policy as networks, contract and scene there, to deploy (docs/deploy.md)"
@@ -82,6 +92,7 @@ def main() -> None:
     task.update_from_run(load_yaml(config), where=shown(config))
     trained = task.to_dict()
     limits = prepare(task, args)
+    crossing_task = prepare_crossing(trained, args)
     changes = changes_since(task, trained)
     for path, (before, now) in sorted(changes.items()):
         print(f"  {path}: {before} -> {now}")
@@ -91,14 +102,14 @@ def main() -> None:
     seed_everything(task.train.seed)
     device = pick_device(args.device)
     rival = find_rival(args, device) if args.compare is not None else None
-    env = task.env_class(task.cfg, device, eager=args.eager)
+    env = make_env(task, args, device)
     policy = load_policy(source.checkpoint, env, task.train, device)
     out = ROOT / "logs" / task.name / "shipped" if source.shipped else source.folder  # where results go
     if args.eval:
         overrides = {path: now for path, (_, now) in changes.items()}
-        columns = [grade(env, policy, source, overrides)]
-        if rival:
-            columns.append(grade(*rival))
+        rough = make_env(crossing_task, args, device) if crossing_task else None
+        candidates = [Candidate(source, policy, env, rough, overrides), *([rival] if rival else [])]
+        columns = [grade(candidate) for candidate in candidates]
         report.write(out / "eval", task.name, columns, elsewhere(task, source))
         print(f"written to {shown(out / 'eval' / 'report.html')}, with report.json and pictures beside it")
     else:
@@ -127,7 +138,7 @@ def shipped(task: LoadedTask) -> Source:
     return Source(folder, folder / "model.pt", shipped=True)
 
 
-def find_rival(args: argparse.Namespace, device: str) -> tuple[LeggedRobot, MLPModel, Source, dict[str, Any]]:
+def find_rival(args: argparse.Namespace, device: str) -> Candidate:
     """What ``--compare`` names, ready to be graded as the first policy is: by the config of its own run, with the same overrides."""
     task = load_task(args.task)
     if args.compare == "shipped":
@@ -143,10 +154,17 @@ def find_rival(args: argparse.Namespace, device: str) -> tuple[LeggedRobot, MLPM
     task.update_from_run(saved, where=shown(source.folder / CONFIG_FILE))
     trained = task.to_dict()
     prepare(task, args)
+    crossing_task = prepare_crossing(trained, args)
     seed_everything(task.train.seed)
-    env = task.env_class(task.cfg, device, eager=args.eager)
+    env = make_env(task, args, device)
     policy = load_policy(source.checkpoint, env, task.train, device)
-    return env, policy, source, {path: now for path, (_, now) in changes_since(task, trained).items()}
+    overrides = {path: now for path, (_, now) in changes_since(task, trained).items()}
+    rough = make_env(crossing_task, args, device) if crossing_task else None
+    return Candidate(source, policy, env, rough, overrides)
+
+
+def make_env(task: LoadedTask, args: argparse.Namespace, device: str) -> LeggedRobot:
+    return task.env_class(task.cfg, device, eager=args.eager)
 
 
 def prepare(task: LoadedTask, args: argparse.Namespace) -> list[list[float]]:
@@ -156,10 +174,7 @@ def prepare(task: LoadedTask, args: argparse.Namespace) -> list[list[float]]:
     else:
         for path, value in NOMINAL.items():
             task.set(path, value, where="play")
-    before = task.to_dict()
-    apply_overrides(task, args)
-    if args.eval and (touched := exam.SETS & changes_since(task, before).keys()):
-        raise ConfigError(f"--eval sets {', '.join(sorted(touched))} itself; an exam with other values would be another exam")
+    override(task, args, exam.SETS if args.eval else set())
     if args.eval:
         report.make_room(task)  # the ranges are known by now
     ranges = task.cfg.commands.ranges
@@ -171,6 +186,26 @@ def prepare(task: LoadedTask, args: argparse.Namespace) -> list[list[float]]:
     return limits
 
 
+def prepare_crossing(trained: dict[str, Any], args: argparse.Namespace) -> LoadedTask | None:
+    """The exam's rough part with the user's overrides; None where it is not asked for, or training was on a plane."""
+    if not args.eval or trained["terrain"]["mesh_type"] == "plane":
+        return None
+    task = load_task(str(trained["task"]))
+    task.update(trained, where=CONFIG_FILE)
+    crossing.prepare(task)
+    override(task, args, crossing.SETS)
+    crossing.make_room(task)  # the kinds of ground are known by now
+    return task
+
+
+def override(task: LoadedTask, args: argparse.Namespace, sets: set[str]) -> None:
+    """Apply the user's overrides, unless one of them changes what the exam ``sets`` itself."""
+    before = task.to_dict()
+    apply_overrides(task, args)
+    if sets and (touched := sets & changes_since(task, before).keys()):
+        raise ConfigError(f"--eval sets {', '.join(sorted(touched))} itself; an exam with other values would be another exam")
+
+
 def changes_since(task: LoadedTask, trained: dict[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Path -> (as trained, now) of every field of both configs that differs."""
     original = load_task(str(task.path))
@@ -179,11 +214,14 @@ def changes_since(task: LoadedTask, trained: dict[str, Any]) -> dict[str, tuple[
     return {path: (before, now) for path, before, now in differences}
 
 
-def grade(env: LeggedRobot, policy: MLPModel, source: Source, overrides: dict[str, Any]) -> report.Column:
-    """The exam and all else of a report, from one roll-out; prints the exam's table."""
-    result, figures = report.examine(env, lambda obs: act(policy, obs))
+def grade(candidate: Candidate) -> report.Column:
+    """The exam and all else of a report, from one roll-out and, if there is a rough part, another; prints their tables."""
+    source, policy, env, rough, overrides = candidate
+    result, figures = report.examine(env, lambda obs: act(policy, obs), rough)
     name = "shipped" if source.shipped else f"{source.folder.name}, {source.checkpoint.stem.removeprefix('model_')}"
     print(f"\n{name}, {env.sim.engine} on {env.device}\n{rules.table(result)}\n")
+    if rough:
+        print(f"{crossing.table(figures['crossing'])}\n")
     about = {"policy": "/".join(source.checkpoint.parts[-3:]), "engine": env.sim.engine, "device": env.device, "overrides": overrides}
     return report.Column(name, about, result, figures)
 

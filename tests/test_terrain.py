@@ -59,6 +59,13 @@ def test_stairs_are_stairs() -> None:
             assert along[round(PLATFORM / 0.1)] == along[0]
 
 
+def test_slopes_go_up_and_down_in_turn() -> None:
+    """Along a column, and side by side: two columns of a kind have one of each at every level."""
+    ground = terrain(proportions={"smooth_slope": 1.0, "rough_slope": 1.0}, columns=4)
+    up = ground.origins[1:, :, 2] < 0.0  # from the middle, in a pit
+    assert (up[:, ::2] != up[:, 1::2]).all() and (up[1:] != up[:-1]).all()
+
+
 def test_the_same_seed_makes_the_same_ground() -> None:
     assert np.array_equal(terrain().heights, terrain().heights)
     assert not np.array_equal(terrain().heights, terrain(seed=2).heights)

@@ -6,90 +6,108 @@ kinds, built anew with another seed. Nominal robot, no noise, no pushes: the sam
 
 from __future__ import annotations
 
+import math
+from statistics import fmean
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exam
 from legged_mw.eval.rollout import Policy
-from legged_mw.sim.terrain import MEASURES
+from legged_mw.sim.terrain import KINDS, MEASURES
+from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask
 
 SPEED, SECONDS = 0.6, 15.0  # [m/s] told; [s] in which the edge must be reached: 9 m at that speed, and the corner is 5.7 m away
-LEVELS, REPEATS = 10, 10  # robots on each level of each kind
+LEVELS, TILES, REPEATS = 10, 2, 5  # of each kind; tiles of each level, of a slope one goes up and one down; robots on each tile
 
 OVERRIDES: dict[str, Any] = {
     **exam.OVERRIDES,
     "terrain.mesh_type": "heightfield",
     "terrain.curriculum": False,
     "terrain.num_rows": LEVELS,
+    "terrain.tile_size": 8.0,  # [m]; what is to be crossed is the same for every task, and so is how steep a step can be:
+    "terrain.horizontal_scale": 0.05,  # [m]
     "terrain.difficulty": [0.0, 1.0],
     "terrain.border_size": 4.0,
     "terrain.seed": 1000,
     "init_state.pos_xy_range": 0.3,
-    "init_state.yaw_range": 3.141592653589793,
+    "init_state.yaw_range": math.pi,
 }
+SETS = {*OVERRIDES, "env.num_envs", "terrain.num_cols"} - {"domain_rand.enable"}  # what it decides itself, as exam.SETS
 
 
 def prepare(task: LoadedTask, repeats: int = REPEATS) -> None:
-    """Turn ``task`` into the rough part; its kinds of ground are those with a share in ``terrain.terrain_proportions``."""
+    """Turn ``task`` into the rough part."""
     for path, value in OVERRIDES.items():
         task.set(path, value, where="exam")
-    kinds = [kind for kind, share in task.cfg.terrain.terrain_proportions.items() if share > 0]
-    task.cfg.terrain.terrain_proportions = dict.fromkeys(kinds, 1.0)
-    task.cfg.terrain.num_cols = len(kinds)
-    task.cfg.env.num_envs = len(kinds) * LEVELS * repeats
+    make_room(task, repeats)
+
+
+def make_room(task: LoadedTask, repeats: int = REPEATS) -> None:
+    """Tiles of each kind of ground that has a share in ``terrain.terrain_proportions``, and ``repeats`` robots for each tile."""
+    ground = task.cfg.terrain
+    kinds = [kind for kind, share in ground.terrain_proportions.items() if share > 0]
+    if not kinds:
+        raise ConfigError(f"terrain.terrain_proportions: no kind of ground has a share above 0; there are: {', '.join(KINDS)}")
+    ground.terrain_proportions, ground.num_cols = dict.fromkeys(kinds, 1.0), len(kinds) * TILES
+    task.cfg.env.num_envs = ground.num_cols * LEVELS * repeats
 
 
 def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
     """Grade ``policy`` in an environment made from a prepared task: shares by kind and level of who crossed, and who fell."""
     assert env.tiles
-    kinds, device = env.tiles.kinds, env.device
-    repeats = env.num_envs // (len(kinds) * LEVELS)
-    levels = torch.arange(env.num_envs, device=device) // repeats % LEVELS
-    with torch.random.fork_rng([device] if device.startswith("cuda") else []):
+    kinds = env.tiles.kinds
+    repeats = env.num_envs // (len(kinds) * TILES * LEVELS)  # worlds go kind by kind, column by column, level by level
+    with torch.random.fork_rng([env.device] if env.device.startswith("cuda") else []):
         torch.manual_seed(0)
-        env.load_training_state({"terrain_levels": levels})
-        env.commands.copy_(torch.tensor([SPEED, 0.0, 0.0], device=device))
-        env.compute_observations()
-        crossed, fell = (torch.zeros(env.num_envs, dtype=torch.bool, device=device) for _ in range(2))
-        over = torch.zeros_like(crossed)
-        obs = env.get_observations()
-        for _ in range(round(SECONDS / env.dt)):
-            with torch.inference_mode():
-                actions = policy(obs)
-            obs, _, dones, extras = env.step(actions)
-            fell |= dones & ~extras["time_outs"] & ~over
-            over |= dones
-            crossed |= (env.farthest[:, 0] > env.tiles.size / 2) & ~over
-            over |= crossed
-            env.commands.copy_(torch.tensor([SPEED, 0.0, 0.0], device=device))  # who began anew is told the same, and no longer counts
-    shares = {
-        name: values.view(len(kinds), LEVELS, repeats).float().mean(dim=2).cpu().numpy().round(3).tolist()
-        for name, values in (("crossed", crossed), ("fell", fell))
-    }
-    return {
-        "speed": SPEED,
-        "seconds": SECONDS,
-        "repeats": repeats,
-        "kinds": {
-            kind: {
-                "measure": MEASURES[kind][0] if kind in MEASURES else None,
-                "values": [round(low + (high - low) * i / (LEVELS - 1), 2) for i in range(LEVELS)] if kind in MEASURES else None,
-                **{name: share[i] for name, share in shares.items()},
-            }
-            for i, kind in enumerate(kinds)
-            for low, high in [MEASURES[kind][1:] if kind in MEASURES else (0.0, 0.0)]
-        },
-    }
+        env.load_training_state({"terrain_levels": torch.arange(env.num_envs) // repeats % LEVELS})
+        outcomes = _walk(env, policy, env.tiles.size / 2)
+    by_tile = [who.view(len(kinds), TILES, LEVELS, repeats).double() for who in outcomes]
+    crossed, fell = (who.mean(dim=(1, 3)).cpu().numpy().round(3).tolist() for who in by_tile)
+    shares = {kind: {**_measure(kind), "crossed": crossed[i], "fell": fell[i]} for i, kind in enumerate(kinds)}
+    return {"speed": SPEED, "seconds": SECONDS, "robots": TILES * repeats, "kinds": shares}
+
+
+def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor]:
+    """Who came ``edge`` [m] away from the middle along x or y, and who fell before that, each (N,)."""
+    told = torch.tensor([SPEED, 0.0, 0.0], device=env.device)
+    crossed, fell, over = (torch.zeros(env.num_envs, dtype=torch.bool, device=env.device) for _ in range(3))
+    env.commands.copy_(told)
+    env.compute_observations()
+    obs = env.get_observations()
+    for _ in range(round(SECONDS / env.dt)):
+        with torch.inference_mode():
+            actions = policy(obs)
+        obs, _, dones, extras = env.step(actions)
+        fell |= dones & ~extras["time_outs"] & ~over
+        over |= dones
+        crossed |= (env.farthest[:, 0] > edge) & ~over
+        over |= crossed
+        env.commands.copy_(told)  # who began anew is told the same, and no longer counts
+    return crossed, fell
+
+
+def _measure(kind: str) -> dict[str, Any]:
+    """What makes a kind hard and its value at each level; None where nothing does."""
+    if kind not in MEASURES:
+        return {"measure": None, "values": None}
+    name, low, high = MEASURES[kind]
+    return {"measure": name, "values": [round(low + (high - low) * i / (LEVELS - 1), 2) for i in range(LEVELS)]}
 
 
 def table(result: dict[str, Any]) -> str:
-    """Shares that crossed, a line a kind, a column a level."""
-    lines = [f"crossed a tile at {result['speed']:g} m/s within {result['seconds']:g} s, by level"]
-    for name, kind in result["kinds"].items():
-        lines.append(f"{name:<16}" + "".join(f"{share:>7.2f}" for share in kind["crossed"]))
+    """Shares that crossed, a line a kind, a column a level; at the end, over all levels, also who fell."""
+    kinds = result["kinds"]
+    lines = [f"share of {result['robots']} robots that crossed a tile at {result['speed']:g} m/s within {result['seconds']:g} s"]
+    lines.append(f"{'level':<16}" + "".join(f"{level:>7}" for level in range(LEVELS)) + f"{'mean':>9}{'fell':>7}")
+    for name, kind in kinds.items():
+        crossed = "".join(f"{share:>7.2f}" for share in kind["crossed"])
+        lines.append(f"{name:<16}{crossed}{fmean(kind['crossed']):>9.2f}{fmean(kind['fell']):>7.2f}")
         if kind["measure"]:
-            lines.append(f"  {kind['measure']:<14}" + "".join(f"{value:>7.4g}" for value in kind["values"]))
+            lines.append(f"  {kind['measure']:<14}" + "".join(f"{value:>7.3g}" for value in kind["values"]))
+    crossed, fell = (fmean(share for kind in kinds.values() for share in kind[which]) for which in ("crossed", "fell"))
+    lines.append(f"{'all':<16}{'':{7 * LEVELS}}{crossed:>9.2f}{fell:>7.2f}")
     return "\n".join(lines)

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 from itertools import zip_longest
+from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from legged_mw.eval import rules
+from legged_mw.eval.crossing import LEVELS
 from legged_mw.eval.style import CSS
 
 if TYPE_CHECKING:
@@ -15,6 +17,9 @@ if TYPE_CHECKING:
     from legged_mw.eval.report import Column
 
 TEXTS = {
+    "crossing": "Told to walk ahead at 0.6 m/s from the middle of a tile, facing any direction: the share of ten robots on two tiles that "
+    "came to their tile's edge within 15 s. Below it those who fell on the way; the rest got stuck or went astray. A row is a kind of "
+    "ground, and below it stands what makes it hard, level by level. Dark is good.",
     "tracking": "Mean absolute error of the velocity at the IMU, body frame, over the last 8 of 10 seconds, command by command over the "
     "range that was trained. Dark is good. The stroke on each scale is what the exam allows on average; a cross is a fall.",
     "steps": "Walking at two thirds of the trained range, then the same backwards, then standing, then walking again. Line: mean of eight "
@@ -114,7 +119,7 @@ def _exam_table(columns: Sequence[Column]) -> str:
 
 def _chapter(section: Section, panels: list[str], extra: str) -> str:
     figures = "".join(f"<figure>{svg}</figure>" for svg in panels)
-    kind = "wide" if section.across == 1 else f"by{section.across}"
+    kind = "wide" if section.across == 1 else "half" if section.panels[0].width > 4.0 else f"by{section.across}"
     text = f'<h2>{section.title}</h2><p class="lead">{TEXTS[section.name]}</p>'
     return f'<section>{text}<div class="panels {kind}">{figures}</div>{extra}</section>'
 
@@ -124,6 +129,7 @@ def _extra(name: str, columns: Sequence[Column]) -> str:
     drawn = [column for column in columns if column.figures]
     figures: dict[str, Any] = drawn[0].figures or {}
     tables = {
+        "crossing": (_crossing_rows, ["", *(f"level {i}" for i in range(LEVELS)), "mean"], "Every share"),
         "steps": (_step_rows, ["", "from", "to", "10 to 90 % in [s]", "overshoot", "left at the end"], ""),
         "gait": (_gait_rows, ["vx, vy, yaw rate", "strides [1/s]", *(f"{foot} down" for foot in figures["foot_names"])], "All commands"),
         "joints": (_joint_rows, ["", "position", "velocity", "torque"], "Share beyond the limit, joint by joint"),
@@ -133,6 +139,15 @@ def _extra(name: str, columns: Sequence[Column]) -> str:
     make, heads, folded = tables[name]
     paired = zip_longest(*(make(column, f", {column.name}" if len(drawn) > 1 else "") for column in drawn))  # ranges may differ
     return _table(heads, [row for rows in paired for row in rows if row], folded)
+
+
+def _crossing_rows(column: Column, whose: str) -> list[list[str]]:
+    rows = []
+    for name, kind in (column.figures or {}).get("crossing", {"kinds": {}})["kinds"].items():
+        for which in ("crossed", "fell"):
+            shares = [*kind[which], fmean(kind[which])]
+            rows.append([f"{name.replace('_', ' ')}, {which}{whose}", *(f"{share:.1%}" for share in shares)])
+    return rows
 
 
 def _step_rows(column: Column, whose: str) -> list[list[str]]:

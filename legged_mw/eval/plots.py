@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from matplotlib import rc_context
+from matplotlib import colormaps, rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -74,7 +74,9 @@ def sections(columns: Columns) -> list[Section]:
     strides = [Panel(partial(_gait, columns, i), height=1.75 + 0.25 * len(columns)) for i in chosen]
     energy = [Panel(partial(_against_speed, columns, "power")), Panel(partial(_against_speed, columns, "cost_of_transport"))]
     terms = len(columns[0][1]["reward"])
+    rough = _crossing_maps(columns)
     return [
+        *([Section("crossing", "Rough ground", rough, across=len(rough))] if rough else []),
         Section("tracking", "Following the command", _heat_maps(columns)),
         Section("steps", "Steps of the command", responses),
         Section("gait", "Gait", strides),
@@ -134,6 +136,51 @@ def _of(name: str, columns: Columns) -> str:
 def _array(values: Any) -> np.ndarray:
     """Nested lists with None as an array with NaN."""
     return np.array(values, dtype=float)
+
+
+# ---- rough ground
+
+
+def _crossing_maps(columns: Columns) -> list[Panel]:
+    """A map a policy that was graded on rough ground."""
+    graded = [(_of(name, columns), figures["crossing"]) for name, figures in columns if "crossing" in figures]
+    kinds = max((len(result["kinds"]) for _, result in graded), default=0)
+    width, height = 6.2 if len(graded) == 1 else 5.2, 0.75 + 0.43 * kinds
+    return [Panel(partial(_crossing, result["kinds"], suffix), width, height) for suffix, result in graded]
+
+
+def _crossing(kinds: dict[str, Figures], suffix: str, ax: Axes) -> None:
+    """A row a kind of ground, a cell a level: who crossed, and who fell; below the cells what makes the kind hard."""
+    for row, kind in enumerate(kinds.values()):
+        shares = _array([kind["crossed"], kind["fell"]])
+        levels = shares.shape[1]
+        means = (levels + 0.3, *shares.mean(axis=1))
+        for x, crossed, fell in [*zip(range(levels), *shares, strict=True), means]:
+            ax.bar(x, 0.66, 0.94, row, color=colormaps[HEAT](1.0 - crossed), linewidth=0)
+            ink: dict[str, Any] = {"color": "#ffffff" if crossed > 0.45 else "#101318", "ha": "center", "va": "center"}
+            ax.text(x, row + (0.24 if fell else 0.33), _percent(crossed), fontsize=7.5, **ink)
+            if fell:
+                ax.text(x, row + 0.5, f"{_percent(fell)} fell", fontsize=5.7, **ink)
+        for x, value in enumerate(kind["values"] or []):
+            ax.text(x, row + 0.8, f"{value:.3g}", fontsize=6.2, color=MUTED, ha="center", va="center")
+    ax.set_yticks(np.arange(len(kinds)) + 0.33, [kind.replace("_", " ") for kind in kinds])
+    ax.set_yticks(np.arange(len(kinds)) + 0.8, [kind["measure"] or "" for kind in kinds.values()], minor=True)
+    ax.tick_params(axis="y", which="minor", length=0.0, labelsize=6.2, labelcolor=MUTED)
+    ax.tick_params(axis="y", labelcolor=INK)
+    ax.set_xticks([*range(levels), levels + 0.3], [*map(str, range(levels)), "mean"])
+    ax.set_xlabel("level", labelpad=2)
+    ax.set_xlim(-0.5, levels + 0.8)
+    ax.set_ylim(len(kinds) - 0.05, 0.0)
+    ax.grid(False)
+    ax.spines[["left", "bottom"]].set_visible(False)
+    crossed, fell = (float(np.mean([kind[which] for kind in kinds.values()])) for which in ("crossed", "fell"))
+    ax.set_title(f"share that crossed [%]{suffix}")
+    ax.set_title(f"all: {_percent(crossed)}, {_percent(fell)} fell", loc="right", color=MUTED, fontsize=7.0)
+
+
+def _percent(share: float) -> str:
+    """In whole percent, downwards: 100 are all, 0 none."""
+    return "<1" if 0.0 < share < 0.01 else f"{math.floor(100 * share + 1e-6)}"
 
 
 # ---- following the command

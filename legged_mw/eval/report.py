@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam, figures, rules
+from legged_mw.eval import crossing, exam, figures, rules
 from legged_mw.eval.rollout import Policy, Record, Signal, roll_out
 from legged_mw.eval.trials import NAMES, STEPS_AT, Plan, make_plan
 from legged_mw.sim.model import per_joint
@@ -51,11 +51,17 @@ def make_room(task: LoadedTask) -> None:
     task.cfg.env.num_envs = len(make_plan(task.cfg, task.cfg.sim.dt * task.cfg.control.decimation).cases)
 
 
-def examine(env: LeggedRobot, policy: Policy) -> tuple[dict[str, Any], dict[str, Any]]:
-    """The exam's result and the report's figures, from one roll-out of an environment made from a prepared task."""
+def examine(env: LeggedRobot, policy: Policy, rough: LeggedRobot | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The exam's result and the report's figures, from one roll-out of an environment made from a prepared task.
+
+    With ``rough``, made from a task that ``crossing`` prepared, its result is among the figures.
+    """
     plan = make_plan(env.cfg, env.dt)
     record = roll_out(env, policy, plan.cases, round(exam.SECONDS / env.dt), SIGNALS, alone=exam.WORLDS)
-    return exam.grade(record.part(slice(exam.WORLDS))), gather(env, plan, record)
+    gathered = gather(env, plan, record)
+    if rough:
+        gathered["crossing"] = crossing.run_crossing(rough, policy)
+    return exam.grade(record.part(slice(exam.WORLDS))), gathered
 
 
 def gather(env: LeggedRobot, plan: Plan, record: Record) -> dict[str, Any]:

@@ -41,7 +41,7 @@ td .value::after{content:"";display:inline-block;width:18px}
 td .pass::after{content:"\\2713";color:var(--good)}td .fail::after{content:"\\2717";color:var(--bad)}
 td .fail{color:var(--bad)}
 .panels{display:grid;gap:22px 20px;grid-template-columns:repeat(3,minmax(0,1fr))}
-.wide{grid-template-columns:minmax(0,760px)}
+.wide{grid-template-columns:minmax(0,760px)}.half{grid-template-columns:repeat(2,minmax(0,1fr))}
 figure{margin:0}
 figure svg{display:block;width:100%;height:auto;overflow:visible}
 .panels+.scroll,.panels+details{margin-top:22px}
@@ -50,7 +50,7 @@ summary{cursor:pointer;color:var(--muted);font-size:14.5px;margin-bottom:8px}
 footer{border-top:1px solid var(--faint);padding-top:22px;color:var(--muted);font-size:14px}
 footer p{margin:0 0 4px}footer b{color:var(--ink);font-weight:600}
 code{font-family:ui-monospace,"SF Mono",Menlo,Consolas,"DejaVu Sans Mono",monospace;font-size:.92em}
-@media (max-width:900px){.panels{grid-template-columns:repeat(2,minmax(0,1fr))}.wide{grid-template-columns:1fr}}
+@media (max-width:900px){.panels{grid-template-columns:repeat(2,minmax(0,1fr))}.wide,.half{grid-template-columns:1fr}}
 @media (max-width:600px){main{padding:32px 18px 48px}h1{font-size:30px}.panels{grid-template-columns:1fr}
 .cards{grid-template-columns:repeat(2,1fr)}.pill{margin:2px 6px 2px 0}th,td{padding-right:12px}}
 @media print{main{max-width:none;padding:0}section{break-inside:avoid-page}}

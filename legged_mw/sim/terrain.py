@@ -75,7 +75,7 @@ def make_terrain(
     for column, kind in enumerate(kinds):
         for level in range(levels):
             hard = difficulty[0] + (difficulty[1] - difficulty[0]) * level / max(levels - 1, 1)
-            patch = KINDS[kind](_Grid(n, cell), hard, rng)
+            patch = KINDS[kind](_Grid(n, cell, pit=(column + level) % 2 == 0), hard, rng)
             row0, col0 = edge + column * n, edge + level * n
             field[row0 : row0 + n + 1, col0 : col0 + n + 1] = patch
             middle = (col0 + n // 2, row0 + n // 2)
@@ -106,6 +106,7 @@ class _Grid:
 
     n: int
     cell: float
+    pit: bool  # every second tile, along both axes, is a pit if it is of a kind that goes up or down
 
     @property
     def distance(self) -> Heights:
@@ -133,9 +134,9 @@ def flat(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
 
 
 def smooth_slope(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """A pyramid or, every second time, a pit, up to 0.4 steep [legged_gym]."""
+    """A pyramid or, every second time, a pit, up to 0.4 steep [legged_gym; ours: in turn, not by chance]."""
     rise = SLOPE * difficulty * np.clip(grid.half - 0.5 - np.maximum(grid.distance, PLATFORM), 0.0, None)
-    return rise if rng.random() < 0.5 else -rise
+    return -rise if grid.pit else rise
 
 
 def rough_slope(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
