@@ -19,7 +19,7 @@ from legged_mw.sim.model import ModelError, unknown
 Heights = NDArray[np.float64]
 STEP = (0.06, 0.195)  # [m] of stairs at difficulty 0 and 1 [legged_gym: 0.05, 0.23; ours: for a leg of 0.43]
 BLOCK = (0.05, 0.25)  # [m] of blocks and holes [legged_gym]
-SLOPE, WAVE, NOISE, DITCH, STONE_GAP = 0.4, 0.15, 0.05, 0.6, 0.2  # at difficulty 1: [-], then [m]
+SLOPE, WAVE, NOISE, DITCH, STONE_GAP = 0.4, 0.3, 0.05, 0.6, 0.2  # at difficulty 1: [-], then [m]; a wave from trough to crest
 PLATFORM = 1.0  # [m] half the edge of the flat middle of a tile, where robots begin [legged_gym: 3 m in all for most, ours 2]
 
 
@@ -167,11 +167,11 @@ def obstacles(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heigh
 
 
 def waves(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """Sines along both axes, up to 15 cm high, 2 m long [ours]."""
+    """Sines along both axes, 2 m long, up to 30 cm from trough to crest [ours]."""
     along = np.arange(grid.n + 1) * grid.cell
     phase = rng.uniform(0.0, 2.0 * np.pi, 2)
     sines = [np.sin(np.pi * along + p) for p in phase]
-    return grid.fade(0.5 * WAVE * difficulty * (sines[0][:, None] + sines[1][None, :]))
+    return grid.fade(0.25 * WAVE * difficulty * (sines[0][:, None] + sines[1][None, :]))
 
 
 def stepping_stones(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
@@ -216,7 +216,7 @@ MEASURES: dict[str, tuple[str, float, float]] = {
     "stairs_up": ("step [cm]", 100 * STEP[0], 100 * STEP[1]),
     "stairs_down": ("step [cm]", 100 * STEP[0], 100 * STEP[1]),
     "obstacles": ("height [cm]", 100 * BLOCK[0], 100 * BLOCK[1]),
-    "waves": ("height [cm]", 0.0, 200 * WAVE),
+    "waves": ("height [cm]", 0.0, 100 * WAVE),
     "stepping_stones": ("gap [cm]", 0.0, 100 * STONE_GAP),
     "gap": ("width [cm]", 0.0, 100 * DITCH),
     "low_random": ("height [cm]", 0.0, 100 * NOISE),
