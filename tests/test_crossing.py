@@ -48,8 +48,8 @@ def test_prepare_is_the_exam_but_for_ground_place_and_heading() -> None:
     assert (ground.mesh_type, ground.curriculum, ground.tile_size, ground.horizontal_scale) == ("heightfield", False, 8.0, 0.05)
     assert ground.terrain_proportions == {"stairs_up": 1.0, "flat": 1.0} and (ground.num_rows, ground.num_cols) == (LEVELS, 2 * TILES)
     assert task.cfg.env.num_envs == 2 * LEVELS * 10
-    differs = {path for path, value in exam.OVERRIDES.items() if crossing.OVERRIDES[path] != value}
-    assert differs == {"terrain.mesh_type", "init_state.pos_xy_range", "init_state.yaw_range"}
+    differs = {path for path, value in exam.OVERRIDES.items() if crossing.OVERRIDES.get(path) != value}
+    assert differs == {"terrain.mesh_type", "init_state.pos_xy_range", "init_state.yaw_range", "termination.min_base_height"}
 
 
 def test_a_ground_of_nothing_is_refused() -> None:
