@@ -31,8 +31,9 @@ NOMINAL = {  # what playing changes in the trained config
     "perturbation.push": False,
     "domain_rand.enable": False,
     "commands.curriculum": False,
-    "terrain.curriculum": False,  # any level, anew at each reset
 }
+
+ROWS, BORDER = 3, 2.0  # of the ground to watch: levels, from the easiest to the hardest, and [m]
 
 
 class Source(NamedTuple):
@@ -174,6 +175,9 @@ def prepare(task: LoadedTask, args: argparse.Namespace) -> list[list[float]]:
     else:
         for path, value in NOMINAL.items():
             task.set(path, value, where="play")
+        apply_overrides(task, args)  # they say on what ground
+        for path, value in ground_to_watch(task).items():
+            task.set(path, value, where="play")
     override(task, args, exam.SETS if args.eval else set())
     if args.eval:
         report.make_room(task)  # the ranges are known by now
@@ -184,6 +188,24 @@ def prepare(task: LoadedTask, args: argparse.Namespace) -> list[list[float]]:
             task.set(f"commands.ranges.{name}", [value, value], where="--command")
         task.set("commands.resampling_time", 0.0, where="--command")
     return limits
+
+
+def ground_to_watch(task: LoadedTask) -> dict[str, Any]:
+    """A grid that is soon drawn, in place of the whole one: few levels, a column and a robot a kind, the most frequent first."""
+    terrain = task.cfg.terrain
+    shares = terrain.terrain_proportions
+    kinds = sorted((kind for kind in shares if shares[kind] > 0), key=lambda kind: -shares[kind])
+    if terrain.mesh_type == "plane" or not kinds:
+        return {}
+    return {
+        "env.num_envs": len(kinds),
+        "terrain.num_rows": ROWS,
+        "terrain.num_cols": len(kinds),
+        "terrain.border_size": BORDER,
+        "terrain.terrain_proportions": dict.fromkeys(kinds, 1.0),
+        "terrain.curriculum": False,  # any level, anew at each reset; else, where that is asked for, from the first one on
+        "terrain.max_init_terrain_level": 0,
+    }
 
 
 def prepare_crossing(trained: dict[str, Any], args: argparse.Namespace) -> LoadedTask | None:

@@ -22,7 +22,7 @@ ONLY_IN = {
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
     "rsl_rl.models": ["legged_mw/rl/*", "play.py"],  # the type of what it plays
     "matplotlib": ["legged_mw/eval/plots.py"],  # a second to import, and only for a report
-    "legged_mw.view": ["legged_mw/view/*", "legged_mw/deploy/*", "play.py", "train.py"],
+    "legged_mw.view": ["legged_mw/view/*", "legged_mw/deploy/*", "legged_mw/terrain_picture.py", "play.py", "train.py"],
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/face.py"],  # young, and not on every platform
     "legged_mw.eval": ["legged_mw/eval/*", "legged_mw/deploy/*", "play.py", "train.py"],
     "legged_mw.deploy": ["legged_mw/deploy/*", "legged_mw/rl/export.py", "legged_mw/eval/*", "play.py"],

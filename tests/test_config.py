@@ -555,6 +555,8 @@ def test_numpy_numbers_become_plain() -> None:
         ("control.limits", "[1e-4, 2]", [1e-4, 2.0]),
         ("control.limits", "5", 5),
         ("control.stiffness", "{knee: 1e1, hip: 2}", {"knee": 10.0, "hip": 2.0}),
+        ("control.stiffness", "{knee:1e1,hip: 2}", {"knee": 10.0, "hip": 2.0}),  # which to YAML is a key 'knee:1e1' without a value
+        ("control.stiffness", "{hip:2}", {"hip": 2.0}),  # in place of the default, not beside it
         ("control.anything", "{a: [1, 1e-4, x]}", {"a": [1, 1e-4, "x"]}),
         ("commands.ranges.lin_vel_x", "[-1, 1e-1]", [-1.0, 0.1]),
         ("commands.ranges.pos", "[1, 2]", (1.0, 2.0)),
@@ -581,7 +583,7 @@ def test_set(path: str, text: Any, expected: Any) -> None:
         ("num_envs", "3", ("num_envs does not exist; did you mean 'env.num_envs'?", "Base has: seed, env, control")),
         ("env", "3", ("env is a section, not a field; set one of its fields: num_envs",)),
         ("env.num_envs.x", "3", ("env.num_envs.x does not exist: env.num_envs is a field (int), not a section",)),
-        ("control.stiffness.hip", "3", ("control.stiffness is a field (dict[str, float]), not a section; set it whole",)),
+        ("control.stiffness.hip", "3", ("a field (dict[str, float]), not a section; set it whole: control.stiffness={hip: ...}",)),
         ("env.num_envs", "3.5", ("env.num_envs must be int, not 3.5 (float)",)),
         ("env.num_envs", "many", ("env.num_envs must be int, not 'many' (str)",)),
         ("env.is_flat", "1", ("env.is_flat must be bool, not 1 (int)",)),

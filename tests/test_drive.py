@@ -277,6 +277,9 @@ class FakeStage:
     def fell(self) -> Any:
         return np.arange(self.num_worlds) == self.falls.get(self.steps, -1)
 
+    def ground(self, world: int) -> str:
+        return "" if world == 0 else "stairs_up, step 12 cm"
+
     def push(self, world: int, velocity: Any) -> None:
         self.events.append((self.steps, "push", world))
 

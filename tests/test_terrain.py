@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import mujoco
@@ -10,8 +12,25 @@ import pytest
 import torch
 from guard import recordable
 
+from legged_mw import ROOT
+from legged_mw.envs.terrain import build_terrain
+from legged_mw.sim import terrain as ground_kinds
 from legged_mw.sim.model import ModelError
-from legged_mw.sim.terrain import KINDS, PLATFORM, HeightMap, Terrain, as_boxes, level_kinds, make_terrain, share_columns
+from legged_mw.sim.terrain import (
+    KINDS,
+    PLATFORM,
+    Grid,
+    HeightMap,
+    Heights,
+    Terrain,
+    add_kind,
+    as_boxes,
+    describe,
+    level_kinds,
+    make_terrain,
+    share_columns,
+)
+from legged_mw.utils.task import load_task
 
 
 def terrain(**changes: Any) -> Terrain:
@@ -114,6 +133,90 @@ def test_a_lookup_can_be_recorded_and_holds_outside() -> None:
 def test_mistakes_are_named(changes: dict[str, Any], message: str) -> None:
     with pytest.raises(ModelError, match=message):
         terrain(**changes)
+
+
+def test_shares_of_nothing_are_refused() -> None:
+    with pytest.raises(ModelError, match="terrain.terrain_proportions: no kind has a share above 0, in {'flat': 0.0}; there are: flat"):
+        terrain(proportions={"flat": 0.0})
+
+
+# ---- kinds of one's own
+
+
+@pytest.fixture
+def own_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a test adds is gone after it."""
+    monkeypatch.setattr(ground_kinds, "KINDS", dict(KINDS))
+    monkeypatch.setattr(ground_kinds, "MEASURES", dict(ground_kinds.MEASURES))
+
+
+@pytest.mark.usefixtures("own_kinds")
+def test_a_kind_of_ones_own() -> None:
+    for depth in (0.2, 0.1):  # a config file may be loaded twice: the last one counts
+
+        @add_kind("depth [cm]", 0.0, 100 * depth)
+        def pits(grid: Grid, difficulty: float, rng: np.random.Generator, depth: float = depth) -> Heights:
+            return grid.fade(np.full((grid.n + 1, grid.n + 1), -depth * difficulty))
+
+    ground = terrain(proportions={"pits": 1.0, "flat": 1.0}, columns=2, levels=3)
+    assert tile(ground, 2, "pits").min() == pytest.approx(-0.1) and tile(ground, 1, "pits").min() == pytest.approx(-0.05)
+    assert ground.difficulties == (0.0, 0.5, 1.0)
+    assert describe("pits", 0.5) == "pits, depth 5 cm" and describe("stairs_up", 0.5) == "stairs_up, step 12.8 cm"
+    assert describe("flat", 0.5) == "flat"
+
+
+@pytest.mark.usefixtures("own_kinds")
+def test_mistakes_of_ones_own_kind_are_named() -> None:
+    @add_kind()
+    def small(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+        return grid.zeros()[1:]
+
+    @add_kind()
+    def cliff(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+        return grid.zeros() + difficulty
+
+    @add_kind()
+    def hole(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+        return np.where(grid.distance < 0.1, np.nan, 0.0)
+
+    with pytest.raises(ModelError, match=r"kind of terrain 'small' returned heights of shape \(80, 81\); a tile has \(81, 81\)"):
+        terrain(proportions={"small": 1.0})
+    for kind in ("cliff", "hole"):
+        with pytest.raises(ModelError, match=f"kind of terrain '{kind}': its heights must be finite, and 0 along the rim"):
+            terrain(proportions={kind: 1.0})
+
+    def gap(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+        return grid.zeros()
+
+    with pytest.raises(ModelError, match="kind of terrain 'gap' is one of the package's own; give yours another name than flat"):
+        add_kind()(gap)
+
+
+@pytest.mark.usefixtures("own_kinds")
+def test_the_kind_in_the_docs_is_ground_that_a_task_can_have(tmp_path: Path) -> None:
+    [code] = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "terrain.md").read_text(), re.DOTALL)
+    (tmp_path / "go1_craters.py").write_text(code)
+    for _ in range(2):  # train.py and play.py load it more than once
+        task = load_task(str(tmp_path / "go1_craters.py"))
+    for path, value in {"terrain.num_rows": 2, "terrain.num_cols": 4}.items():
+        task.set(path, value)
+    ground = build_terrain(task.cfg)
+    assert ground is not None and "craters" in ground.kinds
+    patch = ground.heights[ground.vertices(1, ground.kinds.index("craters"))]
+    assert -0.45 < patch.min() < -0.3 and not patch[78:83, 78:83].any()
+    assert describe("craters", 1.0) == "craters, depth 40 cm"
+
+
+@pytest.mark.parametrize("edge", [8.0, 8.1])
+def test_a_place_is_on_the_tile_whose_vertices_are_around_it(edge: float) -> None:
+    ground = terrain(levels=3, proportions={"flat": 1.0, "stairs_up": 1.0}, columns=2, tile=edge)
+    for level, column in ((0, 0), (2, 1), (1, 0)):
+        rows, columns = ground.vertices(level, column)
+        assert rows.stop - rows.start == columns.stop - columns.start == round(edge / 0.1) + 1
+        x, y = (start + span.start * 0.1 for start, span in zip(ground.corner, (columns, rows), strict=True))
+        for inside in (0.01, edge - 0.01):
+            assert ground.tile_at(x + inside, y + inside) == (level, column)
+    assert ground.tile_at(-1.5 * edge - 0.01, 0.0) is None and ground.tile_at(0.0, edge + 0.01) is None
 
 
 def test_level_pieces_are_told_from_slopes() -> None:

@@ -65,6 +65,10 @@ class DeployStage:
         """(N,) in the last step."""
         return self._fell.copy()
 
+    def ground(self, world: int) -> str:
+        """A plane, always."""
+        return ""
+
     def push(self, world: int, velocity: Any) -> None:
         """The robot's horizontal velocity jumps by ``velocity`` (2,) [m/s, world frame]; the policy sees it a step later."""
         self.fleet.qvel[world, :2] += velocity

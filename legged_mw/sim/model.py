@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING
 import mujoco
 import numpy as np
 
+from legged_mw.sim.relief import add_relief
 from legged_mw.sim.scene import add_scene
 from legged_mw.utils.errors import UserError, unknown
 
@@ -56,7 +57,7 @@ class RobotModel:
     """A compiled model and the tables of names that its user needs."""
 
     physics: mujoco.MjModel  # what is stepped: no visual geoms
-    visual: mujoco.MjModel  # what is drawn: same qpos, qvel and bodies, with visual geoms
+    visual: mujoco.MjModel  # the same with visual geoms: same qpos, qvel and bodies
     root: str  # name of the body that carries the free joint
     joint_names: tuple[str, ...]  # scalar joints, in order of qpos[7:], qvel[6:] and ctrl
     joint_range: np.ndarray  # (D, 2) [rad]
@@ -64,6 +65,7 @@ class RobotModel:
     sensors: dict[str, slice]  # "contact", "linvel", "accelerometer" -> span of sensordata
     spec: mujoco.MjSpec  # what ``visual`` was compiled from: to copy, never to change
     contact_geoms: tuple[str, ...] = ()  # in order of the span "contact"
+    terrain: Terrain | None = None  # None: the plane
     overrides: list[str] = field(default_factory=list)  # what the caller's choices changed, a line each
 
     def ground_geoms(self) -> slice:
@@ -72,6 +74,14 @@ class RobotModel:
         names = [self.physics.geom(i).name for i in range(count)]
         first = names.index(GROUND)
         return slice(first, first + sum(name == GROUND or name.startswith(f"{GROUND}/") for name in names))
+
+    def drawn(self) -> mujoco.MjModel:
+        """``visual`` for somebody to look at: a terrain's steps and slopes are seen. Takes a second where it is large."""
+        if self.terrain is None:
+            return self.visual
+        spec = self.spec.copy()
+        add_relief(spec, self.terrain, GROUND)
+        return spec.compile()
 
     def id(self, kind: str, name: str) -> int:
         """Index of the ``kind`` ("body", "geom", "site") called ``name``."""
@@ -155,9 +165,19 @@ def build_model(
         effort_range=np.array(limits).reshape(-1, 2),
         sensors=_sensor_spans(mj, len(touching), len(velocity_sites), accelerometer_site is not None),
         contact_geoms=touching,
+        terrain=ground.terrain,
         spec=drawn,
         overrides=notes,
     )
+
+
+def ground_model(terrain: Terrain) -> mujoco.MjModel:
+    """The ground alone, to be looked at from afar."""
+    spec = mujoco.MjSpec()
+    _add_ground(spec, Ground(terrain=terrain), "the ground", [])
+    add_scene(spec)
+    add_relief(spec, terrain, GROUND, squares=False)
+    return spec.compile()
 
 
 def _invalid(file: Path, error: ValueError) -> ModelError:

@@ -11,7 +11,7 @@ import mujoco
 
 GROUND_MATERIAL = "ground"  # for the floor or terrain geom
 _ZENITH, _HORIZON = (0.22, 0.32, 0.45), (0.56, 0.63, 0.70)
-_TILE = 0.5  # edge of one checker square [m], a thin line every second one: to judge speed and stride by
+SQUARE = 0.5  # edge of one checker square [m], a thin line every second one: to judge speed and stride by
 
 
 def add_scene(spec: mujoco.MjSpec) -> None:
@@ -52,7 +52,7 @@ def _add_ground_material(spec: mujoco.MjSpec) -> None:
     material = spec.add_material(name=GROUND_MATERIAL, specular=0.1, shininess=0.1, reflectance=0.0)
     # texuniform measures in half-sizes: texrepeat 1 lays the image, 2 x 2 squares with a line around it, over 2 m
     material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = GROUND_MATERIAL
-    material.texuniform, material.texrepeat = True, [1 / _TILE, 1 / _TILE]
+    material.texuniform, material.texrepeat = True, [1 / SQUARE, 1 / SQUARE]
 
 
 def _add_light(spec: mujoco.MjSpec) -> None:

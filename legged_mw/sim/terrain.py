@@ -35,11 +35,23 @@ class Terrain:
     corner: tuple[float, float]  # x, y of the vertex (0, 0) [m, world]
     tile: float  # [m] edge of a tile
     kinds: tuple[str, ...]  # of each column of tiles
+    difficulties: tuple[float, ...]  # of each level, 0 to 1
     origins: NDArray[np.float64]  # (levels, kinds, 3) the middle of each tile, on the ground [m, world]
 
     @property
     def levels(self) -> int:
         return len(self.origins)
+
+    def tile_at(self, x: float, y: float) -> tuple[int, int] | None:
+        """Level and column of the tile there [m, world]; None outside of all tiles."""
+        level, column = (int(np.floor(along / self.tile + count / 2)) for along, count in ((x, self.levels), (y, len(self.kinds))))
+        return (level, column) if 0 <= level < self.levels and 0 <= column < len(self.kinds) else None
+
+    def vertices(self, level: int, column: int) -> tuple[slice, slice]:
+        """Rows and columns of ``heights`` that are a tile's, its rim included."""
+        n = round(self.tile / self.cell)
+        edge = (self.heights.shape[1] - 1 - self.levels * n) // 2
+        return slice(edge + column * n, edge + (column + 1) * n + 1), slice(edge + level * n, edge + (level + 1) * n + 1)
 
     def span(self) -> tuple[float, float]:
         """Lowest and highest point [m]."""
@@ -72,21 +84,36 @@ def make_terrain(
     field = np.zeros((columns * n + 2 * edge + 1, levels * n + 2 * edge + 1))
     origins = np.zeros((levels, columns, 3))
     corner = (-0.5 * levels * tile - edge * cell, -0.5 * columns * tile - edge * cell)
+    difficulties = tuple(_between(difficulty, level / max(levels - 1, 1)) for level in range(levels))
     for column, kind in enumerate(kinds):
-        for level in range(levels):
-            hard = difficulty[0] + (difficulty[1] - difficulty[0]) * level / max(levels - 1, 1)
-            patch = KINDS[kind](_Grid(n, cell, pit=(column + level) % 2 == 0), hard, rng)
+        for level, hard in enumerate(difficulties):
+            patch = _checked(KINDS[kind](Grid(n, cell, pit=(column + level) % 2 == 0), hard, rng), kind, n)
             row0, col0 = edge + column * n, edge + level * n
             field[row0 : row0 + n + 1, col0 : col0 + n + 1] = patch
             middle = (col0 + n // 2, row0 + n // 2)
             origins[level, column] = corner[0] + middle[0] * cell, corner[1] + middle[1] * cell, patch[n // 2, n // 2]
-    return Terrain(field, cell, corner, tile, kinds, origins)
+    return Terrain(field, cell, corner, tile, kinds, difficulties, origins)
+
+
+def _checked(patch: Heights, kind: str, n: int) -> Heights:
+    """The heights that the function ``kind`` made, if they are a tile's."""
+    patch = np.asarray(patch, dtype=float)
+    if patch.shape != (n + 1, n + 1):
+        raise ModelError(f"kind of terrain '{kind}' returned heights of shape {patch.shape}; a tile has {(n + 1, n + 1)}, as grid.zeros()")
+    rim = np.concatenate([patch[[0, -1]].ravel(), patch[:, [0, -1]].ravel()])
+    if not np.isfinite(patch).all() or np.abs(rim).max() > 1e-9:
+        raise ModelError(
+            f"kind of terrain '{kind}': its heights must be finite, and 0 along the rim so that tiles fit together (grid.fade does that)"
+        )
+    return patch
 
 
 def share_columns(proportions: Mapping[str, float], columns: int) -> tuple[str, ...]:
     """A kind for each column, in the order given, as near to the shares as whole columns come; each kind at least once."""
     wanted = {kind: share for kind, share in proportions.items() if share > 0}
-    if not wanted or len(wanted) > columns:
+    if not wanted:
+        raise ModelError(f"terrain.terrain_proportions: no kind has a share above 0, in {dict(proportions)}; there are: {', '.join(KINDS)}")
+    if len(wanted) > columns:
         raise ModelError(f"terrain.num_cols: {columns} columns cannot hold {len(wanted)} kinds; every kind with a share above 0 needs one")
     bounds = np.cumsum(list(wanted.values())) / sum(wanted.values())
     kinds = [list(wanted)[min(int(np.searchsorted(bounds, (i + 0.5) / columns)), len(wanted) - 1)] for i in range(columns)]
@@ -101,12 +128,12 @@ def share_columns(proportions: Mapping[str, float], columns: int) -> tuple[str, 
 
 
 @dataclass(frozen=True)
-class _Grid:
-    """The vertices of one tile."""
+class Grid:
+    """The vertices of one tile, (n + 1, n + 1)."""
 
-    n: int
-    cell: float
-    pit: bool  # every second tile, along both axes, is a pit if it is of a kind that goes up or down
+    n: int  # cells along an edge
+    cell: float  # [m] between two vertices
+    pit: bool  # every second tile, along both axes: a pit if it is of a kind that goes up or down
 
     @property
     def distance(self) -> Heights:
@@ -116,6 +143,7 @@ class _Grid:
 
     @property
     def half(self) -> float:
+        """Half the edge [m]: the largest distance."""
         return 0.5 * self.n * self.cell
 
     def zeros(self) -> Heights:
@@ -128,33 +156,36 @@ class _Grid:
         return heights * inside * outside
 
 
-def flat(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+Kind = Callable[[Grid, float, np.random.Generator], Heights]  # of the grid, the difficulty from 0 to 1, and what is to be drawn from
+
+
+def flat(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """Nothing."""
     return grid.zeros()
 
 
-def smooth_slope(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+def smooth_slope(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """A pyramid or, every second time, a pit, up to 0.4 steep [legged_gym; ours: in turn, not by chance]."""
     rise = SLOPE * difficulty * np.clip(grid.half - 0.5 - np.maximum(grid.distance, PLATFORM), 0.0, None)
     return -rise if grid.pit else rise
 
 
-def rough_slope(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+def rough_slope(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """The same with 5 cm of noise on it [legged_gym]."""
     return smooth_slope(grid, difficulty, rng) + grid.fade(_noise(grid, 0.05, 0.2, rng))
 
 
-def stairs_up(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+def stairs_up(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """From a pit in the middle up to the rim, steps of 6 to 19.5 cm, 30 cm deep."""
     return -_stairs(grid, _between(STEP, difficulty))
 
 
-def stairs_down(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+def stairs_down(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """From the top in the middle down to the rim."""
     return _stairs(grid, _between(STEP, difficulty))
 
 
-def obstacles(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+def obstacles(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """Twenty blocks and holes of 5 to 25 cm, 1 to 2 m across [legged_gym]."""
     heights, height = grid.zeros(), _between(BLOCK, difficulty)
     for _ in range(20):
@@ -166,7 +197,7 @@ def obstacles(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heigh
     return heights
 
 
-def waves(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+def waves(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """Sines along both axes, 2 m long, up to 30 cm from trough to crest [ours]."""
     along = np.arange(grid.n + 1) * grid.cell
     phase = rng.uniform(0.0, 2.0 * np.pi, 2)
@@ -174,7 +205,7 @@ def waves(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     return grid.fade(0.25 * WAVE * difficulty * (sines[0][:, None] + sines[1][None, :]))
 
 
-def stepping_stones(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+def stepping_stones(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """Square stones, 1.5 m down to 0.3 m, with gaps of one cell up to 0.2 m between them, 0.3 m deep [legged_gym; ours: less deep]."""
     stone = max(round((1.5 - 1.2 * difficulty) / grid.cell), 2)
     gap = max(round(STONE_GAP * difficulty / grid.cell), 1)
@@ -190,7 +221,7 @@ def stepping_stones(grid: _Grid, difficulty: float, rng: np.random.Generator) ->
     return heights
 
 
-def gap(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+def gap(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """A ditch around the middle, one cell to 0.6 m wide, 0.5 m deep [legged_gym; ours: less wide]."""
     width = max(DITCH * difficulty, grid.cell)
     heights = grid.zeros()
@@ -198,12 +229,12 @@ def gap(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     return heights
 
 
-def low_random(grid: _Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+def low_random(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
     """Random heights of 0 to 5 cm at every vertex, smaller in lower levels [MuJoCo Playground: 0 to 5 cm]."""
     return grid.fade(NOISE * difficulty * rng.random((grid.n + 1, grid.n + 1)))
 
 
-KINDS: dict[str, Callable[[_Grid, float, np.random.Generator], Heights]] = {
+KINDS: dict[str, Kind] = {
     kind.__name__: kind
     for kind in (flat, smooth_slope, rough_slope, stairs_up, stairs_down, obstacles, waves, stepping_stones, gap, low_random)
 }
@@ -223,18 +254,46 @@ MEASURES: dict[str, tuple[str, float, float]] = {
 }
 
 
+def add_kind(measure: str = "", low: float = 0.0, high: float = 0.0) -> Callable[[Kind], Kind]:
+    """Make the decorated function a kind of ground under its own name, for ``terrain.terrain_proportions``.
+
+    ``measure``: what makes it hard, with its unit, as in "depth [cm]"; ``low`` and ``high``: its value at difficulty 0 and 1.
+    """
+
+    def add(kind: Kind) -> Kind:
+        name = kind.__name__
+        if name in KINDS and KINDS[name].__module__ == __name__:
+            raise ModelError(f"kind of terrain '{name}' is one of the package's own; give yours another name than {', '.join(KINDS)}")
+        KINDS[name] = kind
+        MEASURES.pop(name, None)
+        if measure:
+            MEASURES[name] = (measure, low, high)
+        return kind
+
+    return add
+
+
+def describe(kind: str, difficulty: float) -> str:
+    """A kind and how hard it is, in words: "stairs_up, step 12.8 cm"."""
+    if kind not in MEASURES:
+        return kind
+    measure, low, high = MEASURES[kind]
+    name, _, unit = measure.rstrip("]").partition(" [")
+    return f"{kind}, {name} {_between((low, high), difficulty):.3g} {unit}".rstrip()
+
+
 def _between(span: tuple[float, float], difficulty: float) -> float:
     return span[0] + (span[1] - span[0]) * difficulty
 
 
-def _stairs(grid: _Grid, height: float, width: float = 0.3) -> Heights:
+def _stairs(grid: Grid, height: float, width: float = 0.3) -> Heights:
     """A pyramid of steps: from the rim inwards one step every ``width`` [m], up to the middle."""
     count = int((grid.half - 0.5 - PLATFORM) / width + 1e-6)
     step = np.ceil((grid.half - 0.5 - grid.distance) / width - 1e-6)
     return height * np.clip(step, 0, count)
 
 
-def _noise(grid: _Grid, height: float, every: float, rng: np.random.Generator) -> Heights:
+def _noise(grid: Grid, height: float, every: float, rng: np.random.Generator) -> Heights:
     """Uniform within +-``height``, drawn every ``every`` [m], straight lines between."""
     coarse = np.arange(0.0, 2.0 * grid.half + every, every)
     fine = np.arange(grid.n + 1) * grid.cell

@@ -214,6 +214,8 @@ def _parse(text: str, kind: Any, path: str) -> Any:
     """`text` as a `kind`: verbatim for a str, else read as YAML, else verbatim (`run_7` for a `str | int`)."""
     try:
         value = text if kind is str else None if text == "None" else yaml.load(text, Loader=_Loader)
+        if isinstance(value, dict) and any(":" in str(key) and item is None for key, item in value.items()):
+            value = yaml.load(re.sub(r":(?=\S)", ": ", text), Loader=_Loader)  # {a:1}, which to YAML is a key without a value
     except yaml.YAMLError:
         value = text
     try:
@@ -313,7 +315,8 @@ class Config:
                 here = f"{here}.{section}" if here else section
                 kind = _kind(type(node), section, here)
                 if not _is_section(kind):
-                    raise ConfigError(f"{path} does not exist: {here} is a field ({_show(kind)}), not a section; set it whole")
+                    whole = f": {here}={{{path.removeprefix(f'{here}.')}: ...}}" if get_origin(kind) is dict else ""
+                    raise ConfigError(f"{path} does not exist: {here} is a field ({_show(kind)}), not a section; set it whole{whole}")
                 node = getattr(node, section)
             kind = _kind(type(node), name, path)
             vars(node)[name] = _parse(value, kind, path) if isinstance(value, str) else _fit(value, kind, path)

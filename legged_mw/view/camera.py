@@ -1,4 +1,4 @@
-"""Where the camera stands: it follows the chosen robot, walks behind it, or sees all. Moves a `mujoco.MjvCamera` of somebody else's."""
+"""Where the camera stands: it follows the chosen robot, walks behind it, or sees all; over hills. Moves somebody else's `MjvCamera`."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -9,6 +9,7 @@ import math
 import mujoco
 import numpy as np
 
+from legged_mw.view.hills import Hills
 from legged_mw.view.puppet import Cast
 
 AZIMUTH, ELEVATION = 130.0, -22.0  # [deg] front right of the robot, a little above it
@@ -17,7 +18,10 @@ DISTANCE = 2.4  # [robot radius] camera to base
 FOLLOW_XY, FOLLOW_Z = 0.12, 0.04  # share of the way to the base per frame; slower in z, so that steps do not shake the picture
 FOLLOW_ALL = 0.04  # the same for all: slow, for robots come into reach and leave it
 REACH = 14.0  # [robot radius] how far a robot may be from the followed one and still be among all
+REACH_HILLS = 24.0  # the same on hills, where each begins on a tile of its own
 TURN = 0.08  # share of the way to the heading per frame
+STEEPEST, CLEARANCE, LOOK_BELOW = -60.0, 0.15, 0.6  # [deg], [robot radius]: on hills it sees the feet, that far below the base, over a rise
+LIFT = 0.06  # share of the way to the elevation that this needs per frame
 JUMP = 3.0  # [robot radius] a base this far from where the camera looks was reset, not walked: cut instead of a swish
 
 
@@ -27,6 +31,7 @@ class CameraMan:
     def __init__(self, camera: mujoco.MjvCamera, cast: Cast, by_hand: bool) -> None:
         self.camera, self.cast, self.by_hand = camera, cast, by_hand
         self._shot: tuple[str, int] | None = None  # what it shows: mode, world
+        self._place_then = cast.anchors[0].position  # of that world's robot
         self._frames = 1.0
 
     def update(self, mode: str, world: int, frames: float = 1.0) -> mujoco.MjvCamera:
@@ -34,8 +39,11 @@ class CameraMan:
         self._frames = frames
         before, self._shot = self._shot, (mode, world)
         changed = before is None or before[0] != mode
+        anchor = self.cast.anchors[world]
+        jumped = before == self._shot and float(np.linalg.norm(anchor.position - self._place_then)) > JUMP * anchor.radius
+        self._place_then = anchor.position
         if mode == "all":
-            self._see_all(world, cut=changed)
+            self._see_all(world, cut=changed or jumped)
         elif mode == "behind":
             self._follow(world, cut=before != self._shot)
             self._turn(math.degrees(self.cast.anchors[world].heading), cut=changed)
@@ -68,6 +76,18 @@ class CameraMan:
             camera.lookat[:] = anchor.position
         else:
             camera.lookat[:] += gap * [self._share(share) for share in (FOLLOW_XY, FOLLOW_XY, FOLLOW_Z)]
+        if self.cast.hills is not None:
+            gap = self._free_elevation(self.cast.hills, anchor.radius) - camera.elevation
+            camera.elevation += gap if cut else gap * self._share(LIFT)
+
+    def _free_elevation(self, hills: Hills, radius: float) -> float:
+        """From how high [deg] the robot is seen over the ground between it and the camera."""
+        camera = self.camera
+        away = camera.distance * math.cos(math.radians(ELEVATION)) * np.linspace(0.3, 1.0, 8)
+        azimuth = math.radians(camera.azimuth)
+        places = camera.lookat[:2] - away[:, None] * [math.cos(azimuth), math.sin(azimuth)]
+        rise = np.array([hills.height(place) for place in places]) + CLEARANCE * radius - (camera.lookat[2] - LOOK_BELOW * radius)
+        return max(min(ELEVATION, -math.degrees(float(np.arctan2(rise, away).max()))), STEEPEST)
 
     def _share(self, each: float) -> float:
         """Of the way, after ``self._frames`` steps of the share ``each``."""
@@ -83,7 +103,8 @@ class CameraMan:
     def _see_all(self, world: int, cut: bool) -> None:
         """All robots that are not out of reach of this one; they walk apart, and from too far they are specks."""
         places = np.array([anchor.position for anchor in self.cast.anchors])
-        near = places[np.linalg.norm(places - places[world], axis=1) < REACH * self.cast.radius]
+        limit = REACH if self.cast.hills is None else REACH_HILLS
+        near = places[np.linalg.norm(places - places[world], axis=1) < limit * self.cast.radius]
         camera, middle = self.camera, (near.min(axis=0) + near.max(axis=0)) / 2
         reach = float(np.linalg.norm(near - middle, axis=1).max()) + self.cast.radius
         share = 1.0 if cut else self._share(FOLLOW_ALL)

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.sim.terrain import describe
 from legged_mw.view.stage import BoolArray, FloatArray
 
 
@@ -24,7 +25,7 @@ class EnvStage:
 
     def __init__(self, env: LeggedRobot, policy: Callable[[TensorDict], Tensor], limits: ArrayLike) -> None:
         self.env, self.policy = env, policy
-        self.model, self.num_worlds, self.dt = env.robot.visual, env.num_envs, env.dt
+        self.model, self.num_worlds, self.dt = env.robot.drawn(), env.num_envs, env.dt
         self.limits: FloatArray = np.array(limits, dtype=np.float64)
         self._obs = env.get_observations()
 
@@ -50,6 +51,13 @@ class EnvStage:
 
     def fell(self) -> BoolArray:
         return self.env.fell.cpu().numpy().copy()
+
+    def ground(self, world: int) -> str:
+        terrain = self.env.terrain
+        if terrain is None:
+            return ""
+        tile = terrain.tile_at(*self.env.sim.qpos[world, :2].tolist())
+        return describe(terrain.kinds[tile[1]], terrain.difficulties[tile[0]]) if tile else "border"
 
     @torch.no_grad()
     def push(self, world: int, velocity: FloatArray) -> None:

@@ -22,6 +22,7 @@ from legged_mw.view.video import Frame, VideoWriter, contact_sheet, save_png
 
 SHADOW_MAX = 2048  # ours: edge of the shadow map [px]; 8192, found in many scenes, halves the frame rate of software OpenGL
 GEOMS_MAX = 20_000
+FINE_REACH = 3.0  # [m] beyond the camera's distance: tiles of rough ground farther from what it looks at are drawn coarsely
 TINY, SMALL = 400, 800  # [px] pictures up to these widths get smaller letters
 SHEET_FRAMES, SHEET_COLUMNS, SHEET_WIDTH = 12, 4, 320  # pictures, a row of them, the widest that one may be [px]
 GIF_FPS, GIF_WIDTH = 12.5, 640  # a GIF holds hundredths of a second; more of either and it is larger than its video is good
@@ -44,12 +45,14 @@ class RobotRenderer:
             font = scale.mjFONTSCALE_50 if width <= TINY else scale.mjFONTSCALE_100 if width <= SMALL else scale.mjFONTSCALE_150
             self._renderer = mujoco.Renderer(self.cast.model, height=height, width=width, max_geom=GEOMS_MAX, font_scale=font)
         except Exception as error:  # each OpenGL backend fails with a type of its own
-            raise ViewError(_no_context(error)) from error
+            raise ViewError(no_context(error)) from error
 
     def frame(self, moment: Moment, frames: float = 1.0) -> Frame:
         """One picture (height, width, 3), yours to keep; `frames` of a video passed since the last."""
         self.cast.pose(moment.qpos, moment.world)
         camera, scene = self._camera.update(moment.camera, moment.world, frames), self._renderer.scene
+        if self.cast.hills is not None:
+            self.cast.hills.refine(camera.lookat[:2], FINE_REACH + camera.distance)
         # MuJoCo lays an endless floor around where the camera was; told first, it lies right in the first frame too
         mujoco.mjv_updateCamera(self.cast.model, self.cast.data, camera, scene)
         self._renderer.update_scene(self.cast.data, camera, self._option)
@@ -78,7 +81,8 @@ class RobotRenderer:
         self.close()
 
 
-def _no_context(error: Exception) -> str:
+def no_context(error: Exception) -> str:
+    """What to do where no OpenGL context for drawing without a screen is to be had."""
     state = ", ".join(f"{name}={os.environ.get(name)!r}" for name in ("MUJOCO_GL", "DISPLAY"))
     return (
         f"No OpenGL context for offscreen rendering ({state}): {type(error).__name__}: {error}\n"

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from legged_mw.view.hills import Hills, height_fields
 from legged_mw.view.stage import FloatArray
 
 GROUPS_SHOWN = 3  # geom groups 0 ground, 1 and 2 what is meant to be seen; from 3 on collision shapes
@@ -99,8 +100,7 @@ class Cast:
         self.puppet = Puppet(model)
         self.radius = self.puppet.radius
         self.feet = contact_geoms(model)
-        terrain = bool((model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD).any())
-        self.offsets = np.zeros((count, 3)) if terrain else side_by_side(count, SPACING * self.radius)
+        self.offsets = np.zeros((count, 3)) if has_places(model) else side_by_side(count, SPACING * self.radius)
         self._feet_at = np.zeros((count, len(self.feet), 3))
         self.anchors = [self._anchor(world) for world in range(count)]
         if count == 1:
@@ -110,6 +110,7 @@ class Cast:
             self.data = mujoco.MjData(self.model)
             self.base = self.model.body("focus").id
         self.pose(np.tile(model.qpos0, (count, 1)))  # a window may draw before it is shown anything
+        self.hills = Hills(self.model, self.data) if len(height_fields(model)) else None
 
     def pose(self, qpos: ArrayLike, world: int = 0) -> None:
         """Place all robots, rows of `qpos` (N, nq); lights and tracking cameras go with `world`."""
@@ -151,6 +152,12 @@ def contact_geoms(model: mujoco.MjModel) -> list[int]:
     return [int(model.sensor_objid[i]) for i in range(model.nsensor) if model.sensor_type[i] == contact and model.sensor_objtype[i] == geom]
 
 
+def has_places(model: mujoco.MjModel) -> bool:
+    """Whether it matters where a robot is: there is more ground than planes."""
+    fixed = model.body_weldid[model.geom_bodyid] == 0
+    return bool((fixed & (model.geom_group < GROUPS_SHOWN) & (model.geom_type != mujoco.mjtGeom.mjGEOM_PLANE)).any())
+
+
 def side_by_side(count: int, spacing: float) -> FloatArray:
     """Places (N, 3) on a square grid [m], the first at the origin, the others ahead of it and to its left."""
     columns = math.ceil(math.sqrt(count))
@@ -166,9 +173,10 @@ def marionettes(model: mujoco.MjModel, count: int) -> tuple[mujoco.MjModel, list
     spec = mujoco.MjSpec()
     moving = [body for body in range(1, model.nbody) if model.body_weldid[body] != 0]
     _copy_visuals(spec, model)
-    wide = math.ceil(math.sqrt(count)) * SPACING * 0.5 / max(model.stat.extent, 1e-6)
+    apart = has_places(model)  # too far for one shadow map
+    wide = 0.0 if apart else math.ceil(math.sqrt(count)) * SPACING * 0.5 / max(model.stat.extent, 1e-6)
     spec.visual.map.shadowclip = min(max(model.vis.map.shadowclip, wide), SHADOW_MAX)
-    spec.visual.quality.shadowsize = max(model.vis.quality.shadowsize, SHADOW_SIZE)
+    spec.visual.quality.shadowsize = max(model.vis.quality.shadowsize, 0 if apart else SHADOW_SIZE)
     _copy_assets(spec, model)
     for body in range(model.nbody):
         if model.body_weldid[body] == 0:

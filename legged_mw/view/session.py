@@ -204,6 +204,8 @@ class Session:
         lines = [("command", shown(command)), ("measured", shown(velocity)), ("driven by", driver)]
         if count > 1:
             lines.append(("robot", f"{pilot.world + 1} of {count}"))
+        if ground := self.stage.ground(pilot.world):
+            lines.append(("ground", ground))
         return (*lines, ("falls", str(self.falls)), ("time", f"{self.time:.1f} s{self._tempo()}"))
 
     def _tempo(self) -> str:

@@ -57,6 +57,10 @@ class Stage(Protocol):
         """Which robots fell in the last step (N,)."""
         ...
 
+    def ground(self, world: int) -> str:
+        """What a robot walks on, in words; empty where that is a plane."""
+        ...
+
     def push(self, world: int, velocity: FloatArray) -> None:
         """Let the robot's horizontal velocity jump by (2,) [m/s], world frame."""
         ...
