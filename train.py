@@ -98,6 +98,12 @@ def announce(task: LoadedTask, device: str, rank: Rank) -> None:
         return
     cores, runner = usable_cores(), task.train.runner
     steps = runner.max_iterations * worlds * runner.num_steps_per_env
+    if task.cfg.terrain.mesh_type != "plane":
+        print(
+            f"{cores} cores: {steps / 1e6:.1f} M steps; rough ground takes a CPU several times as long as a plane, and wants a GPU",
+            flush=True,
+        )
+        return
     minutes = steps / (_STEPS_PER_CORE * cores) / 60
     print(f"{cores} cores: {runner.max_iterations} iterations, {steps / 1e6:.1f} M steps, about {minutes:.0f} min", flush=True)
 

@@ -49,11 +49,11 @@ def bare_warp(env: LeggedRobot) -> Callable[[], None]:
     import mujoco_warp as mjw
     import warp as wp
 
-    from legged_mw.sim.warp_engine import put_model, record_warp
+    from legged_mw.sim.warp_engine import make_model, record_warp
 
     device = wp.get_device(env.device)
     with wp.ScopedDevice(device):
-        model = put_model(env.robot.physics, env.terrain)
+        model = make_model(env.robot.physics, env.terrain)
         model.opt.warn_overflow, model.opt.graph_conditional = 0, False
         data = mjw.make_data(env.robot.physics, nworld=env.num_envs, nconmax=env.cfg.sim.nconmax, njmax=env.cfg.sim.njmax)
     for name in ("qpos", "qvel"):

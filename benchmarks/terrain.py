@@ -33,7 +33,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl.policy import act, load_policy
 from legged_mw.sim.graph import StepGraph
 from legged_mw.sim.terrain import Terrain
-from legged_mw.sim.warp_engine import put_model, record_warp
+from legged_mw.sim.warp_engine import make_model, record_warp
 from legged_mw.utils.cli import pick_device, seed_everything
 from legged_mw.utils.task import load_task
 
@@ -53,7 +53,7 @@ class Variant:
         free, begun = free_memory(env.device), time.perf_counter()
         device = wp.get_device(env.device)
         with wp.ScopedDevice(device):
-            model = put_model(ground.model, ground.terrain)
+            model = make_model(ground.model, ground.terrain)
             model.opt.warn_overflow, model.opt.graph_conditional = 0, False
             self.data = mjw.make_data(ground.model, nworld=env.num_envs, nconmax=ground.nconmax, njmax=ground.njmax)
             self.reset = lambda: self._pose(env, ground.level)

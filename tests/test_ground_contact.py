@@ -157,14 +157,30 @@ def test_shapes_and_their_probes() -> None:
     kinds = mujoco.mjtGeom
     for kind, size, count in (
         (kinds.mjGEOM_SPHERE, [0.1, 0, 0], 1),
-        (kinds.mjGEOM_CAPSULE, [0.1, 0.2, 0], 2),
-        (kinds.mjGEOM_BOX, [0.1] * 3, 8),
+        (kinds.mjGEOM_CAPSULE, [0.1, 0.2, 0], 5),
+        (kinds.mjGEOM_BOX, [0.1] * 3, 26),
     ):
         model = ball_model(None, {"type": kind, "size": size})
         geoms, places, radii = probes(model, 0)
         assert geoms == [1] * count and len(places) == len(radii) == count
     with pytest.raises(ModelError, match=r"collider 'ball' is a cylinder: on terrain mujoco_warp knows spheres, capsules and boxes"):
         probes(ball_model(None, {"type": kinds.mjGEOM_CYLINDER, "size": [0.1, 0.1, 0]}), 0)
+
+
+@pytest.mark.parametrize(
+    "shape",
+    [{"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [0.3, 0.1, 0.05]}, {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [0.05, 0.3, 0]}],
+)
+def test_what_lies_across_an_edge_does_not_sink_into_it(shape: dict[str, Any]) -> None:
+    terrain = ground("stairs_down")
+    row = terrain.heights[60, :]
+    edge = next(i for i in range(150, 190) if row[i] - row[i + 1] > 0.1)  # of level 1, going down outwards
+    sim = WarpSimulation(ball_model(terrain, shape), 1, "cpu", nconmax=64, njmax=128, terrain=terrain, eager=True)
+    lying = [1.0, 0.0, 0.0, 0.0] if shape["size"][2] else [0.7071068, 0.0, 0.7071068, 0.0]
+    sim.qpos[0] = torch.tensor([terrain.corner[0] + edge * 0.05 - 0.05, 0.0, row[edge] + 0.052, *lying])
+    for _ in range(40):
+        sim.step()
+    assert sim.qpos[0, 2] > row[edge] + 0.02, "its middle is over the edge's tread"
 
 
 def test_too_little_room_is_seen() -> None:

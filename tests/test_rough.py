@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from guard import recordable
 from torch import Tensor
-from worlds import QUIET, make_env, snapshot
+from worlds import QUIET, make_env
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl.runner import make_runner
@@ -123,6 +124,37 @@ def test_who_walks_off_the_grid_is_timed_out_and_has_not_fallen() -> None:
     assert (env.sim.qpos[:2, :2].abs() < 17.0).all(), "they begin anew on their tiles"
 
 
+def test_without_a_border_they_turn_back_before_the_rim() -> None:
+    env = rough(4, terrain__border_size=0.0)
+    assert env.tiles and env.tiles.edge.tolist() == [15.5, 15.5]
+    assert rough(4, terrain__border_size=0.6).tiles.edge[0] == pytest.approx(16.1)  # type: ignore[union-attr]
+
+
+def test_who_walks_off_has_not_survived_the_episode() -> None:
+    env = rough(2, perturbation__enable=True, perturbation__curriculum=True)
+    env.sim.qpos[0, 0] = 17.1
+    env._episode_length_buf[1] = env.max_episode_length
+    env.step(STAND.expand(2, -1))
+    assert env.time_out_buf.tolist() == [True, True]
+    assert env.kick_level[0] < 0.01 and env.kick_level[1] == 0.5
+
+
+def test_few_worlds_take_kinds_from_all_over() -> None:
+    assert rough(1).tiles.columns.tolist() == [2] and rough(2).tiles.columns.tolist() == [1, 3]  # type: ignore[union-attr]
+
+
+def test_beyond_the_flat_middle_robots_begin_on_the_ground() -> None:
+    env = rough(64, init_state__pos_xy_range=3.0)
+    np.testing.assert_allclose(env.sim.qpos[:, 2].numpy() - ground_under(env, env.sim.qpos[:, :2]), 0.278, atol=1e-4)
+
+
+def test_a_command_below_the_smallest_asks_nothing() -> None:
+    env = rough(2, rewards__min_command=0.2)
+    env.commands[:] = torch.tensor([[0.15, 0.0, 0.0], [0.3, 0.0, 0.0]])
+    env.step(STAND.expand(2, -1))
+    assert env.asked[:, 0].tolist() == [0.0, pytest.approx(0.006)] and env.progress[0] == 0.0
+
+
 def test_a_trunk_near_the_ground_is_a_fall() -> None:
     env = rough(4, termination__min_base_height=0.12)
     env.sim.qpos[0, 2] -= 0.178  # to 0.1 m, and the feet are far below the ground
@@ -142,7 +174,7 @@ def episode(
     env: LeggedRobot, world: int, *, asked: float, progress: float, farthest: float, seconds: float = 20.0, fell: bool = False
 ) -> None:
     """Write into the books that ``world`` had such an episode."""
-    env.asked[world], env.progress[world], env.farthest[world] = asked, progress, farthest
+    env.asked[world], env.progress[world], env.farthest[world], env.asked_speed[world] = asked, progress, farthest, 1.0
     env.episode_steps[world], env.fell[world] = round(seconds / env.dt), fell
 
 
@@ -207,7 +239,7 @@ def test_without_the_curriculum_any_level_comes_at_each_reset() -> None:
 
 def test_a_reset_before_any_step_moves_nobody() -> None:
     env = rough(32)
-    before = snapshot(env)["env.tiles"] if "env.tiles" in snapshot(env) else env.tiles.levels.clone()  # type: ignore[union-attr]
+    before = env.tiles.levels.clone()  # type: ignore[union-attr]
     env.reset()
     env.reset()
     assert torch.equal(env.tiles.levels, before)  # type: ignore[union-attr]
@@ -243,6 +275,22 @@ def test_ranges_of_commands_grow_when_they_are_tracked() -> None:
         ended(10, 0.95)
     assert env.command_curriculum[0] == 1.0 and env.command_ranges[1].tolist() == pytest.approx([1.5, 0.8, 1.2])
     assert env.read_statistics()["command_share"] == 1.0
+
+
+def test_a_range_without_zero_grows_from_its_end_that_is_nearest() -> None:
+    env = rough(2, commands__curriculum=True, commands__curriculum_start=0.5, commands__ranges__lin_vel_x=[0.5, 1.5])
+    assert env.command_ranges[:, 0].tolist() == pytest.approx([0.5, 1.0]) and env.command_ranges[:, 1].tolist() == pytest.approx(
+        [-0.4, 0.4]
+    )
+    with pytest.raises(ConfigError, match=r"commands.curriculum goes by how well tracking_lin_vel is met: give"):
+        rough(2, commands__curriculum=True, rewards__scales__tracking_lin_vel=0.0)
+
+
+def test_the_whole_step_asks_the_host_nothing_with_every_curriculum() -> None:
+    env = rough(8, sim__engine="mujoco_warp", commands__curriculum=True, perturbation__enable=True, termination__max_tilt=10.0)
+    env._episode_length_buf[:4] = env.max_episode_length
+    with recordable():
+        env._step()
 
 
 # ---- resume ---------------------------------------------------------------------------------------------------------
@@ -282,9 +330,11 @@ def test_a_resume_with_other_numbers_of_worlds_and_levels_keeps_what_fits(tmp_pa
     env, runner = trained(16)
     assert env.tiles
     env.tiles.put(torch.tensor([0] * 4 + [1] * 4 + [2] * 4 + [3] * 4))  # a level a kind
+    env.command_curriculum.copy_(torch.tensor([0.7, 11.0, 12.0]))
     runner.save(str(tmp_path / "model_0.pt"))
     more, again = trained(32)
     again.load(str(tmp_path / "model_0.pt"))
+    assert more.command_curriculum[1:].tolist() == [0.0, 0.0], "what was counted was of other worlds"
     assert more.tiles and more.tiles.levels.tolist() == [0] * 8 + [1] * 8 + [2] * 8 + [3] * 8
     fewer, again = trained(16, terrain__num_rows=2, terrain__max_init_terrain_level=1)
     again.load(str(tmp_path / "model_0.pt"))

@@ -18,6 +18,7 @@ from legged_mw.sim import terrain as ground_kinds
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import (
     KINDS,
+    LEVEL,
     PLATFORM,
     Grid,
     HeightMap,
@@ -26,7 +27,6 @@ from legged_mw.sim.terrain import (
     add_kind,
     as_boxes,
     describe,
-    level_kinds,
     make_terrain,
     share_columns,
 )
@@ -219,10 +219,18 @@ def test_a_place_is_on_the_tile_whose_vertices_are_around_it(edge: float) -> Non
     assert ground.tile_at(-1.5 * edge - 0.01, 0.0) is None and ground.tile_at(0.0, edge + 0.01) is None
 
 
-def test_level_pieces_are_told_from_slopes() -> None:
-    level = level_kinds(KINDS, 0.05)
-    assert {"flat", "stairs_up", "stairs_down", "obstacles", "gap"} <= set(level)
-    assert not {"smooth_slope", "rough_slope", "waves", "low_random"} & set(level)
+@pytest.mark.parametrize("cell", [0.05, 0.1, 0.2])
+def test_only_level_pieces_become_boxes(cell: float) -> None:
+    """A slope of few cells is a heap of steps to who counts rectangles."""
+    kinds = [kind for kind in KINDS if kind != "craters"]
+    ground = terrain(levels=2, cell=cell, proportions=dict.fromkeys(kinds, 1.0), columns=len(kinds), difficulty=(0.5, 0.9))
+    _, heights = as_boxes(ground)
+    sunk = set()
+    for column, kind in enumerate(ground.kinds):
+        rows, columns = ground.vertices(1, column)
+        if heights[rows, columns].min() < ground.heights[rows, columns].min() - 0.9:
+            sunk.add(kind)
+    assert sunk == LEVEL
 
 
 def test_boxes_cover_each_level_tile_once_and_at_its_heights() -> None:
@@ -236,5 +244,6 @@ def test_boxes_cover_each_level_tile_once_and_at_its_heights() -> None:
         inside = rng.uniform(np.array(box.low) + 0.051, np.array(box.high) - 0.051, (20, 2))
         np.testing.assert_allclose(look_up(torch.tensor(inside, dtype=torch.float)), box.top, atol=1e-5)
     edge, n = 20, 80
-    assert (heights[edge + 1 : edge + n, edge + 1 : edge + 2 * n : n // 2] < ground.heights.min() - 0.9).any(), "sunk under the boxes"
+    for first in (edge, edge + n):
+        assert (heights[edge + 1 : edge + n, first + 1 : first + n] < -0.9).all(), "sunk under the boxes"
     np.testing.assert_array_equal(heights[edge + n :], ground.heights[edge + n :], "the slopes stay")

@@ -28,7 +28,7 @@ class BaseTask(VecEnv):
         self.actions = torch.zeros(num_envs, num_actions, device=device)
         self.rew_buf = torch.zeros(num_envs, device=device)
         self.reset_buf = torch.zeros(num_envs, dtype=torch.bool, device=device)  # the episode ended in this step
-        self.time_out_buf = torch.zeros(num_envs, dtype=torch.bool, device=device)  # it ended by the clock alone
+        self.time_out_buf = torch.zeros(num_envs, dtype=torch.bool, device=device)  # it ended by the clock, or off the terrain; no fall
         self._episode_length_buf = torch.zeros(num_envs, dtype=torch.long, device=device)  # [control steps]
         self._graph = StepGraph(self._step, device, eager)
 

@@ -53,6 +53,7 @@ ENVIRONMENT: dict[str, Rule] = {
     "termination.max_tilt": ("above 0 and at most 180 degrees", lambda v: 0 < v <= 180),
     **dict.fromkeys(("terrain.num_rows", "terrain.num_cols", "terrain.tile_size", "terrain.horizontal_scale"), POSITIVE),
     **dict.fromkeys(("terrain.border_size", "termination.min_base_height"), NOT_NEGATIVE),
+    "terrain.terrain_proportions": ("kinds with shares from 0", lambda v: all(share >= 0 for share in v.values())),
     "terrain.difficulty": ("two numbers from 0 to 1, the lower first", lambda v: len(v) == 2 and 0 <= v[0] <= v[1] <= 1),
     "terrain.height_scan": ("a list of groups: state, privileged_state", lambda v: {*v} <= {"state", "privileged_state"}),
     **dict.fromkeys(("terrain.measured_points_x", "terrain.measured_points_y"), ("at least one number", lambda v: len(v) > 0)),
@@ -75,6 +76,10 @@ def check_values(cfg: LeggedRobotCfg, train: LeggedRobotCfgPPO | None = None) ->
     """Raise ConfigError at the first value that cannot work."""
     _check(cfg, ENVIRONMENT)
     _check_redraws(cfg)
+    if cfg.commands.curriculum and not cfg.to_dict()["rewards"]["scales"].get("tracking_lin_vel", 0.0) > 0:
+        raise ConfigError(
+            "commands.curriculum goes by how well tracking_lin_vel is met: give rewards.scales.tracking_lin_vel a number above 0"
+        )
     if train is not None:
         _check(train, LEARNER)
         samples = cfg.env.num_envs * train.runner.num_steps_per_env

@@ -28,7 +28,7 @@ from legged_mw.envs.mirror import Mirror, make_mirror
 from legged_mw.envs.terrain import Tiles, build_terrain
 from legged_mw.sim.model import Ground, ModelError, Physics, RobotModel, build_model, per_joint, unknown
 from legged_mw.sim.simulation import make_simulation, pick_engine
-from legged_mw.sim.terrain import make_height_map
+from legged_mw.sim.terrain import PLATFORM, make_height_map
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign, columns, may_hold, quat_rotate, quat_rotate_inverse
 
@@ -130,19 +130,19 @@ class LeggedRobot(BaseTask):
 
     def _measure_ground(self) -> None:
         """Heights of feet and root above the ground under each of them, and how far the robot came."""
-        feet, root = self.sim.site_xpos[:, self.foot_sites], self.sim.qpos[:, :3]
         if not (self.tiles and self._height_at):
-            self.foot_height.copy_(feet[..., 2])
-            self.base_height.copy_(root[:, 2])
+            self.foot_height.copy_(self.sim.site_xpos[:, self.foot_sites, 2])
             return
+        feet, root = self.sim.site_xpos[:, self.foot_sites], self.sim.qpos[:, :3]
         points = torch.cat([feet, root[:, None]], dim=1)
         above = points[..., 2] - self._height_at(points[..., :2])
         self.foot_height.copy_(above[:, :-1])
         self.base_height.copy_(above[:, -1])
         speed = self.commands[:, :2].square().sum(dim=1, keepdim=True).sqrt()
+        self.asked_speed.copy_(torch.where(speed > self.cfg.rewards.min_command, speed, 0.0))
         along = (self.base_lin_vel[:, :2] * self.commands[:, :2]).sum(dim=1, keepdim=True) / speed.clamp(min=1e-6)
-        self.progress.addcmul_(along, (speed > self.cfg.rewards.min_command).float(), value=self.dt)
-        self.asked.add_(speed, alpha=self.dt)
+        self.progress.addcmul_(along, (self.asked_speed > 0.0).float(), value=self.dt)
+        self.asked.add_(self.asked_speed, alpha=self.dt)
         away = (root[:, :2] - self.tiles.origins[:, :2]).abs().amax(dim=1, keepdim=True)
         torch.maximum(self.farthest, away, out=self.farthest)
 
@@ -199,7 +199,8 @@ class LeggedRobot(BaseTask):
         ended = torch.logical_or(self.fell, self.broken)
         over = self._episode_length_buf >= self.max_episode_length
         if self.tiles:  # who walks off the terrain did nothing wrong
-            over |= (self.sim.qpos[:, :2].abs() > self.tiles.edge).any(dim=1)
+            torch.gt((self.sim.qpos[:, :2].abs() - self.tiles.edge).amax(dim=1), 0.0, out=self.walked_off)
+            over |= self.walked_off
         torch.logical_and(over, ~ended, out=self.time_out_buf)
         torch.logical_or(ended, self.time_out_buf, out=self.reset_buf)
 
@@ -246,7 +247,10 @@ class LeggedRobot(BaseTask):
         half = 0.5 * draw[:, 2:3]
         zero = torch.zeros_like(half)
         place = self.init_pos + self.tiles.origins if self.tiles else self.init_pos.expand(n, 3)
-        pose = [place[:, :2] + draw[:, :2], place[:, 2:], torch.cos(half), zero, zero, torch.sin(half)]
+        at, height = place[:, :2] + draw[:, :2], place[:, 2:]
+        if self._height_at and self.cfg.init_state.pos_xy_range > PLATFORM / 2:  # beyond the flat middle of a tile
+            height = self.init_pos[2] + self._height_at(at)[:, None]
+        pose = [at, height, torch.cos(half), zero, zero, torch.sin(half)]
         joints, (low, high) = self.default_dof_pos.expand(n, -1), self.cfg.init_state.dof_pos_range
         if (low, high) != (1.0, 1.0):
             joints = joints * torch.empty_like(self.dof_offset).uniform_(low, high)
@@ -263,9 +267,8 @@ class LeggedRobot(BaseTask):
         A robot that fell still owes what its last command would have asked until the end of the episode.
         """
         assert self.tiles
-        speed = self.commands[:, :2].square().sum(dim=1).sqrt()
         left = (self.max_episode_length - self.episode_steps[:, 0]).clamp(min=0.0) * self.dt
-        asked = self.asked[:, 0] + torch.where(self.fell, speed * left, 0.0)
+        asked = self.asked[:, 0] + torch.where(self.fell, self.asked_speed[:, 0] * left, 0.0)
         up = self.farthest[:, 0] > self.tiles.size / 2
         down = ~up & (self.progress[:, 0] < 0.5 * asked)
         self.tiles.promote(mask & (self.episode_steps[:, 0] > 0.0), up, down)
@@ -290,7 +293,11 @@ class LeggedRobot(BaseTask):
         share.copy_(torch.where(grown, share + self.cfg.commands.curriculum_step, share).clamp(max=1.0))
         for memory in (total, count):
             memory.masked_fill_(full, 0.0)
-        torch.mul(self.full_command_ranges, share, out=self.command_ranges)
+        self._set_command_ranges()
+
+    def _set_command_ranges(self) -> None:
+        """The share of the ranges that commands come from, around their points that are nearest to 0."""
+        torch.lerp(self.still_command, self.full_command_ranges, self.command_curriculum[0], out=self.command_ranges)
 
     def _resample_commands(self, mask: Tensor) -> None:
         """Where a timer ended, each component keeps its value, or goes to zero, or to a new uniform value."""
@@ -349,7 +356,7 @@ class LeggedRobot(BaseTask):
     def _update_kick_level(self, mask: Tensor) -> None:
         """With the curriculum: halfway from the level so far to the share of an episode that was survived."""
         if self.cfg.perturbation.curriculum:
-            survived = torch.where(self.time_out_buf, 1.0, self.episode_steps[:, 0] / self.max_episode_length)
+            survived = torch.where(self.time_out_buf & ~self.walked_off, 1.0, self.episode_steps[:, 0] / self.max_episode_length)
             began = self.episode_steps[:, 0] > 0.0  # a reset before the first step says nothing
             assign(self.kick_level, mask & began, 0.5 * (self.kick_level + survived))
 
@@ -598,10 +605,14 @@ class LeggedRobot(BaseTask):
             state["terrain_levels"] = self.tiles.levels
         if self.cfg.commands.curriculum:
             state["command_curriculum"] = self.command_curriculum
+            state["num_envs"] = torch.tensor(self.num_envs)
         return {name: value.clone() for name, value in state.items()}
 
     def load_training_state(self, state: dict[str, Tensor]) -> None:
-        """Go on from ``training_state``; on terrain with new episodes. For another number of worlds: what the nearest ones had."""
+        """Go on from ``training_state``, of several processes from the first one's; on terrain with new episodes.
+
+        For another number of worlds: what the nearest ones had.
+        """
 
         def spread(values: Tensor) -> Tensor:
             values = values.to(self.device)
@@ -611,7 +622,9 @@ class LeggedRobot(BaseTask):
             self.kick_level.copy_(spread(state["kick_level"]))
         if "command_curriculum" in state and self.cfg.commands.curriculum:
             self.command_curriculum.copy_(state["command_curriculum"])
-            torch.mul(self.full_command_ranges, self.command_curriculum[0], out=self.command_ranges)
+            if int(state["num_envs"]) != self.num_envs:
+                self.command_curriculum[1:] = 0.0  # what was counted was of other worlds
+            self._set_command_ranges()
         if "terrain_levels" in state and self.tiles:
             self._episode.zero_()  # what was under way counts for nothing
             self.tiles.put(spread(state["terrain_levels"]).clamp(max=self.tiles.num_levels - 1))
@@ -658,10 +671,10 @@ class LeggedRobot(BaseTask):
         self.joint_reading = self.dof_offset if self._encoder_offset is None else zeros(self.num_actions)  # the same, as measured
         self._action_delay = self.domain_rand.delay("action_delay", self.num_actions, start=0.0)
         self.foot_height, self.foot_speed = zeros(feet), zeros(feet)  # above the ground under the foot [m], horizontal [m/s]
-        self.base_height = zeros()  # of the root above the ground under it [m]
+        self.base_height = zeros() if self.terrain else sim.qpos[:, 2]  # of the root above the ground under it [m]
         self._init_terrain()
         self.foot_contact, self.first_contact = zeros(feet, dtype=torch.bool), zeros(feet, dtype=torch.bool)
-        self.fell, self.broken, self.moving = (zeros(dtype=torch.bool) for _ in range(3))
+        self.fell, self.broken, self.walked_off, self.moving = (zeros(dtype=torch.bool) for _ in range(4))
         self.commands, self.command_timer = zeros(3), zeros(1)  # vx, vy [m/s], yaw rate [rad/s]; [control steps]
         self.kick, self.kick_clock = zeros(4), zeros()  # pause, duration [control steps], direction [rad], dv [m/s]
         self.kick_force, self.kick_active = zeros(3), zeros(dtype=torch.bool)
@@ -680,7 +693,7 @@ class LeggedRobot(BaseTask):
         joints, feet, terms = self.num_actions, self.num_feet, len(self._active_scales())
         widths = {"last_actions": joints, "feet_air_time": feet, "swing_peak": feet}
         if self.tiles:
-            widths |= {"progress": 1, "asked": 1, "farthest": 1}
+            widths |= {"progress": 1, "asked": 1, "asked_speed": 1, "farthest": 1}
         self._episode, views = columns(self.num_envs, self.device, **widths, episode_sums=terms, episode_return=1, episode_steps=1)
         for name, view in views.items():
             setattr(self, name, view)
@@ -745,7 +758,10 @@ class LeggedRobot(BaseTask):
         self.reset_range = tensor([init.pos_xy_range] * 2 + [init.yaw_range] + [init.lin_vel_range] * 3 + [init.ang_vel_range] * 3)
         self.full_command_ranges = tensor([ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw]).T.contiguous()  # (2, 3)
         self.command_curriculum = tensor([cfg.commands.curriculum_start if cfg.commands.curriculum else 1.0, 0.0, 0.0])
-        self.command_ranges = self.full_command_ranges * self.command_curriculum[0]
+        self.still_command = torch.zeros(3, device=self.device).clamp(*self.full_command_ranges).expand(2, 3)
+        self.command_ranges = self.full_command_ranges.clone()
+        if cfg.commands.curriculum:
+            self._set_command_ranges()
         self.keep_probability = tensor(cfg.commands.keep_probability)
         self.kick_ranges = tensor([kick.interval, kick.duration, [-math.pi, math.pi], kick.velocity]).T.contiguous()  # (2, 4)
 
@@ -755,7 +771,8 @@ class LeggedRobot(BaseTask):
     swing_peak: Tensor  # F, highest foot position since the last contact [m]
     episode_sums: Tensor  # K, scale * term * dt summed over the episode
     episode_return: Tensor  # 1
-    progress: Tensor  # 1, along the commands [m]; only on terrain, as the two below
+    progress: Tensor  # 1, along the commands [m]; only on terrain, as the three below
     asked: Tensor  # 1, what the commands asked [m]
+    asked_speed: Tensor  # 1, what the last one asked [m/s]
     farthest: Tensor  # 1, from the middle of the tile, along x or y [m]
     episode_steps: Tensor  # 1, since the reset; episode_length_buf may start elsewhere

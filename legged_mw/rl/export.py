@@ -41,7 +41,7 @@ from legged_mw.rl.policy import act, load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.sim.model import per_joint
 from legged_mw.sim.standalone import among_steps, standalone
-from legged_mw.sim.terrain import level_kinds, make_terrain
+from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.utils.cli import shown
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import UserError
@@ -321,7 +321,7 @@ def _write_terrain(task: LoadedTask, folder: Path) -> bool:
     """The scene among steps and blocks of the kinds that were trained, at three levels; False where there are no such kinds."""
     cfg, ground = task.cfg.init_state, task.cfg.terrain
     trained = [kind for kind, share in ground.terrain_proportions.items() if share > 0 and kind != "flat"]
-    kinds = level_kinds(trained, ground.horizontal_scale)
+    kinds = [kind for kind in trained if kind in LEVEL]
     if not kinds:
         return False
     terrain = make_terrain(

@@ -12,6 +12,7 @@ the first, as in the corner of a step. A geom is looked at in probes, which are 
 # (mujoco ships no type stubs, and warp compiles what it finds written here as its own language: float() makes a variable)
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -30,6 +31,7 @@ from legged_mw.sim.terrain import Terrain
 
 wp.set_module_options({"enable_backward": False})
 
+SPACING = 0.1  # [m] between probes of a capsule or box
 _CORNER_COS = wp.constant(0.9)  # of the angle from which on a second face is another contact: 26 deg
 _DEEPEST = wp.constant(0.3)  # [m] how far around a probe under the ground its surface is looked for
 
@@ -37,7 +39,8 @@ _DEEPEST = wp.constant(0.3)  # [m] how far around a probe under the ground its s
 def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, list[float]]:
     """Spheres that stand for what can touch the geom ``ground``: their geoms, places in the geom's frame (P, 3), radii [m].
 
-    A sphere is its own probe, a capsule its two ends, a box its eight corners. Raises ModelError for other shapes.
+    A sphere is its own probe; a capsule is a row of them, a box points all over its faces, ``SPACING`` apart at the most, so that a
+    thin edge of the ground may come as far in between. Raises ModelError for other shapes.
     """
     kinds = mujoco.mjtGeom
     geoms, places, radii = [], [], []
@@ -49,9 +52,10 @@ def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, l
         if kind == kinds.mjGEOM_SPHERE:
             found = [((0.0, 0.0, 0.0), size[0])]
         elif kind == kinds.mjGEOM_CAPSULE:
-            found = [((0.0, 0.0, end * size[1]), size[0]) for end in (-1.0, 1.0)]
+            found = [((0.0, 0.0, z), size[0]) for z in _spaced(size[1])]
         elif kind == kinds.mjGEOM_BOX:
-            found = [((x * size[0], y * size[1], z * size[2]), 0.0) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
+            grid = [(x, y, z) for x in _spaced(size[0]) for y in _spaced(size[1]) for z in _spaced(size[2])]
+            found = [(place, 0.0) for place in grid if any(abs(at) == half for at, half in zip(place, size, strict=True))]
         else:
             shape = str(kinds(kind)).rsplit("_", 1)[-1].lower()
             raise ModelError(
@@ -63,6 +67,11 @@ def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, l
             places.append(place)
             radii.append(float(radius))
     return geoms, np.array(places).reshape(-1, 3), radii
+
+
+def _spaced(half: float) -> list[float]:
+    """Places along an axis from one end to the other [m]."""
+    return np.linspace(-half, half, max(2, math.ceil(2.0 * half / SPACING) + 1)).tolist()
 
 
 def _field(terrain: Terrain) -> Any:
@@ -325,7 +334,7 @@ def _gap(m: _Material, geoms: wp.vec2i, world: int) -> float:
 @wp.kernel
 def _touch(
     field: _Field,
-    probes: _Probes,
+    spheres: _Probes,
     ground: int,
     geom_xpos: wp.array2d[wp.vec3],
     geom_xmat: wp.array2d[wp.mat33],
@@ -335,9 +344,9 @@ def _touch(
     nacon: wp.array[int],
 ):
     world, probe = wp.tid()
-    geom, radius = probes.geom[probe], probes.radius[probe]
+    geom, radius = spheres.geom[probe], spheres.radius[probe]
     geoms = wp.vec2i(ground, geom)
-    centre = geom_xpos[world, geom] + geom_xmat[world, geom] @ probes.place[probe]
+    centre = geom_xpos[world, geom] + geom_xmat[world, geom] @ spheres.place[probe]
     farthest = _margin(material, geoms, world) + _gap(material, geoms, world)  # [m] from the surface, that is still a contact
     u, v = (centre[0] - field.corner[0]) * field.per_cell, (centre[1] - field.corner[1]) * field.per_cell
     above = centre[2] - _surface(field, u, v)  # [m] straight up from the ground; negative: under it

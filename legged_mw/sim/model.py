@@ -246,7 +246,10 @@ def _add_height_field(spec: mujoco.MjSpec, terrain: Terrain) -> dict[str, object
 
 
 def _replace_level_pieces(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> None:
-    """Sink the height field where boxes are exact: MuJoCo gives a foot a tilted contact from every triangle near it."""
+    """Sink the height field where boxes are exact: MuJoCo makes a tilted contact with every triangle that is near.
+
+    A small sphere has up to a dozen contacts with what stays a height field, which few iterations leave far from solved.
+    """
     from legged_mw.sim.terrain import as_boxes
 
     assert ground.terrain
@@ -258,19 +261,21 @@ def _replace_level_pieces(spec: mujoco.MjSpec, ground: Ground, notes: list[str])
     floor.pos = [0.0, 0.0, float(heights.min())]
     for number, box in enumerate(boxes):
         low, high = np.array([*box.low, bottom]), np.array([*box.high, box.top])
-        spec.worldbody.add_geom(
-            name=f"{GROUND}/{number}",
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            pos=(low + high) / 2,
-            size=(high - low) / 2,
-            contype=floor.contype,
-            conaffinity=floor.conaffinity,
-            priority=floor.priority,
-            condim=floor.condim,
-            friction=floor.friction,
-        )
+        add_ground_box(spec, low, high).name = f"{GROUND}/{number}"
     feel_all_ground(spec)
+    for name, least in (("iterations", 20), ("ls_iterations", 50)):
+        if (old := getattr(spec.option, name)) < least:
+            notes.append(f"option {name}: {old:g} -> {least}, for the contacts of a height field")
+            setattr(spec.option, name, least)
     notes.append(f"ground: {len(boxes)} boxes for its level pieces")
+
+
+def add_ground_box(spec: mujoco.MjSpec, low: np.ndarray, high: np.ndarray) -> mujoco.MjsGeom:
+    """A box between two corners (3,) [m] that touches as the ground does."""
+    box, floor = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=(low + high) / 2, size=(high - low) / 2), spec.geom(GROUND)
+    for name in ("contype", "conaffinity", "priority", "condim", "friction", "solref", "solimp"):
+        setattr(box, name, getattr(floor, name))
+    return box
 
 
 def feel_all_ground(spec: mujoco.MjSpec) -> None:

@@ -46,8 +46,6 @@ class MujocoSimulation:
         self.num_envs = num_envs
         model = copy.copy(model)
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # else it resets a broken world by itself, unasked
-        if model.nhfield:  # a foot has up to a dozen contacts there, which few iterations leave far from solved (docs/terrain.md)
-            model.opt.iterations, model.opt.ls_iterations = max(model.opt.iterations, 20), max(model.opt.ls_iterations, 50)
         _keep_quiet()
         self._batch = Batch(model, num_envs, threads or usable_cores())
         self._start = self._batch.state[0].copy()  # a row of state, as the model has it

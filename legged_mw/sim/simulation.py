@@ -109,7 +109,7 @@ def make_simulation(
     """Allocate ``num_envs`` worlds of ``model`` on ``device``.
 
     ``terrain`` is what the model's height field was made from: mujoco-warp gets contacts of our own with it
-    (``sim/ground_contact.py``), MuJoCo's own engine has those of the height field.
+    (``sim/ground_contact.py``), MuJoCo's own engine those of the model.
 
     ``nconmax`` and ``njmax`` are the contacts and constraint rows a world has room for; MuJoCo's own engine allocates as it
     needs and leaves them aside. ``threads`` are those of MuJoCo's own engine, 0: one a core. ``world_fields`` names model

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from legged_mw.sim.model import GROUND, ModelError, RobotModel, feel_all_ground
+from legged_mw.sim.model import GROUND, ModelError, RobotModel, add_ground_box, feel_all_ground
 from legged_mw.sim.terrain import Box, Terrain, as_boxes
 
 HOME = "home"  # the keyframe: the pose to start in, and the servos holding it
@@ -74,6 +74,9 @@ def standalone(robot: RobotModel, *, imu: str, feet: Sequence[str], qpos: Sequen
     spec.comment = (
         f"\n    {spec.modelname}: robot, ground, servos, sensors. Self-contained; written by legged_mw from the model that was trained.\n  "
     )
+    for geom in spec.geoms:  # group 0 is the ground's: a height scan's rays look for it there
+        if geom.group == 0 and geom.parent.name != "world":
+            geom.group = 1
     sensors = _add_sensors(spec, robot.joint_names, imu, feet)
     spec.add_key(name=HOME, qpos=list(qpos), ctrl=list(ctrl))
     _write_out_files(spec, robot.visual)
@@ -106,10 +109,7 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
     bottom = terrain.span()[0] - 1.0
     for low, high, top in [*boxes, *(Box(low, high, 0.0) for low, high in border if low[0] < high[0] and low[1] < high[1])]:
         below, above = np.array([*low, bottom]), np.array([*high, top])
-        box = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=(below + above) / 2, size=(above - below) / 2)
-        box.material = floor.material
-        for name in ("contype", "conaffinity", "priority", "condim", "friction", "solref", "solimp"):
-            setattr(box, name, getattr(floor, name))
+        add_ground_box(spec, below, above).material = floor.material
     floor.pos = [0.0, 0.0, bottom]
     feel_all_ground(spec)
     for key in spec.keys:

@@ -1,11 +1,12 @@
 """Ground that is not flat: a grid of tiles, harder from row to row, another kind from column to column; one height field of all.
 
-Heights are made here, on the host, once; looked up on the device, in tensors of fixed shape. Nothing is stepped.
+Heights are made here, on the host, once; looked up on the device, in tensors of fixed shape; and level pieces of them turned into
+boxes, for MuJoCo's own engine. Nothing is stepped.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -304,7 +305,8 @@ def _noise(grid: Grid, height: float, every: float, rng: np.random.Generator) ->
 
 # ---- level pieces as boxes, for MuJoCo's own engine ----
 
-MOST_BOXES = 120  # of a tile; what needs more is no assembly of level pieces
+LEVEL = {"flat", "stairs_up", "stairs_down", "obstacles", "stepping_stones", "gap"}  # kinds that are made of level pieces
+MOST_BOXES = 1000  # of a tile; what needs more stays a height field
 
 
 class Box(NamedTuple):
@@ -326,7 +328,10 @@ def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights]:
     for column in range(len(terrain.kinds)):
         for level in range(terrain.levels):
             row0, col0 = edge + column * n, edge + level * n
-            pieces = _level_pieces(np.round(terrain.heights[row0 : row0 + n + 1, col0 : col0 + n + 1], 6))
+            patch = terrain.heights[row0 : row0 + n + 1, col0 : col0 + n + 1]
+            if terrain.kinds[column] not in LEVEL and np.ptp(patch):
+                continue
+            pieces = _level_pieces(np.round(patch, 6))
             if len(pieces) > MOST_BOXES:
                 continue
             for rows, columns, top in pieces:
@@ -336,17 +341,6 @@ def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights]:
             inside = heights[row0 + 1 : row0 + n, col0 + 1 : col0 + n]
             inside[...] = inside.min() - 1.0
     return boxes, heights
-
-
-def level_kinds(kinds: Iterable[str], cell: float) -> list[str]:
-    """Those of ``kinds`` whose tiles are all level pieces."""
-    found = []
-    for kind in kinds:
-        tiles = make_terrain(levels=3, proportions={kind: 1.0}, columns=1, tile=8.0, cell=cell, border=0.0, seed=0)
-        patches = np.split(tiles.heights[:, :-1], 3, axis=1)
-        if all(len(_level_pieces(np.round(patch, 6))) <= MOST_BOXES for patch in patches):
-            found.append(kind)
-    return found
 
 
 def _level_pieces(patch: Heights) -> list[tuple[tuple[int, int], tuple[int, int], float]]:
@@ -383,7 +377,7 @@ class HeightMap:
         u, v = place[..., 0].clamp(0.0, self._columns - 1.0), place[..., 1].clamp(0.0, self._rows - 1.0)
         column, row = u.floor().clamp(max=self._columns - 2.0), v.floor().clamp(max=self._rows - 2.0)
         across, along = u - column, v - row
-        here = (row * self._columns + column).long()
+        here = row.long() * self._columns + column.long()  # float32 would not count to the end of a large field
         low, high = self._heights[here], self._heights[here + self._columns + 1]
         corner = torch.where(across >= along, self._heights[here + 1], self._heights[here + self._columns])
         return low + (corner - low) * torch.maximum(across, along) + (high - corner) * torch.minimum(across, along)

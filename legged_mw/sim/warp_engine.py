@@ -67,7 +67,7 @@ class WarpSimulation:
         _check_fields(world_fields)
         with wp.ScopedDevice(self._device):
             derived = CONSTANTS if {*CONSTANTS_READ} & {*world_fields} else ()  # else every world silently has the first one's
-            self._model = put_model(model, terrain, dict.fromkeys([*world_fields, *derived], num_envs))
+            self._model = make_model(model, terrain, dict.fromkeys([*world_fields, *derived], num_envs))
             option = self._model.opt
             option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
@@ -141,7 +141,7 @@ def _check_fields(names: Sequence[str]) -> None:
             raise ModelError(unknown("per-world model field", name, known, "mujoco-warp's Model"))
 
 
-def put_model(model: mujoco.MjModel, terrain: Terrain | None = None, batch_sizes: dict[str, int] | None = None) -> mjw.Model:
+def make_model(model: mujoco.MjModel, terrain: Terrain | None = None, batch_sizes: dict[str, int] | None = None) -> mjw.Model:
     """The model on the current device; on ``terrain`` with contacts of our own in place of its height field's."""
     if terrain is None:
         return mjw.put_model(model, batch_sizes=batch_sizes)
