@@ -8,7 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from legged_mw.envs.domain_rand import DomainRand
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.terrain import Tiles
 from legged_mw.utils.task import load_task
 
 QUIET = {"noise.level": 0.0, "commands.resampling_time": 0.0}  # nothing drawn within an episode
@@ -40,6 +42,8 @@ def tensors(env: LeggedRobot) -> dict[str, Tensor]:
         elif isinstance(value, dict):
             for key, inner in value.items():
                 yield from walk(f"{path}.{key}", inner)
+        elif isinstance(value, Tiles | DomainRand):
+            yield from walk(path, vars(value))
         elif isinstance(value, list | tuple):
             for i, inner in enumerate(value):
                 yield from walk(f"{path}.{i}", inner)
