@@ -174,7 +174,8 @@ def run_onnx(path: Path, observations: np.ndarray) -> np.ndarray:
 
 
 def _run_program(path: Path, observations: Tensor) -> np.ndarray:
-    program = torch.export.load(io.BytesIO(path.read_bytes()))  # made by this process; one from elsewhere would be trusted blindly
+    with _quiet_exporter():  # some releases of torch warn of their own buffers
+        program = torch.export.load(io.BytesIO(path.read_bytes()))  # made by this process; one from elsewhere would be trusted blindly
     with torch.inference_mode():
         return program.module()(observations).numpy()
 
