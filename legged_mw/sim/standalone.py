@@ -107,10 +107,16 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
         ((inner_x, -inner_y), (x, inner_y)),
     ]
     bottom = terrain.span()[0] - 1.0
-    for low, high, top in [*boxes, *(Box(low, high, 0.0) for low, high in border if low[0] < high[0] and low[1] < high[1])]:
-        below, above = np.array([*low, bottom]), np.array([*high, top])
-        add_ground_box(spec, below, above).material = floor.material
+    pieces = [*boxes, *(Box(low, high, 0.0) for low, high in border if low[0] < high[0] and low[1] < high[1])]
+    tiles = [terrain.tile_at((low[0] + high[0]) / 2, (low[1] + high[1]) / 2) for low, high, _ in pieces]
+    tops = {tile: sorted({piece.top for piece, where in zip(pieces, tiles, strict=True) if where == tile}) for tile in tiles}
+    for (low, high, top), tile in zip(pieces, tiles, strict=True):
+        box = add_ground_box(spec, np.array([*low, bottom]), np.array([*high, top]))
+        tone = (1.0, 0.7)[tops[tile].index(top) % 2]  # a step looks other than the next one
+        box.material, box.rgba = floor.material, [tone, tone, tone, 1.0]
     floor.pos = [0.0, 0.0, bottom]
+    for light in spec.lights:
+        light.dir = [-0.25, 0.35, -1.0]  # steeper than over a plane: a riser is darker than a tread wherever it faces
     feel_all_ground(spec)
     for key in spec.keys:
         key.qpos = [*start, *list(key.qpos)[3:]]
