@@ -100,7 +100,7 @@ def announce(task: LoadedTask, device: str, rank: Rank) -> None:
     steps = runner.max_iterations * worlds * runner.num_steps_per_env
     if task.cfg.terrain.mesh_type != "plane":
         print(
-            f"{cores} cores: {steps / 1e6:.1f} M steps; rough ground takes a CPU several times as long as a plane, and wants a GPU",
+            f"{cores} cores: {steps:,} steps; rough ground takes a CPU several times as long as a plane, and wants a GPU",
             flush=True,
         )
         return

@@ -96,7 +96,7 @@ def ground(task: LoadedTask, everything: bool) -> Terrain:
         raise ConfigError(f"{task.name} is on a plane; to see its section terrain all the same add --set terrain.mesh_type=heightfield")
     kinds = list(KINDS) if everything else [kind for kind, share in terrain.terrain_proportions.items() if share > 0]
     terrain.terrain_proportions = dict.fromkeys(reversed(kinds), 1.0)
-    terrain.num_cols, terrain.border_size = len(kinds), 0.0
+    terrain.num_cols, terrain.border_size = len(kinds), 1.0
     check_values(task.cfg)
     built = build_terrain(task.cfg)
     assert built is not None

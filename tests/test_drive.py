@@ -336,7 +336,7 @@ def test_falls_are_counted_once_and_shown_for_a_while() -> None:
     stage, pilot = FakeStage(2, falls={3: 1, 4: 1, 50: 0}), Pilot(LIMITS, 2)
     viewer = FakeViewer(pilot)
     summary = Session(stage, viewer, pilot, seconds=2.5, real_time=False).run()
-    assert summary.falls == 2 and dict(viewer.moments[10].lines)["falls"] == "1"
+    assert summary.falls == 2 and dict(viewer.moments[10].lines)["falls, all"] == "1"
     [fall] = viewer.moments[3].falls
     assert fall.world == 1 and fall.place[0] == 2.0  # where it was the step before, for it may be elsewhere since
     assert len(viewer.moments[60].falls) == 2 and len(viewer.moments[120].falls) == 1

@@ -68,7 +68,7 @@ ROUGH: dict[str, object] = {
     "terrain__num_cols": 8,
     "terrain__max_init_terrain_level": 2,
     "terrain__height_scan": ["state", "privileged_state"],
-    "terrain__border_size": 0.0,
+    "terrain__border_size": 1.0,
     "termination__min_base_height": 0.1,
     "commands__curriculum": True,
     "sim__njmax": 56,

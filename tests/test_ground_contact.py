@@ -158,13 +158,14 @@ def test_shapes_and_their_probes() -> None:
     for kind, size, count in (
         (kinds.mjGEOM_SPHERE, [0.1, 0, 0], 1),
         (kinds.mjGEOM_CAPSULE, [0.1, 0.2, 0], 5),
+        (kinds.mjGEOM_CYLINDER, [0.1, 0.1, 0], 38),
         (kinds.mjGEOM_BOX, [0.1] * 3, 26),
     ):
         model = ball_model(None, {"type": kind, "size": size})
         geoms, places, radii = probes(model, 0)
         assert geoms == [1] * count and len(places) == len(radii) == count
-    with pytest.raises(ModelError, match=r"collider 'ball' is a cylinder: on terrain mujoco_warp knows spheres, capsules and boxes"):
-        probes(ball_model(None, {"type": kinds.mjGEOM_CYLINDER, "size": [0.1, 0.1, 0]}), 0)
+    with pytest.raises(ModelError, match=r"collider 'ball' is a ellipsoid: on terrain mujoco_warp knows spheres, capsules, boxes"):
+        probes(ball_model(None, {"type": kinds.mjGEOM_ELLIPSOID, "size": [0.1, 0.1, 0.2]}), 0)
 
 
 @pytest.mark.parametrize(

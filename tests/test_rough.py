@@ -124,12 +124,6 @@ def test_who_walks_off_the_grid_is_timed_out_and_has_not_fallen() -> None:
     assert (env.sim.qpos[:2, :2].abs() < 17.0).all(), "they begin anew on their tiles"
 
 
-def test_without_a_border_they_turn_back_before_the_rim() -> None:
-    env = rough(4, terrain__border_size=0.0)
-    assert env.tiles and env.tiles.edge.tolist() == [15.5, 15.5]
-    assert rough(4, terrain__border_size=0.6).tiles.edge[0] == pytest.approx(16.1)  # type: ignore[union-attr]
-
-
 def test_who_walks_off_has_not_survived_the_episode() -> None:
     env = rough(2, perturbation__enable=True, perturbation__curriculum=True)
     env.sim.qpos[0, 0] = 17.1
@@ -342,8 +336,9 @@ def test_a_resume_with_other_numbers_of_worlds_and_levels_keeps_what_fits(tmp_pa
 
 
 def test_a_mistake_is_named() -> None:
-    with pytest.raises(ConfigError, match=r"terrain.max_init_terrain_level is 5; the levels of terrain.num_rows are 0 to 3"):
-        rough(2, terrain__max_init_terrain_level=5)
+    with pytest.raises(ConfigError, match=r"terrain.border_size is 0.5; it must be 1 m at least"):
+        rough(2, terrain__border_size=0.5)
+    assert max(rough(64, terrain__max_init_terrain_level=50).tiles.levels.tolist()) == 3  # type: ignore[union-attr]
     with pytest.raises(ConfigError, match=r"terrain.height_scan is \['actor'\]; it must be a list of groups"):
         rough(2, terrain__height_scan=["actor"])
     assert math.isfinite(rough(2).base_height.sum())

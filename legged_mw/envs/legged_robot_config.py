@@ -164,7 +164,7 @@ class LeggedRobotCfg(Config):
         }
         seed: int = 1  # of all that is random in it
         curriculum: bool = True  # levels by what a robot can do; False: a random one at each reset [L]
-        max_init_terrain_level: int = 5  # highest level at the start of training [L]
+        max_init_terrain_level: int = 5  # highest level at the start of training; the last one, if there are fewer [L]
         measured_points_x: list[float] = [i / 10 for i in range(-8, 9)]  # of the height scan, ahead of the root [m] [L]
         measured_points_y: list[float] = [i / 10 for i in range(-5, 6)]  # to its left [m] [L]
         height_scan: list[str] = []  # groups of observations that get the row: "state", "privileged_state"

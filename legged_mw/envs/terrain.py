@@ -13,7 +13,6 @@ import torch
 from torch import Tensor
 
 from legged_mw.sim.terrain import Terrain, make_terrain
-from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign
 
 if TYPE_CHECKING:
@@ -42,17 +41,14 @@ class Tiles:
 
     def __init__(self, cfg: LeggedRobotCfg, terrain: Terrain, num_envs: int, device: str) -> None:
         self.curriculum, self.size, self.num_levels = cfg.terrain.curriculum, terrain.tile, terrain.levels
-        highest = cfg.terrain.max_init_terrain_level if self.curriculum else terrain.levels - 1
-        if not 0 <= highest < terrain.levels:
-            raise ConfigError(f"terrain.max_init_terrain_level is {highest}; the levels of terrain.num_rows are 0 to {terrain.levels - 1}")
+        highest = min(cfg.terrain.max_init_terrain_level, terrain.levels - 1) if self.curriculum else terrain.levels - 1
         self.levels = torch.randint(0, highest + 1, (num_envs,), device=device)  # (N,) row of the tile
         world = torch.arange(num_envs, device=device)
         self.columns = (2 * world + 1) * len(terrain.kinds) // (2 * num_envs)  # (N,) never changes; fewer worlds take every so manieth
         self._all_origins = torch.tensor(terrain.origins, dtype=torch.float, device=device)  # (levels, columns, 3)
         self.origins = self._all_origins[self.levels, self.columns]  # (N, 3) where an episode begins [m, world]
         tiles = torch.tensor([terrain.levels, len(terrain.kinds)], dtype=torch.float, device=device)
-        border = cfg.terrain.border_size
-        self.edge = tiles * terrain.tile / 2 + min(border / 2, border - 0.5)  # x, y [m] beyond which a robot has walked off
+        self.edge = tiles * terrain.tile / 2 + cfg.terrain.border_size / 2  # x, y [m] beyond which a robot has walked off
         self.kinds = tuple(dict.fromkeys(terrain.kinds))
         kind = torch.tensor([self.kinds.index(name) for name in terrain.kinds], device=device)[self.columns]
         self._is_kind = torch.nn.functional.one_hot(kind, len(self.kinds)).float()  # (N, kinds)

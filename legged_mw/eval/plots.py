@@ -179,8 +179,8 @@ def _crossing(kinds: dict[str, Figures], suffix: str, ax: Axes) -> None:
 
 
 def _percent(share: float) -> str:
-    """In whole percent, downwards: 100 are all, 0 none."""
-    return "<1" if 0.0 < share < 0.01 else f"{math.floor(100 * share + 1e-6)}"
+    """In whole percent: 100 are all, 0 none."""
+    return "<1" if 0.0 < share < 0.01 else f"{min(round(100 * share), 99) if share < 1.0 else 100}"
 
 
 # ---- following the command

@@ -39,8 +39,8 @@ _DEEPEST = wp.constant(0.3)  # [m] how far around a probe under the ground its s
 def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, list[float]]:
     """Spheres that stand for what can touch the geom ``ground``: their geoms, places in the geom's frame (P, 3), radii [m].
 
-    A sphere is its own probe; a capsule is a row of them, a box points all over its faces, ``SPACING`` apart at the most, so that a
-    thin edge of the ground may come as far in between. Raises ModelError for other shapes.
+    A sphere is its own probe; a capsule is a row of them, a box or cylinder points all over it, ``SPACING`` apart at the most, so
+    that a thin edge of the ground may come as far in between. Raises ModelError for other shapes.
     """
     kinds = mujoco.mjtGeom
     geoms, places, radii = [], [], []
@@ -56,10 +56,14 @@ def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, l
         elif kind == kinds.mjGEOM_BOX:
             grid = [(x, y, z) for x in _spaced(size[0]) for y in _spaced(size[1]) for z in _spaced(size[2])]
             found = [(place, 0.0) for place in grid if any(abs(at) == half for at, half in zip(place, size, strict=True))]
+        elif kind == kinds.mjGEOM_CYLINDER:
+            around = [2.0 * math.pi * i / 12 for i in range(12)]
+            rims = [(size[0] * math.cos(a), size[0] * math.sin(a), z) for z in _spaced(size[1]) for a in around]
+            found = [(place, 0.0) for place in [*rims, (0.0, 0.0, -size[1]), (0.0, 0.0, size[1])]]
         else:
             shape = str(kinds(kind)).rsplit("_", 1)[-1].lower()
             raise ModelError(
-                f"collider '{model.geom(geom).name}' is a {shape}: on terrain mujoco_warp knows spheres, capsules and boxes; "
+                f"collider '{model.geom(geom).name}' is a {shape}: on terrain mujoco_warp knows spheres, capsules, boxes and cylinders; "
                 "leave it out of asset.colliders, give the MJCF one of those shapes there, or take sim.engine = mujoco"
             )
         for place, radius in found:

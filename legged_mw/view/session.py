@@ -206,7 +206,11 @@ class Session:
             lines.append(("robot", f"{pilot.world + 1} of {count}"))
         if ground := self.stage.ground(pilot.world):
             lines.append(("ground", ground))
-        return (*lines, ("falls", str(self.falls)), ("time", f"{self.time:.1f} s{self._tempo()}"))
+        return (
+            *lines,
+            ("falls" if self.stage.num_worlds == 1 else "falls, all", str(self.falls)),
+            ("time", f"{self.time:.1f} s{self._tempo()}"),
+        )
 
     def _tempo(self) -> str:
         """How fast time passes, where that is a question."""
