@@ -26,6 +26,7 @@ import mujoco_warp as mjw
 import numpy as np
 import torch
 import warp as wp
+from step import timed
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from legged_mw import ROOT
@@ -114,17 +115,6 @@ def with_boxes(env: LeggedRobot, count: int) -> mujoco.MjModel:
 
 def free_memory(device: str) -> int:
     return 0 if device == "cpu" else torch.cuda.mem_get_info(device)[0]
-
-
-def timed(call: Callable[[], None], calls: int, device: str) -> float:
-    if device != "cpu":
-        torch.cuda.synchronize()
-    start = time.perf_counter()
-    for _ in range(calls):
-        call()
-    if device != "cpu":
-        torch.cuda.synchronize()
-    return (time.perf_counter() - start) / calls
 
 
 def walked(task_name: str, num_envs: int, device: str) -> LeggedRobot:
