@@ -66,7 +66,7 @@ class DeployStage:
         return self._fell.copy()
 
     def ground(self, world: int) -> str:
-        """A plane, always."""
+        """Nothing is said of it: a scene has no names for its ground."""
         return ""
 
     def push(self, world: int, velocity: Any) -> None:
