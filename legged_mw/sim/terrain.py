@@ -324,22 +324,19 @@ def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights]:
     """
     heights, boxes = terrain.heights.copy(), []
     n = round(terrain.tile / terrain.cell)
-    edge = (heights.shape[1] - 1 - terrain.levels * n) // 2
-    for column in range(len(terrain.kinds)):
-        for level in range(terrain.levels):
-            row0, col0 = edge + column * n, edge + level * n
-            patch = terrain.heights[row0 : row0 + n + 1, col0 : col0 + n + 1]
-            if terrain.kinds[column] not in LEVEL and np.ptp(patch):
-                continue
-            pieces = _level_pieces(np.round(patch, 6))
-            if len(pieces) > MOST_BOXES:
-                continue
-            for rows, columns, top in pieces:
-                x, y = ((first + np.clip([*span], 0.5, n + 0.5) - 0.5) for first, span in ((col0, columns), (row0, rows)))
-                low, high = zip(terrain.corner[0] + x * terrain.cell, terrain.corner[1] + y * terrain.cell, strict=True)
-                boxes.append(Box(low, high, top))
-            inside = heights[row0 + 1 : row0 + n, col0 + 1 : col0 + n]
-            inside[...] = inside.min() - 1.0
+    for column, level in np.ndindex(len(terrain.kinds), terrain.levels):
+        where = terrain.vertices(level, column)
+        if terrain.kinds[column] not in LEVEL and np.ptp(terrain.heights[where]):
+            continue
+        pieces = _level_pieces(np.round(terrain.heights[where], 6))
+        if len(pieces) > MOST_BOXES:
+            continue
+        for rows, columns, top in pieces:
+            y, x = (tile.start + np.clip([*span], 0.5, n + 0.5) - 0.5 for tile, span in zip(where, (rows, columns), strict=True))
+            low, high = zip(terrain.corner[0] + x * terrain.cell, terrain.corner[1] + y * terrain.cell, strict=True)
+            boxes.append(Box(low, high, top))
+        inside = heights[where][1:-1, 1:-1]
+        inside[...] = inside.min() - 1.0
     return boxes, heights
 
 
