@@ -19,7 +19,7 @@ import numpy as np
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.terrain import build_terrain
 from legged_mw.sim.model import ground_model
-from legged_mw.sim.terrain import KINDS, MEASURES, Terrain
+from legged_mw.sim.terrain import KINDS, MEASURES, Terrain, measure
 from legged_mw.utils.cli import Parser, apply_overrides, one_line_errors, shown
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask, load_task
@@ -71,10 +71,8 @@ def _label(scene: mujoco.MjvScene, terrain: Terrain, left: float, line: float) -
         y = terrain.origins[0, column, 1]
         _write(scene, kind, (left, y + 0.1 * line))
         if kind in MEASURES:
-            name, low, high = MEASURES[kind]
-            ends = [low + (high - low) * terrain.difficulties[level] for level in (0, -1)]
-            name, _, unit = name.rstrip("]").partition(" [")
-            _write(scene, f"{name} {ends[0]:.3g} to {ends[1]:.3g} {unit}", (left, y - 0.9 * line))
+            (name, low, unit), (_, high, _) = (measure(kind, terrain.difficulties[level]) for level in (0, -1))
+            _write(scene, f"{name} {low:.3g} to {high:.3g} {unit}", (left, y - 0.9 * line))
     top = terrain.origins[0, -1, 1] + 0.5 * terrain.tile + 0.6 * line
     _write(scene, "difficulty", (left, top))
     for level, difficulty in enumerate(terrain.difficulties):

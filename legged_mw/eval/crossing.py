@@ -16,7 +16,7 @@ from torch import Tensor
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exam
 from legged_mw.eval.rollout import Policy
-from legged_mw.sim.terrain import KINDS, MEASURES
+from legged_mw.sim.terrain import KINDS, MEASURES, measure
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask
 
@@ -94,8 +94,7 @@ def _measure(kind: str) -> dict[str, Any]:
     """What makes a kind hard and its value at each level; None where nothing does."""
     if kind not in MEASURES:
         return {"measure": None, "values": None}
-    name, low, high = MEASURES[kind]
-    return {"measure": name, "values": [round(low + (high - low) * i / (LEVELS - 1), 2) for i in range(LEVELS)]}
+    return {"measure": MEASURES[kind][0], "values": [round(measure(kind, i / (LEVELS - 1))[1], 2) for i in range(LEVELS)]}
 
 
 def table(result: dict[str, Any]) -> str:

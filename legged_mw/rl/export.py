@@ -321,8 +321,7 @@ def make_contract(env: LeggedRobot, task: LoadedTask, folder: Path) -> Contract:
 def _write_terrain(task: LoadedTask, folder: Path) -> bool:
     """The scene among steps and blocks of the kinds that were trained, at three levels; False where there are no such kinds."""
     cfg, ground = task.cfg.init_state, task.cfg.terrain
-    trained = [kind for kind, share in ground.terrain_proportions.items() if share > 0 and kind != "flat"]
-    kinds = [kind for kind in trained if kind in LEVEL]
+    kinds = [kind for kind, share in ground.terrain_proportions.items() if share > 0 and kind in LEVEL - {"flat"}]
     if not kinds:
         return False
     terrain = make_terrain(

@@ -31,7 +31,7 @@ from legged_mw.sim.terrain import Terrain
 
 wp.set_module_options({"enable_backward": False})
 
-SPACING = 0.1  # [m] between probes of a capsule or box
+SPACING = 0.1  # [m] between probes of one geom
 _CORNER_COS = wp.constant(0.9)  # of the angle from which on a second face is another contact: 26 deg
 _DEEPEST = wp.constant(0.3)  # [m] how far around a probe under the ground its surface is looked for
 

@@ -233,16 +233,19 @@ def _add_ground(spec: mujoco.MjSpec, ground: Ground, where: str, notes: list[str
 
 def _add_height_field(spec: mujoco.MjSpec, terrain: Terrain) -> dict[str, object]:
     """Give ``spec`` the heights; returns what makes a geom of them."""
-    (low, high), (rows, columns) = terrain.span(), terrain.heights.shape
-    span = max(high - low, 1e-3)  # MuJoCo wants some; it scales what it is given to 0..1
-    spec.add_hfield(
-        name=GROUND,
-        size=[(columns - 1) * terrain.cell / 2, (rows - 1) * terrain.cell / 2, span, 1.0],
-        nrow=rows,
-        ncol=columns,
-        userdata=((terrain.heights - low) / span).astype(np.float32).ravel(),
-    )
-    return {"type": mujoco.mjtGeom.mjGEOM_HFIELD, "hfieldname": GROUND, "pos": [0.0, 0.0, low]}
+    rows, columns = terrain.heights.shape
+    spec.add_hfield(name=GROUND, nrow=rows, ncol=columns)
+    return {"type": mujoco.mjtGeom.mjGEOM_HFIELD, "hfieldname": GROUND, "pos": _fill_height_field(spec, terrain, terrain.heights)}
+
+
+def _fill_height_field(spec: mujoco.MjSpec, terrain: Terrain, heights: np.ndarray) -> list[float]:
+    """Put ``heights`` (R, C) [m] on the grid of ``terrain``; returns where the geom is to be."""
+    low, (rows, columns) = float(heights.min()), heights.shape
+    span = max(float(np.ptp(heights)), 1e-3)  # MuJoCo wants some; it scales what it is given to 0..1
+    field = spec.hfield(GROUND)
+    field.size = [(columns - 1) * terrain.cell / 2, (rows - 1) * terrain.cell / 2, span, 1.0]
+    field.userdata = ((heights - low) / span).astype(np.float32).ravel()
+    return [0.0, 0.0, low]
 
 
 def _replace_level_pieces(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> None:
@@ -254,11 +257,7 @@ def _replace_level_pieces(spec: mujoco.MjSpec, ground: Ground, notes: list[str])
 
     assert ground.terrain
     boxes, heights = as_boxes(ground.terrain)
-    floor, bottom = spec.geom(GROUND), float(heights.min()) - 1.0
-    span = max(float(np.ptp(heights)), 1e-3)
-    spec.hfield(GROUND).userdata = ((heights - heights.min()) / span).astype(np.float32).ravel()
-    spec.hfield(GROUND).size = [*spec.hfield(GROUND).size[:2], span, 1.0]
-    floor.pos = [0.0, 0.0, float(heights.min())]
+    spec.geom(GROUND).pos, bottom = _fill_height_field(spec, ground.terrain, heights), float(heights.min()) - 1.0
     for number, box in enumerate(boxes):
         low, high = np.array([*box.low, bottom]), np.array([*box.high, box.top])
         add_ground_box(spec, low, high).name = f"{GROUND}/{number}"

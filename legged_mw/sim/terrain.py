@@ -278,9 +278,15 @@ def describe(kind: str, difficulty: float) -> str:
     """A kind and how hard it is, in words: "stairs_up, step 12.8 cm"."""
     if kind not in MEASURES:
         return kind
-    measure, low, high = MEASURES[kind]
-    name, _, unit = measure.rstrip("]").partition(" [")
-    return f"{kind}, {name} {_between((low, high), difficulty):.3g} {unit}".rstrip()
+    name, value, unit = measure(kind, difficulty)
+    return f"{kind}, {name} {value:.3g} {unit}".rstrip()
+
+
+def measure(kind: str, difficulty: float) -> tuple[str, float, str]:
+    """What makes a kind that has a measure hard: its name, its value, the unit."""
+    what, low, high = MEASURES[kind]
+    name, _, unit = what.rstrip("]").partition(" [")
+    return name, _between((low, high), difficulty), unit
 
 
 def _between(span: tuple[float, float], difficulty: float) -> float:
