@@ -1,5 +1,7 @@
 """Shared by all tests: one torch thread; tests that need a GPU or a screen are left out where there is none."""
 
+from collections.abc import Iterator
+
 import pytest
 import torch
 
@@ -18,3 +20,17 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             without = [item for item in items if item.get_closest_marker(mark)]
             config.hook.pytest_deselected(items=without)
             items[:] = [item for item in items if item not in without]
+
+
+@pytest.fixture(params=["cpu", pytest.param("cuda:0", marks=pytest.mark.gpu)])
+def device(request: pytest.FixtureRequest) -> str:
+    """The test runs on a CPU, and again on a GPU where there is one."""
+    return request.param
+
+
+@pytest.fixture
+def double() -> Iterator[None]:
+    """New tensors are float64: what is left of a difference is no longer rounding that a high learning rate has blown up."""
+    torch.set_default_dtype(torch.float64)
+    yield
+    torch.set_default_dtype(torch.float32)

@@ -39,9 +39,9 @@ def ball_model(terrain: Terrain | None, shape: dict[str, Any] | None = None) -> 
     return spec.compile()
 
 
-def contacts(terrain: Terrain, places: np.ndarray) -> tuple[np.ndarray, ...]:
+def contacts(terrain: Terrain, places: np.ndarray, device: str) -> tuple[np.ndarray, ...]:
     """World, depth [m] and normal of every contact of balls at ``places`` (N, 3)."""
-    sim = WarpSimulation(ball_model(terrain), len(places), "cpu", nconmax=4, njmax=24, terrain=terrain, eager=True)
+    sim = WarpSimulation(ball_model(terrain), len(places), device, nconmax=4, njmax=24, terrain=terrain, eager=True)
     sim.qpos[:, :3] = sim.qpos.new_tensor(places)
     sim.step()
     contact, count = sim._data.contact, int(sim._data.nacon.numpy()[0])
@@ -91,10 +91,10 @@ def around(terrain: Terrain, count: int, low: float, high: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", ["rough_slope", "stairs_up", "obstacles", "low_random"])
-def test_a_contact_is_as_deep_as_the_nearest_triangle(kind: str) -> None:
+def test_a_contact_is_as_deep_as_the_nearest_triangle(kind: str, device: str) -> None:
     terrain = ground(kind)
     places = around(terrain, 400, -0.03, 0.04)  # centres of balls, some below the ground
-    world, depth, normal = contacts(terrain, places)
+    world, depth, normal = contacts(terrain, places, device)
     deepest = {w: i for i, w in sorted(enumerate(world), key=lambda pair: -depth[pair[0]])}
     touching = 0
     for number, place in enumerate(places):
@@ -110,41 +110,41 @@ def test_a_contact_is_as_deep_as_the_nearest_triangle(kind: str) -> None:
     assert touching > 100
 
 
-def test_flat_ground_is_a_plane_with_one_contact_a_ball() -> None:
+def test_flat_ground_is_a_plane_with_one_contact_a_ball(device: str) -> None:
     terrain = ground("flat")
     places = around(terrain, 200, 0.01, 0.022)
-    world, depth, normal = contacts(terrain, places)
+    world, depth, normal = contacts(terrain, places, device)
     assert sorted(world) == list(range(200))
     np.testing.assert_allclose(depth, places[world, 2] - RADIUS, atol=1e-6)
     np.testing.assert_allclose(normal, np.tile([0.0, 0.0, 1.0], (200, 1)), atol=1e-6)
 
 
-def test_a_slope_has_no_edges_inside() -> None:
+def test_a_slope_has_no_edges_inside(device: str) -> None:
     terrain = ground("smooth_slope")
     places = np.column_stack([np.full(50, 3.3), np.linspace(-0.5, 0.5, 50), np.zeros(50)])  # on one side of the pyramid of level 1
     places[:, 2] = [terrain.heights[60, round((3.3 - terrain.corner[0]) / 0.05)] + 0.022] * 50
-    world, _, normal = contacts(terrain, places)
+    world, _, normal = contacts(terrain, places, device)
     assert len(world) == len(set(world)) > 0
     assert np.ptp(normal, axis=0).max() < 1e-4, "one plane, one normal"
 
 
-def test_in_the_corner_of_a_step_there_are_two() -> None:
+def test_in_the_corner_of_a_step_there_are_two(device: str) -> None:
     terrain = ground("stairs_up", levels=2)
     row = terrain.heights[60, :]
     rise = next(i for i in range(140, 190) if row[i + 1] - row[i] > 0.1)  # of level 1, going outwards
     x, z = terrain.corner[0] + rise * 0.05, row[rise]
-    world, depth, normal = contacts(terrain, np.array([[x - 0.006, 0.0, z + 0.02], [x - 0.1, 0.0, z + 0.02]]))
+    world, depth, normal = contacts(terrain, np.array([[x - 0.006, 0.0, z + 0.02], [x - 0.1, 0.0, z + 0.02]]), device)
     assert sorted(world) == [0, 0, 1]
     corner = normal[world == 0]
     assert sorted(corner[:, 2].round(3))[-1] == 1.0 and min(corner[:, 0]) < -0.8, "the tread and the riser"
     assert (depth < 0).all()
 
 
-def test_a_ball_rests_as_on_a_plane() -> None:
+def test_a_ball_rests_as_on_a_plane(device: str) -> None:
     terrain = ground("flat")
     heights = []
     for field in (None, terrain):
-        sim = WarpSimulation(ball_model(field), 4, "cpu", nconmax=4, njmax=24, terrain=field, eager=True)
+        sim = WarpSimulation(ball_model(field), 4, device, nconmax=4, njmax=24, terrain=field, eager=True)
         sim.qpos[:, 2], sim.qvel[:, 0] = 0.05, 0.5
         for _ in range(100):
             sim.step()
@@ -172,11 +172,11 @@ def test_shapes_and_their_probes() -> None:
     "shape",
     [{"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [0.3, 0.1, 0.05]}, {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [0.05, 0.3, 0]}],
 )
-def test_what_lies_across_an_edge_does_not_sink_into_it(shape: dict[str, Any]) -> None:
+def test_what_lies_across_an_edge_does_not_sink_into_it(shape: dict[str, Any], device: str) -> None:
     terrain = ground("stairs_down")
     row = terrain.heights[60, :]
     edge = next(i for i in range(150, 190) if row[i] - row[i + 1] > 0.1)  # of level 1, going down outwards
-    sim = WarpSimulation(ball_model(terrain, shape), 1, "cpu", nconmax=64, njmax=128, terrain=terrain, eager=True)
+    sim = WarpSimulation(ball_model(terrain, shape), 1, device, nconmax=64, njmax=128, terrain=terrain, eager=True)
     lying = [1.0, 0.0, 0.0, 0.0] if shape["size"][2] else [0.7071068, 0.0, 0.7071068, 0.0]
     sim.qpos[0] = torch.tensor([terrain.corner[0] + edge * 0.05 - 0.05, 0.0, row[edge] + 0.052, *lying])
     for _ in range(40):
@@ -195,9 +195,10 @@ def test_too_little_room_is_seen() -> None:
 
 
 @pytest.mark.parametrize("kind", ["rough_slope", "stairs_up"])
-def test_both_lookups_find_the_same_heights(kind: str) -> None:
+def test_both_lookups_find_the_same_heights(kind: str, device: str) -> None:
     terrain = ground(kind)
-    points = torch.rand(7, 100, 2) * 14.0 - 7.0  # some of them outside
-    torch.testing.assert_close(HeightLookup(terrain, "cpu")(points), HeightMap(terrain, "cpu")(points), atol=2e-5, rtol=0.0)
-    nothing = torch.tensor([[float("nan"), 0.0], [float("inf"), -float("inf")]])
-    assert HeightLookup(terrain, "cpu")(nothing).isfinite().all() and HeightMap(terrain, "cpu")(nothing).isfinite().all()
+    lookup, tensors = HeightLookup(terrain, device), HeightMap(terrain, device)
+    points = torch.rand(7, 100, 2, device=device) * 14.0 - 7.0  # some of them outside
+    torch.testing.assert_close(lookup(points), tensors(points), atol=2e-5, rtol=0.0)
+    nothing = torch.tensor([[float("nan"), 0.0], [float("inf"), -float("inf")]], device=device)
+    assert lookup(nothing).isfinite().all() and tensors(nothing).isfinite().all()
