@@ -28,9 +28,16 @@ def device(request: pytest.FixtureRequest) -> str:
     return request.param
 
 
+@pytest.fixture(autouse=True)
+def precision() -> Iterator[None]:
+    """A runner sets the precision of matrix products for its whole process: the next test begins with torch's own."""
+    yield
+    torch.set_float32_matmul_precision("highest")
+
+
 @pytest.fixture
 def double() -> Iterator[None]:
-    """New tensors are float64: what is left of a difference is no longer rounding that a high learning rate has blown up."""
+    """New tensors are float64: what differs then is not the rounding of sums."""
     torch.set_default_dtype(torch.float64)
     yield
     torch.set_default_dtype(torch.float32)

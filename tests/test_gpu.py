@@ -175,7 +175,7 @@ def test_recorded_update_is_rsl_rls_own(settings: dict, double: None) -> None:
         share_experience(stock, ours)
         take_over(ours, stock)
         expected, got = update(stock), update(ours)
-        assert difference(parameters(stock), parameters(ours)) < 1e-10
+        assert difference(parameters(stock), parameters(ours)) < 1e-6  # our rate is float32, as the fused Adam wants it
         assert got == pytest.approx(expected, rel=1e-6, abs=1e-8)  # reported in float32
         assert ours.learning_rate == pytest.approx(stock.learning_rate, rel=1e-12)
     assert ours._update_graph.recorded

@@ -47,7 +47,7 @@ def test_same_parameters_as_rsl_rl(settings: dict[str, Any], double: None) -> No
         collect(stock, seed=seed)
         share_experience(stock, ours)
         expected, got = update(stock), update(ours)
-        assert difference(parameters(stock), parameters(ours)) < 1e-11
+        assert difference(parameters(stock), parameters(ours)) < 1e-6  # our rate is float32, as the fused Adam wants it
         assert got == pytest.approx(expected, rel=1e-6, abs=1e-8)  # reported in float32
         assert ours.learning_rate == pytest.approx(stock.learning_rate, rel=1e-12)
     assert difference(before, parameters(ours)) > 1e-2

@@ -81,7 +81,7 @@ class GraphedPPO(PPO):
         if reason:
             print(f"PPO: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
             return
-        self._adam_rate = torch.tensor(self.learning_rate, device=self.device)
+        self._adam_rate = torch.tensor(self.learning_rate, dtype=torch.float32, device=self.device)
         self._rate = torch.tensor(self.learning_rate, dtype=torch.float64, device=self.device)
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = type(self.optimizer)(parameters, lr=self._adam_rate, **self._adam_flags())
