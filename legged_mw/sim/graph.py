@@ -36,6 +36,7 @@ class StepGraph:
         """Eager while warming up, then record and replay; all on one side stream, as capture demands."""
         import warp as wp  # a second to import, and only for a GPU
 
+        wp.init()  # which is nothing where a simulation has done so
         current = torch.cuda.current_stream(stream.device)
         stream.wait_stream(current)
         wp_stream = wp.stream_from_torch(stream)
