@@ -44,14 +44,18 @@ class Source(NamedTuple):
     shipped: bool
 
 
-class Candidate(NamedTuple):
-    """A policy to be graded, and the environments for it."""
+class Run(NamedTuple):
+    """A policy with its config, prepared for what was asked: to watch, to grade, to export."""
 
     source: Source
-    policy: MLPModel
-    env: LeggedRobot
-    rough: LeggedRobot | None  # the exam's rough part; None for a policy that was trained on a plane
-    overrides: dict[str, Any]  # path -> value, of what ``env`` has otherwise than training
+    trained: dict[str, Any]  # the config as it was trained
+    task: LoadedTask  # with what playing or the exam changes, and the user's overrides
+    limits: list[list[float]]  # (2, 3) of the command, as trained
+    crossing: LoadedTask | None  # for the exam's rough part, if there is one
+
+    def changes(self) -> dict[str, tuple[Any, Any]]:
+        """Path -> (as trained, now)."""
+        return changes_since(self.task, self.trained)
 
 
 def parse() -> argparse.Namespace:
@@ -86,41 +90,39 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     args = parse()
+    run = read_run(args, find_policy(load_task(args.task), args))
+    print(f"{'shipped policy' if run.source.shipped else 'policy'}: {shown(run.source.checkpoint)}")
+    for path, (before, now) in sorted(run.changes().items()):
+        print(f"  {path}: {before} -> {now}")
+    if args.export:
+        export(run, Path(args.export))
+        return
+    rival = read_run(args, find_rival(load_task(args.task), args)) if args.compare is not None else None
+    device = pick_device(args.device)
+    out = ROOT / "logs" / run.task.name / "shipped" if run.source.shipped else run.source.folder  # where results go
+    if args.eval:
+        rows = [(each, *build(each, args, device)) for each in (run, rival) if each]  # all, before one is graded for nothing
+        columns = [grade(*row) for row in rows]
+        report.write(out / "eval", run.task.name, columns, elsewhere(run))
+        print(f"written to {shown(out / 'eval' / 'report.html')}, with report.json and pictures beside it")
+    else:
+        policy, env, _ = build(run, args, device)
+        stage, viewer = EnvStage(env, lambda obs: act(policy, obs), run.limits), run.task.cfg.viewer
+        launch.watch(stage, args, out, launch.Picture(viewer.width, viewer.height, viewer.fps), title=run.task.name)
+
+
+def read_run(args: argparse.Namespace, source: Source) -> Run:
+    """The policy's own config, with the user's overrides: two policies are graded each by its own, overridden alike."""
     task = load_task(args.task)
-    source = find_policy(task, args)
-    print(f"{'shipped policy' if source.shipped else 'policy'}: {shown(source.checkpoint)}")
     config = source.folder / CONFIG_FILE
     task.update_from_run(load_yaml(config), where=shown(config))
     trained = task.to_dict()
-    limits = prepare(task, args)
-    crossing_task = prepare_crossing(trained, args)
-    changes = changes_since(task, trained)
-    for path, (before, now) in sorted(changes.items()):
-        print(f"  {path}: {before} -> {now}")
-    if args.export:
-        export(trained, source, Path(args.export))
-        return
-    seed_everything(task.train.seed)
-    device = pick_device(args.device)
-    rival = find_rival(args, device) if args.compare is not None else None
-    env = make_env(task, args, device)
-    policy = load_policy(source.checkpoint, env, task.train, device)
-    out = ROOT / "logs" / task.name / "shipped" if source.shipped else source.folder  # where results go
-    if args.eval:
-        overrides = {path: now for path, (_, now) in changes.items()}
-        rough = make_env(crossing_task, args, device) if crossing_task else None
-        candidates = [Candidate(source, policy, env, rough, overrides), *([rival] if rival else [])]
-        columns = [grade(candidate) for candidate in candidates]
-        report.write(out / "eval", task.name, columns, elsewhere(task, source))
-        print(f"written to {shown(out / 'eval' / 'report.html')}, with report.json and pictures beside it")
-    else:
-        stage, viewer = EnvStage(env, lambda obs: act(policy, obs), limits), task.cfg.viewer
-        launch.watch(stage, args, out, launch.Picture(viewer.width, viewer.height, viewer.fps), title=task.name)
+    return Run(source, trained, task, prepare(task, args), prepare_crossing(trained, args))
 
 
 def find_policy(task: LoadedTask, args: argparse.Namespace) -> Source:
     """The run asked for, else the last run, else the policy that ships with the task."""
-    experiment = ROOT / "logs" / (args.experiment_name or task.train.runner.experiment_name or task.name)
+    experiment = experiment_of(task, args)
     if args.load_run == "shipped":
         if not shipped(task).checkpoint.is_file():
             raise ConfigError(f"--load_run shipped: no policy ships with {task.name}")
@@ -139,33 +141,30 @@ def shipped(task: LoadedTask) -> Source:
     return Source(folder, folder / "model.pt", shipped=True)
 
 
-def find_rival(args: argparse.Namespace, device: str) -> Candidate:
-    """What ``--compare`` names, ready to be graded as the first policy is: by the config of its own run, with the same overrides."""
-    task = load_task(args.task)
+def find_rival(task: LoadedTask, args: argparse.Namespace) -> Source:
+    """What ``--compare`` names; of the same task."""
     if args.compare == "shipped":
-        source = shipped(task)
-        if not source.checkpoint.is_file():
+        if not shipped(task).checkpoint.is_file():
             raise ConfigError(f"--compare shipped: no policy ships with {task.name}")
-    else:
-        run = find_run(ROOT / "logs" / (args.experiment_name or task.train.runner.experiment_name or task.name), args.compare)
-        source = Source(run, find_checkpoint(run, -1), shipped=False)
-    saved = load_yaml(source.folder / CONFIG_FILE)
+        return shipped(task)
+    run = find_run(experiment_of(task, args), args.compare)
+    saved = load_yaml(run / CONFIG_FILE)
     if Path(str(saved.get("task", task.name))).stem != task.name:
         raise ConfigError(f"--compare {args.compare} is of task '{saved['task']}', not '{task.name}': two policies are graded on one task")
-    task.update_from_run(saved, where=shown(source.folder / CONFIG_FILE))
-    trained = task.to_dict()
-    prepare(task, args)
-    crossing_task = prepare_crossing(trained, args)
-    seed_everything(task.train.seed)
-    env = make_env(task, args, device)
-    policy = load_policy(source.checkpoint, env, task.train, device)
-    overrides = {path: now for path, (_, now) in changes_since(task, trained).items()}
-    rough = make_env(crossing_task, args, device) if crossing_task else None
-    return Candidate(source, policy, env, rough, overrides)
+    return Source(run, find_checkpoint(run, -1), shipped=False)
 
 
-def make_env(task: LoadedTask, args: argparse.Namespace, device: str) -> LeggedRobot:
-    return task.env_class(task.cfg, device, eager=args.eager)
+def experiment_of(task: LoadedTask, args: argparse.Namespace) -> Path:
+    """The folder of the task's runs."""
+    return ROOT / "logs" / (args.experiment_name or task.train.runner.experiment_name or task.name)
+
+
+def build(run: Run, args: argparse.Namespace, device: str) -> tuple[MLPModel, LeggedRobot, LeggedRobot | None]:
+    """The policy, the environment to watch or grade it in, and the one of the exam's rough part."""
+    seed_everything(run.task.train.seed)
+    env = run.task.env_class(run.task.cfg, device, eager=args.eager)
+    rough = run.crossing.env_class(run.crossing.cfg, device, eager=args.eager) if run.crossing else None
+    return load_policy(run.source.checkpoint, env, run.task.train, device), env, rough
 
 
 def prepare(task: LoadedTask, args: argparse.Namespace) -> list[list[float]]:
@@ -236,40 +235,41 @@ def changes_since(task: LoadedTask, trained: dict[str, Any]) -> dict[str, tuple[
     return {path: (before, now) for path, before, now in differences}
 
 
-def grade(candidate: Candidate) -> report.Column:
+def grade(run: Run, policy: MLPModel, env: LeggedRobot, rough: LeggedRobot | None) -> report.Column:
     """The exam and all else of a report, from one roll-out and, if there is a rough part, another; prints their tables."""
-    source, policy, env, rough, overrides = candidate
+    source = run.source
     result, figures = report.examine(env, lambda obs: act(policy, obs), rough)
     name = "shipped" if source.shipped else f"{source.folder.name}, {source.checkpoint.stem.removeprefix('model_')}"
     print(f"\n{name}, {env.sim.engine} on {env.device}\n{rules.table(result)}\n")
     if rough:
         print(f"{crossing.table(figures['crossing'])}\n")
+    overrides = {path: now for path, (_, now) in run.changes().items()}
     about = {"policy": "/".join(source.checkpoint.parts[-3:]), "engine": env.sim.engine, "device": env.device, "overrides": overrides}
     return report.Column(name, about, result, figures)
 
 
-def elsewhere(task: LoadedTask, source: Source) -> list[tuple[str, dict[str, Any]]]:
+def elsewhere(run: Run) -> list[tuple[str, dict[str, Any]]]:
     """The exam of the same policy on another physics: MuJoCo's C engine, through an export, as ``legged_mw.deploy`` runs it."""
     from legged_mw.deploy.exam import run_exam
     from legged_mw.rl.export import export
 
-    if active(task.cfg):
+    if active(run.task.cfg):
         print("not graded through an export: that is the nominal robot, and domain_rand makes this one another")
         return []
     with TemporaryDirectory() as folder:
         try:
-            export(task.to_dict(), source.checkpoint, Path(folder) / "export")
+            export(run.task.to_dict(), run.source.checkpoint, Path(folder) / "export")
             return [("the same, deployed in MuJoCo", run_exam(Path(folder) / "export"))]
         except UserError as error:  # a row that nobody can measure, no onnxruntime
             print(f"not graded through an export: {error}")
             return []
 
 
-def export(trained: dict[str, Any], source: Source, folder: Path) -> None:
+def export(run: Run, folder: Path) -> None:
     """Write the policy as it was trained, whatever this call overrode for playing."""
     from legged_mw.rl.export import describe, export  # onnx takes a while to import
 
-    print(describe(export(trained, source.checkpoint, folder), folder))
+    print(describe(export(run.trained, run.source.checkpoint, folder), folder))
 
 
 if __name__ == "__main__":

@@ -320,7 +320,7 @@ def test_curricula_survive_a_resume(tmp_path: Path) -> None:
     again.learn(1)
 
 
-def test_a_resume_with_other_numbers_of_worlds_and_levels_keeps_what_fits(tmp_path: Path) -> None:
+def test_a_resume_with_other_numbers_of_worlds_and_levels_keeps_what_fits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     env, runner = trained(16)
     assert env.tiles
     env.tiles.put(torch.tensor([0] * 4 + [1] * 4 + [2] * 4 + [3] * 4))  # a level a kind
@@ -331,8 +331,10 @@ def test_a_resume_with_other_numbers_of_worlds_and_levels_keeps_what_fits(tmp_pa
     assert more.command_curriculum[1:].tolist() == [0.0, 0.0], "what was counted was of other worlds"
     assert more.tiles and more.tiles.levels.tolist() == [0] * 8 + [1] * 8 + [2] * 8 + [3] * 8
     fewer, again = trained(16, terrain__num_rows=2, terrain__max_init_terrain_level=1)
+    assert "the last one here" not in capsys.readouterr().out
     again.load(str(tmp_path / "model_0.pt"))
     assert fewer.tiles and fewer.tiles.levels.tolist() == [0] * 4 + [1] * 12
+    assert "8 worlds go on on level 1, the last one here" in capsys.readouterr().out
 
 
 def test_a_mistake_is_named() -> None:

@@ -162,7 +162,7 @@ def test_a_kind_of_ones_own() -> None:
     assert tile(ground, 2, "pits").min() == pytest.approx(-0.1) and tile(ground, 1, "pits").min() == pytest.approx(-0.05)
     assert ground.difficulties == (0.0, 0.5, 1.0)
     assert describe("pits", 0.5) == "pits, depth 5 cm" and describe("stairs_up", 0.5) == "stairs_up, step 12.8 cm"
-    assert describe("flat", 0.5) == "flat"
+    assert describe("flat", 0.5) == "flat" and describe("gap", 0.0) == "gap, width 5 cm"
 
 
 @pytest.mark.usefixtures("own_kinds")

@@ -627,7 +627,10 @@ class LeggedRobot(BaseTask):
             self._set_command_ranges()
         if "terrain_levels" in state and self.tiles:
             self._episode.zero_()  # what was under way counts for nothing
-            self.tiles.put(spread(state["terrain_levels"]).clamp(max=self.tiles.num_levels - 1))
+            levels, last = spread(state["terrain_levels"]), self.tiles.num_levels - 1
+            if beyond := int((levels > last).sum()):
+                print(f"terrain: {beyond} worlds go on on level {last}, the last one here; the checkpoint has them higher", flush=True)
+            self.tiles.put(levels.clamp(max=last))
             self._reset_all()
 
     # ---- robot and buffers: born here, never rebound --------------------------------------------------------------------------

@@ -20,7 +20,9 @@ from legged_mw.sim.model import ModelError, unknown
 Heights = NDArray[np.float64]
 STEP = (0.06, 0.195)  # [m] of stairs at difficulty 0 and 1 [legged_gym: 0.05, 0.23; ours: for a leg of 0.43]
 BLOCK = (0.05, 0.25)  # [m] of blocks and holes [legged_gym]
-SLOPE, WAVE, NOISE, DITCH, STONE_GAP = 0.4, 0.3, 0.05, 0.6, 0.2  # at difficulty 1: [-], then [m]; a wave from trough to crest
+STONE_GAP = (0.05, 0.2)  # [m] between stones [legged_gym: 0.05, 0.1]
+DITCH = (0.05, 0.6)  # [m] of width [legged_gym: 0 to 1]
+SLOPE, WAVE, NOISE = 0.4, 0.3, 0.05  # at difficulty 1: [-], then [m]; a wave from trough to crest
 PLATFORM = 1.0  # [m] half the edge of the flat middle of a tile, where robots begin [legged_gym: 3 m in all for most, ours 2]
 
 
@@ -207,9 +209,9 @@ def waves(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
 
 
 def stepping_stones(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """Square stones, 1.5 m down to 0.3 m, with gaps of one cell up to 0.2 m between them, 0.3 m deep [legged_gym; ours: less deep]."""
+    """Square stones, 1.5 m down to 0.3 m, with gaps of 5 to 20 cm between them, 0.3 m deep [legged_gym; ours: less deep]."""
     stone = max(round((1.5 - 1.2 * difficulty) / grid.cell), 2)
-    gap = max(round(STONE_GAP * difficulty / grid.cell), 1)
+    gap = max(round(_between(STONE_GAP, difficulty) / grid.cell), 1)
     heights = np.full((grid.n + 1, grid.n + 1), -0.3)
     row = 0
     while row <= grid.n:
@@ -223,8 +225,8 @@ def stepping_stones(grid: Grid, difficulty: float, rng: np.random.Generator) -> 
 
 
 def gap(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """A ditch around the middle, one cell to 0.6 m wide, 0.5 m deep [legged_gym; ours: less wide]."""
-    width = max(DITCH * difficulty, grid.cell)
+    """A ditch around the middle, 5 to 60 cm wide, 0.5 m deep [legged_gym; ours: less wide]."""
+    width = max(_between(DITCH, difficulty), grid.cell)
     heights = grid.zeros()
     heights[(grid.distance > PLATFORM + 0.5 * grid.cell) & (grid.distance < PLATFORM + width + 0.5 * grid.cell)] = -0.5
     return heights
@@ -249,8 +251,8 @@ MEASURES: dict[str, tuple[str, float, float]] = {
     "stairs_down": ("step [cm]", 100 * STEP[0], 100 * STEP[1]),
     "obstacles": ("height [cm]", 100 * BLOCK[0], 100 * BLOCK[1]),
     "waves": ("height [cm]", 0.0, 100 * WAVE),
-    "stepping_stones": ("gap [cm]", 0.0, 100 * STONE_GAP),
-    "gap": ("width [cm]", 0.0, 100 * DITCH),
+    "stepping_stones": ("gap [cm]", 100 * STONE_GAP[0], 100 * STONE_GAP[1]),
+    "gap": ("width [cm]", 100 * DITCH[0], 100 * DITCH[1]),
     "low_random": ("height [cm]", 0.0, 100 * NOISE),
 }
 
