@@ -13,6 +13,7 @@ import getpass
 import logging
 import os
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -85,13 +86,19 @@ class WebViewer:
         for _ in range(round(START_SECONDS / 0.1)):
             if self._face.begun.wait(0.1) or not self._handle.is_running():  # which raises what went wrong on the viewer's thread
                 break
-        if not self._face.begun.is_set():
+        until = time.monotonic() + START_SECONDS  # its server is another thread
+        while self._face.begun.is_set() and not self._listens() and time.monotonic() < until:
+            time.sleep(0.01)
+        if not self._listens():
             self._handle.close()
             raise ViewError("--viewer web: MuJoCo's web viewer did not start")
         bound = self._face.viewer._http_sock.getsockname()
         if host == LOCAL and bound[0] != LOCAL:
             self._handle.close()
             raise ViewError(f"--viewer web: the page would be open to the network ({bound[0]}:{port}); this mujoco binds it otherwise")
+
+    def _listens(self) -> bool:
+        return self._face.begun.is_set() and self._face.viewer._http_sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1
 
 
 @contextmanager
