@@ -638,6 +638,26 @@ def test_the_page_is_served_on_this_machine_alone_and_says_no_to_a_bad_host() ->
         WebViewer(MODEL, pilot, host="203.0.113.7")
 
 
+def test_the_page_is_named_once_it_listens(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its server is a thread of its own, which may begin late."""
+    import asyncio
+    import urllib.request
+
+    from mujoco.studio.web import web_server
+
+    from legged_mw.view.web import WebViewer
+
+    serve = web_server.serve
+
+    async def late(*args: Any, **settings: Any) -> Any:
+        await asyncio.sleep(0.3)
+        return await serve(*args, **settings)
+
+    monkeypatch.setattr(web_server, "serve", late)
+    with WebViewer(MODEL, Pilot(LIMITS, 2), 2) as page, urllib.request.urlopen(page.url, timeout=10) as answer:
+        assert b"canvas" in answer.read()
+
+
 # ---- the environment as a stage
 
 
