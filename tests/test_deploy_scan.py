@@ -18,6 +18,9 @@ from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.simulated import Fleet, MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.deploy.udp import contract_digest
+from legged_mw.sim.model import ModelError
+from legged_mw.sim.standalone import among_steps
+from legged_mw.sim.terrain import make_terrain
 from legged_mw.utils.config import load_yaml, save_yaml
 
 SHIPPED = ROOT / "resources/policies/go1_rough_scan"
@@ -110,6 +113,23 @@ def test_among_steps_it_stands_on_boxes_and_sees_them() -> None:
     measured = fleet.read()
     assert not fleet.fell()[0] and fleet.qpos[0, 2] > start[2] + 0.15, "it climbs"
     assert measured.others["height_scan"].min() < -0.05
+
+
+@pytest.mark.parametrize("task", ["go1_rough", "go1_rough_scan"])
+def test_around_the_steps_the_ground_goes_on(task: str) -> None:
+    model = mujoco.MjModel.from_xml_path(str(ROOT / "resources/policies" / task / "terrain.xml"))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    for x, y in ((15.9, 0.0), (16.1, 3.0), (-500.0, 0.0), (0.0, 900.0), (300.0, -300.0)):
+        hit = mujoco.mj_ray(model, data, np.array([x, y, 5.0]), np.array([0.0, 0.0, -1.0]), None, 1, -1, np.zeros(1, dtype=np.int32), None)
+        assert hit == pytest.approx(5.0), (x, y)
+
+
+def test_too_many_steps_for_an_export_are_said() -> None:
+    many = {"levels": 1, "columns": 1, "tile": 24.0, "cell": 0.05, "border": 1.0, "difficulty": (1.0, 1.0), "seed": 1}
+    ground = make_terrain(proportions={"stepping_stones": 1.0}, **many)  # type: ignore[arg-type]
+    with pytest.raises(ModelError, match="tiles of stepping_stones are not level pieces, or more than 1000 of them"):
+        among_steps((SHIPPED / "scene.xml").read_text(), ground, [0.0, 0.0, 0.3])
 
 
 def test_an_export_of_flat_ground_has_no_steps(export: Path) -> None:

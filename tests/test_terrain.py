@@ -148,6 +148,7 @@ def own_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
     """What a test adds is gone after it."""
     monkeypatch.setattr(ground_kinds, "KINDS", dict(KINDS))
     monkeypatch.setattr(ground_kinds, "MEASURES", dict(ground_kinds.MEASURES))
+    monkeypatch.setattr(ground_kinds, "LEVEL", set(ground_kinds.LEVEL))
 
 
 @pytest.mark.usefixtures("own_kinds")
@@ -176,6 +177,10 @@ def test_mistakes_of_ones_own_kind_are_named() -> None:
         return grid.zeros() + difficulty
 
     @add_kind()
+    def rough(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+        return np.where(grid.distance < 0.5, 0.01 * rng.random(grid.distance.shape), 0.0)
+
+    @add_kind()
     def hole(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
         return np.where(grid.distance < 0.1, np.nan, 0.0)
 
@@ -184,12 +189,34 @@ def test_mistakes_of_ones_own_kind_are_named() -> None:
     for kind in ("cliff", "hole"):
         with pytest.raises(ModelError, match=f"kind of terrain '{kind}': its heights must be finite, and 0 along the rim"):
             terrain(proportions={kind: 1.0})
+    with pytest.raises(ModelError, match="kind of terrain 'rough': it must be level within 1 m of its middle, where episodes begin"):
+        terrain(proportions={"rough": 1.0})
+    for asked in ((cliff,), (5, 40), ("depth [cm]",)):
+        with pytest.raises(ModelError, match=r"add_kind\(.*\): name what makes the kind hard .* or write @add_kind\(\)"):
+            add_kind(*asked)  # type: ignore[arg-type]
 
     def gap(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
         return grid.zeros()
 
     with pytest.raises(ModelError, match="kind of terrain 'gap' is one of the package's own; give yours another name than flat"):
         add_kind()(gap)
+
+
+@pytest.mark.usefixtures("own_kinds")
+def test_a_kind_of_ones_own_is_boxes_if_it_says_that_it_is_level() -> None:
+    for level in (True, False):
+
+        @add_kind(level=level)
+        def kerb(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+            return np.where((grid.distance > 1.5) & (grid.distance < 2.5), 0.1, 0.0)
+
+        boxes, _, left = as_boxes(terrain(proportions={"kerb": 1.0}, columns=1))
+        assert ({box.top for box in boxes} == {0.0, 0.1} and not left) if level else (not boxes and left == ["kerb"])
+
+
+def test_a_ground_of_too_many_heights_is_refused() -> None:
+    with pytest.raises(ModelError, match=r"4 x 10 tiles of 8 m with a height every 0.002 m have 756 million heights, more than 100; raise"):
+        terrain(cell=0.002)
 
 
 @pytest.mark.usefixtures("own_kinds")
@@ -224,7 +251,7 @@ def test_only_level_pieces_become_boxes(cell: float) -> None:
     """A slope of few cells is a heap of steps to who counts rectangles."""
     kinds = [kind for kind in KINDS if kind != "craters"]
     ground = terrain(levels=2, cell=cell, proportions=dict.fromkeys(kinds, 1.0), columns=len(kinds), difficulty=(0.5, 0.9))
-    _, heights = as_boxes(ground)
+    _, heights, _ = as_boxes(ground)
     sunk = set()
     for column, kind in enumerate(ground.kinds):
         rows, columns = ground.vertices(1, column)
@@ -235,7 +262,8 @@ def test_only_level_pieces_become_boxes(cell: float) -> None:
 
 def test_boxes_cover_each_level_tile_once_and_at_its_heights() -> None:
     ground = terrain(levels=2, proportions={"stairs_up": 1.0, "rough_slope": 1.0}, columns=2)
-    boxes, heights = as_boxes(ground)
+    boxes, heights, left = as_boxes(ground)
+    assert left == ["rough_slope"]
     area = sum((b.high[0] - b.low[0]) * (b.high[1] - b.low[1]) for b in boxes)
     assert area == pytest.approx(2 * 64.0)
     rng = np.random.default_rng(0)

@@ -39,7 +39,7 @@ from legged_mw.deploy.contract import (
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl.policy import act, load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE
-from legged_mw.sim.model import per_joint
+from legged_mw.sim.model import ModelError, per_joint
 from legged_mw.sim.standalone import among_steps, standalone
 from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.utils.cli import shown
@@ -65,6 +65,7 @@ class Exported(NamedTuple):
     gap: float  # largest difference of an action to the trained policy's
     observations: int  # that it was tried on
     unknown: tuple[str, ...]  # observation rows that nobody said how to measure: the export cannot be deployed
+    no_terrain: str = ""  # why there is no scene among steps though training had some; else empty
 
 
 class ExportedPolicy(nn.Module):
@@ -110,9 +111,10 @@ def _export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported
             _compare(NETWORK_FILE, run_onnx(new / NETWORK_FILE, observations.numpy()), actions),
         )
         contract = make_contract(env, task, new)
-        files = (*FILES, TERRAIN_FILE) if ground != "plane" and _write_terrain(task, new) else FILES
+        no_terrain = _write_terrain(task, new) if ground != "plane" else ""
         save_yaml(new / CONTRACT_FILE, contract.to_dict())
-    return Exported(files, gap, len(observations), tuple(row.name for row in contract.rows if not row.measured))
+        files = (*FILES, *([TERRAIN_FILE] if (new / TERRAIN_FILE).exists() else []))
+    return Exported(files, gap, len(observations), tuple(row.name for row in contract.rows if not row.measured), no_terrain)
 
 
 def describe(made: Exported, folder: Path) -> str:
@@ -122,6 +124,8 @@ def describe(made: Exported, folder: Path) -> str:
         line += (
             f"\n  nothing says how to measure {', '.join(made.unknown)}: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)"
         )
+    if made.no_terrain:
+        line += f"\n  no {TERRAIN_FILE}: {made.no_terrain}"
     return line
 
 
@@ -318,12 +322,12 @@ def make_contract(env: LeggedRobot, task: LoadedTask, folder: Path) -> Contract:
     )
 
 
-def _write_terrain(task: LoadedTask, folder: Path) -> bool:
-    """The scene among steps and blocks of the kinds that were trained, at three levels; False where there are no such kinds."""
+def _write_terrain(task: LoadedTask, folder: Path) -> str:
+    """The scene among steps and blocks of the kinds that were trained, at three levels; or why there is none."""
     cfg, ground = task.cfg.init_state, task.cfg.terrain
     kinds = [kind for kind, share in ground.terrain_proportions.items() if share > 0 and kind in LEVEL - {"flat"}]
     if not kinds:
-        return False
+        return ""
     terrain = make_terrain(
         levels=3,
         difficulty=(0.1, 0.7),
@@ -335,9 +339,12 @@ def _write_terrain(task: LoadedTask, folder: Path) -> bool:
         seed=ground.seed,
     )
     start = terrain.origins[0, kinds.index("stairs_up") if "stairs_up" in kinds else 0] + np.array(cfg.pos)
-    xml = among_steps((folder / SCENE_FILE).read_text(encoding="utf-8"), terrain, start.tolist())
+    try:
+        xml = among_steps((folder / SCENE_FILE).read_text(encoding="utf-8"), terrain, start.tolist())
+    except ModelError as error:
+        return str(error)
     (folder / TERRAIN_FILE).write_text(xml, encoding="utf-8")
-    return True
+    return ""
 
 
 def contract_rows(env: LeggedRobot, group: str) -> list[Row]:

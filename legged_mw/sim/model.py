@@ -256,7 +256,7 @@ def _replace_level_pieces(spec: mujoco.MjSpec, ground: Ground, notes: list[str])
     from legged_mw.sim.terrain import as_boxes
 
     assert ground.terrain
-    boxes, heights = as_boxes(ground.terrain)
+    boxes, heights, _ = as_boxes(ground.terrain)
     spec.geom(GROUND).pos, bottom = _fill_height_field(spec, ground.terrain, heights), float(heights.min()) - 1.0
     for number, box in enumerate(boxes):
         low, high = np.array([*box.low, bottom]), np.array([*box.high, box.top])

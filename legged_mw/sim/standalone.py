@@ -14,8 +14,9 @@ import mujoco
 import numpy as np
 
 from legged_mw.sim.model import GROUND, ModelError, RobotModel, add_ground_box, feel_all_ground
-from legged_mw.sim.terrain import Box, Terrain, as_boxes
+from legged_mw.sim.terrain import MOST_BOXES, Box, Terrain, as_boxes
 
+AROUND = 1000.0  # [m] of level ground around tiles of steps: nobody walks to its end
 HOME = "home"  # the keyframe: the pose to start in, and the servos holding it
 TOLERANCE = 1e-5  # relative, absolute below 1: MuJoCo writes MJCF with six digits
 _OPTION = (
@@ -94,11 +95,14 @@ def standalone(robot: RobotModel, *, imu: str, feet: Sequence[str], qpos: Sequen
 def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
     """The scene of ``standalone`` on the level pieces of ``terrain``, as boxes; the robot starts at ``start``, x, y, z [m].
 
-    Tiles that are no such pieces (slopes, noise) stay out: as text, a height field would have some megabytes.
+    Level ground goes on around them for ``AROUND``. Raises ModelError for what is no such pieces (slopes, noise), or too many:
+    as text, a height field would have some megabytes.
     """
     spec = mujoco.MjSpec.from_string(xml)
-    floor, (boxes, _) = spec.geom(GROUND), as_boxes(terrain)
-    x, y = (-corner for corner in terrain.corner)
+    floor, (boxes, _, left) = spec.geom(GROUND), as_boxes(terrain)
+    if left:
+        raise ModelError(f"tiles of {', '.join(left)} are not level pieces, or more than {MOST_BOXES} of them")
+    x, y = (AROUND - corner for corner in terrain.corner)
     inner_x, inner_y = terrain.levels * terrain.tile / 2, len(terrain.kinds) * terrain.tile / 2
     border = [
         ((-x, -y), (x, -inner_y)),

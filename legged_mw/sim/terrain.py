@@ -23,6 +23,7 @@ BLOCK = (0.05, 0.25)  # [m] of blocks and holes [legged_gym]
 STONE_GAP = (0.05, 0.2)  # [m] between stones [legged_gym: 0.05, 0.1]
 DITCH = (0.05, 0.6)  # [m] of width [legged_gym: 0 to 1]
 SLOPE, WAVE, NOISE = 0.4, 0.3, 0.05  # at difficulty 1: [-], then [m]; a wave from trough to crest
+MOST_HEIGHTS = 1e8  # of a whole ground: 0.8 GB on the host, half of it on the device
 PLATFORM = 1.0  # [m] half the edge of the flat middle of a tile, where robots begin [legged_gym: 3 m in all for most, ours 2]
 
 
@@ -84,13 +85,19 @@ def make_terrain(
         )
     kinds, rng = share_columns(proportions, columns), np.random.default_rng(seed)
     edge = round(border / cell)
+    if (count := (columns * n + 2 * edge + 1) * (levels * n + 2 * edge + 1)) > MOST_HEIGHTS:
+        raise ModelError(
+            f"terrain: {levels} x {columns} tiles of {tile:g} m with a height every {cell:g} m have {count / 1e6:.0f} million heights, "
+            f"more than {MOST_HEIGHTS / 1e6:.0f}; raise terrain.horizontal_scale, or lower num_rows, num_cols, tile_size or border_size"
+        )
     field = np.zeros((columns * n + 2 * edge + 1, levels * n + 2 * edge + 1))
     origins = np.zeros((levels, columns, 3))
     corner = (-0.5 * levels * tile - edge * cell, -0.5 * columns * tile - edge * cell)
     difficulties = tuple(_between(difficulty, level / max(levels - 1, 1)) for level in range(levels))
     for column, kind in enumerate(kinds):
         for level, hard in enumerate(difficulties):
-            patch = _checked(KINDS[kind](Grid(n, cell, pit=(column + level) % 2 == 0), hard, rng), kind, n)
+            grid = Grid(n, cell, pit=(column + level) % 2 == 0)
+            patch = _checked(KINDS[kind](grid, hard, rng), kind, grid)
             row0, col0 = edge + column * n, edge + level * n
             field[row0 : row0 + n + 1, col0 : col0 + n + 1] = patch
             middle = (col0 + n // 2, row0 + n // 2)
@@ -98,15 +105,19 @@ def make_terrain(
     return Terrain(field, cell, corner, tile, kinds, difficulties, origins)
 
 
-def _checked(patch: Heights, kind: str, n: int) -> Heights:
+def _checked(patch: Heights, kind: str, grid: Grid) -> Heights:
     """The heights that the function ``kind`` made, if they are a tile's."""
-    patch = np.asarray(patch, dtype=float)
+    patch, n = np.asarray(patch, dtype=float), grid.n
     if patch.shape != (n + 1, n + 1):
         raise ModelError(f"kind of terrain '{kind}' returned heights of shape {patch.shape}; a tile has {(n + 1, n + 1)}, as grid.zeros()")
     rim = np.concatenate([patch[[0, -1]].ravel(), patch[:, [0, -1]].ravel()])
     if not np.isfinite(patch).all() or np.abs(rim).max() > 1e-9:
         raise ModelError(
             f"kind of terrain '{kind}': its heights must be finite, and 0 along the rim so that tiles fit together (grid.fade does that)"
+        )
+    if np.ptp(patch[grid.distance < PLATFORM - 0.5 * grid.cell]) > 1e-3:
+        raise ModelError(
+            f"kind of terrain '{kind}': it must be level within {PLATFORM:g} m of its middle, where episodes begin (grid.fade does that)"
         )
     return patch
 
@@ -241,6 +252,7 @@ KINDS: dict[str, Kind] = {
     kind.__name__: kind
     for kind in (flat, smooth_slope, rough_slope, stairs_up, stairs_down, obstacles, waves, stepping_stones, gap, low_random)
 }
+LEVEL = {"flat", "stairs_up", "stairs_down", "obstacles", "stepping_stones", "gap"}  # kinds that are made of level pieces
 
 
 # What makes a kind hard, for tables: name of the measure, its value at difficulty 0 and 1. A kind that is not here has none.
@@ -257,11 +269,17 @@ MEASURES: dict[str, tuple[str, float, float]] = {
 }
 
 
-def add_kind(measure: str = "", low: float = 0.0, high: float = 0.0) -> Callable[[Kind], Kind]:
+def add_kind(measure: str = "", low: float = 0.0, high: float = 0.0, *, level: bool = False) -> Callable[[Kind], Kind]:
     """Make the decorated function a kind of ground under its own name, for ``terrain.terrain_proportions``.
 
     ``measure``: what makes it hard, with its unit, as in "depth [cm]"; ``low`` and ``high``: its value at difficulty 0 and 1.
+    ``level``: it is made of level pieces, such as steps and blocks, which MuJoCo's own engine and an export then have as boxes.
     """
+    if not isinstance(measure, str) or (measure and low == high):
+        raise ModelError(
+            f"add_kind({measure!r}, {low:g}, {high:g}): name what makes the kind hard and its value at difficulty 0 and 1, "
+            'as in @add_kind("depth [cm]", 5, 40), or write @add_kind()'
+        )
 
     def add(kind: Kind) -> Kind:
         name = kind.__name__
@@ -269,8 +287,11 @@ def add_kind(measure: str = "", low: float = 0.0, high: float = 0.0) -> Callable
             raise ModelError(f"kind of terrain '{name}' is one of the package's own; give yours another name than {', '.join(KINDS)}")
         KINDS[name] = kind
         MEASURES.pop(name, None)
+        LEVEL.discard(name)
         if measure:
             MEASURES[name] = (measure, low, high)
+        if level:
+            LEVEL.add(name)
         return kind
 
     return add
@@ -313,7 +334,6 @@ def _noise(grid: Grid, height: float, every: float, rng: np.random.Generator) ->
 
 # ---- level pieces as boxes, for MuJoCo's own engine ----
 
-LEVEL = {"flat", "stairs_up", "stairs_down", "obstacles", "stepping_stones", "gap"}  # kinds that are made of level pieces
 MOST_BOXES = 1000  # of a tile; what needs more stays a height field
 
 
@@ -325,19 +345,19 @@ class Box(NamedTuple):
     top: float  # [m]
 
 
-def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights]:
-    """Tiles that are few level pieces as boxes, and the heights of all else, sunk by 1 m under the boxes.
+def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights, list[str]]:
+    """Tiles that are few level pieces as boxes, the heights of all else, sunk by 1 m under the boxes, and its kinds.
 
     Steps are upright there, midway between the vertices where the height field has a slope of one cell.
     """
-    heights, boxes = terrain.heights.copy(), []
+    heights, boxes, left = terrain.heights.copy(), [], set()
     n = round(terrain.tile / terrain.cell)
     for column, level in np.ndindex(len(terrain.kinds), terrain.levels):
-        where = terrain.vertices(level, column)
-        if terrain.kinds[column] not in LEVEL and np.ptp(terrain.heights[where]):
-            continue
-        pieces = _level_pieces(np.round(terrain.heights[where], 6))
-        if len(pieces) > MOST_BOXES:
+        where, kind = terrain.vertices(level, column), terrain.kinds[column]
+        is_level = kind in LEVEL or not np.ptp(terrain.heights[where])
+        pieces = _level_pieces(np.round(terrain.heights[where], 6)) if is_level else []
+        if not pieces or len(pieces) > MOST_BOXES:
+            left.add(kind)
             continue
         for rows, columns, top in pieces:
             y, x = (tile.start + np.clip([*span], 0.5, n + 0.5) - 0.5 for tile, span in zip(where, (rows, columns), strict=True))
@@ -345,7 +365,7 @@ def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights]:
             boxes.append(Box(low, high, top))
         inside = heights[where][1:-1, 1:-1]
         inside[...] = inside.min() - 1.0
-    return boxes, heights
+    return boxes, heights, sorted(left)
 
 
 def _level_pieces(patch: Heights) -> list[tuple[tuple[int, int], tuple[int, int], float]]:
