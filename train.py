@@ -20,7 +20,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval.training import TrainingExam, make_exam
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
-from legged_mw.rl.runner import Runner, make_runner
+from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, find_checkpoint, find_run, new_run
 from legged_mw.sim.simulation import pick_engine
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, one_line_errors, pick_device, positive, seed_everything, shown
@@ -78,6 +78,7 @@ def main() -> None:
     announce(task, device, rank)
     env = task.env_class(task.cfg, device, eager=args.eager)
     if args.check:
+        check_mirror(env, task.train)
         print(describe(env, task))
         return
     wanted = rank.leads and 0 < task.train.runner.exam_interval <= task.train.runner.max_iterations

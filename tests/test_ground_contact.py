@@ -164,6 +164,11 @@ def test_shapes_and_their_probes() -> None:
         model = ball_model(None, {"type": kind, "size": size})
         geoms, places, radii = probes(model, 0)
         assert geoms == [1] * count and len(places) == len(radii) == count
+    _, places, _ = probes(ball_model(None, {"type": kinds.mjGEOM_CYLINDER, "size": [0.3, 0.1, 0]}), 0)
+    angle, across = np.meshgrid(np.linspace(0.0, 2.0 * np.pi, 50), np.linspace(0.0, 0.3, 20))
+    cap = np.stack([across * np.cos(angle), across * np.sin(angle), np.full_like(angle, 0.1)], axis=-1)
+    nearest_probe = np.linalg.norm(cap[..., None, :] - places, axis=-1).min(axis=-1)
+    assert nearest_probe.max() < 0.1 / np.sqrt(2) + 1e-6, "10 cm apart along either way"
     with pytest.raises(ModelError, match=r"collider 'ball' is a ellipsoid: on terrain mujoco_warp knows spheres, capsules, boxes"):
         probes(ball_model(None, {"type": kinds.mjGEOM_ELLIPSOID, "size": [0.1, 0.1, 0.2]}), 0)
 

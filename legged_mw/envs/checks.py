@@ -26,6 +26,7 @@ FACTORS: Rule = (
 )
 STEPS: Rule = ("two whole numbers from zero, the lower first, or an empty list", lambda v: not v or (len(v) == 2 and 0 <= v[0] <= v[1]))
 NAMES: Rule = ("a list with at least one name", lambda v: len(v) > 0)
+POINTS: Rule = ("at least one number, all finite", lambda v: len(v) > 0 and all(map(math.isfinite, v)))
 PROBABILITIES: Rule = ("three numbers from 0 to 1", lambda v: len(v) == 3 and all(0 <= p <= 1 for p in v))
 
 ENVIRONMENT: dict[str, Rule] = {
@@ -51,13 +52,14 @@ ENVIRONMENT: dict[str, Rule] = {
     "init_state.pos": ("three numbers, x, y, z", lambda v: len(v) == 3),
     "viewer.camera": ("three numbers, not straight above or below", lambda v: len(v) == 3 and (v[0] != 0 or v[1] != 0)),
     "termination.max_tilt": ("above 0 and at most 180 degrees", lambda v: 0 < v <= 180),
-    **dict.fromkeys(("terrain.num_rows", "terrain.num_cols", "terrain.tile_size", "terrain.horizontal_scale"), POSITIVE),
-    **dict.fromkeys(("terrain.max_init_terrain_level", "termination.min_base_height"), NOT_NEGATIVE),
+    **dict.fromkeys(("terrain.num_rows", "terrain.num_cols", "terrain.tile_size"), POSITIVE),
+    **dict.fromkeys(("terrain.max_init_terrain_level", "terrain.seed", "termination.min_base_height"), NOT_NEGATIVE),
+    "terrain.horizontal_scale": ("above 0 and at most 0.25 m, or a cell would be wider than a step of stairs", lambda v: 0 < v <= 0.25),
     "terrain.border_size": ("1 m at least, for robots that walk off to turn back on", lambda v: 1 <= v < math.inf),
-    "terrain.terrain_proportions": ("kinds with shares from 0", lambda v: all(share >= 0 for share in v.values())),
+    "terrain.terrain_proportions": ("kinds with shares from 0", lambda v: all(0 <= share < math.inf for share in v.values())),
     "terrain.difficulty": ("two numbers from 0 to 1, the lower first", lambda v: len(v) == 2 and 0 <= v[0] <= v[1] <= 1),
     "terrain.height_scan": ("a list of groups: state, privileged_state", lambda v: {*v} <= {"state", "privileged_state"}),
-    **dict.fromkeys(("terrain.measured_points_x", "terrain.measured_points_y"), ("at least one number", lambda v: len(v) > 0)),
+    **dict.fromkeys(("terrain.measured_points_x", "terrain.measured_points_y"), POINTS),
     **dict.fromkeys(("commands.curriculum_start", "commands.curriculum_step"), ("above 0 and at most 1", lambda v: 0 < v <= 1)),
     "terrain.condim": ("1, 3, 4 or 6", lambda v: v in (1, 3, 4, 6)),
 }

@@ -25,6 +25,8 @@ from legged_mw.utils.config import ConfigError
 if TYPE_CHECKING:
     from legged_mw.envs.legged_robot import LeggedRobot, Row
 
+NO_MIRROR = "learn without mirror images: symmetry.use_data_augmentation = False (and use_mirror_loss, if you set it)"
+
 
 class _Block(NamedTuple):
     """Columns that mirror among themselves. A row holds any number of blocks, one after another."""
@@ -103,7 +105,7 @@ def _height_scan(env: LeggedRobot) -> _Block:
     if env.cfg.terrain.height_scan and any(
         abs(left + right) > 1e-6 for left, right in zip(sorted(ys), sorted(ys, reverse=True), strict=True)
     ):
-        raise ConfigError(f"terrain.measured_points_y {ys} is not its own mirror image; make it so, or switch the section symmetry off")
+        raise ConfigError(f"terrain.measured_points_y {ys} is not its own mirror image; make it so, or {NO_MIRROR}")
     partner = [min(range(len(ys)), key=lambda j: abs(ys[j] + y)) for y in ys]
     return _Block([i * len(ys) + j for i in range(len(xs)) for j in partner], [1.0] * (len(xs) * len(ys)))
 
@@ -152,5 +154,5 @@ def _check_pose(env: LeggedRobot, partners: Partners) -> None:
             image = "its own mirror image" if i == j else f"the mirror image of {pose[j]:g} rad at '{names[j]}'"
             raise ConfigError(
                 f"init_state.default_joint_angles: joint '{names[i]}' is at {pose[i]:g} rad, {image} is {sign * pose[j] + 0.0:g}; "
-                "make the default pose symmetric, or switch off what mirrors the robot (section symmetry)"
+                f"make the default pose symmetric, or {NO_MIRROR}"
             )

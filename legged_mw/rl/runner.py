@@ -282,12 +282,17 @@ class Runner(OnPolicyRunner):
 def make_runner(env: LeggedRobot, cfg: LeggedRobotCfgPPO, log_dir: Path | None, device: str) -> Runner:
     """A runner over ``env`` from the learner's config; it writes below ``log_dir``, or nothing if that is None."""
     torch.set_float32_matmul_precision(cfg.runner.matmul_precision)
-    if cfg.symmetry.use_data_augmentation or cfg.symmetry.use_mirror_loss:
-        _ = env.mirror  # a robot without a mirror image is to be named now, not after a rollout
+    check_mirror(env, cfg)
     try:
         return Runner(env, rsl_rl_config(cfg), str(log_dir) if log_dir else None, device)
     except ValueError as error:  # a class, activation, optimizer or observation group that does not exist
         raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None
+
+
+def check_mirror(env: LeggedRobot, cfg: LeggedRobotCfgPPO) -> None:
+    """Name what has no mirror image now, not after a rollout, if learning wants one. Raises ConfigError."""
+    if cfg.symmetry.use_data_augmentation or cfg.symmetry.use_mirror_loss:
+        _ = env.mirror
 
 
 def rsl_rl_config(cfg: LeggedRobotCfgPPO) -> dict[str, Any]:

@@ -57,9 +57,9 @@ def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, l
             grid = [(x, y, z) for x in _spaced(size[0]) for y in _spaced(size[1]) for z in _spaced(size[2])]
             found = [(place, 0.0) for place in grid if any(abs(at) == half for at, half in zip(place, size, strict=True))]
         elif kind == kinds.mjGEOM_CYLINDER:
-            around = [2.0 * math.pi * i / 12 for i in range(12)]
-            rims = [(size[0] * math.cos(a), size[0] * math.sin(a), z) for z in _spaced(size[1]) for a in around]
-            found = [(place, 0.0) for place in [*rims, (0.0, 0.0, -size[1]), (0.0, 0.0, size[1])]]
+            inner = np.linspace(0.0, size[0], math.ceil(size[0] / SPACING) + 1)[:-1]
+            rings = [(size[0], z) for z in _spaced(size[1])] + [(radius, z) for z in (-size[1], size[1]) for radius in inner]
+            found = [((x, y, z), 0.0) for radius, z in rings for x, y in _ring(radius)]
         else:
             shape = str(kinds(kind)).rsplit("_", 1)[-1].lower()
             raise ModelError(
@@ -76,6 +76,12 @@ def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, l
 def _spaced(half: float) -> list[float]:
     """Places along an axis from one end to the other [m]."""
     return np.linspace(-half, half, max(2, math.ceil(2.0 * half / SPACING) + 1)).tolist()
+
+
+def _ring(radius: float) -> list[tuple[float, float]]:
+    """Places around a circle [m]; of none, its middle."""
+    count = max(12, math.ceil(2.0 * math.pi * radius / SPACING)) if radius else 1
+    return [(radius * math.cos(a), radius * math.sin(a)) for a in (2.0 * math.pi * i / count for i in range(count))]
 
 
 def _field(terrain: Terrain) -> Any:
