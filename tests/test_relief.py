@@ -119,6 +119,18 @@ def test_a_plane_is_drawn_as_ever_and_rough_ground_in_tiles(hilly: mujoco.MjMode
     assert (hilly.nq, hilly.nv) == (19, 18)
 
 
+@pytest.mark.parametrize(("levels", "columns"), [(2, 2), (26, 1), (100, 3), (1, 40)])
+def test_flat_ground_lies_all_around_as_far_as_a_camera_sees(levels: int, columns: int) -> None:
+    ground = make_terrain(levels=levels, proportions={"flat": 1.0}, columns=columns, tile=8.0, cell=1.0, border=2.0, seed=1)
+    model = ground_model(ground)
+    pieces = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (model.geom_size[:, 0] > 0)
+    x, y = 4.0 * levels, 4.0 * columns
+    grid = np.stack(np.meshgrid(np.arange(0.25 - x - 150, x + 150, 2.5), np.arange(0.25 - y - 150, y + 150, 2.5)), axis=-1)
+    away = np.abs(grid[:, :, None] - model.geom_pos[pieces, :2]) <= model.geom_size[pieces, :2]
+    tiles = (np.abs(grid) <= [x, y]).all(axis=-1)
+    assert (away.all(axis=-1).sum(axis=-1) == ~tiles).all(), "one piece everywhere beside the tiles, none over them"
+
+
 def test_hills_are_as_high_as_the_ground(hilly: mujoco.MjModel) -> None:
     ground, data = grid(), mujoco.MjData(hilly)
     mujoco.mj_kinematics(hilly, data)

@@ -29,7 +29,7 @@ EDGE, EDGE_WIDTH, EDGE_MAX = 2.5, 0.1, 0.4  # what lies higher than its neighbou
 STEEP, STEEP_FROM, STEEP_TO = 0.3, 0.6, 1.6  # ground as steep as a riser is darker; slopes [-] where that begins and is full
 HILL, HILL_HEIGHT = 0.12, 0.5  # hills are lighter and pits darker, at most by; at about [m]
 PIXELS, PIXELS_MAX = 2, 12_000_000  # two by two a cell, but one where the picture would have more than that
-REACH = 100.0  # half the edge of a piece of flat ground [m]; a camera sees as far as 150
+REACH = 200.0  # of the flat ground beyond the tiles [m]; a camera sees as far as 150
 
 
 def add_relief(spec: mujoco.MjSpec, terrain: Terrain, ground: str, squares: bool = True) -> None:
@@ -149,8 +149,11 @@ def _add_surroundings(spec: mujoco.MjSpec, terrain: Terrain, squares: bool) -> N
     _add_material(spec, AROUND, texuniform=True, texrepeat=[1 / SQUARE, 1 / SQUARE])
     plane = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "contype": 0, "conaffinity": 0, "castshadow": False}
     x, y = 0.5 * terrain.levels * terrain.tile, 0.5 * len(terrain.kinds) * terrain.tile
-    for corner, away in (((-x, y), (1, 1)), ((x, y), (1, -1)), ((x, -y), (-1, -1)), ((-x, -y), (-1, 1))):  # like the vanes of a wheel
+    reach = max(REACH, 2 * x, 2 * y)  # terrain_picture sees as far as the tiles are long
+    wide, deep = (2 * x + reach, reach), (reach, 2 * y + reach)  # [m] along x and y: a side of the tiles and on beyond its end
+    vanes = ((-x, y), (1, 1), wide), ((x, y), (1, -1), deep), ((x, -y), (-1, -1), wide), ((-x, -y), (-1, 1), deep)
+    for corner, away, edges in vanes:  # each from a corner of the tiles, like the vanes of a wheel
         # a plane's picture begins half a metre from its middle; lines are to lie at whole metres
-        middle = [round(start + side * REACH - 0.5) + 0.5 for start, side in zip(corner, away, strict=True)]
+        middle = [round(start + side * edge / 2 - 0.5) + 0.5 for start, side, edge in zip(corner, away, edges, strict=True)]
         size = [abs(place - start) for place, start in zip(middle, corner, strict=True)]
         spec.worldbody.add_geom(pos=[*middle, 0.0], size=[*size, 0.05], material=AROUND, **plane)
