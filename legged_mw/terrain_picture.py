@@ -29,20 +29,22 @@ from legged_mw.view.video import Frame, save_png
 
 PROGRAM = "legged_mw.terrain_picture"
 WIDTH, FINER = 1280, 2  # [px] of the picture; it is drawn that much larger and made smaller, which smooths it
+WIDEST, HIGHEST = 2560, 1280  # [px] with many levels it is wider, so that names have room; with few it is no higher, and less wide
 ELEVATION = 40.0  # [deg] of the camera, which looks along y, so that levels go to the right; without perspective
 LIGHT = (-0.7, -0.45, -0.75)  # direction: low, from the upper right, so that slopes stand out
 BRIGHTER = 2.0  # so low a light leaves level ground dark
-MARGIN, LINE = 0.22, 0.027  # of the width, left of the tiles: room for their names; between two lines of text, on the ground
+MARGIN, LINE = 0.22, 0.027  # of WIDTH, left of the tiles: room for their names; between two lines of text, on the ground
+NUMBER = 0.0375  # of WIDTH, from one level's number to the next
 
 
 def picture(terrain: Terrain) -> Frame:
     """All of ``terrain``, (height, width, 3)."""
     model = ground_model(terrain)
     length, depth = terrain.levels * terrain.tile, len(terrain.kinds) * terrain.tile  # [m] to the right, away
-    wide = length * 1.02 / (1.0 - MARGIN)  # [m] what is seen
-    line = LINE * wide
+    scale = _scale(terrain)
+    line, wide = LINE * WIDTH / scale, length * 1.02 + MARGIN * WIDTH / scale  # [m] between two lines of text; what is seen
     high = (depth + 3.0 * line) * math.sin(math.radians(ELEVATION))
-    width, height = WIDTH * FINER, round(WIDTH * high / wide) * FINER
+    width, height = round(wide * scale) * FINER, round(high * scale) * FINER
     vis = model.vis
     vis.global_.offwidth, vis.global_.offheight, vis.global_.fovy = width, height, high
     vis.map.zfar = 10 * max(length, depth)
@@ -60,23 +62,40 @@ def picture(terrain: Terrain) -> Frame:
     with renderer:
         renderer.update_scene(data, camera)
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = False
-        _label(renderer.scene, terrain, camera.lookat[0] - 0.49 * wide, line)
-        frame = shrunk(renderer.render(), WIDTH)
+        _label(renderer.scene, terrain, camera.lookat[0] - 0.5 * wide + 0.01 * WIDTH / scale, scale)
+        frame = shrunk(renderer.render(), width // FINER)
     return np.minimum(frame * BRIGHTER, 255.0).astype(np.uint8)
 
 
-def _label(scene: mujoco.MjvScene, terrain: Terrain, left: float, line: float) -> None:
-    """Names of the kinds, from ``left`` [m] on, in lines ``line`` [m] apart, and of the levels."""
-    for column, kind in enumerate(terrain.kinds):
-        y = terrain.origins[0, column, 1]
-        _write(scene, kind, (left, y + 0.1 * line))
-        if kind in MEASURES:
+def _scale(terrain: Terrain) -> float:
+    """[px/m] that fills the width, if that is neither too high nor too small for two lines of text beside each tile."""
+    length, depth = terrain.levels * terrain.tile * 1.02, len(terrain.kinds) * terrain.tile
+    fits, most = ((width - MARGIN * WIDTH) / length for width in (WIDTH, WIDEST))
+    low = (HIGHEST / math.sin(math.radians(ELEVATION)) - 3.0 * LINE * WIDTH) / depth
+    return min(max(min(fits, low), 2.0 * LINE * WIDTH / terrain.tile), most)
+
+
+def _label(scene: mujoco.MjvScene, terrain: Terrain, left: float, scale: float) -> None:
+    """Names of the kinds, from ``left`` [m] on, and of the levels, as many as have room at ``scale`` [px/m]."""
+    line, number = LINE * WIDTH / scale, NUMBER * WIDTH / scale  # [m]
+    both = terrain.tile > 1.99 * line  # what makes a kind hard too
+    for column in spaced(len(terrain.kinds), line / terrain.tile):
+        kind, y = terrain.kinds[column], terrain.origins[0, column, 1]
+        _write(scene, kind, (left, y + (0.1 if both else -0.4) * line))
+        if both and kind in MEASURES:
             (name, low, unit), (_, high, _) = (measure(kind, terrain.difficulties[level]) for level in (0, -1))
-            _write(scene, f"{name} {low:.3g} to {high:.3g} {unit}", (left, y - 0.9 * line))
+            span = f"{low:.3g} to {high:.3g}" if low != high else f"{low:.3g}"
+            _write(scene, f"{name} {span} {unit}", (left, y - 0.9 * line))
     top = terrain.origins[0, -1, 1] + 0.5 * terrain.tile + 0.6 * line
     _write(scene, "difficulty", (left, top))
-    for level, difficulty in enumerate(terrain.difficulties):
-        _write(scene, f"{difficulty:.2f}", (terrain.origins[level, 0, 0] - 0.6 * line, top))
+    for level in spaced(terrain.levels, number / terrain.tile):
+        _write(scene, f"{terrain.difficulties[level]:.2f}", (terrain.origins[level, 0, 0] - 0.6 * line, top))
+
+
+def spaced(count: int, room: float) -> list[int]:
+    """Of ``count`` things in a row those to name, at least ``room`` apart: in equal steps from the first, and the last."""
+    step = math.ceil(room)
+    return [*range(0, count - step, step), count - 1] if count > 1 else [0]
 
 
 def _write(scene: mujoco.MjvScene, text: str, place: tuple[float, float]) -> None:

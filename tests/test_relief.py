@@ -250,6 +250,28 @@ def test_the_picture_of_all_tiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert stairs > 2 * flat
 
 
+def blocks(ink: np.ndarray, gap: int) -> int:
+    """How many there are of True, more than ``gap`` apart."""
+    return int((np.diff(np.flatnonzero(ink)) > gap).sum()) + 1
+
+
+@pytest.mark.parametrize(
+    ("levels", "kinds", "size", "numbers", "lines"),
+    [
+        (1, [*KINDS, "gap"], (1280, 667), 1, 6),  # no higher
+        (20, ["stairs_up", "flat"], (156, 1692), 20, 4),  # wider, so that a name and its measure have room
+        (40, ["stairs_up", "flat"], (140, 2560), 40, 3),  # a name alone
+        (100, ["stairs_up", "flat"], (96, 2560), 34, 2),  # every third number, and one name
+    ],
+)
+def test_names_do_not_run_into_each_other(levels: int, kinds: list[str], size: tuple[int, int], numbers: int, lines: int) -> None:
+    frame = terrain_picture.picture(terrain(*kinds, levels=levels, cell=1.0))
+    assert frame.shape[:2] == pytest.approx(size, abs=8)
+    ink = (frame > 230).all(axis=2)
+    assert blocks(ink[:26, 280:].any(axis=0), 8) == numbers
+    assert blocks(ink[:, :200].any(axis=1), 8 if levels == 1 else 1) == lines
+
+
 @pytest.mark.parametrize(
     ("args", "message"),
     [
