@@ -137,3 +137,20 @@ def test_an_export_of_flat_ground_has_no_steps(export: Path) -> None:
         ContractError, match=r"no terrain.xml in .*; an export has one if its task was trained on ground with steps or blocks"
     ):
         DeployStage(export, 1, scene_file="terrain.xml")
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "message"),
+    [
+        ('gainprm="35"', 'gainprm="36"', r"policy.yaml: stiffness is \[35\..*, but terrain.xml has \[36\..*; export the policy again"),
+        ('name="gyro/imu"', 'name="gyro"', "no sensor 'gyro/imu' in terrain.xml; "),
+        ('<gyro site="imu" ', '<framequat objtype="site" objname="imu" ', r"terrain.xml: the sensors of 'ang_vel' .* have 4 values, not 3"),
+    ],
+)
+def test_what_is_wrong_with_terrain_is_not_said_of_the_scene(right: str, wrong: str, message: str, export: Path) -> None:
+    text = (SHIPPED / "terrain.xml").read_text()
+    (export / "terrain.xml").write_text(text.replace(right, wrong))
+    with pytest.raises(ContractError, match=message) as raised:
+        DeployStage(export, 1, scene_file="terrain.xml")
+    assert "scene.xml" not in str(raised.value)
+    DeployStage(export, 1)

@@ -351,27 +351,27 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE) -> Scen
         model = mujoco.MjModel.from_xml_path(str(folder / file))
     except ValueError as error:
         raise ContractError(f"{file} is not a valid MJCF: {' '.join(str(error).split())}") from None
-    joints = [_index(model, "joint", name, "joint") for name in contract.joints]
-    actuators = [_index(model, "actuator", name, "servo") for name in contract.joints]
-    _check_machine(model, contract, joints, actuators)
+    joints = [_index(model, file, "joint", name, "joint") for name in contract.joints]
+    actuators = [_index(model, file, "actuator", name, "servo") for name in contract.joints]
+    _check_machine(model, file, contract, joints, actuators)
     if model.nkey < 1:
         raise ContractError(f"{file} has no keyframe; the first one says where the robot starts")
     named = {**contract.sensors, **{row.name: row.sensors for row in contract.rows if row.sensors}}
     needed = [*SENSED, *([FALL] if contract.falls_on else [])]
     if missing := [name for name in needed if name not in contract.sensors]:
-        raise ContractError(f"{CONTRACT_FILE}: sensors: '{missing[0]}' is missing; name the sensors of {SCENE_FILE} that measure it")
-    data = {name: np.concatenate([_span(model, sensor, f"'{name}'") for sensor in names]) for name, names in named.items()}
+        raise ContractError(f"{CONTRACT_FILE}: sensors: '{missing[0]}' is missing; name the sensors of {file} that measure it")
+    data = {name: np.concatenate([_span(model, file, sensor, f"'{name}'") for sensor in names]) for name, names in named.items()}
     for name, where in data.items():
         size = next((row.size for row in contract.rows if row.sensors and row.name == name), None) or quantity_size(contract, name)
         if len(where) != size:
-            raise ContractError(f"{SCENE_FILE}: the sensors of '{name}' ({', '.join(named[name])}) have {len(where)} values, not {size}")
+            raise ContractError(f"{file}: the sensors of '{name}' ({', '.join(named[name])}) have {len(where)} values, not {size}")
     return Scene(model, np.array([model.jnt_qposadr[j] for j in joints]), np.array(actuators), data)
 
 
-def _index(model: mujoco.MjModel, kind: str, name: str, word: str) -> int:
+def _index(model: mujoco.MjModel, file: str, kind: str, name: str, word: str) -> int:
     index = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}"), name)
     if index < 0:
-        raise ContractError(f"{CONTRACT_FILE}: joints: {unknown(word, name, _names(model, kind), SCENE_FILE)}")
+        raise ContractError(f"{CONTRACT_FILE}: joints: {unknown(word, name, _names(model, kind), file)}")
     return index
 
 
@@ -381,18 +381,18 @@ def _names(model: mujoco.MjModel, kind: str) -> list[str]:
     return [name for name in names if name]
 
 
-def _span(model: mujoco.MjModel, name: str, what: str) -> np.ndarray:
+def _span(model: mujoco.MjModel, file: str, name: str, what: str) -> np.ndarray:
     index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
     if index < 0:
-        raise ContractError(f"{CONTRACT_FILE}: sensors of {what}: {unknown('sensor', name, _names(model, 'sensor'), SCENE_FILE)}")
+        raise ContractError(f"{CONTRACT_FILE}: sensors of {what}: {unknown('sensor', name, _names(model, 'sensor'), file)}")
     return np.arange(model.sensor_adr[index], model.sensor_adr[index] + model.sensor_dim[index])
 
 
-def _check_machine(model: mujoco.MjModel, contract: Contract, joints: Sequence[int], actuators: Sequence[int]) -> None:
+def _check_machine(model: mujoco.MjModel, file: str, contract: Contract, joints: Sequence[int], actuators: Sequence[int]) -> None:
     """Joints, gains, mass and step are those that the contract names."""
     if model.nq != 7 + len(joints) or model.nu != len(joints):
         have = [name for name in _names(model, "joint") if name not in contract.joints]
-        raise ContractError(f"{SCENE_FILE} has joints that {CONTRACT_FILE} does not: {', '.join(have[1:]) or f'{model.nu} servos'}")
+        raise ContractError(f"{file} has joints that {CONTRACT_FILE} does not: {', '.join(have[1:]) or f'{model.nu} servos'}")
     dofs = model.jnt_dofadr[list(joints)]
     checks = {
         "stiffness": (contract.stiffness, model.actuator_gainprm[list(actuators), 0]),
@@ -403,4 +403,4 @@ def _check_machine(model: mujoco.MjModel, contract: Contract, joints: Sequence[i
     for name, (said, found) in checks.items():
         if not np.allclose(said, found, rtol=1e-4, atol=1e-6):
             shown = [np.array2string(np.asarray(x), precision=6, separator=", ", max_line_width=10_000) for x in (said, found)]
-            raise ContractError(f"{CONTRACT_FILE}: {name} is {shown[0]}, but {SCENE_FILE} has {shown[1]}; export the policy again")
+            raise ContractError(f"{CONTRACT_FILE}: {name} is {shown[0]}, but {file} has {shown[1]}; export the policy again")
