@@ -80,6 +80,7 @@ class LeggedGymRobot(LeggedRobot):
                 Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", scale=scale.dof_pos, measured=True),
                 Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", scale=scale.dof_vel, measured=True),
                 Row("last_actions", self.last_actions, mirror="joint"),
+                *(row._replace(scale=scale.height_scan) for row in self._height_rows("state", noise.height_scan)),
             ]
         }
 
@@ -94,8 +95,8 @@ class LeggedGymRobot(LeggedRobot):
         return self.base_ang_vel[:, :2].square().sum(dim=1)
 
     def _reward_base_height(self) -> Tensor:
-        """Height of the root away from its target [m^2]; the ground is at 0."""
-        return (self.sim.qpos[:, 2] - self.cfg.rewards.base_height_target).square()
+        """Height of the root above the ground under it, away from its target [m^2]."""
+        return (self.base_height - self.cfg.rewards.base_height_target).square()
 
     def _reward_torques(self) -> Tensor:
         """Sum of squares of the servos' torques [N^2 m^2]."""
@@ -208,6 +209,7 @@ class Go1LeggedGymCfg(LeggedRobotCfg):
             ang_vel: float = 0.25
             dof_pos: float = 1.0
             dof_vel: float = 0.05
+            height_scan: float = 5.0
 
     class noise(LeggedRobotCfg.noise):
         class scales(LeggedRobotCfg.noise.scales):
@@ -216,6 +218,7 @@ class Go1LeggedGymCfg(LeggedRobotCfg):
             gravity = 0.05
             dof_pos = 0.01
             dof_vel = 1.5
+            height_scan = 0.1
 
     class perturbation(LeggedRobotCfg.perturbation):
         push = True

@@ -120,6 +120,19 @@ def test_reward_term(env: Any, name: str) -> None:
     assert value.dtype == torch.float and changed(env, before) == []
 
 
+def test_on_rough_ground_heights_are_above_the_ground() -> None:
+    stairs = {"mesh_type": "heightfield", "num_rows": 1, "num_cols": 1, "difficulty": [1.0, 1.0], "terrain_proportions": {"stairs_up": 1}}
+    env = ported(2, {**{f"terrain.{name}": value for name, value in stairs.items()}, "terrain.height_scan": ["state"], "noise.level": 0})
+    env.reset()
+    deep = -float(env.terrain.origins[0, 0, 2])  # [m] of the pit where episodes begin
+    env.sim.qpos[:, :3] = torch.tensor([[0.0, 0.0, 0.35 - deep], [5.0, 0.0, 0.35]])  # in the pit, and beside all tiles
+    env._update_state()
+    env.compute_observations()
+    assert deep > 1.0 and env._reward_base_height().tolist() == pytest.approx([0.01, 0.01], rel=1e-4)
+    scan = env.obs_buf["state"][:, 48:]
+    assert scan.shape == (2, 187) and scan[:, 93].tolist() == pytest.approx([5.0 * (0.35 - 0.42)] * 2, abs=1e-5)
+
+
 def test_torque_beyond_its_share_of_the_limit() -> None:
     env = ported(1, {"rewards.soft_torque_limit": 0.5})
     env.sim.actuator_force[0] = torch.tensor([20.0, 0.0, -20.0] + [0.0] * 9)  # hip 20 - 11.85, calf 20 - 17.775
