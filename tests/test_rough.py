@@ -14,7 +14,7 @@ from guard import recordable
 from torch import Tensor
 from worlds import QUIET, make_env
 
-from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.legged_robot import LeggedRobot, Row
 from legged_mw.rl.runner import make_runner
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
@@ -344,6 +344,20 @@ def test_a_mistake_is_named() -> None:
     with pytest.raises(ConfigError, match=r"terrain.height_scan is \['actor'\]; it must be a list of groups"):
         rough(2, terrain__height_scan=["actor"])
     assert math.isfinite(rough(2).base_height.sum())
+
+
+def test_a_table_without_the_scan_that_was_asked_for_is_named() -> None:
+    class Own(LeggedRobot):
+        def _observation_rows(self) -> dict[str, list[Row]]:
+            return {group: [row for row in rows if row.name != "height_scan"] for group, rows in super()._observation_rows().items()}
+
+    task = load_task("go1_rough_scan")
+    task.set("env.num_envs", 2)
+    task.set("terrain.mesh_type", "plane")
+    with pytest.raises(
+        ConfigError, match=r"terrain.height_scan names 'state', but Own._observation_rows has no row height_scan in 'state'"
+    ):
+        Own(task.cfg, "cpu")
 
 
 # ---- MuJoCo's own engine: level pieces as boxes ------------------------------------------------------------------------

@@ -436,6 +436,10 @@ class LeggedRobot(BaseTask):
             scales = [scale for row in rows for scale in row.column_scales()]
             if any(scale != 1.0 for scale in scales):
                 self.obs_scales[group] = torch.tensor(scales, device=self.device)
+        for group in self.cfg.terrain.height_scan:
+            if not any(name == "height_scan" for name, *_ in self.observation_table.get(group, [])):
+                here = f"{type(self).__name__}._observation_rows has no row height_scan in '{group}'"
+                raise ConfigError(f"terrain.height_scan names '{group}', but {here}; add *self._height_rows('{group}', noise) to it")
         measured = [row.measured for row in self._observation_rows().get("state", []) for _ in range(row.value.shape[1])]
         self._measured = torch.tensor(measured, device=self.device)
         self._observation_delay = self.domain_rand.delay("observation_delay", len(measured))
