@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.sim.scene import SQUARE
+from legged_mw.sim.scene import SQUARE, STEEP_LIGHT
 
 if TYPE_CHECKING:
     from legged_mw.sim.terrain import Terrain
@@ -43,8 +43,8 @@ def add_relief(spec: mujoco.MjSpec, terrain: Terrain, ground: str, squares: bool
     for level, column in np.ndindex(terrain.levels, len(terrain.kinds)):
         _add_tile(spec, terrain, level, column, picture)
     for light in spec.lights:
-        if light.name == "key":  # steeper than over a plane: a riser is darker than a tread wherever it faces
-            light.dir, light.diffuse = [-0.25, 0.35, -1.0], [0.75, 0.74, 0.71]
+        if light.name == "key":
+            light.dir, light.diffuse = STEEP_LIGHT, [0.75, 0.74, 0.71]
     spec.visual.headlight.diffuse = [0.15, 0.15, 0.15]
     _add_surroundings(spec, terrain, squares)
     # MuJoCo draws haze where there is an endless plane; this one cannot be seen, for it would fill the pits

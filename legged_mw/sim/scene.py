@@ -12,6 +12,7 @@ import mujoco
 GROUND_MATERIAL = "ground"  # for the floor or terrain geom
 _ZENITH, _HORIZON = (0.22, 0.32, 0.45), (0.56, 0.63, 0.70)
 SQUARE = 0.5  # edge of one checker square [m], a thin line every second one: to judge speed and stride by
+STEEP_LIGHT = (-0.25, 0.35, -1.0)  # of the key light over steps: steeper, so that a riser is darker than a tread wherever it faces
 
 
 def add_scene(spec: mujoco.MjSpec) -> None:

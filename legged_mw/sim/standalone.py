@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.sim.model import GROUND, ModelError, RobotModel, add_ground_box, feel_all_ground
+from legged_mw.sim.scene import STEEP_LIGHT
 from legged_mw.sim.terrain import MOST_BOXES, Box, Terrain, as_boxes
 
 AROUND = 1000.0  # [m] of level ground around tiles of steps: nobody walks to its end
@@ -111,7 +112,7 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
         ((inner_x, -inner_y), (x, inner_y)),
     ]
     bottom = terrain.span()[0] - 1.0
-    pieces = [*boxes, *(Box(low, high, 0.0) for low, high in border if low[0] < high[0] and low[1] < high[1])]
+    pieces = [*boxes, *(Box(low, high, 0.0) for low, high in border)]
     tiles = [terrain.tile_at((low[0] + high[0]) / 2, (low[1] + high[1]) / 2) for low, high, _ in pieces]
     tops = {tile: sorted({piece.top for piece, where in zip(pieces, tiles, strict=True) if where == tile}) for tile in tiles}
     for (low, high, top), tile in zip(pieces, tiles, strict=True):
@@ -120,7 +121,7 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
         box.material, box.rgba = floor.material, [tone, tone, tone, 1.0]
     floor.pos = [0.0, 0.0, bottom]
     for light in spec.lights:
-        light.dir = [-0.25, 0.35, -1.0]  # steeper than over a plane: a riser is darker than a tread wherever it faces
+        light.dir = STEEP_LIGHT
     feel_all_ground(spec)
     for key in spec.keys:
         key.qpos = [*start, *list(key.qpos)[3:]]

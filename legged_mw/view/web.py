@@ -83,12 +83,9 @@ class WebViewer:
 
     def _wait(self, host: str, port: int) -> None:
         """Until the page is served, and on no other interface than the one asked for."""
-        for _ in range(round(START_SECONDS / 0.1)):
-            if self._face.begun.wait(0.1) or not self._handle.is_running():  # which raises what went wrong on the viewer's thread
-                break
-        until = time.monotonic() + START_SECONDS  # its server is another thread
-        while self._face.begun.is_set() and not self._listens() and time.monotonic() < until:
-            time.sleep(0.01)
+        until = time.monotonic() + START_SECONDS
+        while not self._listens() and time.monotonic() < until and self._handle.is_running():  # which raises what its thread raised
+            time.sleep(0.02)
         if not self._listens():
             self._handle.close()
             raise ViewError("--viewer web: MuJoCo's web viewer did not start")
@@ -98,6 +95,7 @@ class WebViewer:
             raise ViewError(f"--viewer web: the page would be open to the network ({bound[0]}:{port}); this mujoco binds it otherwise")
 
     def _listens(self) -> bool:
+        """Its server is one more thread, which begins to listen after the viewer is there."""
         return self._face.begun.is_set() and self._face.viewer._http_sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1
 
 
