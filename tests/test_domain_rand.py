@@ -271,7 +271,7 @@ def test_the_same_seed_draws_the_same_worlds() -> None:
 
 
 def test_the_whole_step_asks_the_host_nothing_with_everything_on() -> None:
-    shaken = {"perturbation.enable": True, "perturbation.push": True, "perturbation.push_interval_s": 0.04}
+    shaken = {"perturbation.kick": True, "perturbation.push": True, "perturbation.push_interval_s": 0.04}
     env = make_env(4, {**ALL, **shaken, "sim.engine": "mujoco_warp"})
     actions = torch.zeros(4, 12)
     with recordable():
@@ -293,12 +293,12 @@ def test_what_was_drawn_is_readable() -> None:
 
 def test_pushes_set_the_velocity_when_their_clock_says_so() -> None:
     env = make_env(64, {**QUIET, "perturbation.push": True, "perturbation.push_interval_s": 0.2, "perturbation.max_push_vel_xy": 1.0})
-    assert len(set(env.push_clock.tolist())) > 5, "each world its own clock"
-    env.push_clock.copy_(torch.arange(64) % 10 + 1.0)
+    assert len(set(env.perturbation._push_clock.tolist())) > 5, "each world its own clock"
+    env.perturbation._push_clock.copy_(torch.arange(64) % 10 + 1.0)
     pushed = torch.zeros(64, dtype=torch.long)
     for step in range(20):
         before = env.sim.qvel[:, :2].clone()
-        env._push_robots()
+        env.perturbation._push_robots()
         moved = (env.sim.qvel[:, :2] != before).any(dim=1)
         assert torch.equal(moved, torch.arange(64) % 10 == step % 10)
         assert env.sim.qvel[moved, :2].abs().max() <= 1.0
