@@ -10,7 +10,7 @@ import pytest
 import torch
 from guard import recordable
 from torch import Tensor
-from worlds import QUIET, changed, make_env, same, snapshot
+from worlds import QUIET, changed, layout, make_env, same, snapshot
 
 from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, world_fields
 from legged_mw.envs.legged_robot import LeggedRobot
@@ -281,10 +281,10 @@ def test_the_whole_step_asks_the_host_nothing_with_everything_on() -> None:
 
 def test_what_was_drawn_is_readable() -> None:
     env = make_env(3, ALL)
-    table = {name: size for name, size, _ in env.observation_table["privileged_state"]}
+    table = layout(env)["privileged_state"]
     assert {name: table[name] for name in KINDS} == {name: env.domain_rand.values[name].shape[1] for name in KINDS}
     assert env.obs_buf["privileged_state"].shape[1] == 123 + sum(value.shape[1] for value in env.domain_rand.values.values())
-    friction = sum(size for name, size, _ in env.observation_table["privileged_state"][: list(table).index("friction")])
+    friction = env.observations.span("privileged_state", "friction").start
     assert torch.equal(env.obs_buf["privileged_state"][:, friction], env.domain_rand.values["friction"][:, 0])
     twice = env.mirror.observations["privileged_state"]
     sample = torch.randn(5, env.obs_buf["privileged_state"].shape[1])
@@ -305,7 +305,7 @@ def test_pushes_set_the_velocity_when_their_clock_says_so() -> None:
         pushed += moved
     assert pushed.eq(2).all()
     plain = make_env(4, QUIET)
-    assert torch.equal(walk(plain, 10), walk(make_env(4, QUIET), 10)) and plain.push_clock.eq(0).all()
+    assert torch.equal(walk(plain, 10), walk(make_env(4, QUIET), 10)) and plain.perturbation._push_clock.eq(0).all()
 
 
 # ---- mistakes

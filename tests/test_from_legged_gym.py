@@ -13,7 +13,7 @@ import torch
 from guard import recordable
 from program import play, run
 from torch import Tensor
-from worlds import QUIET, changed, make_env, same, snapshot
+from worlds import QUIET, changed, layout, make_env, same, snapshot
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
@@ -165,7 +165,7 @@ def test_calf_on_the_ground_costs_and_does_not_end() -> None:
 
 
 def test_observation_is_legged_gyms_row_for_row(env: Any) -> None:
-    assert [(name, size) for name, size, _ in env.observation_table["state"]] == [
+    assert list(layout(env)["state"].items()) == [
         ("base_lin_vel", 3),
         ("base_ang_vel", 3),
         ("projected_gravity", 3),
@@ -185,7 +185,7 @@ def test_observation_is_legged_gyms_row_for_row(env: Any) -> None:
 def test_noise_is_in_the_value_s_unit_and_scaled_with_it() -> None:
     env = ported(512, {"noise.level": 1.0})
     env.compute_observations()
-    clean = torch.cat([row.value for row in env.observation_rows()["state"]], dim=1) * env.obs_scales["state"]
+    clean = torch.cat([row.value for row in env.observation_rows()["state"]], dim=1) * env.observations._parts["state"]._scales
     error = (env.get_observations()["state"] - clean).abs().amax(dim=0)
     most = [(3, 0.1 * 2.0), (3, 0.2 * 0.25), (3, 0.05), (3, 0.0), (12, 0.01), (12, 1.5 * 0.05), (12, 0.0)]
     wanted = torch.tensor([level for size, level in most for _ in range(size)])
@@ -204,8 +204,8 @@ def test_scales_that_do_not_fit_their_row_are_refused() -> None:
 
 def test_a_mirror_follows_the_scales(env: Any) -> None:
     plain = ported(1, {f"normalization.obs_scales.{name}": 1.0 for name in ("lin_vel", "ang_vel", "dof_vel")})
-    assert plain.obs_scales == {}
-    x, scale = torch.randn(5, 48), env.obs_scales["state"]
+    assert plain.observations._parts["state"]._scales is None
+    x, scale = torch.randn(5, 48), env.observations._parts["state"]._scales
     image = env.mirror.observations["state"](x * scale)
     torch.testing.assert_close(image, plain.mirror.observations["state"](x) * scale)
     torch.testing.assert_close(env.mirror.observations["state"](image), x * scale)
@@ -218,12 +218,12 @@ def test_yaw_rate_steers_to_the_heading() -> None:
     env = ported(4, {"commands.resampling_time": 10.0})
     env.sim.qpos[:, 3:7] = torch.stack([yaw(0.0), yaw(3.0), yaw(0.0), yaw(-3.0)])
     env.heading.copy_(torch.tensor([1.0, -3.0, 3.0, 2.5]))
-    env.compute_observations()
+    env._end_step()
     around = 0.5 * (2 * math.pi - 6.0)  # the short way past pi
     assert env.commands[:, 2].tolist() == pytest.approx([0.5, around, 1.0, 0.5 * (5.5 - 2 * math.pi)], abs=1e-5)
     env.cfg.commands.heading_command = False
     env.commands[:, 2] = 0.7
-    env.compute_observations()
+    env._end_step()
     assert env.commands[:, 2].tolist() == pytest.approx([0.7] * 4)
 
 

@@ -314,7 +314,7 @@ def test_curricula_survive_a_resume(tmp_path: Path) -> None:
     other, again = trained(16)
     again.load(str(tmp_path / "model_0.pt"))
     assert other.tiles and torch.equal(other.tiles.levels, env.tiles.levels) and torch.equal(other.tiles.origins, env.tiles.origins)
-    assert torch.equal(other.kick_level, env.perturbation.kick_level) and torch.equal(other.command_curriculum, env.command_curriculum)
+    assert torch.equal(other.perturbation.kick_level, env.perturbation.kick_level) and torch.equal(other.command_curriculum, env.command_curriculum)
     assert other.command_ranges[1, 0] == pytest.approx(0.7 * 1.5)
     away = (other.sim.qpos[:, :2] - other.tiles.origins[:, :2]).abs()
     assert (away <= 0.5).all(), "the worlds stand on the levels that they have"
@@ -350,7 +350,7 @@ def test_a_mistake_is_named() -> None:
 def test_a_table_without_the_scan_that_was_asked_for_is_named() -> None:
     class Own(LeggedRobot):
         def observation_rows(self) -> dict[str, list[Row]]:
-            return {group: [row for row in rows if row.name != "height_scan"] for group, rows in super().observation_rows().items()}
+            return {group: [row for row in rows if getattr(row, "name", row) != "height_scan"] for group, rows in super().observation_rows().items()}
 
     task = load_task("go1_rough_scan")
     task.set("env.num_envs", 2)

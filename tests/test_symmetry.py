@@ -14,7 +14,7 @@ from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
-from worlds import QUIET, changed, make_env, snapshot
+from worlds import QUIET, changed, layout, make_env, snapshot
 
 from legged_mw import ROOT
 from legged_mw.envs.checks import check_values
@@ -201,7 +201,7 @@ def test_one_observation_by_hand(env: LeggedRobot) -> None:
         "kick_force": ([1.0, 2.0, 0.0], [1.0, -2.0, 0.0]),
         "kick_active": ([1.0], [1.0]),
     }
-    assert {group: [name for name, *_ in rows] for group, rows in env.observation_table.items()} == {
+    assert {group: list(rows) for group, rows in layout(env).items()} == {
         "state": list(state),
         "privileged_state": list(privileged),
     }
@@ -328,7 +328,7 @@ def test_mirrored_states_and_actions_give_mirrored_observations_and_equal_reward
     env = make_env(2 * worlds, {**QUIET, **converged, **kicks, **own})
     torch.manual_seed(3)
     mirrored_halves(env, worlds, reach)
-    alive, seen = torch.ones(worlds, dtype=torch.bool), dict.fromkeys((name for name, *_ in env.observation_table["privileged_state"]), 0.0)
+    alive, seen = torch.ones(worlds, dtype=torch.bool), dict.fromkeys(layout(env)["privileged_state"], 0.0)
     for step in range(20):
         actions = mirror(env, None, 0.5 * torch.randn(worlds, 12))[1]
         assert actions is not None
@@ -336,10 +336,10 @@ def test_mirrored_states_and_actions_give_mirrored_observations_and_equal_reward
         alive &= ~(done[:worlds] | done[worlds:])  # a fallen robot begins anew, each its own way
         expected = mirror(env, obs[:worlds], None)[0]
         assert expected is not None
-        for group, table in env.observation_table.items():
-            sizes = [size for _, size, _ in table]
+        for group, table in layout(env).items():
+            sizes = list(table.values())
             rows = zip(table, obs[group][worlds:].split(sizes, dim=1), expected[group][worlds:].split(sizes, dim=1), strict=True)
-            for (name, *_), got, wanted in rows:
+            for name, got, wanted in rows:
                 if name == "accelerometer" and reach:
                     continue
                 error = float((got - wanted)[alive].abs().max())

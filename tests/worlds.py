@@ -48,11 +48,11 @@ def tensors(env: LeggedRobot) -> dict[str, Tensor]:
         elif isinstance(value, dict):
             for key, inner in value.items():
                 yield from walk(f"{path}.{key}", inner)
-        elif type(value).__module__.startswith("legged_mw.envs.") and value is not env:
-            yield from walk(path, vars(value))
         elif isinstance(value, list | tuple):
             for i, inner in enumerate(value):
                 yield from walk(f"{path}.{i}", inner)
+        elif type(value).__module__.startswith("legged_mw.envs.") and value is not env:
+            yield from walk(path, vars(value))
 
     return dict(walk("env", vars(env))) | dict(walk("sim", vars(env.sim)))
 
