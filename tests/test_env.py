@@ -244,6 +244,24 @@ class _Number(LeggedRobot):
         ),
         ({"asset.file": ""}, None, ConfigError, r"^asset\.file is empty; name the robot's MJCF, e\.g\. 'resources/robots/go1/go1\.xml'$"),
         (
+            {"control.damping": {"hip": 1.0}},
+            None,
+            ModelError,
+            r"^control\.damping: joint 'FR_thigh_joint' matches none of \['hip'\]",
+        ),
+        (
+            {"asset.colliders": ["paw"]},
+            None,
+            ModelError,
+            r"^asset\.colliders: no colliding geom 'paw' in go1\.xml; there are: trunk_box",
+        ),
+        (
+            {"terrain.mesh_type": "heightfield", "terrain.tile_size": 7.77},
+            None,
+            ModelError,
+            r"^terrain\.tile_size 7\.77 must be a whole number of cells \(terrain\.horizontal_scale\) of 0\.\d+ m",
+        ),
+        (
             {"rewards.pose_weights": {"hip": 1.0, "thigh": 1.0}},
             None,
             ModelError,
@@ -661,7 +679,10 @@ def test_model_says_what_the_config_changed(quiet: LeggedRobot) -> None:
 def test_camera_looks_at_the_robot_and_is_not_stepped(quiet: LeggedRobot) -> None:
     import mujoco
 
-    visual, data = quiet.robot.visual, mujoco.MjData(quiet.robot.visual)
+    from legged_mw.sim.drawing import visual_model
+
+    visual = visual_model(quiet.robot, quiet.cfg.viewer.camera)
+    data = mujoco.MjData(visual)
     mujoco.mj_forward(visual, data)
     camera = visual.camera("track").id
     to_robot = data.subtree_com[quiet.root_body] - data.cam_xpos[camera]

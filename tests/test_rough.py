@@ -38,7 +38,7 @@ def rough(num_envs: int = 16, task: str = "go1_rough", **changes: Any) -> Legged
 
 def ground_under(env: LeggedRobot, places: Tensor) -> np.ndarray:
     """Height [m] of the compiled height field under places (M, 2), by MuJoCo's own rays."""
-    model = env.robot.visual
+    model = env.robot.spec.copy().compile()
     data, hit = mujoco.MjData(model), np.zeros(1, dtype=np.int32)
     data.qpos[2] = 100.0  # the robot out of the way
     mujoco.mj_forward(model, data)

@@ -26,9 +26,11 @@ from legged_mw.envs.domain_rand import DomainRand, world_fields
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.mirror import Mirror, make_mirror
 from legged_mw.envs.terrain import Tiles, build_terrain
-from legged_mw.sim.model import Ground, ModelError, Physics, RobotModel, build_model, per_joint, unknown
-from legged_mw.sim.simulation import make_simulation, pick_engine
-from legged_mw.sim.terrain import PLATFORM, make_height_map
+from legged_mw.envs.wording import in_config_words
+from legged_mw.sim.engines import make_simulation, pick_engine
+from legged_mw.sim.height_map import make_height_map
+from legged_mw.sim.model import Ground, ModelError, RobotModel, Solver, build_model, per_joint, unknown
+from legged_mw.sim.terrain import PLATFORM
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign, columns, may_hold, quat_rotate, quat_rotate_inverse
 
@@ -60,6 +62,7 @@ class LeggedRobot(BaseTask):
 
     cfg: LeggedRobotCfg
 
+    @in_config_words()
     def __init__(self, cfg: LeggedRobotCfg, device: str, eager: bool = False) -> None:
         check_values(cfg)
         self.cfg = cfg
@@ -645,7 +648,7 @@ class LeggedRobot(BaseTask):
             raise ConfigError("asset.file is empty; name the robot's MJCF, e.g. 'resources/robots/go1/go1.xml'")
         return build_model(
             ROOT / Path(cfg.asset.file).expanduser(),  # an absolute path stays itself
-            physics=Physics(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations),
+            solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations),
             ground=Ground(cfg.terrain.friction, cfg.terrain.condim, self.terrain, boxes=engine == "mujoco"),
             stiffness=cfg.control.stiffness,
             damping=cfg.control.damping,
@@ -654,7 +657,6 @@ class LeggedRobot(BaseTask):
             contact_geoms=[*cfg.asset.foot_names, *cfg.asset.penalize_contacts_on, *cfg.asset.terminate_after_contacts_on],
             velocity_sites=cfg.asset.foot_names,
             accelerometer_site=cfg.asset.imu_site,
-            camera=cfg.viewer.camera,
         )
 
     def _init_buffers(self) -> None:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
+from legged_mw.envs.wording import in_config_words
 from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.utils.math import assign
 
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 
 
+@in_config_words()
 def build_terrain(cfg: LeggedRobotCfg) -> Terrain | None:
     """The ground that the section terrain describes; None: a plane."""
     ground = cfg.terrain

@@ -13,9 +13,13 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from legged_mw.sim.model import GROUND, ModelError, RobotModel, add_ground_box, feel_all_ground
+from legged_mw.sim.drawing import CAMERA, dressed
+from legged_mw.sim.errors import ModelError
+from legged_mw.sim.ground import GROUND, add_ground_box, feel_all_ground
+from legged_mw.sim.level_boxes import MOST_BOXES, Box, as_boxes
+from legged_mw.sim.model import RobotModel
 from legged_mw.sim.scene import STEEP_LIGHT
-from legged_mw.sim.terrain import MOST_BOXES, Box, Terrain, as_boxes
+from legged_mw.sim.terrain import Terrain
 
 AROUND = 1000.0  # [m] of level ground around tiles of steps: nobody walks to its end
 HOME = "home"  # the keyframe: the pose to start in, and the servos holding it
@@ -67,12 +71,20 @@ class Scene:
     sensors: dict[str, list[str]]  # quantity -> names of the sensors whose values, side by side, are it
 
 
-def standalone(robot: RobotModel, *, imu: str, feet: Sequence[str], qpos: Sequence[float], ctrl: Sequence[float]) -> Scene:
+def standalone(
+    robot: RobotModel,
+    *,
+    imu: str,
+    feet: Sequence[str],
+    qpos: Sequence[float],
+    ctrl: Sequence[float],
+    camera: Sequence[float] = CAMERA,
+) -> Scene:
     """``robot`` as MJCF text, with a sensor for all that a controller may read and ``qpos``, ``ctrl`` as keyframe "home".
 
     Raises ModelError if the text cannot be made, or is another machine than the one that was trained.
     """
-    spec = robot.spec.copy()
+    spec = dressed(robot, camera)
     spec.comment = (
         f"\n    {spec.modelname}: robot, ground, servos, sensors. Self-contained; written by legged_mw from the model that was trained.\n  "
     )
@@ -81,7 +93,7 @@ def standalone(robot: RobotModel, *, imu: str, feet: Sequence[str], qpos: Sequen
             geom.group = 1
     sensors = _add_sensors(spec, robot.joint_names, imu, feet)
     spec.add_key(name=HOME, qpos=list(qpos), ctrl=list(ctrl))
-    _write_out_files(spec, robot.visual)
+    _write_out_files(spec, robot.spec.copy().compile())
     try:
         spec.compile()
         xml = spec.to_xml()
