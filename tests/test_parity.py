@@ -36,10 +36,10 @@ def trot(step: int, world: int) -> np.ndarray:
 class Pair:
     """The same worlds in an engine and in C MuJoCo, one MjData each, standing in the home pose."""
 
-    def __init__(self, engine: str, physics: Solver) -> None:
+    def __init__(self, engine: str, solver: Solver) -> None:
         self.robot: RobotModel = build_model(
             ROOT / "resources/robots/go1/go1.xml",
-            physics=physics,
+            solver=solver,
             ground=Ground(),
             stiffness={"joint": 35.0},
             damping={"joint": 0.5},
