@@ -22,7 +22,7 @@ from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, find_checkpoint, find_run, new_run
-from legged_mw.sim.simulation import pick_engine
+from legged_mw.sim.engines import pick_engine
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, one_line_errors, pick_device, positive, seed_everything, shown
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError

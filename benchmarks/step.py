@@ -23,8 +23,8 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.sim.engines import ENGINES, pick_engine
 from legged_mw.sim.graph import StepGraph
-from legged_mw.sim.simulation import ENGINES, pick_engine
 from legged_mw.utils.cli import pick_device
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import load_task

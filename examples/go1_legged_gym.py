@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.observations import Row
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_mw.envs.observations import Row
 from legged_mw.utils.math import assign
 from legged_mw.utils.task import Task
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.terrain import build_terrain
-from legged_mw.sim.model import ground_model
+from legged_mw.sim.drawing import ground_model
 from legged_mw.sim.terrain import KINDS, MEASURES, Terrain, measure
 from legged_mw.utils.cli import Parser, apply_overrides, one_line_errors, shown
 from legged_mw.utils.config import ConfigError

@@ -114,7 +114,14 @@ def test_buffers_are_never_rebound(task: str) -> None:
     """A CUDA graph keeps addresses: each tensor is the same object at the same address after steps with resets of all kinds."""
     env = make_env(4, KICKS, task=task)
     before = tensors(env)
-    assert {"env.actions", "env.rew_buf", "env.obs_buf.state", "env.observations._parts.state._noise", "env._episode", "sim.qpos"} <= before.keys()
+    assert {
+        "env.actions",
+        "env.rew_buf",
+        "env.obs_buf.state",
+        "env.observations._parts.state._noise",
+        "env._episode",
+        "sim.qpos",
+    } <= before.keys()
     addresses = {name: (tensor.data_ptr(), tensor.shape, tensor.stride()) for name, tensor in before.items()}
     resets = 0
     for t in range(5):
@@ -244,6 +251,24 @@ class _Number(LeggedRobot):
             r"^no geom 'RX' in go1\.xml; there are: floor, .*, RL$",
         ),
         ({"asset.file": ""}, None, ConfigError, r"^asset\.file is empty; name the robot's MJCF, e\.g\. 'resources/robots/go1/go1\.xml'$"),
+        (
+            {"control.damping": {"hip": 1.0}},
+            None,
+            ModelError,
+            r"^control\.damping: joint 'FR_thigh_joint' matches none of \['hip'\]",
+        ),
+        (
+            {"asset.colliders": ["paw"]},
+            None,
+            ModelError,
+            r"^asset\.colliders: no colliding geom 'paw' in go1\.xml; there are: trunk_box",
+        ),
+        (
+            {"terrain.mesh_type": "heightfield", "terrain.tile_size": 7.77},
+            None,
+            ModelError,
+            r"^terrain\.tile_size 7\.77 must be a whole number of cells \(terrain\.horizontal_scale\) of 0\.\d+ m",
+        ),
         (
             {"rewards.pose_weights": {"hip": 1.0, "thigh": 1.0}},
             None,
@@ -446,7 +471,16 @@ def test_reset_touches_the_masked_worlds_only(lively: LeggedRobot) -> None:
     before = snapshot(env)
     env.reset_envs(mask)
     assert changed(env, before, worlds=~mask) == []
-    touched = {"sim.qpos", "sim.qvel", "sim.ctrl", "sim.sensordata", "sim.actuator_force", "sim.site_xpos", "env.perturbation._kick", "env.perturbation._clock"}
+    touched = {
+        "sim.qpos",
+        "sim.qvel",
+        "sim.ctrl",
+        "sim.sensordata",
+        "sim.actuator_force",
+        "sim.site_xpos",
+        "env.perturbation._kick",
+        "env.perturbation._clock",
+    }
     touched |= {"env.commands", "env.command_timer", "env._episode", "env._episode_length_buf", "env.base_lin_vel", "env.foot_contact"}
     assert touched <= set(changed(env, before, worlds=mask))
     nothing = snapshot(env)
@@ -503,7 +537,12 @@ def test_state_after_a_reset(lively: LeggedRobot) -> None:
             assert (getattr(sim, name) == 0.0).all(), name
         for name in ("last_actions", "feet_air_time", "swing_peak", "episode_sums", "episode_return", "episode_steps"):
             assert (getattr(env, name) == 0.0).all(), name
-        assert not env.foot_contact.any() and not env.perturbation.kick_active.any() and (env.perturbation.kick_force == 0.0).all() and (env.perturbation._clock == 0.0).all()
+        assert (
+            not env.foot_contact.any()
+            and not env.perturbation.kick_active.any()
+            and (env.perturbation.kick_force == 0.0).all()
+            and (env.perturbation._clock == 0.0).all()
+        )
         assert (env.episode_length_buf == 0).all()
         yaw = 2.0 * torch.atan2(sim.qpos[:, 6], sim.qpos[:, 3])
         yaw = torch.atan2(torch.sin(yaw), torch.cos(yaw))
@@ -663,7 +702,10 @@ def test_model_says_what_the_config_changed(quiet: LeggedRobot) -> None:
 def test_camera_looks_at_the_robot_and_is_not_stepped(quiet: LeggedRobot) -> None:
     import mujoco
 
-    visual, data = quiet.robot.visual, mujoco.MjData(quiet.robot.visual)
+    from legged_mw.sim.drawing import visual_model
+
+    visual = visual_model(quiet.robot, quiet.cfg.viewer.camera)
+    data = mujoco.MjData(visual)
     mujoco.mj_forward(visual, data)
     camera = visual.camera("track").id
     to_robot = data.subtree_com[quiet.root_body] - data.cam_xpos[camera]

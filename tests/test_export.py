@@ -21,8 +21,8 @@ from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.legged_robot import LeggedRobot, Row
 from legged_mw.rl import export as exporting
 from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, describe, export
+from legged_mw.rl.export_scene import differences, standalone
 from legged_mw.sim.model import ModelError
-from legged_mw.sim.standalone import differences, standalone
 from legged_mw.utils.config import load_yaml
 
 TASK = ["--task", "go1_flat", "--device", "cpu"]
@@ -120,9 +120,10 @@ def test_meshes_from_files_are_written_out(tmp_path: Path) -> None:
     scene = standalone(env.robot, imu="imu", feet=["FR"], qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
     assert "stl" not in scene.xml
     model = mujoco.MjModel.from_xml_string(scene.xml)
+    whole = env.robot.spec.copy().compile()
     for name in ("geom_pos", "geom_quat", "geom_size"):
-        index = model.geom("trunk_box").id, env.robot.visual.geom("trunk_box").id
-        np.testing.assert_allclose(getattr(model, name)[index[0]], getattr(env.robot.visual, name)[index[1]], atol=1e-5)
+        index = model.geom("trunk_box").id, whole.geom("trunk_box").id
+        np.testing.assert_allclose(getattr(model, name)[index[0]], getattr(whole, name)[index[1]], atol=1e-5)
 
 
 def test_the_export_is_replaced_whole_or_not_at_all(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

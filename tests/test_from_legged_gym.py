@@ -19,7 +19,7 @@ from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.eval import exam
-from legged_mw.sim.model import Ground, ModelError, Physics, build_model
+from legged_mw.sim.model import Ground, ModelError, Solver, build_model
 from legged_mw.utils import math as math_of_steps
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
@@ -381,7 +381,7 @@ def test_a_urdf_becomes_a_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     exec(code, {})
     robot = build_model(
         tmp_path / "robot.xml",
-        physics=Physics(),
+        solver=Solver(),
         ground=Ground(),
         stiffness={"": 20.0},
         damping={"": 0.5},

@@ -13,13 +13,13 @@ import torch
 from worlds import QUIET, make_env
 
 from legged_mw import ROOT
-from legged_mw.sim.model import Ground, Physics, RobotModel, build_model
-from legged_mw.sim.simulation import make_simulation
+from legged_mw.sim.engines import make_simulation
+from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
 
 FEET = ["FR", "FL", "RR", "RL"]
 HOME = np.array([0, 0, 0.278, 1, 0, 0, 0, *[0.1, 0.9, -1.8, -0.1, 0.9, -1.8] * 2])
 STEPS, SUBSTEPS = 50, 5
-CONVERGED = Physics(iterations=100, ls_iterations=50)
+CONVERGED = Solver(iterations=100, ls_iterations=50)
 WORLDS = 3  # each trots with its own stride, so that a mixed-up world shows
 
 
@@ -36,10 +36,10 @@ def trot(step: int, world: int) -> np.ndarray:
 class Pair:
     """The same worlds in an engine and in C MuJoCo, one MjData each, standing in the home pose."""
 
-    def __init__(self, engine: str, physics: Physics) -> None:
+    def __init__(self, engine: str, solver: Solver) -> None:
         self.robot: RobotModel = build_model(
             ROOT / "resources/robots/go1/go1.xml",
-            physics=physics,
+            solver=solver,
             ground=Ground(),
             stiffness={"joint": 35.0},
             damping={"joint": 0.5},
@@ -190,7 +190,7 @@ def test_spread_of_an_unconverged_solver(warm_start: bool, engine: str, record_p
     Most steps agree to float32; where a contact comes or goes, the engines stop at different points on the way to the solution.
     The bounds only say that neither engine is broken there.
     """
-    pair = Pair(engine, Physics(iterations=1, ls_iterations=5))
+    pair = Pair(engine, Solver(iterations=1, ls_iterations=5))
     spread = []
     for step in range(STEPS):
         pair.copy_state(warm_start)

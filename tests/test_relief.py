@@ -15,7 +15,7 @@ import pytest
 from program import run
 
 from legged_mw import ROOT, terrain_picture
-from legged_mw.sim.model import ground_model
+from legged_mw.sim.drawing import ground_model, visual_model
 from legged_mw.sim.relief import PIXELS, relief
 from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.utils.cli import one_line_errors
@@ -51,7 +51,7 @@ def hilly() -> mujoco.MjModel:
         "terrain.curriculum": False,
     }.items():
         task.set(path, value)
-    return task.env_class(task.cfg, "cpu", eager=True).robot.drawn()
+    return visual_model(task.env_class(task.cfg, "cpu", eager=True).robot)
 
 
 def grid() -> Terrain:
@@ -110,8 +110,8 @@ def test_the_picture_lies_where_the_heights_are() -> None:
 def test_a_plane_is_drawn_as_ever_and_rough_ground_in_tiles(hilly: mujoco.MjModel) -> None:
     task = load_task("go1_flat")
     task.set("env.num_envs", 1)
-    flat = task.env_class(task.cfg, "cpu", eager=True).robot
-    assert flat.drawn() is flat.visual
+    flat = visual_model(task.env_class(task.cfg, "cpu", eager=True).robot)
+    assert flat.nhfield == 0 and flat.geom("floor").type == mujoco.mjtGeom.mjGEOM_PLANE and flat.geom_rgba[0, 3] == 1.0
     assert hilly.nhfield == 2 * 5 + 3, "each tile twice, but for level ones: two that are flat, and a slope of 0"
     assert len(shown(hilly)) == 8 and hilly.geom("floor").type == mujoco.mjtGeom.mjGEOM_PLANE
     robot = hilly.geom_bodyid > 0

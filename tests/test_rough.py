@@ -39,7 +39,7 @@ def rough(num_envs: int = 16, task: str = "go1_rough", **changes: Any) -> Legged
 
 def ground_under(env: LeggedRobot, places: Tensor) -> np.ndarray:
     """Height [m] of the compiled height field under places (M, 2), by MuJoCo's own rays."""
-    model = env.robot.visual
+    model = env.robot.spec.copy().compile()
     data, hit = mujoco.MjData(model), np.zeros(1, dtype=np.int32)
     data.qpos[2] = 100.0  # the robot out of the way
     mujoco.mj_forward(model, data)
@@ -314,7 +314,9 @@ def test_curricula_survive_a_resume(tmp_path: Path) -> None:
     other, again = trained(16)
     again.load(str(tmp_path / "model_0.pt"))
     assert other.tiles and torch.equal(other.tiles.levels, env.tiles.levels) and torch.equal(other.tiles.origins, env.tiles.origins)
-    assert torch.equal(other.perturbation.kick_level, env.perturbation.kick_level) and torch.equal(other.command_curriculum, env.command_curriculum)
+    assert torch.equal(other.perturbation.kick_level, env.perturbation.kick_level) and torch.equal(
+        other.command_curriculum, env.command_curriculum
+    )
     assert other.command_ranges[1, 0] == pytest.approx(0.7 * 1.5)
     away = (other.sim.qpos[:, :2] - other.tiles.origins[:, :2]).abs()
     assert (away <= 0.5).all(), "the worlds stand on the levels that they have"
@@ -350,14 +352,15 @@ def test_a_mistake_is_named() -> None:
 def test_a_table_without_the_scan_that_was_asked_for_is_named() -> None:
     class Own(LeggedRobot):
         def observation_rows(self) -> dict[str, list[Row]]:
-            return {group: [row for row in rows if getattr(row, "name", row) != "height_scan"] for group, rows in super().observation_rows().items()}
+            return {
+                group: [row for row in rows if getattr(row, "name", row) != "height_scan"]
+                for group, rows in super().observation_rows().items()
+            }
 
     task = load_task("go1_rough_scan")
     task.set("env.num_envs", 2)
     task.set("terrain.mesh_type", "plane")
-    with pytest.raises(
-        ConfigError, match=r"terrain.height_scan names 'state', but Own.observation_rows has no row height_scan in 'state'"
-    ):
+    with pytest.raises(ConfigError, match=r"terrain.height_scan names 'state', but Own.observation_rows has no row height_scan in 'state'"):
         Own(task.cfg, "cpu")
 
 

@@ -13,8 +13,12 @@ import torch
 from mujoco_warp import OverflowType
 
 from legged_mw import ROOT
-from legged_mw.sim.model import GROUND, Ground, ModelError, Physics, RobotModel, build_model, per_joint
-from legged_mw.sim.simulation import EngineError, Simulation, make_simulation, pick_engine
+from legged_mw.sim.drawing import visual_model
+from legged_mw.sim.engines import make_simulation, pick_engine
+from legged_mw.sim.errors import EngineError, ModelError
+from legged_mw.sim.ground import GROUND, Ground
+from legged_mw.sim.model import RobotModel, Solver, build_model, per_joint
+from legged_mw.sim.simulation import Simulation
 
 GO1 = ROOT / "resources/robots/go1/go1.xml"
 FEET = ["FR", "FL", "RR", "RL"]
@@ -22,13 +26,13 @@ JOINTS = [f"{leg}_{link}_joint" for leg in FEET for link in ("hip", "thigh", "ca
 POSE = [0.1, 0.9, -1.8, -0.1, 0.9, -1.8] * 2
 HOME = torch.tensor([0.0, 0.0, 0.278, 1.0, 0.0, 0.0, 0.0, *POSE])
 VIEWS = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xfrc_applied")
-EXACT = Physics(iterations=100, ls_iterations=50)  # converged, so that figures do not depend on the solver
+EXACT = Solver(iterations=100, ls_iterations=50)  # converged, so that figures do not depend on the solver
 
 
 def go1(**choices: Any) -> RobotModel:
     """The Go1 as go1_flat builds it, with other choices where given."""
     defaults: dict[str, Any] = {
-        "physics": Physics(),
+        "solver": Solver(),
         "ground": Ground(),
         "stiffness": {"joint": 35.0},
         "damping": {"joint": 0.5},
@@ -97,7 +101,7 @@ def test_table_that_does_not_fit(field: str, table: dict[str, float], parts: tup
     with pytest.raises(ModelError) as error:
         go1(**{field: table})
     text = one_line(error)
-    assert text.startswith(f"control.{field}: ")
+    assert text.startswith(f"`{field}`: ")
     for part in parts:
         assert part in text
 
@@ -175,7 +179,7 @@ def test_mjcf_that_cannot_be_compiled(tmp_path: Path) -> None:
             "joint 'neck' must be a named hinge or slide joint",
         ),
         ({"inside": '<body><joint axis="0 0 1"/><geom size="0.1"/></body>'}, "joint '' must be a named hinge or slide joint"),
-        ({"world": '<geom name="floor" type="plane" size="0 0 1"/>'}, "toy.xml brings a geom 'floor'; leave the ground to the config"),
+        ({"world": '<geom name="floor" type="plane" size="0 0 1"/>'}, "toy.xml brings a geom 'floor'; the ground is added to the MJCF"),
     ],
 )
 def test_mjcf_that_is_not_a_robot_alone(tmp_path: Path, parts: dict[str, str], text: str) -> None:
@@ -197,7 +201,7 @@ def test_mjcf_without_joints(tmp_path: Path) -> None:
 def test_servo_parameters() -> None:
     gains, dampings = {"hip": 20.0, "thigh": 30.0, "calf": 40.0}, {"hip": 0.5, "thigh": 0.6, "calf": 0.7}
     robot = go1(stiffness=gains, damping=dampings)
-    for model in (robot.physics, robot.visual):
+    for model in (robot.physics, visual_model(robot)):
         assert model.nu == 12 and (model.actuator_trnid[:, 0] == range(1, 13)).all()  # servo i is joint i; joint 0 is free
         kp, kd = [20.0, 30.0, 40.0] * 4, [0.5, 0.6, 0.7] * 4
         assert model.actuator_gainprm[:, 0].tolist() == kp
@@ -254,7 +258,7 @@ def test_no_limit_stated_is_no_limit(tmp_path: Path) -> None:
 
 def test_physics_model_is_the_visual_one_without_looks() -> None:
     robot = go1()
-    bare, drawn = robot.physics, robot.visual
+    bare, drawn = robot.physics, visual_model(robot)
     assert (bare.nlight, bare.nmesh) == (0, 0) and drawn.nlight == 1 and drawn.nmesh > 0
     kept = {bare.geom(i).name for i in range(bare.ngeom)}
     assert all(bare.geom(i).contype or bare.geom(i).conaffinity or bare.geom(i).name == GROUND for i in range(bare.ngeom))
@@ -274,7 +278,7 @@ def test_physics_model_is_the_visual_one_without_looks() -> None:
 
 
 def test_options_are_written() -> None:
-    model = go1(physics=Physics(0.002, 3, 7), ground=Ground(0.8, 6)).physics
+    model = go1(solver=Solver(0.002, 3, 7), ground=Ground(0.8, 6)).physics
     assert (model.opt.timestep, model.opt.iterations, model.opt.ls_iterations) == (0.002, 3, 7)
     assert model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     floor = model.geom(GROUND)
@@ -399,9 +403,9 @@ def test_shapes(robot: RobotModel, engine: str) -> None:
 def test_which_engine_steps() -> None:
     assert [pick_engine("auto", device) for device in ("cpu", "cuda:1")] == ["mujoco", "mujoco_warp"]
     assert pick_engine("mujoco_warp", "cpu") == "mujoco_warp"
-    with pytest.raises(EngineError, match="steps on a CPU, and the device is cuda:0; say --device cpu, or --engine mujoco_warp$"):
+    with pytest.raises(EngineError, match="steps on a CPU, and the device is cuda:0; take the device cpu, or the engine mujoco_warp$"):
         pick_engine("mujoco", "cuda:0")
-    with pytest.raises(EngineError, match="no engine 'mujoco-warp' in sim.engine; did you mean 'mujoco_warp'. there are: auto, "):
+    with pytest.raises(EngineError, match="no engine 'mujoco-warp' in `engine`; did you mean 'mujoco_warp'. there are: auto, "):
         pick_engine("mujoco-warp", "cpu")
 
 
@@ -514,7 +518,7 @@ def test_fields_are_views_per_world(robot: RobotModel, engine: str) -> None:
 
 def test_heavier_robot_sags_further(engine: str) -> None:
     """And as far as C MuJoCo says, in its own world only."""
-    robot = go1(physics=EXACT)
+    robot = go1(solver=EXACT)
     trunk, extra = robot.id("body", "trunk"), torch.tensor([0.0, 3.0, 6.0])  # [kg]
     sim = simulate(robot, engine, world_fields=["body_mass"])
     sim.field("body_mass")[:, trunk] += extra
@@ -534,7 +538,7 @@ def test_heavier_robot_sags_further(engine: str) -> None:
 
 def test_less_friction_slides_further(engine: str) -> None:
     """v^2 / (2 mu g), to a fifth: the robot is not a block, but its servos are stiff here."""
-    robot = go1(physics=EXACT, stiffness={"joint": 200.0}, damping={"joint": 1.5})
+    robot = go1(solver=EXACT, stiffness={"joint": 200.0}, damping={"joint": 1.5})
     sim = simulate(robot, engine, world_fields=["geom_friction"])
     friction, speed = torch.tensor([0.6, 0.2, 0.1]), 0.5
     for _ in range(100):  # settle

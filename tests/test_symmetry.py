@@ -23,7 +23,7 @@ from legged_mw.envs.observations import Row
 from legged_mw.rl.runner import rsl_rl_config
 from legged_mw.rl.symmetry import mirror
 from legged_mw.sim.mirror import find_partners
-from legged_mw.sim.model import Ground, ModelError, Physics, RobotModel, build_model
+from legged_mw.sim.model import Ground, ModelError, RobotModel, Solver, build_model
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 
@@ -43,7 +43,7 @@ def load_robot(path: Path, xml: str) -> RobotModel:
     path.write_text(xml)
     return build_model(
         path,
-        physics=Physics(),
+        solver=Solver(),
         ground=Ground(),
         stiffness={"": 10.0},
         damping={"": 0.1},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +15,18 @@ from guard import recordable
 
 from legged_mw import ROOT
 from legged_mw.envs.terrain import build_terrain
-from legged_mw.sim import terrain as ground_kinds
-from legged_mw.sim.model import ModelError
+from legged_mw.sim.errors import ModelError
+from legged_mw.sim.height_map import HeightMap
+from legged_mw.sim.level_boxes import as_boxes
 from legged_mw.sim.terrain import (
     KINDS,
     LEVEL,
+    MEASURES,
     PLATFORM,
     Grid,
-    HeightMap,
     Heights,
     Terrain,
     add_kind,
-    as_boxes,
     describe,
     make_terrain,
     share_columns,
@@ -125,8 +126,8 @@ def test_a_lookup_can_be_recorded_and_holds_outside() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"proportions": {"stair_up": 1.0}}, "no kind of terrain 'stair_up' in terrain.terrain_proportions; did you mean 'stairs_up'"),
-        ({"tile": 8.05}, "terrain.tile_size 8.05 must be a whole number of cells \\(terrain.horizontal_scale\\) of 0.1 m"),
+        ({"proportions": {"stair_up": 1.0}}, "no kind of terrain 'stair_up' in `proportions`; did you mean 'stairs_up'"),
+        ({"tile": 8.05}, "`tile` 8.05 must be a whole number of cells \\(`cell`\\) of 0.1 m"),
         ({"columns": 3}, "3 columns cannot hold 10 kinds"),
     ],
 )
@@ -136,7 +137,7 @@ def test_mistakes_are_named(changes: dict[str, Any], message: str) -> None:
 
 
 def test_shares_of_nothing_are_refused() -> None:
-    with pytest.raises(ModelError, match="terrain.terrain_proportions: no kind has a share above 0, in {'flat': 0.0}; there are: flat"):
+    with pytest.raises(ModelError, match="`proportions`: no kind has a share above 0, in {'flat': 0.0}; there are: flat"):
         terrain(proportions={"flat": 0.0})
 
 
@@ -144,11 +145,14 @@ def test_shares_of_nothing_are_refused() -> None:
 
 
 @pytest.fixture
-def own_kinds(monkeypatch: pytest.MonkeyPatch) -> None:
+def own_kinds() -> Iterator[None]:
     """What a test adds is gone after it."""
-    monkeypatch.setattr(ground_kinds, "KINDS", dict(KINDS))
-    monkeypatch.setattr(ground_kinds, "MEASURES", dict(ground_kinds.MEASURES))
-    monkeypatch.setattr(ground_kinds, "LEVEL", set(ground_kinds.LEVEL))
+    tables = (KINDS, MEASURES, LEVEL)
+    before = [table.copy() for table in tables]
+    yield
+    for table, kept in zip(tables, before, strict=True):
+        table.clear()
+        table.update(kept)  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("own_kinds")

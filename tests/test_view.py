@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from legged_mw import ROOT
+from legged_mw.sim.drawing import visual_model
 from legged_mw.utils.task import load_task
 from legged_mw.view import native, video
 from legged_mw.view.camera import DISTANCE, CameraMan
@@ -504,7 +505,7 @@ def test_feet_are_found_among_other_contacts() -> None:
     """The port of legged_gym's task senses contacts of thighs, calves and trunk too; its feet come first."""
     task = load_task(str(ROOT / "examples" / "go1_legged_gym.py"))
     task.set("env.num_envs", 1)
-    model = task.env_class(task.cfg, "cpu").robot.visual
+    model = visual_model(task.env_class(task.cfg, "cpu").robot)
     cast = Cast(model, 1)
     assert len(cast.feet) > 4
     cast.pose(model.qpos0[None], 0)

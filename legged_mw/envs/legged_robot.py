@@ -14,8 +14,9 @@ from legged_mw.envs.mirror import Block, command_block, foot_blocks, scan_block
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.terrain import Tiles, build_terrain
+from legged_mw.sim.height_map import make_height_map
 from legged_mw.sim.mirror import Partners, find_partners
-from legged_mw.sim.terrain import PLATFORM, Terrain, make_height_map
+from legged_mw.sim.terrain import PLATFORM, Terrain
 from legged_mw.utils.commands import VELOCITY, Command, command_table
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign, maybe_any, wrap_to_pi, yaw_of

@@ -20,9 +20,9 @@ from torch import Tensor
 
 from legged_mw.envs.observations import Row
 from legged_mw.sim.mirror import Partners
-from legged_mw.sim.model import unknown
 from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
 
 NO_MIRROR = "learn without mirror images: symmetry.use_data_augmentation = False (and use_mirror_loss, if you set it)"
 

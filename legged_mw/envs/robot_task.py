@@ -29,12 +29,15 @@ from legged_mw.envs.observations import Observations, Row
 from legged_mw.envs.perturbation import Perturbation
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import Statistics
+from legged_mw.envs.wording import in_config_words
+from legged_mw.sim.engines import make_simulation, pick_engine
+from legged_mw.sim.errors import ModelError
 from legged_mw.sim.mirror import Partners, find_partners
-from legged_mw.sim.model import Ground, ModelError, Physics, RobotModel, build_model, per_joint, unknown
-from legged_mw.sim.simulation import make_simulation, pick_engine
+from legged_mw.sim.model import Ground, RobotModel, Solver, build_model, per_joint
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
 from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse
 
 
@@ -45,6 +48,7 @@ class RobotTask(BaseTask):
     exam = ""  # kind of exam that grades a policy (legged_mw/eval/exams.py); none
     command_table: tuple[Command, ...] = ()  # what a person can ask of the robot, columns of ``commands``; nothing
 
+    @in_config_words()
     def __init__(self, cfg: RobotTaskCfg, device: str, eager: bool = False) -> None:
         check_values(cfg)
         self.cfg = cfg
@@ -419,7 +423,7 @@ class RobotTask(BaseTask):
             raise ConfigError("asset.file is empty; name the robot's MJCF, e.g. 'resources/robots/go1/go1.xml'")
         return build_model(
             ROOT / Path(cfg.asset.file).expanduser(),  # an absolute path stays itself
-            physics=Physics(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations),
+            solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations),
             ground=Ground(cfg.terrain.friction, cfg.terrain.condim, self.terrain, boxes=engine == "mujoco"),
             stiffness=cfg.control.stiffness,
             damping=cfg.control.damping,
@@ -428,7 +432,6 @@ class RobotTask(BaseTask):
             contact_geoms=self._sensed_geoms(),
             velocity_sites=self._sensed_sites(),
             accelerometer_site=cfg.asset.imu_site,
-            camera=cfg.viewer.camera,
         )
 
     def _sensed_geoms(self) -> list[str]:

@@ -11,10 +11,12 @@ import torch
 from torch import Tensor
 
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.envs.wording import in_config_words
 from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.utils.math import assign
 
 
+@in_config_words()
 def build_terrain(cfg: LeggedRobotCfg) -> Terrain | None:
     """The ground that the section terrain describes; None: a plane."""
     ground = cfg.terrain

@@ -37,10 +37,10 @@ from legged_mw.deploy.contract import (
     digest,
 )
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.rl.export_scene import among_steps, standalone
 from legged_mw.rl.policy import act, load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.sim.model import ModelError, per_joint
-from legged_mw.sim.standalone import among_steps, standalone
 from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.utils.cli import shown
 from legged_mw.utils.config import save_yaml
@@ -291,6 +291,7 @@ def make_contract(env: LeggedRobot, task: LoadedTask, folder: Path) -> Contract:
         feet=cfg.asset.foot_names,
         qpos=[*cfg.init_state.pos, 1.0, 0.0, 0.0, 0.0, *pose],
         ctrl=pose,
+        camera=cfg.viewer.camera,
     )
     falls_on = tuple(robot.contact_geoms[i] for i in env.terminating_contacts.tolist())
     sensed = {FALL: tuple(f"contact/{name}" for name in falls_on)} if falls_on else {}

@@ -26,7 +26,7 @@ from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 from torch import Tensor
 
-from legged_mw.sim.model import ModelError
+from legged_mw.sim.errors import ModelError
 from legged_mw.sim.terrain import Terrain
 
 wp.set_module_options({"enable_backward": False})

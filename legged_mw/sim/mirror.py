@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from legged_mw.sim.model import ModelError, RobotModel
+from legged_mw.sim.errors import ModelError
+from legged_mw.sim.model import RobotModel
 
 POLAR = np.array([1.0, -1.0, 1.0])  # a place, a velocity, a force; what turns (an axis, an angular velocity) is axial: -POLAR
 TOLERANCE = 0.001  # [m] between a mirrored place and its partner's

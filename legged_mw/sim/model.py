@@ -13,28 +13,20 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import mujoco
 import numpy as np
 
-from legged_mw.sim.relief import add_relief
-from legged_mw.sim.scene import add_scene
-from legged_mw.utils.errors import UserError, unknown
+from legged_mw.sim.errors import ModelError
+from legged_mw.sim.ground import GROUND, Ground, add_ground, replace_level_pieces
+from legged_mw.sim.terrain import Terrain
+from legged_mw.utils.errors import unknown
 
-if TYPE_CHECKING:
-    from legged_mw.sim.terrain import Terrain
-
-GROUND = "floor"  # name of the ground geom that build_model adds
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 
 
-class ModelError(UserError, ValueError):
-    """A name or number asked of a model that does not fit its MJCF; the message lists what exists."""
-
-
 @dataclass(frozen=True)
-class Physics:
+class Solver:
     """Step and solver: written into the model's options."""
 
     timestep: float = 0.004  # [s]
@@ -43,27 +35,16 @@ class Physics:
 
 
 @dataclass(frozen=True)
-class Ground:
-    """The plane z = 0, or a height field. Its contact parameters win over the geom's that touches it (priority 1)."""
-
-    friction: float = 0.6  # sliding [-]
-    condim: int = 3  # 1 frictionless, 3 sliding, 4 and torsional, 6 and rolling
-    terrain: Terrain | None = None  # None: the plane
-    boxes: bool = False  # level pieces of the terrain as boxes, in what is stepped: for MuJoCo's own engine
-
-
-@dataclass(frozen=True)
 class RobotModel:
     """A compiled model and the tables of names that its user needs."""
 
     physics: mujoco.MjModel  # what is stepped: no visual geoms
-    visual: mujoco.MjModel  # the same with visual geoms: same qpos, qvel and bodies
     root: str  # name of the body that carries the free joint
     joint_names: tuple[str, ...]  # scalar joints, in order of qpos[7:], qvel[6:] and ctrl
     joint_range: np.ndarray  # (D, 2) [rad]
     effort_range: np.ndarray  # (D, 2) [N m]; infinite where the MJCF states none
     sensors: dict[str, slice]  # "contact", "linvel", "accelerometer" -> span of sensordata
-    spec: mujoco.MjSpec  # what ``visual`` was compiled from: to copy, never to change
+    spec: mujoco.MjSpec  # the same with visual geoms: to copy, never to change
     contact_geoms: tuple[str, ...] = ()  # in order of the span "contact"
     terrain: Terrain | None = None  # None: the plane
     overrides: list[str] = field(default_factory=list)  # what the caller's choices changed, a line each
@@ -74,14 +55,6 @@ class RobotModel:
         names = [self.physics.geom(i).name for i in range(count)]
         first = names.index(GROUND)
         return slice(first, first + sum(name == GROUND or name.startswith(f"{GROUND}/") for name in names))
-
-    def drawn(self) -> mujoco.MjModel:
-        """``visual`` for somebody to look at: a terrain's steps and slopes are seen. Takes a second where it is large."""
-        if self.terrain is None:
-            return self.visual
-        spec = self.spec.copy()
-        add_relief(spec, self.terrain, GROUND)
-        return spec.compile()
 
     def id(self, kind: str, name: str) -> int:
         """Index of the ``kind`` ("body", "geom", "site") called ``name``."""
@@ -114,7 +87,7 @@ def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str) -> l
 def build_model(
     file: Path,
     *,
-    physics: Physics,
+    solver: Solver,
     ground: Ground,
     stiffness: Mapping[str, float],  # part of joint name -> position gain [N m/rad]
     damping: Mapping[str, float],  # part of joint name -> passive joint damping [N m s/rad]
@@ -123,9 +96,8 @@ def build_model(
     contact_geoms: Sequence[str],  # sensed: number of contacts with the ground; names or patterns, each geom once
     velocity_sites: Sequence[str],  # sensed: linear velocity, world frame [m/s]
     accelerometer_site: str | None,  # sensed: proper acceleration, site frame [m/s^2]
-    camera: Sequence[float] = (0.9, -1.1, 0.6),  # place of the camera "track" relative to the robot's centre of mass [m]
 ) -> RobotModel:
-    """Compile the MJCF at ``file`` for stepping and for drawing."""
+    """Compile the MJCF at ``file`` for stepping."""
     if not file.is_file():
         raise ModelError(f"no MJCF at {file}")
     try:
@@ -134,31 +106,25 @@ def build_model(
         raise _invalid(file, error) from None
     notes: list[str] = []
     root, joints = _find_joints(spec, file.name)
-    _set_physics(spec, physics, notes)
-    _add_ground(spec, ground, file.name, notes)
+    _set_options(spec, solver, notes)
+    add_ground(spec, ground, file.name, notes)
     _set_collisions(spec, colliders, self_collisions, file.name, notes)
     limits = _add_servos(spec, joints, stiffness, damping, notes)
     touching = _match_geoms(spec, contact_geoms, file.name)
     _add_sensors(spec, touching, velocity_sites, accelerometer_site, file.name)
-    add_scene(spec)
-    _add_camera(spec, root, camera)
+    whole = spec.copy()
+    spec.compiler.discardvisual = True
+    for extra in [*spec.lights, *spec.cameras]:  # mujoco-warp would move lights in every step
+        spec.delete(extra)
+    if ground.terrain and ground.boxes:
+        replace_level_pieces(spec, ground.terrain, notes)
     try:
-        visual = spec.compile()
+        mj = spec.compile()
     except ValueError as error:  # a missing mesh, a name used twice: all that parsing does not see
         raise _invalid(file, error) from None
-    drawn = spec.copy()
-    spec.compiler.discardvisual = True
-    for light in list(spec.lights):
-        spec.delete(light)  # mujoco-warp would move it in every step
-    for view in list(spec.cameras):
-        spec.delete(view)
-    if ground.terrain and ground.boxes:
-        _replace_level_pieces(spec, ground, notes)
-    mj = spec.compile()
     names = tuple(j.name for j in joints)
     return RobotModel(
         physics=mj,
-        visual=visual,
         root=root,
         joint_names=names,
         joint_range=np.array([mj.joint(n).range for n in names]).reshape(-1, 2),
@@ -166,18 +132,9 @@ def build_model(
         sensors=_sensor_spans(mj, len(touching), len(velocity_sites), accelerometer_site is not None),
         contact_geoms=touching,
         terrain=ground.terrain,
-        spec=drawn,
+        spec=whole,
         overrides=notes,
     )
-
-
-def ground_model(terrain: Terrain) -> mujoco.MjModel:
-    """The ground alone, to be looked at from afar."""
-    spec = mujoco.MjSpec()
-    _add_ground(spec, Ground(terrain=terrain), "the ground", [])
-    add_scene(spec)
-    add_relief(spec, terrain, GROUND, squares=False)
-    return spec.compile()
 
 
 def _invalid(file: Path, error: ValueError) -> ModelError:
@@ -194,11 +151,11 @@ def _find_joints(spec: mujoco.MjSpec, where: str) -> tuple[str, list[mujoco.MjsJ
     return first.parent.name, rest
 
 
-def _set_physics(spec: mujoco.MjSpec, physics: Physics, notes: list[str]) -> None:
+def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
     wanted = {
-        "timestep": physics.timestep,
-        "iterations": physics.iterations,
-        "ls_iterations": physics.ls_iterations,
+        "timestep": solver.timestep,
+        "iterations": solver.iterations,
+        "ls_iterations": solver.ls_iterations,
         "solver": mujoco.mjtSolver.mjSOL_NEWTON,
         "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
         "integrator": mujoco.mjtIntegrator.mjINT_EULER,
@@ -214,83 +171,13 @@ def _set_physics(spec: mujoco.MjSpec, physics: Physics, notes: list[str]) -> Non
         spec.delete(key)  # poses are the caller's choice, and a keyframe must fit the actuators added below
 
 
-def _add_ground(spec: mujoco.MjSpec, ground: Ground, where: str, notes: list[str]) -> None:
-    if any(geom.name == GROUND for geom in spec.geoms):
-        raise ModelError(f"{where} brings a geom '{GROUND}'; leave the ground to the config (section terrain)")
-    spec.worldbody.add_geom(
-        name=GROUND,
-        **(_add_height_field(spec, ground.terrain) if ground.terrain else {"type": mujoco.mjtGeom.mjGEOM_PLANE, "size": [0, 0, 0.05]}),
-        material="ground",
-        contype=1,
-        conaffinity=0,
-        priority=1,
-        condim=ground.condim,
-        friction=[ground.friction, 0.005, 0.0001],
-    )
-    shape = "height field of {} x {} tiles".format(*ground.terrain.origins.shape[:2]) if ground.terrain else "plane"
-    notes.append(f"ground: {shape}, friction {ground.friction:g}, condim {ground.condim}, priority 1")
-
-
-def _add_height_field(spec: mujoco.MjSpec, terrain: Terrain) -> dict[str, object]:
-    """Give ``spec`` the heights; returns what makes a geom of them."""
-    rows, columns = terrain.heights.shape
-    spec.add_hfield(name=GROUND, nrow=rows, ncol=columns)
-    return {"type": mujoco.mjtGeom.mjGEOM_HFIELD, "hfieldname": GROUND, "pos": _fill_height_field(spec, terrain, terrain.heights)}
-
-
-def _fill_height_field(spec: mujoco.MjSpec, terrain: Terrain, heights: np.ndarray) -> list[float]:
-    """Put ``heights`` (R, C) [m] on the grid of ``terrain``; returns where the geom is to be."""
-    low, (rows, columns) = float(heights.min()), heights.shape
-    span = max(float(np.ptp(heights)), 1e-3)  # MuJoCo wants some; it scales what it is given to 0..1
-    field = spec.hfield(GROUND)
-    field.size = [(columns - 1) * terrain.cell / 2, (rows - 1) * terrain.cell / 2, span, 1.0]
-    field.userdata = ((heights - low) / span).astype(np.float32).ravel()
-    return [0.0, 0.0, low]
-
-
-def _replace_level_pieces(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> None:
-    """Sink the height field where boxes are exact: MuJoCo makes a tilted contact with every triangle that is near.
-
-    A small sphere has up to a dozen contacts with what stays a height field, which few iterations leave far from solved.
-    """
-    from legged_mw.sim.terrain import as_boxes
-
-    assert ground.terrain
-    boxes, heights, _ = as_boxes(ground.terrain)
-    spec.geom(GROUND).pos, bottom = _fill_height_field(spec, ground.terrain, heights), float(heights.min()) - 1.0
-    for number, box in enumerate(boxes):
-        low, high = np.array([*box.low, bottom]), np.array([*box.high, box.top])
-        add_ground_box(spec, low, high).name = f"{GROUND}/{number}"
-    feel_all_ground(spec)
-    for name, least in (("iterations", 20), ("ls_iterations", 50)):
-        if (old := getattr(spec.option, name)) < least:
-            notes.append(f"option {name}: {old:g} -> {least}, for the contacts of a height field")
-            setattr(spec.option, name, least)
-    notes.append(f"ground: {len(boxes)} boxes for its level pieces")
-
-
-def add_ground_box(spec: mujoco.MjSpec, low: np.ndarray, high: np.ndarray) -> mujoco.MjsGeom:
-    """A box between two corners (3,) [m] that touches as the ground does."""
-    box, floor = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=(low + high) / 2, size=(high - low) / 2), spec.geom(GROUND)
-    for name in ("contype", "conaffinity", "priority", "condim", "friction", "solref", "solimp"):
-        setattr(box, name, getattr(floor, name))
-    return box
-
-
-def feel_all_ground(spec: mujoco.MjSpec) -> None:
-    """Contact sensors that ask for the geom of the ground ask for all geoms of the world instead."""
-    for sensor in spec.sensors:
-        if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT and sensor.refname == GROUND:
-            sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, "world"
-
-
 def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisions: bool, where: str, notes: list[str]) -> None:
     """Ground is contype 1. What may touch it has conaffinity 1; with self-collisions also bit 2 on both sides."""
     robot = [g for g in spec.geoms if g.name != GROUND and (g.contype or g.conaffinity)]
     named = [g.name for g in robot if g.name]
     for pattern in colliders:
         if not any(fnmatchcase(g.name, pattern) for g in robot):
-            raise ModelError(f"colliders: {unknown('colliding geom', pattern, named, where)}")
+            raise ModelError(f"`colliders`: {unknown('colliding geom', pattern, named, where)}")
     off = []
     for geom in robot:
         if geom.priority > 0:
@@ -305,16 +192,6 @@ def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisio
         notes.append(f"collisions off: {', '.join(off)}")
 
 
-def _add_camera(spec: mujoco.MjSpec, root: str, place: Sequence[float]) -> None:
-    """A camera "track" that keeps its distance and looks at the robot; for viewers, the stepped model has none."""
-    away = np.array(place, dtype=float) / np.linalg.norm(place)  # a camera looks along its -z
-    right = np.cross([0.0, 0.0, 1.0], away)
-    right /= np.linalg.norm(right)
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(away, right), away], axis=1).ravel())
-    spec.body(root).add_camera(name="track", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=list(place), quat=quat)
-
-
 def _add_servos(
     spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint], stiffness: Mapping[str, float], damping: Mapping[str, float], notes: list[str]
 ) -> list[list[float]]:
@@ -326,7 +203,7 @@ def _add_servos(
         notes.append(f"actuator '{actuator.name}' replaced by a position servo")
         spec.delete(actuator)
     names = [j.name for j in joints]
-    gains, dampings = per_joint(stiffness, names, "control.stiffness"), per_joint(damping, names, "control.damping")
+    gains, dampings = per_joint(stiffness, names, "`stiffness`"), per_joint(damping, names, "`damping`")
     for joint, kp, kd in zip(joints, gains, dampings, strict=True):
         old = float(np.atleast_1d(joint.damping)[0])
         if old != kd:

@@ -17,7 +17,8 @@ import torch
 from mujoco.batch import MODEL_FIELDS, Batch, SimulationError
 from torch import Tensor
 
-from legged_mw.sim.model import ModelError, unknown
+from legged_mw.sim.errors import ModelError
+from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import usable_cores
 
 _READ_AND_WRITTEN, _WRITTEN = ("qpos", "qvel"), ("ctrl", "xfrc_applied")

@@ -7,16 +7,14 @@ For drawing alone: nothing that is stepped changes. The plane's looks are in sce
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from legged_mw.sim.scene import SQUARE, STEEP_LIGHT
-
-if TYPE_CHECKING:
-    from legged_mw.sim.terrain import Terrain
+from legged_mw.sim.terrain import Terrain
 
 Picture = NDArray[np.uint8]
 Tones = NDArray[np.floating]  # float32: these arrays are large

@@ -1,35 +1,14 @@
-"""What any physics engine promises to those above it, and which of them steps: the seam, written once.
+"""What any physics engine promises to those above it: the seam, written once. Nothing above ``sim/`` knows which engine it talks to."""
 
-Nothing above ``sim/`` knows which engine it talks to. ``mujoco_warp`` steps on a GPU, or on a CPU through warp; ``mujoco``
-is MuJoCo's own engine on a thread pool of the CPU.
-"""
-
-# pyright: reportAttributeAccessIssue=false
-# (mujoco ships no type stubs)
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
-import mujoco
 from torch import Tensor
-
-from legged_mw.sim.model import unknown
-from legged_mw.utils.errors import UserError
-
-if TYPE_CHECKING:
-    from legged_mw.sim.terrain import Terrain
-
-ENGINES = ("auto", "mujoco_warp", "mujoco")
-
 
 # Model fields that others are derived from, and those others: they need a value per world as soon as one of the former has.
 CONSTANTS_READ = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "qpos0")
 CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
-
-
-class EngineError(UserError, ValueError):
-    """An engine that does not exist, or cannot step where it was asked to."""
 
 
 class Simulation(Protocol):
@@ -80,45 +59,3 @@ class Simulation(Protocol):
     def overflow_report(self) -> str:
         """What did not fit since construction, a line, or '' if all did. Reads the device: not for inside a step."""
         ...
-
-
-def pick_engine(asked: str, device: str) -> str:
-    """The engine that ``asked`` means on ``device``: "auto" is MuJoCo's own on a CPU and mujoco-warp on a GPU."""
-    if asked not in ENGINES:
-        raise EngineError(unknown("engine", asked, ENGINES, "sim.engine"))
-    if asked == "auto":
-        return "mujoco" if device == "cpu" else "mujoco_warp"
-    if asked == "mujoco" and device != "cpu":
-        raise EngineError(f"sim.engine = mujoco steps on a CPU, and the device is {device}; say --device cpu, or --engine mujoco_warp")
-    return asked
-
-
-def make_simulation(
-    model: mujoco.MjModel,
-    num_envs: int,
-    device: str,
-    *,
-    engine: str = "auto",
-    nconmax: int,
-    njmax: int,
-    threads: int = 0,
-    world_fields: Sequence[str] = (),
-    terrain: Terrain | None = None,
-    eager: bool = False,
-) -> Simulation:
-    """Allocate ``num_envs`` worlds of ``model`` on ``device``.
-
-    ``terrain`` is what the model's height field was made from: mujoco-warp gets contacts of our own with it
-    (``sim/ground_contact.py``), MuJoCo's own engine those of the model.
-
-    ``nconmax`` and ``njmax`` are the contacts and constraint rows a world has room for; MuJoCo's own engine allocates as it
-    needs and leaves them aside. ``threads`` are those of MuJoCo's own engine, 0: one a core. ``world_fields`` names model
-    fields that get a value per world (see ``field``). ``eager`` switches mujoco-warp's replay on a CPU off.
-    """
-    if pick_engine(engine, device) == "mujoco":
-        from legged_mw.sim.mujoco_engine import MujocoSimulation
-
-        return MujocoSimulation(model, num_envs, threads=threads, world_fields=world_fields)
-    from legged_mw.sim.warp_engine import WarpSimulation  # importing warp takes a second: only where it steps
-
-    return WarpSimulation(model, num_envs, device, nconmax=nconmax, njmax=njmax, world_fields=world_fields, terrain=terrain, eager=eager)

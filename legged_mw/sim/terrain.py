@@ -1,21 +1,18 @@
 """Ground that is not flat: a grid of tiles, harder from row to row, another kind from column to column; one height field of all.
 
-Heights are made here, on the host, once; looked up on the device, in tensors of fixed shape; and level pieces of them turned into
-boxes, for MuJoCo's own engine. Nothing is stepped.
+Heights are made here, on the host, once.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from legged_mw.sim.model import ModelError, unknown
+from legged_mw.sim.errors import ModelError
+from legged_mw.utils.errors import unknown
 
 Heights = NDArray[np.float64]
 STEP = (0.06, 0.195)  # [m] of stairs at difficulty 0 and 1 [legged_gym: 0.05, 0.23; ours: for a leg of 0.43]
@@ -76,19 +73,16 @@ def make_terrain(
     """Build all tiles; difficulty rises in equal steps from level to level. Raises ModelError for what does not exist or fit."""
     for kind in proportions:
         if kind not in KINDS:
-            raise ModelError(unknown("kind of terrain", kind, KINDS, "terrain.terrain_proportions"))
+            raise ModelError(unknown("kind of terrain", kind, KINDS, "`proportions`"))
     n = round(tile / cell)
     if abs(n * cell - tile) > 1e-6 or tile < 4 * PLATFORM:
-        raise ModelError(
-            f"terrain.tile_size {tile:g} must be a whole number of cells (terrain.horizontal_scale) of {cell:g} m, "
-            f"and at least {4 * PLATFORM:g} m"
-        )
+        raise ModelError(f"`tile` {tile:g} must be a whole number of cells (`cell`) of {cell:g} m, and at least {4 * PLATFORM:g} m")
     kinds, rng = share_columns(proportions, columns), np.random.default_rng(seed)
     edge = round(border / cell)
     if (count := (columns * n + 2 * edge + 1) * (levels * n + 2 * edge + 1)) > MOST_HEIGHTS:
         raise ModelError(
             f"terrain: {levels} x {columns} tiles of {tile:g} m with a height every {cell:g} m have {count / 1e6:.0f} million heights, "
-            f"more than {MOST_HEIGHTS / 1e6:.0f}; raise terrain.horizontal_scale, or lower num_rows, num_cols, tile_size or border_size"
+            f"more than {MOST_HEIGHTS / 1e6:.0f}; raise `cell`, or lower `levels`, `columns`, `tile` or `border`"
         )
     field = np.zeros((columns * n + 2 * edge + 1, levels * n + 2 * edge + 1))
     origins = np.zeros((levels, columns, 3))
@@ -126,9 +120,9 @@ def share_columns(proportions: Mapping[str, float], columns: int) -> tuple[str, 
     """A kind for each column, in the order given, as near to the shares as whole columns come; each kind at least once."""
     wanted = {kind: share for kind, share in proportions.items() if share > 0}
     if not wanted:
-        raise ModelError(f"terrain.terrain_proportions: no kind has a share above 0, in {dict(proportions)}; there are: {', '.join(KINDS)}")
+        raise ModelError(f"`proportions`: no kind has a share above 0, in {dict(proportions)}; there are: {', '.join(KINDS)}")
     if len(wanted) > columns:
-        raise ModelError(f"terrain.num_cols: {columns} columns cannot hold {len(wanted)} kinds; every kind with a share above 0 needs one")
+        raise ModelError(f"`columns`: {columns} columns cannot hold {len(wanted)} kinds; every kind with a share above 0 needs one")
     bounds = np.cumsum(list(wanted.values())) / sum(wanted.values())
     kinds = [list(wanted)[min(int(np.searchsorted(bounds, (i + 0.5) / columns)), len(wanted) - 1)] for i in range(columns)]
     for kind in wanted:
@@ -172,105 +166,13 @@ class Grid:
 
 Kind = Callable[[Grid, float, np.random.Generator], Heights]  # of the grid, the difficulty from 0 to 1, and what is to be drawn from
 
-
-def flat(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """Nothing."""
-    return grid.zeros()
-
-
-def smooth_slope(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """A pyramid or, every second time, a pit, up to 0.4 steep [legged_gym; ours: in turn, not by chance]."""
-    rise = SLOPE * difficulty * np.clip(grid.half - 0.5 - np.maximum(grid.distance, PLATFORM), 0.0, None)
-    return -rise if grid.pit else rise
-
-
-def rough_slope(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """The same with 5 cm of noise on it [legged_gym]."""
-    return smooth_slope(grid, difficulty, rng) + grid.fade(_noise(grid, 0.05, 0.2, rng))
-
-
-def stairs_up(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """From a pit in the middle up to the rim, steps of 6 to 19.5 cm, 30 cm deep."""
-    return -_stairs(grid, _between(STEP, difficulty))
-
-
-def stairs_down(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """From the top in the middle down to the rim."""
-    return _stairs(grid, _between(STEP, difficulty))
-
-
-def obstacles(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """Twenty blocks and holes of 5 to 25 cm, 1 to 2 m across [legged_gym]."""
-    heights, height = grid.zeros(), _between(BLOCK, difficulty)
-    for _ in range(20):
-        size = rng.integers(round(1.0 / grid.cell), round(2.0 / grid.cell) + 1, 2)
-        low = [int(rng.integers(0, max(grid.n + 1 - s, 1))) for s in size]
-        level = rng.choice([-height, -height / 2, height / 2, height])
-        heights[low[0] : low[0] + size[0], low[1] : low[1] + size[1]] = level
-    heights[(grid.distance <= PLATFORM) | (grid.distance > grid.half - 0.5)] = 0.0
-    return heights
-
-
-def waves(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """Sines along both axes, 2 m long, up to 30 cm from trough to crest [ours]."""
-    along = np.arange(grid.n + 1) * grid.cell
-    phase = rng.uniform(0.0, 2.0 * np.pi, 2)
-    sines = [np.sin(np.pi * along + p) for p in phase]
-    return grid.fade(0.25 * WAVE * difficulty * (sines[0][:, None] + sines[1][None, :]))
-
-
-def stepping_stones(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """Square stones, 1.5 m down to 0.3 m, with gaps of 5 to 20 cm between them, 0.3 m deep [legged_gym; ours: less deep]."""
-    stone = max(round((1.5 - 1.2 * difficulty) / grid.cell), 2)
-    gap = max(round(_between(STONE_GAP, difficulty) / grid.cell), 1)
-    heights = np.full((grid.n + 1, grid.n + 1), -0.3)
-    row = 0
-    while row <= grid.n:
-        start = -int(rng.integers(0, stone + gap))
-        while start <= grid.n:
-            heights[row : row + stone, max(start, 0) : max(start + stone, 0)] = 0.0
-            start += stone + gap
-        row += stone + gap
-    heights[(grid.distance <= PLATFORM) | (grid.distance > grid.half - 0.5)] = 0.0
-    return heights
-
-
-def gap(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """A ditch around the middle, 5 to 60 cm wide, 0.5 m deep [legged_gym; ours: less wide]."""
-    width = max(_between(DITCH, difficulty), grid.cell)
-    heights = grid.zeros()
-    heights[(grid.distance > PLATFORM + 0.5 * grid.cell) & (grid.distance < PLATFORM + width + 0.5 * grid.cell)] = -0.5
-    return heights
-
-
-def low_random(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
-    """Random heights of 0 to 5 cm at every vertex, smaller in lower levels [MuJoCo Playground: 0 to 5 cm]."""
-    return grid.fade(NOISE * difficulty * rng.random((grid.n + 1, grid.n + 1)))
-
-
-KINDS: dict[str, Kind] = {
-    kind.__name__: kind
-    for kind in (flat, smooth_slope, rough_slope, stairs_up, stairs_down, obstacles, waves, stepping_stones, gap, low_random)
-}
-LEVEL = {"flat", "stairs_up", "stairs_down", "obstacles", "stepping_stones", "gap"}  # kinds that are made of level pieces
-
-
-# What makes a kind hard, for tables: name of the measure, its value at difficulty 0 and 1. A kind that is not here has none.
-MEASURES: dict[str, tuple[str, float, float]] = {
-    "smooth_slope": ("slope [%]", 0.0, 100 * SLOPE),
-    "rough_slope": ("slope [%]", 0.0, 100 * SLOPE),
-    "stairs_up": ("step [cm]", 100 * STEP[0], 100 * STEP[1]),
-    "stairs_down": ("step [cm]", 100 * STEP[0], 100 * STEP[1]),
-    "obstacles": ("height [cm]", 100 * BLOCK[0], 100 * BLOCK[1]),
-    "waves": ("height [cm]", 0.0, 100 * WAVE),
-    "stepping_stones": ("gap [cm]", 100 * STONE_GAP[0], 100 * STONE_GAP[1]),
-    "gap": ("width [cm]", 100 * DITCH[0], 100 * DITCH[1]),
-    "low_random": ("height [cm]", 0.0, 100 * NOISE),
-}
+KINDS: dict[str, Kind] = {}
+MEASURES: dict[str, tuple[str, float, float]] = {}  # what makes a kind hard: name [unit], its value at difficulty 0 and 1
+LEVEL: set[str] = set()  # kinds that are made of level pieces
 
 
 def add_kind(measure: str = "", low: float = 0.0, high: float = 0.0, *, level: bool = False) -> Callable[[Kind], Kind]:
-    """Make the decorated function a kind of ground under its own name, for ``terrain.terrain_proportions``.
+    """Make the decorated function a kind of ground under its own name.
 
     ``measure``: what makes it hard, with its unit, as in "depth [cm]"; ``low`` and ``high``: its value at difficulty 0 and 1.
     ``level``: it is made of level pieces, such as steps and blocks, which MuJoCo's own engine and an export then have as boxes.
@@ -295,6 +197,91 @@ def add_kind(measure: str = "", low: float = 0.0, high: float = 0.0, *, level: b
         return kind
 
     return add
+
+
+@add_kind(level=True)
+def flat(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """Nothing."""
+    return grid.zeros()
+
+
+@add_kind("slope [%]", 0.0, 100 * SLOPE)
+def smooth_slope(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """A pyramid or, every second time, a pit, up to 0.4 steep [legged_gym; ours: in turn, not by chance]."""
+    rise = SLOPE * difficulty * np.clip(grid.half - 0.5 - np.maximum(grid.distance, PLATFORM), 0.0, None)
+    return -rise if grid.pit else rise
+
+
+@add_kind("slope [%]", 0.0, 100 * SLOPE)
+def rough_slope(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """The same with 5 cm of noise on it [legged_gym]."""
+    return smooth_slope(grid, difficulty, rng) + grid.fade(_noise(grid, 0.05, 0.2, rng))
+
+
+@add_kind("step [cm]", 100 * STEP[0], 100 * STEP[1], level=True)
+def stairs_up(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """From a pit in the middle up to the rim, steps of 6 to 19.5 cm, 30 cm deep."""
+    return -_stairs(grid, _between(STEP, difficulty))
+
+
+@add_kind("step [cm]", 100 * STEP[0], 100 * STEP[1], level=True)
+def stairs_down(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """From the top in the middle down to the rim."""
+    return _stairs(grid, _between(STEP, difficulty))
+
+
+@add_kind("height [cm]", 100 * BLOCK[0], 100 * BLOCK[1], level=True)
+def obstacles(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """Twenty blocks and holes of 5 to 25 cm, 1 to 2 m across [legged_gym]."""
+    heights, height = grid.zeros(), _between(BLOCK, difficulty)
+    for _ in range(20):
+        size = rng.integers(round(1.0 / grid.cell), round(2.0 / grid.cell) + 1, 2)
+        low = [int(rng.integers(0, max(grid.n + 1 - s, 1))) for s in size]
+        level = rng.choice([-height, -height / 2, height / 2, height])
+        heights[low[0] : low[0] + size[0], low[1] : low[1] + size[1]] = level
+    heights[(grid.distance <= PLATFORM) | (grid.distance > grid.half - 0.5)] = 0.0
+    return heights
+
+
+@add_kind("height [cm]", 0.0, 100 * WAVE)
+def waves(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """Sines along both axes, 2 m long, up to 30 cm from trough to crest [ours]."""
+    along = np.arange(grid.n + 1) * grid.cell
+    phase = rng.uniform(0.0, 2.0 * np.pi, 2)
+    sines = [np.sin(np.pi * along + p) for p in phase]
+    return grid.fade(0.25 * WAVE * difficulty * (sines[0][:, None] + sines[1][None, :]))
+
+
+@add_kind("gap [cm]", 100 * STONE_GAP[0], 100 * STONE_GAP[1], level=True)
+def stepping_stones(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """Square stones, 1.5 m down to 0.3 m, with gaps of 5 to 20 cm between them, 0.3 m deep [legged_gym; ours: less deep]."""
+    stone = max(round((1.5 - 1.2 * difficulty) / grid.cell), 2)
+    gap = max(round(_between(STONE_GAP, difficulty) / grid.cell), 1)
+    heights = np.full((grid.n + 1, grid.n + 1), -0.3)
+    row = 0
+    while row <= grid.n:
+        start = -int(rng.integers(0, stone + gap))
+        while start <= grid.n:
+            heights[row : row + stone, max(start, 0) : max(start + stone, 0)] = 0.0
+            start += stone + gap
+        row += stone + gap
+    heights[(grid.distance <= PLATFORM) | (grid.distance > grid.half - 0.5)] = 0.0
+    return heights
+
+
+@add_kind("width [cm]", 100 * DITCH[0], 100 * DITCH[1], level=True)
+def gap(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """A ditch around the middle, 5 to 60 cm wide, 0.5 m deep [legged_gym; ours: less wide]."""
+    width = max(_between(DITCH, difficulty), grid.cell)
+    heights = grid.zeros()
+    heights[(grid.distance > PLATFORM + 0.5 * grid.cell) & (grid.distance < PLATFORM + width + 0.5 * grid.cell)] = -0.5
+    return heights
+
+
+@add_kind("height [cm]", 0.0, 100 * NOISE)
+def low_random(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heights:
+    """Random heights of 0 to 5 cm at every vertex, smaller in lower levels [MuJoCo Playground: 0 to 5 cm]."""
+    return grid.fade(NOISE * difficulty * rng.random((grid.n + 1, grid.n + 1)))
 
 
 def describe(kind: str, difficulty: float) -> str:
@@ -330,88 +317,3 @@ def _noise(grid: Grid, height: float, every: float, rng: np.random.Generator) ->
     draws = rng.uniform(-height, height, (len(coarse), len(coarse)))
     rows = np.stack([np.interp(fine, coarse, draws[:, i]) for i in range(len(coarse))], axis=1)
     return np.stack([np.interp(fine, coarse, row) for row in rows])
-
-
-# ---- level pieces as boxes, for MuJoCo's own engine ----
-
-MOST_BOXES = 1000  # of a tile; what needs more stays a height field
-
-
-class Box(NamedTuple):
-    """A block of ground whose top is level."""
-
-    low: tuple[float, float]  # corner x, y [m, world]
-    high: tuple[float, float]  # the opposite one
-    top: float  # [m]
-
-
-def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights, list[str]]:
-    """Tiles that are few level pieces as boxes, the heights of all else, sunk by 1 m under the boxes, and its kinds.
-
-    Steps are upright there, midway between the vertices where the height field has a slope of one cell.
-    """
-    heights, boxes, left = terrain.heights.copy(), [], set()
-    n = round(terrain.tile / terrain.cell)
-    for column, level in np.ndindex(len(terrain.kinds), terrain.levels):
-        where, kind = terrain.vertices(level, column), terrain.kinds[column]
-        is_level = kind in LEVEL or not np.ptp(terrain.heights[where])
-        pieces = _level_pieces(np.round(terrain.heights[where], 6)) if is_level else []
-        if not pieces or len(pieces) > MOST_BOXES:
-            left.add(kind)
-            continue
-        for rows, columns, top in pieces:
-            y, x = (tile.start + np.clip([*span], 0.5, n + 0.5) - 0.5 for tile, span in zip(where, (rows, columns), strict=True))
-            low, high = zip(terrain.corner[0] + x * terrain.cell, terrain.corner[1] + y * terrain.cell, strict=True)
-            boxes.append(Box(low, high, top))
-        inside = heights[where][1:-1, 1:-1]
-        inside[...] = inside.min() - 1.0
-    return boxes, heights, sorted(left)
-
-
-def _level_pieces(patch: Heights) -> list[tuple[tuple[int, int], tuple[int, int], float]]:
-    """Rectangles of vertices of one height: first row and the one after the last, columns likewise, height; too many: cut short."""
-    taken = np.zeros(patch.shape, dtype=bool)
-    pieces: list[tuple[tuple[int, int], tuple[int, int], float]] = []
-    for row in range(patch.shape[0]):
-        while not taken[row].all() and len(pieces) <= MOST_BOXES:
-            first = int(np.argmin(taken[row]))
-            differs = np.flatnonzero((patch[row, first:] != patch[row, first]) | taken[row, first:])
-            last = first + int(differs[0]) if len(differs) else patch.shape[1]
-            same = ((patch[row:, first:last] == patch[row, first]) & ~taken[row:, first:last]).all(axis=1)
-            end = row + (int(np.argmin(same)) if not same.all() else len(same))
-            taken[row:end, first:last] = True
-            pieces.append(((row, end), (first, last), float(patch[row, first])))
-    return pieces
-
-
-# ---- looking heights up, on the device ----
-
-
-class HeightMap:
-    """The heights of a ``Terrain`` on a device; a lookup is a gather of fixed shape and asks the host nothing."""
-
-    def __init__(self, terrain: Terrain, device: str) -> None:
-        self._rows, self._columns = terrain.heights.shape
-        self._heights = torch.tensor(terrain.heights, dtype=torch.float, device=device).flatten()
-        self._corner = torch.tensor(terrain.corner, dtype=torch.float, device=device)
-        self._per_cell = 1.0 / terrain.cell
-
-    def __call__(self, points: Tensor) -> Tensor:
-        """Height [m] of the ground under ``points`` (..., 2) [m, world]; outside of the field, of its rim; of NaN, of a corner."""
-        place = ((points - self._corner) * self._per_cell).nan_to_num(0.0)
-        u, v = place[..., 0].clamp(0.0, self._columns - 1.0), place[..., 1].clamp(0.0, self._rows - 1.0)
-        column, row = u.floor().clamp(max=self._columns - 2.0), v.floor().clamp(max=self._rows - 2.0)
-        across, along = u - column, v - row
-        here = row.long() * self._columns + column.long()  # float32 would not count to the end of a large field
-        low, high = self._heights[here], self._heights[here + self._columns + 1]
-        corner = torch.where(across >= along, self._heights[here + 1], self._heights[here + self._columns])
-        return low + (corner - low) * torch.maximum(across, along) + (high - corner) * torch.minimum(across, along)
-
-
-def make_height_map(terrain: Terrain, device: str) -> Callable[[Tensor], Tensor]:
-    """The lookup that is fastest on ``device``; both give the same heights."""
-    if device == "cpu":
-        return HeightMap(terrain, device)
-    from legged_mw.sim.ground_contact import HeightLookup  # importing warp takes a second: only where it pays
-
-    return HeightLookup(terrain, device)

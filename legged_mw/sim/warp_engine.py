@@ -7,7 +7,6 @@ from __future__ import annotations
 import copy
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING
 
 import mujoco
 import mujoco_warp as mjw
@@ -16,11 +15,12 @@ import warp as wp
 from mujoco_warp import OverflowType
 from torch import Tensor
 
-from legged_mw.sim.model import GROUND, ModelError, unknown
+from legged_mw.sim.errors import ModelError
+from legged_mw.sim.ground import GROUND
+from legged_mw.sim.ground_contact import touch_ground
 from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ
-
-if TYPE_CHECKING:
-    from legged_mw.sim.terrain import Terrain
+from legged_mw.sim.terrain import Terrain
+from legged_mw.utils.errors import unknown
 
 wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it loads; a first run would drown in it
 
@@ -145,8 +145,6 @@ def make_model(model: mujoco.MjModel, terrain: Terrain | None = None, batch_size
     """The model on the current device; on ``terrain`` with contacts of our own in place of its height field's."""
     if terrain is None:
         return mjw.put_model(model, batch_sizes=batch_sizes)
-    from legged_mw.sim.ground_contact import touch_ground  # a module of kernels: only where there is such ground
-
     touch, model = touch_ground(model, model.geom(GROUND).id, terrain), copy.copy(model)
     model.geom(GROUND).contype, model.geom(GROUND).conaffinity = 0, 0
     put = mjw.put_model(model, batch_sizes=batch_sizes)

@@ -11,6 +11,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.sim.drawing import visual_model
 from legged_mw.sim.terrain import describe
 from legged_mw.view.stage import BoolArray, FloatArray
 
@@ -25,7 +26,7 @@ class EnvStage:
 
     def __init__(self, env: LeggedRobot, policy: Callable[[TensorDict], Tensor], limits: ArrayLike) -> None:
         self.env, self.policy = env, policy
-        self.model, self.num_worlds, self.dt = env.robot.drawn(), env.num_envs, env.dt
+        self.model, self.num_worlds, self.dt = visual_model(env.robot, env.cfg.viewer.camera), env.num_envs, env.dt
         self.limits: FloatArray = np.array(limits, dtype=np.float64)
         self._obs = env.get_observations()
 

@@ -13,9 +13,13 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from legged_mw.sim.model import GROUND, ModelError, RobotModel, add_ground_box, feel_all_ground
+from legged_mw.sim.drawing import CAMERA, dressed
+from legged_mw.sim.errors import ModelError
+from legged_mw.sim.ground import GROUND, add_ground_box, feel_all_ground
+from legged_mw.sim.level_boxes import MOST_BOXES, Box, as_boxes
+from legged_mw.sim.model import RobotModel
 from legged_mw.sim.scene import STEEP_LIGHT
-from legged_mw.sim.terrain import MOST_BOXES, Box, Terrain, as_boxes
+from legged_mw.sim.terrain import Terrain
 
 AROUND = 1000.0  # [m] of level ground around tiles of steps: nobody walks to its end
 HOME = "home"  # the keyframe: the pose to start in, and the servos holding it
@@ -67,12 +71,22 @@ class Scene:
     sensors: dict[str, list[str]]  # quantity -> names of the sensors whose values, side by side, are it
 
 
-def standalone(robot: RobotModel, *, imu: str, feet: Sequence[str], qpos: Sequence[float], ctrl: Sequence[float]) -> Scene:
+def standalone(
+    robot: RobotModel,
+    *,
+    imu: str,
+    feet: Sequence[str],
+    qpos: Sequence[float],
+    ctrl: Sequence[float],
+    camera: Sequence[float] = CAMERA,
+) -> Scene:
     """``robot`` as MJCF text, with a sensor for all that a controller may read and ``qpos``, ``ctrl`` as keyframe "home".
 
     Raises ModelError if the text cannot be made, or is another machine than the one that was trained.
     """
-    spec = robot.spec.copy()
+    spec = dressed(robot, camera)
+    if files := [field.name for field in spec.hfields if field.file]:
+        raise ModelError(f"height field '{files[0]}' comes from a file; an export must stand alone, so build it from numbers")
     spec.comment = (
         f"\n    {spec.modelname}: robot, ground, servos, sensors. Self-contained; written by legged_mw from the model that was trained.\n  "
     )
@@ -81,8 +95,8 @@ def standalone(robot: RobotModel, *, imu: str, feet: Sequence[str], qpos: Sequen
             geom.group = 1
     sensors = _add_sensors(spec, robot.joint_names, imu, feet)
     spec.add_key(name=HOME, qpos=list(qpos), ctrl=list(ctrl))
-    _write_out_files(spec, robot.visual)
     try:
+        _write_out_files(spec)
         spec.compile()
         xml = spec.to_xml()
         model = mujoco.MjModel.from_xml_string(xml)
@@ -155,27 +169,24 @@ def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str, feet: Seq
     }
 
 
-def _write_out_files(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
+def _write_out_files(spec: mujoco.MjSpec) -> None:
     """Meshes that come from files become numbers in the text; pictures are dropped, as they are only looks."""
-    for mesh in spec.meshes:
-        if mesh.file:
-            view = model.mesh(mesh.name)
-            vertices, faces = (
-                slice(view.vertadr[0], view.vertadr[0] + view.vertnum[0]),
-                slice(view.faceadr[0], view.faceadr[0] + view.facenum[0]),
-            )
-            rotation = np.zeros(9)
-            mujoco.mju_quat2Mat(rotation, model.mesh_quat[view.id])  # compiled, a mesh lies in its principal axes
-            places = model.mesh_vert[vertices] @ rotation.reshape(3, 3).T + model.mesh_pos[view.id]
-            mesh.file, mesh.scale, mesh.refpos, mesh.refquat = "", [1, 1, 1], [0, 0, 0], [1, 0, 0, 0]
-            mesh.uservert, mesh.userface = places.ravel(), model.mesh_face[faces].ravel()
     pictures = {t.name for t in spec.textures if t.file or any(t.cubefiles)}
     for material in spec.materials:
         material.textures = ["" if name in pictures else name for name in material.textures]
     for texture in [t for t in spec.textures if t.name in pictures]:
         spec.delete(texture)
-    if files := [field.name for field in spec.hfields if field.file]:
-        raise ModelError(f"height field '{files[0]}' comes from a file; an export must stand alone, so build it from numbers")
+    model = spec.copy().compile()
+    for mesh in spec.meshes:
+        if mesh.file:
+            view, rotation = model.mesh(mesh.name), np.zeros(9)
+            vertices, faces = (
+                slice(start[0], start[0] + count[0]) for start, count in ((view.vertadr, view.vertnum), (view.faceadr, view.facenum))
+            )
+            mujoco.mju_quat2Mat(rotation, model.mesh_quat[view.id])  # compiled, a mesh lies in its principal axes
+            places = model.mesh_vert[vertices] @ rotation.reshape(3, 3).T + model.mesh_pos[view.id]
+            mesh.file, mesh.scale, mesh.refpos, mesh.refquat = "", [1, 1, 1], [0, 0, 0], [1, 0, 0, 0]
+            mesh.uservert, mesh.userface = places.ravel(), model.mesh_face[faces].ravel()
     spec.meshdir = spec.texturedir = ""
 
 

@@ -1,0 +1,37 @@
+"""The config's words for what the simulator takes: its errors name parameters in backticks, a user knows fields."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from legged_mw.sim.errors import EngineError, ModelError
+
+FIELDS = {
+    "engine": "sim.engine",
+    "stiffness": "control.stiffness",
+    "damping": "control.damping",
+    "colliders": "asset.colliders",
+    "proportions": "terrain.terrain_proportions",
+    "levels": "terrain.num_rows",
+    "columns": "terrain.num_cols",
+    "tile": "terrain.tile_size",
+    "cell": "terrain.horizontal_scale",
+    "border": "terrain.border_size",
+    "pose": "init_state.default_joint_angles",
+    "sites": "asset.foot_geoms",
+}
+
+
+@contextmanager
+def in_config_words() -> Iterator[None]:
+    """An error of the simulator, raised inside, names the fields that its parameters come from."""
+    try:
+        yield
+    except (ModelError, EngineError) as error:
+        text = str(error)
+        for parameter, field in FIELDS.items():
+            text = text.replace(f"`{parameter}`", field)
+        if text == str(error):
+            raise
+        raise type(error)(text) from None

@@ -1,0 +1,59 @@
+"""Which engine steps: ``mujoco_warp`` on a GPU, or on a CPU through warp; ``mujoco``, MuJoCo's own, on a thread pool of the CPU."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+
+from legged_mw.sim.errors import EngineError
+from legged_mw.sim.simulation import Simulation
+from legged_mw.sim.terrain import Terrain
+from legged_mw.utils.errors import unknown
+
+ENGINES = ("auto", "mujoco_warp", "mujoco")
+
+
+def pick_engine(asked: str, device: str) -> str:
+    """The engine that ``asked`` means on ``device``: "auto" is MuJoCo's own on a CPU and mujoco-warp on a GPU."""
+    if asked not in ENGINES:
+        raise EngineError(unknown("engine", asked, ENGINES, "`engine`"))
+    if asked == "auto":
+        return "mujoco" if device == "cpu" else "mujoco_warp"
+    if asked == "mujoco" and device != "cpu":
+        raise EngineError(f"`engine` = mujoco steps on a CPU, and the device is {device}; take the device cpu, or the engine mujoco_warp")
+    return asked
+
+
+def make_simulation(
+    model: mujoco.MjModel,
+    num_envs: int,
+    device: str,
+    *,
+    engine: str = "auto",
+    nconmax: int,
+    njmax: int,
+    threads: int = 0,
+    world_fields: Sequence[str] = (),
+    terrain: Terrain | None = None,
+    eager: bool = False,
+) -> Simulation:
+    """Allocate ``num_envs`` worlds of ``model`` on ``device``.
+
+    ``terrain`` is what the model's height field was made from: mujoco-warp gets contacts of our own with it
+    (``sim/ground_contact.py``), MuJoCo's own engine those of the model.
+
+    ``nconmax`` and ``njmax`` are the contacts and constraint rows a world has room for; MuJoCo's own engine allocates as it
+    needs and leaves them aside. ``threads`` are those of MuJoCo's own engine, 0: one a core. ``world_fields`` names model
+    fields that get a value per world (see ``field``). ``eager`` switches mujoco-warp's replay on a CPU off.
+    """
+    # each engine is imported where it steps: importing warp takes a second
+    if pick_engine(engine, device) == "mujoco":
+        from legged_mw.sim.mujoco_engine import MujocoSimulation
+
+        return MujocoSimulation(model, num_envs, threads=threads, world_fields=world_fields)
+    from legged_mw.sim.warp_engine import WarpSimulation
+
+    return WarpSimulation(model, num_envs, device, nconmax=nconmax, njmax=njmax, world_fields=world_fields, terrain=terrain, eager=eager)
