@@ -11,8 +11,6 @@ places and velocities of sites, accelerometer, joint torque) is one simulation s
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
 
@@ -23,6 +21,7 @@ from legged_mw import ROOT
 from legged_mw.envs.actuators import Actuators
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.checks import check_values
+from legged_mw.envs.contacts import GroundContacts
 from legged_mw.envs.domain_rand import DomainRand, world_fields
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
 from legged_mw.envs.observations import Observations, Row
@@ -136,8 +135,8 @@ class RobotTask(BaseTask):
     def _fallen(self) -> Tensor:
         """(N,) The robot failed: too tilted, too low, or on the ground with what must not touch it."""
         down = self.projected_gravity[:, 2] > -math.cos(math.radians(self.cfg.termination.max_tilt))
-        if len(self.terminating_contacts):
-            down |= self.contact_count[:, self.terminating_contacts].amax(dim=1) > 0.0
+        if len(self.contacts.terminating):
+            down |= self.contact_count[:, self.contacts.terminating].amax(dim=1) > 0.0
         if self.cfg.termination.min_base_height:
             down |= self.base_height < self.cfg.termination.min_base_height
         return down
@@ -364,7 +363,7 @@ class RobotTask(BaseTask):
 
     def _reward_collision(self) -> Tensor:
         """How many bodies touch the ground that should not: ``asset.penalize_contacts_on``. [L]"""
-        return ((self.contact_count @ self.penalized_contacts) > 0.0).sum(dim=1).float()
+        return ((self.contact_count @ self.contacts.penalized) > 0.0).sum(dim=1).float()
 
     # ---- statistics: summed on the device, read once an iteration ------------------------------------------------------------
 
@@ -464,7 +463,8 @@ class RobotTask(BaseTask):
         self.gravity_dir = torch.tensor([0.0, 0.0, -1.0], device=device).expand(n, 3)
         self.total_mass = float(self.robot.physics.body_subtreemass[0])  # [kg]
         self._init_imu()
-        self._init_contacts()
+        needed = bool(self._active_scales().get("collision"))
+        self.contacts = GroundContacts(self.robot, self.cfg.asset, self.contact_count, needed)
 
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
         return torch.zeros(self.num_envs, *shape, dtype=dtype, device=self.device)
@@ -480,31 +480,6 @@ class RobotTask(BaseTask):
         if model.site_bodyid[imu] != self.root_body or abs(model.site_quat[imu][0]) < 1.0 - 1e-9:
             raise ModelError(f"asset.imu_site '{self.cfg.asset.imu_site}' must be on the root body '{robot.root}' and aligned with it")
         self.imu_pos = self._tensor(model.site_pos[imu]).expand(self.num_envs, 3)  # body frame [m]
-
-    def _init_contacts(self) -> None:
-        """Which columns of ``contact_count`` are a fall, and (C, B) which are of which penalised body."""
-        asset, geoms, model = self.cfg.asset, self.robot.contact_geoms, self.robot.physics
-        terminating = self._contact_columns(asset.terminate_after_contacts_on, "terminate_after_contacts_on")
-        penalized = self._contact_columns(asset.penalize_contacts_on, "penalize_contacts_on")
-        if self._active_scales().get("collision") and not penalized:
-            raise ConfigError("rewards.scales.collision is on, but asset.penalize_contacts_on names nothing; name what should not touch")
-        body = {column: int(model.geom_bodyid[self.robot.id("geom", geoms[column])]) for column in penalized}
-        bodies = sorted(set(body.values()))
-        table = torch.zeros(len(geoms), len(bodies))
-        for column in penalized:
-            table[column, bodies.index(body[column])] = 1.0
-        self.penalized_contacts = table.to(self.device)
-        self.terminating_contacts = torch.tensor(terminating, dtype=torch.long, device=self.device)
-
-    def _contact_columns(self, patterns: Sequence[str], field: str) -> list[int]:
-        """Columns of ``contact_count`` that ``patterns`` mean; each of the geoms must be one that can touch the ground."""
-        hits = [i for i, name in enumerate(self.robot.contact_geoms) if any(fnmatchcase(name, pattern) for pattern in patterns)]
-        for name in (self.robot.contact_geoms[i] for i in hits):
-            if not self.robot.physics.geom_conaffinity[self.robot.id("geom", name)]:
-                raise ConfigError(
-                    f"asset.{field}: '{name}' never touches the ground; add it to asset.colliders: {self.cfg.asset.colliders}"
-                )
-        return hits
 
     def _init_ranges(self) -> None:
         """Config numbers as tensors: joints' tables and ranges of a reset."""
