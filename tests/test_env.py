@@ -255,7 +255,7 @@ class _Number(LeggedRobot):
             {"control.damping": {"hip": 1.0}},
             None,
             ModelError,
-            r"^control\.damping: joint 'FR_thigh_joint' matches none of \['hip'\]",
+            r"^control\.damping: no value for FR_thigh_joint, FR_calf_joint, FL_thigh_joint",
         ),
         (
             {"asset.colliders": ["paw"]},
@@ -273,7 +273,7 @@ class _Number(LeggedRobot):
             {"rewards.pose_weights": {"hip": 1.0, "thigh": 1.0}},
             None,
             ModelError,
-            r"^rewards\.pose_weights: joint 'FR_calf_joint' matches none of \['hip', 'thigh'\]; exactly one must be a part of its name$",
+            r"^rewards\.pose_weights: no value for FR_calf_joint, .*, RL_calf_joint: none of \['hip', 'thigh'\] is a part of these names; ",
         ),
         (
             {"init_state.default_joint_angles": {"joint": 0.0, "toe": 1.0}},

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any
 
 import mujoco
@@ -17,6 +18,8 @@ from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.sim.warp_engine import WarpSimulation
 
 RADIUS = 0.023  # [m] of a Go1's foot
+BRICK, CORNERS = np.array([0.1, 0.05, 0.02]), np.array(list(itertools.product((-1.0, 1.0), repeat=3)))  # a mesh of half these sizes [m]
+MESH = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": "brick"}
 
 
 def ground(kind: str, cell: float = 0.05, levels: int = 2) -> Terrain:
@@ -37,6 +40,7 @@ def ball_model(terrain: Terrain | None, shape: dict[str, Any] | None = None) -> 
     spec.worldbody.add_geom(name=GROUND, priority=1, friction=[0.6, 0.005, 0.0001], **floor)
     body = spec.worldbody.add_body(name="ball")
     body.add_freejoint()
+    spec.add_mesh(name="brick", uservert=np.ravel(BRICK * CORNERS), inertia=mujoco.mjtMeshInertia.mjMESH_INERTIA_CONVEX)
     body.add_geom(name="ball", mass=1.0, **(shape or {"type": mujoco.mjtGeom.mjGEOM_SPHERE, "size": [RADIUS, 0, 0]}))
     return spec.compile()
 
@@ -162,6 +166,7 @@ def test_shapes_and_their_probes() -> None:
         (kinds.mjGEOM_CAPSULE, [0.1, 0.2, 0], 5),
         (kinds.mjGEOM_CYLINDER, [0.1, 0.1, 0], 38),
         (kinds.mjGEOM_BOX, [0.1] * 3, 26),
+        (kinds.mjGEOM_ELLIPSOID, [0.1, 0.1, 0.05], 62),
     ):
         model = ball_model(None, {"type": kind, "size": size})
         geoms, places, radii = probes(model, 0)
@@ -171,13 +176,80 @@ def test_shapes_and_their_probes() -> None:
     cap = np.stack([across * np.cos(angle), across * np.sin(angle), np.full_like(angle, 0.1)], axis=-1)
     nearest_probe = np.linalg.norm(cap[..., None, :] - places, axis=-1).min(axis=-1)
     assert nearest_probe.max() < 0.1 / np.sqrt(2) + 1e-6, "10 cm apart along either way"
-    with pytest.raises(ModelError, match=r"collider 'ball' is a ellipsoid: on terrain mujoco_warp knows spheres, capsules, boxes"):
-        probes(ball_model(None, {"type": kinds.mjGEOM_ELLIPSOID, "size": [0.1, 0.1, 0.2]}), 0)
+    model = ball_model(None)
+    model.geom_type[1] = kinds.mjGEOM_HFIELD
+    with pytest.raises(ModelError, match=r"^geom 'ball' is a hfield: its surface is not known as points, .* or take `engine` = mujoco$"):
+        probes(model, 0)
+
+
+def test_an_ellipsoid_is_probed_on_its_surface_and_at_its_ends() -> None:
+    size = np.array([0.2, 0.1, 0.05])
+    _, places, radii = probes(ball_model(None, {"type": mujoco.mjtGeom.mjGEOM_ELLIPSOID, "size": size}), 0)
+    np.testing.assert_allclose(np.square(places / size).sum(axis=1), 1.0, atol=1e-9)
+    np.testing.assert_allclose(np.abs(places).max(axis=0), size, rtol=0.02)
+    assert not any(radii)
+
+
+def test_a_mesh_is_probed_at_its_corners_and_between_them() -> None:
+    model = ball_model(None, MESH)
+    geoms, places, radii = probes(model, 0)
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, model.mesh_quat[0])  # compiled, a mesh lies in its principal axes
+    places = places @ turn.reshape(3, 3).T + model.mesh_pos[0]
+    assert set(geoms) == {1} and not any(radii)
+    assert {tuple(corner) for corner in (BRICK * CORNERS).round(6)} <= {tuple(place) for place in places.round(6)}
+    on_surface = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 41), np.linspace(-0.05, 0.05, 21), [-0.02, 0.02]), axis=-1).reshape(-1, 1, 3)
+    assert np.linalg.norm(on_surface - places, axis=-1).min(axis=1).max() < 0.1 / np.sqrt(2) + 1e-6
+    assert len(places) < 20, "no more than keeps the surface covered"
+
+
+def test_a_round_mesh_is_thinned_and_as_large_as_it_was() -> None:
+    spec = mujoco.MjSpec.from_string(
+        '<mujoco><asset><mesh name="ball" builtin="sphere" params="4" scale=".05 .05 .05"/></asset><worldbody>'
+        '<geom name="floor" type="plane" size="1 1 1"/><body><freejoint/><geom type="mesh" mesh="ball"/></body></worldbody></mujoco>'
+    )
+    model = spec.compile()
+    _, places, _ = probes(model, 0)
+    assert len(places) < 40 < model.mesh_vertnum[0] and np.linalg.norm(places, axis=1) == pytest.approx(0.05, rel=0.01)
+    down = np.random.default_rng(0).normal(size=(200, 3))
+    reach = (down / np.linalg.norm(down, axis=1, keepdims=True) @ places.T).max(axis=1)
+    assert reach.min() > 0.9 * 0.05, "it sinks by a tenth of its radius at the most, whichever way it lies"
+
+
+@pytest.mark.parametrize("field", ["flat", "smooth_slope"])
+def test_a_mesh_rests_as_the_box_of_its_size_does(field: str, device: str) -> None:
+    """A sole of 20 x 10 x 4 cm, as a mesh and as a box on a height field, and as MuJoCo itself has it there."""
+    terrain, rest = ground(field), []
+    place = [3.0, 0.0, terrain.heights[60, round((3.0 - terrain.corner[0]) / 0.05)] + 0.05]
+    for shape in (MESH, {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": BRICK}):
+        model = ball_model(terrain, shape)
+        model.opt.iterations = 50
+        sim = WarpSimulation(model, 1, device, nconmax=40, njmax=160, terrain=terrain, eager=True)
+        sim.qpos[0, :3] = torch.tensor(place)
+        for _ in range(150):
+            sim.step()
+        assert not sim.overflow_report()
+        rest.append(sim.qpos[0].cpu().numpy())
+    model = ball_model(terrain, MESH)
+    data = mujoco.MjData(model)
+    data.qpos[:3] = place
+    mujoco.mj_step(model, data, 150)
+    np.testing.assert_allclose(rest[0], rest[1], atol=1e-4)
+    slope = 0.4 if field == "smooth_slope" else 0.0  # down along x
+    from_middle = place[2] - 0.05 + slope * place[0]  # what the ground's plane has for z + slope * x
+    for pose in (rest[0], data.qpos):
+        assert (pose[2] + slope * pose[0] - from_middle) / np.hypot(1.0, slope) == pytest.approx(0.02, abs=1e-3), "half its height"
+        w, x, y, z = pose[3:]
+        assert (2 * (x * z + w * y) * slope + 1 - 2 * (x * x + y * y)) / np.hypot(1.0, slope) > 0.999, "it lies on its flat side"
 
 
 @pytest.mark.parametrize(
     "shape",
-    [{"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [0.3, 0.1, 0.05]}, {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [0.05, 0.3, 0]}],
+    [
+        {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [0.3, 0.1, 0.05]},
+        {"type": mujoco.mjtGeom.mjGEOM_CAPSULE, "size": [0.05, 0.3, 0]},
+        {"type": mujoco.mjtGeom.mjGEOM_ELLIPSOID, "size": [0.3, 0.2, 0.05]},
+    ],
 )
 def test_what_lies_across_an_edge_does_not_sink_into_it(shape: dict[str, Any], device: str) -> None:
     terrain = ground("stairs_down")

@@ -17,6 +17,7 @@ from legged_mw.sim.drawing import visual_model
 from legged_mw.sim.engines import make_simulation, pick_engine
 from legged_mw.sim.errors import EngineError, ModelError
 from legged_mw.sim.ground import GROUND, Ground
+from legged_mw.sim.mirror import find_partners
 from legged_mw.sim.model import RobotModel, Solver, build_model, per_joint
 from legged_mw.sim.simulation import Simulation
 
@@ -86,13 +87,34 @@ def test_table_gives_each_joint_its_own_value() -> None:
     assert per_joint(table, JOINTS, "gains") == [1, 2, 3, 1, 2, 4, 1, 2, 5, 1, 2, 6]
 
 
+def test_of_keys_that_fit_the_longest_counts() -> None:
+    joints = ["left_hip", "left_hip_yaw", "left_knee", "neck"]
+    assert per_joint({"": 1.0, "hip": 2.0, "left": 3.0, "left_hip": 4.0}, joints, "gains") == [4, 4, 3, 1]
+    assert per_joint({"hip_yaw": 5.0, "left_hip": 4.0, "left_hip_yaw": 6.0, "": 1}, joints, "gains") == [4, 6, 1, 1]
+    assert per_joint({"": 7.0}, [], "gains") == []
+
+
+def test_two_keys_that_fit_equally_well_are_named() -> None:
+    with pytest.raises(ModelError) as error:
+        per_joint({"": 0.0, "hip": 1.0, "yaw": 2.0}, ["hip_yaw"], "gains")
+    assert one_line(error) == "gains: 'hip' and 'yaw' fit joint 'hip_yaw' equally well; add the key 'hip_yaw'"
+    assert per_joint({"hip": 1.0, "yaw": 2.0, "hip_yaw": 3.0}, ["hip_yaw"], "gains") == [3.0]
+
+
 @pytest.mark.parametrize("field", ["stiffness", "damping"])
 @pytest.mark.parametrize(
     ("table", "parts"),
     [
-        ({"joint": 35.0, "FR_hip": 20.0}, ("'FR_hip_joint' matches ['joint', 'FR_hip']", "exactly one")),
-        ({"hip": 1.0, "thigh": 2.0}, ("'FR_calf_joint' matches none of ['hip', 'thigh']", "exactly one")),
-        ({}, ("'FR_hip_joint' matches none of []",)),
+        (
+            {"joint": 35.0, "thigh": 2.0, "FR_hi": 20.0},
+            ("'joint' and 'FR_hi' fit joint 'FR_hip_joint' equally well; ",),
+        ),
+        (
+            {"hip": 1.0, "thigh": 2.0},
+            ("no value for FR_calf_joint, FL_calf_joint, RR_calf_joint, RL_calf_joint: none of ['hip'",),
+        ),
+        ({}, (f"no value for {', '.join(JOINTS)}: none of [] is a part of these names; add keys, or '' for all others",)),
+        ({"hip": 1.0, "tihgh": 2.0}, ("no joint 'tihgh'", "there are: FR_hip_joint")),  # before what lacks a value for it
         ({"joint": 35.0, "FR_hip_joitn": 20.0}, ("no joint 'FR_hip_joitn'", "did you mean 'FR_hip_joint'?", *JOINTS)),
         ({"joint": 35.0, "wheel": 1.0}, ("no joint 'wheel'", "there are: FR_hip_joint", "RL_calf_joint")),
     ],
@@ -193,6 +215,106 @@ def test_mjcf_without_joints(tmp_path: Path) -> None:
     file.write_text('<mujoco><worldbody><body><geom size="1"/></body></worldbody></mujoco>')
     with pytest.raises(ModelError, match="rock.xml: the first joint must be the root body's free joint; it is missing"):
         go1(file=file)
+
+
+# ---- geoms without a name, sites that are made
+
+
+SOLE = """
+<body name="{0}_ankle" pos="0 {1} -0.3"><joint name="{0}_ankle" axis="0 1 0"/>
+  <geom name="{0}_heel" type="box" size="0.03 0.02 0.01" pos="-0.05 0 0" mass="0.1"/>
+  <geom name="{0}_toe" type="box" size="0.04 0.02 0.01" pos="0.06 0 0" mass="0.1"/>
+  <body name="{0}_nail" pos="0.1 0 0.02"><geom name="{0}_nail" size="0.01" mass="0.01"/></body>
+</body>"""
+SOLES = SOLE.format("left", 0.1) + SOLE.format("right", -0.1)
+
+
+def build_soles(folder: Path, **choices: Any) -> RobotModel:
+    """The toy with a heel and a toe on a joint of its own at either side."""
+    gains = {"stiffness": {"": 10.0}, "damping": {"": 0.2}, "velocity_sites": ["left_sole"], "contact_geoms": [], "colliders": ["*_heel"]}
+    choices.setdefault("sites", {"left_sole": ["left_heel", "left_toe"]})
+    return build_toy(toy(folder, inside=SOLES), **{**gains, **choices})
+
+
+def test_what_may_touch_has_a_name(tmp_path: Path) -> None:
+    shapes = '<geom size="0.01"/><geom size="0.02" contype="0" conaffinity="0"/><body name="hand"><geom size="0.01"/></body>'
+    robot = build_toy(toy(tmp_path, inside=shapes), colliders=["base_1", "hand_*"], contact_geoms=["hand_0", "base_1"])
+    assert robot.contact_geoms == ("hand_0", "base_1") and robot.physics.geom("base_1").conaffinity[0] == 1
+    assert {"geom of 'base' without a name is called 'base_1'", "geom of 'hand' without a name is called 'hand_0'"} <= set(robot.overrides)
+    assert len([line for line in robot.overrides if "without a name" in line]) == 2, "what is only looked at needs none"
+    taken = toy(tmp_path, inside='<geom size="0.01"/><geom name="base_1" size="0.01"/>')
+    assert "geom of 'base' without a name is called 'base_1_'" in build_toy(taken).overrides
+
+
+def test_a_missing_site_is_made_at_its_geom(tmp_path: Path) -> None:
+    file = toy(tmp_path, inside='<geom name="tail" type="capsule" size="0.01" fromto="-0.1 0 0 -0.3 0 0.1"/>')
+    sites = {"tail": ["tail"], "left_foot": ["left_shin"]}
+    robot = build_toy(file, sites=sites, velocity_sites=["left_foot", "tail"])
+    np.testing.assert_allclose(robot.physics.site("tail").pos, [-0.2, 0, 0.05], atol=1e-9)
+    np.testing.assert_allclose(robot.physics.site("left_foot").pos, [0, 0, -0.2], atol=1e-9)  # the MJCF's own stays
+    assert robot.site_geoms == {"tail": ("tail",), "left_foot": ("left_shin",)}
+    assert "site 'tail' made at tail" in robot.overrides and not any("'left_foot' made" in line for line in robot.overrides)
+    data = mujoco.MjData(robot.physics)
+    data.qvel[5] = 2.0  # [rad/s] about z
+    mujoco.mj_forward(robot.physics, data)
+    np.testing.assert_allclose(data.sensordata[robot.sensors["linvel"]][3:], [0.0, -0.4, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("angle", "place"),
+    [
+        (0.0, (0.01, 0.0, -0.01)),  # both soles are level: the middle from the heel's end, -0.08, to the toe's, 0.1
+        (0.5, (0.1, 0.0, -0.01)),  # toes down
+        (-0.5, (-0.08, 0.0, -0.01)),
+    ],
+)
+def test_of_several_geoms_the_lowest_point_is_the_site(tmp_path: Path, angle: float, place: tuple[float, ...]) -> None:
+    robot = build_soles(tmp_path, pose={"ankle": angle, "": 0.0})
+    np.testing.assert_allclose(robot.physics.site("left_sole").pos, place, atol=1e-6)
+    site = robot.physics.site("left_sole").bodyid[0]
+    assert robot.physics.body(site).name == "left_ankle"
+    assert "site 'left_sole' made at the lowest point of left_heel, left_toe" in robot.overrides
+
+
+def test_the_lowest_point_may_be_on_another_body_and_names_may_be_patterns(tmp_path: Path) -> None:
+    robot = build_soles(tmp_path, pose={"ankle": -3.0, "": 0.0}, sites={"left_sole": ["left_t*", "left_nail"]})  # upside down
+    site = robot.physics.site("left_sole")
+    assert robot.site_geoms == {"left_sole": ("left_toe", "left_nail")} and robot.physics.body(site.bodyid[0]).name == "left_nail"
+    np.testing.assert_allclose(site.pos, [0.01 * math.sin(-3.0), 0, -0.01 * math.cos(-3.0)], atol=1e-6)
+
+
+def test_left_and_right_soles_mirror(tmp_path: Path) -> None:
+    sites = {f"{side}_sole": [f"{side}_heel", f"{side}_toe"] for side in ("left", "right")}
+    robot = build_soles(tmp_path, pose={"ankle": 0.2, "": 0.0}, sites=sites)
+    assert find_partners(robot, list(sites)).sites == (1, 0)
+
+
+@pytest.mark.parametrize(
+    ("shape", "lowest"),
+    [
+        ('type="sphere" size="0.05"', 0.05),
+        ('type="capsule" size="0.02 0.1" euler="90 0 0"', 0.02),
+        ('type="capsule" size="0.02 0.1"', 0.12),
+        ('type="box" size="0.03 0.04 0.05" euler="90 0 0"', 0.04),
+        ('type="cylinder" size="0.05 0.1" euler="90 0 0"', 0.05),
+        ('type="ellipsoid" size="0.03 0.04 0.1"', 0.1),
+        ('type="mesh" mesh="brick"', 0.07),
+    ],
+)
+def test_the_lowest_point_of_every_shape(tmp_path: Path, shape: str, lowest: float) -> None:
+    corners = " ".join(f"{x} {y} {z}" for x in (-0.1, 0.1) for y in (-0.05, 0.05) for z in (-0.07, 0.07))
+    mesh = f'<asset><mesh name="brick" vertex="{corners}"/></asset>'
+    geoms = f'<body name="hand"><geom name="a" {shape}/><geom name="b" size="0.001" pos="0 0 0.3"/></body>'
+    robot = build_toy(toy(tmp_path, inside=geoms, extra=mesh), sites={"hand": ["a", "b"]}, self_collisions=True)
+    np.testing.assert_allclose(robot.physics.site("hand").pos, [0.0, 0.0, -lowest], atol=1e-3)
+
+
+def test_a_site_of_no_geom(tmp_path: Path) -> None:
+    with pytest.raises(ModelError) as error:
+        build_soles(tmp_path, sites={"left_sole": ["left_heal"]})
+    assert "no geom 'left_heal' in toy.xml; did you mean 'left_heel'?" in one_line(error)
+    with pytest.raises(ModelError, match=r"^site 'left_sole' is not in toy.xml and no geom is given for it$"):
+        build_soles(tmp_path, sites={"left_sole": []})
 
 
 # ---- servos

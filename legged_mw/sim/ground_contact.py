@@ -12,7 +12,6 @@ the first, as in the corner of a step. A geom is looked at in probes, which are 
 # (mujoco ships no type stubs, and warp compiles what it finds written here as its own language: float() makes a variable)
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -26,7 +25,7 @@ from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import vec5
 from torch import Tensor
 
-from legged_mw.sim.errors import ModelError
+from legged_mw.sim.shapes import spheres_on
 from legged_mw.sim.terrain import Terrain
 
 wp.set_module_options({"enable_backward": False})
@@ -39,49 +38,17 @@ _DEEPEST = wp.constant(0.3)  # [m] how far around a probe under the ground its s
 def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, list[float]]:
     """Spheres that stand for what can touch the geom ``ground``: their geoms, places in the geom's frame (P, 3), radii [m].
 
-    A sphere is its own probe; a capsule is a row of them, a box or cylinder points all over it, ``SPACING`` apart at the most, so
-    that a thin edge of the ground may come as far in between. Raises ModelError for other shapes.
+    They are ``SPACING`` apart at the most, so that a thin edge of the ground may come as far in between.
     """
-    kinds = mujoco.mjtGeom
     geoms, places, radii = [], [], []
     for geom in range(model.ngeom):
         touches = model.geom_contype[ground] & model.geom_conaffinity[geom] or model.geom_contype[geom] & model.geom_conaffinity[ground]
-        if geom == ground or not touches:
-            continue
-        kind, size = model.geom_type[geom], model.geom_size[geom]
-        if kind == kinds.mjGEOM_SPHERE:
-            found = [((0.0, 0.0, 0.0), size[0])]
-        elif kind == kinds.mjGEOM_CAPSULE:
-            found = [((0.0, 0.0, z), size[0]) for z in _spaced(size[1])]
-        elif kind == kinds.mjGEOM_BOX:
-            grid = [(x, y, z) for x in _spaced(size[0]) for y in _spaced(size[1]) for z in _spaced(size[2])]
-            found = [(place, 0.0) for place in grid if any(abs(at) == half for at, half in zip(place, size, strict=True))]
-        elif kind == kinds.mjGEOM_CYLINDER:
-            inner = np.linspace(0.0, size[0], math.ceil(size[0] / SPACING) + 1)[:-1]
-            rings = [(size[0], z) for z in _spaced(size[1])] + [(radius, z) for z in (-size[1], size[1]) for radius in inner]
-            found = [((x, y, z), 0.0) for radius, z in rings for x, y in _ring(radius)]
-        else:
-            shape = str(kinds(kind)).rsplit("_", 1)[-1].lower()
-            raise ModelError(
-                f"collider '{model.geom(geom).name}' is a {shape}: on terrain mujoco_warp knows spheres, capsules, boxes and cylinders; "
-                "leave it out of asset.colliders, give the MJCF one of those shapes there, or take sim.engine = mujoco"
-            )
-        for place, radius in found:
-            geoms.append(geom)
-            places.append(place)
-            radii.append(float(radius))
-    return geoms, np.array(places).reshape(-1, 3), radii
-
-
-def _spaced(half: float) -> list[float]:
-    """Places along an axis from one end to the other [m]."""
-    return np.linspace(-half, half, max(2, math.ceil(2.0 * half / SPACING) + 1)).tolist()
-
-
-def _ring(radius: float) -> list[tuple[float, float]]:
-    """Places around a circle [m]; of none, its middle."""
-    count = max(12, math.ceil(2.0 * math.pi * radius / SPACING)) if radius else 1
-    return [(radius * math.cos(a), radius * math.sin(a)) for a in (2.0 * math.pi * i / count for i in range(count))]
+        if geom != ground and touches:
+            found, radius = spheres_on(model, geom, SPACING)
+            geoms += [geom] * len(found)
+            places.append(found)
+            radii += [radius] * len(found)
+    return geoms, np.concatenate([*places, np.zeros((0, 3))]), radii
 
 
 def _field(terrain: Terrain) -> Any:

@@ -9,7 +9,8 @@ something in the MJCF, and what a choice changes is recorded in ``RobotModel.ove
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -19,6 +20,7 @@ import numpy as np
 
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND, Ground, add_ground, replace_level_pieces
+from legged_mw.sim.sites import add_sites
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import unknown
 
@@ -41,13 +43,22 @@ class RobotModel:
     physics: mujoco.MjModel  # what is stepped: no visual geoms
     root: str  # name of the body that carries the free joint
     joint_names: tuple[str, ...]  # scalar joints, in order of qpos[7:], qvel[6:] and ctrl
-    joint_range: np.ndarray  # (D, 2) [rad]
-    effort_range: np.ndarray  # (D, 2) [N m]; infinite where the MJCF states none
     sensors: dict[str, slice]  # "contact", "linvel", "accelerometer" -> span of sensordata
     spec: mujoco.MjSpec  # the same with visual geoms: to copy, never to change
     contact_geoms: tuple[str, ...] = ()  # in order of the span "contact"
+    site_geoms: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of each site that was asked for with geoms
     terrain: Terrain | None = None  # None: the plane
     overrides: list[str] = field(default_factory=list)  # what the caller's choices changed, a line each
+
+    @property
+    def joint_range(self) -> np.ndarray:
+        """(D, 2) [rad]"""
+        return self.physics.jnt_range[1:]
+
+    @property
+    def effort_range(self) -> np.ndarray:
+        """(D, 2) [N m]; infinite where the MJCF states none."""
+        return np.where(self.physics.actuator_forcelimited[:, None] > 0, self.physics.actuator_forcerange, [-np.inf, np.inf])
 
     def ground_geoms(self) -> slice:
         """Indices of the geoms that are the ground: MuJoCo counts geoms body by body, and these are the world's."""
@@ -68,20 +79,22 @@ class RobotModel:
 
 
 def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str) -> list[float]:
-    """Values (D,) for ``joints`` from a table keyed by joint name or a part of it.
+    """Values (D,) for ``joints``: a joint takes the longest key that is its name or a part of it; "" is a part of every name.
 
-    Raises ModelError if a joint matches no key or several, or a key matches no joint.
+    Raises ModelError for a key without a joint, for joints without a key, and for two keys that fit a joint equally well.
     """
-    values = []
-    for joint in joints:
-        hits = [key for key in table if key in joint]
-        if len(hits) != 1:
-            raise ModelError(f"{what}: joint '{joint}' matches {hits or 'none'} of {list(table)}; exactly one must be a part of its name")
-        values.append(float(table[hits[0]]))
     for key in table:
-        if not any(key in joint for joint in joints):
+        if key and not any(key in joint for joint in joints):
             raise ModelError(f"{what}: {unknown('joint', key, joints, 'the MJCF')} (a key may be a part of a joint's name)")
-    return values
+    fitting = {joint: sorted((key for key in table if key in joint), key=len) for joint in joints}
+    if without := [joint for joint, keys in fitting.items() if not keys]:
+        raise ModelError(
+            f"{what}: no value for {', '.join(without)}: none of {list(table)} is a part of these names; add keys, or '' for all others"
+        )
+    for joint, (*_, second, first) in ((joint, keys) for joint, keys in fitting.items() if len(keys) > 1):
+        if len(first) == len(second):
+            raise ModelError(f"{what}: '{second}' and '{first}' fit joint '{joint}' equally well; add the key '{joint}'")
+    return [float(table[keys[-1]]) for keys in fitting.values()]
 
 
 def build_model(
@@ -89,56 +102,62 @@ def build_model(
     *,
     solver: Solver,
     ground: Ground,
-    stiffness: Mapping[str, float],  # part of joint name -> position gain [N m/rad]
-    damping: Mapping[str, float],  # part of joint name -> passive joint damping [N m s/rad]
+    stiffness: Mapping[str, float],  # as for per_joint: position gain [N m/rad]
+    damping: Mapping[str, float],  # as for per_joint: passive joint damping [N m s/rad]
     colliders: Sequence[str],  # geoms that touch the ground: names or patterns with * and ?
     self_collisions: bool,
     contact_geoms: Sequence[str],  # sensed: number of contacts with the ground; names or patterns, each geom once
     velocity_sites: Sequence[str],  # sensed: linear velocity, world frame [m/s]
     accelerometer_site: str | None,  # sensed: proper acceleration, site frame [m/s^2]
+    sites: Mapping[str, Sequence[str]] | None = None,  # name -> geoms, names or patterns; a site that the MJCF lacks is made there
+    pose: Mapping[str, float] | None = None,  # as for per_joint: angles [rad] at which a made site is the lowest point; None: all 0
 ) -> RobotModel:
     """Compile the MJCF at ``file`` for stepping."""
+    spec, where, notes = _read(file), file.name, []
+    root, joints = _find_joints(spec, where)
+    names = [joint.name for joint in joints]
+    _set_options(spec, solver, notes)
+    add_ground(spec, ground, where, notes)
+    _name_colliders(spec, notes)
+    _set_collisions(spec, colliders, self_collisions, where, notes)
+    _add_servos(spec, joints, per_joint(stiffness, names, "`stiffness`"), per_joint(damping, names, "`damping`"), notes)
+    touching = _match_geoms(spec, contact_geoms, where)
+    site_geoms = {name: _match_geoms(spec, geoms, where) for name, geoms in (sites or {}).items()}
+    with _naming(file):
+        add_sites(spec, site_geoms, per_joint(pose, names, "`pose`") if pose else [0.0] * len(names), where, notes)
+        _add_sensors(spec, touching, velocity_sites, accelerometer_site, where)
+        whole = spec.copy()
+        mj = _compile_bare(spec, ground, notes)
+    spans = _sensor_spans(mj, len(touching), len(velocity_sites), accelerometer_site is not None)
+    return RobotModel(mj, root, tuple(names), spans, whole, touching, site_geoms, ground.terrain, notes)
+
+
+def _read(file: Path) -> mujoco.MjSpec:
     if not file.is_file():
         raise ModelError(f"no MJCF at {file}")
+    with _naming(file):
+        return mujoco.MjSpec.from_file(str(file))
+
+
+@contextmanager
+def _naming(file: Path) -> Iterator[None]:
+    """MuJoCo's errors in one line, with the file's name."""
     try:
-        spec = mujoco.MjSpec.from_file(str(file))
-    except ValueError as error:
-        raise _invalid(file, error) from None
-    notes: list[str] = []
-    root, joints = _find_joints(spec, file.name)
-    _set_options(spec, solver, notes)
-    add_ground(spec, ground, file.name, notes)
-    _set_collisions(spec, colliders, self_collisions, file.name, notes)
-    limits = _add_servos(spec, joints, stiffness, damping, notes)
-    touching = _match_geoms(spec, contact_geoms, file.name)
-    _add_sensors(spec, touching, velocity_sites, accelerometer_site, file.name)
-    whole = spec.copy()
+        yield
+    except ModelError:
+        raise
+    except ValueError as error:  # parsing does not see a missing mesh or a name used twice, compiling does
+        raise ModelError(f"{file.name} is not a valid MJCF: {' '.join(str(error).split())}") from None
+
+
+def _compile_bare(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> mujoco.MjModel:
+    """What is stepped: without visual geoms, lights and cameras."""
     spec.compiler.discardvisual = True
     for extra in [*spec.lights, *spec.cameras]:  # mujoco-warp would move lights in every step
         spec.delete(extra)
     if ground.terrain and ground.boxes:
         replace_level_pieces(spec, ground.terrain, notes)
-    try:
-        mj = spec.compile()
-    except ValueError as error:  # a missing mesh, a name used twice: all that parsing does not see
-        raise _invalid(file, error) from None
-    names = tuple(j.name for j in joints)
-    return RobotModel(
-        physics=mj,
-        root=root,
-        joint_names=names,
-        joint_range=np.array([mj.joint(n).range for n in names]).reshape(-1, 2),
-        effort_range=np.array(limits).reshape(-1, 2),
-        sensors=_sensor_spans(mj, len(touching), len(velocity_sites), accelerometer_site is not None),
-        contact_geoms=touching,
-        terrain=ground.terrain,
-        spec=whole,
-        overrides=notes,
-    )
-
-
-def _invalid(file: Path, error: ValueError) -> ModelError:
-    return ModelError(f"{file.name} is not a valid MJCF: {' '.join(str(error).split())}")
+    return spec.compile()
 
 
 def _find_joints(spec: mujoco.MjSpec, where: str) -> tuple[str, list[mujoco.MjsJoint]]:
@@ -171,12 +190,27 @@ def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
         spec.delete(key)  # poses are the caller's choice, and a keyframe must fit the actuators added below
 
 
+def _name_colliders(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """What may touch gets a name, ``<body>_<number>``, so that it can be asked for."""
+    taken = {geom.name for geom in spec.geoms}
+    for body in spec.bodies:
+        for number, geom in enumerate(body.geoms):
+            name = f"{body.name or 'body'}_{number}"
+            if geom.name or not (geom.contype or geom.conaffinity):
+                continue
+            while name in taken:
+                name += "_"
+            geom.name = name
+            taken.add(name)
+            notes.append(f"geom of '{body.name}' without a name is called '{name}'")
+
+
 def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisions: bool, where: str, notes: list[str]) -> None:
     """Ground is contype 1. What may touch it has conaffinity 1; with self-collisions also bit 2 on both sides."""
     robot = [g for g in spec.geoms if g.name != GROUND and (g.contype or g.conaffinity)]
-    named = [g.name for g in robot if g.name]
+    named = [g.name for g in robot]
     for pattern in colliders:
-        if not any(fnmatchcase(g.name, pattern) for g in robot):
+        if not any(fnmatchcase(name, pattern) for name in named):
             raise ModelError(f"`colliders`: {unknown('colliding geom', pattern, named, where)}")
     off = []
     for geom in robot:
@@ -187,23 +221,21 @@ def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisio
         geom.contype = 2 if self_collisions and touches else 0
         geom.conaffinity = (3 if self_collisions else 1) if touches else 0
         if not touches:
-            off.append(geom.name or "unnamed")
+            off.append(geom.name)
     if off:
         notes.append(f"collisions off: {', '.join(off)}")
 
 
 def _add_servos(
-    spec: mujoco.MjSpec, joints: list[mujoco.MjsJoint], stiffness: Mapping[str, float], damping: Mapping[str, float], notes: list[str]
-) -> list[list[float]]:
-    """One position servo a joint, clamped to the joint's range and force range; returns the force ranges [N m]."""
+    spec: mujoco.MjSpec, joints: Sequence[mujoco.MjsJoint], gains: Sequence[float], dampings: Sequence[float], notes: list[str]
+) -> None:
+    """One position servo a joint, clamped to the joint's range and force range."""
     limits = {j.name: list(j.actfrcrange) for j in joints if j.actfrcrange[1] > j.actfrcrange[0]}
     for actuator in list(spec.actuators):
         if actuator.target not in limits and actuator.forcerange[1] > actuator.forcerange[0]:
             limits[actuator.target] = sorted(actuator.forcerange * actuator.gear[0])  # at the joint
         notes.append(f"actuator '{actuator.name}' replaced by a position servo")
         spec.delete(actuator)
-    names = [j.name for j in joints]
-    gains, dampings = per_joint(stiffness, names, "`stiffness`"), per_joint(damping, names, "`damping`")
     for joint, kp, kd in zip(joints, gains, dampings, strict=True):
         old = float(np.atleast_1d(joint.damping)[0])
         if old != kd:
@@ -217,7 +249,6 @@ def _add_servos(
         if joint.name in limits:  # on the servo and not on the joint, so that actuator_force is the clamped force
             servo.forcelimited, servo.forcerange = True, limits[joint.name]
             joint.actfrclimited, joint.actfrcrange = False, [0.0, 0.0]
-    return [limits.get(name, [-float("inf"), float("inf")]) for name in names]
 
 
 def _match_geoms(spec: mujoco.MjSpec, patterns: Sequence[str], where: str) -> tuple[str, ...]:
@@ -260,10 +291,7 @@ def _add_sensors(
 
 
 def _sensor_spans(mj: mujoco.MjModel, contacts: int, velocities: int, accelerometer: bool) -> dict[str, slice]:
+    """The sensors that were added last lie last."""
     sizes = {"contact": contacts, "linvel": 3 * velocities, "accelerometer": 3 if accelerometer else 0}
-    spans: dict[str, slice] = {}
-    start = int(mj.sensor_adr[mj.nsensor - contacts - velocities - int(accelerometer)]) if sum(sizes.values()) else 0
-    for name, size in sizes.items():
-        spans[name] = slice(start, start + size)
-        start += size
-    return spans
+    ends = mj.nsensordata - sum(sizes.values()) + np.cumsum(list(sizes.values()))
+    return {name: slice(int(end) - size, int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}

@@ -1,0 +1,108 @@
+"""Collision shapes as points or spheres on them: for contacts with a height field, and to find the lowest point of a shape."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from legged_mw.sim.errors import ModelError
+
+Points = NDArray[np.float64]  # (P, 3) [m], in the geom's frame
+
+_KINDS = mujoco.mjtGeom
+
+
+def spheres_on(model: mujoco.MjModel, geom: int, spacing: float) -> tuple[Points, float]:
+    """Centres of spheres that stand for the surface of ``geom``, at most about ``spacing`` [m] apart, and their radius [m].
+
+    A sphere is itself, a capsule is a row of spheres, every other shape is points. Raises ModelError for shapes that are none of these.
+    """
+    kind, size = _KINDS(model.geom_type[geom]), model.geom_size[geom]
+    if kind == _KINDS.mjGEOM_MESH:
+        return _on_mesh(model, int(model.geom_dataid[geom]), spacing), 0.0
+    if kind not in _POINTS:
+        shape = str(kind).rsplit("_", 1)[-1].lower()
+        raise ModelError(
+            f"geom '{model.geom(geom).name}' is a {shape}: its surface is not known as points, as those of spheres, capsules, boxes, "
+            "cylinders, ellipsoids and meshes are. Give the MJCF one of those there, or take `engine` = mujoco"
+        )
+    radius = float(size[0]) if kind in (_KINDS.mjGEOM_SPHERE, _KINDS.mjGEOM_CAPSULE) else 0.0
+    return np.array(_POINTS[kind](size, spacing), dtype=float).reshape(-1, 3), radius
+
+
+def _on_box(size: Points, spacing: float) -> list[tuple[float, ...]]:
+    grid = itertools.product(*(_spaced(half, spacing) for half in size))
+    return [place for place in grid if any(abs(at) == half for at, half in zip(place, size, strict=True))]
+
+
+def _on_cylinder(size: Points, spacing: float) -> list[tuple[float, ...]]:
+    inner = np.linspace(0.0, size[0], math.ceil(size[0] / spacing) + 1)[:-1]
+    rings = [(size[0], z) for z in _spaced(size[1], spacing)] + [(radius, z) for z in (-size[1], size[1]) for radius in inner]
+    return [(x, y, z) for radius, z in rings for x, y in _ring(radius, spacing)]
+
+
+def _on_ellipsoid(size: Points, spacing: float) -> list[tuple[float, ...]]:
+    """Rings around z, their places stretched along x and y."""
+    largest = float(size.max())
+    angles = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 2 * max(3, math.ceil(0.5 * math.pi * largest / spacing)) + 1)
+    rings = [(math.cos(angle) if abs(angle) < 1.57 else 0.0, math.sin(angle)) for angle in angles]
+    return [(x / largest * size[0], y / largest * size[1], z * size[2]) for radius, z in rings for x, y in _ring(radius * largest, spacing)]
+
+
+def _on_mesh(model: mujoco.MjModel, mesh: int, spacing: float) -> Points:
+    """Vertices of the convex hull that lie farthest out in 26 directions, and where a grid of lines along each axis meets the hull."""
+    first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+    vertices, faces = model.mesh_vert[first : first + count].astype(float), model.mesh_face[model.mesh_faceadr[mesh] :]
+    faces = faces[: model.mesh_facenum[mesh]]
+    if (start := model.mesh_graphadr[mesh]) >= 0:  # the hull: how many vertices and faces, two lists a vertex, one an edge, then its faces
+        (count, number), graph = model.mesh_graph[start : start + 2], model.mesh_graph[start + 2 :]
+        faces = graph[3 * count + 3 * number :][: 3 * number].reshape(-1, 3)
+    corners = vertices[np.unique(faces)]
+    middle, half = 0.5 * (corners.max(axis=0) + corners.min(axis=0)), 0.5 * np.ptp(corners, axis=0)
+    outwards = np.array([way for way in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(way)]) / half.clip(1e-6)
+    kept = corners[np.unique((outwards @ corners.T).argmax(axis=1))]
+    for axis in range(3):
+        across = [(axis + 1) % 3, (axis + 2) % 3]
+        lines = np.array(list(itertools.product(*(_spaced(0.999 * half[i], spacing) for i in across)))) + middle[across]
+        for place in _where_lines_meet(vertices[faces], lines, axis, across):
+            if np.linalg.norm(kept - place, axis=1).min() > 0.1 * spacing:
+                kept = np.concatenate([kept, place[None]])
+    return kept
+
+
+def _where_lines_meet(triangles: Points, lines: Points, axis: int, across: list[int]) -> Points:
+    """Points (P, 3) of ``triangles`` (T, 3, 3) on ``lines`` (L, 2) along ``axis``, given by their places along the axes ``across``."""
+    a, ab, ac = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    (au, av), (bu, bv), (cu, cv) = a[:, across].T, ab[:, across].T, ac[:, across].T
+    area = np.where(np.abs(bu * cv - bv * cu) > 1e-12, bu * cv - bv * cu, np.inf)  # a triangle along the lines is met nowhere
+    u, v = lines[:, :1] - au, lines[:, 1:] - av
+    share_b, share_c = (u * cv - v * cu) / area, (v * bu - u * bv) / area
+    met = (share_b >= 0.0) & (share_c >= 0.0) & (share_b + share_c <= 1.0) & np.isfinite(area)
+    return (a + share_b[..., None] * ab + share_c[..., None] * ac)[met]
+
+
+def _spaced(half: float, spacing: float) -> list[float]:
+    """Places along an axis from one end to the other [m]."""
+    return np.linspace(-half, half, max(2, math.ceil(2.0 * half / spacing) + 1)).tolist()
+
+
+def _ring(radius: float, spacing: float) -> list[tuple[float, float]]:
+    """Places around a circle [m]; of none, its middle."""
+    count = max(12, 4 * math.ceil(0.5 * math.pi * radius / spacing)) if radius else 1
+    return [(radius * math.cos(a), radius * math.sin(a)) for a in (2.0 * math.pi * i / count for i in range(count))]
+
+
+_POINTS: dict[int, Callable[[Points, float], list[tuple[float, ...]]]] = {
+    _KINDS.mjGEOM_SPHERE: lambda size, spacing: [(0.0, 0.0, 0.0)],
+    _KINDS.mjGEOM_CAPSULE: lambda size, spacing: [(0.0, 0.0, z) for z in _spaced(size[1], spacing)],
+    _KINDS.mjGEOM_BOX: _on_box,
+    _KINDS.mjGEOM_CYLINDER: _on_cylinder,
+    _KINDS.mjGEOM_ELLIPSOID: _on_ellipsoid,
+}
