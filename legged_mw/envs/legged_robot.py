@@ -313,18 +313,25 @@ class LeggedRobot(RobotTask):
 
     # ---- robot and buffers: born here, never rebound --------------------------------------------------------------------------
 
+    @property
+    def foot_names(self) -> tuple[str, ...]:
+        """What the config calls the feet, in the order of all that is per foot."""
+        return tuple(self.cfg.asset.foot_names)
+
+    @property
+    def foot_geoms(self) -> dict[str, list[str]]:
+        """Geoms of each foot."""
+        return {foot: self.cfg.asset.foot_geoms.get(foot, [foot]) for foot in self.foot_names}
+
     def _make_terrain(self) -> Terrain | None:
         return build_terrain(self.cfg)
 
     def _sensed_geoms(self) -> list[str]:
         """Feet first."""
-        asset = self.cfg.asset
-        self.foot_names = tuple(asset.foot_names)
-        self.foot_geoms = {foot: tuple(asset.foot_geoms.get(foot, [foot])) for foot in self.foot_names}
         return [*(geom for geoms in self.foot_geoms.values() for geom in geoms), *super()._sensed_geoms()]
 
-    def _sensed_sites(self) -> list[str]:
-        return list(self.foot_names)
+    def _sensed_sites(self) -> dict[str, list[str]]:
+        return self.foot_geoms
 
     def _init_buffers(self) -> None:
         super()._init_buffers()

@@ -420,6 +420,7 @@ class RobotTask(BaseTask):
         cfg = self.cfg
         if not cfg.asset.file:
             raise ConfigError("asset.file is empty; name the robot's MJCF, e.g. 'resources/robots/go1/go1.xml'")
+        sites = self._sensed_sites()
         return build_model(
             ROOT / Path(cfg.asset.file).expanduser(),  # an absolute path stays itself
             solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations),
@@ -429,17 +430,19 @@ class RobotTask(BaseTask):
             colliders=cfg.asset.colliders,
             self_collisions=cfg.asset.self_collisions,
             contact_geoms=self._sensed_geoms(),
-            velocity_sites=self._sensed_sites(),
+            velocity_sites=list(sites),
             accelerometer_site=cfg.asset.imu_site,
+            sites=sites,
+            pose=cfg.init_state.default_joint_angles,
         )
 
     def _sensed_geoms(self) -> list[str]:
         """Geoms whose contacts with the ground are counted: names or patterns."""
         return [*self.cfg.asset.penalize_contacts_on, *self.cfg.asset.terminate_after_contacts_on]
 
-    def _sensed_sites(self) -> list[str]:
-        """Sites whose velocity is sensed."""
-        return []
+    def _sensed_sites(self) -> dict[str, list[str]]:
+        """Sites whose velocity is sensed -> geoms: where the MJCF lacks one, it is made at the lowest point of them."""
+        return {}
 
     def _init_buffers(self) -> None:
         n, device, sim, spans = self.num_envs, self.device, self.sim, self.robot.sensors
