@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 from datetime import datetime
@@ -12,6 +11,7 @@ from typing import Any
 import torch
 
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
 
 CONFIG_FILE = "config.yaml"
 
@@ -51,10 +51,7 @@ def find_run(experiment: Path, name: str) -> Path:
     for folder in (experiment / name, Path(name).expanduser()):
         if folder.is_dir() and checkpoints(folder):
             return folder
-    names = [folder.name for folder in found]
-    close = difflib.get_close_matches(name, names, n=1)
-    hint = f"did you mean '{close[0]}'? " if close else ""
-    raise ConfigError(f"no run '{name}' with a checkpoint in {experiment}; {hint}there are: {', '.join(names) or 'none'}")
+    raise ConfigError(unknown("run", name, [folder.name for folder in found], str(experiment)))
 
 
 def find_checkpoint(run: Path, iteration: int) -> Path:
