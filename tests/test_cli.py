@@ -58,7 +58,7 @@ TASK = Task(Dog, DogCfg, DogCfgPPO)
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with one run of one iteration, logs/go1_flat/<time>_first."""
     folder = tmp_path_factory.mktemp("cli")
-    kicks = ["--set", "perturbation.enable=True"]  # which playing switches off
+    kicks = ["--set", "perturbation.kick=True"]  # which playing switches off
     trained(folder, "--max_iterations", "1", "--run_name", "first", *kicks)
     return folder
 
@@ -435,7 +435,7 @@ def test_play_says_what_it_changes(root: Path, first: Path, tmp_path: Path) -> N
         "env.episode_length_s": "0.4 -> 1000000.0",
         "env.num_envs": "16 -> 1",
         "noise.level": f"{was['noise']['level']} -> 0.0",
-        "perturbation.enable": "True -> False",
+        "perturbation.kick": "True -> False",
         "sim.ls_iterations": f"{was['sim']['ls_iterations']} -> 7",
     }
     assert sorted(path.name for path in out.iterdir()) == sorted(FILES)

@@ -779,9 +779,11 @@ def test_an_old_runs_config_loads_under_the_new_names() -> None:
     saved = task.to_dict()
     saved["cpu"] = {**saved["cpu"], "keep_probability": [0.1, 0.2, 0.3], "kick_curriculum": False}
     del saved["cpu"]["overrides"]
+    saved["perturbation"]["enable"] = not saved["perturbation"].pop("kick")
     before = copy.deepcopy(saved)
     assert task.update_from_run(saved, where="config.yaml") == []
     assert task.train.cpu.overrides == {"commands.keep_probability": [0.1, 0.2, 0.3], "perturbation.curriculum": False}
+    assert task.cfg.perturbation.kick == saved["perturbation"]["enable"] != load_task("go1_flat").cfg.perturbation.kick
     assert saved == before  # the caller's own
 
 
@@ -800,6 +802,7 @@ def test_a_wrong_section_of_an_old_run_is_named() -> None:
 
 
 OLD_NAMES = {
+    "perturbation.enable": (True, "perturbation.kick"),
     "cpu.keep_probability": ([0.5, 0.5, 0.5], "cpu.overrides['commands.keep_probability']"),
     "cpu.kick_curriculum": (False, "cpu.overrides['perturbation.curriculum']"),
 }

@@ -20,6 +20,7 @@ from torch import Tensor
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
+from legged_mw.rl.classes import check_classes
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import this_rank
 from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
@@ -296,7 +297,8 @@ def check_mirror(env: LeggedRobot, cfg: LeggedRobotCfgPPO) -> None:
 
 
 def rsl_rl_config(cfg: LeggedRobotCfgPPO) -> dict[str, Any]:
-    """The learner's config as rsl-rl's flat dict; a deep copy, since rsl-rl writes into it."""
+    """The learner's config as rsl-rl's flat dict; a deep copy, since rsl-rl writes into it. Raises ConfigError."""
+    check_classes(cfg)
     sections = copy.deepcopy(cfg.to_dict())
     runner = sections.pop("runner")
     logger = runner["logger"]

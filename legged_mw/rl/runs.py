@@ -12,8 +12,19 @@ import torch
 
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
+from legged_mw.utils.task import LoadedTask
 
 CONFIG_FILE = "config.yaml"
+
+
+def logs_folder() -> Path:
+    """The folder of all runs of all tasks: ``logs`` in the current folder."""
+    return Path.cwd() / "logs"
+
+
+def experiment_folder(task: LoadedTask, name: str | None = None) -> Path:
+    """The folder of a task's runs, or of the experiment called ``name``."""
+    return logs_folder() / (name or task.train.runner.experiment_name or task.name)
 
 
 def new_run(experiment: Path, run_name: str) -> Path:

@@ -8,6 +8,7 @@ from typing import Any
 
 # Old dotted path -> the keys that lead to its value now.
 RENAMED: dict[str, tuple[str, ...]] = {
+    "perturbation.enable": ("perturbation", "kick"),
     "cpu.keep_probability": ("cpu", "overrides", "commands.keep_probability"),
     "cpu.kick_curriculum": ("cpu", "overrides", "perturbation.curriculum"),
 }

@@ -74,6 +74,11 @@ class LoadedTask:
         self.update({**saved, **older}, where)
         return list(older)
 
+    def changes_since(self, before: LoadedTask) -> dict[str, tuple[Any, Any]]:
+        """Dotted path -> (value in ``before``, value now) of every field that differs; ``before`` is a copy of this task."""
+        differences = [*before.cfg.diff(self.cfg), *before.train.diff(self.train)]
+        return {path: (then, now) for path, then, now in differences}
+
     def fit_cpu(self, cores: int) -> None:
         """Take over what the section ``cpu`` says, for ``cores`` cores."""
         train, few = self.train, self.train.cpu
@@ -100,6 +105,11 @@ class LoadedTask:
 def task_names() -> list[str]:
     """Names that ``--task`` knows without a path."""
     return sorted(path.stem for path in (ROOT / "configs").glob("*.py") if not path.stem.startswith("_"))
+
+
+def list_tasks() -> str:
+    """A line a task: its name and the first line of its file."""
+    return "\n".join(f"{name:<16} {load_task(name).about}" for name in task_names())
 
 
 def load_task(name: str) -> LoadedTask:
