@@ -117,7 +117,7 @@ def _announce(task: LoadedTask, device: str, rank: Rank) -> None:
     print(f"{cores} cores: {plan}", flush=True)
 
 
-def build(task: LoadedTask, device: str, eager: bool = False) -> RobotTask:
+def build(task: LoadedTask, device: str, eager: bool = False) -> Any:
     """The environment, if learning can work in it."""
     env = task.env_class(task.cfg, device, eager=eager)
     check_mirror(env, task.train)
