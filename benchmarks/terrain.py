@@ -31,7 +31,7 @@ from step import timed
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl.policy import act, load_policy
+from legged_mw.rl.policies import act, load_policy
 from legged_mw.sim.graph import StepGraph
 from legged_mw.sim.terrain import Terrain
 from legged_mw.sim.warp_engine import make_model, record_warp

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
-from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.cli import apply_overrides, make_parser, pick_device, seed_everything
@@ -57,7 +57,7 @@ def synchronize(device: str) -> None:
         torch.cuda.synchronize()
 
 
-def physics_only(env: LeggedRobot, eager: bool) -> Callable[[], None]:
+def physics_only(env: RobotTask, eager: bool) -> Callable[[], None]:
     """The recorded substeps of one control step, from the environment's present state."""
     graph = StepGraph(lambda: env.sim.step(env.cfg.control.decimation), env.device, eager)
     for _ in range(4):

@@ -58,7 +58,7 @@ TASK = Task(Dog, DogCfg, DogCfgPPO)
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with one run of one iteration, logs/go1_flat/<time>_first."""
     folder = tmp_path_factory.mktemp("cli")
-    kicks = ["--set", "perturbation.enable=True"]  # which playing switches off
+    kicks = ["--set", "perturbation.kick=True"]  # which playing switches off
     trained(folder, "--max_iterations", "1", "--run_name", "first", *kicks)
     return folder
 
@@ -77,7 +77,10 @@ def first(root: Path) -> Path:
     ("args", "parts"),
     [
         ([], ("--task is missing", "tasks: go1_flat")),
-        (["--task", "go1_falt"], ("no task 'go1_falt'; did you mean 'go1_flat'?", "tasks: go1_flat", "or give the path of a config file")),
+        (
+            ["--task", "go1_falt"],
+            ("no task 'go1_falt' in configs/; did you mean 'go1_flat'?", "there are: go1_flat", "or give the path of a config file"),
+        ),
         (["--task", "dog/dog.py"], ("no config file at ", "dog/dog.py")),
         (
             [*TASK, "--num_env", "4"],
@@ -89,7 +92,10 @@ def first(root: Path) -> Path:
         ([*TASK, "--set", "env.num_envs"], ("--set env.num_envs: write it as path=value, e.g. rewards.scales.torques=-1e-4",)),
         ([*TASK, "--set", "env.num_env=4"], ("--set env.num_env=4: env.num_env does not exist; did you mean 'num_envs'?",)),
         ([*TASK, "--set", "env.num_envs=many"], ("--set env.num_envs=many: env.num_envs must be int, not 'many'",)),
-        ([*TASK, "--set", "reward.scales.pose=1"], ("no config section 'reward'; did you mean 'rewards'?", "there are: env, asset, ")),
+        (
+            [*TASK, "--set", "reward.scales.pose=1"],
+            ("no config section 'reward' in this task; did you mean 'rewards'?", "there are: env, asset, "),
+        ),
         ([*TASK, "--set", "env=4"], ("--set env=4: env is a section, not a field; set one of its fields: num_envs",)),
         ([*TASK, "--set", "env.num_envs.x=4"], ("env.num_envs is a field (int), not a section",)),
         ([*TASK, "--set", "terrain.mesh_type=plain"], ("terrain.mesh_type must be", "did you mean 'plane'?")),
@@ -110,7 +116,7 @@ def test_mistakes(root: Path, program: str, args: list[str], parts: tuple[str, .
     ("text", "parts"),
     [
         ("env: {num_env: 4}", ("env.num_env does not exist; did you mean 'num_envs'?",)),
-        ("envs: {num_envs: 4}", ("no config section 'envs'; did you mean 'env'?",)),
+        ("envs: {num_envs: 4}", ("no config section 'envs' in this task; did you mean 'env'?",)),
         ("runner: {max_iterations: soon}", ("runner.max_iterations must be int, not 'soon'",)),
         ("env: 4", ("env is a section and needs a mapping of its fields, not 4",)),
         ("- env", ("holds list, not a mapping of sections and fields",)),
@@ -375,8 +381,8 @@ def test_a_cpu_takes_its_own_section_and_what_the_user_says_wins(tmp_path: Path)
     config, few = load_yaml(saved), load_task("go1_flat").train.cpu
     assert config["env"]["num_envs"] == 5 and config["algorithm"]["desired_kl"] == 0.015
     assert config["actor"]["hidden_dims"] == config["critic"]["hidden_dims"] == few.hidden_dims
-    assert config["perturbation"]["curriculum"] == few.kick_curriculum
-    assert config["commands"]["keep_probability"] == few.keep_probability
+    assert config["perturbation"]["curriculum"] == few.overrides["perturbation.curriculum"] == True  # noqa: E712
+    assert config["commands"]["keep_probability"] == few.overrides["commands.keep_probability"] == [0.7, 0.25, 0.5]
     result = run("train", tmp_path / "off", *TASK, "--device", "cpu", *asked, "--set", "cpu.enable=false")
     assert result.code == 0, result.err
     [saved] = (tmp_path / "off/logs/go1_flat").glob("*/config.yaml")
@@ -429,7 +435,7 @@ def test_play_says_what_it_changes(root: Path, first: Path, tmp_path: Path) -> N
         "env.episode_length_s": "0.4 -> 1000000.0",
         "env.num_envs": "16 -> 1",
         "noise.level": f"{was['noise']['level']} -> 0.0",
-        "perturbation.enable": "True -> False",
+        "perturbation.kick": "True -> False",
         "sim.ls_iterations": f"{was['sim']['ls_iterations']} -> 7",
     }
     assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
@@ -448,7 +454,7 @@ def start(program: str, folder: Path, *args: str) -> Result:
 def test_a_mistake_in_a_real_process(tmp_path: Path) -> None:
     result = start("train", tmp_path, "--task", "go1_falt")
     assert (result.code, result.out) == (2, "") and not files(tmp_path)
-    assert result.err.startswith("train.py: no task 'go1_falt'; did you mean 'go1_flat'?") and result.err.count("\n") == 1
+    assert result.err.startswith("train.py: no task 'go1_falt' in configs/; did you mean 'go1_flat'?") and result.err.count("\n") == 1
 
 
 def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path) -> None:

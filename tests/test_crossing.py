@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 import torch
-from program import play, refused, run, trained
+from program import refused, run, trained
 from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import crossing, exam
+from legged_mw.eval import crossing, exam, grading
 from legged_mw.eval.crossing import LEVELS, TILES
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask, load_task
@@ -197,7 +197,7 @@ def test_eval_of_two_rough_policies(runs: tuple[Path, Path], monkeypatch: pytest
     root, folder = runs
     monkeypatch.setattr(exam, "SECONDS", 2.1)
     monkeypatch.setattr(crossing, "SECONDS", 0.1)
-    monkeypatch.setattr(play, "elsewhere", lambda *_: [])
+    monkeypatch.setattr(grading, "elsewhere", lambda *_: [])
     result = run("play", root, *ROUGH, "--device", "cpu", "--eval", "--compare", folder.name, "--set", KINDS)
     assert result.code == 0, result.err
     walked, crossed = "falls in 22 commands", "share of 10 robots that crossed a tile"
@@ -233,9 +233,8 @@ def test_what_it_decides_cannot_be_overridden(runs: tuple[Path, Path], more: lis
 
 def test_only_what_was_trained_on_rough_ground_crosses_it() -> None:
     args = Namespace(eval=True, override=[], set=["terrain.friction=0.4"])
-    assert play.prepare_crossing(load_task("go1_flat").to_dict(), args) is None
-    assert play.prepare_crossing(load_task("go1_rough").to_dict(), Namespace(eval=False)) is None
-    task = play.prepare_crossing(load_task("go1_rough").to_dict(), args)
+    assert grading.prepare_crossing(load_task("go1_flat"), args) is None
+    task = grading.prepare_crossing(load_task("go1_rough"), args)
     assert task is not None and task.cfg.terrain.friction == 0.4 and task.cfg.env.num_envs == 8 * LEVELS * 10
 
 

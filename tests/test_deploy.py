@@ -31,7 +31,7 @@ from legged_mw.deploy.runner import run
 from legged_mw.deploy.simulated import Fleet, MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import exam, rules
-from legged_mw.rl.policy import act, load_policy
+from legged_mw.rl.policies import act, load_policy
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import UserError

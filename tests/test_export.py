@@ -189,8 +189,7 @@ def test_an_export_that_fails_does_not_end_a_training(tmp_path: Path, monkeypatc
     result = run("train", tmp_path, *SMALL, "--max_iterations", "1", "--set", "runner.export=true")
     assert result.code == 0, result.err
     assert (
-        "done: " in result.out
-        and "not exported: the exporter has a bad day\n  once that is mended: python play.py --task go1_flat" in result.out
+        "done: " in result.out and "not exported: the exporter has a bad day\n  to try again: python play.py --task go1_flat" in result.out
     )
     [folder] = tmp_path.glob("logs/*/*")
     assert (folder / "model_1.pt").is_file() and not (folder / "export").exists()

@@ -10,14 +10,14 @@ from typing import Any
 
 import pytest
 import torch
-from program import play, run
+from program import run
 from torch import Tensor
 from worlds import QUIET, changed, layout, make_env, same, snapshot
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
-from legged_mw.eval import exam
+from legged_mw.eval import exam, grading
 from legged_mw.sim.model import Ground, ModelError, Solver, build_model
 from legged_mw.utils import math as math_of_steps
 from legged_mw.utils.config import ConfigError
@@ -295,7 +295,7 @@ def test_trains_and_is_graded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     result = run("train", tmp_path, "--task", TASK, "--num_envs", "16", "--device", "cpu", "--max_iterations", "2", *small)
     assert result.code == 0, result.err
     assert list((tmp_path / "logs/go1_legged_gym").glob("*/model_2.pt"))
-    monkeypatch.setattr(play, "elsewhere", lambda *_: [])  # the same once more, through an export
+    monkeypatch.setattr(grading, "elsewhere", lambda *_: [])  # the same once more, through an export
     result = run("play", tmp_path, "--task", TASK, "--device", "cpu", "--eval")
     assert result.code == 0 and "survives kicks of 6 m/s" in result.out, result.err
 

@@ -23,10 +23,10 @@ from legged_mw.utils.task import load_task
 from legged_mw.view.camera import ELEVATION, CameraMan
 from legged_mw.view.film import RobotRenderer
 from legged_mw.view.hills import Hills
+from legged_mw.view.playing import ground_to_watch
 from legged_mw.view.puppet import Cast
 from legged_mw.view.session import Session, Summary
 from legged_mw.view.stage import Moment
-from play import ground_to_watch
 
 KINDS = ("stairs_up", "obstacles", "smooth_slope", "flat")
 

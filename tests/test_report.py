@@ -10,16 +10,16 @@ from typing import Any
 
 import pytest
 import torch
-from program import SMALL, play, refused, run, trained
+from program import SMALL, refused, run, trained
 from tensordict import TensorDict
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam, page, report, rules
+from legged_mw.eval import exam, grading, page, report, rules
 from legged_mw.eval.report import Column
 from legged_mw.eval.rollout import Case, Kick, roll_out
 from legged_mw.eval.trials import make_plan
-from legged_mw.rl.policy import act, load_policy
+from legged_mw.rl.policies import act, load_policy
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 
@@ -187,7 +187,7 @@ def test_compare_grades_each_by_its_own_config(two_runs: tuple[Path, Path, Path]
     monkeypatch.setattr(exam, "SECONDS", 2.1)
     written: list[Any] = []
     monkeypatch.setattr(report, "write", lambda folder, task, columns, extras: written.extend([folder, task, *columns]))
-    monkeypatch.setattr(play, "elsewhere", lambda *_: [])
+    monkeypatch.setattr(grading, "elsewhere", lambda *_: [])
     small = ["--load_run", first.name, "--compare", second.name, "--set", "terrain.friction=0.4"]
     result = run("play", root, *SMALL[:2], "--device", "cpu", "--eval", *small)
     assert result.code == 0, result.err

@@ -14,7 +14,7 @@ from legged_mw import ROOT
 from legged_mw.deploy.contract import digest, read_contract, read_scene
 from legged_mw.eval import exam, rules
 from legged_mw.rl.export import FILES, PROGRAM_FILE, ExportedPolicy
-from legged_mw.rl.policy import act, load_policy
+from legged_mw.rl.policies import act, load_policy
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import load_task
 

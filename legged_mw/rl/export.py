@@ -38,7 +38,7 @@ from legged_mw.deploy.contract import (
 )
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl.export_scene import among_steps, standalone
-from legged_mw.rl.policy import act, load_policy, save_policy
+from legged_mw.rl.policies import act, load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.sim.model import ModelError, per_joint
 from legged_mw.sim.terrain import LEVEL, make_terrain

@@ -18,8 +18,9 @@ from rsl_rl.runners import OnPolicyRunner
 from torch import Tensor
 
 from legged_mw import ROOT
-from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
+from legged_mw.rl.classes import check_classes
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import this_rank
 from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
@@ -36,9 +37,9 @@ class Runner(OnPolicyRunner):
     to what grades a policy: it is called every ``exam_interval`` iterations and after the last, and its figures are logged.
     """
 
-    env: LeggedRobot
+    env: RobotTask
 
-    def __init__(self, env: LeggedRobot, train_cfg: dict[str, Any], log_dir: str | None = None, device: str = "cpu") -> None:
+    def __init__(self, env: RobotTask, train_cfg: dict[str, Any], log_dir: str | None = None, device: str = "cpu") -> None:
         super().__init__(env, train_cfg, log_dir, device)
         self.logger.git_status_repos = [str(ROOT)]
         self.total_steps = 0
@@ -279,7 +280,7 @@ class Runner(OnPolicyRunner):
         return infos
 
 
-def make_runner(env: LeggedRobot, cfg: LeggedRobotCfgPPO, log_dir: Path | None, device: str) -> Runner:
+def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, device: str) -> Runner:
     """A runner over ``env`` from the learner's config; it writes below ``log_dir``, or nothing if that is None."""
     torch.set_float32_matmul_precision(cfg.runner.matmul_precision)
     check_mirror(env, cfg)
@@ -289,14 +290,15 @@ def make_runner(env: LeggedRobot, cfg: LeggedRobotCfgPPO, log_dir: Path | None, 
         raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None
 
 
-def check_mirror(env: LeggedRobot, cfg: LeggedRobotCfgPPO) -> None:
+def check_mirror(env: RobotTask, cfg: RobotTaskCfgPPO) -> None:
     """Name what has no mirror image now, not after a rollout, if learning wants one. Raises ConfigError."""
     if cfg.symmetry.use_data_augmentation or cfg.symmetry.use_mirror_loss:
         _ = env.mirror
 
 
-def rsl_rl_config(cfg: LeggedRobotCfgPPO) -> dict[str, Any]:
-    """The learner's config as rsl-rl's flat dict; a deep copy, since rsl-rl writes into it."""
+def rsl_rl_config(cfg: RobotTaskCfgPPO) -> dict[str, Any]:
+    """The learner's config as rsl-rl's flat dict; a deep copy, since rsl-rl writes into it. Raises ConfigError."""
+    check_classes(cfg)
     sections = copy.deepcopy(cfg.to_dict())
     runner = sections.pop("runner")
     logger = runner["logger"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import os
 import re
 from datetime import datetime
@@ -12,8 +11,20 @@ from typing import Any
 import torch
 
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
+from legged_mw.utils.task import LoadedTask
 
 CONFIG_FILE = "config.yaml"
+
+
+def logs_folder() -> Path:
+    """The folder of all runs of all tasks: ``logs`` in the current folder."""
+    return Path.cwd() / "logs"
+
+
+def experiment_folder(task: LoadedTask, name: str | None = None) -> Path:
+    """The folder of a task's runs, or of the experiment called ``name``."""
+    return logs_folder() / (name or task.train.runner.experiment_name or task.name)
 
 
 def new_run(experiment: Path, run_name: str) -> Path:
@@ -51,10 +62,7 @@ def find_run(experiment: Path, name: str) -> Path:
     for folder in (experiment / name, Path(name).expanduser()):
         if folder.is_dir() and checkpoints(folder):
             return folder
-    names = [folder.name for folder in found]
-    close = difflib.get_close_matches(name, names, n=1)
-    hint = f"did you mean '{close[0]}'? " if close else ""
-    raise ConfigError(f"no run '{name}' with a checkpoint in {experiment}; {hint}there are: {', '.join(names) or 'none'}")
+    raise ConfigError(unknown("run", name, [folder.name for folder in found], str(experiment)))
 
 
 def find_checkpoint(run: Path, iteration: int) -> Path:

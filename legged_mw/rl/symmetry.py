@@ -9,11 +9,11 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.mirror import Columns
+from legged_mw.envs.robot_task import RobotTask
 
 
-def mirror(env: LeggedRobot, obs: TensorDict | None, actions: Tensor | None) -> tuple[TensorDict | None, Tensor | None]:
+def mirror(env: RobotTask, obs: TensorDict | None, actions: Tensor | None) -> tuple[TensorDict | None, Tensor | None]:
     """rsl-rl's ``data_augmentation_func``: observations (2B,) by group and actions (2B, A), the B given first, then their mirror images.
 
     ``obs`` may hold any of the environment's groups. It asks the host nothing, so that a CUDA graph can record it; look at

@@ -104,8 +104,9 @@ def duration(text: str) -> float:
 
 
 @contextmanager
-def one_line_errors(program: str) -> Iterator[None]:
+def one_line_errors(program: str = "") -> Iterator[None]:
     """Turn mistakes of the user into one line and exit code 2; memory that runs out into advice."""
+    program = program or Path(sys.argv[0]).name
     try:
         yield
     except UserError as error:
@@ -123,6 +124,14 @@ def fail(program: str, message: str) -> NoReturn:
     """One line on standard error, exit code 2."""
     print(f"{program}: {' '.join(message.split())}", file=sys.stderr)
     raise SystemExit(2)
+
+
+def command(program: str, processes: int = 1) -> str:
+    """How the user starts ``train`` or ``play``: as the script of a clone, or as ``legged-mw train``."""
+    installed = Path(sys.argv[0]).name.startswith("legged-mw")
+    if processes > 1:
+        return f"torchrun --nproc_per_node={processes} " + (f"-m legged_mw.programs {program}" if installed else f"{program}.py")
+    return f"legged-mw {program}" if installed else f"python {program}.py"
 
 
 def shown(path: Path) -> str:

@@ -24,8 +24,9 @@ from weakref import WeakKeyDictionary
 import yaml
 
 from legged_mw.utils.errors import UserError
+from legged_mw.utils.renamed import new_name
 
-_TYPES = (int, float, bool, str, NoneType, list, tuple, dict, Any)
+_TYPES = (int, float, bool, str, NoneType, list, dict, Any)
 _PLAIN = None | bool | int | float | str | list | dict  # `Any` in a config: whatever YAML can hold
 _SCHEMAS: WeakKeyDictionary[type, dict[str, Any]] = WeakKeyDictionary()
 
@@ -74,7 +75,7 @@ def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
     if annotated:
         kind = _declared_type(cls, name, inherited)
     elif inherited is None and not getattr(cls, "_open", False):
-        hint = _nearest(name, known) + (f"; {_path(cls.__bases__[0])} has: {', '.join(known)}" if known else "")
+        hint = _suggest(path, known) + (f"; {_path(cls.__bases__[0])} has: {', '.join(known)}" if known else "")
         declaration = f"`{name}: {type(value).__name__} = {value!r}`"
         raise ConfigError(f"{path} overrides nothing{hint}; if the field is new, declare it with a type: {declaration}")
     else:
@@ -109,7 +110,7 @@ def _declared_type(cls: type, name: str, inherited: Any) -> Any:
         hint = f"import what it names at the top level of module {cls.__module__}"
         raise ConfigError(f"{path}: its type {written!r} cannot be resolved ({error}); {hint}") from None
     if not _is_supported(kind):
-        choice = "int, float, bool, str, None, list[T], tuple[T, ...], dict[str, T], Literal[...], T | U; `class` makes a section"
+        choice = "int, float, bool, str, None, list[T], dict[str, T], Literal[...], Any, T | U; `class` makes a section"
         raise ConfigError(f"{path}: type {_show(kind)} is not supported; there are {choice}")
     if name not in vars(cls):
         raise ConfigError(f"{path} has a type but no value; write `{name}: {_show(kind)} = ...`")
@@ -125,8 +126,8 @@ def _is_supported(kind: Any) -> bool:
         return all(type(choice) in _TYPES for choice in args)
     if origin is dict:
         return args[0] is str and _is_supported(args[1])
-    if origin in (list, tuple, Union, UnionType):
-        return all(arm is ... or _is_supported(arm) for arm in args)
+    if origin in (list, Union, UnionType):
+        return all(map(_is_supported, args))
     return kind in _TYPES
 
 
@@ -144,9 +145,15 @@ def _parents(cls: type, name: str) -> str:
 
 
 def _show(kind: Any) -> str:
-    if get_origin(kind) is Union:  # what Python calls Optional[...]
+    if get_origin(kind) is Union:  # a union with a Literal
         return " | ".join("None" if arm is NoneType else _show(arm) for arm in get_args(kind))
     return kind.__name__ if isinstance(kind, type) else str(kind).replace("typing.", "")
+
+
+def _suggest(path: str, fields: Mapping[str, Any]) -> str:
+    """`; it is called ... now` where the field at `path` was renamed, else `_nearest`."""
+    new = new_name(path)
+    return f"; it is called {new} now" if new else _nearest(path.rpartition(".")[2], fields)
 
 
 def _nearest(name: str, fields: Mapping[str, Any] | Iterable[str]) -> str:
@@ -193,10 +200,9 @@ def _fit(value: Any, kind: Any, path: str) -> Any:
                 continue
     elif origin is Literal and any(type(value) is type(choice) and value == choice for choice in args):
         return value
-    elif origin in (list, tuple) and isinstance(value, list | tuple):
-        kinds = args if origin is tuple and args and ... not in args else (args[0] if args else Any,) * len(value)
-        if len(kinds) == len(value):
-            return origin(_fit(item, kinds[i], f"{path}[{i}]") for i, item in enumerate(value))
+    elif origin is list and isinstance(value, list | tuple):
+        of = args[0] if args else Any
+        return [_fit(item, of, f"{path}[{i}]") for i, item in enumerate(value)]
     elif origin is dict and isinstance(value, Mapping):
         of = args[1] if args else Any
         return {_fit(key, str, f"{path}: key"): _fit(item, of, f"{path}[{key!r}]") for key, item in value.items()}
@@ -213,7 +219,7 @@ def _fit(value: Any, kind: Any, path: str) -> Any:
 def _parse(text: str, kind: Any, path: str) -> Any:
     """`text` as a `kind`: verbatim for a str, else read as YAML, else verbatim (`run_7` for a `str | int`)."""
     try:
-        value = text if kind is str else None if text == "None" else yaml.load(text, Loader=_Loader)
+        value = text if kind is str else yaml.load(text, Loader=_Loader)
         if isinstance(value, dict) and any(":" in str(key) and item is None for key, item in value.items()):
             value = yaml.load(re.sub(r":(?=\S)", ": ", text), Loader=_Loader)  # {a:1}, which to YAML is a key without a value
     except yaml.YAMLError:
@@ -236,7 +242,7 @@ def _kind(cls: type, name: str, path: str) -> Any:
     if is_free and getattr(cls, "_open", False):
         return float
     owner = path.rpartition(".")[0] or _path(cls)
-    raise ConfigError(f"{path} does not exist{_nearest(name, fields)}; {owner} has: {', '.join(fields)}")
+    raise ConfigError(f"{path} does not exist{_suggest(path, fields)}; {owner} has: {', '.join(fields)}")
 
 
 def _guarded_setattr(self: Any, name: str, value: Any) -> None:
@@ -260,7 +266,7 @@ def _plain(value: Any) -> Any:
         return {name: _plain(item) for name, item in vars(value).items() if not name.startswith("_")}
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
-    return [_plain(item) for item in value] if isinstance(value, list | tuple) else value
+    return [_plain(item) for item in value] if isinstance(value, list) else value
 
 
 def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:

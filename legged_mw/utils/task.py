@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import importlib.util
 import sys
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from legged_mw import ROOT
 from legged_mw.utils.config import Config, ConfigError
-
-if TYPE_CHECKING:
-    from legged_mw.envs.legged_robot import LeggedRobot
-    from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_mw.utils.errors import unknown
+from legged_mw.utils.renamed import with_new_names
 
 
 class Task(NamedTuple):
-    """What the last line of a config file names."""
+    """What the last line of a config file names: three classes, and how its policies are graded."""
 
-    env: type[LeggedRobot]
-    cfg: type[LeggedRobotCfg]
-    train: type[LeggedRobotCfgPPO]
+    env: type[Any]  # the environment, a RobotTask
+    cfg: type[Any]  # its config
+    train: type[Any]  # the learner's config
+    exam: str | None = None  # a kind of exam, "" for none; None: the one that the environment's class names
 
 
 class LoadedTask:
@@ -36,6 +34,7 @@ class LoadedTask:
     def __init__(self, name: str, path: Path, task: Task, about: str = "") -> None:
         self.name, self.path, self.env_class = name, path, task.env
         self.about = about  # the config file's first line
+        self.exam: str = getattr(task.env, "exam", "") if task.exam is None else task.exam
         self.cfg, self.train = task.cfg(), task.train()
         beside = path.resolve().parent / Path(self.cfg.asset.file).expanduser()
         if self.cfg.asset.file and beside.is_file():
@@ -61,11 +60,12 @@ class LoadedTask:
             raise
 
     def update_from_run(self, saved: Mapping[str, Any], where: str) -> list[str]:
-        """Take over the ``config.yaml`` of a run; it must be one of this task.
+        """Take over the ``config.yaml`` of a run; it must be one of this task. Its old names are read as the new ones.
 
         A learner's section that the file lacks, since it is older than the section, is what it was then: the base class's,
         not the task's of today. Returns the names of such sections.
         """
+        saved = with_new_names(saved)
         theirs = str(saved.get("task", self.name))
         if Path(theirs).stem != self.name:
             raise ConfigError(f"{where} is of task '{theirs}', not '{self.name}'; say --task {theirs}")
@@ -74,6 +74,11 @@ class LoadedTask:
         self.update({**saved, **older}, where)
         return list(older)
 
+    def changes_since(self, before: LoadedTask) -> dict[str, tuple[Any, Any]]:
+        """Dotted path -> (value in ``before``, value now) of every field that differs; ``before`` is a copy of this task."""
+        differences = [*before.cfg.diff(self.cfg), *before.train.diff(self.train)]
+        return {path: (then, now) for path, then, now in differences}
+
     def fit_cpu(self, cores: int) -> None:
         """Take over what the section ``cpu`` says, for ``cores`` cores."""
         train, few = self.train, self.train.cpu
@@ -81,27 +86,30 @@ class LoadedTask:
         train.runner.num_steps_per_env, train.runner.max_iterations = few.num_steps_per_env, few.max_iterations
         train.algorithm.num_learning_epochs, train.algorithm.num_mini_batches = few.num_learning_epochs, few.num_mini_batches
         train.algorithm.desired_kl = few.desired_kl
+        train.actor.hidden_dims = train.critic.hidden_dims = few.hidden_dims
         for path, value in few.overrides.items():
             self.set(path, value, where="cpu.overrides")
-        train.actor.hidden_dims, train.critic.hidden_dims = list(few.hidden_dims), list(few.hidden_dims)
 
     def to_dict(self) -> dict[str, Any]:
         """Both configs as one mapping, with the task's name: what ``config.yaml`` in a run folder holds."""
         known = self.path.parent.resolve() == (ROOT / "configs").resolve()
         return {"task": self.name if known else str(self.path.resolve()), **self.cfg.to_dict(), **self.train.to_dict()}
 
-    def _owner(self, section: str, where: str) -> LeggedRobotCfg | LeggedRobotCfgPPO:
-        sections = {**dict.fromkeys(self.cfg.to_dict(), self.cfg), **dict.fromkeys(self.train.to_dict(), self.train)}
+    def _owner(self, section: str, where: str) -> Config:
+        sections: dict[str, Config] = {name: owner for owner in (self.cfg, self.train) for name in owner.to_dict()}
         if section not in sections:
-            close = difflib.get_close_matches(section, sections, n=1)
-            hint = f"did you mean '{close[0]}'? " if close else ""
-            raise ConfigError(f"{where}: no config section '{section}'; {hint}there are: {', '.join(sections)}")
+            raise ConfigError(f"{where}: {unknown('config section', section, sections, 'this task')}")
         return sections[section]
 
 
 def task_names() -> list[str]:
     """Names that ``--task`` knows without a path."""
     return sorted(path.stem for path in (ROOT / "configs").glob("*.py") if not path.stem.startswith("_"))
+
+
+def list_tasks() -> str:
+    """A line a task: its name and the first line of its file."""
+    return "\n".join(f"{name:<16} {load_task(name).about}" for name in task_names())
 
 
 def load_task(name: str) -> LoadedTask:
@@ -113,9 +121,7 @@ def load_task(name: str) -> LoadedTask:
     if path.suffix != ".py":
         known = task_names()
         if name not in known:
-            close = difflib.get_close_matches(name, known, n=1)
-            hint = f"did you mean '{close[0]}'? " if close else ""
-            raise ConfigError(f"no task '{name}'; {hint}tasks: {', '.join(known)}; or give the path of a config file (.py)")
+            raise ConfigError(f"{unknown('task', name, known, 'configs/')}; or give the path of a config file (.py)")
         path = ROOT / "configs" / f"{name}.py"
     if not path.is_file():
         raise ConfigError(f"no config file at {path.absolute()}")

@@ -1,0 +1,110 @@
+"""What ``play.py --eval`` does: the exam and the report of one policy, or of two side by side."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+from legged_mw.envs.domain_rand import active
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.eval import crossing, exam, report, rules
+from legged_mw.eval.rollout import Policy
+from legged_mw.rl.classes import check_classes
+from legged_mw.rl.policies import Source, act, introduce, load_policy
+from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything, shown
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import UserError
+from legged_mw.utils.task import LoadedTask
+
+
+class Graded(NamedTuple):
+    """A policy and the tasks that it is graded in."""
+
+    source: Source
+    trained: LoadedTask
+    task: LoadedTask
+    crossing: LoadedTask | None  # for the exam's rough part, if there is one
+
+
+def grade(policies: list[tuple[Source, LoadedTask]], args: argparse.Namespace) -> None:
+    """Grade policies, each by the config that it was trained with; print their tables and write a report beside the first."""
+    device = pick_device(args.device)
+    graded = [prepare(source, trained, args) for source, trained in policies]
+    introduce(graded[0].source, graded[0].task.changes_since(graded[0].trained))
+    built = [(each, *build(each, args, device)) for each in graded]  # all, before one is graded in vain
+    columns = [make_column(*each) for each in built]
+    folder = graded[0].source.results(graded[0].task) / "eval"
+    report.write(folder, graded[0].task.name, columns, elsewhere(graded[0]))
+    print(f"written to {shown(folder / 'report.html')}, with report.json and pictures beside it")
+
+
+def prepare(source: Source, trained: LoadedTask, args: argparse.Namespace) -> Graded:
+    """The trained task with what the exam changes, the user's overrides last."""
+    task = copy.deepcopy(trained)
+    report.prepare(task)
+    override(task, args, exam.SETS)
+    report.make_room(task)  # the ranges are known by now
+    return Graded(source, trained, task, prepare_crossing(trained, args))
+
+
+def prepare_crossing(trained: LoadedTask, args: argparse.Namespace) -> LoadedTask | None:
+    """The exam's rough part with the user's overrides; None where training was on a plane."""
+    if trained.to_dict()["terrain"].get("mesh_type", "plane") == "plane":
+        return None
+    task = copy.deepcopy(trained)
+    crossing.prepare(task)
+    override(task, args, crossing.SETS)
+    crossing.make_room(task)  # the kinds of ground are known by now
+    return task
+
+
+def override(task: LoadedTask, args: argparse.Namespace, sets: set[str]) -> None:
+    """Apply the user's overrides, unless one of them changes what the exam ``sets`` itself."""
+    before = copy.deepcopy(task)
+    apply_overrides(task, args)
+    check_classes(task.train)
+    if touched := sets & task.changes_since(before).keys():
+        raise ConfigError(f"--eval sets {', '.join(sorted(touched))} itself; an exam with other values would be another exam")
+
+
+def build(graded: Graded, args: argparse.Namespace, device: str) -> tuple[Policy, LeggedRobot, LeggedRobot | None]:
+    """The policy, the environment of the exam, and the one of its rough part."""
+    task, rough = graded.task, graded.crossing
+    seed_everything(task.train.seed)
+    env = task.env_class(task.cfg, device, eager=args.eager)
+    ground = rough.env_class(rough.cfg, device, eager=args.eager) if rough else None
+    policy = load_policy(graded.source.checkpoint, env, task.train, device)
+    return lambda obs: act(policy, obs), env, ground
+
+
+def make_column(graded: Graded, policy: Policy, env: LeggedRobot, rough: LeggedRobot | None) -> report.Column:
+    """The exam and all else of a report, from one roll-out and, if there is a rough part, another; prints their tables."""
+    source = graded.source
+    result, figures = report.examine(env, policy, rough)
+    name = "shipped" if source.shipped else f"{source.folder.name}, {source.checkpoint.stem.removeprefix('model_')}"
+    print(f"\n{name}, {env.sim.engine} on {env.device}\n{rules.table(result)}\n")
+    if rough:
+        print(f"{crossing.table(figures['crossing'])}\n")
+    overrides = {path: now for path, (_, now) in graded.task.changes_since(graded.trained).items()}
+    about = {"policy": "/".join(source.checkpoint.parts[-3:]), "engine": env.sim.engine, "device": env.device, "overrides": overrides}
+    return report.Column(name, about, result, figures)
+
+
+def elsewhere(graded: Graded) -> list[tuple[str, dict[str, Any]]]:
+    """The exam of the same policy on another physics: MuJoCo's C engine, through an export, as ``legged_mw.deploy`` runs it."""
+    from legged_mw.deploy.exam import run_exam
+    from legged_mw.rl.export import export  # onnx takes a while to import
+
+    if active(graded.task.cfg):
+        print("not graded through an export: that is the nominal robot, and domain_rand makes this one another")
+        return []
+    with TemporaryDirectory() as folder:
+        try:
+            export(graded.task.to_dict(), graded.source.checkpoint, Path(folder) / "export")
+            return [("the same, deployed in MuJoCo", run_exam(Path(folder) / "export"))]
+        except UserError as error:  # a row that nobody can measure, no onnxruntime
+            print(f"not graded through an export: {error}")
+            return []

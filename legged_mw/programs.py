@@ -1,0 +1,88 @@
+"""The programs: legged-mw train, play and deploy. train.py and play.py of a clone are the first two.
+
+Each imports what it needs when it starts: deploy also runs where torch is not installed.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+from legged_mw.utils.cli import fail, one_line_errors
+from legged_mw.utils.task import LoadedTask, list_tasks, load_task
+
+
+@one_line_errors()
+def train() -> None:
+    """Train a task. On 8 GPUs: torchrun --nproc_per_node=8 train.py --task go1_flat"""
+    from legged_mw.envs.describe import describe
+    from legged_mw.eval.training import make_exam
+    from legged_mw.rl import training
+
+    args = training.parse(train.__doc__)
+    if args.list:
+        print(list_tasks())
+        return
+    task = load_task(args.task)
+    start, device = training.configure(task, args)
+    env = training.build(task, device, args.eager)
+    if args.check:
+        print(describe(env, task))
+        return
+    examine = make_exam(task, env, args.eager) if training.wants_exam(task) else None
+    training.train(task, env, start, examine, export, args.deadline)
+
+
+@one_line_errors()
+def play() -> None:
+    """Watch, grade or export a policy."""
+    from legged_mw.eval import grading
+    from legged_mw.rl.policies import find_policy, find_rival, load_trained
+    from legged_mw.view import playing
+
+    args = playing.parse(play.__doc__)
+    task = load_task(args.task)
+    source = find_policy(task, args.load_run, args.checkpoint, args.experiment_name)
+    trained = load_trained(args.task, source)
+    if args.eval:
+        rivals = [find_rival(task, args.compare, args.experiment_name)] if args.compare is not None else []
+        grading.grade([(source, trained), *((rival, load_trained(args.task, rival)) for rival in rivals)], args)
+        return
+    played = playing.prepare(source, trained, args)
+    if args.export:
+        print(export(trained, source.checkpoint, Path(args.export)))
+    else:
+        playing.watch(source, played, args)
+
+
+def export(task: LoadedTask, checkpoint: Path, folder: Path) -> str:
+    """Export a policy with the config that it was trained with; returns what was written, in words."""
+    from legged_mw.rl.export import describe, export  # onnx takes a while to import
+
+    return describe(export(task.to_dict(), checkpoint, folder), folder)
+
+
+def deploy() -> None:
+    """Run an exported policy without torch."""
+    from legged_mw.deploy.__main__ import main
+
+    with one_line_errors():
+        main()
+
+
+PROGRAMS = {"train": train, "play": play, "deploy": deploy}
+
+
+def main() -> None:
+    """``legged-mw NAME ...``"""
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name not in PROGRAMS:
+        fail(
+            "legged-mw", f"{f'no program {name!r}; ' if name else ''}there are: {', '.join(PROGRAMS)}; e.g. legged-mw train --task go1_flat"
+        )
+    sys.argv = [f"legged-mw {name}", *sys.argv[2:]]
+    PROGRAMS[name]()
+
+
+if __name__ == "__main__":
+    main()

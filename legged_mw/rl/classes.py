@@ -1,0 +1,62 @@
+"""Classes that a learner's config may name: in a file or a flag those listed here, in the task's own Python file any.
+
+rsl-rl imports and calls what ``class_name`` says. A run folder may come from a stranger, so its config.yaml must not choose code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+from rsl_rl.algorithms import PPO
+from rsl_rl.models import CNNModel, MLPModel, RNNModel
+from rsl_rl.modules import BetaDistribution, GaussianDistribution, HeteroscedasticGaussianDistribution
+
+from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.utils.config import Config, ConfigError
+
+_NETWORKS = (MLPModel, CNNModel, RNNModel)
+_DISTRIBUTIONS = (GaussianDistribution, HeteroscedasticGaussianDistribution, BetaDistribution)
+ALLOWED: dict[str, tuple[type, ...]] = {
+    "actor.class_name": _NETWORKS,
+    "critic.class_name": _NETWORKS,
+    "actor.distribution_cfg.class_name": _DISTRIBUTIONS,
+    "critic.distribution_cfg.class_name": _DISTRIBUTIONS,
+    "algorithm.class_name": (GraphedPPO, PPO),
+}
+_IMPORTED = ("class_name", "data_augmentation_func")  # rsl-rl imports and calls what these keys name
+
+
+def check_classes(cfg: Config) -> None:
+    """Refuse a class that neither the task's own Python file nor ``ALLOWED`` names. Imports nothing. Raises ConfigError."""
+    own = dict(_class_names(type(cfg)().to_dict()))
+    for path, name in _class_names(cfg.to_dict()):
+        if path in own and name == own[path]:
+            continue
+        allowed = [spelling for kind in ALLOWED.get(path, ()) for spelling in _spellings(kind)]
+        if name not in allowed:
+            shortest = [_spellings(kind)[0] for kind in ALLOWED.get(path, ())]
+            raise ConfigError(
+                f"{path} is {name!r}: only the task's own Python file, which --task names, may choose that; "
+                f"a run's config.yaml, --set and --override may name {', '.join(shortest) or 'nothing else there'}"
+            )
+
+
+def _spellings(kind: type) -> list[str]:
+    """All names under which rsl-rl finds a class, the shortest first."""
+    module, name = kind.__module__, kind.__qualname__
+    long = [f"{module}:{name}", f"{module}.{name}"]
+    if not module.startswith("rsl_rl."):
+        return long
+    package = module.rpartition(".")[0]
+    return [name, f"{package}:{name}", f"{package}.{name}", *long]
+
+
+def _class_names(values: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """(dotted path, value) of everything in nested mappings and lists that rsl-rl would import."""
+    items = values.items() if isinstance(values, dict) else enumerate(values) if isinstance(values, list) else ()
+    for key, value in items:
+        here = f"{path}.{key}" if path else str(key)
+        if key in _IMPORTED:
+            yield here, value
+        yield from _class_names(value, here)

@@ -1,0 +1,229 @@
+"""What train.py does: settle what is trained on what, train it, stop and resume, and say how to go on.
+
+The exam and the exporter are handed in, since neither is part of the core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shlex
+import signal
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from legged_mw.envs.checks import check_values
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.classes import check_classes
+from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
+from legged_mw.rl.runner import Runner, check_mirror, make_runner
+from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
+from legged_mw.sim.engines import pick_engine
+from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything, shown
+from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
+from legged_mw.utils.errors import UserError
+from legged_mw.utils.machine import usable_cores
+from legged_mw.utils.task import LoadedTask, load_task, task_names
+
+_STEPS_PER_CORE = 6500  # a second, in training with the section `cpu` as it is (docs/performance.md)
+
+Examine = Callable[[Any], dict[str, float]]  # policy -> figures by name
+Export = Callable[[LoadedTask, Path, Path], str]  # task, checkpoint, folder to write -> what was written, in words
+
+
+class Start(NamedTuple):
+    """What a training begins with."""
+
+    experiment: Path  # folder for a new run
+    run: Path | None = None  # the run to go on with
+    checkpoint: Path | None = None
+
+
+def parse(description: str | None) -> argparse.Namespace:
+    """The flags of training. From here on only the first of several processes prints."""
+    parser = make_parser(description)
+    parser.add_argument("--max_iterations", type=positive, metavar="N", help="train until this iteration, resumed or not")
+    parser.add_argument("--run_name", metavar="NAME", help="appended to the run folder's name")
+    parser.add_argument("--resume", action="store_true", help="go on with the last run, or the one of --load_run")
+    parser.add_argument("--headless", action="store_true", help="accepted as in legged_gym; training never opens a window")
+    parser.add_argument("--max_time", type=duration, metavar="T", help="end, after a checkpoint, after 90s, 5m, 1.5h ...")
+    parser.add_argument("--list", action="store_true", help="show the tasks and exit")
+    parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")
+    args = parser.parse_args()
+    if not (args.task or args.list):
+        parser.error(f"--task is missing; tasks: {', '.join(task_names())}")
+    if not args.resume and (args.load_run is not None or args.checkpoint != -1):
+        parser.error("--load_run and --checkpoint say what to go on with: add --resume")
+    args.deadline = time.time() + args.max_time if args.max_time else None
+    quiet(this_rank())
+    if not torch.cuda.is_available():
+        torch.set_num_threads(1)  # hundreds of small operations a step stall on a second thread
+    return args
+
+
+def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
+    """Give ``task`` its final config: the resumed run's, the user's, a CPU's. Returns what to begin with and the device."""
+    start = _resume(task, args) if args.resume else None
+    apply_overrides(task, args)
+    start = start or Start(experiment_folder(task))
+    rank = this_rank()
+    device = pick_device(rank_device(rank, args.device))
+    if device == "cpu" and task.train.cpu.enable and not start.run:
+        task.fit_cpu(usable_cores())
+        apply_overrides(task, args)  # again: what the user says wins
+        print("on a CPU the section cpu sets worlds, networks and learner; flags win, --set cpu.enable=false keeps the task's own")
+    check_classes(task.train)
+    check_values(task.cfg, task.train)
+    if device != "cpu":
+        torch.cuda.set_device(device)
+    seed_everything(task.train.seed + rank.index)  # every rank its own worlds, commands and noise
+    _announce(task, device, rank)
+    return start, device
+
+
+def _resume(task: LoadedTask, args: argparse.Namespace) -> Start:
+    """Find the run to go on with and take over its config."""
+    experiment = experiment_folder(task, args.experiment_name)
+    run = find_run(experiment, args.load_run or "-1")
+    start, config = Start(experiment, run, find_checkpoint(run, args.checkpoint)), run / CONFIG_FILE
+    for section in task.update_from_run(load_yaml(config), where=shown(config)):
+        print(f"{shown(config)} is older than the section {section}: left as it was then")
+    return start
+
+
+def _announce(task: LoadedTask, device: str, rank: Rank) -> None:
+    """Say what is trained on what; on a CPU also how long it may take."""
+    worlds, engine = task.cfg.env.num_envs, pick_engine(task.cfg.sim.engine, device)
+    where = device if rank.count == 1 else f"each of {rank.count} {'processes' if device == 'cpu' else 'GPUs'}"
+    compiles = "; a first run compiles kernels, about a minute" if engine == "mujoco_warp" else ""
+    print(f"{task.name}: {worlds} worlds on {where}, engine {engine}{compiles}", flush=True)
+    if device != "cpu":
+        return
+    cores, runner = usable_cores(), task.train.runner
+    steps = runner.max_iterations * worlds * runner.num_steps_per_env
+    minutes = steps / (_STEPS_PER_CORE * cores) / 60
+    rough = task.to_dict()["terrain"].get("mesh_type", "plane") != "plane"
+    slow = "rough ground takes a CPU several times as long as a plane, and wants a GPU"
+    plan = (
+        f"{steps:,} steps; {slow}" if rough else f"{runner.max_iterations} iterations, {steps / 1e6:.1f} M steps, about {minutes:.0f} min"
+    )
+    print(f"{cores} cores: {plan}", flush=True)
+
+
+def build(task: LoadedTask, device: str, eager: bool = False) -> Any:
+    """The environment, if learning can work in it."""
+    env = task.env_class(task.cfg, device, eager=eager)
+    check_mirror(env, task.train)
+    return env
+
+
+def wants_exam(task: LoadedTask) -> bool:
+    """Whether this process grades the policy during training."""
+    return this_rank().leads and 0 < task.train.runner.exam_interval <= task.train.runner.max_iterations
+
+
+def train(task: LoadedTask, env: RobotTask, start: Start, examine: Examine | None, export: Export, deadline: float | None = None) -> None:
+    """Train from ``start`` to the last iteration or until stopped (at ``deadline`` [s], a time of the clock), then export."""
+    rank, runner = this_rank(), make_runner(env, task.train, None, str(env.device))
+    runner.examine = examine
+    left = _load(runner, task, start)
+    _stop_on_signals(runner, deadline)
+    leave_when_stuck(rank)
+    folder = _open_run(runner, task, start) if rank.leads else None  # one run folder, written by the first rank
+    _learn(runner, left, rank)
+    finished = folder is not None and _say_how_it_ended(runner, task, folder, rank)
+    leave_together(rank)
+    if folder and finished and task.train.runner.export:
+        _export(task, folder, export)
+
+
+def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
+    """Load the checkpoint to go on from, if there is one; returns how many iterations are left."""
+    if start.checkpoint:
+        runner.load(str(start.checkpoint))
+        print(f"resuming {shown(start.checkpoint)}")
+    done, wanted = runner.current_learning_iteration, task.train.runner.max_iterations
+    if done >= wanted:
+        what = shown(start.checkpoint or start.experiment)
+        raise ConfigError(f"{what} has done {done} iterations of {wanted}; raise --max_iterations to go on")
+    return wanted - done
+
+
+def _open_run(runner: Runner, task: LoadedTask, start: Start) -> Path:
+    """The folder that this training writes to, with the config in it; an earlier checkpoint begins a folder of its own."""
+    newest = start.run is not None and start.checkpoint == find_checkpoint(start.run, -1)
+    folder = start.run if start.run and newest else new_run(start.experiment, task.train.runner.run_name)
+    save_yaml(folder / CONFIG_FILE, task.to_dict())
+    runner.logger.log_dir = str(folder)
+    print(f"writing to {shown(folder)}", flush=True)
+    return folder
+
+
+def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
+    """Learn; if another rank is lost on the way, say so in a line."""
+    try:
+        runner.learn(iterations)
+        if isinstance(runner.alg, GraphedPPO):
+            runner.alg.release()
+    except RuntimeError as error:
+        lost = r"(closed|reset|aborted) by|connection (was )?(closed|reset|refused)|remote process|remoteerror"
+        if rank.count == 1 or not re.search(lost, str(error), re.IGNORECASE):
+            raise
+        reason = str(error).strip().splitlines()[0]
+        raise UserError(
+            f"rank {rank.index} lost another rank ({reason}); --resume goes on from the last checkpoint, if there is one"
+        ) from error
+
+
+def _say_how_it_ended(runner: Runner, task: LoadedTask, folder: Path, rank: Rank) -> bool:
+    """Print the last exam and the command that comes next; returns whether the training is finished."""
+    if runner.last_exam:
+        iteration, figures = runner.last_exam
+        print(f"exam after {iteration} iterations: {', '.join(f'{figure} {value:.3f}' for figure, value in figures.items())}")
+    flags = _flags(task, folder)
+    if runner.stop and runner.current_learning_iteration < task.train.runner.max_iterations:
+        print(f"stopped: {runner.stop}; go on with\n  {command('train', rank.count)} --resume {flags}")
+        return False
+    print(f"done: {shown(folder)}; watch it with\n  {command('play')} {flags}", flush=True)
+    return True
+
+
+def _flags(task: LoadedTask, folder: Path) -> str:
+    """The flags that find a run again."""
+    name = task.to_dict()["task"]
+    home = experiment_folder(load_task(name))
+    return shlex.join(["--task", name, "--load_run", folder.name if folder.parent == home else shown(folder)])
+
+
+def _export(task: LoadedTask, run: Path, export: Export) -> None:
+    """Export what was trained. The training is done and saved, so that no error of an exporter may end it."""
+    folder = run / "export"
+    try:
+        print(export(task, find_checkpoint(run, -1), folder))
+    except Exception as error:  # whatever an exporter may throw
+        reason = " ".join(f"{error}".split()) or type(error).__name__
+        print(f"not exported: {reason}\n  to try again: {command('play')} {_flags(task, run)} --export {shown(folder)}")
+
+
+def _stop_on_signals(runner: Runner, deadline: float | None) -> None:
+    """Ctrl-C, SIGTERM and the clock ask the runner to save and stop; a second Ctrl-C stops at once."""
+
+    def ask(number: int, _: object) -> None:
+        runner.stop = signal.Signals(number).name
+        # os.write, since print must not be called while another print is interrupted
+        os.write(1, f"{runner.stop}: saving and stopping after this step; again to stop at once\n".encode())
+        signal.signal(number, signal.SIG_DFL)
+
+    signal.signal(signal.SIGINT, ask)
+    signal.signal(signal.SIGTERM, ask)
+    if deadline is not None:
+        timer = threading.Timer(max(0.0, deadline - time.time()), lambda: setattr(runner, "stop", "--max_time"))
+        timer.daemon = True
+        timer.start()

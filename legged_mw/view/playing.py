@@ -1,0 +1,117 @@
+"""What play.py prepares to watch: the flags, the config as it is played, the ground to walk on."""
+
+from __future__ import annotations
+
+import argparse
+import copy
+from typing import Any, NamedTuple
+
+import torch
+
+from legged_mw.rl.classes import check_classes
+from legged_mw.rl.policies import Source, act, introduce, load_policy
+from legged_mw.utils.cli import apply_overrides, duration, make_parser, pick_device, seed_everything
+from legged_mw.utils.task import LoadedTask, task_names
+from legged_mw.view import launch
+from legged_mw.view.env_stage import EnvStage
+
+NOMINAL = {  # what playing changes in the trained config
+    "env.num_envs": 1,
+    "env.episode_length_s": 1e6,  # the robot that is watched walks on where training would begin a new episode
+    "noise.level": 0.0,
+    "perturbation.kick": False,
+    "perturbation.push": False,
+    "domain_rand.enable": False,
+    "commands.curriculum": False,
+}
+ROWS, BORDER = 3, 2.0  # of the ground to watch: levels, from the easiest to the hardest, and [m]
+
+
+class Played(NamedTuple):
+    """A task as it is played."""
+
+    task: LoadedTask
+    limits: list[list[float]]  # (2, 3) of the command, as trained
+
+
+def parse(description: str | None) -> argparse.Namespace:
+    """The flags of playing."""
+    parser = make_parser(description)
+    parser.add_argument(
+        "--command", metavar="VX,VY,YAW", help="fixed command [m/s, m/s, rad/s]; write --command=-0.5,0,0 if it starts with a minus"
+    )
+    parser.add_argument(
+        "--time", type=duration, default=None, metavar="T", help="how long to play (default: 10s of video, a window until closed)"
+    )
+    launch.add_flags(parser)
+    parser.add_argument("--eval", action="store_true", help="run the walking exam (on rough ground too), print its tables, write a report")
+    parser.add_argument("--compare", metavar="RUN", help="with --eval: grade this run beside it; its name or path, or 'shipped'")
+    parser.add_argument(
+        "--export", metavar="DIR", help="write the policy as networks, contract and scene there, to deploy (docs/deploy.md)"
+    )
+    args = parser.parse_args()
+    if not args.task:
+        parser.error(f"--task is missing; tasks: {', '.join(task_names())}")
+    asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag)]
+    if len(asked) > 1 or (args.eval and args.command is not None):
+        parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
+    if args.compare is not None and not args.eval:
+        parser.error("--compare grades two policies side by side: add --eval")
+    if args.commands and (args.eval or args.export or args.command is not None):
+        parser.error("--commands drives what is watched: it goes with neither --command nor --eval nor --export")
+    if (args.eval or args.export) and (watching := launch.asked(args)):
+        parser.error(f"--eval and --export show nothing: leave {', '.join(watching)} out")
+    launch.check_flags(args)
+    torch.set_num_threads(1)  # a step of few worlds stalls on more
+    return args
+
+
+def prepare(source: Source, trained: LoadedTask, args: argparse.Namespace) -> Played:
+    """The trained task with what playing changes, the user's overrides last; says what they are."""
+    task = copy.deepcopy(trained)
+    config = task.to_dict()
+    for path, value in NOMINAL.items():
+        section, _, field = path.partition(".")
+        if field in config.get(section, {}):
+            task.set(path, value, where="play")
+    apply_overrides(task, args)  # they say on what ground
+    for path, value in ground_to_watch(task).items():
+        task.set(path, value, where="play")
+    apply_overrides(task, args)
+    check_classes(task.train)
+    ranges = task.cfg.commands.ranges
+    limits = [list(side) for side in zip(ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw, strict=True)]
+    if (command := launch.check_drive(args, limits)) is not None:
+        for name, value in zip(("lin_vel_x", "lin_vel_y", "ang_vel_yaw"), command, strict=True):
+            task.set(f"commands.ranges.{name}", [value, value], where="--command")
+        task.set("commands.resampling_time", 0.0, where="--command")
+    introduce(source, task.changes_since(trained))
+    return Played(task, limits)
+
+
+def ground_to_watch(task: LoadedTask) -> dict[str, Any]:
+    """A grid that is soon drawn, in place of the whole one: few levels, a column and a robot a kind, the most frequent first."""
+    terrain = task.to_dict()["terrain"]
+    shares = terrain.get("terrain_proportions", {})
+    kinds = sorted((kind for kind in shares if shares[kind] > 0), key=lambda kind: -shares[kind])
+    if terrain.get("mesh_type", "plane") == "plane" or not kinds:
+        return {}
+    return {
+        "env.num_envs": len(kinds),
+        "terrain.num_rows": ROWS,
+        "terrain.num_cols": len(kinds),
+        "terrain.border_size": BORDER,
+        "terrain.terrain_proportions": dict.fromkeys(kinds, 1.0),
+        "terrain.curriculum": False,  # any level, drawn at each reset; else, where that is asked for, from the first one on
+        "terrain.max_init_terrain_level": 0,
+    }
+
+
+def watch(source: Source, played: Played, args: argparse.Namespace) -> None:
+    """Show the policy in the environment of the task as it is played."""
+    task, device = played.task, pick_device(args.device)
+    seed_everything(task.train.seed)
+    env = task.env_class(task.cfg, device, eager=args.eager)
+    policy, picture = load_policy(source.checkpoint, env, task.train, device), task.cfg.viewer
+    stage = EnvStage(env, lambda obs: act(policy, obs), played.limits)
+    launch.watch(stage, args, source.results(task), launch.Picture(picture.width, picture.height, picture.fps), title=task.name)
