@@ -11,7 +11,8 @@ import torch
 from program import run
 
 from legged_mw import ROOT
-from legged_mw.deploy.contract import digest, read_contract, read_scene
+from legged_mw.deploy.contract import digest, read_contract
+from legged_mw.deploy.scene import read_scene
 from legged_mw.eval import exam, rules
 from legged_mw.rl.export import FILES, PROGRAM_FILE, ExportedPolicy
 from legged_mw.rl.policy import act, load_policy
