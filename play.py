@@ -267,9 +267,9 @@ def elsewhere(run: Run) -> list[tuple[str, dict[str, Any]]]:
 
 def export(run: Run, folder: Path) -> None:
     """Write the policy as it was trained, whatever this call overrode for playing."""
-    from legged_mw.rl.export import describe, export  # onnx takes a while to import
+    from legged_mw.rl.export import export  # onnx takes a while to import
 
-    print(describe(export(run.trained, run.source.checkpoint, folder), folder))
+    print(export(run.trained, run.source.checkpoint, folder).text(folder))
 
 
 if __name__ == "__main__":

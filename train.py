@@ -159,9 +159,9 @@ def take_away(task: LoadedTask, run: Path, flags: str) -> None:
     """Export what was trained; the training is done and saved, so that nothing may end it in an error now."""
     folder = run / "export"
     try:
-        from legged_mw.rl.export import describe, export  # onnx takes a while to import
+        from legged_mw.rl.export import export  # onnx takes a while to import
 
-        print(describe(export(task.to_dict(), find_checkpoint(run, -1), folder), folder))
+        print(export(task.to_dict(), find_checkpoint(run, -1), folder).text(folder))
     except Exception as error:  # whatever an exporter may throw
         reason = " ".join(f"{error}".split()) or type(error).__name__
         print(f"not exported: {reason}\n  once that is mended: python play.py {flags} --export {shown(folder)}")

@@ -56,7 +56,7 @@ ROWS: dict[str, Quantity] = {
 }
 COMPUTED = ("joint_offset", "last_action", "command")  # by the controller; a robot measures all others
 # What the sensors of a scene measure; "up" is the world's z axis in the IMU's frame, opposite to gravity.
-SENSED = ("lin_vel", "ang_vel", "up", "acceleration", "joint_pos", "joint_vel", "joint_torque", "foot_contact")
+SENSED = ("lin_vel", "ang_vel", "up", "acceleration", "joint_pos", "joint_vel", "joint_torque")
 FALL = "fall_contact"  # contacts of `ends: falls_on` with the ground; only where there are such geoms
 SENSORS = "sensors"  # ContractRow.measured of a row that names sensors of the scene
 SCAN = "height_scan"  # ContractRow.measured of the height scan
@@ -125,7 +125,7 @@ class Contract:
     commands: tuple[Command, ...]  # as trained; none of a task without commands
     rows: tuple[ContractRow, ...]
     sensors: dict[str, tuple[str, ...]]  # quantity -> sensors of the scene
-    feet: tuple[str, ...]
+    feet: dict[str, tuple[str, ...]]  # foot -> its contact sensors: it touches the ground where one of them does
     ends: Ends
     imu: str
     mass: float  # [kg] of the whole robot
@@ -159,7 +159,7 @@ class Contract:
             "commands": [{"name": c.name, "unit": c.unit, "lowest": c.low, "highest": c.high, "default": c.default} for c in self.commands],
             "observation": [_row_to_dict(row) for row in self.rows],
             "ends": ends,
-            "robot": {"mass": self.mass, "feet": list(self.feet), "imu": self.imu},
+            "robot": {"mass": self.mass, "feet": {foot: list(names) for foot, names in self.feet.items()}, "imu": self.imu},
             "physics": {"file": SCENE_FILE, "timestep": self.timestep, "decimation": self.decimation},
             "sensors": {name: list(names) for name, names in self.sensors.items()},
             **({SCAN: {"x": list(self.scan.x), "y": list(self.scan.y), "standing": self.scan.standing}} if self.scan else {}),
@@ -253,7 +253,7 @@ def read_contract(folder: Path) -> Contract:
     top = _Reader(load_yaml(path), CONTRACT_FILE)
     top.take("format", f"{FORMAT}, the one that this version reads; export the policy again", lambda v: v == FORMAT)
     network, action, robot, physics, measured = (top.section(name) for name in ("network", "action", "robot", "physics", "sensors"))
-    joints = top.texts("joints")
+    joints, feet = top.texts("joints"), robot.section("feet")
     top.take("joints", "names, each once", lambda names: len(set(names)) == len(names))
     count, timestep, decimation = len(joints), physics.above_zero("timestep"), physics.count("decimation")
     step = timestep * decimation
@@ -270,8 +270,8 @@ def read_contract(folder: Path) -> Contract:
         decimation=decimation,
         commands=tuple(map(_read_command, top.sections("commands", empty=True))),
         rows=tuple(map(_read_row, top.sections("observation"))),
-        sensors={name: measured.texts(name, empty=True) for name in measured.values},
-        feet=robot.texts("feet", empty=True),
+        sensors={name: measured.texts(name) for name in measured.values},
+        feet={name: feet.texts(name) for name in feet.values},
         ends=_read_ends(top.section("ends")),
         imu=robot.text("imu"),
         mass=robot.above_zero("mass"),

@@ -46,7 +46,7 @@ QUANTITIES = tuple(f.name for f in fields(Measurement) if f.name != "others")
 
 def layout(contract: Contract) -> dict[str, int]:
     """Values of each part of a measurement, the rows with sensors of their own last."""
-    own = {row.name: row.size for row in contract.rows if row.measured in OWN}
+    own = {row.name: row.size for row in contract.rows if row.measured in OWN and row.measured}
     return {**{name: quantity_size(contract, name) for name in QUANTITIES}, **own}
 
 

@@ -22,6 +22,7 @@ class Scene:
     model: mujoco.MjModel
     actuators: np.ndarray  # (D,) index of each joint's servo in ctrl
     sensordata: dict[str, np.ndarray]  # quantity, or name of a row with sensors of its own -> indices in sensordata
+    contacts: list[np.ndarray]  # the same of each foot
 
 
 def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE) -> Scene:
@@ -43,11 +44,11 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE) -> Scen
     own = {row.name: row for row in contract.rows if row.sensors}
     named, places = {**contract.sensors, **{name: row.sensors for name, row in own.items()}}, {}
     for name, sensors in named.items():
-        places[name] = np.concatenate([np.empty(0, dtype=int), *[_span(model, file, sensor, f"'{name}'") for sensor in sensors]])
+        places[name] = _places(model, file, sensors, name)
         size = own[name].size if name in own else quantity_size(contract, name)
         if len(places[name]) != size:
             raise ContractError(f"{file}: the sensors of '{name}' ({', '.join(sensors)}) have {len(places[name])} values, not {size}")
-    return Scene(model, np.array(actuators), places)
+    return Scene(model, np.array(actuators), places, [_places(model, file, names, foot) for foot, names in contract.feet.items()])
 
 
 def _index(model: mujoco.MjModel, file: str, kind: str, name: str, word: str) -> int:
@@ -63,11 +64,15 @@ def _names(model: mujoco.MjModel, kind: str) -> list[str]:
     return [name for name in names if name]
 
 
-def _span(model: mujoco.MjModel, file: str, name: str, what: str) -> np.ndarray:
-    index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
-    if index < 0:
-        raise ContractError(f"{CONTRACT_FILE}: sensors of {what}: {unknown('sensor', name, _names(model, 'sensor'), file)}")
-    return np.arange(model.sensor_adr[index], model.sensor_adr[index] + model.sensor_dim[index])
+def _places(model: mujoco.MjModel, file: str, sensors: Sequence[str], what: str) -> np.ndarray:
+    """Indices in sensordata of ``sensors``, side by side."""
+    spans = []
+    for name in sensors:
+        index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
+        if index < 0:
+            raise ContractError(f"{CONTRACT_FILE}: sensors of '{what}': {unknown('sensor', name, _names(model, 'sensor'), file)}")
+        spans.append(np.arange(model.sensor_adr[index], model.sensor_adr[index] + model.sensor_dim[index]))
+    return np.concatenate(spans)
 
 
 def _check_machine(model: mujoco.MjModel, file: str, contract: Contract, joints: Sequence[int], actuators: Sequence[int]) -> None:

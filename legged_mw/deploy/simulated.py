@@ -41,7 +41,8 @@ class Fleet:
         self._sensors, self._layout = self._batch.bind("sensordata"), layout(contract)
         self.qpos: Floats = self._batch.bind("qpos")  # (N, nq), a view: position [m], quaternion, joints in MuJoCo's order
         self.qvel: Floats = self._batch.bind("qvel")  # (N, nv), a view: the next step starts from what is written
-        self._ctrl, self._where, self._actuators = self._batch.bind("ctrl"), scene.sensordata, scene.actuators
+        self._ctrl, self._actuators = self._batch.bind("ctrl"), scene.actuators
+        self._where, self._contacts = scene.sensordata, scene.contacts
         self.broken: NDArray[np.bool_] = np.zeros(count, dtype=bool)  # robots that MuJoCo could not step since their reset
         self.reset()
 
@@ -86,8 +87,10 @@ class Fleet:
             return -self._sensors[:, self._where["up"]]
         if any(row.name == name and row.measured == SCAN for row in self.contract.rows):
             return self._scan()
-        value = self._sensors[:, self._where[name]]
-        return (value > 0.0).astype(float) if name == "foot_contact" else value
+        if name == "foot_contact":
+            feet = [(self._sensors[:, where] > 0.0).any(axis=1) for where in self._contacts]
+            return np.stack(feet, axis=1).astype(float) if feet else np.zeros((self.count, 0))
+        return self._sensors[:, self._where[name]]
 
     def _scan(self) -> Floats:
         """The height scan (N, points) [m] of the contract."""
