@@ -274,6 +274,52 @@ def test_a_task_with_a_row_of_its_own_is_deployed(tmp_path: Path) -> None:
         stage.controller.observe(dataclasses.replace(stage.measured, others={}), stage.commands())
 
 
+CROUCHER = '''"""A Go1 that also takes a base height and remembers its joint velocities."""
+from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.utils.task import Task
+class Croucher(LeggedRobot):
+    def _reward_crouch(self):
+        return (self.base_height - self.commands[:, 3]).abs()
+class CroucherCfg(Go1FlatCfg):
+    class commands(Go1FlatCfg.commands):
+        units = {"base_height": "m"}
+        mirror = {"base_height": 1.0}
+        class ranges(Go1FlatCfg.commands.ranges):
+            base_height: list[float] = [0.2, 0.3]
+    class observations(Go1FlatCfg.observations):
+        leave_out = {"state": ["base_lin_vel"]}
+        history = {"state.dof_vel": 3, "state.last_actions": 2}
+    class rewards(Go1FlatCfg.rewards):
+        class scales(Go1FlatCfg.rewards.scales):
+            crouch = -1.0
+TASK = Task(Croucher, CroucherCfg, Go1FlatCfgPPO)
+'''
+
+
+def test_a_further_command_and_history_are_deployed(tmp_path: Path) -> None:
+    (tmp_path / "croucher.py").write_text(CROUCHER)
+    args = [*SMALL[2:], "--max_iterations", "1", "--set", "runner.export=true", "--set", "env.episode_length_s=20"]
+    result = run("train", tmp_path, "--task", str(tmp_path / "croucher.py"), *args)
+    assert result.code == 0 and "not exported" not in result.out, result.out + result.err
+    [folder] = tmp_path.glob("logs/*/*/export")
+    contract = read_contract(folder)
+    assert [(c.name, c.unit, c.low, c.high, c.default) for c in contract.commands][3] == ("base_height", "m", 0.2, 0.3, 0.2)
+    assert [(row.name, row.size, row.history) for row in contract.rows] == [
+        ("base_ang_vel", 3, 1),
+        ("projected_gravity", 3, 1),
+        ("dof_pos", 12, 1),
+        ("dof_vel", 12, 3),
+        ("last_actions", 12, 2),
+        ("commands", 4, 1),
+    ]
+    assert contract.size == 18 + 36 + 24 + 4 and contract.rows[-1].unit == "m/s, m/s, rad/s, m"
+    stage = DeployStage(folder, 2, command=(0.0, 0.0, 0.0, 0.25))
+    stage.step()
+    np.testing.assert_array_equal(stage.commands(), [[0, 0, 0, 0.25]] * 2)
+    np.testing.assert_allclose(stage.controller.observe(stage.measured, stage.commands())[:, -1], 0.25)
+
+
 def test_a_row_that_nobody_can_measure_is_said(tmp_path: Path) -> None:
     text = Exported(FILES, 2e-7, 256, ("guess",)).text(tmp_path)
     assert "policy.onnx" in text and "differ from the trained policy's by 2e-07 at most" in text
