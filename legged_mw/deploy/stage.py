@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.deploy.contract import SCENE_FILE, Contract, read_contract
+from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.simulated import Fleet
@@ -26,10 +27,20 @@ class DeployStage:
     """``num_worlds`` robots that follow an exported policy in MuJoCo's C engine (the viewers' protocol ``Stage``)."""
 
     def __init__(
-        self, folder: Path, num_worlds: int = 1, command: Sequence[float] | None = None, threads: int = 0, scene_file: str = SCENE_FILE
+        self,
+        folder: Path,
+        num_worlds: int = 1,
+        command: Sequence[float] | None = None,
+        threads: int = 0,
+        scene_file: str = SCENE_FILE,
+        ends: Ends | None = None,
     ) -> None:
-        """Load the export in ``folder``; ``command`` (C,) is what robots follow where ``step`` gets none."""
-        self.contract = read_contract(folder)
+        """Load the export in ``folder``.
+
+        ``command`` (C,) is what robots follow where ``step`` gets none; ``ends`` are other rules for a fall than the contract's.
+        """
+        contract = read_contract(folder)
+        self.contract = replace(contract, ends=ends or contract.ends)
         self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file)
         self.controller = Controller(folder, self.contract, num_worlds)
         self.model, self.num_worlds, self.dt = self.fleet.model, num_worlds, self.contract.period
