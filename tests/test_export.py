@@ -125,7 +125,7 @@ def test_meshes_from_files_are_written_out(tmp_path: Path) -> None:
     (tmp_path / "robot.xml").write_text(mjcf)
     env = make_env(1, {"asset.file": str(tmp_path / "robot.xml"), "asset.colliders": ["FR", "FL", "RR", "RL", "trunk_box"]})
     pose = env.default_dof_pos.tolist()
-    scene = standalone(env.robot, imu="imu", feet=["FR"], qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
+    scene = standalone(env.robot, imu="imu", qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
     assert "stl" not in scene.xml
     model = mujoco.MjModel.from_xml_string(scene.xml)
     whole = env.robot.spec.copy().compile()
@@ -333,7 +333,7 @@ def test_a_picture_is_left_out_and_a_height_field_refused(monkeypatch: pytest.Mo
     spec.add_hfield(name="hills", file="hills.png")
     pose = env.default_dof_pos.tolist()
     with pytest.raises(ModelError, match="height field 'hills' comes from a file; an export must stand alone"):
-        standalone(type(robot)(**{**vars(robot), "spec": spec}), imu="imu", feet=["FR"], qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
+        standalone(type(robot)(**{**vars(robot), "spec": spec}), imu="imu", qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
 
 
 # ---- an export that would act otherwise is refused

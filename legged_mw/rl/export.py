@@ -233,7 +233,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
     pose = per_joint(cfg.init_state.default_joint_angles, robot.joint_names, "init_state.default_joint_angles")
     scales = per_joint(scale if isinstance(scale, dict) else {"": scale}, robot.joint_names, "control.action_scale")
     start = [*cfg.init_state.pos, 1.0, 0.0, 0.0, 0.0, *pose]
-    scene = standalone(robot, imu=cfg.asset.imu_site, feet=[], qpos=start, ctrl=pose, camera=cfg.viewer.camera)
+    scene = standalone(robot, cfg.asset.imu_site, qpos=start, ctrl=pose, camera=cfg.viewer.camera)
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
     end = cfg.termination
     ends = Ends(
@@ -256,7 +256,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         commands=env.command_table,
         rows=rows,
         scan=_scan(task) if any(row.measured == SCAN for row in rows) else None,
-        sensors={name: tuple(names) for name, names in scene.sensors.items() if names}
+        sensors={name: tuple(names) for name, names in scene.sensors.items()}
         | ({FALL: tuple(f"contact/{name}" for name in ends.falls_on)} if ends.falls_on else {}),
         feet=feet,
         ends=ends,
