@@ -57,9 +57,9 @@ def play() -> None:
 
 def export(task: LoadedTask, checkpoint: Path, folder: Path) -> str:
     """Export a policy with the config that it was trained with; returns what was written, in words."""
-    from legged_mw.rl.export import describe, export  # onnx takes a while to import
+    from legged_mw.rl.export import export  # onnx takes a while to import
 
-    return describe(export(task.to_dict(), checkpoint, folder), folder)
+    return export(task.to_dict(), checkpoint, folder).text(folder)
 
 
 def deploy() -> None:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import shutil
-import socket
 import subprocess
 import sys
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,18 +21,17 @@ import yaml
 
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
-from legged_mw.deploy import udp
-from legged_mw.deploy.contract import Contract, read_contract, read_scene
+from legged_mw.deploy.contract import Contract, ContractRow, Ends, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
 from legged_mw.deploy.runner import run
+from legged_mw.deploy.scene import read_scene
 from legged_mw.deploy.simulated import Fleet, MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import exam, rules
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.config import load_yaml
-from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import load_task
 
 SHIPPED = ROOT / "resources/policies/go1_flat"
@@ -120,15 +117,29 @@ WRONG = [
         lambda said: [said[name].pop() for name in ("joints", "default_pose", "stiffness", "damping")],
         "has size 12; joint_offset has 11 values",
     ),
-    (put("observation.4.scale", [1.0, 2.0]), "observation[4]: 'scale' is [1.0, 2.0]; it must be 12 numbers, one a value of the row"),
-    (put("robot.falls_on", ["trunk_box"]), "sensors: 'fall_contact' is missing; name the sensors of scene.xml that measure it"),
+    (
+        put("observation.4.scale", [1.0, 2.0]),
+        "observation[4]: 'scale' is [1.0, 2.0]; it must be a number, or 12 numbers, one a value of the row",
+    ),
+    (put("ends.falls_on", ["trunk_box"]), "sensors: 'fall_contact' is missing; name the sensors of scene.xml that measure it"),
     (put("default_pose", [0.0] * 11), "it must be 12 numbers, one a joint"),
     (put("default_pose.2", "bent"), "it must be 12 numbers, one a joint"),
     (put("stiffness.0", 20.0), "stiffness is [20., 35., 35.,"),
     (put("robot.mass", 20.0), "robot: mass is 20., but scene.xml has 12.743"),
-    (put("format", 2), "'format' is 2; it must be 1, the one that this version reads; export the policy again"),
-    (without("format"), "policy.yaml: 'format' is missing; it must be 1"),
-    (without("action.scale"), "policy.yaml: action: 'scale' is missing; it must be a number"),
+    (put("format", 1), "'format' is 1; it must be 2, the one that this version reads; export the policy again"),
+    (without("format"), "policy.yaml: 'format' is missing; it must be 2"),
+    (without("action.scale"), "policy.yaml: action: 'scale' is missing; it must be a number, or 12 numbers, one a joint"),
+    (put("action.scale", [0.5] * 11), "it must be a number, or 12 numbers, one a joint"),
+    (put("action.origin", "pose"), "policy.yaml: action: 'origin' is 'pose'; it must be one of default, joints, targets"),
+    (without("action.origin"), "policy.yaml: action: 'origin' is missing; it must be one of default, joints, targets"),
+    (without("commands"), "policy.yaml: 'commands' is missing; it must be a list of mappings"),
+    (put("commands.1.default", 0.9), "policy.yaml: commands[1]: 'default' is 0.9; it must be a number from -0.8 to 0.8"),
+    (lambda said: said["commands"].pop(), "observation row 'commands' has size 3; command has 2 values on this robot"),
+    (put("observation.3.history", 0), "policy.yaml: observation[3]: 'history' is 0; it must be a whole number from 1"),
+    (put("observation.3.history", 3), "its input is 'obs' ['batch', 48], the contract's is 'obs' [1, 72]"),
+    (without("ends"), "policy.yaml: 'ends' is missing; it must be a mapping"),
+    (put("ends.max_tlit", 60.0), "policy.yaml: ends: no rule 'max_tlit' in the rules that end a walk; did you mean 'max_tilt'?"),
+    (put("ends.max_tilt", 200.0), "policy.yaml: ends: 'max_tilt' is 200.0; it must be a number from 0 to 180"),
     (put("action.clip", float("nan")), "policy.yaml: action: 'clip' is nan; it must be a number"),
     (put("period", 0.03), "'period' is 0.03; it must be physics: timestep * decimation = 0.02"),
     (put("network.input", "observations"), "the contract's is 'observations' [1, 48]"),
@@ -189,23 +200,22 @@ def test_numbers_as_people_write_them(export: Path) -> None:
     text = (export / "policy.yaml").read_text()
     assert "scale: 0.5" in text
     (export / "policy.yaml").write_text(text.replace("scale: 0.5", "scale: 5e-1"))
-    assert read_contract(export).action_scale == 0.5
+    np.testing.assert_array_equal(read_contract(export).action.scale, [0.5] * 12)
 
 
 @pytest.mark.parametrize(
     ("args", "said"),
     [
-        (("--eval", "--serve", "127.0.0.1:1"), "are one thing each"),
-        (("--eval", "--viewer", "none"), "are one thing each"),
-        (("--serve", "127.0.0.1:1", "--video", "x.mp4"), "are one thing each"),
-        (("--eval", "--command", "1,0,0"), "--eval and --commands bring their own commands"),
+        (("--eval", "--viewer", "none"), "--eval brings its own commands, is on flat ground and shows nothing: leave --viewer out"),
+        (("--eval", "--command", "1,0,0"), "leave --command out"),
+        (("--eval", "--terrain"), "leave --terrain out"),
+        (("--command", "1,0,0", "--commands", "x.yaml"), "--commands brings its own commands: leave --command out"),
         (("--command", "fast"), "--command fast: write three numbers, vx,vy,yaw"),
         (("--command", "0,0,nan"), "--command 0,0,nan: write three numbers"),
         (
             ("--command", "0,1,0"),
             "--command 0,1,0: vy = 1 m/s is outside of what the policy was trained for, -0.8 to 0.8; the ranges are in ",
         ),
-        (("--udp", "robot"), "'robot' is no address; write HOST:PORT, e.g. 127.0.0.1:9870"),
         (("--time", "soon"), "'soon' is no duration"),
     ],
 )
@@ -314,7 +324,11 @@ def test_threads_change_no_bit(contract: Contract) -> None:
 def test_stage() -> None:
     stage = DeployStage(SHIPPED, 3, command=(0.5, 0.0, 0.0))
     assert stage.num_worlds == 3 and stage.dt == 0.02 and stage.qpos().shape == (3, 19)
-    np.testing.assert_array_equal(stage.limits, [[-1.5, -0.8, -1.2], [1.5, 0.8, 1.2]])
+    assert [(c.name, c.low, c.high) for c in stage.command_table] == [
+        ("lin_vel_x", -1.5, 1.5),
+        ("lin_vel_y", -0.8, 0.8),
+        ("ang_vel_yaw", -1.2, 1.2),
+    ]
     stage.step(None)
     np.testing.assert_array_equal(stage.commands(), [[0.5, 0, 0]] * 3)
     stage.step(np.array([[1.0, 0, 0], [0, 0.4, 0], [0, 0, 0.6]]))
@@ -325,7 +339,7 @@ def test_stage() -> None:
     stage.fleet.qpos[2, 3:7] = [0, 1, 0, 0]  # on its back
     stage.step(None)
     assert stage.fell().tolist() == [False, False, True]
-    assert stage.qpos()[2, 2] == 0.278 and not stage.controller.last_actions[2].any()  # begins anew
+    assert stage.qpos()[2, 2] == 0.278 and not stage.controller.last_actions[2].any()  # it starts again
     stage.step(None)
     assert not stage.fell().any()
     stage.reset(1)
@@ -398,7 +412,7 @@ def test_a_robot_walks_behind_the_seam(contract: Contract) -> None:
     assert done.steps == 150 == len(robot.targets) and done.fell is None and robot.closed == 1
     assert done.velocity is not None
     np.testing.assert_allclose(done.velocity, AHEAD, atol=0.08)
-    robot.robot.fleet.write(np.tile(contract.default_pose, (1, 1)))  # type: ignore[attr-defined]  # let go: targets move nothing
+    robot.robot.fleet.write(np.tile(contract.default_pose, (1, 1)))  # type: ignore[attr-defined]  # closed: targets move nothing
     assert not robot.robot.read().joint_torque.any()
 
 
@@ -417,7 +431,128 @@ def test_a_fall_ends_the_walk(contract: Contract) -> None:
     assert done.fell == 0.0 and done.steps == 0
 
 
-def test_what_is_not_finite_lets_the_joints_go(contract: Contract, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("ends", "turned", "down", "falls"),
+    [
+        ({}, [0, 1, 0, 0], 0.2, False),  # a handstand, or lying: nothing ends it
+        ({"max_tilt": 90.0}, [0, 1, 0, 0], 0.2, True),
+        ({"max_tilt": 170.0}, [0.17, 0.98, 0, 0], 0.2, False),
+        ({"max_tilt": 20.0}, [0.97, 0.24, 0, 0], 0.278, True),
+        ({"min_base_height": 0.18}, [1, 0, 0, 0], 0.278, False),
+        ({"min_base_height": 0.18}, [1, 0, 0, 0], 0.15, True),
+    ],
+)
+def test_the_contract_states_what_ends_a_walk(ends: dict[str, float], turned: list[float], down: float, falls: bool, export: Path) -> None:
+    """For one robot behind the seam, and for the robots of a stage."""
+    rewrite(export, put("ends", ends))
+    contract = read_contract(export)
+    assert contract.to_dict()["ends"] == ends
+    robot, stage = MujocoRobot(export, contract), DeployStage(export, 2)
+    for fleet in (robot.fleet, stage.fleet):
+        fleet.qpos[0, 2], fleet.qpos[0, 3:7] = down, np.array(turned) / np.linalg.norm(turned)
+    robot.fleet.refresh()
+    assert robot.fleet.fell().tolist() == [falls]
+    done = run(robot, Controller(export, contract), lambda _: AHEAD, 0.02, live=False)
+    assert done.steps == (0 if falls else 1) and (done.fell == 0.0 if falls else done.fell is None)
+    stage.step()
+    assert stage.fell().tolist() == [falls, False]
+
+
+def test_a_state_that_is_not_finite_always_ends(export: Path) -> None:
+    rewrite(export, put("ends", {}))
+    fleet = Fleet(export, read_contract(export), 2)
+    fleet.qvel[1, 0] = np.nan
+    fleet.write(np.tile(fleet.contract.default_pose, (2, 1)))
+    assert fleet.fell().tolist() == [False, True]
+
+
+# ---- the controller: what an action means, what it remembers
+
+
+def controller_of(contract: Contract, **changes: Any) -> tuple[Controller, list[Floats]]:
+    """A controller of two robots whose network answers 0.1, 0.2, 0.3 ..., and all that this network saw."""
+    saw: list[Floats] = []
+
+    def network(obs: Floats) -> Floats:
+        saw.append(np.array(obs))
+        return np.full((2, 12), 0.1 * len(saw), dtype=np.float32)
+
+    return Controller(SHIPPED, replace(contract, **changes), 2, network), saw
+
+
+def measured_at(angles: float, contract: Contract) -> Measurement:
+    """Two robots at rest, all joints at one angle [rad]."""
+    values = dict.fromkeys(("lin_vel", "ang_vel", "gravity", "acceleration"), np.zeros((2, 3)))
+    joints = dict.fromkeys(("joint_pos", "joint_vel", "joint_torque"), np.full((2, 12), angles))
+    return Measurement(**values, **joints, foot_contact=np.zeros((2, 4)))
+
+
+@pytest.mark.parametrize("origin", ["default", "joints", "targets"])
+def test_where_a_target_starts_from(origin: str, contract: Contract) -> None:
+    scale = np.linspace(0.1, 1.2, 12)
+    controller, _ = controller_of(contract, action=contract.action._replace(origin=origin, scale=scale, clip=0.25))
+    pose, commands = contract.default_pose, np.zeros((2, 3))
+    targets = [controller.act(measured_at(angle, contract), commands)[0] for angle in (0.5, 0.6, 0.7)]
+    starts = {"default": [pose] * 3, "joints": [0.5, 0.6, 0.7], "targets": [pose, pose + 0.1 * scale, pose + 0.3 * scale]}[origin]
+    for got, start, action in zip(targets, starts, (0.1, 0.2, 0.25), strict=True):  # the third is clipped
+        np.testing.assert_allclose(got, start + action * scale, atol=1e-7)
+    controller.reset([1])
+    after = controller.act(measured_at(0.5, contract), commands)
+    start = {"default": pose, "joints": 0.5, "targets": pose}[origin]
+    np.testing.assert_allclose(after[1], start + 0.25 * scale, atol=1e-7)
+    before = {"default": pose, "joints": 0.5, "targets": pose + 0.55 * scale}[origin]
+    np.testing.assert_allclose(after[0], before + 0.25 * scale, atol=1e-7)
+
+
+def test_history_is_oldest_first_and_filled_after_a_reset(contract: Contract) -> None:
+    rows = (
+        ContractRow("dof_vel", 12, "rad/s", "", 0.0, "joint_vel", scale=(0.5,) * 12, history=3),
+        ContractRow("commands", 3, "", "", 0.0, "command"),
+        ContractRow("last_actions", 12, "1", "", 0.0, "last_action", history=2),
+    )
+    controller, saw = controller_of(contract, rows=rows)
+    assert controller.contract.size == 36 + 3 + 24
+    for angle in (1.0, 2.0, 3.0, 4.0):
+        if angle == 4.0:
+            controller.reset(np.array([False, True]))
+        commands = np.full((2, 3), angle)
+        before = controller.observe(measured_at(angle, contract), commands)  # looking changes nothing
+        controller.act(measured_at(angle, contract), commands)
+        np.testing.assert_array_equal(before, saw[-1])
+    frames = [[*obs[0, [0, 12, 24]], obs[0, 36], *obs[0, [39, 51]]] for obs in saw]
+    expected = [[0.5, 0.5, 0.5, 1, 0, 0], [0.5, 0.5, 1, 2, 0, 0.1], [0.5, 1, 1.5, 3, 0.1, 0.2], [1, 1.5, 2, 4, 0.2, 0.3]]
+    np.testing.assert_allclose(frames, expected, atol=1e-7)
+    np.testing.assert_allclose(saw[3][1, [0, 12, 24, 36, 39, 51]], [2, 2, 2, 4, 0, 0], atol=1e-7)  # the robot that was reset
+
+
+def test_a_robot_without_feet_and_a_task_without_commands(export: Path) -> None:
+    def change(entries: Any) -> None:
+        entries["robot"]["feet"], entries["commands"] = {}, []
+        entries["observation"].pop()
+        entries["ends"] = {}
+        model = onnx.load(export / "policy.onnx")  # the network takes no commands: it pads them with zeros
+        [old] = model.graph.input
+        model.graph.initializer.append(onnx.helper.make_tensor("pads", onnx.TensorProto.INT64, [4], [0, 0, 0, 3]))
+        model.graph.node.insert(0, onnx.helper.make_node("Pad", ["short", "pads"], [old.name]))
+        model.graph.input.insert(0, onnx.helper.make_tensor_value_info("short", onnx.TensorProto.FLOAT, ["batch", 45]))
+        model.graph.input.remove(old)
+        onnx.save(model, export / "policy.onnx")
+        entries["network"] |= {"input": "short", "sha256": hashlib.sha256((export / "policy.onnx").read_bytes()).hexdigest()}
+
+    rewrite(export, change)
+    contract = read_contract(export)
+    assert contract.commands == () and contract.feet == {} and contract.ends == Ends()
+    assert read_contract(export).to_dict() == contract.to_dict() == load_yaml(export / "policy.yaml")
+    stage = DeployStage(export, 2)
+    for _ in range(20):
+        stage.step()
+    assert stage.commands().shape == (2, 0) and stage.contacts().shape == (2, 0) and np.isfinite(stage.qpos()).all()
+    np.testing.assert_allclose(stage.velocity()[:, :2], 0.0, atol=0.1)  # it stands
+    done = run(MujocoRobot(export, contract), Controller(export, contract), lambda _: np.zeros(0), 0.1, live=False)
+    assert done.steps == 5 and done.velocity is not None
+
+
+def test_targets_that_are_not_finite_close_the_robot(contract: Contract, monkeypatch: pytest.MonkeyPatch) -> None:
     robot, controller = Recorder(MujocoRobot(SHIPPED, contract)), Controller(SHIPPED, contract)
     monkeypatch.setattr(controller, "_network", lambda obs: np.full((1, 12), np.nan, dtype=np.float32))
     with pytest.raises(RobotError, match="the policy's targets are not finite"):
@@ -444,96 +579,6 @@ def test_live_keeps_time(contract: Contract, monkeypatch: pytest.MonkeyPatch) ->
     assert done.steps == 10 and done.late == 1  # and what was lost is not made up for
     np.testing.assert_allclose(slept, [0, *[0.015] * 8], atol=1e-9)
     np.testing.assert_allclose(written[:5], [0, 0.02, 0.04, 0.09, 0.11], atol=1e-9)
-
-
-# ---- the seam over UDP
-
-
-@pytest.fixture
-def served(contract: Contract) -> Iterator[tuple[udp.UdpServer, MujocoRobot, list[str]]]:
-    """A server on a thread, and what it said."""
-    said: list[str] = []
-    robot = MujocoRobot(SHIPPED, contract)
-    server = udp.UdpServer(robot, contract, ("127.0.0.1", 0), timeout=5.0)
-    thread = threading.Thread(target=server.serve, args=(said.append,), daemon=True)
-    thread.start()
-    yield server, robot, said
-    with contextlib.suppress(RobotError):  # a test's own client may have closed it, and it may be about to end
-        udp.UdpRobot(contract, server.address).close()
-    thread.join(timeout=20)
-    assert not thread.is_alive()
-
-
-def test_the_walk_is_the_same_over_udp(served: Any, contract: Contract) -> None:
-    server, _, said = served
-    runs = []
-    for robot in (MujocoRobot(SHIPPED, contract), udp.UdpRobot(contract, server.address, timeout=5.0)):
-        recorder = Recorder(robot)
-        run(recorder, Controller(SHIPPED, contract), lambda _: AHEAD, 1.0, live=False)
-        runs.append(recorder)
-    here, there = runs
-    np.testing.assert_array_equal(here.targets, there.targets)  # bit for bit
-    np.testing.assert_array_equal([m.joint_torque for m in here.measured], [m.joint_torque for m in there.measured])
-    for _ in range(200):
-        if len(said) == 2:
-            break
-        threading.Event().wait(0.02)
-    assert said[0].endswith("took the robot") and said[1].endswith("closed the link; the joints are damped, no longer servoed")
-
-
-def test_a_silent_client_costs_the_servos(contract: Contract) -> None:
-    robot, said = MujocoRobot(SHIPPED, contract), []
-    server = udp.UdpServer(robot, contract, ("127.0.0.1", 0), timeout=0.2)
-    thread = threading.Thread(target=server.serve, args=(said.append,), daemon=True)
-    thread.start()
-    client = udp.UdpRobot(contract, server.address)
-    client.write(contract.default_pose)
-    thread.join(timeout=20)
-    assert said[-1].endswith("fell silent for 0.2 s; the joints are damped, no longer servoed")
-    robot.write(contract.default_pose)
-    assert not robot.read().joint_torque.any()
-    with pytest.raises(RobotError, match=r"robot at 127.0.0.1:\d+: .*; stopped \(start one with"):
-        client.write(contract.default_pose)
-    client.close()
-
-
-def test_nobody_answers(contract: Contract, capsys: pytest.CaptureFixture[str]) -> None:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as deaf:
-        deaf.bind(("127.0.0.1", 0))
-        port = deaf.getsockname()[1]
-        with pytest.raises(RobotError, match=f"robot at 127.0.0.1:{port}: no answer within 0.1 s; stopped"):
-            udp.UdpRobot(contract, ("127.0.0.1", port), timeout=0.1)
-        with pytest.raises(UserError, match=f"cannot listen at 127.0.0.1:{port}: "):
-            udp.UdpServer(MujocoRobot(SHIPPED, contract), contract, ("127.0.0.1", port))
-
-
-def test_a_client_of_another_contract_is_refused(served: Any, contract: Contract, export: Path) -> None:
-    server, robot, _ = served
-    rewrite(export, put("joints", list(reversed(contract.joints))))
-    other = read_contract(export)
-    assert udp.contract_digest(other) != udp.contract_digest(contract)
-    with pytest.raises(RobotError, match="its export has other joints, measurements or another period; use one export at both ends"):
-        udp.UdpRobot(other, server.address, timeout=5.0)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as raw:
-        raw.settimeout(5.0)
-        raw.sendto(b"hello?", server.address)  # none of ours: no answer
-        packet = bytearray(udp.pack(udp.HELLO, udp.contract_digest(contract), 0))
-        packet[4] = 9
-        raw.sendto(packet, server.address)
-        answer = udp.unpack(raw.recv(1000))
-        assert answer is not None and answer.kind == udp.REFUSED and b"speaks version 9 of the link, this one 1" in answer.body
-        raw.sendto(udp.pack(udp.TARGETS, udp.contract_digest(contract), 1, bytes(96)), server.address)
-        answer = udp.unpack(raw.recv(1000))
-        assert answer is not None and answer.kind == udp.REFUSED and answer.body == b"say hello first"
-    assert robot.fleet.qpos[0, 2] == 0.278  # nobody has moved it
-
-
-def test_bad_targets_move_nothing(served: Any, contract: Contract) -> None:
-    server, robot, _ = served
-    client = udp.UdpRobot(contract, server.address, timeout=5.0)
-    with pytest.raises(RobotError, match="targets must be 12 finite numbers, one a joint"):
-        client.write(np.full(12, np.nan))
-    assert robot.fleet.qpos[0, 2] == 0.278
 
 
 # ---- where torch is not installed

@@ -17,7 +17,6 @@ from legged_mw.deploy.contract import ContractError, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.simulated import Fleet, MujocoRobot
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.deploy.udp import contract_digest
 from legged_mw.rl.export_scene import among_steps
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import make_terrain
@@ -89,7 +88,7 @@ def test_where_there_is_no_ground_it_is_deep(export: Path) -> None:
     assert np.allclose(scan[8, 5], 0.0, atol=1e-6) and np.allclose(scan[0], 1.0) and np.allclose(scan[:, 0], 1.0)
 
 
-def test_it_walks_behind_the_seam_and_another_grid_is_another_contract() -> None:
+def test_it_walks_behind_the_seam() -> None:
     stage = DeployStage(SHIPPED, 2, command=(0.6, 0.0, 0.0))
     for _ in range(150):
         stage.step()
@@ -98,7 +97,6 @@ def test_it_walks_behind_the_seam_and_another_grid_is_another_contract() -> None
     robot, controller = MujocoRobot(SHIPPED, contract), Controller(SHIPPED, contract)
     measured = robot.read()
     assert measured.others["height_scan"].shape == (187,) and controller.act(measured, np.zeros((1, 3))).shape == (1, 12)
-    assert contract_digest(contract) != contract_digest(read_contract(ROOT / "resources/policies/go1_rough"))
 
 
 def test_among_steps_it_stands_on_boxes_and_sees_them() -> None:

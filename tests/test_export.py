@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shutil
 import zipfile
 from pathlib import Path
@@ -16,14 +17,18 @@ from program import SMALL, files, run, trained
 from worlds import make_env
 
 from legged_mw import ROOT
-from legged_mw.deploy.contract import ROWS, ContractError, read_contract, read_scene
+from legged_mw.deploy.contract import ROWS, ContractError, Ends, read_contract
+from legged_mw.deploy.scene import read_scene
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.envs.legged_robot import LeggedRobot, Row
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.observations import Row
 from legged_mw.rl import export as exporting
-from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, describe, export
+from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, export
+from legged_mw.rl.export_replay import overridden
 from legged_mw.rl.export_scene import differences, standalone
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import load_yaml
+from legged_mw.utils.task import LoadedTask, load_task
 
 TASK = ["--task", "go1_flat", "--device", "cpu"]
 
@@ -68,12 +73,15 @@ def test_no_file_says_where_it_was_made(made: Path) -> None:
 
 def test_contract_states_what_was_trained(made: Path) -> None:
     contract, env = read_contract(made), make_env(1)
-    assert contract.joints == env.robot.joint_names and contract.imu == "imu" and contract.feet == ("FR", "FL", "RR", "RL")
+    assert contract.joints == env.robot.joint_names and contract.imu == "imu" and list(contract.feet) == ["FR", "FL", "RR", "RL"]
     np.testing.assert_allclose(contract.default_pose, env.default_dof_pos, atol=1e-7)
-    assert (contract.action_scale, contract.action_clip, contract.period, contract.decimation) == (0.5, 2.0, 0.02, 5)
+    assert (contract.action.origin, set(contract.action.scale), contract.action.clip) == ("default", {0.5}, 2.0)
+    assert (contract.period, contract.decimation, contract.ends) == (0.02, 5, Ends(max_tilt=90.0))
     assert contract.mass == pytest.approx(env.total_mass, abs=1e-5) and set(contract.stiffness) == {35.0} and set(contract.damping) == {0.5}
-    np.testing.assert_allclose(contract.command_ranges, env.command_ranges)
-    assert [(row.name, row.size, row.noise) for row in contract.rows] == env.observation_table["state"]
+    np.testing.assert_allclose([[c.low for c in contract.commands], [c.high for c in contract.commands]], env.command_ranges)
+    assert [(c.name, c.unit) for c in contract.commands] == [("lin_vel_x", "m/s"), ("lin_vel_y", "m/s"), ("ang_vel_yaw", "rad/s")]
+    trained_rows = [(row.name, row.size, row.noise) for row in env.observations.groups["state"]]
+    assert [(row.name, row.size, row.noise) for row in contract.rows] == trained_rows
     assert all(row.unit and row.frame and row.measured for row in contract.rows) and contract.size == 48
 
 
@@ -117,7 +125,7 @@ def test_meshes_from_files_are_written_out(tmp_path: Path) -> None:
     (tmp_path / "robot.xml").write_text(mjcf)
     env = make_env(1, {"asset.file": str(tmp_path / "robot.xml"), "asset.colliders": ["FR", "FL", "RR", "RL", "trunk_box"]})
     pose = env.default_dof_pos.tolist()
-    scene = standalone(env.robot, imu="imu", feet=["FR"], qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
+    scene = standalone(env.robot, imu="imu", qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
     assert "stl" not in scene.xml
     model = mujoco.MjModel.from_xml_string(scene.xml)
     whole = env.robot.spec.copy().compile()
@@ -130,9 +138,8 @@ def test_the_export_is_replaced_whole_or_not_at_all(made: Path, tmp_path: Path, 
     """Foreign files in the folder stay; a failure, early or late, leaves the export that was there."""
     out = tmp_path / "out"
     shutil.copytree(made, out)
-    for name, file in (("save_onnx", "policy.onnx"), ("save_program", "policy.pt")):  # tracing takes seconds and is not what is tried
-        monkeypatch.setattr(exporting, name, lambda _, path, file=file: shutil.copy(made / file, path))
-    monkeypatch.setattr(exporting, "trace", lambda *_: None)
+    # the exporter takes seconds and is not what is tried
+    monkeypatch.setattr(exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(made / "policy.onnx", path))
     (out / "README.md").write_text("mine")
     before = files(tmp_path)
     for name, fails in (("run_onnx", lambda path, obs: np.ones((len(obs), 12))), ("make_contract", lambda *_: 1 / 0)):
@@ -166,11 +173,11 @@ def test_a_network_that_cannot_be_traced(made: Path, tmp_path: Path, monkeypatch
 
 
 def test_a_nan_is_a_mismatch() -> None:
-    actions = torch.zeros(3, 2)
+    actions = np.zeros((3, 2))
     with pytest.raises(ExportError, match="acts otherwise"):
-        exporting._compare("policy.onnx", np.full((3, 2), np.nan), actions)
+        exporting._compare(np.full((3, 2), np.nan), actions)
     with pytest.raises(ExportError, match="acts otherwise"):
-        exporting._compare("policy.onnx", np.zeros((1, 2)), actions)
+        exporting._compare(np.zeros((1, 2)), actions)
 
 
 def test_without_onnxruntime(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -199,8 +206,8 @@ def test_an_export_that_fails_does_not_end_a_training(tmp_path: Path, monkeypatc
 
 
 class OwnRows(LeggedRobot):
-    def _observation_rows(self) -> dict[str, list[Row]]:
-        rows = super()._observation_rows()
+    def observation_rows(self) -> dict[str, list[Row | str]]:
+        rows = super().observation_rows()
         sensed = self.sim.sensordata[:, self.robot.sensors["accelerometer"]]
         rows["state"] += [Row("shake", sensed, 0.5, sensors=("accelerometer/imu",), unit="m/s^2", frame="body")]
         rows["state"] += [Row("guess", self.feet_air_time)]
@@ -209,31 +216,32 @@ class OwnRows(LeggedRobot):
 
 def test_rows_of_ones_own() -> None:
     """One that names its sensors can be deployed; one of an unknown name says that nobody knows."""
-    *_, shake, guess = contract_rows(make_env(1, env_class=OwnRows), "state")
+    *_, shake, guess = contract_rows(make_env(1, env_class=OwnRows), "state", 1.0)
     assert (shake.measured, shake.sensors, shake.unit, shake.size, shake.noise, shake.scale) == (
         "sensors",
         ("accelerometer/imu",),
         "m/s^2",
         3,
         0.5,
-        (1.0,),
+        (1.0, 1.0, 1.0),
     )
     assert (guess.measured, guess.unit, guess.size) == ("", "", 4)
 
 
 def test_a_group_within_a_group_is_written_out() -> None:
-    names = [row.name for row in contract_rows(make_env(1), "privileged_state")]
+    names = [row.name for row in contract_rows(make_env(1), "privileged_state", 1.0)]
     assert names[:7] == ["base_lin_vel", "base_ang_vel", "projected_gravity", "dof_pos", "dof_vel", "last_actions", "commands"]
     assert names[7:9] == ["base_ang_vel", "accelerometer"] and {"torques", "foot_contact"} <= set(names) & set(ROWS)
 
 
 DOG = '''"""A dog that feels its shakes."""
 from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
-from legged_mw.envs.legged_robot import LeggedRobot, Row
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.observations import Row
 from legged_mw.utils.task import Task
 class Dog(LeggedRobot):
-    def _observation_rows(self):
-        rows = super()._observation_rows()
+    def observation_rows(self):
+        rows = super().observation_rows()
         sensed = self.sim.sensordata[:, self.robot.sensors["accelerometer"]]
         rows["state"] += [Row("shake", sensed, mirror="polar", sensors=("accelerometer/imu",), unit="m/s^2", scale=(0.5, 0.5, 0.1))]
         return rows
@@ -257,7 +265,7 @@ def test_a_task_with_a_row_of_its_own_is_deployed(tmp_path: Path) -> None:
     obs = stage.controller.observe(stage.measured, stage.commands())
     assert obs.shape == (2, 51)
     np.testing.assert_allclose(obs[:, -3:], stage.measured.acceleration * [0.5, 0.5, 0.1], rtol=1e-6)
-    assert stage.contract.falls_on == ("trunk_box", "trunk_right", "trunk_left") and not stage.fell().any()
+    assert stage.contract.ends.falls_on == ("trunk_box", "trunk_right", "trunk_left") and not stage.fell().any()
     stage.fleet.qpos[1, 2] = 0.04  # with its trunk in the ground
     stage.fleet.write(stage.contract.default_pose + np.zeros((2, 1)))
     assert stage.fleet.fell().tolist() == [False, True]
@@ -265,8 +273,54 @@ def test_a_task_with_a_row_of_its_own_is_deployed(tmp_path: Path) -> None:
         stage.controller.observe(dataclasses.replace(stage.measured, others={}), stage.commands())
 
 
+CROUCHER = '''"""A Go1 that also takes a base height and remembers its joint velocities."""
+from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.utils.task import Task
+class Croucher(LeggedRobot):
+    def _reward_crouch(self):
+        return (self.base_height - self.commands[:, 3]).abs()
+class CroucherCfg(Go1FlatCfg):
+    class commands(Go1FlatCfg.commands):
+        units = {"base_height": "m"}
+        mirror = {"base_height": 1.0}
+        class ranges(Go1FlatCfg.commands.ranges):
+            base_height: list[float] = [0.2, 0.3]
+    class observations(Go1FlatCfg.observations):
+        leave_out = {"state": ["base_lin_vel"]}
+        history = {"state.dof_vel": 3, "state.last_actions": 2}
+    class rewards(Go1FlatCfg.rewards):
+        class scales(Go1FlatCfg.rewards.scales):
+            crouch = -1.0
+TASK = Task(Croucher, CroucherCfg, Go1FlatCfgPPO)
+'''
+
+
+def test_a_further_command_and_history_are_deployed(tmp_path: Path) -> None:
+    (tmp_path / "croucher.py").write_text(CROUCHER)
+    args = [*SMALL[2:], "--max_iterations", "1", "--set", "runner.export=true", "--set", "env.episode_length_s=20"]
+    result = run("train", tmp_path, "--task", str(tmp_path / "croucher.py"), *args)
+    assert result.code == 0 and "not exported" not in result.out, result.out + result.err
+    [folder] = tmp_path.glob("logs/*/*/export")
+    contract = read_contract(folder)
+    assert [(c.name, c.unit, c.low, c.high, c.default) for c in contract.commands][3] == ("base_height", "m", 0.2, 0.3, 0.2)
+    assert [(row.name, row.size, row.history) for row in contract.rows] == [
+        ("base_ang_vel", 3, 1),
+        ("projected_gravity", 3, 1),
+        ("dof_pos", 12, 1),
+        ("dof_vel", 12, 3),
+        ("last_actions", 12, 2),
+        ("commands", 4, 1),
+    ]
+    assert contract.size == 18 + 36 + 24 + 4 and contract.rows[-1].unit == "m/s, m/s, rad/s, m"
+    stage = DeployStage(folder, 2, command=(0.0, 0.0, 0.0, 0.25))
+    stage.step()
+    np.testing.assert_array_equal(stage.commands(), [[0, 0, 0, 0.25]] * 2)
+    np.testing.assert_allclose(stage.controller.observe(stage.measured, stage.commands())[:, -1], 0.25)
+
+
 def test_a_row_that_nobody_can_measure_is_said(tmp_path: Path) -> None:
-    text = describe(Exported(FILES, 2e-7, 256, ("guess",)), tmp_path)
+    text = Exported(FILES, 2e-7, 256, ("guess",)).text(tmp_path)
     assert "policy.onnx" in text and "differ from the trained policy's by 2e-07 at most" in text
     assert "nothing says how to measure guess: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)" in text
 
@@ -278,4 +332,163 @@ def test_a_picture_is_left_out_and_a_height_field_refused(monkeypatch: pytest.Mo
     spec.add_hfield(name="hills", file="hills.png")
     pose = env.default_dof_pos.tolist()
     with pytest.raises(ModelError, match="height field 'hills' comes from a file; an export must stand alone"):
-        standalone(type(robot)(**{**vars(robot), "spec": spec}), imu="imu", feet=["FR"], qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
+        standalone(type(robot)(**{**vars(robot), "spec": spec}), imu="imu", qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
+
+
+# ---- an export that would act otherwise is refused
+
+
+class OtherTargets(LeggedRobot):
+    def _apply_actions(self) -> None:
+        torch.add(self.dof_pos, self.actions, alpha=0.25, out=self.sim.ctrl)
+
+
+class OtherAngles(LeggedRobot):
+    def observation_rows(self) -> dict[str, list[Row | str]]:
+        rows = super().observation_rows()
+        rows["state"] = [
+            row._replace(value=self.dof_pos) if isinstance(row, Row) and row.name == "dof_pos" else row for row in rows["state"]
+        ]
+        return rows
+
+
+class OtherScale(LeggedRobot):
+    def compute_observations(self) -> None:
+        super().compute_observations()
+        self.obs_buf["state"][:, self.observations.span("state", "base_ang_vel")] *= 0.25
+
+
+class OtherVelocity(LeggedRobot):
+    """What rows read is changed, not the rows."""
+
+    def _update_state(self) -> None:
+        super()._update_state()
+        self.base_lin_vel.mul_(2.0)
+
+
+class OtherMemory(LeggedRobot):
+    def _end_step(self) -> None:
+        super()._end_step()
+        self.last_actions.mul_(0.5)
+
+
+class OtherPose(LeggedRobot):
+    def _init_buffers(self) -> None:
+        self.default_dof_pos += 0.1
+        super()._init_buffers()
+
+
+class NoClip(LeggedRobot):
+    def _step(self) -> None:
+        raw = self.actions.clone()
+        super()._step()
+        self.obs_buf["state"][:, self.observations.span("state", "last_actions")] = raw.masked_fill_(self.reset_buf[:, None], 0.0)
+
+
+class OtherRewards(LeggedRobot):
+    """Nothing of this is an export's business."""
+
+    def _reward_torques(self) -> torch.Tensor:
+        return super()._reward_torques() * 2.0
+
+    def check_termination(self) -> None:
+        super().check_termination()
+
+
+def export_of(env_class: type[LeggedRobot], made: Path, out: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> Exported:
+    """Export the trained policy as one of another class and other settings, by their dotted paths."""
+
+    def load(name: str) -> LoadedTask:
+        task = load_task("go1_flat")
+        task.env_class = env_class
+        return task
+
+    monkeypatch.setattr(exporting, "load_task", load)
+    monkeypatch.setattr(exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(made / "policy.onnx", path))
+    task = load_task("go1_flat")
+    task.update(load_yaml(made / "config.yaml"), "config.yaml")
+    for path, value in changes.items():
+        task.set(path.replace("__", "."), value)
+    return export(task.to_dict(), made / "model.pt", out)
+
+
+@pytest.mark.parametrize(
+    ("env_class", "what", "method"),
+    [
+        (OtherTargets, "joint target ", "OtherTargets overrides _apply_actions"),
+        (OtherAngles, "observation row 'dof_pos' 0 is ", "OtherAngles overrides observation_rows"),
+        (OtherScale, "observation row 'base_ang_vel' ", "OtherScale overrides compute_observations"),
+        (OtherVelocity, "observation row 'base_lin_vel' ", "OtherVelocity overrides _update_state"),
+        (OtherMemory, "observation row 'last_actions' ", "OtherMemory overrides _end_step"),
+        (NoClip, "observation row 'last_actions' ", "NoClip overrides _step"),
+        (OtherPose, "observation row 'dof_pos' ", "OtherPose overrides _init_buffers"),
+    ],
+)
+def test_an_export_that_would_act_otherwise_is_refused(
+    env_class: type[LeggedRobot], what: str, method: str, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(ExportError, match="legged_mw.deploy would act otherwise than the environment: ") as error:
+        export_of(env_class, made, tmp_path / "out", monkeypatch)
+    assert what in str(error.value) and f"{method}. State it where the contract can take it from" in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_refusal_states_place_and_both_values(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(ExportError) as error:
+        export_of(OtherAngles, made, tmp_path / "out", monkeypatch)
+    found = re.search(r"row 'dof_pos' 0 is (\S+) in the environment and (\S+) by policy.yaml, at step 0\.", str(error.value))
+    assert found and float(found[1]) - float(found[2]) == pytest.approx(0.1, abs=1e-4)  # the default angle of the first joint
+    with pytest.raises(ExportError) as error:
+        export_of(OtherTargets, made, tmp_path / "out", monkeypatch)
+    assert "joint target FR_hip_joint is " in str(error.value)
+
+
+def test_what_the_contract_states_is_exported(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Actions from another origin with a scale a joint, encoders that are off, delays, noise: deploy acts as the environment."""
+    changes = {
+        "control__action_origin": "targets",
+        "control__action_scale": {"hip": 0.1, "thigh": 0.1, "calf": 0.05},
+        "domain_rand__enable": True,
+        "domain_rand__encoder_offset": [-0.05, 0.05],
+        "domain_rand__action_delay": [0, 2],
+        "domain_rand__observation_delay": [1, 2],
+        "termination__max_tilt": 180.0,
+        "termination__min_base_height": 0.1,
+    }
+    export_of(OtherRewards, made, tmp_path / "out", monkeypatch, **changes)
+    contract = read_contract(tmp_path / "out")
+    assert contract.action.origin == "targets" and contract.action.scale.tolist() == [0.1, 0.1, 0.05] * 4
+    assert contract.ends == Ends(min_base_height=0.1)
+    assert load_yaml(tmp_path / "out/config.yaml")["domain_rand"]["action_delay"] == [0, 2]  # as trained
+    assert [row.noise for row in contract.rows][:2] == [0.1, 0.2]
+    export_of(LeggedRobot, made, tmp_path / "joints", monkeypatch, control__action_origin="joints")
+    assert read_contract(tmp_path / "joints").action.origin == "joints"
+
+
+class Unmeasured(LeggedRobot):
+    """The speed of the feet instead of the commands: nobody can measure it."""
+
+    def observation_rows(self) -> dict[str, list[Row | str]]:
+        rows = super().observation_rows()
+        rows["state"][-1] = Row("speeds", self.foot_speed[:, :3])
+        return rows
+
+
+class UnmeasuredAndOther(Unmeasured, OtherScale):
+    pass
+
+
+def test_a_row_that_cannot_be_measured_is_exported_and_the_others_compared(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    exported = export_of(Unmeasured, made, tmp_path / "out", monkeypatch)
+    assert exported.unknown == ("speeds",) and "nothing says how to measure speeds" in exported.text(tmp_path)
+    with pytest.raises(ContractError, match="observation row 'speeds': nothing says how it is measured"):
+        read_contract(tmp_path / "out")
+    with pytest.raises(ExportError, match="row 'base_ang_vel' .*UnmeasuredAndOther overrides observation_rows, compute_observations"):
+        export_of(UnmeasuredAndOther, made, tmp_path / "out", monkeypatch)
+
+
+def test_only_methods_of_the_framework_count_as_overridden() -> None:
+    assert overridden(LeggedRobot) == [] and overridden(OtherRewards) == ["check_termination"]
+    assert overridden(UnmeasuredAndOther) == ["observation_rows", "compute_observations"]

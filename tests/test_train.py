@@ -28,7 +28,7 @@ from tensordict import TensorDict
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl.export import save_onnx, trace
+from legged_mw.rl.export import save_onnx
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.rl.runner import Runner, make_runner, rsl_rl_config
 from legged_mw.rl.runs import checkpoints, find_checkpoint, find_run, new_run, runs
@@ -443,7 +443,7 @@ def policy(three: Path, env: LeggedRobot) -> Any:
 def test_onnx_equals_torch(policy: Any, env: LeggedRobot, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """The normaliser and the clamp are inside: it takes raw observations and its output can go to the servos."""
     clip = env.cfg.normalization.clip_actions
-    save_onnx(trace(policy, clip), tmp_path / "policy.onnx")
+    save_onnx(policy, clip, tmp_path / "policy.onnx")
     assert not [record for record in caplog.records if record.levelno >= logging.WARNING]  # the exporter's own affairs
     assert [path.name for path in tmp_path.iterdir()] == ["policy.onnx"]
     model = onnx.load(str(tmp_path / "policy.onnx"), load_external_data=False)
@@ -465,7 +465,7 @@ def test_onnx_equals_torch(policy: Any, env: LeggedRobot, tmp_path: Path, caplog
 def test_onnx_leaves_the_policy_alone(policy: Any, env: LeggedRobot, tmp_path: Path) -> None:
     before, obs = copy.deepcopy(policy.state_dict()), env.get_observations()
     acted = act(policy, obs)
-    save_onnx(trace(policy, 0.01), tmp_path / "policy.onnx")
+    save_onnx(policy, 0.01, tmp_path / "policy.onnx")
     assert_equal(dict(policy.state_dict()), dict(before))
     assert torch.equal(act(policy, obs), acted) and acted.abs().max() > 0.01
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from legged_mw.deploy.contract import Ends, read_contract
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rules
 
@@ -20,7 +21,8 @@ def run_exam(folder: Path, threads: int = 0) -> dict[str, Any]:
     asked = np.array(rules.commands())
     kicks = len(rules.KICK_SPEEDS) * rules.KICK_DIRECTIONS
     wanted = np.concatenate([asked, np.tile([rules.KICK_COMMAND, 0.0, 0.0], (kicks, 1))])
-    stage = DeployStage(folder, len(wanted), threads=threads)
+    ends = Ends(max_tilt=90.0, falls_on=read_contract(folder).ends.falls_on)  # what counts as a fall in legged_mw.eval.exam
+    stage = DeployStage(folder, len(wanted), threads=threads, ends=ends)
     fell_at = np.full(len(wanted), math.inf)
     velocity, position, power, joint_speed = [], [], [], []
     for step in range(round(rules.SECONDS / stage.dt)):

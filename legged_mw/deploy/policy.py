@@ -1,10 +1,8 @@
-"""The network of an export, and the loop of thought around it: measurement and command in, servo targets out.
-
-Knows no robot and no clock.
-"""
+"""The network of an export and the controller around it: measurement and command in, servo targets out. No robot, no clock."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -59,34 +57,51 @@ class Network:
 
 
 class Controller:
-    """A policy at work on ``count`` robots: builds observations as the contract says and remembers the last actions."""
+    """A policy at work on ``count`` robots: observations and joint targets as the contract states them, and the memory they need."""
 
-    def __init__(self, folder: Path, contract: Contract, count: int = 1) -> None:
-        self.contract, self._network = contract, Network(folder, contract)
+    def __init__(self, folder: Path, contract: Contract, count: int = 1, network: Callable[[Floats], Floats] | None = None) -> None:
+        """``network``: observations (N, size) to actions (N, D), instead of the one in ``folder``."""
+        self.contract, self._network = contract, network or Network(folder, contract)
         self.last_actions = np.zeros((count, len(contract.joints)), dtype=np.float32)
+        self.last_targets = np.tile(contract.default_pose, (count, 1))  # (N, D) [rad]
+        self._frames = [np.zeros((count, row.history, row.size), dtype=np.float32) for row in contract.rows]  # as last observed
+        self._fresh = np.ones(count, dtype=bool)  # robots that have observed nothing since their reset
 
     def observe(self, measurement: Measurement, commands: Floats) -> NDArray[np.float32]:
         """The network's input (N, size) from a measurement of N robots (or of one, without the leading axis)."""
-        values = {
+        return _side_by_side(self._look(measurement, commands))
+
+    def act(self, measurement: Measurement, commands: Floats) -> NDArray[np.float64]:
+        """Joint targets (N, D) [rad] for the next period; ``commands`` (N, C) in the contract's order."""
+        action = self.contract.action
+        self._frames, self._fresh[:] = self._look(measurement, commands), False
+        self.last_actions = np.clip(self._network(_side_by_side(self._frames)), -action.clip, action.clip)
+        origins = {"default": self.contract.default_pose, "joints": np.atleast_2d(measurement.joint_pos), "targets": self.last_targets}
+        self.last_targets = origins[action.origin] + action.scale * self.last_actions.astype(np.float64)
+        return self.last_targets.copy()
+
+    def reset(self, which: Any = slice(None)) -> None:
+        """The robots ``which`` (indices or a mask) begin again: no actions, targets or frames of theirs are remembered."""
+        self.last_actions[which], self.last_targets[which], self._fresh[which] = 0.0, self.contract.default_pose, True
+
+    def _look(self, measurement: Measurement, commands: Floats) -> list[NDArray[np.float32]]:
+        """Frames (N, history, size) of each row, the newest last."""
+        computed = {
             "command": commands,
             "last_action": self.last_actions,
             "joint_offset": measurement.joint_pos - self.contract.default_pose,
         }
-        rows = []
-        for row in self.contract.rows:
+        frames = []
+        for row, before in zip(self.contract.rows, self._frames, strict=True):
             if row.measured in OWN and row.name not in measurement.others:
                 raise ContractError(f"the robot does not measure row '{row.name}': it must be in Measurement.others ({row.size} values)")
-            value = measurement.others[row.name] if row.measured in OWN else values.get(row.measured)
+            value = measurement.others[row.name] if row.measured in OWN else computed.get(row.measured)
             value = np.atleast_2d(getattr(measurement, row.measured) if value is None else value)
-            rows.append((value * np.array(row.scale)).astype(np.float32))
-        return np.concatenate(rows, axis=1)
+            newest = (value * np.array(row.scale)).astype(np.float32)[:, None]
+            older = np.where(self._fresh[:, None, None], newest, before[:, 1:])
+            frames.append(np.concatenate([older, newest], axis=1))
+        return frames
 
-    def act(self, measurement: Measurement, commands: Floats) -> NDArray[np.float64]:
-        """Servo targets (N, D) [rad] for the next period; ``commands`` (N, 3): vx, vy [m/s], yaw rate [rad/s]."""
-        clip = self.contract.action_clip
-        self.last_actions = np.clip(self._network(self.observe(measurement, commands)), -clip, clip)
-        return self.contract.default_pose + self.contract.action_scale * self.last_actions.astype(np.float64)
 
-    def reset(self, which: Any = slice(None)) -> None:
-        """Forget the last actions of the robots ``which``, that begin anew."""
-        self.last_actions[which] = 0.0
+def _side_by_side(frames: list[NDArray[np.float32]]) -> NDArray[np.float32]:
+    return np.concatenate([frame.reshape(len(frame), -1) for frame in frames], axis=1)

@@ -1,4 +1,4 @@
-"""The seam: what a robot promises to a policy. A simulated one is in ``simulated``, one behind a network link in ``udp``.
+"""The seam: what a robot promises to a policy. ``simulated`` has a simulated one, ``examples/udp_robot.py`` one behind a network link.
 
 A real robot's SDK plugs in here: write one class with the three methods of ``Robot`` and hand it to ``runner.run``.
 """
@@ -20,12 +20,12 @@ Floats = NDArray[np.float64]
 
 
 class RobotError(UserError, RuntimeError):
-    """A robot that does not answer, or not as the contract wants; the text says what happened and what was done."""
+    """A robot that does not answer, or not as the contract wants; the text states what happened and what was done."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What a robot knows of itself at one moment; D joints in the contract's order, F feet. Many robots: (N, ...) each.
+    """What one robot measures at one moment; D joints in the contract's order, F feet. Many robots: (N, ...) each.
 
     What no observation row of the contract needs may stay zero.
     """
@@ -46,14 +46,14 @@ QUANTITIES = tuple(f.name for f in fields(Measurement) if f.name != "others")
 
 def layout(contract: Contract) -> dict[str, int]:
     """Values of each part of a measurement, the rows with sensors of their own last."""
-    own = {row.name: row.size for row in contract.rows if row.measured in OWN}
+    own = {row.name: row.size for row in contract.rows if row.measured in OWN and row.measured}
     return {**{name: quantity_size(contract, name) for name in QUANTITIES}, **own}
 
 
 class Robot(ABC):
-    """One robot. ``read``, decide, ``write``, every ``contract.period`` seconds; whoever calls keeps the time.
+    """One robot. The caller calls ``read``, then ``write``, once a ``contract.period``, and keeps the time.
 
-    Both calls must return well within the period. Joints are in the contract's order, whatever the machine's own is.
+    Both calls must return well within the period. Joints are in the contract's order, not in the machine's own.
     """
 
     @abstractmethod
@@ -66,7 +66,11 @@ class Robot(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Let go: joints damped and no longer servoed, links closed. Safe to call twice, and after an error."""
+        """Switch the servos off, so that joints are only damped, and close links. Safe to call twice, and after an error."""
+
+    def fell(self) -> bool:
+        """Whether it fell by a rule of the contract that only the robot can judge; the tilt is judged from ``read``."""
+        return False
 
     def __enter__(self) -> Any:
         return self

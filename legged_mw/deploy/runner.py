@@ -1,4 +1,4 @@
-"""The loop that ties a policy to a robot at the contract's period. Knows neither what the robot is nor who commands it."""
+"""The loop between a policy and a robot, at the contract's period. It knows neither the kind of robot nor the source of commands."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Summary:
 
     steps: int = 0
     late: int = 0  # steps that began more than LATE periods after their time
-    fell: float | None = None  # [s] when its z axis pointed below the horizon, which ended the walk
+    fell: float | None = None  # [s] of the fall that ended the walk, by the contract's `ends`
     velocity: Floats | None = None  # (3,) mean of vx, vy [m/s], yaw rate [rad/s] over the second half
 
 
@@ -34,13 +34,13 @@ def run(
     live: bool = True,
     watch: Callable[[float, Measurement], None] | None = None,
 ) -> Summary:
-    """Walk for ``seconds``, or until it falls: read, decide, write, once a period; then let go, whatever happens.
+    """Run for ``seconds``, or until the robot falls: read, decide, write, once a period; then close the robot, also after an error.
 
-    ``command`` gives (3,) vx, vy [m/s], yaw rate [rad/s] at a time [s] since the start; it is held within the trained ranges.
-    ``live``: in real time, as a robot needs it; else as fast as the robot answers. ``watch`` sees each measurement.
+    ``command`` gives (C,), in the contract's order, at a time [s] since the start; it is held within the trained ranges.
+    ``live``: in real time, as a robot needs it; else as fast as the robot answers. ``watch`` gets each measurement.
     """
-    period, summary, seen = controller.contract.period, Summary(), []
-    low, high = controller.contract.command_ranges
+    contract, summary, velocities = controller.contract, Summary(), []
+    period = contract.period
     controller.reset()
     with robot:
         due = time.perf_counter()
@@ -49,24 +49,24 @@ def run(
             if live:
                 due = _wait(due, period, summary) + period
             measured = robot.read()
-            if measured.gravity[2] > 0.0:
+            if contract.ends.tilted(measured.gravity) or robot.fell():
                 summary.fell = now
                 break
-            targets = controller.act(measured, np.clip(command(now), low, high))[0]
+            targets = controller.act(measured, contract.held(command(now)))[0]
             if not np.isfinite(targets).all():
-                raise RobotError("the policy's targets are not finite: is what the robot measures? its joints were let go")
+                raise RobotError("the policy's targets are not finite: is what the robot measures? its servos were switched off")
             robot.write(targets)
-            seen.append([*measured.lin_vel[:2], measured.ang_vel[2]])
+            velocities.append([*measured.lin_vel[:2], measured.ang_vel[2]])
             if watch:
                 watch(now, measured)
             summary.steps += 1
-    if seen:
-        summary.velocity = np.mean(seen[len(seen) // 2 :], axis=0)
+    if velocities:
+        summary.velocity = np.mean(velocities[len(velocities) // 2 :], axis=0)
     return summary
 
 
 def _wait(due: float, period: float, summary: Summary) -> float:
-    """Sleep until ``due``; returns when the step really begins. A late loop is not hurried afterwards: lost time stays lost."""
+    """Sleep until ``due``; returns when the step really begins. A late loop does not hurry afterwards: lost time stays lost."""
     behind = time.perf_counter() - due
     if behind > LATE * period:
         summary.late += 1

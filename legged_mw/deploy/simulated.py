@@ -1,8 +1,8 @@
 """Robots in MuJoCo's C engine, from an export's ``scene.xml``: one behind the seam, or many side by side.
 
-Measurements come from MuJoCo's sensors by their names. Physics computes sensors before it moves on, so after each period
-the sensors of position, velocity and contact are computed again, in the new state; what needs forces (torque, acceleration)
-is one physics step old, as it was in training. There, contact was as old, too.
+Measurements come from MuJoCo's sensors by their names. A physics step computes sensors before it moves the robot, so after each
+period the sensors of position, velocity and contact are computed again, in the new state. What needs forces (torque,
+acceleration) is one physics step old, as it was in training. Contact was one step old in training, too.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -15,10 +15,11 @@ from typing import Any
 import mujoco
 import numpy as np
 from mujoco.batch import Batch, SimulationError
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from legged_mw.deploy.contract import FALL, SCAN, SCENE_FILE, Contract, read_scene
+from legged_mw.deploy.contract import FALL, SCAN, SCENE_FILE, Contract
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, layout
+from legged_mw.deploy.scene import read_scene
 from legged_mw.utils.machine import usable_cores
 
 _NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # sensors of position and velocity describe the new state
@@ -34,13 +35,14 @@ class Fleet:
         """Load the scene and put every robot into its first keyframe. Raises ContractError."""
         scene = read_scene(folder, contract, scene_file)
         self.contract, self.count, self.model = contract, count, scene.model
-        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world counts as fallen, in silence
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world counts as fallen; nothing is printed
         _keep_quiet()
         self._batch = Batch(self.model, count, threads or min(usable_cores(), count))
         self._sensors, self._layout = self._batch.bind("sensordata"), layout(contract)
         self.qpos: Floats = self._batch.bind("qpos")  # (N, nq), a view: position [m], quaternion, joints in MuJoCo's order
-        self.qvel: Floats = self._batch.bind("qvel")  # (N, nv), a view: what is written is in force in the next step
-        self._ctrl, self._where, self._actuators = self._batch.bind("ctrl"), scene.sensordata, scene.actuators
+        self.qvel: Floats = self._batch.bind("qvel")  # (N, nv), a view: the next step starts from what is written
+        self._ctrl, self._actuators = self._batch.bind("ctrl"), scene.actuators
+        self._where, self._contacts = scene.sensordata, scene.contacts
         self.broken: NDArray[np.bool_] = np.zeros(count, dtype=bool)  # robots that MuJoCo could not step since their reset
         self.reset()
 
@@ -58,11 +60,16 @@ class Fleet:
             self.broken[error.ids] = True
 
     def fell(self) -> NDArray[np.bool_]:
-        """Robots (N,) whose z axis points below the horizon, that touch the ground with what must not, or whose state is not finite."""
-        w, x, y, z = self.qpos[:, 3:7].T
-        upright = w**2 - x**2 - y**2 + z**2 >= 0.0  # NaN compares false
-        fell = ~upright | ~np.isfinite(self.qvel).all(axis=1) | self.broken
-        return fell | (self._sensors[:, self._where[FALL]] > 0.0).any(axis=1) if FALL in self._where else fell
+        """Robots (N,) that fell by the contract's `ends`, or whose state is not finite."""
+        ends = self.contract.ends
+        fell = ends.tilted(self._value("gravity")) | ~np.isfinite(self.qvel).all(axis=1) | self.broken
+        if ends.min_base_height is not None:
+            fell |= self._heights([0.0], [0.0])[:, 0] < ends.min_base_height
+        return fell | (self._sensors[:, self._where[FALL]] > 0.0).any(axis=1) if ends.falls_on else fell
+
+    def refresh(self) -> None:
+        """Compute the sensors of position, velocity and contact after a change of ``qpos`` or ``qvel``."""
+        self._batch.forward(stage=_NOW)
 
     def reset(self, which: Any = None) -> None:
         """Put the robots ``which`` (indices; None: all) into the first keyframe, at rest."""
@@ -80,23 +87,31 @@ class Fleet:
             return -self._sensors[:, self._where["up"]]
         if any(row.name == name and row.measured == SCAN for row in self.contract.rows):
             return self._scan()
-        value = self._sensors[:, self._where[name]]
-        return (value > 0.0).astype(float) if name == "foot_contact" else value
+        if name == "foot_contact":
+            feet = [(self._sensors[:, where] > 0.0).any(axis=1) for where in self._contacts]
+            return np.stack(feet, axis=1).astype(float) if feet else np.zeros((self.count, 0))
+        return self._sensors[:, self._where[name]]
 
     def _scan(self) -> Floats:
-        """Heights of the ground around each robot (N, points), by rays from above that see nothing of group 1 and up."""
+        """The height scan (N, points) [m] of the contract."""
         assert self.contract.scan
         xs, ys, standing = self.contract.scan
         px, py = (grid.ravel() for grid in np.meshgrid(xs, ys, indexing="ij"))
-        root, (w, x, y, z) = self.qpos[:, :3], self.qpos[:, 3:7].T
+        return np.clip(self._heights(px, py) - standing, -1.0, 1.0)
+
+    def _heights(self, px: ArrayLike, py: ArrayLike) -> Floats:
+        """Height (N, points) [m] of each root above the ground at points ahead of it and to its left; inf where there is no ground.
+
+        Rays from above find the ground: they see geom group 0 alone.
+        """
+        px, py, root, (w, x, y, z) = np.asarray(px), np.asarray(py), self.qpos[:, :3], self.qpos[:, 3:7].T
         yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))[:, None]
         start = np.empty((self.count, len(px), 3))
         start[..., 0] = root[:, :1] + np.cos(yaw) * px - np.sin(yaw) * py
         start[..., 1] = root[:, 1:2] + np.sin(yaw) * px + np.cos(yaw) * py
         start[..., 2] = root[:, 2:] + _ABOVE
         distance, _ = self._batch.ray(start, [0.0, 0.0, -1.0], geomgroup=_GROUND_GROUP)
-        below = np.where(distance < 0.0, np.inf, distance - _ABOVE)  # of the root; nothing there: as deep as it gets
-        return np.clip(below - standing, -1.0, 1.0)
+        return np.where(distance < 0.0, np.inf, distance - _ABOVE)
 
 
 class MujocoRobot(Robot):
@@ -114,6 +129,9 @@ class MujocoRobot(Robot):
 
     def close(self) -> None:
         self.fleet.limp()
+
+    def fell(self) -> bool:
+        return bool(self.fleet.fell()[0])
 
 
 def _keep_quiet() -> None:

@@ -3,41 +3,58 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.deploy.contract import SCENE_FILE, read_contract
+from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.simulated import Fleet
 
-STROLL = (0.5, 0.0, 0.0)  # what a robot does that nobody commands: vx, vy [m/s], yaw rate [rad/s]; within the trained ranges
+STROLL = {"lin_vel_x": 0.5}  # [m/s] where no command is given: a robot that walks shows more than one that stands
+
+
+def idle_command(contract: Contract) -> Floats:
+    """(C,) what a robot follows that gets no command: a stroll where it is trained to walk, else the defaults."""
+    return contract.held([STROLL.get(command.name, command.default) for command in contract.commands])
 
 
 class DeployStage:
     """``num_worlds`` robots that follow an exported policy in MuJoCo's C engine (the viewers' protocol ``Stage``)."""
 
     def __init__(
-        self, folder: Path, num_worlds: int = 1, command: Sequence[float] | None = None, threads: int = 0, scene_file: str = SCENE_FILE
+        self,
+        folder: Path,
+        num_worlds: int = 1,
+        command: Sequence[float] | None = None,
+        threads: int = 0,
+        scene_file: str = SCENE_FILE,
+        ends: Ends | None = None,
     ) -> None:
-        """Load the export in ``folder``; ``command`` is what is followed while nobody says otherwise."""
-        self.contract = read_contract(folder)
+        """Load the export in ``folder``.
+
+        ``command`` (C,) is what robots follow where ``step`` gets none; ``ends`` are other rules for a fall than the contract's.
+        """
+        contract = read_contract(folder)
+        self.contract = replace(contract, ends=ends or contract.ends)
         self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file)
         self.controller = Controller(folder, self.contract, num_worlds)
         self.model, self.num_worlds, self.dt = self.fleet.model, num_worlds, self.contract.period
-        self.limits: Floats = self.contract.command_ranges
-        own = np.clip(STROLL, *self.limits) if command is None else np.array(command)
+        self.command_table = self.contract.commands
+        self.limits: Floats = np.array([[c.low for c in self.command_table], [c.high for c in self.command_table]])
+        own = idle_command(self.contract) if command is None else np.array(command, dtype=float)
         self._own = np.tile(own, (num_worlds, 1))
         self._commands = self._own.copy()
         self._fell = np.zeros(num_worlds, dtype=bool)
         self.measured = self.fleet.read()  # at the end of the last step
 
     def step(self, commands: Floats | None = None) -> None:
-        """One period with ``commands`` (N, 3), or the stage's own. A robot that falls begins anew."""
-        self._commands = self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self.num_worlds, 3)
+        """One period with ``commands`` (N, C), or the stage's own. A robot that falls starts again."""
+        self._commands = self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self._own.shape)
         self.fleet.write(self.controller.act(self.measured, self._commands))
         self._fell = self.fleet.fell()
         if self._fell.any():
@@ -46,7 +63,7 @@ class DeployStage:
         self.measured = self.fleet.read()
 
     def commands(self) -> Floats:
-        """(N, 3) vx, vy [m/s], yaw rate [rad/s], body frame, of the last step."""
+        """(N, C) of the last step, in the order of ``command_table``."""
         return self._commands.copy()
 
     def velocity(self) -> Floats:
@@ -66,11 +83,11 @@ class DeployStage:
         return self._fell.copy()
 
     def ground(self, world: int) -> str:
-        """Nothing is said of it: a scene has no names for its ground."""
+        """Empty: a scene has no names for its ground."""
         return ""
 
     def push(self, world: int, velocity: Any) -> None:
-        """The robot's horizontal velocity jumps by ``velocity`` (2,) [m/s, world frame]; the policy sees it a step later."""
+        """Add ``velocity`` (2,) [m/s, world frame] to the robot's horizontal velocity; the policy sees it a step later."""
         self.fleet.qvel[world, :2] += velocity
 
     def reset(self, world: int) -> None:

@@ -1,4 +1,4 @@
-"""A trained policy to take away: network files, contract, scene; compared with what was trained before anything is written.
+"""A trained policy to take away: network, contract and scene, compared with what was trained before anything is written.
 
 What the files mean is in ``legged_mw.deploy.contract``; nothing here is needed to run them.
 """
@@ -6,7 +6,6 @@ What the files mean is in ``legged_mw.deploy.contract``; nothing here is needed 
 from __future__ import annotations
 
 import copy
-import io
 import logging
 import os
 import shutil
@@ -31,31 +30,29 @@ from legged_mw.deploy.contract import (
     SCENE_FILE,
     SENSORS,
     TERRAIN_FILE,
+    Action,
     Contract,
+    ContractRow,
+    Ends,
     HeightScan,
-    Row,
     digest,
 )
-from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.export_replay import ExportError, record, replay
 from legged_mw.rl.export_scene import among_steps, standalone
-from legged_mw.rl.policies import act, load_policy, save_policy
+from legged_mw.rl.policies import load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.sim.model import ModelError, per_joint
 from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.utils.cli import shown
 from legged_mw.utils.config import save_yaml
-from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import LoadedTask, load_task
 
-MODEL_FILE, PROGRAM_FILE = "model.pt", "policy.pt"
-FILES = (MODEL_FILE, CONFIG_FILE, NETWORK_FILE, PROGRAM_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
+MODEL_FILE = "model.pt"
+FILES = (MODEL_FILE, CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
 INPUT, OUTPUT = "obs", "actions"
-WORLDS, STEPS = 8, 32  # of the roll-out that the files are tried on
+WORLDS = 8  # of the roll-out that the export is tried on
 TOLERANCE = 1e-4  # between actions of the same observation, relative above 1: float32 sums in another order
-
-
-class ExportError(UserError, RuntimeError):
-    """A policy that cannot be exported; nothing was written."""
 
 
 class Exported(NamedTuple):
@@ -64,8 +61,18 @@ class Exported(NamedTuple):
     files: tuple[str, ...]
     gap: float  # largest difference of an action to the trained policy's
     observations: int  # that it was tried on
-    unknown: tuple[str, ...]  # observation rows that nobody said how to measure: the export cannot be deployed
+    unknown: tuple[str, ...]  # observation rows without a statement of how to measure them: the export cannot be deployed
     no_terrain: str = ""  # why there is no scene among steps though training had some; else empty
+
+    def text(self, folder: Path) -> str:
+        """What was written, in a line, and what stands in the way of its use."""
+        lines = [f"written to {shown(folder)}: {', '.join(self.files)}; actions differ from the trained policy's by {self.gap:.0e} at most"]
+        if self.unknown:
+            names = ", ".join(self.unknown)
+            lines.append(f"nothing says how to measure {names}: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)")
+        if self.no_terrain:
+            lines.append(f"no {TERRAIN_FILE}: {self.no_terrain}")
+        return "\n  ".join(lines)
 
 
 class ExportedPolicy(nn.Module):
@@ -82,12 +89,14 @@ class ExportedPolicy(nn.Module):
 def export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
     """Write the policy in ``checkpoint``, trained with the config ``trained``, to ``folder``: all files, or none.
 
-    Raises ExportError, ConfigError or ModelError; an export that stands there already is then as it was.
+    Raises ExportError, ContractError, ConfigError or ModelError; an earlier export in the folder stays as it was then.
     """
     precision = torch.get_float32_matmul_precision()
-    torch.set_float32_matmul_precision("highest")  # training may have left less, and some CPUs take it
+    torch.set_float32_matmul_precision("highest")  # training may have set less, and some CPUs follow it
     try:
-        return _export(trained, checkpoint, folder)
+        with torch.random.fork_rng(devices=[]):  # the roll-out must not change the caller's draws
+            torch.default_generator.manual_seed(0)
+            return _export(trained, checkpoint, folder)
     finally:
         torch.set_float32_matmul_precision(precision)
 
@@ -95,73 +104,53 @@ def export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
 def _export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
     task = load_task(str(trained["task"]))
     task.update(trained, where=CONFIG_FILE)
-    config, ground = task.to_dict(), task.cfg.terrain.mesh_type
-    with torch.random.fork_rng(devices=[]):  # trying the policy draws numbers that are not ours to draw
-        torch.default_generator.manual_seed(0)  # of the CPU alone
-        env = _small_env(task)
-        policy = load_policy(checkpoint, env, task.train, "cpu")
-        observations, actions = _roll_out(env, policy, task)
-    clip = task.cfg.normalization.clip_actions
+    config, noise = task.to_dict(), task.cfg.noise.level
+    ground = getattr(task.cfg.terrain, "mesh_type", "plane")
+    env = _small_env(task)
+    policy = load_policy(checkpoint, env, task.train, "cpu")
+    groups, clip = task.train.obs_groups.actor, task.cfg.normalization.clip_actions
     with _all_or_nothing(folder) as new:
         save_policy(policy, new / MODEL_FILE, {"task": task.name})
         save_yaml(new / CONFIG_FILE, config)
-        _save_networks(policy, clip, new)
-        gap = max(
-            _compare(PROGRAM_FILE, _run_program(new / PROGRAM_FILE, observations), actions),
-            _compare(NETWORK_FILE, run_onnx(new / NETWORK_FILE, observations.numpy()), actions),
-        )
-        contract = make_contract(env, task, new)
-        no_terrain = _write_terrain(task, new) if ground != "plane" else ""
+        try:
+            save_onnx(policy, clip, new / NETWORK_FILE)
+        except Exception as error:  # the exporter's own, one for each thing that a network may do and it may not
+            first = next(iter(str(error).strip().splitlines()), type(error).__name__)
+            raise ExportError(f"the network ({type(policy).__name__}) cannot be exported: {first}") from error
+        contract = make_contract(env, task, new, noise)
         save_yaml(new / CONTRACT_FILE, contract.to_dict())
+        steps = record(env, policy, groups, contract, new)
+        observations, actions = (np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions"))
+        gap = _compare(run_onnx(new / NETWORK_FILE, observations), np.clip(actions, -clip, clip))
+        replay(env, contract, steps, new)
+        no_terrain = _write_terrain(task, new) if ground != "plane" else ""
         files = (*FILES, *([TERRAIN_FILE] if (new / TERRAIN_FILE).exists() else []))
     return Exported(files, gap, len(observations), tuple(row.name for row in contract.rows if not row.measured), no_terrain)
 
 
-def describe(made: Exported, folder: Path) -> str:
-    """What an export made, in a line, and what stands in the way of its use."""
-    line = f"written to {shown(folder)}: {', '.join(made.files)}; actions differ from the trained policy's by {made.gap:.0e} at most"
-    if made.unknown:
-        line += (
-            f"\n  nothing says how to measure {', '.join(made.unknown)}: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)"
-        )
-    if made.no_terrain:
-        line += f"\n  no {TERRAIN_FILE}: {made.no_terrain}"
-    return line
-
-
-# ---- trying it out -------------------------------------------------------------------------------------------------
-
-
-def _small_env(task: LoadedTask) -> LeggedRobot:
-    """The task as trained, with noise and kicks, but small and on a CPU."""
-    task.set("env.num_envs", WORLDS, where="export")
-    task.set("sim.engine", "mujoco", where="export")
-    task.set("terrain.mesh_type", "plane", where="export")  # the scene is the robot's; whoever takes it away has ground of his own
+def _small_env(task: LoadedTask) -> RobotTask:
+    """The task as trained, kicks and pushes too, but small, on a CPU, and without what stands between a robot and its policy."""
+    settings = {"env.num_envs": WORLDS, "sim.engine": "mujoco", "noise.level": 0.0}
+    settings |= {"domain_rand.action_delay": [], "domain_rand.observation_delay": []}
+    if hasattr(task.cfg.terrain, "mesh_type"):
+        settings["terrain.mesh_type"] = "plane"  # the scene is the robot's alone
+    for path, value in settings.items():
+        task.set(path, value, where="export")
     return task.env_class(task.cfg, "cpu", eager=True)
 
 
-def _roll_out(env: LeggedRobot, policy: MLPModel, task: LoadedTask) -> tuple[Tensor, Tensor]:
-    """Observations (B, size) of the policy walking, and its clipped actions (B, A) on them."""
-    groups, clip = task.train.obs_groups.actor, task.cfg.normalization.clip_actions
-    seen: list[tuple[Tensor, Tensor]] = []
-    obs = env.get_observations()
-    for _ in range(STEPS):
-        actions = act(policy, obs)
-        seen.append((torch.cat([obs[group] for group in groups], dim=1), actions.clamp(-clip, clip).clone()))
-        obs, *_ = env.step(actions)
-    return torch.cat([pair[0] for pair in seen]), torch.cat([pair[1] for pair in seen])
-
-
-def _compare(name: str, got: np.ndarray, actions: Tensor) -> float:
-    """The largest difference; refuses a file that acts otherwise than the policy."""
-    wanted = actions.numpy()
+def _compare(got: np.ndarray, wanted: np.ndarray) -> float:
+    """The largest difference; refuses a network that acts otherwise than the policy."""
     gap = float((np.abs(got - wanted) / np.maximum(1.0, np.abs(wanted))).max()) if got.shape == wanted.shape else float("inf")
     if not gap <= TOLERANCE:  # NaN too
         raise ExportError(
-            f"{name} acts otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
+            f"{NETWORK_FILE} acts otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
             f"(at most {TOLERANCE:g} is allowed); nothing was written"
         )
     return gap
+
+
+# ---- files ---------------------------------------------------------------------------------------------------------
 
 
 def run_onnx(path: Path, observations: np.ndarray) -> np.ndarray:
@@ -177,68 +166,25 @@ def run_onnx(path: Path, observations: np.ndarray) -> np.ndarray:
     return np.asarray(session.run([OUTPUT], {INPUT: observations})[0])
 
 
-def _run_program(path: Path, observations: Tensor) -> np.ndarray:
-    with _quiet_exporter():  # some releases of torch warn of their own buffers
-        program = torch.export.load(io.BytesIO(path.read_bytes()))  # made by this process; one from elsewhere would be trusted blindly
-    with torch.inference_mode():
-        return program.module()(observations).numpy()
-
-
-def _save_networks(policy: MLPModel, clip_actions: float, folder: Path) -> None:
-    try:
-        program = trace(policy, clip_actions)
-        save_program(program, folder / PROGRAM_FILE)
-        save_onnx(program, folder / NETWORK_FILE)
-    except Exception as error:  # the exporters' own, one for each thing that a network may do and they may not
-        first = next(iter(str(error).strip().splitlines()), type(error).__name__)
-        raise ExportError(f"the network ({type(policy).__name__}) cannot be exported: {first}") from error
-
-
-# ---- files ---------------------------------------------------------------------------------------------------------
-
-
-def trace(policy: MLPModel, clip_actions: float) -> torch.export.ExportedProgram:
-    """The policy as a graph that takes any number of observations, without notes of where its code lies."""
-    example = torch.zeros(2, policy.obs_dim)
-    batch = torch.export.Dim("batch", min=1)
-    program = torch.export.export(ExportedPolicy(policy, clip_actions).eval(), (example,), dynamic_shapes={INPUT: {0: batch}})
-    for node in program.graph.nodes:
-        for note in ("stack_trace", "nn_module_stack", "source_fn_stack", "from_node", "custom"):
-            node.meta.pop(note, None)
-    return program
-
-
-def save_program(program: torch.export.ExportedProgram, path: Path) -> None:
-    """Write for ``torch.export.load``."""
-    file = io.BytesIO()  # for a path it would want the ending .pt2
-    with _quiet_exporter():
-        torch.export.save(program, file)
-    path.write_bytes(file.getvalue())
-
-
-def save_onnx(program: torch.export.ExportedProgram, path: Path) -> None:
+def save_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
     """Write one self-contained ONNX file: input ``obs`` (batch, size), output ``actions`` (batch, A)."""
-    with _quiet_exporter():
+    example = torch.zeros(2, policy.obs_dim)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the exporter warns of its own internals, and logs that torchvision is missing
+        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         torch.onnx.export(
-            program,
-            (),
+            ExportedPolicy(policy, clip_actions).eval(),
+            (example,),
             path,
             input_names=[INPUT],
             output_names=[OUTPUT],
             opset_version=18,
+            dynamic_shapes={INPUT: {0: torch.export.Dim("batch", min=1)}},
             external_data=False,
             dynamo=True,
             verbose=False,
         )
     _strip(path)
-
-
-@contextmanager
-def _quiet_exporter() -> Iterator[None]:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter warns of its own internals, and logs that torchvision is missing
-        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-        yield
 
 
 def _strip(path: Path) -> None:
@@ -281,46 +227,79 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
 # ---- the contract --------------------------------------------------------------------------------------------------
 
 
-def make_contract(env: LeggedRobot, task: LoadedTask, folder: Path) -> Contract:
-    """The contract of the network that lies in ``folder``; writes the scene there."""
-    cfg, robot = task.cfg, env.robot
+def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) -> Contract:
+    """The contract of the network in ``folder``, trained with the noise level ``noise``; writes the scene there."""
+    cfg, robot, scale = task.cfg, env.robot, task.cfg.control.action_scale
     pose = per_joint(cfg.init_state.default_joint_angles, robot.joint_names, "init_state.default_joint_angles")
-    scene = standalone(
-        robot,
-        imu=cfg.asset.imu_site,
-        feet=cfg.asset.foot_names,
-        qpos=[*cfg.init_state.pos, 1.0, 0.0, 0.0, 0.0, *pose],
-        ctrl=pose,
-        camera=cfg.viewer.camera,
-    )
-    falls_on = tuple(robot.contact_geoms[i] for i in env.contacts.terminating.tolist())
-    sensed = {FALL: tuple(f"contact/{name}" for name in falls_on)} if falls_on else {}
+    scales = per_joint(scale if isinstance(scale, dict) else {"": scale}, robot.joint_names, "control.action_scale")
+    start = [*cfg.init_state.pos, 1.0, 0.0, 0.0, 0.0, *pose]
+    scene = standalone(robot, cfg.asset.imu_site, qpos=start, ctrl=pose, camera=cfg.viewer.camera)
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
-    rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group))
-    points = HeightScan(tuple(cfg.terrain.measured_points_x), tuple(cfg.terrain.measured_points_y), cfg.init_state.pos[2])
+    end = cfg.termination
+    ends = Ends(
+        max_tilt=end.max_tilt if end.max_tilt < 180.0 else None,
+        min_base_height=end.min_base_height or None,
+        falls_on=tuple(robot.contact_geoms[i] for i in env.contacts.terminating.tolist()),
+    )
+    rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))
+    feet = {foot: tuple(f"contact/{geom}" for geom in geoms) for foot, geoms in getattr(env, "foot_geoms", {}).items()}
     return Contract(
         task=task.name,
         joints=robot.joint_names,
         default_pose=np.array(pose),
-        action_scale=cfg.control.action_scale,
-        action_clip=cfg.normalization.clip_actions,
+        action=Action(cfg.control.action_origin, np.array(scales), cfg.normalization.clip_actions),
         stiffness=np.array(per_joint(cfg.control.stiffness, robot.joint_names, "control.stiffness")),
         damping=np.array(per_joint(cfg.control.damping, robot.joint_names, "control.damping")),
         period=round(env.dt, 9),
         timestep=cfg.sim.dt,
         decimation=cfg.control.decimation,
-        command_ranges=np.array([cfg.commands.ranges.lin_vel_x, cfg.commands.ranges.lin_vel_y, cfg.commands.ranges.ang_vel_yaw]).T,
+        commands=env.command_table,
         rows=rows,
-        scan=points if any(row.measured == SCAN for row in rows) else None,
-        sensors={**{name: tuple(names) for name, names in scene.sensors.items()}, **sensed},
-        feet=tuple(cfg.asset.foot_names),
-        falls_on=falls_on,
+        scan=_scan(task) if any(row.measured == SCAN for row in rows) else None,
+        sensors={name: tuple(names) for name, names in scene.sensors.items()}
+        | ({FALL: tuple(f"contact/{name}" for name in ends.falls_on)} if ends.falls_on else {}),
+        feet=feet,
+        ends=ends,
         imu=cfg.asset.imu_site,
         mass=round(env.total_mass, 6),
         input=INPUT,
         output=OUTPUT,
         digest=digest(folder / NETWORK_FILE),
     )
+
+
+def _scan(task: LoadedTask) -> HeightScan:
+    ground = task.cfg.terrain
+    return HeightScan(tuple(ground.measured_points_x), tuple(ground.measured_points_y), task.cfg.init_state.pos[2])
+
+
+def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]:
+    """A group's rows with what is known of how they are measured; a row that is a group itself is written out."""
+    rows = []
+    for row in env.observations.groups[group]:
+        if row.group:
+            if row.noise or row.history > 1 or any(scale != 1.0 for scale in row.column_scales()):
+                raise ExportError(
+                    f"observation row '{row.name}' of '{group}' is a group with its own noise, scale or history: give those to its rows"
+                )
+            rows += contract_rows(env, row.group, noise)
+            continue
+        known = ROWS.get(row.name)
+        units = ", ".join(command.unit for command in env.command_table) if row.name == "commands" else ""
+        rows.append(
+            ContractRow(
+                name=row.name,
+                size=int(row.value.shape[1]),
+                unit=row.unit or (known.unit if known else "") or units,
+                frame=row.frame or (known.frame if known else ""),
+                noise=row.noise * noise,
+                measured=SENSORS if row.sensors else known.measured if known else "",
+                sensors=tuple(row.sensors),
+                scale=tuple(row.column_scales()),
+                history=row.history,
+            )
+        )
+    return rows
 
 
 def _write_terrain(task: LoadedTask, folder: Path) -> str:
@@ -346,31 +325,3 @@ def _write_terrain(task: LoadedTask, folder: Path) -> str:
         return str(error)
     (folder / TERRAIN_FILE).write_text(xml, encoding="utf-8")
     return ""
-
-
-def contract_rows(env: LeggedRobot, group: str) -> list[Row]:
-    """A group's rows with what is known of how they are measured; a row that is a group itself is written out."""
-    table, rows = env._observation_rows(), []
-    for row in table[group]:
-        if row.name in table and row.name != group:
-            if row.noise or any(scale != 1.0 for scale in row.column_scales()):
-                raise ExportError(
-                    f"observation row '{row.name}' of '{group}' is a group with a noise or scale of its own: give those to its rows"
-                )
-            rows += contract_rows(env, row.name)
-            continue
-        kind = ROWS.get(row.name)
-        measured = SENSORS if row.sensors else kind.measured if kind else ""
-        rows.append(
-            Row(
-                name=row.name,
-                size=int(row.value.shape[1]),
-                unit=row.unit or (kind.unit if kind else ""),
-                frame=row.frame or (kind.frame if kind else ""),
-                noise=row.noise * env.cfg.noise.level,
-                measured=measured,
-                sensors=tuple(row.sensors),
-                scale=tuple(row.column_scales()) if isinstance(row.scale, tuple) else (float(row.scale),),
-            )
-        )
-    return rows

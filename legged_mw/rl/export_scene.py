@@ -21,21 +21,12 @@ from legged_mw.sim.model import RobotModel
 from legged_mw.sim.scene import STEEP_LIGHT
 from legged_mw.sim.terrain import Terrain
 
-AROUND = 1000.0  # [m] of level ground around tiles of steps: nobody walks to its end
+AROUND = 1000.0  # [m] of level ground around tiles of steps, more than a robot walks
 HOME = "home"  # the keyframe: the pose to start in, and the servos holding it
 TOLERANCE = 1e-5  # relative, absolute below 1: MuJoCo writes MJCF with six digits
 _OPTION = (
-    "timestep",
-    "integrator",
-    "cone",
-    "solver",
-    "iterations",
-    "ls_iterations",
-    "tolerance",
-    "disableflags",
-    "enableflags",
-    "gravity",
-    "impratio",
+    *("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "tolerance"),
+    *("disableflags", "enableflags", "gravity", "impratio"),
 )
 _FIELDS = (
     *("qpos0", "body_parentid", "body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat"),
@@ -45,42 +36,21 @@ _FIELDS = (
     *("actuator_ctrllimited", "actuator_forcelimited", "jnt_actfrclimited", "jnt_actfrcrange"),
 )
 _CONTACT = (
-    "type",
-    "bodyid",
-    "size",
-    "pos",
-    "quat",
-    "solmix",
-    "contype",
-    "conaffinity",
-    "condim",
-    "priority",
-    "friction",
-    "solref",
-    "solimp",
-    "margin",
-    "gap",
+    *("type", "bodyid", "size", "pos", "quat", "solmix", "contype", "conaffinity", "condim", "priority"),
+    *("friction", "solref", "solimp", "margin", "gap"),
 )
 
 
 @dataclass(frozen=True)
 class Scene:
-    """What ``standalone`` makes."""
+    """The result of ``standalone``."""
 
     xml: str
     sensors: dict[str, list[str]]  # quantity -> names of the sensors whose values, side by side, are it
 
 
-def standalone(
-    robot: RobotModel,
-    *,
-    imu: str,
-    feet: Sequence[str],
-    qpos: Sequence[float],
-    ctrl: Sequence[float],
-    camera: Sequence[float] = CAMERA,
-) -> Scene:
-    """``robot`` as MJCF text, with a sensor for all that a controller may read and ``qpos``, ``ctrl`` as keyframe "home".
+def standalone(robot: RobotModel, imu: str, qpos: Sequence[float], ctrl: Sequence[float], camera: Sequence[float] = CAMERA) -> Scene:
+    """``robot`` as MJCF text, with a sensor for each quantity that a controller may read and ``qpos``, ``ctrl`` as keyframe "home".
 
     Raises ModelError if the text cannot be made, or is another machine than the one that was trained.
     """
@@ -93,7 +63,7 @@ def standalone(
     for geom in spec.geoms:  # group 0 is the ground's: a height scan's rays look for it there
         if geom.group == 0 and geom.parent.name != "world":
             geom.group = 1
-    sensors = _add_sensors(spec, robot.joint_names, imu, feet)
+    sensors = _add_sensors(spec, robot.joint_names, imu)
     spec.add_key(name=HOME, qpos=list(qpos), ctrl=list(ctrl))
     try:
         _write_out_files(spec)
@@ -110,8 +80,8 @@ def standalone(
 def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
     """The scene of ``standalone`` on the level pieces of ``terrain``, as boxes; the robot starts at ``start``, x, y, z [m].
 
-    Level ground goes on around them for ``AROUND``. Raises ModelError for what is no such pieces (slopes, noise), or too many:
-    as text, a height field would have some megabytes.
+    Level ground surrounds them for ``AROUND``. Raises ModelError for slopes and noise, which are no level pieces, and for too
+    many pieces: as text, a height field would have some megabytes.
     """
     spec = mujoco.MjSpec.from_string(xml)
     floor, (boxes, _, left) = spec.geom(GROUND), as_boxes(terrain)
@@ -131,7 +101,7 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
     tops = {tile: sorted({piece.top for piece, where in zip(pieces, tiles, strict=True) if where == tile}) for tile in tiles}
     for (low, high, top), tile in zip(pieces, tiles, strict=True):
         box = add_ground_box(spec, np.array([*low, bottom]), np.array([*high, top]))
-        tone = (1.0, 0.7)[tops[tile].index(top) % 2]  # a step looks other than the next one
+        tone = (1.0, 0.7)[tops[tile].index(top) % 2]  # a step has another tone than the next one
         box.material, box.rgba = floor.material, [tone, tone, tone, 1.0]
     floor.pos = [0.0, 0.0, bottom]
     for light in spec.lights:
@@ -143,8 +113,8 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
     return spec.to_xml()
 
 
-def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str, feet: Sequence[str]) -> dict[str, list[str]]:
-    """Name what training senses, add what it computes from the state instead."""
+def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str) -> dict[str, list[str]]:
+    """Name the sensors of training, and add sensors for what training computes from the state; contacts keep training's sensors."""
     kinds, objects = mujoco.mjtSensor, mujoco.mjtObj
     taken = {sensor.name for sensor in spec.sensors}
 
@@ -165,7 +135,6 @@ def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str, feet: Seq
         "joint_pos": [add("jointpos", name, kinds.mjSENS_JOINTPOS, joint) for name in joints],
         "joint_vel": [add("jointvel", name, kinds.mjSENS_JOINTVEL, joint) for name in joints],
         "joint_torque": [add("torque", name, kinds.mjSENS_ACTUATORFRC, objects.mjOBJ_ACTUATOR) for name in joints],
-        "foot_contact": [f"contact/{name}" for name in feet],  # training has these
     }
 
 

@@ -1,11 +1,15 @@
-"""A robot at the other end of a network link: packets, the client that is a ``Robot``, and the server that owns one.
+"""A robot at the other end of a network link: an example of the seam ``Robot``, with its own server.
 
-Little-endian; a header, then float64 values. Both ends read the same export: the header's digest says whether they did.
-Meant for one machine or a cable between two: nothing is encrypted, and whoever can send to the port moves the robot.
+    python examples/udp_robot.py resources/policies/go1_flat --serve 127.0.0.1:9870                     # one terminal
+    python examples/udp_robot.py resources/policies/go1_flat --drive 127.0.0.1:9870 --command 0.8,0,0   # another
+
+Packets are little-endian: a header, then float64 values. Both ends read the same export: the header's digest shows whether they did.
+Use it on one machine, or on a cable between two: nothing is encrypted, and anybody who can send to the port moves the robot.
 """
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import hashlib
 import json
@@ -13,12 +17,19 @@ import socket
 import struct
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, RobotError, layout
+from legged_mw.deploy.runner import run
+from legged_mw.deploy.simulated import MujocoRobot
+from legged_mw.deploy.stage import idle_command
+from legged_mw.utils.cli import Parser, duration, one_line_errors
+from legged_mw.utils.commands import describe, parse_command
 from legged_mw.utils.errors import UserError
 
 VERSION = 1
@@ -48,12 +59,12 @@ def pack(kind: int, digest: bytes, count: int, body: bytes = b"") -> bytes:
 
 
 def unpack(data: bytes) -> Packet | None:
-    """A packet from its bytes; None for what is none of ours. Raises RobotError for one of another version."""
+    """A packet from its bytes; None if they are not a packet of this link. Raises RobotError for another version."""
     if len(data) < _HEADER.size or data[:4] != _MAGIC:
         return None
     _, version, kind, digest, count = _HEADER.unpack_from(data)
     if version != VERSION:
-        raise RobotError(f"the other end speaks version {version} of the link, this one {VERSION}: update one of them")
+        raise RobotError(f"the other end uses version {version} of the link, this one {VERSION}: update one of them")
     return Packet(kind, digest, count, data[_HEADER.size :])
 
 
@@ -66,10 +77,10 @@ def parse_address(text: str) -> tuple[str, int]:
 
 
 class UdpRobot(Robot):
-    """The robot that a server at ``address`` owns. Every packet is answered by a measurement, or there is none: no blind step."""
+    """The robot that a server at ``address`` owns. The server answers each packet with a measurement; no answer, no step."""
 
     def __init__(self, contract: Contract, address: tuple[str, int], timeout: float = 0.5) -> None:
-        """Say hello and take the first measurement; raises RobotError if nobody answers within ``timeout`` [s]."""
+        """Send a hello and take the first measurement; raises RobotError if no answer comes within ``timeout`` [s]."""
         self._layout, self._digest, self._name = layout(contract), contract_digest(contract), f"{address[0]}:{address[1]}"
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.settimeout(timeout)
@@ -90,7 +101,7 @@ class UdpRobot(Robot):
     def close(self) -> None:
         if self._open:
             self._open = False
-            with contextlib.suppress(OSError):  # it is gone: its server lets the joints go by itself
+            with contextlib.suppress(OSError):  # if the server hears nothing more, it switches the servos off by itself
                 self._socket.send(pack(CLOSE, self._digest, self._count))
             self._socket.close()
 
@@ -101,7 +112,7 @@ class UdpRobot(Robot):
                 packet = unpack(self._socket.recv(_MOST))
                 if packet and packet.kind == REFUSED:
                     raise self._lost(packet.body.decode("utf-8", "replace"))
-                if packet and packet.kind == MEASURED and packet.count == self._count:  # an answer to an older one is late
+                if packet and packet.kind == MEASURED and packet.count == self._count:  # not a late answer to an older one
                     return self._measurement(packet.body)
         except TimeoutError:
             raise self._lost(f"no answer within {self._timeout:g} s") from None
@@ -110,7 +121,7 @@ class UdpRobot(Robot):
 
     def _lost(self, why: str) -> RobotError:
         self.close()
-        return RobotError(f"robot at {self._name}: {why}; stopped (start one with: python -m legged_mw.deploy DIR --serve {self._name})")
+        return RobotError(f"robot at {self._name}: {why}; stopped (start one with: python examples/udp_robot.py DIR --serve {self._name})")
 
     def _measurement(self, body: bytes) -> Measurement:
         values = np.frombuffer(body, dtype="<f8").astype(float)
@@ -121,10 +132,10 @@ class UdpRobot(Robot):
 
 
 class UdpServer:
-    """Owns ``robot`` and does what one client at a time says. A client that falls silent costs the joints their servos."""
+    """Owns ``robot`` and obeys one client. When that client closes or sends nothing for too long, the servos are switched off."""
 
     def __init__(self, robot: Robot, contract: Contract, address: tuple[str, int], timeout: float = 0.5) -> None:
-        """Listen at ``address`` (port 0: any free one); ``timeout`` [s] is the longest silence of a client."""
+        """Listen at ``address`` (port 0: any free one); ``timeout`` [s] is the longest time between two packets of the client."""
         self._robot, self._contract, self._timeout = robot, contract, timeout
         self._layout, self._digest, self._count = layout(contract), contract_digest(contract), 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -136,7 +147,7 @@ class UdpServer:
         self.address: tuple[str, int] = self._socket.getsockname()
 
     def serve(self, say: Callable[[str], None] = print) -> str:
-        """Serve one client, from its hello until it closes or falls silent; then let the robot go. Returns why it ended."""
+        """Serve one client from its hello until it closes or falls silent, then close the robot. Returns why it ended."""
         why = "interrupted"
         try:
             client = self._wait_for_client(say)
@@ -148,7 +159,7 @@ class UdpServer:
         return why
 
     def _wait_for_client(self, say: Callable[[str], None]) -> tuple[str, int]:
-        """The first that says hello with the same contract."""
+        """The first client that sends a hello with the same contract."""
         self._socket.settimeout(None)
         while True:
             data, sender = self._socket.recvfrom(_MOST)
@@ -160,7 +171,7 @@ class UdpServer:
                 return sender
 
     def _obey(self, client: tuple[str, int]) -> str:
-        """Do what ``client`` says, and nobody else, until it closes or is silent for too long; returns which."""
+        """Obey ``client`` alone until it closes or falls silent; returns which."""
         heard = time.monotonic()
         while (left := heard + self._timeout - time.monotonic()) > 0:
             self._socket.settimeout(left)
@@ -180,7 +191,7 @@ class UdpServer:
         return f"{client[0]}:{client[1]} fell silent for {self._timeout:g} s"
 
     def _answer(self, data: bytes, started: bool) -> tuple[int, bytes | None]:
-        """Do what a packet says; its kind, or 0 if it was refused or none of ours, and the reply."""
+        """Do what a packet asks; returns its kind, or 0 if it was refused or not of this link, and the reply."""
         try:
             packet = unpack(data)
         except RobotError as error:
@@ -193,11 +204,11 @@ class UdpServer:
             targets = np.frombuffer(packet.body[: len(packet.body) // 8 * 8], dtype="<f8")
             if len(targets) != len(self._contract.joints) or not np.isfinite(targets).all():
                 return 0, self._refuse(f"targets must be {len(self._contract.joints)} finite numbers, one a joint")
-            if packet.count > self._count:  # one that came twice, or late, moves nothing
+            if packet.count > self._count:  # a packet that comes twice or late moves nothing
                 self._count = packet.count
                 self._robot.write(targets)
         elif packet.kind == TARGETS:
-            return 0, self._refuse("say hello first")
+            return 0, self._refuse("send a hello first")
         elif packet.kind == CLOSE:
             return CLOSE, None
         return packet.kind, self._measured()
@@ -209,3 +220,49 @@ class UdpServer:
 
     def _refuse(self, why: str) -> bytes:
         return pack(REFUSED, self._digest, self._count, why.encode())
+
+
+# ---- the program -----------------------------------------------------------------------------------------------------
+
+
+def drive(folder: Path, contract: Contract, address: tuple[str, int], command: Floats, seconds: float) -> None:
+    """Drive the robot at ``address`` with one command; prints a line a second and one at the end."""
+    period = contract.period
+
+    def tell(now: float, measured: Measurement) -> None:
+        if round(now / period) % round(1.0 / period) == 0:
+            velocity = f"vx {measured.lin_vel[0]:6.2f} m/s  vy {measured.lin_vel[1]:6.2f} m/s  yaw rate {measured.ang_vel[2]:6.2f} rad/s"
+            print(f"{now:6.1f} s  {velocity}", flush=True)
+
+    done = run(UdpRobot(contract, address), Controller(folder, contract), lambda _: command, seconds, watch=tell)
+    if done.fell is not None:
+        print(f"it fell after {done.fell:.1f} s; its servos were switched off")
+    if done.velocity is not None:
+        wanted, got = (", ".join(f"{v:.2f}" for v in vector) for vector in (command, done.velocity))
+        print(f"{done.steps} steps of {period:g} s, {done.late} of them late")
+        print(f"commanded {wanted} ({describe(contract.commands)}); vx, vy [m/s], yaw rate [rad/s] over the second half: {got}")
+
+
+def main() -> None:
+    parser = Parser(prog="udp_robot.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
+    parser.add_argument("folder", metavar="DIR", type=Path, help="an export: the same at both ends")
+    what = parser.add_mutually_exclusive_group(required=True)
+    what.add_argument("--serve", metavar="HOST:PORT", help="be a simulated robot that listens there")
+    what.add_argument("--drive", metavar="HOST:PORT", help="drive the robot that listens there")
+    parser.add_argument("--command", metavar="C", help="of --drive: e.g. 0.8,0,0 in the order of the contract's commands")
+    parser.add_argument("--time", type=duration, default=10.0, metavar="T", help="of --drive: how long (default: 10s)")
+    args = parser.parse_args()
+    contract, address = read_contract(args.folder), parse_address(args.serve or args.drive)
+    if args.drive:
+        command = idle_command(contract) if args.command is None else np.array(parse_command(args.command, contract.commands))
+        drive(args.folder, contract, address, command, args.time)
+        return
+    server = UdpServer(MujocoRobot(args.folder, contract), contract, address)
+    print(f"a simulated robot for {contract.task} at {server.address[0]}:{server.address[1]}; Ctrl-C ends it", flush=True)
+    with contextlib.suppress(KeyboardInterrupt):
+        server.serve(lambda line: print(line, flush=True))
+
+
+if __name__ == "__main__":
+    with one_line_errors("udp_robot.py"):
+        main()

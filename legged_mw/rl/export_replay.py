@@ -1,0 +1,137 @@
+"""Does ``legged_mw.deploy`` act as the environment does? Recorded steps, played through deploy's own controller and compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+import numpy as np
+import torch
+from rsl_rl.models import MLPModel
+
+from legged_mw.deploy.contract import CONTRACT_FILE, Contract
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.robot import Measurement
+from legged_mw.deploy.simulated import Fleet
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.policies import act
+from legged_mw.utils.errors import UserError
+
+STEPS = 32
+TOLERANCE = 1e-4  # relative above 1: MJCF has six digits, and the environment computes in float32
+
+
+class ExportError(UserError, RuntimeError):
+    """A policy that cannot be exported; nothing was written."""
+
+
+class Step(NamedTuple):
+    """One control step of N worlds, as the environment made it."""
+
+    observation: np.ndarray  # (N, size) of the actor
+    measured: Measurement
+    commands: np.ndarray  # (N, C)
+    actions: np.ndarray  # (N, D) of the policy, not clipped
+    taken: np.ndarray  # (N, D) that the environment got
+    targets: np.ndarray  # (N, D) [rad] that the servos got, by encoders that may be off
+    ended: np.ndarray  # (N,) the episode ended, so that nothing of the targets is left to see
+
+
+def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Contract, folder: Path) -> list[Step]:
+    """The policy at work in ``env``, with what a robot with the export in ``folder`` would measure.
+
+    The last two worlds get large random actions on top, so that some actions are clipped and some robots fall.
+    """
+    fleet, offset, steps = Fleet(folder, contract, env.num_envs, threads=1), env.actuators.encoder_offset, []
+    seen = env.get_observations()
+    for _ in range(STEPS):
+        actions = act(policy, seen)
+        observation = torch.cat([seen[group] for group in groups], dim=1).numpy()
+        measured, commands = _measure(env, fleet), np.zeros((env.num_envs, 0))
+        if contract.commands:
+            commands = env.commands.numpy().copy()  # type: ignore[attr-defined]
+        taken = actions.clone()
+        taken[-2:] += contract.action.clip * torch.randn_like(taken[-2:])
+        seen, _, dones, _ = env.step(taken)
+        targets = env.sim.ctrl if offset is None else env.sim.ctrl + offset
+        arrays = (tensor.numpy().copy() for tensor in (actions, taken, targets, dones.bool()))
+        steps.append(Step(observation, measured, commands, *arrays))
+    return steps
+
+
+def _measure(env: RobotTask, fleet: Fleet) -> Measurement:
+    """What the environment's robots would measure now.
+
+    Deploy's own scene measures positions and velocities, in the state of the environment. What needs forces or contacts comes
+    from the environment, whose sensors are one physics step old and zero after a reset.
+    """
+    fleet.qpos[:], fleet.qvel[:] = env.sim.qpos.numpy(), env.sim.qvel.numpy()
+    fleet.refresh()
+    now, contract = fleet.read(), fleet.contract
+
+    def sensed(names: Sequence[str]) -> np.ndarray:
+        model, parts = env.robot.physics, []
+        for index in (env.robot.id("sensor", name) for name in names):
+            start = model.sensor_adr[index]
+            parts.append(env.sim.sensordata[:, start : start + model.sensor_dim[index]])
+        return torch.cat(parts, dim=1).numpy().copy()
+
+    own = {row.name: sensed(row.sensors) for row in contract.rows if row.sensors}
+    unknown = {row.name: value for row in contract.rows if not row.measured for value in [_value(env, row.name)]}
+    contact = [(sensed(names) > 0.0).any(axis=1) for names in contract.feet.values()]
+    offset = env.actuators.encoder_offset
+    return replace(
+        now,
+        joint_pos=now.joint_pos if offset is None else now.joint_pos + offset.numpy(),
+        joint_torque=env.torques.numpy().copy(),
+        acceleration=sensed(contract.sensors["acceleration"]),
+        foot_contact=np.stack(contact, axis=1).astype(float) if contact else now.foot_contact,
+        others={**now.others, **own, **unknown},
+    )
+
+
+def _value(env: RobotTask, name: str) -> np.ndarray:
+    """The value (N, size) of an observation row that cannot be measured, so that the others can be compared."""
+    return next(row.value for rows in env.observations.groups.values() for row in rows if row.name == name).float().numpy().copy()
+
+
+def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) -> None:
+    """Play ``steps`` through deploy's controller. Raises ExportError at the first observation or joint target that differs."""
+    actions = iter([step.taken for step in steps])
+    controller = Controller(folder, contract, env.num_envs, network=lambda _: next(actions))
+    for number, step in enumerate(steps):
+        observed, start = controller.observe(step.measured, step.commands), 0
+        for row in contract.rows:
+            columns = slice(start, start := start + row.size * row.history)
+            what = f"observation row '{row.name}'"
+            _compare(env, number, what, range(row.size * row.history), step.observation[:, columns], observed[:, columns])
+        targets = controller.act(step.measured, step.commands)
+        _compare(env, number, "joint target", contract.joints, step.targets[~step.ended], targets[~step.ended])
+        controller.reset(step.ended)
+
+
+def _compare(env: RobotTask, step: int, what: str, names: Sequence[Any], theirs: np.ndarray, ours: np.ndarray) -> None:
+    wrong = ~(np.abs(ours - theirs) <= TOLERANCE * np.maximum(1.0, np.abs(theirs)))  # NaN too
+    if wrong.any():
+        world, column = np.argwhere(wrong)[0]
+        _refuse(env, step, f"{what} {names[column]}", float(theirs[world, column]), float(ours[world, column]))
+
+
+def _refuse(env: RobotTask, step: int, what: str, theirs: float, ours: float) -> NoReturn:
+    methods = overridden(type(env))
+    why = f"{type(env).__name__} overrides {', '.join(methods)}" if methods else f"{type(env).__name__} overrides no method"
+    raise ExportError(
+        f"legged_mw.deploy would act otherwise than the environment: {what} is {theirs:.6g} in the environment and {ours:.6g} by "
+        f"{CONTRACT_FILE}, at step {step}. {why}. State it where the contract can take it from: an action's scale and origin in section "
+        f"control, a row's scale in its Row, a value of your own as a row of another name with sensors=; nothing was written"
+    )
+
+
+def overridden(task: type[RobotTask]) -> list[str]:
+    """Methods of RobotTask or LeggedRobot that the task has its own of; rewards aside."""
+    own = [kind for kind in task.__mro__ if kind not in LeggedRobot.__mro__]
+    names = [name for kind in own for name, value in vars(kind).items() if callable(value) and hasattr(LeggedRobot, name)]
+    return [name for name in dict.fromkeys(names) if not name.startswith("_reward_") and name not in ("__module__", "__doc__")]
