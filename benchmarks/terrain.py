@@ -127,7 +127,7 @@ def walked(task_name: str, num_envs: int, device: str) -> LeggedRobot:
         "domain_rand.enable": False,
     }.items():
         task.set(path, value)
-    task.set("perturbation.enable", False)
+    task.set("perturbation.kick", False)
     task.set("perturbation.push", False)
     task.set("terrain.height_scan", [])
     env = task.env_class(task.cfg, device)

@@ -44,7 +44,7 @@ class Go1FlatCfg(LeggedRobotCfg):
             tracking_ang_vel = 1.0  # [P 0.5] [ours: likewise]
 
     class perturbation(LeggedRobotCfg.perturbation):
-        enable = True  # [ours: trained without, a quarter of 2 m/s kicks topple it; docs/training.md]
+        kick = True  # [ours: trained without, a quarter of 2 m/s kicks topple it; docs/training.md]
         velocity = [0.0, 8.0]  # [m/s] [ours: with up to 3, an eighth still do]
 
 

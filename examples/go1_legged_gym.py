@@ -6,14 +6,13 @@ why, is in docs/from_legged_gym.md. Run it with: python train.py --task examples
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
-from legged_mw.envs.legged_robot import LeggedRobot, Row
+from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
-from legged_mw.utils.math import assign, quat_rotate
+from legged_mw.envs.observations import Row
+from legged_mw.utils.math import assign
 from legged_mw.utils.task import Task
 
 
@@ -25,8 +24,6 @@ class LeggedGymRobot(LeggedRobot):
     def _init_buffers(self) -> None:
         super()._init_buffers()
         self.last_dof_vel = torch.zeros_like(self.dof_vel)  # [rad/s]
-        self.heading = torch.zeros(self.num_envs, device=self.device)  # to be reached, world frame [rad]
-        self.forward = torch.tensor([1.0, 0.0, 0.0], device=self.device).expand(self.num_envs, 3)
         self.effort_limit = torch.tensor(self.robot.effort_range[:, 1], dtype=torch.float, device=self.device)  # (D,) [N m]
 
     def reset_envs(self, mask: Tensor) -> None:
@@ -44,30 +41,17 @@ class LeggedGymRobot(LeggedRobot):
         return torch.full_like(self.command_timer, self.cfg.commands.resampling_time / self.dt)
 
     def _reset_commands(self, mask: Tensor) -> None:
-        """Uniform; velocities too small to walk at become zero; a heading, from which the yaw rate follows. [L]"""
+        """Uniform; velocities too small to walk at become zero. [L]"""
         super()._reset_commands(mask)
         small = torch.linalg.vector_norm(self.commands[:, :2], dim=1) <= self.cfg.commands.min_lin_vel
         self.commands[:, :2].masked_fill_((small & mask)[:, None], 0.0)
-        assign(self.heading, mask, torch.empty_like(self.heading).uniform_(*self.cfg.commands.ranges.heading))
 
     def _resample_commands(self, mask: Tensor) -> None:
         self._reset_commands(mask)  # legged_gym redraws all of a command, LeggedRobot some of it
 
-    def compute_observations(self) -> None:
-        if self.cfg.commands.heading_command and self.cfg.commands.resampling_time > 0:  # 0: the command is the caller's
-            self._steer()
-        super().compute_observations()
-
-    def _steer(self) -> None:
-        """Yaw rate towards the heading. [L]"""
-        forward = quat_rotate(self.sim.qpos[:, 3:7], self.forward)
-        error = self.heading - torch.atan2(forward[:, 1], forward[:, 0])
-        error = torch.remainder(error + math.pi, 2.0 * math.pi) - math.pi
-        self.commands[:, 2] = (0.5 * error).clamp(*self.cfg.commands.ranges.ang_vel_yaw)
-
     # ---- observations
 
-    def _observation_rows(self) -> dict[str, list[Row]]:
+    def observation_rows(self) -> dict[str, list[Row | str]]:
         """One group: legged_gym's actor and critic see the same."""
         noise, scale = self.cfg.noise.scales, self.cfg.normalization.obs_scales
         velocities = (scale.lin_vel, scale.lin_vel, scale.ang_vel)
@@ -157,7 +141,7 @@ class Go1LeggedGymCfg(LeggedRobotCfg):
         decimation = 4
 
     class commands(LeggedRobotCfg.commands):
-        heading_command: bool = True  # the yaw rate steers to a drawn heading; off: it is drawn itself
+        heading_command = True
         resampling_time = 10.0
         min_lin_vel: float = 0.2  # norm of (vx, vy) below which both are zero [m/s]
 
@@ -165,7 +149,7 @@ class Go1LeggedGymCfg(LeggedRobotCfg):
             lin_vel_x = [-1.0, 1.0]
             lin_vel_y = [-1.0, 1.0]
             ang_vel_yaw = [-1.0, 1.0]
-            heading: list[float] = [-3.14, 3.14]  # [rad]
+            heading = [-3.14, 3.14]  # [rad]
 
     class termination(LeggedRobotCfg.termination):
         max_tilt = 180.0  # none: only a contact of the trunk is a fall

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 
-from legged_mw.utils.math import may_hold
+from legged_mw.utils.math import maybe_any
 
 # Seen by name, because on a CPU some of them reach no kernel at all.
 _HOST_READS = {"item", "tolist", "cpu", "numpy", "__array__", "__dlpack__", "__repr__", "__str__", "__format__", "__contains__"}
@@ -73,6 +73,6 @@ def _moves(args: tuple, kwargs: dict[str, Any]) -> bool:
 def recordable() -> Iterator[None]:
     """Inside, torch calls that a CUDA graph could not record raise NotRecordable; what only a CPU would ask is not asked."""
     with pytest.MonkeyPatch.context() as patch, _FunctionGuard(), _DispatchGuard():
-        for module in [m for m in sys.modules.values() if getattr(m, "may_hold", None) is may_hold]:
-            patch.setattr(module, "may_hold", lambda mask: True)
+        for module in [m for m in sys.modules.values() if getattr(m, "maybe_any", None) is maybe_any]:
+            patch.setattr(module, "maybe_any", lambda mask: True)
         yield

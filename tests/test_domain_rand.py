@@ -10,7 +10,7 @@ import pytest
 import torch
 from guard import recordable
 from torch import Tensor
-from worlds import QUIET, changed, make_env, same, snapshot
+from worlds import QUIET, changed, layout, make_env, same, snapshot
 
 from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, world_fields
 from legged_mw.envs.legged_robot import LeggedRobot
@@ -271,7 +271,7 @@ def test_the_same_seed_draws_the_same_worlds() -> None:
 
 
 def test_the_whole_step_asks_the_host_nothing_with_everything_on() -> None:
-    shaken = {"perturbation.enable": True, "perturbation.push": True, "perturbation.push_interval_s": 0.04}
+    shaken = {"perturbation.kick": True, "perturbation.push": True, "perturbation.push_interval_s": 0.04}
     env = make_env(4, {**ALL, **shaken, "sim.engine": "mujoco_warp"})
     actions = torch.zeros(4, 12)
     with recordable():
@@ -281,10 +281,10 @@ def test_the_whole_step_asks_the_host_nothing_with_everything_on() -> None:
 
 def test_what_was_drawn_is_readable() -> None:
     env = make_env(3, ALL)
-    table = {name: size for name, size, _ in env.observation_table["privileged_state"]}
+    table = layout(env)["privileged_state"]
     assert {name: table[name] for name in KINDS} == {name: env.domain_rand.values[name].shape[1] for name in KINDS}
     assert env.obs_buf["privileged_state"].shape[1] == 123 + sum(value.shape[1] for value in env.domain_rand.values.values())
-    friction = sum(size for name, size, _ in env.observation_table["privileged_state"][: list(table).index("friction")])
+    friction = env.observations.span("privileged_state", "friction").start
     assert torch.equal(env.obs_buf["privileged_state"][:, friction], env.domain_rand.values["friction"][:, 0])
     twice = env.mirror.observations["privileged_state"]
     sample = torch.randn(5, env.obs_buf["privileged_state"].shape[1])
@@ -293,19 +293,19 @@ def test_what_was_drawn_is_readable() -> None:
 
 def test_pushes_set_the_velocity_when_their_clock_says_so() -> None:
     env = make_env(64, {**QUIET, "perturbation.push": True, "perturbation.push_interval_s": 0.2, "perturbation.max_push_vel_xy": 1.0})
-    assert len(set(env.push_clock.tolist())) > 5, "each world its own clock"
-    env.push_clock.copy_(torch.arange(64) % 10 + 1.0)
+    assert len(set(env.perturbation._push_clock.tolist())) > 5, "each world its own clock"
+    env.perturbation._push_clock.copy_(torch.arange(64) % 10 + 1.0)
     pushed = torch.zeros(64, dtype=torch.long)
     for step in range(20):
         before = env.sim.qvel[:, :2].clone()
-        env._push_robots()
+        env.perturbation._push_robots()
         moved = (env.sim.qvel[:, :2] != before).any(dim=1)
         assert torch.equal(moved, torch.arange(64) % 10 == step % 10)
         assert env.sim.qvel[moved, :2].abs().max() <= 1.0
         pushed += moved
     assert pushed.eq(2).all()
     plain = make_env(4, QUIET)
-    assert torch.equal(walk(plain, 10), walk(make_env(4, QUIET), 10)) and plain.push_clock.eq(0).all()
+    assert torch.equal(walk(plain, 10), walk(make_env(4, QUIET), 10)) and plain.perturbation._push_clock.eq(0).all()
 
 
 # ---- mistakes

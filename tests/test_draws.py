@@ -139,7 +139,7 @@ class Kick(NamedTuple):
 
 
 KICKS = {
-    "perturbation.enable": True,
+    "perturbation.kick": True,
     "perturbation.interval": [0.1, 0.3],
     "perturbation.duration": [0.08, 0.2],
     "perturbation.velocity": [0.0, 3.0],
@@ -169,12 +169,12 @@ def history() -> list[Kick]:
     body = env.robot.physics.body("trunk").id
     force, active = [], []
     for _ in range(300):
-        env._kick_robots()
+        env.perturbation._kick_robots()
         applied = env.sim.xfrc_applied
         assert (applied[:, :body] == 0).all() and (applied[:, body + 1 :] == 0).all() and (applied[:, body, 2:] == 0).all()
-        assert torch.equal(applied[:, body, :3], env.kick_force)
+        assert torch.equal(applied[:, body, :3], env.perturbation.kick_force)
         force.append(applied[:, body, :3].clone())
-        active.append(env.kick_active.clone())
+        active.append(env.perturbation.kick_active.clone())
     forces, actives = torch.stack(force), torch.stack(active)
     assert (forces[~actives] == 0.0).all()  # not a newton between kicks
     kicks = [kick for world in range(N) for kick in read_kicks(forces[:, world], actives[:, world])]
@@ -216,11 +216,11 @@ def test_every_kick_is_drawn_anew(history: list[Kick]) -> None:
 
 def test_configured_kicks_are_the_tasks() -> None:
     """go1_flat: every 1 to 3 s, for 0.05 to 0.2 s, as in the joystick task; up to 8 m/s, which is ours."""
-    env = make_env(N, {"perturbation.enable": True})
+    env = make_env(N, {"perturbation.kick": True})
     draws = []
     for _ in range(60):
-        env._redraw_kicks(torch.ones(N, dtype=torch.bool))
-        draws.append(env.kick.clone())
+        env.perturbation._redraw(torch.ones(N, dtype=torch.bool))
+        draws.append(env.perturbation._kick.clone())
     pause, steps, angle, dv = torch.cat(draws).unbind(dim=1)
     assert (pause.min(), pause.max()) == (50.0, 150.0) and torch.equal(pause, pause.round())
     assert steps.min() in (2.0, 3.0) and steps.max() == 10.0 and torch.equal(steps, steps.round())  # 0.05 s is 2.5 steps
@@ -229,37 +229,37 @@ def test_configured_kicks_are_the_tasks() -> None:
     off = make_env(2)
     for _ in range(5):
         off.step(torch.zeros(2, 12))
-    assert (off.sim.xfrc_applied == 0.0).all() and (off.kick_force == 0.0).all() and not off.kick_active.any()
+    assert (off.sim.xfrc_applied == 0.0).all() and (off.perturbation.kick_force == 0.0).all() and not off.perturbation.kick_active.any()
 
 
 def test_reset_ends_a_kick_and_the_next_one_is_whole() -> None:
     env = make_env(N, {**KICKS, **QUIET})
-    env.kick.copy_(torch.tensor([2.0, 6.0, 0.5, 2.0]).expand(N, 4))
-    env.kick_clock.zero_()
+    env.perturbation._kick.copy_(torch.tensor([2.0, 6.0, 0.5, 2.0]).expand(N, 4))
+    env.perturbation._clock.zero_()
     for _ in range(5):  # two steps of pause, three of the kick
-        env._kick_robots()
+        env.perturbation._kick_robots()
     body = env.robot.physics.body("trunk").id
-    assert env.kick_active.all() and (env.sim.xfrc_applied[:, body, :2].norm(dim=1) > 1.0).all()
+    assert env.perturbation.kick_active.all() and (env.sim.xfrc_applied[:, body, :2].norm(dim=1) > 1.0).all()
     mask = torch.arange(N) < N // 2
     env.reset_envs(mask)
     env.compute_observations()
     obs = env.get_observations()["privileged_state"]
     assert (env.sim.xfrc_applied[mask] == 0.0).all() and (obs[mask][:, 119:] == 0.0).all()
     assert (env.sim.xfrc_applied[~mask, body, :2].norm(dim=1) > 1.0).all() and (obs[~mask][:, 122] == 1.0).all()
-    pause = env.kick[mask, 0].clone()
+    pause = env.perturbation._kick[mask, 0].clone()
     assert pause.min() >= 5.0 and pause.max() > pause.min()  # new draws
     for t in range(6):  # the others finish theirs; the reset worlds wait at least five steps
-        env._kick_robots()
-        assert torch.equal(env.kick_active[mask], pause <= t)
+        env.perturbation._kick_robots()
+        assert torch.equal(env.perturbation.kick_active[mask], pause <= t)
 
 
 def test_a_kick_moves_the_robot_by_its_impulse() -> None:
     """In free flight the momentum of the whole robot gains the sum of force * dt, and the observation shows the force acting."""
     env = make_env(8, {**KICKS, **QUIET, "init_state.pos": [0.0, 0.0, 30.0], "init_state.ang_vel_range": 0.0})
-    env.kick.copy_(torch.tensor([2.0, 5.0, 0.0, 0.0]).expand(8, 4))
-    env.kick[:, 2], env.kick[:, 3] = torch.linspace(-3.0, 3.0, 8), torch.linspace(0.5, 3.0, 8)
-    env.kick_clock.zero_()
-    angle, dv = env.kick[:, 2].clone(), env.kick[:, 3].clone()
+    env.perturbation._kick.copy_(torch.tensor([2.0, 5.0, 0.0, 0.0]).expand(8, 4))
+    env.perturbation._kick[:, 2], env.perturbation._kick[:, 3] = torch.linspace(-3.0, 3.0, 8), torch.linspace(0.5, 3.0, 8)
+    env.perturbation._clock.zero_()
+    angle, dv = env.perturbation._kick[:, 2].clone(), env.perturbation._kick[:, 3].clone()
     before, impulse, shown = momentum(env), torch.zeros(8, 3), []
     for _ in range(7):
         obs, _, done, _ = env.step(torch.zeros(8, 12))
@@ -288,18 +288,18 @@ def momentum(env: LeggedRobot) -> Tensor:
 
 def test_kicks_grow_with_what_a_world_survives() -> None:
     """Halfway, at the end of each episode, to the share of it that was survived; the time-out counts in full."""
-    env = make_env(3, {**QUIET, "perturbation.enable": True, "perturbation.velocity": [2.0, 2.0], "perturbation.curriculum": True})
-    assert env.kick_level.tolist() == [0.0, 0.0, 0.0] and not env.kick[:, 3].any()
+    env = make_env(3, {**QUIET, "perturbation.kick": True, "perturbation.velocity": [2.0, 2.0], "perturbation.curriculum": True})
+    assert env.perturbation.kick_level.tolist() == [0.0, 0.0, 0.0] and not env.perturbation._kick[:, 3].any()
     env.episode_steps[:] = torch.tensor([[0.5], [0.25], [0.75]]) * env.max_episode_length
     env.time_out_buf[:] = torch.tensor([True, False, False])
     env.reset_envs(torch.tensor([True, True, False]))
-    assert env.kick_level.tolist() == [0.5, 0.125, 0.0]
-    assert env.kick[:, 3].tolist() == [1.0, 0.25, 0.0]  # the pause of the third goes on
+    assert env.perturbation.kick_level.tolist() == [0.5, 0.125, 0.0]
+    assert env.perturbation._kick[:, 3].tolist() == [1.0, 0.25, 0.0]  # the pause of the third goes on
     env.reset_envs(torch.tensor([True, True, True]))  # no step in between: two of them had no episode that says anything
-    assert env.kick_level.tolist() == [0.5, 0.125, 0.375]
+    assert env.perturbation.kick_level.tolist() == [0.5, 0.125, 0.375]
 
 
 def test_kicks_are_at_full_strength_without_the_curriculum() -> None:
-    env = make_env(4, {"perturbation.enable": True, "perturbation.velocity": [2.0, 2.0]})
+    env = make_env(4, {"perturbation.kick": True, "perturbation.velocity": [2.0, 2.0]})
     env.reset()
-    assert env.kick[:, 3].tolist() == [2.0] * 4
+    assert env.perturbation._kick[:, 3].tolist() == [2.0] * 4

@@ -12,17 +12,18 @@ import pytest
 import torch
 from guard import NotRecordable, recordable
 from torch import Tensor
-from worlds import QUIET, changed, make_env, same, snapshot, tensors
+from worlds import QUIET, changed, layout, make_env, same, snapshot, tensors
 
 from legged_mw.envs.base_task import BaseTask
-from legged_mw.envs.legged_robot import LeggedRobot, Row
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.observations import Row
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import task_names
 
 HOME = [0.1, 0.9, -1.8, -0.1, 0.9, -1.8, 0.1, 0.9, -1.8, -0.1, 0.9, -1.8]  # [rad] FR, FL, RR, RL; hip, thigh, calf
 FEET = ("FR", "FL", "RR", "RL")
-KICKS = {"perturbation.enable": True, "perturbation.interval": [0.02, 0.1], "perturbation.duration": [0.06, 0.2]}
+KICKS = {"perturbation.kick": True, "perturbation.interval": [0.02, 0.1], "perturbation.duration": [0.06, 0.2]}
 N = 10  # no other tensor has as many rows, so that a first dimension of 10 means worlds
 
 
@@ -113,7 +114,14 @@ def test_buffers_are_never_rebound(task: str) -> None:
     """A CUDA graph keeps addresses: each tensor is the same object at the same address after steps with resets of all kinds."""
     env = make_env(4, KICKS, task=task)
     before = tensors(env)
-    assert {"env.actions", "env.rew_buf", "env.obs_buf.state", "env.noise_vec.state", "env._episode", "sim.qpos"} <= before.keys()
+    assert {
+        "env.actions",
+        "env.rew_buf",
+        "env.obs_buf.state",
+        "env.observations._parts.state._noise",
+        "env._episode",
+        "sim.qpos",
+    } <= before.keys()
     addresses = {name: (tensor.data_ptr(), tensor.shape, tensor.stride()) for name, tensor in before.items()}
     resets = 0
     for t in range(5):
@@ -282,8 +290,8 @@ def test_mistakes_are_named(overrides: dict[str, Any], env_class: type[LeggedRob
 
 def test_groups_may_have_any_name() -> None:
     class Renamed(LeggedRobot):
-        def _observation_rows(self) -> dict[str, list[Row]]:
-            return {"senses": super()._observation_rows()["state"]}
+        def observation_rows(self) -> dict[str, list[Row]]:
+            return {"senses": super().observation_rows()["state"]}
 
     env = make_env(2, env_class=Renamed)
     env.step(torch.zeros(2, 12))
@@ -347,12 +355,13 @@ def by_sensor(env: LeggedRobot, prefix: str) -> Tensor:
 
 def test_sizes_and_noise_of_the_layout() -> None:
     env = make_env(2, {"noise.level": 0.5})
-    tables = {group: {name: size for name, size, _ in rows} for group, rows in env.observation_table.items()}
+    tables = layout(env)
     assert tables == {"state": STATE, "privileged_state": PRIVILEGED}
     assert [list(table) for table in tables.values()] == [list(STATE), list(PRIVILEGED)]  # the order
     assert {group: tuple(obs.shape) for group, obs in env.obs_buf.items()} == {"state": (2, 48), "privileged_state": (2, 123)}
     noise = [HALF_WIDTH.get(name, 0.0) * 0.5 for name, size in STATE.items() for _ in range(size)]
-    assert env.noise_vec.keys() == {"state"} and env.noise_vec["state"].tolist() == pytest.approx(noise)
+    vectors = {group: part._noise for group, part in env.observations._parts.items()}
+    assert vectors["privileged_state"] is None and vectors["state"].tolist() == pytest.approx(noise)
 
 
 def test_each_row_holds_what_its_name_says(lively: LeggedRobot) -> None:
@@ -381,7 +390,7 @@ def test_each_row_holds_what_its_name_says(lively: LeggedRobot) -> None:
             "foot_lin_vel": by_sensor(env, "linvel"),
             "feet_air_time": air,
             "kick_force": env.sim.xfrc_applied[:, body, :3],
-            "kick_active": env.kick_active[:, None].float(),
+            "kick_active": env.perturbation.kick_active[:, None].float(),
         }
         for group, table in (("state", STATE), ("privileged_state", PRIVILEGED)):
             spans = obs[group].split(list(table.values()), dim=1)
@@ -410,7 +419,7 @@ def test_a_standing_robot_senses_gravity_and_its_weight(quiet: LeggedRobot) -> N
 def test_noise_is_uniform_within_its_half_width_and_new_for_each_number() -> None:
     env = make_env(N)
     run_a_while(env, 3)
-    clean = torch.cat([row.value for row in env._observation_rows()["state"]], dim=1)
+    clean = torch.cat([row.value for row in env.observation_rows()["state"]], dim=1)
     samples = []
     for _ in range(400):
         env.compute_observations()
@@ -462,7 +471,16 @@ def test_reset_touches_the_masked_worlds_only(lively: LeggedRobot) -> None:
     before = snapshot(env)
     env.reset_envs(mask)
     assert changed(env, before, worlds=~mask) == []
-    touched = {"sim.qpos", "sim.qvel", "sim.ctrl", "sim.sensordata", "sim.actuator_force", "sim.site_xpos", "env.kick", "env.kick_clock"}
+    touched = {
+        "sim.qpos",
+        "sim.qvel",
+        "sim.ctrl",
+        "sim.sensordata",
+        "sim.actuator_force",
+        "sim.site_xpos",
+        "env.perturbation._kick",
+        "env.perturbation._clock",
+    }
     touched |= {"env.commands", "env.command_timer", "env._episode", "env._episode_length_buf", "env.base_lin_vel", "env.foot_contact"}
     assert touched <= set(changed(env, before, worlds=mask))
     nothing = snapshot(env)
@@ -519,7 +537,12 @@ def test_state_after_a_reset(lively: LeggedRobot) -> None:
             assert (getattr(sim, name) == 0.0).all(), name
         for name in ("last_actions", "feet_air_time", "swing_peak", "episode_sums", "episode_return", "episode_steps"):
             assert (getattr(env, name) == 0.0).all(), name
-        assert not env.foot_contact.any() and not env.kick_active.any() and (env.kick_force == 0.0).all() and (env.kick_clock == 0.0).all()
+        assert (
+            not env.foot_contact.any()
+            and not env.perturbation.kick_active.any()
+            and (env.perturbation.kick_force == 0.0).all()
+            and (env.perturbation._clock == 0.0).all()
+        )
         assert (env.episode_length_buf == 0).all()
         yaw = 2.0 * torch.atan2(sim.qpos[:, 6], sim.qpos[:, 3])
         yaw = torch.atan2(torch.sin(yaw), torch.cos(yaw))

@@ -13,10 +13,11 @@ import torch
 from guard import recordable
 from program import play, run
 from torch import Tensor
-from worlds import QUIET, changed, make_env, same, snapshot
+from worlds import QUIET, changed, layout, make_env, same, snapshot
 
 from legged_mw import ROOT
-from legged_mw.envs.legged_robot import LeggedRobot, Row
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.observations import Row
 from legged_mw.eval import exam
 from legged_mw.sim.model import Ground, ModelError, Solver, build_model
 from legged_mw.utils import math as math_of_steps
@@ -164,7 +165,7 @@ def test_calf_on_the_ground_costs_and_does_not_end() -> None:
 
 
 def test_observation_is_legged_gyms_row_for_row(env: Any) -> None:
-    assert [(name, size) for name, size, _ in env.observation_table["state"]] == [
+    assert list(layout(env)["state"].items()) == [
         ("base_lin_vel", 3),
         ("base_ang_vel", 3),
         ("projected_gravity", 3),
@@ -184,7 +185,7 @@ def test_observation_is_legged_gyms_row_for_row(env: Any) -> None:
 def test_noise_is_in_the_value_s_unit_and_scaled_with_it() -> None:
     env = ported(512, {"noise.level": 1.0})
     env.compute_observations()
-    clean = torch.cat([row.value for row in env._observation_rows()["state"]], dim=1) * env.obs_scales["state"]
+    clean = torch.cat([row.value for row in env.observation_rows()["state"]], dim=1) * env.observations._parts["state"]._scales
     error = (env.get_observations()["state"] - clean).abs().amax(dim=0)
     most = [(3, 0.1 * 2.0), (3, 0.2 * 0.25), (3, 0.05), (3, 0.0), (12, 0.01), (12, 1.5 * 0.05), (12, 0.0)]
     wanted = torch.tensor([level for size, level in most for _ in range(size)])
@@ -192,7 +193,7 @@ def test_noise_is_in_the_value_s_unit_and_scaled_with_it() -> None:
 
 
 class _TwoScales(LeggedRobot):
-    def _observation_rows(self) -> dict[str, list[Row]]:
+    def observation_rows(self) -> dict[str, list[Row]]:
         return {"state": [Row("commands", self.commands, scale=(1.0, 2.0))]}
 
 
@@ -203,8 +204,8 @@ def test_scales_that_do_not_fit_their_row_are_refused() -> None:
 
 def test_a_mirror_follows_the_scales(env: Any) -> None:
     plain = ported(1, {f"normalization.obs_scales.{name}": 1.0 for name in ("lin_vel", "ang_vel", "dof_vel")})
-    assert plain.obs_scales == {}
-    x, scale = torch.randn(5, 48), env.obs_scales["state"]
+    assert plain.observations._parts["state"]._scales is None
+    x, scale = torch.randn(5, 48), env.observations._parts["state"]._scales
     image = env.mirror.observations["state"](x * scale)
     torch.testing.assert_close(image, plain.mirror.observations["state"](x) * scale)
     torch.testing.assert_close(env.mirror.observations["state"](image), x * scale)
@@ -217,12 +218,12 @@ def test_yaw_rate_steers_to_the_heading() -> None:
     env = ported(4, {"commands.resampling_time": 10.0})
     env.sim.qpos[:, 3:7] = torch.stack([yaw(0.0), yaw(3.0), yaw(0.0), yaw(-3.0)])
     env.heading.copy_(torch.tensor([1.0, -3.0, 3.0, 2.5]))
-    env.compute_observations()
+    env._end_step()
     around = 0.5 * (2 * math.pi - 6.0)  # the short way past pi
     assert env.commands[:, 2].tolist() == pytest.approx([0.5, around, 1.0, 0.5 * (5.5 - 2 * math.pi)], abs=1e-5)
     env.cfg.commands.heading_command = False
     env.commands[:, 2] = 0.7
-    env.compute_observations()
+    env._end_step()
     assert env.commands[:, 2].tolist() == pytest.approx([0.7] * 4)
 
 
@@ -243,10 +244,10 @@ def test_commands_are_redrawn_every_ten_seconds_and_never_too_small_to_walk_at()
 def test_a_push_replaces_the_horizontal_velocity_every_fifteen_seconds() -> None:
     env = ported(3, {"perturbation.push": True})
     env.sim.qvel[:] = 5.0
-    env.push_clock.copy_(torch.tensor([750.0, 2.0, 1.0]))
-    env._push_robots()
+    env.perturbation._push_clock.copy_(torch.tensor([750.0, 2.0, 1.0]))
+    env.perturbation._push_robots()
     assert (env.sim.qvel[:2] == 5.0).all() and (env.sim.qvel[2, 2:] == 5.0).all()
-    assert env.sim.qvel[2, :2].abs().max() <= 1.0 and env.push_clock.tolist() == [749.0, 1.0, 750.0]
+    assert env.sim.qvel[2, :2].abs().max() <= 1.0 and env.perturbation._push_clock.tolist() == [749.0, 1.0, 750.0]
 
 
 def test_joints_are_scattered_at_reset_and_the_exam_starts_without() -> None:
@@ -259,7 +260,7 @@ def test_joints_are_scattered_at_reset_and_the_exam_starts_without() -> None:
     assert same(env.dof_pos[1:], kept) and not env.last_dof_vel[0].any() and env.last_dof_vel[1:].all()
     task = load_task(TASK)
     exam.prepare(task)
-    assert task.cfg.init_state.dof_pos_range == [1.0, 1.0] and not task.cfg.perturbation.enable
+    assert task.cfg.init_state.dof_pos_range == [1.0, 1.0] and not task.cfg.perturbation.kick
     graded = make_env(2, {path: value for path, value in exam.OVERRIDES.items() if path != "env.num_envs"}, task=TASK)
     assert torch.equal(graded.dof_pos, graded.default_dof_pos.expand(2, -1))
     graded.commands[:] = torch.tensor([0.1, 0.0, 1.2])  # the exam's commands are its own: no steering, no limit
@@ -274,7 +275,7 @@ def test_joints_are_scattered_at_reset_and_the_exam_starts_without() -> None:
 def test_step_asks_the_host_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """All but physics, which is the same for every task: the engine of this test is one that asks."""
     env = make_env(4, task=TASK)
-    env.cfg.perturbation.enable = True
+    env.cfg.perturbation.kick = True
     monkeypatch.setattr(env.sim, "step", lambda substeps: None)
     monkeypatch.setattr(env.sim, "reset", lambda mask: None)
     env.episode_length_buf = torch.tensor([0, 750, env.max_episode_length, 3])

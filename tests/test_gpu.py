@@ -26,7 +26,7 @@ DEVICE = "cuda:0"
 def make_env(eager: bool, **overrides: object) -> LeggedRobot:
     task = load_task("go1_flat")
     task.set("env.num_envs", 64)
-    task.set("perturbation.enable", False)
+    task.set("perturbation.kick", False)
     for path, value in overrides.items():
         task.set(path.replace("__", "."), value)
     torch.manual_seed(3)
@@ -78,7 +78,7 @@ ROUGH: dict[str, object] = {
 def test_replay_equals_eager_over_100_steps(randomized: dict[str, object]) -> None:
     """Bit for bit, with noise, kicks, falls, time outs and resets: the same random numbers are drawn in both."""
     actions = torch.randn(100, 64, 12, generator=torch.Generator().manual_seed(0)).to(DEVICE)
-    overrides = {"perturbation__enable": True, "env__episode_length_s": 1.0, "termination__max_tilt": 10.0, **randomized}
+    overrides = {"perturbation__kick": True, "env__episode_length_s": 1.0, "termination__max_tilt": 10.0, **randomized}
     eager, recorded = (without_constraints(make_env(eager, **overrides)) for eager in (True, False))
     expected, got = roll_out(eager, actions), roll_out(recorded, actions)
     assert recorded._graph.recorded and not eager._graph.recorded

@@ -120,7 +120,7 @@ def env() -> Iterator[LeggedRobot]:
 
 
 def test_every_term_has_a_figure_here_and_a_scale() -> None:
-    methods = {name.removeprefix("_reward_") for name in vars(LeggedRobot) if name.startswith("_reward_")}
+    methods = {name.removeprefix("_reward_") for name in dir(LeggedRobot) if name.startswith("_reward_")}
     assert methods == EXPECTED.keys() == SCALES.keys()
     assert LeggedRobotCfg().to_dict()["rewards"]["scales"] == SCALES
     assert make_env(1)._active_scales() == GO1_FLAT

@@ -14,7 +14,8 @@ from guard import recordable
 from torch import Tensor
 from worlds import QUIET, make_env
 
-from legged_mw.envs.legged_robot import LeggedRobot, Row
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.observations import Row
 from legged_mw.rl.runner import make_runner
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
@@ -125,12 +126,12 @@ def test_who_walks_off_the_grid_is_timed_out_and_has_not_fallen() -> None:
 
 
 def test_who_walks_off_has_not_survived_the_episode() -> None:
-    env = rough(2, perturbation__enable=True, perturbation__curriculum=True)
+    env = rough(2, perturbation__kick=True, perturbation__curriculum=True)
     env.sim.qpos[0, 0] = 17.1
     env._episode_length_buf[1] = env.max_episode_length
     env.step(STAND.expand(2, -1))
     assert env.time_out_buf.tolist() == [True, True]
-    assert env.kick_level[0] < 0.01 and env.kick_level[1] == 0.5
+    assert env.perturbation.kick_level[0] < 0.01 and env.perturbation.kick_level[1] == 0.5
 
 
 def test_few_worlds_take_kinds_from_all_over() -> None:
@@ -281,7 +282,7 @@ def test_a_range_without_zero_grows_from_its_end_that_is_nearest() -> None:
 
 
 def test_the_whole_step_asks_the_host_nothing_with_every_curriculum() -> None:
-    env = rough(8, sim__engine="mujoco_warp", commands__curriculum=True, perturbation__enable=True, termination__max_tilt=10.0)
+    env = rough(8, sim__engine="mujoco_warp", commands__curriculum=True, perturbation__kick=True, termination__max_tilt=10.0)
     env._episode_length_buf[:4] = env.max_episode_length
     with recordable():
         env._step()
@@ -291,7 +292,7 @@ def test_the_whole_step_asks_the_host_nothing_with_every_curriculum() -> None:
 
 
 def trained(num_envs: int, **changes: Any) -> tuple[LeggedRobot, Any]:
-    env = rough(num_envs, commands__curriculum=True, perturbation__enable=True, perturbation__curriculum=True, **changes)
+    env = rough(num_envs, commands__curriculum=True, perturbation__kick=True, perturbation__curriculum=True, **changes)
     task = load_task("go1_rough")
     for path, value in {
         "runner.num_steps_per_env": 4,
@@ -307,13 +308,15 @@ def test_curricula_survive_a_resume(tmp_path: Path) -> None:
     env, runner = trained(16)
     assert env.tiles
     env.tiles.put(torch.arange(16) % 4)
-    env.kick_level.copy_(torch.linspace(0.0, 1.0, 16))
+    env.perturbation.kick_level.copy_(torch.linspace(0.0, 1.0, 16))
     env.command_curriculum.copy_(torch.tensor([0.7, 3.5, 5.0]))
     runner.save(str(tmp_path / "model_0.pt"))
     other, again = trained(16)
     again.load(str(tmp_path / "model_0.pt"))
     assert other.tiles and torch.equal(other.tiles.levels, env.tiles.levels) and torch.equal(other.tiles.origins, env.tiles.origins)
-    assert torch.equal(other.kick_level, env.kick_level) and torch.equal(other.command_curriculum, env.command_curriculum)
+    assert torch.equal(other.perturbation.kick_level, env.perturbation.kick_level) and torch.equal(
+        other.command_curriculum, env.command_curriculum
+    )
     assert other.command_ranges[1, 0] == pytest.approx(0.7 * 1.5)
     away = (other.sim.qpos[:, :2] - other.tiles.origins[:, :2]).abs()
     assert (away <= 0.5).all(), "the worlds stand on the levels that they have"
@@ -348,15 +351,16 @@ def test_a_mistake_is_named() -> None:
 
 def test_a_table_without_the_scan_that_was_asked_for_is_named() -> None:
     class Own(LeggedRobot):
-        def _observation_rows(self) -> dict[str, list[Row]]:
-            return {group: [row for row in rows if row.name != "height_scan"] for group, rows in super()._observation_rows().items()}
+        def observation_rows(self) -> dict[str, list[Row]]:
+            return {
+                group: [row for row in rows if getattr(row, "name", row) != "height_scan"]
+                for group, rows in super().observation_rows().items()
+            }
 
     task = load_task("go1_rough_scan")
     task.set("env.num_envs", 2)
     task.set("terrain.mesh_type", "plane")
-    with pytest.raises(
-        ConfigError, match=r"terrain.height_scan names 'state', but Own._observation_rows has no row height_scan in 'state'"
-    ):
+    with pytest.raises(ConfigError, match=r"terrain.height_scan names 'state', but Own.observation_rows has no row height_scan in 'state'"):
         Own(task.cfg, "cpu")
 
 

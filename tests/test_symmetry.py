@@ -14,11 +14,12 @@ from rsl_rl.runners import OnPolicyRunner
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor
-from worlds import QUIET, changed, make_env, snapshot
+from worlds import QUIET, changed, layout, make_env, snapshot
 
 from legged_mw import ROOT
 from legged_mw.envs.checks import check_values
-from legged_mw.envs.legged_robot import LeggedRobot, Row
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.observations import Row
 from legged_mw.rl.runner import rsl_rl_config
 from legged_mw.rl.symmetry import mirror
 from legged_mw.sim.mirror import find_partners
@@ -200,7 +201,7 @@ def test_one_observation_by_hand(env: LeggedRobot) -> None:
         "kick_force": ([1.0, 2.0, 0.0], [1.0, -2.0, 0.0]),
         "kick_active": ([1.0], [1.0]),
     }
-    assert {group: [name for name, *_ in rows] for group, rows in env.observation_table.items()} == {
+    assert {group: list(rows) for group, rows in layout(env).items()} == {
         "state": list(state),
         "privileged_state": list(privileged),
     }
@@ -295,8 +296,8 @@ def mirrored_halves(env: LeggedRobot, worlds: int, reach: float) -> None:
     q[here, 7:] += 0.1 * torch.randn(worlds, 12)
     v[here] = 0.5 * torch.randn(worlds, 18)
     env.commands[here] = torch.randn(worlds, 3)
-    env.kick[here] = torch.tensor([2.0, 30.0, 0.0, 3.0])  # pause, duration [control steps], direction [rad], dv [m/s]
-    env.kick[here, 2] = torch.randn(worlds)
+    env.perturbation._kick[here] = torch.tensor([2.0, 30.0, 0.0, 3.0])  # pause, duration [control steps], direction [rad], dv [m/s]
+    env.perturbation._kick[here, 2] = torch.randn(worlds)
     # written out here, joints too, so that nothing is checked against itself
     swap, sign = torch.tensor([3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]), torch.tensor([-1.0, 1.0, 1.0] * 4)
     q[there, :3] = q[here, :3] * POLAR
@@ -307,7 +308,7 @@ def mirrored_halves(env: LeggedRobot, worlds: int, reach: float) -> None:
     v[there, 6:] = v[here, 6:][:, swap] * sign
     env.commands[there] = env.commands[here] * torch.tensor([1.0, -1.0, -1.0])
     env.commands[there, 0] += reach * env.commands[here, 2]
-    env.kick[there] = env.kick[here] * torch.tensor([1.0, 1.0, -1.0, 1.0])
+    env.perturbation._kick[there] = env.perturbation._kick[here] * torch.tensor([1.0, 1.0, -1.0, 1.0])
 
 
 # Float32 over 20 control steps with contacts grew to 4e-5 rad/s in a joint; an acceleration and a torque are larger numbers.
@@ -322,12 +323,12 @@ def test_mirrored_states_and_actions_give_mirrored_observations_and_equal_reward
     """
     worlds = 16
     converged = {"sim.iterations": 100, "sim.ls_iterations": 50}
-    kicks = {"perturbation.enable": True, "perturbation.interval": [5.0, 5.0], "perturbation.duration": [1.0, 1.0]}
+    kicks = {"perturbation.kick": True, "perturbation.interval": [5.0, 5.0], "perturbation.duration": [1.0, 1.0]}
     own = {"asset.file": symmetric_go1(tmp_path, imu_y), "rewards.only_positive_rewards": False}
     env = make_env(2 * worlds, {**QUIET, **converged, **kicks, **own})
     torch.manual_seed(3)
     mirrored_halves(env, worlds, reach)
-    alive, seen = torch.ones(worlds, dtype=torch.bool), dict.fromkeys((name for name, *_ in env.observation_table["privileged_state"]), 0.0)
+    alive, seen = torch.ones(worlds, dtype=torch.bool), dict.fromkeys(layout(env)["privileged_state"], 0.0)
     for step in range(20):
         actions = mirror(env, None, 0.5 * torch.randn(worlds, 12))[1]
         assert actions is not None
@@ -335,10 +336,10 @@ def test_mirrored_states_and_actions_give_mirrored_observations_and_equal_reward
         alive &= ~(done[:worlds] | done[worlds:])  # a fallen robot begins anew, each its own way
         expected = mirror(env, obs[:worlds], None)[0]
         assert expected is not None
-        for group, table in env.observation_table.items():
-            sizes = [size for _, size, _ in table]
+        for group, table in layout(env).items():
+            sizes = list(table.values())
             rows = zip(table, obs[group][worlds:].split(sizes, dim=1), expected[group][worlds:].split(sizes, dim=1), strict=True)
-            for (name, *_), got, wanted in rows:
+            for name, got, wanted in rows:
                 if name == "accelerometer" and reach:
                     continue
                 error = float((got - wanted)[alive].abs().max())
@@ -361,8 +362,8 @@ class _Extra(LeggedRobot):
 
     kind: str | None = None
 
-    def _observation_rows(self) -> dict[str, list[Row]]:
-        rows = super()._observation_rows()
+    def observation_rows(self) -> dict[str, list[Row]]:
+        rows = super().observation_rows()
         rows["state"].append(Row("extra", self.feet_air_time, mirror=self.kind))
         return rows
 

@@ -8,9 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from legged_mw.envs.domain_rand import DomainRand
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.terrain import Tiles
+from legged_mw.envs.observations import Row
 from legged_mw.utils.task import load_task
 
 QUIET = {"noise.level": 0.0, "commands.resampling_time": 0.0}  # nothing drawn within an episode
@@ -21,7 +20,7 @@ def make_env(
 ) -> LeggedRobot:
     """A task's environment with fields overridden by their dotted path, always from the same seed; no kicks unless asked for."""
     loaded = load_task(task)
-    for path, value in {"env.num_envs": num_envs, "perturbation.enable": False, **(overrides or {})}.items():
+    for path, value in {"env.num_envs": num_envs, "perturbation.kick": False, **(overrides or {})}.items():
         loaded.set(path, value)
     torch.manual_seed(0)
     return (env_class or loaded.env_class)(loaded.cfg, "cpu")
@@ -33,20 +32,27 @@ def only_scales(**wanted: float) -> dict[str, float]:
     return {f"rewards.scales.{name}": wanted.get(name, 0.0) for name in {**names, **wanted}}
 
 
+def layout(env: LeggedRobot) -> dict[str, dict[str, int]]:
+    """Columns of each row of each observation group."""
+    return {group: {row.name: row.size for row in rows} for group, rows in env.observations.groups.items()}
+
+
 def tensors(env: LeggedRobot) -> dict[str, Tensor]:
     """Every tensor that ``env`` or its simulation holds, also inside dicts and lists, by its path."""
 
     def walk(path: str, value: Any) -> Iterator[tuple[str, Tensor]]:
         if isinstance(value, Tensor):
             yield path, value
+        elif isinstance(value, Row):
+            yield from walk(path, value.value)
         elif isinstance(value, dict):
             for key, inner in value.items():
                 yield from walk(f"{path}.{key}", inner)
-        elif isinstance(value, Tiles | DomainRand):
-            yield from walk(path, vars(value))
         elif isinstance(value, list | tuple):
             for i, inner in enumerate(value):
                 yield from walk(f"{path}.{i}", inner)
+        elif type(value).__module__.startswith("legged_mw.envs.") and value is not env:
+            yield from walk(path, vars(value))
 
     return dict(walk("env", vars(env))) | dict(walk("sim", vars(env.sim)))
 

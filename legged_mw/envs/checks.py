@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, active
-from legged_mw.sim.model import unknown
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
 from legged_mw.utils.config import Config, ConfigError
-
-if TYPE_CHECKING:
-    from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_mw.utils.errors import unknown
 
 Rule = tuple[str, Callable[[Any], bool]]
 
@@ -27,15 +26,14 @@ FACTORS: Rule = (
 STEPS: Rule = ("two whole numbers from zero, the lower first, or an empty list", lambda v: not v or (len(v) == 2 and 0 <= v[0] <= v[1]))
 NAMES: Rule = ("a list with at least one name", lambda v: len(v) > 0)
 POINTS: Rule = ("at least one number, all finite", lambda v: len(v) > 0 and all(map(math.isfinite, v)))
-PROBABILITIES: Rule = ("three numbers from 0 to 1", lambda v: len(v) == 3 and all(0 <= p <= 1 for p in v))
+PROBABILITIES: Rule = ("numbers from 0 to 1, one a command", lambda v: len(v) > 0 and all(0 <= p <= 1 for p in v))
 
 ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys(("env.num_envs", "env.episode_length_s", "control.decimation", "normalization.clip_actions"), POSITIVE),
     **dict.fromkeys(("sim.dt", "sim.iterations", "sim.ls_iterations", "sim.nconmax", "sim.njmax"), POSITIVE),
-    **dict.fromkeys(("rewards.tracking_sigma", "rewards.swing_height", "rewards.max_reward", "termination.max_speed"), POSITIVE),
+    **dict.fromkeys(("rewards.max_reward", "termination.max_speed"), POSITIVE),
     **dict.fromkeys(("viewer.width", "viewer.height", "viewer.fps"), POSITIVE),
-    **dict.fromkeys(("terrain.friction", "noise.level", "commands.resampling_time", "sim.threads"), NOT_NEGATIVE),
-    **dict.fromkeys((f"commands.ranges.{name}" for name in ("lin_vel_x", "lin_vel_y", "ang_vel_yaw")), RANGE),
+    **dict.fromkeys(("terrain.friction", "noise.level", "sim.threads", "termination.min_base_height"), NOT_NEGATIVE),
     **dict.fromkeys(("perturbation.interval", "perturbation.duration"), SPAN),
     "perturbation.velocity": RANGE,
     "init_state.dof_pos_range": RANGE,
@@ -46,43 +44,44 @@ ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys((f"domain_rand.{name}" for name in ("friction", "contact_time", "frictionloss")), FACTORS),
     **dict.fromkeys(("domain_rand.action_delay", "domain_rand.observation_delay"), STEPS),
     "domain_rand.redraw_iterations": NOT_NEGATIVE,
-    "asset.foot_names": NAMES,
     "asset.colliders": NAMES,
-    "commands.keep_probability": PROBABILITIES,
     "init_state.pos": ("three numbers, x, y, z", lambda v: len(v) == 3),
     "viewer.camera": ("three numbers, not straight above or below", lambda v: len(v) == 3 and (v[0] != 0 or v[1] != 0)),
     "termination.max_tilt": ("above 0 and at most 180 degrees", lambda v: 0 < v <= 180),
+    "terrain.condim": ("1, 3, 4 or 6", lambda v: v in (1, 3, 4, 6)),
+}
+WALKING: dict[str, Rule] = {
+    "asset.foot_names": NAMES,
+    "commands.resampling_time": NOT_NEGATIVE,
+    "commands.keep_probability": PROBABILITIES,
+    **dict.fromkeys(("rewards.tracking_sigma", "rewards.swing_height", "commands.heading_gain"), POSITIVE),
     **dict.fromkeys(("terrain.num_rows", "terrain.num_cols", "terrain.tile_size"), POSITIVE),
-    **dict.fromkeys(("terrain.max_init_terrain_level", "terrain.seed", "termination.min_base_height"), NOT_NEGATIVE),
+    **dict.fromkeys(("terrain.max_init_terrain_level", "terrain.seed"), NOT_NEGATIVE),
     "terrain.horizontal_scale": ("above 0 and at most 0.25 m, or a cell would be wider than a step of stairs", lambda v: 0 < v <= 0.25),
-    "terrain.border_size": ("1 m at least, for robots that walk off to turn back on", lambda v: 1 <= v < math.inf),
+    "terrain.border_size": ("1 m at least, for a robot that leaves the tiles to turn back", lambda v: 1 <= v < math.inf),
     "terrain.terrain_proportions": ("kinds with shares from 0", lambda v: all(0 <= share < math.inf for share in v.values())),
     "terrain.difficulty": ("two numbers from 0 to 1, the lower first", lambda v: len(v) == 2 and 0 <= v[0] <= v[1] <= 1),
     "terrain.height_scan": ("a list of groups: state, privileged_state", lambda v: {*v} <= {"state", "privileged_state"}),
     **dict.fromkeys(("terrain.measured_points_x", "terrain.measured_points_y"), POINTS),
     **dict.fromkeys(("commands.curriculum_start", "commands.curriculum_step"), ("above 0 and at most 1", lambda v: 0 < v <= 1)),
-    "terrain.condim": ("1, 3, 4 or 6", lambda v: v in (1, 3, 4, 6)),
 }
 LEARNER: dict[str, Rule] = {
     **dict.fromkeys(("runner.num_steps_per_env", "runner.max_iterations", "runner.save_interval"), POSITIVE),
     **dict.fromkeys(("algorithm.learning_rate", "algorithm.num_learning_epochs", "algorithm.num_mini_batches"), POSITIVE),
     **dict.fromkeys(("cpu.envs_per_core", "cpu.num_steps_per_env", "cpu.max_iterations"), POSITIVE),
     **dict.fromkeys(("cpu.num_learning_epochs", "cpu.num_mini_batches", "cpu.desired_kl"), POSITIVE),
-    "cpu.keep_probability": PROBABILITIES,
     **dict.fromkeys(("symmetry.mirror_loss_coeff", "anneal.entropy_coef", "anneal.desired_kl", "cpu.update_threads"), NOT_NEGATIVE),
     "runner.exam_interval": NOT_NEGATIVE,
     "runner.run_name": ("part of a folder's name, without / or \\", lambda v: "/" not in v and "\\" not in v),
 }
 
 
-def check_values(cfg: LeggedRobotCfg, train: LeggedRobotCfgPPO | None = None) -> None:
+def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None) -> None:
     """Raise ConfigError at the first value that cannot work."""
     _check(cfg, ENVIRONMENT)
     _check_redraws(cfg)
-    if cfg.commands.curriculum and not cfg.to_dict()["rewards"]["scales"].get("tracking_lin_vel", 0.0) > 0:
-        raise ConfigError(
-            "commands.curriculum goes by how well tracking_lin_vel is met: give rewards.scales.tracking_lin_vel a number above 0"
-        )
+    if isinstance(cfg, LeggedRobotCfg):
+        _check_walking(cfg)
     if train is not None:
         _check(train, LEARNER)
         samples = cfg.env.num_envs * train.runner.num_steps_per_env
@@ -97,7 +96,20 @@ def check_values(cfg: LeggedRobotCfg, train: LeggedRobotCfgPPO | None = None) ->
             )
 
 
-def _check_redraws(cfg: LeggedRobotCfg) -> None:
+def _check_walking(cfg: LeggedRobotCfg) -> None:
+    _check(cfg, {**WALKING, **dict.fromkeys((f"commands.ranges.{name}" for name in vars(cfg.commands.ranges)), RANGE)})
+    for foot in cfg.asset.foot_geoms:
+        if foot not in cfg.asset.foot_names:
+            raise ConfigError(f"asset.foot_geoms: {unknown('foot', foot, cfg.asset.foot_names, 'asset.foot_names')}")
+        if not cfg.asset.foot_geoms[foot]:
+            raise ConfigError(f"asset.foot_geoms: foot '{foot}' has no geom; name the geoms that touch the ground")
+    if cfg.commands.curriculum and not cfg.to_dict()["rewards"]["scales"].get("tracking_lin_vel", 0.0) > 0:
+        raise ConfigError(
+            "commands.curriculum goes by how well tracking_lin_vel is met: give rewards.scales.tracking_lin_vel a number above 0"
+        )
+
+
+def _check_redraws(cfg: RobotTaskCfg) -> None:
     for name in cfg.domain_rand.redraw_at_reset:
         if name in ONLY_AT_START:
             raise ConfigError(

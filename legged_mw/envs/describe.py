@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.utils.task import LoadedTask
 
-if TYPE_CHECKING:
-    from legged_mw.envs.legged_robot import LeggedRobot
 
-
-def describe(env: LeggedRobot, task: LoadedTask) -> str:
+def describe(env: RobotTask, task: LoadedTask) -> str:
     """Observation rows, reward terms, joints, what the config changed in the model and what was overridden, as text."""
     lines: list[str] = []
-    for group, rows in env.observation_table.items():
-        scales = [row.scale for row in env._observation_rows()[group]]
-        lines.append(f"observation {group} ({sum(size for _, size, _ in rows)})")
-        start = 0
-        for (name, size, noise), scale in zip(rows, scales, strict=True):
-            line = f"  {start:>4}  {name:<20} {size:>3}" + (f"   noise +-{noise:g}" if noise else "")
-            lines.append(line + (f"   scale {scale}" if scale != 1.0 else ""))
-            start += size
+    for group, rows in env.observations.groups.items():
+        lines.append(f"observation {group} ({sum(row.size for row in rows)})")
+        for row in rows:
+            noise, start = row.noise * env.cfg.noise.level, env.observations.span(group, row.name).start
+            line = f"  {start:>4}  {row.name:<20} {row.size:>3}" + (f"   noise +-{noise:g}" if noise else "")
+            line += f"   scale {row.scale}" if row.scale != 1.0 else ""
+            lines.append(line + (f"   {row.history} frames" if row.history > 1 else ""))
+    for command in env.command_table:
+        lines.append(f"command {command.label:<14} [{command.low:g}, {command.high:g}] {command.unit}")
     lines.append(f"actions ({env.num_actions}), clipped at +-{task.cfg.normalization.clip_actions:g}, {1 / env.dt:g} Hz")
     lines.append("reward terms (scale)")
     scales = task.cfg.to_dict()["rewards"]["scales"]

@@ -9,18 +9,17 @@ nothing is computed.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from legged_mw.envs.delay import Delay
+from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign
-
-if TYPE_CHECKING:
-    from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 
 
 class Kind(NamedTuple):
@@ -52,7 +51,7 @@ KINDS: dict[str, Kind] = {
 ONLY_AT_START = tuple(name for name, kind in KINDS.items() if {*kind.fields} & {*CONSTANTS_READ})
 
 
-def active(cfg: LeggedRobotCfg) -> dict[str, tuple[Kind, float, float]]:
+def active(cfg: RobotTaskCfg) -> dict[str, tuple[Kind, float, float]]:
     """Name -> kind, lowest, highest of all that the config randomizes: what is given and is not neutral."""
     rand = cfg.domain_rand
     if not rand.enable:
@@ -62,41 +61,15 @@ def active(cfg: LeggedRobotCfg) -> dict[str, tuple[Kind, float, float]]:
     return {name: (kind, span[0], span[1]) for name, (kind, span) in given.items() if span and not span[0] == span[1] == kind.neutral}
 
 
-def world_fields(cfg: LeggedRobotCfg) -> list[str]:
+def world_fields(cfg: RobotTaskCfg) -> list[str]:
     """Model fields that need a value per world."""
     return list(dict.fromkeys(field for kind, _, _ in active(cfg).values() for field in kind.fields))
-
-
-class Delay:
-    """A value of d steps ago, each world its own d: ``delay(now)`` (N, width) once a step."""
-
-    def __init__(self, steps: Tensor, longest: int, width: int, start: float | None = None) -> None:
-        """``steps`` (N, 1), read at each call; before an episode the value was ``start``, or None: its first one."""
-        self.steps, self.start = steps, start
-        self.past = torch.zeros(len(steps), longest + 1, width, device=steps.device)
-        self._new = torch.ones(len(steps), dtype=torch.bool, device=steps.device)
-
-    def restart(self, mask: Tensor) -> None:
-        """An episode begins where ``mask`` (N,) is true."""
-        if self.start is None:
-            self._new.logical_or_(mask)
-        else:
-            assign(self.past, mask, self.start)
-
-    def __call__(self, now: Tensor) -> Tensor:
-        self.past[:, 1:] = self.past[:, :-1].clone()
-        self.past[:, 0] = now
-        if self.start is None:
-            self.past.copy_(torch.where(self._new[:, None, None], now[:, None], self.past))
-            self._new.fill_(False)
-        index = self.steps.long()[:, :, None].expand(-1, 1, now.shape[1])
-        return self.past.gather(1, index)[:, 0]
 
 
 class DomainRand:
     """The draws of N worlds and what they write. ``values[name]`` (N, width): the numbers drawn, in the config's units."""
 
-    def __init__(self, cfg: LeggedRobotCfg, robot: RobotModel, sim: Simulation) -> None:
+    def __init__(self, cfg: RobotTaskCfg, robot: RobotModel, sim: Simulation) -> None:
         self._sim, self._mask = sim, torch.ones(sim.num_envs, dtype=torch.bool, device=sim.device)
         kinds = active(cfg)
         again = [name for name in kinds if name in cfg.domain_rand.redraw_at_reset]
@@ -199,7 +172,7 @@ class DomainRand:
             assign(self._sim.field(field)[:, :, place], mask, self._nominal[field][:, :, place] * self.values["stiffness"])
 
 
-def _check_mass(cfg: LeggedRobotCfg, robot: RobotModel) -> None:
+def _check_mass(cfg: RobotTaskCfg, robot: RobotModel) -> None:
     """The lightest root that can be drawn still has a mass."""
     kinds, nominal = active(cfg), float(robot.physics.body_mass[robot.id("body", robot.root)])
     lightest = nominal * (kinds["link_mass"][1] if "link_mass" in kinds else 1.0) + (kinds["base_mass"][1] if "base_mass" in kinds else 0.0)

@@ -1,23 +1,19 @@
 """Which tile of the terrain each world is on, and how a world gets on to a harder one.
 
-legged_gym's game: who leaves its tile goes one level up, who covers less than half of what it was told goes one down, who
-masters the last level starts anew at a random one. Progress is measured along the command, for a robot that turns on the
-spot as it was told goes nowhere and is not to blame.
+The rules are legged_gym's. A robot that leaves its tile goes one level up. One that covers less than half of what the
+command asked goes one level down. One that masters the last level goes to a random one. Progress is measured along the
+command, since a robot that turns on the spot as commanded goes nowhere.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 from torch import Tensor
 
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.wording import in_config_words
 from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.utils.math import assign
-
-if TYPE_CHECKING:
-    from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 
 
 @in_config_words()
@@ -46,18 +42,18 @@ class Tiles:
         highest = min(cfg.terrain.max_init_terrain_level, terrain.levels - 1) if self.curriculum else terrain.levels - 1
         self.levels = torch.randint(0, highest + 1, (num_envs,), device=device)  # (N,) row of the tile
         world = torch.arange(num_envs, device=device)
-        self.columns = (2 * world + 1) * len(terrain.kinds) // (2 * num_envs)  # (N,) never changes; fewer worlds take every so manieth
+        self.columns = (2 * world + 1) * len(terrain.kinds) // (2 * num_envs)  # (N,) fixed; few worlds take some of them
         self._all_origins = torch.tensor(terrain.origins, dtype=torch.float, device=device)  # (levels, columns, 3)
         self.origins = self._all_origins[self.levels, self.columns]  # (N, 3) where an episode begins [m, world]
         tiles = torch.tensor([terrain.levels, len(terrain.kinds)], dtype=torch.float, device=device)
-        self.edge = tiles * terrain.tile / 2 + cfg.terrain.border_size / 2  # x, y [m] beyond which a robot has walked off
+        self.edge = tiles * terrain.tile / 2 + cfg.terrain.border_size / 2  # x, y [m] beyond which a robot has left the terrain
         self.kinds = tuple(dict.fromkeys(terrain.kinds))
         kind = torch.tensor([self.kinds.index(name) for name in terrain.kinds], device=device)[self.columns]
         self._is_kind = torch.nn.functional.one_hot(kind, len(self.kinds)).float()  # (N, kinds)
         self._count = self._is_kind.sum(dim=0)
 
     def put(self, levels: Tensor) -> None:
-        """Put each world on the level (N,) of its column; in force from its next reset."""
+        """Put each world on the level (N,) of its column; its next reset goes there."""
         self.levels.copy_(levels)
         self.origins.copy_(self._all_origins[self.levels, self.columns])
 
@@ -69,12 +65,8 @@ class Tiles:
         assign(self.levels, mask, level)
         self.origins.copy_(self._all_origins[self.levels, self.columns])
 
-    def statistics(self) -> Tensor:
-        """Sums of levels by kind, and numbers of worlds by kind (2 * kinds,); sums over ranks are meaningful."""
-        return torch.cat([self.levels.float() @ self._is_kind, self._count])
-
-    def name_statistics(self, taken: list[float]) -> dict[str, float]:
-        """Mean levels from what ``statistics`` gave: of all worlds, and by kind."""
-        sums, counts = taken[: len(self.kinds)], taken[len(self.kinds) :]
-        by_kind = {f"terrain_level/{kind}": total / count for kind, total, count in zip(self.kinds, sums, counts, strict=True) if count}
-        return {"terrain_level": sum(sums) / sum(counts), **by_kind}
+    def statistics(self) -> dict[str, Tensor]:
+        """Mean level of all worlds and by kind of ground, each as a sum and a count (2,), so that ranks can add theirs."""
+        sums = torch.stack([self.levels.float() @ self._is_kind, self._count])  # (2, kinds)
+        by_kind = {f"terrain_level/{kind}": sums[:, i] for i, kind in enumerate(self.kinds)}
+        return {"terrain_level": sums.sum(dim=1), **by_kind}

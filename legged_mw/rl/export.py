@@ -293,7 +293,7 @@ def make_contract(env: LeggedRobot, task: LoadedTask, folder: Path) -> Contract:
         ctrl=pose,
         camera=cfg.viewer.camera,
     )
-    falls_on = tuple(robot.contact_geoms[i] for i in env.terminating_contacts.tolist())
+    falls_on = tuple(robot.contact_geoms[i] for i in env.contacts.terminating.tolist())
     sensed = {FALL: tuple(f"contact/{name}" for name in falls_on)} if falls_on else {}
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group))

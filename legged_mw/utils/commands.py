@@ -72,7 +72,8 @@ def parse_command(text: str, table: Sequence[Command]) -> list[float]:
         if equals and name.strip() not in names:
             raise ConfigError(f"--command {text}: {unknown('command', name.strip(), names, 'this task')}")
         if not equals and place >= len(table):
-            raise ConfigError(f"--command {text}: {place + 1} numbers, but this task has {len(table)} commands: {describe(table) or 'none'}")
+            known = describe(table) or "none"
+            raise ConfigError(f"--command {text}: {place + 1} numbers, but this task has {len(table)} commands: {known}")
         try:
             value = float(number if equals else item)
         except ValueError:

@@ -20,6 +20,17 @@ def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
     return torch.addcmul(v, w, t, value=-2.0).add_(torch.linalg.cross(u, t), alpha=2.0)
 
 
+def yaw_of(q: Tensor) -> Tensor:
+    """Heading of the body's x axis in the world's plane [rad] (...,) from the attitude ``q`` (..., 4)."""
+    w, x, y, z = q.unbind(dim=-1)
+    return torch.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def wrap_to_pi(angle: Tensor) -> Tensor:
+    """The same angle [rad] between -pi and pi."""
+    return torch.remainder(angle + torch.pi, 2.0 * torch.pi) - torch.pi
+
+
 def assign(dst: Tensor, mask: Tensor, src: Tensor | float) -> None:
     """Write ``src`` into the rows of ``dst`` (N, ...) where ``mask`` (N,) is true; fixed shape, in place, NaN-safe."""
     mask = mask.view(-1, *[1] * (dst.dim() - 1))
@@ -29,8 +40,8 @@ def assign(dst: Tensor, mask: Tensor, src: Tensor | float) -> None:
         dst.masked_fill_(mask, src)
 
 
-def may_hold(mask: Tensor) -> bool:
-    """False if ``mask`` is known to be true nowhere. A CPU is asked; a GPU is not, for its steps are recorded: there it is true."""
+def maybe_any(mask: Tensor) -> bool:
+    """False if ``mask`` is true nowhere. A GPU is not asked, since its steps are recorded: there the answer is True."""
     return mask.device.type != "cpu" or bool(mask.any())
 
 

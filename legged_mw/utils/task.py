@@ -80,8 +80,9 @@ class LoadedTask:
         self.cfg.env.num_envs = min(self.cfg.env.num_envs, few.envs_per_core * cores)
         train.runner.num_steps_per_env, train.runner.max_iterations = few.num_steps_per_env, few.max_iterations
         train.algorithm.num_learning_epochs, train.algorithm.num_mini_batches = few.num_learning_epochs, few.num_mini_batches
-        train.algorithm.desired_kl, self.cfg.perturbation.curriculum = few.desired_kl, few.kick_curriculum
-        self.cfg.commands.keep_probability = list(few.keep_probability)
+        train.algorithm.desired_kl = few.desired_kl
+        for path, value in few.overrides.items():
+            self.set(path, value, where="cpu.overrides")
         train.actor.hidden_dims, train.critic.hidden_dims = list(few.hidden_dims), list(few.hidden_dims)
 
     def to_dict(self) -> dict[str, Any]:

@@ -1,0 +1,179 @@
+"""Observations from a task's table of rows: sizes, noise, scale, delay, history and order, all from the table and built once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from legged_mw.envs.delay import Delay
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
+from legged_mw.utils.math import assign
+
+
+class Row(NamedTuple):
+    """One row of the observation table."""
+
+    name: str
+    value: Tensor  # (N, size), a buffer that the step writes in place
+    noise: float = 0.0  # half width of the uniform noise added to it, in the value's unit
+    mirror: str | None = None  # its mirror image, left for right: a kind of envs/mirror.py, or a group; None: not stated
+    scale: float | tuple[float, ...] = 1.0  # a number, or one a column; the policy sees scale * (value + noise)
+    measured: bool = False  # comes from a sensor, so that domain_rand.observation_delay applies to it
+    # how a robot measures it, for the exported policy; legged_mw/deploy/contract.py knows the rows of RobotTask by their names
+    sensors: tuple[str, ...] = ()  # sensors of the MJCF, whose values side by side are the row
+    unit: str = ""
+    frame: str = ""
+    history: int = 1  # frames that the policy sees, oldest first; from section `observations`
+    group: str = ""  # the group that this row is, if it is one
+
+    @property
+    def size(self) -> int:
+        """Columns of the row in its group."""
+        return self.value.shape[1] * self.history
+
+    def column_scales(self) -> list[float]:
+        """The scale of each column of ``value``; raises ConfigError where there is not one for each."""
+        size = self.value.shape[1]
+        if isinstance(self.scale, tuple) and len(self.scale) != size:
+            raise ConfigError(f"observation row '{self.name}' has {size} columns and {len(self.scale)} scales; give one, or one a column")
+        return list(self.scale) if isinstance(self.scale, tuple) else [float(self.scale)] * size
+
+
+class Observations:
+    """The observation groups of N worlds. ``groups`` are the rows of each, ``buffers[group]`` (N, size) what the policy sees."""
+
+    def __init__(
+        self,
+        table: Mapping[str, Sequence[Row | str]],
+        cfg: type[RobotTaskCfg.observations],
+        noise_level: float,
+        num_envs: int,
+        device: str,
+        make_delay: Callable[[int], Delay | None],
+    ) -> None:
+        """``table`` is what ``observation_rows`` returned; ``make_delay(width)`` gives a group its delay, or None."""
+        self.groups: dict[str, list[Row]] = {}
+        self.buffers: dict[str, Tensor] = {}
+        self._parts: dict[str, _Group] = {}
+        _check_names(table, cfg)
+        for group, entries in table.items():
+            rows = [self._group_row(group, entry) if isinstance(entry, str) else entry for entry in entries]
+            rows = [row for row in rows if row.name not in cfg.leave_out.get(group, [])]
+            frames = {row.name: cfg.history.get(f"{group}.{row.name}", cfg.history.get(group, 1)) for row in rows}
+            self.groups[group] = [row._replace(history=frames[row.name]) for row in rows]
+            part = _Group(self.groups[group], noise_level, num_envs, device)
+            if any(row.measured for row in rows):
+                part.delay = make_delay(part.frame.shape[1])
+            self._parts[group], self.buffers[group] = part, part.buffer
+
+    def compute(self) -> None:
+        """Fill the buffers: rows side by side, plus noise, times scale, as late as they are measured, with their history."""
+        for part in self._parts.values():
+            part.compute()
+
+    def restart(self, mask: Tensor) -> None:
+        """An episode begins where ``mask`` (N,) is true: no delayed value and no frame of the last one is seen in it."""
+        for part in self._parts.values():
+            if part.delay:
+                part.delay.restart(mask)
+            part.fresh.logical_or_(mask)
+
+    def remember(self) -> list[tuple[Tensor, Tensor]]:
+        """Everything that ``compute`` changes, and copies of it."""
+        return [(tensor, tensor.clone()) for part in self._parts.values() for tensor in part.memory()]
+
+    def recall(self, before: list[tuple[Tensor, Tensor]], mask: Tensor) -> None:
+        """Put back what ``remember`` returned, in the worlds where ``mask`` (N,) is true."""
+        for tensor, copy in before:
+            assign(tensor, mask, copy)
+
+    def span(self, group: str, row: str) -> slice:
+        """Columns of ``row`` in ``group``, all frames of it. Raises ConfigError if the group has no such row."""
+        start = 0
+        for each in self.groups[group]:
+            if each.name == row:
+                return slice(start, start + each.size)
+            start += each.size
+        raise ConfigError(unknown("observation row", row, [each.name for each in self.groups[group]], f"'{group}'"))
+
+    def newest(self, group: str, row: str) -> slice:
+        """Columns of the newest frame of ``row`` in ``group``."""
+        whole = self.span(group, row)
+        size = next(each.value.shape[1] for each in self.groups[group] if each.name == row)
+        return slice(whole.stop - size, whole.stop)
+
+    def _group_row(self, group: str, name: str) -> Row:
+        """A group as a row of another: the same noisy sample."""
+        if name not in self.buffers:
+            raise ConfigError(f"observation group '{group}': {unknown('group', name, self.buffers, 'the groups that come before it')}")
+        return Row(name, self.buffers[name], mirror=name, group=name)
+
+
+class _Group:
+    """One group: how its rows become a buffer."""
+
+    def __init__(self, rows: list[Row], noise_level: float, num_envs: int, device: str) -> None:
+        noise = [row.noise * noise_level for row in rows for _ in range(row.value.shape[1])]
+        scales = [scale for row in rows for scale in row.column_scales()]
+        self._values = [row.value for row in rows]
+        self._noise = torch.tensor(noise, device=device) if any(noise) else None
+        self._scales = torch.tensor(scales, device=device) if any(scale != 1.0 for scale in scales) else None
+        self._measured = torch.tensor([row.measured for row in rows for _ in range(row.value.shape[1])], device=device)
+        self.delay: Delay | None = None
+        self.fresh = torch.ones(num_envs, dtype=torch.bool, device=device)  # no frame of this episode is there yet
+        self.frame = torch.zeros(num_envs, len(noise), device=device)  # the newest frame of each row
+        self.buffer = self.frame
+        self._histories: list[tuple[Tensor, Tensor]] = []  # frames (N, F, size) in the buffer, newest (N, size) in the frame
+        if any(row.history > 1 for row in rows):
+            self.buffer = torch.zeros(num_envs, sum(row.size for row in rows), device=device)
+            spans = self.buffer.split([row.size for row in rows], dim=1), self.frame.split([row.value.shape[1] for row in rows], dim=1)
+            self._histories = [(all_.unflatten(1, (row.history, -1)), new) for row, all_, new in zip(rows, *spans, strict=True)]
+
+    def compute(self) -> None:
+        torch.cat(self._values, dim=1, out=self.frame)
+        if self._noise is not None:
+            self.frame.addcmul_(torch.empty_like(self.frame).uniform_(-1.0, 1.0), self._noise)
+        if self._scales is not None:
+            self.frame.mul_(self._scales)
+        if self.delay:
+            self.frame.copy_(torch.where(self._measured, self.delay(self.frame), self.frame))
+        for frames, newest in self._histories:
+            older = torch.where(self.fresh[:, None, None], newest[:, None], frames[:, 1:])
+            frames[:, :-1] = older
+            frames[:, -1] = newest
+        self.fresh.fill_(False)
+
+    def memory(self) -> Iterator[Tensor]:
+        """All that ``compute`` writes."""
+        yield self.frame
+        if self._histories:
+            yield self.buffer
+        if self.delay:
+            yield self.delay.past
+
+
+def _check_names(table: Mapping[str, Sequence[Row | str]], cfg: type[RobotTaskCfg.observations]) -> None:
+    """Every group and row that the section ``observations`` names is in the table. Raises ConfigError."""
+    names = {group: [entry if isinstance(entry, str) else entry.name for entry in entries] for group, entries in table.items()}
+    for group, rows in names.items():
+        if twice := [name for name in rows if rows.count(name) > 1]:
+            raise ConfigError(f"observation group '{group}' has two rows '{twice[0]}': give each a name of its own")
+    for group, left in cfg.leave_out.items():
+        if group not in names:
+            raise ConfigError(f"observations.leave_out: {unknown('group', group, names, 'the observation table')}")
+        for row in left:
+            if row not in names[group]:
+                raise ConfigError(f"observations.leave_out: {unknown('row', row, names[group], repr(group))}")
+    for where, frames in cfg.history.items():
+        group, _, row = where.partition(".")
+        if group not in names:
+            raise ConfigError(f"observations.history: {unknown('group', group, names, 'the observation table')}")
+        if row and (row not in names[group] or row in cfg.leave_out.get(group, [])):
+            raise ConfigError(f"observations.history: {unknown('row', row, names[group], repr(group))}")
+        if frames < 1:
+            raise ConfigError(f"observations.history['{where}'] is {frames}; it must be 1 (the newest frame alone) or more")

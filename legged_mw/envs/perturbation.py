@@ -1,0 +1,87 @@
+"""Kicks and pushes: a kick is a force over time, a push is a velocity set at once."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.sim.simulation import Simulation
+from legged_mw.utils.math import assign, maybe_any
+
+
+class Perturbation:
+    """Kicks and pushes of the root in N worlds, as the section ``perturbation`` has them."""
+
+    def __init__(self, cfg: type[RobotTaskCfg.perturbation], sim: Simulation, root_body: int, mass: float, dt: float) -> None:
+        """``mass`` [kg] of the robot, ``dt`` [s] of a control step."""
+        self.cfg, self._sim, self._root, self._mass, self._dt = cfg, sim, root_body, mass, dt
+        device = sim.device
+
+        def zeros(*shape: int, dtype: torch.dtype = torch.float) -> Tensor:
+            return torch.zeros(sim.num_envs, *shape, dtype=dtype, device=device)
+
+        spans = [cfg.interval, cfg.duration, [-math.pi, math.pi], cfg.velocity]
+        self._ranges = torch.tensor(spans, dtype=torch.float, device=device).T.contiguous()  # (2, 4)
+        self._kick, self._clock = zeros(4), zeros()  # pause, duration [control steps], direction [rad], dv [m/s]; [control steps]
+        self.kick_force = zeros(3)  # (N, 3) on the root, world frame [N]
+        self.kick_active = zeros(dtype=torch.bool)  # (N,)
+        self.kick_level = zeros().fill_(0.0 if cfg.curriculum else 1.0)  # (N,) share of the range of dv that is drawn from
+        interval = cfg.push_interval_s / dt
+        self._push_clock = zeros().uniform_(0.0, interval).round_() if cfg.push else zeros()  # [control steps] to go
+
+    def apply(self) -> None:
+        """What disturbs the robots in this step."""
+        if self.cfg.kick:
+            self._kick_robots()
+        if self.cfg.push:
+            self._push_robots()
+
+    def update_level(self, mask: Tensor, survived: Tensor) -> None:
+        """Where ``mask`` (N,) is true: halfway from the level so far to the share of an episode that was ``survived`` (N,).
+
+        A negative share leaves the level as it is.
+        """
+        assign(self.kick_level, mask & (survived >= 0.0), 0.5 * (self.kick_level + survived))
+
+    def reset(self, mask: Tensor) -> None:
+        """An episode begins where ``mask`` (N,) is true."""
+        if self.cfg.kick:
+            self._redraw(mask)
+            self.kick_active.masked_fill_(mask, False)
+            self.kick_force.masked_fill_(mask[:, None], 0.0)
+
+    def _kick_robots(self) -> None:
+        """After a pause, a half sine of force in a horizontal direction; then all is drawn again."""
+        wait, steps, angle, speed = self._kick.unbind(dim=1)
+        elapsed = self._clock - wait
+        self.kick_active.copy_((elapsed >= 0.0) & (elapsed < steps))
+        peak = 0.5 * self._mass * speed / (steps * self._dt)
+        force = torch.where(self.kick_active, torch.sin(math.pi * elapsed / steps) * peak, 0.0)
+        self.kick_force[:, 0] = force * torch.cos(angle)
+        self.kick_force[:, 1] = force * torch.sin(angle)
+        self._sim.xfrc_applied[:, self._root, :3] = self.kick_force
+        self._clock.add_(1.0)
+        over = elapsed + 1.0 >= steps
+        if maybe_any(over):
+            self._redraw(over)
+
+    def _redraw(self, mask: Tensor) -> None:
+        low, high = self._ranges
+        draw = torch.lerp(low, high, torch.rand(self._sim.num_envs, 4, device=self._sim.device))
+        draw[:, :2] = (draw[:, :2] / self._dt).round_().clamp_(min=1.0)  # [control steps]
+        draw[:, 3] *= self.kick_level
+        assign(self._kick, mask, draw)
+        self._clock.masked_fill_(mask, 0.0)
+
+    def _push_robots(self) -> None:
+        """Where a clock has run down the root's horizontal velocity becomes a random one. [L]"""
+        self._push_clock.sub_(1.0)
+        due = self._push_clock <= 0.0
+        if maybe_any(due):
+            speed = self.cfg.max_push_vel_xy
+            draw = torch.rand(self._sim.num_envs, 2, device=self._sim.device).mul_(2.0 * speed).sub_(speed)
+            assign(self._sim.qvel[:, :2], due, draw)
+            self._push_clock.masked_fill_(due, round(self.cfg.push_interval_s / self._dt))

@@ -1,0 +1,502 @@
+"""What every robot does in every task: act, sense, end, reset, observe, be rewarded. Read top to bottom; no simulator import.
+
+Everything under ``_step`` is recorded as one CUDA graph: fixed buffers, masks instead of index lists, no question to
+the host. Shapes: N environments, D joints, K reward terms. A reward is a method ``_reward_<name>``, switched on
+by a number of that name in ``cfg.rewards.scales``; it returns (N,) and only reads.
+
+Freshness: ``qpos`` and ``qvel`` and all that is computed from them are current. What comes from sensors (contacts,
+places and velocities of sites, accelerometer, joint torque) is one simulation step old and zero in a world just reset.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cached_property
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from legged_mw import ROOT
+from legged_mw.envs.actuators import Actuators
+from legged_mw.envs.base_task import BaseTask
+from legged_mw.envs.checks import check_values
+from legged_mw.envs.contacts import GroundContacts
+from legged_mw.envs.domain_rand import DomainRand, world_fields
+from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
+from legged_mw.envs.observations import Observations, Row
+from legged_mw.envs.perturbation import Perturbation
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.envs.statistics import Statistics
+from legged_mw.envs.wording import in_config_words
+from legged_mw.sim.engines import make_simulation, pick_engine
+from legged_mw.sim.errors import ModelError
+from legged_mw.sim.mirror import Partners, find_partners
+from legged_mw.sim.model import Ground, RobotModel, Solver, build_model, per_joint
+from legged_mw.sim.terrain import Terrain
+from legged_mw.utils.commands import Command
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
+from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse
+
+
+class RobotTask(BaseTask):
+    """N robots in N worlds of their own, as one vectorized environment. A task is a subclass with its rewards and its rows."""
+
+    cfg: RobotTaskCfg
+    exam = ""  # kind of exam that grades a policy (legged_mw/eval/exams.py); none
+    command_table: tuple[Command, ...] = ()  # what a person can ask of the robot, columns of ``commands``; nothing
+
+    @in_config_words()
+    def __init__(self, cfg: RobotTaskCfg, device: str, eager: bool = False) -> None:
+        check_values(cfg)
+        self.cfg = cfg
+        self.terrain = self._make_terrain()
+        self.robot = self._load_robot(pick_engine(cfg.sim.engine, device))
+        super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
+        self.sim = make_simulation(
+            self.robot.physics,
+            cfg.env.num_envs,
+            device,
+            engine=cfg.sim.engine,
+            nconmax=cfg.sim.nconmax,
+            njmax=cfg.sim.njmax,
+            threads=cfg.sim.threads,
+            world_fields=world_fields(cfg),
+            terrain=self.terrain,
+            eager=eager,
+        )
+        self.domain_rand = DomainRand(cfg, self.robot, self.sim)
+        self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
+        self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
+        self._init_ranges()
+        self._init_buffers()
+        self.perturbation = Perturbation(cfg.perturbation, self.sim, self.root_body, self.total_mass, self.dt)
+        self._prepare_observations()
+        self._prepare_reward_function()
+        self.domain_rand.redraw()
+        self._reset_all()
+
+    # ---- the step -------------------------------------------------------------------------------------------------
+
+    def _step(self) -> None:
+        clip = self.cfg.normalization.clip_actions
+        self.actions.clamp_(-clip, clip)
+        self.perturbation.apply()
+        self._apply_actions()
+        self.sim.step(self.cfg.control.decimation)
+        self._update_state()
+        self.check_termination()
+        self.compute_reward()
+        self._end_step()
+        if maybe_any(self.reset_buf):
+            self._sum_statistics()
+            self.reset_envs(self.reset_buf)
+        self.compute_observations()
+
+    def _apply_actions(self) -> None:
+        """Servo targets from the actions."""
+        self.actuators.apply(self.actions)
+
+    def _update_state(self) -> None:
+        """All that termination and rewards read, computed once."""
+        self._episode_length_buf.add_(1)
+        self._refresh_base()
+
+    def _refresh_base(self) -> None:
+        """Joint offsets, and velocity and gravity at the IMU, from qpos and qvel: v_imu = R^T v + w x r."""
+        torch.sub(self.dof_pos, self.default_dof_pos, out=self.dof_offset)
+        if self.actuators.encoder_offset is not None:
+            torch.add(self.dof_offset, self.actuators.encoder_offset, out=self.joint_reading)
+        quat, lever = self.root_quat[:, None], torch.linalg.cross(self.base_ang_vel, self.imu_pos)
+        in_body = quat_rotate_inverse(quat, torch.stack([self.gravity_dir, self.root_lin_vel], dim=1))
+        self.projected_gravity.copy_(in_body[:, 0])
+        torch.add(in_body[:, 1], lever, out=self.base_lin_vel)
+        self.base_ang_vel_world.copy_(quat_rotate(quat[:, 0], self.base_ang_vel))
+
+    def _end_step(self) -> None:
+        """What the next step remembers; the reward has seen this step's values."""
+        self.last_actions.copy_(self.actions)
+
+    # ---- termination ----------------------------------------------------------------------------------------------
+
+    def check_termination(self) -> None:
+        """Ends episodes: fallen, out of time, or broken (a state or an action that is not finite)."""
+        speed = self.sim.qvel.abs().amax(dim=1)
+        position = self.sim.qpos.abs().amax(dim=1)
+        action = self.actions.abs().amax(dim=1)  # a servo swallows NaN, the reward does not
+        finite = (speed <= self.cfg.termination.max_speed) & (position < math.inf) & (action < math.inf)  # NaN compares false
+        torch.logical_not(finite, out=self.broken)
+        torch.logical_and(self._fallen(), finite, out=self.fell)
+        ended = torch.logical_or(self.fell, self.broken)
+        torch.logical_and(self._timed_out(), ~ended, out=self.time_out_buf)
+        torch.logical_or(ended, self.time_out_buf, out=self.reset_buf)
+
+    def _fallen(self) -> Tensor:
+        """(N,) The robot failed: too tilted, too low, or on the ground with what must not touch it."""
+        down = self.projected_gravity[:, 2] > -math.cos(math.radians(self.cfg.termination.max_tilt))
+        if len(self.contacts.terminating):
+            down |= self.contact_count[:, self.contacts.terminating].amax(dim=1) > 0.0
+        if self.cfg.termination.min_base_height:
+            down |= self.base_height < self.cfg.termination.min_base_height
+        return down
+
+    def _timed_out(self) -> Tensor:
+        """(N,) The episode ends, but not by a failure."""
+        return self._episode_length_buf >= self.max_episode_length
+
+    # ---- resets: masks, never index lists ---------------------------------------------------------------------------
+
+    def _reset_all(self) -> None:
+        self.reset_envs(torch.ones_like(self.reset_buf))
+        self.compute_observations()
+
+    def reset_envs(self, mask: Tensor) -> None:
+        """Begin a new episode in the worlds where ``mask`` (N,) is true; the others stay as they are, bit for bit."""
+        self._update_curricula(mask)
+        self.sim.reset(mask)
+        self.domain_rand.reset(mask)
+        self._reset_robots(mask)
+        self._reset_task(mask)
+        self.perturbation.reset(mask)
+        self._episode.masked_fill_(mask[:, None], 0.0)
+        self._episode_length_buf.masked_fill_(mask, 0)
+        self._refresh_base()
+
+    def restart(self, mask: Tensor) -> None:
+        """Reset the masked worlds between two steps and refresh their observations. Other worlds keep theirs."""
+        before = self.observations.remember()
+        self.reset_envs(mask)
+        self.fell.masked_fill_(mask, False)
+        self.compute_observations()
+        self.observations.recall(before, ~mask)
+
+    def _update_curricula(self, mask: Tensor) -> None:
+        """Where ``mask`` (N,) is true an episode has ended: what becomes harder or easier."""
+        if self.cfg.perturbation.curriculum:
+            self.perturbation.update_level(mask, self._share_survived())
+
+    def _reset_robots(self, mask: Tensor) -> None:
+        """Root near its start with any heading and a small velocity, joints and servo targets at (or near) the default pose."""
+        n = self.num_envs
+        draw = torch.rand(n, 9, device=self.device).mul_(2.0).sub_(1.0).mul_(self.reset_range)  # x, y, yaw, velocities
+        half = 0.5 * draw[:, 2:3]
+        zero = torch.zeros_like(half)
+        pose = [self._start_places(draw[:, :2]), torch.cos(half), zero, zero, torch.sin(half)]
+        joints, (low, high) = self.default_dof_pos.expand(n, -1), self.cfg.init_state.dof_pos_range
+        if (low, high) != (1.0, 1.0):
+            joints = joints * torch.empty_like(self.dof_offset).uniform_(low, high)
+        assign(self.sim.qpos, mask, torch.cat([*pose, joints], dim=1))
+        assign(self.sim.qvel[:, :6], mask, draw[:, 3:])  # the joints' velocity is zero from the reset
+        self.actuators.reset(mask)
+        self.observations.restart(mask)
+
+    def _start_places(self, offset: Tensor) -> Tensor:
+        """Where an episode begins, (N, 3) [m, world], ``offset`` (N, 2) [m] away from the middle."""
+        place = self.init_pos.expand(self.num_envs, 3)
+        return torch.cat([place[:, :2] + offset, place[:, 2:]], dim=1)
+
+    def _reset_task(self, mask: Tensor) -> None:
+        """What else of the task begins where ``mask`` (N,) is true. Here nothing."""
+
+    def _share_survived(self) -> Tensor:
+        """(N,) How much of its episode a robot survived, from 0 to 1; negative before its first step."""
+        share = torch.where(self.time_out_buf, 1.0, self.episode_steps[:, 0] / self.max_episode_length)
+        return torch.where(self.episode_steps[:, 0] > 0.0, share, -1.0)
+
+    # ---- observations: the table is the only place that states the layout ------------------------------------------------
+
+    def observation_rows(self) -> dict[str, list[Row | str]]:
+        """Rows of each group, in order; a name stands for a group above it. Asked once: values are buffers of the step."""
+        return {
+            "state": [*self._measured_rows()],
+            "privileged_state": ["state", *self._body_rows(), *self._disturbance_rows()],  # first the same noisy sample
+        }
+
+    def _measured_rows(self) -> list[Row]:
+        """What a robot measures or estimates of itself, with noise, and its last action."""
+        noise = self.cfg.noise.scales
+        return [
+            Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", measured=True),  # at the IMU, body frame [m/s]
+            Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", measured=True),  # gyro, body frame [rad/s]
+            Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar", measured=True),  # direction, body frame
+            Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", measured=True),  # minus the default pose [rad]
+            Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", measured=True),  # [rad/s]
+            Row("last_actions", self.last_actions, mirror="joint"),  # a_t, clipped
+        ]
+
+    def _body_rows(self) -> list[Row]:
+        """The same without noise, and more, as only a simulator knows it."""
+        return [
+            Row("base_ang_vel", self.base_ang_vel, mirror="axial"),
+            Row("accelerometer", self.accelerometer, mirror="polar"),  # proper acceleration at the IMU [m/s^2]
+            Row("projected_gravity", self.projected_gravity, mirror="polar"),
+            Row("base_lin_vel", self.base_lin_vel, mirror="imu_velocity"),
+            Row("base_ang_vel_world", self.base_ang_vel_world, mirror="axial"),  # the world mirrors about its own x-z plane
+            Row("dof_pos", self.dof_offset, mirror="joint"),
+            Row("dof_vel", self.dof_vel, mirror="joint"),
+            Row("torques", self.torques, mirror="joint"),  # [N m]
+        ]
+
+    def _disturbance_rows(self) -> list[Row]:
+        """Kicks, and with ``domain_rand.observe`` what was drawn, in the config's units."""
+        rand = self.domain_rand
+        drawn = [Row(name, value, mirror=rand.mirrors[name]) for name, value in rand.values.items() if self.cfg.domain_rand.observe]
+        return [
+            Row("kick_force", self.perturbation.kick_force, mirror="polar"),  # on the root, world frame [N]
+            Row("kick_active", self.perturbation.kick_active[:, None], mirror="scalar"),  # 0 or 1
+            *drawn,
+        ]
+
+    def compute_observations(self) -> None:
+        """Fill ``obs_buf`` as the table says."""
+        self.observations.compute()
+
+    def _prepare_observations(self) -> None:
+        if hasattr(self, "_observation_rows"):
+            raise ConfigError(f"{type(self).__name__}._observation_rows: the method is now called observation_rows")
+        self.observations = Observations(
+            self.observation_rows(),
+            self.cfg.observations,
+            self.cfg.noise.level,
+            self.num_envs,
+            self.device,
+            lambda width: self.domain_rand.delay("observation_delay", width),
+        )
+        self.obs_buf = self.observations.buffers
+
+    @cached_property
+    def mirror(self) -> Mirror:
+        """Observations and actions left for right, from the table; made when first asked for, and not for the step."""
+        return make_mirror(self.observations.groups, self._mirror_blocks(), self._mirror_reach(), self.device)
+
+    def _mirror_blocks(self) -> dict[str, Block]:
+        """Kinds of mirror image that rows may have, by name."""
+        partners = self._partners()
+        check_pose(self.robot.joint_names, self.default_dof_pos.tolist(), partners)
+        return robot_blocks(partners)
+
+    def _partners(self) -> Partners:
+        return find_partners(self.robot)
+
+    def _mirror_reach(self) -> float:
+        """[m] from the mirrored IMU to the IMU."""
+        return 2.0 * float(self.imu_pos[0, 1])
+
+    # ---- reward -------------------------------------------------------------------------------------------------------
+
+    def compute_reward(self) -> None:
+        """Sum of scale * term * dt, clipped; ``termination`` is added after the clip. Broken worlds get 0."""
+        rewards = self.cfg.rewards
+        total = torch.zeros_like(self.rew_buf)
+        if self._reward_terms:
+            terms = torch.stack([term() for term in self._reward_terms], dim=1).mul_(self.reward_scales)
+            terms.masked_fill_(self.broken[:, None], 0.0)
+            total = terms[:, : self._num_clipped].sum(dim=1)
+            if rewards.only_positive_rewards:
+                total.clamp_(0.0, rewards.max_reward)
+            if self._num_clipped < len(self.reward_names):
+                total += terms[:, self._num_clipped]
+            self.episode_sums.add_(terms)
+        self.rew_buf.copy_(total)
+        self.episode_return.add_(total[:, None])
+        self.episode_steps.add_(1.0)
+
+    def _active_scales(self) -> dict[str, float]:
+        return {name: float(scale) for name, scale in self.cfg.to_dict()["rewards"]["scales"].items() if scale}
+
+    def _prepare_reward_function(self) -> None:
+        """Match scales to methods by name; every term is tried once, so that a mistake shows before training."""
+        scales = self._active_scales()
+        terms = {name.removeprefix("_reward_"): getattr(self, name) for name in dir(self) if name.startswith("_reward_")}
+        after_clip = [] if self.cfg.rewards.clip_termination else ["termination"]
+        self.reward_names = [n for n in scales if n not in after_clip] + [n for n in after_clip if n in scales]
+        self._num_clipped = len([n for n in scales if n not in after_clip])
+        for name in self.reward_names:
+            where = f"{type(self).__name__} (a method _reward_<name>)"
+            if name not in terms:
+                raise ConfigError(f"rewards.scales.{name} = {scales[name]:g}: {unknown('reward term', name, terms, where)}")
+            value = terms[name]()
+            if not isinstance(value, Tensor) or value.shape != (self.num_envs,):
+                got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+                raise ConfigError(f"_reward_{name} must return a tensor ({self.num_envs},), one value an environment; it returned {got}")
+        self._reward_terms = [terms[name] for name in self.reward_names]
+        self.reward_scales = torch.tensor([scales[name] for name in self.reward_names], device=self.device) * self.dt
+        means = [*(f"rew_{name}" for name in self.reward_names), "reward", "episode_length"]
+        self.statistics = Statistics(means, ["episodes", "fell", "broken"], self.device)
+
+    def _reward_lin_vel_z(self) -> Tensor:
+        """Square of the vertical velocity at the IMU, world frame (gravity points down, hence the same square). [P]"""
+        return (self.base_lin_vel * self.projected_gravity).sum(dim=1).square()
+
+    def _reward_ang_vel_xy(self) -> Tensor:
+        """Roll and pitch rates, world frame. [P]"""
+        return self.base_ang_vel_world[:, :2].square().sum(dim=1)
+
+    def _reward_orientation(self) -> Tensor:
+        """Tilt: gravity's share in the body's plane, equal to the xy share of the body's z axis in the world. [L, P]"""
+        return self.projected_gravity[:, :2].square().sum(dim=1)
+
+    def _reward_dof_pos_limits(self) -> Tensor:
+        """What joints exceed the soft limits by [rad]. [L]"""
+        return (self.dof_pos - self.dof_pos.clamp(self.soft_lower, self.soft_upper)).abs().sum(dim=1)
+
+    def _reward_pose(self) -> Tensor:
+        """Staying near the default pose, each joint with its weight. [P]"""
+        return torch.exp(-(self.dof_offset.square() * self.pose_weights).sum(dim=1))
+
+    def _reward_termination(self) -> Tensor:
+        """A fall. [L, P]"""
+        return self.fell.float()
+
+    def _reward_torques(self) -> Tensor:
+        """2-norm plus 1-norm of the joint torques [N m]. [P]"""
+        return self.torques.square().sum(dim=1).sqrt() + self.torques.abs().sum(dim=1)
+
+    def _reward_action_rate(self) -> Tensor:
+        """Change of the clipped action. [L]"""
+        return (self.actions - self.last_actions).square().sum(dim=1)
+
+    def _reward_energy(self) -> Tensor:
+        """Sum of |joint velocity * torque| [W]. [P]"""
+        return (self.dof_vel * self.torques).abs().sum(dim=1)
+
+    def _reward_collision(self) -> Tensor:
+        """How many bodies touch the ground that should not: ``asset.penalize_contacts_on``. [L]"""
+        return ((self.contact_count @ self.contacts.penalized) > 0.0).sum(dim=1).float()
+
+    # ---- statistics: summed on the device, read once an iteration ------------------------------------------------------------
+
+    def _sum_statistics(self) -> None:
+        """Add the episodes that end in this step. Runs before the reset."""
+        means = torch.cat([self.episode_sums, self.episode_return, self.episode_steps], dim=1)
+        self.statistics.add(self.reset_buf, means, torch.stack([self.reset_buf, self.fell, self.broken], dim=1))
+
+    def _live_statistics(self) -> dict[str, Tensor]:
+        """Values as they stand: () a sum, or (2,) a sum and what to divide it by, so that ranks can add theirs."""
+        return {"overflowed": self.sim.overflowed_worlds()}  # worlds, so far
+
+    def take_statistics(self) -> Tensor:
+        """Sums since the last call and values as they stand (S,), on the device."""
+        return self.statistics.take(self._live_statistics())
+
+    def name_statistics(self, taken: list[float]) -> dict[str, float]:
+        """Statistics by name, from what ``take_statistics`` returned. Means are NaN if no episode ended.
+
+        ``rew_<name>``: mean over episodes of the sum of scale * term * dt, before the clip, divided by ``env.episode_length_s``.
+        ``reward``: the episode's return. ``episode_length`` [control steps].
+        """
+        seconds = self.cfg.env.episode_length_s
+        named = self.statistics.name(taken)
+        return {name: value / seconds if name.startswith("rew_") else value for name, value in named.items()}
+
+    def read_statistics(self) -> dict[str, float]:
+        """Statistics since the last call, by name. Reads the device."""
+        return self.name_statistics(self.take_statistics().tolist())
+
+    # ---- what training learned about its worlds, for a checkpoint --------------------------------------------------------------
+
+    def training_state(self) -> dict[str, Tensor]:
+        """Curricula as they stand: tensors, by name."""
+        return {"kick_level": self.perturbation.kick_level.clone()} if self.cfg.perturbation.curriculum else {}
+
+    def load_training_state(self, state: dict[str, Tensor]) -> None:
+        """Go on from ``training_state``, of several processes from the first one's. Worlds take what the nearest ones had."""
+        if "kick_level" in state and self.cfg.perturbation.curriculum:
+            self.perturbation.kick_level.copy_(self._spread(state["kick_level"]))
+
+    def _spread(self, values: Tensor) -> Tensor:
+        """Values (M,) of M worlds for N worlds."""
+        values = values.to(self.device)
+        return values[torch.arange(self.num_envs, device=self.device) * len(values) // self.num_envs]
+
+    # ---- robot and buffers: born here, never rebound --------------------------------------------------------------------------
+
+    def _make_terrain(self) -> Terrain | None:
+        """The ground; None: a plane."""
+        return None
+
+    def _load_robot(self, engine: str) -> RobotModel:
+        cfg = self.cfg
+        if not cfg.asset.file:
+            raise ConfigError("asset.file is empty; name the robot's MJCF, e.g. 'resources/robots/go1/go1.xml'")
+        return build_model(
+            ROOT / Path(cfg.asset.file).expanduser(),  # an absolute path stays itself
+            solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations),
+            ground=Ground(cfg.terrain.friction, cfg.terrain.condim, self.terrain, boxes=engine == "mujoco"),
+            stiffness=cfg.control.stiffness,
+            damping=cfg.control.damping,
+            colliders=cfg.asset.colliders,
+            self_collisions=cfg.asset.self_collisions,
+            contact_geoms=self._sensed_geoms(),
+            velocity_sites=self._sensed_sites(),
+            accelerometer_site=cfg.asset.imu_site,
+        )
+
+    def _sensed_geoms(self) -> list[str]:
+        """Geoms whose contacts with the ground are counted: names or patterns."""
+        return [*self.cfg.asset.penalize_contacts_on, *self.cfg.asset.terminate_after_contacts_on]
+
+    def _sensed_sites(self) -> list[str]:
+        """Sites whose velocity is sensed."""
+        return []
+
+    def _init_buffers(self) -> None:
+        n, device, sim, spans = self.num_envs, self.device, self.sim, self.robot.sensors
+        self.root_pos, self.root_quat = sim.qpos[:, :3], sim.qpos[:, 3:7]  # views [m, world], wxyz
+        self.root_lin_vel, self.base_ang_vel = sim.qvel[:, :3], sim.qvel[:, 3:6]  # views [m/s, world], [rad/s, body]
+        self.dof_pos, self.dof_vel = sim.qpos[:, 7:], sim.qvel[:, 6:]  # views (N, D) [rad], [rad/s]
+        self.torques = sim.actuator_force  # view (N, D) [N m]
+        self.contact_count = sim.sensordata[:, spans["contact"]]  # view (N, C), of robot.contact_geoms with the ground
+        self.accelerometer = sim.sensordata[:, spans["accelerometer"]]  # view (N, 3) [m/s^2]
+        self.base_lin_vel, self.projected_gravity, self.base_ang_vel_world = (self._zeros(3) for _ in range(3))
+        self.dof_offset = self._zeros(self.num_actions)  # joint position minus default [rad]
+        names = self.robot.joint_names
+        self.actuators = Actuators(self.cfg.control, names, self.default_dof_pos, self.dof_pos, sim, self.domain_rand)
+        exact = self.actuators.encoder_offset is None
+        self.joint_reading = self.dof_offset if exact else self._zeros(self.num_actions)  # the same, as measured
+        self.base_height = self.root_pos[:, 2]  # of the root above the ground under it [m]
+        self.fell, self.broken = self._zeros(dtype=torch.bool), self._zeros(dtype=torch.bool)
+        self._episode, views = columns(n, device, **self._episode_columns())  # one matrix, so that a reset clears it in one go
+        for name, view in views.items():
+            setattr(self, name, view)
+        self.gravity_dir = torch.tensor([0.0, 0.0, -1.0], device=device).expand(n, 3)
+        self.total_mass = float(self.robot.physics.body_subtreemass[0])  # [kg]
+        self._init_imu()
+        needed = bool(self._active_scales().get("collision"))
+        self.contacts = GroundContacts(self.robot, self.cfg.asset, self.contact_count, needed)
+
+    def _zeros(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
+        return torch.zeros(self.num_envs, *shape, dtype=dtype, device=self.device)
+
+    def _episode_columns(self) -> dict[str, int]:
+        """What an episode remembers, as name -> width: attributes (N, width) that a reset clears."""
+        return {"last_actions": self.num_actions, "episode_sums": len(self._active_scales()), "episode_return": 1, "episode_steps": 1}
+
+    def _init_imu(self) -> None:
+        robot, model = self.robot, self.robot.physics
+        imu = robot.id("site", self.cfg.asset.imu_site)
+        self.root_body = robot.id("body", robot.root)
+        if model.site_bodyid[imu] != self.root_body or abs(model.site_quat[imu][0]) < 1.0 - 1e-9:
+            raise ModelError(f"asset.imu_site '{self.cfg.asset.imu_site}' must be on the root body '{robot.root}' and aligned with it")
+        self.imu_pos = self._tensor(model.site_pos[imu]).expand(self.num_envs, 3)  # body frame [m]
+
+    def _init_ranges(self) -> None:
+        """Config numbers as tensors: joints' tables and ranges of a reset."""
+        cfg, names, init = self.cfg, self.robot.joint_names, self.cfg.init_state
+        self.default_dof_pos = self._tensor(per_joint(init.default_joint_angles, names, "init_state.default_joint_angles"))
+        self.pose_weights = self._tensor(per_joint(cfg.rewards.pose_weights, names, "rewards.pose_weights"))
+        low, high = self._tensor(self.robot.joint_range).unbind(dim=1)
+        middle, half = (low + high) / 2, (high - low) / 2 * cfg.rewards.soft_dof_pos_limit
+        self.soft_lower, self.soft_upper = middle - half, middle + half
+        self.init_pos = self._tensor(init.pos)
+        self.reset_range = self._tensor([init.pos_xy_range] * 2 + [init.yaw_range] + [init.lin_vel_range] * 3 + [init.ang_vel_range] * 3)
+
+    def _tensor(self, values: object) -> Tensor:
+        return torch.tensor(values, dtype=torch.float, device=self.device)
+
+    # declared for readers and type checkers; columns of self._episode, (N, width)
+    last_actions: Tensor  # D
+    episode_sums: Tensor  # K, scale * term * dt summed over the episode
+    episode_return: Tensor  # 1
+    episode_steps: Tensor  # 1, since the reset; episode_length_buf may start elsewhere

@@ -1,0 +1,230 @@
+"""Every field of RobotTask and of its training, once, typed, with unit and source. Tasks override these in configs/.
+
+Sources: [P] MuJoCo Playground's Go1 joystick task and its learner settings; [L] legged_gym; [R] rsl-rl's defaults;
+[ours] with the reason. A field that turns one of our departures back into Playground's behaviour says so.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from legged_mw.utils.config import Config
+
+
+class RobotTaskCfg(Config):
+    """The environment of any robot in any task. A joint's own value stands in a table: key -> number. The exact name wins, then the
+    longest key that is part of the name, then the key "".
+    """
+
+    class env:
+        num_envs: int = 4096  # worlds stepped together
+        episode_length_s: float = 20.0  # [s], then the episode times out [P]
+
+    class asset:
+        file: str = ""  # MJCF of the robot alone; relative to the config file, or to the repository
+        imu_site: str = "imu"  # on the root body and aligned with it
+        colliders: list[str] = ["*"]  # geoms that touch the ground; names or patterns, of those that collide in the MJCF
+        self_collisions: bool = False  # among the colliders
+        penalize_contacts_on: list[str] = []  # colliders, or patterns: `collision` counts their bodies on the ground [L]
+        terminate_after_contacts_on: list[str] = []  # likewise: to touch the ground with one of these is a fall [L]
+        joint_speed_limits: dict[str, float] = {}  # table a joint: the motor's highest speed [rad/s]; for the report only
+
+    class init_state:
+        pos: list[float] = [0.0, 0.0, 1.0]  # root at reset [m]
+        default_joint_angles: dict[str, float] = {}  # table a joint [rad]: the pose of action 0
+        dof_pos_range: list[float] = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
+        pos_xy_range: float = 0.5  # root x and y + U(-range, range) [m] [P]
+        yaw_range: float = 3.141592653589793  # U(-range, range) [rad] [P]
+        lin_vel_range: float = 0.5  # root velocity, world frame, each axis U(-range, range) [m/s] [P]
+        ang_vel_range: float = 0.5  # root angular velocity, body frame, each axis U(-range, range) [rad/s] [P]
+
+    class control:
+        stiffness: dict[str, float] = {}  # table a joint: position gain [N m/rad]
+        damping: dict[str, float] = {}  # table a joint: passive damping [N m s/rad]
+        action_scale: float | dict[str, float] = 0.5  # target = origin + scale * action [rad]; a number, or a table a joint [P]
+        action_origin: Literal["default", "joints", "targets"] = "default"  # the default pose, the measured angles or the last targets [P]
+        decimation: int = 5  # simulation steps a control step [P]
+
+    class observations:
+        leave_out: dict[str, list[str]] = {}  # group -> rows of the table that it does without: {"state": ["base_lin_vel"]}
+        history: dict[str, int] = {}  # group, or "group.row" -> frames of each row, oldest first: {"state": 5}
+
+    class termination:
+        max_tilt: float = 90.0  # [deg] between the root's z axis and the vertical; beyond it, it fell [P]
+        min_base_height: float = 0.0  # [m] of the root above the ground under it; lower, it fell; 0: anything [ours]
+        max_speed: float = 1.0e4  # [m/s, rad/s] of any degree of freedom; beyond it the state counts as not finite [ours]
+
+    class rewards:
+        only_positive_rewards: bool = True  # clip the sum at 0: without it the robot learns to stand still [P, L]
+        clip_termination: bool = False  # True: `termination` is inside that clip, where a fall costs nothing [P]; False [L]
+        max_reward: float = 10000.0  # upper clip of the sum, a step [P]
+        soft_dof_pos_limit: float = 0.95  # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
+        pose_weights: dict[str, float] = {"": 1.0}  # table a joint: weight in `pose` [-]
+
+        class scales:
+            """Reward terms by name: each number switches on the method _reward_<name>, 0 switches it off."""
+
+            _open = True
+
+    class normalization:
+        clip_actions: float = 2.0  # the clipped action is applied, penalised, observed and exported [ours: P has no bound, and thrashes]
+
+    class noise:
+        level: float = 1.0  # multiplies every scale; 0: no noise [P]
+
+        class scales:
+            """Half width of uniform noise on a row of `state`. All [P]."""
+
+            lin_vel: float = 0.1  # [m/s]
+            ang_vel: float = 0.2  # [rad/s]
+            gravity: float = 0.05  # [-]
+            dof_pos: float = 0.03  # [rad]
+            dof_vel: float = 1.5  # [rad/s]
+
+    class perturbation:
+        """A kick is a force on the root, a half sine over the duration: one of dv changes its velocity by dv / pi.
+
+        A push sets the velocity at once.
+        """
+
+        kick: bool = False  # [P]
+        interval: list[float] = [1.0, 3.0]  # pause between kicks [s] [P]
+        duration: list[float] = [0.05, 0.2]  # [s] [P]
+        velocity: list[float] = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
+        curriculum: bool = False  # a world's dv grows with the share of an episode that it survives, from 0 [ours]
+        push: bool = False  # the root's horizontal velocity becomes a random one; beside kicks or alone [L]
+        push_interval_s: float = 15.0  # between pushes, each world's clock its own [s] [L]
+        max_push_vel_xy: float = 1.0  # each axis U(-max, max) [m/s] [L]
+
+    class domain_rand:
+        """What differs between worlds. Two numbers are the ends of a uniform distribution; an empty list leaves the model's value."""
+
+        enable: bool = False  # [P]
+        link_mass: list[float] = [0.9, 1.1]  # factor on each link's mass, its inertia with it [P; inertia ours]
+        base_mass: list[float] = [-1.0, 1.0]  # added to the root's [kg], its inertia in proportion [P; inertia ours]
+        base_com: list[float] = [-0.05, 0.05]  # added to the place of the root's centre of mass, each axis [m] [P]
+        armature: list[float] = [1.0, 1.05]  # factor on each joint's [P]
+        friction: list[float] = [0.4, 1.0]  # sliding friction of the ground [-] [P]
+        contact_time: list[float] = []  # time constant of the ground's contacts (solref) [s]: longer is softer, 0.02 is MuJoCo's
+        frictionloss: list[float] = [0.9, 1.1]  # factor on each joint's dry friction [P]
+        stiffness: list[float] = []  # factor on each servo's position gain
+        damping: list[float] = []  # factor on each joint's damping
+        strength: list[float] = []  # factor on each servo's force limit
+        encoder_offset: list[float] = [-0.05, 0.05]  # what each encoder reads beside the true angle [rad] [P]
+        action_delay: list[int] = []  # control steps from an action to its servo, whole numbers, both ends included
+        observation_delay: list[int] = []  # control steps that what `state` measures is old
+        model_factors: dict[str, list[float]] = {}  # any other field of the model that may differ: a factor per world on all of it
+        redraw_at_reset: list[str] = [  # anew at every reset of a world; the others once, at the start
+            *["friction", "contact_time", "frictionloss", "stiffness", "damping", "strength"],
+            *["encoder_offset", "action_delay", "observation_delay"],
+        ]
+        redraw_iterations: int = 0  # draw everything anew every so many iterations of training, and when it is resumed; 0: never
+        observe: bool = False  # rows in `privileged_state` with what was drawn
+
+    class terrain:
+        friction: float = 0.6  # sliding friction of the ground, which overrules the robot's [-] [P]
+        condim: int = 3  # contact dimensions: 3 is sliding without torsion [P]
+
+    class sim:
+        engine: Literal["auto", "mujoco_warp", "mujoco"] = "auto"  # auto: mujoco_warp on a GPU, MuJoCo's own on a CPU
+        threads: int = 0  # of MuJoCo's own engine; 0: one a core
+        dt: float = 0.004  # simulation step [s] [P]
+        iterations: int = 1  # Newton iterations [P]
+        ls_iterations: int = 5  # line-search iterations [P]
+        nconmax: int = 8  # contacts a world has room for (mujoco_warp); four feet on a plane make four
+        njmax: int = 40  # constraint rows a world has room for (mujoco_warp): 12 friction, 12 limits, 4 a contact [ours: never seen full]
+
+    class viewer:
+        width: int = 1280  # [pixel]
+        height: int = 720  # [pixel]
+        camera: list[float] = [0.9, -1.1, 0.6]  # place of the camera "track", from the robot, world axes [m]
+        fps: int = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
+
+
+class RobotTaskCfgPPO(Config):
+    """The learner. Keys below actor, critic and algorithm are rsl-rl's own and pass through untranslated.
+
+    What is marked [ours] was found by measurement: docs/training.md.
+    """
+
+    seed: int = 1
+
+    class runner:
+        num_steps_per_env: int = 24  # control steps a world between two updates [P]
+        max_iterations: int = 300  # [ours: a robot of one's own shows something by then]
+        save_interval: int = 50  # [iterations] between checkpoints
+        exam_interval: int = (
+            200  # [iterations] between small exams, and one at the end; 0, or more than max_iterations: none [ours: docs/grading.md]
+        )
+        experiment_name: str = ""  # folder below logs/; empty: the task's name
+        run_name: str = ""  # appended to the run folder's time stamp
+        logger: Literal["tensorboard", "wandb"] = "tensorboard"
+        wandb_project: str = "legged_mw"
+        export: bool = True  # a finished training writes <run folder>/export/, as play.py --export does [ours]
+        matmul_precision: Literal["highest", "high"] = "high"  # of the networks on a GPU: high is TF32, highest float32
+
+    class obs_groups:
+        actor: list[str] = ["state"]
+        critic: list[str] = ["privileged_state"]
+
+    class actor:
+        class_name: str = "MLPModel"
+        hidden_dims: list[int] = [512, 256, 128]  # [P]
+        activation: str = "elu"  # [P]
+        obs_normalization: bool = True  # [P]
+
+        class distribution_cfg:
+            class_name: str = "GaussianDistribution"
+            init_std: float = 0.6  # [ours: from 1.0 it thrashes, from 0.4 it may stand for good]
+            std_type: Literal["scalar", "log"] = "scalar"  # [R]
+            std_range: list[float] = [1e-6, 1e6]  # [R]
+
+    class critic:
+        class_name: str = "MLPModel"
+        hidden_dims: list[int] = [512, 256, 128]  # [P]
+        activation: str = "elu"  # [P]
+        obs_normalization: bool = True  # [P]
+
+    class algorithm:
+        class_name: str = "legged_mw.rl.ppo:GraphedPPO"  # or "PPO": rsl-rl's own, same results, slower on a GPU
+        num_learning_epochs: int = 5  # [P]
+        num_mini_batches: int = 4  # [P]
+        clip_param: float = 0.2  # [P]
+        gamma: float = 0.99  # [P]
+        lam: float = 0.95  # [P]
+        value_loss_coef: float = 1.0  # [P]
+        entropy_coef: float = 0.005  # [ours; P 0.001]
+        learning_rate: float = 1e-3  # at the start [R; P 3e-4]
+        max_grad_norm: float = 1.0  # [P]
+        optimizer: str = "adam"  # [P]
+        use_clipped_value_loss: bool = True  # [P]
+        schedule: Literal["adaptive", "fixed"] = "adaptive"  # fixed: `learning_rate` throughout [R; P fixed]
+        desired_kl: float = 0.01  # between updates, for the adaptive schedule [R]
+        normalize_advantage_per_mini_batch: bool = False  # [R]
+
+    class anneal:
+        """What a number of `algorithm` goes to, in a straight line over max_iterations; 0: it stays [ours]."""
+
+        entropy_coef: float = 0.0
+        desired_kl: float = 0.0
+
+    class cpu:
+        """What train.py takes on a CPU instead, before the command line has its say [ours: docs/training.md]."""
+
+        enable: bool = True
+        envs_per_core: int = 256  # worlds; the task's own number, if that is less
+        num_steps_per_env: int = 16
+        num_learning_epochs: int = 5
+        num_mini_batches: int = 4
+        desired_kl: float = 0.02
+        hidden_dims: list[int] = [128, 64, 32]  # of actor and critic
+        max_iterations: int = 2600
+        overrides: dict[str, Any] = {}  # fields of the environment: dotted path -> value
+        update_threads: int = 0  # of torch in an update; 0: one a core. Everything else of a step runs on one
+
+    class symmetry:
+        """Left-right symmetry in the update, as in Mittal et al. 2024. Rows of observations say how they mirror: envs/mirror.py."""
+
+        use_data_augmentation: bool = False  # learn from the mirror image of every sample too: twice the batch [R]
+        use_mirror_loss: bool = False  # pull the mean action in the mirrored state to the mirrored mean action [R]
+        mirror_loss_coeff: float = 0.0  # weight of that pull, mean square over actions [-] [R]
