@@ -58,7 +58,7 @@ def _field(terrain: Terrain) -> Any:
 
 
 class HeightLookup:
-    """``terrain.HeightMap`` as one kernel: the contacts' own ground. For a GPU, where many small operations cost more than they do."""
+    """``height_map.HeightMap`` as one kernel: the contacts' own ground. For a GPU, where many small operations cost more than they do."""
 
     def __init__(self, terrain: Terrain, device: str) -> None:
         self._device = wp.get_device(device)
@@ -166,7 +166,7 @@ def _vertex(field: _Field, row: int, column: int) -> wp.vec3:
 
 @wp.func
 def _surface(field: _Field, u: float, v: float) -> float:
-    """Height [m] at column u, row v: triangles, as ``terrain.HeightMap``. What is not finite is somewhere."""
+    """Height [m] at column u, row v: triangles, as ``height_map.HeightMap``. What is not finite is somewhere."""
     column = wp.clamp(int(wp.floor(u)), 0, field.heights.shape[1] - 2)
     row = wp.clamp(int(wp.floor(v)), 0, field.heights.shape[0] - 2)
     across, along = wp.clamp(u - float(column), 0.0, 1.0), wp.clamp(v - float(row), 0.0, 1.0)
