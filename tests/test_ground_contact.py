@@ -218,7 +218,7 @@ def test_a_round_mesh_is_thinned_and_as_large_as_it_was() -> None:
 
 @pytest.mark.parametrize("field", ["flat", "smooth_slope"])
 def test_a_mesh_rests_as_the_box_of_its_size_does(field: str, device: str) -> None:
-    """A sole of 20 x 10 x 4 cm, as a mesh and as a box on a height field, and as MuJoCo itself has it there."""
+    """A sole of 20 x 10 x 4 cm, as a mesh and as a box on a height field, and as MuJoCo itself has it on the level."""
     terrain, rest = ground(field), []
     place = [3.0, 0.0, terrain.heights[60, round((3.0 - terrain.corner[0]) / 0.05)] + 0.05]
     for shape in (MESH, {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": BRICK}):
@@ -237,7 +237,7 @@ def test_a_mesh_rests_as_the_box_of_its_size_does(field: str, device: str) -> No
     np.testing.assert_allclose(rest[0], rest[1], atol=1e-4)
     slope = 0.4 if field == "smooth_slope" else 0.0  # down along x
     from_middle = place[2] - 0.05 + slope * place[0]  # what the ground's plane has for z + slope * x
-    for pose in (rest[0], data.qpos):
+    for pose in (rest[0], data.qpos) if field == "flat" else rest:  # MuJoCo's own has tilted contacts on a slope
         assert (pose[2] + slope * pose[0] - from_middle) / np.hypot(1.0, slope) == pytest.approx(0.02, abs=1e-3), "half its height"
         w, x, y, z = pose[3:]
         assert (2 * (x * z + w * y) * slope + 1 - 2 * (x * x + y * y)) / np.hypot(1.0, slope) > 0.999, "it lies on its flat side"

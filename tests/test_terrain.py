@@ -193,7 +193,7 @@ def test_mistakes_of_ones_own_kind_are_named() -> None:
     for kind in ("cliff", "hole"):
         with pytest.raises(ModelError, match=f"kind of terrain '{kind}': its heights must be finite, and 0 along the rim"):
             terrain(proportions={kind: 1.0})
-    with pytest.raises(ModelError, match="kind of terrain 'rough': it must be level within 1 m of its middle, where episodes begin"):
+    with pytest.raises(ModelError, match="kind of terrain 'rough': it must be level within 1 m of its middle, where robots begin"):
         terrain(proportions={"rough": 1.0})
     for asked in ((cliff,), (5, 40), ("depth [cm]",)):
         with pytest.raises(ModelError, match=r"add_kind\(.*\): name what makes the kind hard .* or write @add_kind\(\)"):

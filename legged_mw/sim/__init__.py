@@ -1,1 +1,1 @@
-"""The simulator seam: takes numbers and names, hands out torch tensors; knows no reward, command or config."""
+"""The simulator seam: takes numbers and names, hands out torch tensors; does not know what they are for."""

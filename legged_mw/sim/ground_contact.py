@@ -58,7 +58,7 @@ def _field(terrain: Terrain) -> Any:
 
 
 class HeightLookup:
-    """``terrain.HeightMap`` as one kernel: the contacts' own ground. For a GPU, where many small operations cost more than they do."""
+    """``height_map.HeightMap`` as one kernel: the contacts' own ground. For a GPU, where many small operations cost more than they do."""
 
     def __init__(self, terrain: Terrain, device: str) -> None:
         self._device = wp.get_device(device)
@@ -166,7 +166,7 @@ def _vertex(field: _Field, row: int, column: int) -> wp.vec3:
 
 @wp.func
 def _surface(field: _Field, u: float, v: float) -> float:
-    """Height [m] at column u, row v: triangles, as ``terrain.HeightMap``. What is not finite is somewhere."""
+    """Height [m] at column u, row v: triangles, as ``height_map.HeightMap``. What is not finite is somewhere."""
     column = wp.clamp(int(wp.floor(u)), 0, field.heights.shape[1] - 2)
     row = wp.clamp(int(wp.floor(v)), 0, field.heights.shape[0] - 2)
     across, along = wp.clamp(u - float(column), 0.0, 1.0), wp.clamp(v - float(row), 0.0, 1.0)
@@ -281,6 +281,7 @@ def _write(
     nacon: wp.array[int],
 ):
     """One contact, with the parameters that MuJoCo's rules of mixing give it."""
+    allowance = _margin_and_gap(m, geoms, world)
     # fmt: off
     condim, friction, solref, solreffriction, solimp, adhesion = contact_material_params(
         m.geom_condim, m.geom_priority, m.geom_solmix, m.geom_solref, m.geom_solimp, m.geom_friction, m.geom_adhesion,
@@ -288,7 +289,7 @@ def _write(
         geoms, -1, world,
     )
     write_contact(
-        naconmax, which, depth, place, make_frame(normal), _margin(m, geoms, world), _gap(m, geoms, world),
+        naconmax, which, depth, place, make_frame(normal), allowance[0], allowance[1],
         condim, friction, solref, solreffriction, solimp, adhesion, geoms, wp.vec2i(-1, -1), world,
         out.dist, out.pos, out.frame, out.includemargin, out.friction, out.solref, out.solreffriction, out.solimp, out.dim,
         out.geom, out.efc_address, out.worldid, out.type, out.geomcollisionid, out.adhesion, nacon,
@@ -297,15 +298,10 @@ def _write(
 
 
 @wp.func
-def _margin(m: _Material, geoms: wp.vec2i, world: int) -> float:
-    row = world % m.geom_margin.shape[0]
-    return m.geom_margin[row, geoms[0]] + m.geom_margin[row, geoms[1]]
-
-
-@wp.func
-def _gap(m: _Material, geoms: wp.vec2i, world: int) -> float:
-    row = world % m.geom_gap.shape[0]
-    return m.geom_gap[row, geoms[0]] + m.geom_gap[row, geoms[1]]
+def _margin_and_gap(m: _Material, geoms: wp.vec2i, world: int) -> wp.vec2:
+    """[m] of a pair."""
+    margins, gaps = m.geom_margin[world % m.geom_margin.shape[0]], m.geom_gap[world % m.geom_gap.shape[0]]
+    return wp.vec2(margins[geoms[0]] + margins[geoms[1]], gaps[geoms[0]] + gaps[geoms[1]])
 
 
 @wp.kernel
@@ -324,7 +320,8 @@ def _touch(
     geom, radius = spheres.geom[probe], spheres.radius[probe]
     geoms = wp.vec2i(ground, geom)
     centre = geom_xpos[world, geom] + geom_xmat[world, geom] @ spheres.place[probe]
-    farthest = _margin(material, geoms, world) + _gap(material, geoms, world)  # [m] from the surface, that is still a contact
+    allowance = _margin_and_gap(material, geoms, world)
+    farthest = allowance[0] + allowance[1]  # [m] from the surface, that is still a contact
     u, v = (centre[0] - field.corner[0]) * field.per_cell, (centre[1] - field.corner[1]) * field.per_cell
     above = centre[2] - _surface(field, u, v)  # [m] straight up from the ground; negative: under it
     touching = radius + farthest

@@ -7,13 +7,11 @@ For drawing alone: nothing that is stepped changes. The plane's looks are in sce
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-from typing import Any
-
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.sim.scene import SQUARE, STEEP_LIGHT
+from legged_mw.sim.scene import SQUARE, STEEP_LIGHT, add_material, add_squares
 from legged_mw.sim.terrain import Terrain
 
 Picture = NDArray[np.uint8]
@@ -59,7 +57,7 @@ def _add_tile(spec: mujoco.MjSpec, terrain: Terrain, level: int, column: int, pi
     image = picture[rows.start * pixels : (rows.start + n) * pixels, columns.start * pixels : (columns.start + n) * pixels]
     texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=n * pixels, height=n * pixels, nchannel=3)
     texture.data = image[::-1].tobytes()  # a texture begins at the largest y
-    _add_material(spec, name, texuniform=False, texrepeat=[1, 1])
+    add_material(spec, name, texuniform=False, texrepeat=[1, 1])
     x, y = (start + first.start * terrain.cell + half for start, first in zip(terrain.corner, (columns, rows), strict=True))
     level_ground = not np.ptp(heights)
     coarse = next(step for step in ((n,) if level_ground else (COARSE, 3, 1)) if n % step == 0)
@@ -126,25 +124,9 @@ def _enlarged(values: Tones, pixels: int) -> Tones:
     return values
 
 
-def _add_material(spec: mujoco.MjSpec, name: str, **mapping: Any) -> None:
-    material = spec.add_material(name=name, specular=0.1, shininess=0.1, reflectance=0.0, **mapping)
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
-
-
 def _add_surroundings(spec: mujoco.MjSpec, terrain: Terrain, squares: bool) -> None:
     """The border, and flat ground on from there, as far as one sees."""
-    spec.add_texture(
-        name=AROUND,
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=COLOUR * (1 - CHECKER * squares),
-        rgb2=COLOUR * (1 + CHECKER * squares),
-        mark=mujoco.mjtMark.mjMARK_EDGE,
-        markrgb=COLOUR * (1 + LINE * squares),
-        width=512,
-        height=512,
-    )
-    _add_material(spec, AROUND, texuniform=True, texrepeat=[1 / SQUARE, 1 / SQUARE])
+    add_squares(spec, AROUND, *(COLOUR * (1 + share * squares) for share in (-CHECKER, CHECKER, LINE)))
     plane = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "contype": 0, "conaffinity": 0, "castshadow": False}
     x, y = 0.5 * terrain.levels * terrain.tile, 0.5 * len(terrain.kinds) * terrain.tile
     reach = max(REACH, 2 * x, 2 * y)  # terrain_picture sees as far as the tiles are long

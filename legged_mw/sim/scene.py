@@ -7,8 +7,13 @@ No geom is added here and nothing that is stepped changes; the names given are f
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-import mujoco
+from collections.abc import Sequence
+from typing import Any
 
+import mujoco
+import numpy as np
+
+Colour = Sequence[float] | np.ndarray
 GROUND_MATERIAL = "ground"  # for the floor or terrain geom
 _ZENITH, _HORIZON = (0.22, 0.32, 0.45), (0.56, 0.63, 0.70)
 SQUARE = 0.5  # edge of one checker square [m], a thin line every second one: to judge speed and stride by
@@ -18,7 +23,7 @@ STEEP_LIGHT = (-0.25, 0.35, -1.0)  # of the key light over steps: steeper, so th
 def add_scene(spec: mujoco.MjSpec) -> None:
     """Give ``spec`` a sky, the material "ground", one key light that follows the first body, and render settings."""
     _add_sky(spec)
-    _add_ground_material(spec)
+    add_squares(spec, GROUND_MATERIAL, [0.23, 0.26, 0.30], [0.28, 0.31, 0.35], [0.40, 0.43, 0.47])
     _add_light(spec)
     _set_quality(spec)
 
@@ -26,34 +31,23 @@ def add_scene(spec: mujoco.MjSpec) -> None:
 def _add_sky(spec: mujoco.MjSpec) -> None:
     # the gradient runs from zenith to nadir, so the horizon is its middle; the haze has that colour, and the ground no edge
     nadir = [2 * h - z for h, z in zip(_HORIZON, _ZENITH, strict=True)]
-    spec.add_texture(
-        name="sky",
-        type=mujoco.mjtTexture.mjTEXTURE_SKYBOX,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_GRADIENT,
-        rgb1=_ZENITH,
-        rgb2=nadir,
-        width=512,
-        height=3072,
-    )
+    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, rgb1=_ZENITH, rgb2=nadir, width=512, height=3072)
+    sky.builtin = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
     spec.visual.rgba.haze = [*_HORIZON, 1.0]
 
 
-def _add_ground_material(spec: mujoco.MjSpec) -> None:
-    spec.add_texture(
-        name=GROUND_MATERIAL,
-        type=mujoco.mjtTexture.mjTEXTURE_2D,
-        builtin=mujoco.mjtBuiltin.mjBUILTIN_CHECKER,
-        rgb1=[0.23, 0.26, 0.30],
-        rgb2=[0.28, 0.31, 0.35],
-        mark=mujoco.mjtMark.mjMARK_EDGE,
-        markrgb=[0.40, 0.43, 0.47],
-        width=512,
-        height=512,
-    )
-    material = spec.add_material(name=GROUND_MATERIAL, specular=0.1, shininess=0.1, reflectance=0.0)
+def add_squares(spec: mujoco.MjSpec, name: str, dark: Colour, light: Colour, line: Colour) -> None:
+    """A material of squares, 2 x 2 of them with a line around."""
+    picture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, rgb1=dark, rgb2=light, markrgb=line, width=512, height=512)
+    picture.builtin, picture.mark = mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mujoco.mjtMark.mjMARK_EDGE
     # texuniform measures in half-sizes: texrepeat 1 lays the image, 2 x 2 squares with a line around it, over 2 m
-    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = GROUND_MATERIAL
-    material.texuniform, material.texrepeat = True, [1 / SQUARE, 1 / SQUARE]
+    add_material(spec, name, texuniform=True, texrepeat=[1 / SQUARE, 1 / SQUARE])
+
+
+def add_material(spec: mujoco.MjSpec, name: str, **mapping: Any) -> None:
+    """A dull material with the texture of that name."""
+    material = spec.add_material(name=name, specular=0.1, shininess=0.1, reflectance=0.0, **mapping)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
 
 
 def _add_light(spec: mujoco.MjSpec) -> None:

@@ -111,7 +111,7 @@ def _checked(patch: Heights, kind: str, grid: Grid) -> Heights:
         )
     if np.ptp(patch[grid.distance < PLATFORM - 0.5 * grid.cell]) > 1e-3:
         raise ModelError(
-            f"kind of terrain '{kind}': it must be level within {PLATFORM:g} m of its middle, where episodes begin (grid.fade does that)"
+            f"kind of terrain '{kind}': it must be level within {PLATFORM:g} m of its middle, where robots begin (grid.fade does that)"
         )
     return patch
 
