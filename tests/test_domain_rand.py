@@ -8,7 +8,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from guard import recordable
 from torch import Tensor
 from worlds import QUIET, changed, layout, make_env, same, snapshot
 
@@ -17,6 +16,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.sim.engines import make_simulation
 from legged_mw.sim.model import GROUND, ModelError
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import load_task
 
 ENGINES = ["mujoco", "mujoco_warp"]

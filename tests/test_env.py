@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from guard import NotRecordable, recordable
 from torch import Tensor
 from worlds import QUIET, changed, layout, make_env, same, snapshot, tensors
 
@@ -19,6 +18,8 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import NotRecordable
+from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import task_names
 
 HOME = [0.1, 0.9, -1.8, -0.1, 0.9, -1.8, 0.1, 0.9, -1.8, -0.1, 0.9, -1.8]  # [rad] FR, FL, RR, RL; hip, thigh, calf
@@ -97,10 +98,10 @@ class _Shapes(LeggedRobot):
 @pytest.mark.parametrize(
     ("env_class", "message"),
     [
-        (_Reads, "host read: __bool__"),
-        (_Indexes, "boolean mask as an index: aten.index_put_"),
-        (_Creates, "copy between host and device: tensor"),
-        (_Shapes, "data-dependent shape: aten.nonzero"),
+        (_Reads, "a tensor as a condition .* is read to the host"),
+        (_Indexes, "a mask as an index has a shape that depends on data"),
+        (_Creates, "tensor.. copies data from the host"),
+        (_Shapes, "nonzero has a shape that depends on data"),
     ],
 )
 def test_guard_reaches_every_part_of_the_step(env_class: type[LeggedRobot], message: str) -> None:

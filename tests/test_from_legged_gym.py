@@ -10,7 +10,6 @@ from typing import Any
 
 import pytest
 import torch
-from guard import recordable
 from program import play, run
 from torch import Tensor
 from worlds import QUIET, changed, layout, make_env, same, snapshot
@@ -22,6 +21,7 @@ from legged_mw.eval import exam
 from legged_mw.sim.model import Ground, ModelError, Solver, build_model
 from legged_mw.utils import math as math_of_steps
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import load_task
 
 TASK = str(ROOT / "examples/go1_legged_gym.py")

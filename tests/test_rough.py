@@ -10,7 +10,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from guard import recordable
 from torch import Tensor
 from worlds import QUIET, make_env
 
@@ -18,6 +17,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.rl.runner import make_runner
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import load_task
 
 ENGINES = ("mujoco", "mujoco_warp")

@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 import torch
-from guard import recordable
 from program import SMALL
 from rsl_rl.extensions import Symmetry
 from rsl_rl.runners import OnPolicyRunner
@@ -25,6 +24,7 @@ from legged_mw.rl.symmetry import mirror
 from legged_mw.sim.mirror import find_partners
 from legged_mw.sim.model import Ground, ModelError, RobotModel, Solver, build_model
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
+from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import LoadedTask, load_task
 
 FEET = ["FR", "FL", "RR", "RL"]

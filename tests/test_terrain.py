@@ -11,7 +11,6 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from guard import recordable
 
 from legged_mw import ROOT
 from legged_mw.envs.terrain import build_terrain
@@ -31,6 +30,7 @@ from legged_mw.sim.terrain import (
     make_terrain,
     share_columns,
 )
+from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import load_task
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from typing import Any
 
 import torch
+
+from legged_mw.utils.errors import NotRecordable, line_to_blame
 
 
 class StepGraph:
@@ -47,13 +51,34 @@ class StepGraph:
             current.wait_stream(stream)
             return
         torch.cuda.synchronize(stream.device)
-        graph = torch.cuda.CUDAGraph()
-        with torch.cuda.graph(graph, stream=stream), wp.ScopedStream(wp_stream, sync_enter=False):
-            wp.capture_begin(stream=wp_stream, external=True)
-            try:
-                self._fn()
-            finally:
-                wp.capture_end(stream=wp_stream)
-        self._graph = graph
+        self._graph = self._record(stream, wp, wp_stream)
         current.wait_stream(stream)
-        graph.replay()
+        self._graph.replay()
+
+    def _record(self, stream: torch.cuda.Stream, wp: Any, wp_stream: Any) -> torch.cuda.CUDAGraph:
+        """The graph of one call. Raises NotRecordable with the line of ``fn`` that failed, not with what then failed to end."""
+        graph, failed = torch.cuda.CUDAGraph(), None
+        try:
+            with torch.cuda.graph(graph, stream=stream), wp.ScopedStream(wp_stream, sync_enter=False):
+                wp.capture_begin(stream=wp_stream, external=True)
+                try:
+                    self._fn()
+                except Exception as error:
+                    failed = error
+                    raise
+                finally:
+                    wp.capture_end(stream=wp_stream)
+        except Exception as error:
+            first = failed or error
+            if isinstance(first, RuntimeError) and not re.search(
+                r"out of memory|failed to allocate|alloc_failed", str(first), re.IGNORECASE
+            ):
+                raise _refused(first) from None
+            raise first from None
+        return graph
+
+
+def _refused(error: RuntimeError) -> NotRecordable:
+    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    what = f"cannot be recorded for a GPU ({reason}); a recorded step asks the host for no value, copies none, and has fixed shapes"
+    return NotRecordable(what, line_to_blame(error)[0])

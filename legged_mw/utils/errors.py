@@ -3,11 +3,67 @@
 from __future__ import annotations
 
 import difflib
+import sysconfig
+import traceback
 from collections.abc import Iterable
+from pathlib import Path
+from types import CodeType
+
+_LIBRARIES = {
+    "torch",
+    "numpy",
+    "warp",
+    "mujoco",
+    "mujoco_warp",
+    "tensordict",
+    "rsl_rl",
+    "legged_mw.envs.guard",
+    "legged_mw.utils.recordable",
+}
+_STANDARD = sysconfig.get_paths()["stdlib"]
 
 
 class UserError(Exception):
     """A mistake in what was asked, or something that the machine lacks; the text says what exists and what to do."""
+
+
+class StepError(UserError):
+    """A task's step goes wrong in the user's code: ``what`` is wrong and what to write instead, and ``where`` it stands."""
+
+    def __init__(self, what: str, where: str = "") -> None:
+        self.what, self.where = what, where
+        super().__init__(" ".join(f"{where}: {what}".split()) if where else what)
+
+
+class NotRecordable(StepError):
+    """The step does what a CUDA graph cannot record."""
+
+
+def line_of(code: CodeType, line: int) -> str:
+    """``file:line, Class.method``, the file as the user would type it."""
+    path = Path(code.co_filename)
+    shown = path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
+    return f"{shown}:{line}, {code.co_qualname.rpartition('<locals>.')[2]}"
+
+
+def is_library(module: str, file: str) -> bool:
+    """Whether code is neither the user's nor legged_mw's, or is the guard that watches both."""
+    parts = module.split(".")
+    known = any(".".join(parts[:n]) in _LIBRARIES for n in range(1, len(parts) + 1))
+    return known or file.startswith("<") or (file.startswith(_STANDARD) and "-packages" not in file)
+
+
+def line_to_blame(error: BaseException) -> tuple[str, bool]:
+    """The innermost line of the user's code that led to ``error``, and True; without one, of legged_mw's code, and False.
+
+    It must be below the function that caught the error; where there is none, it is "".
+    """
+    every = [(frame.f_code, line, frame.f_globals.get("__name__", "")) for frame, line in traceback.walk_tb(error.__traceback__)]
+    ours = [entry for entry in every if not is_library(entry[2], entry[0].co_filename)]
+    users = [entry for entry in ours if not entry[2].startswith("legged_mw.")]
+    for code, line, _ in reversed(users or ours):
+        return line_of(code, line), bool(users)
+    return "", False
 
 
 def unknown(what: str, name: str, known: Iterable[str], where: str) -> str:

@@ -1,0 +1,250 @@
+"""Checks a task before it is trained: on a CPU, in a second, that its step can be recorded; the line that breaks a law is named.
+
+A recorded step is replayed as it was. It may not ask the host for a value, copy from it, or have a shape that depends on
+data (``utils/recordable.py``). Every tensor stays where it was, Python numbers stay what they were, and rewards only read.
+"""
+
+from __future__ import annotations
+
+import copy
+import functools
+import inspect
+import random
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
+from types import FrameType
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.utils.config import Config
+from legged_mw.utils.errors import NotRecordable, StepError, UserError, is_library, line_of, line_to_blame
+from legged_mw.utils.recordable import Guard, recordable
+from legged_mw.utils.task import LoadedTask
+
+_WORLDS, _STEPS = 4, 3
+
+Path = tuple[str | int, ...]  # attributes, keys and places that lead from the environment to what it holds
+
+
+def check_recordable(task: LoadedTask) -> None:
+    """Run a few steps of a tiny environment of ``task`` on the CPU under the guard; takes less than a second.
+
+    Raises StepError, one line with the user's file, line and method: for what a CUDA graph cannot record (NotRecordable), and
+    for a method that raises, or returns NaN or the wrong shape. Random numbers go on as if it had not been called.
+    """
+    guard = Guard()
+    with _nothing_changed():
+        try:
+            env = _watched(task.env_class, guard)(_tiny(task.cfg), "cpu", True)
+            for name in ("step", "reset", "refresh"):  # the engine of a CPU may ask the host
+                if method := getattr(env.sim, name, None):
+                    setattr(env.sim, name, _unwatched(method, guard))
+            _check_rows(env)
+            _check_steps(env, guard)
+        except StepError as error:
+            raise type(error)(error.what, f"{task.name}: {error.where or line_to_blame(error)[0]}") from None
+        except UserError:
+            raise
+        except Exception as error:
+            where, users = line_to_blame(error)
+            if not users:
+                raise
+            raise StepError(f"{type(error).__name__}: {error}", f"{task.name}: {where}") from error
+
+
+def _tiny(cfg: RobotTaskCfg) -> RobotTaskCfg:
+    """The same task in a few worlds, on a terrain of two tiles if it has one."""
+    tiny = copy.deepcopy(cfg)
+    tiny.env.num_envs, tiny.sim.engine, tiny.sim.threads = _WORLDS, "mujoco", 1
+    if hasattr(tiny.terrain, "num_rows"):
+        small = {"num_rows": 2, "num_cols": 1, "border_size": 1.0, "terrain_proportions": {"flat": 1.0}}
+        tiny.update({"terrain": small}, where="the guard")
+    return tiny
+
+
+def _watched(env_class: type[RobotTask], guard: Guard) -> type[Any]:
+    """The same class, whose rewards are looked at: they only read, and return finite numbers (N,)."""
+
+    def watch(method: Callable[[RobotTask], Any]) -> Callable[[RobotTask], Any]:
+        @functools.wraps(method)
+        def term(self: RobotTask) -> Any:
+            with guard.set(on_write=functools.partial(_check_written, self)):
+                value = method(self)
+            if not isinstance(value, Tensor) or value.shape != (self.num_envs,):
+                got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+                raise StepError(f"must return a tensor ({self.num_envs},), one value an environment; it returned {got}", _where(method))
+            watched = guard.on
+            with guard.set(on=False):
+                if watched and bool((~value.isfinite() & ~self.broken).any()):
+                    raise StepError(
+                        "returned a value that is not finite; look for a division by 0 or a root of a negative number", _where(method)
+                    )
+            return value
+
+        return term
+
+    body: dict[str, Any] = {name: watch(getattr(env_class, name)) for name in dir(env_class) if name.startswith("_reward_")}
+    body |= {"__module__": env_class.__module__, "__qualname__": env_class.__qualname__}
+    return type(env_class.__name__, (env_class,), body)
+
+
+def _unwatched(method: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
+    def call(*args: Any, **kwargs: Any) -> Any:
+        with guard.set(on=False):
+            return method(*args, **kwargs)
+
+    return call
+
+
+def _check_written(env: RobotTask, tensor: Tensor) -> None:
+    """Inside a reward, no tensor may be written to that the environment holds."""
+    memory = tensor.untyped_storage().data_ptr()
+    held = [(path, value) for path, value in _held(env) if isinstance(value, Tensor) and value.untyped_storage().data_ptr() == memory]
+    if held and memory:
+        path, _ = min(held, key=lambda entry: _place(entry[1]) != _place(tensor))
+        raise NotRecordable(f"writes to {_shown(path)}; a reward only reads: write to it in _update_state or _end_step")
+
+
+def _check_rows(env: RobotTask) -> None:
+    """Values of observation rows are buffers: asked again, they are the same."""
+    tables = env.observation_rows(), env.observation_rows()
+    for group in tables[0]:
+        for row, again in zip(tables[0][group], tables[1][group], strict=True):
+            if not isinstance(row, str) and not isinstance(again, str) and _place(row.value) != _place(again.value):
+                what = f"row '{row.name}' of '{group}' is computed when the table is made, which is once"
+                raise NotRecordable(f"{what}; give it a buffer, which _update_state writes in place", _where(env.observation_rows))
+
+
+def _check_steps(env: RobotTask, guard: Guard) -> None:
+    def step(watch: bool = True) -> None:
+        env.episode_length_buf = torch.arange(_WORLDS) % 2 * env.max_episode_length  # every second episode ends
+        actions = torch.rand(_WORLDS, env.num_actions).mul_(2.0).sub_(1.0)
+        with recordable(guard) if watch else nullcontext():
+            env.step(actions)
+
+    # on a GPU the first steps are not recorded: what is made once, may be made there; what __init__ made must stay
+    _check_kept(env, {path: value for path, value in _held(env) if isinstance(value, Tensor)}, lambda: step(watch=False), alone=True)
+    for _ in range(_STEPS):
+        _check_kept(env, dict(_held(env)), step)
+        for group, rows in env.observations.groups.items():
+            bad = ~env.obs_buf[group].isfinite() & ~env.broken[:, None]
+            for row in rows:
+                if not row.group and bool(bad[:, env.observations.span(group, row.name)].any()):
+                    raise StepError(f"row '{row.name}' of '{group}' is not finite", _where(env.observation_rows))
+
+
+def _check_kept(env: RobotTask, before: dict[Path, Any], step: Callable[[], None], alone: bool = False) -> None:
+    """After ``step`` all that was held ``before`` is in its place; and unless it is looked at ``alone``, there is nothing else."""
+    places = {path: _place(value) for path, value in before.items()}
+    step()
+    after = {path: _place(value) for path, value in _held(env)}
+    for path in places if alone else [*places, *after]:
+        if places.get(path) != after.get(path):
+            what = f"{_shown(path)} becomes another tensor; make it once, in __init__, and write in place: {_shown(path)}.copy_(...)"
+            if isinstance(before.get(path), int | float):
+                what = f"{_shown(path)} is a Python number and changes, but a replay repeats what was recorded; make it a tensor"
+            raise NotRecordable(what, _line_that_changes(step, env, path, before))
+
+
+@contextmanager
+def _nothing_changed() -> Iterator[None]:
+    """Random numbers and threads are afterwards as they were; inside torch has one thread."""
+    threads, python, numpy = torch.get_num_threads(), random.getstate(), np.random.get_state()
+    torch.set_num_threads(1)
+    try:
+        with torch.random.fork_rng(devices=[]):
+            yield
+    finally:
+        torch.set_num_threads(threads)
+        random.setstate(python)
+        np.random.set_state(numpy)
+
+
+# ---- what an environment holds, and which line changes it ---------------------------------------------------------------
+
+
+def _held(owner: Any, path: Path = (), seen: set[int] | None = None) -> Iterator[tuple[Path, Any]]:
+    """Tensors and numbers that ``owner`` and its parts hold, also inside dicts and lists; of the simulation the tensors alone."""
+    seen = set() if seen is None else seen
+    for key, value in _entries(owner).items():
+        if isinstance(value, Tensor) or (isinstance(value, int | float) and path[:1] != ("sim",)):
+            yield (*path, key), value
+        elif (isinstance(value, dict | list | tuple) or _is_part(value)) and id(value) not in seen:
+            seen.add(id(value))
+            yield from _held(value, (*path, key), seen)
+
+
+def _entries(owner: Any) -> dict[Any, Any]:
+    if isinstance(owner, list | tuple):
+        return dict(enumerate(owner))
+    return dict(owner if isinstance(owner, dict) else vars(owner))
+
+
+def _is_part(value: Any) -> bool:
+    """Whether it is an object of a class of legged_mw's or of the user's, and no config."""
+    module = type(value).__module__
+    file = getattr(sys.modules.get(module), "__file__", None) or "<built in>"
+    return hasattr(value, "__dict__") and not isinstance(value, Config) and not is_library(module, file)
+
+
+def _place(value: Any) -> object:
+    """What must not change: where a tensor is, what a number is."""
+    return (value.data_ptr(), value.shape, value.stride(), value.dtype) if isinstance(value, Tensor) else repr(value)  # NaN is NaN
+
+
+def _at(owner: Any, path: Path) -> Any:
+    for key in path:
+        owner = None if owner is None else _entries(owner).get(key)
+    return owner
+
+
+def _shown(path: Path) -> str:
+    return "self" + "".join(f".{key}" if i == 0 or isinstance(key, str) else f"[{key}]" for i, key in enumerate(path))
+
+
+def _where(method: Any) -> str:
+    function = inspect.unwrap(getattr(method, "__func__", method))
+    return line_of(function.__code__, function.__code__.co_firstlineno)
+
+
+def _put_back(owner: Any, path: Path, before: dict[Path, Any]) -> None:
+    holder: Any = _at(owner, path[:-1])
+    holder = holder if isinstance(holder, dict | list | tuple) else vars(holder)
+    if path in before and not isinstance(holder, tuple):
+        holder[path[-1]] = before[path]
+    elif not isinstance(holder, tuple):
+        del holder[path[-1]]
+
+
+def _line_that_changes(step: Callable[[], None], env: RobotTask, path: Path, before: dict[Path, Any]) -> str:
+    """Put back what was ``before`` and make another step; watch line by line for the one that changes what is at ``path``."""
+    _put_back(env, path, before)
+    place = _place(_at(env, path))
+    last, found = type(env).__name__, ""
+
+    def trace(frame: FrameType, event: str, arg: object) -> Any:
+        nonlocal last, found
+        if not found and _place(_at(env, path)) != place:
+            found = last
+        at = frame.f_back if event == "return" else frame
+        if at and not _library(at):
+            last = line_of(at.f_code, at.f_lineno)
+        return None if _library(frame) else trace
+
+    debugger = sys.gettrace()
+    sys.settrace(trace)
+    try:
+        step()
+    finally:
+        sys.settrace(debugger)
+    return found or type(env).__name__
+
+
+def _library(frame: FrameType) -> bool:
+    return is_library(frame.f_globals.get("__name__", ""), frame.f_code.co_filename)

@@ -1,0 +1,145 @@
+"""What a recorded step may not do, caught on a CPU where it is done: ask the host, copy from it, or depend on data for a shape."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from legged_mw.utils import math
+from legged_mw.utils.errors import NotRecordable
+
+# Seen by name, because on a CPU some of them reach no kernel at all.
+_CONDITIONS = {"__bool__", "is_nonzero", "__contains__"}
+_PRINTS = {"__repr__", "__str__", "__format__"}
+_HOST_READS = {"item", "tolist", "cpu", "numpy", "__array__", "__dlpack__", "__int__", "__float__", "__complex__", "__index__"}
+_HOST_WRITES = {"tensor", "as_tensor", "asarray", "scalar_tensor", "new_tensor"}
+_MOVES = {"cuda", "pin_memory"}
+_FACTORIES = {"empty", "zeros", "ones", "full", "eye", "arange", "linspace", "rand", "randn", "randint", "randperm", "normal"}
+# Kernels that read a value to the host, or whose result has as many elements as the data say.
+_READING = {"_local_scalar_dense", "equal", "allclose", "histc", "bincount", "_linalg_check_errors"}
+_DATA_SHAPED = {"nonzero", "masked_select", "_unique", "_unique2", "unique_dim", "unique_consecutive", "unique_dim_consecutive"}
+_INDEXED = {"index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index", "_unsafe_index_put"}
+
+
+class Guard:
+    """What is watched at the moment: calls while ``on``, and then ``on_write`` is called with each tensor that is written to."""
+
+    def __init__(self) -> None:
+        self.on = False
+        self.on_write: Callable[[Tensor], None] | None = None
+
+    @contextmanager
+    def set(self, **values: Any) -> Iterator[None]:
+        """``on`` or ``on_write`` for a while."""
+        before = {name: getattr(self, name) for name in values}
+        vars(self).update(values)
+        try:
+            yield
+        finally:
+            vars(self).update(before)
+
+
+class _FunctionGuard(TorchFunctionMode):
+    """What Python calls torch by."""
+
+    def __init__(self, guard: Guard) -> None:
+        super().__init__()
+        self.guard = guard
+
+    def __torch_function__(self, func: Callable[..., Any], types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        kwargs = kwargs or {}
+        if self.guard.on and (found := _breach_of_call(func, args, kwargs)):
+            raise NotRecordable(found)
+        return func(*args, **kwargs)
+
+
+class _DispatchGuard(TorchDispatchMode):
+    """What torch itself runs, however it was called."""
+
+    def __init__(self, guard: Guard) -> None:
+        super().__init__()
+        self.guard = guard
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        kwargs = kwargs or {}
+        if self.guard.on and (found := _breach_of_kernel(func, args)):
+            raise NotRecordable(found)
+        if self.guard.on and self.guard.on_write:
+            for i, argument in enumerate(func._schema.arguments):
+                if argument.alias_info is not None and argument.alias_info.is_write:
+                    written = args[i] if i < len(args) else kwargs.get(argument.name)
+                    for tensor in written if isinstance(written, list | tuple) else [written]:
+                        if isinstance(tensor, Tensor):
+                            self.guard.on_write(tensor)
+        return func(*args, **kwargs)
+
+
+def _breach_of_call(func: Callable[..., Any], args: tuple, kwargs: dict[str, Any]) -> str:
+    """What is wrong with a call, and what to write instead; "" if nothing is."""
+    name = getattr(func, "__name__", "")
+    call = f"{name.strip('_')}()"
+    if name in ("__getitem__", "__setitem__") and any(map(_is_scalar_index, args[1] if isinstance(args[1], tuple) else args[1:2])):
+        return "a tensor without dimensions as an index is read to the host; write x.index_select(dim, index.view(1)), or use a Python int"
+    if name in _CONDITIONS:
+        return "a tensor as a condition (if, and, not, in) is read to the host; write torch.where(condition, a, b)"
+    if name in _PRINTS:
+        return "a tensor as text is read to the host; print it between steps"
+    if name in _HOST_READS:
+        return f"{call} reads a tensor to the host; keep it a tensor and compute with that"
+    if name in _HOST_WRITES:
+        return f"{call} copies data from the host; make the tensor once, in __init__"
+    if name in _MOVES or (name == "to" and _moves(args[1:], kwargs)):
+        return f"{call} copies between host and device; make the tensor on self.device, in __init__"
+    tensors = any(isinstance(arg, Tensor) for arg in args)  # normal(mean, std) takes its device from them
+    if name in _FACTORIES and func is getattr(torch, name) and not tensors and not {"device", "out"} & kwargs.keys():
+        return f"{call} without a device makes a tensor on the host; add device=self.device"
+    return ""
+
+
+def _breach_of_kernel(func: Any, args: tuple) -> str:
+    """What is wrong with a kernel, and what to write instead; "" if nothing is."""
+    name, overload = func.overloadpacket.__name__, func._overloadname
+    if name in _READING:
+        return f"{name.strip('_')} reads a tensor to the host; keep it a tensor and compute with that"
+    # a number assigned through an index is lifted too, without a copy: it has no dimension
+    if name == "lift_fresh" and args[0].dim() > 0:
+        return "a list or an array, as data or as an index, copies from the host; make it a tensor once, in __init__"
+    if name in _DATA_SHAPED or (name, overload) == ("repeat_interleave", "Tensor"):
+        return f"{name.strip('_')} has a shape that depends on data; keep every row, and write torch.where(mask, a, b)"
+    if name == "normal" and overload in ("Tensor_Tensor", "float_Tensor"):
+        return "normal reads the sign of a tensor of deviations to the host; write mean + std * torch.randn_like(std)"
+    if name in _INDEXED and any(index is not None and index.dtype in (torch.bool, torch.uint8) for index in args[1]):
+        return "a mask as an index has a shape that depends on data; write torch.where(mask, a, b), or assign(x, mask, value)"
+    return ""
+
+
+def _is_scalar_index(index: object) -> bool:
+    return isinstance(index, Tensor) and index.dim() == 0 and not index.is_floating_point() and index.dtype not in (torch.bool, torch.uint8)
+
+
+def _moves(args: tuple, kwargs: dict[str, Any]) -> bool:
+    """Whether arguments of ``Tensor.to`` name a device, not only a dtype; another tensor names its device."""
+    return any(isinstance(value, str | int | torch.device | Tensor) and not isinstance(value, bool) for value in [*args, *kwargs.values()])
+
+
+@contextmanager
+def recordable(guard: Guard | None = None) -> Iterator[None]:
+    """Inside, calls that a CUDA graph cannot record raise NotRecordable; what only a CPU asks is not asked."""
+    guard = guard or Guard()
+    asks = [module for module in list(sys.modules.values()) if getattr(module, "maybe_any", None) is math.maybe_any]
+    original = math.maybe_any
+    try:
+        for module in asks:
+            vars(module)["maybe_any"] = lambda mask: True
+        with guard.set(on=True), _FunctionGuard(guard), _DispatchGuard(guard):
+            yield
+    finally:
+        for module in asks:
+            vars(module)["maybe_any"] = original
