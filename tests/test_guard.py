@@ -13,6 +13,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from legged_mw import ROOT
 from legged_mw.envs.guard import check_recordable
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.config import ConfigError
@@ -338,7 +339,10 @@ def test_what_can_be_recorded_passes(tmp_path: Path, body: str, line: str) -> No
     check_recordable(_task(tmp_path, body, line)[0])
 
 
-@pytest.mark.parametrize("name", [*task_names(), "examples/go1_legged_gym.py"])
+EXAMPLES = [str(path) for path in sorted(ROOT.glob("examples/*.py")) if "TASK = " in path.read_text()]
+
+
+@pytest.mark.parametrize("name", [*task_names(), *EXAMPLES])
 def test_own_tasks_pass_and_nothing_is_changed(name: str) -> None:
     task = load_task(name)
     before, threads = task.to_dict(), torch.get_num_threads()
