@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.eval.rules import GRAVITY, KICK_DIRECTIONS, SLOW
+from legged_mw.eval.rules import GRAVITY, PUSH_DIRECTIONS, SLOW
 
 if TYPE_CHECKING:
     from legged_mw.eval.rollout import Record
@@ -31,7 +31,7 @@ Array = NDArray[Any]
 
 def tracking_errors(record: Record, settled: int, rows: int) -> list[list[list[float | None]]]:
     """Mean absolute error of vx, vy, yaw rate over a grid of worlds: 3 x rows x columns."""
-    error = np.abs(record.signals["velocity"][settled:] - record.commands[settled:]).mean(axis=0, dtype=float)  # (N, 3)
+    error = np.abs(record.signals["velocity"][settled:] - record.commands[settled:, :, :3]).mean(axis=0, dtype=float)  # (N, 3)
     error[np.isfinite(record.fell_at)] = np.nan
     return [plain(error[:, k].reshape(rows, -1)) for k in range(3)]
 
@@ -73,7 +73,7 @@ def _first_crossing(time: Array, values: Array, level: float) -> float | None:
 
 
 def responses(record: Record, axis: int, begin: int) -> dict[str, Any]:
-    """Worlds that are told the same from step ``begin`` on: command, and mean, lowest and highest of one axis at each time.
+    """Worlds that get the same command from step ``begin`` on: command, and mean, lowest and highest of one axis at each time.
 
     A world that falls is left out.
     """
@@ -124,8 +124,8 @@ def stride_frequency(contact: Array, dt: float) -> float:
     return float(np.mean(rates)) if rates else 0.0
 
 
-def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], shown: float) -> list[dict[str, Any]]:
-    """Of each command's world: duty factor, stride frequency, and which foot is down in the last ``shown`` seconds (F, T)."""
+def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], seconds: float) -> list[dict[str, Any]]:
+    """Of each command's world: duty factor, stride frequency, and which foot is down in the last ``seconds`` (F, T)."""
     found = []
     for world, command in enumerate(commands):
         contact = record.signals["contact"][settled:, world]
@@ -135,7 +135,7 @@ def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], sho
                 "command": list(command),
                 "duty_factor": None if fell else duty_factor(contact),
                 "stride_frequency": None if fell else stride_frequency(contact, record.dt),
-                "contact": None if fell else contact[-round(shown / record.dt) :].T.astype(int).tolist(),
+                "contact": None if fell else contact[-round(seconds / record.dt) :].T.astype(int).tolist(),
             }
         )
     return found
@@ -174,12 +174,12 @@ def joints(record: Record, settled: int, limits: dict[str, tuple[Array, Array]])
     return found
 
 
-# ---- kicks, energy, reward
+# ---- pushes, energy, reward
 
 
-def survival(fell_at: Array, until: int, speeds: Sequence[float]) -> list[list[bool]]:
+def survival(fell_at: Array, until: int) -> list[list[bool]]:
     """Not fallen up to step ``until``: speeds x directions."""
-    return (fell_at > until).reshape(len(speeds), KICK_DIRECTIONS).tolist()
+    return (fell_at > until).reshape(-1, PUSH_DIRECTIONS).tolist()
 
 
 def transport(record: Record, settled: int) -> dict[str, list[float | None]]:

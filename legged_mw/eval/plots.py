@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from legged_mw.eval.rules import ERROR_MARKS, PEER
+from legged_mw.eval.rules import AXES, ExamRules
 
 Figures = dict[str, Any]
 Columns = list[tuple[str, Figures]]  # (name, figures) of one policy or two
@@ -40,8 +40,7 @@ STYLE: dict[Any, Any] = {
     **{"lines.linewidth": 1.4, "figure.facecolor": "none", "axes.facecolor": "none", "savefig.facecolor": "none"},
 }
 HEAT = "viridis"  # perceptually uniform
-MEASURES = (("vx", "m/s"), ("vy", "m/s"), ("yaw rate", "rad/s"))
-GAITS = ((0.5, 0.0, 0.0), (1.0, 0.0, 0.0), (1.5, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.8, 0.0), (0.0, 0.0, 1.2))  # that are drawn
+GAITS = (1, 2, 3, 5, 7, 11)  # of the 22 commands, that are drawn: ahead, at three speeds; back; left; turning left
 
 
 class Panel(NamedTuple):
@@ -62,26 +61,25 @@ class Section(NamedTuple):
     across: int = 3  # panels side by side
 
 
-def sections(columns: Columns) -> list[Section]:
-    """All that is drawn of one policy or two."""
-    kicks = [Panel(partial(_kick_curve, columns), height=2.9)]
+def sections(columns: Columns, rules: ExamRules) -> list[Section]:
+    """All that is drawn of one policy or two, with the marks and the peer of the first one's rules."""
+    pushes = [Panel(partial(_push_curve, columns, rules), height=2.9)]
     for which in ("walking", "standing"):
         for i, (name, figures) in enumerate(columns):
             title = f"{which}{_of(name, columns)}"
-            kicks.append(Panel(partial(_kick_wheel, figures["kicks"], which, PAIR[i], title), height=2.9, polar=True))
-    chosen = [i for i, row in enumerate(columns[0][1]["gait"]) if tuple(row["command"]) in GAITS]
+            pushes.append(Panel(partial(_push_wheel, figures["pushes"], which, PAIR[i], title), height=2.9, polar=True))
     responses = [Panel(partial(_response, columns, i)) for i in range(3)]
-    strides = [Panel(partial(_gait, columns, i), height=1.75 + 0.25 * len(columns)) for i in chosen]
-    energy = [Panel(partial(_against_speed, columns, "power")), Panel(partial(_against_speed, columns, "cost_of_transport"))]
+    strides = [Panel(partial(_gait, columns, i), height=1.75 + 0.25 * len(columns)) for i in GAITS]
+    energy = [Panel(partial(_against_speed, columns, rules, key)) for key in ("power", "cost_of_transport")]
     terms = len(columns[0][1]["reward"])
     rough = _crossing_maps(columns)
     return [
         *([Section("crossing", "Rough ground", rough, across=len(rough))] if rough else []),
-        Section("tracking", "Following the command", _heat_maps(columns)),
+        Section("tracking", "Following the command", _heat_maps(columns, rules.most)),
         Section("steps", "Steps of the command", responses),
         Section("gait", "Gait", strides),
         Section("joints", "Joints against their limits", _joint_panels(columns)),
-        Section("kicks", "Kicks", kicks),
+        Section("pushes", "Pushes", pushes),
         Section("energy", "Energy", energy, across=2),
         Section("reward", "Reward", [Panel(partial(_reward, columns), width=7.2, height=0.9 + 0.21 * terms)], across=1),
     ]
@@ -186,19 +184,19 @@ def _percent(share: float) -> str:
 # ---- following the command
 
 
-def _heat_maps(columns: Columns) -> list[Panel]:
+def _heat_maps(columns: Columns, marks: Sequence[float]) -> list[Panel]:
     """Three errors over two grids, each error on one scale: up to its largest value, but at most three times the exam's mark."""
     panels = []
     for grid, across in (("vx_yaw", "yaw"), ("vx_vy", "vy")):
         for name, figures in columns:
-            for k, mark in enumerate(ERROR_MARKS):
+            for k, mark in enumerate(marks):
                 every = np.concatenate([_array(f["tracking"][g][k]).ravel() for _, f in columns for g in ("vx_yaw", "vx_vy")])
                 top = max(1.25 * mark, min(3 * mark, float(np.nanmax(every)) if np.isfinite(every).any() else mark))
-                panels.append(Panel(partial(_heat, figures["tracking"], grid, across, k, top, _of(name, columns)), height=2.45))
+                panels.append(Panel(partial(_heat, figures["tracking"], grid, across, k, mark, top, _of(name, columns)), height=2.45))
     return panels
 
 
-def _heat(tracking: Figures, grid: str, down: str, k: int, top: float, suffix: str, ax: Axes) -> None:
+def _heat(tracking: Figures, grid: str, down: str, k: int, mark: float, top: float, suffix: str, ax: Axes) -> None:
     x, y, values = _array(tracking["axes"]["vx"]), _array(tracking["axes"][down]), _array(tracking[grid][k])
     scale = Normalize(0.0, top)
     ax.pcolormesh(_edges(x), _edges(y), values, cmap=HEAT, norm=scale, edgecolors=PAPER, linewidth=0.8)
@@ -209,17 +207,17 @@ def _heat(tracking: Figures, grid: str, down: str, k: int, top: float, suffix: s
     for axis, centres in ((ax.xaxis, x), (ax.yaxis, y)):
         ticks = centres[:: max(1, len(centres) // 4)]
         axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
-    name, unit = MEASURES[k]
+    name, unit = AXES[k]
     ax.set_title(f"error of {name} [{unit}]{suffix}")
     ax.set_xlabel("commanded vx [m/s]", labelpad=2)
     ax.set_ylabel("yaw rate [rad/s]" if down == "yaw" else "vy [m/s]", labelpad=2)
     beyond = bool((values > top).any())
-    levels, ticks = np.linspace(0.0, top, 33), [0.0, ERROR_MARKS[k], *([top] if top > 1.4 * ERROR_MARKS[k] else [])]
+    levels, ticks = np.linspace(0.0, top, 33), [0.0, mark, *([top] if top > 1.4 * mark else [])]
     marks = {"aspect": 18, "pad": 0.03, "extend": "max" if beyond else "neither", "boundaries": levels, "ticks": ticks, "format": "%.2f"}
     bar = ax.figure.colorbar(ScalarMappable(scale, HEAT), ax=ax, **marks)
     bar.solids.set_edgecolor("face")  # type: ignore[union-attr]
     bar.outline.set_visible(False)  # type: ignore[operator]
-    bar.ax.axhline(ERROR_MARKS[k], color=PAPER, linewidth=1.2)
+    bar.ax.axhline(mark, color=PAPER, linewidth=1.2)
     bar.ax.grid(False)
 
 
@@ -230,7 +228,7 @@ def _edges(centres: np.ndarray) -> np.ndarray:
 
 
 def _response(columns: Columns, k: int, ax: Axes) -> None:
-    name, unit = MEASURES[k]
+    name, unit = AXES[k]
     for i, (label, figures) in enumerate(columns):
         step = figures["steps"][("vx", "vy", "yaw")[k]]
         time, low, high = (_array(step[key]) for key in ("time", "low", "high"))
@@ -259,9 +257,8 @@ def _gait(columns: Columns, world: int, ax: Axes) -> None:
         for foot, down in enumerate(row["contact"]):
             bars = [(start * figures["dt"], length * figures["dt"]) for start, length in _runs(down)]
             ax.broken_barh(bars, (foot - 0.31 + i * height, height * 0.94), facecolors=PAIR[i], linewidth=0)
-    vx, vy, yaw = columns[0][1]["gait"][world]["command"]
-    told = [f"{name} {value:g} {unit}" for (name, unit), value in zip(MEASURES, (vx, vy, yaw), strict=True) if value]
-    ax.set_title(f"{', '.join(told) or 'stand'}")
+    command = columns[0][1]["gait"][world]["command"]
+    ax.set_title(", ".join(f"{name} {value:g} {unit}" for (name, unit), value in zip(AXES, command, strict=True) if value) or "stand")
     rows = [figures["gait"][world] for _, figures in columns]
     rates = " / ".join("fell" if row["contact"] is None else f"{row['stride_frequency']:.1f}" for row in rows)
     duties = " / ".join("-" if row["contact"] is None else f"{np.mean(row['duty_factor']):.2f}" for row in rows)
@@ -315,15 +312,17 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
     ax.margins(x=0.04)
 
 
-# ---- kicks
+# ---- pushes
 
 
-def _kick_curve(columns: Columns, ax: Axes) -> None:
-    speeds = columns[0][1]["kicks"]["speeds"]
-    ax.plot(speeds, list(PEER["kicks"].values()), color=GREEN, marker="D", markersize=3.2, linewidth=1.0, label="peer, walking")
+def _push_curve(columns: Columns, rules: ExamRules, ax: Axes) -> None:
+    speeds = rules.push_speeds
+    if rules.peer:
+        shares = list(rules.peer.figures["pushes"].values())
+        ax.plot(speeds, shares, color=GREEN, marker="D", markersize=3.2, linewidth=1.0, label="peer, walking")
     for i, (name, figures) in enumerate(columns):
         for which, line in (("walking", "-"), ("standing", (0, (2, 1.5)))):
-            share = np.mean(figures["kicks"][which], axis=1)
+            share = np.mean(figures["pushes"][which], axis=1)
             label = f"{which}{_of(name, columns)}"
             ax.plot(speeds, share, color=PAIR[i], linestyle=line, marker="o", markersize=3.2, label=label)
     ax.set_title("share of 16 directions survived")
@@ -332,9 +331,9 @@ def _kick_curve(columns: Columns, ax: Axes) -> None:
     ax.legend(loc="best", handlelength=2.2)
 
 
-def _kick_wheel(kicks: Figures, which: str, colour: str, title: str, ax: Any) -> None:
-    """A tile a kick: ring by strength, sector by direction as the robot sees it; full where it was survived."""
-    survived = np.array(kicks[which])
+def _push_wheel(pushes: Figures, which: str, colour: str, title: str, ax: Any) -> None:
+    """A tile a push: ring by strength, sector by direction as the robot sees it; full where it was survived."""
+    survived = np.array(pushes[which])
     width = 2 * math.pi / survived.shape[1]
     rings, sectors = np.indices(survived.shape).reshape(2, -1)
     ax.bar(sectors * width, 0.9, width * 0.95, rings + 1, color=np.where(survived, colour, FAINT).ravel(), linewidth=0)
@@ -350,11 +349,11 @@ def _kick_wheel(kicks: Figures, which: str, colour: str, title: str, ax: Any) ->
 # ---- energy, reward
 
 
-def _against_speed(columns: Columns, key: str, ax: Axes) -> None:
+def _against_speed(columns: Columns, rules: ExamRules, key: str, ax: Axes) -> None:
     for i, (name, figures) in enumerate(columns):
         ax.plot(figures["transport"]["vx"], _array(figures["transport"][key]), color=PAIR[i], marker="o", markersize=3.2, label=name)
-    if key == "cost_of_transport":
-        ax.plot([1.0], [PEER["cost_of_transport"]], color=GREEN, marker="D", markersize=4.5, linestyle="none", label="peer")
+    if key == "cost_of_transport" and rules.peer:
+        ax.plot([rules.transport_vx], [rules.peer.figures[key]], color=GREEN, marker="D", markersize=4.5, linestyle="none", label="peer")
     ax.set_title("mean power [W]" if key == "power" else "cost of transport [-]")
     ax.set_xlabel("commanded vx [m/s]", labelpad=2)
     ax.set_ylim(0.0, None)

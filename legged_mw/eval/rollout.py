@@ -1,7 +1,7 @@
 """Drives the environment through cases and records what it sees; what the cases are and what is made of a record is not here.
 
-One case a world: what it is told, when, and how it is kicked. All cases run side by side, once. Exam, report and the exam
-during training differ in their cases and signals only.
+One case a world: its commands, and when it is pushed. All cases run side by side, once. Exam, report and the exam during
+training differ in their cases and signals only.
 """
 
 from __future__ import annotations
@@ -18,12 +18,11 @@ from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
 
-Command = tuple[float, float, float]  # vx, vy [m/s], yaw rate [rad/s], body frame
 Policy = Callable[[TensorDict], Tensor]
 Signal = Callable[[LeggedRobot], Tensor]  # a value a world, (N, ...)
 
 
-class Kick(NamedTuple):
+class Push(NamedTuple):
     """The base's horizontal velocity jumps, after that step's action is computed and before its physics."""
 
     step: int  # [control steps]
@@ -32,15 +31,15 @@ class Kick(NamedTuple):
 
 
 class Case(NamedTuple):
-    """What one world is told, and how it is pushed."""
+    """What one world is asked to do, and how it is pushed."""
 
-    commands: tuple[tuple[int, Command], ...]  # from that control step on; the first from step 0
-    kick: Kick | None = None
+    commands: tuple[tuple[int, tuple[float, ...]], ...]  # from that control step on: the first commands of the table; others keep
+    push: Push | None = None  # their default
 
 
-def holding(command: Command, kick: Kick | None = None) -> Case:
+def holding(command: tuple[float, ...], push: Push | None = None) -> Case:
     """One command throughout."""
-    return Case(((0, command),), kick)
+    return Case(((0, command),), push)
 
 
 class Record(NamedTuple):
@@ -48,7 +47,7 @@ class Record(NamedTuple):
 
     dt: float  # [s] a control step
     mass: float  # [kg]
-    commands: NDArray[Any]  # (T, N, 3), what each world was told [m/s, m/s, rad/s]
+    commands: NDArray[Any]  # (T, N, C), what each world was asked for
     fell_at: NDArray[Any]  # (N,) control step of the first fall, or inf; from there on the world is another episode
     last_position: NDArray[Any]  # (N, 2) of the base after the last step [m]
     signals: dict[str, NDArray[Any]]  # name -> (T, N, ...)
@@ -70,9 +69,9 @@ def roll_out(
     if len(cases) != env.num_envs:
         raise ValueError(f"{len(cases)} cases need as many worlds; this environment has {env.num_envs}")
     env.reset()
-    told, kicks = _commands_by_step(cases, env.device), _kicks_by_step(cases, env.device)
-    worlds, commands = told.pop(0)
-    env.commands[worlds] = commands
+    commands, pushes = _timeline(cases, steps, default_commands(env)), _pushes_by_step(cases, env.device)
+    asked = torch.tensor(commands, dtype=torch.float, device=env.device)
+    _command(env, asked[0])
     env.compute_observations()
     obs = env.get_observations()
     fell_at = torch.full((env.num_envs,), math.inf, device=env.device)
@@ -84,22 +83,39 @@ def roll_out(
                 kept[name] = torch.empty(steps, *value.shape, dtype=value.dtype, device=value.device)
             kept[name][step] = value
         actions = _act(policy, obs, alone)
-        if step in kicks:
-            worlds, jumps = kicks[step]
-            env.sim.qvel[worlds, :2] += jumps
-        if step + 1 in told:  # this step's end observes it; to observe anew would be a step of time for what is delayed
-            worlds, commands = told[step + 1]
-            env.commands[worlds] = commands
+        if step in pushes:
+            worlds, jumps = pushes[step]
+            root_lin_vel(env)[worlds, :2] += jumps
+        if step + 1 < steps:  # the observation at the end of this step shows the next command: a second one would be a step of delay
+            _command(env, asked[step + 1])
         obs, _, dones, _ = env.step(actions)
         fell_at = torch.where(dones & (fell_at == math.inf), torch.full_like(fell_at, step), fell_at)
     return Record(
         dt=env.dt,
         mass=env.total_mass,
-        commands=_timeline(cases, steps),
+        commands=commands,
         fell_at=fell_at.cpu().numpy(),
-        last_position=env.sim.qpos[:, :2].cpu().numpy().copy(),
+        last_position=root_pos(env)[:, :2].cpu().numpy().copy(),
         signals={name: values.cpu().numpy() for name, values in kept.items()},
     )
+
+
+def root_pos(env: LeggedRobot) -> Tensor:
+    return env.sim.qpos[:, :3]
+
+
+def root_lin_vel(env: LeggedRobot) -> Tensor:
+    return env.sim.qvel[:, :3]
+
+
+def default_commands(env: LeggedRobot) -> list[float]:
+    """(C,) in the order of the task's table; empty for a task without commands."""
+    return [command.default for command in getattr(env, "command_table", ())] or [0.0] * 3
+
+
+def _command(env: LeggedRobot, values: Tensor) -> None:
+    if values.shape[1]:  # a task without commands has no buffer for them
+        env.commands.copy_(values)
 
 
 def _act(policy: Policy, obs: TensorDict, alone: int | None) -> Tensor:
@@ -109,36 +125,24 @@ def _act(policy: Policy, obs: TensorDict, alone: int | None) -> Tensor:
         return torch.cat([policy(obs[:alone]), policy(obs[alone:])])
 
 
-def _timeline(cases: Sequence[Case], steps: int) -> NDArray[Any]:
-    """What each world is told at each step, (T, N, 3)."""
-    timeline = np.zeros((steps, len(cases), 3))
+def _timeline(cases: Sequence[Case], steps: int, default: Sequence[float]) -> NDArray[Any]:
+    """What each world is asked for at each step, (T, N, C)."""
+    timeline = np.tile(np.array(default, dtype=float), (steps, len(cases), 1))
     for world, case in enumerate(cases):
         for step, command in case.commands:
-            timeline[step:, world] = command
+            timeline[step:, world, : len(command)] = command
     return timeline
 
 
-def _commands_by_step(cases: Sequence[Case], device: str) -> dict[int, tuple[Tensor, Tensor]]:
-    """Step -> worlds (M,) and their new commands (M, 3)."""
-    changes: dict[int, list[tuple[int, Command]]] = {}
-    for world, case in enumerate(cases):
-        for step, command in case.commands:
-            changes.setdefault(step, []).append((world, command))
-    return {
-        step: (torch.tensor([w for w, _ in rows], device=device), torch.tensor([c for _, c in rows], dtype=torch.float, device=device))
-        for step, rows in changes.items()
-    }
-
-
-def _kicks_by_step(cases: Sequence[Case], device: str) -> dict[int, tuple[Tensor, Tensor]]:
+def _pushes_by_step(cases: Sequence[Case], device: str) -> dict[int, tuple[Tensor, Tensor]]:
     """Step -> worlds (M,) and the jumps of their horizontal velocity (M, 2) [m/s, world]."""
-    kicks: dict[int, list[tuple[int, Kick]]] = {}
+    by_step: dict[int, list[tuple[int, Push]]] = {}
     for world, case in enumerate(cases):
-        if case.kick:
-            kicks.setdefault(case.kick.step, []).append((world, case.kick))
-    by_step = {}
-    for step, rows in kicks.items():
-        speed = torch.tensor([[kick.speed] for _, kick in rows], device=device)
-        jumps = speed * torch.tensor([[math.cos(kick.angle), math.sin(kick.angle)] for _, kick in rows], device=device)
-        by_step[step] = torch.tensor([world for world, _ in rows], device=device), jumps
-    return by_step
+        if case.push:
+            by_step.setdefault(case.push.step, []).append((world, case.push))
+    found = {}
+    for step, rows in by_step.items():
+        speed = torch.tensor([[push.speed] for _, push in rows], device=device)
+        jumps = speed * torch.tensor([[math.cos(push.angle), math.sin(push.angle)] for _, push in rows], device=device)
+        found[step] = torch.tensor([world for world, _ in rows], device=device), jumps
+    return found

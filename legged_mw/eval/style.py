@@ -10,7 +10,7 @@ CSS = """
 body{margin:0;background:var(--paper);color:var(--ink);font:16px/1.55 var(--font);-webkit-text-size-adjust:100%}
 main{max-width:1120px;margin:0 auto;padding:56px 28px 72px}
 header{margin-bottom:56px}
-.kicker{margin:0;color:var(--muted);font-size:13px;letter-spacing:.09em;text-transform:uppercase}
+.above{margin:0;color:var(--muted);font-size:13px;letter-spacing:.09em;text-transform:uppercase}
 h1{margin:2px 0 14px;font-size:38px;line-height:1.15;font-weight:650;letter-spacing:-.02em}
 h2{margin:0 0 6px;font-size:22px;font-weight:620;letter-spacing:-.01em}
 section{margin:0 0 60px}
