@@ -51,10 +51,8 @@ class Go1FlatCfg(LeggedRobotCfg):
         push_speeds = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]  # [m/s]
         push_vx = 0.8  # [m/s]
         transport_vx = 1.0  # [m/s]
+        marks = [0.06, 0.06, 0.12]  # [m/s, m/s, rad/s]
         peer = "playground_go1"
-
-        class marks(LeggedRobotCfg.exam.marks):
-            most = [0.06, 0.06, 0.12]  # [m/s, m/s, rad/s]
 
 
 class Go1FlatCfgPPO(LeggedRobotCfgPPO):

@@ -35,12 +35,14 @@ def run_exam(folder: Path, exam: ExamRules | None = None, threads: int = 0) -> d
         stage.step(wanted)
         fell_at[stage.fell() & np.isinf(fell_at)] = step
     signals = {name: np.stack(values) for name, values in sampled.items()}
-    return exam.grade(**signals, last_position=stage.qpos()[:, :2], fell_at=fell_at, mass=stage.contract.mass, dt=stage.dt)
+    return exam.grade(signals, last_position=stage.qpos()[:, :2], fell_at=fell_at, mass=stage.contract.mass, dt=stage.dt)
 
 
 def contract_rules(contract: Contract) -> ExamRules:
-    """The rules for the policy of ``contract``: its trained ranges, and defaults for what it does not say."""
-    return ExamRules.from_mapping({}, dict(zip(VELOCITY, contract.command_ranges.T.tolist(), strict=True)))
+    """The rules for the policy of ``contract``: its own, else those that follow from the trained ranges."""
+    return ExamRules.from_mapping(
+        getattr(contract, "exam", None) or {}, dict(zip(VELOCITY, contract.command_ranges.T.tolist(), strict=True))
+    )
 
 
 def _push(stage: DeployStage, exam: ExamRules, step: int) -> None:

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exam
-from legged_mw.eval.rollout import Policy, default_commands
+from legged_mw.eval.rollout import Policy
 from legged_mw.sim.terrain import KINDS, MEASURES, measure
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask
@@ -73,7 +73,7 @@ def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
 
 def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor]:
     """Which worlds came ``edge`` [m] away from the middle along x or y, and which fell before that, each (N,)."""
-    command = torch.tensor([SPEED, 0.0, 0.0, *default_commands(env)[3:]], device=env.device)
+    command = torch.tensor([SPEED, 0.0, 0.0, *(further.default for further in env.command_table[3:])], device=env.device)
     crossed, fell, over = (torch.zeros(env.num_envs, dtype=torch.bool, device=env.device) for _ in range(3))
     env.commands.copy_(command)
     env.compute_observations()

@@ -12,14 +12,14 @@ from typing import Any
 import torch
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval.rollout import Case, Policy, Push, Record, Signal, holding, roll_out, root_pos
+from legged_mw.eval.rollout import Case, Policy, Push, Record, Signal, holding, roll_out
 from legged_mw.eval.rules import PUSH_AT, PUSH_DIRECTIONS, SECONDS, ExamRules, Velocity
 from legged_mw.utils.task import LoadedTask
 
 OVERRIDES: dict[str, Any] = {
     "env.episode_length_s": 1000.0,  # no time outs
     "noise.level": 0.0,
-    "perturbation.enable": False,
+    "perturbation.kick": False,
     "perturbation.push": False,
     "domain_rand.enable": False,
     "terrain.mesh_type": "plane",
@@ -37,7 +37,7 @@ SETS = {*OVERRIDES, "env.num_envs"} - {"domain_rand.enable"}  # what the exam de
 
 SIGNALS: dict[str, Signal] = {
     "velocity": lambda env: torch.cat([env.base_lin_vel[:, :2], env.base_ang_vel[:, 2:]], dim=1),  # at the IMU, body frame
-    "position": lambda env: root_pos(env)[:, :2],  # [m, world]
+    "position": lambda env: env.root_pos[:, :2],  # [m, world]
     "power": lambda env: (env.torques * env.dof_vel).abs().sum(dim=1),  # [W]
     "joint_speed": lambda env: env.dof_vel.abs().mean(dim=1),  # [rad/s]
 }
@@ -70,5 +70,4 @@ def run_exam(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
 
 def grade(rules: ExamRules, record: Record) -> dict[str, Any]:
     """What ``rules`` makes of a record whose worlds are the exam's."""
-    sampled = {name: record.signals[name] for name in SIGNALS}
-    return rules.grade(**sampled, last_position=record.last_position, fell_at=record.fell_at, mass=record.mass, dt=record.dt)
+    return rules.grade(record.signals, last_position=record.last_position, fell_at=record.fell_at, mass=record.mass, dt=record.dt)

@@ -34,7 +34,7 @@ EXAMS = {
 
 def find_exam(task: LoadedTask) -> Exam | None:
     """The exam that grades ``task``; None if it names none. Raises ConfigError for a kind that does not exist."""
-    kind = getattr(task, "exam", getattr(task.env_class, "exam", "walking"))
+    kind = getattr(task, "exam", task.env_class.exam)
     if kind and kind not in EXAMS:
         raise ConfigError(f"{task.path}: {unknown('exam', kind, EXAMS, 'legged_mw/eval/exams.py')}")
     return EXAMS[kind] if kind else None

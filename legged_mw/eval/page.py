@@ -46,7 +46,7 @@ def html(task: str, rules: ExamRules, columns: Sequence[Column], drawn: Sequence
     """The whole page; ``rules`` are those of the first column."""
     words = {"speeds": " to ".join(f"{end(rules.push_speeds):g}" for end in (min, max)), "vx": rules.push_vx}
     chapters = [_chapter(section, panels, TEXTS[section.name].format(**words), _extra(section.name, columns)) for section, panels in drawn]
-    peer = f" The peer is {rules.peer.about}." if rules.peer else ""
+    peer = f" The peer is {rules.peer_policy.about}." if rules.peer_policy else ""
     note = EXAM_NOTE.format(pushes=len(rules.push_speeds) * PUSH_DIRECTIONS, peer=peer)
     figures = [rules.figures(column.exam) for column in columns]
     return f"""<!doctype html>
@@ -54,7 +54,7 @@ def html(task: str, rules: ExamRules, columns: Sequence[Column], drawn: Sequence
 <meta name="color-scheme" content="light dark"><title>{escape(task)}: walking exam</title><style>{CSS}</style></head>
 <body><main>
 <header><p class="above">Walking exam</p><h1>{escape(task)}</h1>{_names(columns)}{_cards(figures[0])}</header>
-<section><h2>Exam</h2><p class="lead">{note}</p>{_exam_table(columns, figures, bool(rules.peer))}</section>
+<section><h2>Exam</h2><p class="lead">{note}</p>{_exam_table(columns, figures, bool(rules.peer_policy))}</section>
 {"".join(chapters)}
 <footer>{_about(columns)}</footer>
 </main></body></html>

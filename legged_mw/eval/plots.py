@@ -75,7 +75,7 @@ def sections(columns: Columns, rules: ExamRules) -> list[Section]:
     rough = _crossing_maps(columns)
     return [
         *([Section("crossing", "Rough ground", rough, across=len(rough))] if rough else []),
-        Section("tracking", "Following the command", _heat_maps(columns, rules.most)),
+        Section("tracking", "Following the command", _heat_maps(columns, rules.marks)),
         Section("steps", "Steps of the command", responses),
         Section("gait", "Gait", strides),
         Section("joints", "Joints against their limits", _joint_panels(columns)),
@@ -317,8 +317,8 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
 
 def _push_curve(columns: Columns, rules: ExamRules, ax: Axes) -> None:
     speeds = rules.push_speeds
-    if rules.peer:
-        shares = list(rules.peer.figures["pushes"].values())
+    if rules.peer_policy:
+        shares = list(rules.peer_policy.figures["pushes"].values())
         ax.plot(speeds, shares, color=GREEN, marker="D", markersize=3.2, linewidth=1.0, label="peer, walking")
     for i, (name, figures) in enumerate(columns):
         for which, line in (("walking", "-"), ("standing", (0, (2, 1.5)))):
@@ -352,8 +352,10 @@ def _push_wheel(pushes: Figures, which: str, colour: str, title: str, ax: Any) -
 def _against_speed(columns: Columns, rules: ExamRules, key: str, ax: Axes) -> None:
     for i, (name, figures) in enumerate(columns):
         ax.plot(figures["transport"]["vx"], _array(figures["transport"][key]), color=PAIR[i], marker="o", markersize=3.2, label=name)
-    if key == "cost_of_transport" and rules.peer:
-        ax.plot([rules.transport_vx], [rules.peer.figures[key]], color=GREEN, marker="D", markersize=4.5, linestyle="none", label="peer")
+    if key == "cost_of_transport" and rules.peer_policy:
+        ax.plot(
+            [rules.transport_vx], [rules.peer_policy.figures[key]], color=GREEN, marker="D", markersize=4.5, linestyle="none", label="peer"
+        )
     ax.set_title("mean power [W]" if key == "power" else "cost of transport [-]")
     ax.set_xlabel("commanded vx [m/s]", labelpad=2)
     ax.set_ylim(0.0, None)

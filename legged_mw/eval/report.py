@@ -73,7 +73,7 @@ def gather(env: LeggedRobot, asked: rules.ExamRules, plan: Plan, record: Record)
     ahead = parts["vx_vy"].part(slice(straight, straight + len(axes["vx"])))
     return {
         "joint_names": list(env.robot.joint_names),
-        "foot_names": list(env.cfg.asset.foot_names),
+        "foot_names": list(env.foot_names),
         "dt": env.dt,
         "tracking": {
             "axes": axes,
@@ -114,7 +114,9 @@ def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[t
     folder.mkdir(parents=True, exist_ok=True)
     asked = rules.ExamRules.from_mapping(columns[0].exam["rules"])
     content = {"task": task, "columns": [column._asdict() for column in columns]}
-    _write_text(folder / "report.json", json.dumps(content | ({"peer": asked.peer.figures} if asked.peer else {}), indent=1) + "\n")
+    _write_text(
+        folder / "report.json", json.dumps(content | ({"peer": asked.peer_policy.figures} if asked.peer_policy else {}), indent=1) + "\n"
+    )
     sections = plots.sections([(column.name, column.figures) for column in columns if column.figures], asked)
     for section in sections:
         plots.write_png(section, folder / f"{section.name}.png")

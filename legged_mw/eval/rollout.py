@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.robot_task import RobotTask
 
 Policy = Callable[[TensorDict], Tensor]
-Signal = Callable[[LeggedRobot], Tensor]  # a value a world, (N, ...)
+Signal = Callable[[Any], Tensor]  # a value a world, (N, ...)
 
 
 class Push(NamedTuple):
@@ -59,7 +59,7 @@ class Record(NamedTuple):
 
 
 def roll_out(
-    env: LeggedRobot, policy: Policy, cases: Sequence[Case], steps: int, signals: Mapping[str, Signal], alone: int | None = None
+    env: RobotTask, policy: Policy, cases: Sequence[Case], steps: int, signals: Mapping[str, Signal], alone: int | None = None
 ) -> Record:
     """Run each case in a world of its own for ``steps`` control steps.
 
@@ -69,9 +69,10 @@ def roll_out(
     if len(cases) != env.num_envs:
         raise ValueError(f"{len(cases)} cases need as many worlds; this environment has {env.num_envs}")
     env.reset()
-    commands, pushes = _timeline(cases, steps, default_commands(env)), _pushes_by_step(cases, env.device)
-    asked = torch.tensor(commands, dtype=torch.float, device=env.device)
-    _command(env, asked[0])
+    timeline = _timeline(cases, steps, [command.default for command in env.command_table])
+    asked, pushes = torch.tensor(timeline, dtype=torch.float, device=env.device), _pushes_by_step(cases, env.device)
+    commands = getattr(env, "commands", asked[0])  # a task without commands has no buffer for them
+    commands.copy_(asked[0])
     env.compute_observations()
     obs = env.get_observations()
     fell_at = torch.full((env.num_envs,), math.inf, device=env.device)
@@ -85,37 +86,19 @@ def roll_out(
         actions = _act(policy, obs, alone)
         if step in pushes:
             worlds, jumps = pushes[step]
-            root_lin_vel(env)[worlds, :2] += jumps
+            env.root_lin_vel[worlds, :2] += jumps
         if step + 1 < steps:  # the observation at the end of this step shows the next command: a second one would be a step of delay
-            _command(env, asked[step + 1])
+            commands.copy_(asked[step + 1])
         obs, _, dones, _ = env.step(actions)
         fell_at = torch.where(dones & (fell_at == math.inf), torch.full_like(fell_at, step), fell_at)
     return Record(
         dt=env.dt,
         mass=env.total_mass,
-        commands=commands,
+        commands=timeline,
         fell_at=fell_at.cpu().numpy(),
-        last_position=root_pos(env)[:, :2].cpu().numpy().copy(),
+        last_position=env.root_pos[:, :2].cpu().numpy().copy(),
         signals={name: values.cpu().numpy() for name, values in kept.items()},
     )
-
-
-def root_pos(env: LeggedRobot) -> Tensor:
-    return env.sim.qpos[:, :3]
-
-
-def root_lin_vel(env: LeggedRobot) -> Tensor:
-    return env.sim.qvel[:, :3]
-
-
-def default_commands(env: LeggedRobot) -> list[float]:
-    """(C,) in the order of the task's table; empty for a task without commands."""
-    return [command.default for command in getattr(env, "command_table", ())] or [0.0] * 3
-
-
-def _command(env: LeggedRobot, values: Tensor) -> None:
-    if values.shape[1]:  # a task without commands has no buffer for them
-        env.commands.copy_(values)
 
 
 def _act(policy: Policy, obs: TensorDict, alone: int | None) -> Tensor:
