@@ -65,8 +65,8 @@ def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
         torch.manual_seed(0)
         env.load_training_state({"terrain_levels": torch.arange(env.num_envs) // repeats % LEVELS})
         outcomes = _walk(env, policy, env.tiles.size / 2)
-    by_tile = [who.view(len(kinds), TILES, LEVELS, repeats).double() for who in outcomes]
-    crossed, fell = (who.mean(dim=(1, 3)).cpu().numpy().round(3).tolist() for who in by_tile)
+    by_tile = [worlds.view(len(kinds), TILES, LEVELS, repeats).double() for worlds in outcomes]
+    crossed, fell = (worlds.mean(dim=(1, 3)).cpu().numpy().round(3).tolist() for worlds in by_tile)
     shares = {kind: {**_measure(kind), "crossed": crossed[i], "fell": fell[i]} for i, kind in enumerate(kinds)}
     return {"speed": SPEED, "seconds": SECONDS, "robots": TILES * repeats, "kinds": shares}
 

@@ -43,10 +43,8 @@ def find_exam(task: LoadedTask) -> Exam | None:
 def require_exam(task: LoadedTask) -> Exam:
     """The exam of a task that is to be graded. Raises ConfigError if it has none."""
     if not (found := find_exam(task)):
-        raise ConfigError(
-            f"--eval: no exam grades task '{task.name}'; there are: {', '.join(EXAMS)}. A task that walks by command has the "
-            "walking exam, another one names its own: TASK = Task(Env, Cfg, CfgPPO, exam=...)"
-        )
+        hint = "A task that walks by command has the walking exam, another one names its own: TASK = Task(Env, Cfg, CfgPPO, exam=...)"
+        raise ConfigError(f"--eval: no exam grades task '{task.name}'; there are: {', '.join(EXAMS)}. {hint}")
     return found
 
 

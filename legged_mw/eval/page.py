@@ -5,17 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 from itertools import zip_longest
+from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
 from legged_mw.eval.crossing import LEVELS
 from legged_mw.eval.rules import AXES, PUSH_DIRECTIONS, ExamRules, Figure
-from legged_mw.eval.style import CSS
 
 if TYPE_CHECKING:
     from legged_mw.eval.plots import Section
     from legged_mw.eval.report import Column
 
+CSS = Path(__file__).with_name("report.css").read_text(encoding="utf-8")
 TEXTS = {
     "crossing": "Commanded ahead at 0.6 m/s from the middle of a tile, facing any direction: the share of ten robots on two tiles that "
     "reached their tile's edge within 15 s. Below it the share that fell on the way; the rest got stuck or went astray. A row is a kind of "
@@ -149,16 +150,9 @@ def _step_rows(column: Column, whose: str) -> list[list[str]]:
     for name, unit in AXES:
         for number in (column.figures or {})["steps"][name.removesuffix(" rate")]["numbers"]:
             rise, over, left = number["rise_time"], number["overshoot"], number["left"]
-            rows.append(
-                [
-                    f"{name} [{unit}]{whose}",
-                    f"{number['from']:g}",
-                    f"{number['to']:g}",
-                    "not reached" if rise is None else f"{rise:.2f}",
-                    "" if over is None else f"{over:.0%}",
-                    "" if left is None else f"{left:+.3f}",
-                ]
-            )
+            rose = "not reached" if rise is None else f"{rise:.2f}"
+            rest = ["" if over is None else f"{over:.0%}", "" if left is None else f"{left:+.3f}"]
+            rows.append([f"{name} [{unit}]{whose}", f"{number['from']:g}", f"{number['to']:g}", rose, *rest])
     return rows
 
 
@@ -166,10 +160,8 @@ def _gait_rows(column: Column, whose: str) -> list[list[str]]:
     rows = []
     for gait in (column.figures or {})["gait"]:
         name = ", ".join(f"{v:g}" for v in gait["command"]) + whose
-        if gait["duty_factor"] is None:
-            rows.append([name, "fell"])
-        else:
-            rows.append([name, f"{gait['stride_frequency']:.2f}", *(f"{share:.0%}" for share in gait["duty_factor"])])
+        strides, duty = gait["stride_frequency"], gait["duty_factor"]
+        rows.append([name, "fell"] if duty is None else [name, f"{strides:.2f}", *(f"{share:.0%}" for share in duty)])
     return rows
 
 

@@ -33,7 +33,14 @@ PAIR, GREEN = ("#0072b2", "#d55e00"), "#009e73"
 VARIABLES = {INK: "ink", MUTED: "muted", FAINT: "faint", PAPER: "paper", PAIR[0]: "first", PAIR[1]: "second", GREEN: "peer"}
 STYLE: dict[Any, Any] = {
     **{"font.family": "DejaVu Sans", "font.size": 7.5, "svg.fonttype": "none", "text.color": INK, "axes.labelcolor": MUTED},
-    **{"axes.edgecolor": FAINT, "axes.linewidth": 0.8, "axes.titlesize": 8.0, "axes.titlelocation": "left", "axes.titlepad": 7.0},
+    **{
+        "axes.edgecolor": FAINT,
+        "axes.linewidth": 0.8,
+        "axes.titlesize": 8.0,
+        "axes.titlelocation": "left",
+        "axes.titlepad": 7.0,
+        "axes.labelpad": 2.0,
+    },
     **{"axes.titlecolor": INK, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True},
     **{"grid.color": FAINT, "grid.linewidth": 0.6, "xtick.color": MUTED, "ytick.color": MUTED, "xtick.major.size": 0.0},
     **{"ytick.major.size": 0.0, "xtick.major.pad": 4.0, "ytick.major.pad": 4.0, "legend.frameon": False, "legend.fontsize": 7.0},
@@ -148,7 +155,7 @@ def _crossing_maps(columns: Columns) -> list[Panel]:
 
 
 def _crossing(kinds: dict[str, Figures], suffix: str, ax: Axes) -> None:
-    """A row a kind of ground, a cell a level: who crossed, and who fell; below the cells what makes the kind hard."""
+    """A row a kind of ground, a cell a level: which share crossed, and which fell; below the cells what makes the kind hard."""
     for row, kind in enumerate(kinds.values()):
         shares = _array([kind["crossed"], kind["fell"]])
         levels = shares.shape[1]
@@ -166,9 +173,7 @@ def _crossing(kinds: dict[str, Figures], suffix: str, ax: Axes) -> None:
     ax.tick_params(axis="y", which="minor", length=0.0, labelsize=6.2, labelcolor=MUTED)
     ax.tick_params(axis="y", labelcolor=INK)
     ax.set_xticks([*range(levels), levels + 0.3], [*map(str, range(levels)), "mean"])
-    ax.set_xlabel("level", labelpad=2)
-    ax.set_xlim(-0.5, levels + 0.8)
-    ax.set_ylim(len(kinds) - 0.05, 0.0)
+    ax.set(xlabel="level", xlim=(-0.5, levels + 0.8), ylim=(len(kinds) - 0.05, 0.0))
     ax.grid(False)
     ax.spines[["left", "bottom"]].set_visible(False)
     crossed, fell = (float(np.mean([kind[which] for kind in kinds.values()])) for which in ("crossed", "fell"))
@@ -208,13 +213,11 @@ def _heat(tracking: Figures, grid: str, down: str, k: int, mark: float, top: flo
         ticks = centres[:: max(1, len(centres) // 4)]
         axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
     name, unit = AXES[k]
-    ax.set_title(f"error of {name} [{unit}]{suffix}")
-    ax.set_xlabel("commanded vx [m/s]", labelpad=2)
-    ax.set_ylabel("yaw rate [rad/s]" if down == "yaw" else "vy [m/s]", labelpad=2)
-    beyond = bool((values > top).any())
-    levels, ticks = np.linspace(0.0, top, 33), [0.0, mark, *([top] if top > 1.4 * mark else [])]
-    marks = {"aspect": 18, "pad": 0.03, "extend": "max" if beyond else "neither", "boundaries": levels, "ticks": ticks, "format": "%.2f"}
-    bar = ax.figure.colorbar(ScalarMappable(scale, HEAT), ax=ax, **marks)
+    beside = "yaw rate [rad/s]" if down == "yaw" else "vy [m/s]"
+    ax.set(title=f"error of {name} [{unit}]{suffix}", xlabel="commanded vx [m/s]", ylabel=beside)
+    shape: dict[str, Any] = {"aspect": 18, "pad": 0.03, "extend": "max" if (values > top).any() else "neither", "format": "%.2f"}
+    ticks = [0.0, mark, *([top] if top > 1.4 * mark else [])]
+    bar = ax.figure.colorbar(ScalarMappable(scale, HEAT), ax=ax, boundaries=np.linspace(0.0, top, 33), ticks=ticks, **shape)
     bar.solids.set_edgecolor("face")  # type: ignore[union-attr]
     bar.outline.set_visible(False)  # type: ignore[operator]
     bar.ax.axhline(mark, color=PAPER, linewidth=1.2)
@@ -236,8 +239,7 @@ def _response(columns: Columns, k: int, ax: Axes) -> None:
         ax.plot(time, _array(step["mean"]), color=PAIR[i], label=label if len(columns) > 1 else "measured")
         if i == 0:
             ax.step(time, _array(step["commanded"]), where="post", color=INK, linestyle=(0, (4, 2)), linewidth=1.0, label="commanded")
-    ax.set_title(f"{name} [{unit}]")
-    ax.set_xlabel("time [s]", labelpad=2)
+    ax.set(title=f"{name} [{unit}]", xlabel="time [s]")
     ax.margins(x=0)
     if k == 0:
         ax.legend(loc="lower right", handlelength=1.6)
@@ -249,32 +251,21 @@ def _response(columns: Columns, k: int, ax: Axes) -> None:
 def _gait(columns: Columns, world: int, ax: Axes) -> None:
     """A bar where a foot is down; two policies share each foot's lane."""
     feet, count = columns[0][1]["foot_names"], len(columns)
-    height = 0.62 / count
-    for i, (_, figures) in enumerate(columns):
-        row = figures["gait"][world]
-        if row["contact"] is None:
-            continue
-        for foot, down in enumerate(row["contact"]):
-            bars = [(start * figures["dt"], length * figures["dt"]) for start, length in _runs(down)]
+    rows, height = [figures["gait"][world] for _, figures in columns], 0.62 / count
+    for i, row in enumerate(rows):
+        for foot, down in enumerate(row["contact"] or []):
+            edges = np.flatnonzero(np.diff([0, *down, 0])).reshape(-1, 2) * columns[i][1]["dt"]  # begin and end of each stance
+            bars = [(begin, end - begin) for begin, end in edges]
             ax.broken_barh(bars, (foot - 0.31 + i * height, height * 0.94), facecolors=PAIR[i], linewidth=0)
-    command = columns[0][1]["gait"][world]["command"]
-    ax.set_title(", ".join(f"{name} {value:g} {unit}" for (name, unit), value in zip(AXES, command, strict=True) if value) or "stand")
-    rows = [figures["gait"][world] for _, figures in columns]
+    command = zip(AXES, rows[0]["command"], strict=True)
+    ax.set_title(", ".join(f"{name} {value:g} {unit}" for (name, unit), value in command if value) or "stand")
     rates = " / ".join("fell" if row["contact"] is None else f"{row['stride_frequency']:.1f}" for row in rows)
     duties = " / ".join("-" if row["contact"] is None else f"{np.mean(row['duty_factor']):.2f}" for row in rows)
     ax.set_title(f"{rates} Hz, duty {duties}", loc="right", color=MUTED, fontsize=7.0)
     ax.set_yticks(range(len(feet)), feet)
-    ax.set_ylim(len(feet) - 0.5, -0.5)
-    ax.set_xlim(0.0, None)
+    ax.set(xlim=(0.0, None), ylim=(len(feet) - 0.5, -0.5), xlabel="time [s]")
     ax.grid(False, axis="y")
     ax.spines["left"].set_visible(False)
-    ax.set_xlabel("time [s]", labelpad=2)
-
-
-def _runs(down: list[int]) -> list[tuple[int, int]]:
-    """(start, length) of each stretch of ones."""
-    edges = np.flatnonzero(np.diff([0, *down, 0]))
-    return [(int(a), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 # ---- joints
@@ -290,24 +281,21 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
     """A hill a joint, as high as any; limits are upright strokes, the middle 90 % a line on the ground."""
     names = [name.removesuffix("_joint") for name in columns[0][1]["joint_names"]]
     for i, (_, figures) in enumerate(columns):
-        shown = figures["joints"][key]
-        for joint, (edges, density) in enumerate(zip(shown["edges"], shown["density"], strict=True)):
-            peak = max(density) or 1.0
-            hill = joint - 0.78 * np.array([*density, density[-1]]) / peak
+        found = figures["joints"][key]
+        for joint, (edges, density) in enumerate(zip(found["edges"], found["density"], strict=True)):
+            hill = joint - 0.78 * np.array([*density, density[-1]]) / (max(density) or 1.0)
             if i == 0:
                 ax.fill_between(edges, joint, hill, step="post", color=PAIR[i], alpha=0.55, linewidth=0)
             else:
                 ax.step(edges, hill, where="post", color=PAIR[i], linewidth=1.0)
-            for end in (shown["low"][joint], shown["high"][joint]):
+            for end in (found["low"][joint], found["high"][joint]):
                 if end is not None and i == 0:
                     ax.plot([end, end], [joint, joint - 0.72], color=INK, linewidth=1.2)
-            share = shown["saturated"][joint]
-            if share:
+            if share := found["saturated"][joint]:
                 text = f"{share:.1%}" if share >= 0.001 else "<0.1%"
                 ax.annotate(text, (1.01, joint - 0.1 - 0.4 * i), xycoords=("axes fraction", "data"), color=PAIR[i], fontsize=6.2)
-    ax.set_title(label)
     ax.set_yticks(range(len(names)), names)
-    ax.set_ylim(len(names) - 0.6, -1.05)
+    ax.set(title=label, ylim=(len(names) - 0.6, -1.05))
     ax.spines["left"].set_visible(False)
     ax.margins(x=0.04)
 
@@ -322,12 +310,9 @@ def _push_curve(columns: Columns, rules: ExamRules, ax: Axes) -> None:
         ax.plot(speeds, shares, color=GREEN, marker="D", markersize=3.2, linewidth=1.0, label="peer, walking")
     for i, (name, figures) in enumerate(columns):
         for which, line in (("walking", "-"), ("standing", (0, (2, 1.5)))):
-            share = np.mean(figures["pushes"][which], axis=1)
-            label = f"{which}{_of(name, columns)}"
+            share, label = np.mean(figures["pushes"][which], axis=1), f"{which}{_of(name, columns)}"
             ax.plot(speeds, share, color=PAIR[i], linestyle=line, marker="o", markersize=3.2, label=label)
-    ax.set_title("share of 16 directions survived")
-    ax.set_xlabel("jump of the velocity [m/s]", labelpad=2)
-    ax.set_ylim(-0.03, 1.04)
+    ax.set(title="share of 16 directions survived", xlabel="jump of the velocity [m/s]", ylim=(-0.03, 1.04))
     ax.legend(loc="best", handlelength=2.2)
 
 
@@ -339,11 +324,9 @@ def _push_wheel(pushes: Figures, which: str, colour: str, title: str, ax: Any) -
     ax.bar(sectors * width, 0.9, width * 0.95, rings + 1, color=np.where(survived, colour, FAINT).ravel(), linewidth=0)
     ax.set_theta_zero_location("N")
     ax.set_xticks(np.arange(4) * math.pi / 2, ["ahead", "left", "behind", "right"])
-    ax.set_yticks([])
-    ax.set_ylim(0, len(survived) + 1)
+    ax.set(title=title, yticks=[], ylim=(0, len(survived) + 1))
     ax.grid(False)
     ax.spines["polar"].set_visible(False)
-    ax.set_title(title)
 
 
 # ---- energy, reward
@@ -353,12 +336,9 @@ def _against_speed(columns: Columns, rules: ExamRules, key: str, ax: Axes) -> No
     for i, (name, figures) in enumerate(columns):
         ax.plot(figures["transport"]["vx"], _array(figures["transport"][key]), color=PAIR[i], marker="o", markersize=3.2, label=name)
     if key == "cost_of_transport" and rules.peer_policy:
-        ax.plot(
-            [rules.transport_vx], [rules.peer_policy.figures[key]], color=GREEN, marker="D", markersize=4.5, linestyle="none", label="peer"
-        )
-    ax.set_title("mean power [W]" if key == "power" else "cost of transport [-]")
-    ax.set_xlabel("commanded vx [m/s]", labelpad=2)
-    ax.set_ylim(0.0, None)
+        cost = rules.peer_policy.figures[key]
+        ax.plot([rules.transport_vx], [cost], color=GREEN, marker="D", markersize=4.5, linestyle="none", label="peer")
+    ax.set(title="mean power [W]" if key == "power" else "cost of transport [-]", xlabel="commanded vx [m/s]", ylim=(0.0, None))
     if key == "cost_of_transport" or len(columns) > 1:
         ax.legend(loc="best", handlelength=1.6)
 
@@ -377,11 +357,10 @@ def _reward(columns: Columns, ax: Axes) -> None:
             text = {"textcoords": "offset points", "va": "center", "ha": align, "fontsize": 6.2, "color": MUTED}
             ax.annotate(f"{value:.3g}" if abs(value) >= 5e-5 else "0", (value, y), (side, 0), **text)
     ax.set_yticks(range(len(terms)), terms)
-    ax.set_ylim(len(terms) - 0.4, -0.6)
+    ax.set(title="scale times term, a second", ylim=(len(terms) - 0.4, -0.6))
     ax.axvline(0.0, color=MUTED, linewidth=0.8)
     ax.grid(False, axis="y")
     ax.spines["left"].set_visible(False)
     ax.margins(x=0.09)
-    ax.set_title("scale times term, a second")
     if len(columns) > 1:
         ax.legend(loc="lower right")

@@ -33,8 +33,8 @@ class Push(NamedTuple):
 class Case(NamedTuple):
     """What one world is asked to do, and how it is pushed."""
 
-    commands: tuple[tuple[int, tuple[float, ...]], ...]  # from that control step on: the first commands of the table; others keep
-    push: Push | None = None  # their default
+    commands: tuple[tuple[int, tuple[float, ...]], ...]  # from that control step on, the first of the task's table; the rest: default
+    push: Push | None = None
 
 
 def holding(command: tuple[float, ...], push: Push | None = None) -> Case:
@@ -119,13 +119,10 @@ def _timeline(cases: Sequence[Case], steps: int, default: Sequence[float]) -> ND
 
 def _pushes_by_step(cases: Sequence[Case], device: str) -> dict[int, tuple[Tensor, Tensor]]:
     """Step -> worlds (M,) and the jumps of their horizontal velocity (M, 2) [m/s, world]."""
-    by_step: dict[int, list[tuple[int, Push]]] = {}
-    for world, case in enumerate(cases):
-        if case.push:
-            by_step.setdefault(case.push.step, []).append((world, case.push))
-    found = {}
-    for step, rows in by_step.items():
-        speed = torch.tensor([[push.speed] for _, push in rows], device=device)
-        jumps = speed * torch.tensor([[math.cos(push.angle), math.sin(push.angle)] for _, push in rows], device=device)
-        found[step] = torch.tensor([world for world, _ in rows], device=device), jumps
+    pushed, found = [(world, case.push) for world, case in enumerate(cases) if case.push], {}
+    for step in {push.step for _, push in pushed}:
+        now = [(world, push) for world, push in pushed if push.step == step]
+        speeds = torch.tensor([[push.speed] for _, push in now], device=device)
+        directions = torch.tensor([[math.cos(push.angle), math.sin(push.angle)] for _, push in now], device=device)
+        found[step] = torch.tensor([world for world, _ in now], device=device), speeds * directions
     return found
