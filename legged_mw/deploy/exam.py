@@ -11,18 +11,21 @@ from typing import Any
 
 import numpy as np
 
-from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.contract import CONTRACT_FILE, Contract, ContractError, read_contract
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rules
 from legged_mw.eval.rules import ExamRules
 from legged_mw.utils.commands import VELOCITY
+from legged_mw.utils.config import load_yaml
 
 
 def run_exam(folder: Path, exam: ExamRules | None = None, threads: int = 0) -> dict[str, Any]:
     """Grade the export in ``folder`` by the rules ``exam``, else by those of its contract. Raises ContractError, ConfigError."""
-    exam = exam or contract_rules(read_contract(folder))
-    held = np.array(exam.held())
-    wanted = np.concatenate([held, np.tile([exam.push_vx, 0.0, 0.0], (exam.worlds() - len(held), 1))])
+    contract = read_contract(folder)
+    exam, names = exam or contract_rules(contract, folder), [command.name for command in contract.commands]
+    wanted = np.tile([command.default for command in contract.commands], (exam.worlds(), 1))
+    pushed = [(exam.push_vx, 0.0, 0.0)] * (exam.worlds() - len(exam.held()))
+    wanted[:, [names.index(name) for name in VELOCITY]] = [*exam.held(), *pushed]
     stage = DeployStage(folder, len(wanted), threads=threads)
     fell_at = np.full(len(wanted), math.inf)
     sampled: dict[str, list[Any]] = {"velocity": [], "position": [], "power": [], "joint_speed": []}
@@ -38,11 +41,15 @@ def run_exam(folder: Path, exam: ExamRules | None = None, threads: int = 0) -> d
     return exam.grade(signals, last_position=stage.qpos()[:, :2], fell_at=fell_at, mass=stage.contract.mass, dt=stage.dt)
 
 
-def contract_rules(contract: Contract) -> ExamRules:
-    """The rules for the policy of ``contract``: its own, else those that follow from the trained ranges."""
-    return ExamRules.from_mapping(
-        getattr(contract, "exam", None) or {}, dict(zip(VELOCITY, contract.command_ranges.T.tolist(), strict=True))
-    )
+def contract_rules(contract: Contract, folder: Path) -> ExamRules:
+    """The rules for an export: the section ``exam`` of its contract, if it has one, and the trained ranges."""
+    trained = {command.name: (command.low, command.high) for command in contract.commands}
+    if missing := [name for name in VELOCITY if name not in trained]:
+        raise ContractError(f"{CONTRACT_FILE}: the walking exam needs the commands {', '.join(VELOCITY)}; missing: {', '.join(missing)}")
+    try:
+        return ExamRules.from_mapping(load_yaml(folder / CONTRACT_FILE).get("exam") or {}, trained)
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ContractError(f"{CONTRACT_FILE}: exam: {error}") from error
 
 
 def _push(stage: DeployStage, exam: ExamRules, step: int) -> None:
