@@ -47,6 +47,13 @@ class Go1FlatCfg(LeggedRobotCfg):
         kick = True  # [ours: trained without, a quarter of 2 m/s kicks topple it; docs/training.md]
         velocity = [0.0, 8.0]  # [m/s] [ours: with up to 3, an eighth still do]
 
+    class exam(LeggedRobotCfg.exam):  # [ours: what P's policy was graded with]
+        push_speeds = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]  # [m/s]
+        push_vx = 0.8  # [m/s]
+        transport_vx = 1.0  # [m/s]
+        marks = [0.06, 0.06, 0.12]  # [m/s, m/s, rad/s]
+        peer = "playground_go1"
+
 
 class Go1FlatCfgPPO(LeggedRobotCfgPPO):
     class runner(LeggedRobotCfgPPO.runner):

@@ -119,14 +119,14 @@ def move(distance: float, axis: int = 0) -> Callable[[LeggedRobot, int], None]:
 
     def happens(env: LeggedRobot, world: int) -> None:
         assert env.tiles is not None
-        env.sim.qpos[world, axis] = env.tiles.origins[world, axis] + distance
+        env.root_pos[world, axis] = env.tiles.origins[world, axis] + distance
 
     return happens
 
 
 def upset(env: LeggedRobot, world: int) -> None:
     """Turn it on its back."""
-    env.sim.qpos[world, 3:7] = torch.tensor([0.0, 1.0, 0.0, 0.0])
+    env.root_quat[world] = torch.tensor([0.0, 1.0, 0.0, 0.0])
 
 
 def lose(env: LeggedRobot, world: int) -> None:

@@ -232,7 +232,7 @@ def test_walks_as_in_the_environment(contract: Contract) -> None:
     task = load_task("go1_flat")
     task.update_from_run(load_yaml(SHIPPED / "config.yaml"), where="config.yaml")
     exam.prepare(task)
-    commands = np.array(rules.commands())
+    commands = np.array(rules.ExamRules.from_config(task.cfg).commands())
     task.cfg.env.num_envs = len(commands)
     env = task.env_class(task.cfg, "cpu")
     policy = load_policy(SHIPPED / "model.pt", env, task.train, "cpu")
@@ -363,15 +363,15 @@ def test_it_is_driven(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
 
 
 def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The first seconds of it, with every kick: written and printed."""
+    """The first seconds of it, with every push: written and printed."""
     monkeypatch.setattr(rules, "SECONDS", 2.6)
-    monkeypatch.setattr(rules, "KICK_AT", 1.0)
-    monkeypatch.setattr(rules, "KICK_UNTIL", 2.2)
+    monkeypatch.setattr(rules, "PUSH_AT", 1.0)
+    monkeypatch.setattr(rules, "PUSH_UNTIL", 2.2)
     code, out, err = main(capsys, SHIPPED, "--eval", "--out", tmp_path / "exam.json")
     assert code == 0, err
     saved = json.loads((tmp_path / "exam.json").read_text())
     assert "falls in 22 commands                     0" in out and saved["falls"] == 0 and saved["engine"] == "mujoco (deploy)"
-    assert saved["kicks"]["1"] == saved["kicks"]["2"] == 1.0 and saved["kicks"]["6"] < 1.0
+    assert saved["pushes"]["1"] == saved["pushes"]["2"] == 1.0 and saved["pushes"]["6"] < 1.0
     assert all(error < 0.12 for error in saved["error"]) and 0.5 < saved["cost_of_transport"] < 1.2
 
 
@@ -593,7 +593,7 @@ class Block:
 
 sys.meta_path.insert(0, Block())
 from legged_mw.eval import rules
-rules.SECONDS, rules.KICK_AT, rules.KICK_UNTIL = 2.1, 0.5, 1.5
+rules.SECONDS, rules.PUSH_AT, rules.PUSH_UNTIL = 2.1, 0.5, 1.5
 import runpy
 sys.argv = ['deploy', *sys.argv[1:]]
 runpy.run_module('legged_mw.deploy', run_name='__main__')

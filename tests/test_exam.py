@@ -5,27 +5,38 @@ from __future__ import annotations
 import copy
 import json
 import math
+import re
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
-from program import SMALL, refused, run, trained
+import yaml
+from program import SMALL, play, refused, run, trained
 from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.eval import exam, rules
+from legged_mw.eval.exams import EXAMS, find_exam, make_exam, require_exam
+from legged_mw.eval.peers import PEERS
+from legged_mw.eval.rollout import holding, roll_out
+from legged_mw.eval.rules import ExamRules
+from legged_mw.utils.commands import Command
+from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
 
-TRACKED, KICKED = 22, 6 * 16  # worlds
-WORLDS = TRACKED + KICKED
+TRACKED, PUSHED = 22, 6 * 16  # worlds
+WORLDS = TRACKED + PUSHED
+GO1 = ExamRules.from_config(load_task("go1_flat").cfg)
+RANGES = {"lin_vel_x": [-0.5, 1.0], "lin_vel_y": [-0.3, 0.4], "ang_vel_yaw": [-1.0, 0.8]}  # of no robot
 
 
 def test_commands_are_the_22() -> None:
-    assert rules.commands() == [
+    assert GO1.commands() == [
         (0, 0, 0),
         *((0.5, 0, 0), (1.0, 0, 0), (1.5, 0, 0), (-0.5, 0, 0), (-1.0, 0, 0)),
         *((0, 0.4, 0), (0, 0.8, 0), (0, -0.4, 0), (0, -0.8, 0)),
@@ -35,34 +46,119 @@ def test_commands_are_the_22() -> None:
     ]
 
 
+def test_commands_of_another_range() -> None:
+    """Thirds of vx, halves of vy and yaw rate, worked out by hand; a range that is not given is the trained one."""
+    rules = ExamRules.from_mapping({"ranges": {"lin_vel_x": [-0.5, 1.0]}}, {**RANGES, "lin_vel_x": [-9.0, 9.0], "base_height": [0.2, 0.3]})
+    assert rules.commands() == [
+        (0, 0, 0),
+        *((0.3333, 0, 0), (0.6667, 0, 0), (1.0, 0, 0), (-0.1667, 0, 0), (-0.3333, 0, 0)),
+        *((0, 0.2, 0), (0, 0.4, 0), (0, -0.15, 0), (0, -0.3, 0)),
+        *((0, 0, 0.4), (0, 0, 0.8), (0, 0, -0.5), (0, 0, -1.0)),
+        *((0.6667, 0.2, 0.4), (0.6667, 0.2, -0.5), (0.6667, -0.15, 0.4), (0.6667, -0.15, -0.5)),
+        *((-0.3333, 0.2, 0.4), (-0.3333, 0.2, -0.5), (-0.3333, -0.15, 0.4), (-0.3333, -0.15, -0.5)),
+    ]
+    assert (rules.push_vx, rules.transport_vx) == (0.5, 0.5) and rules.held() == [*rules.commands(), (0.5, 0, 0)]
+    assert rules.push_speeds == (0.5, 1, 1.5, 2, 3, 4, 5, 6) and rules.worlds() == 23 + 8 * 16
+    assert (rules.marks, rules.marks_of, rules.push_mark, rules.peer_policy) == ((0.06, 0.06, 0.08), "error", 2.0, None)
+
+
+def test_marks_follow_from_the_ranges() -> None:
+    def marks(vx: float, yaw: float, **given: Any) -> tuple[float, ...]:
+        return ExamRules.from_mapping(given, {**RANGES, "lin_vel_x": [0.0, vx], "ang_vel_yaw": [-yaw, yaw]}).marks
+
+    assert marks(2.0, 2.0) == (0.12, 0.06, 0.2) and marks(0.5, 0.0) == (0.04, 0.06, 0.12)  # vx 0.04 at least; no turning at all
+    assert marks(2.0, 2.0, marks_of="offset") == (0.06, 0.06, 0.12) and marks(2.0, 2.0, marks=[0.1, 0.2, 0.3]) == (0.1, 0.2, 0.3)
+
+
+def test_rules_survive_being_written() -> None:
+    """In a contract, and in a result; Go1's are what its peer was asked."""
+    for asked in (GO1, ExamRules.from_mapping({"marks_of": "offset", "push_mark": 1.0}, RANGES)):
+        for text in (json.dumps(asked.to_mapping()), yaml.safe_dump(asked.to_mapping())):
+            assert ExamRules.from_mapping(yaml.safe_load(text)) == asked
+    assert GO1.peer_policy is PEERS["playground_go1"] and GO1.worlds() == WORLDS
+
+
+def test_a_peer_that_was_asked_something_else_is_left_out() -> None:
+    for given in ({"ranges": RANGES}, {"push_vx": 0.5}, {"transport_vx": 0.5}, {"push_speeds": [1.0, 2.0]}):
+        assert ExamRules.from_mapping({**GO1.to_mapping(), **given}).peer_policy is None
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        ({"ranges": {"base_height": [0.2, 0.3]}}, "exam.ranges: no command 'base_height' in the walking exam; there are: lin_vel_x, "),
+        ({"ranges": {"lin_vel_x": [1.0, 0.0]}}, "exam.ranges: lin_vel_x is [1.0, 0.0]; it must be two numbers, the lower first"),
+        ({"push_speeds": []}, "exam.push_speeds is []; it must be one or more numbers above zero"),
+        ({"push_speeds": [1.0]}, "exam.push_mark is 2; it must be one of exam.push_speeds, [1.0]"),
+        ({"marks": [0.1]}, "exam.marks is [0.1]; it must be three numbers, or an empty list"),
+        ({"peer": "playground_go"}, "exam.peer: no peer 'playground_go' in legged_mw/eval/peers.py; did you mean 'playground_go1'?"),
+    ],
+)
+def test_rules_that_cannot_be_applied(given: dict[str, Any], line: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        ExamRules.from_mapping(given, RANGES)
+    assert line in str(error.value)
+
+
+# ---- which exam grades a task
+
+
+class Pose(RobotTask):
+    """Has no commands, and nothing that grades it."""
+
+
+def test_a_task_without_an_exam() -> None:
+    task = load_task("go1_flat")
+    assert find_exam(task) is require_exam(task) is EXAMS["walking"]
+    task.env_class = Pose
+    task.exam = ""  # what the loader makes of it
+    assert find_exam(task) is None and make_exam(task, None) is None
+    line = "--eval: no exam grades task 'go1_flat'; there are: walking. A task that walks by command has the walking exam, another one "
+    with pytest.raises(ConfigError, match=re.escape(line + "names its own: TASK = Task(Env, Cfg, CfgPPO, exam=...)")):
+        require_exam(task)
+    task.exam = "walkin"
+    with pytest.raises(ConfigError, match=r"go1_flat.py: no exam 'walkin' in legged_mw/eval/exams.py; did you mean 'walking'\?"):
+        find_exam(task)
+    with pytest.raises(
+        ConfigError, match="the walking exam needs a config with the sections commands and exam: a subclass of LeggedRobotCfg"
+    ):
+        ExamRules.from_config(RobotTaskCfg())
+
+
 def test_prepare_leaves_nothing_to_chance() -> None:
     """Whatever a task trains with is switched off."""
     task = load_task("go1_flat")
     for path in ("init_state.pos_xy_range", "init_state.yaw_range", "init_state.lin_vel_range", "init_state.ang_vel_range", "noise.level"):
         task.set(path, 3.0)
-    task.set("perturbation.enable", True)
+    task.set("perturbation.kick", True)
     task.set("env.episode_length_s", 1.0)
     exam.prepare(task)
     cfg = task.cfg
     init = cfg.init_state
     assert (init.pos_xy_range, init.yaw_range, init.lin_vel_range, init.ang_vel_range, cfg.noise.level) == (0, 0, 0, 0, 0)
-    assert cfg.perturbation.enable is False and cfg.commands.resampling_time == 0
+    assert cfg.perturbation.kick is False and cfg.commands.resampling_time == 0
     assert cfg.env.episode_length_s > rules.SECONDS and cfg.env.num_envs == WORLDS
 
 
 # ---- the arithmetic, with a made-up environment whose figures are known
 
 
-class Puppet:
+class FakeRobot:
     """Stands in for LeggedRobot: every world does exactly what the script says."""
 
-    def __init__(self, script: Callable[[Puppet, int], None], falls: dict[int, list[int]] | None = None) -> None:
-        self.num_envs, self.device, self.dt, self.total_mass = WORLDS, "cpu", 0.02, 10.0
+    def __init__(self, script: Callable[[FakeRobot, int], None], falls: dict[int, list[int]] | None = None, **asked: Any) -> None:
+        task = load_task("go1_flat")
+        for name, value in asked.items():
+            task.set(f"exam.{name}", value)
+        self.cfg = task.cfg
+        self.num_envs = worlds = ExamRules.from_config(task.cfg).worlds()
+        self.device, self.dt, self.total_mass = "cpu", 0.02, 10.0
         self.script, self.falls, self.time = script, falls or {}, 0
-        self.sim = SimpleNamespace(qpos=torch.zeros(WORLDS, 19), qvel=torch.zeros(WORLDS, 18))
-        self.commands = torch.full((WORLDS, 3), math.nan)  # the exam must set all
-        self.base_lin_vel, self.base_ang_vel = torch.zeros(WORLDS, 3), torch.zeros(WORLDS, 3)
-        self.torques, self.dof_vel = torch.zeros(WORLDS, 12), torch.zeros(WORLDS, 12)
+        self.command_table = tuple(Command(name, -1.5, 1.5) for name in RANGES)
+        self.root_pos, self.root_lin_vel = torch.zeros(worlds, 3), torch.zeros(worlds, 3)
+        self.commands = torch.full((worlds, 3), math.nan)  # the exam must set all
+        self.base_lin_vel, self.base_ang_vel = torch.zeros(worlds, 3), torch.zeros(worlds, 3)
+        self.torques, self.dof_vel = torch.zeros(worlds, 12), torch.zeros(worlds, 12)
         self.shown: Tensor | None = None
         self.jumps: list[Tensor] = []
         self.actions: list[Tensor] = []
@@ -75,28 +171,28 @@ class Puppet:
         self.shown = self.commands.clone()
 
     def get_observations(self) -> TensorDict:
-        shown = torch.zeros(WORLDS, 3) if self.shown is None else self.shown
-        return TensorDict({"state": shown.clone()}, batch_size=[WORLDS])
+        shown = torch.zeros(self.num_envs, 3) if self.shown is None else self.shown
+        return TensorDict({"state": shown.clone()}, batch_size=[self.num_envs])
 
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
         self.actions.append(actions.clone())
-        self.jumps.append(self.sim.qvel[:, :2].clone())
-        self.sim.qvel.zero_()
-        dones = torch.zeros(WORLDS, dtype=torch.bool)
+        self.jumps.append(self.root_lin_vel[:, :2].clone())
+        self.root_lin_vel.zero_()
+        dones = torch.zeros(self.num_envs, dtype=torch.bool)
         dones[self.falls.get(self.time, [])] = True
         self.time += 1
         self.script(self, self.time)
-        return self.get_observations(), torch.zeros(WORLDS), dones, {}
+        return self.get_observations(), torch.zeros(self.num_envs), dones, {}
 
 
-def follow(env: Puppet, step: int) -> None:
+def follow(env: FakeRobot, step: int) -> None:
     """Every world does as commanded."""
     commands = torch.nan_to_num(env.commands)
     env.base_lin_vel[:, :2], env.base_ang_vel[:, 2] = commands[:, :2], commands[:, 2]
 
 
 def grade(env: Any, policy: Callable[[TensorDict], Tensor] | None = None) -> dict[str, Any]:
-    return exam.run_exam(env, policy or (lambda obs: torch.zeros(WORLDS, 12)))
+    return exam.run_exam(env, policy or (lambda obs: torch.zeros(len(obs), 12)))
 
 
 def test_worlds_are_commanded_and_the_policy_sees_it() -> None:
@@ -106,20 +202,20 @@ def test_worlds_are_commanded_and_the_policy_sees_it() -> None:
         seen.append(obs["state"].clone())
         return torch.full((WORLDS, 12), float(len(seen)))
 
-    env = Puppet(follow)
+    env = FakeRobot(follow)
     grade(env, policy)
-    wanted = torch.tensor([*rules.commands(), *[(0.8, 0.0, 0.0)] * KICKED])
+    wanted = torch.tensor([*GO1.commands(), *[(0.8, 0.0, 0.0)] * PUSHED])
     assert torch.equal(env.commands, wanted) and len(seen) == 500
     assert all(torch.equal(obs, wanted) for obs in seen)
     assert [float(action[0, 0]) for action in env.actions] == [float(i) for i in range(1, 501)]  # each acted upon once, in order
 
 
-def test_kicks() -> None:
+def test_pushes() -> None:
     """World 16 s + k after the tracked ones jumps by s + 1 m/s at 22.5 k degrees, at step 150 + k, after that step's action."""
-    env = Puppet(follow)
+    env = FakeRobot(follow)
 
     def policy(obs: TensorDict) -> Tensor:
-        assert not env.sim.qvel.any()  # it does not see the kick coming
+        assert not env.root_lin_vel.any()  # it does not see the push coming
         return torch.zeros(WORLDS, 12)
 
     grade(env, policy)
@@ -134,7 +230,7 @@ def test_kicks() -> None:
 def test_errors_are_means_over_the_counted_time() -> None:
     """The first 2 s are dropped; then world i is off by 0.001 i, to either side in turn."""
 
-    def script(env: Puppet, step: int) -> None:
+    def script(env: FakeRobot, step: int) -> None:
         follow(env, step)
         if step < 100:
             env.base_lin_vel += 5.0
@@ -144,10 +240,10 @@ def test_errors_are_means_over_the_counted_time() -> None:
             env.base_lin_vel[:, 1] += 2 * off
             env.base_ang_vel[:, 2] += 3 * off
 
-    result = grade(Puppet(script))
+    result = grade(FakeRobot(script))
     assert result["error"] == pytest.approx([0.0105, 0.021, 0.0315], abs=2e-5)  # the mean of 0 .. 21 is 10.5
     assert result["worst"] == pytest.approx([0.021, 0.042, 0.063], abs=2e-5)
-    for i, (row, command) in enumerate(zip(result["commands"], rules.commands(), strict=True)):
+    for i, (row, command) in enumerate(zip(result["commands"], GO1.commands(), strict=True)):
         assert row["command"] == list(command) and row["fell"] is False
         assert row["error"] == pytest.approx([0.001 * i, 0.002 * i, 0.003 * i], abs=2e-5)
 
@@ -155,37 +251,95 @@ def test_errors_are_means_over_the_counted_time() -> None:
 def test_drift_joint_speed_and_cost_of_transport() -> None:
     """Standing at sqrt(0.3^2 + 0.4^2) m from where it stood at 2 s; 72 W for 8 s at 0.9 m/s and 10 kg."""
 
-    def script(env: Puppet, step: int) -> None:
+    def script(env: FakeRobot, step: int) -> None:
         follow(env, step)
-        env.sim.qpos[0, :2] = (
+        env.root_pos[0, :2] = (
             torch.tensor([7.0, 7.0]) if step < 100 else torch.tensor([1.0, 2.0]) + (step - 100) / 400 * torch.tensor([0.3, 0.4])
         )
-        env.sim.qpos[2, 0] = 0.9 * 0.02 * step
+        env.root_pos[2, 0] = 0.9 * 0.02 * step
         env.torques[2], env.dof_vel[2] = 2.0, 3.0 if step % 2 else -3.0  # braking costs too
         if step < 100:
             env.torques[2] = 50.0
         env.dof_vel[0] = 9.0 if step < 450 else torch.tensor([0.2, -0.4] * 6)
 
-    result = grade(Puppet(script))
+    result = grade(FakeRobot(script))
     assert result["drift"] == pytest.approx(0.5, abs=1e-5)
     assert result["joint_speed"] == pytest.approx(0.3, abs=1e-5)
     assert result["cost_of_transport"] == pytest.approx(72 * 8 / (10 * 9.81 * 0.9 * 8), rel=1e-4)
 
 
+def test_cost_of_transport_at_a_command_of_its_own() -> None:
+    """At 0.75 m/s, which is none of the 22: a world more, whose fall is none of theirs. Fewer pushes, so that the worlds suffice."""
+
+    def script(env: FakeRobot, step: int) -> None:
+        follow(env, step)
+        env.root_pos[22, 0], env.torques[22], env.dof_vel[22] = 0.75 * 0.02 * step, 1.0, 2.0
+
+    asked = {"transport_vx": 0.75, "push_speeds": [1.0, 2.0]}
+    result = grade(FakeRobot(script, {5: [3]}, **asked))
+    assert result["cost_of_transport"] == pytest.approx(12 * 2.0 / (10 * 9.81 * 0.75), rel=1e-4) and "beats_peer" not in result
+    assert result["falls"] == 1 and len(result["commands"]) == 22 and result["pushes"] == {"1": 1.0, "2": 1.0}
+    text = rules.table(result)
+    assert "cost of transport at 0.75 m/s" in text and "peer" not in text and text.endswith("walks: no")
+    fallen = grade(FakeRobot(script, {5: [22]}, **asked))
+    assert (
+        fallen["falls"] == 0 and fallen["cost_of_transport"] is None and "cost of transport at 0.75 m/s         none" in rules.table(fallen)
+    )
+
+
+def test_offsets_are_what_remains_of_the_mean_velocity() -> None:
+    """A robot sways by 0.2 m/s about 0.05 m/s too much: too far off step by step, near enough on average."""
+
+    def script(env: FakeRobot, step: int) -> None:
+        follow(env, step)
+        env.base_lin_vel[:, 0] += 0.05 + 0.2 * (-1) ** step
+
+    strict, mild = grade(FakeRobot(script)), grade(FakeRobot(script, marks_of="offset"))
+    assert strict["error"] == mild["error"] == pytest.approx([0.2, 0, 0], abs=1e-4)
+    assert strict["offset"] == mild["offset"] == pytest.approx([0.05, 0, 0], abs=1e-4)
+    assert mild["commands"][4]["offset"] == pytest.approx([0.05, 0, 0], abs=1e-4)
+    assert (strict["walks"], mild["walks"]) == (False, True)
+    assert "of the mean velocity" not in rules.table(strict)
+    assert rules.table(mild).count("  of the mean velocity               0.0") == 3
+
+
+def test_further_commands_stay_at_their_default() -> None:
+    seen = []
+
+    def policy(obs: TensorDict) -> Tensor:
+        seen.append(obs["state"].clone())
+        return torch.zeros(WORLDS, 12)
+
+    env = FakeRobot(follow)
+    env.command_table = (*env.command_table, Command("base_height", 0.2, 0.3, default=0.28))
+    env.commands = torch.full((WORLDS, 4), math.nan)
+    assert grade(env, policy)["error"] == [0, 0, 0]
+    assert all(torch.equal(obs[:, :3], seen[0][:, :3]) and (obs[:, 3] == 0.28).all() for obs in seen) and len(seen) == 500
+
+
+def test_a_task_without_commands_can_be_rolled_out() -> None:
+    env = FakeRobot(lambda env, step: None)
+    env.command_table = ()
+    del env.commands
+    env.compute_observations = lambda: None
+    record = roll_out(env, lambda obs: torch.zeros(WORLDS, 12), [holding(())] * WORLDS, 5, {"position": lambda env: env.root_pos})
+    assert record.commands.shape == (5, WORLDS, 0) and record.signals["position"].shape == (5, WORLDS, 3)
+
+
 def test_falls() -> None:
     """A fallen command leaves the means; what falls again counts once."""
 
-    def script(env: Puppet, step: int) -> None:
+    def script(env: FakeRobot, step: int) -> None:
         follow(env, step)
         env.base_lin_vel[3] += 1.0
 
-    result = grade(Puppet(script, {120: [3, 7], 300: [3]}))
+    result = grade(FakeRobot(script, {120: [3, 7], 300: [3]}))
     assert result["falls"] == 2 and [i for i, row in enumerate(result["commands"]) if row["fell"]] == [3, 7]
     assert result["error"] == result["worst"] == [0, 0, 0] and result["walks"] is False
-    assert grade(Puppet(script))["worst"] == pytest.approx([1, 1, 0])
+    assert grade(FakeRobot(script))["worst"] == pytest.approx([1, 1, 0])
 
 
-def test_a_kick_is_survived_if_it_stands_until_step_300() -> None:
+def test_a_push_is_survived_if_it_stands_until_step_300() -> None:
     def world(speed: int, k: int) -> int:
         return TRACKED + 16 * (speed - 1) + k
 
@@ -194,22 +348,27 @@ def test_a_kick_is_survived_if_it_stands_until_step_300() -> None:
         299: [world(5, 0), world(5, 1)],
         300: [world(4, 3)],
         301: [world(3, 3), world(2, 15)],  # too late to count
-        20: [world(1, 9)],  # before its kick: it did not survive either
+        20: [world(1, 9)],  # before its push: it did not survive either
     }
-    result = grade(Puppet(follow, falls))
-    assert result["kicks"] == {"1": 0.9375, "2": 1.0, "3": 1.0, "4": 0.9375, "5": 0.875, "6": 0.0}
+    result = grade(FakeRobot(follow, falls))
+    assert result["pushes"] == {"1": 0.9375, "2": 1.0, "3": 1.0, "4": 0.9375, "5": 0.875, "6": 0.0}
     assert result["falls"] == 0 and result["walks"] is True
 
 
 # ---- verdicts
 
-WALKS: dict[str, Any] = {"falls": 0, "error": [0.06, 0.06, 0.12], "kicks": {"1": 0.5, "2": 1.0, "3": 0.0, "4": 0.0, "5": 0.0, "6": 0.0}}
+WALKS: dict[str, Any] = {
+    "falls": 0,
+    "error": [0.06, 0.06, 0.12],
+    "offset": [9.0] * 3,
+    "pushes": {"1": 0.5, "2": 1.0, "3": 0.0, "4": 0.0, "5": 0.0, "6": 0.0},
+}
 BEATS: dict[str, Any] = {
     "falls": 0,
     "error": [0.0239, 0.0309, 0.0839],
     "worst": [0.042, 0.063, 0.357],
     "drift": 0.005,
-    "kicks": {"1": 1.0, "2": 1.0, "3": 1.0, "4": 0.81, "5": 0.38, "6": 0.13},
+    "pushes": {"1": 1.0, "2": 1.0, "3": 1.0, "4": 0.81, "5": 0.38, "6": 0.13},
     "cost_of_transport": 0.859,
 }
 
@@ -225,20 +384,20 @@ def changed(result: dict[str, Any], path: str, value: float) -> dict[str, Any]:
 
 
 def test_walks_at_the_threshold() -> None:
-    assert rules.walks(WALKS)
+    assert GO1.walks(WALKS)
 
 
 @pytest.mark.parametrize(
     ("path", "value"),
-    [("falls", 1), ("error.0", 0.0601), ("error.1", 0.0601), ("error.2", 0.1201), ("kicks.2", 0.9375), ("error.0", math.inf)],
+    [("falls", 1), ("error.0", 0.0601), ("error.1", 0.0601), ("error.2", 0.1201), ("pushes.2", 0.9375), ("error.0", math.inf)],
 )
 def test_does_not_walk_past_it(path: str, value: float) -> None:
-    assert not rules.walks(changed(WALKS, path, value))
+    assert not GO1.walks(changed(WALKS, path, value))
 
 
 def test_beats_the_peer_by_a_little() -> None:
-    assert rules.beats_peer(BEATS)
-    assert rules.beats_peer(changed(BEATS, "kicks.6", 1.0)) and rules.beats_peer(changed(BEATS, "drift", 0.0))
+    assert GO1.beats_peer(BEATS)
+    assert GO1.beats_peer(changed(BEATS, "pushes.6", 1.0)) and GO1.beats_peer(changed(BEATS, "drift", 0.0))
 
 
 @pytest.mark.parametrize(
@@ -246,17 +405,17 @@ def test_beats_the_peer_by_a_little() -> None:
     [
         *(("error.0", 0.024), ("error.1", 0.031), ("error.2", 0.084), ("cost_of_transport", 0.86)),  # as good is not better
         *(("worst.0", 0.0421), ("worst.1", 0.0631), ("worst.2", 0.3571), ("drift", 0.0051), ("falls", 1)),
-        *(("kicks.1", 0.9375), ("kicks.2", 0.9375), ("kicks.3", 0.9375), ("kicks.4", 0.75), ("kicks.5", 0.375), ("kicks.6", 0.125)),
+        *(("pushes.1", 0.9375), ("pushes.2", 0.9375), ("pushes.3", 0.9375), ("pushes.4", 0.75), ("pushes.5", 0.375), ("pushes.6", 0.125)),
     ],
 )
 def test_does_not_beat_the_peer(path: str, value: float) -> None:
-    assert not rules.beats_peer(changed(BEATS, path, value))
+    assert not GO1.beats_peer(changed(BEATS, path, value))
 
 
 def test_table_names_every_figure() -> None:
-    result = grade(Puppet(follow))
+    result = grade(FakeRobot(follow))
     text = rules.table({**result, "drift": 0.1234, "cost_of_transport": 4.56, "joint_speed": 0.789})
-    for part in ("0.1234", "4.56", "0.789", "survives kicks of 6 m/s", "worst command", "0.0007", "walks: yes; beats the peer: no"):
+    for part in ("0.1234", "4.56", "0.789", "survives pushes of 6 m/s", "worst command", "0.0007", "walks: yes; beats the peer: no"):
         assert part in text
 
 
@@ -288,9 +447,9 @@ def test_standing_still(standing: tuple[dict[str, Any], Tensor]) -> None:
     assert result["drift"] < 0.05 and result["joint_speed"] < 0.05
 
 
-def test_real_kicks_move_the_robot_and_throw_it(standing: tuple[dict[str, Any], Tensor]) -> None:
+def test_real_pushes_move_the_robot_and_throw_it(standing: tuple[dict[str, Any], Tensor]) -> None:
     result, qvel = standing
-    shares = list(result["kicks"].values())
+    shares = list(result["pushes"].values())
     assert shares[-1] == 0.0 and shares[0] <= 1.0 and shares == sorted(shares, reverse=True)
     before, after = qvel[150, TRACKED:, :2].view(6, 16, 2), qvel[151, TRACKED:, :2].view(6, 16, 2)
     jump = (after - before)[:, 0, 0]  # k = 0: forward in the world; a foot on the ground takes a part within the step
@@ -302,12 +461,12 @@ def test_real_kicks_move_the_robot_and_throw_it(standing: tuple[dict[str, Any], 
 def test_two_exams_are_the_same_exam(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the seed, with a policy that answers to every observation."""
     monkeypatch.setattr(exam, "SECONDS", 2.4)
-    monkeypatch.setattr(exam, "KICK_AT", 30)
+    monkeypatch.setattr(exam, "PUSH_AT", 0.6)
     mix = torch.randn(48, 12, generator=torch.Generator().manual_seed(0))
     results = []
     for seed in (1, 2):
         task = load_task("go1_flat")
-        task.set("perturbation.enable", True)  # a task that kicks while it trains
+        task.set("perturbation.kick", True)  # a task that kicks while it trains
         exam.prepare(task)
         torch.manual_seed(seed)
         env = LeggedRobot(task.cfg, "cpu")
@@ -337,12 +496,27 @@ def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert len(graded["commands"]) == TRACKED and graded["walks"] is False
     assert about["overrides"]["noise.level"] == 0.0 and about["overrides"]["terrain.friction"] == 0.4
     assert folder.name in (folder / "eval/report.html").read_text(encoding="utf-8")
+
+
+def test_ranges_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They scale the commands; the peer was asked others and is not spoken of. What the exam decides itself is refused."""
+    monkeypatch.setattr(exam, "SECONDS", 2.1)
+    monkeypatch.setattr(play, "elsewhere", lambda *_: [])
+    folder = trained(tmp_path, "--max_iterations", "1")
+    start = [*SMALL[:2], "--device", "cpu", "--eval"]
+    result = run("play", tmp_path, *start, "--set", "exam.ranges={lin_vel_x: [0, 0.9]}")
+    assert result.code == 0, result.err
+    assert result.out.count("walks: no\n") == 1 and "peer" not in result.out
+    [column] = json.loads((folder / "eval/report.json").read_text())["columns"]
+    assert [row["command"] for row in column["exam"]["commands"]][:6] == [[v, 0, 0] for v in (0, 0.3, 0.6, 0.9, 0, 0)]
+    assert column["exam"]["commands"][-1]["command"] == [0, -0.4, -0.6] and "beats_peer" not in column["exam"]
+
     for more, field in (
         (["--num_envs", "4"], "env.num_envs"),
         (["--set", "noise.level=1"], "noise.level"),
         (["--set", "commands.resampling_time=5"], "commands.resampling_time"),
     ):
-        line = refused(tmp_path, "play", *SMALL[:2], "--device", "cpu", "--eval", *more)
+        line = refused(tmp_path, "play", *start, *more)
         assert f"--eval sets {field} itself; an exam with other values would be another exam" in line
     for more in (["--command", "1,0,0"], ["--video", "x.mp4"], ["--export", "x"]):
-        assert "one thing each" in refused(tmp_path, "play", *SMALL[:2], "--device", "cpu", "--eval", *more)
+        assert "one thing each" in refused(tmp_path, "play", *start, *more)

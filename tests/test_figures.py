@@ -15,7 +15,7 @@ DT = 0.02
 
 
 def make(worlds: int = 1, steps: int = 500, fell: dict[int, int] | None = None, **signals: Any) -> Record:
-    """A record of ``worlds`` that are told nothing; each signal is broadcast to (T, N, ...)."""
+    """A record of ``worlds`` whose commands are zero; each signal is broadcast to (T, N, ...)."""
     fell_at = np.full(worlds, math.inf)
     for world, step in (fell or {}).items():
         fell_at[world] = step
@@ -112,7 +112,7 @@ def test_a_foot_that_chatters_does_not_stride() -> None:
 
 def test_gaits_command_by_command() -> None:
     contact = np.stack([trot(20, 12), trot(25, 10)], axis=1)
-    first, second = figures.gaits(make(2, 400, {1: 30}, contact=contact), 0, [(1.0, 0.0, 0.0), (0.0, 0.8, 0.0)], shown=0.4)
+    first, second = figures.gaits(make(2, 400, {1: 30}, contact=contact), 0, [(1.0, 0.0, 0.0), (0.0, 0.8, 0.0)], seconds=0.4)
     assert first["command"] == [1.0, 0.0, 0.0] and first["contact"] == contact[-20:, 0].T.astype(int).tolist()
     assert second == {"command": [0.0, 0.8, 0.0], "duty_factor": None, "stride_frequency": None, "contact": None}
 
@@ -146,13 +146,13 @@ def test_what_fell_is_not_counted() -> None:
     assert figures.joints(make(2, 100, {0: 5, 1: 5}, torque=torque), 0, limits)["torque"]["saturated"] == []
 
 
-# ---- kicks, energy, reward
+# ---- pushes, energy, reward
 
 
 def test_survival_by_strength_and_direction() -> None:
     fell_at = np.full(32, math.inf)
     fell_at[[3, 16, 17]] = 300, 299, 301
-    weak, strong = figures.survival(fell_at, 300, (1.0, 2.0))
+    weak, strong = figures.survival(fell_at, 300)
     assert [k for k, stood in enumerate(weak) if not stood] == [3] and [k for k, stood in enumerate(strong) if not stood] == [0]
 
 

@@ -297,7 +297,7 @@ def test_trains_and_is_graded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     assert list((tmp_path / "logs/go1_legged_gym").glob("*/model_2.pt"))
     monkeypatch.setattr(grading, "elsewhere", lambda *_: [])  # the same once more, through an export
     result = run("play", tmp_path, "--task", TASK, "--device", "cpu", "--eval")
-    assert result.code == 0 and "survives kicks of 6 m/s" in result.out, result.err
+    assert result.code == 0 and "survives pushes of 6 m/s" in result.out, result.err
 
 
 # ---- what is asked for wrongly

@@ -15,15 +15,18 @@ from tensordict import TensorDict
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam, grading, page, report, rules
+from legged_mw.eval import exam, exams, grading, page, report
+from legged_mw.eval.peers import PEERS
 from legged_mw.eval.report import Column
-from legged_mw.eval.rollout import Case, Kick, roll_out
+from legged_mw.eval.rollout import Case, Push, roll_out
+from legged_mw.eval.rules import ExamRules
 from legged_mw.eval.trials import make_plan
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 
 SHIPPED = ROOT / "resources/policies/go1_flat"
+GO1 = ExamRules.from_config(load_task("go1_flat").cfg)
 
 
 def shipped() -> LoadedTask:
@@ -37,7 +40,7 @@ def both() -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """The shipped policy, 2.4 s: the plain exam's result, the report's, and the report's figures."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(exam, "SECONDS", 2.4)
-        patch.setattr(exam, "KICK_AT", 0.6)
+        patch.setattr(exam, "PUSH_AT", 0.6)
         task = shipped()
         exam.prepare(task)
         env = task.env_class(task.cfg, "cpu")
@@ -48,11 +51,11 @@ def both() -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
 
 
 def test_the_reports_exam_is_the_plain_exam(both: tuple[dict[str, Any], ...]) -> None:
-    """However many worlds stand beside, to the last digit, though the robots walk and are kicked."""
+    """However many worlds stand beside, to the last digit, though the robots walk and are pushed."""
     plain, result, _ = both
     for row in [*plain["commands"], *result["commands"]]:
         assert row["fell"] is False
-    assert plain == result and min(plain["kicks"].values()) < 1.0
+    assert plain == result and min(plain["pushes"].values()) < 1.0
 
 
 def test_figures_of_a_policy_that_walks(both: tuple[dict[str, Any], ...]) -> None:
@@ -60,7 +63,7 @@ def test_figures_of_a_policy_that_walks(both: tuple[dict[str, Any], ...]) -> Non
     _, result, figures = both
     ahead = figures["tracking"]["axes"]["vx"].index(1.0)
     straight, row = figures["tracking"]["axes"]["vy"].index(0.0), figures["tracking"]["vx_vy"][0]
-    walk = next(i for i, c in enumerate(rules.commands()) if c == (1.0, 0.0, 0.0))
+    walk = next(i for i, c in enumerate(GO1.commands()) if c == (1.0, 0.0, 0.0))
     assert row[straight][ahead] == pytest.approx(result["commands"][walk]["error"][0], abs=1e-5)
     assert figures["transport"]["cost_of_transport"][ahead] == pytest.approx(result["cost_of_transport"], rel=1e-3)
     assert all(max(max(r) for r in error) < 0.5 for error in figures["tracking"]["vx_yaw"])
@@ -71,7 +74,7 @@ def test_figures_of_a_policy_that_walks(both: tuple[dict[str, Any], ...]) -> Non
     assert figures["joints"]["torque"]["high"][2] == pytest.approx(35.55)
     [shares] = {len(figures["joints"][key]["saturated"]) for key in ("dof_pos", "dof_vel", "torque")}
     assert shares == 12
-    assert [sum(row) / 16 for row in figures["kicks"]["walking"]] == pytest.approx(list(result["kicks"].values()), abs=1e-4)
+    assert [sum(row) / 16 for row in figures["pushes"]["walking"]] == pytest.approx(list(result["pushes"].values()), abs=1e-4)
     assert figures["steps"]["vx"]["commanded"] == [1.0] * 20 and figures["steps"]["vx"]["fell"] == 0
     assert figures["steps"]["vx"]["mean"] == pytest.approx([1.0] * 20, abs=0.15)
 
@@ -79,8 +82,8 @@ def test_figures_of_a_policy_that_walks(both: tuple[dict[str, Any], ...]) -> Non
 def test_the_plan() -> None:
     """Exam first; grids over the trained ranges; the same steps in each world, later and later."""
     plan = make_plan(shipped().cfg, 0.02)
-    assert plan.cases[: exam.WORLDS] == exam.cases(0.02)
-    assert [plan.parts[name] for name in ("commands", "kicks")] == [slice(0, 22), slice(22, 118)]
+    assert plan.cases[: GO1.worlds()] == exam.cases(GO1, 0.02)
+    assert [plan.parts[name] for name in ("commands", "transport", "pushes")] == [slice(0, 22), slice(22, 22), slice(22, 118)]
     corner = plan.cases[plan.parts["vx_yaw"]][-1]
     assert corner == Case(((0, (1.5, 0.0, 1.2)),)) and plan.cases[plan.parts["vx_vy"]][0] == Case(((0, (-1.5, -0.8, 0.0)),))
     first, second, *_ = plan.cases[plan.parts["step_vy"]]
@@ -93,16 +96,16 @@ def test_the_plan() -> None:
     assert plan.axes["vy"] == [0.0] and plan.cases[plan.parts["vx_yaw"]][0].commands[0][1] == (0.5, 0.0, -1.2)
 
 
-def test_commands_change_and_kicks_come_when_they_should() -> None:
+def test_commands_change_and_pushes_come_when_they_should() -> None:
     task = load_task("go1_flat")
     exam.prepare(task, 2)
     env = LeggedRobot(task.cfg, "cpu")
-    cases = [Case(((0, (0.5, 0.0, 0.0)), (3, (0.0, 0.4, 0.0)))), Case(((0, (0.0, 0.0, 0.0)),), Kick(2, 1.0, 0.0))]
+    cases = [Case(((0, (0.5, 0.0, 0.0)), (3, (0.0, 0.4, 0.0)))), Case(((0, (0.0, 0.0, 0.0)),), Push(2, 1.0, 0.0))]
     seen, speed = [], []
 
     def policy(obs: TensorDict) -> torch.Tensor:
         seen.append(obs["state"][0, -3:].tolist())
-        speed.append(float(env.sim.qvel[1, 0]))
+        speed.append(float(env.root_lin_vel[1, 0]))
         return torch.zeros(len(obs), 12)
 
     record = roll_out(env, policy, cases, 5, {"command": lambda env: env.commands})
@@ -165,10 +168,22 @@ def test_json_holds_every_figure_and_pictures_are_there(pages: Path, both: tuple
     first, numpy, rival = saved["columns"]
     assert first["exam"] == json.loads(json.dumps(result)) and first["figures"] == json.loads(json.dumps(figures))
     assert numpy["name"] == "by numpy" and numpy["figures"] is None and rival["exam"]["falls"] == 22
-    assert saved["task"] == "go1_flat" and saved["peer"] == rules.PEER
-    names = {"tracking", "steps", "gait", "joints", "kicks", "energy", "reward"}
+    assert saved["task"] == "go1_flat" and saved["peer"] == PEERS["playground_go1"].figures
+    names = {"tracking", "steps", "gait", "joints", "pushes", "energy", "reward"}
     assert {path.stem for path in pages.glob("*.png")} == names
     assert all(path.stat().st_size > 5000 and path.read_bytes().startswith(b"\x89PNG") for path in pages.glob("*.png"))
+
+
+def test_a_task_without_a_peer(both: tuple[dict[str, Any], ...], tmp_path: Path) -> None:
+    """Neither page nor JSON speaks of one; pushes and cost of transport are drawn all the same."""
+    _, result, figures = both
+    rules = {**result["rules"], "peer": ""}
+    alone = {name: value for name, value in result.items() if name != "beats_peer"} | {"rules": rules}
+    report.write(tmp_path, "pose", [Column("mine", {}, alone, figures)])
+    html, saved = (tmp_path / "report.html").read_text(encoding="utf-8"), (tmp_path / "report.json").read_text()
+    body = html[html.index("<body>") :]
+    assert "peer" not in body and "peer" not in json.loads(saved) and "beats" not in saved
+    assert "survives pushes of 2 m/s" in body and body.count("<svg") == 3 * 2 + 3 + 6 + 3 + 3 + 2 + 1
 
 
 # ---- --compare
@@ -186,7 +201,8 @@ def test_compare_grades_each_by_its_own_config(two_runs: tuple[Path, Path, Path]
     root, first, second = two_runs
     monkeypatch.setattr(exam, "SECONDS", 2.1)
     written: list[Any] = []
-    monkeypatch.setattr(report, "write", lambda folder, task, columns, extras: written.extend([folder, task, *columns]))
+    kind = exams.EXAMS["walking"]._replace(write=lambda folder, task, columns, extras: written.extend([folder, task, *columns]))
+    monkeypatch.setitem(exams.EXAMS, "walking", kind)
     monkeypatch.setattr(grading, "elsewhere", lambda *_: [])
     small = ["--load_run", first.name, "--compare", second.name, "--set", "terrain.friction=0.4"]
     result = run("play", root, *SMALL[:2], "--device", "cpu", "--eval", *small)
@@ -197,6 +213,7 @@ def test_compare_grades_each_by_its_own_config(two_runs: tuple[Path, Path, Path]
     assert one.about["overrides"]["terrain.friction"] == other.about["overrides"]["terrain.friction"] == 0.4
     assert one.exam != other.exam and one.figures.keys() == other.figures.keys()
     assert result.out.count("falls in 22 commands") == 2
+    assert one.exam["rules"] == other.exam["rules"]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """The exam's rough part: on every kind and level of ground, does the robot get from the middle of a tile to its edge?
 
-Told to walk ahead at 0.6 m/s, from a random place near the middle and in a random direction; the ground is the task's own
-kinds, built anew with another seed. Nominal robot, no noise, no pushes: the same overrides as the walking exam's.
+The command is to walk ahead at 0.6 m/s, from a random place near the middle and in a random direction; the ground is the task's
+own kinds, built with another seed. Nominal robot, no noise, no pushes: the same overrides as the walking exam's.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from legged_mw.sim.terrain import KINDS, MEASURES, measure
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask
 
-SPEED, SECONDS = 0.6, 15.0  # [m/s] told; [s] in which the edge must be reached: 9 m at that speed, and the corner is 5.7 m away
+SPEED, SECONDS = 0.6, 15.0  # [m/s] commanded; [s] in which the edge must be reached: 9 m at that speed, and the corner is 5.7 m away
 LEVELS, TILES, REPEATS = 10, 2, 5  # of each kind; tiles of each level, of a slope one goes up and one down; robots on each tile
 
 OVERRIDES: dict[str, Any] = {
@@ -36,7 +36,7 @@ OVERRIDES: dict[str, Any] = {
     "init_state.pos_xy_range": 0.3,
     "init_state.yaw_range": math.pi,
 }
-SETS = {*OVERRIDES, "env.num_envs", "terrain.num_cols"} - {"domain_rand.enable"}  # what it decides itself, as exam.SETS
+SETS = {*OVERRIDES, "env.num_envs", "terrain.num_cols"} - {"domain_rand.enable"}  # config fields that it decides itself
 
 
 def prepare(task: LoadedTask, repeats: int = REPEATS) -> None:
@@ -57,7 +57,7 @@ def make_room(task: LoadedTask, repeats: int = REPEATS) -> None:
 
 
 def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
-    """Grade ``policy`` in an environment made from a prepared task: shares by kind and level of who crossed, and who fell."""
+    """Grade ``policy`` in an environment made from a prepared task: by kind and level the shares that crossed and that fell."""
     assert env.tiles
     kinds = env.tiles.kinds
     repeats = env.num_envs // (len(kinds) * TILES * LEVELS)  # worlds go kind by kind, column by column, level by level
@@ -65,17 +65,17 @@ def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
         torch.manual_seed(0)
         env.load_training_state({"terrain_levels": torch.arange(env.num_envs) // repeats % LEVELS})
         outcomes = _walk(env, policy, env.tiles.size / 2)
-    by_tile = [who.view(len(kinds), TILES, LEVELS, repeats).double() for who in outcomes]
-    crossed, fell = (who.mean(dim=(1, 3)).cpu().numpy().round(3).tolist() for who in by_tile)
+    by_tile = [worlds.view(len(kinds), TILES, LEVELS, repeats).double() for worlds in outcomes]
+    crossed, fell = (worlds.mean(dim=(1, 3)).cpu().numpy().round(3).tolist() for worlds in by_tile)
     shares = {kind: {**_measure(kind), "crossed": crossed[i], "fell": fell[i]} for i, kind in enumerate(kinds)}
     return {"speed": SPEED, "seconds": SECONDS, "robots": TILES * repeats, "kinds": shares}
 
 
 def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor]:
-    """Who came ``edge`` [m] away from the middle along x or y, and who fell before that, each (N,)."""
-    told = torch.tensor([SPEED, 0.0, 0.0], device=env.device)
+    """Which worlds came ``edge`` [m] away from the middle along x or y, and which fell before that, each (N,)."""
+    command = torch.tensor([SPEED, 0.0, 0.0, *(further.default for further in env.command_table[3:])], device=env.device)
     crossed, fell, over = (torch.zeros(env.num_envs, dtype=torch.bool, device=env.device) for _ in range(3))
-    env.commands.copy_(told)
+    env.commands.copy_(command)
     env.compute_observations()
     obs = env.get_observations()
     for _ in range(round(SECONDS / env.dt)):
@@ -86,7 +86,7 @@ def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor
         over |= dones
         crossed |= (env.farthest[:, 0] > edge) & ~over
         over |= crossed
-        env.commands.copy_(told)  # who began anew is told the same, and no longer counts
+        env.commands.copy_(command)  # in a world that was reset too; it no longer counts
     return crossed, fell
 
 
@@ -98,7 +98,7 @@ def _measure(kind: str) -> dict[str, Any]:
 
 
 def table(result: dict[str, Any]) -> str:
-    """Shares that crossed, a line a kind, a column a level; at the end, over all levels, also who fell."""
+    """Shares that crossed, a line a kind, a column a level; at the end the means over all levels, of those that fell too."""
     kinds = result["kinds"]
     lines = [f"share of {result['robots']} robots that crossed a tile at {result['speed']:g} m/s within {result['seconds']:g} s"]
     lines.append(f"{'level':<16}" + "".join(f"{level:>7}" for level in range(LEVELS)) + f"{'mean':>9}{'fell':>7}")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.eval.rules import GRAVITY, KICK_DIRECTIONS, SLOW
+from legged_mw.eval.rules import GRAVITY, PUSH_DIRECTIONS, SLOW
 
 if TYPE_CHECKING:
     from legged_mw.eval.rollout import Record
@@ -31,7 +31,7 @@ Array = NDArray[Any]
 
 def tracking_errors(record: Record, settled: int, rows: int) -> list[list[list[float | None]]]:
     """Mean absolute error of vx, vy, yaw rate over a grid of worlds: 3 x rows x columns."""
-    error = np.abs(record.signals["velocity"][settled:] - record.commands[settled:]).mean(axis=0, dtype=float)  # (N, 3)
+    error = np.abs(record.signals["velocity"][settled:] - record.commands[settled:, :, :3]).mean(axis=0, dtype=float)  # (N, 3)
     error[np.isfinite(record.fell_at)] = np.nan
     return [plain(error[:, k].reshape(rows, -1)) for k in range(3)]
 
@@ -53,27 +53,20 @@ def step_response(time: Array, measured: Array, start: float, target: float) -> 
     if abs(way[0]) > STRAY or abs(np.mean(end) - 1.0) > STRAY:
         return {"rise_time": None, "overshoot": None, "left": left}
     low, high = _first_crossing(time, way, 0.1), _first_crossing(time, way, 0.9)
-    return {
-        "rise_time": None if low is None or high is None else high - low,
-        "overshoot": max(0.0, float(way.max()) - 1.0),
-        "left": left,
-    }
+    rise_time = None if low is None or high is None else high - low
+    return {"rise_time": rise_time, "overshoot": max(0.0, float(way.max()) - 1.0), "left": left}
 
 
 def _first_crossing(time: Array, values: Array, level: float) -> float | None:
     """When ``values`` first reaches ``level``, between the samples."""
-    above = np.flatnonzero(values >= level)
-    if not len(above):
+    i = int(np.argmax(values >= level))
+    if values[i] < level:
         return None
-    i = int(above[0])
-    if i == 0:
-        return float(time[0])
-    share = (level - values[i - 1]) / (values[i] - values[i - 1])
-    return float(time[i - 1] + share * (time[i] - time[i - 1]))
+    return float(np.interp(level, values[i - 1 : i + 1], time[i - 1 : i + 1])) if i else float(time[0])
 
 
 def responses(record: Record, axis: int, begin: int) -> dict[str, Any]:
-    """Worlds that are told the same from step ``begin`` on: command, and mean, lowest and highest of one axis at each time.
+    """Worlds that get the same command from step ``begin`` on: command, and mean, lowest and highest of one axis at each time.
 
     A world that falls is left out.
     """
@@ -81,15 +74,9 @@ def responses(record: Record, axis: int, begin: int) -> dict[str, Any]:
     moved = record.signals["velocity"][begin:, stood, axis].astype(float)
     time = np.arange(len(commanded)) * record.dt
     mean, low, high = (f(moved, axis=1) if stood.any() else np.full(len(time), np.nan) for f in (np.mean, np.min, np.max))
-    return {
-        "time": plain(time.round(4)),
-        "commanded": plain(commanded),
-        "mean": plain(mean),
-        "low": plain(low),
-        "high": plain(high),
-        "fell": int((~stood).sum()),
-        "numbers": _each_step(time, commanded, mean),
-    }
+    curves = {"time": time.round(4), "commanded": commanded, "mean": mean, "low": low, "high": high}
+    numbers = _each_step(time, commanded, mean)
+    return {**{name: plain(values) for name, values in curves.items()}, "fell": int((~stood).sum()), "numbers": numbers}
 
 
 def _each_step(time: Array, commanded: Array, mean: Array) -> list[dict[str, Any]]:
@@ -124,20 +111,14 @@ def stride_frequency(contact: Array, dt: float) -> float:
     return float(np.mean(rates)) if rates else 0.0
 
 
-def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], shown: float) -> list[dict[str, Any]]:
-    """Of each command's world: duty factor, stride frequency, and which foot is down in the last ``shown`` seconds (F, T)."""
+def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], seconds: float) -> list[dict[str, Any]]:
+    """Of each command's world: duty factor, stride frequency, and which foot is down in the last ``seconds`` (F, T)."""
     found = []
     for world, command in enumerate(commands):
-        contact = record.signals["contact"][settled:, world]
-        fell = bool(np.isfinite(record.fell_at[world]))
-        found.append(
-            {
-                "command": list(command),
-                "duty_factor": None if fell else duty_factor(contact),
-                "stride_frequency": None if fell else stride_frequency(contact, record.dt),
-                "contact": None if fell else contact[-round(shown / record.dt) :].T.astype(int).tolist(),
-            }
-        )
+        contact, fell = record.signals["contact"][settled:, world], bool(np.isfinite(record.fell_at[world]))
+        last = contact[-round(seconds / record.dt) :].T.astype(int).tolist()
+        gait = {"duty_factor": duty_factor(contact), "stride_frequency": stride_frequency(contact, record.dt), "contact": last}
+        found.append({"command": list(command), **(dict.fromkeys(gait) if fell else gait)})
     return found
 
 
@@ -174,12 +155,12 @@ def joints(record: Record, settled: int, limits: dict[str, tuple[Array, Array]])
     return found
 
 
-# ---- kicks, energy, reward
+# ---- pushes, energy, reward
 
 
-def survival(fell_at: Array, until: int, speeds: Sequence[float]) -> list[list[bool]]:
+def survival(fell_at: Array, until: int) -> list[list[bool]]:
     """Not fallen up to step ``until``: speeds x directions."""
-    return (fell_at > until).reshape(len(speeds), KICK_DIRECTIONS).tolist()
+    return (fell_at > until).reshape(-1, PUSH_DIRECTIONS).tolist()
 
 
 def transport(record: Record, settled: int) -> dict[str, list[float | None]]:
@@ -189,9 +170,8 @@ def transport(record: Record, settled: int) -> dict[str, list[float | None]]:
     speed = np.linalg.norm(record.last_position - record.signals["position"][settled], axis=1) / seconds
     cost = np.where(speed > SLOW, power / (record.mass * GRAVITY * np.maximum(speed, SLOW)), np.nan)
     stood = np.isinf(record.fell_at)
-    return {
-        name: plain(np.where(stood, values, np.nan)) for name, values in (("speed", speed), ("power", power), ("cost_of_transport", cost))
-    }
+    each = {"speed": speed, "power": power, "cost_of_transport": cost}
+    return {name: plain(np.where(stood, values, np.nan)) for name, values in each.items()}
 
 
 def reward_shares(record: Record, settled: int, names: Sequence[str]) -> dict[str, float | None]:

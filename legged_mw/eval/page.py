@@ -5,53 +5,57 @@ from __future__ import annotations
 from collections.abc import Sequence
 from html import escape
 from itertools import zip_longest
+from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any
 
-from legged_mw.eval import rules
 from legged_mw.eval.crossing import LEVELS
-from legged_mw.eval.style import CSS
+from legged_mw.eval.rules import AXES, PUSH_DIRECTIONS, ExamRules, Figure
 
 if TYPE_CHECKING:
     from legged_mw.eval.plots import Section
     from legged_mw.eval.report import Column
 
+CSS = Path(__file__).with_name("report.css").read_text(encoding="utf-8")
 TEXTS = {
-    "crossing": "Told to walk ahead at 0.6 m/s from the middle of a tile, facing any direction: the share of ten robots on two tiles that "
-    "came to their tile's edge within 15 s. Below it those who fell on the way; the rest got stuck or went astray. A row is a kind of "
-    "ground, and below it stands what makes it hard, level by level. Dark is good.",
+    "crossing": "Commanded ahead at 0.6 m/s from the middle of a tile, facing any direction: the share of ten robots on two tiles that "
+    "reached their tile's edge within 15 s. Below it the share that fell on the way; the rest got stuck or went astray. A row is a kind of "
+    "ground; below it stands what makes it hard, level by level. Dark is good.",
     "tracking": "Mean absolute error of the velocity at the IMU, body frame, over the last 8 of 10 seconds, command by command over the "
     "range that was trained. Dark is good. The stroke on each scale is what the exam allows on average; a cross is a fall.",
     "steps": "Walking at two thirds of the trained range, then the same backwards, then standing, then walking again. Line: mean of eight "
-    "robots whom the steps meet in different phases of their gait; band: lowest and highest of them.",
+    "robots, each in another phase of its gait at the step; band: lowest and highest of them.",
     "gait": "A bar where a foot is on the ground, the last two seconds of each command. Above: strides a second, and the duty factor: "
     "the share of time that a foot is down, mean over the feet.",
     "joints": "Where the joints are, how fast they move and what torque they need over all 22 commands. Upright strokes are limits: soft "
     "position limits, the motors' speed, the torque that the servos are clamped to. At the right the share of samples beyond a limit "
     "(of a torque: at 98 % of it or more), where there are any.",
-    "kicks": "The base's horizontal velocity jumps; a kick is survived if the robot has not fallen three seconds later. Rings: jumps "
-    "of 1 to 6 m/s, from the inside; sectors: where it is kicked to. Coloured tiles were survived. Walking is at 0.8 m/s; the exam counts "
-    "these.",
+    "pushes": "The base's horizontal velocity jumps; a push is survived if the robot has not fallen three seconds later. Rings: jumps "
+    "of {speeds} m/s, from the inside; sectors: where it is pushed to. Coloured tiles were survived. Walking is at {vx:g} m/s; the exam "
+    "counts these.",
     "energy": "Straight ahead and backwards. Power: sum over the joints of |torque x speed|. Cost of transport: energy over weight "
     "times distance.",
     "reward": "What each term adds to the reward in a second, before the clip at zero, mean over the 22 commands.",
 }
 EXAM_NOTE = (
-    "22 commands of 10 s and 96 kicks, all from rest on flat ground, without noise. A policy walks if it passes every row that has a "
-    "mark. The peer is the policy that ships with MuJoCo Playground for this robot, graded by the same rules in MuJoCo's C engine."
+    "22 commands of 10 s and {pushes} pushes, all from rest on flat ground, without noise. A policy walks if it passes every row that "
+    "has a mark.{peer}"
 )
 
 
-def html(task: str, columns: Sequence[Column], drawn: Sequence[tuple[Section, list[str]]]) -> str:
-    """The whole page."""
-    first = columns[0]
-    chapters = [_chapter(section, panels, _extra(section.name, columns)) for section, panels in drawn]
+def html(task: str, rules: ExamRules, columns: Sequence[Column], drawn: Sequence[tuple[Section, list[str]]]) -> str:
+    """The whole page; ``rules`` are those of the first column."""
+    words = {"speeds": " to ".join(f"{end(rules.push_speeds):g}" for end in (min, max)), "vx": rules.push_vx}
+    chapters = [_chapter(section, panels, TEXTS[section.name].format(**words), _extra(section.name, columns)) for section, panels in drawn]
+    peer = f" The peer is {rules.peer_policy.about}." if rules.peer_policy else ""
+    note = EXAM_NOTE.format(pushes=len(rules.push_speeds) * PUSH_DIRECTIONS, peer=peer)
+    figures = [rules.figures(column.exam) for column in columns]
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark"><title>{escape(task)}: walking exam</title><style>{CSS}</style></head>
 <body><main>
-<header><p class="kicker">Walking exam</p><h1>{escape(task)}</h1>{_names(columns)}{_cards(first)}</header>
-<section><h2>Exam</h2><p class="lead">{EXAM_NOTE}</p>{_exam_table(columns)}</section>
+<header><p class="above">Walking exam</p><h1>{escape(task)}</h1>{_names(columns)}{_cards(figures[0])}</header>
+<section><h2>Exam</h2><p class="lead">{note}</p>{_exam_table(columns, figures, bool(rules.peer_policy))}</section>
 {"".join(chapters)}
 <footer>{_about(columns)}</footer>
 </main></body></html>
@@ -64,9 +68,9 @@ def _names(columns: Sequence[Column]) -> str:
     for column in columns:
         swatch = f'<i class="swatch c{drawn.index(column.name)}"></i>' if column.figures and len(drawn) > 1 else ""
         engine = escape(str(column.about.get("engine", "")))
-        result = column.exam
-        words = [_pill("walks", "does not walk", result["walks"]), _pill("beats the peer", "does not beat the peer", result["beats_peer"])]
-        items.append(f"<li>{swatch}<b>{escape(column.name)}</b> <span class='muted'>{engine}</span> {' '.join(words)}</li>")
+        verdicts = {"walks": ("walks", "does not walk"), "beats_peer": ("beats the peer", "does not beat the peer")}
+        pills = [_pill(*words, column.exam[key]) for key, words in verdicts.items() if key in column.exam]
+        items.append(f"<li>{swatch}<b>{escape(column.name)}</b> <span class='muted'>{engine}</span> {' '.join(pills)}</li>")
     return f'<ul class="names">{"".join(items)}</ul>'
 
 
@@ -74,53 +78,44 @@ def _pill(good: str, bad: str, yes: bool) -> str:
     return f'<span class="pill {"yes" if yes else "no"}">{"&#10003;" if yes else "&#10007;"} {good if yes else bad}</span>'
 
 
-def _cards(column: Column) -> str:
+def _cards(figures: Sequence[Figure]) -> str:
     """The figures that one looks for first."""
-    result = column.exam
-    rows = {row.name.strip(): row for row in rules.rows(result) if not row.name.startswith(" ")}
-    wanted = {
-        "error vx [m/s]": ("vx error", "m/s"),
-        "error vy [m/s]": ("vy error", "m/s"),
-        "error yaw rate [rad/s]": ("yaw error", "rad/s"),
-        "falls in 22 commands": ("falls", "of 22"),
-        "survives kicks of 2 m/s": ("2 m/s kicks", "survived"),
-        "cost of transport at 1 m/s": ("cost of transport", "at 1 m/s"),
-    }
     cards = []
-    for name, (label, unit) in wanted.items():
-        row = rows[name]
-        value = f"{row.value:.0%}" if row.more_is_better and row.value is not None else row.shown(row.value)
-        cards.append(f'<div class="card{_mood(row)}"><span>{label}</span><b>{value}</b><small>{unit}</small></div>')
+    for figure in figures:
+        if figure.card:
+            title, unit = figure.card
+            value = f"{figure.value:.0%}" if figure.more_is_better and figure.value is not None else figure.text(figure.value)
+            cards.append(f'<div class="card{_mood(figure)}"><span>{title}</span><b>{value}</b><small>{unit}</small></div>')
     return f'<div class="cards">{"".join(cards)}</div>'
 
 
-def _mood(row: rules.Row) -> str:
-    return {True: " pass", False: " fail", None: ""}[row.passes()]
+def _mood(figure: Figure) -> str:
+    return {True: " pass", False: " fail", None: ""}[figure.passes()]
 
 
-def _exam_table(columns: Sequence[Column]) -> str:
+def _exam_table(columns: Sequence[Column], figures: Sequence[Sequence[Figure]], peer: bool) -> str:
     """A row a figure; from the second column on with the gap to the first."""
-    listed = [rules.rows(column.exam) for column in columns]
-    heads = "".join(f"<th>{escape(column.name)}</th>" for column in columns)
     lines = []
-    for row, *others in zip(*listed, strict=True):
-        cells = [f'<td><span class="value{_mood(row)}">{row.shown(row.value)}</span></td>']
+    for first, *others in zip(*figures, strict=True):
+        cells = [f'<td><span class="value{_mood(first)}">{first.text(first.value)}</span></td>']
         for other in others:
-            gap = "" if other.value is None or row.value is None else f"{other.value - row.value:+.{row.digits}f}"
+            gap = "" if other.value is None or first.value is None else f"{other.value - first.value:+.{first.digits}f}"
             gap = gap if gap.strip("+-0.") else ""
-            cells.append(f'<td><span class="value{_mood(other)}">{other.shown(other.value)}</span> <small>{gap}</small></td>')
-        peer = "" if row.peer is None else row.shown(row.peer)
-        name = escape(row.name.strip())
-        sub = ' class="sub"' if row.name.startswith(" ") else ""
-        lines.append(f"<tr{sub}><th>{name}</th>{''.join(cells)}<td>{row.shown_mark()}</td><td>{peer}</td></tr>")
-    head = f"<thead><tr><th></th>{heads}<th>walks at</th><th>peer</th></tr></thead>"
+            cells.append(f'<td><span class="value{_mood(other)}">{other.text(other.value)}</span> <small>{gap}</small></td>')
+        cells.append(f"<td>{first.mark_text()}</td>")
+        if peer:
+            cells.append(f"<td>{'' if first.peer is None else first.text(first.peer)}</td>")
+        sub = ' class="sub"' if first.name.startswith(" ") else ""
+        lines.append(f"<tr{sub}><th>{escape(first.name.strip())}</th>{''.join(cells)}</tr>")
+    heads = "".join(f"<th>{escape(name)}</th>" for name in [*(column.name for column in columns), "walks at", *(["peer"] if peer else [])])
+    head = f"<thead><tr><th></th>{heads}</tr></thead>"
     return f'<div class="scroll"><table class="exam">{head}<tbody>{"".join(lines)}</tbody></table></div>'
 
 
-def _chapter(section: Section, panels: list[str], extra: str) -> str:
+def _chapter(section: Section, panels: list[str], lead: str, extra: str) -> str:
     figures = "".join(f"<figure>{svg}</figure>" for svg in panels)
     kind = "wide" if section.across == 1 else "half" if section.panels[0].width > 4.0 else f"by{section.across}"
-    text = f'<h2>{section.title}</h2><p class="lead">{TEXTS[section.name]}</p>'
+    text = f'<h2>{section.title}</h2><p class="lead">{lead}</p>'
     return f'<section>{text}<div class="panels {kind}">{figures}</div>{extra}</section>'
 
 
@@ -152,19 +147,12 @@ def _crossing_rows(column: Column, whose: str) -> list[list[str]]:
 
 def _step_rows(column: Column, whose: str) -> list[list[str]]:
     rows = []
-    for axis, (name, unit) in {"vx": ("vx", "m/s"), "vy": ("vy", "m/s"), "yaw": ("yaw rate", "rad/s")}.items():
-        for number in (column.figures or {})["steps"][axis]["numbers"]:
+    for name, unit in AXES:
+        for number in (column.figures or {})["steps"][name.removesuffix(" rate")]["numbers"]:
             rise, over, left = number["rise_time"], number["overshoot"], number["left"]
-            rows.append(
-                [
-                    f"{name} [{unit}]{whose}",
-                    f"{number['from']:g}",
-                    f"{number['to']:g}",
-                    "not reached" if rise is None else f"{rise:.2f}",
-                    "" if over is None else f"{over:.0%}",
-                    "" if left is None else f"{left:+.3f}",
-                ]
-            )
+            rose = "not reached" if rise is None else f"{rise:.2f}"
+            rest = ["" if over is None else f"{over:.0%}", "" if left is None else f"{left:+.3f}"]
+            rows.append([f"{name} [{unit}]{whose}", f"{number['from']:g}", f"{number['to']:g}", rose, *rest])
     return rows
 
 
@@ -172,10 +160,8 @@ def _gait_rows(column: Column, whose: str) -> list[list[str]]:
     rows = []
     for gait in (column.figures or {})["gait"]:
         name = ", ".join(f"{v:g}" for v in gait["command"]) + whose
-        if gait["duty_factor"] is None:
-            rows.append([name, "fell"])
-        else:
-            rows.append([name, f"{gait['stride_frequency']:.2f}", *(f"{share:.0%}" for share in gait["duty_factor"])])
+        strides, duty = gait["stride_frequency"], gait["duty_factor"]
+        rows.append([name, "fell"] if duty is None else [name, f"{strides:.2f}", *(f"{share:.0%}" for share in duty)])
     return rows
 
 

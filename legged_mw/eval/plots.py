@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +23,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
-from legged_mw.eval.rules import ERROR_MARKS, PEER
+from legged_mw.eval.rules import AXES, ExamRules
 
 Figures = dict[str, Any]
 Columns = list[tuple[str, Figures]]  # (name, figures) of one policy or two
@@ -33,15 +33,21 @@ PAIR, GREEN = ("#0072b2", "#d55e00"), "#009e73"
 VARIABLES = {INK: "ink", MUTED: "muted", FAINT: "faint", PAPER: "paper", PAIR[0]: "first", PAIR[1]: "second", GREEN: "peer"}
 STYLE: dict[Any, Any] = {
     **{"font.family": "DejaVu Sans", "font.size": 7.5, "svg.fonttype": "none", "text.color": INK, "axes.labelcolor": MUTED},
-    **{"axes.edgecolor": FAINT, "axes.linewidth": 0.8, "axes.titlesize": 8.0, "axes.titlelocation": "left", "axes.titlepad": 7.0},
+    **{
+        "axes.edgecolor": FAINT,
+        "axes.linewidth": 0.8,
+        "axes.titlesize": 8.0,
+        "axes.titlelocation": "left",
+        "axes.titlepad": 7.0,
+        "axes.labelpad": 2.0,
+    },
     **{"axes.titlecolor": INK, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True},
     **{"grid.color": FAINT, "grid.linewidth": 0.6, "xtick.color": MUTED, "ytick.color": MUTED, "xtick.major.size": 0.0},
     **{"ytick.major.size": 0.0, "xtick.major.pad": 4.0, "ytick.major.pad": 4.0, "legend.frameon": False, "legend.fontsize": 7.0},
     **{"lines.linewidth": 1.4, "figure.facecolor": "none", "axes.facecolor": "none", "savefig.facecolor": "none"},
 }
 HEAT = "viridis"  # perceptually uniform
-MEASURES = (("vx", "m/s"), ("vy", "m/s"), ("yaw rate", "rad/s"))
-GAITS = ((0.5, 0.0, 0.0), (1.0, 0.0, 0.0), (1.5, 0.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.8, 0.0), (0.0, 0.0, 1.2))  # that are drawn
+GAITS = (1, 2, 3, 5, 7, 11)  # of the 22 commands, that are drawn: ahead, at three speeds; back; left; turning left
 
 
 class Panel(NamedTuple):
@@ -62,26 +68,25 @@ class Section(NamedTuple):
     across: int = 3  # panels side by side
 
 
-def sections(columns: Columns) -> list[Section]:
-    """All that is drawn of one policy or two."""
-    kicks = [Panel(partial(_kick_curve, columns), height=2.9)]
+def sections(columns: Columns, rules: ExamRules) -> list[Section]:
+    """All that is drawn of one policy or two, with the marks and the peer of the first one's rules."""
+    pushes = [Panel(partial(_push_curve, columns, rules), height=2.9)]
     for which in ("walking", "standing"):
         for i, (name, figures) in enumerate(columns):
             title = f"{which}{_of(name, columns)}"
-            kicks.append(Panel(partial(_kick_wheel, figures["kicks"], which, PAIR[i], title), height=2.9, polar=True))
-    chosen = [i for i, row in enumerate(columns[0][1]["gait"]) if tuple(row["command"]) in GAITS]
+            pushes.append(Panel(partial(_push_wheel, figures["pushes"], which, PAIR[i], title), height=2.9, polar=True))
     responses = [Panel(partial(_response, columns, i)) for i in range(3)]
-    strides = [Panel(partial(_gait, columns, i), height=1.75 + 0.25 * len(columns)) for i in chosen]
-    energy = [Panel(partial(_against_speed, columns, "power")), Panel(partial(_against_speed, columns, "cost_of_transport"))]
+    strides = [Panel(partial(_gait, columns, i), height=1.75 + 0.25 * len(columns)) for i in GAITS]
+    energy = [Panel(partial(_against_speed, columns, rules, key)) for key in ("power", "cost_of_transport")]
     terms = len(columns[0][1]["reward"])
     rough = _crossing_maps(columns)
     return [
         *([Section("crossing", "Rough ground", rough, across=len(rough))] if rough else []),
-        Section("tracking", "Following the command", _heat_maps(columns)),
+        Section("tracking", "Following the command", _heat_maps(columns, rules.marks)),
         Section("steps", "Steps of the command", responses),
         Section("gait", "Gait", strides),
         Section("joints", "Joints against their limits", _joint_panels(columns)),
-        Section("kicks", "Kicks", kicks),
+        Section("pushes", "Pushes", pushes),
         Section("energy", "Energy", energy, across=2),
         Section("reward", "Reward", [Panel(partial(_reward, columns), width=7.2, height=0.9 + 0.21 * terms)], across=1),
     ]
@@ -150,7 +155,7 @@ def _crossing_maps(columns: Columns) -> list[Panel]:
 
 
 def _crossing(kinds: dict[str, Figures], suffix: str, ax: Axes) -> None:
-    """A row a kind of ground, a cell a level: who crossed, and who fell; below the cells what makes the kind hard."""
+    """A row a kind of ground, a cell a level: which share crossed, and which fell; below the cells what makes the kind hard."""
     for row, kind in enumerate(kinds.values()):
         shares = _array([kind["crossed"], kind["fell"]])
         levels = shares.shape[1]
@@ -168,9 +173,7 @@ def _crossing(kinds: dict[str, Figures], suffix: str, ax: Axes) -> None:
     ax.tick_params(axis="y", which="minor", length=0.0, labelsize=6.2, labelcolor=MUTED)
     ax.tick_params(axis="y", labelcolor=INK)
     ax.set_xticks([*range(levels), levels + 0.3], [*map(str, range(levels)), "mean"])
-    ax.set_xlabel("level", labelpad=2)
-    ax.set_xlim(-0.5, levels + 0.8)
-    ax.set_ylim(len(kinds) - 0.05, 0.0)
+    ax.set(xlabel="level", xlim=(-0.5, levels + 0.8), ylim=(len(kinds) - 0.05, 0.0))
     ax.grid(False)
     ax.spines[["left", "bottom"]].set_visible(False)
     crossed, fell = (float(np.mean([kind[which] for kind in kinds.values()])) for which in ("crossed", "fell"))
@@ -186,19 +189,19 @@ def _percent(share: float) -> str:
 # ---- following the command
 
 
-def _heat_maps(columns: Columns) -> list[Panel]:
+def _heat_maps(columns: Columns, marks: Sequence[float]) -> list[Panel]:
     """Three errors over two grids, each error on one scale: up to its largest value, but at most three times the exam's mark."""
     panels = []
     for grid, across in (("vx_yaw", "yaw"), ("vx_vy", "vy")):
         for name, figures in columns:
-            for k, mark in enumerate(ERROR_MARKS):
+            for k, mark in enumerate(marks):
                 every = np.concatenate([_array(f["tracking"][g][k]).ravel() for _, f in columns for g in ("vx_yaw", "vx_vy")])
                 top = max(1.25 * mark, min(3 * mark, float(np.nanmax(every)) if np.isfinite(every).any() else mark))
-                panels.append(Panel(partial(_heat, figures["tracking"], grid, across, k, top, _of(name, columns)), height=2.45))
+                panels.append(Panel(partial(_heat, figures["tracking"], grid, across, k, mark, top, _of(name, columns)), height=2.45))
     return panels
 
 
-def _heat(tracking: Figures, grid: str, down: str, k: int, top: float, suffix: str, ax: Axes) -> None:
+def _heat(tracking: Figures, grid: str, down: str, k: int, mark: float, top: float, suffix: str, ax: Axes) -> None:
     x, y, values = _array(tracking["axes"]["vx"]), _array(tracking["axes"][down]), _array(tracking[grid][k])
     scale = Normalize(0.0, top)
     ax.pcolormesh(_edges(x), _edges(y), values, cmap=HEAT, norm=scale, edgecolors=PAPER, linewidth=0.8)
@@ -209,17 +212,15 @@ def _heat(tracking: Figures, grid: str, down: str, k: int, top: float, suffix: s
     for axis, centres in ((ax.xaxis, x), (ax.yaxis, y)):
         ticks = centres[:: max(1, len(centres) // 4)]
         axis.set_ticks(ticks, [f"{tick:g}" for tick in ticks])
-    name, unit = MEASURES[k]
-    ax.set_title(f"error of {name} [{unit}]{suffix}")
-    ax.set_xlabel("commanded vx [m/s]", labelpad=2)
-    ax.set_ylabel("yaw rate [rad/s]" if down == "yaw" else "vy [m/s]", labelpad=2)
-    beyond = bool((values > top).any())
-    levels, ticks = np.linspace(0.0, top, 33), [0.0, ERROR_MARKS[k], *([top] if top > 1.4 * ERROR_MARKS[k] else [])]
-    marks = {"aspect": 18, "pad": 0.03, "extend": "max" if beyond else "neither", "boundaries": levels, "ticks": ticks, "format": "%.2f"}
-    bar = ax.figure.colorbar(ScalarMappable(scale, HEAT), ax=ax, **marks)
+    name, unit = AXES[k]
+    beside = "yaw rate [rad/s]" if down == "yaw" else "vy [m/s]"
+    ax.set(title=f"error of {name} [{unit}]{suffix}", xlabel="commanded vx [m/s]", ylabel=beside)
+    shape: dict[str, Any] = {"aspect": 18, "pad": 0.03, "extend": "max" if (values > top).any() else "neither", "format": "%.2f"}
+    ticks = [0.0, mark, *([top] if top > 1.4 * mark else [])]
+    bar = ax.figure.colorbar(ScalarMappable(scale, HEAT), ax=ax, boundaries=np.linspace(0.0, top, 33), ticks=ticks, **shape)
     bar.solids.set_edgecolor("face")  # type: ignore[union-attr]
     bar.outline.set_visible(False)  # type: ignore[operator]
-    bar.ax.axhline(ERROR_MARKS[k], color=PAPER, linewidth=1.2)
+    bar.ax.axhline(mark, color=PAPER, linewidth=1.2)
     bar.ax.grid(False)
 
 
@@ -230,7 +231,7 @@ def _edges(centres: np.ndarray) -> np.ndarray:
 
 
 def _response(columns: Columns, k: int, ax: Axes) -> None:
-    name, unit = MEASURES[k]
+    name, unit = AXES[k]
     for i, (label, figures) in enumerate(columns):
         step = figures["steps"][("vx", "vy", "yaw")[k]]
         time, low, high = (_array(step[key]) for key in ("time", "low", "high"))
@@ -238,8 +239,7 @@ def _response(columns: Columns, k: int, ax: Axes) -> None:
         ax.plot(time, _array(step["mean"]), color=PAIR[i], label=label if len(columns) > 1 else "measured")
         if i == 0:
             ax.step(time, _array(step["commanded"]), where="post", color=INK, linestyle=(0, (4, 2)), linewidth=1.0, label="commanded")
-    ax.set_title(f"{name} [{unit}]")
-    ax.set_xlabel("time [s]", labelpad=2)
+    ax.set(title=f"{name} [{unit}]", xlabel="time [s]")
     ax.margins(x=0)
     if k == 0:
         ax.legend(loc="lower right", handlelength=1.6)
@@ -251,33 +251,21 @@ def _response(columns: Columns, k: int, ax: Axes) -> None:
 def _gait(columns: Columns, world: int, ax: Axes) -> None:
     """A bar where a foot is down; two policies share each foot's lane."""
     feet, count = columns[0][1]["foot_names"], len(columns)
-    height = 0.62 / count
-    for i, (_, figures) in enumerate(columns):
-        row = figures["gait"][world]
-        if row["contact"] is None:
-            continue
-        for foot, down in enumerate(row["contact"]):
-            bars = [(start * figures["dt"], length * figures["dt"]) for start, length in _runs(down)]
+    rows, height = [figures["gait"][world] for _, figures in columns], 0.62 / count
+    for i, row in enumerate(rows):
+        for foot, down in enumerate(row["contact"] or []):
+            edges = np.flatnonzero(np.diff([0, *down, 0])).reshape(-1, 2) * columns[i][1]["dt"]  # begin and end of each stance
+            bars = [(begin, end - begin) for begin, end in edges]
             ax.broken_barh(bars, (foot - 0.31 + i * height, height * 0.94), facecolors=PAIR[i], linewidth=0)
-    vx, vy, yaw = columns[0][1]["gait"][world]["command"]
-    told = [f"{name} {value:g} {unit}" for (name, unit), value in zip(MEASURES, (vx, vy, yaw), strict=True) if value]
-    ax.set_title(f"{', '.join(told) or 'stand'}")
-    rows = [figures["gait"][world] for _, figures in columns]
+    command = zip(AXES, rows[0]["command"], strict=True)
+    ax.set_title(", ".join(f"{name} {value:g} {unit}" for (name, unit), value in command if value) or "stand")
     rates = " / ".join("fell" if row["contact"] is None else f"{row['stride_frequency']:.1f}" for row in rows)
     duties = " / ".join("-" if row["contact"] is None else f"{np.mean(row['duty_factor']):.2f}" for row in rows)
     ax.set_title(f"{rates} Hz, duty {duties}", loc="right", color=MUTED, fontsize=7.0)
     ax.set_yticks(range(len(feet)), feet)
-    ax.set_ylim(len(feet) - 0.5, -0.5)
-    ax.set_xlim(0.0, None)
+    ax.set(xlim=(0.0, None), ylim=(len(feet) - 0.5, -0.5), xlabel="time [s]")
     ax.grid(False, axis="y")
     ax.spines["left"].set_visible(False)
-    ax.set_xlabel("time [s]", labelpad=2)
-
-
-def _runs(down: list[int]) -> list[tuple[int, int]]:
-    """(start, length) of each stretch of ones."""
-    edges = np.flatnonzero(np.diff([0, *down, 0]))
-    return [(int(a), int(b - a)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
 # ---- joints
@@ -293,71 +281,64 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
     """A hill a joint, as high as any; limits are upright strokes, the middle 90 % a line on the ground."""
     names = [name.removesuffix("_joint") for name in columns[0][1]["joint_names"]]
     for i, (_, figures) in enumerate(columns):
-        shown = figures["joints"][key]
-        for joint, (edges, density) in enumerate(zip(shown["edges"], shown["density"], strict=True)):
-            peak = max(density) or 1.0
-            hill = joint - 0.78 * np.array([*density, density[-1]]) / peak
+        found = figures["joints"][key]
+        for joint, (edges, density) in enumerate(zip(found["edges"], found["density"], strict=True)):
+            hill = joint - 0.78 * np.array([*density, density[-1]]) / (max(density) or 1.0)
             if i == 0:
                 ax.fill_between(edges, joint, hill, step="post", color=PAIR[i], alpha=0.55, linewidth=0)
             else:
                 ax.step(edges, hill, where="post", color=PAIR[i], linewidth=1.0)
-            for end in (shown["low"][joint], shown["high"][joint]):
+            for end in (found["low"][joint], found["high"][joint]):
                 if end is not None and i == 0:
                     ax.plot([end, end], [joint, joint - 0.72], color=INK, linewidth=1.2)
-            share = shown["saturated"][joint]
-            if share:
+            if share := found["saturated"][joint]:
                 text = f"{share:.1%}" if share >= 0.001 else "<0.1%"
                 ax.annotate(text, (1.01, joint - 0.1 - 0.4 * i), xycoords=("axes fraction", "data"), color=PAIR[i], fontsize=6.2)
-    ax.set_title(label)
     ax.set_yticks(range(len(names)), names)
-    ax.set_ylim(len(names) - 0.6, -1.05)
+    ax.set(title=label, ylim=(len(names) - 0.6, -1.05))
     ax.spines["left"].set_visible(False)
     ax.margins(x=0.04)
 
 
-# ---- kicks
+# ---- pushes
 
 
-def _kick_curve(columns: Columns, ax: Axes) -> None:
-    speeds = columns[0][1]["kicks"]["speeds"]
-    ax.plot(speeds, list(PEER["kicks"].values()), color=GREEN, marker="D", markersize=3.2, linewidth=1.0, label="peer, walking")
+def _push_curve(columns: Columns, rules: ExamRules, ax: Axes) -> None:
+    speeds = rules.push_speeds
+    if rules.peer_policy:
+        shares = list(rules.peer_policy.figures["pushes"].values())
+        ax.plot(speeds, shares, color=GREEN, marker="D", markersize=3.2, linewidth=1.0, label="peer, walking")
     for i, (name, figures) in enumerate(columns):
         for which, line in (("walking", "-"), ("standing", (0, (2, 1.5)))):
-            share = np.mean(figures["kicks"][which], axis=1)
-            label = f"{which}{_of(name, columns)}"
+            share, label = np.mean(figures["pushes"][which], axis=1), f"{which}{_of(name, columns)}"
             ax.plot(speeds, share, color=PAIR[i], linestyle=line, marker="o", markersize=3.2, label=label)
-    ax.set_title("share of 16 directions survived")
-    ax.set_xlabel("jump of the velocity [m/s]", labelpad=2)
-    ax.set_ylim(-0.03, 1.04)
+    ax.set(title="share of 16 directions survived", xlabel="jump of the velocity [m/s]", ylim=(-0.03, 1.04))
     ax.legend(loc="best", handlelength=2.2)
 
 
-def _kick_wheel(kicks: Figures, which: str, colour: str, title: str, ax: Any) -> None:
-    """A tile a kick: ring by strength, sector by direction as the robot sees it; full where it was survived."""
-    survived = np.array(kicks[which])
+def _push_wheel(pushes: Figures, which: str, colour: str, title: str, ax: Any) -> None:
+    """A tile a push: ring by strength, sector by direction as the robot sees it; full where it was survived."""
+    survived = np.array(pushes[which])
     width = 2 * math.pi / survived.shape[1]
     rings, sectors = np.indices(survived.shape).reshape(2, -1)
     ax.bar(sectors * width, 0.9, width * 0.95, rings + 1, color=np.where(survived, colour, FAINT).ravel(), linewidth=0)
     ax.set_theta_zero_location("N")
     ax.set_xticks(np.arange(4) * math.pi / 2, ["ahead", "left", "behind", "right"])
-    ax.set_yticks([])
-    ax.set_ylim(0, len(survived) + 1)
+    ax.set(title=title, yticks=[], ylim=(0, len(survived) + 1))
     ax.grid(False)
     ax.spines["polar"].set_visible(False)
-    ax.set_title(title)
 
 
 # ---- energy, reward
 
 
-def _against_speed(columns: Columns, key: str, ax: Axes) -> None:
+def _against_speed(columns: Columns, rules: ExamRules, key: str, ax: Axes) -> None:
     for i, (name, figures) in enumerate(columns):
         ax.plot(figures["transport"]["vx"], _array(figures["transport"][key]), color=PAIR[i], marker="o", markersize=3.2, label=name)
-    if key == "cost_of_transport":
-        ax.plot([1.0], [PEER["cost_of_transport"]], color=GREEN, marker="D", markersize=4.5, linestyle="none", label="peer")
-    ax.set_title("mean power [W]" if key == "power" else "cost of transport [-]")
-    ax.set_xlabel("commanded vx [m/s]", labelpad=2)
-    ax.set_ylim(0.0, None)
+    if key == "cost_of_transport" and rules.peer_policy:
+        cost = rules.peer_policy.figures[key]
+        ax.plot([rules.transport_vx], [cost], color=GREEN, marker="D", markersize=4.5, linestyle="none", label="peer")
+    ax.set(title="mean power [W]" if key == "power" else "cost of transport [-]", xlabel="commanded vx [m/s]", ylim=(0.0, None))
     if key == "cost_of_transport" or len(columns) > 1:
         ax.legend(loc="best", handlelength=1.6)
 
@@ -376,11 +357,10 @@ def _reward(columns: Columns, ax: Axes) -> None:
             text = {"textcoords": "offset points", "va": "center", "ha": align, "fontsize": 6.2, "color": MUTED}
             ax.annotate(f"{value:.3g}" if abs(value) >= 5e-5 else "0", (value, y), (side, 0), **text)
     ax.set_yticks(range(len(terms)), terms)
-    ax.set_ylim(len(terms) - 0.4, -0.6)
+    ax.set(title="scale times term, a second", ylim=(len(terms) - 0.4, -0.6))
     ax.axvline(0.0, color=MUTED, linewidth=0.8)
     ax.grid(False, axis="y")
     ax.spines["left"].set_visible(False)
     ax.margins(x=0.09)
-    ax.set_title("scale times term, a second")
     if len(columns) > 1:
         ax.legend(loc="lower right")

@@ -36,7 +36,7 @@ class Column(NamedTuple):
 
     name: str
     about: dict[str, Any]  # policy, engine, device, overrides
-    exam: dict[str, Any]  # what ``rules.grade`` gives
+    exam: dict[str, Any]  # what ``ExamRules.grade`` gives
     figures: dict[str, Any] | None = None  # None: only the exam is known
 
 
@@ -56,40 +56,40 @@ def examine(env: LeggedRobot, policy: Policy, rough: LeggedRobot | None = None) 
 
     With ``rough``, made from a task that ``crossing`` prepared, its result is among the figures.
     """
-    plan = make_plan(env.cfg, env.dt)
-    record = roll_out(env, policy, plan.cases, round(exam.SECONDS / env.dt), SIGNALS, alone=exam.WORLDS)
-    gathered = gather(env, plan, record)
+    plan, asked = make_plan(env.cfg, env.dt), rules.ExamRules.from_config(env.cfg)
+    record = roll_out(env, policy, plan.cases, round(exam.SECONDS / env.dt), SIGNALS, alone=asked.worlds())
+    gathered = gather(env, asked, plan, record)
     if rough:
         gathered["crossing"] = crossing.run_crossing(rough, policy)
-    return exam.grade(record.part(slice(exam.WORLDS))), gathered
+    return exam.grade(asked, record.part(slice(asked.worlds()))), gathered
 
 
-def gather(env: LeggedRobot, plan: Plan, record: Record) -> dict[str, Any]:
+def gather(env: LeggedRobot, asked: rules.ExamRules, plan: Plan, record: Record) -> dict[str, Any]:
     """Everything that the report shows besides the exam, as plain numbers."""
     parts = {name: record.part(worlds) for name, worlds in plan.parts.items()}
-    settled, until = round(rules.SETTLING / env.dt), round(rules.KICK_UNTIL / env.dt)
-    told, axes, shown = parts["commands"], plan.axes, round((STEPS_AT[0] - BEFORE_STEP) / env.dt)
+    settled, until = round(rules.SETTLING / env.dt), round(rules.PUSH_UNTIL / env.dt)
+    held, axes, first = parts["commands"], plan.axes, round((STEPS_AT[0] - BEFORE_STEP) / env.dt)
     straight = int(np.argmin(np.abs(axes["vy"]))) * len(axes["vx"])  # the row of the grid that goes straight ahead
     ahead = parts["vx_vy"].part(slice(straight, straight + len(axes["vx"])))
     return {
         "joint_names": list(env.robot.joint_names),
-        "foot_names": list(env.cfg.asset.foot_names),
+        "foot_names": list(env.foot_names),
         "dt": env.dt,
         "tracking": {
             "axes": axes,
             "vx_yaw": figures.tracking_errors(parts["vx_yaw"], settled, len(axes["yaw"])),
             "vx_vy": figures.tracking_errors(parts["vx_vy"], settled, len(axes["vy"])),
         },
-        "steps": {name: figures.responses(parts[f"step_{name}"], i, shown) for i, name in enumerate(NAMES)},
-        "gait": figures.gaits(told, settled, rules.commands(), GAIT_SECONDS),
-        "joints": figures.joints(told, settled, joint_limits(env)),
-        "kicks": {
-            "speeds": list(rules.KICK_SPEEDS),
-            "walking": figures.survival(parts["kicks"].fell_at, until, rules.KICK_SPEEDS),
-            "standing": figures.survival(parts["standing_kicks"].fell_at, until, rules.KICK_SPEEDS),
+        "steps": {name: figures.responses(parts[f"step_{name}"], i, first) for i, name in enumerate(NAMES)},
+        "gait": figures.gaits(held, settled, asked.commands(), GAIT_SECONDS),
+        "joints": figures.joints(held, settled, joint_limits(env)),
+        "pushes": {
+            "speeds": list(asked.push_speeds),
+            "walking": figures.survival(parts["pushes"].fell_at, until),
+            "standing": figures.survival(parts["standing_pushes"].fell_at, until),
         },
         "transport": {"vx": axes["vx"], **figures.transport(ahead, settled)},
-        "reward": figures.reward_shares(told, settled, env.reward_names),
+        "reward": figures.reward_shares(held, settled, env.reward_names),
     }
 
 
@@ -105,20 +105,22 @@ def joint_limits(env: LeggedRobot) -> dict[str, tuple[NDArray[Any], NDArray[Any]
 def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()) -> None:
     """Write ``report.json``, a PNG a section and the self-contained ``report.html``.
 
-    The first column is what the others are held against; at most two have figures. ``extras`` are further results of
-    ``rules.grade`` by name, of which the exam's table shows the gap to the first: the first policy in another physics, say.
+    The other columns are compared with the first, by its rules; at most two have figures. ``extras`` are further results of
+    the exam by name, such as the first policy's in another physics: the exam's table shows their gap to the first.
     """
     from legged_mw.eval import page, plots  # matplotlib takes a second to import
 
     columns = [columns[0], *(Column(name, {}, result) for name, result in extras), *columns[1:]]
     folder.mkdir(parents=True, exist_ok=True)
-    content = {"task": task, "columns": [column._asdict() for column in columns], "peer": rules.PEER}
-    _write_text(folder / "report.json", json.dumps(content, indent=1) + "\n")
-    drawn = [column for column in columns if column.figures]
-    sections = plots.sections([(column.name, column.figures or {}) for column in drawn])
+    asked = rules.ExamRules.from_mapping(columns[0].exam["rules"])
+    content = {"task": task, "columns": [column._asdict() for column in columns]}
+    _write_text(
+        folder / "report.json", json.dumps(content | ({"peer": asked.peer_policy.figures} if asked.peer_policy else {}), indent=1) + "\n"
+    )
+    sections = plots.sections([(column.name, column.figures) for column in columns if column.figures], asked)
     for section in sections:
         plots.write_png(section, folder / f"{section.name}.png")
-    _write_text(folder / "report.html", page.html(task, columns, [(section, plots.svgs(section)) for section in sections]))
+    _write_text(folder / "report.html", page.html(task, asked, columns, [(section, plots.svgs(section)) for section in sections]))
 
 
 def _write_text(path: Path, text: str) -> None:

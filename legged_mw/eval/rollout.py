@@ -1,7 +1,7 @@
 """Drives the environment through cases and records what it sees; what the cases are and what is made of a record is not here.
 
-One case a world: what it is told, when, and how it is kicked. All cases run side by side, once. Exam, report and the exam
-during training differ in their cases and signals only.
+One case a world: its commands, and when it is pushed. All cases run side by side, once. Exam, report and the exam during
+training differ in their cases and signals only.
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.robot_task import RobotTask
 
-Command = tuple[float, float, float]  # vx, vy [m/s], yaw rate [rad/s], body frame
 Policy = Callable[[TensorDict], Tensor]
-Signal = Callable[[LeggedRobot], Tensor]  # a value a world, (N, ...)
+Signal = Callable[[Any], Tensor]  # a value a world, (N, ...)
 
 
-class Kick(NamedTuple):
+class Push(NamedTuple):
     """The base's horizontal velocity jumps, after that step's action is computed and before its physics."""
 
     step: int  # [control steps]
@@ -32,15 +31,15 @@ class Kick(NamedTuple):
 
 
 class Case(NamedTuple):
-    """What one world is told, and how it is pushed."""
+    """What one world is asked to do, and how it is pushed."""
 
-    commands: tuple[tuple[int, Command], ...]  # from that control step on; the first from step 0
-    kick: Kick | None = None
+    commands: tuple[tuple[int, tuple[float, ...]], ...]  # from that control step on, the first of the task's table; the rest: default
+    push: Push | None = None
 
 
-def holding(command: Command, kick: Kick | None = None) -> Case:
+def holding(command: tuple[float, ...], push: Push | None = None) -> Case:
     """One command throughout."""
-    return Case(((0, command),), kick)
+    return Case(((0, command),), push)
 
 
 class Record(NamedTuple):
@@ -48,7 +47,7 @@ class Record(NamedTuple):
 
     dt: float  # [s] a control step
     mass: float  # [kg]
-    commands: NDArray[Any]  # (T, N, 3), what each world was told [m/s, m/s, rad/s]
+    commands: NDArray[Any]  # (T, N, C), what each world was asked for
     fell_at: NDArray[Any]  # (N,) control step of the first fall, or inf; from there on the world is another episode
     last_position: NDArray[Any]  # (N, 2) of the base after the last step [m]
     signals: dict[str, NDArray[Any]]  # name -> (T, N, ...)
@@ -60,7 +59,7 @@ class Record(NamedTuple):
 
 
 def roll_out(
-    env: LeggedRobot, policy: Policy, cases: Sequence[Case], steps: int, signals: Mapping[str, Signal], alone: int | None = None
+    env: RobotTask, policy: Policy, cases: Sequence[Case], steps: int, signals: Mapping[str, Signal], alone: int | None = None
 ) -> Record:
     """Run each case in a world of its own for ``steps`` control steps.
 
@@ -70,9 +69,10 @@ def roll_out(
     if len(cases) != env.num_envs:
         raise ValueError(f"{len(cases)} cases need as many worlds; this environment has {env.num_envs}")
     env.reset()
-    told, kicks = _commands_by_step(cases, env.device), _kicks_by_step(cases, env.device)
-    worlds, commands = told.pop(0)
-    env.commands[worlds] = commands
+    timeline = _timeline(cases, steps, [command.default for command in env.command_table])
+    asked, pushes = torch.tensor(timeline, dtype=torch.float, device=env.device), _pushes_by_step(cases, env.device)
+    commands = getattr(env, "commands", asked[0])  # a task without commands has no buffer for them
+    commands.copy_(asked[0])
     env.compute_observations()
     obs = env.get_observations()
     fell_at = torch.full((env.num_envs,), math.inf, device=env.device)
@@ -84,20 +84,19 @@ def roll_out(
                 kept[name] = torch.empty(steps, *value.shape, dtype=value.dtype, device=value.device)
             kept[name][step] = value
         actions = _act(policy, obs, alone)
-        if step in kicks:
-            worlds, jumps = kicks[step]
-            env.sim.qvel[worlds, :2] += jumps
-        if step + 1 in told:  # this step's end observes it; to observe anew would be a step of time for what is delayed
-            worlds, commands = told[step + 1]
-            env.commands[worlds] = commands
+        if step in pushes:
+            worlds, jumps = pushes[step]
+            env.root_lin_vel[worlds, :2] += jumps
+        if step + 1 < steps:  # the observation at the end of this step shows the next command: a second one would be a step of delay
+            commands.copy_(asked[step + 1])
         obs, _, dones, _ = env.step(actions)
         fell_at = torch.where(dones & (fell_at == math.inf), torch.full_like(fell_at, step), fell_at)
     return Record(
         dt=env.dt,
         mass=env.total_mass,
-        commands=_timeline(cases, steps),
+        commands=timeline,
         fell_at=fell_at.cpu().numpy(),
-        last_position=env.sim.qpos[:, :2].cpu().numpy().copy(),
+        last_position=env.root_pos[:, :2].cpu().numpy().copy(),
         signals={name: values.cpu().numpy() for name, values in kept.items()},
     )
 
@@ -109,36 +108,21 @@ def _act(policy: Policy, obs: TensorDict, alone: int | None) -> Tensor:
         return torch.cat([policy(obs[:alone]), policy(obs[alone:])])
 
 
-def _timeline(cases: Sequence[Case], steps: int) -> NDArray[Any]:
-    """What each world is told at each step, (T, N, 3)."""
-    timeline = np.zeros((steps, len(cases), 3))
+def _timeline(cases: Sequence[Case], steps: int, default: Sequence[float]) -> NDArray[Any]:
+    """What each world is asked for at each step, (T, N, C)."""
+    timeline = np.tile(np.array(default, dtype=float), (steps, len(cases), 1))
     for world, case in enumerate(cases):
         for step, command in case.commands:
-            timeline[step:, world] = command
+            timeline[step:, world, : len(command)] = command
     return timeline
 
 
-def _commands_by_step(cases: Sequence[Case], device: str) -> dict[int, tuple[Tensor, Tensor]]:
-    """Step -> worlds (M,) and their new commands (M, 3)."""
-    changes: dict[int, list[tuple[int, Command]]] = {}
-    for world, case in enumerate(cases):
-        for step, command in case.commands:
-            changes.setdefault(step, []).append((world, command))
-    return {
-        step: (torch.tensor([w for w, _ in rows], device=device), torch.tensor([c for _, c in rows], dtype=torch.float, device=device))
-        for step, rows in changes.items()
-    }
-
-
-def _kicks_by_step(cases: Sequence[Case], device: str) -> dict[int, tuple[Tensor, Tensor]]:
+def _pushes_by_step(cases: Sequence[Case], device: str) -> dict[int, tuple[Tensor, Tensor]]:
     """Step -> worlds (M,) and the jumps of their horizontal velocity (M, 2) [m/s, world]."""
-    kicks: dict[int, list[tuple[int, Kick]]] = {}
-    for world, case in enumerate(cases):
-        if case.kick:
-            kicks.setdefault(case.kick.step, []).append((world, case.kick))
-    by_step = {}
-    for step, rows in kicks.items():
-        speed = torch.tensor([[kick.speed] for _, kick in rows], device=device)
-        jumps = speed * torch.tensor([[math.cos(kick.angle), math.sin(kick.angle)] for _, kick in rows], device=device)
-        by_step[step] = torch.tensor([world for world, _ in rows], device=device), jumps
-    return by_step
+    pushed, found = [(world, case.push) for world, case in enumerate(cases) if case.push], {}
+    for step in {push.step for _, push in pushed}:
+        now = [(world, push) for world, push in pushed if push.step == step]
+        speeds = torch.tensor([[push.speed] for _, push in now], device=device)
+        directions = torch.tensor([[math.cos(push.angle), math.sin(push.angle)] for _, push in now], device=device)
+        found[step] = torch.tensor([world for world, _ in now], device=device), speeds * directions
+    return found

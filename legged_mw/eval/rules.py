@@ -1,11 +1,13 @@
-"""The walking exam's rules: commands, kicks, what is measured, what passes. Plain numbers: needs numpy, neither torch nor warp.
+"""The walking exam's rules: what it asks, what is measured, what passes. Plain numbers: needs numpy, neither torch nor warp.
 
-Who drives the robot through it: ``exam`` in the training environment, ``legged_mw.deploy`` on an exported policy.
+``exam`` applies them in the training environment, ``legged_mw.deploy`` to an exported policy. A push sets the velocity at once.
 """
 
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,93 +15,23 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from legged_mw.eval.peers import PEERS, Peer
+from legged_mw.utils.commands import LABELS, VELOCITY
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
+
 SECONDS, SETTLING = 10.0, 2.0  # [s] of a tracking command, and of its start that is not counted
-KICK_COMMAND, KICK_AT, KICK_UNTIL = 0.8, 3.0, 6.0  # vx [m/s]; [s]
-KICK_SPEEDS, KICK_DIRECTIONS = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0), 16  # [m/s]
+PUSH_AT, PUSH_UNTIL, PUSH_DIRECTIONS = 3.0, 6.0, 16  # [s] of the first direction; [s] survived if it still stands then
 GRAVITY = 9.81  # [m/s^2]
 SLOW = 0.1  # [m/s] below which a cost of transport says nothing
-
-# What the policy that ships with MuJoCo Playground for this robot scores in MuJoCo's C engine under these rules.
-PEER: dict[str, Any] = {
-    "falls": 0,
-    "error": [0.024, 0.031, 0.084],
-    "worst": [0.042, 0.063, 0.357],
-    "drift": 0.0007,
-    "kicks": {"1": 1.0, "2": 1.0, "3": 1.0, "4": 0.81, "5": 0.38, "6": 0.13},
-    "cost_of_transport": 0.86,
-}
-ERROR_MARKS = (0.06, 0.06, 0.12)  # largest mean error of a policy that walks [m/s, m/s, rad/s]
 EQUAL_DRIFT = 0.005  # [m], below which drifts count as equal
+PUSH_SPEEDS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0)  # [m/s] where no config says others
+AXES = tuple(zip(LABELS.values(), ("m/s", "m/s", "rad/s"), strict=True))  # vx, vy, yaw rate: name and unit
+
+Velocity = tuple[float, float, float]  # vx, vy [m/s], yaw rate [rad/s]: body frame, at the IMU
 
 
-def commands() -> list[tuple[float, float, float]]:
-    """The 22 commands (vx, vy [m/s], yaw rate [rad/s]); the first is to stand."""
-    along = [(v, 0.0, 0.0) for v in (0.5, 1.0, 1.5, -0.5, -1.0)]
-    across = [(0.0, v, 0.0) for v in (0.4, 0.8, -0.4, -0.8)]
-    turning = [(0.0, 0.0, w) for w in (0.6, 1.2, -0.6, -1.2)]
-    return [(0.0, 0.0, 0.0), *along, *across, *turning, *product((1.0, -1.0), (0.4, -0.4), (0.6, -0.6))]
-
-
-def grade(
-    *,
-    error: NDArray[Any],
-    fell_at: NDArray[Any],
-    distance: NDArray[Any],
-    energy: NDArray[Any],
-    standing_joint_speed: float,
-    seconds: float,
-    mass: float,
-    dt: float,
-) -> dict[str, Any]:
-    """The exam's result from what was measured; C commands, N = C + kick speeds * kick directions worlds, in that order.
-
-    ``error`` (C, 3): mean absolute difference to the command after settling [m/s, m/s, rad/s]. ``fell_at`` (N,): control step
-    of the first fall, or inf. ``distance`` (C,): straight line over the ``seconds`` since settling [m];
-    ``energy`` (C,): sum of |torque * joint speed| dt over the same time [J]. ``standing_joint_speed``: mean of the last second
-    at the command to stand [rad/s].
-    ``mass`` [kg], ``dt`` a control step [s].
-    """
-    count = len(commands())
-    stood = np.isinf(fell_at[:count])
-    ahead = commands().index((1.0, 0.0, 0.0))
-    moved = distance[ahead] > SLOW * seconds
-    survived = (fell_at[count:] > round(KICK_UNTIL / dt)).reshape(len(KICK_SPEEDS), KICK_DIRECTIONS).mean(axis=1)
-    result = {
-        "falls": int((~stood).sum()),
-        "error": _figures(error[stood].mean(axis=0)) if stood.any() else None,  # None: nothing left to measure, all fell
-        "worst": _figures(error[stood].max(axis=0)) if stood.any() else None,
-        "drift": float(distance[0]) if stood[0] else None,
-        "joint_speed": standing_joint_speed if stood[0] else None,
-        "kicks": {f"{speed:g}": round(float(share), 4) for speed, share in zip(KICK_SPEEDS, survived, strict=True)},
-        "cost_of_transport": float(energy[ahead] / (mass * GRAVITY * distance[ahead])) if stood[ahead] and moved else None,
-        "commands": [
-            {"command": list(c), "error": _figures(e) if ok else None, "fell": not bool(ok)}
-            for c, e, ok in zip(commands(), error, stood, strict=True)
-        ],
-    }
-    return {"walks": walks(result), "beats_peer": beats_peer(result), **result}
-
-
-def walks(result: dict[str, Any]) -> bool:
-    """No falls, small errors, every kick of 2 m/s survived."""
-    if result["falls"]:
-        return False
-    small = all(error <= most for error, most in zip(result["error"], ERROR_MARKS, strict=True))
-    return small and result["kicks"]["2"] == 1.0
-
-
-def beats_peer(result: dict[str, Any]) -> bool:
-    """At least as good on each of the peer's figures, better on the errors and the cost of transport."""
-    if result["falls"] > PEER["falls"]:
-        return False
-    better = all(a < b for a, b in zip(result["error"], PEER["error"], strict=True))
-    better = better and result["cost_of_transport"] is not None and result["cost_of_transport"] < PEER["cost_of_transport"]
-    worst = all(a <= b for a, b in zip(result["worst"], PEER["worst"], strict=True))
-    kicks = all(result["kicks"][speed] >= share for speed, share in PEER["kicks"].items())
-    return better and worst and kicks and result["drift"] <= max(EQUAL_DRIFT, PEER["drift"])
-
-
-class Row(NamedTuple):
+class Figure(NamedTuple):
     """One figure of the exam beside what walking asks and what the peer has."""
 
     name: str
@@ -108,13 +40,16 @@ class Row(NamedTuple):
     mark: float | None = None  # what walking needs; None: anything
     peer: float | None = None
     more_is_better: bool = False
-    without: str = "fell"  # what stands for no value
+    without: str = "fell"  # stands for no value
+    card: tuple[str, str] | None = None  # title and unit among the figures that one looks for first
 
-    def shown(self, value: float | None) -> str:
+    def text(self, value: float | None) -> str:
         return self.without if value is None else f"{value:.{self.digits}f}"
 
-    def shown_mark(self) -> str:
-        return "" if self.mark is None else f"{self.mark:.{min(self.digits, 2)}f}"
+    def mark_text(self) -> str:
+        if self.mark is None:
+            return ""
+        return f"{self.mark:.{min(self.digits, 2 if round(self.mark, 2) == self.mark else 3)}f}"
 
     def passes(self) -> bool | None:
         """Whether the value is what walking needs; None where it needs nothing."""
@@ -123,29 +58,191 @@ class Row(NamedTuple):
         return self.value is not None and (self.value >= self.mark if self.more_is_better else self.value <= self.mark)
 
 
-def rows(result: dict[str, Any]) -> list[Row]:
-    """The result's figures in the order of the table."""
-    listed = [Row("falls in 22 commands", result["falls"], 0, 0, PEER["falls"])]
-    error, worst = result["error"] or [None] * 3, result["worst"] or [None] * 3
-    for i, name in enumerate(("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")):
-        listed.append(Row(f"error {name}", error[i], 3, ERROR_MARKS[i], PEER["error"][i]))
-        listed.append(Row("  worst command", worst[i], 3, None, PEER["worst"][i]))
-    listed.append(Row("drift standing 8 s [m]", result["drift"], 4, None, PEER["drift"]))
-    listed.append(Row("joint speed standing [rad/s]", result["joint_speed"], 3))
-    for speed, share in result["kicks"].items():
-        listed.append(Row(f"survives kicks of {speed} m/s", share, 2, 1.0 if speed == "2" else None, PEER["kicks"][speed], True))
-    listed.append(Row("cost of transport at 1 m/s", result["cost_of_transport"], 2, None, PEER["cost_of_transport"], without="none"))
-    return listed
+@dataclass(frozen=True)
+class ExamRules:
+    """What the walking exam asks of one task, and what counts as walking: the config section ``exam`` without its open ends."""
+
+    ranges: tuple[tuple[float, float], ...]  # lowest and highest vx, vy [m/s], yaw rate [rad/s]
+    push_speeds: tuple[float, ...]  # [m/s] by which the base's horizontal velocity jumps
+    push_vx: float  # [m/s] at which the robot walks when it is pushed
+    transport_vx: float  # [m/s] at which the cost of transport is measured
+    marks: tuple[float, ...]  # largest mean error, or offset, of a policy that walks [m/s, m/s, rad/s]
+    marks_of: str = "error"  # or "offset": of the mean velocity
+    push_mark: float = 2.0  # [m/s]: a policy that walks survives all pushes of this speed
+    peer: str = ""  # name in PEERS
+
+    @classmethod
+    def from_config(cls, cfg: Any) -> ExamRules:
+        """The rules for a task that walks by command. Raises ConfigError."""
+        if not hasattr(cfg, "exam"):
+            raise ConfigError("the walking exam needs a config with the sections commands and exam: a subclass of LeggedRobotCfg")
+        return cls.from_mapping(vars(cfg.exam), vars(cfg.commands.ranges))
+
+    @classmethod
+    def from_mapping(cls, given: Mapping[str, Any], trained: Mapping[str, Sequence[float]] | None = None) -> ExamRules:
+        """The rules from the fields of the config section ``exam`` or from what ``to_mapping`` returned; both may lack some.
+
+        ``trained``: command -> lowest and highest, where ``given`` has no range. Raises ConfigError.
+        """
+        given = {"ranges": {}, "push_speeds": PUSH_SPEEDS, "push_mark": cls.push_mark, "marks_of": cls.marks_of, "peer": "", **given}
+        ranges = {**(trained or {}), **given["ranges"]}
+        _check(given, ranges)
+        vx, vy, yaw = ((float(ranges[name][0]), float(ranges[name][1])) for name in VELOCITY)
+        scaled = (round(max(0.06 * vx[1], 0.04), 4), 0.06, round(0.1 * yaw[1], 4) if yaw[1] > 0 else 0.12)
+        marks = given.get("marks") or (scaled if given["marks_of"] == "error" else (0.06, 0.06, 0.12))
+        push_vx, transport_vx = (float(given.get(name) or round(vx[1] / 2, 4)) for name in ("push_vx", "transport_vx"))
+        speeds, kept = tuple(map(float, given["push_speeds"])), {name: given[name] for name in ("marks_of", "push_mark", "peer")}
+        return cls((vx, vy, yaw), speeds, push_vx, transport_vx, tuple(map(float, marks)), **kept)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """What ``from_mapping`` reads; it can be written as JSON or YAML."""
+        plain = {name: list(value) if isinstance(value, tuple) else value for name, value in vars(self).items()}
+        return {**plain, "ranges": {name: list(ends) for name, ends in zip(VELOCITY, self.ranges, strict=True)}}
+
+    @property
+    def peer_policy(self) -> Peer | None:
+        """The peer that the task names, if it was asked the same."""
+        peer = PEERS.get(self.peer)
+        return peer if peer and all(getattr(self, name) == value for name, value in peer.asked.items()) else None
+
+    def commands(self) -> list[Velocity]:
+        """The 22 commands; the first is to stand."""
+        (x0, x1), (y0, y1), (w0, w1) = self.ranges
+        along = [(v, 0.0, 0.0) for v in (x1 / 3, 2 * x1 / 3, x1, x0 / 3, 2 * x0 / 3)]
+        across = [(0.0, v, 0.0) for v in (y1 / 2, y1, y0 / 2, y0)]
+        turning = [(0.0, 0.0, w) for w in (w1 / 2, w1, w0 / 2, w0)]
+        mixed = product((2 * x1 / 3, 2 * x0 / 3), (y1 / 2, y0 / 2), (w1 / 2, w0 / 2))
+        every = [(0.0, 0.0, 0.0), *along, *across, *turning, *mixed]
+        return [(round(vx, 4), round(vy, 4), round(yaw, 4)) for vx, vy, yaw in every]
+
+    def held(self) -> list[Velocity]:
+        """The commands that a world each holds: the 22, and that of the cost of transport if it is none of them."""
+        ahead = (self.transport_vx, 0.0, 0.0)
+        return self.commands() if ahead in self.commands() else [*self.commands(), ahead]
+
+    def worlds(self) -> int:
+        """One a held command, then one a push: speeds x directions."""
+        return len(self.held()) + len(self.push_speeds) * PUSH_DIRECTIONS
+
+    def grade(
+        self, signals: Mapping[str, NDArray[Any]], *, last_position: NDArray[Any], fell_at: NDArray[Any], mass: float, dt: float
+    ) -> dict[str, Any]:
+        """The exam's result from samples of its N worlds before each of T control steps of ``dt`` [s].
+
+        ``signals``: velocity (T, N, 3) [m/s, m/s, rad/s]; position (T, N, 2) [m]; power (T, N), the sum of |torque * joint speed|
+        [W]; joint_speed (T, N), the mean over the joints [rad/s]. ``last_position`` (N, 2) after the last step [m];
+        ``fell_at`` (N,): control step of the first fall, or inf; ``mass`` [kg].
+        """
+        velocity, position, power, joint_speed = (signals[name] for name in ("velocity", "position", "power", "joint_speed"))
+        commands, held, settled = self.commands(), self.held(), round(SETTLING / dt)
+        ahead, stood = held.index((self.transport_vx, 0.0, 0.0)), np.isinf(fell_at)
+        distance = ((last_position - position[settled]) ** 2).sum(axis=1) ** 0.5  # a straight line
+        energy = power[settled:, ahead].sum(dtype=float) * dt
+        moved = stood[ahead] and distance[ahead] > SLOW * (len(velocity) - settled) * dt
+        survived = (fell_at[len(held) :] > round(PUSH_UNTIL / dt)).reshape(-1, PUSH_DIRECTIONS).mean(axis=1)
+        result = {
+            **_tracking(velocity[settled:, : len(commands)], commands, stood[: len(commands)]),
+            "drift": float(distance[0]) if stood[0] else None,
+            "joint_speed": float(joint_speed[-round(1.0 / dt) :, 0].mean()) if stood[0] else None,
+            "pushes": {f"{speed:g}": round(float(share), 4) for speed, share in zip(self.push_speeds, survived, strict=True)},
+            "cost_of_transport": float(energy / (mass * GRAVITY * distance[ahead])) if moved else None,
+            "rules": self.to_mapping(),
+        }
+        beats = {"beats_peer": self.beats_peer(result)} if self.peer_policy else {}
+        return {"walks": self.walks(result), **beats, **result}
+
+    def walks(self, result: Mapping[str, Any]) -> bool:
+        """No falls, small errors (or offsets), every push of the mark's speed survived."""
+        if result["falls"]:
+            return False
+        small = all(value <= most for value, most in zip(result[self.marks_of], self.marks, strict=True))
+        return small and result["pushes"][f"{self.push_mark:g}"] == 1.0
+
+    def beats_peer(self, result: Mapping[str, Any]) -> bool:
+        """At least as good on each of the peer's figures, better on the errors and the cost of transport."""
+        assert self.peer_policy
+        peer = self.peer_policy.figures
+        if result["falls"] > peer["falls"]:
+            return False
+        better = all(a < b for a, b in zip(result["error"], peer["error"], strict=True))
+        better = better and result["cost_of_transport"] is not None and result["cost_of_transport"] < peer["cost_of_transport"]
+        worst = all(a <= b for a, b in zip(result["worst"], peer["worst"], strict=True))
+        pushes = all(result["pushes"][speed] >= share for speed, share in peer["pushes"].items())
+        return better and worst and pushes and result["drift"] <= max(EQUAL_DRIFT, peer["drift"])
+
+    def figures(self, result: Mapping[str, Any]) -> list[Figure]:
+        """The result's figures in the order of the table."""
+        peer: dict[str, Any] = self.peer_policy.figures if self.peer_policy else {}
+        fell = peer_lacks = (None, None, None)
+        listed = [Figure("falls in 22 commands", result["falls"], 0, 0, peer.get("falls"), card=("falls", "of 22"))]
+        for i, (axis, unit) in enumerate(AXES):
+            card = (f"{axis.removesuffix(' rate')} {self.marks_of}", unit)
+            for measure, name in {
+                "error": f"error {axis} [{unit}]",
+                "worst": "  worst command",
+                "offset": "  of the mean velocity",
+            }.items():
+                mark, shown_first = (self.marks[i], card) if measure == self.marks_of else (None, None)
+                value, beside = (result[measure] or fell)[i], peer.get(measure, peer_lacks)[i]
+                if measure != "offset" or measure == self.marks_of:
+                    listed.append(Figure(name, value, 3, mark, beside, card=shown_first))
+        listed.append(Figure("drift standing 8 s [m]", result["drift"], 4, None, peer.get("drift")))
+        listed.append(Figure("joint speed standing [rad/s]", result["joint_speed"], 3))
+        for speed, share in result["pushes"].items():
+            mark, card = (1.0, (f"{speed} m/s pushes", "survived")) if float(speed) == self.push_mark else (None, None)
+            listed.append(Figure(f"survives pushes of {speed} m/s", share, 2, mark, peer.get("pushes", {}).get(speed), True, card=card))
+        name, ahead = "cost_of_transport", f"at {self.transport_vx:g} m/s"
+        card = ("cost of transport", ahead)
+        return [*listed, Figure(" ".join(card), result[name], 2, None, peer.get(name), without="none", card=card)]
 
 
-def table(result: dict[str, Any]) -> str:
-    """The result beside the peer's, as text."""
-    lines = [f"{'':<30}{'this policy':>12}{'walks at':>10}{'peer':>8}"]
-    for row in rows(result):
-        peer = "" if row.peer is None else row.shown(row.peer)
-        lines.append(f"{row.name:<30}{row.shown(row.value):>12}{row.shown_mark():>10}{peer:>8}")
-    verdict = f"walks: {'yes' if result['walks'] else 'no'}; beats the peer: {'yes' if result['beats_peer'] else 'no'}"
-    return "\n".join([*lines, verdict])
+def _tracking(velocity: NDArray[Any], commands: list[Velocity], stood: NDArray[Any]) -> dict[str, Any]:
+    """How well C commands were followed: from the velocities (T, C, 3), and which worlds did not fall (C,)."""
+    difference = velocity - np.array(commands)
+    error, offset = abs(difference).mean(axis=0), abs(difference.mean(axis=0))
+    e, o = error[stood], offset[stood]
+    means = {"error": e.mean(axis=0), "worst": e.max(axis=0), "offset": o.mean(axis=0)} if stood.any() else {}
+    each = [
+        {"error": _plain(e), "offset": _plain(o)} if ok else {"error": None, "offset": None}
+        for e, o, ok in zip(error, offset, stood, strict=True)
+    ]
+    return {
+        "falls": int((~stood).sum()),
+        **{name: _plain(means[name]) if means else None for name in ("error", "worst", "offset")},  # None: all fell
+        "commands": [{"command": list(c), **row, "fell": not ok} for c, row, ok in zip(commands, each, stood.tolist(), strict=True)],
+    }
+
+
+def _check(given: Mapping[str, Any], ranges: Mapping[str, Sequence[float]]) -> None:
+    """Raises ConfigError for rules that cannot be applied."""
+    for name in given["ranges"]:
+        if name not in VELOCITY:
+            raise ConfigError(f"exam.ranges: {unknown('command', name, VELOCITY, 'the walking exam')}; others stay at their default")
+    for name in VELOCITY:
+        if len(ranges.get(name, ())) != 2 or ranges[name][0] > ranges[name][1]:
+            raise ConfigError(f"exam.ranges: {name} is {ranges.get(name)}; it must be two numbers, the lower first")
+    speeds, mark = list(given["push_speeds"]), given["push_mark"]
+    if not speeds or min(speeds) <= 0:
+        raise ConfigError(f"exam.push_speeds is {speeds}; it must be one or more numbers above zero")
+    if mark not in speeds:
+        raise ConfigError(f"exam.push_mark is {mark:g}; it must be one of exam.push_speeds, {speeds}")
+    if len(given.get("marks") or "xyw") != 3:
+        raise ConfigError(f"exam.marks is {list(given['marks'])}; it must be three numbers, or an empty list")
+    if given["peer"] and given["peer"] not in PEERS:
+        raise ConfigError(f"exam.peer: {unknown('peer', given['peer'], PEERS, 'legged_mw/eval/peers.py')}")
+
+
+def table(result: Mapping[str, Any]) -> str:
+    """The result as text, beside what walking asks and what the peer has if there is one."""
+    rules = ExamRules.from_mapping(result["rules"])
+    beside = rules.peer_policy is not None
+    lines = [f"{'':<30}{'this policy':>12}{'walks at':>10}" + f"{'peer':>8}" * beside]
+    for figure in rules.figures(result):
+        peer = f"{'' if figure.peer is None else figure.text(figure.peer):>8}" * beside
+        lines.append(f"{figure.name:<30}{figure.text(figure.value):>12}{figure.mark_text():>10}{peer}")
+    words = {"walks": "walks", "beats_peer": "beats the peer"}
+    verdicts = [f"{words[key]}: {'yes' if result[key] else 'no'}" for key in words if key in result]
+    return "\n".join([*lines, "; ".join(verdicts)])
 
 
 def save(result: dict[str, Any], path: Path) -> None:
@@ -154,5 +251,5 @@ def save(result: dict[str, Any], path: Path) -> None:
     path.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 
 
-def _figures(row: NDArray[np.float64]) -> list[float]:
+def _plain(row: NDArray[np.float64]) -> list[float]:
     return [round(float(value), 5) for value in row]

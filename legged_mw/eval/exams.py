@@ -1,0 +1,65 @@
+"""The exams, one a kind of task, and which of them grades a task: what play.py and train.py know of exams."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any, NamedTuple
+
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.eval import crossing, exam, report, rules
+from legged_mw.eval.training import TrainingExam
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
+from legged_mw.utils.task import LoadedTask
+
+
+class Exam(NamedTuple):
+    """One kind of exam. A result and figures are dicts that JSON can hold."""
+
+    sets: set[str]  # config fields that it decides itself, so that nobody may override them
+    prepare: Callable[[LoadedTask], None]  # turn a task into the exam
+    make_room: Callable[[LoadedTask], None]  # set the number of worlds once more, after the user's overrides
+    examine: Callable[..., tuple[dict[str, Any], dict[str, Any]]]  # (env, policy, env of the rough part or None) -> result, figures
+    table: Callable[[dict[str, Any]], str]  # the result as text
+    write: Callable[..., None]  # the report: see report.write
+    in_training: type[TrainingExam]  # (task, device, eager); called with a policy it gives figures by name
+    rough: ModuleType | None = None  # a second part for tasks on rough ground, with prepare, SETS, make_room and table
+
+
+EXAMS = {
+    "walking": Exam(exam.SETS, report.prepare, report.make_room, report.examine, rules.table, report.write, TrainingExam, rough=crossing),
+}
+
+
+def find_exam(task: LoadedTask) -> Exam | None:
+    """The exam that grades ``task``; None if it names none. Raises ConfigError for a kind that does not exist."""
+    kind = getattr(task, "exam", task.env_class.exam)
+    if kind and kind not in EXAMS:
+        raise ConfigError(f"{task.path}: {unknown('exam', kind, EXAMS, 'legged_mw/eval/exams.py')}")
+    return EXAMS[kind] if kind else None
+
+
+def require_exam(task: LoadedTask) -> Exam:
+    """The exam of a task that is to be graded. Raises ConfigError if it has none."""
+    if not (found := find_exam(task)):
+        hint = "A task that walks by command has the walking exam, another one names its own: TASK = Task(Env, Cfg, CfgPPO, exam=...)"
+        raise ConfigError(f"--eval: no exam grades task '{task.name}'; there are: {', '.join(EXAMS)}. {hint}")
+    return found
+
+
+def make_exam(task: LoadedTask, env: LeggedRobot, eager: bool = False) -> TrainingExam | None:
+    """The exam for a policy that trains in ``env``; None if the task has none.
+
+    None, too, and a line that says why, if the policy could not read the exam's nominal world.
+    """
+    if not (kind := find_exam(task)):
+        return None
+    examine = kind.in_training(task, env.device, eager)
+    here, there = env.get_observations(), examine.env.get_observations()
+    for group in task.train.obs_groups.actor:
+        if group in here and here[group].shape[1] != there[group].shape[1]:  # a group that does not exist is the learner's to refuse
+            sizes = f"{there[group].shape[1]} values in the exam's nominal world and {here[group].shape[1]} in training"
+            print(f"no exam during training: the actor's observation group '{group}' has {sizes}")
+            return None
+    return examine
