@@ -5,7 +5,9 @@ import os
 import sys
 from pathlib import Path
 
-ROOT = Path(__file__).resolve().parent.parent
+_HERE = Path(__file__).resolve().parent
+# What holds configs/ and resources/: the clone, or the installed package, which has them inside.
+ROOT = _HERE if (_HERE / "configs").is_dir() else _HERE.parent
 
 # rsl-rl imports GitPython, which fails on a machine without git
 os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")

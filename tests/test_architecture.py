@@ -73,7 +73,7 @@ MAY_ALL_THE_SAME = ["legged_mw/view/env_stage.py", "legged_mw/view/playing.py"]
 CONFIGS_MAY = ["legged_mw.envs", "legged_mw.utils", "configs", "math", "__future__"]  # numbers and names only
 # What runs on a robot's computer: neither torch nor warp, nor anything of ours that needs them.
 DEPLOY_MAY = [
-    *("numpy", "mujoco", "onnxruntime", "yaml", "legged_mw.deploy", "legged_mw.view", "legged_mw.eval.rules"),
+    *("numpy", "mujoco", "onnxruntime", "yaml", "legged_mw.ROOT", "legged_mw.deploy", "legged_mw.view", "legged_mw.eval.rules"),
     *("legged_mw.utils.cli", "legged_mw.utils.config", "legged_mw.utils.errors", "legged_mw.utils.machine", *sys.stdlib_module_names),
 ]
 

@@ -1,6 +1,7 @@
 """Class-based configuration: what a class may declare, what its instances accept, and what every error says."""
 
 import copy
+import importlib
 import importlib.util
 import math
 import os
@@ -847,6 +848,74 @@ def test_a_wrong_override_of_a_cpu_is_named(path: str, value: Any, text: str) ->
     task.set("cpu.overrides", {path: value})
     with says(text):
         task.fit_cpu(cores=1)
+
+
+# ---- the name `configs`
+
+FAST = """from configs.go1_flat import {base}
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
+from legged_mw.utils.task import Task
+
+
+class FastCfg({base}):
+    class env({base}.env):
+        num_envs = 7
+
+
+TASK = Task(LeggedRobot, FastCfg, LeggedRobotCfgPPO)
+"""
+
+
+@pytest.fixture
+def no_configs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As for an installed package: nothing on the path has the name."""
+    for name in [name for name in sys.modules if name.partition(".")[0] == "configs"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if not (Path(place) / "configs").is_dir()])
+    monkeypatch.chdir("/")
+    importlib.invalidate_caches()
+
+
+def test_a_task_finds_configs_where_nothing_else_has_them(no_configs: None, tmp_path: Path) -> None:
+    (tmp_path / "fast.py").write_text(FAST.format(base="Go1FlatCfg"))
+    task = load_task(str(tmp_path / "fast.py"))
+    assert task.cfg.env.num_envs == 7 and task.cfg.asset.imu_site == "imu"
+    assert load_task("go1_flat_dr").cfg.domain_rand.enable
+    assert isinstance(task.cfg, load_task("go1_flat").cfg.__class__)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_a_folder_configs_beside_the_task_wins(no_configs: None, tmp_path: Path, inside: bool) -> None:
+    """Also if the task lies in it. What it has not comes from the package."""
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs/go1_flat.py").write_text(
+        "from configs.go1_rough import Go1FlatDrCfg as Theirs\n\nclass MyCfg(Theirs):\n    pass\n"
+    )
+    (tmp_path / "configs/go1_flat_dr.py").write_text(
+        "from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO\n\n"
+        "class Go1FlatDrCfg(LeggedRobotCfg):\n    class noise(LeggedRobotCfg.noise):\n        level = 0.25\n\n"
+        "class Go1FlatDrCfgPPO(LeggedRobotCfgPPO):\n    pass\n"
+    )
+    file = tmp_path / ("configs/fast.py" if inside else "fast.py")
+    file.write_text(FAST.format(base="MyCfg"))
+    task = load_task(str(file))
+    assert (task.cfg.env.num_envs, task.cfg.noise.level) == (7, 0.25)
+    assert task.to_dict()["task"] == str(file)
+    assert load_task("go1_flat").cfg.noise.level == 1.0  # by name it is the package's own
+
+
+def test_another_packages_name_configs_is_given_back(no_configs: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "configs").mkdir()
+    (tmp_path / "configs/__init__.py").write_text("")
+    (tmp_path / "configs/mine.py").write_text("VALUE = 3\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    first = load_task("go1_flat_dr")  # before anybody imported it
+    mine = importlib.import_module("configs.mine")
+    assert mine.VALUE == 3
+    again = load_task("go1_flat_dr")  # and after
+    assert sys.modules["configs.mine"] is mine and "configs.go1_flat" not in sys.modules
+    assert type(first.cfg) is type(again.cfg)
 
 
 # ---- what a task says of its exam

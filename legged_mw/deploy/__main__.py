@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from legged_mw import ROOT
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, read_contract
 from legged_mw.deploy.exam import run_exam
 from legged_mw.deploy.stage import DeployStage
@@ -18,7 +19,8 @@ RESULT_FILE = "exam.json"
 
 def parse() -> argparse.Namespace:
     parser = Parser(prog="python -m legged_mw.deploy", description=__doc__, allow_abbrev=False)
-    parser.add_argument("folder", metavar="DIR", help="an export: play.py --export DIR, or export/ in the folder of a finished run")
+    made = "play.py --export DIR makes one, a finished training too, in its run folder; or the name of a shipped policy"
+    parser.add_argument("folder", metavar="DIR", help=f"an export: {made}")
     parser.add_argument("--eval", action="store_true", help=f"the walking exam; prints its table and writes DIR/{RESULT_FILE}")
     parser.add_argument("--out", metavar="FILE", help=f"where --eval writes (default: DIR/{RESULT_FILE})")
     parser.add_argument(
@@ -39,7 +41,8 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     args = parse()
-    folder = Path(args.folder)
+    shipped = ROOT / "resources" / "policies" / args.folder
+    folder = shipped if shipped.is_dir() and not Path(args.folder).exists() else Path(args.folder)
     contract, scene_file = read_contract(folder), TERRAIN_FILE if args.terrain else SCENE_FILE
     command = launch.check_drive(
         args,

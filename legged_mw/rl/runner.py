@@ -41,7 +41,7 @@ class Runner(OnPolicyRunner):
 
     def __init__(self, env: RobotTask, train_cfg: dict[str, Any], log_dir: str | None = None, device: str = "cpu") -> None:
         super().__init__(env, train_cfg, log_dir, device)
-        self.logger.git_status_repos = [str(ROOT)]
+        self.logger.git_status_repos = [str(ROOT)] if (ROOT / ".git").exists() else []
         self.total_steps = 0
         self.stop: str | None = None
         self.examine: Callable[[Any], dict[str, float]] | None = None

@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib
 import importlib.util
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from importlib.machinery import PathFinder
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -14,6 +16,8 @@ from legged_mw import ROOT
 from legged_mw.utils.config import Config, ConfigError
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.renamed import with_new_names
+
+_loaded: dict[tuple[str, ...], dict[str, ModuleType]] = {}  # folders of `configs` -> its modules, kept while the name is another's
 
 
 class Task(NamedTuple):
@@ -133,15 +137,46 @@ def load_task(name: str) -> LoadedTask:
 
 
 def _import(path: Path) -> ModuleType:
-    """The module of a config file; those in configs/ are ordinary imports, so that they can subclass one another."""
-    if str(ROOT) not in sys.path:
-        sys.path.insert(0, str(ROOT))
-    if path.resolve().parent == (ROOT / "configs").resolve():
-        return importlib.import_module(f"configs.{path.stem}")
+    """The module of a config file. Those in configs/ are imported by name, so that they can subclass one another."""
+    folder, shipped = path.resolve().parent, (ROOT / "configs").resolve()
+    if folder == shipped:
+        with _configs(shipped):
+            return importlib.import_module(f"configs.{path.stem}")
     spec = importlib.util.spec_from_file_location(f"legged_mw_task_{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # annotations are resolved through it
-    spec.loader.exec_module(module)
+    beside = folder if folder.name == "configs" else folder / "configs"
+    with _configs(*([beside] if beside.is_dir() else []), shipped):
+        spec.loader.exec_module(module)
     return module
+
+
+@contextmanager
+def _configs(*folders: Path) -> Iterator[None]:
+    """While a task is loaded, ``configs`` is the package of these folders; the first one that has a module wins.
+
+    Afterwards the name is given back if something else on the path has it.
+    """
+    places = [str(folder) for folder in folders]
+    before = _take_out("configs")
+    if before and [str(Path(place).resolve()) for place in before["configs"].__path__] == places:
+        sys.modules.update(before)
+        yield
+        return
+    package = ModuleType("configs")
+    package.__path__ = places
+    sys.modules.update(_loaded.get(tuple(places), {"configs": package}))
+    try:
+        yield
+    finally:
+        other = PathFinder.find_spec("configs")
+        if before or (other and [*(other.submodule_search_locations or ())] != places):
+            _loaded[tuple(places)] = _take_out("configs")
+            sys.modules.update(before)
+
+
+def _take_out(package: str) -> dict[str, ModuleType]:
+    """Remove a package and its modules from those that are imported; returns them."""
+    return {name: sys.modules.pop(name) for name in [*sys.modules] if name.partition(".")[0] == package}
