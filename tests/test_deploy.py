@@ -612,7 +612,7 @@ def test_the_scene_is_read_by_plain_mujoco(contract: Contract) -> None:
     model = mujoco.MjModel.from_xml_path(str(SHIPPED / "scene.xml"))
     assert model.key(0).name == "home" and model.key(0).qpos[2] == 0.278
     scene = read_scene(SHIPPED, contract)
-    assert sorted(np.concatenate(list(scene.sensordata.values())).tolist()) == sorted(
+    assert sorted(np.concatenate([*scene.sensordata.values(), *scene.contacts]).tolist()) == sorted(
         i
         for i in range(model.nsensordata)
         if not 4 <= i < 16  # the feet's velocities, which no contract names
