@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import legged_mw  # noqa: F401  (sets MUJOCO_GL, which mujoco reads when it is imported)
@@ -147,7 +148,7 @@ def test_hills_are_as_high_as_the_ground(hilly: mujoco.MjModel) -> None:
 def test_only_near_tiles_are_drawn_in_full(hilly: mujoco.MjModel) -> None:
     ground = grid()
     middle = ground.origins[0, 0]
-    with RobotRenderer(hilly, 64, 48, count=2) as renderer:
+    with closing(RobotRenderer(hilly, 64, 48, count=2)) as renderer:
         qpos = np.tile(hilly.qpos0, (2, 1))
         qpos[:, :3] = middle + (0.0, 0.0, 0.3)
         still = Moment(0.0, qpos, np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, 4), dtype=bool))

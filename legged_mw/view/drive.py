@@ -1,6 +1,6 @@
 """Driving: the command, held to the trained ranges, and everything else that a user can ask for while watching.
 
-Only the table `BINDINGS` names keys; the window, the web page, the help text and the table in the documentation follow it.
+Only the table `BINDINGS` names keys; the window, the web page and the table in the documentation follow it.
 Nothing here draws, steps or waits: a session asks the pilot what is wanted.
 """
 
@@ -71,11 +71,6 @@ _STEP = {  # command, sign
 }
 
 
-def help_text() -> str:
-    """The table of keys, a line each."""
-    return "\n".join(f"{' or '.join(binding.keys):<16}{binding.text}" for binding in BINDINGS)
-
-
 class Pilot:
     """What the user wants now. `ask`, `press`, `steer` and `push` may be called from any thread; the rest belongs to the session's."""
 
@@ -93,8 +88,8 @@ class Pilot:
         self.push_speed = PUSH_SPEED
         self.message = ""  # why the last action did nothing
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._pushes: list[tuple[int, FloatArray | None]] = []
-        self._resets: list[int] = []
+        self._pushes: list[tuple[int, FloatArray]] = []
+        self._resets: set[int] = set()
         self._random = np.random.default_rng(0)
 
     def ask(self, action: str) -> None:
@@ -148,24 +143,41 @@ class Pilot:
     def take_pushes(self) -> list[tuple[int, FloatArray]]:
         """(world, velocity (2,) [m/s]) of each push since the last call."""
         pushes, self._pushes = self._pushes, []
-        return [(world, self._random_push() if velocity is None else velocity) for world, velocity in pushes]
+        return pushes
 
     def take_resets(self) -> list[int]:
         """Worlds to reset, each once."""
-        resets, self._resets = self._resets, []
-        return sorted(set(resets))
+        resets, self._resets = self._resets, set()
+        return sorted(resets)
 
     # ---- the actions
 
     def _do(self, action: str) -> None:
         self.message = ""
-        if action in _STEP:
-            self._step(*_STEP[action])
-        elif action in ("slower", "faster"):
-            index = SPEEDS.index(self.speed) + (1 if action == "slower" else -1)
-            self.speed = SPEEDS[min(max(index, 0), len(SPEEDS) - 1)]
-        else:
-            getattr(self, f"_{action}")()
+        match action:
+            case "stop":
+                self._steer(self.default)
+            case "own":
+                self.driving = False
+            case "push":
+                self._push(None)
+            case "reset":
+                self._resets |= set(self.driven())
+            case "next":
+                self.world = (self.world + 1) % self.num_worlds
+            case "everyone":
+                self.everyone = not self.everyone
+            case "pause":
+                self.paused = not self.paused
+            case "slower" | "faster":
+                index = SPEEDS.index(self.speed) + (1 if action == "slower" else -1)
+                self.speed = SPEEDS[min(max(index, 0), len(SPEEDS) - 1)]
+            case "camera":
+                self.camera = CAMERAS[(CAMERAS.index(self.camera) + 1) % len(CAMERAS)]
+            case "help":
+                self.help = not self.help
+            case _:
+                self._step(*_STEP[action])
 
     def _step(self, name: str, sign: int) -> None:
         """One press of a key: a fifth of the way from the default to the farther end of the range."""
@@ -179,36 +191,11 @@ class Pilot:
         # five steps up and five down end exactly at the default
         self._steer(np.where(np.abs(command - self.default) < 1e-9, self.default, command))
 
-    def _stop(self) -> None:
-        self._steer(self.default)
-
-    def _own(self) -> None:
-        self.driving = False
-
-    def _reset(self) -> None:
-        self._resets += self.driven()
-
-    def _next(self) -> None:
-        self.world = (self.world + 1) % self.num_worlds
-
-    def _everyone(self) -> None:
-        self.everyone = not self.everyone
-
-    def _pause(self) -> None:
-        self.paused = not self.paused
-
-    def _camera(self) -> None:
-        self.camera = CAMERAS[(CAMERAS.index(self.camera) + 1) % len(CAMERAS)]
-
-    def _help(self) -> None:
-        self.help = not self.help
-
-    def _push(self, velocity: FloatArray | None = None) -> None:
-        self._pushes += [(world, velocity) for world in self.driven()]
-
-    def _random_push(self) -> FloatArray:
-        angle = self._random.uniform(-math.pi, math.pi)
-        return self.push_speed * np.array([math.cos(angle), math.sin(angle)])
+    def _push(self, velocity: FloatArray | None) -> None:
+        for world in self.driven():
+            angle = self._random.uniform(-math.pi, math.pi)
+            sideways = self.push_speed * np.array([math.cos(angle), math.sin(angle)])
+            self._pushes.append((world, sideways if velocity is None else velocity))
 
     def _steer(self, command: FloatArray) -> None:
         if not self.table:

@@ -46,12 +46,15 @@ class NativeViewer:
         before = set(threading.enumerate())
         self._handle: Any = _launch(self.robots.model, self.robots.data, on_key(pilot) if pilot else None)
         self._threads = set(threading.enumerate()) - before
-        self._words = _TextWriter(self._handle)
+        self._texts: list[Text] = []  # replaced, never changed: another thread reads it
+        self._ended = threading.Event()
+        self._writer = threading.Thread(target=self._write, daemon=True)  # a closed window may never answer
         with self._handle.lock():
             show_groups(self._handle.opt)
             self._camera = RobotCamera(self._handle.cam, self.robots, by_hand=True)
             ours = {chr(code) for code in KEY_CODES if code < 128}
             self._own_flags = {i: bool(self._handle.opt.flags[i]) for i, row in enumerate(mujoco.mjVISSTRING) if row[2] in ours}
+        self._writer.start()
 
     def show(self, moment: Moment) -> None:
         """Show one moment. Does nothing once the window is closed."""
@@ -65,7 +68,7 @@ class NativeViewer:
             self._camera.update(moment.camera, moment.world)
             for flag, value in self._own_flags.items():
                 handle.opt.flags[flag] = value
-        self._words.texts = window_texts(moment)
+        self._texts = window_texts(moment)
         handle.sync()
 
     def is_running(self) -> bool:
@@ -74,48 +77,25 @@ class NativeViewer:
 
     def close(self) -> None:
         """Close the window and wait until it is gone; again is allowed."""
-        self._words.close()
+        self._ended.set()
+        self._writer.join(timeout=CLOSE_SECONDS)
         self._handle.close()
         for thread in self._threads:  # a process that ends while the window still closes crashes in its OpenGL driver
             thread.join(timeout=CLOSE_SECONDS)
 
-    def __enter__(self) -> NativeViewer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class _TextWriter:
-    """Sets the window's texts on a thread of its own: a change waits for a redraw, twice a second with software OpenGL."""
-
-    def __init__(self, handle: Any) -> None:
-        self.texts: list[Text] = []  # wanted; replaced by the session's thread
-        self._handle, self._ended = handle, threading.Event()
-        self._thread = threading.Thread(target=self._write, daemon=True)  # a closed window may never answer
-        self._thread.start()
-
     def _write(self) -> None:
+        """Set the window's texts, on a thread of its own: a change waits for a redraw, twice a second with software OpenGL."""
         written: list[Text] = []
         while not self._ended.wait(TEXT_SECONDS) and self._handle.is_running():
-            texts = self.texts
+            texts = self._texts
             if texts != written:
                 self._handle.set_texts(texts)
                 written = texts
 
-    def close(self) -> None:
-        self._ended.set()
-        self._thread.join(timeout=CLOSE_SECONDS)
-
 
 def on_key(pilot: Pilot) -> Callable[[int], None]:
     """The callback for key presses: MuJoCo's window calls it with a GLFW key code, on its own thread."""
-
-    def pressed(code: int) -> None:
-        if code in KEY_CODES:
-            pilot.press(KEY_CODES[code])
-
-    return pressed
+    return lambda code: pilot.press(KEY_CODES.get(code, ""))
 
 
 def window_texts(moment: Moment) -> list[Text]:

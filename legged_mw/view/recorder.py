@@ -73,12 +73,6 @@ class RobotRenderer:
         """Free the OpenGL context; again is allowed."""
         self._renderer.close()
 
-    def __enter__(self) -> RobotRenderer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 def no_context(error: Exception) -> str:
     """What to do where there is no OpenGL context for drawing without a screen."""

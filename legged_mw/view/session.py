@@ -72,26 +72,6 @@ class Pace:
             self._next = now + self.dt
 
 
-class _Mean:
-    """Mean velocity of a segment, without its first `settling` steps if it is long enough."""
-
-    def __init__(self, start: float, command: FloatArray, settling: int) -> None:
-        self.start, self.command, self.settling = start, np.array(command), settling
-        self.count = 0
-        self._all, self._settled = np.zeros(3), np.zeros(3)
-
-    def add(self, velocity: FloatArray) -> None:
-        self._all += velocity
-        if self.count >= self.settling:
-            self._settled += velocity
-        self.count += 1
-
-    def value(self) -> FloatArray:
-        if self.count > 2 * self.settling:
-            return self._settled / (self.count - self.settling)
-        return self._all / self.count
-
-
 class Session:
     """One stage before one viewer, until the viewer is closed, `seconds` have passed, or Ctrl-C."""
 
@@ -111,7 +91,8 @@ class Session:
         self._fallen: BoolArray = np.zeros(stage.num_worlds, dtype=bool)
         self._recent_falls: list[tuple[float, Fall]] = []
         self._segments: list[Segment] = []
-        self._mean: _Mean | None = None
+        self._since, self._followed = 0.0, np.zeros(0)  # of the current segment: its start [s] and command
+        self._velocities: list[FloatArray] = []  # and one velocity a step
         self._pace = Pace(stage.dt)
         self._measured = (time.perf_counter(), 0, 0.0)  # since when, steps then, share of real time
 
@@ -166,16 +147,18 @@ class Session:
         self._note(followed, stage.velocity()[self.pilot.world])
 
     def _note(self, command: FloatArray, velocity: FloatArray) -> None:
-        """Add to the segment, or begin one where the command changed."""
-        if self._mean is None or not np.allclose(self._mean.command, command, atol=1e-6):
+        """Add a step to the segment, or begin one where the command changed."""
+        if not self._velocities or not np.allclose(self._followed, command, atol=1e-6):
             self._end_segment()
-            self._mean = _Mean(self.time - self.stage.dt, command, round(SETTLING / self.stage.dt))
-        self._mean.add(velocity)
+            self._since, self._followed = self.time - self.stage.dt, np.array(command)
+        self._velocities.append(velocity)
 
     def _end_segment(self) -> None:
-        if self._mean is not None:
-            mean, self._mean = self._mean, None
-            self._segments.append(Segment(mean.start, mean.count * self.stage.dt, mean.command, mean.value()))
+        steps, settling = len(self._velocities), round(SETTLING / self.stage.dt)
+        if steps:
+            mean = np.mean(self._velocities[settling if steps > 2 * settling else 0 :], axis=0)
+            self._segments.append(Segment(self._since, steps * self.stage.dt, self._followed, mean))
+            self._velocities = []
 
     def _moment(self, commands: FloatArray | None) -> Moment:
         stage, pilot = self.stage, self.pilot

@@ -10,7 +10,6 @@ import zlib
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -85,12 +84,6 @@ class VideoWriter:
             with contextlib.suppress(Exception):  # it cannot be finished in any state
                 container.close()
         self._partial.unlink(missing_ok=True)
-
-    def __enter__(self) -> VideoWriter:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        self.close() if kind is None else self.abort()
 
     def _open(self, kind: str, rate: Fraction) -> None:
         import av

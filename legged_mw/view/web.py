@@ -84,12 +84,6 @@ class WebViewer:
         """Stop serving; again is allowed."""
         self._handle.close()
 
-    def __enter__(self) -> WebViewer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _wait(self, host: str, port: int) -> None:
         """Wait until the page is served, and refuse any interface but the one asked for."""
         until = time.monotonic() + START_SECONDS
