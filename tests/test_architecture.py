@@ -42,8 +42,8 @@ ONLY_IN = {
     "rsl_rl": ["legged_mw/rl/*"],
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
     "matplotlib": ["legged_mw/eval/plots.py"],  # a second to import, and only for a report
-    "legged_mw.view": ["legged_mw/view/*", "legged_mw/deploy/*", "legged_mw/terrain_picture.py", "legged_mw/programs.py"],
-    "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/face.py"],  # young, and not on every platform
+    "legged_mw.view": ["legged_mw/view/*", "legged_mw/deploy/*", "legged_mw/programs.py"],
+    "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/studio.py"],  # young, and not on every platform
     "legged_mw.eval": ["legged_mw/eval/*", "legged_mw/deploy/*", "legged_mw/programs.py"],
     "legged_mw.deploy": ["legged_mw/deploy/*", "legged_mw/rl/export.py", "legged_mw/eval/*", "legged_mw/programs.py"],
     "legged_mw.rl.export": ["legged_mw/rl/export.py", "legged_mw/eval/*", "legged_mw/programs.py"],

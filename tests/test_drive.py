@@ -1,11 +1,11 @@
-"""Driving: the command and its limits, the keys, scripts, a gamepad, the loop of a session, the web panel without a browser."""
+"""Driving: commands and their ranges, keys, scripts, the loop of a session, the web panel without a browser."""
 
 from __future__ import annotations
 
 import argparse
-import os
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,18 +17,27 @@ import mujoco
 import numpy as np
 import pytest
 
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.utils.commands import Command
 from legged_mw.utils.errors import UserError
+from legged_mw.utils.task import load_task
 from legged_mw.view import launch, web
-from legged_mw.view.drive import ACTIONS, BINDINGS, CAMERAS, KEY_ACTION, SPEEDS, STEPS, Pilot, help_text, outside
+from legged_mw.view.drive import ACTIONS, BINDINGS, CAMERAS, KEY_ACTION, NO_COMMANDS, SPEEDS, STEPS, Pilot
 from legged_mw.view.env_stage import EnvStage
-from legged_mw.view.gamepad import AXIS, BUTTON, EVENT, INITIAL, Gamepad, find_gamepad
 from legged_mw.view.panel import BUTTONS, CURVE_SECONDS, KEY_NAMES, Curves, Panel
 from legged_mw.view.script import AFTER, load_script
-from legged_mw.view.session import Session, shown
-from legged_mw.view.stage import Moment, Stage, ViewError
-from tests.worlds import make_env
+from legged_mw.view.session import Session, signed
+from legged_mw.view.stage import Moment, Stage, ViewError, target_velocity
+from tests.worlds import QUIET, make_env
 
-LIMITS = np.array([[-1.0, -0.4, -2.0], [1.5, 0.8, 2.0]])
+THREE = (
+    Command("lin_vel_x", -1.0, 1.5, "m/s", 1.0),
+    Command("lin_vel_y", -0.4, 0.8, "m/s", -1.0),
+    Command("ang_vel_yaw", -2.0, 2.0, "rad/s", -1.0),
+)
+HEIGHT = Command("base_height", 0.2, 0.3, "m", 1.0, 0.28)
+FOUR = (*THREE, HEIGHT)
 MODEL = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>')
 
 
@@ -43,7 +52,7 @@ def done(pilot: Pilot, *actions: str) -> Pilot:
 
 
 def test_arrows_step_to_the_limits_and_no_further() -> None:
-    pilot = done(Pilot(LIMITS), "forward")
+    pilot = done(Pilot(THREE), "forward")
     assert pilot.driving and np.allclose(pilot.command, [1.5 / STEPS, 0, 0])
     assert np.allclose(done(pilot, *["forward"] * 9).command, [1.5, 0, 0])
     assert np.allclose(done(pilot, *["back"] * 20, *["right"] * 20, *["turn_left"] * 20).command, [-1.0, -0.4, 2.0])
@@ -53,28 +62,15 @@ def test_arrows_step_to_the_limits_and_no_further() -> None:
 
 @pytest.mark.parametrize(("asked", "held"), [((9, -9, 9), (1.5, -0.4, 2.0)), ((0.3, 0.1, -0.2), (0.3, 0.1, -0.2))])
 def test_sliders_are_held_to_the_limits(asked: tuple[float, ...], held: tuple[float, ...]) -> None:
-    pilot = Pilot(LIMITS)
+    pilot = Pilot(THREE)
     pilot.steer(asked)
     assert not pilot.driving  # until the session's next turn
     pilot.listen()
     assert pilot.driving and np.allclose(pilot.command, held)
 
 
-def test_a_stick_spans_the_limits_on_both_sides() -> None:
-    pilot = Pilot(LIMITS)
-    for deflection, command in (
-        ((1, 1, 1), (1.5, 0.8, 2)),
-        ((-1, -1, -1), (-1, -0.4, -2)),
-        ((0.5, -0.5, 0), (0.75, -0.2, 0)),
-        ((7, 0, 0), (1.5, 0, 0)),
-    ):
-        pilot.stick(deflection)
-        pilot.listen()
-        assert np.allclose(pilot.command, command)
-
-
 def test_who_drives_whom() -> None:
-    pilot, own = Pilot(LIMITS, 3), np.full((3, 3), 0.1)
+    pilot, own = Pilot(THREE, 3), np.full((3, 3), 0.1)
     assert pilot.commands(own) is None
     pilot.follow(own[0])
     done(pilot, "next", "forward")
@@ -87,8 +83,32 @@ def test_who_drives_whom() -> None:
     assert done(pilot, "next", "next").world == 0
 
 
+def test_a_further_command_has_keys_of_its_own_and_stops_at_its_default() -> None:
+    pilot = done(Pilot(FOUR), "raise")
+    assert np.allclose(pilot.command, [0, 0, 0, 0.28 + 0.08 / STEPS])  # a fifth of the way to the farther end
+    assert pilot.command[3] != 0.28 and done(pilot, "lower").command[3] == 0.28  # exactly
+    assert np.allclose(done(pilot, *["lower"] * 9, "forward").command, [0.3, 0, 0, 0.2])
+    assert done(pilot, "stop").command.tolist() == [0, 0, 0, 0.28] and not pilot.message
+    pilot = done(Pilot([HEIGHT]), "raise")
+    assert pilot.driving and np.allclose(pilot.command, [0.28 + 0.08 / STEPS])
+
+
+def test_keys_for_what_a_task_does_not_have_say_so() -> None:
+    for table, action, message in (
+        ([HEIGHT], "forward", "this task has no command vx"),
+        ([HEIGHT], "turn_left", "this task has no command yaw rate"),
+        (THREE, "raise", "this task has no command beyond vx, vy, yaw rate"),
+        ((), "forward", NO_COMMANDS),
+        ((), "raise", NO_COMMANDS),
+        ((), "stop", NO_COMMANDS),
+    ):
+        pilot = done(Pilot(table), action)
+        assert pilot.message == message and not pilot.driving
+        assert done(pilot, "push").message == "" and len(pilot.take_pushes()) == 1
+
+
 def test_pushes_and_resets_are_handed_out_once() -> None:
-    pilot = done(Pilot(LIMITS, 2), "push", "reset", "reset", "everyone", "push")
+    pilot = done(Pilot(THREE, 2), "push", "reset", "reset", "everyone", "push")
     pilot.push((0.5, -0.5))
     pilot.listen()
     pushes = pilot.take_pushes()
@@ -99,7 +119,7 @@ def test_pushes_and_resets_are_handed_out_once() -> None:
 
 
 def test_speed_camera_pause_and_help_go_round() -> None:
-    pilot = Pilot(LIMITS)
+    pilot = Pilot(THREE)
     assert [done(pilot, "slower").speed for _ in range(4)] == [*SPEEDS[1:], SPEEDS[-1]]
     assert [done(pilot, "faster").speed for _ in range(4)] == [*SPEEDS[-2::-1], 1.0]
     assert [done(pilot, "camera").camera for _ in CAMERAS] == [*CAMERAS[1:], CAMERAS[0]]
@@ -109,13 +129,12 @@ def test_speed_camera_pause_and_help_go_round() -> None:
 def test_the_table_of_keys_is_whole() -> None:
     keys = [key for binding in BINDINGS for key in binding.keys]
     assert len(keys) == len(set(keys)) == len(KEY_ACTION)
-    pilot = Pilot(LIMITS, 2)
+    pilot = Pilot(THREE, 2)
     for action in ACTIONS:  # each has something that does it
         done(pilot, action)
     with pytest.raises(ValueError, match="no action 'jump'; there are: forward, back"):
         pilot.ask("jump")
     pilot.press("z")  # no key of ours
-    assert all(binding.text in help_text() and binding.keys[0] in help_text() for binding in BINDINGS)
 
 
 def test_keys_in_the_documentation_are_those_of_the_table() -> None:
@@ -123,12 +142,6 @@ def test_keys_in_the_documentation_are_those_of_the_table() -> None:
     for binding in BINDINGS:
         row = next((line for line in text.splitlines() if line.startswith("|") and binding.text in line), "")
         assert all(f"`{key}`" in row for key in binding.keys), f"docs/playing.md: {binding}"
-
-
-def test_what_was_not_trained_is_named() -> None:
-    assert outside((1.5, 0.8, -2), LIMITS) is None
-    assert outside((0, -0.5, 0), LIMITS) == "vy = -0.5 m/s is outside of what the policy was trained for, -0.4 to 0.8"
-    assert "yaw rate = nan rad/s" in str(outside((0, 0, float("nan")), LIMITS))
 
 
 # ---- scripts
@@ -142,7 +155,7 @@ def script(folder: Path, text: str) -> Path:
 
 def test_a_script_drives_in_its_time(tmp_path: Path) -> None:
     text = "commands:\n  - {time: 0, command: [5e-1, 0, 0]}\n  - {time: 2, push: [0, 1.5]}\n  - {time: 2.0, reset: true}\n"
-    drive, pilot = load_script(script(tmp_path, text), LIMITS), Pilot(LIMITS)
+    drive, pilot = load_script(script(tmp_path, text), THREE), Pilot(THREE)
     assert drive.seconds == 2 + AFTER
     drive.play(0.0, pilot)
     pilot.listen()
@@ -165,9 +178,19 @@ def test_a_script_drives_in_its_time(tmp_path: Path) -> None:
         ("commands: [{time: 1}]", "entry 1 of commands: nothing happens at 1 s; say command, push or reset"),
         ("commands: [{time: soon, reset: true}]", "entry 1 of commands: time: write seconds from the start, not 'soon'"),
         ("commands: [{time: -1, reset: true}]", "entry 1 of commands: time = -1 s is before the start"),
-        ("commands: [{time: 0, command: [1, 0]}]", "entry 1 of commands: command: write [vx, vy, yaw rate] in m/s, m/s, rad/s, not [1, 0]"),
-        ("commands: [{time: 0, command: [1, 0, .nan]}]", "entry 1 of commands: command: write [vx, vy, yaw rate]"),
-        ("commands: [{time: 0, command: [2, 0, 0]}]", "commands: vx = 2 m/s is outside of what the policy was trained for, -1 to 1.5"),
+        (
+            "commands: [{time: 0, command: [1, 0, 0, 0]}]",
+            "entry 1 of commands: command: write a list of vx [m/s], vy [m/s], yaw rate [rad/s], or {name: value}, not [1, 0, 0, 0]",
+        ),
+        ("commands: [{time: 0, command: []}]", "entry 1 of commands: command: write a list of vx [m/s], vy [m/s]"),
+        ("commands: [{time: 0, command: [1, 0, .nan]}]", "entry 1 of commands: command: write a list of vx [m/s], vy [m/s]"),
+        ("commands: [{time: 0, command: {lin_vel_x: fast}}]", "command: lin_vel_x: write a number, not 'fast'"),
+        (
+            "commands: [{time: 0, command: {lin_vel: 1}}]",
+            "entry 1 of commands: command: no command 'lin_vel' in this task; did you mean 'lin_vel_y'? there are: lin_vel_x,",
+        ),
+        ("commands: [{time: 0, command: [2, 0, 0]}]", "command: vx = 2 m/s is outside of what was trained, [-1, 1.5] m/s"),
+        ("commands: [{time: 0, command: {ang_vel_yaw: -3}}]", "command: yaw rate = -3 rad/s is outside of what was trained, [-2, 2] rad/s"),
         ("commands: [{time: 0, push: 3}]", "entry 1 of commands: push: write [vx, vy] in m/s, world frame, not 3"),
         ("commands: [{time: 0, push: [30, 0]}]", "entry 1 of commands: a push of 30 m/s; at most 8"),
         ("commands: [{time: 0, reset: later}]", "entry 1 of commands: reset is true or false, not 'later'"),
@@ -177,70 +200,18 @@ def test_a_script_drives_in_its_time(tmp_path: Path) -> None:
 )
 def test_a_wrong_script_is_one_line(tmp_path: Path, text: str, part: str) -> None:
     with pytest.raises(UserError) as error:
-        load_script(script(tmp_path, text), LIMITS)
+        load_script(script(tmp_path, text), THREE)
     assert "drive.yaml" in str(error.value) and part in str(error.value) and "\n" not in str(error.value)
 
 
-# ---- a gamepad
-
-
-@pytest.fixture
-def pad(tmp_path: Path) -> Any:
-    """A device that is a pipe: what is written to it are events."""
-    os.mkfifo(tmp_path / "js0")
-    gamepad = Gamepad(tmp_path / "js0")
-    with open(tmp_path / "js0", "wb", buffering=0) as device:
-
-        def send(kind: int, number: int, value: int) -> None:
-            device.write(EVENT.pack(0, value, kind, number))
-
-        yield SimpleNamespace(gamepad=gamepad, send=send, device=device)
-    gamepad.close()
-
-
-def test_sticks_and_buttons(pad: Any) -> None:
-    pilot = Pilot(LIMITS, 2)
-    pad.gamepad.poll(pilot)
-    pad.send(AXIS | INITIAL, 1, 100)
-    pad.gamepad.poll(pilot)
-    pilot.listen()
-    assert not pilot.driving  # nobody has touched it
-    pad.send(AXIS, 1, -32767)  # ahead
-    pad.send(AXIS, 3, 32767)  # to the right
-    pad.send(AXIS, 0, 2000)  # within the dead zone
-    pad.send(BUTTON, 3, 1)
-    pad.send(BUTTON, 3, 0)  # let go
-    pad.gamepad.poll(pilot)
-    pilot.listen()
-    assert np.allclose(pilot.command, [1.5, 0, -2]) and pilot.world == 1
-    pad.device.write(EVENT.pack(0, 0, AXIS, 1)[:5])  # half an event waits for its other half
-    pad.gamepad.poll(pilot)
-    pad.device.write(EVENT.pack(0, 0, AXIS, 1)[5:])
-    pad.gamepad.poll(pilot)
-    pilot.listen()
-    assert np.allclose(pilot.command, [0, 0, -2])
-
-
-def test_a_pad_that_is_unplugged_stops_the_robot(pad: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    pilot = Pilot(LIMITS)
-    pad.send(AXIS, 1, -32767)
-    pad.gamepad.poll(pilot)
-
-    def gone(*_: object) -> bytes:
-        raise OSError(19, "No such device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "read", gone)
-        pad.gamepad.poll(pilot)
-    pilot.listen()
-    assert np.array_equal(pilot.command, np.zeros(3))
-    pad.gamepad.poll(pilot)
-
-
-def test_finding_a_gamepad(tmp_path: Path) -> None:
-    assert find_gamepad(tmp_path) is None
-    (tmp_path / "js1").write_bytes(b"")
-    assert find_gamepad(tmp_path) == tmp_path / "js1"
+def test_a_script_gives_commands_by_order_or_by_name(tmp_path: Path) -> None:
+    text = "commands: [{time: 0, command: [0.5, 0, 0]}, {time: 1, command: {base_height: 0.25, lin_vel_x: -1}}, "
+    text += "{time: 2, command: [1, 0, 0, 0.2]}]"
+    drive = load_script(script(tmp_path, text), FOUR)
+    assert [entry.command for entry in drive.entries] == [[0.5, 0, 0, 0.28], [-1, 0, 0, 0.25], [1, 0, 0, 0.2]]
+    with pytest.raises(UserError, match=rf"entry 1 of commands: command: {NO_COMMANDS}"):
+        load_script(script(tmp_path, text), ())
+    assert load_script(script(tmp_path, "commands: [{time: 0, push: [1, 0]}]"), ()).seconds == AFTER
 
 
 # ---- the session
@@ -249,11 +220,11 @@ def test_finding_a_gamepad(tmp_path: Path) -> None:
 class FakeStage:
     """Robots that do at once what they are told, and fall when `falls` says so."""
 
-    model, dt, limits = MODEL, 0.02, LIMITS
+    model, dt = MODEL, 0.02
 
-    def __init__(self, num_worlds: int = 2, falls: dict[int, int] | None = None) -> None:
-        self.num_worlds, self.falls = num_worlds, falls or {}  # step -> world
-        self.steps, self.own = 0, np.full((num_worlds, 3), 0.1)
+    def __init__(self, num_worlds: int = 2, falls: dict[int, int] | None = None, table: tuple[Command, ...] = THREE) -> None:
+        self.num_worlds, self.falls, self.command_table = num_worlds, falls or {}, table  # falls: step -> world
+        self.steps, self.own = 0, np.full((num_worlds, len(table)), 0.1)
         self.now, self.events = self.own.copy(), []
         self.given: list[Any] = []
 
@@ -266,7 +237,7 @@ class FakeStage:
         return self.now.copy()
 
     def velocity(self) -> Any:
-        return self.now + 0.01
+        return np.resize(self.now, (self.num_worlds, 3)) + 0.01 if len(self.command_table) == 3 else np.full((self.num_worlds, 3), 0.11)
 
     def qpos(self) -> Any:
         return np.tile([self.steps * 1.0, 0, 1, 1, 0, 0, 0], (self.num_worlds, 1))
@@ -307,10 +278,10 @@ class FakeViewer:
 
 def test_a_session_does_what_the_keys_say() -> None:
     stage: Stage = FakeStage()
-    pilot = Pilot(stage.limits, 2)
+    pilot = Pilot(stage.command_table, 2)
     viewer = FakeViewer(pilot, {2: "space", 4: "up", 5: "p", 6: "n", 7: "r", 8: "o"}, until=10)
-    summary = Session(stage, viewer, pilot, real_time=False).run()
-    assert isinstance(stage, FakeStage) and stage.steps == 10 and summary.seconds == pytest.approx(0.2)
+    outcome = Session(stage, viewer, pilot, real_time=False).run()
+    assert isinstance(stage, FakeStage) and stage.steps == 10 and outcome.seconds == pytest.approx(0.2)
     assert stage.given[:2] == [None, None] and stage.given[8:] == [None, None]
     assert np.allclose(stage.given[2][0], 0) and np.allclose(stage.given[2][1], 0.1)  # the other robot goes on as it was
     assert np.allclose(stage.given[4][0], [0.3, 0, 0])
@@ -319,9 +290,28 @@ def test_a_session_does_what_the_keys_say() -> None:
     assert [np.allclose(moment.commands[0], 0) for moment in viewer.moments[1:4]] == [False, True, True]  # shown as it will be followed
 
 
+def test_a_stage_without_commands_is_watched_pushed_and_reset() -> None:
+    stage = FakeStage(2, table=())
+    viewer = FakeViewer(Pilot((), 2), {2: "up", 4: "p", 5: "r"}, until=8)
+    outcome = Session(stage, viewer, viewer.pilot, real_time=False).run()
+    assert stage.given == [None] * 8 and stage.events == [(4, "push", 0), (5, "reset", 0)]
+    assert [dict(moment.lines).get("note", "") for moment in viewer.moments[1:5]] == ["", NO_COMMANDS, NO_COMMANDS, ""]
+    assert [name for name, _ in viewer.moments[0].lines] == ["measured", "robot", "falls, all", "time"]
+    assert np.isnan(viewer.moments[0].target_velocity).all() and "commanded: nothing" in outcome.text()
+
+
+def test_velocities_are_found_among_the_commands_by_name() -> None:
+    table = (HEIGHT, THREE[2], THREE[0])
+    target = target_velocity(table, np.array([[0.25, -2.0, 0.5]]))
+    assert np.array_equal(target, [[0.5, np.nan, -2.0]], equal_nan=True)
+    viewer = FakeViewer(Pilot(table), until=1)
+    Session(FakeStage(1, table=table), viewer, viewer.pilot, real_time=False).run()
+    assert np.array_equal(viewer.moments[0].target_velocity, [[0.1, np.nan, 0.1]], equal_nan=True)
+
+
 def test_pause_stands_still_and_slow_motion_takes_longer() -> None:
     stage = FakeStage(1)
-    pilot = Pilot(LIMITS)
+    pilot = Pilot(THREE)
     viewer = FakeViewer(pilot, {3: "enter", 6: "enter"}, until=10)
     Session(stage, viewer, pilot, real_time=False).run()
     assert stage.steps == 7 and [moment.time for moment in viewer.moments[3:6]] == [viewer.moments[3].time] * 3
@@ -333,10 +323,10 @@ def test_pause_stands_still_and_slow_motion_takes_longer() -> None:
 
 
 def test_falls_are_counted_once_and_shown_for_a_while() -> None:
-    stage, pilot = FakeStage(2, falls={3: 1, 4: 1, 50: 0}), Pilot(LIMITS, 2)
+    stage, pilot = FakeStage(2, falls={3: 1, 4: 1, 50: 0}), Pilot(THREE, 2)
     viewer = FakeViewer(pilot)
-    summary = Session(stage, viewer, pilot, seconds=2.5, real_time=False).run()
-    assert summary.falls == 2 and dict(viewer.moments[10].lines)["falls, all"] == "1"
+    outcome = Session(stage, viewer, pilot, seconds=2.5, real_time=False).run()
+    assert outcome.falls == 2 and dict(viewer.moments[10].lines)["falls, all"] == "1"
     [fall] = viewer.moments[3].falls
     assert fall.world == 1 and fall.place[0] == 2.0  # where it was the step before, for it may be elsewhere since
     assert len(viewer.moments[60].falls) == 2 and len(viewer.moments[120].falls) == 1
@@ -349,20 +339,23 @@ def test_ctrl_c_ends_a_session_in_order(capsys: pytest.CaptureFixture[str]) -> N
             if self.steps == 3:
                 raise KeyboardInterrupt
 
-    pilot = Pilot(LIMITS, 2)
-    summary = Session(Interrupted(), FakeViewer(pilot), pilot, seconds=10, real_time=False).run()
-    assert summary.seconds == pytest.approx(0.04) and "stopped" in capsys.readouterr().out
+    pilot = Pilot(THREE, 2)
+    outcome = Session(Interrupted(), FakeViewer(pilot), pilot, seconds=10, real_time=False).run()
+    assert outcome.seconds == pytest.approx(0.04) and "stopped" in capsys.readouterr().out
 
 
 def test_the_summary_of_a_script_has_a_row_a_command(tmp_path: Path) -> None:
     text = "commands: [{time: 0, command: [0.5, 0, 0]}, {time: 3, command: [0, 0, 1]}]"
-    pilot = Pilot(LIMITS)
+    pilot = Pilot(THREE)
     pilot.everyone = True
-    drive = load_script(script(tmp_path, text), LIMITS)
-    summary = Session(FakeStage(2), FakeViewer(pilot), pilot, seconds=drive.seconds, real_time=False, script=drive).run()
-    assert [(round(leg.start, 2), round(leg.seconds, 2)) for leg in summary.legs] == [(0, 3), (3, 3)]
-    assert "   0.0 s   3.0 s   +0.50 +0.00 +0.00       +0.51 +0.01 +0.01" in summary.text()
-    assert shown(np.array([-0.001, 0.004, -1.5])) == "+0.00 +0.00 -1.50"
+    drive = load_script(script(tmp_path, text), THREE)
+    outcome = Session(FakeStage(2), FakeViewer(pilot), pilot, seconds=drive.seconds, real_time=False, script=drive).run()
+    assert [(round(each.start, 2), round(each.seconds, 2)) for each in outcome.segments] == [(0, 3), (3, 3)]
+    title, row = outcome.text().splitlines()[1:3]
+    assert title == "    from     for   commanded: vx [m/s], vy [m/s], yaw rate [rad/s]   measured: vx, vy, yaw rate"
+    assert row.split() == ["0.0", "s", "3.0", "s", "+0.50", "+0.00", "+0.00", "+0.51", "+0.01", "+0.01"]
+    assert row.index("+0.51") == title.index("measured")
+    assert signed(np.array([-0.001, 0.004, -1.5])) == "+0.00 +0.00 -1.50"
 
 
 # ---- which viewer
@@ -404,22 +397,26 @@ def test_auto_takes_the_best_there_is_and_says_why(
         (["--video", "a.avi"], "Cannot write 'a.avi': the supported extensions are .mp4 (H.264) and .gif."),
         (["--sheet", "a.jpg"], "Cannot write 'a.jpg': a contact sheet is a .png."),
         (["--port", "70000"], "--port 70000: a port is a number from 1 to 65535"),
-        (["--command", "2,0,0"], "--command 2,0,0: vx = 2 m/s is outside of what the policy was trained for, -1 to 1.5; to see what"),
-        (["--command", "1,0"], "--command 1,0: write three numbers, vx,vy,yaw [m/s, m/s, rad/s], e.g. 0.8,0,0"),
+        (
+            ["--command", "2,0,0"],
+            "--command 2,0,0: vx = 2 m/s is outside of what was trained, [-1, 1.5] m/s; to see what it does there, widen",
+        ),
+        (["--command", "1,fast"], "--command 1,fast: 'fast' is no number; write --command=0,0,0 (vx [m/s], vy [m/s], yaw rate [rad/s])"),
+        (["--command", "1,0,0,0"], "--command 1,0,0,0: 4 numbers, but this task has 3 commands"),
     ],
 )
 def test_flags_that_cannot_be(args: list[str], part: str) -> None:
     with pytest.raises(UserError) as error:
         launch.check_flags(flags(*args))
-        launch.check_drive(flags(*args), LIMITS)
+        launch.check_drive(flags(*args), THREE)
     assert part in str(error.value)
 
 
 def test_watching_without_a_viewer_ends_by_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive = script(tmp_path, "commands: [{time: 0, command: [0.5, 0, 0]}]")
-    summary = launch.watch(FakeStage(), flags("--viewer", "none", "--commands", str(drive)), tmp_path)
+    outcome = launch.watch(FakeStage(), flags("--viewer", "none", "--commands", str(drive)), tmp_path)
     out = capsys.readouterr().out
-    assert summary.seconds == pytest.approx(AFTER)
+    assert outcome.seconds == pytest.approx(AFTER)
     assert "viewer: none (as asked)" in out and "3.0 s, 0 falls" in out and "+0.50 +0.00 +0.00" in out
 
 
@@ -441,9 +438,9 @@ def test_a_window_that_cannot_open_does_not_leave_a_batch_job_waiting(
     monkeypatch.setattr(launch, "NativeViewer", refuse)
     monkeypatch.setattr("sys.stdout.isatty", lambda: False, raising=False)
     monkeypatch.setattr(launch, "SECONDS", 0.1)  # nobody said how long
-    summary = launch.watch(FakeStage(), flags(), tmp_path, launch.Picture(64, 48))
+    outcome = launch.watch(FakeStage(), flags(), tmp_path, launch.Picture(64, 48))
     assert (
-        summary.seconds == pytest.approx(0.1)
+        outcome.seconds == pytest.approx(0.1)
         and (tmp_path / "play.mp4").exists()
         and "no window: no OpenGL on :99" in capsys.readouterr().out
     )
@@ -533,12 +530,12 @@ class FakePlot:
         return lambda *_: None
 
 
-def panel(worlds: int = 2) -> tuple[Panel, FakeUi, FakePlot, Pilot]:
-    pilot, ui, plot = Pilot(LIMITS, worlds), FakeUi(), FakePlot()
+def panel(worlds: int = 2, table: tuple[Command, ...] = THREE) -> tuple[Panel, FakeUi, FakePlot, Pilot]:
+    pilot, ui, plot = Pilot(table, worlds), FakeUi(), FakePlot()
     page = Panel(pilot, "go1", ui, plot)
     page.build()  # nothing to show yet
-    now = np.full((worlds, 3), 0.25)
-    page.show(Moment(0.0, np.zeros((worlds, 7)), now, now, np.ones((worlds, 4), dtype=bool), lines=(("falls", "3"),)))
+    now, commands = np.full((worlds, 3), 0.25), np.full((worlds, len(table)), 0.25)
+    page.show(Moment(0.0, np.zeros((worlds, 7)), commands, now, now, np.ones((worlds, 4), dtype=bool), lines=(("falls", "3"),)))
     return page, ui, plot, pilot
 
 
@@ -557,7 +554,7 @@ def test_each_button_asks_for_its_action(action: str) -> None:
 def test_sliders_have_the_trained_limits_and_drive() -> None:
     page, ui, _, pilot = panel()
     page.build()
-    assert [ui.ranges[name] for name in ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")] == [tuple(LIMITS[:, i]) for i in range(3)]
+    assert [ui.ranges[name] for name in ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")] == [(each.low, each.high) for each in THREE]
     ui.dragged = {"vy [m/s]": -0.3}
     page.build()
     pilot.listen()
@@ -569,6 +566,23 @@ def test_sliders_have_the_trained_limits_and_drive() -> None:
     page.build()
     pilot.listen()
     assert pilot.everyone
+
+
+def test_a_panel_has_a_slider_and_a_curve_for_each_command_of_the_table() -> None:
+    page, ui, plot, pilot = panel(1, (HEIGHT, *THREE[:2], Command("gait", 0.0, 3.0)))
+    page.build()
+    assert {name: ui.ranges[name] for name in ("base height [m]", "gait")} == {"base height [m]": (0.2, 0.3), "gait": (0.0, 3.0)}
+    assert [(label, len(ys)) for label, _, ys in plot.lines[:4]] == [
+        *(("measured##base_height", 0), ("command##base_height", 1)),  # the first colour is for what is measured
+        *(("measured##lin_vel_x", 1), ("command##lin_vel_x", 1)),
+    ]
+    ui.dragged = {"base height [m]": 0.22}
+    page.build()
+    pilot.listen()
+    assert np.allclose(pilot.command, [0.22, 0.25, 0.25, 0.25])
+    page, ui, plot, pilot = panel(1, ())
+    page.build()
+    assert NO_COMMANDS in ui.seen and list(ui.ranges) == ["push [m/s]"] and not plot.lines and ui.depth == 0
 
 
 def test_keys_of_the_page_are_those_of_the_window_unless_somebody_types() -> None:
@@ -596,10 +610,10 @@ def test_one_robot_has_no_next_one_and_speed_goes_round() -> None:
 
 def test_curves_are_of_the_last_seconds_and_the_panel_closes_what_it_opens() -> None:
     page, ui, plot, _ = panel(1)
-    page.curves = Curves()
+    page.curves = Curves(3)
     for step in range(2000):
         now = np.full((1, 3), 0.001 * step)
-        page.show(Moment(step * 0.02, np.zeros((1, 7)), now, -now, np.ones((1, 4), dtype=bool)))
+        page.show(Moment(step * 0.02, np.zeros((1, 7)), now, now, -now, np.ones((1, 4), dtype=bool)))
     page.build()
     assert len(plot.lines) == 6 and plot.depth == 0
     label, times, values = plot.lines[0]
@@ -624,19 +638,19 @@ def test_the_page_is_served_on_this_machine_alone_and_says_no_to_a_bad_host(monk
 
     from legged_mw.view.web import WebViewer
 
-    pilot, serve = Pilot(LIMITS, 2), web_server.serve
+    pilot, serve = Pilot(THREE, 2), web_server.serve
 
     async def late(*args: Any, **settings: Any) -> Any:
         await asyncio.sleep(0.3)
         return await serve(*args, **settings)
 
     monkeypatch.setattr(web_server, "serve", late)
-    with WebViewer(MODEL, pilot, 2) as page:
-        assert page._face.viewer._http_sock.getsockname()[0] == "127.0.0.1"
+    with closing(WebViewer(MODEL, pilot, 2)) as page:
+        assert page._plugin.viewer._http_sock.getsockname()[0] == "127.0.0.1"
         stage = FakeStage()
         now = np.zeros((2, 3))
         for _ in range(3):
-            page.show(Moment(0.0, stage.qpos(), now, now, np.ones((2, 4), dtype=bool)))
+            page.show(Moment(0.0, stage.qpos(), now, now, now, np.ones((2, 4), dtype=bool)))
         with urllib.request.urlopen(f"http://127.0.0.1:{page.port}/", timeout=10) as answer:
             assert b"canvas" in answer.read()
         with pytest.raises(OSError):  # any other address of this machine
@@ -652,14 +666,15 @@ def test_the_page_is_served_on_this_machine_alone_and_says_no_to_a_bad_host(monk
 
 
 def test_the_environment_follows_the_pilot() -> None:
-    env = make_env(2, {"env.episode_length_s": 100.0})
+    env = make_env(2, {"env.episode_length_s": 100.0, "observations.history": {"state.commands": 2}})
     seen: list[Any] = []
 
     def policy(obs: Any) -> Any:
         seen.append(obs["state"][:, -3:].clone())
         return env.actions * 0.0
 
-    stage: Stage = EnvStage(env, policy, LIMITS)
+    stage: Stage = EnvStage(env, policy)
+    assert stage.command_table == env.command_table and EnvStage(env, policy, THREE).command_table == THREE
     stage.step(None)
     commands = stage.commands()
     commands[1] = (0.5, -0.2, 0.3)
@@ -682,12 +697,57 @@ def test_the_environment_follows_the_pilot() -> None:
     assert stage.fell().all()
 
 
+def test_a_command_is_written_where_the_policy_sees_it_also_in_a_group_of_a_group() -> None:
+    env = make_env(2, {**QUIET, "observations.history": {"state.commands": 2}})
+    stage = EnvStage(env, lambda obs: env.actions * 0.0)
+    wanted = np.array([[0.5, -0.2, 0.3], [0.1, 0.2, -0.3]])
+    seen: list[Any] = []
+    stage.policy = lambda obs: seen.append({name: value.clone() for name, value in obs.items()}) or env.actions * 0.0
+    before = {name: value.clone() for name, value in env.obs_buf.items()}
+    stage.step(wanted)
+    columns = env.observations.newest("state", "commands")
+    for group in ("state", "privileged_state"):  # the second begins with the first
+        assert np.allclose(seen[0][group][:, columns], wanted)
+        rest = np.delete(np.arange(seen[0][group].shape[1]), np.arange(columns.start, columns.stop))
+        assert np.array_equal(seen[0][group][:, rest], before[group][:, rest])
+    stage.step(None)
+    older = slice(columns.start - 3, columns.start)
+    assert np.allclose(seen[1]["state"][:, older], wanted)  # its history is of what the policy saw
+
+
+def test_a_task_without_commands_and_feet_is_a_stage_too() -> None:
+    go1 = load_task("go1_flat").cfg
+
+    class Cfg(RobotTaskCfg):
+        class env(RobotTaskCfg.env):
+            num_envs = 2
+
+        class asset(RobotTaskCfg.asset):
+            file = go1.asset.file
+            colliders = go1.asset.colliders
+
+        class init_state(RobotTaskCfg.init_state):
+            pos = go1.init_state.pos
+            default_joint_angles = go1.init_state.default_joint_angles
+
+        class control(RobotTaskCfg.control):
+            stiffness = go1.control.stiffness
+            damping = go1.control.damping
+
+    env = RobotTask(Cfg(), "cpu")
+    stage: Stage = EnvStage(env, lambda obs: env.actions * 0.0)
+    assert stage.command_table == () and stage.commands().shape == (2, 0) and stage.contacts().shape == (2, 0)
+    viewer = FakeViewer(Pilot(stage.command_table, 2), {1: "up", 2: "p", 3: "r"}, until=4)
+    outcome = Session(stage, viewer, viewer.pilot, real_time=False).run()
+    assert outcome.seconds == pytest.approx(4 * env.dt) and stage.velocity().shape == (2, 3) and stage.ground(0) == ""
+
+
 def test_watching_needs_no_torch() -> None:
     """What a robot's computer has is enough: all of view/ but env_stage.py and playing.py."""
     modules = [
         path.stem
         for path in (legged_mw.ROOT / "legged_mw/view").glob("*.py")
-        if path.stem not in ("env_stage", "playing", "__init__", "face")
+        if path.stem not in ("env_stage", "playing", "__init__", "studio")
     ]
     code = "import sys\nfor name in ('torch', 'warp', 'rsl_rl', 'mujoco_warp'): sys.modules[name] = None\nimport "
     code += ", ".join(f"legged_mw.view.{name}" for name in modules)

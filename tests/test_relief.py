@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import legged_mw  # noqa: F401  (sets MUJOCO_GL, which mujoco reads when it is imported)
@@ -14,18 +15,19 @@ import numpy as np
 import pytest
 from program import run
 
-from legged_mw import ROOT, terrain_picture
+from benchmarks import terrain_picture
+from legged_mw import ROOT
 from legged_mw.sim.drawing import ground_model, visual_model
 from legged_mw.sim.relief import PIXELS, relief
 from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.task import load_task
-from legged_mw.view.camera import ELEVATION, CameraMan
-from legged_mw.view.film import RobotRenderer
-from legged_mw.view.hills import Hills
+from legged_mw.view.camera import ELEVATION, RobotCamera
 from legged_mw.view.playing import ground_to_watch
-from legged_mw.view.puppet import Cast
-from legged_mw.view.session import Session, Summary
+from legged_mw.view.posed_robot import PosedRobots
+from legged_mw.view.recorder import RobotRenderer
+from legged_mw.view.rough_ground import RoughGround
+from legged_mw.view.session import Outcome, Session
 from legged_mw.view.stage import Moment
 
 KINDS = ("stairs_up", "obstacles", "smooth_slope", "flat")
@@ -134,7 +136,7 @@ def test_flat_ground_lies_all_around_as_far_as_a_camera_sees(levels: int, column
 def test_hills_are_as_high_as_the_ground(hilly: mujoco.MjModel) -> None:
     ground, data = grid(), mujoco.MjData(hilly)
     mujoco.mj_kinematics(hilly, data)
-    hills = Hills(hilly, data)
+    hills = RoughGround(hilly, data)
     rows, columns = ground.heights.shape
     rng = np.random.default_rng(0)
     for row, column in zip(rng.integers(0, rows, 200), rng.integers(0, columns, 200), strict=True):
@@ -146,21 +148,21 @@ def test_hills_are_as_high_as_the_ground(hilly: mujoco.MjModel) -> None:
 def test_only_near_tiles_are_drawn_in_full(hilly: mujoco.MjModel) -> None:
     ground = grid()
     middle = ground.origins[0, 0]
-    with RobotRenderer(hilly, 64, 48, count=2) as renderer:
+    with closing(RobotRenderer(hilly, 64, 48, count=2)) as renderer:
         qpos = np.tile(hilly.qpos0, (2, 1))
         qpos[:, :3] = middle + (0.0, 0.0, 0.3)
-        still = Moment(0.0, qpos, np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, 4), dtype=bool))
+        still = Moment(0.0, qpos, np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, 4), dtype=bool))
         renderer.frame(still)
-        model, hills = renderer.cast.model, renderer.cast.hills
+        model, hills = renderer.robots.model, renderer.robots.ground
         assert hills is not None and len(shown(model)) == 8, "one of each tile"
         fine = shown(model) & set(hills.fine[hills.fine != hills.coarse].tolist())
         near = [tile for tile in range(8) if hills.fine[tile] in fine]
         assert 0 < len(near) < 6 and min(np.abs(hills.places[near] - middle[:2]).max(axis=1)) < 1e-6
-        assert renderer.cast.offsets.tolist() == [[0.0] * 3] * 2, "each on its tile"
+        assert renderer.robots.offsets.tolist() == [[0.0] * 3] * 2, "each on its tile"
 
 
 def test_the_camera_looks_over_what_rises_before_it(hilly: mujoco.MjModel) -> None:
-    ground, cast = grid(), Cast(hilly)
+    ground, cast = grid(), PosedRobots(hilly)
     qpos = np.array(hilly.qpos0)
     elevations = []
     for column, ahead in ((KINDS.index("flat"), 0.0), (KINDS.index("stairs_up"), 2.0)):
@@ -169,7 +171,7 @@ def test_the_camera_looks_over_what_rises_before_it(hilly: mujoco.MjModel) -> No
         qpos[:3] = *place[:2], ground.heights[y, x] + 0.3
         qpos[3:7] = np.cos(np.radians(25)), 0, 0, np.sin(np.radians(25))  # so that the camera is at larger x, up the stairs
         cast.pose(qpos)
-        camera = CameraMan(mujoco.MjvCamera(), cast, by_hand=False).update("follow", 0)
+        camera = RobotCamera(mujoco.MjvCamera(), cast, by_hand=False).update("follow", 0)
         assert camera.azimuth == pytest.approx(180.0)
         elevations.append(camera.elevation)
     assert elevations[0] == ELEVATION > elevations[1] + 5.0
@@ -177,7 +179,7 @@ def test_the_camera_looks_over_what_rises_before_it(hilly: mujoco.MjModel) -> No
 
 def test_boxes_are_places_too() -> None:
     step = "<worldbody><geom type='box' size='1 1 .1'/><body pos='0 0 1'><freejoint/><geom size='.1'/></body></worldbody>"
-    assert not Cast(mujoco.MjModel.from_xml_string(f"<mujoco>{step}</mujoco>"), 3).offsets.any()
+    assert not PosedRobots(mujoco.MjModel.from_xml_string(f"<mujoco>{step}</mujoco>"), 3).offsets.any()
 
 
 # ---- the small grid of play.py
@@ -187,9 +189,9 @@ def played(*args: str) -> tuple[str, Session]:
     """What play.py prints, and the session that it would have run."""
     sessions: list[Session] = []
 
-    def note(session: Session) -> Summary:
+    def note(session: Session) -> Outcome:
         sessions.append(session)
-        return Summary(0.0, 0, [])
+        return Outcome(0.0, 0, [])
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Session, "run", note)

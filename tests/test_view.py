@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import os
-import stat
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -21,14 +21,15 @@ import pytest
 
 from legged_mw import ROOT
 from legged_mw.sim.drawing import visual_model
+from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.task import load_task
-from legged_mw.view import native, video
-from legged_mw.view.camera import DISTANCE, CameraMan
+from legged_mw.view import native
+from legged_mw.view.camera import DISTANCE, RobotCamera
 from legged_mw.view.drive import BINDINGS, Pilot
-from legged_mw.view.film import Film, RobotRenderer, shrunk
 from legged_mw.view.native import NativeViewer, has_display
-from legged_mw.view.overlay import draw_velocities
-from legged_mw.view.puppet import Anchor, Cast, Puppet, marionettes
+from legged_mw.view.overlay import ARC_SEGMENTS, draw_velocities
+from legged_mw.view.posed_robot import Placement, PosedRobot, PosedRobots, moving_geoms, show_groups
+from legged_mw.view.recorder import Recorder, RobotRenderer, shrunk
 from legged_mw.view.session import Pace
 from legged_mw.view.stage import Fall, Moment
 from legged_mw.view.video import VideoWriter, contact_sheet, save_png
@@ -64,31 +65,17 @@ def model() -> mujoco.MjModel:
 
 @pytest.fixture  # a new one for each test: the camera remembers where the robot was
 def renderer(model: mujoco.MjModel) -> Iterator[RobotRenderer]:
-    with RobotRenderer(model, 320, 240) as robot_renderer:
+    with closing(RobotRenderer(model, 320, 240)) as robot_renderer:
         yield robot_renderer
 
 
-@pytest.fixture
-def no_program(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A PATH without ffmpeg: the folder `bin` and nothing else."""
-    folder = tmp_path / "bin"
-    folder.mkdir()
-    monkeypatch.setenv("PATH", str(folder))
-    return folder
-
-
-def fake_ffmpeg(folder: Path, body: str) -> None:
-    """An ffmpeg that lists libx264 when asked for its encoders and else runs `body`; `$out` is the file to write."""
-    script = folder / "ffmpeg"
-    lines = f'if [ "$2" = "-encoders" ]; then echo " V....D libx264"; exit; fi\nfor out; do :; done\n{body}\n'
-    script.write_text(f"#!/bin/sh\nPATH=/usr/bin:/bin\n{lines}")
-    script.chmod(script.stat().st_mode | stat.S_IXUSR)
+TABLE = [Command(name, -1.0, 1.0) for name in VELOCITY]
 
 
 def moment(model: mujoco.MjModel, count: int = 1, **changes: Any) -> Moment:
     """Robots that stand in their first pose and do nothing, but for `changes`."""
     zero = np.zeros((count, 3))
-    still = Moment(0.0, np.tile(model.qpos0, (count, 1)), zero, zero, np.zeros((count, 2), dtype=bool))
+    still = Moment(0.0, np.tile(model.qpos0, (count, 1)), zero, zero, zero, np.zeros((count, 2), dtype=bool))
     return still._replace(**changes)
 
 
@@ -104,9 +91,9 @@ def frames(count: int) -> list[np.ndarray]:
 # ---- video files
 
 
-def test_video_decodes_to_what_was_written(tmp_path: Path, no_program: Path) -> None:
+def test_video_decodes_to_what_was_written(tmp_path: Path) -> None:
     path = tmp_path / "new" / "folder" / "walk.mp4"
-    with VideoWriter(path, 320, 240, fps=50) as writer:
+    with closing(VideoWriter(path, 320, 240, fps=50)) as writer:
         for frame in frames(10):
             writer.add(frame)
         assert not path.exists()
@@ -122,41 +109,26 @@ def test_video_decodes_to_what_was_written(tmp_path: Path, no_program: Path) -> 
     assert all(abs(frame.mean() - 20 * i) < 5 for i, frame in enumerate(decoded))
 
 
-def test_video_goes_through_ffmpeg_where_there_is_one(tmp_path: Path, no_program: Path) -> None:
-    fake_ffmpeg(no_program, 'cat > "$out"')
-    with VideoWriter(tmp_path / "walk.mp4", 320, 240, fps=50) as writer:
-        for frame in frames(3):
-            writer.add(frame)
-    assert (tmp_path / "walk.mp4").read_bytes() == b"".join(frame.tobytes() for frame in frames(3))
-
-
-@pytest.mark.parametrize("fake", [False, True])
-def test_broken_run_leaves_the_old_file_and_nothing_else(tmp_path: Path, no_program: Path, fake: bool) -> None:
-    if fake:
-        fake_ffmpeg(no_program, 'cat > "$out"')
-    path = tmp_path / "out" / "walk.mp4"
+@pytest.mark.parametrize("name", ["walk.mp4", "walk.gif"])
+def test_broken_run_leaves_the_old_file_and_nothing_else(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "out" / name
     path.parent.mkdir()
     path.write_bytes(b"old")
-    with pytest.raises(KeyboardInterrupt), VideoWriter(path, 320, 240, fps=50) as writer:
-        writer.add(frames(1)[0])
-        raise KeyboardInterrupt
-    assert [(file.name, file.read_bytes()) for file in path.parent.iterdir()] == [("walk.mp4", b"old")]
+    writer = VideoWriter(path, 320, 240, fps=50)
+    writer.add(frames(1)[0])
+    writer.abort()
+    writer.close()  # harmless
+    assert [(file.name, file.read_bytes()) for file in path.parent.iterdir()] == [(name, b"old")]
 
 
-def test_a_dying_ffmpeg_is_quoted(tmp_path: Path, no_program: Path) -> None:
-    fake_ffmpeg(no_program, "echo disk full >&2; exit 3")
-    with (
-        pytest.raises(RuntimeError, match="ffmpeg ended with status 3: disk full"),
-        VideoWriter(tmp_path / "walk.mp4", 320, 240, fps=50) as writer,
-    ):
-        for frame in frames(10):
-            writer.add(frame)
-    assert [file.name for file in tmp_path.iterdir()] == ["bin"]
-
-
-def test_no_encoder_says_what_was_tried(tmp_path: Path, no_program: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_encoder_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(av, "codecs_available", {"gif"})
+        VideoWriter(tmp_path / "walk.gif", 320, 240, fps=12.5).abort()
+        with pytest.raises(RuntimeError, match=r"PyAV .* was built without libx264. Install another: pip install --force-reinstall av"):
+            VideoWriter(tmp_path / "walk.mp4", 320, 240, fps=50)
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(RuntimeError, match=r"ffmpeg: not on PATH; PyAV: .*pip install av, or ffmpeg"):
+    with pytest.raises(RuntimeError, match=r'Videos are written by PyAV \(.*\). Install it: pip install "legged_mw\[video\]"'):
         VideoWriter(tmp_path / "walk.mp4", 320, 240, fps=50)
 
 
@@ -167,13 +139,11 @@ def test_bad_video_requests(tmp_path: Path) -> None:
         VideoWriter(tmp_path / "walk.mp4", 321, 240, fps=50)
     with pytest.raises(ValueError, match="fps = 0"):
         VideoWriter(tmp_path / "walk.mp4", 320, 240, fps=0)
-    with (
-        pytest.raises(ValueError, match=r"uint8 \(240, 320, 3\); got float64 \(2, 2, 3\)"),
-        VideoWriter(tmp_path / "a.mp4", 320, 240, 50) as w,
-    ):
-        w.add(np.zeros((2, 2, 3)))  # pyright: ignore[reportArgumentType]
-    with pytest.raises(RuntimeError, match="empty.mp4 was not written: no frame"), VideoWriter(tmp_path / "empty.mp4", 320, 240, 50):
-        pass
+    writer = VideoWriter(tmp_path / "empty.mp4", 320, 240, 50)
+    with pytest.raises(ValueError, match=r"uint8 \(240, 320, 3\); got float64 \(2, 2, 3\)"):
+        writer.add(np.zeros((2, 2, 3)))  # pyright: ignore[reportArgumentType]
+    with pytest.raises(RuntimeError, match="empty.mp4 was not written: no frame"):
+        writer.close()
     assert list(tmp_path.iterdir()) == []
 
 
@@ -188,10 +158,10 @@ def test_contact_sheet_and_png(tmp_path: Path) -> None:
         contact_sheet([], columns=3)
 
 
-def test_gif_is_an_animation_in_its_own_colours(tmp_path: Path, no_program: Path) -> None:
+def test_gif_is_an_animation_in_its_own_colours(tmp_path: Path) -> None:
     path = tmp_path / "walk.gif"
     pictures = [np.full((40, 61, 3), (200, 20 * i, 30), dtype=np.uint8) for i in range(6)]  # odd widths are no trouble
-    with VideoWriter(path, 61, 40, fps=12.5) as writer:
+    with closing(VideoWriter(path, 61, 40, fps=12.5)) as writer:
         for picture in pictures:
             writer.add(picture)
         assert not path.exists()
@@ -203,17 +173,8 @@ def test_gif_is_an_animation_in_its_own_colours(tmp_path: Path, no_program: Path
     assert all(np.abs(seen.astype(int) - drawn).mean() < 6 for seen, drawn in zip(decoded, pictures, strict=True))
 
 
-def test_gif_goes_through_ffmpeg_where_there_is_one(tmp_path: Path, no_program: Path) -> None:
-    fake_ffmpeg(no_program, 'echo "$@" > "$out"; cat > /dev/null')
-    script = no_program / "ffmpeg"
-    script.write_text(script.read_text().replace("libx264", "gif"))
-    with VideoWriter(tmp_path / "walk.gif", 320, 240, fps=12.5) as writer:
-        writer.add(frames(1)[0])
-    assert "split[a][b];[a]palettegen=stats_mode=full[p];[b][p]paletteuse=" in (tmp_path / "walk.gif").read_text()
-
-
-def test_film_writes_a_video_and_a_sheet(tmp_path: Path, model: mujoco.MjModel) -> None:
-    film = Film(model, 1, 0.02, 1.2, video=tmp_path / "a.mp4", sheet=tmp_path / "a.png", width=160, height=120, fps=25)
+def test_a_recorder_writes_a_video_and_a_sheet(tmp_path: Path, model: mujoco.MjModel) -> None:
+    film = Recorder(model, 1, 0.02, 1.2, video=tmp_path / "a.mp4", sheet=tmp_path / "a.png", width=160, height=120, fps=25)
     for step in range(60):
         film.show(moment(model, time=step * 0.02))
     film.close()
@@ -222,7 +183,7 @@ def test_film_writes_a_video_and_a_sheet(tmp_path: Path, model: mujoco.MjModel) 
     with av.open(str(tmp_path / "a.png")) as container:
         assert next(container.decode(video=0)).to_ndarray(format="rgb24").shape == (3 * 120, 4 * 160, 3)
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
-    film = Film(model, 1, 0.02, 1.2, video=tmp_path / "a.mp4", sheet=None, width=160, height=120)
+    film = Recorder(model, 1, 0.02, 1.2, video=tmp_path / "a.mp4", sheet=None, width=160, height=120)
     film.show(moment(model))
     film.abort()
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
@@ -252,18 +213,30 @@ def test_both_arrows_are_drawn_and_collision_shapes_are_not(model: mujoco.MjMode
     plain = renderer.frame(moment(model))
     assert [colour_count(plain, rgb) for rgb in (orange, blue, red)] == [0, 0, 0]
     for value in ([[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]]):
-        commanded = renderer.frame(moment(model, commands=np.array(value)))
-        both = renderer.frame(moment(model, commands=np.array(value), velocity=np.array(value)))
+        commanded = renderer.frame(moment(model, target_velocity=np.array(value)))
+        both = renderer.frame(moment(model, target_velocity=np.array(value), velocity=np.array(value)))
         assert colour_count(commanded, orange) > 20 and colour_count(commanded, blue) == 0
         assert colour_count(both, orange) > 10 and colour_count(both, blue) > 10
 
 
 def test_arrow_points_along_the_body_velocity() -> None:
     scene = mujoco.MjvScene(mujoco.MjModel.from_xml_string(ROBOT), 100)
-    draw_velocities(scene, Anchor(np.zeros(3), np.pi / 2, 0.4, 0.1), np.array([1.0, 0.0, 0.0]), np.zeros(3))  # heading +y
+    draw_velocities(scene, Placement(np.zeros(3), np.pi / 2, 0.4, 0.1), np.array([1.0, 0.0, 0.0]), np.zeros(3))  # heading +y
     [arrow] = scene.geoms[: scene.ngeom]
     assert arrow.type == mujoco.mjtGeom.mjGEOM_ARROW
     assert np.allclose(arrow.mat[:, 2], [0, 1, 0], atol=1e-6)
+
+
+def test_a_task_without_a_velocity_command_has_no_arrow_for_it() -> None:
+    scene = mujoco.MjvScene(mujoco.MjModel.from_xml_string(ROBOT), 100)
+    place, moving = Placement(np.zeros(3), 0.0, 0.4, 0.1), np.ones(3)
+    counts = []
+    for target in ([np.nan] * 3, [1.0, np.nan, np.nan], [1.0, 0.0, np.nan], [np.nan, np.nan, 1.0], [1.0, 0.0, 1.0]):
+        scene.ngeom = 0
+        draw_velocities(scene, place, np.array(target), moving)
+        counts.append(scene.ngeom)
+    turn = 2 * (ARC_SEGMENTS + 1)
+    assert counts == [0, 0, 2, turn, 2 + turn]
 
 
 def test_feet_that_stand_and_places_of_falls_are_marked(model: mujoco.MjModel, renderer: RobotRenderer) -> None:
@@ -282,39 +255,39 @@ def test_words_are_written_over_the_picture(model: mujoco.MjModel, renderer: Rob
 
 
 def test_camera_glides_after_the_base_and_cuts_after_a_jump(model: mujoco.MjModel) -> None:
-    cast, qpos = Cast(model), model.qpos0.copy()
-    follow = CameraMan(mujoco.MjvCamera(), cast, by_hand=False)
-    assert np.allclose(follow.update("follow", 0).lookat, cast.anchors[0].position)
-    assert follow.camera.distance == pytest.approx(DISTANCE * cast.radius)
-    assert 0.3 < cast.radius < 0.5 and cast.puppet.top == pytest.approx(0.15)  # group 3 does not count
+    robots, qpos = PosedRobots(model), model.qpos0.copy()
+    follow = RobotCamera(mujoco.MjvCamera(), robots, by_hand=False)
+    assert np.allclose(follow.update("follow", 0).lookat, robots.placements[0].position)
+    assert follow.camera.distance == pytest.approx(DISTANCE * robots.radius)
+    assert 0.3 < robots.radius < 0.5 and robots.placements[0].top == pytest.approx(0.15)  # group 3 does not count
     qpos[0] += 0.1
-    cast.pose(qpos)
+    robots.pose(qpos)
     assert 0 < follow.update("follow", 0).lookat[0] < 0.05
     for _ in range(60):
         follow.update("follow", 0)
     assert follow.camera.lookat[0] == pytest.approx(0.1, abs=1e-3)
     qpos[0] += 10
-    cast.pose(qpos)
+    robots.pose(qpos)
     assert follow.update("follow", 0).lookat[0] == pytest.approx(10.1)
 
 
 def test_camera_walks_behind_and_sees_all(model: mujoco.MjModel) -> None:
-    cast = Cast(model, 4)
-    camera = CameraMan(mujoco.MjvCamera(), cast, by_hand=False)
+    robots = PosedRobots(model, 4)
+    camera = RobotCamera(mujoco.MjvCamera(), robots, by_hand=False)
     qpos = np.tile(model.qpos0, (4, 1))
     qpos[1, 3:7] = np.cos(np.pi / 4), 0, 0, np.sin(np.pi / 4)
-    cast.pose(qpos, 1)
+    robots.pose(qpos, 1)
     assert camera.update("behind", 1).azimuth == pytest.approx(90)  # looks along the robot's x axis
     near = camera.camera.distance
     camera.update("all", 1)
-    assert np.allclose(camera.camera.lookat[:2], cast.offsets[:, :2].mean(axis=0)) and camera.camera.distance > 2 * near
+    assert np.allclose(camera.camera.lookat[:2], robots.offsets[:, :2].mean(axis=0)) and camera.camera.distance > 2 * near
 
 
 def test_a_mouse_may_turn_the_camera_that_follows(model: mujoco.MjModel) -> None:
-    cast = Cast(model)
-    camera = CameraMan(mujoco.MjvCamera(), cast, by_hand=True)
+    robots = PosedRobots(model)
+    camera = RobotCamera(mujoco.MjvCamera(), robots, by_hand=True)
     camera.update("follow", 0)
-    assert camera.camera.type == mujoco.mjtCamera.mjCAMERA_TRACKING and camera.camera.trackbodyid == cast.base
+    assert camera.camera.type == mujoco.mjtCamera.mjCAMERA_TRACKING and camera.camera.trackbodyid == robots.base
     camera.camera.azimuth = 17.0
     assert camera.update("follow", 0).azimuth == 17.0
 
@@ -322,43 +295,62 @@ def test_a_mouse_may_turn_the_camera_that_follows(model: mujoco.MjModel) -> None
 # ---- several robots
 
 
-def test_a_marionette_looks_as_its_robot_does(model: mujoco.MjModel) -> None:
-    cast = Cast(model)
-    cast.pose(model.qpos0 + 0.2 * np.eye(model.nq)[7] + 0.3 * np.eye(model.nq)[0])
-    copy, bodies = marionettes(model, 1)
-    data = mujoco.MjData(copy)
-    data.mocap_pos[:-1], data.mocap_quat[:-1] = cast.data.xpos[bodies], cast.data.xquat[bodies]
-    data.mocap_pos[-1] = cast.anchors[0].position
-    mujoco.mj_forward(copy, data)
+def test_another_robot_looks_as_the_followed_one_does(model: mujoco.MjModel) -> None:
+    """The same robot in the same pose at the same place: followed, and added beside a followed one that is behind the camera."""
+    pose = model.qpos0 + 0.2 * np.eye(model.nq)[7] + 0.3 * np.eye(model.nq)[0]
     pictures = []
-    for which, state in ((model, cast.data), (copy, data)):
+    for count in (1, 2):
+        robots = PosedRobots(model, count)
+        robots.offsets[:] = 0.0
+        away = model.qpos0 - 6.0 * np.eye(model.nq)[1]
+        robots.pose(np.stack([away, pose])[-count:])
         camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
         camera.lookat[:], camera.distance, camera.elevation = [0.3, 0, 0.2], 1.2, -20
-        option.geomgroup[3] = 0
-        with mujoco.Renderer(which, 120, 160) as view:
-            view.update_scene(state, camera, option)
+        show_groups(option)
+        with mujoco.Renderer(robots.model, 120, 160) as view:
+            view.update_scene(robots.data, camera, option)
+            before = view.scene.ngeom
+            robots.add_others(view.scene, option)
+            assert view.scene.ngeom - before == (count - 1) * moving_geoms(model)
+            lamp = next(light for light in view.scene.lights[: view.scene.nlight] if not light.headlight)
+            lamp.pos[:] = 0.3, 0, 4  # the model's light stays with the followed robot
             pictures.append(view.render().astype(int))
     difference = np.abs(pictures[0] - pictures[1])
     assert pictures[0].std() > 20 and difference.mean() < 1.5, difference.mean()
 
 
 def test_robots_stand_side_by_side_each_in_its_pose(model: mujoco.MjModel) -> None:
-    cast, qpos = Cast(model, 5), np.tile(model.qpos0, (5, 1))
+    robots, qpos = PosedRobots(model, 5), np.tile(model.qpos0, (5, 1))
     qpos[3, :3] += (0.5, -0.2, 0.1)
     qpos[3, 7] = 0.7
-    cast.pose(qpos, 3)
-    apart = np.linalg.norm(cast.offsets[:, None] - cast.offsets[None], axis=2) + 10 * np.eye(5)
-    assert apart.min() >= 2 * cast.radius and not cast.offsets[0].any()
-    assert np.allclose(cast.anchors[3].position, cast.offsets[3] + qpos[3, :3])
-    puppet = Puppet(model)
-    puppet.pose(qpos[3])
-    assert np.allclose(cast.data.xpos[cast.model.body("3/2").id], puppet.data.xpos[2] + cast.offsets[3])
-    assert np.allclose(cast.data.xquat[cast.model.body("3/2").id], puppet.data.xquat[2])
-    assert np.allclose(cast.data.xpos[cast.base], cast.anchors[3].position)  # what the camera tracks
-    assert cast.model.nv == 0 and cast.model.ngeom == 1 + 5 * 6  # nothing to solve; group 3 stays behind
+    robots.pose(qpos, 3)
+    apart = np.linalg.norm(robots.offsets[:, None] - robots.offsets[None], axis=2) + 10 * np.eye(5)
+    assert apart.min() >= 2 * robots.radius and not robots.offsets[0].any()
+    assert np.allclose(robots.placements[3].position, robots.offsets[3] + qpos[3, :3])
+    alone = PosedRobot(model)
+    alone.pose(qpos[3])
+    assert np.allclose(robots.data.xpos[1:], alone.data.xpos[1:] + robots.offsets[3])  # the followed one
+    assert np.allclose(robots.data.xquat, alone.data.xquat)
+    robots.pose(qpos, 1)
+    assert np.allclose(robots.data.xpos[robots.base], robots.placements[1].position)  # what the camera tracks
+    scene, option = mujoco.MjvScene(model, 100), mujoco.MjvOption()
+    show_groups(option)
+    robots.add_others(scene, option)
+    assert scene.ngeom == 4 * 6  # group 3 stays behind
+    third = scene.geoms[2 * 6 : 3 * 6]  # robots 0, 2, 3, 4
+    shown = np.flatnonzero((model.geom_group < 3) & (model.geom_bodyid > 0))
+    spheres = model.geom_type[shown] == mujoco.mjtGeom.mjGEOM_SPHERE
+    assert np.allclose(np.array([geom.pos for geom in third])[spheres], alone.data.geom_xpos[shown[spheres]] + robots.offsets[3], atol=1e-5)
     contacts = np.zeros((5, 2), dtype=bool)
-    contacts[3, 1] = True
-    assert np.allclose(cast.standing(contacts), [puppet.data.geom("foot-0.1").xpos + cast.offsets[3]])
+    contacts[3, 0] = True  # of the leg that is turned
+    assert np.allclose(robots.below_feet(contacts), [alone.data.geom("foot0.1").xpos + robots.offsets[3] - (0, 0, 0.03)])
+
+
+def test_the_disc_of_a_flat_foot_is_below_its_sole() -> None:
+    boxes = ROBOT.replace('size=".03" pos="0 0 -.3"', 'type="box" size=".1 .04 .01" pos=".05 0 -.3"')
+    robots = PosedRobots(mujoco.MjModel.from_xml_string(boxes))
+    assert robots.foot_radius == pytest.approx(0.04)
+    assert np.allclose(robots.below_feet([[True, False]]), [[0.18 + 0.05, 0.1, 0.35 - 0.31]])
 
 
 def test_on_a_terrain_each_robot_stays_where_it_is() -> None:
@@ -366,16 +358,15 @@ def test_on_a_terrain_each_robot_stays_where_it_is() -> None:
     floor = '<geom name="floor" type="plane" size="0 0 .05" material="floor"/>'
     ground = floor.replace("plane", "hfield").replace('size="0 0 .05"', 'hfield="hills"')
     hills = mujoco.MjModel.from_xml_string(ROBOT.replace("<worldbody>", terrain, 1).replace(floor, ground))
-    cast = Cast(hills, 3)
-    assert not cast.offsets.any() and cast.model.nhfield == 1
-    assert np.allclose(cast.model.hfield_data, hills.hfield_data) and np.allclose(cast.model.hfield_size, hills.hfield_size)
+    robots = PosedRobots(hills, 3)
+    assert not robots.offsets.any() and robots.ground is not None
 
 
 def test_many_robots_are_in_one_picture(model: mujoco.MjModel) -> None:
-    with RobotRenderer(model, 320, 240, count=4) as several:
+    with closing(RobotRenderer(model, 320, 240, count=4)) as several:
         command = np.tile([1.0, 0.0, 0.0], (4, 1))
-        one = colour_count(several.frame(moment(model, 4, commands=command * [[1], [0], [0], [0]], camera="all")), (255, 130, 0))
-        four = colour_count(several.frame(moment(model, 4, commands=command, camera="all")), (255, 130, 0))
+        one = colour_count(several.frame(moment(model, 4, target_velocity=command * [[1], [0], [0], [0]], camera="all")), (255, 130, 0))
+        four = colour_count(several.frame(moment(model, 4, target_velocity=command, camera="all")), (255, 130, 0))
         assert one > 5 and four > 2.5 * one
 
 
@@ -385,14 +376,15 @@ def test_bad_poses_and_models(model: mujoco.MjModel, renderer: RobotRenderer) ->
     with pytest.raises(ValueError, match=r"qpos\[8\] is not finite"):
         renderer.frame(moment(model, qpos=np.append(model.qpos0[:-1], np.nan)[None]))
     with pytest.raises(ValueError, match=r"\(vx, vy, yaw rate\), shape \(3,\); got shape \(2,\)"):
-        renderer.frame(moment(model, commands=np.zeros((1, 2))))
+        renderer.frame(moment(model, target_velocity=np.zeros((1, 2))))
     arm = '<mujoco><worldbody><body><joint name="elbow"/><geom size=".1"/></body></worldbody></mujoco>'
     with pytest.raises(ValueError, match="free joint, which must be the model's first joint; found 'elbow'"):
-        Puppet(mujoco.MjModel.from_xml_string(arm))
+        PosedRobot(mujoco.MjModel.from_xml_string(arm))
 
 
 def test_missing_opengl_names_the_remedy_and_the_state() -> None:
-    code = f"import mujoco\nfrom legged_mw.view.film import RobotRenderer\nRobotRenderer(mujoco.MjModel.from_xml_string({ROBOT!r}), 64, 48)"
+    code = "import mujoco\nfrom legged_mw.view.recorder import RobotRenderer\n"
+    code += f"RobotRenderer(mujoco.MjModel.from_xml_string({ROBOT!r}), 64, 48)"
     environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")} | {"MUJOCO_GL": "glfw"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert "ViewError: No OpenGL context for offscreen rendering (MUJOCO_GL='glfw', DISPLAY=None)" in done.stderr
@@ -442,12 +434,12 @@ def test_plain_python_on_macos_is_told_of_mjpython(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.display
 def test_window_shows_poses_and_is_gone_after_close(model: mujoco.MjModel) -> None:
-    pilot = Pilot(np.array([[-1.0, -1, -1], [1, 1, 1]]), 2)
-    with NativeViewer(model, pilot, 2) as viewer:
+    pilot = Pilot(TABLE, 2)
+    with closing(NativeViewer(model, pilot, 2)) as viewer:
         qpos = np.tile(model.qpos0, (2, 1)) + np.eye(model.nq)[0]
-        viewer.show(moment(model, 2, qpos=qpos, commands=np.ones((2, 3)), lines=(("falls", "0"),), world=1))
+        viewer.show(moment(model, 2, qpos=qpos, target_velocity=np.ones((2, 3)), lines=(("falls", "0"),), world=1))
         assert viewer.is_running()
-        assert viewer.cast.anchors[0].position[0] == pytest.approx(1.0)
+        assert viewer.robots.placements[0].position[0] == pytest.approx(1.0)
         assert viewer._handle.user_scn.ngeom > 2
         flag = int(mujoco.mjtVisFlag.mjVIS_CONTACTSPLIT)  # what P switches in MuJoCo's windows
         viewer._handle.opt.flags[flag] = 1
@@ -459,13 +451,32 @@ def test_window_shows_poses_and_is_gone_after_close(model: mujoco.MjModel) -> No
 
 def test_every_key_of_the_table_reaches_the_pilot_by_its_code() -> None:
     asked: list[str] = []
-    pilot = Pilot(np.array([[-1.0, -1, -1], [1, 1, 1]]))
+    pilot = Pilot(TABLE)
     pilot.ask = asked.append  # pyright: ignore[reportAttributeAccessIssue]
     pressed = native.on_key(pilot)
-    for code in (265, 264, 263, 262, ord("Q"), ord("E"), 32, ord("P"), ord("R"), 259, ord("N"), 257, ord("-"), ord("="), ord("C"), 290):
+    for code in (
+        265,
+        264,
+        263,
+        262,
+        ord("Q"),
+        ord("E"),
+        ord("U"),
+        ord("J"),
+        32,
+        ord("P"),
+        ord("R"),
+        259,
+        ord("N"),
+        257,
+        ord("-"),
+        ord("="),
+        ord("C"),
+        290,
+    ):
         pressed(code)  # the last is F1, which is MuJoCo's
-    assert asked[:7] == ["forward", "back", "left", "right", "turn_left", "turn_right", "stop"]
-    assert asked[7:] == ["push", "reset", "reset", "next", "pause", "slower", "faster", "camera"]
+    assert asked[:9] == ["forward", "back", "left", "right", "turn_left", "turn_right", "raise", "lower", "stop"]
+    assert asked[9:] == ["push", "reset", "reset", "next", "pause", "slower", "faster", "camera"]
     assert len(native.KEY_CODES) == sum(len(binding.keys) for binding in BINDINGS)
 
 
@@ -494,33 +505,26 @@ def test_pace_holds_real_time_and_does_not_hurry_after_a_delay() -> None:
     assert time.perf_counter() - start >= 0.03
 
 
-def test_encoder_without_libx264_is_not_chosen(no_program: Path) -> None:
-    fake_ffmpeg(no_program, "exit 1")
-    script = no_program / "ffmpeg"
-    script.write_text(script.read_text().replace("libx264", "mpeg4"))
-    assert video._choose_encoder(gif=False) is video._PyAv
-
-
 def test_feet_are_found_among_other_contacts() -> None:
     """The port of legged_gym's task senses contacts of thighs, calves and trunk too; its feet come first."""
     task = load_task(str(ROOT / "examples" / "go1_legged_gym.py"))
     task.set("env.num_envs", 1)
     model = visual_model(task.env_class(task.cfg, "cpu").robot)
-    cast = Cast(model, 1)
-    assert len(cast.feet) > 4
-    cast.pose(model.qpos0[None], 0)
-    assert cast.standing(np.array([[True, False, True, False]])).shape == (2, 3)
+    robots = PosedRobots(model, 1)
+    assert len(robots.feet) > 4
+    robots.pose(model.qpos0[None], 0)
+    assert robots.below_feet(np.array([[True, False, True, False]])).shape == (2, 3)
 
 
 def test_a_camera_that_draws_seldom_is_where_one_that_draws_always_is(model: mujoco.MjModel) -> None:
     """A contact sheet alone draws every twentieth frame; its robot must not have left the picture."""
     seen = []
     for skip in (1, 20):
-        cast = Cast(model, 1)
-        man, qpos = CameraMan(mujoco.MjvCamera(), cast, by_hand=False), np.array(model.qpos0)
+        robots = PosedRobots(model, 1)
+        man, qpos = RobotCamera(mujoco.MjvCamera(), robots, by_hand=False), np.array(model.qpos0)
         for step in range(0, 61, skip):
             qpos[0] = 0.02 * step  # 1 m/s at 50 frames a second
-            cast.pose(qpos[None], 0)
+            robots.pose(qpos[None], 0)
             man.update("follow", 0, frames=skip)
         seen.append(qpos[0] - man.camera.lookat[0])
     assert 0.0 < seen[1] < seen[0] < 0.2

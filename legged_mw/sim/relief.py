@@ -129,7 +129,7 @@ def _add_surroundings(spec: mujoco.MjSpec, terrain: Terrain, squares: bool) -> N
     add_squares(spec, AROUND, *(COLOUR * (1 + share * squares) for share in (-CHECKER, CHECKER, LINE)))
     plane = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "contype": 0, "conaffinity": 0, "castshadow": False}
     x, y = 0.5 * terrain.levels * terrain.tile, 0.5 * len(terrain.kinds) * terrain.tile
-    reach = max(REACH, 2 * x, 2 * y)  # terrain_picture sees as far as the tiles are long
+    reach = max(REACH, 2 * x, 2 * y)  # benchmarks/terrain_picture.py sees as far as the tiles are long
     wide, deep = (2 * x + reach, reach), (reach, 2 * y + reach)  # [m] along x and y: a side of the tiles and on beyond its end
     vanes = ((-x, y), (1, 1), wide), ((x, y), (1, -1), deep), ((x, -y), (-1, -1), wide), ((-x, -y), (-1, 1), deep)
     for corner, away, edges in vanes:  # each from a corner of the tiles, like the vanes of a wheel

@@ -1,4 +1,4 @@
-"""Where the camera stands: it follows the chosen robot, walks behind it, or sees all; over hills. Moves somebody else's `MjvCamera`."""
+"""Moves an `MjvCamera`: it follows the chosen robot, stays behind it, or sees all robots, and looks over hills."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -9,49 +9,49 @@ import math
 import mujoco
 import numpy as np
 
-from legged_mw.view.hills import Hills
-from legged_mw.view.puppet import Cast
+from legged_mw.view.posed_robot import PosedRobots
+from legged_mw.view.rough_ground import RoughGround
 
 AZIMUTH, ELEVATION = 130.0, -22.0  # [deg] front right of the robot, a little above it
 ELEVATION_ALL = -35.0  # [deg]
 DISTANCE = 2.4  # [robot radius] camera to base
 FOLLOW_XY, FOLLOW_Z = 0.12, 0.04  # share of the way to the base per frame; slower in z, so that steps do not shake the picture
-FOLLOW_ALL = 0.04  # the same for all: slow, for robots come into reach and leave it
-REACH = 14.0  # [robot radius] how far a robot may be from the followed one and still be among all
+FOLLOW_ALL = 0.04  # the same for all: slow, because robots come into reach and leave it
+REACH = 14.0  # [robot radius] from the followed robot; "all" shows the robots within it
 REACH_HILLS = 24.0  # the same on hills, where each begins on a tile of its own
 TURN = 0.08  # share of the way to the heading per frame
-STEEPEST, CLEARANCE, LOOK_BELOW = -60.0, 0.15, 0.6  # [deg], [robot radius]: on hills it sees the feet, that far below the base, over a rise
+STEEPEST, CLEARANCE, LOOK_BELOW = -60.0, 0.15, 0.6  # [deg], [robot radius]: on hills it sees the feet, so far below the base, over a rise
 LIFT = 0.06  # share of the way to the elevation that this needs per frame
-JUMP = 3.0  # [robot radius] a base this far from where the camera looks was reset, not walked: cut instead of a swish
+JUMP = 3.0  # [robot radius] a base that moved this far at once was reset: the camera cuts to it
 
 
-class CameraMan:
+class RobotCamera:
     """Moves `camera`. Where a mouse can turn it (`by_hand`), it is placed once and then tracks the robot by itself."""
 
-    def __init__(self, camera: mujoco.MjvCamera, cast: Cast, by_hand: bool) -> None:
-        self.camera, self.cast, self.by_hand = camera, cast, by_hand
-        self._shot: tuple[str, int] | None = None  # what it shows: mode, world
-        self._place_then = cast.anchors[0].position  # of that world's robot
+    def __init__(self, camera: mujoco.MjvCamera, robots: PosedRobots, by_hand: bool) -> None:
+        self.camera, self.robots, self.by_hand = camera, robots, by_hand
+        self._target: tuple[str, int] | None = None  # mode, world
+        self._last_position = robots.placements[0].position  # of that world's robot
         self._frames = 1.0
 
     def update(self, mode: str, world: int, frames: float = 1.0) -> mujoco.MjvCamera:
-        """Be where `mode` wants it: one of drive.CAMERAS. `frames` of a video passed since the last call, most not drawn."""
+        """Move as `mode` says, one of drive.CAMERAS. `frames` of a video passed since the last call."""
         self._frames = frames
-        before, self._shot = self._shot, (mode, world)
+        before, self._target = self._target, (mode, world)
         changed = before is None or before[0] != mode
-        anchor = self.cast.anchors[world]
-        jumped = before == self._shot and float(np.linalg.norm(anchor.position - self._place_then)) > JUMP * anchor.radius
-        self._place_then = anchor.position
+        placement = self.robots.placements[world]
+        jumped = before == self._target and float(np.linalg.norm(placement.position - self._last_position)) > JUMP * placement.radius
+        self._last_position = placement.position
         if mode == "all":
             self._see_all(world, cut=changed or jumped)
         elif mode == "behind":
-            self._follow(world, cut=before != self._shot)
-            self._turn(math.degrees(self.cast.anchors[world].heading), cut=changed)
+            self._follow(world, cut=before != self._target)
+            self._turn(math.degrees(self.robots.placements[world].heading), cut=changed)
         elif self.by_hand:
             if changed:
                 self._place(world)
                 self.camera.type = mujoco.mjtCamera.mjCAMERA_TRACKING
-                self.camera.trackbodyid = self.cast.base
+                self.camera.trackbodyid = self.robots.base
         else:
             if changed:
                 self._place(world)
@@ -59,38 +59,38 @@ class CameraMan:
         return self.camera
 
     def _place(self, world: int) -> None:
-        """Look at the robot from its front right, wherever it heads now."""
-        anchor, camera = self.cast.anchors[world], self.camera
+        """Look at the robot from its front right."""
+        placement, camera = self.robots.placements[world], self.camera
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        camera.lookat[:] = anchor.position
-        camera.distance = DISTANCE * anchor.radius
-        camera.azimuth = math.degrees(anchor.heading) + AZIMUTH
+        camera.lookat[:] = placement.position
+        camera.distance = DISTANCE * placement.radius
+        camera.azimuth = math.degrees(placement.heading) + AZIMUTH
         camera.elevation = ELEVATION
 
     def _follow(self, world: int, cut: bool) -> None:
-        """One frame's share of the way to the robot; all of it after a jump."""
-        camera, anchor = self.camera, self.cast.anchors[world]
+        """Move one frame's share of the way to the robot; all of it after a jump."""
+        camera, placement = self.camera, self.robots.placements[world]
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-        gap = anchor.position - camera.lookat
-        if cut or float(np.linalg.norm(gap)) > JUMP * anchor.radius:
-            camera.lookat[:] = anchor.position
+        gap = placement.position - camera.lookat
+        if cut or float(np.linalg.norm(gap)) > JUMP * placement.radius:
+            camera.lookat[:] = placement.position
         else:
             camera.lookat[:] += gap * [self._share(share) for share in (FOLLOW_XY, FOLLOW_XY, FOLLOW_Z)]
-        if self.cast.hills is not None:
-            gap = self._free_elevation(self.cast.hills, anchor.radius) - camera.elevation
+        if self.robots.ground is not None:
+            gap = self._free_elevation(self.robots.ground, placement.radius) - camera.elevation
             camera.elevation += gap if cut else gap * self._share(LIFT)
 
-    def _free_elevation(self, hills: Hills, radius: float) -> float:
-        """From how high [deg] the robot is seen over the ground between it and the camera."""
+    def _free_elevation(self, ground: RoughGround, radius: float) -> float:
+        """Elevation [deg] from which the ground between camera and robot hides nothing."""
         camera = self.camera
         away = camera.distance * math.cos(math.radians(ELEVATION)) * np.linspace(0.3, 1.0, 8)
         azimuth = math.radians(camera.azimuth)
         places = camera.lookat[:2] - away[:, None] * [math.cos(azimuth), math.sin(azimuth)]
-        rise = np.array([hills.height(place) for place in places]) + CLEARANCE * radius - (camera.lookat[2] - LOOK_BELOW * radius)
+        rise = np.array([ground.height(place) for place in places]) + CLEARANCE * radius - (camera.lookat[2] - LOOK_BELOW * radius)
         return max(min(ELEVATION, -math.degrees(float(np.arctan2(rise, away).max()))), STEEPEST)
 
     def _share(self, each: float) -> float:
-        """Of the way, after ``self._frames`` steps of the share ``each``."""
+        """Share of the way after `self._frames` steps of `each`."""
         return 1.0 - (1.0 - each) ** self._frames
 
     def _turn(self, azimuth: float, cut: bool) -> None:
@@ -98,15 +98,15 @@ class CameraMan:
         gap = (azimuth - camera.azimuth + 180.0) % 360.0 - 180.0
         camera.azimuth += gap if cut else gap * self._share(TURN)
         if cut:
-            camera.distance, camera.elevation = 1.3 * DISTANCE * self.cast.radius, ELEVATION
+            camera.distance, camera.elevation = 1.3 * DISTANCE * self.robots.radius, ELEVATION
 
     def _see_all(self, world: int, cut: bool) -> None:
-        """All robots that are not out of reach of this one; they walk apart, and from too far they are specks."""
-        places = np.array([anchor.position for anchor in self.cast.anchors])
-        limit = REACH if self.cast.hills is None else REACH_HILLS
-        near = places[np.linalg.norm(places - places[world], axis=1) < limit * self.cast.radius]
+        """Show all robots within reach of this one: robots walk apart, and from too far they are specks."""
+        places = np.array([placement.position for placement in self.robots.placements])
+        limit = REACH if self.robots.ground is None else REACH_HILLS
+        near = places[np.linalg.norm(places - places[world], axis=1) < limit * self.robots.radius]
         camera, middle = self.camera, (near.min(axis=0) + near.max(axis=0)) / 2
-        reach = float(np.linalg.norm(near - middle, axis=1).max()) + self.cast.radius
+        reach = float(np.linalg.norm(near - middle, axis=1).max()) + self.robots.radius
         share = 1.0 if cut else self._share(FOLLOW_ALL)
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         camera.lookat[:] += share * (middle - camera.lookat)

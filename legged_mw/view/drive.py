@@ -1,7 +1,7 @@
-"""What a pilot does: the command, held to what the policy was trained for, and the things one can ask for while watching.
+"""Driving: the command, held to the trained ranges, and everything else that a user can ask for while watching.
 
-The table `BINDINGS` is the only place that states a key; windows, the web page, the help text and the documentation's
-table are made from it. Nothing here draws, steps or waits; a session asks the pilot what is wanted.
+Only the table `BINDINGS` names keys; the window, the web page and the table in the documentation follow it.
+Nothing here draws, steps or waits: a session asks the pilot what is wanted.
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from legged_mw.utils.commands import LABELS, VELOCITY, Command
 from legged_mw.view.stage import FloatArray
 
-COMPONENTS = ("vx", "vy", "yaw rate")
-UNITS = ("m/s", "m/s", "rad/s")
 CAMERAS = ("follow", "behind", "all")
-STEPS = 5  # ours: presses of a key from standing to the limit
+STEPS = 5  # ours: presses of a key from the default of a command to the farther end of its range
 SPEEDS = (1.0, 0.5, 0.25, 0.1)  # shares of real time
 PUSH_SPEED = 1.0  # [m/s] ours: seen well, and survived by any policy that walks (the exam asks for 2)
 PUSH_MAX = 4.0  # [m/s]
+NO_COMMANDS = "this task has no commands: its robots cannot be driven"
 
 
 class Binding(NamedTuple):
-    """One thing that can be asked for, the keys that ask for it and the words for it."""
+    """An action, its keys and its description."""
 
     action: str
     keys: tuple[str, ...]
     text: str
 
 
-# Keys are chosen around what MuJoCo's window does with the same press; what remains is undone there (native.py).
+# MuJoCo's window gets the same presses; what they switch there is switched back (native.py).
 BINDINGS = (
     Binding("forward", ("up",), "faster ahead"),
     Binding("back", ("down",), "slower, then backwards"),
@@ -41,10 +41,12 @@ BINDINGS = (
     Binding("right", ("right",), "sideways to the right"),
     Binding("turn_left", ("q",), "turn left"),
     Binding("turn_right", ("e",), "turn right"),
-    Binding("stop", ("space",), "stop: command zero"),
-    Binding("own", ("o",), "give the robot back to the task's own commands"),
+    Binding("raise", ("u",), "raise the first command beyond these"),
+    Binding("lower", ("j",), "lower it"),
+    Binding("stop", ("space",), "stop: all commands to their defaults"),
+    Binding("own", ("o",), "back to the task's own commands"),
     Binding("push", ("p",), "push the robot sideways"),
-    Binding("reset", ("r", "backspace"), "set the robot up anew"),
+    Binding("reset", ("r", "backspace"), "reset the robot"),
     Binding("next", ("n",), "go to the next robot"),
     Binding("everyone", ("a",), "drive all robots, or only this one"),
     Binding("pause", ("enter",), "pause and go on"),
@@ -55,78 +57,68 @@ BINDINGS = (
 )
 ACTIONS = tuple(binding.action for binding in BINDINGS)
 KEY_ACTION = {key: binding.action for binding in BINDINGS for key in binding.keys}
-_DIRECTION = {  # component, sign
-    "forward": (0, 1),
-    "back": (0, -1),
-    "left": (1, 1),
-    "right": (1, -1),
-    "turn_left": (2, 1),
-    "turn_right": (2, -1),
+_VX, _VY, _YAW_RATE = VELOCITY
+_FURTHER = ""  # in place of a name: the first command that is none of these
+_STEP = {  # command, sign
+    "forward": (_VX, 1),
+    "back": (_VX, -1),
+    "left": (_VY, 1),
+    "right": (_VY, -1),
+    "turn_left": (_YAW_RATE, 1),
+    "turn_right": (_YAW_RATE, -1),
+    "raise": (_FURTHER, 1),
+    "lower": (_FURTHER, -1),
 }
 
 
-def help_text() -> str:
-    """The table of keys, a line each."""
-    return "\n".join(f"{' or '.join(binding.keys):<16}{binding.text}" for binding in BINDINGS)
-
-
-def outside(command: Sequence[float], limits: FloatArray) -> str | None:
-    """What is wrong with a command that the policy was not trained for, in words; None if nothing is."""
-    for name, unit, value, low, high in zip(COMPONENTS, UNITS, command, limits[0], limits[1], strict=True):
-        if not (math.isfinite(value) and low - 1e-6 <= value <= high + 1e-6):
-            return f"{name} = {value:g} {unit} is outside of what the policy was trained for, {low:g} to {high:g}"
-    return None
-
-
 class Pilot:
-    """What is wanted now. `ask` and `steer` may be called from any thread; the rest belongs to the session's."""
+    """What the user wants now. `ask`, `press`, `steer` and `push` may be called from any thread; the rest belongs to the session's."""
 
-    def __init__(self, limits: FloatArray, num_worlds: int = 1, camera: str = "follow") -> None:
-        self.limits, self.num_worlds = np.array(limits, dtype=np.float64), num_worlds
-        self.command = np.zeros(3)
+    def __init__(self, table: Sequence[Command], num_worlds: int = 1, camera: str = "follow") -> None:
+        self.table, self.num_worlds = tuple(table), num_worlds
+        self.low, self.high, self.default = (
+            np.array([getattr(command, end) for command in table], dtype=np.float64) for end in ("low", "high", "default")
+        )
+        self.command = self.default.copy()
         self.driving = False  # else the stage follows its own commands
         self.everyone = False  # drive all robots, else only `world`
         self.world, self.camera = 0, camera
         self.paused, self.help = False, False
         self.speed = SPEEDS[0]
         self.push_speed = PUSH_SPEED
+        self.message = ""  # why the last action did nothing
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
-        self._pushes: list[tuple[int, FloatArray | None]] = []
-        self._resets: list[int] = []
+        self._pushes: list[tuple[int, FloatArray]] = []
+        self._resets: set[int] = set()
         self._random = np.random.default_rng(0)
 
     def ask(self, action: str) -> None:
-        """One of ACTIONS, done at the session's next turn."""
+        """Do one of ACTIONS at the session's next turn."""
         if action not in ACTIONS:
             raise ValueError(f"no action '{action}'; there are: {', '.join(ACTIONS)}")
         self._asked.put(lambda: self._do(action))
 
     def press(self, key: str) -> None:
-        """A key of the table; others do nothing."""
+        """Do what a key of the table asks for; other keys do nothing."""
         if key in KEY_ACTION:
             self.ask(KEY_ACTION[key])
 
     def steer(self, command: ArrayLike) -> None:
-        """Drive by `command` (3,), held to the limits, from the session's next turn on."""
+        """Drive by `command` (C,), held to its ranges, from the session's next turn on."""
         wanted = np.array(command, dtype=np.float64)
         self._asked.put(lambda: self._steer(wanted))
 
-    def stick(self, deflection: ArrayLike) -> None:
-        """Drive by a stick's deflection (3,) in [-1, 1]: 1 is the highest command, -1 the lowest."""
-        share = np.clip(np.asarray(deflection, dtype=np.float64), -1.0, 1.0)
-        self.steer(np.where(share >= 0.0, share * self.limits[1], -share * self.limits[0]))
-
     def push(self, velocity: ArrayLike | None = None) -> None:
         """Push the driven robots by (2,) [m/s], world frame; None: at `push_speed` in a random direction."""
-        jump = None if velocity is None else np.array(velocity, dtype=np.float64)
-        self._asked.put(lambda: self._push(jump))
-
-    def follow(self, command: ArrayLike) -> None:
-        """Take over where the robot is: what a pilot who begins to drive finds."""
-        if not self.driving:
-            self.command = self._held(command)
+        added = None if velocity is None else np.array(velocity, dtype=np.float64)
+        self._asked.put(lambda: self._push(added))
 
     # ---- the session's side
+
+    def follow(self, command: ArrayLike) -> None:
+        """Keep the robot's own command (C,) while nobody drives: driving begins from there."""
+        if not self.driving:
+            self.command = self._held(command)
 
     def listen(self) -> None:
         """Do all that was asked since the last turn."""
@@ -137,7 +129,7 @@ class Pilot:
                 return
 
     def commands(self, own: FloatArray) -> FloatArray | None:
-        """What to step with, given what each robot follows now (N, 3); None: the stage's own commands."""
+        """The commands to step with, given those of the stage (N, C); None: the stage's own."""
         if not self.driving:
             return None
         wanted = np.array(own, dtype=np.float64)
@@ -149,64 +141,68 @@ class Pilot:
         return list(range(self.num_worlds)) if self.everyone else [self.world]
 
     def take_pushes(self) -> list[tuple[int, FloatArray]]:
-        """(world, velocity (2,) [m/s]) of each push asked for since."""
+        """(world, velocity (2,) [m/s]) of each push since the last call."""
         pushes, self._pushes = self._pushes, []
-        return [(world, self._random_push() if velocity is None else velocity) for world, velocity in pushes]
+        return pushes
 
     def take_resets(self) -> list[int]:
         """Worlds to reset, each once."""
-        resets, self._resets = self._resets, []
-        return sorted(set(resets))
+        resets, self._resets = self._resets, set()
+        return sorted(resets)
 
-    # ---- what the actions do
+    # ---- the actions
 
     def _do(self, action: str) -> None:
-        if action in _DIRECTION:
-            component, sign = _DIRECTION[action]
-            command = self.command.copy()
-            command[component] += sign * float(np.abs(self.limits[:, component]).max()) / STEPS
-            command[np.abs(command) < 1e-9] = 0.0  # five steps ahead and five back are a stop
-            self._steer(command)
-        elif action in ("slower", "faster"):
-            index = SPEEDS.index(self.speed) + (1 if action == "slower" else -1)
-            self.speed = SPEEDS[min(max(index, 0), len(SPEEDS) - 1)]
-        else:
-            getattr(self, f"_{action}")()
+        self.message = ""
+        match action:
+            case "stop":
+                self._steer(self.default)
+            case "own":
+                self.driving = False
+            case "push":
+                self._push(None)
+            case "reset":
+                self._resets |= set(self.driven())
+            case "next":
+                self.world = (self.world + 1) % self.num_worlds
+            case "everyone":
+                self.everyone = not self.everyone
+            case "pause":
+                self.paused = not self.paused
+            case "slower" | "faster":
+                index = SPEEDS.index(self.speed) + (1 if action == "slower" else -1)
+                self.speed = SPEEDS[min(max(index, 0), len(SPEEDS) - 1)]
+            case "camera":
+                self.camera = CAMERAS[(CAMERAS.index(self.camera) + 1) % len(CAMERAS)]
+            case "help":
+                self.help = not self.help
+            case _:
+                self._step(*_STEP[action])
 
-    def _stop(self) -> None:
-        self._steer(np.zeros(3))
+    def _step(self, name: str, sign: int) -> None:
+        """One press of a key: a fifth of the way from the default to the farther end of the range."""
+        columns = [i for i, each in enumerate(self.table) if (each.name == name if name else each.name not in VELOCITY)]
+        if self.table and not columns:
+            self.message = f"this task has no command {LABELS[name] if name else 'beyond ' + ', '.join(LABELS.values())}"
+            return
+        command = self.command.copy()
+        for i in columns[:1]:
+            command[i] += sign * max(self.high[i] - self.default[i], self.default[i] - self.low[i]) / STEPS
+        # five steps up and five down end exactly at the default
+        self._steer(np.where(np.abs(command - self.default) < 1e-9, self.default, command))
 
-    def _own(self) -> None:
-        self.driving = False
-
-    def _reset(self) -> None:
-        self._resets += self.driven()
-
-    def _next(self) -> None:
-        self.world = (self.world + 1) % self.num_worlds
-
-    def _everyone(self) -> None:
-        self.everyone = not self.everyone
-
-    def _pause(self) -> None:
-        self.paused = not self.paused
-
-    def _camera(self) -> None:
-        self.camera = CAMERAS[(CAMERAS.index(self.camera) + 1) % len(CAMERAS)]
-
-    def _help(self) -> None:
-        self.help = not self.help
-
-    def _push(self, velocity: FloatArray | None = None) -> None:
-        self._pushes += [(world, velocity) for world in self.driven()]
-
-    def _random_push(self) -> FloatArray:
-        angle = self._random.uniform(-math.pi, math.pi)
-        return self.push_speed * np.array([math.cos(angle), math.sin(angle)])
+    def _push(self, velocity: FloatArray | None) -> None:
+        for world in self.driven():
+            angle = self._random.uniform(-math.pi, math.pi)
+            sideways = self.push_speed * np.array([math.cos(angle), math.sin(angle)])
+            self._pushes.append((world, sideways if velocity is None else velocity))
 
     def _steer(self, command: FloatArray) -> None:
+        if not self.table:
+            self.message = NO_COMMANDS
+            return
         self.driving = True
         self.command = self._held(command)
 
     def _held(self, command: ArrayLike) -> FloatArray:
-        return np.clip(np.asarray(command, dtype=np.float64), self.limits[0], self.limits[1])
+        return np.clip(np.asarray(command, dtype=np.float64), self.low, self.high)

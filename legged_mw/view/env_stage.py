@@ -1,8 +1,8 @@
-"""The training environment and a policy as a stage. The one file below `view/` that knows torch and the environment."""
+"""The training environment and a policy as a stage. The only file of `view/` that uses torch and the environment."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import torch
@@ -11,35 +11,44 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.sim.drawing import visual_model
 from legged_mw.sim.terrain import describe
+from legged_mw.utils.commands import Command
 from legged_mw.view.stage import BoolArray, FloatArray
 
 
 class EnvStage:
-    """Robots of a `LeggedRobot` under `policy`; see `stage.Stage`.
+    """Robots of a task under `policy`; see `stage.Stage`. `command_table` has the ranges as trained, by default the task's own.
 
-    The environment's step may be a recorded graph, so what a pilot changes is written into its buffers between two
-    steps. The policy sees a command in the step that it is given for: the observations' row "commands" is filled anew,
-    and that row alone, for noise and delays of the others belong to the step.
+    The environment's step may be a recorded graph, so a pilot's changes are written into its buffers between two steps.
+    The policy sees a command in the same step: the observations' row "commands" is written again. That row only, because
+    noise and delays of the others belong to the step.
     """
 
-    def __init__(self, env: LeggedRobot, policy: Callable[[TensorDict], Tensor], limits: ArrayLike) -> None:
+    def __init__(self, env: RobotTask, policy: Callable[[TensorDict], Tensor], command_table: Sequence[Command] | None = None) -> None:
         self.env, self.policy = env, policy
         self.model, self.num_worlds, self.dt = visual_model(env.robot, env.cfg.viewer.camera), env.num_envs, env.dt
-        self.limits: FloatArray = np.array(limits, dtype=np.float64)
+        self.command_table = env.command_table if command_table is None else tuple(command_table)
+        # a task with a table has a buffer for it, (N, C)
+        self._commands: Tensor = env.commands if env.command_table else env.actions[:, :0]  # pyright: ignore[reportAttributeAccessIssue]
+        self._command_columns = _command_columns(env)
+        geoms = sum(map(len, env.foot_geoms.values())) if isinstance(env, LeggedRobot) else 0
+        self._foot_contacts = env.contact_count[:, :geoms]
         self._obs = env.get_observations()
 
     @torch.no_grad()
     def step(self, commands: FloatArray | None) -> None:
         env = self.env
         if commands is not None:
-            env.commands.copy_(torch.as_tensor(commands, dtype=torch.float, device=env.device))
-            self._tell()
+            self._commands.copy_(torch.as_tensor(commands, dtype=torch.float, device=env.device))
+            for group, columns, scales in self._command_columns:
+                env.obs_buf[group][:, columns] = self._commands * scales
+            self._obs = env.get_observations()
         self._obs, *_ = env.step(self.policy(self._obs))
 
     def commands(self) -> FloatArray:
-        return _array(self.env.commands)
+        return _array(self._commands)
 
     def velocity(self) -> FloatArray:
         return _array(torch.cat([self.env.base_lin_vel[:, :2], self.env.base_ang_vel[:, 2:]], dim=1))
@@ -48,7 +57,7 @@ class EnvStage:
         return _array(self.env.sim.qpos)
 
     def contacts(self) -> BoolArray:
-        return self.env.foot_contact.cpu().numpy().copy()
+        return (self._foot_contacts > 0.0).cpu().numpy()
 
     def fell(self) -> BoolArray:
         return self.env.fell.cpu().numpy().copy()
@@ -57,12 +66,12 @@ class EnvStage:
         terrain = self.env.terrain
         if terrain is None:
             return ""
-        tile = terrain.tile_at(*self.env.sim.qpos[world, :2].tolist())
+        tile = terrain.tile_at(*self.env.root_pos[world, :2].tolist())
         return describe(terrain.kinds[tile[1]], terrain.difficulties[tile[0]]) if tile else "border"
 
     @torch.no_grad()
-    def push(self, world: int, velocity: FloatArray) -> None:
-        self.env.sim.qvel[world, :2] += torch.as_tensor(velocity, dtype=torch.float, device=self.env.device)
+    def push(self, world: int, velocity: ArrayLike) -> None:
+        self.env.root_lin_vel[world, :2] += torch.as_tensor(velocity, dtype=torch.float, device=self.env.device)
 
     @torch.no_grad()
     def reset(self, world: int) -> None:
@@ -71,16 +80,19 @@ class EnvStage:
         self.env.restart(mask)
         self._obs = self.env.get_observations()
 
-    def _tell(self) -> None:
-        """Put the command into the observations at hand."""
-        for group, rows in self.env._observation_rows().items():
-            start = 0
-            for row in rows:
-                span = slice(start, start + row.value.shape[1])
-                if row.name == "commands":
-                    scale = self.env.obs_scales[group][span] if group in self.env.obs_scales else 1.0
-                    self._obs[group][:, span] = row.value * scale
-                start = span.stop
+
+def _command_columns(env: RobotTask) -> list[tuple[str, slice, Tensor]]:
+    """Where the observations hold the newest command, also inside of a group in a group: (group, columns, scales (C,))."""
+    found: list[tuple[str, slice, Tensor]] = []
+    for group, rows in env.observations.groups.items():
+        for row in rows:
+            newest = env.observations.newest(group, row.name)
+            if row.name == "commands":
+                found.append((group, newest, torch.tensor(row.column_scales(), device=env.device)))
+            elif row.group:
+                inside = [(columns, scales) for name, columns, scales in found if name == row.group]
+                found += [(group, slice(newest.start + cols.start, newest.start + cols.stop), scales) for cols, scales in inside]
+    return found
 
 
 def _array(tensor: Tensor) -> FloatArray:

@@ -1,39 +1,37 @@
-"""From flags to a running session: which viewer this machine has, what drives, how long. Used by every program that shows a stage."""
+"""From flags to a running session: the viewer, the driver, the time. Used by every program that shows a stage."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import ArrayLike
-
+from legged_mw.utils.commands import Command, outside, parse_command
 from legged_mw.utils.errors import UserError
 from legged_mw.view import web
-from legged_mw.view.drive import CAMERAS, Pilot, outside
-from legged_mw.view.film import Film
-from legged_mw.view.gamepad import LAYOUT, Gamepad, find_gamepad
+from legged_mw.view.drive import CAMERAS, NO_COMMANDS, Pilot
 from legged_mw.view.native import NativeViewer, has_display
+from legged_mw.view.recorder import Recorder
 from legged_mw.view.script import load_script
-from legged_mw.view.session import Session, Summary
+from legged_mw.view.session import Outcome, Session
 from legged_mw.view.stage import Moment, Stage, Viewer, ViewError
 from legged_mw.view.video import check_format, no_encoder
 
 VIEWERS = ("auto", "native", "web", "video", "none")
-ROBOTS_SHOWN = 64  # of a stage that has more: a picture of all would take longer than a control step
-SECONDS = 10.0  # how long to record or run where nobody closes anything
-WIDEN = "to see what it does all the same, widen the range: --set commands.ranges.lin_vel_x=[-3,3]"
-COMMAND_FORM = "write three numbers, vx,vy,yaw [m/s, m/s, rad/s], e.g. 0.8,0,0"
+ROBOTS_SHOWN = 64  # at most: a picture of more takes longer than a control step
+SECONDS = 10.0  # ours: how long to record, or to run without a viewer
+WIDEN = "to see what it does there, widen the range: --set commands.ranges.lin_vel_x=[-3,3]"
 
 
 class FlagError(UserError, ValueError):
-    """Flags that do not go together, or a value that is none."""
+    """Flags that do not go together, or a wrong value."""
 
 
 class Picture(NamedTuple):
-    """Of a video."""
+    """The size of a video."""
 
     width: int = 1280  # [pixel]
     height: int = 720  # [pixel]
@@ -41,7 +39,7 @@ class Picture(NamedTuple):
 
 
 def add_flags(parser: argparse.ArgumentParser, viewer: str = "auto") -> None:
-    """The flags of watching and driving; the program adds `--command` and `--time` [s] itself."""
+    """Add the flags of watching and driving; the program adds `--command` and `--time` [s] itself."""
     best = " (auto: the best that this machine has)"
     parser.add_argument("--viewer", choices=VIEWERS, default=viewer, help=f"where to show it, by default {viewer}{best}")
     parser.add_argument("--video", metavar="FILE", help="record an .mp4 or a .gif instead")
@@ -53,14 +51,14 @@ def add_flags(parser: argparse.ArgumentParser, viewer: str = "auto") -> None:
 
 
 def check_flags(args: argparse.Namespace) -> None:
-    """Refuse what cannot be, before anything is loaded. Raises FlagError or ViewError."""
+    """Refuse wrong flags before anything is loaded. Raises FlagError or ViewError."""
     files = [flag for flag in ("video", "sheet") if getattr(args, flag)]
     if files and args.viewer not in ("auto", "video"):
         raise FlagError(f"--{files[0]} records and --viewer {args.viewer} does not: leave one of them out")
     if args.video:
         check_format(Path(args.video))
     for name in filter(None, (args.video, args.sheet)):
-        if (taken := next(folder for folder in Path(name).absolute().parents if folder.exists())) and not taken.is_dir():
+        if not (taken := next(folder for folder in Path(name).absolute().parents if folder.exists())).is_dir():
             raise ViewError(f"Cannot write {name}: {taken} is a file, not a folder.")
     if args.sheet and Path(args.sheet).suffix.lower() != ".png":
         raise ViewError(f"Cannot write {Path(args.sheet).name!r}: a contact sheet is a .png.")
@@ -68,22 +66,21 @@ def check_flags(args: argparse.Namespace) -> None:
         raise FlagError(f"--port {args.port}: a port is a number from 1 to 65535")
 
 
-def check_drive(args: argparse.Namespace, limits: ArrayLike, advice: str = WIDEN) -> list[float] | None:
-    """Refuse a `--command` or a `--commands` file that is wrong or that the policy was not trained for; the former as numbers."""
-    limits = np.asarray(limits, dtype=np.float64)
+def check_drive(args: argparse.Namespace, table: Sequence[Command], advice: str = WIDEN) -> list[float] | None:
+    """Check `--commands` and `--command` against the commands as trained; the latter as values (C,), None if not given.
+
+    Raises ConfigError or FlagError.
+    """
     if args.commands:
-        load_script(args.commands, limits)
+        load_script(args.commands, table)
     if args.command is None:
         return None
-    try:
-        command = [float(value) for value in args.command.split(",")]
-    except ValueError:
-        command = []
-    if len(command) != 3 or not np.isfinite(command).all():
-        raise FlagError(f"--command {args.command}: {COMMAND_FORM}")
-    if (wrong := outside(command, limits)) is not None:
+    if not table:
+        raise FlagError(f"--command {args.command}: {NO_COMMANDS}")
+    values = parse_command(args.command, [each._replace(low=-math.inf, high=math.inf) for each in table])
+    if wrong := outside(values, table):
         raise FlagError(f"--command {args.command}: {wrong}; {advice}")
-    return command
+    return values
 
 
 def asked(args: argparse.Namespace) -> list[str]:
@@ -94,7 +91,7 @@ def asked(args: argparse.Namespace) -> list[str]:
 
 
 def choose(args: argparse.Namespace, terminal: bool, screen: bool) -> tuple[str, str]:
-    """The viewer to take, and why in words. A terminal has somebody at it who can open a page; a batch job must end by itself."""
+    """The viewer to take, and why. Somebody at a terminal can open a web page; a batch job must end by itself."""
     if args.viewer != "auto":
         return args.viewer, "as asked"
     if args.video or args.sheet:
@@ -108,38 +105,47 @@ def choose(args: argparse.Namespace, terminal: bool, screen: bool) -> tuple[str,
     return "web", "no screen here"
 
 
-def watch(stage: Stage, args: argparse.Namespace, folder: Path, picture: Picture | None = None, title: str = "legged_mw") -> Summary:
-    """Show `stage` as the flags say; files without a name go to `folder`. Prints what it chose, where to look, and what came of it."""
-    script = load_script(args.commands, stage.limits) if args.commands else None
+def watch(stage: Stage, args: argparse.Namespace, folder: Path, picture: Picture | None = None, title: str = "legged_mw") -> Outcome:
+    """Show `stage` as the flags say; files without a name go to `folder`. Prints its choice, where to look, and the outcome."""
+    script = load_script(args.commands, stage.command_table) if args.commands else None
     kind, why = choose(args, sys.stdout.isatty(), has_display())
-    pilot = Pilot(stage.limits, min(stage.num_worlds, ROBOTS_SHOWN), args.camera)
-    if stage.num_worlds > ROBOTS_SHOWN and kind != "none":
-        print(f"{stage.num_worlds} robots, the first {ROBOTS_SHOWN} of them are shown")
-    pilot.everyone = script is not None
-    viewer: Viewer | None = None
+    pilot, viewer = _pilot(stage, args, kind), None
     if kind == "native" and (viewer := _window(stage, pilot, why, fall_back=args.viewer == "auto")) is None:
         kind, why = choose(args, sys.stdout.isatty(), screen=False)
-    seconds = args.time or (script.seconds if script else None) or (None if kind in ("native", "web") else SECONDS)
-    viewer = viewer or _open(kind, why, stage, pilot, args, folder, picture or Picture(), seconds or SECONDS, title)
-    gamepad = _gamepad() if kind in ("native", "web") else None
-    session = Session(stage, viewer, pilot, seconds=seconds, real_time=kind in ("native", "web"), script=script, gamepad=gamepad)
+        pilot = _pilot(stage, args, kind)
+    live = kind in ("native", "web")
+    seconds = args.time or (script.seconds if script else None) or (None if live else SECONDS)
+    if kind == "web":
+        viewer = _web_page(stage, pilot, why, args, title)
+    elif kind == "video":
+        viewer = _recorder(stage, pilot, why, args, folder, picture or Picture(), seconds or SECONDS)
+    elif kind == "none":
+        print(f"viewer: none ({why})")
+    viewer = viewer or NoViewer()
     try:
-        summary = session.run()
+        outcome = Session(stage, viewer, pilot, seconds=seconds, real_time=live, script=script).run()
         viewer.close()
     except BaseException:
-        (viewer.abort if isinstance(viewer, Film) else viewer.close)()
+        (viewer.abort if isinstance(viewer, Recorder) else viewer.close)()
         raise
-    finally:
-        if gamepad is not None:
-            gamepad.close()
-    if isinstance(viewer, Film):
-        print(f"written to {', '.join(_shown(path) for path in (viewer.video, viewer.sheet) if path)}")
-    print(summary.text() if script or kind == "none" else summary.text().splitlines()[0])
-    return summary
+    if isinstance(viewer, Recorder):
+        print(f"written to {_names(viewer.video, viewer.sheet, between=', ')}")
+    print(outcome.text() if script or kind == "none" else outcome.text().splitlines()[0])
+    return outcome
+
+
+def _pilot(stage: Stage, args: argparse.Namespace, kind: str) -> Pilot:
+    """A pilot of the robots that are shown; scripts drive all of them."""
+    count = min(stage.num_worlds, ROBOTS_SHOWN, web.most_robots(stage.model) if kind == "web" else ROBOTS_SHOWN)
+    if count < stage.num_worlds and kind != "none":
+        print(f"{stage.num_worlds} robots, the first {count} of them are shown")
+    pilot = Pilot(stage.command_table, count, args.camera)
+    pilot.everyone = bool(args.commands)
+    return pilot
 
 
 def _window(stage: Stage, pilot: Pilot, why: str, fall_back: bool) -> Viewer | None:
-    """MuJoCo's window; None, and why in a line, where none can be opened and something else may be taken."""
+    """MuJoCo's window; None, with a printed reason, where it cannot be opened and another viewer may be taken."""
     try:
         viewer = NativeViewer(stage.model, pilot, pilot.num_worlds)
     except ViewError as error:
@@ -151,42 +157,31 @@ def _window(stage: Stage, pilot: Pilot, why: str, fall_back: bool) -> Viewer | N
     return viewer
 
 
-def _open(
-    kind: str,
-    why: str,
-    stage: Stage,
-    pilot: Pilot,
-    args: argparse.Namespace,
-    folder: Path,
-    picture: Picture,
-    seconds: float,
-    title: str,
-) -> Viewer:
-    count = pilot.num_worlds
-    if kind == "web":
-        page = web.WebViewer(stage.model, pilot, count, host=args.host, port=args.port, title=title)
-        print(f"viewer: a web page ({why}): {page.url}  Ctrl-C ends it")
-        if args.host == web.LOCAL and not has_display():
-            print(f"  on another machine paste this into a terminal there, then open the page: {web.tunnel_line(page.port)}")
-        elif args.host != web.LOCAL:
-            print("  it has no password: whoever reaches this port can drive")
-        sys.stdout.flush()
-        return page
-    if kind == "none":
-        print(f"viewer: none ({why})")
-        return Nobody()
+def _web_page(stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, title: str) -> Viewer:
+    page = web.WebViewer(stage.model, pilot, pilot.num_worlds, host=args.host, port=args.port, title=title)
+    print(f"viewer: a web page ({why}): {page.url}  Ctrl-C ends it")
+    if args.host == web.LOCAL and not has_display():
+        print(f"  on another machine paste this into a terminal there, then open the page: {web.tunnel_line(page.port)}")
+    elif args.host != web.LOCAL:
+        print("  it has no password: whoever reaches this port can drive")
+    sys.stdout.flush()
+    return page
+
+
+def _recorder(stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, folder: Path, picture: Picture, seconds: float) -> Viewer:
     video, sheet = (Path(name) if name else None for name in (args.video, args.sheet))
     if video is None and sheet is None:
         video, sheet = folder / "play.mp4", folder / "play.png"
-        if (reason := no_encoder()) is not None:  # nobody asked for a video by name
+        if (reason := no_encoder()) is not None:  # no video was asked for by name
             print(f"no video: {reason}")
             video = None
-    names = " and ".join(_shown(path) for path in (video, sheet) if path)
-    print(f"viewer: {seconds:g} s of {names} ({why}); without a GPU for drawing it takes a while", flush=True)
-    return Film(stage.model, count, stage.dt, seconds, video=video, sheet=sheet, **picture._asdict())
+    print(
+        f"viewer: {seconds:g} s of {_names(video, sheet, between=' and ')} ({why}); without a GPU for drawing it takes a while", flush=True
+    )
+    return Recorder(stage.model, pilot.num_worlds, stage.dt, seconds, video=video, sheet=sheet, **picture._asdict())
 
 
-class Nobody:
+class NoViewer:
     """The viewer that shows nothing."""
 
     def show(self, moment: Moment) -> None: ...
@@ -197,21 +192,8 @@ class Nobody:
     def close(self) -> None: ...
 
 
-def _gamepad() -> Gamepad | None:
-    path = find_gamepad()
-    if path is None:
-        return None
-    try:
-        pad = Gamepad(path)
-    except OSError as error:
-        print(f"gamepad: {path} cannot be opened: {error.strerror}")
-        return None
-    print(f"gamepad: {path}: {LAYOUT}")
-    return pad
-
-
-def _shown(path: Path) -> str:
-    try:
-        return str(path.resolve().relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
+def _names(*paths: Path | None, between: str) -> str:
+    """Paths for people: relative to the current folder where they are below it."""
+    here = Path.cwd()
+    full = [path.resolve() for path in paths if path]
+    return between.join(str(path.relative_to(here) if path.is_relative_to(here) else path) for path in full)

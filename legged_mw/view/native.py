@@ -1,4 +1,4 @@
-"""MuJoCo's own window: shows moments, listens to keys; steps no simulation. The window lives on a thread of MuJoCo's."""
+"""MuJoCo's own window: shows moments and hands keys to the pilot. MuJoCo runs it on a thread of its own."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -12,10 +12,10 @@ from typing import Any
 
 import mujoco
 
-from legged_mw.view.camera import CameraMan
+from legged_mw.view.camera import RobotCamera
 from legged_mw.view.drive import BINDINGS, KEY_ACTION, Pilot
-from legged_mw.view.overlay import draw, set_options
-from legged_mw.view.puppet import Cast
+from legged_mw.view.overlay import draw
+from legged_mw.view.posed_robot import PosedRobots, show_groups
 from legged_mw.view.stage import Moment, ViewError
 
 CLOSE_SECONDS = 5.0
@@ -25,7 +25,7 @@ KEY_CODES = {_GLFW.get(key, ord(key[0].upper())): key for key in KEY_ACTION}  # 
 
 
 def has_display() -> bool:
-    """Whether a window could open here: on Linux an X or Wayland display must be named, elsewhere there always is one."""
+    """Whether a window could open here. Linux needs an X or Wayland display; other systems have one."""
     if not sys.platform.startswith("linux"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
@@ -37,21 +37,24 @@ Text = tuple[int | None, int | None, str, str]  # font, place, left column, righ
 class NativeViewer:
     """A window. The camera follows the chosen robot; the mouse turns it. Keys go to the pilot.
 
-    MuJoCo's own shortcuts see the same presses and would switch what is drawn (P: contact points, R: reflections ...);
-    what our keys switch is switched back before the next picture. All its other keys work as in any MuJoCo window.
+    MuJoCo's own shortcuts get the same presses and switch what is drawn (P: contact points, R: reflections ...). What
+    our keys switch is switched back before the next picture. All its other keys work as in any MuJoCo window.
     """
 
     def __init__(self, model: mujoco.MjModel, pilot: Pilot | None = None, count: int = 1) -> None:
-        self.cast = Cast(model, count)
+        self.robots = PosedRobots(model, count)
         before = set(threading.enumerate())
-        self._handle: Any = _launch(self.cast.model, self.cast.data, on_key(pilot) if pilot else None)
+        self._handle: Any = _launch(self.robots.model, self.robots.data, on_key(pilot) if pilot else None)
         self._threads = set(threading.enumerate()) - before
-        self._scribe = _Scribe(self._handle)
+        self._texts: list[Text] = []  # replaced, never changed: another thread reads it
+        self._ended = threading.Event()
+        self._writer = threading.Thread(target=self._write, daemon=True)  # a closed window may never answer
         with self._handle.lock():
-            set_options(self._handle.opt)
-            self._camera = CameraMan(self._handle.cam, self.cast, by_hand=True)
+            show_groups(self._handle.opt)
+            self._camera = RobotCamera(self._handle.cam, self.robots, by_hand=True)
             ours = {chr(code) for code in KEY_CODES if code < 128}
             self._own_flags = {i: bool(self._handle.opt.flags[i]) for i, row in enumerate(mujoco.mjVISSTRING) if row[2] in ours}
+        self._writer.start()
 
     def show(self, moment: Moment) -> None:
         """Show one moment. Does nothing once the window is closed."""
@@ -59,67 +62,44 @@ class NativeViewer:
             return
         handle = self._handle
         with handle.lock():  # the window's thread draws from all of these
-            self.cast.pose(moment.qpos, moment.world)
+            self.robots.pose(moment.qpos, moment.world)
             handle.user_scn.ngeom = 0
-            draw(handle.user_scn, self.cast, moment)
+            draw(handle.user_scn, self.robots, moment, handle.opt)
             self._camera.update(moment.camera, moment.world)
             for flag, value in self._own_flags.items():
                 handle.opt.flags[flag] = value
-        self._scribe.texts = window_texts(moment)
+        self._texts = window_texts(moment)
         handle.sync()
 
     def is_running(self) -> bool:
-        """False once somebody closed the window."""
+        """False once the window is closed."""
         return bool(self._handle.is_running())
 
     def close(self) -> None:
         """Close the window and wait until it is gone; again is allowed."""
-        self._scribe.close()
+        self._ended.set()
+        self._writer.join(timeout=CLOSE_SECONDS)
         self._handle.close()
         for thread in self._threads:  # a process that ends while the window still closes crashes in its OpenGL driver
             thread.join(timeout=CLOSE_SECONDS)
 
-    def __enter__(self) -> NativeViewer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-
-class _Scribe:
-    """Writes the words on a thread of its own: a change of text waits for the window to draw, which software OpenGL does twice a second."""
-
-    def __init__(self, handle: Any) -> None:
-        self.texts: list[Text] = []  # what should stand there; replaced by the session's thread
-        self._handle, self._ended = handle, threading.Event()
-        self._thread = threading.Thread(target=self._write, daemon=True)  # a window that was closed may never answer
-        self._thread.start()
-
     def _write(self) -> None:
+        """Set the window's texts, on a thread of its own: a change waits for a redraw, twice a second with software OpenGL."""
         written: list[Text] = []
         while not self._ended.wait(TEXT_SECONDS) and self._handle.is_running():
-            texts = self.texts
+            texts = self._texts
             if texts != written:
                 self._handle.set_texts(texts)
                 written = texts
 
-    def close(self) -> None:
-        self._ended.set()
-        self._thread.join(timeout=CLOSE_SECONDS)
-
 
 def on_key(pilot: Pilot) -> Callable[[int], None]:
-    """What MuJoCo's window calls with a GLFW key code, on its own thread, for presses only."""
-
-    def pressed(code: int) -> None:
-        if code in KEY_CODES:
-            pilot.press(KEY_CODES[code])
-
-    return pressed
+    """The callback for key presses: MuJoCo's window calls it with a GLFW key code, on its own thread."""
+    return lambda code: pilot.press(KEY_CODES.get(code, ""))
 
 
 def window_texts(moment: Moment) -> list[Text]:
-    """What MuJoCo's window takes, block by block."""
+    """The blocks of text for MuJoCo's window."""
     grid = mujoco.mjtGridPos
     blocks: list[Text] = []
     if moment.lines:
@@ -151,9 +131,9 @@ def _launch(model: mujoco.MjModel, data: mujoco.MjData, on_key: Callable[[int], 
 
 
 def _probe_window() -> None:
-    """Open and drop a hidden window: where that fails, `launch_passive` would wait for ever for its dead thread."""
+    """Open and drop a hidden window: where that fails, `launch_passive` would wait for its dead thread forever."""
     opened: list[bool] = []
-    # on a thread of its own, for GLX may not become current where an offscreen renderer holds an EGL context
+    # on a thread of its own: GLX may not become current where an offscreen renderer holds an EGL context
     thread = threading.Thread(target=lambda: opened.append(_can_open_window()))
     thread.start()
     thread.join()

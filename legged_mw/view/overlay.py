@@ -1,6 +1,6 @@
-"""What is drawn into a picture besides the robots: arrows of command and velocity, feet that stand, places of falls.
+"""Geoms of a picture beside the followed robot: velocity arrows, feet on the ground, places of falls, the other robots.
 
-Draws into a `mujoco.MjvScene` that somebody else owns; opens no window, no file and no OpenGL context.
+Appends to a `mujoco.MjvScene`; opens no window, no file and no OpenGL context.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
-from legged_mw.view.puppet import GROUPS_SHOWN, Anchor, Cast
+from legged_mw.view.posed_robot import Placement, PosedRobots
 from legged_mw.view.stage import FloatArray, Moment
 
 # ours: vermillion, sky blue, bluish green and reddish purple of Okabe and Ito's palette, which the colour-blind tell apart
@@ -27,73 +27,70 @@ ARC_PER_RATE = 1.0  # [rad per rad/s] the turn arrow shows one second of turning
 ARC_MAX = 1.75 * math.pi  # [rad]
 ARC_SEGMENTS = 12
 SPEED_MIN, RATE_MIN = 0.03, 0.05  # [m/s], [rad/s] below these an arrow is a speck that flickers
-ROBOTS_WITH_ARROWS = 32  # more of them would be a thicket; a web page gets some 300 bytes a geom and picture
+ROBOTS_WITH_ARROWS = 32  # more of them hide the robots
 
 
-def set_options(option: mujoco.MjvOption) -> None:
-    """Show the groups that are meant to be seen; hide collision shapes and sites."""
-    option.geomgroup[:] = [group < GROUPS_SHOWN for group in range(len(option.geomgroup))]
-    option.sitegroup[:] = 0
-
-
-def draw(scene: mujoco.MjvScene, cast: Cast, moment: Moment) -> None:
-    """Append all that belongs to `moment` to what `scene` holds."""
-    for world in range(min(cast.count, ROBOTS_WITH_ARROWS)):
-        draw_velocities(scene, cast.anchors[world], moment.commands[world], moment.velocity[world], turn=world == moment.world)
-    _draw_contacts(scene, cast, moment)
+def draw(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment, option: mujoco.MjvOption) -> None:
+    """Append all of `moment` to `scene`, which shows the followed robot already; the other robots are drawn as `option` says."""
+    for world in range(min(robots.count, ROBOTS_WITH_ARROWS)):
+        draw_velocities(scene, robots.placements[world], moment.target_velocity[world], moment.velocity[world], turn=world == moment.world)
+    _draw_contacts(scene, robots, moment)
     for fall in moment.falls:
-        if fall.world < cast.count:
-            _draw_fall(scene, fall.place + cast.offsets[fall.world], cast.radius)
+        if fall.world < robots.count:
+            _draw_fall(scene, fall.place + robots.offsets[fall.world], robots.radius)
+    robots.add_others(scene, option)  # last: a full scene loses parts of robots, not arrows
 
 
-def draw_velocities(scene: mujoco.MjvScene, anchor: Anchor, command: ArrayLike, velocity: ArrayLike, turn: bool = True) -> None:
-    """Append the commanded and the measured velocity, each (vx, vy, yaw rate) in the body frame, above the trunk.
+def draw_velocities(scene: mujoco.MjvScene, placement: Placement, target: ArrayLike, velocity: ArrayLike, turn: bool = True) -> None:
+    """Append arrows for the commanded and the measured velocity, each (vx, vy, yaw rate) in the body frame, above the trunk.
 
-    `turn`: the yaw rate too.
+    A component whose target is NaN has no arrows. `turn`: the yaw rate too.
     """
-    for value, rgba, level in ((command, COMMAND_RGBA, 0.40), (velocity, VELOCITY_RGBA, 0.28)):
-        array = np.asarray(value, dtype=np.float64)
+    target, velocity = np.asarray(target, dtype=np.float64), np.asarray(velocity, dtype=np.float64)
+    for array in (target, velocity):
         if array.shape != (3,):
             raise ValueError(f"A velocity to draw is (vx, vy, yaw rate), shape (3,); got shape {array.shape}.")
-        origin = anchor.position + (0.0, 0.0, anchor.top + level * anchor.radius)
-        _draw_straight(scene, anchor, origin, array, rgba)
-        if turn:
-            _draw_turn(scene, anchor, origin, array[2], rgba)
+    for array, rgba, level in ((target, COMMAND_RGBA, 0.40), (velocity, VELOCITY_RGBA, 0.28)):
+        origin = placement.position + (0.0, 0.0, placement.top + level * placement.radius)
+        if not np.isnan(target[:2]).any():
+            _draw_straight(scene, placement, origin, array, rgba)
+        if turn and not np.isnan(target[2]):
+            _draw_turn(scene, placement, origin, array[2], rgba)
 
 
-def _draw_straight(scene: mujoco.MjvScene, anchor: Anchor, origin: FloatArray, velocity: FloatArray, rgba: tuple[float, ...]) -> None:
-    """An arrow along (vx, vy); level even when the trunk is not, for commands are meant in the plane."""
+def _draw_straight(scene: mujoco.MjvScene, placement: Placement, origin: FloatArray, velocity: FloatArray, rgba: tuple[float, ...]) -> None:
+    """An arrow along (vx, vy), level even when the trunk is not: commands are meant in the plane."""
     if math.hypot(velocity[0], velocity[1]) < SPEED_MIN:
         return
-    cos, sin = math.cos(anchor.heading), math.sin(anchor.heading)
+    cos, sin = math.cos(placement.heading), math.sin(placement.heading)
     along = np.array([cos * velocity[0] - sin * velocity[1], sin * velocity[0] + cos * velocity[1], 0.0])
-    tip = origin + ARROW_PER_SPEED * anchor.radius * along
-    _connect(scene, mujoco.mjtGeom.mjGEOM_ARROW, 0.03 * anchor.radius, origin, tip, rgba)
+    tip = origin + ARROW_PER_SPEED * placement.radius * along
+    _connect(scene, mujoco.mjtGeom.mjGEOM_ARROW, 0.03 * placement.radius, origin, tip, rgba)
 
 
-def _draw_turn(scene: mujoco.MjvScene, anchor: Anchor, origin: FloatArray, rate: float, rgba: tuple[float, ...]) -> None:
+def _draw_turn(scene: mujoco.MjvScene, placement: Placement, origin: FloatArray, rate: float, rgba: tuple[float, ...]) -> None:
     """A bent arrow around the vertical: it starts in front of the robot and turns with the yaw rate."""
     if abs(rate) < RATE_MIN:
         return
     angle = math.copysign(min(ARC_PER_RATE * abs(rate), ARC_MAX), rate)
-    angles = anchor.heading + np.linspace(0.0, angle, ARC_SEGMENTS + 1)
-    ring = 0.5 * anchor.radius * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1) + origin
-    width = 0.016 * anchor.radius
+    angles = placement.heading + np.linspace(0.0, angle, ARC_SEGMENTS + 1)
+    ring = 0.5 * placement.radius * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1) + origin
+    width = 0.016 * placement.radius
     for start, end in zip(ring[:-1], ring[1:], strict=True):
         _connect(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, width, start, end, rgba)
     tangent = math.copysign(1.0, rate) * np.array([-math.sin(angles[-1]), math.cos(angles[-1]), 0.0])
-    _connect(scene, mujoco.mjtGeom.mjGEOM_ARROW, 2.0 * width, ring[-1], ring[-1] + 0.13 * anchor.radius * tangent, rgba)
+    _connect(scene, mujoco.mjtGeom.mjGEOM_ARROW, 2.0 * width, ring[-1], ring[-1] + 0.13 * placement.radius * tangent, rgba)
 
 
-def _draw_contacts(scene: mujoco.MjvScene, cast: Cast, moment: Moment) -> None:
-    """A disc under each foot that stands."""
-    radius = cast.foot_radius()
-    for place in cast.standing(moment.contacts):
-        _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (2.2 * radius, 0.003, 0.0), place - (0.0, 0.0, radius - 0.004), CONTACT_RGBA)
+def _draw_contacts(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment) -> None:
+    """A disc under each foot on the ground."""
+    size = (2.2 * robots.foot_radius, 0.003, 0.0)
+    for place in robots.below_feet(moment.contacts):
+        _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, place + (0.0, 0.0, 0.004), CONTACT_RGBA)
 
 
 def _draw_fall(scene: mujoco.MjvScene, place: FloatArray, radius: float) -> None:
-    """A ball where the robot was when it fell, with the word."""
+    """A ball with the word "fell" where the robot was when it fell."""
     _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (0.35 * radius,) * 3, place, FALL_RGBA, "fell")
 
 
@@ -106,7 +103,7 @@ def _connect(scene: mujoco.MjvScene, kind: int, width: float, start: FloatArray,
 def _add(
     scene: mujoco.MjvScene, kind: int, size: tuple[float, ...], place: FloatArray, rgba: tuple[float, ...], label: str = ""
 ) -> mujoco.MjvGeom | None:
-    """One geom; dropped silently where the scene is full, as MuJoCo does with its own."""
+    """One geom; None where the scene is full."""
     if scene.ngeom >= scene.maxgeom:
         return None
     geom = scene.geoms[scene.ngeom]

@@ -1,7 +1,7 @@
-"""The web page's panel, built from Dear ImGui: sliders, buttons, keys and curves that speak to a pilot.
+"""The web page's panel, in Dear ImGui: numbers, sliders, buttons, keys and curves, for one pilot.
 
-Built anew for every picture, on the viewer's thread, out of the last moment and the pilot; draws no robot. All that may
-fail is computed before a block is opened: ImGui ends the process where a block is left open.
+The viewer's thread builds it for every picture from the last moment and the pilot; it draws no robot. ImGui ends the
+process where a block is left open, so everything that may fail is computed before.
 """
 
 from __future__ import annotations
@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from legged_mw.view.drive import BINDINGS, COMPONENTS, KEY_ACTION, PUSH_MAX, SPEEDS, UNITS, Pilot
+from legged_mw.utils.commands import describe
+from legged_mw.view.drive import BINDINGS, KEY_ACTION, NO_COMMANDS, PUSH_MAX, SPEEDS, Pilot
 from legged_mw.view.overlay import COMMAND_RGBA, VELOCITY_RGBA
-from legged_mw.view.stage import Moment
+from legged_mw.view.stage import FloatArray, Moment, velocity_columns
 
 CURVE_SECONDS, CURVE_POINTS = 10.0, 100
 WIDTH, COLUMN = 330, 90  # [px] of the panel, where its second column begins
@@ -29,14 +30,14 @@ BUTTONS = (  # rows of (action, label)
 
 
 class Curves:
-    """Command and velocity of the followed robot over the last seconds. `rows` is replaced, never changed: any thread may read it."""
+    """Velocity and command of the followed robot over the last seconds. `rows` is replaced, never changed: any thread may read it."""
 
-    def __init__(self) -> None:
-        self.rows = np.zeros((0, 7))  # time, command (3,), velocity (3,)
+    def __init__(self, commands: int) -> None:
+        self.rows = np.zeros((0, 4 + commands))  # time, velocity (3,), command (C,)
 
     def add(self, moment: Moment) -> None:
-        """Note a moment; at most CURVE_POINTS are kept, and a reset of time begins anew."""
-        row = np.concatenate([[moment.time], moment.commands[moment.world], moment.velocity[moment.world]])
+        """Keep a moment; at most CURVE_POINTS of them."""
+        row = np.concatenate([[moment.time], moment.velocity[moment.world], moment.commands[moment.world]])
         rows = self.rows
         if len(rows) and moment.time - rows[-1, 0] < 0.999 * CURVE_SECONDS / CURVE_POINTS:
             return
@@ -44,21 +45,21 @@ class Curves:
 
 
 class Panel:
-    """What the page shows and what it does with the mouse and the keys. `ui` and `plot` are ImGui's and ImPlot's modules."""
+    """The panel. `ui` and `plot` are the modules of ImGui and ImPlot."""
 
     def __init__(self, pilot: Pilot, title: str, ui: Any, plot: Any) -> None:
         self.pilot, self.title, self.ui, self.plot = pilot, title, ui, plot
-        self.curves = Curves()
+        self.curves = Curves(len(pilot.table))
         self._folded = False
-        self.moment: Moment | None = None  # the last one; replaced by the session's thread
+        self.moment: Moment | None = None  # the last one
 
     def show(self, moment: Moment) -> None:
-        """What to speak of from now on. Called by the session's thread."""
+        """Show this moment from now on. The session's thread calls it."""
         self.curves.add(moment)
         self.moment = moment
 
     def build(self) -> None:
-        """One picture's panel, and the keys pressed since the last."""
+        """Handle the pressed keys and build the panel of one picture."""
         moment = self.moment
         if moment is None:
             return
@@ -70,7 +71,7 @@ class Panel:
             ui.SetNextWindowCollapsed(True)
         try:
             opened, kept = ui.Begin(self.title, True, ui.WindowFlags.NoFocusOnAppearing)
-            self._folded = not kept  # the cross folds the panel: the session goes on, and a click on the title unfolds it
+            self._folded = not kept  # the cross folds the panel, a click on the title unfolds it
             if opened:
                 self._numbers(moment)
                 self._sliders(moment)
@@ -82,7 +83,7 @@ class Panel:
 
     def _keys(self) -> None:
         ui = self.ui
-        if ui.GetIO().WantCaptureKeyboard:  # somebody types a number into a slider
+        if ui.GetIO().WantCaptureKeyboard:  # the user types a number into a slider
             return
         for key, name in KEY_NAMES.items():
             if ui.IsKeyPressed(getattr(ui.Key, name), False):
@@ -95,19 +96,20 @@ class Panel:
             if name in colours:
                 ui.TextColored(ui.Vec4(*colours[name]), name)
             else:
-                ui.Text(name)  # in the theme's colour, which may be light or dark
+                ui.Text(name)  # in the theme's colour
             ui.SameLine(COLUMN)
             ui.Text(value)
 
     def _sliders(self, moment: Moment) -> None:
-        """The command; what is dragged is driven."""
+        """A slider for each command; dragging one drives the robot."""
         ui, pilot = self.ui, self.pilot
         command = np.array(pilot.command if pilot.driving else moment.commands[moment.world])
         ui.SeparatorText("command")
-        for index, (name, unit) in enumerate(zip(COMPONENTS, UNITS, strict=True)):
-            low, high = (float(limit) for limit in pilot.limits[:, index])
+        if not pilot.table:
+            ui.Text(NO_COMMANDS)
+        for index, each in enumerate(pilot.table):
             ui.SetNextItemWidth(0.62 * WIDTH)
-            changed, value = ui.SliderFloat(f"{name} [{unit}]", float(command[index]), low, high, "%.2f")
+            changed, value = ui.SliderFloat(describe([each]), float(command[index]), each.low, each.high, "%.2f")
             if changed:
                 command[index] = value
                 pilot.steer(command)
@@ -130,13 +132,13 @@ class Panel:
             pilot.ask("everyone")
 
     def _label(self, action: str, label: str) -> str:
-        """What the button will do; the part after ### keeps it the same button."""
+        """What the button will do; ImGui knows it by the part after ###."""
         pilot = self.pilot
         words = {"pause": "Go on" if pilot.paused else "Pause", "slower": f"Speed x {pilot.speed:g}", "camera": f"View: {pilot.camera}"}
         return f"{words.get(action, label)}###{action}"
 
     def _click(self, action: str) -> None:
-        """A button does what its key does; the one for speed goes round."""
+        """Do what the button's key does; the button for speed goes round."""
         pilot = self.pilot
         if action == "slower" and pilot.speed == SPEEDS[-1]:
             for _ in SPEEDS[1:]:
@@ -145,21 +147,23 @@ class Panel:
             pilot.ask(action)
 
     def _curves(self) -> None:
-        """Measured and commanded, in the colours of the arrows."""
-        ui, plot, rows, limits = self.ui, self.plot, self.curves.rows, self.pilot.limits
-        if not len(rows):
+        """A plot for each command, with the measured velocity where it is one."""
+        ui, plot, rows, table = self.ui, self.plot, self.curves.rows, self.pilot.table
+        if not len(rows) or not table:
             return
         ui.SeparatorText("last 10 s: command orange, measured blue")
-        times = [float(t) for t in rows[:, 0] - rows[-1, 0]]
-        curves = [[[float(v) for v in rows[:, 1 + part + index]] for part in (3, 0)] for index in range(3)]
-        for index, name in enumerate(COMPONENTS):
-            low, high = (1.25 * float(limit) for limit in limits[:, index])
-            if plot.BeginPlot(f"##{name}", ui.Vec2(-1, 70), int(plot.Flags.CanvasOnly) | int(plot.Flags.NoInputs)):
+        times, measured = _floats(rows[:, 0] - rows[-1, 0]), velocity_columns(table)
+        for index, each in enumerate(table):
+            known = index in measured
+            curves = {"measured": rows[:, 1 + measured[index]] if known else rows[:0, 0], "command": rows[:, 4 + index]}
+            lines = [(label, times[: len(values)], _floats(values)) for label, values in curves.items()]
+            margin = 0.125 * (each.high - each.low) or 1.0
+            if plot.BeginPlot(f"##{each.name}", ui.Vec2(-1, 70), int(plot.Flags.CanvasOnly) | int(plot.Flags.NoInputs)):
                 try:
-                    plot.SetupAxes("", name, plot.AxisFlags.NoTickLabels, plot.AxisFlags.NoGridLines)
-                    plot.SetupAxesLimits(-CURVE_SECONDS, 0.0, low, high, plot.Cond.Always)
-                    for label, values in zip(("measured", "command"), curves[index], strict=True):  # ImPlot's first colours: blue, orange
-                        plot.PlotLine(f"{label}##{name}", times, values)
+                    plot.SetupAxes("", each.label, plot.AxisFlags.NoTickLabels, plot.AxisFlags.NoGridLines)
+                    plot.SetupAxesLimits(-CURVE_SECONDS, 0.0, each.low - margin, each.high + margin, plot.Cond.Always)
+                    for label, past, values in lines:  # ImPlot's first colours: blue, orange
+                        plot.PlotLine(f"{label}##{each.name}", past, values)
                 finally:
                     plot.EndPlot()
 
@@ -170,3 +174,7 @@ class Panel:
                 ui.Text(" ".join(binding.keys))
                 ui.SameLine(COLUMN)
                 ui.Text(binding.text)
+
+
+def _floats(values: FloatArray) -> list[float]:
+    return [float(value) for value in values]

@@ -11,6 +11,7 @@ import torch
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.policies import Source, act, introduce, load_policy
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, pick_device, seed_everything
+from legged_mw.utils.commands import Command, command_table
 from legged_mw.utils.task import LoadedTask, task_names
 from legged_mw.view import launch
 from legged_mw.view.env_stage import EnvStage
@@ -31,14 +32,14 @@ class Played(NamedTuple):
     """A task as it is played."""
 
     task: LoadedTask
-    limits: list[list[float]]  # (2, 3) of the command, as trained
+    commands: tuple[Command, ...]  # with their ranges as trained
 
 
 def parse(description: str | None) -> argparse.Namespace:
     """The flags of playing."""
     parser = make_parser(description)
     parser.add_argument(
-        "--command", metavar="VX,VY,YAW", help="fixed command [m/s, m/s, rad/s]; write --command=-0.5,0,0 if it starts with a minus"
+        "--command", metavar="VX,VY,YAW", help="fixed command [m/s, m/s, rad/s]; --command=-0.5,0,0; others by name: base_height=0.25"
     )
     parser.add_argument(
         "--time", type=duration, default=None, metavar="T", help="how long to play (default: 10s of video, a window until closed)"
@@ -79,14 +80,16 @@ def prepare(source: Source, trained: LoadedTask, args: argparse.Namespace) -> Pl
         task.set(path, value, where="play")
     apply_overrides(task, args)
     check_classes(task.train)
-    ranges = task.cfg.commands.ranges
-    limits = [list(side) for side in zip(ranges.lin_vel_x, ranges.lin_vel_y, ranges.ang_vel_yaw, strict=True)]
-    if (command := launch.check_drive(args, limits)) is not None:
-        for name, value in zip(("lin_vel_x", "lin_vel_y", "ang_vel_yaw"), command, strict=True):
+    commands = command_table(task.cfg)
+    if (values := launch.check_drive(args, commands)) is not None:
+        fixed = {each.name: value for each, value in zip(commands, values, strict=True)}
+        for name, value in fixed.items():
             task.set(f"commands.ranges.{name}", [value, value], where="--command")
+        defaults = {name: fixed[name] for name in task.cfg.commands.default}
+        task.set("commands.default", defaults, where="--command")
         task.set("commands.resampling_time", 0.0, where="--command")
     introduce(source, task.changes_since(trained))
-    return Played(task, limits)
+    return Played(task, commands)
 
 
 def ground_to_watch(task: LoadedTask) -> dict[str, Any]:
@@ -113,5 +116,5 @@ def watch(source: Source, played: Played, args: argparse.Namespace) -> None:
     seed_everything(task.train.seed)
     env = task.env_class(task.cfg, device, eager=args.eager)
     policy, picture = load_policy(source.checkpoint, env, task.train, device), task.cfg.viewer
-    stage = EnvStage(env, lambda obs: act(policy, obs), played.limits)
+    stage = EnvStage(env, lambda obs: act(policy, obs), played.commands)
     launch.watch(stage, args, source.results(task), launch.Picture(picture.width, picture.height, picture.fps), title=task.name)

@@ -1,55 +1,58 @@
-"""The loop of watching: asks the pilot, steps the stage, shows the moment, keeps real time, and counts what happened.
+"""The loop of watching: ask the pilot, step the stage, show the moment, keep real time, and count what happened.
 
-Knows no viewer and no physics by name; both are seams of `stage.py`.
+Knows no viewer and no physics by name; `stage.py` has the protocols of both.
 """
 
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
+from legged_mw.utils.commands import LABELS, Command, describe
 from legged_mw.view.drive import Pilot
-from legged_mw.view.gamepad import Gamepad
 from legged_mw.view.script import Script
-from legged_mw.view.stage import BoolArray, Fall, FloatArray, Moment, Stage, Viewer
+from legged_mw.view.stage import BoolArray, Fall, FloatArray, Moment, Stage, Viewer, target_velocity
 
 FALL_SECONDS = 2.0  # ours: how long the place of a fall is shown
-SETTLING = 1.0  # [s] ours: after a change of command, left out of the mean of a leg if the leg is longer than twice that
-PACE_SECONDS = 0.5  # the time that the measured pace is a mean of
+SETTLING = 1.0  # [s] ours: left out of a segment's mean velocity if the segment is longer than twice that
+PACE_SECONDS = 0.5  # over which the pace is measured
+MEASURED = ", ".join(LABELS.values())
 
 
-class Leg(NamedTuple):
-    """What one command gave, until the next one came."""
+class Segment(NamedTuple):
+    """The time between two changes of the command."""
 
     start: float  # [s]
     seconds: float
-    command: FloatArray  # (3,)
+    command: FloatArray  # (C,)
     velocity: FloatArray  # (3,) mean after settling
 
 
-class Summary(NamedTuple):
-    """What a session was, for the followed robot."""
+class Outcome(NamedTuple):
+    """What happened in a session; segments are of the followed robot."""
 
     seconds: float
     falls: int  # of all robots
-    legs: list[Leg]
+    segments: list[Segment]
+    table: Sequence[Command] = ()
 
     def text(self) -> str:
-        """A table of legs, at most the last twenty."""
-        unit = "vx, vy [m/s], yaw rate [rad/s]"
-        rows = [f"{self.seconds:.1f} s, {self.falls} {'fall' if self.falls == 1 else 'falls'}"]
-        if self.legs:
-            rows.append(f"{'from':>8}{'for':>8}   {'commanded':<24}measured: {unit}")
-        for leg in self.legs[-20:]:
-            rows.append(f"{leg.start:>6.1f} s{leg.seconds:>6.1f} s   {shown(leg.command):<24}{shown(leg.velocity)}")
-        return "\n".join(rows)
+        """A line, then a table of the last twenty segments at most."""
+        lines = [f"{self.seconds:.1f} s, {self.falls} {'fall' if self.falls == 1 else 'falls'}"]
+        commanded = f"commanded: {describe(self.table) or 'nothing'}"
+        if self.segments:
+            lines.append(f"{'from':>8}{'for':>8}   {commanded}   measured: {MEASURED}")
+        for each in self.segments[-20:]:
+            lines.append(f"{each.start:>6.1f} s{each.seconds:>6.1f} s   {signed(each.command):<{len(commanded)}}   {signed(each.velocity)}")
+        return "\n".join(lines)
 
 
-def shown(velocity: FloatArray) -> str:
-    """Three numbers that do not jump about while they change."""
-    return " ".join(f"{value + 0.0:+.2f}" for value in np.round(velocity, 2))
+def signed(values: FloatArray) -> str:
+    """Numbers of constant width."""
+    return " ".join(f"{value + 0.0:+.2f}" for value in np.round(values, 2))
 
 
 class Pace:
@@ -60,7 +63,7 @@ class Pace:
         self._next = time.perf_counter() + dt
 
     def wait(self) -> None:
-        """Sleep until this turn is over. A late loop is not hurried afterwards: lost time stays lost."""
+        """Sleep until this turn is over. Turns after a late one take no less time."""
         now = time.perf_counter()
         if self._next > now:
             time.sleep(self._next - now)
@@ -69,28 +72,8 @@ class Pace:
             self._next = now + self.dt
 
 
-class _Mean:
-    """Of the velocities of a leg, without its beginning if it is long enough."""
-
-    def __init__(self, start: float, command: FloatArray, settling: int) -> None:
-        self.start, self.command, self.settling = start, np.array(command), settling
-        self.count = 0
-        self._all, self._settled = np.zeros(3), np.zeros(3)
-
-    def add(self, velocity: FloatArray) -> None:
-        self._all += velocity
-        if self.count >= self.settling:
-            self._settled += velocity
-        self.count += 1
-
-    def value(self) -> FloatArray:
-        if self.count > 2 * self.settling:
-            return self._settled / (self.count - self.settling)
-        return self._all / self.count
-
-
 class Session:
-    """One stage before one viewer, until somebody closes it, `seconds` of it have passed, or Ctrl-C."""
+    """One stage before one viewer, until the viewer is closed, `seconds` have passed, or Ctrl-C."""
 
     def __init__(
         self,
@@ -101,37 +84,36 @@ class Session:
         seconds: float | None = None,
         real_time: bool = True,
         script: Script | None = None,
-        gamepad: Gamepad | None = None,
     ) -> None:
         self.stage, self.viewer, self.pilot = stage, viewer, pilot
-        self.seconds, self.real_time = seconds, real_time
-        self.script, self.gamepad = script, gamepad
+        self.seconds, self.real_time, self.script = seconds, real_time, script
         self.steps = self.falls = 0
         self._fallen: BoolArray = np.zeros(stage.num_worlds, dtype=bool)
-        self._shown_falls: list[tuple[float, Fall]] = []
-        self._legs: list[Leg] = []
-        self._leg: _Mean | None = None
+        self._recent_falls: list[tuple[float, Fall]] = []
+        self._segments: list[Segment] = []
+        self._since, self._followed = 0.0, np.zeros(0)  # of the current segment: its start [s] and command
+        self._velocities: list[FloatArray] = []  # and one velocity a step
         self._pace = Pace(stage.dt)
         self._measured = (time.perf_counter(), 0, 0.0)  # since when, steps then, share of real time
 
     @property
     def time(self) -> float:
-        """Of the stage [s]."""
+        """Simulated time [s]."""
         return self.steps * self.stage.dt
 
-    def run(self) -> Summary:
+    def run(self) -> Outcome:
         """Turn after turn; Ctrl-C ends it as closing the viewer does."""
         try:
             while self.viewer.is_running() and (self.seconds is None or self.time < self.seconds - 1e-9):
                 self.turn()
         except KeyboardInterrupt:
             print("\nstopped", flush=True)
-        self._end_leg()
-        return Summary(self.time, self.falls, self._legs)
+        self._end_segment()
+        return Outcome(self.time, self.falls, self._segments, self.stage.command_table)
 
     def turn(self) -> None:
-        """Show where things stand, then do what is wanted for one control step."""
-        self._hear()
+        """Show the moment, then do one control step as the pilot wants it."""
+        self._listen()
         commands = self.pilot.commands(self.stage.commands())
         self.viewer.show(self._moment(commands))
         if not self.pilot.paused:
@@ -140,10 +122,8 @@ class Session:
             self._pace.dt = self.stage.dt / (1.0 if self.pilot.paused else self.pilot.speed)
             self._pace.wait()
 
-    def _hear(self) -> None:
+    def _listen(self) -> None:
         pilot, stage = self.pilot, self.stage
-        if self.gamepad is not None:
-            self.gamepad.poll(pilot)
         if self.script is not None:
             self.script.play(self.time, pilot)
         pilot.follow(stage.commands()[pilot.world])
@@ -162,34 +142,37 @@ class Session:
         fell = stage.fell()
         for world in np.flatnonzero(fell & ~self._fallen):
             self.falls += 1
-            self._shown_falls.append((self.time, Fall(int(world), before[world])))
+            self._recent_falls.append((self.time, Fall(int(world), before[world])))
         self._fallen = fell
         self._note(followed, stage.velocity()[self.pilot.world])
 
     def _note(self, command: FloatArray, velocity: FloatArray) -> None:
-        """Add to the leg, or begin one where the command changed."""
-        if self._leg is None or not np.allclose(self._leg.command, command, atol=1e-6):
-            self._end_leg()
-            self._leg = _Mean(self.time - self.stage.dt, command, round(SETTLING / self.stage.dt))
-        self._leg.add(velocity)
+        """Add a step to the segment, or begin one where the command changed."""
+        if not self._velocities or not np.allclose(self._followed, command, atol=1e-6):
+            self._end_segment()
+            self._since, self._followed = self.time - self.stage.dt, np.array(command)
+        self._velocities.append(velocity)
 
-    def _end_leg(self) -> None:
-        if self._leg is not None:
-            self._legs.append(Leg(self._leg.start, self._leg.count * self.stage.dt, self._leg.command, self._leg.value()))
-            self._leg = None
+    def _end_segment(self) -> None:
+        steps, settling = len(self._velocities), round(SETTLING / self.stage.dt)
+        if steps:
+            mean = np.mean(self._velocities[settling if steps > 2 * settling else 0 :], axis=0)
+            self._segments.append(Segment(self._since, steps * self.stage.dt, self._followed, mean))
+            self._velocities = []
 
     def _moment(self, commands: FloatArray | None) -> Moment:
         stage, pilot = self.stage, self.pilot
-        self._shown_falls = [(when, fall) for when, fall in self._shown_falls if self.time - when < FALL_SECONDS]
+        self._recent_falls = [(when, fall) for when, fall in self._recent_falls if self.time - when < FALL_SECONDS]
         commands = stage.commands() if commands is None else commands
         velocity = stage.velocity()
         return Moment(
             time=self.time,
             qpos=stage.qpos(),
             commands=commands,
+            target_velocity=target_velocity(stage.command_table, commands),
             velocity=velocity,
             contacts=stage.contacts(),
-            falls=tuple(fall for _, fall in self._shown_falls),
+            falls=tuple(fall for _, fall in self._recent_falls),
             world=pilot.world,
             camera=pilot.camera,
             lines=self._lines(commands[pilot.world], velocity[pilot.world]),
@@ -197,23 +180,29 @@ class Session:
         )
 
     def _lines(self, command: FloatArray, velocity: FloatArray) -> tuple[tuple[str, str], ...]:
-        pilot, count = self.pilot, self.stage.num_worlds
-        driver = ("you, all robots" if pilot.everyone and count > 1 else "you") if pilot.driving else "nobody: own commands"
-        if self.script is not None and pilot.driving:
-            driver = "the script"
-        lines = [("command", shown(command)), ("measured", shown(velocity)), ("driven by", driver)]
-        if count > 1:
-            lines.append(("robot", f"{pilot.world + 1} of {count}"))
-        if ground := self.stage.ground(pilot.world):
+        pilot, stage = self.pilot, self.stage
+        lines = [("measured", signed(velocity))]
+        if stage.command_table:
+            lines = [("command", signed(command)), *lines, ("driven by", self._driver())]
+        if stage.num_worlds > 1:
+            lines.append(("robot", f"{pilot.world + 1} of {stage.num_worlds}"))
+        if ground := stage.ground(pilot.world):
             lines.append(("ground", ground))
-        return (
-            *lines,
-            ("falls" if self.stage.num_worlds == 1 else "falls, all", str(self.falls)),
-            ("time", f"{self.time:.1f} s{self._tempo()}"),
-        )
+        lines.append(("falls" if stage.num_worlds == 1 else "falls, all", str(self.falls)))
+        lines.append(("time", f"{self.time:.1f} s{self._tempo()}"))
+        if pilot.message:
+            lines.append(("note", pilot.message))
+        return tuple(lines)
+
+    def _driver(self) -> str:
+        if not self.pilot.driving:
+            return "the task's own commands"
+        if self.script is not None:
+            return "the script"
+        return "you, all robots" if self.pilot.everyone and self.stage.num_worlds > 1 else "you"
 
     def _tempo(self) -> str:
-        """How fast time passes, where that is a question."""
+        """The pace, where real time matters."""
         if self.pilot.paused:
             return ", paused"
         if not self.real_time:

@@ -1,20 +1,21 @@
-"""The two seams of watching: a stage has robots that move, a viewer shows a moment of it. Types only.
+"""The two protocols of watching: a stage has moving robots, a viewer shows a moment of it. Types only.
 
 A stage may be the training environment or any other physics; a viewer may be a window, a web page or a file. Neither
-knows the other: `session.py` steps the one and shows the other what there is to see. No torch here, nor below `view/`
-but in `env_stage.py`.
+knows the other: `session.py` steps the stage and hands moments to the viewer. In `view/` only `env_stage.py` uses torch.
 """
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.errors import UserError
 
 FloatArray = NDArray[np.float64]
@@ -26,23 +27,23 @@ class ViewError(UserError, RuntimeError):
 
 
 class Stage(Protocol):
-    """N robots in N worlds of their own that follow commands. Arrays handed out are the caller's to keep."""
+    """N robots in N separate worlds. They follow C commands; a stage with C = 0 cannot be driven. Arrays handed out are the caller's."""
 
     model: mujoco.MjModel  # one robot with its scene, for drawing
     num_worlds: int
     dt: float  # control step [s]
-    limits: FloatArray  # (2, 3) lowest and highest command as trained: vx, vy [m/s], yaw rate [rad/s]
+    command_table: tuple[Command, ...]  # (C,) with the ranges as trained
 
     def step(self, commands: FloatArray | None) -> None:
-        """One control step of all worlds under `commands` (N, 3); None: under the stage's own."""
+        """One control step of all worlds under `commands` (N, C); None: under the stage's own."""
         ...
 
     def commands(self) -> FloatArray:
-        """What each robot follows now (N, 3)."""
+        """The command of each robot now (N, C)."""
         ...
 
     def velocity(self) -> FloatArray:
-        """What each robot does (N, 3): vx, vy, yaw rate at the IMU, body frame."""
+        """The measured velocity of each robot (N, 3): vx, vy, yaw rate at the IMU, body frame."""
         ...
 
     def qpos(self) -> FloatArray:
@@ -50,7 +51,7 @@ class Stage(Protocol):
         ...
 
     def contacts(self) -> BoolArray:
-        """Which feet stand (N, F), in the order of the model's first F contact sensors."""
+        """Which geoms of the feet touch the ground (N, G), in the order of the model's first G contact sensors."""
         ...
 
     def fell(self) -> BoolArray:
@@ -58,23 +59,23 @@ class Stage(Protocol):
         ...
 
     def ground(self, world: int) -> str:
-        """What a robot walks on, in words; empty where that is a plane."""
+        """The ground below a robot, in words; empty where that is a plane."""
         ...
 
     def push(self, world: int, velocity: FloatArray) -> None:
-        """Let the robot's horizontal velocity jump by (2,) [m/s], world frame."""
+        """Add (2,) [m/s], world frame, to the robot's horizontal velocity at once."""
         ...
 
     def reset(self, world: int) -> None:
-        """Set one robot up anew."""
+        """Put one robot back to its start."""
         ...
 
 
 class Fall(NamedTuple):
-    """Where somebody fell."""
+    """Where a robot fell."""
 
     world: int
-    place: FloatArray  # (3,) of the base just before, that world's frame [m]
+    place: FloatArray  # (3,) of the base one step before, in that world's frame [m]
 
 
 class Moment(NamedTuple):
@@ -82,27 +83,41 @@ class Moment(NamedTuple):
 
     time: float  # [s]
     qpos: FloatArray  # (N, nq)
-    commands: FloatArray  # (N, 3)
-    velocity: FloatArray  # (N, 3)
-    contacts: BoolArray  # (N, F)
-    falls: tuple[Fall, ...] = ()  # the latest, as long as they are to be seen
+    commands: FloatArray  # (N, C)
+    target_velocity: FloatArray  # (N, 3) commanded vx, vy, yaw rate; NaN where there is no such command
+    velocity: FloatArray  # (N, 3) measured
+    contacts: BoolArray  # (N, G)
+    falls: tuple[Fall, ...] = ()  # the latest ones
     world: int = 0  # the robot that is followed, driven and measured
     camera: str = "follow"  # one of drive.CAMERAS
-    lines: tuple[tuple[str, str], ...] = ()  # what to say in words: (name, value)
-    help: bool = False  # the keys are asked for
+    lines: tuple[tuple[str, str], ...] = ()  # text to show: (name, value)
+    help: bool = False  # show the keys
 
 
 class Viewer(Protocol):
-    """Shows moments until somebody closes it."""
+    """Shows moments until it is closed."""
 
     def show(self, moment: Moment) -> None:
         """Show one moment; does nothing once closed."""
         ...
 
     def is_running(self) -> bool:
-        """False once there is nobody left to show anything to."""
+        """False once the user closed it."""
         ...
 
     def close(self) -> None:
         """Free all that is held; again is allowed."""
         ...
+
+
+def velocity_columns(table: Sequence[Command]) -> dict[int, int]:
+    """Column of the command -> column of the velocity (vx, vy, yaw rate), for the commands that are velocities."""
+    return {column: VELOCITY.index(command.name) for column, command in enumerate(table) if command.name in VELOCITY}
+
+
+def target_velocity(table: Sequence[Command], commands: FloatArray) -> FloatArray:
+    """Commanded vx, vy, yaw rate (N, 3) out of `commands` (N, C); NaN where there is no such command."""
+    target = np.full((len(commands), len(VELOCITY)), np.nan)
+    for column, component in velocity_columns(table).items():
+        target[:, component] = commands[:, column]
+    return target

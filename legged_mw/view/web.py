@@ -1,7 +1,7 @@
-"""A web page: MuJoCo Studio's web viewer, with our panel. Served from this process, without anything from the net.
+"""A web page: MuJoCo Studio's web viewer with our panel. This process serves it and loads nothing from the net.
 
-It has neither password nor encryption, so it is bound to 127.0.0.1 unless another host is asked for; from afar it is
-reached through `ssh -L`. Studio is young: what is used of it beyond its documented shape is in `_held_to`, and checked.
+The page has neither password nor encryption, so it is bound to 127.0.0.1 unless another host is asked for; `ssh -L` reaches
+it from afar. Studio is young: our only use of its undocumented parts is in `_bound_to`, and checked.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -21,12 +21,14 @@ from typing import Any
 import mujoco
 
 from legged_mw.view.drive import Pilot
-from legged_mw.view.puppet import Cast
+from legged_mw.view.posed_robot import PosedRobots, moving_geoms
 from legged_mw.view.stage import Moment, ViewError
 
 LOCAL = "127.0.0.1"
 FIRST_PORT, PORTS = 8080, 20
 START_SECONDS = 20.0
+GEOMS_MAX = 1024  # that a page draws beside those of the model: Studio's MAX_EXTRA_GEOMS
+GEOMS_DRAWN = 64, 6  # ours: of them for arrows and falls, and for the arrows and feet of each robot
 
 
 def missing() -> str | None:
@@ -38,8 +40,14 @@ def missing() -> str | None:
     return None
 
 
+def most_robots(model: mujoco.MjModel) -> int:
+    """How many robots a page can draw."""
+    ours, each = GEOMS_DRAWN
+    return 1 + (GEOMS_MAX - ours) // (moving_geoms(model) + each)
+
+
 class WebViewer:
-    """Serves the page until it is closed. `url` is where."""
+    """Serves the page at `url` until it is closed."""
 
     def __init__(
         self, model: mujoco.MjModel, pilot: Pilot, count: int = 1, *, host: str = LOCAL, port: int = 0, title: str = "legged_mw"
@@ -48,66 +56,61 @@ class WebViewer:
             raise ViewError(f"--viewer web: {reason}")
         from mujoco.studio import launch_web, viewer_protocol
 
-        from legged_mw.view.face import Face  # imports what a mujoco without web viewer lacks
+        from legged_mw.view.studio import StudioPlugin  # a mujoco without web viewer cannot import it
 
-        self.cast = Cast(model, count)
+        self.robots = PosedRobots(model, count)
         port = free_port(host, port)
-        self._face = Face(self.cast, pilot, title)
+        self._plugin = StudioPlugin(self.robots, pilot, title)
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
-        with _held_to(host):
-            self._handle: Any = launch_web.launch(config, plugins=[self._face])
+        with _bound_to(host):
+            self._handle: Any = launch_web.launch(config, plugins=[self._plugin])
             self._wait(host, port)
         self.url = f"http://{'localhost' if host == LOCAL else host}:{port}/"
         self.port = port
 
     def show(self, moment: Moment) -> None:
-        """Send one moment to whoever looks."""
+        """Send one moment to all browsers."""
         if self.is_running():
-            self.cast.pose(moment.qpos, moment.world)
-            self._face.show(moment)
-            self._handle.sync(self.cast.model, self.cast.data)
+            with self._plugin.lock:
+                self.robots.pose(moment.qpos, moment.world)
+            self._plugin.show(moment)
+            self._handle.sync(self.robots.model, self.robots.data)
 
     def is_running(self) -> bool:
-        """Until `close`; a page that somebody closes may be opened again."""
+        """Until `close`: a closed page may be opened again."""
         return bool(self._handle.is_running())
 
     def close(self) -> None:
         """Stop serving; again is allowed."""
         self._handle.close()
 
-    def __enter__(self) -> WebViewer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
     def _wait(self, host: str, port: int) -> None:
-        """Until the page is served, and on no other interface than the one asked for."""
+        """Wait until the page is served, and refuse any interface but the one asked for."""
         until = time.monotonic() + START_SECONDS
-        while not self._listens() and time.monotonic() < until and self._handle.is_running():  # which raises what its thread raised
+        while not self._listens() and time.monotonic() < until and self._handle.is_running():  # raises what its thread raised
             time.sleep(0.02)
         if not self._listens():
             self._handle.close()
             raise ViewError("--viewer web: MuJoCo's web viewer did not start")
-        bound = self._face.viewer._http_sock.getsockname()
+        bound = self._plugin.viewer._http_sock.getsockname()
         if host == LOCAL and bound[0] != LOCAL:
             self._handle.close()
             raise ViewError(f"--viewer web: the page would be open to the network ({bound[0]}:{port}); this mujoco binds it otherwise")
 
     def _listens(self) -> bool:
-        """Its server is one more thread, which begins to listen after the viewer is there."""
-        return self._face.begun.is_set() and self._face.viewer._http_sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1
+        """Whether its server listens: one more thread, which starts after the viewer."""
+        return self._plugin.begun.is_set() and self._plugin.viewer._http_sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1
 
 
 @contextmanager
-def _held_to(host: str) -> Iterator[None]:
-    """Studio binds all interfaces and has no setting for it: while it starts, its socket is bound to `host` instead. It also says less."""
+def _bound_to(host: str) -> Iterator[None]:
+    """While Studio starts, bind its socket to `host`: it binds all interfaces and has no setting for it. Its log is quieter too."""
     from mujoco.studio import web_viewer
     from mujoco.studio.web import web_server
 
     bind = getattr(web_server, "bind_public_socket", None)
     if bind is None:
-        raise ViewError(f"--viewer web: the page of this mujoco ({mujoco.__version__}) cannot be held to {host}")
+        raise ViewError(f"--viewer web: the page of this mujoco ({mujoco.__version__}) cannot be bound to {host}")
     logging.getLogger("WebServer").setLevel(logging.WARNING)
     web_viewer.print = lambda *_, **__: None  # type: ignore[attr-defined]  # its banner names all interfaces
     web_server.bind_public_socket = lambda _, port=0: bind(host, port)
@@ -118,7 +121,7 @@ def _held_to(host: str) -> Iterator[None]:
 
 
 def free_port(host: str, port: int = 0) -> int:
-    """`port` if nobody listens on it, or the first free one from FIRST_PORT on. Raises ViewError."""
+    """`port` if it is free; for 0 the first free one from FIRST_PORT on. Raises ViewError."""
     candidates = [port] if port else range(FIRST_PORT, FIRST_PORT + PORTS)
     for candidate in candidates:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:
@@ -138,7 +141,7 @@ def free_port(host: str, port: int = 0) -> int:
 
 
 def tunnel_line(port: int) -> str:
-    """What to paste into a terminal on the desk, to see the page of this machine there."""
+    """The command that brings this machine's page to the user's own machine."""
     user = getpass.getuser()
     client = os.environ.get("SSH_CONNECTION", "").split()  # client's address and port, then ours as the client knows them
     if len(client) == 4:

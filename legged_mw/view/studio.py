@@ -1,6 +1,6 @@
-"""What of ours runs on the thread of MuJoCo Studio's web viewer: the panel, the camera and the extra geoms of each picture.
+"""Our plugin of MuJoCo Studio's web viewer, run on its thread: the panel, the camera and the extra geoms of each picture.
 
-Imported only where a page is asked for: a mujoco without Studio cannot import it.
+Import it only where a page is asked for: a mujoco without Studio cannot import it.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -16,30 +16,30 @@ import mujoco
 from mujoco.studio import messages, plugin
 from mujoco.studio.dear_imgui import dear_imgui
 from mujoco.studio.implot import implot
+from mujoco.studio.web import state_payload
 
-from legged_mw.view.camera import CameraMan
+from legged_mw.view.camera import RobotCamera
 from legged_mw.view.drive import Pilot
-from legged_mw.view.overlay import draw, set_options
+from legged_mw.view.overlay import draw
 from legged_mw.view.panel import Panel
-from legged_mw.view.puppet import Cast
+from legged_mw.view.posed_robot import PosedRobots, show_groups
 from legged_mw.view.stage import Moment
 
-DECOR_MAX = 1000  # geoms beside the model's that a page draws
 
+class StudioPlugin(plugin.ViewerPlugin):
+    """An exception in a handler would end the session, so it is printed once, and the session goes on."""
 
-class Face(plugin.ViewerPlugin):
-    """An exception in a handler would end the session, so it is said once, and the picture goes on."""
-
-    def __init__(self, cast: Cast, pilot: Pilot, title: str) -> None:
-        self.cast = cast
+    def __init__(self, robots: PosedRobots, pilot: Pilot, title: str) -> None:
+        self.robots = robots
+        self.lock = threading.Lock()  # of the robots' poses
         self.panel = Panel(pilot, title, dear_imgui, implot)
         self.begun = threading.Event()
-        self._said: set[str] = set()
+        self._printed: set[str] = set()
         self._scene: mujoco.MjvScene | None = None
-        self._camera: CameraMan | None = None
+        self._camera: RobotCamera | None = None
 
     def show(self, moment: Moment) -> None:
-        """What to show from now on. Called by the session's thread."""
+        """Show this moment from now on. The session's thread calls it."""
         self.panel.show(moment)
 
     @messages.handler
@@ -48,11 +48,11 @@ class Face(plugin.ViewerPlugin):
 
     @messages.handler
     def on_model(self, event: messages.PostModelEvent) -> None:
-        if event.model.nbody < 2:  # an empty one comes first
+        if event.model.nbody < 2:  # the first one is empty
             return
-        set_options(self.viewer.vis_options)
-        self._scene = mujoco.MjvScene(event.model, DECOR_MAX)
-        self._camera = CameraMan(self.viewer.camera, self.cast, by_hand=True)
+        show_groups(self.viewer.vis_options)
+        self._scene = mujoco.MjvScene(event.model, state_payload.MAX_EXTRA_GEOMS)
+        self._camera = RobotCamera(self.viewer.camera, self.robots, by_hand=True)
 
     @messages.handler
     def on_update(self, _: messages.UpdateEvent) -> None:
@@ -66,15 +66,16 @@ class Face(plugin.ViewerPlugin):
         moment = self.panel.moment
         if moment is None or self._scene is None or self._camera is None:
             return
-        self._camera.update(moment.camera, moment.world)
         self._scene.ngeom = 0
-        draw(self._scene, self.cast, moment)
+        with self.lock:
+            self._camera.update(moment.camera, moment.world)
+            draw(self._scene, self.robots, moment, self.viewer.vis_options)
         self.viewer.extra_geoms[:] = self._scene.geoms[: self._scene.ngeom]
 
     def _guard(self, work: Callable[[], None]) -> None:
         try:
             work()
-        except Exception as error:  # whatever it is, the robot walks on
-            if repr(error) not in self._said:
-                self._said.add(repr(error))
+        except Exception as error:
+            if repr(error) not in self._printed:
+                self._printed.add(repr(error))
                 traceback.print_exc(file=sys.stderr)

@@ -1,6 +1,6 @@
-"""The rough ground of a model, for cameras and for who draws slowly: how high it is, and which of its tiles are drawn coarsely.
+"""The rough ground of a model: its height for cameras, and fine or coarse tiles for slow renderers.
 
-The ground is height fields, side by side. Where two are at the same place one is the other in coarse, and is hidden at first.
+The ground is height fields side by side. Where two are at the same place, one is a coarse copy of the other and is hidden at first.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from legged_mw.view.stage import FloatArray
 
 
-class Hills:
+class RoughGround:
     """All height fields of a model, at places (T, 2) with half edges (T, 2) [m], world frame; they do not move."""
 
     def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -31,7 +31,7 @@ class Hills:
         self._bottoms: FloatArray = np.array(data.geom_xpos[self.fine, 2])
 
     def height(self, place: FloatArray) -> float:
-        """Of the vertex nearest to ``place`` (2,) [m]; beside all tiles 0."""
+        """Height [m] of the vertex nearest to `place` (2,) [m]; 0 outside of all tiles."""
         inside = np.flatnonzero((np.abs(self.places - place) <= self.halves).all(axis=1))
         if not len(inside):
             return 0.0
@@ -43,14 +43,13 @@ class Hills:
         vertex = model.hfield_data[model.hfield_adr[field] + row * columns + column]
         return float(vertex * model.hfield_size[field, 2] + self._bottoms[tile])
 
-    def refine(self, place: FloatArray, reach: float) -> NDArray[np.int64]:
-        """Show the tiles within ``reach`` [m] of ``place`` (2,) in full, the others coarsely; returns the former."""
+    def refine(self, place: FloatArray, reach: float) -> None:
+        """Draw the tiles within `reach` [m] of `place` (2,) finely, the others coarsely."""
         near = (np.maximum(np.abs(self.places - place) - self.halves, 0.0) ** 2).sum(axis=1) < reach**2
         self._model.geom_rgba[self.coarse, 3] = ~near
         self._model.geom_rgba[self.fine, 3] = near | (self.fine == self.coarse)
-        return np.flatnonzero(near)
 
 
 def height_fields(model: mujoco.MjModel) -> NDArray[np.int64]:
-    """Indices of the geoms that are."""
+    """Indices of the geoms that are height fields."""
     return np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)

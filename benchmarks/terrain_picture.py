@@ -1,6 +1,6 @@
 """A picture of rough ground from above: a row of tiles for each kind, harder to the right.
 
-python -m legged_mw.terrain_picture terrain.png --task go1_rough
+python benchmarks/terrain_picture.py terrain.png --task go1_rough
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -8,8 +8,10 @@ python -m legged_mw.terrain_picture terrain.png --task go1_rough
 from __future__ import annotations
 
 import math
+import sys
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 import legged_mw  # noqa: F401  (chooses what draws without a screen, before mujoco is imported)
 
 # isort: split
@@ -23,11 +25,11 @@ from legged_mw.sim.terrain import KINDS, MEASURES, Terrain, measure
 from legged_mw.utils.cli import Parser, apply_overrides, one_line_errors, shown
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask, load_task
-from legged_mw.view.film import no_context, shrunk
+from legged_mw.view.recorder import no_context, shrunk
 from legged_mw.view.stage import ViewError
 from legged_mw.view.video import Frame, save_png
 
-PROGRAM = "legged_mw.terrain_picture"
+PROGRAM = "benchmarks/terrain_picture.py"
 WIDTH, FINER = 1280, 2  # [px] of the picture; it is drawn that much larger and made smaller, which smooths it
 WIDEST, HIGHEST = 2560, 1280  # [px] with many levels it is wider, so that names have room; with few it is no higher, and less wide
 ELEVATION = 40.0  # [deg] of the camera, which looks along y, so that levels go to the right; without perspective

@@ -1,4 +1,4 @@
-"""Pictures without a screen: an offscreen renderer of a moment, and the viewer that makes a video and a contact sheet of them.
+"""Pictures without a screen: an offscreen renderer of a moment, and the viewer that records a video and a contact sheet.
 
 `MUJOCO_GL` must be set before mujoco is imported; the package does it.
 """
@@ -7,16 +7,15 @@
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-import copy
 import os
 from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from legged_mw.view.camera import CameraMan
-from legged_mw.view.overlay import draw, set_options
-from legged_mw.view.puppet import Cast
+from legged_mw.view.camera import RobotCamera
+from legged_mw.view.overlay import draw
+from legged_mw.view.posed_robot import PosedRobots, show_groups
 from legged_mw.view.stage import Moment, ViewError
 from legged_mw.view.video import Frame, VideoWriter, contact_sheet, save_png
 
@@ -24,44 +23,44 @@ SHADOW_MAX = 2048  # ours: edge of the shadow map [px]; 8192, found in many scen
 GEOMS_MAX = 20_000
 FINE_REACH = 3.0  # [m] beyond the camera's distance: tiles of rough ground farther from what it looks at are drawn coarsely
 TINY, SMALL = 400, 800  # [px] pictures up to these widths get smaller letters
-SHEET_FRAMES, SHEET_COLUMNS, SHEET_WIDTH = 12, 4, 320  # pictures, a row of them, the widest that one may be [px]
-GIF_FPS, GIF_WIDTH = 12.5, 640  # a GIF holds hundredths of a second; more of either and it is larger than its video is good
+SHEET_FRAMES, SHEET_COLUMNS, SHEET_WIDTH = 12, 4, 320  # pictures, pictures in a row, width of a picture at most [px]
+GIF_FPS, GIF_WIDTH = 12.5, 640  # a GIF counts in hundredths of a second, and grows large with more of either
 
 
 class RobotRenderer:
-    """Offscreen pictures of some robots from a camera that follows one. To be used from the thread that made it."""
+    """Offscreen pictures of some robots from a camera that follows one. Use it from the thread that made it."""
 
     def __init__(self, model: mujoco.MjModel, width: int = 1280, height: int = 720, count: int = 1) -> None:
-        self.cast = Cast(copy.copy(model), count)
-        vis = self.cast.model.vis  # frame buffer and shadows are ours to set, the caller's model is not
+        self.robots = PosedRobots(model, count)
+        vis = self.robots.model.vis
         vis.global_.offwidth, vis.global_.offheight = width, height
         vis.quality.shadowsize = min(vis.quality.shadowsize, SHADOW_MAX)
         self.width, self.height = width, height
-        self._camera = CameraMan(mujoco.MjvCamera(), self.cast, by_hand=False)
+        self._camera = RobotCamera(mujoco.MjvCamera(), self.robots, by_hand=False)
         self._option = mujoco.MjvOption()
-        set_options(self._option)
+        show_groups(self._option)
         try:
             scale = mujoco.mjtFontScale
             font = scale.mjFONTSCALE_50 if width <= TINY else scale.mjFONTSCALE_100 if width <= SMALL else scale.mjFONTSCALE_150
-            self._renderer = mujoco.Renderer(self.cast.model, height=height, width=width, max_geom=GEOMS_MAX, font_scale=font)
+            self._renderer = mujoco.Renderer(self.robots.model, height=height, width=width, max_geom=GEOMS_MAX, font_scale=font)
         except Exception as error:  # each OpenGL backend fails with a type of its own
             raise ViewError(no_context(error)) from error
 
     def frame(self, moment: Moment, frames: float = 1.0) -> Frame:
-        """One picture (height, width, 3), yours to keep; `frames` of a video passed since the last."""
-        self.cast.pose(moment.qpos, moment.world)
+        """One picture (height, width, 3), yours to keep; `frames` of a video passed since the last call."""
+        self.robots.pose(moment.qpos, moment.world)
         camera, scene = self._camera.update(moment.camera, moment.world, frames), self._renderer.scene
-        if self.cast.hills is not None:
-            self.cast.hills.refine(camera.lookat[:2], FINE_REACH + camera.distance)
-        # MuJoCo lays an endless floor around where the camera was; told first, it lies right in the first frame too
-        mujoco.mjv_updateCamera(self.cast.model, self.cast.data, camera, scene)
-        self._renderer.update_scene(self.cast.data, camera, self._option)
-        draw(scene, self.cast, moment)
+        if self.robots.ground is not None:
+            self.robots.ground.refine(camera.lookat[:2], FINE_REACH + camera.distance)
+        # MuJoCo lays an endless floor around the camera's last position; this makes it right in the first frame too
+        mujoco.mjv_updateCamera(self.robots.model, self.robots.data, camera, scene)
+        self._renderer.update_scene(self.robots.data, camera, self._option)
+        draw(scene, self.robots, moment, self._option)
         frame = self._renderer.render()  # a new array each time
         return self._write(frame, moment.lines) if moment.lines else frame
 
     def _write(self, frame: Frame, lines: tuple[tuple[str, str], ...]) -> Frame:
-        """The lines over the picture that was just drawn, which has to be read again."""
+        """Write the lines over the picture that was just drawn, and read it again."""
         renderer = self._renderer
         names, values = ("\n".join(column) for column in zip(*lines, strict=True))
         place = mujoco.mjtGridPos.mjGRID_TOPLEFT
@@ -74,15 +73,9 @@ class RobotRenderer:
         """Free the OpenGL context; again is allowed."""
         self._renderer.close()
 
-    def __enter__(self) -> RobotRenderer:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
 
 def no_context(error: Exception) -> str:
-    """What to do where no OpenGL context for drawing without a screen is to be had."""
+    """What to do where there is no OpenGL context for drawing without a screen."""
     state = ", ".join(f"{name}={os.environ.get(name)!r}" for name in ("MUJOCO_GL", "DISPLAY"))
     return (
         f"No OpenGL context for offscreen rendering ({state}): {type(error).__name__}: {error}\n"
@@ -91,15 +84,15 @@ def no_context(error: Exception) -> str:
     )
 
 
-class Film:
-    """The viewer that writes files: `video` (MP4 or GIF), `sheet` (a PNG with pictures from all of it), or both."""
+class Recorder:
+    """The viewer that writes files: `video` (MP4 or GIF), `sheet` (a PNG of pictures from the whole run), or both."""
 
     def __init__(
         self,
         model: mujoco.MjModel,
         count: int,
         dt: float,  # [s] between two moments
-        seconds: float,  # how long it will be, for the sheet's pictures to be spread over
+        seconds: float,  # length of the run [s]; the sheet's pictures are spread over it
         *,
         video: Path | None,
         sheet: Path | None,
@@ -112,10 +105,10 @@ class Film:
             fps, shrink = min(fps, GIF_FPS), max(1.0, width / GIF_WIDTH)
             width, height = round(width / shrink), round(height / shrink)
         self._every = max(1, round(1 / (fps * dt)))
-        self._shots = [index * seconds / SHEET_FRAMES for index in range(SHEET_FRAMES)] if sheet else []  # [s]
+        self._sheet_times = [index * seconds / SHEET_FRAMES for index in range(SHEET_FRAMES)] if sheet else []  # [s]
         self._pictures: list[Frame] = []
         self._turn = self._drawn = 0
-        # the files' names are refused before a context is made, and an old file stays if that fails
+        # the files' names are checked before a context is made, and an old file stays if that fails
         self._writer = VideoWriter(video, width, height, 1 / (self._every * dt)) if video else None
         try:
             self._renderer = RobotRenderer(model, width, height, count)
@@ -124,9 +117,9 @@ class Film:
             raise
 
     def show(self, moment: Moment) -> None:
-        """A frame, if one is due."""
+        """Record a frame, if one is due."""
         film = self._writer is not None and self._turn % self._every == 0
-        still = len(self._pictures) < len(self._shots) and moment.time >= self._shots[len(self._pictures)] - 1e-9
+        still = len(self._pictures) < len(self._sheet_times) and moment.time >= self._sheet_times[len(self._pictures)] - 1e-9
         self._turn += 1
         if not (film or still):
             return
@@ -138,7 +131,7 @@ class Film:
             self._pictures.append(shrunk(frame, SHEET_WIDTH))
 
     def is_running(self) -> bool:
-        """Always: nobody closes a file from outside."""
+        """Always True: nobody closes a file from outside."""
         return True
 
     def close(self) -> None:
@@ -151,7 +144,7 @@ class Film:
             self._pictures = []
 
     def abort(self) -> None:
-        """Drop all; an old file stays."""
+        """Drop the files; older ones of these names stay."""
         if self._writer is not None:
             self._writer.abort()
 
