@@ -16,7 +16,7 @@ from legged_mw.utils.task import LoadedTask, list_tasks, load_task
 def train() -> None:
     """Train a task. On 8 GPUs: torchrun --nproc_per_node=8 train.py --task go1_flat"""
     from legged_mw.envs.describe import describe
-    from legged_mw.eval.training import make_exam
+    from legged_mw.eval.exams import make_exam
     from legged_mw.rl import training
 
     args = training.parse(train.__doc__)

@@ -44,11 +44,7 @@ def main() -> None:
     shipped = ROOT / "resources" / "policies" / args.folder
     folder = shipped if shipped.is_dir() and not Path(args.folder).exists() else Path(args.folder)
     contract, scene_file = read_contract(folder), TERRAIN_FILE if args.terrain else SCENE_FILE
-    command = launch.check_drive(
-        args,
-        [[c.low for c in contract.commands], [c.high for c in contract.commands]],
-        advice=f"the ranges are in {folder / CONTRACT_FILE}",
-    )
+    command = launch.check_drive(args, contract.commands, advice=f"the ranges are in {folder / CONTRACT_FILE}")
     if args.eval:
         examine(folder, Path(args.out) if args.out else folder / RESULT_FILE)
     else:
