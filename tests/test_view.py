@@ -25,10 +25,11 @@ from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.task import load_task
 from legged_mw.view import native
 from legged_mw.view.camera import DISTANCE, RobotCamera
+from legged_mw.view.copied_model import CopiedRobots
 from legged_mw.view.drive import BINDINGS, Pilot
 from legged_mw.view.native import NativeViewer, has_display
 from legged_mw.view.overlay import ARC_SEGMENTS, draw_velocities
-from legged_mw.view.posed_robot import Placement, PosedRobot, PosedRobots, moving_geoms, show_groups
+from legged_mw.view.posed_robot import Placement, PosedRobot, PosedRobots, show_groups
 from legged_mw.view.recorder import Recorder, RobotRenderer, shrunk
 from legged_mw.view.session import Pace
 from legged_mw.view.stage import Fall, Moment
@@ -311,12 +312,43 @@ def test_another_robot_looks_as_the_followed_one_does(model: mujoco.MjModel) -> 
             view.update_scene(robots.data, camera, option)
             before = view.scene.ngeom
             robots.add_others(view.scene, option)
-            assert view.scene.ngeom - before == (count - 1) * moving_geoms(model)
+            assert view.scene.ngeom - before == (count - 1) * 6
             lamp = next(light for light in view.scene.lights[: view.scene.nlight] if not light.headlight)
             lamp.pos[:] = 0.3, 0, 4  # the model's light stays with the followed robot
             pictures.append(view.render().astype(int))
     difference = np.abs(pictures[0] - pictures[1])
     assert pictures[0].std() > 20 and difference.mean() < 1.5, difference.mean()
+
+
+def test_a_copied_robot_looks_as_the_robot_does(model: mujoco.MjModel) -> None:
+    pose = model.qpos0 + 0.2 * np.eye(model.nq)[7] + 0.3 * np.eye(model.nq)[0]
+    pictures = []
+    for robots in (PosedRobots(model), CopiedRobots(model, 1)):
+        robots.pose(pose)
+        camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
+        camera.lookat[:], camera.distance, camera.elevation = [0.3, 0, 0.2], 1.2, -20
+        show_groups(option)
+        with mujoco.Renderer(robots.model, 120, 160) as view:
+            view.update_scene(robots.data, camera, option)
+            pictures.append(view.render().astype(int))
+    difference = np.abs(pictures[0] - pictures[1])
+    assert pictures[0].std() > 20 and difference.mean() < 1.5, difference.mean()
+
+
+def test_copied_robots_are_one_model_without_joints(model: mujoco.MjModel) -> None:
+    robots, qpos = CopiedRobots(model, 5), np.tile(model.qpos0, (5, 1))
+    qpos[3, :3] += (0.5, -0.2, 0.1)
+    qpos[3, 7] = 0.7
+    robots.pose(qpos, 3)
+    alone = PosedRobot(model)
+    alone.pose(qpos[3])
+    assert np.allclose(robots.data.xpos[robots.model.body("3/2").id], alone.data.xpos[2] + robots.offsets[3])
+    assert np.allclose(robots.data.xquat[robots.model.body("3/2").id], alone.data.xquat[2])
+    assert np.allclose(robots.data.xpos[robots.base], robots.placements[3].position)  # what the camera tracks
+    assert robots.model.nv == 0 and robots.model.ngeom == 1 + 5 * 6  # nothing to solve; group 3 stays behind
+    scene = mujoco.MjvScene(model, 100)
+    robots.add_others(scene, mujoco.MjvOption())
+    assert scene.ngeom == 0
 
 
 def test_robots_stand_side_by_side_each_in_its_pose(model: mujoco.MjModel) -> None:
@@ -360,6 +392,8 @@ def test_on_a_terrain_each_robot_stays_where_it_is() -> None:
     hills = mujoco.MjModel.from_xml_string(ROBOT.replace("<worldbody>", terrain, 1).replace(floor, ground))
     robots = PosedRobots(hills, 3)
     assert not robots.offsets.any() and robots.ground is not None
+    copied = CopiedRobots(hills, 3).model
+    assert np.allclose(copied.hfield_data, hills.hfield_data) and np.allclose(copied.hfield_size, hills.hfield_size)
 
 
 def test_many_robots_are_in_one_picture(model: mujoco.MjModel) -> None:

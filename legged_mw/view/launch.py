@@ -136,7 +136,7 @@ def watch(stage: Stage, args: argparse.Namespace, folder: Path, picture: Picture
 
 def _pilot(stage: Stage, args: argparse.Namespace, kind: str) -> Pilot:
     """A pilot of the robots that are shown; scripts drive all of them."""
-    count = min(stage.num_worlds, ROBOTS_SHOWN, web.most_robots(stage.model) if kind == "web" else ROBOTS_SHOWN)
+    count = min(stage.num_worlds, ROBOTS_SHOWN)
     if count < stage.num_worlds and kind != "none":
         print(f"{stage.num_worlds} robots, the first {count} of them are shown")
     pilot = Pilot(stage.command_table, count, args.camera)

@@ -112,8 +112,12 @@ class PosedRobots:
         for index in range(self.count):
             robot = self._followed if index == world else self._other
             self.placements.append(robot.pose(self._qpos[index], self.offsets[index]))
-            for foot, geom in enumerate(self.feet):
-                self._below_feet[index, foot] = robot.lowest(geom)
+            self._place(index, robot)
+
+    def _place(self, index: int, robot: PosedRobot) -> None:
+        """Keep what the picture needs of the robot that was just posed."""
+        for foot, geom in enumerate(self.feet):
+            self._below_feet[index, foot] = robot.lowest(geom)
 
     def add_others(self, scene: mujoco.MjvScene, option: mujoco.MjvOption) -> None:
         """Append every robot but the followed one to `scene`."""
@@ -136,11 +140,6 @@ def contact_geoms(model: mujoco.MjModel) -> list[int]:
     geom = int(mujoco.mjtObj.mjOBJ_GEOM)
     contact = int(mujoco.mjtSensor.mjSENS_CONTACT)
     return [int(model.sensor_objid[i]) for i in range(model.nsensor) if model.sensor_type[i] == contact and model.sensor_objtype[i] == geom]
-
-
-def moving_geoms(model: mujoco.MjModel) -> int:
-    """How many visible geoms a robot has."""
-    return int(((model.body_weldid[model.geom_bodyid] != 0) & (model.geom_group < GROUPS_SHOWN)).sum())
 
 
 def has_places(model: mujoco.MjModel) -> bool:

@@ -20,15 +20,14 @@ from typing import Any
 
 import mujoco
 
+from legged_mw.view.copied_model import CopiedRobots
 from legged_mw.view.drive import Pilot
-from legged_mw.view.posed_robot import PosedRobots, moving_geoms
+from legged_mw.view.posed_robot import PosedRobots
 from legged_mw.view.stage import Moment, ViewError
 
 LOCAL = "127.0.0.1"
 FIRST_PORT, PORTS = 8080, 20
 START_SECONDS = 20.0
-GEOMS_MAX = 1024  # that a page draws beside those of the model: Studio's MAX_EXTRA_GEOMS
-GEOMS_DRAWN = 64, 6  # ours: of them for arrows and falls, and for the arrows and feet of each robot
 
 
 def missing() -> str | None:
@@ -38,12 +37,6 @@ def missing() -> str | None:
     except ImportError as error:
         return f"this mujoco ({mujoco.__version__}) brings no web viewer: {error}"
     return None
-
-
-def most_robots(model: mujoco.MjModel) -> int:
-    """How many robots a page can draw."""
-    ours, each = GEOMS_DRAWN
-    return 1 + (GEOMS_MAX - ours) // (moving_geoms(model) + each)
 
 
 class WebViewer:
@@ -58,7 +51,7 @@ class WebViewer:
 
         from legged_mw.view.studio import StudioPlugin  # a mujoco without web viewer cannot import it
 
-        self.robots = PosedRobots(model, count)
+        self.robots = CopiedRobots(model, count) if count > 1 else PosedRobots(model)
         port = free_port(host, port)
         self._plugin = StudioPlugin(self.robots, pilot, title)
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
