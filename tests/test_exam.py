@@ -13,14 +13,14 @@ from typing import Any
 import pytest
 import torch
 import yaml
-from program import SMALL, play, refused, run, trained
+from program import SMALL, refused, run, trained
 from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.eval import exam, rules
+from legged_mw.eval import exam, grading, rules
 from legged_mw.eval.exams import EXAMS, find_exam, make_exam, require_exam
 from legged_mw.eval.peers import PEERS
 from legged_mw.eval.rollout import holding, roll_out
@@ -111,7 +111,7 @@ def test_a_task_without_an_exam() -> None:
     task = load_task("go1_flat")
     assert find_exam(task) is require_exam(task) is EXAMS["walking"]
     task.env_class = Pose
-    task.exam = ""  # what the loader makes of it
+    task.exam = Pose.exam  # as the loader does
     assert find_exam(task) is None and make_exam(task, None) is None
     line = "--eval: no exam grades task 'go1_flat'; there are: walking. A task that walks by command has the walking exam, another one "
     with pytest.raises(ConfigError, match=re.escape(line + "names its own: TASK = Task(Env, Cfg, CfgPPO, exam=...)")):
@@ -501,7 +501,7 @@ def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_ranges_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They scale the commands; the peer was asked others and is not spoken of. What the exam decides itself is refused."""
     monkeypatch.setattr(exam, "SECONDS", 2.1)
-    monkeypatch.setattr(play, "elsewhere", lambda *_: [])
+    monkeypatch.setattr(grading, "elsewhere", lambda *_: [])
     folder = trained(tmp_path, "--max_iterations", "1")
     start = [*SMALL[:2], "--device", "cpu", "--eval"]
     result = run("play", tmp_path, *start, "--set", "exam.ranges={lin_vel_x: [0, 0.9]}")
