@@ -7,6 +7,7 @@ import json
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,9 @@ from program import SMALL, refused, run, trained
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_mw import ROOT
+from legged_mw.deploy.contract import ContractError, read_contract
+from legged_mw.deploy.exam import contract_rules
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
@@ -29,6 +33,7 @@ from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
 
+SHIPPED = ROOT / "resources/policies/go1_flat"
 TRACKED, PUSHED = 22, 6 * 16  # worlds
 WORLDS = TRACKED + PUSHED
 GO1 = ExamRules.from_config(load_task("go1_flat").cfg)
@@ -98,6 +103,34 @@ def test_rules_that_cannot_be_applied(given: dict[str, Any], line: str) -> None:
     with pytest.raises(ConfigError) as error:
         ExamRules.from_mapping(given, RANGES)
     assert line in str(error.value)
+
+
+def test_rules_of_an_export() -> None:
+    """The shipped policy's contract says what its task's config says; one of an older export follows from its ranges."""
+    contract = read_contract(SHIPPED)
+    assert contract_rules(contract, SHIPPED) == GO1
+    names = [command.name for command in contract.commands]
+    with pytest.raises(
+        ContractError, match="policy.yaml: the walking exam needs the commands lin_vel_x, lin_vel_y, ang_vel_yaw; missing: a"
+    ):
+        contract_rules(replace(contract, commands=contract.commands[:2]), SHIPPED)
+    assert names == list(RANGES)
+
+
+@pytest.mark.parametrize(
+    ("section", "line"),
+    [
+        ({"push_speeds": 3.0}, "policy.yaml: exam: 'float' object is not iterable"),
+        ({"peer": "nobody"}, "policy.yaml: exam: exam.peer: no peer 'nobody' in legged_mw/eval/peers.py"),
+    ],
+)
+def test_a_contract_with_another_section(section: dict[str, Any], line: str, tmp_path: Path) -> None:
+    contract = read_contract(SHIPPED)
+    (tmp_path / "policy.yaml").write_text(yaml.safe_dump({}))
+    assert contract_rules(contract, tmp_path) == ExamRules.from_mapping({}, {c.name: (c.low, c.high) for c in contract.commands})
+    (tmp_path / "policy.yaml").write_text(yaml.safe_dump({"exam": section}))
+    with pytest.raises(ContractError, match=re.escape(line)):
+        contract_rules(contract, tmp_path)
 
 
 # ---- which exam grades a task
