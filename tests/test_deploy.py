@@ -372,6 +372,7 @@ def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Ca
     saved = json.loads((tmp_path / "exam.json").read_text())
     assert "falls in 22 commands                     0" in out and saved["falls"] == 0 and saved["engine"] == "mujoco (deploy)"
     assert saved["pushes"]["1"] == saved["pushes"]["2"] == 1.0 and saved["pushes"]["6"] < 1.0
+    assert list(saved["pushes"]) == ["1", "2", "3", "4", "5", "6"] and "beats the peer: " in out
     assert all(error < 0.12 for error in saved["error"]) and 0.5 < saved["cost_of_transport"] < 1.2
 
 

@@ -7,20 +7,24 @@ import json
 import math
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 import yaml
-from program import SMALL, play, refused, run, trained
+from program import SMALL, refused, run, trained
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_mw import ROOT
+from legged_mw.deploy.contract import ContractError, read_contract
+from legged_mw.deploy.exam import contract_rules
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.eval import exam, rules
+from legged_mw.eval import exam, grading, rules
 from legged_mw.eval.exams import EXAMS, find_exam, make_exam, require_exam
 from legged_mw.eval.peers import PEERS
 from legged_mw.eval.rollout import holding, roll_out
@@ -29,6 +33,7 @@ from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
 
+SHIPPED = ROOT / "resources/policies/go1_flat"
 TRACKED, PUSHED = 22, 6 * 16  # worlds
 WORLDS = TRACKED + PUSHED
 GO1 = ExamRules.from_config(load_task("go1_flat").cfg)
@@ -100,6 +105,34 @@ def test_rules_that_cannot_be_applied(given: dict[str, Any], line: str) -> None:
     assert line in str(error.value)
 
 
+def test_rules_of_an_export() -> None:
+    """The shipped policy's contract says what its task's config says; one of an older export follows from its ranges."""
+    contract = read_contract(SHIPPED)
+    assert contract_rules(contract, SHIPPED) == GO1
+    names = [command.name for command in contract.commands]
+    with pytest.raises(
+        ContractError, match="policy.yaml: the walking exam needs the commands lin_vel_x, lin_vel_y, ang_vel_yaw; missing: a"
+    ):
+        contract_rules(replace(contract, commands=contract.commands[:2]), SHIPPED)
+    assert names == list(RANGES)
+
+
+@pytest.mark.parametrize(
+    ("section", "line"),
+    [
+        ({"push_speeds": 3.0}, "policy.yaml: exam: 'float' object is not iterable"),
+        ({"peer": "nobody"}, "policy.yaml: exam: exam.peer: no peer 'nobody' in legged_mw/eval/peers.py"),
+    ],
+)
+def test_a_contract_with_another_section(section: dict[str, Any], line: str, tmp_path: Path) -> None:
+    contract = read_contract(SHIPPED)
+    (tmp_path / "policy.yaml").write_text(yaml.safe_dump({}))
+    assert contract_rules(contract, tmp_path) == ExamRules.from_mapping({}, {c.name: (c.low, c.high) for c in contract.commands})
+    (tmp_path / "policy.yaml").write_text(yaml.safe_dump({"exam": section}))
+    with pytest.raises(ContractError, match=re.escape(line)):
+        contract_rules(contract, tmp_path)
+
+
 # ---- which exam grades a task
 
 
@@ -111,7 +144,7 @@ def test_a_task_without_an_exam() -> None:
     task = load_task("go1_flat")
     assert find_exam(task) is require_exam(task) is EXAMS["walking"]
     task.env_class = Pose
-    task.exam = ""  # what the loader makes of it
+    task.exam = Pose.exam  # as the loader does
     assert find_exam(task) is None and make_exam(task, None) is None
     line = "--eval: no exam grades task 'go1_flat'; there are: walking. A task that walks by command has the walking exam, another one "
     with pytest.raises(ConfigError, match=re.escape(line + "names its own: TASK = Task(Env, Cfg, CfgPPO, exam=...)")):
@@ -501,7 +534,7 @@ def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_ranges_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They scale the commands; the peer was asked others and is not spoken of. What the exam decides itself is refused."""
     monkeypatch.setattr(exam, "SECONDS", 2.1)
-    monkeypatch.setattr(play, "elsewhere", lambda *_: [])
+    monkeypatch.setattr(grading, "elsewhere", lambda *_: [])
     folder = trained(tmp_path, "--max_iterations", "1")
     start = [*SMALL[:2], "--device", "cpu", "--eval"]
     result = run("play", tmp_path, *start, "--set", "exam.ranges={lin_vel_x: [0, 0.9]}")

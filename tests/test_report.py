@@ -197,6 +197,19 @@ def two_runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path
     return root, first, trained(root, "--max_iterations", "1", "--set", "actor.hidden_dims=[8]", "--run_name", "other")
 
 
+def test_two_policies_are_asked_the_same() -> None:
+    """The second was trained with other ranges: it is asked for the first one's commands, on a grid of its own."""
+    first, second = shipped(), shipped()
+    second.cfg.commands.ranges.lin_vel_x = [0.5, 0.5]
+    for task in (first, second):
+        report.prepare(task)
+    worlds = second.cfg.env.num_envs
+    assert ExamRules.from_config(second.cfg) != GO1
+    report.ask_alike([first, second])
+    assert ExamRules.from_config(first.cfg) == ExamRules.from_config(second.cfg) == GO1
+    assert first.cfg.exam.ranges == {} and second.cfg.env.num_envs == worlds - 1  # no world more for the cost of transport
+
+
 def test_compare_grades_each_by_its_own_config(two_runs: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
     root, first, second = two_runs
     monkeypatch.setattr(exam, "SECONDS", 2.1)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -20,6 +20,7 @@ class Exam(NamedTuple):
     sets: set[str]  # config fields that it decides itself, so that nobody may override them
     prepare: Callable[[LoadedTask], None]  # turn a task into the exam
     make_room: Callable[[LoadedTask], None]  # set the number of worlds once more, after the user's overrides
+    ask_alike: Callable[[Sequence[LoadedTask]], None]  # grade prepared tasks by the rules of the first
     examine: Callable[..., tuple[dict[str, Any], dict[str, Any]]]  # (env, policy, env of the rough part or None) -> result, figures
     table: Callable[[dict[str, Any]], str]  # the result as text
     write: Callable[..., None]  # the report: see report.write
@@ -28,16 +29,25 @@ class Exam(NamedTuple):
 
 
 EXAMS = {
-    "walking": Exam(exam.SETS, report.prepare, report.make_room, report.examine, rules.table, report.write, TrainingExam, rough=crossing),
+    "walking": Exam(
+        exam.SETS,
+        report.prepare,
+        report.make_room,
+        report.ask_alike,
+        report.examine,
+        rules.table,
+        report.write,
+        TrainingExam,
+        rough=crossing,
+    ),
 }
 
 
 def find_exam(task: LoadedTask) -> Exam | None:
     """The exam that grades ``task``; None if it names none. Raises ConfigError for a kind that does not exist."""
-    kind = getattr(task, "exam", task.env_class.exam)
-    if kind and kind not in EXAMS:
-        raise ConfigError(f"{task.path}: {unknown('exam', kind, EXAMS, 'legged_mw/eval/exams.py')}")
-    return EXAMS[kind] if kind else None
+    if task.exam and task.exam not in EXAMS:
+        raise ConfigError(f"{task.path}: {unknown('exam', task.exam, EXAMS, 'legged_mw/eval/exams.py')}")
+    return EXAMS.get(task.exam)
 
 
 def require_exam(task: LoadedTask) -> Exam:

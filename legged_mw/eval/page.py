@@ -63,7 +63,7 @@ def html(task: str, rules: ExamRules, columns: Sequence[Column], drawn: Sequence
 
 
 def _names(columns: Sequence[Column]) -> str:
-    """Who is graded, and whether they pass; the colour is that of their curves."""
+    """The graded policies and whether they pass, each in the colour of its curves."""
     items, drawn = [], [column.name for column in columns if column.figures]
     for column in columns:
         swatch = f'<i class="swatch c{drawn.index(column.name)}"></i>' if column.figures and len(drawn) > 1 else ""

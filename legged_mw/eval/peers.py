@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 class Peer(NamedTuple):
     """A policy's figures and what it was asked."""
 
-    about: str  # who it is, for the report
+    about: str  # what it is, for the report
     asked: dict[str, Any]  # fields of ExamRules that its figures depend on
     figures: dict[str, Any]
 

@@ -51,6 +51,15 @@ def make_room(task: LoadedTask) -> None:
     task.cfg.env.num_envs = len(make_plan(task.cfg, task.cfg.sim.dt * task.cfg.control.decimation).cases)
 
 
+def ask_alike(tasks: Sequence[LoadedTask]) -> None:
+    """Grade prepared tasks by the rules of the first, whatever ranges the others were trained with."""
+    first, *others = (rules.ExamRules.from_config(task.cfg) for task in tasks)
+    for task, own in zip(tasks[1:], others, strict=True):
+        if own != first:
+            task.update({"exam": first.to_mapping()}, where="--compare")
+            make_room(task)
+
+
 def examine(env: LeggedRobot, policy: Policy, rough: LeggedRobot | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
     """The exam's result and the report's figures, from one roll-out of an environment made from a prepared task.
 

@@ -118,7 +118,8 @@ def _export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported
             first = next(iter(str(error).strip().splitlines()), type(error).__name__)
             raise ExportError(f"the network ({type(policy).__name__}) cannot be exported: {first}") from error
         contract = make_contract(env, task, new, noise)
-        save_yaml(new / CONTRACT_FILE, contract.to_dict())
+        asked = {"exam": config["exam"]} if "exam" in config else {}  # for legged_mw.deploy --eval
+        save_yaml(new / CONTRACT_FILE, {**contract.to_dict(), **asked})
         steps = record(env, policy, groups, contract, new)
         observations, actions = (np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions"))
         gap = _compare(run_onnx(new / NETWORK_FILE, observations), np.clip(actions, -clip, clip))
