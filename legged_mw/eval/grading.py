@@ -1,4 +1,4 @@
-"""What ``play.py --eval`` does: the exam and the report of one policy, or of two side by side."""
+"""What ``play.py --eval`` does: the exam that the task names and its report, for one policy or two side by side."""
 
 from __future__ import annotations
 
@@ -10,8 +10,10 @@ from typing import Any, NamedTuple
 
 from legged_mw.envs.domain_rand import active
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import crossing, exam, report, rules
+from legged_mw.eval.exams import require_exam
+from legged_mw.eval.report import Column
 from legged_mw.eval.rollout import Policy
+from legged_mw.eval.rules import ExamRules
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.policies import Source, act, introduce, load_policy
 from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything, shown
@@ -33,26 +35,38 @@ def grade(policies: list[tuple[Source, LoadedTask]], args: argparse.Namespace) -
     """Grade policies, each by the config that it was trained with; print their tables and write a report beside the first."""
     device = pick_device(args.device)
     graded = [prepare(source, trained, args) for source, trained in policies]
-    introduce(graded[0].source, graded[0].task.changes_since(graded[0].trained))
+    first, *others = graded
+    introduce(first.source, first.task.changes_since(first.trained))
+    for other in others:
+        _ask_the_same(first.task, other.task)
     built = [(each, *build(each, args, device)) for each in graded]  # all, before one is graded in vain
     columns = [make_column(*each) for each in built]
-    folder = graded[0].source.results(graded[0].task) / "eval"
-    report.write(folder, graded[0].task.name, columns, elsewhere(graded[0]))
+    folder = first.source.results(first.task) / "eval"
+    require_exam(first.task).write(folder, first.task.name, columns, elsewhere(first))
     print(f"written to {shown(folder / 'report.html')}, with report.json and pictures beside it")
 
 
 def prepare(source: Source, trained: LoadedTask, args: argparse.Namespace) -> Graded:
     """The trained task with what the exam changes, the user's overrides last."""
-    task = copy.deepcopy(trained)
-    report.prepare(task)
-    override(task, args, exam.SETS)
-    report.make_room(task)  # the ranges are known by now
+    task, exam = copy.deepcopy(trained), require_exam(trained)
+    exam.prepare(task)
+    override(task, args, exam.sets)
+    exam.make_room(task)  # the ranges are known by now
     return Graded(source, trained, task, prepare_crossing(trained, args))
 
 
+def _ask_the_same(first: LoadedTask, other: LoadedTask) -> None:
+    """Give ``other`` the commands, pushes and marks of ``first``: policies are compared by one exam."""
+    asked = ExamRules.from_config(first.cfg)
+    if asked != ExamRules.from_config(other.cfg):
+        other.update({"exam": asked.to_mapping()}, where="--compare")
+        require_exam(other).make_room(other)
+
+
 def prepare_crossing(trained: LoadedTask, args: argparse.Namespace) -> LoadedTask | None:
-    """The exam's rough part with the user's overrides; None where training was on a plane."""
-    if trained.to_dict()["terrain"].get("mesh_type", "plane") == "plane":
+    """The exam's rough part with the user's overrides; None where it has none, or training was on a plane."""
+    crossing = require_exam(trained).rough
+    if not crossing or trained.to_dict()["terrain"].get("mesh_type", "plane") == "plane":
         return None
     task = copy.deepcopy(trained)
     crossing.prepare(task)
@@ -80,17 +94,17 @@ def build(graded: Graded, args: argparse.Namespace, device: str) -> tuple[Policy
     return lambda obs: act(policy, obs), env, ground
 
 
-def make_column(graded: Graded, policy: Policy, env: LeggedRobot, rough: LeggedRobot | None) -> report.Column:
+def make_column(graded: Graded, policy: Policy, env: LeggedRobot, rough: LeggedRobot | None) -> Column:
     """The exam and all else of a report, from one roll-out and, if there is a rough part, another; prints their tables."""
-    source = graded.source
-    result, figures = report.examine(env, policy, rough)
+    source, exam = graded.source, require_exam(graded.task)
+    result, figures = exam.examine(env, policy, rough)
     name = "shipped" if source.shipped else f"{source.folder.name}, {source.checkpoint.stem.removeprefix('model_')}"
-    print(f"\n{name}, {env.sim.engine} on {env.device}\n{rules.table(result)}\n")
-    if rough:
-        print(f"{crossing.table(figures['crossing'])}\n")
+    print(f"\n{name}, {env.sim.engine} on {env.device}\n{exam.table(result)}\n")
+    if rough and exam.rough:
+        print(f"{exam.rough.table(figures['crossing'])}\n")
     overrides = {path: now for path, (_, now) in graded.task.changes_since(graded.trained).items()}
     about = {"policy": "/".join(source.checkpoint.parts[-3:]), "engine": env.sim.engine, "device": env.device, "overrides": overrides}
-    return report.Column(name, about, result, figures)
+    return Column(name, about, result, figures)
 
 
 def elsewhere(graded: Graded) -> list[tuple[str, dict[str, Any]]]:
@@ -104,7 +118,7 @@ def elsewhere(graded: Graded) -> list[tuple[str, dict[str, Any]]]:
     with TemporaryDirectory() as folder:
         try:
             export(graded.task.to_dict(), graded.source.checkpoint, Path(folder) / "export")
-            return [("the same, deployed in MuJoCo", run_exam(Path(folder) / "export"))]
+            return [("the same, deployed in MuJoCo", run_exam(Path(folder) / "export", ExamRules.from_config(graded.task.cfg)))]
         except UserError as error:  # a row that nobody can measure, no onnxruntime
             print(f"not graded through an export: {error}")
             return []
