@@ -338,6 +338,17 @@ def test_check(tmp_path: Path) -> None:
     assert "pose 0" not in lines and "pose 0.5" not in lines
 
 
+@pytest.mark.parametrize("more", [["--check"], ["--max_iterations", "1"]])
+def test_a_reward_that_asks_the_host_is_named_before_training(tmp_path: Path, more: list[str]) -> None:
+    """A CPU would run it, a recorded step cannot; --eager records nothing."""
+    source = DOG.replace("return self.dof_vel.abs().sum(dim=1)", "return self.dof_vel[:, 0] * self.dof_vel.max().item()")
+    (tmp_path / "dog.py").write_text(source.replace('"robot/dog.xml"', '"resources/robots/go1/go1.xml"'))
+    line = refused(tmp_path, "train", "--task", str(tmp_path / "dog.py"), *SMALL[2:], *more)
+    assert "dog.py:10, Dog._reward_calm: item() reads a tensor to the host; keep it a tensor and compute with that" in line
+    if more == ["--check"]:
+        assert run("train", tmp_path, "--task", str(tmp_path / "dog.py"), *SMALL[2:], *more, "--eager").code == 0
+
+
 def test_help_lists_every_flag(tmp_path: Path) -> None:
     for program, flags in (
         ("train", ("--resume", "--max_time", "--list", "--check")),

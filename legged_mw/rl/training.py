@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import torch
 
 from legged_mw.envs.checks import check_values
+from legged_mw.envs.guard import check_recordable
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.ppo import GraphedPPO
@@ -118,7 +119,9 @@ def _announce(task: LoadedTask, device: str, rank: Rank) -> None:
 
 
 def build(task: LoadedTask, device: str, eager: bool = False) -> Any:
-    """The environment, if learning can work in it."""
+    """The environment, if its step can be recorded and learning can work in it. With ``eager`` nothing is recorded."""
+    if this_rank().leads and not eager:
+        check_recordable(task)
     env = task.env_class(task.cfg, device, eager=eager)
     check_mirror(env, task.train)
     return env
