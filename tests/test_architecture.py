@@ -18,7 +18,6 @@ FILES = sorted(
 MAX_LINES, MAX_FUNCTION = 400, 40
 # What still breaks a rule. A line goes as soon as its file keeps the rule, and none is added.
 LONG = {
-    "legged_mw/deploy/contract.py": ["406 lines", "read_contract: 49 lines"],
     "legged_mw/envs/robot_task.py": ["502 lines"],
     "legged_mw/eval/rollout.py": ["roll_out: 41 lines"],
     "legged_mw/rl/runner.py": ["learn: 46 lines"],
@@ -45,7 +44,10 @@ ONLY_IN = {
     "legged_mw.view": ["legged_mw/view/*", "legged_mw/deploy/*", "legged_mw/programs.py"],
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/studio.py"],  # young, and not on every platform
     "legged_mw.eval": ["legged_mw/eval/*", "legged_mw/deploy/*", "legged_mw/programs.py"],
-    "legged_mw.deploy": ["legged_mw/deploy/*", "legged_mw/rl/export.py", "legged_mw/eval/*", "legged_mw/programs.py"],
+    "legged_mw.deploy": [
+        *("legged_mw/deploy/*", "legged_mw/rl/export*.py", "legged_mw/eval/*", "legged_mw/programs.py"),
+        "examples/udp_robot.py",
+    ],
     "legged_mw.rl.export": ["legged_mw/rl/export.py", "legged_mw/eval/*", "legged_mw/programs.py"],
     "legged_mw.programs": ["train.py", "play.py"],
     "onnxruntime": ["legged_mw/deploy/*", "legged_mw/rl/export.py"],
@@ -74,7 +76,8 @@ CONFIGS_MAY = ["legged_mw.envs", "legged_mw.utils", "configs", "math", "__future
 # What runs on a robot's computer: neither torch nor warp, nor anything of ours that needs them.
 DEPLOY_MAY = [
     *("numpy", "mujoco", "onnxruntime", "yaml", "legged_mw.ROOT", "legged_mw.deploy", "legged_mw.view", "legged_mw.eval.rules"),
-    *("legged_mw.utils.cli", "legged_mw.utils.config", "legged_mw.utils.errors", "legged_mw.utils.machine", *sys.stdlib_module_names),
+    *("legged_mw.utils.cli", "legged_mw.utils.config", "legged_mw.utils.errors", "legged_mw.utils.machine", "legged_mw.utils.commands"),
+    *sys.stdlib_module_names,
 ]
 
 

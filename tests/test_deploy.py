@@ -21,7 +21,8 @@ import yaml
 
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
-from legged_mw.deploy.contract import Contract, ContractRow, Ends, read_contract
+from legged_mw.deploy.contract import Contract, ContractError, ContractRow, Ends, read_contract
+from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
 from legged_mw.deploy.runner import run
@@ -32,6 +33,7 @@ from legged_mw.eval import exam, rules
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.config import load_yaml
+from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import load_task
 
 SHIPPED = ROOT / "resources/policies/go1_flat"
@@ -146,6 +148,7 @@ WRONG = [
     (put("sensors.ang_vel", ["gyro/imuu"]), "sensors of 'ang_vel': no sensor 'gyro/imuu' in scene.xml; did you mean 'gyro/imu'?"),
     (put("sensors.ang_vel", ["gyro/imu", "up/imu"]), "the sensors of 'ang_vel' (gyro/imu, up/imu) have 6 values, not 3"),
     (without("sensors.joint_vel"), "sensors: 'joint_vel' is missing; name the sensors of scene.xml that measure it"),
+    (put("exam", 3), "policy.yaml: 'exam' is 3; it must be a mapping"),
     (put("observation", {}), "policy.yaml: 'observation' is {}; it must be a list of mappings"),
 ]
 
@@ -210,12 +213,13 @@ def test_numbers_as_people_write_them(export: Path) -> None:
         (("--eval", "--command", "1,0,0"), "leave --command out"),
         (("--eval", "--terrain"), "leave --terrain out"),
         (("--command", "1,0,0", "--commands", "x.yaml"), "--commands brings its own commands: leave --command out"),
-        (("--command", "fast"), "--command fast: write three numbers, vx,vy,yaw"),
-        (("--command", "0,0,nan"), "--command 0,0,nan: write three numbers"),
+        (("--command", "fast"), "--command fast: 'fast' is no number; write --command=0,0,0 (vx [m/s], vy [m/s], yaw rate [rad/s])"),
+        (("--command", "0,0,nan"), "--command 0,0,nan: 'nan' is no number; write --command=0,0,0"),
         (
             ("--command", "0,1,0"),
-            "--command 0,1,0: vy = 1 m/s is outside of what the policy was trained for, -0.8 to 0.8; the ranges are in ",
+            "--command 0,1,0: vy = 1 m/s is outside of what was trained, [-0.8, 0.8] m/s; the ranges are in ",
         ),
+        (("--command", "base_height=0.3"), "--command base_height=0.3: no command 'base_height' in this task"),
         (("--time", "soon"), "'soon' is no duration"),
     ],
 )
@@ -374,6 +378,16 @@ def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Ca
     assert saved["pushes"]["1"] == saved["pushes"]["2"] == 1.0 and saved["pushes"]["6"] < 1.0
     assert list(saved["pushes"]) == ["1", "2", "3", "4", "5", "6"] and "beats the peer: " in out
     assert all(error < 0.12 for error in saved["error"]) and 0.5 < saved["cost_of_transport"] < 1.2
+
+
+def test_the_contract_brings_the_rules_of_the_exam(export: Path) -> None:
+    shipped = contract_rules(read_contract(export))
+    assert shipped.peer == "playground_go1" and shipped.push_vx == 0.8 and shipped.push_speeds == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+    rewrite(export, put("exam", {"push_speeds": [1.5], "push_mark": 1.5}))
+    assert contract_rules(read_contract(export)).push_speeds == (1.5,)
+    rewrite(export, put("exam", {"push_speeds": 3}))
+    with pytest.raises(UserError, match=r"exam"):
+        contract_rules(read_contract(export))
 
 
 def test_a_result_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -551,6 +565,10 @@ def test_a_robot_without_feet_and_a_task_without_commands(export: Path) -> None:
     np.testing.assert_allclose(stage.velocity()[:, :2], 0.0, atol=0.1)  # it stands
     done = run(MujocoRobot(export, contract), Controller(export, contract), lambda _: np.zeros(0), 0.1, live=False)
     assert done.steps == 5 and done.velocity is not None
+    with pytest.raises(
+        ContractError, match="the walking exam needs the commands lin_vel_x, lin_vel_y, ang_vel_yaw; missing: lin_vel_x, lin"
+    ):
+        run_exam(export)
 
 
 def test_targets_that_are_not_finite_close_the_robot(contract: Contract, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import re
 import shutil
@@ -14,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from program import SMALL, files, run, trained
+from rsl_rl.utils import resolve_class
 from worlds import make_env
 
 from legged_mw import ROOT
@@ -26,6 +28,7 @@ from legged_mw.rl import export as exporting
 from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, export
 from legged_mw.rl.export_replay import overridden
 from legged_mw.rl.export_scene import differences, standalone
+from legged_mw.rl.policies import save_policy
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
@@ -333,6 +336,49 @@ def test_a_picture_is_left_out_and_a_height_field_refused(monkeypatch: pytest.Mo
     pose = env.default_dof_pos.tolist()
     with pytest.raises(ModelError, match="height field 'hills' comes from a file; an export must stand alone"):
         standalone(type(robot)(**{**vars(robot), "spec": spec}), imu="imu", qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
+
+
+def untrained(path: Path, folder: Path) -> tuple[dict[str, Any], Path]:
+    """The config of a task and a checkpoint whose small networks have seen no training."""
+    task = load_task(str(path))
+    task.set("env.num_envs", 1)
+    task.set("sim.engine", "mujoco")
+    for part in ("actor", "critic"):
+        task.set(f"{part}.hidden_dims", [16, 16])
+    torch.manual_seed(0)
+    env = task.env_class(task.cfg, "cpu")
+    sections = task.train.to_dict()
+    actor_class, settings = resolve_class(copy.deepcopy(sections["actor"]))
+    actor = actor_class(env.get_observations(), sections["obs_groups"], "actor", env.num_actions, **settings)
+    save_policy(actor, folder / "model.pt", {"task": task.name})
+    return task.to_dict(), folder / "model.pt"
+
+
+@pytest.mark.parametrize(
+    ("name", "commands", "feet", "rows"),
+    [
+        ("go1_stand", 0, {}, {"base_lin_vel", "base_ang_vel", "projected_gravity", "dof_pos", "dof_vel", "last_actions"}),
+        (
+            "toy_biped",
+            3,
+            {"left": ("contact/left_heel", "contact/left_toe"), "right": ("contact/right_heel", "contact/right_toe")},
+            {"base_lin_vel", "base_ang_vel", "projected_gravity", "dof_vel", "last_actions", "commands"},
+        ),
+        ("go1_base_height", 4, {name: (f"contact/{name}",) for name in ("FR", "FL", "RR", "RL")}, None),
+    ],
+)
+def test_other_robots_and_tasks_are_deployed(name: str, commands: int, feet: dict[str, Any], rows: set[str] | None, tmp_path: Path) -> None:
+    """No commands and no feet; feet of two boxes, a scale a joint and no joint angles; a further command."""
+    export(*untrained(ROOT / f"examples/{name}.py", tmp_path), tmp_path / "out")
+    stage = DeployStage(tmp_path / "out", 2)
+    assert len(stage.command_table) == commands and stage.contract.feet == feet
+    assert rows is None or {row.name for row in stage.contract.rows} == rows
+    for _ in range(3):
+        stage.step()
+    assert stage.commands().shape == (2, commands) and stage.contacts().shape == (2, len(feet)) and np.isfinite(stage.qpos()).all()
+    if name == "toy_biped":
+        assert stage.contract.action.scale.tolist() == [0.4, 0.4, 0.25] * 2
+        np.testing.assert_array_equal(stage.contacts(), (stage.measured.foot_contact > 0.0))
 
 
 # ---- an export that would act otherwise is refused

@@ -23,9 +23,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("folder", metavar="DIR", help=f"an export: {made}")
     parser.add_argument("--eval", action="store_true", help=f"the walking exam; prints its table and writes DIR/{RESULT_FILE}")
     parser.add_argument("--out", metavar="FILE", help=f"where --eval writes (default: DIR/{RESULT_FILE})")
-    parser.add_argument(
-        "--command", metavar="VX,VY,YAW", help="fixed command [m/s, m/s, rad/s]; --command=-0.5,0,0 if it starts with a minus"
-    )
+    parser.add_argument("--command", metavar="VALUES", help="fixed command: 0.5,0,0 in the contract's order, or base_height=0.3 by name")
     parser.add_argument("--num_envs", type=positive, default=1, metavar="N", help="robots side by side")
     parser.add_argument("--time", type=duration, metavar="T", help="how long (default: until closed; 10s of a recording)")
     parser.add_argument("--terrain", action="store_true", help=f"among the steps and blocks of {TERRAIN_FILE}, if the export has it")

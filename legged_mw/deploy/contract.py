@@ -133,6 +133,7 @@ class Contract:
     output: str  # (batch, D)
     digest: str  # SHA-256 of the network's file
     scan: HeightScan | None = None  # where a row asks for one
+    exam: Mapping[str, Any] | None = None  # the task's section `exam`, if the walking exam grades it
 
     @property
     def size(self) -> int:
@@ -163,6 +164,7 @@ class Contract:
             "physics": {"file": SCENE_FILE, "timestep": self.timestep, "decimation": self.decimation},
             "sensors": {name: list(names) for name, names in self.sensors.items()},
             **({SCAN: {"x": list(self.scan.x), "y": list(self.scan.y), "standing": self.scan.standing}} if self.scan else {}),
+            **({"exam": dict(self.exam)} if self.exam is not None else {}),
         }
 
 
@@ -250,7 +252,17 @@ def read_contract(folder: Path) -> Contract:
     for file in (path, folder / NETWORK_FILE, folder / SCENE_FILE):
         if not file.is_file():
             raise ContractError(f"no {file.name} in {folder}; make an export with: python play.py --task <task> --export {folder}")
-    top = _Reader(load_yaml(path), CONTRACT_FILE)
+    contract = _read(_Reader(load_yaml(path), CONTRACT_FILE))
+    _check_rows(contract)
+    if digest(folder / NETWORK_FILE) != contract.digest:
+        raise ContractError(
+            f"{NETWORK_FILE} is not the file that {CONTRACT_FILE} was written for (its SHA-256 differs): "
+            "it is damaged, or of another export; export the policy again"
+        )
+    return contract
+
+
+def _read(top: _Reader) -> Contract:
     top.take("format", f"{FORMAT}, the one that this version reads; export the policy again", lambda v: v == FORMAT)
     network, action, robot, physics, measured = (top.section(name) for name in ("network", "action", "robot", "physics", "sensors"))
     joints, feet = top.texts("joints"), robot.section("feet")
@@ -258,7 +270,7 @@ def read_contract(folder: Path) -> Contract:
     count, timestep, decimation = len(joints), physics.above_zero("timestep"), physics.count("decimation")
     step = timestep * decimation
     top.take("period", f"physics: timestep * decimation = {step:g}", lambda v: _is_number(v) and math.isclose(v, step, rel_tol=1e-6))
-    contract = Contract(
+    return Contract(
         task=top.text("task"),
         joints=joints,
         default_pose=top.numbers("default_pose", count, "joint"),
@@ -279,14 +291,8 @@ def read_contract(folder: Path) -> Contract:
         output=network.text("output"),
         digest=network.text("sha256"),
         scan=_read_scan(top),
+        exam=top.section("exam").values if "exam" in top.values else None,
     )
-    _check_rows(contract)
-    if digest(folder / NETWORK_FILE) != contract.digest:
-        raise ContractError(
-            f"{NETWORK_FILE} is not the file that {CONTRACT_FILE} was written for (its SHA-256 differs): "
-            "it is damaged, or of another export; export the policy again"
-        )
-    return contract
 
 
 def _read_action(action: _Reader, joints: int) -> Action:

@@ -45,7 +45,6 @@ class DeployStage:
         self.controller = Controller(folder, self.contract, num_worlds)
         self.model, self.num_worlds, self.dt = self.fleet.model, num_worlds, self.contract.period
         self.command_table = self.contract.commands
-        self.limits: Floats = np.array([[c.low for c in self.command_table], [c.high for c in self.command_table]])
         own = idle_command(self.contract) if command is None else np.array(command, dtype=float)
         self._own = np.tile(own, (num_worlds, 1))
         self._commands = self._own.copy()

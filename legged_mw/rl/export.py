@@ -266,6 +266,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         input=INPUT,
         output=OUTPUT,
         digest=digest(folder / NETWORK_FILE),
+        exam=cfg.to_dict().get("exam") if getattr(task, "exam", env.exam) == "walking" else None,
     )
 
 
