@@ -243,6 +243,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         falls_on=tuple(robot.contact_geoms[i] for i in env.contacts.terminating.tolist()),
     )
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))
+    ground, scanned = cfg.terrain, any(row.measured == SCAN for row in rows)
     feet = {foot: tuple(f"contact/{geom}" for geom in geoms) for foot, geoms in getattr(env, "foot_geoms", {}).items()}
     return Contract(
         task=task.name,
@@ -256,7 +257,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         decimation=cfg.control.decimation,
         commands=env.command_table,
         rows=rows,
-        scan=_scan(task) if any(row.measured == SCAN for row in rows) else None,
+        scan=HeightScan(tuple(ground.measured_points_x), tuple(ground.measured_points_y), cfg.init_state.pos[2]) if scanned else None,
         sensors={name: tuple(names) for name, names in scene.sensors.items()}
         | ({FALL: tuple(f"contact/{name}" for name in ends.falls_on)} if ends.falls_on else {}),
         feet=feet,
@@ -268,11 +269,6 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         digest=digest(folder / NETWORK_FILE),
         exam=cfg.to_dict().get("exam") if getattr(task, "exam", env.exam) == "walking" else None,
     )
-
-
-def _scan(task: LoadedTask) -> HeightScan:
-    ground = task.cfg.terrain
-    return HeightScan(tuple(ground.measured_points_x), tuple(ground.measured_points_y), task.cfg.init_state.pos[2])
 
 
 def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]:
