@@ -236,12 +236,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
     start = [*cfg.init_state.pos, 1.0, 0.0, 0.0, 0.0, *pose]
     scene = standalone(robot, cfg.asset.imu_site, qpos=start, ctrl=pose, camera=cfg.viewer.camera)
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
-    end = cfg.termination
-    ends = Ends(
-        max_tilt=end.max_tilt if end.max_tilt < 180.0 else None,
-        min_base_height=end.min_base_height or None,
-        falls_on=tuple(robot.contact_geoms[i] for i in env.contacts.terminating.tolist()),
-    )
+    ends = _ends(env)
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))
     ground, scanned = cfg.terrain, any(row.measured == SCAN for row in rows)
     feet = {foot: tuple(f"contact/{geom}" for geom in geoms) for foot, geoms in getattr(env, "foot_geoms", {}).items()}
@@ -269,6 +264,12 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         digest=digest(folder / NETWORK_FILE),
         exam=cfg.to_dict().get("exam") if getattr(task, "exam", env.exam) == "walking" else None,
     )
+
+
+def _ends(env: RobotTask) -> Ends:
+    """The task's rule for a fall."""
+    rule, geoms = env.cfg.termination, [env.robot.contact_geoms[i] for i in env.contacts.terminating.tolist()]
+    return Ends(rule.max_tilt if rule.max_tilt < 180.0 else None, rule.min_base_height or None, tuple(geoms))
 
 
 def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]:
