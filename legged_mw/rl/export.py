@@ -118,8 +118,7 @@ def _export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported
             first = next(iter(str(error).strip().splitlines()), type(error).__name__)
             raise ExportError(f"the network ({type(policy).__name__}) cannot be exported: {first}") from error
         contract = make_contract(env, task, new, noise)
-        asked = {"exam": config["exam"]} if "exam" in config else {}  # for legged_mw.deploy --eval
-        save_yaml(new / CONTRACT_FILE, {**contract.to_dict(), **asked})
+        save_yaml(new / CONTRACT_FILE, contract.to_dict())
         steps = record(env, policy, groups, contract, new)
         observations, actions = (np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions"))
         gap = _compare(run_onnx(new / NETWORK_FILE, observations), np.clip(actions, -clip, clip))
@@ -262,7 +261,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         input=INPUT,
         output=OUTPUT,
         digest=digest(folder / NETWORK_FILE),
-        exam=cfg.to_dict().get("exam") if getattr(task, "exam", env.exam) == "walking" else None,
+        exam=cfg.to_dict().get("exam") if task.exam == "walking" else None,
     )
 
 
