@@ -399,7 +399,8 @@ def test_auto_takes_the_best_there_is_and_says_why(
         (["--port", "70000"], "--port 70000: a port is a number from 1 to 65535"),
         (
             ["--command", "2,0,0"],
-            "--command 2,0,0: vx = 2 m/s is outside of what was trained, [-1, 1.5] m/s; to see what it does there, widen",
+            "--command 2,0,0: vx = 2 m/s is outside of what was trained, [-1, 1.5] m/s; to see what it does there, widen the range: "
+            "--set commands.ranges.lin_vel_x=[-1,2]",
         ),
         (["--command", "1,fast"], "--command 1,fast: 'fast' is no number; write --command=0,0,0 (vx [m/s], vy [m/s], yaw rate [rad/s])"),
         (["--command", "1,0,0,0"], "--command 1,0,0,0: 4 numbers, but this task has 3 commands"),
@@ -410,6 +411,12 @@ def test_flags_that_cannot_be(args: list[str], part: str) -> None:
         launch.check_flags(flags(*args))
         launch.check_drive(flags(*args), THREE)
     assert part in str(error.value)
+
+
+def test_the_range_to_widen_is_that_of_the_command_outside_of_it() -> None:
+    table = (*THREE, Command("base_height", 0.18, 0.3, "m"))
+    with pytest.raises(UserError, match=r"base height = 0.1 m is outside .*: --set commands.ranges.base_height=\[0.1,0.3\]$"):
+        launch.check_drive(flags("--command", "base_height=0.1"), table)
 
 
 def test_watching_without_a_viewer_ends_by_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,7 +20,6 @@ from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import NotRecordable
 from legged_mw.utils.recordable import recordable
-from legged_mw.utils.task import task_names
 
 HOME = [0.1, 0.9, -1.8, -0.1, 0.9, -1.8, 0.1, 0.9, -1.8, -0.1, 0.9, -1.8]  # [rad] FR, FL, RR, RL; hip, thigh, calf
 FEET = ("FR", "FL", "RR", "RL")
@@ -53,23 +52,6 @@ def run_a_while(env: LeggedRobot, steps: int = 20, seed: int = 1) -> None:
 
 
 # ---- the recorded step
-
-
-@pytest.mark.parametrize(
-    "overrides",
-    [{}, {**KICKS, **QUIET, "rewards.only_positive_rewards": False}],
-    ids=["as configured", "kicks, no noise, no resampling, no clip"],
-)
-@pytest.mark.parametrize("task", task_names())
-def test_whole_step_asks_the_host_nothing(task: str, overrides: dict[str, Any]) -> None:
-    env = make_env(4, {**overrides, "sim.engine": "mujoco_warp"}, task=task)
-    env.sim.qpos[1] = math.nan
-    env.episode_length_buf = torch.tensor([0, 0, env.max_episode_length, 0])
-    for _ in range(2):
-        env.actions.copy_(act(env))
-        with recordable():
-            env._step()
-        assert env.reset_buf.tolist() == [False, True, True, False] or not env.reset_buf.any()
 
 
 class _Reads(LeggedRobot):
@@ -108,35 +90,6 @@ def test_guard_reaches_every_part_of_the_step(env_class: type[LeggedRobot], mess
     env = make_env(2, {"sim.engine": "mujoco_warp"}, env_class=env_class)
     with pytest.raises(NotRecordable, match=f"^{message}"), recordable():
         env._step()
-
-
-@pytest.mark.parametrize("task", task_names())
-def test_buffers_are_never_rebound(task: str) -> None:
-    """A CUDA graph keeps addresses: each tensor is the same object at the same address after steps with resets of all kinds."""
-    env = make_env(4, KICKS, task=task)
-    before = tensors(env)
-    assert {
-        "env.actions",
-        "env.rew_buf",
-        "env.obs_buf.state",
-        "env.observations._parts.state._noise",
-        "env._episode",
-        "sim.qpos",
-    } <= before.keys()
-    addresses = {name: (tensor.data_ptr(), tensor.shape, tensor.stride()) for name, tensor in before.items()}
-    resets = 0
-    for t in range(5):
-        if t == 2:
-            env.sim.qvel[1] = math.nan
-            env.episode_length_buf = torch.tensor([env.max_episode_length, 5, 7, 9])
-        resets += int(env.step(act(env))[2].sum())
-    env.reset()
-    env.read_statistics()
-    assert resets == 2
-    after = tensors(env)
-    assert after.keys() == before.keys()
-    assert [name for name in before if after[name] is not before[name]] == []
-    assert [name for name in before if addresses[name] != (after[name].data_ptr(), after[name].shape, after[name].stride())] == []
 
 
 # ---- the border: buffers in, copies out
@@ -487,23 +440,6 @@ def test_reset_touches_the_masked_worlds_only(lively: LeggedRobot) -> None:
     nothing = snapshot(env)
     env.reset_envs(torch.zeros(N, dtype=torch.bool))
     assert set(changed(env, nothing)) <= {"sim._reset_mask"}
-
-
-def test_neighbours_of_a_reset_world_live_on_as_without_it() -> None:
-    """What no tensor shows (warm start, contacts): the other worlds' next steps are the same with and without a reset."""
-    alone, beside = make_env(N, QUIET), make_env(N, QUIET)
-    mask = torch.arange(N) % 3 == 0
-    for env in (alone, beside):
-        run_a_while(env)
-        if env is beside:
-            env.reset_envs(mask)
-        torch.manual_seed(4)
-        for _ in range(5):
-            env.step(act(env))
-    for name in ("qpos", "qvel", "sensordata", "actuator_force"):
-        a, b = getattr(alone.sim, name), getattr(beside.sim, name)
-        assert same(a[~mask], b[~mask]), name
-        assert not same(a[mask], b[mask]), name
 
 
 def test_reset_forgets_everything(lively: LeggedRobot) -> None:

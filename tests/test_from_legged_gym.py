@@ -272,23 +272,6 @@ def test_joints_are_scattered_at_reset_and_the_exam_starts_without() -> None:
 # ---- the step, and the programs
 
 
-def test_step_asks_the_host_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All but physics, which is the same for every task: the engine of this test is one that asks."""
-    env = make_env(4, task=TASK)
-    env.cfg.perturbation.kick = True
-    monkeypatch.setattr(env.sim, "step", lambda substeps: None)
-    monkeypatch.setattr(env.sim, "reset", lambda mask: None)
-    env.episode_length_buf = torch.tensor([0, 750, env.max_episode_length, 3])
-    touch(env, 3, "trunk_box")
-    addresses = {name: tensor.data_ptr() for name, tensor in vars(env).items() if isinstance(tensor, Tensor)}
-    for _ in range(2):
-        env.actions.normal_()
-        with recordable():
-            env._step()
-        assert env.reset_buf.tolist()[:3] == [False, False, True] or not env.reset_buf[:3].any()
-    assert {name: tensor.data_ptr() for name, tensor in vars(env).items() if isinstance(tensor, Tensor)} == addresses
-
-
 def test_trains_and_is_graded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exam, "SECONDS", 2.1)
     small = ["--set", "actor.hidden_dims=[16]", "--set", "critic.hidden_dims=[16]", "--set", "runner.num_steps_per_env=8"]

@@ -224,20 +224,6 @@ def test_one_observation_by_hand(env: LeggedRobot) -> None:
     assert actions.tolist() == [plain, mirrored]
 
 
-def test_mirroring_twice_is_the_identity(env: LeggedRobot) -> None:
-    obs = TensorDict({group: torch.randn(5, value.shape[1]) for group, value in env.obs_buf.items()}, batch_size=[5])
-    actions = torch.randn(5, 12)
-    once = mirror(env, obs, actions)
-    assert once[0] is not None and once[1] is not None
-    image = once[0][5:], once[1][5:]
-    twice = mirror(env, *image)
-    assert twice[0] is not None and twice[1] is not None
-    for group in obs.keys():  # noqa: SIM118  (a TensorDict iterates over its batch)
-        assert torch.equal(once[0][group][:5], obs[group]) and torch.allclose(twice[0][group][5:], obs[group], atol=1e-6)
-        assert not torch.equal(image[0][group], obs[group])
-    assert torch.equal(once[1][:5], actions) and torch.equal(twice[1][5:], actions)
-
-
 def test_what_is_not_given_is_not_made(env: LeggedRobot) -> None:
     obs = env.get_observations()
     assert mirror(env, None, None) == (None, None)

@@ -23,7 +23,6 @@ from legged_mw.view.video import check_format, no_encoder
 VIEWERS = ("auto", "native", "web", "video", "none")
 ROBOTS_SHOWN = 64  # at most: a picture of more takes longer than a control step
 SECONDS = 10.0  # ours: how long to record, or to run without a viewer
-WIDEN = "to see what it does there, widen the range: --set commands.ranges.lin_vel_x=[-3,3]"
 
 
 class FlagError(UserError, ValueError):
@@ -66,10 +65,10 @@ def check_flags(args: argparse.Namespace) -> None:
         raise FlagError(f"--port {args.port}: a port is a number from 1 to 65535")
 
 
-def check_drive(args: argparse.Namespace, table: Sequence[Command], advice: str = WIDEN) -> list[float] | None:
+def check_drive(args: argparse.Namespace, table: Sequence[Command], advice: str = "") -> list[float] | None:
     """Check `--commands` and `--command` against the commands as trained; the latter as values (C,), None if not given.
 
-    Raises ConfigError or FlagError.
+    `advice` is for a value outside of its range (empty: widen the range). Raises ConfigError or FlagError.
     """
     if args.commands:
         load_script(args.commands, table)
@@ -79,8 +78,15 @@ def check_drive(args: argparse.Namespace, table: Sequence[Command], advice: str 
         raise FlagError(f"--command {args.command}: {NO_COMMANDS}")
     values = parse_command(args.command, [each._replace(low=-math.inf, high=math.inf) for each in table])
     if wrong := outside(values, table):
-        raise FlagError(f"--command {args.command}: {wrong}; {advice}")
+        raise FlagError(f"--command {args.command}: {wrong}; {advice or _widen(values, table)}")
     return values
+
+
+def _widen(values: Sequence[float], table: Sequence[Command]) -> str:
+    """How to see what a policy does outside of the ranges that it was trained in."""
+    value, command = next(pair for pair in zip(values, table, strict=True) if outside(pair[:1], pair[1:]))
+    low, high = min(command.low, value), max(command.high, value)
+    return f"to see what it does there, widen the range: --set commands.ranges.{command.name}=[{low:g},{high:g}]"
 
 
 def asked(args: argparse.Namespace) -> list[str]:
