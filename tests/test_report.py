@@ -16,8 +16,8 @@ from tensordict import TensorDict
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exam, exams, grading, page, report
+from legged_mw.eval.page import Column
 from legged_mw.eval.peers import PEERS
-from legged_mw.eval.report import Column
 from legged_mw.eval.rollout import Case, Push, roll_out
 from legged_mw.eval.rules import ExamRules
 from legged_mw.eval.trials import make_plan

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 from legged_mw.envs.domain_rand import active
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval.exams import Exam, require_exam
-from legged_mw.eval.report import Column
+from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
 from legged_mw.eval.rules import ExamRules
 from legged_mw.rl.classes import check_classes

@@ -7,14 +7,13 @@ from html import escape
 from itertools import zip_longest
 from pathlib import Path
 from statistics import fmean
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from legged_mw.eval.crossing import LEVELS
 from legged_mw.eval.rules import AXES, PUSH_DIRECTIONS, ExamRules, Figure
 
 if TYPE_CHECKING:
     from legged_mw.eval.plots import Section
-    from legged_mw.eval.report import Column
 
 CSS = Path(__file__).with_name("report.css").read_text(encoding="utf-8")
 TEXTS = {
@@ -41,6 +40,15 @@ EXAM_NOTE = (
     "22 commands of 10 s and {pushes} pushes, all from rest on flat ground, without noise. A policy walks if it passes every row that "
     "has a mark.{peer}"
 )
+
+
+class Column(NamedTuple):
+    """One policy in one physics."""
+
+    name: str
+    about: dict[str, Any]  # policy, engine, device, overrides
+    exam: dict[str, Any]  # what ``ExamRules.grade`` gives
+    figures: dict[str, Any] | None = None  # None: only the exam is known
 
 
 def html(task: str, rules: ExamRules, columns: Sequence[Column], drawn: Sequence[tuple[Section, list[str]]]) -> str:

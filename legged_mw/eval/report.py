@@ -5,14 +5,15 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import crossing, exam, figures, rules
+from legged_mw.eval import crossing, exam, figures, page, rules
+from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy, Record, Signal, roll_out
 from legged_mw.eval.trials import NAMES, STEPS_AT, Plan, make_plan
 from legged_mw.sim.model import per_joint
@@ -29,15 +30,6 @@ SIGNALS: dict[str, Signal] = {
     "torque": lambda env: env.torques,  # [N m], one simulation step old
     "reward": lambda env: env.episode_sums,  # (N, K), scale * term * dt since the start
 }
-
-
-class Column(NamedTuple):
-    """One policy in one physics."""
-
-    name: str
-    about: dict[str, Any]  # policy, engine, device, overrides
-    exam: dict[str, Any]  # what ``ExamRules.grade`` gives
-    figures: dict[str, Any] | None = None  # None: only the exam is known
 
 
 def prepare(task: LoadedTask) -> None:
@@ -117,7 +109,7 @@ def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[t
     The other columns are compared with the first, by its rules; at most two have figures. ``extras`` are further results of
     the exam by name, such as the first policy's in another physics: the exam's table shows their gap to the first.
     """
-    from legged_mw.eval import page, plots  # matplotlib takes a second to import
+    from legged_mw.eval import plots  # matplotlib takes a second to import
 
     columns = [columns[0], *(Column(name, {}, result) for name, result in extras), *columns[1:]]
     folder.mkdir(parents=True, exist_ok=True)
