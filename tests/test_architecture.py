@@ -21,15 +21,8 @@ LONG = {
     "legged_mw/envs/robot_task.py": ["502 lines"],
     "legged_mw/eval/rollout.py": ["roll_out: 41 lines"],
     "legged_mw/rl/runner.py": ["learn: 46 lines"],
-    "train.py": ["train: 44 lines"],
 }
-WRONG_WAY = {
-    "legged_mw/utils/task.py": [
-        "legged_mw.envs.legged_robot.LeggedRobot",
-        "legged_mw.envs.legged_robot_config.LeggedRobotCfg",
-        "legged_mw.envs.legged_robot_config.LeggedRobotCfgPPO",
-    ],
-}
+WRONG_WAY: dict[str, list[str]] = {}
 CIRCLES = [("legged_mw.eval.page", "legged_mw.eval.report")]
 
 # Imports run one way: train, play -> rl -> envs -> sim -> utils; configs -> envs, utils.
