@@ -274,16 +274,23 @@ def test_durations() -> None:
     assert [duration(text) for text in ("90", "90s", "5m", "1.5h", "0.5s")] == [90, 90, 300, 5400, 0.5]
 
 
-@pytest.mark.parametrize("text", ["", "fast", "1", "1,2", "1,2,3,4", "1;2;3", "0.5,,0", "nan,0,0", "0,inf,0"])
+@pytest.mark.parametrize("text", ["", "fast", "1;2;3", "0.5,,0", "nan,0,0", "0,inf,0", "1,x"])
 def test_no_command(root: Path, text: str) -> None:
     line = refused(root, "play", *TASK, f"--command={text}")
-    assert f"--command {text}: write three numbers, vx,vy,yaw [m/s, m/s, rad/s], e.g. 0.8,0,0" in line
+    assert f"--command {text}: '" in line and "' is no number; write --command=0,0,0 (vx [m/s], vy [m/s], yaw rate [rad/s])" in line
+
+
+def test_a_command_too_many_or_of_no_such_name(root: Path) -> None:
+    line = refused(root, "play", *TASK, "--command=1,0,0,0")
+    assert "--command 1,0,0,0: 4 numbers, but this task has 3 commands: vx [m/s], vy [m/s], yaw rate [rad/s]" in line
+    line = refused(root, "play", *TASK, "--command=ang_vel_jaw=1")
+    assert "--command ang_vel_jaw=1: no command 'ang_vel_jaw' in this task; did you mean 'ang_vel_yaw'?" in line
 
 
 @pytest.mark.parametrize(
     ("args", "part"),
     [
-        (["--command=9,0,0"], "vx = 9 m/s is outside of what the policy was trained for, -1.5 to 1.5"),
+        (["--command=9,0,0"], "--command 9,0,0: vx = 9 m/s is outside of what was trained, [-1.5, 1.5] m/s"),
         (["--commands", "none.yaml"], "none.yaml: cannot read this config file: No such file"),
         (["--commands", "a.yaml", "--command=0,0,0"], "it goes with neither --command nor --eval nor --export"),
         (["--viewer", "wbe"], "argument --viewer: invalid choice: 'wbe'"),

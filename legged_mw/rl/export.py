@@ -118,8 +118,7 @@ def _export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported
             first = next(iter(str(error).strip().splitlines()), type(error).__name__)
             raise ExportError(f"the network ({type(policy).__name__}) cannot be exported: {first}") from error
         contract = make_contract(env, task, new, noise)
-        asked = {"exam": config["exam"]} if "exam" in config else {}  # for legged_mw.deploy --eval
-        save_yaml(new / CONTRACT_FILE, {**contract.to_dict(), **asked})
+        save_yaml(new / CONTRACT_FILE, contract.to_dict())
         steps = record(env, policy, groups, contract, new)
         observations, actions = (np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions"))
         gap = _compare(run_onnx(new / NETWORK_FILE, observations), np.clip(actions, -clip, clip))
@@ -236,13 +235,9 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
     start = [*cfg.init_state.pos, 1.0, 0.0, 0.0, 0.0, *pose]
     scene = standalone(robot, cfg.asset.imu_site, qpos=start, ctrl=pose, camera=cfg.viewer.camera)
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
-    end = cfg.termination
-    ends = Ends(
-        max_tilt=end.max_tilt if end.max_tilt < 180.0 else None,
-        min_base_height=end.min_base_height or None,
-        falls_on=tuple(robot.contact_geoms[i] for i in env.contacts.terminating.tolist()),
-    )
+    ends = _ends(env)
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))
+    ground, scanned = cfg.terrain, any(row.measured == SCAN for row in rows)
     feet = {foot: tuple(f"contact/{geom}" for geom in geoms) for foot, geoms in getattr(env, "foot_geoms", {}).items()}
     return Contract(
         task=task.name,
@@ -256,7 +251,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         decimation=cfg.control.decimation,
         commands=env.command_table,
         rows=rows,
-        scan=_scan(task) if any(row.measured == SCAN for row in rows) else None,
+        scan=HeightScan(tuple(ground.measured_points_x), tuple(ground.measured_points_y), cfg.init_state.pos[2]) if scanned else None,
         sensors={name: tuple(names) for name, names in scene.sensors.items()}
         | ({FALL: tuple(f"contact/{name}" for name in ends.falls_on)} if ends.falls_on else {}),
         feet=feet,
@@ -266,13 +261,14 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         input=INPUT,
         output=OUTPUT,
         digest=digest(folder / NETWORK_FILE),
-        exam=cfg.to_dict().get("exam") if getattr(task, "exam", env.exam) == "walking" else None,
+        exam=cfg.to_dict().get("exam") if task.exam == "walking" else None,
     )
 
 
-def _scan(task: LoadedTask) -> HeightScan:
-    ground = task.cfg.terrain
-    return HeightScan(tuple(ground.measured_points_x), tuple(ground.measured_points_y), task.cfg.init_state.pos[2])
+def _ends(env: RobotTask) -> Ends:
+    """The task's rule for a fall."""
+    rule, geoms = env.cfg.termination, [env.robot.contact_geoms[i] for i in env.contacts.terminating.tolist()]
+    return Ends(rule.max_tilt if rule.max_tilt < 180.0 else None, rule.min_base_height or None, tuple(geoms))
 
 
 def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple, NoReturn
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -80,7 +80,8 @@ def _measure(env: RobotTask, fleet: Fleet) -> Measurement:
         return torch.cat(parts, dim=1).numpy().copy()
 
     own = {row.name: sensed(row.sensors) for row in contract.rows if row.sensors}
-    unknown = {row.name: value for row in contract.rows if not row.measured for value in [_value(env, row.name)]}
+    values = {row.name: row.value for rows in env.observations.groups.values() for row in rows}
+    unknown = {row.name: values[row.name].float().numpy().copy() for row in contract.rows if not row.measured}
     contact = [(sensed(names) > 0.0).any(axis=1) for names in contract.feet.values()]
     offset = env.actuators.encoder_offset
     return replace(
@@ -91,11 +92,6 @@ def _measure(env: RobotTask, fleet: Fleet) -> Measurement:
         foot_contact=np.stack(contact, axis=1).astype(float) if contact else now.foot_contact,
         others={**now.others, **own, **unknown},
     )
-
-
-def _value(env: RobotTask, name: str) -> np.ndarray:
-    """The value (N, size) of an observation row that cannot be measured, so that the others can be compared."""
-    return next(row.value for rows in env.observations.groups.values() for row in rows if row.name == name).float().numpy().copy()
 
 
 def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) -> None:
@@ -114,19 +110,16 @@ def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) 
 
 
 def _compare(env: RobotTask, step: int, what: str, names: Sequence[Any], theirs: np.ndarray, ours: np.ndarray) -> None:
-    wrong = ~(np.abs(ours - theirs) <= TOLERANCE * np.maximum(1.0, np.abs(theirs)))  # NaN too
-    if wrong.any():
-        world, column = np.argwhere(wrong)[0]
-        _refuse(env, step, f"{what} {names[column]}", float(theirs[world, column]), float(ours[world, column]))
-
-
-def _refuse(env: RobotTask, step: int, what: str, theirs: float, ours: float) -> NoReturn:
-    methods = overridden(type(env))
-    why = f"{type(env).__name__} overrides {', '.join(methods)}" if methods else f"{type(env).__name__} overrides no method"
+    """Refuse the first value (world, column) that differs."""
+    wrong = np.argwhere(~(np.abs(ours - theirs) <= TOLERANCE * np.maximum(1.0, np.abs(theirs))))  # NaN too
+    if not len(wrong):
+        return
+    world, column = wrong[0]
     raise ExportError(
-        f"legged_mw.deploy would act otherwise than the environment: {what} is {theirs:.6g} in the environment and {ours:.6g} by "
-        f"{CONTRACT_FILE}, at step {step}. {why}. State it where the contract can take it from: an action's scale and origin in section "
-        f"control, a row's scale in its Row, a value of your own as a row of another name with sensors=; nothing was written"
+        f"legged_mw.deploy would act otherwise than the environment: {what} {names[column]} is {theirs[world, column]:.6g} in the "
+        f"environment and {ours[world, column]:.6g} by {CONTRACT_FILE}, at step {step}. {type(env).__name__} overrides "
+        f"{', '.join(overridden(type(env))) or 'no method'}. State it where the contract can take it from: an action's scale and origin "
+        f"in section control, a row's scale in its Row, a value of your own as a row of another name with sensors=; nothing was written"
     )
 
 
