@@ -32,7 +32,7 @@ def test_tasks_as_they_ship_pass(name: str) -> None:
         ("terrain.measured_points_y", [float("nan")], "at least one number, all finite"),
         ("commands.ranges.lin_vel_x", [1.0, -1.0], "two numbers, the lower first"),
         ("commands.ranges.lin_vel_y", [0.5], "two numbers, the lower first"),
-        ("commands.keep_probability", [0.9, 0.25], "three numbers from 0 to 1"),
+        ("commands.keep_probability", [0.9, 0.25], "numbers from 0 to 1, one a command"),
         ("perturbation.duration", [0.0, 0.2], "two numbers above zero, the lower first"),
         ("asset.foot_names", [], "a list with at least one name"),
         ("termination.max_tilt", 0.0, "above 0 and at most 180 degrees"),

@@ -182,7 +182,7 @@ def test_config_that_does_not_fit_the_robot_or_the_learner(root: Path, item: str
 def test_unknown_run_and_checkpoint(root: Path, first: Path, program: str) -> None:
     more = ["--resume"] if program == "train" else []
     line = refused(root, program, *TASK, *more, "--load_run", first.name.replace("first", "frist"))
-    assert f"did you mean '{first.name}'? there are: {first.name}" in line and "no run '" in line
+    assert f"did you mean '{first.name}'? there are: {first.name}" in line and "no run with a checkpoint '" in line
     line = refused(root, program, *TASK, *more, "--checkpoint", "7")
     assert f"no checkpoint 7 in {first}; there are: 1" in line
     line = refused(root, program, *TASK, *more, "--experiment_name", "elsewhere", "--load_run", "-1")

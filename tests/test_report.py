@@ -256,7 +256,7 @@ def test_compare_mistakes(two_runs: tuple[Path, Path, Path]) -> None:
     root, *_ = two_runs
     start = [*SMALL[:2], "--device", "cpu"]
     assert "add --eval" in refused(root, "play", *start, "--compare", "shipped")
-    assert "no run 'nobody' in " in refused(root, "play", *start, "--eval", "--compare", "nobody")
+    assert "no run with a checkpoint 'nobody' in " in refused(root, "play", *start, "--eval", "--compare", "nobody")
     assert "--compare shipped: no policy ships with go1_flat" in refused(root, "play", *start, "--eval", "--compare", "shipped")
 
 

@@ -26,7 +26,7 @@ FACTORS: Rule = (
 STEPS: Rule = ("two whole numbers from zero, the lower first, or an empty list", lambda v: not v or (len(v) == 2 and 0 <= v[0] <= v[1]))
 NAMES: Rule = ("a list with at least one name", lambda v: len(v) > 0)
 POINTS: Rule = ("at least one number, all finite", lambda v: len(v) > 0 and all(map(math.isfinite, v)))
-PROBABILITIES: Rule = ("numbers from 0 to 1, one a command", lambda v: len(v) > 0 and all(0 <= p <= 1 for p in v))
+PROBABILITIES: Rule = ("numbers from 0 to 1, one a command", lambda v: len(v) >= 3 and all(0 <= p <= 1 for p in v))
 
 ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys(("env.num_envs", "env.episode_length_s", "control.decimation", "normalization.clip_actions"), POSITIVE),

@@ -61,7 +61,7 @@ def find_run(experiment: Path, name: str) -> Path:
     for folder in (experiment / name, Path(name).expanduser()):
         if folder.is_dir() and checkpoints(folder):
             return folder
-    raise ConfigError(unknown("run", name, [folder.name for folder in found], str(experiment)))
+    raise ConfigError(unknown("run with a checkpoint", name, [folder.name for folder in found], str(experiment)))
 
 
 def find_checkpoint(run: Path, iteration: int) -> Path:

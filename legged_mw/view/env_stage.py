@@ -31,7 +31,7 @@ class EnvStage:
         self.model, self.num_worlds, self.dt = visual_model(env.robot, env.cfg.viewer.camera), env.num_envs, env.dt
         self.command_table = env.command_table if command_table is None else tuple(command_table)
         # a task with a table has a buffer for it, (N, C)
-        self._commands: Tensor = env.commands if env.command_table else env.actions[:, :0]  # pyright: ignore[reportAttributeAccessIssue]
+        self._commands: Tensor = env.commands if env.command_table else env.actions[:, :0]
         self._command_columns = _command_columns(env)
         geoms = sum(map(len, env.foot_geoms.values())) if isinstance(env, LeggedRobot) else 0
         self._foot_contacts = env.contact_count[:, :geoms]
