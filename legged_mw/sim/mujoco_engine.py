@@ -18,6 +18,7 @@ from mujoco.batch import MODEL_FIELDS, Batch, SimulationError
 from torch import Tensor
 
 from legged_mw.sim.errors import ModelError
+from legged_mw.sim.simulation import Simulation
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import usable_cores
 
@@ -26,21 +27,13 @@ _READ = ("sensordata", "actuator_force", "site_xpos")  # computed by a step
 _FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
 
-class MujocoSimulation:
-    """The seam on MuJoCo's own engine (``legged_mw.sim.simulation.Simulation`` says what it promises).
+class MujocoSimulation(Simulation):
+    """The seam on MuJoCo's own engine.
 
     The same calls give the same bits, on any number of threads. A world that MuJoCo cannot step gets a ``qpos`` of NaN.
     """
 
     engine, device = "mujoco", "cpu"
-
-    qpos: Tensor
-    qvel: Tensor
-    ctrl: Tensor
-    sensordata: Tensor
-    actuator_force: Tensor
-    site_xpos: Tensor
-    xfrc_applied: Tensor
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, *, threads: int = 0, world_fields: Sequence[str] = ()) -> None:
         """Allocate ``num_envs`` worlds, stepped by ``threads`` threads; 0: one a core."""

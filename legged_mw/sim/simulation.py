@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 from torch import Tensor
 
@@ -11,7 +11,7 @@ CONSTANTS_READ = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_a
 CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
 
 
-class Simulation(Protocol):
+class Simulation(ABC):
     """``num_envs`` worlds of one model, stepped together.
 
     Every tensor below is fixed for the life of the object: read it, write it in place, never rebind it. After ``step``,
@@ -31,31 +31,31 @@ class Simulation(Protocol):
     site_xpos: Tensor  # (N, nsite, 3) [m, world], of the last substep
     xfrc_applied: Tensor  # (N, nbody, 6) force [N] and torque [N m], world frame, at the body's centre of mass; persists
 
+    @abstractmethod
     def step(self, substeps: int = 1) -> None:
         """Advance every world by ``substeps`` time steps, with ``ctrl`` and ``xfrc_applied`` as they stand."""
-        ...
 
+    @abstractmethod
     def reset(self, mask: Tensor) -> None:
         """Clear the worlds where ``mask`` (N,) bool is true; what is not state is zero until the next ``step``.
 
         State goes to the model's own ``qpos0``: write the wanted ``qpos``, ``qvel`` and ``ctrl`` after it.
         """
-        ...
 
+    @abstractmethod
     def field(self, name: str) -> Tensor:
         """View (N, ...) of a model field that was declared in ``world_fields``; write it in place."""
-        ...
 
+    @abstractmethod
     def set_constants(self) -> None:
         """Bring what the model derives from masses, inertias, armatures and zero angles up to date with what was written
         into their fields, in every world. Slow, and not for inside a recorded step.
         """
-        ...
 
+    @abstractmethod
     def overflowed_worlds(self) -> Tensor:
         """How many worlds did not fit into the engine's buffers since construction, float (), on the device."""
-        ...
 
+    @abstractmethod
     def overflow_report(self) -> str:
         """What did not fit since construction, a line, or '' if all did. Reads the device: not for inside a step."""
-        ...

@@ -18,7 +18,7 @@ from torch import Tensor
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND
 from legged_mw.sim.ground_contact import touch_ground
-from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ
+from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ, Simulation
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import unknown
 
@@ -31,18 +31,10 @@ _EXPECTED = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
 _UNROLLED_ITERATIONS = 10
 
 
-class WarpSimulation:
-    """The seam on mujoco-warp (``legged_mw.sim.simulation.Simulation`` says what it promises)."""
+class WarpSimulation(Simulation):
+    """The seam on mujoco-warp."""
 
     engine = "mujoco_warp"
-
-    qpos: Tensor
-    qvel: Tensor
-    ctrl: Tensor
-    sensordata: Tensor
-    actuator_force: Tensor
-    site_xpos: Tensor
-    xfrc_applied: Tensor
     overflow: Tensor  # (N,) int32, bits of mujoco_warp.OverflowType since the world's last reset
 
     def __init__(

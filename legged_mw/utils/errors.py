@@ -9,17 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from types import CodeType
 
-_LIBRARIES = {
-    "torch",
-    "numpy",
-    "warp",
-    "mujoco",
-    "mujoco_warp",
-    "tensordict",
-    "rsl_rl",
-    "legged_mw.envs.guard",
-    "legged_mw.utils.recordable",
-}
+_LIBRARIES = {"torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl", "legged_mw.check"}
 _STANDARD = sysconfig.get_paths()["stdlib"]
 
 
