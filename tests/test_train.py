@@ -377,7 +377,7 @@ KILLED = """
 import os, random, signal, sys, time
 from pathlib import Path
 import torch
-from legged_mw.utils.config import save_whole
+from legged_mw.rl.runs import save_whole
 
 torch.set_num_threads(1)
 folder, dice = Path(sys.argv[1]), random.Random(0)
@@ -385,8 +385,7 @@ for attempt in range(12):
     child = os.fork()
     if child == 0:
         for i in range(10**6):
-            content = {"actor_state_dict": {"w": torch.full((500_000,), float(i))}, "iter": i}
-            save_whole(folder / f"model_{i % 3}.pt", lambda file: torch.save(content, file))
+            save_whole({"actor_state_dict": {"w": torch.full((500_000,), float(i))}, "iter": i}, folder / f"model_{i % 3}.pt")
     while attempt == 0 and len(list(folder.glob("model_*.pt"))) < 3:
         assert os.waitpid(child, os.WNOHANG) == (0, 0)  # it still runs
         time.sleep(0.01)

@@ -15,9 +15,18 @@ from torch import Tensor
 from legged_mw import ROOT
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.rl.classes import check_classes
-from legged_mw.rl.runs import CONFIG_FILE, check_fit, experiment_folder, find_checkpoint, find_run, load_tensors, runs
+from legged_mw.rl.runs import (
+    CONFIG_FILE,
+    check_fit,
+    experiment_folder,
+    find_checkpoint,
+    find_run,
+    load_tensors,
+    runs,
+    save_whole,
+)
 from legged_mw.utils.cli import shown
-from legged_mw.utils.config import Config, ConfigError, load_yaml, save_whole
+from legged_mw.utils.config import Config, ConfigError, load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 
 
@@ -95,8 +104,7 @@ def load_policy(path: Path, env: BaseTask, cfg: Config, device: str) -> MLPModel
 
 def save_policy(policy: MLPModel, path: Path, infos: dict[str, Any]) -> None:
     """Write the actor alone: what playing needs, a fraction of a checkpoint."""
-    content = {"actor_state_dict": {k: v.cpu() for k, v in policy.state_dict().items()}, "infos": infos}
-    save_whole(path, lambda file: torch.save(content, file))
+    save_whole({"actor_state_dict": {k: v.cpu() for k, v in policy.state_dict().items()}, "infos": infos}, path)
 
 
 def act(policy: MLPModel, obs: TensorDict) -> Tensor:

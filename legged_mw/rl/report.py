@@ -8,6 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+CURRICULA = ("terrain_level", "command_share")  # what such statistics begin with
+
 Mark = torch.cuda.Event | float
 
 
@@ -64,3 +66,25 @@ class Report(NamedTuple):
         """The rollout's and the update's."""
         begin, collected, end = self.marks
         return Clock.seconds(begin, collected), Clock.seconds(collected, end)
+
+
+def console_block(title: str, rows: dict[str, str]) -> str:
+    """A headline and a line a row, as the console shows an iteration."""
+    return "\n".join([f" {title} ".center(80, "#"), *(f"{name:>32}: {text}" for name, text in rows.items())])
+
+
+def console_rows(numbers: dict[str, float], losses: dict[str, float], speed: float, collect: float, learn: float) -> dict[str, str]:
+    """What an iteration shows of its numbers: name -> text."""
+    return {
+        "Computation": f"{speed:.0f} steps/s (collection {collect:.3f} s, learning {learn:.3f} s)",
+        **{f"{name.capitalize()} loss": f"{value:.4f}" for name, value in losses.items()},
+        "Learning rate": f"{numbers['learning_rate']:.1e}",
+        "Action std": f"{numbers['action_std']:.2f}",
+        "Mean reward": f"{numbers['reward']:.2f}",
+        "Mean episode length": f"{numbers['episode_length']:.1f}",
+        **{name: f"{value:.4f}" for name, value in numbers.items() if name.startswith("rew_")},
+        **{
+            name.replace("_", " ").replace("/", ", ").capitalize(): f"{numbers[name]:.2f}" for name in numbers if name.startswith(CURRICULA)
+        },
+        "Episodes ended": f"{numbers['episodes']:.0f} ({numbers['fell']:.0f} falls, {numbers['broken']:.0f} not finite)",
+    }

@@ -23,9 +23,9 @@ from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import this_rank
-from legged_mw.rl.report import Clock, Mark, Message, Report
-from legged_mw.rl.runs import check_fit, load_tensors
-from legged_mw.utils.config import ConfigError, save_whole
+from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
+from legged_mw.rl.runs import check_fit, load_tensors, save_whole
+from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
 
 
@@ -165,8 +165,13 @@ class Runner(OnPolicyRunner):
         finally:
             policy.train(training)
         self.last_exam = self.current_learning_iteration, figures
-        curves = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
-        self._show(f"Exam after iteration {self.current_learning_iteration}/{self._last}", self.current_learning_iteration, curves)
+        if self.logger.writer is not None:
+            curves = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
+            for name, value in curves.items():
+                if not math.isnan(value):
+                    self.logger.writer.add_scalar(name, value, self.current_learning_iteration)
+        title = f"Exam after iteration {self.current_learning_iteration}/{self._last}"
+        print(console_block(title, {name: f"{value:.3f}" for name, value in figures.items()}), flush=True)
 
     # ---- what the user sees ---------------------------------------------------------------------------------------
 
@@ -197,26 +202,41 @@ class Runner(OnPolicyRunner):
         values, count = report.message.read(), len(report.losses)
         numbers = self.env.name_statistics(values[: -count - 3])
         self._all_stop = values[-count - 3] > 0
+        losses = dict(zip(report.losses, values[-count - 2 : -2], strict=True))
         self._last_means.update({name: value for name, value in numbers.items() if not math.isnan(value)})
         numbers = {name: self._last_means.get(name, math.nan) for name in numbers}
-        losses = dict(zip([*report.losses, "learning_rate", "action_std"], values[-count - 2 :], strict=True))
+        numbers["learning_rate"], numbers["action_std"] = values[-2:]
+        collect, learn = report.seconds()
+        speed = report.steps / (collect + learn)
+        if self.logger.writer is not None:
+            for name, value in self._curves(numbers, losses, speed, collect, learn, report.total_steps).items():
+                if not math.isnan(value):
+                    self.logger.writer.add_scalar(name, value, report.iteration)
         left = (time.time() - self._begun) / (report.iteration - self._first) * (self._last - report.iteration)
-        times = ", ".join(str(timedelta(seconds=round(t))) for t in (time.time() - self._begun, left))
-        title = f"Learning iteration {report.iteration}/{self._last}"
-        self._show(title, report.iteration, _curves(report, numbers, losses), {"Time elapsed, left": times})
+        rows = console_rows(numbers, losses, speed, collect, learn)
+        rows["Total steps"] = f"{report.total_steps}"
+        rows["Time elapsed, left"] = ", ".join(str(timedelta(seconds=round(t))) for t in (time.time() - self._begun, left))
+        print(console_block(f"Learning iteration {report.iteration}/{self._last}", rows), flush=True)
         if numbers["overflowed"] and not self._warned_overflow:
             text = self.env.sim.overflow_report() or f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks"
             print(f"WARNING: {text} (config section sim)", flush=True)
             self._warned_overflow = True
 
-    def _show(self, title: str, iteration: int, curves: dict[str, float], more: dict[str, str] | None = None) -> None:
-        """One point a curve in the writer, and a block on the console with the same names."""
-        if self.logger.writer is not None:
-            for name, value in curves.items():
-                if not math.isnan(value):
-                    self.logger.writer.add_scalar(name, value, iteration)
-        rows = {name: f"{value:.0f}" if abs(value) >= 1000 else f"{value:.4g}" for name, value in curves.items()} | (more or {})
-        print("\n".join([f" {title} ".center(80, "#"), *(f"{name:>40}: {text}" for name, text in rows.items())]), flush=True)
+    @staticmethod
+    def _curves(
+        numbers: dict[str, float], losses: dict[str, float], speed: float, collect: float, learn: float, total_steps: int
+    ) -> dict[str, float]:
+        """Curve -> value, under rsl-rl's names where it has them."""
+        return {
+            **{f"Loss/{name}": value for name, value in losses.items()},
+            **{"Loss/learning_rate": numbers["learning_rate"], "Policy/mean_std": numbers["action_std"]},
+            **{"Perf/total_fps": speed, "Perf/collection_time": collect, "Perf/learning_time": learn},
+            **{"Train/mean_reward": numbers["reward"], "Train/mean_episode_length": numbers["episode_length"]},
+            **{f"Episode/{name}": value for name, value in numbers.items() if name.startswith("rew_")},
+            **{"Episode/fell": numbers["fell"], "Episode/broken": numbers["broken"], "Train/total_steps": total_steps},
+            "Sim/overflowed_worlds": numbers["overflowed"],  # so far
+            **{f"Curriculum/{name}": value for name, value in numbers.items() if name.startswith(CURRICULA)},
+        }
 
     # ---- checkpoints ----------------------------------------------------------------------------------------------
 
@@ -231,7 +251,7 @@ class Runner(OnPolicyRunner):
         content["iter"] = self.current_learning_iteration
         content["infos"] = {**(infos or {}), "total_steps": self.total_steps, "random_state": _random_state(self.device)}
         content["infos"]["env"] = self.env.training_state()
-        save_whole(Path(path), lambda file: torch.save(content, file))
+        save_whole(content, Path(path))
         self.logger.save_model(path, self.current_learning_iteration)
 
     def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
@@ -258,21 +278,6 @@ class Runner(OnPolicyRunner):
         else:  # the file holds the first rank's; the others must not draw the same
             torch.manual_seed(hash((self.gpu_global_rank, self.total_steps, torch.initial_seed())) % 2**63)
         return infos
-
-
-def _curves(report: Report, numbers: dict[str, float], losses: dict[str, float]) -> dict[str, float]:
-    """Curve -> value, under rsl-rl's names where it has them. ``numbers`` are the environment's statistics."""
-    (collect, learn), rate, std = report.seconds(), losses.pop("learning_rate"), losses.pop("action_std")
-    return {
-        **{"Perf/total_fps": report.steps / (collect + learn), "Perf/collection_time": collect, "Perf/learning_time": learn},
-        **{f"Loss/{name}": value for name, value in losses.items()},
-        **{"Loss/learning_rate": rate, "Policy/mean_std": std},
-        **{"Train/mean_reward": numbers["reward"], "Train/mean_episode_length": numbers["episode_length"]},
-        **{f"Episode/{name}": value for name, value in numbers.items() if name.startswith("rew_")},
-        **{f"Curriculum/{name}": value for name, value in numbers.items() if name.startswith(("terrain_level", "command_share"))},
-        **{f"Episode/{name}": numbers[name] for name in ("episodes", "fell", "broken")},  # ended; of these by a fall, not finite
-        **{"Sim/overflowed_worlds": numbers["overflowed"], "Train/total_steps": report.total_steps},  # so far
-    }
 
 
 def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, device: str) -> Runner:

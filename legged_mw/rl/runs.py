@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from datetime import datetime
 from pathlib import Path
@@ -74,6 +75,19 @@ def find_checkpoint(run: Path, iteration: int) -> Path:
     if iteration not in found:
         raise ConfigError(f"no checkpoint {iteration} in {run}; there are: {', '.join(map(str, found))}")
     return found[iteration]
+
+
+def save_whole(content: dict[str, Any], path: Path) -> None:
+    """Write a checkpoint so that a kill at any moment leaves either all of it or nothing."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            torch.save(content, file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def load_tensors(path: Path, device: str) -> dict[str, Any]:

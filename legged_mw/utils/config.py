@@ -14,11 +14,11 @@ import os
 import re
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from numbers import Integral, Real
 from pathlib import Path
 from types import NoneType, SimpleNamespace, UnionType
-from typing import TYPE_CHECKING, Any, BinaryIO, Literal, TypeGuard, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeGuard, Union, get_args, get_origin, get_type_hints
 from weakref import WeakKeyDictionary
 
 import yaml
@@ -365,23 +365,16 @@ for _side in (_Loader, _Dumper):
     _side.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789"))
 
 
-def save_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:
-    """Write a file so that a kill at any moment leaves either all of it or what was there before."""
+def save_yaml(path: str | os.PathLike[str], mapping: Mapping[str, Any]) -> None:
+    """Writes `mapping` whole or not at all: neither a reader nor a crash ever meets half a file."""
+    path = Path(path)
+    text = yaml.dump(dict(mapping), Dumper=_Dumper, sort_keys=False, allow_unicode=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
-        with open(temporary, "wb") as file:
-            write(file)
-            file.flush()
-            os.fsync(file.fileno())
+        temporary.write_text(text, encoding="utf-8")
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def save_yaml(path: str | os.PathLike[str], mapping: Mapping[str, Any]) -> None:
-    """Writes `mapping` whole or not at all."""
-    text = yaml.dump(dict(mapping), Dumper=_Dumper, sort_keys=False, allow_unicode=True)
-    save_whole(Path(path), lambda file: file.write(text.encode()))
 
 
 def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
