@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from worlds import QUIET, changed, layout, make_env, same, snapshot, tensors
 
+from legged_mw import ROOT
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.legged_robot import LeggedRobot
@@ -20,6 +21,7 @@ from legged_mw.envs.observations import Row
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import NotRecordable
+from legged_mw.utils.task import load_task
 
 HOME = [0.1, 0.9, -1.8, -0.1, 0.9, -1.8, 0.1, 0.9, -1.8, -0.1, 0.9, -1.8]  # [rad] FR, FL, RR, RL; hip, thigh, calf
 FEET = ("FR", "FL", "RR", "RL")
@@ -649,3 +651,24 @@ def test_camera_looks_at_the_robot_and_is_not_stepped(quiet: LeggedRobot) -> Non
     looking = -data.cam_xmat[camera].reshape(3, 3)[:, 2]
     assert to_robot @ looking > 0.99 * (to_robot @ to_robot) ** 0.5
     assert quiet.robot.physics.ncam == 0 and quiet.robot.physics.nlight == 0
+
+
+@pytest.mark.parametrize(
+    ("foot_geoms", "felt"),
+    [
+        ({"left": ["left_*"], "right": ["right_*"]}, [False, True]),
+        ({"left": ["left_toe"], "right": ["left_toe", "right_*"]}, [False, True]),
+        ({"left": ["right_heel"], "right": ["right_heel"]}, [True, True]),
+        ({"left": ["right_heel"], "right": ["left_toe"]}, [True, False]),
+    ],
+)
+def test_a_foot_feels_all_of_its_geoms(foot_geoms: dict[str, list[str]], felt: list[bool]) -> None:
+    task = load_task(str(ROOT / "examples" / "toy_biped.py"))
+    task.cfg.env.num_envs = 2
+    task.set("asset.foot_geoms", foot_geoms)
+    env = LeggedRobot(task.cfg, "cpu")
+    env.contact_count.zero_()
+    env.contact_count[1, env.robot.contact_geoms.index("right_heel")] = 1.0
+    env._update_state()
+    assert env.foot_contact.tolist() == [[False, False], felt]
+    assert all("*" not in geom for geoms in env.foot_geoms.values() for geom in geoms)

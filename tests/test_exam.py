@@ -199,8 +199,9 @@ class FakeRobot:
     def reset(self) -> TensorDict:
         return self.get_observations()
 
-    def compute_observations(self) -> None:
+    def first_observations(self) -> TensorDict:
         self.shown = self.commands.clone()
+        return self.get_observations()
 
     def get_observations(self) -> TensorDict:
         shown = torch.zeros(self.num_envs, 3) if self.shown is None else self.shown
@@ -353,7 +354,7 @@ def test_a_task_without_commands_can_be_rolled_out() -> None:
     env = FakeRobot(lambda env, step: None)
     env.command_table = ()
     del env.commands
-    env.compute_observations = lambda: None
+    env.first_observations = env.get_observations
     record = roll_out(env, lambda obs: torch.zeros(WORLDS, 12), [holding(())] * WORLDS, 5, {"position": lambda env: env.root_pos})
     assert record.commands.shape == (5, WORLDS, 0) and record.signals["position"].shape == (5, WORLDS, 3)
 

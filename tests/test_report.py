@@ -96,6 +96,20 @@ def test_the_plan() -> None:
     assert plan.axes["vy"] == [0.0] and plan.cases[plan.parts["vx_yaw"]][0].commands[0][1] == (0.5, 0.0, -1.2)
 
 
+def test_a_roll_out_begins_with_a_history_of_its_own_command() -> None:
+    task = load_task("go1_flat")
+    exam.prepare(task, 2)
+    task.cfg.observations.history = {"state": 3}
+    env, seen = LeggedRobot(task.cfg, "cpu"), []
+
+    def policy(obs: TensorDict) -> torch.Tensor:
+        seen.append(obs["state"][0, env.observations.span("state", "commands")].tolist())
+        return torch.zeros(len(obs), 12)
+
+    roll_out(env, policy, [Case(((0, (0.5, 0.0, 0.25)),))] * 2, 2, {"command": lambda env: env.commands})
+    assert seen == [[0.5, 0.0, 0.25] * 3] * 2
+
+
 def test_commands_change_and_pushes_come_when_they_should() -> None:
     task = load_task("go1_flat")
     exam.prepare(task, 2)

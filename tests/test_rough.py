@@ -86,6 +86,16 @@ def test_the_scan_is_noisy_for_the_policy_and_true_for_the_critic() -> None:
     assert blind.obs_buf["state"].shape[1] == 48 and blind.obs_buf["privileged_state"].shape[1] == 123 + 187
 
 
+def test_the_scan_of_the_policy_is_late_also_in_a_table_of_its_own() -> None:
+    class Own(LeggedRobot):
+        def observation_rows(self) -> dict[str, list[Row | str]]:
+            return {"state": self._height_rows("state", 0.1), "privileged_state": ["state", *self._height_rows("privileged_state")]}
+
+    overrides = {**SMALL, **QUIET, "terrain.height_scan": ["state", "privileged_state"]}
+    rows = make_env(2, overrides, task="go1_rough_scan", env_class=Own).observations.groups
+    assert [row.measured for row in (rows["state"][0], rows["privileged_state"][1])] == [True, False]
+
+
 def test_on_a_plane_the_scan_is_flat() -> None:
     env = rough(4, "go1_rough_scan", terrain__mesh_type="plane", noise__level=0.0)
     env.sim.qpos[:, 2] = 0.378

@@ -200,7 +200,7 @@ class LeggedRobot(RobotTask):
             "state": [
                 *self._measured_rows(),
                 Row("commands", self.commands, mirror="command"),  # vx, vy [m/s], yaw rate [rad/s], body frame; further ones
-                *self._height_rows("state", self.cfg.noise.scales.height_scan, measured=True),
+                *self._height_rows("state", self.cfg.noise.scales.height_scan),
             ],
             "privileged_state": [
                 "state",  # the same noisy sample
@@ -213,9 +213,9 @@ class LeggedRobot(RobotTask):
             ],
         }
 
-    def _height_rows(self, group: str, noise: float = 0.0, measured: bool = False) -> list[Row]:
+    def _height_rows(self, group: str, noise: float = 0.0) -> list[Row]:
         """The height scan [m], x by x from behind, in each from right to left; where ``terrain.height_scan`` names the group."""
-        row = Row("height_scan", self.height_scan, noise, mirror="height_scan", measured=measured)
+        row = Row("height_scan", self.height_scan, noise, mirror="height_scan", measured=group == "state")
         return [row] if group in self.cfg.terrain.height_scan else []
 
     def compute_observations(self) -> None:
@@ -319,19 +319,19 @@ class LeggedRobot(RobotTask):
         return tuple(self.cfg.asset.foot_names)
 
     @property
-    def foot_geoms(self) -> dict[str, list[str]]:
-        """Geoms of each foot."""
-        return {foot: self.cfg.asset.foot_geoms.get(foot, [foot]) for foot in self.foot_names}
+    def foot_geoms(self) -> dict[str, tuple[str, ...]]:
+        """Names of the geoms of each foot."""
+        return {foot: self.robot.site_geoms[foot] for foot in self.foot_names}
 
     def _make_terrain(self) -> Terrain | None:
         return build_terrain(self.cfg)
 
     def _sensed_geoms(self) -> list[str]:
         """Feet first."""
-        return [*(geom for geoms in self.foot_geoms.values() for geom in geoms), *super()._sensed_geoms()]
+        return [*(geom for geoms in self._sensed_sites().values() for geom in geoms), *super()._sensed_geoms()]
 
     def _sensed_sites(self) -> dict[str, list[str]]:
-        return self.foot_geoms
+        return {foot: self.cfg.asset.foot_geoms.get(foot, [foot]) for foot in self.foot_names}
 
     def _init_buffers(self) -> None:
         super()._init_buffers()
@@ -349,10 +349,11 @@ class LeggedRobot(RobotTask):
     def _init_foot_contacts(self) -> None:
         """Contacts of each foot with the ground (N, F): a column of the sensors, or of feet with several geoms their sum."""
         self.foot_contact_count, self._foot_of_geom = self.contact_count[:, : self.num_feet], None
-        geoms = [(geom, foot) for foot, geoms in enumerate(self.foot_geoms.values()) for geom in geoms]
-        if len(geoms) > self.num_feet:
+        feet = self.foot_geoms.values()
+        geoms = list(dict.fromkeys(geom for each in feet for geom in each))  # G, the first columns of the sensors
+        if [(geom,) for geom in geoms] != [*feet]:
             self.foot_contact_count = self._zeros(self.num_feet)
-            self._foot_of_geom = self._tensor([[float(foot == column) for column in range(self.num_feet)] for _, foot in geoms])  # (G, F)
+            self._foot_of_geom = self._tensor([[float(geom in each) for each in feet] for geom in geoms])  # (G, F)
 
     def _episode_columns(self) -> dict[str, int]:
         feet = len(self.foot_names)

@@ -15,7 +15,7 @@ class LeggedRobotCfg(RobotTaskCfg):
 
     class asset(RobotTaskCfg.asset):
         foot_names: list[str] = []  # of sites, and of geoms if foot_geoms says nothing; the order is the order in observations
-        foot_geoms: dict[str, list[str]] = {}  # foot -> its geoms, where a foot is not one geom of its name
+        foot_geoms: dict[str, list[str]] = {}  # foot -> its geoms, names or patterns, where a foot is not one geom of its name
 
     class commands:
         resampling_time: float = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]

@@ -81,7 +81,8 @@ class Observations:
         for part in self._parts.values():
             if part.delay:
                 part.delay.restart(mask)
-            part.fresh.logical_or_(mask)
+            if part.histories:
+                part.fresh.logical_or_(mask)
 
     def remember(self) -> list[tuple[Tensor, Tensor]]:
         """Everything that ``compute`` changes, and copies of it."""
@@ -128,11 +129,11 @@ class _Group:
         self.fresh = torch.ones(num_envs, dtype=torch.bool, device=device)  # no frame of this episode is there yet
         self.frame = torch.zeros(num_envs, len(noise), device=device)  # the newest frame of each row
         self.buffer = self.frame
-        self._histories: list[tuple[Tensor, Tensor]] = []  # frames (N, F, size) in the buffer, newest (N, size) in the frame
+        self.histories: list[tuple[Tensor, Tensor]] = []  # frames (N, F, size) in the buffer, newest (N, size) in the frame
         if any(row.history > 1 for row in rows):
             self.buffer = torch.zeros(num_envs, sum(row.size for row in rows), device=device)
             spans = self.buffer.split([row.size for row in rows], dim=1), self.frame.split([row.value.shape[1] for row in rows], dim=1)
-            self._histories = [(all_.unflatten(1, (row.history, -1)), new) for row, all_, new in zip(rows, *spans, strict=True)]
+            self.histories = [(all_.unflatten(1, (row.history, -1)), new) for row, all_, new in zip(rows, *spans, strict=True)]
 
     def compute(self) -> None:
         torch.cat(self._values, dim=1, out=self.frame)
@@ -142,16 +143,17 @@ class _Group:
             self.frame.mul_(self._scales)
         if self.delay:
             self.frame.copy_(torch.where(self._measured, self.delay(self.frame), self.frame))
-        for frames, newest in self._histories:
+        for frames, newest in self.histories:
             older = torch.where(self.fresh[:, None, None], newest[:, None], frames[:, 1:])
             frames[:, :-1] = older
             frames[:, -1] = newest
-        self.fresh.fill_(False)
+        if self.histories:
+            self.fresh.fill_(False)
 
     def memory(self) -> Iterator[Tensor]:
         """All that ``compute`` writes."""
         yield self.frame
-        if self._histories:
+        if self.histories:
             yield self.buffer
         if self.delay:
             yield self.delay.past

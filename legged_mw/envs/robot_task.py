@@ -15,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw import ROOT
@@ -171,6 +172,12 @@ class RobotTask(BaseTask):
         self.fell.masked_fill_(mask, False)
         self.compute_observations()
         self.observations.recall(before, ~mask)
+
+    def first_observations(self) -> TensorDict:
+        """Observe as an episode begins, after a caller changed state or commands: no delay or history shows what was before."""
+        self.observations.restart(torch.ones_like(self.reset_buf))
+        self.compute_observations()
+        return self.get_observations()
 
     def _update_curricula(self, mask: Tensor) -> None:
         """Where ``mask`` (N,) is true an episode has ended: what becomes harder or easier."""

@@ -76,8 +76,7 @@ def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor
     command = torch.tensor([SPEED, 0.0, 0.0, *(further.default for further in env.command_table[3:])], device=env.device)
     crossed, fell, over = (torch.zeros(env.num_envs, dtype=torch.bool, device=env.device) for _ in range(3))
     env.commands.copy_(command)
-    env.compute_observations()
-    obs = env.get_observations()
+    obs = env.first_observations()
     for _ in range(round(SECONDS / env.dt)):
         with torch.inference_mode():
             actions = policy(obs)

@@ -73,8 +73,7 @@ def roll_out(
     asked, pushes = torch.tensor(timeline, dtype=torch.float, device=env.device), _pushes_by_step(cases, env.device)
     commands = getattr(env, "commands", asked[0])  # a task without commands has no buffer for them
     commands.copy_(asked[0])
-    env.compute_observations()
-    obs = env.get_observations()
+    obs = env.first_observations()
     fell_at = torch.full((env.num_envs,), math.inf, device=env.device)
     kept: dict[str, Tensor] = {}
     for step in range(steps):

@@ -33,7 +33,7 @@ class EnvStage:
         # a task with a table has a buffer for it, (N, C)
         self._commands: Tensor = env.commands if env.command_table else env.actions[:, :0]
         self._command_columns = _command_columns(env)
-        geoms = sum(map(len, env.foot_geoms.values())) if isinstance(env, LeggedRobot) else 0
+        geoms = len({geom for geoms in env.foot_geoms.values() for geom in geoms}) if isinstance(env, LeggedRobot) else 0
         self._foot_contacts = env.contact_count[:, :geoms]
         self._obs = env.get_observations()
 
