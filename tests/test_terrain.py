@@ -16,8 +16,8 @@ from legged_mw import ROOT
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.terrain import build_terrain
 from legged_mw.sim.errors import ModelError
+from legged_mw.sim.ground import as_boxes
 from legged_mw.sim.height_map import HeightMap
-from legged_mw.sim.level_boxes import as_boxes
 from legged_mw.sim.terrain import (
     KINDS,
     LEVEL,

@@ -6,6 +6,9 @@ from abc import ABC, abstractmethod
 
 from torch import Tensor
 
+from legged_mw.sim.errors import ModelError
+from legged_mw.utils.errors import unknown
+
 # Model fields that others are derived from, and those others: they need a value per world as soon as one of the former has.
 CONSTANTS_READ = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "qpos0")
 CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
@@ -31,6 +34,8 @@ class Simulation(ABC):
     site_xpos: Tensor  # (N, nsite, 3) [m, world], of the last substep
     xfrc_applied: Tensor  # (N, nbody, 6) force [N] and torque [N m], world frame, at the body's centre of mass; persists
 
+    _fields: dict[str, Tensor]  # of ``world_fields``
+
     @abstractmethod
     def step(self, substeps: int = 1) -> None:
         """Advance every world by ``substeps`` time steps, with ``ctrl`` and ``xfrc_applied`` as they stand."""
@@ -42,9 +47,11 @@ class Simulation(ABC):
         State goes to the model's own ``qpos0``: write the wanted ``qpos``, ``qvel`` and ``ctrl`` after it.
         """
 
-    @abstractmethod
     def field(self, name: str) -> Tensor:
         """View (N, ...) of a model field that was declared in ``world_fields``; write it in place."""
+        if name not in self._fields:
+            raise ModelError(unknown("per-world model field", name, self._fields, "this simulation (declare it in world_fields)"))
+        return self._fields[name]
 
     @abstractmethod
     def set_constants(self) -> None:

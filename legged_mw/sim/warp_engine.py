@@ -82,11 +82,6 @@ class WarpSimulation(Simulation):
         for stale in (self.actuator_force, self.site_xpos):  # reset_data leaves the dead episode's values, even NaN
             stale.masked_fill_(mask.view(-1, *[1] * (stale.dim() - 1)), 0.0)
 
-    def field(self, name: str) -> Tensor:
-        if name not in self._fields:
-            raise ModelError(unknown("per-world model field", name, self._fields, "this simulation (declare it in world_fields)"))
-        return self._fields[name]
-
     def set_constants(self) -> None:
         with wp.ScopedDevice(self._device):
             mjw.set_const(self._model, self._data, groups=int(mjw.SetConstGroup.FIXED | mjw.SetConstGroup.INERT0))
