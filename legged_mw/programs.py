@@ -49,11 +49,11 @@ def play() -> None:
         rivals = [find_rival(task, args.compare, args.experiment_name)] if args.compare is not None else []
         grading.grade([(source, trained), *((rival, load_trained(args.task, rival)) for rival in rivals)], args)
         return
-    played = playing.prepare(source, trained, args)
+    task, commands = playing.prepare(source, trained, args)
     if args.export:
         print(export(trained, source.checkpoint, Path(args.export)))
     else:
-        playing.watch(source, played, args)
+        playing.watch(source, task, commands, args)
 
 
 def export(task: LoadedTask, checkpoint: Path, folder: Path) -> str:
