@@ -26,9 +26,9 @@ from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, ra
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
 from legged_mw.sim.engines import pick_engine
-from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything, shown
+from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 

@@ -56,6 +56,14 @@ def line_to_blame(error: BaseException) -> tuple[str, bool]:
     return "", False
 
 
+def shown(path: Path) -> str:
+    """A path for a message: as the user would type it."""
+    try:
+        return str(path.resolve().relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
+
+
 def unknown(what: str, name: str, known: Iterable[str], where: str) -> str:
     """One line: ``name`` does not exist, the nearest name that does, and all that do."""
     known = list(known)

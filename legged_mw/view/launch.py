@@ -9,9 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from legged_mw.utils.cli import shown
 from legged_mw.utils.commands import Command, outside, parse_command
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.errors import UserError, shown
 from legged_mw.view import web
 from legged_mw.view.drive import CAMERAS, NO_COMMANDS, Pilot
 from legged_mw.view.native import NativeViewer, has_display
