@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from legged_mw.envs.checks import ENVIRONMENT, LEARNER, check_values
+from legged_mw.envs.checks import ENVIRONMENT, LEARNER, WALKING, check_values
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task, task_names
 
@@ -32,7 +32,8 @@ def test_tasks_as_they_ship_pass(name: str) -> None:
         ("terrain.measured_points_y", [float("nan")], "at least one number, all finite"),
         ("commands.ranges.lin_vel_x", [1.0, -1.0], "two numbers, the lower first"),
         ("commands.ranges.lin_vel_y", [0.5], "two numbers, the lower first"),
-        ("commands.keep_probability", [0.9, 0.25], "numbers from 0 to 1, one a command"),
+        ("commands.keep_probability", [0.9, 0.25], "three numbers from 0 to 1"),
+        ("commands.mirror", {"lin_vel_x": 0.5}, "1 or -1 for each command"),
         ("perturbation.duration", [0.0, 0.2], "two numbers above zero, the lower first"),
         ("asset.foot_names", [], "a list with at least one name"),
         ("termination.max_tilt", 0.0, "above 0 and at most 180 degrees"),
@@ -53,7 +54,7 @@ def test_mistake_is_named(path: str, value: Any, wanted: str) -> None:
 def test_rules_name_fields_that_exist() -> None:
     task = load_task("go1_flat")
     known = task.to_dict()
-    for path in [*ENVIRONMENT, *LEARNER]:
+    for path in [*ENVIRONMENT, *WALKING, *LEARNER]:
         node = known
         for part in path.split("."):
             assert part in node, path

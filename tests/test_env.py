@@ -204,7 +204,7 @@ class _Number(LeggedRobot):
             {"asset.foot_names": ["FR", "FL", "RR", "RX"]},
             None,
             ModelError,
-            r"^no geom 'RX' in go1\.xml; there are: floor, .*, RL$",
+            r"^asset.foot_names or foot_geoms: 'RX': no geom 'RX' in go1\.xml; there are: floor, .*, RL$",
         ),
         ({"asset.file": ""}, None, ConfigError, r"^asset\.file is empty; name the robot's MJCF, e\.g\. 'resources/robots/go1/go1\.xml'$"),
         (
@@ -672,3 +672,9 @@ def test_a_foot_feels_all_of_its_geoms(foot_geoms: dict[str, list[str]], felt: l
     env._update_state()
     assert env.foot_contact.tolist() == [[False, False], felt]
     assert all("*" not in geom for geoms in env.foot_geoms.values() for geom in geoms)
+
+
+def test_walking_needs_a_config_of_walking() -> None:
+    task = load_task(str(ROOT / "examples" / "go1_stand.py"))
+    with pytest.raises(ConfigError, match="^LeggedRobot walks by command: it needs a LeggedRobotCfg, not a Go1StandCfg$"):
+        LeggedRobot(task.cfg, "cpu")

@@ -289,7 +289,10 @@ def test_trains_and_is_graded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        ({"asset.penalize_contacts_on": ["*_thig_*"]}, r"^no geom '\*_thig_\*' in go1.xml; .*there are: .*trunk_box"),
+        (
+            {"asset.penalize_contacts_on": ["*_thig_*"]},
+            r"^asset.penalize_contacts_on or terminate_.*: no geom '\*_thig_\*' in go1.xml; .*there are: .*trunk_box",
+        ),
         (
             {"asset.colliders": ["FR", "FL", "RR", "RL"]},
             r"^asset.terminate_after_contacts_on: 'trunk_box' never touches the ground; "

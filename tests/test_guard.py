@@ -60,6 +60,10 @@ HOST_READS: dict[str, Callable[[], object]] = {
     "allclose": lambda: torch.allclose(X, X),
     "bincount": lambda: torch.bincount(PICK),
     "histc": lambda: torch.histc(X),
+    "multinomial": lambda: torch.multinomial(torch.ones(4, 3), 1),
+    "eigh": lambda: torch.linalg.eigh(torch.eye(3)),
+    "svd": lambda: torch.linalg.svd(torch.eye(3)),
+    "lstsq": lambda: torch.linalg.lstsq(torch.eye(3), torch.eye(3)),
     "inv": lambda: torch.linalg.inv(X[:, :2] + 1.0),
     "normal": lambda: torch.normal(X, X + 1.0),
 }

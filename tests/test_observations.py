@@ -122,6 +122,7 @@ class _Old(LeggedRobot):
         ),
         ({"observations.history": {"states": 2}}, LeggedRobot, "observations.history: no group 'states' in the observation table; did you"),
         ({"observations.history": {"state": 0}}, LeggedRobot, r"observations.history\['state'\] is 0; it must be 1"),
+        ({"observations.leave_out": {"state": [*SIZES]}}, LeggedRobot, "observations.leave_out: 'state' has no row left; leave one in"),
         ({}, _Twice, "observation group 'state' has two rows 'dof_vel'"),
         ({}, _Backwards, "observation group 'privileged_state': no group 'state' in the groups that come before it"),
         ({}, _Old, "_Old._observation_rows: the method is now called observation_rows"),

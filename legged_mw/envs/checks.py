@@ -26,7 +26,10 @@ FACTORS: Rule = (
 STEPS: Rule = ("two whole numbers from zero, the lower first, or an empty list", lambda v: not v or (len(v) == 2 and 0 <= v[0] <= v[1]))
 NAMES: Rule = ("a list with at least one name", lambda v: len(v) > 0)
 POINTS: Rule = ("at least one number, all finite", lambda v: len(v) > 0 and all(map(math.isfinite, v)))
-PROBABILITIES: Rule = ("numbers from 0 to 1, one a command", lambda v: len(v) >= 3 and all(0 <= p <= 1 for p in v))
+PROBABILITIES: Rule = (
+    "three numbers from 0 to 1, and more for further commands",
+    lambda v: len(v) >= 3 and all(0 <= p <= 1 for p in v),
+)
 
 ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys(("env.num_envs", "env.episode_length_s", "control.decimation", "normalization.clip_actions"), POSITIVE),
@@ -54,6 +57,7 @@ WALKING: dict[str, Rule] = {
     "asset.foot_names": NAMES,
     "commands.resampling_time": NOT_NEGATIVE,
     "commands.keep_probability": PROBABILITIES,
+    "commands.mirror": ("1 or -1 for each command", lambda v: all(sign in (1, -1) for sign in v.values())),
     **dict.fromkeys(("rewards.tracking_sigma", "rewards.swing_height", "commands.heading_gain"), POSITIVE),
     **dict.fromkeys(("terrain.num_rows", "terrain.num_cols", "terrain.tile_size"), POSITIVE),
     **dict.fromkeys(("terrain.max_init_terrain_level", "terrain.seed"), NOT_NEGATIVE),

@@ -324,6 +324,8 @@ class LeggedRobot(RobotTask):
         return {foot: self.robot.site_geoms[foot] for foot in self.foot_names}
 
     def _make_terrain(self) -> Terrain | None:
+        if not isinstance(self.cfg, LeggedRobotCfg):
+            raise ConfigError(f"{type(self).__name__} walks by command: it needs a LeggedRobotCfg, not a {type(self.cfg).__name__}")
         return build_terrain(self.cfg)
 
     def _sensed_geoms(self) -> list[str]:

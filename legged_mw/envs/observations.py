@@ -171,6 +171,8 @@ def _check_names(table: Mapping[str, Sequence[Row | str]], cfg: type[RobotTaskCf
         for row in left:
             if row not in names[group]:
                 raise ConfigError(f"observations.leave_out: {unknown('row', row, names[group], repr(group))}")
+        if {*left} == {*names[group]}:
+            raise ConfigError(f"observations.leave_out: '{group}' has no row left; leave one in")
     for where, frames in cfg.history.items():
         group, _, row = where.partition(".")
         if group not in names:

@@ -19,7 +19,8 @@ FIELDS = {
     "cell": "terrain.horizontal_scale",
     "border": "terrain.border_size",
     "pose": "init_state.default_joint_angles",
-    "sites": "asset.foot_geoms",
+    "sites": "asset.foot_names or foot_geoms",
+    "contact_geoms": "asset.penalize_contacts_on or terminate_after_contacts_on",
 }
 
 

@@ -121,8 +121,8 @@ def build_model(
     _name_colliders(spec, notes)
     _set_collisions(spec, colliders, self_collisions, where, notes)
     _add_servos(spec, joints, per_joint(stiffness, names, "`stiffness`"), per_joint(damping, names, "`damping`"), notes)
-    touching = _match_geoms(spec, contact_geoms, where)
-    site_geoms = {name: _match_geoms(spec, geoms, where) for name, geoms in (sites or {}).items()}
+    site_geoms = {name: _match_geoms(spec, geoms, where, f"`sites`: '{name}'") for name, geoms in (sites or {}).items()}
+    touching = _match_geoms(spec, contact_geoms, where, "`contact_geoms`")
     with _naming(file):
         add_sites(spec, site_geoms, per_joint(pose, names, "`pose`") if pose else [0.0] * len(names), where, notes)
         _add_sensors(spec, touching, velocity_sites, accelerometer_site, where)
@@ -251,14 +251,14 @@ def _add_servos(
             joint.actfrclimited, joint.actfrcrange = False, [0.0, 0.0]
 
 
-def _match_geoms(spec: mujoco.MjSpec, patterns: Sequence[str], where: str) -> tuple[str, ...]:
-    """Names of the geoms that ``patterns`` mean, in their order, each once."""
+def _match_geoms(spec: mujoco.MjSpec, patterns: Sequence[str], where: str, what: str) -> tuple[str, ...]:
+    """Names of the geoms that ``patterns`` mean, in their order, each once; an error begins with ``what`` asked for them."""
     geoms = [g.name for g in spec.geoms if g.name]
     found: dict[str, None] = {}
     for pattern in patterns:
         hits = [name for name in geoms if fnmatchcase(name, pattern)]
         if not hits:
-            raise ModelError(unknown("geom", pattern, geoms, where))
+            raise ModelError(f"{what}: {unknown('geom', pattern, geoms, where)}")
         found |= dict.fromkeys(hits)
     return tuple(found)
 
