@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from legged_mw.sim.scene import add_scene
+from legged_mw.sim.drawing import add_scene
 
 XML = Path(__file__).parents[1] / "resources" / "robots" / "go1" / "go1.xml"
 LEGS, LINKS = ("FR", "FL", "RR", "RL"), ("hip", "thigh", "calf")

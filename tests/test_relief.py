@@ -18,7 +18,7 @@ from program import run
 from benchmarks import terrain_picture
 from legged_mw import ROOT
 from legged_mw.sim.drawing import ground_model, visual_model, visual_spec
-from legged_mw.sim.relief import PIXELS, relief
+from legged_mw.sim.relief import relief
 from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.task import load_task
@@ -77,14 +77,14 @@ def test_edges_are_light_and_risers_dark() -> None:
     along = tone[tone.shape[0] // 2, tone.shape[1] // 2 :]  # from the middle of the top, outwards
     heights = ground.heights[ground.heights.shape[0] // 2, ground.heights.shape[1] // 2 :]
     edge = int(np.flatnonzero(np.diff(heights))[0])  # the cell of the first riser
-    level, upper, riser, lower = along[10], along[PIXELS * edge - 1], along[PIXELS * edge], along[PIXELS * (edge + 1)]
+    level, upper, riser, lower = along[10], along[edge - 1], along[edge], along[edge + 1]
     assert riser < lower < level < upper
 
 
 def test_squares_of_half_a_metre_and_lines_around_tiles() -> None:
     ground = terrain("flat", levels=2)
     tone = relief(ground)[..., 1].astype(int)
-    pixel = 0.1 / PIXELS
+    pixel = 0.1
 
     def at(x: float, y: float) -> int:
         return tone[int((y - ground.corner[1]) / pixel), int((x - ground.corner[0]) / pixel)]
@@ -101,12 +101,12 @@ def test_the_picture_lies_where_the_heights_are() -> None:
     camera, data = mujoco.MjvCamera(), mujoco.MjData(model)
     camera.orthographic, camera.azimuth, camera.elevation, camera.distance = 1, 90, -90, 20.0
     mujoco.mj_forward(model, data)
-    with mujoco.Renderer(model, 320, 320) as renderer:
+    with mujoco.Renderer(model, 160, 160) as renderer:
         renderer.update_scene(data, camera)
         renderer.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = False
         seen = renderer.render()[::-1, :, 1].astype(float)  # row = +y
-    edge = round(2.0 / 0.1) * PIXELS
-    asked = relief(ground, squares=False)[edge:-edge, edge:-edge, 1].astype(float)  # 320 x 320: a pixel each
+    edge = round(2.0 / 0.1)
+    asked = relief(ground, squares=False)[edge:-edge, edge:-edge, 1].astype(float)  # 160 x 160: a pixel each
     assert asked.shape == seen.shape
     match = np.corrcoef(seen.ravel(), asked.ravel())[0, 1]
     others = [np.corrcoef(seen.ravel(), other.ravel())[0, 1] for other in (asked[::-1], asked[:, ::-1], asked.T)]

@@ -18,18 +18,19 @@ POSITIVE: Rule = ("positive", lambda v: 0 < v < math.inf)
 NOT_NEGATIVE: Rule = ("zero or more", lambda v: 0 <= v < math.inf)
 RANGE: Rule = ("two numbers, the lower first", lambda v: len(v) == 2 and v[0] <= v[1])
 SPAN: Rule = ("two numbers above zero, the lower first", lambda v: len(v) == 2 and 0 < v[0] <= v[1])
-MAYBE_RANGE: Rule = ("two numbers, the lower first, or an empty list", lambda v: not v or (len(v) == 2 and v[0] <= v[1]))
-FACTORS: Rule = (
-    "two numbers above zero, the lower first, or an empty list",
-    lambda v: not v or (len(v) == 2 and 0 < v[0] <= v[1]),
-)
-STEPS: Rule = ("two whole numbers from zero, the lower first, or an empty list", lambda v: not v or (len(v) == 2 and 0 <= v[0] <= v[1]))
+STEPS: Rule = ("two whole numbers from zero, the lower first", lambda v: len(v) == 2 and 0 <= v[0] <= v[1])
 NAMES: Rule = ("a list with at least one name", lambda v: len(v) > 0)
 POINTS: Rule = ("at least one number, all finite", lambda v: len(v) > 0 and all(map(math.isfinite, v)))
 PROBABILITIES: Rule = (
     "three numbers from 0 to 1, and more for further commands",
     lambda v: len(v) >= 3 and all(0 <= p <= 1 for p in v),
 )
+
+
+def or_empty(rule: Rule) -> Rule:
+    """The same rule, or an empty list."""
+    return f"{rule[0]}, or an empty list", lambda v: not v or rule[1](v)
+
 
 ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys(("env.num_envs", "env.episode_length_s", "control.decimation", "normalization.clip_actions"), POSITIVE),
@@ -42,10 +43,7 @@ ENVIRONMENT: dict[str, Rule] = {
     "init_state.dof_pos_range": RANGE,
     "perturbation.push_interval_s": POSITIVE,
     "perturbation.max_push_vel_xy": NOT_NEGATIVE,
-    **dict.fromkeys((f"domain_rand.{name}" for name in ("base_mass", "base_com", "encoder_offset")), MAYBE_RANGE),
-    **dict.fromkeys((f"domain_rand.{name}" for name in ("link_mass", "armature", "stiffness", "damping", "strength")), FACTORS),
-    **dict.fromkeys((f"domain_rand.{name}" for name in ("friction", "contact_time", "frictionloss")), FACTORS),
-    **dict.fromkeys(("domain_rand.action_delay", "domain_rand.observation_delay"), STEPS),
+    **{f"domain_rand.{name}": or_empty(STEPS if kind.whole else RANGE if kind.neutral == 0.0 else SPAN) for name, kind in KINDS.items()},
     "domain_rand.redraw_iterations": NOT_NEGATIVE,
     "asset.colliders": NAMES,
     "init_state.pos": ("three numbers, x, y, z", lambda v: len(v) == 3),
@@ -123,8 +121,9 @@ def _check_redraws(cfg: RobotTaskCfg) -> None:
         if name not in KINDS:
             raise ConfigError(f"domain_rand.redraw_at_reset: {unknown('range', name, KINDS, 'domain_rand')}")
     for name, span in cfg.domain_rand.model_factors.items():
-        if not FACTORS[1](span):
-            raise ConfigError(f"domain_rand.model_factors.{name} is {span!r}; it must be {FACTORS[0]}")
+        wanted, holds = or_empty(SPAN)
+        if not holds(span):
+            raise ConfigError(f"domain_rand.model_factors.{name} is {span!r}; it must be {wanted}")
         writers = [kind for kind, (what, *_) in active(cfg).items() if kind != name and name in what.fields]
         if writers:
             raise ConfigError(f"domain_rand.model_factors.{name}: domain_rand.{writers[0]} writes that field; leave one of them out ([])")

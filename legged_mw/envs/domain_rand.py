@@ -26,7 +26,7 @@ class Kind(NamedTuple):
     """What one range of the config means."""
 
     per: str  # how many numbers a world draws: "world" one, "axis" three, "joint" D, "link" 1 + D: the root's, then each joint's
-    neutral: float | None  # that changes nothing; None: the number is itself the new value
+    neutral: float | None  # that changes nothing; None: the number is itself the first one of the field, in the ground's geoms
     mirror: str  # its mirror image, a kind of envs/mirror.py
     fields: tuple[str, ...] = ()  # of the model, that it writes
     whole: bool = False  # whole numbers, both ends included
@@ -132,12 +132,12 @@ class DomainRand:
         special = {
             "body_mass": self._write_masses,
             "body_ipos": self._write_com,
-            "geom_friction": self._write_friction,
-            "geom_solref": self._write_contact_time,
             "actuator_gainprm": self._write_stiffness,
         }
         if name in KINDS and field in special:
             return special[field]
+        if name in KINDS and KINDS[name].neutral is None:
+            return lambda mask: assign(self._sim.field(field)[:, self._ground, 0], mask, self.values[name])  # of the ground's geoms
         first = self._nominal[field].shape[1] - self.values[name].shape[1] if name in KINDS else 0  # the free joint's six come first
 
         def scale(mask: Tensor) -> None:
@@ -160,12 +160,6 @@ class DomainRand:
 
     def _write_com(self, mask: Tensor) -> None:
         assign(self._sim.field("body_ipos")[:, self._root], mask, self._nominal["body_ipos"][:, self._root] + self.values["base_com"])
-
-    def _write_friction(self, mask: Tensor) -> None:
-        assign(self._sim.field("geom_friction")[:, self._ground, 0], mask, self.values["friction"])
-
-    def _write_contact_time(self, mask: Tensor) -> None:
-        assign(self._sim.field("geom_solref")[:, self._ground, 0], mask, self.values["contact_time"])
 
     def _write_stiffness(self, mask: Tensor) -> None:
         for field, place in (("actuator_gainprm", 0), ("actuator_biasprm", 1)):

@@ -17,7 +17,7 @@ from legged_mw.sim.drawing import CAMERA, dressed
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND, MOST_BOXES, Box, add_ground_box, as_boxes, feel_all_ground
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.scene import STEEP_LIGHT
+from legged_mw.sim.relief import STEEP_LIGHT
 from legged_mw.sim.terrain import Terrain
 
 AROUND = 1000.0  # [m] of level ground around tiles of steps, more than a robot walks

@@ -1,4 +1,4 @@
-"""A robot and its ground to be looked at: scene, camera and relief around the spec of a model. Nothing here is stepped."""
+"""A robot and its ground to be looked at: sky, light, camera and relief around the spec of a model. Nothing here is stepped."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -11,10 +11,11 @@ import numpy as np
 
 from legged_mw.sim.ground import GROUND, Ground, add_ground
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.relief import add_relief
-from legged_mw.sim.scene import GROUND_MATERIAL, add_scene
+from legged_mw.sim.relief import add_relief, add_squares
 from legged_mw.sim.terrain import Terrain
 
+GROUND_MATERIAL = "ground"  # of the floor
+_ZENITH, _HORIZON = (0.22, 0.32, 0.45), (0.56, 0.63, 0.70)
 CAMERA = (0.9, -1.1, 0.6)  # place of the camera "track" relative to the robot's centre of mass [m]
 
 
@@ -34,7 +35,7 @@ def visual_spec(robot: RobotModel, camera: Sequence[float] = CAMERA) -> mujoco.M
 def dressed(robot: RobotModel, camera: Sequence[float] = CAMERA) -> mujoco.MjSpec:
     """A copy of the robot's spec with a scene and a camera; its terrain is still the one height field."""
     spec = robot.spec.copy()
-    _add_scene(spec)
+    add_scene(spec)
     _add_camera(spec, robot.root, camera)
     return spec
 
@@ -43,14 +44,19 @@ def ground_model(terrain: Terrain) -> mujoco.MjModel:
     """The ground alone, to be looked at from afar."""
     spec = mujoco.MjSpec()
     add_ground(spec, Ground(terrain=terrain), "the ground", [])
-    _add_scene(spec)
+    add_scene(spec)
     add_relief(spec, terrain, GROUND, squares=False)
     return spec.compile()
 
 
-def _add_scene(spec: mujoco.MjSpec) -> None:
-    add_scene(spec)
-    spec.geom(GROUND).material = GROUND_MATERIAL
+def add_scene(spec: mujoco.MjSpec) -> None:
+    """Give ``spec`` a sky, the material "ground", one key light that follows the first body, and render settings."""
+    _add_sky(spec)
+    add_squares(spec, GROUND_MATERIAL, [0.23, 0.26, 0.30], [0.28, 0.31, 0.35], [0.40, 0.43, 0.47])
+    _add_light(spec)
+    _set_quality(spec)
+    if floor := spec.geom(GROUND):
+        floor.material = GROUND_MATERIAL
 
 
 def _add_camera(spec: mujoco.MjSpec, root: str, place: Sequence[float]) -> None:
@@ -61,3 +67,44 @@ def _add_camera(spec: mujoco.MjSpec, root: str, place: Sequence[float]) -> None:
     quat = np.zeros(4)
     mujoco.mju_mat2Quat(quat, np.stack([right, np.cross(away, right), away], axis=1).ravel())
     spec.body(root).add_camera(name="track", mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM, pos=list(place), quat=quat)
+
+
+def _add_sky(spec: mujoco.MjSpec) -> None:
+    # the gradient runs from zenith to nadir, so the horizon is its middle; the haze has that colour, and the ground no edge
+    nadir = [2 * h - z for h, z in zip(_HORIZON, _ZENITH, strict=True)]
+    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, rgb1=_ZENITH, rgb2=nadir, width=512, height=3072)
+    sky.builtin = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
+    spec.visual.rgba.haze = [*_HORIZON, 1.0]
+
+
+def _add_light(spec: mujoco.MjSpec) -> None:
+    # trackcom: the shadow map covers a few metres around the robot, wherever it walks. A directional light keeps its direction
+    body = next(iter(spec.worldbody.bodies), spec.worldbody)
+    body.add_light(
+        name="key",
+        type=mujoco.mjtLightType.mjLIGHT_DIRECTIONAL,
+        mode=mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM,
+        pos=[1.4, -1.8, 4.0],
+        dir=[-0.35, 0.45, -1.0],
+        diffuse=[0.62, 0.61, 0.58],
+        specular=[0.35, 0.35, 0.35],
+        castshadow=True,
+    )
+    for geom in spec.geoms:
+        if geom.type == mujoco.mjtGeom.mjGEOM_PLANE:
+            geom.castshadow = False  # it has nothing to shade but itself, which shows as moire
+    headlight = spec.visual.headlight
+    headlight.active = 1
+    headlight.ambient, headlight.diffuse, headlight.specular = [0.34, 0.35, 0.37], [0.26, 0.26, 0.26], [0.1, 0.1, 0.1]
+
+
+def _set_quality(spec: mujoco.MjSpec) -> None:
+    spec.stat.extent = 1.0  # [m] clipping, fog and shadow are multiples of it; computed, it would grow with the terrain
+    vis = spec.visual
+    vis.map.znear, vis.map.zfar = 0.02, 150.0  # [extent]
+    vis.map.shadowclip = 2.0  # [extent] half-width of the shadow map: 2 mm a pixel
+    vis.map.haze = 0.9  # from a tenth of zfar on, a plane fades into the horizon; fog stays off
+    vis.quality.shadowsize = 2048  # 4096 costs a software renderer a seventh of its frames and is hardly seen
+    vis.quality.offsamples = 4
+    vis.quality.numslices, vis.quality.numstacks = 28, 12  # facets of round primitives
+    vis.global_.offwidth, vis.global_.offheight = 1920, 1080  # [pixels] the largest picture, not the size of one

@@ -20,7 +20,7 @@ import numpy as np
 
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND, Ground, add_ground, replace_level_pieces
-from legged_mw.sim.sites import add_sites
+from legged_mw.sim.shapes import add_sites
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import unknown
 

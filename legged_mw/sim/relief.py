@@ -1,22 +1,27 @@
 """What makes steps and slopes of a height field seen: a picture laid over it, light from above, flat ground around it to the horizon.
 
-For drawing alone: nothing that is stepped changes. The plane's looks are in scene.py.
+For drawing alone: nothing that is stepped changes. The plane's looks are in drawing.py.
 """
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.sim.scene import SQUARE, STEEP_LIGHT, add_material, add_squares
 from legged_mw.sim.terrain import Terrain
 
+Colour = Sequence[float] | np.ndarray
 Picture = NDArray[np.uint8]
 Tones = NDArray[np.floating]  # float32: these arrays are large
 
+SQUARE = 0.5  # edge of one checker square [m], a thin line every second one: to judge speed and stride by
+STEEP_LIGHT = (-0.25, 0.35, -1.0)  # of the key light over steps: steeper, so that a riser is darker than a tread wherever it faces
 RELIEF, AROUND = "relief", "around"  # materials of the tiles, and of the flat ground around them
 COARSE = 2  # cells of a tile that is far away are so much longer
 COLOUR = np.array([0.30, 0.33, 0.37], dtype=np.float32)  # of level ground; each number below is a share of it, lighter or darker
@@ -24,7 +29,6 @@ CHECKER, LINE, TILE_LINE = 0.05, 0.15, 0.3  # a square, a line every metre, a li
 EDGE, EDGE_WIDTH, EDGE_MAX = 2.5, 0.1, 0.4  # what lies higher than its neighbourhood is lighter by [1/m], within [m], at most by
 STEEP, STEEP_FROM, STEEP_TO = 0.3, 0.6, 1.6  # ground as steep as a riser is darker; slopes [-] where that begins and is full
 HILL, HILL_HEIGHT = 0.12, 0.5  # hills are lighter and pits darker, at most by; at about [m]
-PIXELS, PIXELS_MAX = 2, 12_000_000  # two by two a cell, but one where the picture would have more than that
 REACH = 200.0  # of the flat ground beyond the tiles [m]; a camera sees as far as 150
 
 
@@ -32,7 +36,7 @@ def add_relief(spec: mujoco.MjSpec, terrain: Terrain, ground: str, squares: bool
     """Dress the geom ``ground``, a height field of ``terrain``, in a ``spec`` that has a scene; ``squares``: for speed to be judged by.
 
     It is cut into its tiles, each of them there twice: as it is, and coarse and hidden, for who draws slowly and shows that one
-    instead where a tile is far away (view/hills.py).
+    instead where a tile is far away (view/rough_ground.py).
     """
     floor, picture = spec.geom(ground), relief(terrain, squares)
     spec.delete(spec.hfield(floor.hfieldname))
@@ -51,11 +55,11 @@ def add_relief(spec: mujoco.MjSpec, terrain: Terrain, ground: str, squares: bool
 def _add_tile(spec: mujoco.MjSpec, terrain: Terrain, level: int, column: int, picture: Picture) -> None:
     """One tile, in full and coarse; one that is level only coarse."""
     rows, columns = terrain.vertices(level, column)
-    heights, pixels = terrain.heights[rows, columns], (picture.shape[0] // (terrain.heights.shape[0] - 1))
+    heights = terrain.heights[rows, columns]
     name, n, half = f"{RELIEF}/{level}/{column}", len(heights) - 1, terrain.tile / 2
     low, span = float(heights.min()), max(float(np.ptp(heights)), 1e-3)  # MuJoCo wants some span
-    image = picture[rows.start * pixels : (rows.start + n) * pixels, columns.start * pixels : (columns.start + n) * pixels]
-    texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=n * pixels, height=n * pixels, nchannel=3)
+    image = picture[rows.start : rows.start + n, columns.start : columns.start + n]
+    texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=n, height=n, nchannel=3)
     texture.data = image[::-1].tobytes()  # a texture begins at the largest y
     add_material(spec, name, texuniform=False, texrepeat=[1, 1])
     x, y = (start + first.start * terrain.cell + half for start, first in zip(terrain.corner, (columns, rows), strict=True))
@@ -72,23 +76,22 @@ def _add_tile(spec: mujoco.MjSpec, terrain: Terrain, level: int, column: int, pi
 
 
 def relief(terrain: Terrain, squares: bool = True) -> Picture:
-    """The ground as seen from above, row = +y, column = +x."""
+    """The ground as seen from above, a pixel a cell, row = +y, column = +x."""
     heights = terrain.heights.astype(np.float32)
-    pixels = PIXELS if heights.size * PIXELS**2 <= PIXELS_MAX else 1
     above = heights - _blurred(heights, max(round(0.5 * EDGE_WIDTH / terrain.cell), 1))
     tone = 1.0 + np.clip(EDGE * above, -EDGE_MAX, EDGE_MAX) + HILL * np.tanh(heights / HILL_HEIGHT)
     steep = np.clip((_slopes(heights) / terrain.cell - STEEP_FROM) / (STEEP_TO - STEEP_FROM), 0.0, 1.0)
-    picture = _enlarged(tone, pixels) * (1.0 - STEEP * steep.repeat(pixels, axis=0).repeat(pixels, axis=1))
-    picture *= 1.0 + _lines(terrain, pixels, squares)
+    cells = 0.25 * (tone[1:, 1:] + tone[1:, :-1] + tone[:-1, 1:] + tone[:-1, :-1])
+    picture = cells * (1.0 - STEEP * steep) * (1.0 + _lines(terrain, squares))
     return (np.minimum(picture[..., None] * COLOUR, 1.0) * 255).astype(np.uint8)
 
 
-def _lines(terrain: Terrain, pixels: int, squares: bool) -> Tones:
+def _lines(terrain: Terrain, squares: bool) -> Tones:
     """How much lighter squares and lines are, at the middles of pixels."""
     at_square, at_metre, at_tile = [], [], []  # along x, along y
     first = (along.start * terrain.cell for along in terrain.vertices(0, 0)[::-1])
     for count, corner, start in zip(terrain.heights.shape[::-1], terrain.corner, first, strict=True):
-        place = corner + (np.arange((count - 1) * pixels) + 0.5) / pixels * terrain.cell  # [m, world]
+        place = corner + (np.arange(count - 1) + 0.5) * terrain.cell  # [m, world]
         at_square.append(np.floor(place / SQUARE).astype(int) % 2)
         for on, origin, every in ((at_metre, 0.0, 1.0), (at_tile, corner + start, terrain.tile)):
             share = (place - origin) / every
@@ -114,14 +117,18 @@ def _slopes(heights: Tones) -> Tones:
     return np.maximum(np.maximum(x[1:], x[:-1]), np.maximum(y[:, 1:], y[:, :-1]))
 
 
-def _enlarged(values: Tones, pixels: int) -> Tones:
-    """Values at vertices, at the middles of ``pixels`` x ``pixels`` pixels a cell."""
-    for axis in (0, 1):
-        low, high = (np.take(values, range(start, values.shape[axis] - 1 + start), axis=axis) for start in (0, 1))
-        shares = [(i + 0.5) / pixels for i in range(pixels)]
-        between = np.stack([low * np.float32(1 - share) + high * np.float32(share) for share in shares], axis=axis + 1)
-        values = between.reshape([size * (pixels if which == axis else 1) for which, size in enumerate(low.shape)])
-    return values
+def add_squares(spec: mujoco.MjSpec, name: str, dark: Colour, light: Colour, line: Colour) -> None:
+    """A material of squares, 2 x 2 of them with a line around."""
+    picture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, rgb1=dark, rgb2=light, markrgb=line, width=512, height=512)
+    picture.builtin, picture.mark = mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mujoco.mjtMark.mjMARK_EDGE
+    # texuniform measures in half-sizes: texrepeat 1 lays the image, 2 x 2 squares with a line around it, over 2 m
+    add_material(spec, name, texuniform=True, texrepeat=[1 / SQUARE, 1 / SQUARE])
+
+
+def add_material(spec: mujoco.MjSpec, name: str, **mapping: Any) -> None:
+    """A dull material with the texture of that name."""
+    material = spec.add_material(name=name, specular=0.1, shininess=0.1, reflectance=0.0, **mapping)
+    material.textures[mujoco.mjtTextureRole.mjTEXROLE_RGB] = name
 
 
 def _add_surroundings(spec: mujoco.MjSpec, terrain: Terrain, squares: bool) -> None:
