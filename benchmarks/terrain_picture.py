@@ -22,8 +22,9 @@ from legged_mw.envs.checks import check_values
 from legged_mw.envs.terrain import build_terrain
 from legged_mw.sim.drawing import ground_model
 from legged_mw.sim.terrain import KINDS, MEASURES, Terrain, measure
-from legged_mw.utils.cli import Parser, apply_overrides, one_line_errors, shown
+from legged_mw.utils.cli import Parser, apply_overrides, one_line_errors
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import shown
 from legged_mw.utils.task import LoadedTask, load_task
 from legged_mw.view.recorder import no_context, shrunk
 from legged_mw.view.stage import ViewError
