@@ -60,6 +60,10 @@ HOST_READS: dict[str, Callable[[], object]] = {
     "allclose": lambda: torch.allclose(X, X),
     "bincount": lambda: torch.bincount(PICK),
     "histc": lambda: torch.histc(X),
+    "multinomial": lambda: torch.multinomial(X + 1.0, 1),
+    "eigh": lambda: torch.linalg.eigh(X[:, :2]),
+    "svd": lambda: torch.linalg.svd(X),
+    "lstsq": lambda: torch.linalg.lstsq(X[:, :2], X),
     "inv": lambda: torch.linalg.inv(X[:, :2] + 1.0),
     "normal": lambda: torch.normal(X, X + 1.0),
 }

@@ -24,6 +24,7 @@ _MOVES = {"cuda", "pin_memory"}
 _FACTORIES = {"empty", "zeros", "ones", "full", "eye", "arange", "linspace", "rand", "randn", "randint", "randperm", "normal"}
 # Kernels that read a value to the host, or whose result has as many elements as the data say.
 _READING = {"_local_scalar_dense", "equal", "allclose", "histc", "bincount", "_linalg_check_errors"}
+_READING |= {"_linalg_eigh", "_linalg_svd", "linalg_eig", "linalg_lstsq"}  # only on a GPU
 _DATA_SHAPED = {"nonzero", "masked_select", "_unique", "_unique2", "unique_dim", "unique_consecutive", "unique_dim_consecutive"}
 _INDEXED = {"index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index", "_unsafe_index_put"}
 
@@ -111,6 +112,8 @@ def _breach_of_kernel(func: Any, args: tuple) -> str:
     # a number assigned through an index is lifted too, without a copy: it has no dimension
     if name == "lift_fresh" and args[0].dim() > 0:
         return "a list or an array, as data or as an index, copies from the host; make it a tensor once, in __init__"
+    if name == "multinomial":
+        return "multinomial reads a tensor to the host; write (weights / torch.empty_like(weights).exponential_()).argmax(dim=1)"
     if name in _DATA_SHAPED or (name, overload) == ("repeat_interleave", "Tensor"):
         return f"{name.strip('_')} has a shape that depends on data; keep every row, and write torch.where(mask, a, b)"
     if name == "normal" and overload in ("Tensor_Tensor", "float_Tensor"):
