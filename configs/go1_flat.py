@@ -36,15 +36,15 @@ class Go1FlatCfg(LeggedRobotCfg):
         damping = {"joint": 0.5}  # [N m s/rad] [P]
 
     class rewards(LeggedRobotCfg.rewards):
-        tracking_sigma = 0.2  # [P 0.25] [ours: vx 0.019 m/s instead of 0.024; docs/training.md]
+        tracking_sigma = 0.2  # [P 0.25] [ours: vx 0.019 m/s instead of 0.024; docs/lab.md]
         pose_weights = {"hip": 1.0, "thigh": 1.0, "calf": 0.1}  # [P]
 
         class scales(LeggedRobotCfg.rewards.scales):
-            tracking_lin_vel = 2.0  # [P 1.0] [ours: with P's the error of vx stays at 0.033 m/s; docs/training.md]
+            tracking_lin_vel = 2.0  # [P 1.0] [ours: with P's the error of vx stays at 0.033 m/s; docs/lab.md]
             tracking_ang_vel = 1.0  # [P 0.5] [ours: likewise]
 
     class perturbation(LeggedRobotCfg.perturbation):
-        kick = True  # [ours: trained without, a quarter of 2 m/s kicks topple it; docs/training.md]
+        kick = True  # [ours: trained without, a quarter of pushes of 2 m/s topple it; docs/lab.md]
         velocity = [0.0, 8.0]  # [m/s] [ours: with up to 3, an eighth still do]
 
     class exam(LeggedRobotCfg.exam):  # [ours: what P's policy was graded with]
@@ -69,7 +69,7 @@ class Go1FlatCfgPPO(LeggedRobotCfgPPO):
         desired_kl = 0.003  # [ours]
 
     class symmetry(LeggedRobotCfgPPO.symmetry):
-        use_data_augmentation = True  # [ours: walks after 47 M steps where 63 M do not suffice without; docs/training.md]
+        use_data_augmentation = True  # [ours: walks after 47 M steps where 63 M do not suffice without; docs/lab.md]
 
 
 TASK = Task(LeggedRobot, Go1FlatCfg, Go1FlatCfgPPO)

@@ -99,7 +99,7 @@ class LeggedGymRobot(LeggedRobot):
         return ((self.dof_vel - self.last_dof_vel) / self.dt).square().sum(dim=1)
 
     def _reward_feet_air_time(self) -> Tensor:
-        """At touch-down, how much longer than ``min_air_time`` the foot was in the air [s], unless told to stand or turn."""
+        """At touch-down, how much longer than ``min_air_time`` the foot was in the air [s], unless commanded to stand or turn."""
         excess = (self.feet_air_time - self.cfg.rewards.min_air_time) * self.first_contact
         walking = torch.linalg.vector_norm(self.commands[:, :2], dim=1) > 0.1
         return excess.sum(dim=1) * walking

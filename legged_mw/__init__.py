@@ -14,7 +14,7 @@ os.environ.setdefault("GIT_PYTHON_REFRESH", "quiet")
 
 
 def _choose_offscreen_renderer() -> None:
-    """Without a screen MuJoCo draws through EGL, or OSMesa, if told so; where it is told and the library is missing, it fails at import."""
+    """Without a screen MuJoCo draws through EGL or OSMesa if MUJOCO_GL names it, but fails at import if the library is missing."""
     if sys.platform != "linux" or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or "MUJOCO_GL" in os.environ:
         return
     for name, library in (("egl", "libEGL.so.1"), ("osmesa", "libOSMesa.so.8")):

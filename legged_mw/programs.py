@@ -15,7 +15,8 @@ from legged_mw.utils.task import LoadedTask, list_tasks, load_task
 @one_line_errors()
 def train() -> None:
     """Train a task. On 8 GPUs: torchrun --nproc_per_node=8 train.py --task go1_flat"""
-    from legged_mw.envs.describe import describe
+    from legged_mw.check.describe import describe
+    from legged_mw.check.guard import check_recordable
     from legged_mw.eval.exams import make_exam
     from legged_mw.rl import training
 
@@ -25,7 +26,7 @@ def train() -> None:
         return
     task = load_task(args.task)
     start, device = training.configure(task, args)
-    env = training.build(task, device, args.eager)
+    env = training.build(task, device, args.eager, check_recordable)
     if args.check:
         print(describe(env, task))
         return
@@ -48,11 +49,11 @@ def play() -> None:
         rivals = [find_rival(task, args.compare, args.experiment_name)] if args.compare is not None else []
         grading.grade([(source, trained), *((rival, load_trained(args.task, rival)) for rival in rivals)], args)
         return
-    played = playing.prepare(source, trained, args)
+    task, commands = playing.prepare(source, trained, args)
     if args.export:
         print(export(trained, source.checkpoint, Path(args.export)))
     else:
-        playing.watch(source, played, args)
+        playing.watch(source, task, commands, args)
 
 
 def export(task: LoadedTask, checkpoint: Path, folder: Path) -> str:

@@ -26,8 +26,7 @@ from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
 from legged_mw.deploy.runner import run
-from legged_mw.deploy.scene import read_scene
-from legged_mw.deploy.simulated import Fleet, MujocoRobot
+from legged_mw.deploy.simulated import Fleet, MujocoRobot, read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import exam, rules
 from legged_mw.rl.policies import act, load_policy

@@ -11,12 +11,12 @@ import torch
 from torch import Tensor
 from worlds import QUIET, changed, layout, make_env, same, snapshot
 
+from legged_mw.check.recordable import recordable
 from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, world_fields
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.sim.engines import make_simulation
 from legged_mw.sim.model import GROUND, ModelError
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import load_task
 
 ENGINES = ["mujoco", "mujoco_warp"]

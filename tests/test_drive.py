@@ -38,7 +38,7 @@ THREE = (
 )
 HEIGHT = Command("base_height", 0.2, 0.3, "m", 1.0, 0.28)
 FOUR = (*THREE, HEIGHT)
-MODEL = mujoco.MjModel.from_xml_string('<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>')
+SPEC = mujoco.MjSpec.from_string('<mujoco><worldbody><body><freejoint/><geom size=".1"/></body></worldbody></mujoco>')
 
 
 def done(pilot: Pilot, *actions: str) -> Pilot:
@@ -220,7 +220,7 @@ def test_a_script_gives_commands_by_order_or_by_name(tmp_path: Path) -> None:
 class FakeStage:
     """Robots that do at once what they are told, and fall when `falls` says so."""
 
-    model, dt = MODEL, 0.02
+    spec, dt = SPEC, 0.02
 
     def __init__(self, num_worlds: int = 2, falls: dict[int, int] | None = None, table: tuple[Command, ...] = THREE) -> None:
         self.num_worlds, self.falls, self.command_table = num_worlds, falls or {}, table  # falls: step -> world
@@ -429,8 +429,8 @@ def test_watching_without_a_viewer_ends_by_itself(tmp_path: Path, capsys: pytest
 
 def test_a_batch_job_gets_a_video_and_a_sheet(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(launch, "has_display", lambda: False)
-    picture = launch.Picture(64, 48, 25)
-    launch.watch(FakeStage(), flags("--time", "0.2"), tmp_path, picture)
+    picture: Any = {"width": 64, "height": 48, "fps": 25.0}
+    launch.watch(FakeStage(), flags("--time", "0.2"), tmp_path, **picture)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["play.mp4", "play.png"]
     assert "(no screen here, and no terminal" in capsys.readouterr().out
 
@@ -445,7 +445,7 @@ def test_a_window_that_cannot_open_does_not_leave_a_batch_job_waiting(
     monkeypatch.setattr(launch, "NativeViewer", refuse)
     monkeypatch.setattr("sys.stdout.isatty", lambda: False, raising=False)
     monkeypatch.setattr(launch, "SECONDS", 0.1)  # nobody said how long
-    outcome = launch.watch(FakeStage(), flags(), tmp_path, launch.Picture(64, 48))
+    outcome = launch.watch(FakeStage(), flags(), tmp_path, width=64, height=48)
     assert (
         outcome.seconds == pytest.approx(0.1)
         and (tmp_path / "play.mp4").exists()
@@ -652,7 +652,7 @@ def test_the_page_is_served_on_this_machine_alone_and_says_no_to_a_bad_host(monk
         return await serve(*args, **settings)
 
     monkeypatch.setattr(web_server, "serve", late)
-    with closing(WebViewer(MODEL, pilot, 2)) as page:
+    with closing(WebViewer(SPEC, pilot, 2)) as page:
         assert page._plugin.viewer._http_sock.getsockname()[0] == "127.0.0.1"
         stage = FakeStage()
         now = np.zeros((2, 3))
@@ -663,10 +663,10 @@ def test_the_page_is_served_on_this_machine_alone_and_says_no_to_a_bad_host(monk
         with pytest.raises(OSError):  # any other address of this machine
             urllib.request.urlopen(f"http://[::1]:{page.port}/", timeout=2)
         with pytest.raises(ViewError, match=rf"--port {page.port} is in use on 127.0.0.1; leave it out"):
-            WebViewer(MODEL, pilot, port=page.port)
+            WebViewer(SPEC, pilot, port=page.port)
     assert not page.is_running()
     with pytest.raises(ViewError, match=r"--host 203.0.113.7: this machine has no such address"):
-        WebViewer(MODEL, pilot, host="203.0.113.7")
+        WebViewer(SPEC, pilot, host="203.0.113.7")
 
 
 # ---- the environment as a stage
@@ -695,7 +695,7 @@ def test_the_environment_follows_the_pilot() -> None:
     assert np.linalg.norm(after[0, :2] - before[0, :2]) > 1 and np.linalg.norm(after[1, :2] - before[1, :2]) < 1
     stage.reset(1)
     qpos = stage.qpos()
-    assert qpos.shape == (2, stage.model.nq) and qpos.dtype == np.float64 and np.allclose(qpos[1, 2], env.init_pos[2])
+    assert qpos.shape == (2, stage.spec.compile().nq) and qpos.dtype == np.float64 and np.allclose(qpos[1, 2], env.init_pos[2])
     assert stage.contacts().shape == (2, 4) and not stage.fell().any()
     kept = stage._obs["state"].clone()  # pyright: ignore[reportAttributeAccessIssue]
     stage.step(commands * 0.5)

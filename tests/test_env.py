@@ -14,13 +14,13 @@ from torch import Tensor
 from worlds import QUIET, changed, layout, make_env, same, snapshot, tensors
 
 from legged_mw import ROOT
+from legged_mw.check.recordable import recordable
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import NotRecordable
-from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import load_task
 
 HOME = [0.1, 0.9, -1.8, -0.1, 0.9, -1.8, 0.1, 0.9, -1.8, -0.1, 0.9, -1.8]  # [rad] FR, FL, RR, RL; hip, thigh, calf

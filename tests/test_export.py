@@ -20,7 +20,7 @@ from worlds import make_env
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import ROWS, ContractError, Ends, read_contract
-from legged_mw.deploy.scene import read_scene
+from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row

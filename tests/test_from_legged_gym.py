@@ -15,13 +15,13 @@ from torch import Tensor
 from worlds import QUIET, changed, layout, make_env, same, snapshot
 
 from legged_mw import ROOT
+from legged_mw.check.recordable import recordable
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.eval import exam, grading
 from legged_mw.sim.model import Ground, ModelError, Solver, build_model
 from legged_mw.utils import math as math_of_steps
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import load_task
 
 TASK = str(ROOT / "examples/go1_legged_gym.py")

@@ -12,11 +12,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from legged_mw.envs.guard import check_recordable
+from legged_mw.check.guard import check_recordable
+from legged_mw.check.recordable import recordable
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import NotRecordable, StepError
-from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import load_task
 
 X = torch.arange(6.0).view(2, 3)

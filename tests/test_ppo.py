@@ -119,8 +119,9 @@ def test_learning_rate_can_be_set() -> None:
     [
         ({"optimizer": "sgd"}, "the optimizer is SGD"),
         ({"distribution": {"class_name": "BetaDistribution"}}, "drawn from a BetaDistribution"),
+        ({"use_mixed_precision": True}, "use_mixed_precision is set"),
     ],
-    ids=["sgd", "beta"],
+    ids=["sgd", "beta", "mixed precision"],
 )
 def test_what_cannot_be_recorded_is_left_to_rsl_rl(settings: dict, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
     alg = make(GraphedPPO, **settings)

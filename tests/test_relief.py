@@ -17,16 +17,15 @@ from program import run
 
 from benchmarks import terrain_picture
 from legged_mw import ROOT
-from legged_mw.sim.drawing import ground_model, visual_model
+from legged_mw.sim.drawing import ground_model, visual_model, visual_spec
 from legged_mw.sim.relief import PIXELS, relief
 from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.task import load_task
 from legged_mw.view.camera import ELEVATION, RobotCamera
 from legged_mw.view.playing import ground_to_watch
-from legged_mw.view.posed_robot import PosedRobots
+from legged_mw.view.posed_robot import PosedRobots, RoughGround
 from legged_mw.view.recorder import RobotRenderer
-from legged_mw.view.rough_ground import RoughGround
 from legged_mw.view.session import Outcome, Session
 from legged_mw.view.stage import Moment
 
@@ -40,7 +39,7 @@ def terrain(*kinds: str, levels: int = 2, cell: float = 0.1, **more: float) -> T
 
 
 @pytest.fixture(scope="module")
-def hilly() -> mujoco.MjModel:
+def hilly_spec() -> mujoco.MjSpec:
     """A Go1 among two levels of each kind, as it is drawn."""
     task = load_task("go1_rough")
     for path, value in {
@@ -53,7 +52,12 @@ def hilly() -> mujoco.MjModel:
         "terrain.curriculum": False,
     }.items():
         task.set(path, value)
-    return visual_model(task.env_class(task.cfg, "cpu", eager=True).robot)
+    return visual_spec(task.env_class(task.cfg, "cpu", eager=True).robot)
+
+
+@pytest.fixture(scope="module")
+def hilly(hilly_spec: mujoco.MjSpec) -> mujoco.MjModel:
+    return hilly_spec.compile()
 
 
 def grid() -> Terrain:
@@ -145,10 +149,10 @@ def test_hills_are_as_high_as_the_ground(hilly: mujoco.MjModel) -> None:
     assert hills.height(np.array([500.0, 0.0])) == 0.0
 
 
-def test_only_near_tiles_are_drawn_in_full(hilly: mujoco.MjModel) -> None:
+def test_only_near_tiles_are_drawn_in_full(hilly_spec: mujoco.MjSpec, hilly: mujoco.MjModel) -> None:
     ground = grid()
     middle = ground.origins[0, 0]
-    with closing(RobotRenderer(hilly, 64, 48, count=2)) as renderer:
+    with closing(RobotRenderer(hilly_spec, 64, 48, count=2)) as renderer:
         qpos = np.tile(hilly.qpos0, (2, 1))
         qpos[:, :3] = middle + (0.0, 0.0, 0.3)
         still = Moment(0.0, qpos, np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, 4), dtype=bool))
@@ -161,8 +165,8 @@ def test_only_near_tiles_are_drawn_in_full(hilly: mujoco.MjModel) -> None:
         assert renderer.robots.offsets.tolist() == [[0.0] * 3] * 2, "each on its tile"
 
 
-def test_the_camera_looks_over_what_rises_before_it(hilly: mujoco.MjModel) -> None:
-    ground, cast = grid(), PosedRobots(hilly)
+def test_the_camera_looks_over_what_rises_before_it(hilly_spec: mujoco.MjSpec, hilly: mujoco.MjModel) -> None:
+    ground, cast = grid(), PosedRobots(hilly_spec)
     qpos = np.array(hilly.qpos0)
     elevations = []
     for column, ahead in ((KINDS.index("flat"), 0.0), (KINDS.index("stairs_up"), 2.0)):
@@ -179,7 +183,7 @@ def test_the_camera_looks_over_what_rises_before_it(hilly: mujoco.MjModel) -> No
 
 def test_boxes_are_places_too() -> None:
     step = "<worldbody><geom type='box' size='1 1 .1'/><body pos='0 0 1'><freejoint/><geom size='.1'/></body></worldbody>"
-    assert not PosedRobots(mujoco.MjModel.from_xml_string(f"<mujoco>{step}</mujoco>"), 3).offsets.any()
+    assert not PosedRobots(mujoco.MjSpec.from_string(f"<mujoco>{step}</mujoco>"), 3).offsets.any()
 
 
 # ---- the small grid of play.py

@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 from worlds import QUIET, make_env
 
+from legged_mw.check.recordable import recordable
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.rl.runner import make_runner
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import load_task
 
 ENGINES = ("mujoco", "mujoco_warp")

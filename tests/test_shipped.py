@@ -12,7 +12,7 @@ from program import run
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import digest, read_contract
-from legged_mw.deploy.scene import read_scene
+from legged_mw.deploy.simulated import read_scene
 from legged_mw.eval import exam, rules
 from legged_mw.rl.export import FILES, ExportedPolicy
 from legged_mw.rl.policies import act, load_policy

@@ -21,9 +21,10 @@ from torch import Tensor, nn
 from worlds import changed, same, snapshot, tensors
 
 from legged_mw import ROOT
+from legged_mw.check.guard import check_recordable
+from legged_mw.check.recordable import recordable
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.envs.guard import check_recordable
 from legged_mw.rl import export as exporting
 from legged_mw.rl.export import Exported, export
 from legged_mw.rl.policies import act, load_policy
@@ -31,7 +32,6 @@ from legged_mw.rl.runner import make_runner
 from legged_mw.rl.symmetry import mirror
 from legged_mw.sim.errors import ModelError
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 EXAMPLES = [str(path) for path in sorted(ROOT.glob("examples/*.py")) if "TASK = " in path.read_text()]

@@ -16,6 +16,7 @@ from torch import Tensor
 from worlds import QUIET, changed, layout, make_env, snapshot
 
 from legged_mw import ROOT
+from legged_mw.check.recordable import recordable
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
@@ -24,7 +25,6 @@ from legged_mw.rl.symmetry import mirror
 from legged_mw.sim.mirror import find_partners
 from legged_mw.sim.model import Ground, ModelError, RobotModel, Solver, build_model
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
-from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import LoadedTask, load_task
 
 FEET = ["FR", "FL", "RR", "RL"]

@@ -13,10 +13,11 @@ import pytest
 import torch
 
 from legged_mw import ROOT
+from legged_mw.check.recordable import recordable
 from legged_mw.envs.terrain import build_terrain
 from legged_mw.sim.errors import ModelError
+from legged_mw.sim.ground import as_boxes
 from legged_mw.sim.height_map import HeightMap
-from legged_mw.sim.level_boxes import as_boxes
 from legged_mw.sim.terrain import (
     KINDS,
     LEVEL,
@@ -30,7 +31,6 @@ from legged_mw.sim.terrain import (
     make_terrain,
     share_columns,
 )
-from legged_mw.utils.recordable import recordable
 from legged_mw.utils.task import load_task
 
 

@@ -20,16 +20,15 @@ import numpy as np
 import pytest
 
 from legged_mw import ROOT
-from legged_mw.sim.drawing import visual_model
+from legged_mw.sim.drawing import visual_spec
 from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.task import load_task
 from legged_mw.view import native
 from legged_mw.view.camera import DISTANCE, RobotCamera
-from legged_mw.view.copied_model import CopiedRobots
 from legged_mw.view.drive import BINDINGS, Pilot
 from legged_mw.view.native import NativeViewer, has_display
 from legged_mw.view.overlay import ARC_SEGMENTS, draw_velocities
-from legged_mw.view.posed_robot import Placement, PosedRobot, PosedRobots, show_groups
+from legged_mw.view.posed_robot import Placement, PosedRobots, show_groups
 from legged_mw.view.recorder import Recorder, RobotRenderer, shrunk
 from legged_mw.view.session import Pace
 from legged_mw.view.stage import Fall, Moment
@@ -59,6 +58,9 @@ ROBOT = f"""
 </mujoco>"""
 
 
+SPEC = mujoco.MjSpec.from_string(ROBOT)
+
+
 @pytest.fixture(scope="module")
 def model() -> mujoco.MjModel:
     return mujoco.MjModel.from_xml_string(ROBOT)
@@ -66,7 +68,7 @@ def model() -> mujoco.MjModel:
 
 @pytest.fixture  # a new one for each test: the camera remembers where the robot was
 def renderer(model: mujoco.MjModel) -> Iterator[RobotRenderer]:
-    with closing(RobotRenderer(model, 320, 240)) as robot_renderer:
+    with closing(RobotRenderer(SPEC, 320, 240)) as robot_renderer:
         yield robot_renderer
 
 
@@ -175,7 +177,7 @@ def test_gif_is_an_animation_in_its_own_colours(tmp_path: Path) -> None:
 
 
 def test_a_recorder_writes_a_video_and_a_sheet(tmp_path: Path, model: mujoco.MjModel) -> None:
-    film = Recorder(model, 1, 0.02, 1.2, video=tmp_path / "a.mp4", sheet=tmp_path / "a.png", width=160, height=120, fps=25)
+    film = Recorder(SPEC, 1, 0.02, 1.2, video=tmp_path / "a.mp4", sheet=tmp_path / "a.png", width=160, height=120, fps=25)
     for step in range(60):
         film.show(moment(model, time=step * 0.02))
     film.close()
@@ -184,7 +186,7 @@ def test_a_recorder_writes_a_video_and_a_sheet(tmp_path: Path, model: mujoco.MjM
     with av.open(str(tmp_path / "a.png")) as container:
         assert next(container.decode(video=0)).to_ndarray(format="rgb24").shape == (3 * 120, 4 * 160, 3)
     before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
-    film = Recorder(model, 1, 0.02, 1.2, video=tmp_path / "a.mp4", sheet=None, width=160, height=120)
+    film = Recorder(SPEC, 1, 0.02, 1.2, video=tmp_path / "a.mp4", sheet=None, width=160, height=120)
     film.show(moment(model))
     film.abort()
     assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
@@ -256,7 +258,7 @@ def test_words_are_written_over_the_picture(model: mujoco.MjModel, renderer: Rob
 
 
 def test_camera_glides_after_the_base_and_cuts_after_a_jump(model: mujoco.MjModel) -> None:
-    robots, qpos = PosedRobots(model), model.qpos0.copy()
+    robots, qpos = PosedRobots(SPEC), model.qpos0.copy()
     follow = RobotCamera(mujoco.MjvCamera(), robots, by_hand=False)
     assert np.allclose(follow.update("follow", 0).lookat, robots.placements[0].position)
     assert follow.camera.distance == pytest.approx(DISTANCE * robots.radius)
@@ -273,7 +275,7 @@ def test_camera_glides_after_the_base_and_cuts_after_a_jump(model: mujoco.MjMode
 
 
 def test_camera_walks_behind_and_sees_all(model: mujoco.MjModel) -> None:
-    robots = PosedRobots(model, 4)
+    robots = PosedRobots(SPEC, 4)
     camera = RobotCamera(mujoco.MjvCamera(), robots, by_hand=False)
     qpos = np.tile(model.qpos0, (4, 1))
     qpos[1, 3:7] = np.cos(np.pi / 4), 0, 0, np.sin(np.pi / 4)
@@ -285,7 +287,7 @@ def test_camera_walks_behind_and_sees_all(model: mujoco.MjModel) -> None:
 
 
 def test_a_mouse_may_turn_the_camera_that_follows(model: mujoco.MjModel) -> None:
-    robots = PosedRobots(model)
+    robots = PosedRobots(SPEC)
     camera = RobotCamera(mujoco.MjvCamera(), robots, by_hand=True)
     camera.update("follow", 0)
     assert camera.camera.type == mujoco.mjtCamera.mjCAMERA_TRACKING and camera.camera.trackbodyid == robots.base
@@ -297,11 +299,11 @@ def test_a_mouse_may_turn_the_camera_that_follows(model: mujoco.MjModel) -> None
 
 
 def test_another_robot_looks_as_the_followed_one_does(model: mujoco.MjModel) -> None:
-    """The same robot in the same pose at the same place: followed, and added beside a followed one that is behind the camera."""
+    """The same robot in the same pose at the same place: followed, and beside a followed one that is behind the camera."""
     pose = model.qpos0 + 0.2 * np.eye(model.nq)[7] + 0.3 * np.eye(model.nq)[0]
     pictures = []
     for count in (1, 2):
-        robots = PosedRobots(model, count)
+        robots = PosedRobots(SPEC, count)
         robots.offsets[:] = 0.0
         away = model.qpos0 - 6.0 * np.eye(model.nq)[1]
         robots.pose(np.stack([away, pose])[-count:])
@@ -310,9 +312,7 @@ def test_another_robot_looks_as_the_followed_one_does(model: mujoco.MjModel) -> 
         show_groups(option)
         with mujoco.Renderer(robots.model, 120, 160) as view:
             view.update_scene(robots.data, camera, option)
-            before = view.scene.ngeom
-            robots.add_others(view.scene, option)
-            assert view.scene.ngeom - before == (count - 1) * 6
+            assert view.scene.ngeom == 1 + count * 6  # group 3 stays behind
             lamp = next(light for light in view.scene.lights[: view.scene.nlight] if not light.headlight)
             lamp.pos[:] = 0.3, 0, 4  # the model's light stays with the followed robot
             pictures.append(view.render().astype(int))
@@ -320,59 +320,25 @@ def test_another_robot_looks_as_the_followed_one_does(model: mujoco.MjModel) -> 
     assert pictures[0].std() > 20 and difference.mean() < 1.5, difference.mean()
 
 
-def test_a_copied_robot_looks_as_the_robot_does(model: mujoco.MjModel) -> None:
-    pose = model.qpos0 + 0.2 * np.eye(model.nq)[7] + 0.3 * np.eye(model.nq)[0]
-    pictures = []
-    for robots in (PosedRobots(model), CopiedRobots(model, 1)):
-        robots.pose(pose)
-        camera, option = mujoco.MjvCamera(), mujoco.MjvOption()
-        camera.lookat[:], camera.distance, camera.elevation = [0.3, 0, 0.2], 1.2, -20
-        show_groups(option)
-        with mujoco.Renderer(robots.model, 120, 160) as view:
-            view.update_scene(robots.data, camera, option)
-            pictures.append(view.render().astype(int))
-    difference = np.abs(pictures[0] - pictures[1])
-    assert pictures[0].std() > 20 and difference.mean() < 1.5, difference.mean()
-
-
-def test_copied_robots_are_one_model_without_joints(model: mujoco.MjModel) -> None:
-    robots, qpos = CopiedRobots(model, 5), np.tile(model.qpos0, (5, 1))
-    qpos[3, :3] += (0.5, -0.2, 0.1)
-    qpos[3, 7] = 0.7
-    robots.pose(qpos, 3)
-    alone = PosedRobot(model)
-    alone.pose(qpos[3])
-    assert np.allclose(robots.data.xpos[robots.model.body("3/2").id], alone.data.xpos[2] + robots.offsets[3])
-    assert np.allclose(robots.data.xquat[robots.model.body("3/2").id], alone.data.xquat[2])
-    assert np.allclose(robots.data.xpos[robots.base], robots.placements[3].position)  # what the camera tracks
-    assert robots.model.nv == 0 and robots.model.ngeom == 1 + 5 * 6  # nothing to solve; group 3 stays behind
-    scene = mujoco.MjvScene(model, 100)
-    robots.add_others(scene, mujoco.MjvOption())
-    assert scene.ngeom == 0
-
-
 def test_robots_stand_side_by_side_each_in_its_pose(model: mujoco.MjModel) -> None:
-    robots, qpos = PosedRobots(model, 5), np.tile(model.qpos0, (5, 1))
+    robots, qpos = PosedRobots(SPEC, 5), np.tile(model.qpos0, (5, 1))
     qpos[3, :3] += (0.5, -0.2, 0.1)
     qpos[3, 7] = 0.7
     robots.pose(qpos, 3)
     apart = np.linalg.norm(robots.offsets[:, None] - robots.offsets[None], axis=2) + 10 * np.eye(5)
     assert apart.min() >= 2 * robots.radius and not robots.offsets[0].any()
     assert np.allclose(robots.placements[3].position, robots.offsets[3] + qpos[3, :3])
-    alone = PosedRobot(model)
+    alone = PosedRobots(SPEC)
     alone.pose(qpos[3])
-    assert np.allclose(robots.data.xpos[1:], alone.data.xpos[1:] + robots.offsets[3])  # the followed one
-    assert np.allclose(robots.data.xquat, alone.data.xquat)
+    followed, fourth = slice(1, model.nbody), slice(1 + 3 * (model.nbody - 1), 1 + 4 * (model.nbody - 1))
+    assert np.allclose(robots.data.xpos[followed], alone.data.xpos[1:] + robots.offsets[3])
+    assert np.allclose(robots.data.xquat[followed], alone.data.xquat[1:])
     robots.pose(qpos, 1)
     assert np.allclose(robots.data.xpos[robots.base], robots.placements[1].position)  # what the camera tracks
-    scene, option = mujoco.MjvScene(model, 100), mujoco.MjvOption()
-    show_groups(option)
-    robots.add_others(scene, option)
-    assert scene.ngeom == 4 * 6  # group 3 stays behind
-    third = scene.geoms[2 * 6 : 3 * 6]  # robots 0, 2, 3, 4
-    shown = np.flatnonzero((model.geom_group < 3) & (model.geom_bodyid > 0))
-    spheres = model.geom_type[shown] == mujoco.mjtGeom.mjGEOM_SPHERE
-    assert np.allclose(np.array([geom.pos for geom in third])[spheres], alone.data.geom_xpos[shown[spheres]] + robots.offsets[3], atol=1e-5)
+    assert np.allclose(robots.placements[3].position, robots.offsets[3] + qpos[3, :3])
+    assert np.allclose(robots.data.xpos[fourth], alone.data.xpos[1:] + robots.offsets[3])  # robots 1, 0, 2, 3, 4
+    assert np.allclose(robots.data.xquat[fourth], alone.data.xquat[1:])
+    assert robots.model.nlight == 1 and robots.model.nsensor == 0 and robots.model.nmesh == 1
     contacts = np.zeros((5, 2), dtype=bool)
     contacts[3, 0] = True  # of the leg that is turned
     assert np.allclose(robots.below_feet(contacts), [alone.data.geom("foot0.1").xpos + robots.offsets[3] - (0, 0, 0.03)])
@@ -380,7 +346,7 @@ def test_robots_stand_side_by_side_each_in_its_pose(model: mujoco.MjModel) -> No
 
 def test_the_disc_of_a_flat_foot_is_below_its_sole() -> None:
     boxes = ROBOT.replace('size=".03" pos="0 0 -.3"', 'type="box" size=".1 .04 .01" pos=".05 0 -.3"')
-    robots = PosedRobots(mujoco.MjModel.from_xml_string(boxes))
+    robots = PosedRobots(mujoco.MjSpec.from_string(boxes))
     assert robots.foot_radius == pytest.approx(0.04)
     assert np.allclose(robots.below_feet([[True, False]]), [[0.18 + 0.05, 0.1, 0.35 - 0.31]])
 
@@ -389,15 +355,14 @@ def test_on_a_terrain_each_robot_stays_where_it_is() -> None:
     terrain = '<asset><hfield name="hills" nrow="2" ncol="2" size="2 2 .5 .1" elevation="0 1 1 0"/></asset><worldbody>'
     floor = '<geom name="floor" type="plane" size="0 0 .05" material="floor"/>'
     ground = floor.replace("plane", "hfield").replace('size="0 0 .05"', 'hfield="hills"')
-    hills = mujoco.MjModel.from_xml_string(ROBOT.replace("<worldbody>", terrain, 1).replace(floor, ground))
+    hills = mujoco.MjSpec.from_string(ROBOT.replace("<worldbody>", terrain, 1).replace(floor, ground))
     robots = PosedRobots(hills, 3)
     assert not robots.offsets.any() and robots.ground is not None
-    copied = CopiedRobots(hills, 3).model
-    assert np.allclose(copied.hfield_data, hills.hfield_data) and np.allclose(copied.hfield_size, hills.hfield_size)
+    assert robots.model.nhfield == 1 and np.allclose(robots.model.hfield_data, hills.compile().hfield_data)
 
 
 def test_many_robots_are_in_one_picture(model: mujoco.MjModel) -> None:
-    with closing(RobotRenderer(model, 320, 240, count=4)) as several:
+    with closing(RobotRenderer(SPEC, 320, 240, count=4)) as several:
         command = np.tile([1.0, 0.0, 0.0], (4, 1))
         one = colour_count(several.frame(moment(model, 4, target_velocity=command * [[1], [0], [0], [0]], camera="all")), (255, 130, 0))
         four = colour_count(several.frame(moment(model, 4, target_velocity=command, camera="all")), (255, 130, 0))
@@ -413,12 +378,12 @@ def test_bad_poses_and_models(model: mujoco.MjModel, renderer: RobotRenderer) ->
         renderer.frame(moment(model, target_velocity=np.zeros((1, 2))))
     arm = '<mujoco><worldbody><body><joint name="elbow"/><geom size=".1"/></body></worldbody></mujoco>'
     with pytest.raises(ValueError, match="free joint, which must be the model's first joint; found 'elbow'"):
-        PosedRobot(mujoco.MjModel.from_xml_string(arm))
+        PosedRobots(mujoco.MjSpec.from_string(arm))
 
 
 def test_missing_opengl_names_the_remedy_and_the_state() -> None:
     code = "import mujoco\nfrom legged_mw.view.recorder import RobotRenderer\n"
-    code += f"RobotRenderer(mujoco.MjModel.from_xml_string({ROBOT!r}), 64, 48)"
+    code += f"RobotRenderer(mujoco.MjSpec.from_string({ROBOT!r}), 64, 48)"
     environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")} | {"MUJOCO_GL": "glfw"}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert "ViewError: No OpenGL context for offscreen rendering (MUJOCO_GL='glfw', DISPLAY=None)" in done.stderr
@@ -446,12 +411,12 @@ def test_has_display_follows_the_environment(monkeypatch: pytest.MonkeyPatch) ->
 def test_window_without_display_says_what_to_do(monkeypatch: pytest.MonkeyPatch, model: mujoco.MjModel) -> None:
     monkeypatch.setattr(native, "has_display", lambda: False)
     with pytest.raises(RuntimeError, match="neither DISPLAY nor WAYLAND_DISPLAY is set.*--viewer web, record a video"):
-        NativeViewer(model)
+        NativeViewer(SPEC)
     monkeypatch.setattr(native, "has_display", lambda: True)
     monkeypatch.setattr(native, "_can_open_window", lambda: False)
     monkeypatch.setenv("DISPLAY", ":99")
     with pytest.raises(RuntimeError, match="No OpenGL window can be opened on this display .*DISPLAY=':99'"):
-        NativeViewer(model)
+        NativeViewer(SPEC)
 
 
 def test_plain_python_on_macos_is_told_of_mjpython(monkeypatch: pytest.MonkeyPatch, model: mujoco.MjModel) -> None:
@@ -463,13 +428,13 @@ def test_plain_python_on_macos_is_told_of_mjpython(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(sys, "platform", "darwin")
     monkeypatch.setattr(mujoco.viewer, "launch_passive", refuse)
     with pytest.raises(RuntimeError, match="start with `mjpython` in place of `python`"):
-        NativeViewer(model)
+        NativeViewer(SPEC)
 
 
 @pytest.mark.display
 def test_window_shows_poses_and_is_gone_after_close(model: mujoco.MjModel) -> None:
     pilot = Pilot(TABLE, 2)
-    with closing(NativeViewer(model, pilot, 2)) as viewer:
+    with closing(NativeViewer(SPEC, pilot, 2)) as viewer:
         qpos = np.tile(model.qpos0, (2, 1)) + np.eye(model.nq)[0]
         viewer.show(moment(model, 2, qpos=qpos, target_velocity=np.ones((2, 3)), lines=(("falls", "0"),), world=1))
         assert viewer.is_running()
@@ -543,10 +508,10 @@ def test_feet_are_found_among_other_contacts() -> None:
     """The port of legged_gym's task senses contacts of thighs, calves and trunk too; its feet come first."""
     task = load_task(str(ROOT / "examples" / "go1_legged_gym.py"))
     task.set("env.num_envs", 1)
-    model = visual_model(task.env_class(task.cfg, "cpu").robot)
-    robots = PosedRobots(model, 1)
+    spec = visual_spec(task.env_class(task.cfg, "cpu").robot)
+    robots = PosedRobots(spec, 1)
     assert len(robots.feet) > 4
-    robots.pose(model.qpos0[None], 0)
+    robots.pose(spec.compile().qpos0[None], 0)
     assert robots.below_feet(np.array([[True, False, True, False]])).shape == (2, 3)
 
 
@@ -554,7 +519,7 @@ def test_a_camera_that_draws_seldom_is_where_one_that_draws_always_is(model: muj
     """A contact sheet alone draws every twentieth frame; its robot must not have left the picture."""
     seen = []
     for skip in (1, 20):
-        robots = PosedRobots(model, 1)
+        robots = PosedRobots(SPEC, 1)
         man, qpos = RobotCamera(mujoco.MjvCamera(), robots, by_hand=False), np.array(model.qpos0)
         for step in range(0, 61, skip):
             qpos[0] = 0.02 * step  # 1 m/s at 50 frames a second

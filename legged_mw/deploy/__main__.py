@@ -10,8 +10,8 @@ from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, r
 from legged_mw.deploy.exam import run_exam
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rules
-from legged_mw.utils.cli import Parser, duration, one_line_errors, positive, shown
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.cli import Parser, duration, one_line_errors, positive
+from legged_mw.utils.errors import UserError, shown
 from legged_mw.view import launch
 
 RESULT_FILE = "exam.json"

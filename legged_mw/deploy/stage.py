@@ -43,7 +43,7 @@ class DeployStage:
         self.contract = replace(contract, ends=ends or contract.ends)
         self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file)
         self.controller = Controller(folder, self.contract, num_worlds)
-        self.model, self.num_worlds, self.dt = self.fleet.model, num_worlds, self.contract.period
+        self.spec, self.num_worlds, self.dt = self.fleet.spec, num_worlds, self.contract.period
         self.command_table = self.contract.commands
         own = idle_command(self.contract) if command is None else np.array(command, dtype=float)
         self._own = np.tile(own, (num_worlds, 1))
@@ -74,8 +74,8 @@ class DeployStage:
         return self.fleet.qpos.copy()
 
     def contacts(self) -> NDArray[np.bool_]:
-        """(N, F), in the contract's order of feet."""
-        return self.measured.foot_contact > 0.0
+        """(N, G), the geoms of the feet."""
+        return self.fleet.touching()
 
     def fell(self) -> NDArray[np.bool_]:
         """(N,) in the last step."""

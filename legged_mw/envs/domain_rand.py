@@ -47,7 +47,7 @@ KINDS: dict[str, Kind] = {
     "action_delay": Kind("world", 0.0, "scalar", whole=True),
     "observation_delay": Kind("world", 0.0, "scalar", whole=True),
 }
-# Constants of the model depend on them: derived anew at the start, never within a recorded step.
+# Constants of the model depend on them: derived once they are drawn, never within a recorded step.
 ONLY_AT_START = tuple(name for name, kind in KINDS.items() if {*kind.fields} & {*CONSTANTS_READ})
 
 
@@ -98,7 +98,7 @@ class DomainRand:
         return Delay(self.values[name], self._longest[name], width, start) if name in self.values else None
 
     def redraw(self) -> None:
-        """Draw everything anew in every world, and what the model derives from it. Not for inside a recorded step."""
+        """Draw everything again in every world, and what the model derives from it. Not for inside a recorded step."""
         self._draw(self._mask, 0)
         for write in self._writers:
             write(self._mask)
@@ -106,7 +106,7 @@ class DomainRand:
             self._sim.set_constants()
 
     def reset(self, mask: Tensor) -> None:
-        """Draw anew, where ``mask`` (N,) is true, what is drawn at every reset."""
+        """Draw what is drawn at every reset, where ``mask`` (N,) is true."""
         if self._first_again < self._draws.shape[1]:
             self._draw(mask, self._first_again)
             for write in self._writers_again:

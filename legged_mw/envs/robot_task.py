@@ -46,7 +46,8 @@ class RobotTask(BaseTask):
 
     cfg: RobotTaskCfg
     exam = ""  # kind of exam that grades a policy (legged_mw/eval/exams.py); none
-    command_table: tuple[Command, ...] = ()  # what a person can ask of the robot, columns of ``commands``; nothing
+    command_table: tuple[Command, ...] = ()  # what a person can ask of the robot; nothing
+    commands: Tensor  # (N, C), in the order of command_table; only where that is not empty
 
     @in_config_words()
     def __init__(self, cfg: RobotTaskCfg, device: str, eager: bool = False) -> None:

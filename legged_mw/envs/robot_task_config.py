@@ -114,11 +114,11 @@ class RobotTaskCfg(Config):
         action_delay: list[int] = []  # control steps from an action to its servo, whole numbers, both ends included
         observation_delay: list[int] = []  # control steps that what `state` measures is old
         model_factors: dict[str, list[float]] = {}  # any other field of the model that may differ: a factor per world on all of it
-        redraw_at_reset: list[str] = [  # anew at every reset of a world; the others once, at the start
+        redraw_at_reset: list[str] = [  # drawn at every reset of a world; the others once, at the start
             *["friction", "contact_time", "frictionloss", "stiffness", "damping", "strength"],
             *["encoder_offset", "action_delay", "observation_delay"],
         ]
-        redraw_iterations: int = 0  # draw everything anew every so many iterations of training, and when it is resumed; 0: never
+        redraw_iterations: int = 0  # draw everything again every so many iterations of training, and when it is resumed; 0: never
         observe: bool = False  # rows in `privileged_state` with what was drawn
 
     class terrain:
@@ -144,7 +144,7 @@ class RobotTaskCfg(Config):
 class RobotTaskCfgPPO(Config):
     """The learner. Keys below actor, critic and algorithm are rsl-rl's own and pass through untranslated.
 
-    What is marked [ours] was found by measurement: docs/training.md.
+    What is marked [ours] was found by measurement: docs/lab.md.
     """
 
     seed: int = 1
@@ -209,7 +209,7 @@ class RobotTaskCfgPPO(Config):
         desired_kl: float = 0.0
 
     class cpu:
-        """What train.py takes on a CPU instead, before the command line has its say [ours: docs/training.md]."""
+        """What train.py takes on a CPU instead, before the command line has its say [ours: docs/lab.md]."""
 
         enable: bool = True
         envs_per_core: int = 256  # worlds; the task's own number, if that is less

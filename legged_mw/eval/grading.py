@@ -16,9 +16,9 @@ from legged_mw.eval.rollout import Policy
 from legged_mw.eval.rules import ExamRules
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.policies import Source, act, introduce, load_policy
-from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything, shown
+from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.task import LoadedTask
 
 

@@ -44,8 +44,8 @@ from legged_mw.rl.policies import load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.sim.model import ModelError, per_joint
 from legged_mw.sim.terrain import LEVEL, make_terrain
-from legged_mw.utils.cli import shown
 from legged_mw.utils.config import save_yaml
+from legged_mw.utils.errors import shown
 from legged_mw.utils.task import LoadedTask, load_task
 
 MODEL_FILE = "model.pt"

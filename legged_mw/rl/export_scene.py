@@ -15,8 +15,7 @@ import numpy as np
 
 from legged_mw.sim.drawing import CAMERA, dressed
 from legged_mw.sim.errors import ModelError
-from legged_mw.sim.ground import GROUND, add_ground_box, feel_all_ground
-from legged_mw.sim.level_boxes import MOST_BOXES, Box, as_boxes
+from legged_mw.sim.ground import GROUND, MOST_BOXES, Box, add_ground_box, as_boxes, feel_all_ground
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.scene import STEEP_LIGHT
 from legged_mw.sim.terrain import Terrain

@@ -25,8 +25,8 @@ from legged_mw.rl.runs import (
     runs,
     save_whole,
 )
-from legged_mw.utils.cli import shown
 from legged_mw.utils.config import Config, ConfigError, load_yaml
+from legged_mw.utils.errors import shown
 from legged_mw.utils.task import LoadedTask, load_task
 
 

@@ -65,8 +65,8 @@ class Linear(torch.autograd.Function):
 class GraphedPPO(PPO):
     """PPO whose update and acting are replayed CUDA graphs.
 
-    What cannot be recorded (a network that is not a plain MLPModel or shares parameters, RND, an optimizer other
-    than Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. The first
+    What cannot be recorded (a network that is not a plain MLPModel or shares parameters, RND, mixed precision, an optimizer
+    other than Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. The first
     three updates of a run are launched step by step and the fourth is recorded: nothing is warmed up on a throw-away step.
     On a CPU nothing is recorded.
     """
@@ -89,17 +89,11 @@ class GraphedPPO(PPO):
 
     def _why_stock(self) -> str | None:
         """What keeps this configuration from being recorded, or None."""
-        models = (self.actor, self.critic)
-        if any(model.is_recurrent for model in models):
-            return "the networks are recurrent"
-        if self.rnd:
-            return "rnd_cfg is set"
-        return self._why_not_plain(models)
-
-    def _why_not_plain(self, models: tuple[MLPModel, MLPModel]) -> str | None:
-        for model in models:
+        for model in (self.actor, self.critic):
             if type(model) is not MLPModel:
                 return f"a network is a {type(model).__name__}"
+        if self.rnd or self.use_mixed_precision:
+            return f"{'rnd_cfg' if self.rnd else 'use_mixed_precision'} is set"
         if getattr(type(self.actor.distribution), "sample", None) is not GaussianDistribution.sample:
             return f"actions are drawn from a {type(self.actor.distribution).__name__}"
         if not {*map(id, self.actor.parameters())}.isdisjoint(map(id, self.critic.parameters())):
@@ -233,19 +227,16 @@ class GraphedPPO(PPO):
     def _input(self, model: MLPModel, obs: Any) -> Tensor:
         """What the network sees of observations, normalised, with columns of zeros up to a multiple of four."""
         latent = model.get_latent(obs)
-        return latent if self.use_mixed_precision else nn.functional.pad(latent, (0, -latent.shape[1] % 4))
+        return nn.functional.pad(latent, (0, -latent.shape[1] % 4))
 
     def _minibatch(self, minibatch: Minibatch) -> None:
         """One gradient step."""
         batch, actor_input, critic_input = minibatch
-        mixed = torch.autocast(torch.device(self.device).type, torch.bfloat16, self.use_mixed_precision, cache_enabled=False)
         self.optimizer.zero_grad()
         with self._beside():
-            with mixed:
-                value_loss = self._value_loss(batch, self._forward(self.critic, critic_input))
+            value_loss = self._value_loss(batch, _forward(self.critic, critic_input))
             (self.value_loss_coef * value_loss).backward()
-        with mixed:
-            loss, parts, kl = self._policy_loss(batch, self._forward(self.actor, actor_input))
+        loss, parts, kl = self._policy_loss(batch, _forward(self.actor, actor_input))
         loss.backward()
         self._meet()
         if self.is_multi_gpu:
@@ -255,15 +246,7 @@ class GraphedPPO(PPO):
         nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
         nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
         self.optimizer.step()
-        self._losses.add_(torch.stack([value.detach().float() for value in (value_loss, *parts)]))
-
-    def _forward(self, model: MLPModel, inputs: Tensor) -> Tensor:
-        """The network's output for normalised inputs (B, size)."""
-        if self.use_mixed_precision:
-            return model.mlp(inputs)
-        for layer in model.mlp:
-            inputs = Linear.apply(inputs, layer.weight, layer.bias) if type(layer) is nn.Linear else layer(inputs)  # type: ignore[misc]
-        return inputs
+        self._losses.add_(torch.stack([value.detach() for value in (value_loss, *parts)]))
 
     def _value_loss(self, batch: Any, values: Tensor) -> Tensor:
         error = (values - batch.returns).square()
@@ -374,6 +357,13 @@ class GraphedPPO(PPO):
                 memory["step"] = memory["step"].to(self.device, torch.float32)
             self._begin()  # Adam's memory has moved
         return iteration
+
+
+def _forward(model: MLPModel, inputs: Tensor) -> Tensor:
+    """The network's output for normalised inputs (B, size)."""
+    for layer in model.mlp:
+        inputs = Linear.apply(inputs, layer.weight, layer.bias) if type(layer) is nn.Linear else layer(inputs)  # type: ignore[misc]
+    return inputs
 
 
 def _update_normalizer(normalizer: EmpiricalNormalization, x: Tensor, world_size: int) -> None:

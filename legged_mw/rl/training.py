@@ -1,6 +1,6 @@
 """What train.py does: settle what is trained on what, train it, stop and resume, and say how to go on.
 
-The exam and the exporter are handed in, since neither is part of the core.
+The check of a task, the exam and the exporter are handed in, since none of them is part of the core.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import torch
 
 from legged_mw.envs.checks import check_values
-from legged_mw.envs.guard import check_recordable
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.ppo import GraphedPPO
@@ -27,14 +26,15 @@ from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, ra
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
 from legged_mw.sim.engines import pick_engine
-from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything, shown
+from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 _STEPS_PER_CORE = 6500  # a second, in training with the section `cpu` as it is (docs/performance.md)
 
+Check = Callable[[LoadedTask], None]  # raises where the step cannot be recorded
 Examine = Callable[[Any], dict[str, float]]  # policy -> figures by name
 Export = Callable[[LoadedTask, Path, Path], str]  # task, checkpoint, folder to write -> what was written, in words
 
@@ -118,7 +118,7 @@ def _announce(task: LoadedTask, device: str, rank: Rank) -> None:
     print(f"{cores} cores: {plan}", flush=True)
 
 
-def build(task: LoadedTask, device: str, eager: bool = False) -> Any:
+def build(task: LoadedTask, device: str, eager: bool, check_recordable: Check) -> Any:
     """The environment, if its step can be recorded and learning can work in it. With ``eager`` nothing is recorded."""
     if this_rank().leads and not eager:
         check_recordable(task)

@@ -20,10 +20,15 @@ CAMERA = (0.9, -1.1, 0.6)  # place of the camera "track" relative to the robot's
 
 def visual_model(robot: RobotModel, camera: Sequence[float] = CAMERA) -> mujoco.MjModel:
     """``robot`` with its visual geoms: same qpos, qvel and bodies as what is stepped. Takes a second where the terrain is large."""
+    return visual_spec(robot, camera).compile()
+
+
+def visual_spec(robot: RobotModel, camera: Sequence[float] = CAMERA) -> mujoco.MjSpec:
+    """What ``visual_model`` is compiled from."""
     spec = dressed(robot, camera)
     if robot.terrain:
         add_relief(spec, robot.terrain, GROUND)
-    return spec.compile()
+    return spec
 
 
 def dressed(robot: RobotModel, camera: Sequence[float] = CAMERA) -> mujoco.MjSpec:

@@ -12,6 +12,7 @@ the first, as in the corner of a step. A geom is looked at in probes, which are 
 # (mujoco ships no type stubs, and warp compiles what it finds written here as its own language: float() makes a variable)
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -22,7 +23,7 @@ import torch
 import warp as wp
 from mujoco_warp._src.collision_core import contact_material_params, write_contact
 from mujoco_warp._src.math import make_frame
-from mujoco_warp._src.types import vec5
+from mujoco_warp._src.types import Contact
 from torch import Tensor
 
 from legged_mw.sim.shapes import spheres_on
@@ -108,46 +109,21 @@ class _Probes:
     radius: wp.array[float]
 
 
-@wp.struct
-class _Material:
-    """Fields of mujoco-warp's Model, under its names."""
-
-    geom_condim: wp.array[int]
-    geom_priority: wp.array[int]
-    geom_solmix: wp.array2d[float]
-    geom_solref: wp.array2d[wp.vec2]
-    geom_solimp: wp.array2d[vec5]
-    geom_friction: wp.array2d[wp.vec3]
-    geom_adhesion: wp.array2d[float]
-    geom_margin: wp.array2d[float]
-    geom_gap: wp.array2d[float]
-    pair_dim: wp.array[int]
-    pair_solref: wp.array2d[wp.vec2]
-    pair_solreffriction: wp.array2d[wp.vec2]
-    pair_solimp: wp.array2d[vec5]
-    pair_adhesion: wp.array2d[float]
-    pair_friction: wp.array2d[vec5]
+def _struct(source: type, names: str) -> Any:
+    """Some arrays of a dataclass of mujoco-warp as one argument of a kernel, under its names and with its types."""
+    kinds = {field.name: field.type for field in dataclasses.fields(source)}
+    return wp.struct(type(f"_{source.__name__}", (), {"__annotations__": {name: kinds[name] for name in names.split()}}))
 
 
-@wp.struct
-class _Contacts:
-    """Fields of mujoco-warp's Data.contact, under its names."""
-
-    dist: wp.array[float]
-    pos: wp.array[wp.vec3]
-    frame: wp.array[wp.mat33]
-    includemargin: wp.array[float]
-    friction: wp.array[vec5]
-    solref: wp.array[wp.vec2]
-    solreffriction: wp.array[wp.vec2]
-    solimp: wp.array[vec5]
-    dim: wp.array[int]
-    geom: wp.array[wp.vec2i]
-    efc_address: wp.array2d[int]
-    worldid: wp.array[int]
-    type: wp.array[int]
-    geomcollisionid: wp.array[int]
-    adhesion: wp.array[float]
+_Material = _struct(
+    mjw.Model,
+    "geom_condim geom_priority geom_solmix geom_solref geom_solimp geom_friction geom_adhesion geom_margin geom_gap "
+    "pair_dim pair_solref pair_solreffriction pair_solimp pair_adhesion pair_friction",
+)
+_Contacts = _struct(
+    Contact,
+    "dist pos frame includemargin friction solref solreffriction solimp dim geom efc_address worldid type geomcollisionid adhesion",
+)
 
 
 def _gather(struct: Any, source: Any) -> Any:

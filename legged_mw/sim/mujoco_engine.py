@@ -18,29 +18,22 @@ from mujoco.batch import MODEL_FIELDS, Batch, SimulationError
 from torch import Tensor
 
 from legged_mw.sim.errors import ModelError
+from legged_mw.sim.simulation import Simulation
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import usable_cores
 
-_READ_AND_WRITTEN, _WRITTEN = ("qpos", "qvel"), ("ctrl", "xfrc_applied")
+_STATE, _WRITTEN = ("qpos", "qvel"), ("ctrl", "xfrc_applied")  # a step reads and writes the state, and reads the rest
 _READ = ("sensordata", "actuator_force", "site_xpos")  # computed by a step
 _FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
 
-class MujocoSimulation:
-    """The seam on MuJoCo's own engine (``legged_mw.sim.simulation.Simulation`` says what it promises).
+class MujocoSimulation(Simulation):
+    """The seam on MuJoCo's own engine.
 
     The same calls give the same bits, on any number of threads. A world that MuJoCo cannot step gets a ``qpos`` of NaN.
     """
 
     engine, device = "mujoco", "cpu"
-
-    qpos: Tensor
-    qvel: Tensor
-    ctrl: Tensor
-    sensordata: Tensor
-    actuator_force: Tensor
-    site_xpos: Tensor
-    xfrc_applied: Tensor
 
     def __init__(self, model: mujoco.MjModel, num_envs: int, *, threads: int = 0, world_fields: Sequence[str] = ()) -> None:
         """Allocate ``num_envs`` worlds, stepped by ``threads`` threads; 0: one a core."""
@@ -50,17 +43,13 @@ class MujocoSimulation:
         _keep_quiet()
         self._batch = Batch(model, num_envs, threads or usable_cores())
         self._start = self._batch.state[0].copy()  # a row of state, as the model has it
-        # tensor and the engine's rows, to be copied before and after a step
-        into, out = {}, {}
-        for name in _READ_AND_WRITTEN + _WRITTEN:
-            into[name] = self._adopt(name)
-        for name in _READ:
-            out[name] = self._adopt(name)
-        self._out = [*(into[name] for name in _READ_AND_WRITTEN), *out.values()]
-        self._fields = {name: self._expand(name) for name in world_fields}
-        self._written = {name: tensor._version for name, (tensor, _) in self._fields.items()}
-        self._into = list(into.values())
-        self._cleared = [into[name][0] for name in ("qvel", *_WRITTEN)] + [tensor for tensor, _ in out.values()]
+        pairs = {name: self._adopt(name) for name in (*_STATE, *_WRITTEN, *_READ)}  # tensors and the engine's rows
+        self._into = [pairs[name] for name in (*_STATE, *_WRITTEN)]  # to be copied before a step
+        self._out = [pairs[name] for name in (*_STATE, *_READ)]  # and after it
+        self._cleared = [tensor for name, (tensor, _) in pairs.items() if name != "qpos"]
+        self._field_rows = {name: self._expand(name) for name in world_fields}
+        self._fields = {name: rows.float() for name, rows in self._field_rows.items()}
+        self._written = {name: tensor._version for name, tensor in self._fields.items()}
         self._failed, self._reason = np.zeros(num_envs, dtype=bool), ""  # worlds that MuJoCo ever refused to step
         self._qpos0 = torch.tensor(model.qpos0, dtype=torch.float)
 
@@ -88,11 +77,6 @@ class MujocoSimulation:
         for tensor in self._cleared:
             tensor[worlds] = 0.0
 
-    def field(self, name: str) -> Tensor:
-        if name not in self._fields:
-            raise ModelError(unknown("per-world model field", name, self._fields, "this simulation (declare it in world_fields)"))
-        return self._fields[name][0]
-
     def set_constants(self) -> None:
         self._write_fields()
         self._batch.set_const()
@@ -110,9 +94,9 @@ class MujocoSimulation:
 
     def _write_fields(self) -> None:
         """Hand over the fields that were written since the last time; the others keep their float64 values."""
-        for name, (tensor, rows) in self._fields.items():
+        for name, tensor in self._fields.items():
             if tensor._version != self._written[name]:
-                rows.copy_(tensor)
+                self._field_rows[name].copy_(tensor)
                 self._written[name] = tensor._version
 
     def _full(self) -> np.ndarray:
@@ -126,13 +110,12 @@ class MujocoSimulation:
         setattr(self, name, tensor)
         return tensor, rows
 
-    def _expand(self, name: str) -> tuple[Tensor, Tensor]:
-        """A tensor (N, ...) for a field of the model, and the engine's rows of it."""
+    def _expand(self, name: str) -> Tensor:
+        """The engine's rows (N, ...) of a field of the model."""
         known = sorted(field for field in MODEL_FIELDS if getattr(getattr(self._batch.model, field, None), "dtype", None) == np.float64)
         if name not in known:
             raise ModelError(unknown("per-world model field", name, known, "MuJoCo's Model"))
-        rows = _tensor(self._batch.expand(name))
-        return rows.float(), rows
+        return _tensor(self._batch.expand(name))
 
 
 def _keep_quiet() -> None:

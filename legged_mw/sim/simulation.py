@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from abc import ABC, abstractmethod
 
 from torch import Tensor
+
+from legged_mw.sim.errors import ModelError
+from legged_mw.utils.errors import unknown
 
 # Model fields that others are derived from, and those others: they need a value per world as soon as one of the former has.
 CONSTANTS_READ = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "qpos0")
 CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
 
 
-class Simulation(Protocol):
+class Simulation(ABC):
     """``num_envs`` worlds of one model, stepped together.
 
     Every tensor below is fixed for the life of the object: read it, write it in place, never rebind it. After ``step``,
@@ -31,31 +34,35 @@ class Simulation(Protocol):
     site_xpos: Tensor  # (N, nsite, 3) [m, world], of the last substep
     xfrc_applied: Tensor  # (N, nbody, 6) force [N] and torque [N m], world frame, at the body's centre of mass; persists
 
+    _fields: dict[str, Tensor]  # of ``world_fields``
+
+    @abstractmethod
     def step(self, substeps: int = 1) -> None:
         """Advance every world by ``substeps`` time steps, with ``ctrl`` and ``xfrc_applied`` as they stand."""
-        ...
 
+    @abstractmethod
     def reset(self, mask: Tensor) -> None:
         """Clear the worlds where ``mask`` (N,) bool is true; what is not state is zero until the next ``step``.
 
         State goes to the model's own ``qpos0``: write the wanted ``qpos``, ``qvel`` and ``ctrl`` after it.
         """
-        ...
 
     def field(self, name: str) -> Tensor:
         """View (N, ...) of a model field that was declared in ``world_fields``; write it in place."""
-        ...
+        if name not in self._fields:
+            raise ModelError(unknown("per-world model field", name, self._fields, "this simulation (declare it in world_fields)"))
+        return self._fields[name]
 
+    @abstractmethod
     def set_constants(self) -> None:
         """Bring what the model derives from masses, inertias, armatures and zero angles up to date with what was written
         into their fields, in every world. Slow, and not for inside a recorded step.
         """
-        ...
 
+    @abstractmethod
     def overflowed_worlds(self) -> Tensor:
         """How many worlds did not fit into the engine's buffers since construction, float (), on the device."""
-        ...
 
+    @abstractmethod
     def overflow_report(self) -> str:
         """What did not fit since construction, a line, or '' if all did. Reads the device: not for inside a step."""
-        ...

@@ -18,7 +18,7 @@ from torch import Tensor
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND
 from legged_mw.sim.ground_contact import touch_ground
-from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ
+from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ, Simulation
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import unknown
 
@@ -31,18 +31,10 @@ _EXPECTED = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
 _UNROLLED_ITERATIONS = 10
 
 
-class WarpSimulation:
-    """The seam on mujoco-warp (``legged_mw.sim.simulation.Simulation`` says what it promises)."""
+class WarpSimulation(Simulation):
+    """The seam on mujoco-warp."""
 
     engine = "mujoco_warp"
-
-    qpos: Tensor
-    qvel: Tensor
-    ctrl: Tensor
-    sensordata: Tensor
-    actuator_force: Tensor
-    site_xpos: Tensor
-    xfrc_applied: Tensor
     overflow: Tensor  # (N,) int32, bits of mujoco_warp.OverflowType since the world's last reset
 
     def __init__(
@@ -89,11 +81,6 @@ class WarpSimulation:
         self._run("reset", lambda: mjw.reset_data(self._model, self._data, reset=self._reset_mask_wp))
         for stale in (self.actuator_force, self.site_xpos):  # reset_data leaves the dead episode's values, even NaN
             stale.masked_fill_(mask.view(-1, *[1] * (stale.dim() - 1)), 0.0)
-
-    def field(self, name: str) -> Tensor:
-        if name not in self._fields:
-            raise ModelError(unknown("per-world model field", name, self._fields, "this simulation (declare it in world_fields)"))
-        return self._fields[name]
 
     def set_constants(self) -> None:
         with wp.ScopedDevice(self._device):

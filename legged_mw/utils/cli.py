@@ -132,11 +132,3 @@ def command(program: str, processes: int = 1) -> str:
     if processes > 1:
         return f"torchrun --nproc_per_node={processes} " + (f"-m legged_mw.programs {program}" if installed else f"{program}.py")
     return f"legged-mw {program}" if installed else f"python {program}.py"
-
-
-def shown(path: Path) -> str:
-    """A path as the user would type it."""
-    try:
-        return str(path.resolve().relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)

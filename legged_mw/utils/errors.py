@@ -9,17 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from types import CodeType
 
-_LIBRARIES = {
-    "torch",
-    "numpy",
-    "warp",
-    "mujoco",
-    "mujoco_warp",
-    "tensordict",
-    "rsl_rl",
-    "legged_mw.envs.guard",
-    "legged_mw.utils.recordable",
-}
+_LIBRARIES = {"torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl", "legged_mw.check"}
 _STANDARD = sysconfig.get_paths()["stdlib"]
 
 
@@ -64,6 +54,14 @@ def line_to_blame(error: BaseException) -> tuple[str, bool]:
     for code, line, _ in reversed(users or ours):
         return line_of(code, line), bool(users)
     return "", False
+
+
+def shown(path: Path) -> str:
+    """A path for a message: as the user would type it."""
+    try:
+        return str(path.resolve().relative_to(Path.cwd()))
+    except ValueError:
+        return str(path)
 
 
 def unknown(what: str, name: str, known: Iterable[str], where: str) -> str:

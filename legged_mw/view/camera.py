@@ -9,8 +9,7 @@ import math
 import mujoco
 import numpy as np
 
-from legged_mw.view.posed_robot import PosedRobots
-from legged_mw.view.rough_ground import RoughGround
+from legged_mw.view.posed_robot import PosedRobots, RoughGround
 
 AZIMUTH, ELEVATION = 130.0, -22.0  # [deg] front right of the robot, a little above it
 ELEVATION_ALL = -35.0  # [deg]

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.sim.drawing import visual_model
+from legged_mw.sim.drawing import visual_spec
 from legged_mw.sim.terrain import describe
 from legged_mw.utils.commands import Command
 from legged_mw.view.stage import BoolArray, FloatArray
@@ -28,10 +28,10 @@ class EnvStage:
 
     def __init__(self, env: RobotTask, policy: Callable[[TensorDict], Tensor], command_table: Sequence[Command] | None = None) -> None:
         self.env, self.policy = env, policy
-        self.model, self.num_worlds, self.dt = visual_model(env.robot, env.cfg.viewer.camera), env.num_envs, env.dt
+        self.spec, self.num_worlds, self.dt = visual_spec(env.robot, env.cfg.viewer.camera), env.num_envs, env.dt
         self.command_table = env.command_table if command_table is None else tuple(command_table)
         # a task with a table has a buffer for it, (N, C)
-        self._commands: Tensor = env.commands if env.command_table else env.actions[:, :0]  # pyright: ignore[reportAttributeAccessIssue]
+        self._commands: Tensor = env.commands if env.command_table else env.actions[:, :0]
         self._command_columns = _command_columns(env)
         geoms = len({geom for geoms in env.foot_geoms.values() for geom in geoms}) if isinstance(env, LeggedRobot) else 0
         self._foot_contacts = env.contact_count[:, :geoms]

@@ -7,10 +7,10 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 from legged_mw.utils.commands import Command, outside, parse_command
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.errors import UserError, shown
 from legged_mw.view import web
 from legged_mw.view.drive import CAMERAS, NO_COMMANDS, Pilot
 from legged_mw.view.native import NativeViewer, has_display
@@ -27,14 +27,6 @@ SECONDS = 10.0  # ours: how long to record, or to run without a viewer
 
 class FlagError(UserError, ValueError):
     """Flags that do not go together, or a wrong value."""
-
-
-class Picture(NamedTuple):
-    """The size of a video."""
-
-    width: int = 1280  # [pixel]
-    height: int = 720  # [pixel]
-    fps: float = 25.0  # [1/s]
 
 
 def add_flags(parser: argparse.ArgumentParser, viewer: str = "auto") -> None:
@@ -111,8 +103,11 @@ def choose(args: argparse.Namespace, terminal: bool, screen: bool) -> tuple[str,
     return "web", "no screen here"
 
 
-def watch(stage: Stage, args: argparse.Namespace, folder: Path, picture: Picture | None = None, title: str = "legged_mw") -> Outcome:
-    """Show `stage` as the flags say; files without a name go to `folder`. Prints its choice, where to look, and the outcome."""
+def watch(stage: Stage, args: argparse.Namespace, folder: Path, title: str = "legged_mw", **picture: Any) -> Outcome:
+    """Show `stage` as the flags say, a video of the size and rate `picture` (see Recorder); files without a name go to `folder`.
+
+    Prints its choice, where to look, and the outcome.
+    """
     script = load_script(args.commands, stage.command_table) if args.commands else None
     kind, why = choose(args, sys.stdout.isatty(), has_display())
     pilot, viewer = _pilot(stage, args, kind), None
@@ -124,7 +119,7 @@ def watch(stage: Stage, args: argparse.Namespace, folder: Path, picture: Picture
     if kind == "web":
         viewer = _web_page(stage, pilot, why, args, title)
     elif kind == "video":
-        viewer = _recorder(stage, pilot, why, args, folder, picture or Picture(), seconds or SECONDS)
+        viewer = _recorder(stage, pilot, why, args, folder, seconds or SECONDS, picture)
     elif kind == "none":
         print(f"viewer: none ({why})")
     viewer = viewer or NoViewer()
@@ -135,7 +130,7 @@ def watch(stage: Stage, args: argparse.Namespace, folder: Path, picture: Picture
         (viewer.abort if isinstance(viewer, Recorder) else viewer.close)()
         raise
     if isinstance(viewer, Recorder):
-        print(f"written to {_names(viewer.video, viewer.sheet, between=', ')}")
+        print(f"written to {', '.join(_names(viewer.video, viewer.sheet))}")
     print(outcome.text() if script or kind == "none" else outcome.text().splitlines()[0])
     return outcome
 
@@ -153,7 +148,7 @@ def _pilot(stage: Stage, args: argparse.Namespace, kind: str) -> Pilot:
 def _window(stage: Stage, pilot: Pilot, why: str, fall_back: bool) -> Viewer | None:
     """MuJoCo's window; None, with a printed reason, where it cannot be opened and another viewer may be taken."""
     try:
-        viewer = NativeViewer(stage.model, pilot, pilot.num_worlds)
+        viewer = NativeViewer(stage.spec, pilot, pilot.num_worlds)
     except ViewError as error:
         if not fall_back:
             raise
@@ -164,7 +159,7 @@ def _window(stage: Stage, pilot: Pilot, why: str, fall_back: bool) -> Viewer | N
 
 
 def _web_page(stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, title: str) -> Viewer:
-    page = web.WebViewer(stage.model, pilot, pilot.num_worlds, host=args.host, port=args.port, title=title)
+    page = web.WebViewer(stage.spec, pilot, pilot.num_worlds, host=args.host, port=args.port, title=title)
     print(f"viewer: a web page ({why}): {page.url}  Ctrl-C ends it")
     if args.host == web.LOCAL and not has_display():
         print(f"  on another machine paste this into a terminal there, then open the page: {web.tunnel_line(page.port)}")
@@ -174,17 +169,15 @@ def _web_page(stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, ti
     return page
 
 
-def _recorder(stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, folder: Path, picture: Picture, seconds: float) -> Viewer:
+def _recorder(stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, folder: Path, seconds: float, size: Any) -> Viewer:
     video, sheet = (Path(name) if name else None for name in (args.video, args.sheet))
     if video is None and sheet is None:
         video, sheet = folder / "play.mp4", folder / "play.png"
         if (reason := no_encoder()) is not None:  # no video was asked for by name
             print(f"no video: {reason}")
             video = None
-    print(
-        f"viewer: {seconds:g} s of {_names(video, sheet, between=' and ')} ({why}); without a GPU for drawing it takes a while", flush=True
-    )
-    return Recorder(stage.model, pilot.num_worlds, stage.dt, seconds, video=video, sheet=sheet, **picture._asdict())
+    print(f"viewer: {seconds:g} s of {' and '.join(_names(video, sheet))} ({why}); without a GPU for drawing it takes a while", flush=True)
+    return Recorder(stage.spec, pilot.num_worlds, stage.dt, seconds, video=video, sheet=sheet, **size)
 
 
 class NoViewer:
@@ -198,8 +191,5 @@ class NoViewer:
     def close(self) -> None: ...
 
 
-def _names(*paths: Path | None, between: str) -> str:
-    """Paths for people: relative to the current folder where they are below it."""
-    here = Path.cwd()
-    full = [path.resolve() for path in paths if path]
-    return between.join(str(path.relative_to(here) if path.is_relative_to(here) else path) for path in full)
+def _names(*paths: Path | None) -> list[str]:
+    return [shown(path) for path in paths if path]

@@ -41,8 +41,8 @@ class NativeViewer:
     our keys switch is switched back before the next picture. All its other keys work as in any MuJoCo window.
     """
 
-    def __init__(self, model: mujoco.MjModel, pilot: Pilot | None = None, count: int = 1) -> None:
-        self.robots = PosedRobots(model, count)
+    def __init__(self, spec: mujoco.MjSpec, pilot: Pilot | None = None, count: int = 1) -> None:
+        self.robots = PosedRobots(spec, count)
         before = set(threading.enumerate())
         self._handle: Any = _launch(self.robots.model, self.robots.data, on_key(pilot) if pilot else None)
         self._threads = set(threading.enumerate()) - before
@@ -64,7 +64,7 @@ class NativeViewer:
         with handle.lock():  # the window's thread draws from all of these
             self.robots.pose(moment.qpos, moment.world)
             handle.user_scn.ngeom = 0
-            draw(handle.user_scn, self.robots, moment, handle.opt)
+            draw(handle.user_scn, self.robots, moment)
             self._camera.update(moment.camera, moment.world)
             for flag, value in self._own_flags.items():
                 handle.opt.flags[flag] = value

@@ -1,4 +1,4 @@
-"""Geoms of a picture beside the followed robot: velocity arrows, feet on the ground, places of falls, the other robots.
+"""Geoms of a picture beside the robots: velocity arrows, feet on the ground, places of falls.
 
 Appends to a `mujoco.MjvScene`; opens no window, no file and no OpenGL context.
 """
@@ -30,15 +30,14 @@ SPEED_MIN, RATE_MIN = 0.03, 0.05  # [m/s], [rad/s] below these an arrow is a spe
 ROBOTS_WITH_ARROWS = 32  # more of them hide the robots
 
 
-def draw(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment, option: mujoco.MjvOption) -> None:
-    """Append all of `moment` to `scene`, which shows the followed robot already; the other robots are drawn as `option` says."""
+def draw(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment) -> None:
+    """Append all of `moment` to `scene`, which shows the robots already."""
     for world in range(min(robots.count, ROBOTS_WITH_ARROWS)):
         draw_velocities(scene, robots.placements[world], moment.target_velocity[world], moment.velocity[world], turn=world == moment.world)
     _draw_contacts(scene, robots, moment)
     for fall in moment.falls:
         if fall.world < robots.count:
             _draw_fall(scene, fall.place + robots.offsets[fall.world], robots.radius)
-    robots.add_others(scene, option)  # last: a full scene loses parts of robots, not arrows
 
 
 def draw_velocities(scene: mujoco.MjvScene, placement: Placement, target: ArrayLike, velocity: ArrayLike, turn: bool = True) -> None:

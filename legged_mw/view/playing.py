@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import copy
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 
@@ -26,13 +26,6 @@ NOMINAL = {  # what playing changes in the trained config
     "commands.curriculum": False,
 }
 ROWS, BORDER = 3, 2.0  # of the ground to watch: levels, from the easiest to the hardest, and [m]
-
-
-class Played(NamedTuple):
-    """A task as it is played."""
-
-    task: LoadedTask
-    commands: tuple[Command, ...]  # with their ranges as trained
 
 
 def parse(description: str | None) -> argparse.Namespace:
@@ -67,8 +60,8 @@ def parse(description: str | None) -> argparse.Namespace:
     return args
 
 
-def prepare(source: Source, trained: LoadedTask, args: argparse.Namespace) -> Played:
-    """The trained task with what playing changes, the user's overrides last; says what they are."""
+def prepare(source: Source, trained: LoadedTask, args: argparse.Namespace) -> tuple[LoadedTask, tuple[Command, ...]]:
+    """The trained task with what playing changes, the user's overrides last, and its commands as trained; prints the changes."""
     task = copy.deepcopy(trained)
     config = task.to_dict()
     for path, value in NOMINAL.items():
@@ -89,7 +82,7 @@ def prepare(source: Source, trained: LoadedTask, args: argparse.Namespace) -> Pl
         task.set("commands.default", defaults, where="--command")
         task.set("commands.resampling_time", 0.0, where="--command")
     introduce(source, task.changes_since(trained))
-    return Played(task, commands)
+    return task, commands
 
 
 def ground_to_watch(task: LoadedTask) -> dict[str, Any]:
@@ -110,11 +103,12 @@ def ground_to_watch(task: LoadedTask) -> dict[str, Any]:
     }
 
 
-def watch(source: Source, played: Played, args: argparse.Namespace) -> None:
-    """Show the policy in the environment of the task as it is played."""
-    task, device = played.task, pick_device(args.device)
+def watch(source: Source, task: LoadedTask, commands: tuple[Command, ...], args: argparse.Namespace) -> None:
+    """Show the policy in the environment of the task as it is played; ``commands`` have their ranges as trained."""
+    device = pick_device(args.device)
     seed_everything(task.train.seed)
     env = task.env_class(task.cfg, device, eager=args.eager)
-    policy, picture = load_policy(source.checkpoint, env, task.train, device), task.cfg.viewer
-    stage = EnvStage(env, lambda obs: act(policy, obs), played.commands)
-    launch.watch(stage, args, source.results(task), launch.Picture(picture.width, picture.height, picture.fps), title=task.name)
+    policy = load_policy(source.checkpoint, env, task.train, device)
+    sizes = {name: getattr(task.cfg.viewer, name) for name in ("width", "height", "fps")}
+    stage = EnvStage(env, lambda obs: act(policy, obs), commands)
+    launch.watch(stage, args, source.results(task), title=task.name, **sizes)

@@ -1,18 +1,16 @@
-"""Robots placed by `qpos` alone: kinematics, no dynamics. Opens no window, no file and no OpenGL context."""
+"""Robots placed by `qpos` alone, and the ground below them: kinematics, no dynamics. Opens no window, no file, no OpenGL context."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-import copy
 import math
 from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from legged_mw.view.rough_ground import RoughGround, height_fields
 from legged_mw.view.stage import FloatArray
 
 GROUPS_SHOWN = 3  # geom groups 0 ground, 1 and 2 visuals; from 3 on collision shapes
@@ -29,38 +27,68 @@ class Placement(NamedTuple):
     top: float  # its height above its base [m]
 
 
-class PosedRobot:
-    """One robot. `radius` and `top` are measured in the model's first pose."""
+class PosedRobots:
+    """All robots of one picture as one `model` and its `data`, without dynamics.
 
-    def __init__(self, model: mujoco.MjModel) -> None:
-        if model.njnt == 0 or model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
-            first = "no joint at all" if model.njnt == 0 else f"{model.joint(0).name!r}, which is not one"
+    The followed robot is always the first one in the model: its lights and cameras follow it, and a camera can track its
+    body `base`. Robots stand side by side, `offsets` (N, 3) apart; on rough ground each stays where it is. `radius` and
+    `top` [m] are measured in the model's first pose.
+    """
+
+    def __init__(self, spec: mujoco.MjSpec, count: int = 1) -> None:
+        single = spec.compile()
+        if single.njnt == 0 or single.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
+            first = "no joint at all" if single.njnt == 0 else f"{single.joint(0).name!r}, which is not one"
             raise ValueError(f"A viewer follows the robot's free joint, which must be the model's first joint; found {first}.")
-        self.model = model
-        self.data = mujoco.MjData(model)
-        self.base = int(model.jnt_bodyid[0])
+        self.count, self._nq = count, single.nq
+        self.model, self._bases, self._feet = many_robots(spec, single, count)
+        self.data, self.base = mujoco.MjData(self.model), self._bases[0]
         self._forward()
         self.radius, self.top = self._measure()
+        self.feet = self._feet[0]
+        self.foot_radius = float(np.median(self.model.geom_aabb[self.feet[0], 3:])) if self.feet else 0.0  # of the first one [m]
+        rough = has_places(self.model)
+        self.offsets = np.zeros((count, 3)) if rough else side_by_side(count, SPACING * self.radius)
+        if count > 1 and not rough:  # one shadow map for all; on rough ground they are too far apart
+            width = math.ceil(math.sqrt(count)) * SPACING * 0.5 / max(single.stat.extent, 1e-6)
+            vis = self.model.vis
+            vis.map.shadowclip = min(max(vis.map.shadowclip, width), SHADOW_MAX)
+            vis.quality.shadowsize = max(vis.quality.shadowsize, SHADOW_SIZE)
+        self.pose(np.tile(single.qpos0, (count, 1)))  # a window may draw before the first moment is shown
+        self.ground = RoughGround(self.model, self.data) if len(height_fields(self.model)) else None
 
-    def pose(self, qpos: ArrayLike, offset: ArrayLike = 0.0) -> Placement:
-        """Place all bodies, lights and cameras by `qpos` (nq,), with the base moved by `offset` (3,) [m]."""
-        array = np.asarray(qpos, dtype=np.float64)
-        if array.shape != (self.model.nq,):
-            raise ValueError(f"qpos has shape {array.shape}; this model has nq = {self.model.nq}, so ({self.model.nq},) is needed.")
+    def pose(self, qpos: ArrayLike, world: int = 0) -> None:
+        """Place all robots by the rows of `qpos` (N, nq), and follow robot `world`."""
+        array = np.atleast_2d(np.array(qpos, dtype=np.float64))[: self.count]
+        if array.shape[1:] != (self._nq,):
+            raise ValueError(f"qpos has shape {array.shape[1:]}; this model has nq = {self._nq}, so ({self._nq},) is needed.")
         if not np.isfinite(array).all():
-            raise ValueError(f"qpos[{int(np.flatnonzero(~np.isfinite(array))[0])}] is not finite: the simulation diverged.")
-        self.data.qpos[:] = array
-        self.data.qpos[:3] += offset
+            raise ValueError(f"qpos[{int(np.argwhere(~np.isfinite(array))[0, 1])}] is not finite: the simulation diverged.")
+        array[:, :3] += self.offsets
+        self._order = [world, *(index for index in range(self.count) if index != world)]  # robot of each copy in the model
+        self.data.qpos[:] = array[self._order].ravel()
         self._forward()
-        rotation = self.data.xmat[self.base]
-        return Placement(np.array(self.data.xpos[self.base]), math.atan2(rotation[3], rotation[0]), self.radius, self.top)
+        self.placements: list[Placement] = [self._placement(self._order.index(index)) for index in range(self.count)]
+
+    def below_feet(self, contacts: ArrayLike) -> FloatArray:
+        """Points (M, 3) [m] below the geoms that `contacts` (N, G) marks, the first G with a contact sensor."""
+        touching = np.asarray(contacts, dtype=bool)[: self.count]
+        if len(touching) < self.count or touching.shape[1] > len(self.feet):
+            return np.zeros((0, 3))  # the model has fewer contact sensors
+        points = [self._lowest(self._feet[self._order.index(world)][foot]) for world, foot in np.argwhere(touching)]
+        return np.array(points).reshape(-1, 3)
 
     def _forward(self) -> None:
         mujoco.mj_kinematics(self.model, self.data)
         mujoco.mj_comPos(self.model, self.data)  # tracking cameras and lights aim at the centre of mass
         mujoco.mj_camlight(self.model, self.data)
 
-    def lowest(self, geom: int) -> FloatArray:
+    def _placement(self, copy: int) -> Placement:
+        body = self._bases[copy]
+        rotation = self.data.xmat[body]
+        return Placement(np.array(self.data.xpos[body]), math.atan2(rotation[3], rotation[0]), self.radius, self.top)
+
+    def _lowest(self, geom: int) -> FloatArray:
         """The point (3,) below the middle of a geom, at its lowest height [m]."""
         centre, half = self._box(geom)
         return centre - (0.0, 0.0, min(half[2], self.model.geom_rbound[geom]))  # a sphere's box grows as it turns
@@ -71,7 +99,7 @@ class PosedRobot:
         return self.data.geom_xpos[geom] + rotation @ box[:3], np.abs(rotation) @ box[3:]
 
     def _measure(self) -> tuple[float, float]:
-        """Largest distance of the visible geometry from the base, and its height above the base [m]."""
+        """Largest distance of the visible geometry of a robot from its base, and its height above the base [m]."""
         model, radius, top = self.model, 0.0, 0.0
         robot = model.body_rootid[model.geom_bodyid] == model.body_rootid[self.base]
         for geom in map(int, np.flatnonzero(robot & (model.geom_group < GROUPS_SHOWN))):
@@ -82,64 +110,28 @@ class PosedRobot:
         return (radius or 0.5), top  # a robot without geometry still needs a camera distance
 
 
-class PosedRobots:
-    """All robots of one picture. `data` holds the followed one, whose `base` a camera can track; `add_others` draws the rest.
+def many_robots(spec: mujoco.MjSpec, single: mujoco.MjModel, count: int) -> tuple[mujoco.MjModel, list[int], list[list[int]]]:
+    """`count` copies of the robot of `spec` as one model for drawing: nothing senses, acts or collides.
 
-    They stand side by side, `offsets` (N, 3) apart. On rough ground each stays where it is.
+    Returns also the base of each copy, and each copy's geoms with a contact sensor, in the order of the sensors.
     """
-
-    def __init__(self, model: mujoco.MjModel, count: int = 1) -> None:
-        self.count, self.model = count, copy.copy(model)  # its shadows and colours change here, the caller's stay
-        self._followed, self._other = PosedRobot(self.model), PosedRobot(self.model)
-        self.data, self.base, self.radius = self._followed.data, self._followed.base, self._followed.radius
-        self.feet = contact_geoms(model)
-        self.foot_radius = float(np.median(model.geom_aabb[self.feet[0], 3:])) if self.feet else 0.0  # of the first one [m]
-        rough = has_places(model)
-        self.offsets = np.zeros((count, 3)) if rough else side_by_side(count, SPACING * self.radius)
-        if count > 1 and not rough:  # one shadow map for all; on rough ground they are too far apart
-            width = math.ceil(math.sqrt(count)) * SPACING * 0.5 / max(model.stat.extent, 1e-6)
-            vis = self.model.vis
-            vis.map.shadowclip = min(max(vis.map.shadowclip, width), SHADOW_MAX)
-            vis.quality.shadowsize = max(vis.quality.shadowsize, SHADOW_SIZE)
-        self._below_feet = np.zeros((count, len(self.feet), 3))
-        self.pose(np.tile(model.qpos0, (count, 1)))  # a window may draw before the first moment is shown
-        self.ground = RoughGround(self.model, self.data) if len(height_fields(model)) else None
-
-    def pose(self, qpos: ArrayLike, world: int = 0) -> None:
-        """Place all robots by the rows of `qpos` (N, nq), and follow robot `world`."""
-        self._qpos, self._world = np.atleast_2d(np.array(qpos, dtype=np.float64)), world
-        self.placements: list[Placement] = []
-        for index in range(self.count):
-            robot = self._followed if index == world else self._other
-            self.placements.append(robot.pose(self._qpos[index], self.offsets[index]))
-            self._place(index, robot)
-
-    def _place(self, index: int, robot: PosedRobot) -> None:
-        """Keep what the picture needs of the robot that was just posed."""
-        for foot, geom in enumerate(self.feet):
-            self._below_feet[index, foot] = robot.lowest(geom)
-
-    def add_others(self, scene: mujoco.MjvScene, option: mujoco.MjvOption) -> None:
-        """Append every robot but the followed one to `scene`."""
-        for index in range(self.count):
-            if index != self._world:
-                self._other.pose(self._qpos[index], self.offsets[index])
-                mujoco.mjv_addGeoms(self.model, self._other.data, option, mujoco.MjvPerturb(), mujoco.mjtCatBit.mjCAT_DYNAMIC, scene)
-
-    def below_feet(self, contacts: ArrayLike) -> FloatArray:
-        """Points (M, 3) below the geoms that `contacts` (N, G) marks, the first G with a contact sensor."""
-        touching = np.asarray(contacts, dtype=bool)[: self.count]
-        feet = self._below_feet[:, : touching.shape[1]]
-        if touching.shape != feet.shape[:2]:
-            return np.zeros((0, 3))  # the model has fewer contact sensors
-        return feet[touching]
-
-
-def contact_geoms(model: mujoco.MjModel) -> list[int]:
-    """The geoms of the model's contact sensors, in the sensors' order."""
-    geom = int(mujoco.mjtObj.mjOBJ_GEOM)
-    contact = int(mujoco.mjtSensor.mjSENS_CONTACT)
-    return [int(model.sensor_objid[i]) for i in range(model.nsensor) if model.sensor_type[i] == contact and model.sensor_objtype[i] == geom]
+    spec = spec.copy()
+    contact, geom = mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtObj.mjOBJ_GEOM
+    feet = [sensor.objname for sensor in spec.sensors if sensor.type == contact and sensor.objtype == geom]
+    for kind in ("sensors", "actuators", "keys", "equalities", "tendons", "pairs", "excludes"):
+        for element in getattr(spec, kind):
+            spec.delete(element)
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+    spec.stat.extent, spec.stat.center, spec.stat.meansize = single.stat.extent, single.stat.center, single.stat.meansize
+    spec.copy_during_attach = True
+    bases = [spec.joints[0].parent]
+    for index in range(1, count):
+        bases.append(spec.worldbody.add_frame().attach_body(bases[0], f"{index}/", ""))
+        for light in bases[-1].find_all("light"):
+            spec.delete(light)
+    model = spec.compile()
+    prefixes = ["", *(f"{index}/" for index in range(1, count))]
+    return model, [body.id for body in bases], [[model.geom(prefix + name).id for name in feet] for prefix in prefixes]
 
 
 def has_places(model: mujoco.MjModel) -> bool:
@@ -159,3 +151,47 @@ def show_groups(option: mujoco.MjvOption) -> None:
     """Show the visuals; hide collision shapes and sites."""
     option.geomgroup[:] = [group < GROUPS_SHOWN for group in range(len(option.geomgroup))]
     option.sitegroup[:] = 0
+
+
+class RoughGround:
+    """All height fields of a model, at places (T, 2) with half edges (T, 2) [m], world frame; they do not move.
+
+    Where two are at the same place, one is a coarse copy of the other and is hidden at first.
+    """
+
+    def __init__(self, model: mujoco.MjModel, data: mujoco.MjData) -> None:
+        geoms = height_fields(model)
+        vertices = model.hfield_nrow * model.hfield_ncol
+        found: dict[tuple[float, float], list[int]] = {}
+        for geom in sorted(geoms, key=lambda geom: -vertices[model.geom_dataid[geom]]):
+            x, y = np.round(data.geom_xpos[geom, :2], 6)
+            found.setdefault((x, y), []).append(int(geom))
+        self._model = model
+        self.fine, self.coarse = (np.array([same[which] for same in found.values()]) for which in (0, -1))  # (T,), the same if alone
+        self.places: FloatArray = np.array(list(found))
+        self.halves: FloatArray = np.array([model.hfield_size[model.geom_dataid[geom], :2] for geom in self.fine])
+        self._bottoms: FloatArray = np.array(data.geom_xpos[self.fine, 2])
+
+    def height(self, place: FloatArray) -> float:
+        """Height [m] of the vertex nearest to `place` (2,) [m]; 0 outside of all tiles."""
+        inside = np.flatnonzero((np.abs(self.places - place) <= self.halves).all(axis=1))
+        if not len(inside):
+            return 0.0
+        tile, model = int(inside[0]), self._model
+        field = int(model.geom_dataid[self.fine[tile]])
+        rows, columns = int(model.hfield_nrow[field]), int(model.hfield_ncol[field])
+        share = (place - self.places[tile] + self.halves[tile]) / (2 * self.halves[tile])
+        column, row = np.round(share * [columns - 1, rows - 1]).astype(int)
+        vertex = model.hfield_data[model.hfield_adr[field] + row * columns + column]
+        return float(vertex * model.hfield_size[field, 2] + self._bottoms[tile])
+
+    def refine(self, place: FloatArray, reach: float) -> None:
+        """Draw the tiles within `reach` [m] of `place` (2,) finely, the others coarsely."""
+        near = (np.maximum(np.abs(self.places - place) - self.halves, 0.0) ** 2).sum(axis=1) < reach**2
+        self._model.geom_rgba[self.coarse, 3] = ~near
+        self._model.geom_rgba[self.fine, 3] = near | (self.fine == self.coarse)
+
+
+def height_fields(model: mujoco.MjModel) -> NDArray[np.int64]:
+    """Indices of the geoms that are height fields."""
+    return np.flatnonzero(model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD)

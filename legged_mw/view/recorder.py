@@ -30,8 +30,8 @@ GIF_FPS, GIF_WIDTH = 12.5, 640  # a GIF counts in hundredths of a second, and gr
 class RobotRenderer:
     """Offscreen pictures of some robots from a camera that follows one. Use it from the thread that made it."""
 
-    def __init__(self, model: mujoco.MjModel, width: int = 1280, height: int = 720, count: int = 1) -> None:
-        self.robots = PosedRobots(model, count)
+    def __init__(self, spec: mujoco.MjSpec, width: int = 1280, height: int = 720, count: int = 1) -> None:
+        self.robots = PosedRobots(spec, count)
         vis = self.robots.model.vis
         vis.global_.offwidth, vis.global_.offheight = width, height
         vis.quality.shadowsize = min(vis.quality.shadowsize, SHADOW_MAX)
@@ -55,7 +55,7 @@ class RobotRenderer:
         # MuJoCo lays an endless floor around the camera's last position; this makes it right in the first frame too
         mujoco.mjv_updateCamera(self.robots.model, self.robots.data, camera, scene)
         self._renderer.update_scene(self.robots.data, camera, self._option)
-        draw(scene, self.robots, moment, self._option)
+        draw(scene, self.robots, moment)
         frame = self._renderer.render()  # a new array each time
         return self._write(frame, moment.lines) if moment.lines else frame
 
@@ -89,7 +89,7 @@ class Recorder:
 
     def __init__(
         self,
-        model: mujoco.MjModel,
+        spec: mujoco.MjSpec,
         count: int,
         dt: float,  # [s] between two moments
         seconds: float,  # length of the run [s]; the sheet's pictures are spread over it
@@ -111,7 +111,7 @@ class Recorder:
         # the files' names are checked before a context is made, and an old file stays if that fails
         self._writer = VideoWriter(video, width, height, 1 / (self._every * dt)) if video else None
         try:
-            self._renderer = RobotRenderer(model, width, height, count)
+            self._renderer = RobotRenderer(spec, width, height, count)
         except BaseException:
             self.abort()
             raise

@@ -29,14 +29,13 @@ class ViewError(UserError, RuntimeError):
 class Stage(Protocol):
     """N robots in N separate worlds. They follow C commands; a stage with C = 0 cannot be driven. Arrays handed out are the caller's."""
 
-    model: mujoco.MjModel  # one robot with its scene, for drawing
+    spec: mujoco.MjSpec  # one robot with its scene, for drawing
     num_worlds: int
     dt: float  # control step [s]
     command_table: tuple[Command, ...]  # (C,) with the ranges as trained
 
     def step(self, commands: FloatArray | None) -> None:
         """One control step of all worlds under `commands` (N, C); None: under the stage's own."""
-        ...
 
     def commands(self) -> FloatArray:
         """The command of each robot now (N, C)."""
@@ -64,11 +63,9 @@ class Stage(Protocol):
 
     def push(self, world: int, velocity: FloatArray) -> None:
         """Add (2,) [m/s], world frame, to the robot's horizontal velocity at once."""
-        ...
 
     def reset(self, world: int) -> None:
         """Put one robot back to its start."""
-        ...
 
 
 class Fall(NamedTuple):
@@ -99,7 +96,6 @@ class Viewer(Protocol):
 
     def show(self, moment: Moment) -> None:
         """Show one moment; does nothing once closed."""
-        ...
 
     def is_running(self) -> bool:
         """False once the user closed it."""
@@ -107,7 +103,6 @@ class Viewer(Protocol):
 
     def close(self) -> None:
         """Free all that is held; again is allowed."""
-        ...
 
 
 def velocity_columns(table: Sequence[Command]) -> dict[int, int]:

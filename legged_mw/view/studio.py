@@ -69,7 +69,7 @@ class StudioPlugin(plugin.ViewerPlugin):
         self._scene.ngeom = 0
         with self.lock:
             self._camera.update(moment.camera, moment.world)
-            draw(self._scene, self.robots, moment, self.viewer.vis_options)
+            draw(self._scene, self.robots, moment)
         self.viewer.extra_geoms[:] = self._scene.geoms[: self._scene.ngeom]
 
     def _guard(self, work: Callable[[], None]) -> None:

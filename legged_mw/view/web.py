@@ -20,7 +20,6 @@ from typing import Any
 
 import mujoco
 
-from legged_mw.view.copied_model import CopiedRobots
 from legged_mw.view.drive import Pilot
 from legged_mw.view.posed_robot import PosedRobots
 from legged_mw.view.stage import Moment, ViewError
@@ -43,7 +42,7 @@ class WebViewer:
     """Serves the page at `url` until it is closed."""
 
     def __init__(
-        self, model: mujoco.MjModel, pilot: Pilot, count: int = 1, *, host: str = LOCAL, port: int = 0, title: str = "legged_mw"
+        self, spec: mujoco.MjSpec, pilot: Pilot, count: int = 1, *, host: str = LOCAL, port: int = 0, title: str = "legged_mw"
     ) -> None:
         if (reason := missing()) is not None:
             raise ViewError(f"--viewer web: {reason}")
@@ -51,7 +50,7 @@ class WebViewer:
 
         from legged_mw.view.studio import StudioPlugin  # a mujoco without web viewer cannot import it
 
-        self.robots = CopiedRobots(model, count) if count > 1 else PosedRobots(model)
+        self.robots = PosedRobots(spec, count)
         port = free_port(host, port)
         self._plugin = StudioPlugin(self.robots, pilot, title)
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)

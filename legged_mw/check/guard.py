@@ -1,7 +1,7 @@
 """Checks a task before it is trained: on a CPU, in a second, that its step can be recorded; the line that breaks a law is named.
 
 A recorded step is replayed as it was. It may not ask the host for a value, copy from it, or have a shape that depends on
-data (``utils/recordable.py``). Every tensor stays where it was, Python numbers stay what they were, and rewards only read.
+data (``check/recordable.py``). Every tensor stays where it was, Python numbers stay what they were, and rewards only read.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from legged_mw.check.recordable import Guard, recordable
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.utils.config import Config
 from legged_mw.utils.errors import NotRecordable, StepError, UserError, is_library, line_of, line_to_blame
-from legged_mw.utils.recordable import Guard, recordable
 from legged_mw.utils.task import LoadedTask
 
 _WORLDS, _STEPS = 4, 3
