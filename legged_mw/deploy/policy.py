@@ -37,7 +37,7 @@ class Network:
 
     def _check(self, contract: Contract) -> bool:
         """One input and one output of the contract's names and sizes; returns whether the batch is fixed to 1."""
-        names = ", ".join(f"{row.name} {row.size}" for row in contract.rows)
+        names = ", ".join(f"{row.name} {row.size * row.history}" for row in contract.rows)
         for what, ports, name, size, why in (
             ("input", self._session.get_inputs(), contract.input, contract.size, f"the rows of `observation`: {names}"),
             ("output", self._session.get_outputs(), contract.output, len(contract.joints), "one action a joint"),

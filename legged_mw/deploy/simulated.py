@@ -69,6 +69,11 @@ class Fleet:
             fell |= self._heights([0.0], [0.0])[:, 0] < ends.min_base_height
         return fell | (self._sensors[:, self._where[FALL]] > 0.0).any(axis=1) if ends.falls_on else fell
 
+    def touching(self) -> NDArray[np.bool_]:
+        """Which geoms of the feet touch the ground (N, G), in the order of their sensors."""
+        where = sorted({int(place) for places in self._contacts for place in places})
+        return self._sensors[:, where] > 0.0
+
     def refresh(self) -> None:
         """Compute the sensors of position, velocity and contact after a change of ``qpos`` or ``qvel``."""
         self._batch.forward(stage=_NOW)

@@ -74,8 +74,8 @@ class DeployStage:
         return self.fleet.qpos.copy()
 
     def contacts(self) -> NDArray[np.bool_]:
-        """(N, F), in the contract's order of feet."""
-        return self.measured.foot_contact > 0.0
+        """(N, G), the geoms of the feet."""
+        return self.fleet.touching()
 
     def fell(self) -> NDArray[np.bool_]:
         """(N,) in the last step."""

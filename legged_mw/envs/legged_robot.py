@@ -190,7 +190,7 @@ class LeggedRobot(RobotTask):
         self._set_command_ranges()
 
     def _set_command_ranges(self) -> None:
-        """The share of the ranges that commands come from, around their points that are nearest to 0."""
+        """The share of the ranges that commands come from, around their defaults."""
         torch.lerp(self._narrowest, self.full_command_ranges, self.command_curriculum[0], out=self.command_ranges)
 
     # ---- observations ---------------------------------------------------------------------------------------------------

@@ -40,9 +40,7 @@ def parse(description: str | None) -> argparse.Namespace:
     launch.add_flags(parser)
     parser.add_argument("--eval", action="store_true", help="run the walking exam (on rough ground too), print its tables, write a report")
     parser.add_argument("--compare", metavar="RUN", help="with --eval: grade this run beside it; its name or path, or 'shipped'")
-    parser.add_argument(
-        "--export", metavar="DIR", help="write the policy as networks, contract and scene there, to deploy (docs/deploy.md)"
-    )
+    parser.add_argument("--export", metavar="DIR", help="write the policy as network, contract and scene there, to deploy (docs/deploy.md)")
     args = parser.parse_args()
     if not args.task:
         parser.error(f"--task is missing; tasks: {', '.join(task_names())}")
