@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from typing import Any
 
 import torch
 
-from legged_mw.utils.errors import NotRecordable, line_to_blame
+from legged_mw.utils.errors import NotRecordable, line_to_blame, out_of_memory
 
 
 class StepGraph:
@@ -70,9 +69,7 @@ class StepGraph:
                     wp.capture_end(stream=wp_stream)
         except Exception as error:
             first = failed or error
-            if isinstance(first, RuntimeError) and not re.search(
-                r"out of memory|failed to allocate|alloc_failed", str(first), re.IGNORECASE
-            ):
+            if isinstance(first, RuntimeError) and not out_of_memory(first):
                 raise _refused(first) from None
             raise first from None
         return graph

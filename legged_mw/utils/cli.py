@@ -14,7 +14,7 @@ from typing import NoReturn
 import numpy as np
 
 from legged_mw.utils.config import ConfigError, load_yaml
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.errors import UserError, out_of_memory
 from legged_mw.utils.task import LoadedTask
 
 
@@ -115,7 +115,7 @@ def one_line_errors(program: str = "") -> Iterator[None]:
         first: BaseException = error
         while first.__context__ is not None:
             first = first.__context__  # what ran out may show as the failure of what it interrupted
-        if not re.search(r"out of memory|failed to allocate|alloc_failed", f"{first} {error}", re.IGNORECASE):
+        if not out_of_memory(first) and not out_of_memory(error):
             raise
         fail(program, f"out of memory ({str(first).splitlines()[0]}); fewer worlds need less: try half with --num_envs")
 

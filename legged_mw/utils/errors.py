@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import sysconfig
 import traceback
 from collections.abc import Iterable
@@ -27,6 +28,11 @@ class StepError(UserError):
 
 class NotRecordable(StepError):
     """The step does what a CUDA graph cannot record."""
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an error of torch, CUDA or warp says that memory ran out."""
+    return bool(re.search(r"out of memory|failed to allocate|alloc_failed", str(error), re.IGNORECASE))
 
 
 def line_of(code: CodeType, line: int) -> str:
