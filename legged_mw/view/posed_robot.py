@@ -15,6 +15,7 @@ from legged_mw.view.stage import FloatArray
 
 GROUPS_SHOWN = 3  # geom groups 0 ground, 1 and 2 visuals; from 3 on collision shapes
 SHADOW_MAX, SHADOW_SIZE = 8.0, 4096  # [extent] half-width of the shadow map, [px] its edge: 4 mm a pixel at the most
+SEVERAL_WITHOUT = ("sensors", "actuators", "equalities", "tendons", "pairs", "excludes")  # each copy of a body would copy them too
 SPACING = 3.0  # [robot radius] between robots that stand side by side
 
 
@@ -111,14 +112,14 @@ class PosedRobots:
 
 
 def many_robots(spec: mujoco.MjSpec, single: mujoco.MjModel, count: int) -> tuple[mujoco.MjModel, list[int], list[list[int]]]:
-    """`count` copies of the robot of `spec` as one model for drawing: nothing senses, acts or collides.
+    """`count` copies of the robot of `spec` as one model for drawing: nothing collides, and one robot has the lights and cameras.
 
     Returns also the base of each copy, and each copy's geoms with a contact sensor, in the order of the sensors.
     """
     spec = spec.copy()
     contact, geom = mujoco.mjtSensor.mjSENS_CONTACT, mujoco.mjtObj.mjOBJ_GEOM
     feet = [sensor.objname for sensor in spec.sensors if sensor.type == contact and sensor.objtype == geom]
-    for kind in ("sensors", "actuators", "keys", "equalities", "tendons", "pairs", "excludes"):
+    for kind in ("keys", *(SEVERAL_WITHOUT if count > 1 else ())):
         for element in getattr(spec, kind):
             spec.delete(element)
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
@@ -127,8 +128,8 @@ def many_robots(spec: mujoco.MjSpec, single: mujoco.MjModel, count: int) -> tupl
     bases = [spec.joints[0].parent]
     for index in range(1, count):
         bases.append(spec.worldbody.add_frame().attach_body(bases[0], f"{index}/", ""))
-        for light in bases[-1].find_all("light"):
-            spec.delete(light)
+        for element in (*bases[-1].find_all("light"), *bases[-1].find_all("camera")):
+            spec.delete(element)
     model = spec.compile()
     prefixes = ["", *(f"{index}/" for index in range(1, count))]
     return model, [body.id for body in bases], [[model.geom(prefix + name).id for name in feet] for prefix in prefixes]
