@@ -77,6 +77,9 @@ PROGRAMS = {"train": train, "play": play, "deploy": deploy}
 def main() -> None:
     """``legged-mw NAME ...``"""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name in ("-h", "--help"):
+        print(f"legged-mw {' | '.join(PROGRAMS)} ...; each has --help, e.g. legged-mw train --help")
+        return
     if name not in PROGRAMS:
         fail(
             "legged-mw", f"{f'no program {name!r}; ' if name else ''}there are: {', '.join(PROGRAMS)}; e.g. legged-mw train --task go1_flat"

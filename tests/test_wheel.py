@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from legged_mw import ROOT
+from legged_mw import ROOT, programs
 
 CONFIGS = {path.name for path in (ROOT / "configs").glob("*.py")}
 
@@ -99,3 +99,9 @@ def test_without_a_program_the_programs_are_named(tmp_path: Path) -> None:
         command = [sys.executable, "-m", "legged_mw.programs", *words]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
         assert (done.returncode, done.stderr) == (2, f"legged-mw: {said}; e.g. legged-mw train --task go1_flat\n")
+
+
+def test_help_names_the_programs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["legged-mw", "--help"])
+    programs.main()
+    assert capsys.readouterr().out.startswith("legged-mw train | play | deploy ...; each has --help")
