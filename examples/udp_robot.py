@@ -29,7 +29,7 @@ from legged_mw.deploy.runner import run
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import idle_command
 from legged_mw.utils.cli import Parser, duration, one_line_errors
-from legged_mw.utils.commands import describe, parse_command
+from legged_mw.utils.commands import parse_command, with_units
 from legged_mw.utils.errors import UserError
 
 VERSION = 1
@@ -240,7 +240,7 @@ def drive(folder: Path, contract: Contract, address: tuple[str, int], command: F
     if done.velocity is not None:
         wanted, got = (", ".join(f"{v:.2f}" for v in vector) for vector in (command, done.velocity))
         print(f"{done.steps} steps of {period:g} s, {done.late} of them late")
-        print(f"commanded {wanted} ({describe(contract.commands)}); vx, vy [m/s], yaw rate [rad/s] over the second half: {got}")
+        print(f"commanded {wanted} ({with_units(contract.commands)}); vx, vy [m/s], yaw rate [rad/s] over the second half: {got}")
 
 
 def main() -> None:

@@ -28,7 +28,7 @@ def train() -> None:
     start, device = training.configure(task, args)
     env = training.build(task, device, args.eager, check_recordable)
     if args.check:
-        print(describe(env, task))
+        print(describe(env, task) + ("" if args.eager else "\nthe step can be recorded as a CUDA graph"))
         return
     examine = make_exam(task, env, args.eager) if training.wants_exam(task) else None
     training.train(task, env, start, examine, export, args.deadline)

@@ -331,6 +331,7 @@ def test_check(tmp_path: Path) -> None:
     lines = [" ".join(line.split()) for line in result.out.splitlines()]
     for line in (
         "go1_flat: 16 worlds on cpu, engine mujoco",
+        "the step can be recorded as a CUDA graph",
         "observation state (48)",
         "9 dof_pos 12 noise +-0.06",
         "45 commands 3",

@@ -11,7 +11,7 @@ from worlds import QUIET, layout, make_env
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
-from legged_mw.utils.commands import Command, command_table, describe, outside, parse_command
+from legged_mw.utils.commands import Command, command_table, outside, parse_command, with_units
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
 
@@ -51,7 +51,7 @@ def env() -> LeggedRobot:
 def test_the_table_is_the_ranges_in_order() -> None:
     assert command_table(HeightCfg()) == TABLE
     assert command_table(Go1FlatCfg()) == TABLE[:3], "a heading is no command"
-    assert describe(TABLE) == "vx [m/s], vy [m/s], yaw rate [rad/s], base height [m]"
+    assert with_units(TABLE) == "vx [m/s], vy [m/s], yaw rate [rad/s], base height [m]"
 
 
 def test_a_further_command_is_drawn_and_observed(env: LeggedRobot) -> None:

@@ -27,8 +27,8 @@ from legged_mw.sim.terrain import (
     Heights,
     Terrain,
     add_kind,
-    describe,
     make_terrain,
+    name_tile,
     share_columns,
 )
 from legged_mw.utils.task import load_task
@@ -166,8 +166,8 @@ def test_a_kind_of_ones_own() -> None:
     ground = terrain(proportions={"pits": 1.0, "flat": 1.0}, columns=2, levels=3)
     assert tile(ground, 2, "pits").min() == pytest.approx(-0.1) and tile(ground, 1, "pits").min() == pytest.approx(-0.05)
     assert ground.difficulties == (0.0, 0.5, 1.0)
-    assert describe("pits", 0.5) == "pits, depth 5 cm" and describe("stairs_up", 0.5) == "stairs_up, step 12.8 cm"
-    assert describe("flat", 0.5) == "flat" and describe("gap", 0.0) == "gap, width 5 cm"
+    assert name_tile("pits", 0.5) == "pits, depth 5 cm" and name_tile("stairs_up", 0.5) == "stairs_up, step 12.8 cm"
+    assert name_tile("flat", 0.5) == "flat" and name_tile("gap", 0.0) == "gap, width 5 cm"
 
 
 @pytest.mark.usefixtures("own_kinds")
@@ -235,7 +235,7 @@ def test_the_kind_in_the_docs_is_ground_that_a_task_can_have(tmp_path: Path) -> 
     assert ground is not None and "craters" in ground.kinds
     patch = ground.heights[ground.vertices(1, ground.kinds.index("craters"))]
     assert -0.45 < patch.min() < -0.3 and not patch[78:83, 78:83].any()
-    assert describe("craters", 1.0) == "craters, depth 40 cm"
+    assert name_tile("craters", 1.0) == "craters, depth 40 cm"
 
 
 @pytest.mark.parametrize("edge", [8.0, 8.1])

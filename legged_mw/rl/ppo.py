@@ -121,7 +121,7 @@ class GraphedPPO(PPO):
         )
 
     def release(self) -> None:
-        """Drop what is recorded: NCCL does not close a connection that a CUDA graph still names. The next calls record anew."""
+        """Drop what is recorded: NCCL does not close a connection that a CUDA graph still names. The next calls record again."""
         if self.graphed:
             self._begin()
 

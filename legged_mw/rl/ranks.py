@@ -86,9 +86,9 @@ def leave_when_stuck(rank: Rank, patience: float = _PATIENCE) -> None:
     """
     if rank.count == 1:
         return
-    wake, told = socket.socketpair()
-    told.setblocking(False)
-    signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+    wake, listener = socket.socketpair()
+    listener.setblocking(False)
+    signal.set_wakeup_fd(listener.fileno(), warn_on_full_buffer=False)
 
     def watch() -> None:
         while signal.SIGTERM not in wake.recv(16):
@@ -98,5 +98,5 @@ def leave_when_stuck(rank: Rank, patience: float = _PATIENCE) -> None:
         os.write(2, text.encode())
         os._exit(128 + signal.SIGTERM)
 
-    _sockets.append((wake, told))
+    _sockets.append((wake, listener))
     threading.Thread(target=watch, daemon=True).start()

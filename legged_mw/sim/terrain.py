@@ -284,7 +284,7 @@ def low_random(grid: Grid, difficulty: float, rng: np.random.Generator) -> Heigh
     return grid.fade(NOISE * difficulty * rng.random((grid.n + 1, grid.n + 1)))
 
 
-def describe(kind: str, difficulty: float) -> str:
+def name_tile(kind: str, difficulty: float) -> str:
     """A kind and how hard it is, in words: "stairs_up, step 12.8 cm"."""
     if kind not in MEASURES:
         return kind

@@ -56,7 +56,7 @@ def command_table(cfg: Any) -> tuple[Command, ...]:
     return tuple(table)
 
 
-def describe(table: Sequence[Command]) -> str:
+def with_units(table: Sequence[Command]) -> str:
     """``vx, vy [m/s], yaw rate [rad/s]``: labels with units."""
     return ", ".join(f"{c.label} [{c.unit}]" if c.unit else c.label for c in table)
 
@@ -72,7 +72,7 @@ def parse_command(text: str, table: Sequence[Command]) -> list[float]:
         if equals and name.strip() not in names:
             raise ConfigError(f"--command {text}: {unknown('command', name.strip(), names, 'this task')}")
         if not equals and place >= len(table):
-            known = describe(table) or "none"
+            known = with_units(table) or "none"
             raise ConfigError(f"--command {text}: {place + 1} numbers, but this task has {len(table)} commands: {known}")
         try:
             value = float(number if equals else item)
@@ -80,7 +80,7 @@ def parse_command(text: str, table: Sequence[Command]) -> list[float]:
             value = math.nan
         if not math.isfinite(value):
             example = ",".join(f"{c.default:g}" for c in table)
-            raise ConfigError(f"--command {text}: '{item.strip()}' is no number; write --command={example} ({describe(table)})")
+            raise ConfigError(f"--command {text}: '{item.strip()}' is no number; write --command={example} ({with_units(table)})")
         values[names.index(name.strip()) if equals else place] = value
     if wrong := outside(values, table):
         raise ConfigError(f"--command {text}: {wrong}")

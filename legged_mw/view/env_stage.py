@@ -13,7 +13,7 @@ from torch import Tensor
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.sim.drawing import visual_spec
-from legged_mw.sim.terrain import describe
+from legged_mw.sim.terrain import name_tile
 from legged_mw.utils.commands import Command
 from legged_mw.view.stage import BoolArray, FloatArray
 
@@ -67,7 +67,7 @@ class EnvStage:
         if terrain is None:
             return ""
         tile = terrain.tile_at(*self.env.root_pos[world, :2].tolist())
-        return describe(terrain.kinds[tile[1]], terrain.difficulties[tile[0]]) if tile else "border"
+        return name_tile(terrain.kinds[tile[1]], terrain.difficulties[tile[0]]) if tile else "border"
 
     @torch.no_grad()
     def push(self, world: int, velocity: ArrayLike) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from legged_mw.utils.commands import describe
+from legged_mw.utils.commands import with_units
 from legged_mw.view.drive import BINDINGS, KEY_ACTION, NO_COMMANDS, PUSH_MAX, SPEEDS, Pilot
 from legged_mw.view.overlay import COMMAND_RGBA, VELOCITY_RGBA
 from legged_mw.view.stage import FloatArray, Moment, velocity_columns
@@ -109,7 +109,7 @@ class Panel:
             ui.Text(NO_COMMANDS)
         for index, each in enumerate(pilot.table):
             ui.SetNextItemWidth(0.62 * WIDTH)
-            changed, value = ui.SliderFloat(describe([each]), float(command[index]), each.low, each.high, "%.2f")
+            changed, value = ui.SliderFloat(with_units([each]), float(command[index]), each.low, each.high, "%.2f")
             if changed:
                 command[index] = value
                 pilot.steer(command)

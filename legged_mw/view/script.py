@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from legged_mw.utils.commands import Command, describe, outside
+from legged_mw.utils.commands import Command, outside, with_units
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import unknown
 from legged_mw.view.drive import NO_COMMANDS, PUSH_MAX, Pilot
@@ -108,7 +108,7 @@ def _command(value: Any, where: str, table: Sequence[Command]) -> list[float]:
                 raise ConfigError(f"{where}: {unknown('command', str(name), names, 'this task')}")
             [command[names.index(name)]] = _numbers(number, [1], f"{where}: {name}", "a number")
     else:
-        values = _numbers(value, range(1, len(table) + 1), where, f"a list of {describe(table)}, or {{name: value}}")
+        values = _numbers(value, range(1, len(table) + 1), where, f"a list of {with_units(table)}, or {{name: value}}")
         command[: len(values)] = values
     if wrong := outside(command, table):
         raise ConfigError(f"{where}: {wrong}")

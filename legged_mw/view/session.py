@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from legged_mw.utils.commands import LABELS, Command, describe
+from legged_mw.utils.commands import LABELS, Command, with_units
 from legged_mw.view.drive import Pilot
 from legged_mw.view.script import Script
 from legged_mw.view.stage import BoolArray, Fall, FloatArray, Moment, Stage, Viewer, target_velocity
@@ -42,7 +42,7 @@ class Outcome(NamedTuple):
     def text(self) -> str:
         """A line, then a table of the last twenty segments at most."""
         lines = [f"{self.seconds:.1f} s, {self.falls} {'fall' if self.falls == 1 else 'falls'}"]
-        commanded = f"commanded: {describe(self.table) or 'nothing'}"
+        commanded = f"commanded: {with_units(self.table) or 'nothing'}"
         if self.segments:
             lines.append(f"{'from':>8}{'for':>8}   {commanded}   measured: {MEASURED}")
         for each in self.segments[-20:]:
