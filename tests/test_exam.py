@@ -27,9 +27,9 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.eval import exam, grading, rules
 from legged_mw.eval.exams import EXAMS, find_exam, make_exam, require_exam
-from legged_mw.eval.peers import PEERS, best_of, in_common
+from legged_mw.eval.peers import PEERS, best_of
 from legged_mw.eval.rollout import holding, roll_out
-from legged_mw.eval.rules import ExamRules
+from legged_mw.eval.rules import ExamRules, in_common
 from legged_mw.eval.rules import table as rules_table
 from legged_mw.rl.policies import Source
 from legged_mw.utils.commands import Command

@@ -17,9 +17,9 @@ from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exam, exams, grading, page, report
 from legged_mw.eval.page import Column
-from legged_mw.eval.peers import PEERS, in_common
+from legged_mw.eval.peers import PEERS
 from legged_mw.eval.rollout import Case, Push, roll_out
-from legged_mw.eval.rules import ExamRules
+from legged_mw.eval.rules import ExamRules, in_common
 from legged_mw.eval.trials import make_plan
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.utils.config import load_yaml

@@ -14,8 +14,7 @@ import numpy as np
 from legged_mw.deploy.contract import CONTRACT_FILE, Contract, ContractError, Ends, read_contract
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rules
-from legged_mw.eval.peers import in_common
-from legged_mw.eval.rules import ExamRules
+from legged_mw.eval.rules import ExamRules, in_common
 from legged_mw.utils.commands import VELOCITY
 
 

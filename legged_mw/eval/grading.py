@@ -12,9 +12,8 @@ from legged_mw.envs.domain_rand import active
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval.exams import Exam, require_exam
 from legged_mw.eval.page import Column
-from legged_mw.eval.peers import in_common
 from legged_mw.eval.rollout import Policy
-from legged_mw.eval.rules import ExamRules
+from legged_mw.eval.rules import ExamRules, in_common
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.policies import Source, act, introduce, load_policy
 from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from legged_mw.utils.commands import VELOCITY
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
@@ -156,17 +155,6 @@ def robot_of(name: str) -> str:
     if name and name not in PEERS:
         raise ConfigError(f"exam.peer: {unknown('robot', name, PEERS, 'legged_mw/eval/peers.py')}")
     return name
-
-
-def in_common(peer: str) -> dict[str, Any]:
-    """Fields of the config section ``exam`` that ask the range which all published policies of the robot ``peer`` were asked.
-
-    Raises ConfigError if there is none.
-    """
-    if (robot := robot_of(peer)) not in COMMON:
-        raise ConfigError(f"--ranges common: exam.peer is '{robot}'; one range for all published policies is known of: {', '.join(COMMON)}")
-    ranges = {name: list(ends) for name, ends in zip(VELOCITY, COMMON[robot], strict=True)}
-    return {"ranges": ranges, "push_vx": 0.0, "transport_vx": 0.0}
 
 
 def best_of(peers: list[Peer]) -> dict[str, Any]:

@@ -279,6 +279,17 @@ def _check(given: Mapping[str, Any], ranges: Mapping[str, Sequence[float]]) -> N
         raise ConfigError(f"exam.marks is {list(given['marks'])}; it must be three numbers, or an empty list")
 
 
+def in_common(peer: str) -> dict[str, Any]:
+    """Fields of the config section ``exam`` that ask the range which all published policies of the robot ``peer`` were asked.
+
+    Raises ConfigError if there is none.
+    """
+    if (robot := robot_of(peer)) not in COMMON:
+        raise ConfigError(f"--ranges common: exam.peer is '{robot}'; one range for all published policies is known of: {', '.join(COMMON)}")
+    ranges = {name: list(ends) for name, ends in zip(VELOCITY, COMMON[robot], strict=True)}
+    return {"ranges": ranges, "push_vx": 0.0, "transport_vx": 0.0}
+
+
 def table(result: Mapping[str, Any]) -> str:
     """The result as text, beside what walking asks and what the peer, or the best of several, has if there is one."""
     rules = ExamRules.from_mapping(result["rules"])
