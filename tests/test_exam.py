@@ -160,7 +160,7 @@ def test_what_the_common_range_did_not_ask_alike_is_said() -> None:
         "asked: vx -0.5 to 1 m/s, vy -0.4 to 0.4 m/s, yaw rate -1 to 1 rad/s, the one range that all published policies of this robot "
         "were asked"
     )
-    words = "Their pushes and cost of transport were taken at half of each policy's own highest vx, not at 0.5 m/s: compare them with care."
+    words = "* Their pushes and cost of transport were taken at half of each policy's own highest vx, not all at 0.5 m/s: compare"
     assert rules.peer_words().startswith("Best of 10: ") and words in rules.peer_words()
     with pytest.raises(ConfigError, match="--ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2, g1"):
         in_common("go1")

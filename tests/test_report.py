@@ -213,10 +213,15 @@ def test_several_peers_are_their_best_and_a_table(both: tuple[dict[str, Any], ..
     graded = {**result, "pushes": pushes, "beats_peer": False, "rules": asked.to_mapping()}
     report.write(tmp_path, "go2", [Column("mine", {}, graded, figures)])
     html, saved = (tmp_path / "report.html").read_text(encoding="utf-8"), json.loads((tmp_path / "report.json").read_text())
-    assert "<th>best of 10</th>" in html and "does not beat all 10 published policies (at or beyond their best in " in html
-    assert "half of each policy&#x27;s own highest vx, not at 0.5 m/s" in html
+    assert (
+        "<td>0.30*</td>" in html
+        and "<td>0.034</td>" in html
+        and "<th>best of 10</th>" in html
+        and "does not beat all 10 published policies (at or beyond their best in " in html
+    )
+    assert "half of each policy&#x27;s own highest vx, not all at 0.5 m/s" in html
     table = html[html.index("<h2>Published policies</h2>") :]
-    row = "<tr><th>DLS basic-locomotion</th><td>0</td><td>0.046, 0.037, 0.058</td><td>0.160, 0.060, 0.120</td><td>0.032, 0.019, 0.015</td>"
+    row = "<tr><th>DLS basic-locomotion</th><td>0</td><td>0.046, 0.037, 0.058</td><td>0.16, 0.06, 0.12</td><td>0.032, 0.019, 0.015</td>"
     assert row + "<td>0.002</td><td>0.63</td><td>100, 69, 12, 6, 0, 0, 0, 0</td><td>0.25</td></tr>" in table
     assert table.count("<tr>") == 1 + 1 + 10 and "<tr><th>mine</th><td>0</td>" in table
     assert len(saved["peers"]) == 10 and saved["peer"]["cost_of_transport"] == 0.3

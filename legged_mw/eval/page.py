@@ -118,7 +118,7 @@ def _exam_table(columns: Sequence[Column], figures: Sequence[Sequence[Figure]], 
             cells.append(f'<td><span class="value{_mood(other)}">{other.text(other.value)}</span> <small>{gap}</small></td>')
         cells.append(f"<td>{first.mark_text()}</td>")
         if peer:
-            cells.append(f"<td>{'' if first.peer is None else first.text(first.peer)}</td>")
+            cells.append(f"<td>{first.peer_text()}</td>")
         sub = ' class="sub"' if first.name.startswith(" ") else ""
         lines.append(f"<tr{sub}><th>{escape(first.name.strip())}</th>{''.join(cells)}</tr>")
     heads = "".join(f"<th>{escape(name)}</th>" for name in [*(column.name for column in columns), "walks at", *([peer] if peer else [])])
@@ -143,14 +143,15 @@ def _published(rules: ExamRules, columns: Sequence[Column]) -> str:
     ]
     cells = []
     for name, found, vx in [*rows, *peers]:
-        triples = [", ".join(f"{value:.3f}" for value in found[key]) for key in ("error", "worst", "offset")]
+        digits = {"error": 3, "worst": 2, "offset": 3}
+        triples = [", ".join(f"{value:.{each}f}" for value in found[key]) for key, each in digits.items()]
         drift = "fell" if found["drift"] is None else f"{found['drift']:.3f}"
         cost = "none" if found["cost_of_transport"] is None else f"{found['cost_of_transport']:.2f}"
         shares = ", ".join(f"{100 * share:.0f}" for share in found["pushes"].values())
         cells.append([name, str(found["falls"]), *triples, drift, cost, shares, vx])
     pushes = ", ".join(f"{speed:g}" for speed in rules.push_speeds)
-    lead = f"All were asked the same commands. Pushes of {pushes} m/s, and cost of transport: walking ahead at the last column's vx."
-    return f'<section><h2>Published policies</h2><p class="lead">{lead}</p>{_table(heads, cells)}</section>'
+    lead = f"All were asked the same commands. Cost of transport, and pushes of {pushes} m/s: walking ahead at the last column's vx [m/s]."
+    return f'<section class="peers"><h2>Published policies</h2><p class="lead">{lead}</p>{_table(heads, cells)}</section>'
 
 
 def _chapter(section: Section, panels: list[str], lead: str, extra: str) -> str:

@@ -47,9 +47,13 @@ class Figure(NamedTuple):
     without: str = "fell"  # stands for no value
     card: tuple[str, str] | None = None  # title and unit among the figures that one looks for first
     equal: float = 0.0  # up to here all values count as equal
+    peer_mark: str = ""  # on the peer's value: what it means is said below the table
 
     def text(self, value: float | None) -> str:
         return self.without if value is None else f"{value:.{self.digits}f}"
+
+    def peer_text(self) -> str:
+        return "" if self.peer is None else f"{self.text(self.peer)}{self.peer_mark}"
 
     def mark_text(self) -> str:
         if self.mark is None:
@@ -137,8 +141,8 @@ class ExamRules:
         if len(self.peers) == 1:
             return f"The peer is {first.name}'s policy for this robot, graded by the same rules in MuJoCo's C engine."
         apart = (
-            f"Their pushes and cost of transport were taken at half of each policy's own highest vx, not at {self.push_vx:g} m/s: compare "
-            "them with care. "
+            f"* Their pushes and cost of transport were taken at half of each policy's own highest vx, not all at {self.push_vx:g} m/s: "
+            "compare them with care."
         )
         return (
             f"Best of {len(self.peers)}: figure by figure the best of any published policy for this robot that was asked these ranges, "
@@ -210,6 +214,7 @@ class ExamRules:
     def figures(self, result: Mapping[str, Any]) -> list[Figure]:
         """The result's figures in the order of the table."""
         peer, unknown_of_peer = best_of(self.peers), (None, None, None)
+        apart = "*" if any(peer.own_speed for peer in self.peers) else ""
         listed = [Figure("falls in 22 commands", result["falls"], 0, 0, peer.get("falls"), card=("falls", "of 22"))]
         for i, (axis, unit) in enumerate(AXES):
             card = (f"{axis.removesuffix(' rate')} {self.marks_of}", unit)
@@ -226,10 +231,14 @@ class ExamRules:
         listed.append(Figure("joint speed standing [rad/s]", result["joint_speed"], 3))
         for speed, share in result["pushes"].items():
             mark, card = (1.0, (f"{speed} m/s pushes", "survived")) if float(speed) == self.push_mark else (None, None)
-            listed.append(Figure(f"survives pushes of {speed} m/s", share, 2, mark, peer.get("pushes", {}).get(speed), True, card=card))
+            listed.append(
+                Figure(
+                    f"survives pushes of {speed} m/s", share, 2, mark, peer.get("pushes", {}).get(speed), True, card=card, peer_mark=apart
+                )
+            )
         name, ahead = "cost_of_transport", f"at {self.transport_vx:g} m/s"
         card = ("cost of transport", ahead)
-        return [*listed, Figure(" ".join(card), result[name], 2, None, peer.get(name), without="none", card=card)]
+        return [*listed, Figure(" ".join(card), result[name], 2, None, peer.get(name), without="none", card=card, peer_mark=apart)]
 
 
 def _tracking(velocity: NDArray[Any], commands: list[Velocity], stood: NDArray[Any]) -> dict[str, Any]:
@@ -297,8 +306,7 @@ def table(result: Mapping[str, Any]) -> str:
     width = max(8, len(label) + 2) if label else 0
     lines = [rules.asked_words(), f"{'':<30}{'this policy':>12}{'walks at':>10}{label:>{width}}"]
     for figure in rules.figures(result):
-        peer = "" if figure.peer is None else figure.text(figure.peer)
-        lines.append(f"{figure.name:<30}{figure.text(figure.value):>12}{figure.mark_text():>10}{peer:>{width}}".rstrip())
+        lines.append(f"{figure.name:<30}{figure.text(figure.value):>12}{figure.mark_text():>10}{figure.peer_text():>{width}}".rstrip())
     if len(rules.peers) > 1:
         lines.append(rules.peer_words())
     return "\n".join([*lines, "; ".join(f"{words}: {'yes' if yes else 'no'}" for words, yes in verdicts(rules, result))])
