@@ -378,6 +378,14 @@ def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Ca
     assert all(error < 0.12 for error in saved["error"]) and 0.5 < saved["cost_of_transport"] < 1.2
 
 
+def test_the_common_range_of_published_policies(capsys: pytest.CaptureFixture[str]) -> None:
+    """Asked of a robot that has none, and without an exam."""
+    code, _, err = main(capsys, SHIPPED, "--eval", "--ranges", "common")
+    assert code == 2 and "exam: --ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2, g1" in err
+    code, _, err = main(capsys, SHIPPED, "--ranges", "common")
+    assert code == 2 and "--ranges says what the exam asks: add --eval" in err
+
+
 def test_the_contract_brings_the_rules_of_the_exam(export: Path) -> None:
     shipped = contract_rules(read_contract(export))
     assert shipped.peer == "go1" and shipped.push_vx == 0.8 and shipped.push_speeds == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
