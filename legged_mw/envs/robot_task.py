@@ -23,6 +23,7 @@ from legged_mw.envs.actuators import Actuators
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.contacts import GroundContacts
+from legged_mw.envs.divergence import Divergence
 from legged_mw.envs.domain_rand import DomainRand, world_fields
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
 from legged_mw.envs.observations import Observations, Row
@@ -126,12 +127,8 @@ class RobotTask(RobotRewards, BaseTask):
 
     def check_termination(self) -> None:
         """Ends episodes: fallen, out of time, or broken (a state or an action that is not finite)."""
-        speed = self.sim.qvel.abs().amax(dim=1)
-        position = self.sim.qpos.abs().amax(dim=1)
-        action = self.actions.abs().amax(dim=1)  # a servo swallows NaN, the reward does not
-        finite = (speed <= self.cfg.termination.max_speed) & (position < math.inf) & (action < math.inf)  # NaN compares false
-        torch.logical_not(finite, out=self.broken)
-        torch.logical_and(self._fallen(), finite, out=self.fell)
+        self.divergence.find(self.broken)
+        torch.logical_and(self._fallen(), ~self.broken, out=self.fell)
         ended = torch.logical_or(self.fell, self.broken)
         torch.logical_and(self._timed_out(), ~ended, out=self.time_out_buf)
         torch.logical_or(ended, self.time_out_buf, out=self.reset_buf)
@@ -351,7 +348,7 @@ class RobotTask(RobotRewards, BaseTask):
 
     def _live_statistics(self) -> dict[str, Tensor]:
         """Values as they stand: () a sum, or (2,) a sum and what to divide it by, so that ranks can add theirs."""
-        return {"overflowed": self.sim.overflowed_worlds()}  # worlds, so far
+        return {"overflowed": self.sim.overflowed_worlds(), **self.divergence.statistics()}  # worlds, so far
 
     def take_statistics(self) -> Tensor:
         """Sums since the last call and values as they stand (S,), on the device."""
@@ -400,7 +397,7 @@ class RobotTask(RobotRewards, BaseTask):
         sites = self._sensed_sites()
         return build_model(
             ROOT / Path(cfg.asset.file).expanduser(),  # an absolute path stays itself
-            solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations),
+            solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations, cfg.sim.integrator),
             ground=Ground(cfg.terrain.friction, cfg.terrain.condim, self.terrain, boxes=engine == "mujoco"),
             stiffness=cfg.control.stiffness,
             damping=cfg.control.damping,
@@ -437,6 +434,7 @@ class RobotTask(RobotRewards, BaseTask):
         self.joint_reading = self.dof_offset if exact else self._zeros(self.num_actions)  # the same, as measured
         self.base_height = self.root_pos[:, 2]  # of the root above the ground under it [m]
         self.fell, self.broken = self._zeros(dtype=torch.bool), self._zeros(dtype=torch.bool)
+        self.divergence = Divergence(sim, self.actions, names, self.cfg.termination.max_speed)
         self._episode, views = columns(n, device, **self._episode_columns())  # one matrix, so that a reset clears it in one go
         for name, view in views.items():
             setattr(self, name, view)

@@ -136,6 +136,7 @@ class RobotTaskCfg(Config):
         dt: float = 0.004  # simulation step [s] [P]
         iterations: int = 1  # Newton iterations [P]
         ls_iterations: int = 5  # line-search iterations [P]
+        integrator: Literal["euler", "implicitfast"] = "euler"  # implicitfast: joint damping is stable however large [P: euler]
         nconmax: int = 8  # contacts a world has room for (mujoco_warp); four feet on a plane make four
         njmax: int = 40  # constraint rows a world has room for (mujoco_warp): 12 friction, 12 limits, 4 a contact [ours: never seen full]
 

@@ -9,6 +9,7 @@ from legged_mw.sim.errors import EngineError, ModelError
 
 FIELDS = {
     "engine": "sim.engine",
+    "integrator": "sim.integrator",
     "stiffness": "control.stiffness",
     "damping": "control.damping",
     "colliders": "asset.colliders",
