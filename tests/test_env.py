@@ -204,7 +204,7 @@ class _Number(LeggedRobot):
             {"asset.foot_names": ["FR", "FL", "RR", "RX"]},
             None,
             ModelError,
-            r"^asset.foot_names or foot_geoms: 'RX': no geom 'RX' in go1\.xml; there are: floor, .*, RL$",
+            r"^asset.foot_names or foot_geoms: 'RX': no geom or body 'RX' in go1\.xml; there are: geoms .*, RL; bodies trunk, .*, RL_calf$",
         ),
         ({"asset.file": ""}, None, ConfigError, r"^asset\.file is empty; name the robot's MJCF, e\.g\. 'resources/robots/go1/go1\.xml'$"),
         (
@@ -217,7 +217,7 @@ class _Number(LeggedRobot):
             {"asset.colliders": ["paw"]},
             None,
             ModelError,
-            r"^asset\.colliders: no colliding geom 'paw' in go1\.xml; there are: trunk_box",
+            r"^asset\.colliders: no colliding geom or body 'paw' in go1\.xml; there are: geoms trunk_box",
         ),
         (
             {"terrain.mesh_type": "heightfield", "terrain.tile_size": 7.77},

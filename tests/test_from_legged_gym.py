@@ -291,7 +291,7 @@ def test_trains_and_is_graded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     [
         (
             {"asset.penalize_contacts_on": ["*_thig_*"]},
-            r"^asset.penalize_contacts_on or terminate_.*: no geom '\*_thig_\*' in go1.xml; .*there are: .*trunk_box",
+            r"^asset.penalize_contacts_on or terminate_.*: no geom or body '\*_thig_\*' in go1.xml; .*there are: geoms .*trunk_box",
         ),
         (
             {"asset.colliders": ["FR", "FL", "RR", "RL"]},

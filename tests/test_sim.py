@@ -134,9 +134,12 @@ def test_table_that_does_not_fit(field: str, table: dict[str, float], parts: tup
 @pytest.mark.parametrize(
     ("choice", "parts"),
     [
-        ({"colliders": ["FR", "FL", "RR", "RLL"]}, ("no colliding geom 'RLL' in go1.xml", "did you mean 'RL'?", "trunk_box")),
-        ({"colliders": ["foot_*"]}, ("no colliding geom 'foot_*'", "there are: trunk_box", "RL_calf_2")),
-        ({"contact_geoms": ["FR", "FL", "RR", "RLL"]}, ("no geom 'RLL' in go1.xml", "did you mean 'RL'?")),
+        ({"colliders": ["FR", "FL", "RR", "RLL"]}, ("no colliding geom or body 'RLL' in go1.xml", "did you mean 'RL'?", "trunk_box")),
+        (
+            {"colliders": ["foot_*"]},
+            ("no colliding geom or body 'foot_*'", "there are: geoms trunk_box", "RL_calf_2", "; bodies trunk, FR_hip"),
+        ),
+        ({"contact_geoms": ["FR", "FL", "RR", "RLL"]}, ("no geom or body 'RLL' in go1.xml", "did you mean 'RL'?")),
         ({"velocity_sites": ["FR", "FLL"]}, ("no site 'FLL' in go1.xml", "did you mean 'FL'?", "head, imu")),
         ({"accelerometer_site": "imuu"}, ("no site 'imuu' in go1.xml", "did you mean 'imu'?", "there are: head, imu, FR, FL, RR, RL")),
     ],
@@ -246,6 +249,25 @@ def test_what_may_touch_has_a_name(tmp_path: Path) -> None:
     assert "geom of 'base' without a name is called 'base_1_'" in build_toy(taken).overrides
 
 
+def test_a_body_means_its_geoms_that_collide(tmp_path: Path) -> None:
+    looks = '<geom name="shade" size="0.3" contype="0" conaffinity="0"/><body name="hand"><geom name="palm" size="0.01"/></body>'
+    robot = build_toy(toy(tmp_path, inside=looks), colliders=["base", "*_leg"], contact_geoms=["left_leg", "ba*"])
+    assert robot.contact_geoms == ("left_shin", "left_foot", "shell"), "neither what is looked at nor what is on a child"
+    assert robot.names.find(["*"], "") == robot.names.geoms and robot.names.find(["*_foot"], "") == ("left_foot", "right_foot")
+    assert robot.names.find(["hand"], "") == ("palm",)
+    touching = {robot.physics.geom(i).name for i in range(robot.physics.ngeom) if robot.physics.geom_conaffinity[i]}
+    assert touching == {"shell", "left_shin", "left_foot", "right_shin", "right_foot"}
+    same = toy(tmp_path, inside='<body name="left_foot"><geom name="thumb" size="0.01"/></body>')
+    assert build_toy(same).names.find(["left_foot"], "") == ("left_foot",), "a geom wins over a body of its name"
+    with pytest.raises(ModelError) as error:
+        build_toy(
+            toy(tmp_path, inside='<body name="tail"><joint name="tail_hip"/><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/></body>'),
+            contact_geoms=["tail"],
+        )
+    text = "`contact_geoms`: body 'tail' of toy.xml has no geom that collides; bodies that have: base, left_leg, right_leg"
+    assert one_line(error) == text
+
+
 def test_a_missing_site_is_made_at_its_geom(tmp_path: Path) -> None:
     file = toy(tmp_path, inside='<geom name="tail" type="capsule" size="0.01" fromto="-0.1 0 0 -0.3 0 0.1"/>')
     sites = {"tail": ["tail"], "left_foot": ["left_shin"]}
@@ -312,7 +334,7 @@ def test_the_lowest_point_of_every_shape(tmp_path: Path, shape: str, lowest: flo
 def test_a_site_of_no_geom(tmp_path: Path) -> None:
     with pytest.raises(ModelError) as error:
         build_soles(tmp_path, sites={"left_sole": ["left_heal"]})
-    assert "no geom 'left_heal' in toy.xml; did you mean 'left_heel'?" in one_line(error)
+    assert "no geom or body 'left_heal' in toy.xml; did you mean 'left_heel'?" in one_line(error)
     with pytest.raises(ModelError, match=r"^site 'left_sole' is not in toy.xml and no geom is given for it$"):
         build_soles(tmp_path, sites={"left_sole": []})
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 import mujoco
@@ -20,7 +19,9 @@ import numpy as np
 
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND, Ground, add_ground, replace_level_pieces
+from legged_mw.sim.names import Names, name_geoms
 from legged_mw.sim.shapes import add_sites
+from legged_mw.sim.tables import per_joint, per_joint_all
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import unknown
 
@@ -47,6 +48,7 @@ class RobotModel:
     joint_names: tuple[str, ...]  # scalar joints, in order of qpos[7:], qvel[6:] and ctrl
     sensors: dict[str, slice]  # "contact", "linvel", "accelerometer" -> span of sensordata
     spec: mujoco.MjSpec  # the same with visual geoms: to copy, never to change
+    names: Names  # of geoms and bodies, as a caller may ask for them
     contact_geoms: tuple[str, ...] = ()  # in order of the span "contact"
     site_geoms: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of each site that was asked for with geoms
     terrain: Terrain | None = None  # None: the plane
@@ -80,25 +82,6 @@ class RobotModel:
         return index
 
 
-def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str) -> list[float]:
-    """Values (D,) for ``joints``: a joint takes the longest key that is its name or a part of it; "" is a part of every name.
-
-    Raises ModelError for a key without a joint, for joints without a key, and for two keys that fit a joint equally well.
-    """
-    for key in table:
-        if key and not any(key in joint for joint in joints):
-            raise ModelError(f"{what}: {unknown('joint', key, joints, 'the MJCF')} (a key may be a part of a joint's name)")
-    fitting = {joint: sorted((key for key in table if key in joint), key=len) for joint in joints}
-    if without := [joint for joint, keys in fitting.items() if not keys]:
-        raise ModelError(
-            f"{what}: no value for {', '.join(without)}: none of {list(table)} is a part of these names; add keys, or '' for all others"
-        )
-    for joint, (*_, second, first) in ((joint, keys) for joint, keys in fitting.items() if len(keys) > 1):
-        if len(first) == len(second):
-            raise ModelError(f"{what}: '{second}' and '{first}' fit joint '{joint}' equally well; add the key '{joint}'")
-    return [float(table[keys[-1]]) for keys in fitting.values()]
-
-
 def build_model(
     file: Path,
     *,
@@ -106,12 +89,12 @@ def build_model(
     ground: Ground,
     stiffness: Mapping[str, float],  # as for per_joint: position gain [N m/rad]
     damping: Mapping[str, float],  # as for per_joint: passive joint damping [N m s/rad]
-    colliders: Sequence[str],  # geoms that touch the ground: names or patterns with * and ?
+    colliders: Sequence[str],  # geoms that touch the ground: names of geoms or bodies, or patterns with * and ?
     self_collisions: bool,
-    contact_geoms: Sequence[str],  # sensed: number of contacts with the ground; names or patterns, each geom once
+    contact_geoms: Sequence[str],  # sensed: number of contacts with the ground; likewise, each geom once
     velocity_sites: Sequence[str],  # sensed: linear velocity, world frame [m/s]
     accelerometer_site: str | None,  # sensed: proper acceleration, site frame [m/s^2]
-    sites: Mapping[str, Sequence[str]] | None = None,  # name -> geoms, names or patterns; a site that the MJCF lacks is made there
+    sites: Mapping[str, Sequence[str]] | None = None,  # name -> geoms, likewise; a site that the MJCF lacks is made there
     pose: Mapping[str, float] | None = None,  # as for per_joint: angles [rad] at which a made site is the lowest point; None: all 0
 ) -> RobotModel:
     """Compile the MJCF at ``file`` for stepping."""
@@ -119,19 +102,19 @@ def build_model(
     root, joints = _find_joints(spec, where)
     names = [joint.name for joint in joints]
     _set_options(spec, solver, notes)
+    parts = name_geoms(spec, where, notes)
     add_ground(spec, ground, where, notes)
-    _name_colliders(spec, notes)
-    _set_collisions(spec, colliders, self_collisions, where, notes)
-    _add_servos(spec, joints, per_joint(stiffness, names, "`stiffness`"), per_joint(damping, names, "`damping`"), notes)
-    site_geoms = {name: _match_geoms(spec, geoms, where, f"`sites`: '{name}'") for name, geoms in (sites or {}).items()}
-    touching = _match_geoms(spec, contact_geoms, where, "`contact_geoms`")
+    _set_collisions(spec, parts.find(colliders, "`colliders`", colliding=True), self_collisions, notes)
+    _add_servos(spec, joints, *per_joint_all({"`stiffness`": stiffness, "`damping`": damping}, names), notes)
+    site_geoms = {name: parts.find(geoms, f"`sites`: '{name}'") for name, geoms in (sites or {}).items()}
+    touching = parts.find(contact_geoms, "`contact_geoms`")
     with _naming(file):
         add_sites(spec, site_geoms, per_joint(pose, names, "`pose`") if pose else [0.0] * len(names), where, notes)
         _add_sensors(spec, touching, velocity_sites, accelerometer_site, where)
         whole = spec.copy()
         mj = _compile_bare(spec, ground, notes)
     spans = _sensor_spans(mj, len(touching), len(velocity_sites), accelerometer_site is not None)
-    return RobotModel(mj, root, tuple(names), spans, whole, touching, site_geoms, ground.terrain, notes)
+    return RobotModel(mj, root, tuple(names), spans, whole, parts, touching, site_geoms, ground.terrain, notes)
 
 
 def _read(file: Path) -> mujoco.MjSpec:
@@ -195,34 +178,15 @@ def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
         spec.delete(key)  # poses are the caller's choice, and a keyframe must fit the actuators added below
 
 
-def _name_colliders(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """What may touch gets a name, ``<body>_<number>``, so that it can be asked for."""
-    taken = {geom.name for geom in spec.geoms}
-    for body in spec.bodies:
-        for number, geom in enumerate(body.geoms):
-            name = f"{body.name or 'body'}_{number}"
-            if geom.name or not (geom.contype or geom.conaffinity):
-                continue
-            while name in taken:
-                name += "_"
-            geom.name = name
-            taken.add(name)
-            notes.append(f"geom of '{body.name}' without a name is called '{name}'")
-
-
-def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisions: bool, where: str, notes: list[str]) -> None:
+def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisions: bool, notes: list[str]) -> None:
     """Ground is contype 1. What may touch it has conaffinity 1; with self-collisions also bit 2 on both sides."""
     robot = [g for g in spec.geoms if g.name != GROUND and (g.contype or g.conaffinity)]
-    named = [g.name for g in robot]
-    for pattern in colliders:
-        if not any(fnmatchcase(name, pattern) for name in named):
-            raise ModelError(f"`colliders`: {unknown('colliding geom', pattern, named, where)}")
     off = []
     for geom in robot:
         if geom.priority > 0:
             notes.append(f"geom '{geom.name}' priority: {geom.priority} -> 0, so that the ground's friction wins")
             geom.priority = 0
-        touches = any(fnmatchcase(geom.name, pattern) for pattern in colliders)
+        touches = geom.name in colliders
         geom.contype = 2 if self_collisions and touches else 0
         geom.conaffinity = (3 if self_collisions else 1) if touches else 0
         if not touches:
@@ -254,18 +218,6 @@ def _add_servos(
         if joint.name in limits:  # on the servo and not on the joint, so that actuator_force is the clamped force
             servo.forcelimited, servo.forcerange = True, limits[joint.name]
             joint.actfrclimited, joint.actfrcrange = False, [0.0, 0.0]
-
-
-def _match_geoms(spec: mujoco.MjSpec, patterns: Sequence[str], where: str, what: str) -> tuple[str, ...]:
-    """Names of the geoms that ``patterns`` mean, in their order, each once; an error begins with ``what`` asked for them."""
-    geoms = [g.name for g in spec.geoms if g.name]
-    found: dict[str, None] = {}
-    for pattern in patterns:
-        hits = [name for name in geoms if fnmatchcase(name, pattern)]
-        if not hits:
-            raise ModelError(f"{what}: {unknown('geom', pattern, geoms, where)}")
-        found |= dict.fromkeys(hits)
-    return tuple(found)
 
 
 def _add_sensors(
