@@ -160,7 +160,7 @@ def test_config_file_with_a_mistake(root: Path, tmp_path: Path) -> None:
     ("item", "parts"),
     [
         ("asset.file=dog.xml", ("no MJCF at ", "dog.xml")),
-        ("asset.file=", ("asset.file is empty; name the robot's MJCF",)),
+        ("asset.file=", ("asset.file is empty; name the robot's MJCF or URDF",)),
         ("asset.foot_names=[FR, FL, RR, RLL]", ("no geom or body 'RLL' in go1.xml; did you mean 'RL'?",)),
         ("control.stiffness={hip: 30}", ("control.stiffness: no value for FR_thigh_joint, ",)),
         ("init_state.default_joint_angles={joint: 0, wheel: 1}", ("init_state.default_joint_angles: no joint 'wheel'",)),

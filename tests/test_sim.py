@@ -41,7 +41,7 @@ def go1(**choices: Any) -> RobotModel:
         "self_collisions": False,
         "contact_geoms": FEET,
         "velocity_sites": FEET,
-        "accelerometer_site": "imu",
+        "imu_site": "imu",
     }
     return build_model(choices.pop("file", GO1), **{**defaults, **choices})
 
@@ -141,7 +141,7 @@ def test_table_that_does_not_fit(field: str, table: dict[str, float], parts: tup
         ),
         ({"contact_geoms": ["FR", "FL", "RR", "RLL"]}, ("no geom or body 'RLL' in go1.xml", "did you mean 'RL'?")),
         ({"velocity_sites": ["FR", "FLL"]}, ("no site 'FLL' in go1.xml", "did you mean 'FL'?", "head, imu")),
-        ({"accelerometer_site": "imuu"}, ("no site 'imuu' in go1.xml", "did you mean 'imu'?", "there are: head, imu, FR, FL, RR, RL")),
+        ({"imu_site": "imuu"}, ("no site 'imuu' in go1.xml", "did you mean 'imu'?", "there are: head, imu, FR, FL, RR, RL")),
     ],
 )
 def test_unknown_names(choice: dict[str, Any], parts: tuple[str, ...]) -> None:
@@ -185,7 +185,10 @@ def test_file_that_is_no_mjcf(tmp_path: Path, text: str, part: str) -> None:
 def test_mjcf_that_cannot_be_compiled(tmp_path: Path) -> None:
     """It parses; that a file is missing or a name is used twice comes out later."""
     mesh = toy(tmp_path, inside='<geom type="mesh" mesh="hull"/>', extra='<asset><mesh name="hull" file="hull.stl"/></asset>')
-    with pytest.raises(ModelError, match="toy.xml is not a valid MJCF: .*hull.stl") as error:
+    with pytest.raises(
+        ModelError,
+        match=r"^toy.xml: a geom of body 'base' collides as the mesh 'hull', and its file hull.stl cannot be read \(no such file; ",
+    ) as error:
         build_toy(mesh)
     one_line(error)
     twice = toy(tmp_path, inside='<site name="imu"/>')
@@ -197,14 +200,16 @@ def test_mjcf_that_cannot_be_compiled(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("parts", "text"),
     [
-        ({"root": ""}, "toy.xml: the first joint must be the root body's free joint; it is left_hip"),
         ({"root": '<joint name="rail" type="slide"/>'}, "the first joint must be the root body's free joint; it is rail"),
         (
             {"inside": '<body><joint name="neck" type="ball"/><geom size="0.1"/></body>'},
             "joint 'neck' must be a named hinge or slide joint",
         ),
         ({"inside": '<body><joint axis="0 0 1"/><geom size="0.1"/></body>'}, "joint '' must be a named hinge or slide joint"),
-        ({"world": '<geom name="floor" type="plane" size="0 0 1"/>'}, "toy.xml brings a geom 'floor'; the ground is added to the MJCF"),
+        (
+            {"world": '<body name="cart"><joint name="rail" type="slide"/><geom size="0.1"/></body>'},
+            "toy.xml has 2 bodies with joints in its world: cart, base; leave one of them, the robot",
+        ),
     ],
 )
 def test_mjcf_that_is_not_a_robot_alone(tmp_path: Path, parts: dict[str, str], text: str) -> None:
@@ -216,7 +221,7 @@ def test_mjcf_that_is_not_a_robot_alone(tmp_path: Path, parts: dict[str, str], t
 def test_mjcf_without_joints(tmp_path: Path) -> None:
     file = tmp_path / "rock.xml"
     file.write_text('<mujoco><worldbody><body><geom size="1"/></body></worldbody></mujoco>')
-    with pytest.raises(ModelError, match="rock.xml: the first joint must be the root body's free joint; it is missing"):
+    with pytest.raises(ModelError, match="^rock.xml has no hinge or slide joint, so nothing of it can be moved$"):
         go1(file=file)
 
 
@@ -298,11 +303,11 @@ def test_of_several_geoms_the_lowest_point_is_the_site(tmp_path: Path, angle: fl
     assert "site 'left_sole' made at the lowest point of left_heel, left_toe" in robot.overrides
 
 
-def test_the_lowest_point_may_be_on_another_body_and_names_may_be_patterns(tmp_path: Path) -> None:
+def test_the_lowest_point_may_be_on_a_fixed_body_and_names_may_be_patterns(tmp_path: Path) -> None:
     robot = build_soles(tmp_path, pose={"ankle": -3.0, "": 0.0}, sites={"left_sole": ["left_t*", "left_nail"]})  # upside down
     site = robot.physics.site("left_sole")
-    assert robot.site_geoms == {"left_sole": ("left_toe", "left_nail")} and robot.physics.body(site.bodyid[0]).name == "left_nail"
-    np.testing.assert_allclose(site.pos, [0.01 * math.sin(-3.0), 0, -0.01 * math.cos(-3.0)], atol=1e-6)
+    assert robot.site_geoms == {"left_sole": ("left_toe", "left_nail")} and robot.physics.body(site.bodyid[0]).name == "left_ankle"
+    np.testing.assert_allclose(site.pos, [0.1 + 0.01 * math.sin(-3.0), 0, 0.02 - 0.01 * math.cos(-3.0)], atol=1e-6)  # the nail is fused
 
 
 def test_left_and_right_soles_mirror(tmp_path: Path) -> None:
@@ -430,13 +435,14 @@ def test_options_are_written() -> None:
 
 
 def test_sensor_spans_after_the_mjcfs_own_sensors(tmp_path: Path) -> None:
-    own = '<sensor><gyro site="imu"/><jointpos joint="left_hip"/></sensor>'
+    own = '<sensor><gyro name="gyro" site="imu"/><jointpos joint="left_hip"/><touch name="skin" site="imu"/><force site="imu"/></sensor>'
     robot = build_toy(toy(tmp_path, extra=own))
     assert robot.sensors == {"contact": slice(4, 6), "linvel": slice(6, 12), "accelerometer": slice(12, 15)}
+    assert "sensors dropped, as nothing reads them: gyro, one without a name" in robot.overrides
     data = mujoco.MjData(robot.physics)
     mujoco.mj_forward(robot.physics, data)
     np.testing.assert_allclose(data.sensordata[robot.sensors["accelerometer"]], 0, atol=1e-9)  # falls freely
-    none = build_toy(toy(tmp_path), contact_geoms=[], velocity_sites=[], accelerometer_site=None)
+    none = build_toy(toy(tmp_path), contact_geoms=[], velocity_sites=[], imu_site=None)
     assert none.sensors == {name: slice(0, 0) for name in ("contact", "linvel", "accelerometer")}
 
 

@@ -18,9 +18,10 @@ def some_joints(table: Mapping[str, float], joints: Sequence[str], what: str, sp
             raise ModelError(f"{what}: {unknown('joint', key, joints, 'the MJCF')} (a key may be a part of a joint's name)")
     found = {}
     for joint in joints:
-        *others, best = sorted((key for key in table if key in joint), key=len) or [None]
-        if best is None:
+        fitting = sorted((key for key in table if key in joint), key=len)
+        if not fitting:
             continue
+        *others, best = fitting
         if others and len(others[-1]) == len(best):
             raise ModelError(f"{what}: '{others[-1]}' and '{best}' fit joint '{joint}' equally well; add the key '{joint}'")
         found[joint] = float(table[best])
