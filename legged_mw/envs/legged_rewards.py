@@ -60,7 +60,7 @@ class LeggedRewards(RobotRewards):
         stands = upright(self.robot, self.default_dof_pos.tolist(), self.foot_names)
         self.foot_up = torch.tensor(stands.up, dtype=torch.float, device=self.device)
         self.foot_bodies = torch.tensor(stands.bodies, dtype=torch.long, device=self.device)
-        if "feet_distance" in on:
+        if "feet_distance" in on and self.num_feet > 1:
             other = [1, 0] if self.num_feet == 2 else self._partners().sites
             pairs = [(i, j) for i, j in enumerate(other) if stands.places[i, 1] > stands.places[j, 1]]
             self.neighbours = torch.tensor(pairs, dtype=torch.long, device=self.device).view(-1, 2).T.contiguous()
