@@ -45,7 +45,7 @@ from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
 from legged_mw.rl.export_scene import among_steps, standalone
 from legged_mw.rl.policies import load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE
-from legged_mw.sim.model import ModelError, per_joint
+from legged_mw.sim.model import ModelError, RobotModel, per_joint
 from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import shown
@@ -130,7 +130,7 @@ def _export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported
         observations, actions = (np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions"))
         gap = _compare(run_onnx(new / NETWORK_FILE, observations), np.clip(actions, -clip, clip))
         replay(env, contract, steps, new)
-        no_terrain = _write_terrain(task, new) if ground != "plane" else ""
+        no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
         files = (*FILES, *([TERRAIN_FILE] if (new / TERRAIN_FILE).exists() else []))
     unknown_rows = tuple(row.name for row in contract.rows if not row.measured)
     return Exported(files, gap, len(observations), unknown_rows, no_terrain, contract.ends.not_covered)
@@ -238,10 +238,8 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
 def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) -> Contract:
     """The contract of the network in ``folder``, trained with the noise level ``noise``; writes the scene there."""
     cfg, robot, scale = task.cfg, env.robot, task.cfg.control.action_scale
-    pose = per_joint(cfg.init_state.default_joint_angles, robot.joint_names, "init_state.default_joint_angles")
-    scales = per_joint(scale if isinstance(scale, dict) else {"": scale}, robot.joint_names, "control.action_scale")
-    start = [*cfg.init_state.pos, 1.0, 0.0, 0.0, 0.0, *pose]
-    scene = standalone(robot, cfg.asset.imu_site, qpos=start, ctrl=pose, camera=cfg.viewer.camera)
+    start = [*env.start_place, 1.0, 0.0, 0.0, 0.0, *robot.pose]
+    scene = standalone(robot, robot.imu, qpos=start, ctrl=robot.pose, camera=cfg.viewer.camera)
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
     ends = _ends(env)
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))
@@ -250,28 +248,36 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
     return Contract(
         task=task.name,
         joints=robot.joint_names,
-        default_pose=np.array(pose),
-        action=Action(cfg.control.action_origin, np.array(scales), cfg.normalization.clip_actions),
-        stiffness=np.array(per_joint(cfg.control.stiffness, robot.joint_names, "control.stiffness")),
-        damping=np.array(per_joint(cfg.control.damping, robot.joint_names, "control.damping")),
+        default_pose=np.array(robot.pose),
+        action=Action(
+            cfg.control.action_origin,
+            _table(robot, scale if isinstance(scale, dict) else {"": scale}, "control.action_scale"),
+            cfg.normalization.clip_actions,
+        ),
+        stiffness=_table(robot, cfg.control.stiffness, "control.stiffness"),
+        damping=_table(robot, cfg.control.damping, "control.damping"),
         period=round(env.dt, 9),
         timestep=cfg.sim.dt,
         decimation=cfg.control.decimation,
         commands=env.command_table,
         rows=rows,
-        scan=HeightScan(tuple(ground.measured_points_x), tuple(ground.measured_points_y), cfg.init_state.pos[2]) if scanned else None,
+        scan=HeightScan(tuple(ground.measured_points_x), tuple(ground.measured_points_y), env.start_place[2]) if scanned else None,
         sensors={name: tuple(names) for name, names in scene.sensors.items()}
         | ({FALL: tuple(f"contact/{name}" for name in ends.falls_on)} if ends.falls_on else {}),
         gait=_gait(env) if any(row.measured == CLOCK for row in rows) else None,
         feet=feet,
         ends=ends,
-        imu=cfg.asset.imu_site,
+        imu=robot.imu,
         mass=round(env.total_mass, 6),
         input=INPUT,
         output=OUTPUT,
         digest=digest(folder / NETWORK_FILE),
         exam=cfg.to_dict().get("exam") if task.exam == "walking" else None,
     )
+
+
+def _table(robot: RobotModel, values: dict[str, float], field: str) -> np.ndarray:
+    return np.array(per_joint(values, robot.joint_names, field, robot.held))
 
 
 def _ends(env: RobotTask) -> Ends:
@@ -316,9 +322,9 @@ def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]
     return rows
 
 
-def _write_terrain(task: LoadedTask, folder: Path) -> str:
+def _write_terrain(env: RobotTask, task: LoadedTask, folder: Path) -> str:
     """The scene among steps and blocks of the kinds that were trained, at three levels; or why there is none."""
-    cfg, ground = task.cfg.init_state, task.cfg.terrain
+    ground = task.cfg.terrain
     kinds = [kind for kind, share in ground.terrain_proportions.items() if share > 0 and kind in LEVEL - {"flat"}]
     if not kinds:
         return ""
@@ -332,7 +338,7 @@ def _write_terrain(task: LoadedTask, folder: Path) -> str:
         border=4.0,
         seed=ground.seed,
     )
-    start = terrain.origins[0, kinds.index("stairs_up") if "stairs_up" in kinds else 0] + np.array(cfg.pos)
+    start = terrain.origins[0, kinds.index("stairs_up") if "stairs_up" in kinds else 0] + np.array(env.start_place)
     try:
         xml = among_steps((folder / SCENE_FILE).read_text(encoding="utf-8"), terrain, start.tolist())
     except ModelError as error:
