@@ -387,7 +387,7 @@ def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Ca
 
 def test_the_contract_brings_the_rules_of_the_exam(export: Path) -> None:
     shipped = contract_rules(read_contract(export))
-    assert shipped.peer == "playground_go1" and shipped.push_vx == 0.8 and shipped.push_speeds == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+    assert shipped.peer == "go1" and shipped.push_vx == 0.8 and shipped.push_speeds == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     rewrite(export, put("exam", {"push_speeds": [1.5], "push_mark": 1.5}))
     assert contract_rules(read_contract(export)).push_speeds == (1.5,)
     rewrite(export, put("exam", {"push_speeds": 3}))
@@ -396,7 +396,7 @@ def test_the_contract_brings_the_rules_of_the_exam(export: Path) -> None:
 
 
 def test_a_result_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(program, "run_exam", lambda _: {})
+    monkeypatch.setattr(program, "run_exam", lambda *_, **__: {})
     monkeypatch.setattr(rules, "table", lambda _: "the table")
     (tmp_path / "file").write_text("")
     code, out, err = main(capsys, SHIPPED, "--eval", "--out", tmp_path / "file/exam.json")
