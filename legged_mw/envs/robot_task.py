@@ -12,13 +12,11 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from pathlib import Path
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_mw import ROOT
 from legged_mw.envs.actuators import Actuators
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.checks import check_values
@@ -38,6 +36,7 @@ from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
+from legged_mw.utils.files import find_file
 from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse
 
 
@@ -430,7 +429,7 @@ class RobotTask(BaseTask):
             raise ConfigError("asset.file is empty; name the robot's MJCF, e.g. 'resources/robots/go1/go1.xml'")
         sites = self._sensed_sites()
         return build_model(
-            ROOT / Path(cfg.asset.file).expanduser(),  # an absolute path stays itself
+            find_file(cfg, "asset.file"),
             solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations),
             ground=Ground(cfg.terrain.friction, cfg.terrain.condim, self.terrain, boxes=engine == "mujoco"),
             stiffness=cfg.control.stiffness,

@@ -21,7 +21,7 @@ class RobotTaskCfg(Config):
         episode_length_s: float = 20.0  # [s], then the episode times out [P]
 
     class asset:
-        file: str = ""  # MJCF of the robot alone; relative to the config file, or to the repository
+        file: str = ""  # MJCF of the robot alone; relative to the file of the class that writes it, or to the repository
         imu_site: str = "imu"  # on the root body and aligned with it
         colliders: list[str] = ["*"]  # geoms that touch the ground; names or patterns, of those that collide in the MJCF
         self_collisions: bool = False  # among the colliders

@@ -24,6 +24,7 @@ from weakref import WeakKeyDictionary
 import yaml
 
 from legged_mw.utils.errors import UserError
+from legged_mw.utils.files import note_file
 from legged_mw.utils.renamed import new_name
 
 _TYPES = (int, float, bool, str, NoneType, list, dict, Any)
@@ -55,6 +56,7 @@ def _schema(cls: type) -> dict[str, Any]:
         if _is_section(kind):
             _schema(kind)
             fields[name].__setattr__ = _guarded_setattr  # all that is ever added to a section: it stays the user's plain class
+    note_file(cls)
     return _SCHEMAS.setdefault(cls, fields)
 
 
@@ -271,9 +273,11 @@ def _plain(value: Any) -> Any:
 
 def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
     for name, value in vars(node).items():
+        if name.startswith("_"):
+            continue
         if _is_section(type(value)):
             yield from _leaves(value, f"{prefix}{name}.")
-        elif not name.startswith("_"):
+        else:
             yield prefix + name, _plain(value)
 
 
