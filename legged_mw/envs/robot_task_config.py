@@ -131,8 +131,8 @@ class RobotTaskCfg(Config):
         dt: float = 0.004  # simulation step [s] [P]
         iterations: int = 1  # Newton iterations [P]
         ls_iterations: int = 5  # line-search iterations [P]
-        nconmax: int = 8  # contacts a world has room for (mujoco_warp); four feet on a plane make four
-        njmax: int = 40  # constraint rows a world has room for (mujoco_warp): 12 friction, 12 limits, 4 a contact [ours: never seen full]
+        nconmax: int = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model, as --check says [ours: sim/room.py]
+        njmax: int = 0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
 
     class viewer:
         width: int = 1280  # [pixel]

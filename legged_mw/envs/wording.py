@@ -9,6 +9,8 @@ from legged_mw.sim.errors import EngineError, ModelError
 
 FIELDS = {
     "engine": "sim.engine",
+    "nconmax": "sim.nconmax",
+    "njmax": "sim.njmax",
     "stiffness": "control.stiffness",
     "damping": "control.damping",
     "colliders": "asset.colliders",
@@ -24,15 +26,20 @@ FIELDS = {
 }
 
 
+def config_words(text: str) -> str:
+    """What the simulator says, with the fields that its parameters come from."""
+    for parameter, field in FIELDS.items():
+        text = text.replace(f"`{parameter}`", field)
+    return text
+
+
 @contextmanager
 def in_config_words() -> Iterator[None]:
     """An error of the simulator, raised inside, names the fields that its parameters come from."""
     try:
         yield
     except (ModelError, EngineError) as error:
-        text = str(error)
-        for parameter, field in FIELDS.items():
-            text = text.replace(f"`{parameter}`", field)
+        text = config_words(str(error))
         if text == str(error):
             raise
         raise type(error)(text) from None

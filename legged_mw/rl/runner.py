@@ -20,6 +20,7 @@ from torch import Tensor
 from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
+from legged_mw.envs.wording import config_words
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import this_rank
@@ -218,8 +219,8 @@ class Runner(OnPolicyRunner):
         rows["Time elapsed, left"] = ", ".join(str(timedelta(seconds=round(t))) for t in (time.time() - self._begun, left))
         print(console_block(f"Learning iteration {report.iteration}/{self._last}", rows), flush=True)
         if numbers["overflowed"] and not self._warned_overflow:
-            text = self.env.sim.overflow_report() or f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks"
-            print(f"WARNING: {text} (config section sim)", flush=True)
+            others = f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks; raise `nconmax` and `njmax`"
+            print(f"WARNING: {config_words(self.env.sim.overflow_report() or others)}", flush=True)
             self._warned_overflow = True
 
     @staticmethod
