@@ -11,6 +11,7 @@ FIELDS = {
     "engine": "sim.engine",
     "nconmax": "sim.nconmax",
     "njmax": "sim.njmax",
+    "integrator": "sim.integrator",
     "stiffness": "control.stiffness",
     "damping": "control.damping",
     "colliders": "asset.colliders",

@@ -18,6 +18,7 @@ from rsl_rl.runners import OnPolicyRunner
 from torch import Tensor
 
 from legged_mw import ROOT
+from legged_mw.envs.divergence import Watch
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.envs.wording import config_words
@@ -34,8 +35,9 @@ class Runner(OnPolicyRunner):
     """Trains with rsl-rl's algorithm, storage and writers.
 
     ``current_learning_iteration`` counts finished iterations: a checkpoint ``model_100.pt`` has done 100 of them, and a
-    resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after a checkpoint. Set ``examine``
-    to what grades a policy: it is called every ``exam_interval`` iterations and after the last, and its figures are logged.
+    resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after a checkpoint; ``diverged`` says
+    why the runner set it by itself. Set ``examine`` to what grades a policy: it is called every ``exam_interval`` iterations and
+    after the last, and its figures are logged.
     """
 
     env: RobotTask
@@ -45,6 +47,8 @@ class Runner(OnPolicyRunner):
         self.logger.git_status_repos = [str(ROOT)] if (ROOT / ".git").exists() else []
         self.total_steps = 0
         self.stop: str | None = None
+        self.diverged = ""  # why training had to end, in words
+        self._watch = Watch()
         self.examine: Callable[[Any], dict[str, float]] | None = None
         self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
         self._warned_overflow = False
@@ -203,6 +207,8 @@ class Runner(OnPolicyRunner):
         values, count = report.message.read(), len(report.losses)
         numbers = self.env.name_statistics(values[: -count - 3])
         self._all_stop = values[-count - 3] > 0
+        if verdict := self._watch.verdict(numbers):
+            self.diverged, self.stop = verdict, self.stop or "what it simulates is not finite"
         losses = dict(zip(report.losses, values[-count - 2 : -2], strict=True))
         self._last_means.update({name: value for name, value in numbers.items() if not math.isnan(value)})
         numbers = {name: self._last_means.get(name, math.nan) for name in numbers}
@@ -242,6 +248,11 @@ class Runner(OnPolicyRunner):
     # ---- checkpoints ----------------------------------------------------------------------------------------------
 
     def _save_checkpoint(self) -> None:
+        """Write a checkpoint, unless the networks hold what is not finite: the newest one must be good to go on from."""
+        weights = [*self.alg.get_policy().parameters(), *self.alg.critic.parameters()]
+        if not all(bool(weight.isfinite().all()) for weight in weights):
+            print(f"WARNING: after iteration {self.current_learning_iteration} the networks are not finite; not saved", flush=True)
+            return
         if self.logger.writer is not None:
             assert self.logger.log_dir is not None
             self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))

@@ -143,6 +143,8 @@ def train(task: LoadedTask, env: RobotTask, start: Start, examine: Examine | Non
     _learn(runner, left, rank)
     finished = folder is not None and _say_how_it_ended(runner, task, folder, rank)
     leave_together(rank)
+    if runner.diverged:
+        raise UserError(runner.diverged)
     if folder and finished and task.train.runner.export:
         _export(task, folder, export)
 

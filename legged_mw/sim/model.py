@@ -25,6 +25,7 @@ from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import unknown
 
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_INTEGRATORS = {"euler": mujoco.mjtIntegrator.mjINT_EULER, "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST}
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,7 @@ class Solver:
     timestep: float = 0.004  # [s]
     iterations: int = 1  # Newton iterations a substep
     ls_iterations: int = 5  # line-search iterations a Newton iteration
+    integrator: str = "euler"  # or "implicitfast": joint damping is then implicit in velocity, and stable however large
 
 
 @dataclass(frozen=True)
@@ -171,13 +173,16 @@ def _find_joints(spec: mujoco.MjSpec, where: str) -> tuple[str, list[mujoco.MjsJ
 
 
 def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
+    if solver.integrator not in _INTEGRATORS:
+        raise ModelError(unknown("integrator", solver.integrator, _INTEGRATORS, "`integrator`"))
     wanted = {
         "timestep": solver.timestep,
         "iterations": solver.iterations,
         "ls_iterations": solver.ls_iterations,
         "solver": mujoco.mjtSolver.mjSOL_NEWTON,
         "cone": mujoco.mjtCone.mjCONE_PYRAMIDAL,
-        "integrator": mujoco.mjtIntegrator.mjINT_EULER,
+        "integrator": _INTEGRATORS[solver.integrator],
+        # Euler's damping stays explicit, as it was trained with; implicitfast does not read this flag
         "disableflags": spec.option.disableflags | mujoco.mjtDisableBit.mjDSBL_EULERDAMP.value,
     }
     for name, value in wanted.items():

@@ -13,10 +13,11 @@ from legged_mw.utils.errors import UserError
 _FILES: WeakKeyDictionary[type, Path] = WeakKeyDictionary()  # class -> the Python file with its body
 
 
-def note_file(cls: type) -> None:
-    """Remember which file ``cls`` is written in. Called as its statement runs: later its module's name may be another's."""
+def note_file(cls: type) -> type:
+    """Remember which file ``cls`` is written in; returns it. Called as its statement runs: later its module's name may be another's."""
     if file := getattr(sys.modules.get(cls.__module__), "__file__", None):
         _FILES.setdefault(cls, Path(file).resolve())
+    return cls
 
 
 def find_file(cfg: Any, path: str) -> Path:
@@ -29,11 +30,10 @@ def find_file(cfg: Any, path: str) -> Path:
     owner = getattr(cfg, section)
     written = Path(getattr(owner, name)).expanduser()
     author = next(cls for cls in type(owner).__mro__ if name in vars(cls))
-    if getattr(owner, name) == getattr(author, name):
-        folders = [_folder(author)]
-    else:
-        folders = [Path.cwd(), getattr(cfg, "_folder", None), *map(_folder, [*type(owner).__mro__, *type(cfg).__mro__])]
-    places = list(dict.fromkeys(folder for folder in (*folders, ROOT) if folder))
+    folders = [_folder(author)]
+    if getattr(owner, name) != getattr(author, name):
+        folders = [Path.cwd(), Path(getattr(cfg, "_folder", "")), *map(_folder, [*type(owner).__mro__, *type(cfg).__mro__])]
+    places = list(dict.fromkeys(folder for folder in (*folders, ROOT) if folder and folder.is_absolute()))
     for file in (place / written for place in places):  # an absolute path stays itself
         if file.is_file():
             return file

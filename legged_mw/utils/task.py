@@ -35,7 +35,7 @@ class LoadedTask:
         self.about = about  # the config file's first line
         self.exam: str = getattr(task.env, "exam", "") if task.exam is None else task.exam
         self.cfg, self.train = task.cfg(), task.train()
-        self.cfg._folder = path.resolve().parent  # where files that flags name are looked for: utils/files.py
+        self.cfg._folder = str(path.resolve().parent)  # where files that flags name are looked for: utils/files.py
 
     def set(self, path: str, value: Any, where: str = "--set") -> None:
         """Override one field by its dotted path; text is parsed by the field's type."""
