@@ -96,7 +96,8 @@ def test_robots_that_thrash_find_room(own: bool) -> None:
 
 def test_an_engine_takes_what_was_counted() -> None:
     model = make_env(1).robot.physics
-    for asked, got in (({}, (8, 40)), ({"nconmax": 5}, (5, 40)), ({"njmax": 50}, (8, 50))):
+    cases: list[tuple[dict[str, Any], tuple[int, int]]] = [({}, (8, 40)), ({"nconmax": 5}, (5, 40)), ({"njmax": 50}, (8, 50))]
+    for asked, got in cases:
         sim: Any = make_simulation(model, 1, "cpu", engine="mujoco_warp", eager=True, **asked)
         assert (sim.nconmax, sim.njmax) == got
 

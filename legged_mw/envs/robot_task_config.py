@@ -226,7 +226,7 @@ class RobotTaskCfgPPO(Config):
         hidden_dims: list[int] = [128, 64, 32]  # of actor and critic
         max_iterations: int = 2600
         overrides: dict[str, Any] = {}  # fields of the environment: dotted path -> value
-        update_threads: int = 0  # of torch in an update; 0: one a core. Everything else of a step runs on one
+        update_threads: int = 0  # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one
 
     class symmetry:
         """Left-right symmetry in the update, as in Mittal et al. 2024. Rows of observations say how they mirror: envs/mirror.py."""
