@@ -60,7 +60,7 @@ def export(task: LoadedTask, checkpoint: Path, folder: Path) -> str:
     """Export a policy with the config that it was trained with; returns what was written, in words."""
     from legged_mw.rl.export import export  # onnx takes a while to import
 
-    return export(task.to_dict(), checkpoint, folder).text(folder)
+    return export(task, checkpoint, folder).text(folder)
 
 
 def deploy() -> None:

@@ -35,10 +35,11 @@ def or_empty(rule: Rule) -> Rule:
 
 ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys(("env.num_envs", "env.episode_length_s", "control.decimation", "normalization.clip_actions"), POSITIVE),
-    **dict.fromkeys(("sim.dt", "sim.iterations", "sim.ls_iterations", "sim.nconmax", "sim.njmax"), POSITIVE),
+    **dict.fromkeys(("sim.dt", "sim.iterations", "sim.ls_iterations"), POSITIVE),
     **dict.fromkeys(("rewards.max_reward", "termination.max_speed"), POSITIVE),
     **dict.fromkeys(("viewer.width", "viewer.height", "viewer.fps"), POSITIVE),
-    **dict.fromkeys(("terrain.friction", "noise.level", "sim.threads", "termination.min_base_height"), NOT_NEGATIVE),
+    **dict.fromkeys(("terrain.friction", "noise.level", "termination.min_base_height"), NOT_NEGATIVE),
+    **dict.fromkeys(("sim.threads", "sim.nconmax", "sim.njmax"), NOT_NEGATIVE),
     **dict.fromkeys(("perturbation.interval", "perturbation.duration"), SPAN),
     "perturbation.velocity": RANGE,
     **dict.fromkeys(("init_state.dof_pos_range", "init_state.dof_pos_offset"), RANGE),

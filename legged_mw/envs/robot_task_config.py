@@ -21,7 +21,9 @@ class RobotTaskCfg(Config):
         episode_length_s: float = 20.0  # [s], then the episode times out [P]
 
     class asset:
-        file: str = ""  # MJCF or URDF of the robot, as its vendor wrote it; relative to the config file, or to the repository
+        file: str = (
+            ""  # MJCF or URDF of the robot, as its vendor wrote it; relative to the file of the class that says so, or to the repository
+        )
         imu_site: str = ""  # site, or body, that is fixed to the root; empty: the site "imu", or else the root's origin [ours]
         # names of geoms; of bodies, which mean their own geoms that collide; or patterns. Geoms that touch the ground:
         colliders: list[str] = ["*"]  # of those that collide in the file
@@ -143,8 +145,8 @@ class RobotTaskCfg(Config):
         iterations: int = 1  # Newton iterations [P]
         ls_iterations: int = 5  # line-search iterations [P]
         integrator: Literal["euler", "implicitfast"] = "euler"  # implicitfast: joint damping is stable however large [P: euler]
-        nconmax: int = 8  # contacts a world has room for (mujoco_warp); four feet on a plane make four
-        njmax: int = 40  # constraint rows a world has room for (mujoco_warp): 12 friction, 12 limits, 4 a contact [ours: never seen full]
+        nconmax: int = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model, as --check says [ours: sim/room.py]
+        njmax: int = 0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
 
     class viewer:
         width: int = 1280  # [pixel]
@@ -232,7 +234,7 @@ class RobotTaskCfgPPO(Config):
         hidden_dims: list[int] = [128, 64, 32]  # of actor and critic
         max_iterations: int = 2600
         overrides: dict[str, Any] = {}  # fields of the environment: dotted path -> value
-        update_threads: int = 0  # of torch in an update; 0: one a core. Everything else of a step runs on one
+        update_threads: int = 0  # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one
 
     class symmetry:
         """Left-right symmetry in the update, as in Mittal et al. 2024. Rows of observations say how they mirror: envs/mirror.py."""
