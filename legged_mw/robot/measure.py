@@ -32,6 +32,7 @@ STAND_TILT = 60.0  # [deg] of the root: beyond it, it fell
 STAND_HEIGHT = 0.5  # of the height it began with: below it, it sank
 TOPPLED = 15.0  # [deg] a statue that tilts so far does not rest on its feet
 _STIFF = 1e5  # [kg m^2] armature of a joint that gravity shall not move: 100 N m turn it by 1 mrad/s in a second
+_CONTACTS = {int(mujoco.mjtGeom.mjGEOM_SPHERE): 1, int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): 1, int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2}  # with a plane
 _FAST = 1.0e4  # [m/s, rad/s] beyond it a state counts as not finite (termination.max_speed)
 
 
@@ -116,6 +117,8 @@ class Health:
     stand: Stand
     dt: float  # substep [s]
     implicit: bool  # whether the integrator is implicitfast
+    nconmax: int  # contacts, if all that may touch the ground did
+    njmax: int  # constraint rows then, with every joint at a limit
 
 
 def measure(robot: RobotModel, pose: Sequence[float], place: Sequence[float], speeds: Sequence[float | None], decimation: int = 5) -> Health:
@@ -139,7 +142,17 @@ def measure(robot: RobotModel, pose: Sequence[float], place: Sequence[float], sp
         stand=stand_on_servos(robot, angles, place, decimation),
         dt=float(model.opt.timestep),
         implicit=implicit,
+        **dict(zip(("nconmax", "njmax"), room(robot), strict=True)),
     )
+
+
+def room(robot: RobotModel) -> tuple[int, int]:
+    """Contacts and constraint rows, if every geom that may touch the ground lay on it and every joint were at a limit."""
+    model, ground = robot.physics, robot.ground_geoms()
+    touches = [g for g in range(model.ngeom) if g >= ground.stop and model.geom_conaffinity[g] & 1]
+    contacts = sum(_CONTACTS.get(int(model.geom_type[g]), 4) for g in touches)
+    rows_each = max(1, 2 * (int(model.geom_condim[ground.start]) - 1))  # of a pyramid
+    return contacts, int((model.dof_frictionloss > 0).sum() + model.jnt_limited.sum()) + rows_each * contacts
 
 
 # ---- at rest ----
