@@ -40,11 +40,21 @@ class LeggedRobotCfg(RobotTaskCfg):
             ang_vel_yaw: list[float] = [-1.2, 1.2]  # [rad/s] [P]
             heading: list[float] = [-3.14, 3.14]  # [rad], world; not seen by the policy, only for heading_command [L]
 
+    class gait:
+        """A clock (legged_mw/envs/gait.py): where each foot is in its step, for the policy and the terms feet_phase, contact_phase."""
+
+        period: float = 0.0  # of a step of both legs [s]; 0: no clock [unitree_rl_gym: 0.8]
+        offsets: list[float] = []  # where each foot is when the clock is at 0, share of the period; empty: of two feet [0.0, 0.5]
+        stance: float = 0.55  # share of the period that a foot stands, from its phase 0 [unitree_rl_gym]
+        random_start: bool = True  # episodes begin anywhere in the period, so that each leg learns to lead; False: at 0, as deploy does
+
     class rewards(RobotTaskCfg.rewards):
         tracking_sigma: float = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
         swing_height: float = 0.1  # wanted height of a swinging foot [m] [P]
         min_air_time: float = 0.1  # a step that lasts less is penalised [s] [P]
         min_command: float = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]
+        min_feet_distance: float = 0.2  # sideways between left and right feet, of `feet_distance` [m] [P: T1, G1]
+        max_single_stance: float = 0.4  # on one foot, from where `single_stance` grows no more [s] [Isaac Lab: G1]
 
         class scales(RobotTaskCfg.rewards.scales):
             """Reward terms by name: each number switches on the method _reward_<name>, 0 switches it off. All [P]."""

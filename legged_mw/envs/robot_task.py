@@ -2,7 +2,7 @@
 
 Everything under ``_step`` is recorded as one CUDA graph: fixed buffers, masks instead of index lists, no question to
 the host. Shapes: N environments, D joints, K reward terms. A reward is a method ``_reward_<name>``, switched on
-by a number of that name in ``cfg.rewards.scales``; it returns (N,) and only reads.
+by a number of that name in ``cfg.rewards.scales``; it returns (N,) and only reads. The terms are in ``robot_rewards``.
 
 Freshness: ``qpos`` and ``qvel`` and all that is computed from them are current. What comes from sensors (contacts,
 places and velocities of sites, accelerometer, joint torque) is one simulation step old and zero in a world just reset.
@@ -28,6 +28,7 @@ from legged_mw.envs.domain_rand import DomainRand, world_fields
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
 from legged_mw.envs.observations import Observations, Row
 from legged_mw.envs.perturbation import Perturbation
+from legged_mw.envs.robot_rewards import RobotRewards
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import Statistics
 from legged_mw.envs.wording import in_config_words
@@ -42,7 +43,7 @@ from legged_mw.utils.errors import unknown
 from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse
 
 
-class RobotTask(BaseTask):
+class RobotTask(RobotRewards, BaseTask):
     """N robots in N worlds of their own, as one vectorized environment. A task is a subclass with its rewards and its rows."""
 
     cfg: RobotTaskCfg
@@ -120,6 +121,7 @@ class RobotTask(BaseTask):
     def _end_step(self) -> None:
         """What the next step remembers; the reward has seen this step's values."""
         self.last_actions.copy_(self.actions)
+        self._remember_for_rewards()
 
     # ---- termination ----------------------------------------------------------------------------------------------
 
@@ -188,13 +190,23 @@ class RobotTask(BaseTask):
         half = 0.5 * draw[:, 2:3]
         zero = torch.zeros_like(half)
         pose = [self._start_places(draw[:, :2]), torch.cos(half), zero, zero, torch.sin(half)]
-        joints, (low, high) = self.default_dof_pos.expand(n, -1), self.cfg.init_state.dof_pos_range
-        if (low, high) != (1.0, 1.0):
-            joints = joints * torch.empty_like(self.dof_offset).uniform_(low, high)
-        assign(self.sim.qpos, mask, torch.cat([*pose, joints], dim=1))
+        assign(self.sim.qpos, mask, torch.cat([*pose, self._start_angles()], dim=1))
         assign(self.sim.qvel[:, :6], mask, draw[:, 3:])  # the joints' velocity is zero from the reset
+        if speed := self.cfg.init_state.dof_vel_range:
+            assign(self.dof_vel, mask, torch.empty_like(self.dof_offset).uniform_(-speed, speed))
+        self._forget_for_rewards(mask)
         self.actuators.reset(mask)
         self.observations.restart(mask)
+
+    def _start_angles(self) -> Tensor:
+        """Joint angles of a new episode (N, D) [rad]: the default pose, or drawn around it and within the joints' ranges."""
+        joints, init = self.default_dof_pos.expand(self.num_envs, -1), self.cfg.init_state
+        if init.dof_pos_range != [1.0, 1.0]:
+            joints = joints * torch.empty_like(self.dof_offset).uniform_(*init.dof_pos_range)
+        if init.dof_pos_offset != [0.0, 0.0]:
+            joints = joints + torch.empty_like(self.dof_offset).uniform_(*init.dof_pos_offset)
+            joints = joints.clamp(self.joint_lower, self.joint_upper)
+        return joints
 
     def _start_places(self, offset: Tensor) -> Tensor:
         """Where an episode begins, (N, 3) [m, world], ``offset`` (N, 2) [m] away from the middle."""
@@ -307,9 +319,6 @@ class RobotTask(BaseTask):
         self.episode_return.add_(total[:, None])
         self.episode_steps.add_(1.0)
 
-    def _active_scales(self) -> dict[str, float]:
-        return {name: float(scale) for name, scale in self.cfg.to_dict()["rewards"]["scales"].items() if scale}
-
     def _prepare_reward_function(self) -> None:
         """Match scales to methods by name; every term is tried once, so that a mistake shows before training."""
         scales = self._active_scales()
@@ -329,46 +338,6 @@ class RobotTask(BaseTask):
         self.reward_scales = torch.tensor([scales[name] for name in self.reward_names], device=self.device) * self.dt
         means = [*(f"rew_{name}" for name in self.reward_names), "reward", "episode_length"]
         self.statistics = Statistics(means, ["episodes", "fell", "broken"], self.device)
-
-    def _reward_lin_vel_z(self) -> Tensor:
-        """Square of the vertical velocity at the IMU, world frame (gravity points down, hence the same square). [P]"""
-        return (self.base_lin_vel * self.projected_gravity).sum(dim=1).square()
-
-    def _reward_ang_vel_xy(self) -> Tensor:
-        """Roll and pitch rates, world frame. [P]"""
-        return self.base_ang_vel_world[:, :2].square().sum(dim=1)
-
-    def _reward_orientation(self) -> Tensor:
-        """Tilt: gravity's share in the body's plane, equal to the xy share of the body's z axis in the world. [L, P]"""
-        return self.projected_gravity[:, :2].square().sum(dim=1)
-
-    def _reward_dof_pos_limits(self) -> Tensor:
-        """What joints exceed the soft limits by [rad]. [L]"""
-        return (self.dof_pos - self.dof_pos.clamp(self.soft_lower, self.soft_upper)).abs().sum(dim=1)
-
-    def _reward_pose(self) -> Tensor:
-        """Staying near the default pose, each joint with its weight. [P]"""
-        return torch.exp(-(self.dof_offset.square() * self.pose_weights).sum(dim=1))
-
-    def _reward_termination(self) -> Tensor:
-        """A fall. [L, P]"""
-        return self.fell.float()
-
-    def _reward_torques(self) -> Tensor:
-        """2-norm plus 1-norm of the joint torques [N m]. [P]"""
-        return self.torques.square().sum(dim=1).sqrt() + self.torques.abs().sum(dim=1)
-
-    def _reward_action_rate(self) -> Tensor:
-        """Change of the clipped action. [L]"""
-        return (self.actions - self.last_actions).square().sum(dim=1)
-
-    def _reward_energy(self) -> Tensor:
-        """Sum of |joint velocity * torque| [W]. [P]"""
-        return (self.dof_vel * self.torques).abs().sum(dim=1)
-
-    def _reward_collision(self) -> Tensor:
-        """How many bodies touch the ground that should not: ``asset.penalize_contacts_on``. [L]"""
-        return ((self.contact_count @ self.contacts.penalized) > 0.0).sum(dim=1).float()
 
     # ---- statistics: summed on the device, read once an iteration ------------------------------------------------------------
 
@@ -474,6 +443,7 @@ class RobotTask(BaseTask):
         self._init_imu()
         needed = bool(self._active_scales().get("collision"))
         self.contacts = GroundContacts(self.robot, self.cfg.asset, self.contact_count, needed)
+        self._init_robot_rewards()
 
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
         return torch.zeros(self.num_envs, *shape, dtype=dtype, device=self.device)
@@ -498,6 +468,7 @@ class RobotTask(BaseTask):
         low, high = self._tensor(self.robot.joint_range).unbind(dim=1)
         middle, half = (low + high) / 2, (high - low) / 2 * cfg.rewards.soft_dof_pos_limit
         self.soft_lower, self.soft_upper = middle - half, middle + half
+        self.joint_lower, self.joint_upper = low, high
         self.init_pos = self._tensor(init.pos)
         self.reset_range = self._tensor([init.pos_xy_range] * 2 + [init.yaw_range] + [init.lin_vel_range] * 3 + [init.ang_vel_range] * 3)
 

@@ -33,6 +33,8 @@ class RobotTaskCfg(Config):
         pos: list[float] = [0.0, 0.0, 1.0]  # root at reset [m]
         default_joint_angles: dict[str, float] = {}  # table a joint [rad]: the pose of action 0
         dof_pos_range: list[float] = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
+        dof_pos_offset: list[float] = [0.0, 0.0]  # added to each joint at reset, U(low, high), within its range [rad]
+        dof_vel_range: float = 0.0  # each joint's velocity at reset, U(-range, range) [rad/s]
         pos_xy_range: float = 0.5  # root x and y + U(-range, range) [m] [P]
         yaw_range: float = 3.141592653589793  # U(-range, range) [rad] [P]
         lin_vel_range: float = 0.5  # root velocity, world frame, each axis U(-range, range) [m/s] [P]
@@ -60,6 +62,9 @@ class RobotTaskCfg(Config):
         max_reward: float = 10000.0  # upper clip of the sum, a step [P]
         soft_dof_pos_limit: float = 0.95  # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
         pose_weights: dict[str, float] = {"": 1.0}  # table a joint: weight in `pose` [-]
+        base_height_target: float = 0.0  # of `base_height`: of the root above the ground under it [m]
+        hip_joints: list[str] = []  # of `hip_pos`: joints' names, patterns, or parts of names
+        torques_as: Literal["norms", "squares"] = "norms"  # `torques` is the 2-norm plus the 1-norm [P], or the sum of squares [L]
 
         class scales:
             """Reward terms by name: each number switches on the method _reward_<name>, 0 switches it off."""

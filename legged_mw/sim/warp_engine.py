@@ -24,7 +24,7 @@ from legged_mw.utils.errors import unknown
 
 wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it loads; a first run would drown in it
 
-_STATE = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xfrc_applied", "overflow")
+_STATE = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xquat", "xfrc_applied", "overflow")
 # With 1 Newton and 5 line-search iterations these two are always set: they say "not converged", which is the plan.
 _EXPECTED = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
 # From this many Newton iterations on, a conditional loop in the graph is worth its launch.
@@ -79,7 +79,7 @@ class WarpSimulation(Simulation):
     def reset(self, mask: Tensor) -> None:
         self._reset_mask.copy_(mask)
         self._run("reset", lambda: mjw.reset_data(self._model, self._data, reset=self._reset_mask_wp))
-        for stale in (self.actuator_force, self.site_xpos):  # reset_data leaves the dead episode's values, even NaN
+        for stale in (self.actuator_force, self.site_xpos, self.xquat):  # reset_data leaves the dead episode's values, even NaN
             stale.masked_fill_(mask.view(-1, *[1] * (stale.dim() - 1)), 0.0)
 
     def set_constants(self) -> None:
