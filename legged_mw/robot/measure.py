@@ -32,7 +32,11 @@ STAND_TILT = 60.0  # [deg] of the root: beyond it, it fell
 STAND_HEIGHT = 0.5  # of the height it began with: below it, it sank
 TOPPLED = 15.0  # [deg] a statue that tilts so far does not rest on its feet
 _STIFF = 1e5  # [kg m^2] armature of a joint that gravity shall not move: 100 N m turn it by 1 mrad/s in a second
-_CONTACTS = {int(mujoco.mjtGeom.mjGEOM_SPHERE): 1, int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): 1, int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2}  # with a plane
+_CONTACTS = {
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): 1,
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): 1,
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2,
+}  # with a plane
 _FAST = 1.0e4  # [m/s, rad/s] beyond it a state counts as not finite (termination.max_speed)
 
 
@@ -121,15 +125,16 @@ class Health:
     njmax: int  # constraint rows then, with every joint at a limit
 
 
-def measure(robot: RobotModel, pose: Sequence[float], place: Sequence[float], speeds: Sequence[float | None], decimation: int = 5) -> Health:
+def measure(
+    robot: RobotModel, pose: Sequence[float], place: Sequence[float], speeds: Sequence[float | None], decimation: int = 5
+) -> Health:
     """The health of ``robot`` on level ground, in ``pose`` (D,) [rad], with its root at ``place`` (3,) [m], upright.
 
     ``speeds`` (D,) are the motors' highest [rad/s], None where not known.
     """
     model, angles = robot.physics, np.array(pose, dtype=float)
     rest = stand_as_statue(robot, angles, np.array(place, dtype=float))
-    poses = some_poses(robot, angles)
-    matrices = {name: mass_matrix(model, each) for name, each in poses.items()}
+    matrices = mass_matrices(robot, angles)
     implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     return Health(
         mass=float(model.body_subtreemass[0]),
@@ -137,7 +142,7 @@ def measure(robot: RobotModel, pose: Sequence[float], place: Sequence[float], sp
         top=_highest(robot, rest.qpos),
         margin=inside_by(rest.points[:, :2], rest.com[:2]),
         rest=rest,
-        joints=tuple(_joints(robot, matrices, rest.torque, speeds)),
+        joints=what_joints_bear(robot, matrices, rest.torque, speeds),
         mode=max((fastest_mode(robot, matrix, implicit) for matrix in matrices.values()), key=lambda mode: mode.growth),
         stand=stand_on_servos(robot, angles, place, decimation),
         dt=float(model.opt.timestep),
@@ -247,16 +252,16 @@ def _highest(robot: RobotModel, qpos: FloatArray) -> float:
 # ---- servos ----
 
 
-def some_poses(robot: RobotModel, pose: FloatArray) -> dict[str, FloatArray]:
-    """``pose`` (D,) as "default", and all joints at the "low", "middle" and "high" of their range, by name."""
+def mass_matrices(robot: RobotModel, pose: FloatArray) -> dict[str, FloatArray]:
+    """(V, V) with the root upright, armature included, by pose: ``pose`` (D,) is "default"; all joints "low", "middle", "high"."""
     limited = robot.physics.jnt_limited[1:] > 0
     low, high = robot.joint_range.T
     low, high = np.where(limited, low, pose - 1.0), np.where(limited, high, pose + 1.0)
-    return {"default": pose, "low": low, "middle": (low + high) / 2, "high": high}
+    poses = {"default": pose, "low": low, "middle": (low + high) / 2, "high": high}
+    return {name: _mass_matrix(robot.physics, each) for name, each in poses.items()}
 
 
-def mass_matrix(model: mujoco.MjModel, pose: FloatArray) -> FloatArray:
-    """(V, V) with the root upright and the joints at ``pose`` (D,), armature included."""
+def _mass_matrix(model: mujoco.MjModel, pose: FloatArray) -> FloatArray:
     data = mujoco.MjData(model)
     data.qpos[:] = [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, *pose]
     mujoco.mj_forward(model, data)
@@ -265,14 +270,16 @@ def mass_matrix(model: mujoco.MjModel, pose: FloatArray) -> FloatArray:
     return matrix
 
 
-def _joints(robot: RobotModel, matrices: dict[str, FloatArray], torque: FloatArray, speeds: Sequence[float | None]) -> list[Joint]:
+def what_joints_bear(
+    robot: RobotModel, matrices: dict[str, FloatArray], torque: FloatArray, speeds: Sequence[float | None]
+) -> tuple[Joint, ...]:
+    """Each joint with the smallest inertia of ``mass_matrices``, and its ``torque`` (D,) at rest [N m]."""
     model, rows = robot.physics, []
     free = {name: 1.0 / np.diag(np.linalg.inv(matrix)) for name, matrix in matrices.items()}
     for i, name in enumerate(robot.joint_names):
         dof = 6 + i
-        pose = min(free, key=lambda each: float(free[each][dof]))
-        limited = bool(model.jnt_limited[1 + i])
-        low, high = robot.joint_range[i] if limited else (-math.inf, math.inf)
+        pose = min(free, key=lambda each, dof=dof: float(free[each][dof]))
+        low, high = robot.joint_range[i] if model.jnt_limited[1 + i] else (-math.inf, math.inf)
         rows.append(
             Joint(
                 *(name, float(low), float(high), float(robot.effort_range[i, 1]), speeds[i], float(model.dof_armature[dof])),
@@ -280,7 +287,7 @@ def _joints(robot: RobotModel, matrices: dict[str, FloatArray], torque: FloatArr
                 *(float(free[pose][dof]), pose, float(matrices["default"][dof, dof]), float(torque[i])),
             )
         )
-    return rows
+    return tuple(rows)
 
 
 def fastest_mode(robot: RobotModel, matrix: FloatArray, implicit: bool) -> Mode:

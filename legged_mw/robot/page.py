@@ -26,7 +26,7 @@ _LEGEND = (
     "  inertia [kg m^2] that a motor turns while all else is free: the smallest of the poses default, low, middle, high (of all ranges), "
     "and in which;",
     "  dt kd/I: from 1 on it rings, from 2 on it is unstable; dt sqrt(kp/I): unstable from 2 on; ratio: kd / (2 sqrt(kp I));",
-    "  sag [rad] under gravity at rest; effort [N m]; speed [rad/s]; kp [N m/rad]; kd [N m s/rad]; suggested kp, kd (legged_mw/robot/suggest.py)",
+    '  sag [rad] under gravity at rest; effort [N m]; speed [rad/s]; kp [N m/rad]; kd [N m s/rad]; "cut": the step bears no more',
 )
 
 
@@ -71,7 +71,8 @@ def _table(health: Health, gains: Sequence[Gains]) -> list[str]:
     rows = [_HEAD, *(_row(joint, gain, health) for joint, gain in zip(health.joints, gains, strict=True))]
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEAD))]
     return [
-        "  " + "  ".join(cell.ljust(width) if i == 0 else cell.rjust(width) for i, (cell, width) in enumerate(zip(row, widths, strict=True)))
+        "  "
+        + "  ".join(cell.ljust(width) if i == 0 else cell.rjust(width) for i, (cell, width) in enumerate(zip(row, widths, strict=True)))
         for row in rows
     ]
 
@@ -120,7 +121,7 @@ def remarks(health: Health, gains: Sequence[Gains]) -> list[str]:
     if soft := [joint for joint in joints if joint.sag() > _TIP]:
         lines.append(f"sags by more than {_TIP:g} rad at rest: {those(soft)}: raise control.stiffness, or choose another pose")
     if health.rest.toppled or health.margin < 0.0:
-        lines.append("the centre of mass is not over the feet: choose another init_state.default_joint_angles, or it has to learn to balance first")
+        lines.append("the centre of mass is not over the feet: choose another init_state.default_joint_angles")
     if health.stand.end != "stands":
         lines.append(f"with action zero it {standing(health.stand)}; a task is learned sooner where it stands")
     return lines

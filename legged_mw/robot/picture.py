@@ -31,7 +31,15 @@ COLLIDER_RGBA, LOOK_ALPHA = (1.0, 0.55, 0.1, 0.42), 0.4
 FOOT_RGBA = (0.0, 0.75, 0.52, 1.0)
 AXES_RGB = ((0.95, 0.2, 0.2), (0.25, 0.85, 0.25), (0.3, 0.5, 1.0))  # x, y, z
 # of the families of joints: Okabe and Ito's palette and lighter ones, which the colour-blind tell apart
-FAMILY_RGB = ((0.34, 0.71, 0.91), (0.94, 0.89, 0.26), (0.85, 0.55, 0.75), (0.55, 0.9, 0.75), (0.95, 0.6, 0.4), (0.75, 0.75, 0.95), (0.9, 0.9, 0.9))
+FAMILY_RGB = (
+    (0.34, 0.71, 0.91),
+    (0.94, 0.89, 0.26),
+    (0.85, 0.55, 0.75),
+    (0.55, 0.9, 0.75),
+    (0.95, 0.6, 0.4),
+    (0.75, 0.75, 0.95),
+    (0.9, 0.9, 0.9),
+)
 LEFT_COLUMN, ROW = 12, 22  # [px] from the edge to a column of names; between two names at least
 CAPTION = "joint axes: arrows (turn by the right hand)   feet: green discs   imu: x red, y green, z blue   colliders: orange"
 
@@ -161,7 +169,9 @@ class _Picture:
 
     def _arrow(self, place: FloatArray, axis: FloatArray, length: float, rgba: Sequence[float]) -> None:
         geom = self._geom(mujoco.mjtGeom.mjGEOM_ARROW, (0.0, 0.0, 0.0), place, rgba)
-        mujoco.mjv_connector(geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.009 * self.size, place, place + 2.0 * length * axis)  # it draws half of it
+        mujoco.mjv_connector(
+            geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.009 * self.size, place, place + 2.0 * length * axis
+        )  # it draws half of it
 
     def _geom(self, kind: int, size: Sequence[float], place: FloatArray, rgba: Sequence[float]) -> mujoco.MjvGeom:
         scene = self._renderer.scene

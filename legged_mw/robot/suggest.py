@@ -21,7 +21,28 @@ LOAD, SAG = 2.0, 0.3  # times the torque at rest, held within so much [rad]
 SWING = 2.0  # [Hz]
 DAMPING_TIME = 0.025  # [s] kd / kp
 MOST = 0.5  # of dt sqrt(kp / I) and of dt kd / I
-_SIDES = {"l", "r", "left", "right", "fl", "fr", "rl", "rr", "lf", "rf", "lh", "rh", "hl", "hr", "bl", "br", "front", "rear", "hind", "back"}
+_SIDES = {
+    "l",
+    "r",
+    "left",
+    "right",
+    "fl",
+    "fr",
+    "rl",
+    "rr",
+    "lf",
+    "rf",
+    "lh",
+    "rh",
+    "hl",
+    "hr",
+    "bl",
+    "br",
+    "front",
+    "rear",
+    "hind",
+    "back",
+}
 
 
 class Gains(NamedTuple):
