@@ -50,13 +50,10 @@ def draft(file: Path) -> Draft:
     feet = guess_feet(case.robot, rest.qpos)
     joints = what_joints_bear(case.robot, mass_matrices(case.robot, pose), rest.torque, case.speeds)
     gains = suggest(joints, float(case.robot.physics.opt.timestep))
-    said = (
-        "the file's keyframe"
-        if from_file
-        else "all joints at 0" + (", or at the nearest end of their range" if (pose != zero).any() else "")
-    )
+    came_from = "the file's keyframe" if from_file else "all joints at 0"
+    clipped = ", or at the nearest end of their range" if (pose != zero).any() else ""
     guessed = [
-        f"pose: {"the file's keyframe" if from_file else 'all joints at 0'}{clipped}",
+        f"pose: {came_from}{clipped}",
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest parts that carry no others",
         "gains: as suggested below",
     ]
