@@ -16,7 +16,7 @@ import torch
 from legged_mw import ROOT
 from legged_mw.envs.divergence import Divergence, Watch
 from legged_mw.robot import __main__ as program
-from legged_mw.robot.draft import draft, table
+from legged_mw.robot.draft import Draft, as_env, draft, table
 from legged_mw.robot.measure import Health, Joint, inside_by, measure, tilt
 from legged_mw.robot.new import config_text
 from legged_mw.robot.page import page
@@ -132,6 +132,12 @@ def test_a_damping_that_the_step_does_not_bear(tmp_path: Path) -> None:
     assert "!!3.20" in text and "action zero          diverges after" in text
     calm = health(wheel(tmp_path, damping={"": 40.0}, solver=Solver(DT, 10, 20, "implicitfast")))
     assert calm.stand.end == "stands" and "implicitfast; servos in the air: stable" in page(calm, "it")
+
+
+def health_of(found: Draft) -> Health:
+    case = found.case
+    env = as_env(found, GO1)
+    return measure(env.robot, case.pose, case.place, case.speeds)
 
 
 def test_inside_by() -> None:
@@ -291,8 +297,10 @@ def test_a_new_task_overwrites_nothing(tmp_path: Path, monkeypatch: pytest.Monke
 def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
     found = draft(GO1)
     assert [foot.name for foot in found.feet] == ["FR", "FL", "RR", "RL"]
-    assert found.guessed[0] == "pose: all joints at 0, or at the nearest end of their range"
-    assert found.case.pose[2] == pytest.approx(-0.888) and found.case.place[2] == pytest.approx(0.373, abs=0.003)
+    assert found.guessed[0] == "pose: knees bent, feet under the hips"
+    assert found.case.pose[:3] == pytest.approx([0.0, 0.8, -1.6], abs=0.02)  # two links of 0.213 m: half of the knee's angle
+    assert found.case.place[2] == pytest.approx(2 * 0.213 * math.cos(0.8) + 0.023, abs=0.01)
+    assert health_of(found).stand.end == "stands"
     text = config_text(found, GO1, "my_go")
     assert "class MyGoFlatCfg(LeggedRobotCfg):" in text and 'foot_names = ["FR", "FL", "RR", "RL"]  # LOOK: guessed' in text
     assert "(quadruped)" in text and "effort" not in text

@@ -17,6 +17,7 @@ from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.robot.case import TABLES, Case, from_env
+from legged_mw.robot.crouch import bent
 from legged_mw.robot.feet import Foot, guess_feet
 from legged_mw.robot.measure import Joint, mass_matrices, stand_as_statue, what_joints_bear
 from legged_mw.robot.suggest import Gains, family, suggest
@@ -35,7 +36,7 @@ class Draft(NamedTuple):
     gains: list[Gains]
     feet: list[Foot]
     guessed: list[str]  # what nobody said, a line each
-    pose_from_file: bool  # a keyframe, or the zero pose
+    pose: str  # where the default pose is from, in words
 
 
 def draft(file: Path) -> Draft:
@@ -44,23 +45,26 @@ def draft(file: Path) -> Draft:
     case = from_env(env)
     limited = case.robot.physics.jnt_limited[1:] > 0
     low, high = case.robot.joint_range.T
-    zero = np.array(case.pose)
-    pose = np.where(limited, np.clip(zero, low, high), zero)
+    pose = np.array(case.pose)
+    pose = np.where(limited, np.clip(pose, low, high), pose)
     rest = stand_as_statue(case.robot, pose, np.array(case.place))
     feet = guess_feet(case.robot, rest.qpos)
+    bends = None if from_file else bent(case.robot, pose, feet)
+    if bends is not None:
+        pose, rest = bends, stand_as_statue(case.robot, bends, np.array(case.place))
     joints = what_joints_bear(case.robot, mass_matrices(case.robot, pose), rest.torque, case.speeds)
     gains = suggest(joints, float(case.robot.physics.opt.timestep))
-    came_from = "the file's keyframe" if from_file else "all joints at 0"
-    clipped = ", or at the nearest end of their range" if (pose != zero).any() else ""
+    how = "all joints at 0, or at the nearest end of their range" if bends is None else "knees bent, feet under the hips"
+    how = "the file's keyframe" if from_file else how
     guessed = [
-        f"pose: {came_from}{clipped}",
+        f"pose: {how}",
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest parts that carry no others",
         "gains: as suggested below",
     ]
     pose = np.round(pose, 4)
     place = [0.0, 0.0, round(float(rest.qpos[2]) + CLEARANCE, 3)]
     case = case._replace(pose=pose.tolist(), place=place, feet={foot.name: foot.geoms for foot in feet})
-    return Draft(case, joints, gains, feet, guessed, from_file)
+    return Draft(case, joints, gains, feet, guessed, how)
 
 
 def _bare(file: Path) -> tuple[RobotTask, bool]:

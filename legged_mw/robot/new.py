@@ -74,8 +74,7 @@ def config_text(found: Draft, file: Path, name: str) -> str:
     lines = [_HEAD.format(title=name, joints=len(found.joints), legs=legs, file=file.name, name=title).rstrip("\n")]
     sections = values(found)
     sections["asset"] = {"file": f"{name}.xml", **sections["asset"]}
-    pose = "LOOK: the file's keyframe" if found.pose_from_file else "LOOK: all joints at 0; bend the knees, it learns sooner"
-    comments = {**_COMMENTS, "default_joint_angles": f"[rad] {pose}"}
+    comments = {**_COMMENTS, "default_joint_angles": f"[rad] LOOK: {found.pose}"}
     for section, fields in sections.items():
         lines += [f"    class {section}(LeggedRobotCfg.{section}):"]
         for field, value in fields.items():
