@@ -21,9 +21,7 @@ class RobotTaskCfg(Config):
         episode_length_s: float = 20.0  # [s], then the episode times out [P]
 
     class asset:
-        file: str = (
-            ""  # MJCF or URDF of the robot, as its vendor wrote it; relative to the file of the class that says so, or to the repository
-        )
+        file: str = ""  # MJCF or URDF, as its vendor wrote it; beside the file of the class that says so, or in the repository
         imu_site: str = ""  # site, or body, that is fixed to the root; empty: the site "imu", or else the root's origin [ours]
         # names of geoms; of bodies, which mean their own geoms that collide; or patterns. Geoms that touch the ground:
         colliders: list[str] = ["*"]  # of those that collide in the file
