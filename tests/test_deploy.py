@@ -364,6 +364,13 @@ def test_it_is_driven(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert "the ranges are in" in main(capsys, SHIPPED, "--viewer", "none", "--command", "9,0,0")[2]
 
 
+def test_an_end_that_nobody_judges_is_said(export: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rewrite(export, lambda said: said["ends"].update(not_covered=["Dog._fallen"]))
+    assert read_contract(export).ends == Ends(max_tilt=90.0, not_covered=("Dog._fallen",))
+    code, out, err = main(capsys, export, "--viewer", "none", "--time", "0.1")
+    assert code == 0 and out.startswith("not judged here: Dog._fallen, which ended episodes in training\n"), out + err
+
+
 def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The first seconds of it, with every push: written and printed."""
     monkeypatch.setattr(rules, "SECONDS", 2.6)

@@ -47,6 +47,8 @@ def main() -> None:
     folder = shipped if shipped.is_dir() and not Path(args.folder).exists() else Path(args.folder)
     contract, scene_file = read_contract(folder), TERRAIN_FILE if args.terrain else SCENE_FILE
     command = launch.check_drive(args, contract.commands, advice=f"the ranges are in {folder / CONTRACT_FILE}")
+    if contract.ends.not_covered:
+        print(f"not judged here: {', '.join(contract.ends.not_covered)}, which ended episodes in training")
     if args.eval:
         examine(folder, Path(args.out) if args.out else folder / RESULT_FILE, common=args.ranges == "common")
     else:
