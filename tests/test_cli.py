@@ -160,8 +160,8 @@ def test_config_file_with_a_mistake(root: Path, tmp_path: Path) -> None:
     ("item", "parts"),
     [
         ("asset.file=dog.xml", ("asset.file: no file 'dog.xml' in ", "configs, ")),
-        ("asset.file=", ("asset.file is empty; name the robot's MJCF",)),
-        ("asset.foot_names=[FR, FL, RR, RLL]", ("no geom 'RLL' in go1.xml; did you mean 'RL'?",)),
+        ("asset.file=", ("asset.file is empty; name the robot's MJCF or URDF",)),
+        ("asset.foot_names=[FR, FL, RR, RLL]", ("no geom or body 'RLL' in go1.xml; did you mean 'RL'?",)),
         ("control.stiffness={hip: 30}", ("control.stiffness: no value for FR_thigh_joint, ",)),
         ("init_state.default_joint_angles={joint: 0, wheel: 1}", ("init_state.default_joint_angles: no joint 'wheel'",)),
         ("rewards.scales.torqes=-1", ("rewards.scales.torqes = -1: no reward term 'torqes'", "did you mean 'torques'?")),

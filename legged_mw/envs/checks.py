@@ -21,6 +21,7 @@ SPAN: Rule = ("two numbers above zero, the lower first", lambda v: len(v) == 2 a
 STEPS: Rule = ("two whole numbers from zero, the lower first", lambda v: len(v) == 2 and 0 <= v[0] <= v[1])
 NAMES: Rule = ("a list with at least one name", lambda v: len(v) > 0)
 POINTS: Rule = ("at least one number, all finite", lambda v: len(v) > 0 and all(map(math.isfinite, v)))
+NUMBERS: Rule = ("a table of numbers from 0", lambda v: all(0 <= number < math.inf for number in v.values()))
 PROBABILITIES: Rule = (
     "three numbers from 0 to 1, and more for further commands",
     lambda v: len(v) >= 3 and all(0 <= p <= 1 for p in v),
@@ -48,8 +49,9 @@ ENVIRONMENT: dict[str, Rule] = {
     **{f"domain_rand.{name}": or_empty(STEPS if kind.whole else RANGE if kind.neutral == 0.0 else SPAN) for name, kind in KINDS.items()},
     "domain_rand.redraw_iterations": NOT_NEGATIVE,
     "asset.colliders": NAMES,
-    "init_state.pos": ("three numbers, x, y, z", lambda v: len(v) == 3),
-    "viewer.camera": ("three numbers, not straight above or below", lambda v: len(v) == 3 and (v[0] != 0 or v[1] != 0)),
+    "init_state.pos": or_empty(("three numbers, x, y, z", lambda v: len(v) == 3)),
+    **dict.fromkeys((f"asset.{name}" for name in ("effort", "armature", "frictionloss", "joint_speed_limits")), NUMBERS),
+    "viewer.camera": or_empty(("three numbers, not straight above or below", lambda v: len(v) == 3 and (v[0] != 0 or v[1] != 0))),
     "termination.max_tilt": ("above 0 and at most 180 degrees", lambda v: 0 < v <= 180),
     "terrain.condim": ("1, 3, 4 or 6", lambda v: v in (1, 3, 4, 6)),
 }

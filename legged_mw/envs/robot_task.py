@@ -23,6 +23,7 @@ from legged_mw.envs.checks import check_values
 from legged_mw.envs.contacts import GroundContacts
 from legged_mw.envs.divergence import Divergence
 from legged_mw.envs.domain_rand import DomainRand, world_fields
+from legged_mw.envs.loading import load_robot, soft_limits, start_place
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
 from legged_mw.envs.observations import Observations, Row
 from legged_mw.envs.perturbation import Perturbation
@@ -31,14 +32,12 @@ from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import Statistics
 from legged_mw.envs.wording import in_config_words
 from legged_mw.sim.engines import make_simulation, pick_engine
-from legged_mw.sim.errors import ModelError
 from legged_mw.sim.mirror import Partners, find_partners
-from legged_mw.sim.model import Ground, RobotModel, Solver, build_model, per_joint
+from legged_mw.sim.model import RobotModel, per_joint
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
-from legged_mw.utils.files import find_file
 from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse
 
 
@@ -390,24 +389,7 @@ class RobotTask(RobotRewards, BaseTask):
         return None
 
     def _load_robot(self, engine: str) -> RobotModel:
-        cfg = self.cfg
-        if not cfg.asset.file:
-            raise ConfigError("asset.file is empty; name the robot's MJCF, e.g. 'resources/robots/go1/go1.xml'")
-        sites = self._sensed_sites()
-        return build_model(
-            find_file(cfg, "asset.file"),
-            solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations, cfg.sim.integrator),
-            ground=Ground(cfg.terrain.friction, cfg.terrain.condim, self.terrain, boxes=engine == "mujoco"),
-            stiffness=cfg.control.stiffness,
-            damping=cfg.control.damping,
-            colliders=cfg.asset.colliders,
-            self_collisions=cfg.asset.self_collisions,
-            contact_geoms=self._sensed_geoms(),
-            velocity_sites=list(sites),
-            accelerometer_site=cfg.asset.imu_site,
-            sites=sites,
-            pose=cfg.init_state.default_joint_angles,
-        )
+        return load_robot(self.cfg, engine, self.terrain, self._sensed_geoms(), self._sensed_sites())
 
     def _sensed_geoms(self) -> list[str]:
         """Geoms whose contacts with the ground are counted: names or patterns."""
@@ -428,7 +410,7 @@ class RobotTask(RobotRewards, BaseTask):
         self.base_lin_vel, self.projected_gravity, self.base_ang_vel_world = (self._zeros(3) for _ in range(3))
         self.dof_offset = self._zeros(self.num_actions)  # joint position minus default [rad]
         names = self.robot.joint_names
-        self.actuators = Actuators(self.cfg.control, names, self.default_dof_pos, self.dof_pos, sim, self.domain_rand)
+        self.actuators = Actuators(self.cfg.control, self.robot, self.default_dof_pos, self.dof_pos, sim, self.domain_rand)
         exact = self.actuators.encoder_offset is None
         self.joint_reading = self.dof_offset if exact else self._zeros(self.num_actions)  # the same, as measured
         self.base_height = self.root_pos[:, 2]  # of the root above the ground under it [m]
@@ -438,8 +420,10 @@ class RobotTask(RobotRewards, BaseTask):
         for name, view in views.items():
             setattr(self, name, view)
         self.gravity_dir = torch.tensor([0.0, 0.0, -1.0], device=device).expand(n, 3)
-        self.total_mass = float(self.robot.physics.body_subtreemass[0])  # [kg]
-        self._init_imu()
+        model = self.robot.physics
+        self.total_mass = float(model.body_subtreemass[0])  # [kg]
+        self.root_body = self.robot.id("body", self.robot.root)
+        self.imu_pos = self._tensor(model.site_pos[self.robot.id("site", self.robot.imu)]).expand(n, 3)  # body frame [m]
         needed = bool(self._active_scales().get("collision"))
         self.contacts = GroundContacts(self.robot, self.cfg.asset, self.contact_count, needed)
         self._init_robot_rewards()
@@ -451,24 +435,15 @@ class RobotTask(RobotRewards, BaseTask):
         """What an episode remembers, as name -> width: attributes (N, width) that a reset clears."""
         return {"last_actions": self.num_actions, "episode_sums": len(self._active_scales()), "episode_return": 1, "episode_steps": 1}
 
-    def _init_imu(self) -> None:
-        robot, model = self.robot, self.robot.physics
-        imu = robot.id("site", self.cfg.asset.imu_site)
-        self.root_body = robot.id("body", robot.root)
-        if model.site_bodyid[imu] != self.root_body or abs(model.site_quat[imu][0]) < 1.0 - 1e-9:
-            raise ModelError(f"asset.imu_site '{self.cfg.asset.imu_site}' must be on the root body '{robot.root}' and aligned with it")
-        self.imu_pos = self._tensor(model.site_pos[imu]).expand(self.num_envs, 3)  # body frame [m]
-
     def _init_ranges(self) -> None:
         """Config numbers as tensors: joints' tables and ranges of a reset."""
         cfg, names, init = self.cfg, self.robot.joint_names, self.cfg.init_state
-        self.default_dof_pos = self._tensor(per_joint(init.default_joint_angles, names, "init_state.default_joint_angles"))
-        self.pose_weights = self._tensor(per_joint(cfg.rewards.pose_weights, names, "rewards.pose_weights"))
-        low, high = self._tensor(self.robot.joint_range).unbind(dim=1)
-        middle, half = (low + high) / 2, (high - low) / 2 * cfg.rewards.soft_dof_pos_limit
-        self.soft_lower, self.soft_upper = middle - half, middle + half
-        self.joint_lower, self.joint_upper = low, high
-        self.init_pos = self._tensor(init.pos)
+        self.default_dof_pos = self._tensor(self.robot.pose)
+        self.pose_weights = self._tensor(per_joint(cfg.rewards.pose_weights, names, "rewards.pose_weights", self.robot.held))
+        self.joint_lower, self.joint_upper = self._tensor(self.robot.joint_range).unbind(dim=1)
+        self.soft_lower, self.soft_upper = soft_limits(self.robot, cfg.rewards.soft_dof_pos_limit, self.device)
+        self.start_place = start_place(cfg, self.robot, cfg.asset.colliders)  # of the root at reset [m]
+        self.init_pos = self._tensor(self.start_place)
         self.reset_range = self._tensor([init.pos_xy_range] * 2 + [init.yaw_range] + [init.lin_vel_range] * 3 + [init.ang_vel_range] * 3)
 
     def _tensor(self, values: object) -> Tensor:

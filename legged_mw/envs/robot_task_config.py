@@ -21,17 +21,23 @@ class RobotTaskCfg(Config):
         episode_length_s: float = 20.0  # [s], then the episode times out [P]
 
     class asset:
-        file: str = ""  # MJCF of the robot alone; relative to the file of the class that writes it, or to the repository
-        imu_site: str = "imu"  # on the root body and aligned with it
-        colliders: list[str] = ["*"]  # geoms that touch the ground; names or patterns, of those that collide in the MJCF
+        file: str = ""  # MJCF or URDF of the robot, as its vendor wrote it; beside the class that writes it, or in the repository
+        imu_site: str = ""  # site, or body, that is fixed to the root; empty: the site "imu", or else the root's origin [ours]
+        # names of geoms; of bodies, which mean their own geoms that collide; or patterns. Geoms that touch the ground:
+        colliders: list[str] = ["*"]  # of those that collide in the file
         self_collisions: bool = False  # among the colliders
-        penalize_contacts_on: list[str] = []  # colliders, or patterns: `collision` counts their bodies on the ground [L]
+        penalize_contacts_on: list[str] = []  # likewise, colliders: `collision` counts their bodies on the ground [L]
         terminate_after_contacts_on: list[str] = []  # likewise: to touch the ground with one of these is a fall [L]
-        joint_speed_limits: dict[str, float] = {}  # table a joint: the motor's highest speed [rad/s]; for the report only
+        held_joints: list[str] = []  # names or patterns: welded at their default angle, so that they are no joints any more
+        # tables a joint that need not name every joint; the others keep the file's
+        effort: dict[str, float] = {}  # highest force of the servo, both ways [N m]
+        armature: dict[str, float] = {}  # inertia of the rotor at the joint [kg m^2]
+        frictionloss: dict[str, float] = {}  # dry friction [N m]
+        joint_speed_limits: dict[str, float] = {}  # the motor's highest speed [rad/s] (a URDF has it); for the report only
 
     class init_state:
-        pos: list[float] = [0.0, 0.0, 1.0]  # root at reset [m]
-        default_joint_angles: dict[str, float] = {}  # table a joint [rad]: the pose of action 0
+        pos: list[float] = []  # root at reset [m]; empty: the file's keyframe "home" or its only one, or else the lowest foot on the ground
+        default_joint_angles: dict[str, float] = {}  # table a joint [rad]: the pose of action 0; joints without a key: that keyframe's
         dof_pos_range: list[float] = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
         dof_pos_offset: list[float] = [0.0, 0.0]  # added to each joint at reset, U(low, high), within its range [rad]
         dof_vel_range: float = 0.0  # each joint's velocity at reset, U(-range, range) [rad/s]
@@ -143,7 +149,7 @@ class RobotTaskCfg(Config):
     class viewer:
         width: int = 1280  # [pixel]
         height: int = 720  # [pixel]
-        camera: list[float] = [0.9, -1.1, 0.6]  # place of the camera "track", from the robot, world axes [m]
+        camera: list[float] = []  # place of the camera "track", from the robot, world axes [m]; empty: by its size, Go1's is 0.9 -1.1 0.6
         fps: int = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
 
 

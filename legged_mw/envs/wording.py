@@ -24,11 +24,12 @@ FIELDS = {
     "pose": "init_state.default_joint_angles",
     "sites": "asset.foot_names or foot_geoms",
     "contact_geoms": "asset.penalize_contacts_on or terminate_after_contacts_on",
+    **{name: f"asset.{name}" for name in ("imu_site", "held_joints", "effort", "armature", "frictionloss", "joint_speed_limits")},
 }
 
 
 def config_words(text: str) -> str:
-    """What the simulator says, with the fields that its parameters come from."""
+    """``text`` with the fields that the parameters in it come from."""
     for parameter, field in FIELDS.items():
         text = text.replace(f"`{parameter}`", field)
     return text

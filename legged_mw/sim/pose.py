@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.sim.model import RobotModel
+from legged_mw.sim.shapes import surfaces
 
 
 class Upright(NamedTuple):
@@ -30,3 +31,11 @@ def upright(robot: RobotModel, joints: Sequence[float], sites: Sequence[str]) ->
     where = [robot.id("site", name) for name in sites]
     bodies = model.site_bodyid[where]
     return Upright(data.site_xpos[where].copy(), bodies.copy(), data.xmat[bodies].reshape(-1, 3, 3)[:, 2].copy())
+
+
+def standing_height(robot: RobotModel, geoms: Sequence[str]) -> float:
+    """How high the root is above a plane that the lowest of ``geoms`` touches, upright and in the robot's pose [m]."""
+    data = mujoco.MjData(robot.physics)
+    data.qpos[:7], data.qpos[7:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), robot.pose
+    mujoco.mj_kinematics(robot.physics, data)
+    return -float(min(points[:, 2].min() for points in surfaces(robot.physics, data, geoms).values()))
