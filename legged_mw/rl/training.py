@@ -57,7 +57,10 @@ def parse(description: str | None) -> argparse.Namespace:
     parser.add_argument("--max_time", type=duration, metavar="T", help="end, after a checkpoint, after 90s, 5m, 1.5h ...")
     parser.add_argument("--list", action="store_true", help="show the tasks and exit")
     parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")
+    parser.add_argument("--picture", metavar="PNG", help="with --check: the robot's health page too, and a picture of the robot")
     args = parser.parse_args()
+    if args.picture and not args.check:
+        parser.error("--picture draws what --check shows: add --check")
     if not args.list:
         require_task(args, parser)
     if not args.resume and (args.load_run is not None or args.checkpoint != -1):
