@@ -18,13 +18,14 @@ import onnx
 import pytest
 import torch
 import yaml
+from recorder import Recorder
 
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import Contract, ContractError, ContractRow, Ends, read_contract
 from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.policy import Controller
-from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
+from legged_mw.deploy.robot import Floats, Measurement, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.simulated import Fleet, MujocoRobot, read_scene
 from legged_mw.deploy.stage import DeployStage
@@ -412,26 +413,6 @@ def test_a_result_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 
 # ---- the seam
-
-
-class Recorder(Robot):
-    """Passes on to a robot and keeps what went through."""
-
-    def __init__(self, robot: Robot) -> None:
-        self.robot, self.targets, self.closed = robot, [], 0
-        self.measured: list[Measurement] = []
-
-    def read(self) -> Measurement:
-        self.measured.append(self.robot.read())
-        return self.measured[-1]
-
-    def write(self, targets: Floats) -> None:
-        self.targets.append(np.array(targets))
-        self.robot.write(targets)
-
-    def close(self) -> None:
-        self.closed += 1
-        self.robot.close()
 
 
 def test_a_robot_walks_behind_the_seam(contract: Contract) -> None:
