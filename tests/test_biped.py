@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+import shutil
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import test_rewards
 import torch
+from test_export import untrained
 from torch import Tensor
 from worlds import QUIET, make_env
 
+from legged_mw import ROOT
 from legged_mw.check.guard import check_recordable
+from legged_mw.deploy.contract import ContractError, Gait, read_contract
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.robot import QUANTITIES, Measurement
+from legged_mw.envs.gait import GaitClock
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.utils.config import ConfigError
+from legged_mw.rl import export as exporting
+from legged_mw.rl.export import ExportError, export
+from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.task import load_task
 
 BIPED, DT = "examples/toy_biped.py", 0.02
@@ -367,3 +378,84 @@ def test_one_foot_has_no_neighbour() -> None:
     one = {"asset.foot_names": ["left"], "asset.foot_geoms": {"left": ["left_heel"]}}
     with pytest.raises(ConfigError, match="asset.foot_names has one foot, which has no neighbour$"):
         make_env(1, {**QUIET, "rewards.scales.feet_distance": 1.0, **one}, task=BIPED)
+
+
+# ---- deployed
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An untrained biped's export; commands changed and episodes ended while it was tried."""
+    folder, often = tmp_path_factory.mktemp("biped"), {"commands.resampling_time": 0.2, "env.episode_length_s": 0.4, "gait.period": 0.5}
+    config, checkpoint = untrained(ROOT / BIPED, folder, {**ON, **often})
+    export(config, checkpoint, folder / "out")
+    return folder
+
+
+def test_the_contract_states_the_clock(exported: Path) -> None:
+    contract = read_contract(exported / "out")
+    assert contract.gait == Gait(0.5, (0.0, 0.5), 0.01)
+    [clock] = [row for row in contract.rows if row.name == "gait_clock"]
+    assert (clock.size, clock.unit, clock.measured) == (4, "1", "gait_clock") and clock.frame.startswith("sine of each foot's phase")
+
+
+def test_deploy_keeps_the_clock_of_the_environment(exported: Path) -> None:
+    """Standing, walking, standing, walking, each robot at other times; one starts again while it walks."""
+    env = biped({"gait.period": 0.5, "gait.random_start": False}, worlds=3)
+    contract = read_contract(exported / "out")
+    controller = Controller(exported / "out", contract, 3, network=lambda seen: np.zeros((len(seen), 6)))
+    sizes = {"joint_pos": 6, "joint_vel": 6, "joint_torque": 6, "foot_contact": 2}
+    nothing = {name: np.zeros((3, sizes.get(name, 3))) for name in QUANTITIES}
+    columns, rests, commands = env.observations.span("state", "gait_clock"), 0, env.commands
+    commands.zero_()
+    env.first_observations()
+    for step in range(70):
+        seen = env.obs_buf["state"][:, columns]
+        own = controller.observe(Measurement(**nothing), commands.numpy())[:, columns]
+        np.testing.assert_allclose(own, seen, atol=1e-5, err_msg=f"step {step}")
+        rests += int((seen == 0.0).all(dim=1).sum())
+        controller.act(Measurement(**nothing), commands.numpy())
+        commands[:, 0] = torch.tensor([float(5 <= step < 40 or step > 60) * 0.5, float(step > 20) * -0.2, 0.0])
+        commands[:, 2] = torch.tensor([0.0, 0.0, float(step % 30 > 10) * 0.3])
+        env._end_step()
+        if step == 50:
+            env.reset_envs(torch.tensor([False, True, False]))
+            controller.reset([1])
+            commands[1] = torch.tensor([0.3, 0.0, 0.0])
+        env.compute_observations()
+    assert 60 < rests < 90
+
+
+def test_a_clock_that_runs_otherwise_is_not_exported(exported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def late(self: GaitClock) -> None:
+        self.phase.add_(self.running, alpha=0.01).remainder_(1.0)
+
+    monkeypatch.setattr(GaitClock, "tick", late)
+    monkeypatch.setattr(exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(exported / "out/policy.onnx", path))
+    text = "^legged_mw.deploy would act otherwise than the environment: observation row 'gait_clock' "
+    with pytest.raises(ExportError, match=text):
+        export(load_yaml(exported / "out/config.yaml"), exported / "model.pt", exported / "late")
+
+
+@pytest.mark.parametrize(
+    ("change", "text"),
+    [
+        (lambda said: said.pop("gait"), "^policy.yaml: 'gait' is missing; it must be a mapping$"),
+        (lambda said: said["gait"].update(period=0.0), "^policy.yaml: gait: 'period' is 0.0; it must be above zero$"),
+        (
+            lambda said: said["gait"].update(offsets=[0.0]),
+            r"^policy.yaml: gait: 'offsets' is \[0.0\]; it must be 2 numbers, one a foot$",
+        ),
+        (
+            lambda said: said["commands"].pop(0),
+            "^policy.yaml: gait_clock rests by the commands lin_vel_x, lin_vel_y, ang_vel_yaw; missing: lin_vel_x$",
+        ),
+    ],
+)
+def test_a_contract_whose_clock_is_not_whole(exported: Path, tmp_path: Path, change: Callable[[Any], Any], text: str) -> None:
+    shutil.copytree(exported / "out", tmp_path / "out")
+    said = load_yaml(tmp_path / "out/policy.yaml")
+    change(said)
+    save_yaml(tmp_path / "out/policy.yaml", said)
+    with pytest.raises(ContractError, match=text):
+        read_contract(tmp_path / "out")

@@ -24,9 +24,10 @@ from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl import export as exporting
 from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, export
-from legged_mw.rl.export_replay import overridden
+from legged_mw.rl.export_replay import overridden, own_ends
 from legged_mw.rl.export_scene import differences, standalone
 from legged_mw.rl.policies import save_policy
 from legged_mw.sim.model import ModelError
@@ -328,6 +329,20 @@ def test_a_row_that_nobody_can_measure_is_said(tmp_path: Path) -> None:
     assert "nothing says how to measure guess: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)" in text
 
 
+def test_ends_of_the_tasks_own_are_said(tmp_path: Path) -> None:
+    class Own(OtherRewards):
+        def _fallen(self) -> torch.Tensor:
+            return super()._fallen()
+
+        def _timed_out(self) -> torch.Tensor:
+            return super()._timed_out()
+
+    assert own_ends(LeggedRobot) == own_ends(RobotTask) == own_ends(OtherPose) == ()
+    assert own_ends(Own) == ("Own._fallen", "Own._timed_out", "OtherRewards.check_termination")
+    text = Exported(FILES, 0.0, 256, (), not_covered=own_ends(Own)[:2]).text(tmp_path)
+    assert "Own._fallen, Own._timed_out ended episodes in training; a deployed robot walks on (policy.yaml: ends: not_covered)" in text
+
+
 def test_a_picture_is_left_out_and_a_height_field_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     env = make_env(1)
     robot = env.robot
@@ -338,11 +353,11 @@ def test_a_picture_is_left_out_and_a_height_field_refused(monkeypatch: pytest.Mo
         standalone(type(robot)(**{**vars(robot), "spec": spec}), imu="imu", qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
 
 
-def untrained(path: Path, folder: Path) -> tuple[dict[str, Any], Path]:
+def untrained(path: Path, folder: Path, settings: dict[str, Any] | None = None) -> tuple[dict[str, Any], Path]:
     """The config of a task and a checkpoint whose small networks have seen no training."""
     task = load_task(str(path))
-    task.set("env.num_envs", 1)
-    task.set("sim.engine", "mujoco")
+    for field, value in {"env.num_envs": 1, "sim.engine": "mujoco", **(settings or {})}.items():
+        task.set(field, value)
     for part in ("actor", "critic"):
         task.set(f"{part}.hidden_dims", [16, 16])
     torch.manual_seed(0)
@@ -505,7 +520,7 @@ def test_what_the_contract_states_is_exported(made: Path, tmp_path: Path, monkey
     export_of(OtherRewards, made, tmp_path / "out", monkeypatch, **changes)
     contract = read_contract(tmp_path / "out")
     assert contract.action.origin == "targets" and contract.action.scale.tolist() == [0.1, 0.1, 0.05] * 4
-    assert contract.ends == Ends(min_base_height=0.1)
+    assert contract.ends == Ends(min_base_height=0.1, not_covered=("OtherRewards.check_termination",))
     assert load_yaml(tmp_path / "out/config.yaml")["domain_rand"]["action_delay"] == [0, 2]  # as trained
     assert [row.noise for row in contract.rows][:2] == [0.1, 0.2]
     export_of(LeggedRobot, made, tmp_path / "joints", monkeypatch, control__action_origin="joints")

@@ -50,7 +50,7 @@ ENVIRONMENT: dict[str, Rule] = {
     "asset.colliders": NAMES,
     "init_state.pos": or_empty(("three numbers, x, y, z", lambda v: len(v) == 3)),
     **dict.fromkeys((f"asset.{name}" for name in ("effort", "armature", "frictionloss", "joint_speed_limits")), NUMBERS),
-    "viewer.camera": ("three numbers, not straight above or below", lambda v: len(v) == 3 and (v[0] != 0 or v[1] != 0)),
+    "viewer.camera": or_empty(("three numbers, not straight above or below", lambda v: len(v) == 3 and (v[0] != 0 or v[1] != 0))),
     "termination.max_tilt": ("above 0 and at most 180 degrees", lambda v: 0 < v <= 180),
     "terrain.condim": ("1, 3, 4 or 6", lambda v: v in (1, 3, 4, 6)),
 }

@@ -42,7 +42,7 @@ class GaitClock:
 
     def observe(self, moving: Tensor) -> None:
         """Fill ``row`` by the commands that are about to be seen; ``moving`` (N,) is where they say to move. Twice is as good as once."""
-        self.phase.masked_fill_(~(self.running & moving), 0.0)
+        self.phase.masked_fill_(~moving, 0.0)
         self.running.copy_(moving)
         torch.add(self.phase[:, None], self._shift, out=self.foot_phase).remainder_(1.0)
         angle = 2.0 * math.pi * self.foot_phase

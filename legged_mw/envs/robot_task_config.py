@@ -149,7 +149,7 @@ class RobotTaskCfg(Config):
     class viewer:
         width: int = 1280  # [pixel]
         height: int = 720  # [pixel]
-        camera: list[float] = [0.9, -1.1, 0.6]  # place of the camera "track", from the robot, world axes [m]
+        camera: list[float] = []  # place of the camera "track", from the robot, world axes [m]; empty: by its size, Go1's is 0.9 -1.1 0.6
         fps: int = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import crossing, exam, figures, page, rules
 from legged_mw.eval.page import Column
+from legged_mw.eval.peers import best_of
 from legged_mw.eval.rollout import Policy, Record, Signal, roll_out
 from legged_mw.eval.trials import NAMES, STEPS_AT, Plan, make_plan
 from legged_mw.utils.task import LoadedTask
@@ -113,9 +114,9 @@ def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[t
     folder.mkdir(parents=True, exist_ok=True)
     asked = rules.ExamRules.from_mapping(columns[0].exam["rules"])
     content = {"task": task, "columns": [column._asdict() for column in columns]}
-    _write_text(
-        folder / "report.json", json.dumps(content | ({"peer": asked.peer_policy.figures} if asked.peer_policy else {}), indent=1) + "\n"
-    )
+    if asked.peers:
+        content |= {"peer": best_of(asked.peers), "peers": [peer._asdict() for peer in asked.peers]}
+    _write_text(folder / "report.json", json.dumps(content, indent=1) + "\n")
     sections = plots.sections([(column.name, column.figures) for column in columns if column.figures], asked)
     for section in sections:
         plots.write_png(section, folder / f"{section.name}.png")

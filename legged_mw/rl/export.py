@@ -22,6 +22,7 @@ from rsl_rl.models import MLPModel
 from torch import Tensor, nn
 
 from legged_mw.deploy.contract import (
+    CLOCK,
     CONTRACT_FILE,
     FALL,
     NETWORK_FILE,
@@ -34,11 +35,13 @@ from legged_mw.deploy.contract import (
     Contract,
     ContractRow,
     Ends,
+    Gait,
     HeightScan,
     digest,
 )
+from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.export_replay import ExportError, record, replay
+from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
 from legged_mw.rl.export_scene import among_steps, standalone
 from legged_mw.rl.policies import load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE
@@ -63,6 +66,7 @@ class Exported(NamedTuple):
     observations: int  # that it was tried on
     unknown: tuple[str, ...]  # observation rows without a statement of how to measure them: the export cannot be deployed
     no_terrain: str = ""  # why there is no scene among steps though training had some; else empty
+    not_covered: tuple[str, ...] = ()  # methods of the task that ended episodes in training and cannot end a walk
 
     def text(self, folder: Path) -> str:
         """What was written, in a line, and what stands in the way of its use."""
@@ -70,6 +74,9 @@ class Exported(NamedTuple):
         if self.unknown:
             names = ", ".join(self.unknown)
             lines.append(f"nothing says how to measure {names}: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)")
+        if self.not_covered:
+            names = ", ".join(self.not_covered)
+            lines.append(f"{names} ended episodes in training; a deployed robot walks on ({CONTRACT_FILE}: ends: not_covered)")
         if self.no_terrain:
             lines.append(f"no {TERRAIN_FILE}: {self.no_terrain}")
         return "\n  ".join(lines)
@@ -125,7 +132,8 @@ def _export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported
         replay(env, contract, steps, new)
         no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
         files = (*FILES, *([TERRAIN_FILE] if (new / TERRAIN_FILE).exists() else []))
-    return Exported(files, gap, len(observations), tuple(row.name for row in contract.rows if not row.measured), no_terrain)
+    unknown_rows = tuple(row.name for row in contract.rows if not row.measured)
+    return Exported(files, gap, len(observations), unknown_rows, no_terrain, contract.ends.not_covered)
 
 
 def _small_env(task: LoadedTask) -> RobotTask:
@@ -256,6 +264,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         scan=HeightScan(tuple(ground.measured_points_x), tuple(ground.measured_points_y), env.start_place[2]) if scanned else None,
         sensors={name: tuple(names) for name, names in scene.sensors.items()}
         | ({FALL: tuple(f"contact/{name}" for name in ends.falls_on)} if ends.falls_on else {}),
+        gait=_gait(env) if any(row.measured == CLOCK for row in rows) else None,
         feet=feet,
         ends=ends,
         imu=robot.imu,
@@ -274,7 +283,14 @@ def _table(robot: RobotModel, values: dict[str, float], field: str) -> np.ndarra
 def _ends(env: RobotTask) -> Ends:
     """The task's rule for a fall."""
     rule, geoms = env.cfg.termination, [env.robot.contact_geoms[i] for i in env.contacts.terminating.tolist()]
-    return Ends(rule.max_tilt if rule.max_tilt < 180.0 else None, rule.min_base_height or None, tuple(geoms))
+    tilt = rule.max_tilt if rule.max_tilt < 180.0 else None
+    return Ends(tilt, rule.min_base_height or None, tuple(geoms), own_ends(type(env)))
+
+
+def _gait(env: RobotTask) -> Gait:
+    """The clock that a row shows."""
+    assert isinstance(env, LeggedRobot) and env.gait
+    return Gait(env.cfg.gait.period, tuple(env.gait.offsets), env.cfg.rewards.min_command)
 
 
 def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]:
@@ -288,7 +304,7 @@ def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]
                 )
             rows += contract_rows(env, row.group, noise)
             continue
-        known = ROWS.get(row.name)
+        known = ROWS.get(row.name) if row.name != CLOCK or getattr(env, "gait", None) else None  # a clock of the task's own
         units = ", ".join(command.unit for command in env.command_table) if row.name == "commands" else ""
         rows.append(
             ContractRow(

@@ -40,6 +40,8 @@ def parse(description: str | None) -> argparse.Namespace:
     launch.add_flags(parser)
     parser.add_argument("--eval", action="store_true", help="run the walking exam (on rough ground too), print its tables, write a report")
     parser.add_argument("--compare", metavar="RUN", help="with --eval: grade this run beside it; its name or path, or 'shipped'")
+    common = "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
+    parser.add_argument("--ranges", choices=("trained", "common"), help=common)
     parser.add_argument("--export", metavar="DIR", help="write the policy as network, contract and scene there, to deploy (docs/deploy.md)")
     args = parser.parse_args()
     if not args.task:
@@ -49,6 +51,8 @@ def parse(description: str | None) -> argparse.Namespace:
         parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
     if args.compare is not None and not args.eval:
         parser.error("--compare grades two policies side by side: add --eval")
+    if args.ranges and not args.eval:
+        parser.error("--ranges says what the exam asks: add --eval")
     if args.commands and (args.eval or args.export or args.command is not None):
         parser.error("--commands drives what is watched: it goes with neither --command nor --eval nor --export")
     if (args.eval or args.export) and (watching := launch.asked(args)):
