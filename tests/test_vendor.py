@@ -328,6 +328,21 @@ def test_a_second_ground_is_dropped(tmp_path: Path) -> None:
         assert line in robot.overrides
 
 
+def test_a_geom_of_the_robot_that_is_called_as_the_ground(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="^toy.xml calls a geom of the robot 'floor', which is the name of the ground; give it another$"):
+        build_toy(toy(tmp_path, inside='<geom name="floor" size="0.1"/>'))
+
+
+def test_of_keyframes_home_or_the_only_one_is_read(tmp_path: Path) -> None:
+    def keys(*names: str, qpos: str = "0 0 0.4 1 0 0 0 0.1 0.2") -> RobotModel:
+        return build_toy(toy(tmp_path, extra=f"<keyframe>{''.join(f'<key name={name!r} qpos={qpos!r}/>' for name in names)}</keyframe>"))
+
+    for robot in (keys("sit", "home"), keys("sit")):
+        assert robot.pose == (0.1, 0.2) and robot.start == (0.0, 0.0, 0.4)
+    assert keys("sit", "lie").pose == (0.0, 0.0) and "keyframe 'lie' dropped" in keys("sit", "lie").overrides
+    assert "keyframe 'home' dropped" in " ".join(keys("home", qpos="0 0 1").overrides)
+
+
 def test_what_a_files_defaults_say_is_not_of_what_is_added(tmp_path: Path) -> None:
     defaults = '<default><geom margin="0.01" solref="0.1 1"/><motor gear="7" ctrlrange="-1 1" forcerange="-1 1"/></default>'
     robot = build_toy(toy(tmp_path, extra=defaults))
@@ -342,6 +357,14 @@ def test_ties_to_the_world_are_dropped(tmp_path: Path) -> None:
     robot = build_toy(toy(tmp_path, extra=ties))
     assert robot.physics.neq == 1 and robot.physics.npair == 0 and robot.physics.nexclude == 1
     assert "equality 'hook' dropped: it holds 'base' to the world" in robot.overrides
+
+
+def test_a_frictionless_flight(tmp_path: Path) -> None:
+    """A joint's default holds for a <joint type="free"> too, where it would brake the robot in the air."""
+    robot = build_toy(toy(tmp_path, root='<joint type="free" damping="0.5" armature="0.1" frictionloss="0.2"/>'))
+    model = robot.physics
+    assert not (model.dof_damping[:6].any() or model.dof_armature[:6].any() or model.dof_frictionloss[:6].any())
+    assert {"free joint damping: 0.5 -> 0", "free joint armature: 0.1 -> 0", "free joint frictionloss: 0.2 -> 0"} <= set(robot.overrides)
 
 
 # ---- held joints
@@ -366,6 +389,24 @@ def test_a_held_joint_takes_actuator_and_keyframe_with_it() -> None:
     assert env.num_actions == 8 and env.robot.pose == (0.0, 0.9) * 4 and env.robot.physics.nu == 8
     assert "joint 'FL_calf_joint' held at -1.8 rad" in env.robot.overrides
     assert env.robot.effort_range[:, 1].tolist() == [24] * 8
+
+
+def test_held_joints_within_frames_and_with_others_on_their_body(tmp_path: Path) -> None:
+    arm = """<frame pos="0 0.3 0" euler="0 0 90"><body name="arm" pos="0.1 0 0" euler="0 30 0">
+      <joint name="a" axis="1 0 0" pos="0 0 0.1"/><joint name="b" axis="0 1 0"/><geom name="hand" size="0.02" pos="0.1 0.1 0.1"/>
+      </body></frame>"""
+    file, places = toy(tmp_path, inside=arm), []
+    table = {"stiffness": {"": 1.0}, "damping": {"": 1.0}, "pose": {"": 0.3, "b": 0.7}, "colliders": ["hand"], "contact_geoms": []}
+    for held in ([], ["a"], ["a", "b"]):
+        robot = build_toy(file, held_joints=held, **table)
+        data = mujoco.MjData(robot.physics)
+        data.qpos[7:] = robot.pose
+        mujoco.mj_kinematics(robot.physics, data)
+        places.append(data.geom("hand").xpos - data.xpos[1])
+    np.testing.assert_allclose(places[1], places[0], atol=1e-9)
+    np.testing.assert_allclose(places[2], places[0], atol=1e-9)
+    with pytest.raises(ModelError, match="^`held_joints`: joint 'b' moves together with 'a' on body 'arm'; hold both of them, or neither$"):
+        build_toy(file, held_joints=["b"], **table)
 
 
 def test_held_joints_that_are_none() -> None:
@@ -487,6 +528,15 @@ def test_package_paths_are_found_near_the_file(tmp_path: Path, place: str) -> No
     robot = build(urdf(file, leg=part("collision", names) + part("visual", names)))
     assert robot.physics.geom("leg_0").type[0] == mujoco.mjtGeom.mjGEOM_MESH and robot.physics.nmesh == 1
     assert not any("left out" in line for line in robot.overrides) and visual_model(robot).ngeom == 4
+
+
+def test_meshes_of_a_urdf_for_mujoco_are_found_in_its_meshdir_and_may_be_scaled(tmp_path: Path) -> None:
+    brick(tmp_path / "parts/leg.stl")
+    one = part("collision", "leg.stl")
+    text = '<mujoco><compiler meshdir="parts" balanceinertia="true"/></mujoco>'
+    robot = build(urdf(tmp_path / "mini.urdf", leg=one + one.replace("leg.stl'", "leg.stl' scale='1 -1 2'"), more=text))
+    sizes = [np.ptp(robot.physics.mesh(i).vert, axis=0).max() for i in range(robot.physics.nmesh)]
+    assert robot.physics.nmesh == 2 and max(sizes) > 1.3 * min(sizes)
 
 
 def test_two_meshes_of_one_name_are_two(tmp_path: Path) -> None:

@@ -27,6 +27,6 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
         env.robot.joint_names, env.default_dof_pos.tolist(), env.robot.joint_range, env.robot.effort_range, strict=True
     ):
         lines.append(f"  {name:<20} {default:>7.3f}  [{low:.3f}, {high:.3f}]  {limit:g}")
-    lines.append(f"what the config changed in {task.cfg.asset.file}")
+    lines.append(f"what was dropped, added or changed in {task.cfg.asset.file}")
     lines += [f"  {line}" for line in env.robot.overrides]
     return "\n".join(lines)

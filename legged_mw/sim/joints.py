@@ -45,7 +45,7 @@ def pose_joints(robot: Loaded, gains: Mapping[str, Mapping[str, float]], pose: M
         tables["`pose`"] = pose
     stiffness, damping, *_ = per_joint_all(tables, moving, spare=welded)
     known = {**(robot.keyframe.angles if robot.keyframe else {}), **some_joints(pose or {}, every, "`pose`")}
-    model = robot.spec.copy().compile()
+    model = robot.model
     if welded:
         nearest = {name: float(np.clip(0.0, *span)) for name, span in zip(welded, _ranges(model, welded), strict=True)}  # to 0
         hold_joints(robot.spec, model, {name: known.get(name, nearest[name]) for name in welded}, robot.notes)
