@@ -76,10 +76,10 @@ def first(root: Path) -> Path:
 @pytest.mark.parametrize(
     ("args", "parts"),
     [
-        ([], ("--task is missing", "tasks: go1_flat")),
+        ([], ("--task is missing", "go1_flat, go1_flat_dr")),
         (
             ["--task", "go1_falt"],
-            ("no task 'go1_falt' in configs/; did you mean 'go1_flat'?", "there are: go1_flat", "or give the path of a config file"),
+            ("no task 'go1_falt' in configs/; did you mean 'go1_flat'?", "go1_flat, go1_flat_dr", "or give the path of a config file"),
         ),
         (["--task", "dog/dog.py"], ("no config file at ", "dog/dog.py")),
         (
@@ -159,7 +159,7 @@ def test_config_file_with_a_mistake(root: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("item", "parts"),
     [
-        ("asset.file=dog.xml", ("no MJCF at ", "dog.xml")),
+        ("asset.file=dog.xml", ("asset.file: no file 'dog.xml' in ", "configs, ")),
         ("asset.file=", ("asset.file is empty; name the robot's MJCF or URDF",)),
         ("asset.foot_names=[FR, FL, RR, RLL]", ("no geom or body 'RLL' in go1.xml; did you mean 'RL'?",)),
         ("control.stiffness={hip: 30}", ("control.stiffness: no value for FR_thigh_joint, ",)),
@@ -491,7 +491,7 @@ def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path) -> None:
     assert "Learning iteration 1/1" in result.out and "rew_calm" in result.out
     [folder] = Path(logs).iterdir()
     config = load_yaml(folder / "config.yaml")
-    assert config["asset"]["file"] == str(home / "robot/dog.xml") and config["task"] == str(home / "dog.py")
+    assert config["asset"]["file"] == "robot/dog.xml" and config["task"] == "my dog/dog.py"
     video = tmp_path / "dog.mp4"
     elsewhere = ["--video", str(video), "--time", "0.1s", "--set", "viewer.width=160", "--set", "viewer.height=120"]
     result = run("play", tmp_path, "--task", str(home / "dog.py"), *common, *elsewhere)

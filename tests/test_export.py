@@ -51,8 +51,10 @@ def made(root: Path) -> Path:
     return folder
 
 
-def arguments(made: Path) -> tuple[dict[str, Any], Path]:
-    return load_yaml(made / "config.yaml"), made / "model.pt"
+def arguments(made: Path) -> tuple[LoadedTask, Path]:
+    task = load_task("go1_flat")
+    task.update_from_run(load_yaml(made / "config.yaml"), "config.yaml")
+    return task, made / "model.pt"
 
 
 def test_a_finished_training_exports(made: Path) -> None:
@@ -353,8 +355,8 @@ def test_a_picture_is_left_out_and_a_height_field_refused(monkeypatch: pytest.Mo
         standalone(type(robot)(**{**vars(robot), "spec": spec}), imu="imu", qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
 
 
-def untrained(path: Path, folder: Path, settings: dict[str, Any] | None = None) -> tuple[dict[str, Any], Path]:
-    """The config of a task and a checkpoint whose small networks have seen no training."""
+def untrained(path: Path, folder: Path, settings: dict[str, Any] | None = None) -> tuple[LoadedTask, Path]:
+    """A task and a checkpoint whose small networks have seen no training."""
     task = load_task(str(path))
     for field, value in {"env.num_envs": 1, "sim.engine": "mujoco", **(settings or {})}.items():
         task.set(field, value)
@@ -366,7 +368,7 @@ def untrained(path: Path, folder: Path, settings: dict[str, Any] | None = None) 
     actor_class, settings = resolve_class(copy.deepcopy(sections["actor"]))
     actor = actor_class(env.get_observations(), sections["obs_groups"], "actor", env.num_actions, **settings)
     save_policy(actor, folder / "model.pt", {"task": task.name})
-    return task.to_dict(), folder / "model.pt"
+    return task, folder / "model.pt"
 
 
 @pytest.mark.parametrize(
@@ -459,19 +461,12 @@ class OtherRewards(LeggedRobot):
 
 def export_of(env_class: type[LeggedRobot], made: Path, out: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> Exported:
     """Export the trained policy as one of another class and other settings, by their dotted paths."""
-
-    def load(name: str) -> LoadedTask:
-        task = load_task("go1_flat")
-        task.env_class = env_class
-        return task
-
-    monkeypatch.setattr(exporting, "load_task", load)
     monkeypatch.setattr(exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(made / "policy.onnx", path))
-    task = load_task("go1_flat")
-    task.update(load_yaml(made / "config.yaml"), "config.yaml")
+    task, checkpoint = arguments(made)
+    task.env_class = env_class
     for path, value in changes.items():
         task.set(path.replace("__", "."), value)
-    return export(task.to_dict(), made / "model.pt", out)
+    return export(task, checkpoint, out)
 
 
 @pytest.mark.parametrize(

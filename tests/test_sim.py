@@ -760,9 +760,9 @@ def test_all_fits(robot: RobotModel) -> None:
 @pytest.mark.parametrize(
     ("room", "advice"),
     [
-        ({"nconmax": 1, "njmax": 4}, "raise njmax (now 4) and nconmax (now 1)"),
-        ({"nconmax": 8, "njmax": 4}, "raise njmax (now 4)"),
-        ({"nconmax": 1, "njmax": 40}, "raise nconmax (now 1)"),
+        ({"nconmax": 1, "njmax": 4}, "raise `njmax` (now 4) and `nconmax` (now 1)"),
+        ({"nconmax": 8, "njmax": 4}, "raise `njmax` (now 4)"),
+        ({"nconmax": 1, "njmax": 40}, "raise `nconmax` (now 1)"),
     ],
 )
 def test_what_does_not_fit_is_named(robot: RobotModel, room: dict[str, int], advice: str) -> None:

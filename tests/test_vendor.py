@@ -535,7 +535,7 @@ def test_meshes_of_a_urdf_for_mujoco_are_found_in_its_meshdir_and_may_be_scaled(
     one = part("collision", "leg.stl")
     text = '<mujoco><compiler meshdir="parts" balanceinertia="true"/></mujoco>'
     robot = build(urdf(tmp_path / "mini.urdf", leg=one + one.replace("leg.stl'", "leg.stl' scale='1 -1 2'"), more=text))
-    sizes = [np.ptp(robot.physics.mesh(i).vert, axis=0).max() for i in range(robot.physics.nmesh)]
+    sizes = [np.ptp(robot.physics.mesh_vert[robot.physics.mesh_vertadr[i] :][:4], axis=0).max() for i in range(robot.physics.nmesh)]
     assert robot.physics.nmesh == 2 and max(sizes) > 1.3 * min(sizes)
 
 

@@ -35,10 +35,11 @@ def or_empty(rule: Rule) -> Rule:
 
 ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys(("env.num_envs", "env.episode_length_s", "control.decimation", "normalization.clip_actions"), POSITIVE),
-    **dict.fromkeys(("sim.dt", "sim.iterations", "sim.ls_iterations", "sim.nconmax", "sim.njmax"), POSITIVE),
+    **dict.fromkeys(("sim.dt", "sim.iterations", "sim.ls_iterations"), POSITIVE),
     **dict.fromkeys(("rewards.max_reward", "termination.max_speed"), POSITIVE),
     **dict.fromkeys(("viewer.width", "viewer.height", "viewer.fps"), POSITIVE),
-    **dict.fromkeys(("terrain.friction", "noise.level", "sim.threads", "termination.min_base_height"), NOT_NEGATIVE),
+    **dict.fromkeys(("terrain.friction", "noise.level", "termination.min_base_height"), NOT_NEGATIVE),
+    **dict.fromkeys(("sim.threads", "sim.nconmax", "sim.njmax"), NOT_NEGATIVE),
     **dict.fromkeys(("perturbation.interval", "perturbation.duration"), SPAN),
     "perturbation.velocity": RANGE,
     **dict.fromkeys(("init_state.dof_pos_range", "init_state.dof_pos_offset"), RANGE),
@@ -72,7 +73,10 @@ WALKING: dict[str, Rule] = {
     "terrain.difficulty": ("two numbers from 0 to 1, the lower first", lambda v: len(v) == 2 and 0 <= v[0] <= v[1] <= 1),
     "terrain.height_scan": ("a list of groups: state, privileged_state", lambda v: {*v} <= {"state", "privileged_state"}),
     **dict.fromkeys(("terrain.measured_points_x", "terrain.measured_points_y"), POINTS),
-    **dict.fromkeys(("commands.curriculum_start", "commands.curriculum_step"), ("above 0 and at most 1", lambda v: 0 < v <= 1)),
+    **dict.fromkeys(
+        ("commands.curriculum_start", "commands.curriculum_step", "perturbation.curriculum_rate"),
+        ("above 0 and at most 1", lambda v: 0 < v <= 1),
+    ),
 }
 LEARNER: dict[str, Rule] = {
     **dict.fromkeys(("runner.num_steps_per_env", "runner.max_iterations", "runner.save_interval"), POSITIVE),

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from legged_mw import ROOT
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.wording import config_words
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
 from legged_mw.sim.pose import standing_height
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.files import find_file
 
 
 def load_robot(
@@ -25,7 +24,7 @@ def load_robot(
     if not asset.file:
         raise ConfigError("asset.file is empty; name the robot's MJCF or URDF, e.g. 'resources/robots/go1/go1.xml'")
     robot = build_model(
-        ROOT / Path(asset.file).expanduser(),  # an absolute path stays itself
+        find_file(cfg, "asset.file"),
         solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations, cfg.sim.integrator),
         ground=Ground(cfg.terrain.friction, cfg.terrain.condim, terrain, boxes=engine == "mujoco"),
         stiffness=cfg.control.stiffness,

@@ -21,7 +21,7 @@ class RobotTaskCfg(Config):
         episode_length_s: float = 20.0  # [s], then the episode times out [P]
 
     class asset:
-        file: str = ""  # MJCF or URDF of the robot, as its vendor wrote it; relative to the config file, or to the repository
+        file: str = ""  # MJCF or URDF, as its vendor wrote it; beside the file of the class that says so, or in the repository
         imu_site: str = ""  # site, or body, that is fixed to the root; empty: the site "imu", or else the root's origin [ours]
         # names of geoms; of bodies, which mean their own geoms that collide; or patterns. Geoms that touch the ground:
         colliders: list[str] = ["*"]  # of those that collide in the file
@@ -103,6 +103,7 @@ class RobotTaskCfg(Config):
         duration: list[float] = [0.05, 0.2]  # [s] [P]
         velocity: list[float] = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
         curriculum: bool = False  # a world's dv grows with the share of an episode that it survives, from 0 [ours]
+        curriculum_rate: float = 0.5  # by which share of the way it does, at the end of an episode, from above 0 to 1 [ours]
         push: bool = False  # the root's horizontal velocity becomes a random one; beside kicks or alone [L]
         push_interval_s: float = 15.0  # between pushes, each world's clock its own [s] [L]
         max_push_vel_xy: float = 1.0  # each axis U(-max, max) [m/s] [L]
@@ -143,8 +144,8 @@ class RobotTaskCfg(Config):
         iterations: int = 1  # Newton iterations [P]
         ls_iterations: int = 5  # line-search iterations [P]
         integrator: Literal["euler", "implicitfast"] = "euler"  # implicitfast: joint damping is stable however large [P: euler]
-        nconmax: int = 8  # contacts a world has room for (mujoco_warp); four feet on a plane make four
-        njmax: int = 40  # constraint rows a world has room for (mujoco_warp): 12 friction, 12 limits, 4 a contact [ours: never seen full]
+        nconmax: int = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model, as --check says [ours: sim/room.py]
+        njmax: int = 0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
 
     class viewer:
         width: int = 1280  # [pixel]
@@ -232,7 +233,7 @@ class RobotTaskCfgPPO(Config):
         hidden_dims: list[int] = [128, 64, 32]  # of actor and critic
         max_iterations: int = 2600
         overrides: dict[str, Any] = {}  # fields of the environment: dotted path -> value
-        update_threads: int = 0  # of torch in an update; 0: one a core. Everything else of a step runs on one
+        update_threads: int = 0  # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one
 
     class symmetry:
         """Left-right symmetry in the update, as in Mittal et al. 2024. Rows of observations say how they mirror: envs/mirror.py."""

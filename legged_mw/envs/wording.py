@@ -9,6 +9,8 @@ from legged_mw.sim.errors import EngineError, ModelError
 
 FIELDS = {
     "engine": "sim.engine",
+    "nconmax": "sim.nconmax",
+    "njmax": "sim.njmax",
     "integrator": "sim.integrator",
     "stiffness": "control.stiffness",
     "damping": "control.damping",

@@ -110,7 +110,7 @@ def elsewhere(graded: Graded) -> list[tuple[str, dict[str, Any]]]:
         return []
     with TemporaryDirectory() as folder:
         try:
-            export(graded.task.to_dict(), graded.source.checkpoint, Path(folder) / "export")
+            export(graded.task, graded.source.checkpoint, Path(folder) / "export")
             return [("the same, deployed in MuJoCo", run_exam(Path(folder) / "export", ExamRules.from_config(graded.task.cfg)))]
         except UserError as error:  # a row that nobody can measure, no onnxruntime
             print(f"not graded through an export: {error}")

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import onnx
@@ -49,7 +49,7 @@ from legged_mw.sim.model import ModelError, RobotModel, per_joint
 from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import shown
-from legged_mw.utils.task import LoadedTask, load_task
+from legged_mw.utils.task import LoadedTask
 
 MODEL_FILE = "model.pt"
 FILES = (MODEL_FILE, CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
@@ -93,8 +93,8 @@ class ExportedPolicy(nn.Module):
         return self.policy(obs).clamp(-self.clip_actions, self.clip_actions)
 
 
-def export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
-    """Write the policy in ``checkpoint``, trained with the config ``trained``, to ``folder``: all files, or none.
+def export(trained: LoadedTask, checkpoint: Path, folder: Path) -> Exported:
+    """Write the policy in ``checkpoint``, of the task as it was ``trained``, to ``folder``: all files, or none.
 
     Raises ExportError, ContractError, ConfigError or ModelError; an earlier export in the folder stays as it was then.
     """
@@ -108,9 +108,8 @@ def export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
         torch.set_float32_matmul_precision(precision)
 
 
-def _export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
-    task = load_task(str(trained["task"]))
-    task.update(trained, where=CONFIG_FILE)
+def _export(trained: LoadedTask, checkpoint: Path, folder: Path) -> Exported:
+    task = copy.deepcopy(trained)
     config, noise = task.to_dict(), task.cfg.noise.level
     ground = getattr(task.cfg.terrain, "mesh_type", "plane")
     env = _small_env(task)

@@ -6,8 +6,8 @@ import copy
 import importlib.util
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import nullcontext
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,13 @@ from legged_mw import ROOT
 from legged_mw.envs.divergence import Watch
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
+from legged_mw.envs.wording import config_words
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import this_rank
 from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
+from legged_mw.rl.threads import UpdateThreads
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
 
@@ -50,6 +52,7 @@ class Runner(OnPolicyRunner):
         self._watch = Watch()
         self.examine: Callable[[Any], dict[str, float]] | None = None
         self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
+        self._update_threads = UpdateThreads(self.cfg["cpu"]["update_threads"], usable_cores()) if device == "cpu" else nullcontext()
         self._warned_overflow = False
         self._last_means: dict[str, float] = {}
 
@@ -92,7 +95,7 @@ class Runner(OnPolicyRunner):
                 self.alg.compute_returns(obs)
             collected = clock.mark()
             self._anneal()
-            with self.update_threads():
+            with self._update_threads:
                 losses = self.alg.update()
             report = self._report(losses, (start, collected, start := clock.mark()))
             if waiting:
@@ -119,17 +122,6 @@ class Runner(OnPolicyRunner):
         for name, (begin, end) in self.cfg["anneal"].items():
             if end and begin is not None:
                 setattr(self.alg, name, begin + (end - begin) * done)
-
-    @contextmanager
-    def update_threads(self) -> Iterator[None]:
-        """On a CPU, an update's matrices are worth torch's threads; a step's hundreds of small operations are not."""
-        if self.device == "cpu":
-            before = torch.get_num_threads()
-            torch.set_num_threads(self.cfg["cpu"]["update_threads"] or usable_cores())
-            yield
-            torch.set_num_threads(before)
-        else:
-            yield
 
     def _must_stop(self) -> bool:
         """Ranks stop together, one iteration after the first was asked to: each waits for the others in every update."""
@@ -224,8 +216,8 @@ class Runner(OnPolicyRunner):
         rows["Time elapsed, left"] = ", ".join(str(timedelta(seconds=round(t))) for t in (time.time() - self._begun, left))
         print(console_block(f"Learning iteration {report.iteration}/{self._last}", rows), flush=True)
         if numbers["overflowed"] and not self._warned_overflow:
-            text = self.env.sim.overflow_report() or f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks"
-            print(f"WARNING: {text} (config section sim)", flush=True)
+            others = f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks; raise `nconmax` and `njmax`"
+            print(f"WARNING: {config_words(self.env.sim.overflow_report() or others)}", flush=True)
             self._warned_overflow = True
 
     @staticmethod

@@ -97,11 +97,13 @@ class WarpSimulation(Simulation):
         bits = [bit for bit in OverflowType if bit != OverflowType.ALL and bool((seen & int(bit)).any())]
         raise_ = []
         if OverflowType.NEFC in bits:
-            raise_.append(f"njmax (now {self.njmax})")
+            raise_.append(f"`njmax` (now {self.njmax})")
         if {OverflowType.NARROWPHASE, OverflowType.BROADPHASE} & set(bits):
-            raise_.append(f"nconmax (now {self.nconmax})")
+            raise_.append(f"`nconmax` (now {self.nconmax})")
         names = ", ".join(str(bit.name) for bit in bits)
-        return f"simulator overflow ({names}) in {worlds} of {self.num_envs} worlds; raise {' and '.join(raise_) or 'nconmax and njmax'}"
+        return (
+            f"simulator overflow ({names}) in {worlds} of {self.num_envs} worlds; raise {' and '.join(raise_) or '`nconmax` and `njmax`'}"
+        )
 
     def _substeps(self, count: int) -> None:
         """Sensors feed nothing back, so only the last substep computes them: same state, a tenth less work."""

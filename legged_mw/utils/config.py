@@ -24,6 +24,7 @@ from weakref import WeakKeyDictionary
 import yaml
 
 from legged_mw.utils.errors import UserError
+from legged_mw.utils.files import note_file
 from legged_mw.utils.renamed import new_name
 
 _TYPES = (int, float, bool, str, NoneType, list, dict, Any)
@@ -60,7 +61,7 @@ def _schema(cls: type) -> dict[str, Any]:
             raise ConfigError(f"{_place(cls, '_only')}: {_path(cls)} is not an open table of numbers: leave `_only` out of it")
         for name in known.keys() - vars(cls).keys():
             setattr(cls, name, 0.0)
-    return _SCHEMAS.setdefault(cls, fields)
+    return _SCHEMAS.setdefault(note_file(cls), fields)
 
 
 def _check(cls: type, name: str, known: dict[str, Any]) -> Any:

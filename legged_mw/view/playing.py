@@ -10,9 +10,10 @@ import torch
 
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.policies import Source, act, introduce, load_policy
+from legged_mw.rl.runs import require_task
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, pick_device, seed_everything
 from legged_mw.utils.commands import Command, command_table
-from legged_mw.utils.task import LoadedTask, task_names
+from legged_mw.utils.task import LoadedTask
 from legged_mw.view import launch
 from legged_mw.view.env_stage import EnvStage
 
@@ -44,8 +45,7 @@ def parse(description: str | None) -> argparse.Namespace:
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
     parser.add_argument("--export", metavar="DIR", help="write the policy as network, contract and scene there, to deploy (docs/deploy.md)")
     args = parser.parse_args()
-    if not args.task:
-        parser.error(f"--task is missing; tasks: {', '.join(task_names())}")
+    require_task(args, parser)
     asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag)]
     if len(asked) > 1 or (args.eval and args.command is not None):
         parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
