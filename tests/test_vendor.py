@@ -449,7 +449,7 @@ def test_a_turned_imu_reads_in_the_roots_axes() -> None:
 def test_an_imu_beyond_a_joint_is_an_error() -> None:
     text = (
         r"^asset\.imu_site: 'imu_in_torso' is on body 'torso_link', which moves against the root 'pelvis' by joint 'waist_pitch_joint', so "
-        r"what it senses is not the root's; take a site that is fixed to the root, or hold that joint by asset\.held_joints$"
+        r"what it senses is not the root's; take a site or body that is fixed to the root, or hold that joint by asset\.held_joints$"
     )
     with pytest.raises(ModelError, match=text):
         make("g1_29dof_style", **{"asset.imu_site": "imu_in_torso"})

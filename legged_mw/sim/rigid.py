@@ -94,13 +94,14 @@ def sensed_site(spec: mujoco.MjSpec, model: mujoco.MjModel, root: str, asked: st
         notes.append(f"site '{name}' made at the origin of '{root}'")
         return name
     if not is_site and spec.body(name) is None:
-        raise ModelError(f"`imu_site`: {unknown('site', name, [site.name for site in spec.sites if site.name], where)}")
+        known = [thing.name for thing in (*spec.sites, *spec.bodies) if thing.name and thing.name != "world"]
+        raise ModelError(f"`imu_site`: {unknown('site or body', name, known, where)}")
     body = int(model.site(name).bodyid[0]) if is_site else model.body(name).id
     if (welded := int(model.body_weldid[body])) != model.body_weldid[model.body(root).id]:
         joint = model.joint(int(model.body_jntadr[welded])).name
         raise ModelError(
             f"`imu_site`: '{name}' is on body '{model.body(body).name}', which moves against the root '{root}' by joint '{joint}', so what "
-            "it senses is not the root's; take a site that is fixed to the root, or hold that joint by `held_joints`"
+            "it senses is not the root's; take a site or body that is fixed to the root, or hold that joint by `held_joints`"
         )
     place, turn = _pose_in_root(model, root, name, is_site)
     if is_site and model.body(body).name == root and turn < ALIGNED:
