@@ -446,6 +446,17 @@ def test_a_turned_imu_reads_in_the_roots_axes() -> None:
     np.testing.assert_allclose(acceleration, turn @ data.sensor("a").data, atol=1e-4)
 
 
+def test_an_imu_beyond_a_joint_is_made_at_the_root_unless_it_is_asked_for(tmp_path: Path) -> None:
+    text = (HERE / "g1_29dof_style.xml").read_text()
+    (tmp_path / "robot.xml").write_text(text.replace('"imu_in_torso"', '"imu"'))  # as Unitree's file has it
+    robot = make("g1_29dof_style", **{"asset.file": str(tmp_path / "robot.xml"), "asset.imu_site": ""}).robot
+    assert robot.imu == "imu_root" and robot.physics.site("imu_root").pos.tolist() == [0.0, 0.0, 0.0]
+    said = "site 'imu_root' made at the origin of 'pelvis': 'imu' is on body 'torso_link', which moves against the root 'pelvis' by joint "
+    assert said + "'waist_pitch_joint'; asset.imu_site may name another" in robot.overrides
+    held = make("g1_held_style", **{"asset.file": str(tmp_path / "robot.xml"), "asset.imu_site": ""}).robot
+    assert held.imu == "imu_aligned"
+
+
 def test_an_imu_beyond_a_joint_is_an_error() -> None:
     text = (
         r"^asset\.imu_site: 'imu_in_torso' is on body 'torso_link', which moves against the root 'pelvis' by joint 'waist_pitch_joint', so "

@@ -69,7 +69,7 @@ def _read_error(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
     """What MuJoCo says of the mesh alone; "" if nothing is wrong with it."""
     alone = mujoco.MjSpec()
     alone.add_mesh(name="mesh", file=str(_path(spec, mesh).resolve()), scale=mesh.scale, inertia=mesh.inertia)
-    alone.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
+    alone.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh", contype=0, conaffinity=0, density=0.0)
     try:
         alone.compile()
     except ValueError as error:
