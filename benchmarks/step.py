@@ -49,13 +49,14 @@ def bare_warp(env: LeggedRobot) -> Callable[[], None]:
     import mujoco_warp as mjw
     import warp as wp
 
-    from legged_mw.sim.warp_engine import make_model, record_warp
+    from legged_mw.sim.warp_engine import WarpSimulation, make_model, record_warp
 
-    device = wp.get_device(env.device)
+    device, sim = wp.get_device(env.device), env.sim
+    assert isinstance(sim, WarpSimulation)
     with wp.ScopedDevice(device):
         model = make_model(env.robot.physics, env.terrain)
         model.opt.warn_overflow, model.opt.graph_conditional = 0, False
-        data = mjw.make_data(env.robot.physics, nworld=env.num_envs, nconmax=env.cfg.sim.nconmax, njmax=env.cfg.sim.njmax)
+        data = mjw.make_data(env.robot.physics, nworld=env.num_envs, nconmax=sim.nconmax, njmax=sim.njmax)
     for name in ("qpos", "qvel"):
         wp.to_torch(getattr(data, name)).copy_(getattr(env.sim, name))
     wp.to_torch(data.ctrl).copy_(env.default_dof_pos.expand(env.num_envs, -1))

@@ -35,6 +35,10 @@ class Go1FlatCfg(LeggedRobotCfg):
         stiffness = {"joint": 35.0}  # [N m/rad] [P]
         damping = {"joint": 0.5}  # [N m s/rad] [P]
 
+    class sim(LeggedRobotCfg.sim):
+        nconmax = 8
+        njmax = 40  # 12 friction, 12 limits, 4 a contact of four feet [ours: never seen full]
+
     class rewards(LeggedRobotCfg.rewards):
         tracking_sigma = 0.2  # [P 0.25] [ours: vx 0.019 m/s instead of 0.024; docs/lab.md]
         pose_weights = {"hip": 1.0, "thigh": 1.0, "calf": 0.1}  # [P]

@@ -12,7 +12,6 @@ from torch import Tensor
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 from legged_mw.envs.observations import Row
-from legged_mw.utils.math import assign
 from legged_mw.utils.task import Task
 
 
@@ -23,16 +22,7 @@ class LeggedGymRobot(LeggedRobot):
 
     def _init_buffers(self) -> None:
         super()._init_buffers()
-        self.last_dof_vel = torch.zeros_like(self.dof_vel)  # [rad/s]
         self.effort_limit = torch.tensor(self.robot.effort_range[:, 1], dtype=torch.float, device=self.device)  # (D,) [N m]
-
-    def reset_envs(self, mask: Tensor) -> None:
-        super().reset_envs(mask)
-        assign(self.last_dof_vel, mask, 0.0)
-
-    def _end_step(self) -> None:
-        super()._end_step()
-        self.last_dof_vel.copy_(self.dof_vel)
 
     # ---- commands
 
@@ -78,25 +68,9 @@ class LeggedGymRobot(LeggedRobot):
         """Roll and pitch rates, body frame."""
         return self.base_ang_vel[:, :2].square().sum(dim=1)
 
-    def _reward_base_height(self) -> Tensor:
-        """Height of the root above the ground under it, away from its target [m^2]."""
-        return (self.base_height - self.cfg.rewards.base_height_target).square()
-
-    def _reward_torques(self) -> Tensor:
-        """Sum of squares of the servos' torques [N^2 m^2]."""
-        return self.torques.square().sum(dim=1)
-
     def _reward_torque_limits(self) -> Tensor:
         """What torques exceed a share of their limits by [N m]."""
         return (self.torques.abs() - self.cfg.rewards.soft_torque_limit * self.effort_limit).clamp(min=0.0).sum(dim=1)
-
-    def _reward_dof_vel(self) -> Tensor:
-        """Joint speeds."""
-        return self.dof_vel.square().sum(dim=1)
-
-    def _reward_dof_acc(self) -> Tensor:
-        """Joint accelerations: the change of velocity over a control step [rad^2/s^4]."""
-        return ((self.dof_vel - self.last_dof_vel) / self.dt).square().sum(dim=1)
 
     def _reward_feet_air_time(self) -> Tensor:
         """At touch-down, how much longer than ``min_air_time`` the foot was in the air [s], unless commanded to stand or turn."""
@@ -157,7 +131,8 @@ class Go1LeggedGymCfg(LeggedRobotCfg):
     class rewards(LeggedRobotCfg.rewards):
         soft_dof_pos_limit = 0.9
         soft_torque_limit: float = 1.0  # share of a joint's torque limit
-        base_height_target: float = 0.25  # [m]
+        base_height_target = 0.25  # [m]
+        torques_as = "squares"
         min_air_time = 0.5
 
         class scales(LeggedRobotCfg.rewards.scales):

@@ -19,6 +19,7 @@ def train() -> None:
     from legged_mw.check.guard import check_recordable
     from legged_mw.eval.exams import make_exam
     from legged_mw.rl import training
+    from legged_mw.robot.case import naming_every_missing_key
 
     args = training.parse(train.__doc__)
     if args.list:
@@ -26,9 +27,14 @@ def train() -> None:
         return
     task = load_task(args.task)
     start, device = training.configure(task, args)
-    env = training.build(task, device, args.eager, check_recordable)
+    with naming_every_missing_key(task):
+        env = training.build(task, device, args.eager, check_recordable)
     if args.check:
         print(describe(env, task) + ("" if args.eager else "\nthe step can be recorded as a CUDA graph"))
+        if args.picture:
+            from legged_mw.robot.__main__ import task_page
+
+            print(task_page(task, Path(args.picture)))
         return
     examine = make_exam(task, env, args.eager) if training.wants_exam(task) else None
     training.train(task, env, start, examine, export, args.deadline)
@@ -60,7 +66,7 @@ def export(task: LoadedTask, checkpoint: Path, folder: Path) -> str:
     """Export a policy with the config that it was trained with; returns what was written, in words."""
     from legged_mw.rl.export import export  # onnx takes a while to import
 
-    return export(task.to_dict(), checkpoint, folder).text(folder)
+    return export(task, checkpoint, folder).text(folder)
 
 
 def deploy() -> None:

@@ -159,9 +159,9 @@ def test_config_file_with_a_mistake(root: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("item", "parts"),
     [
-        ("asset.file=dog.xml", ("no MJCF at ", "dog.xml")),
-        ("asset.file=", ("asset.file is empty; name the robot's MJCF",)),
-        ("asset.foot_names=[FR, FL, RR, RLL]", ("no geom 'RLL' in go1.xml; did you mean 'RL'?",)),
+        ("asset.file=dog.xml", ("asset.file: no file 'dog.xml' in ", "configs, ")),
+        ("asset.file=", ("asset.file is empty; name the robot's MJCF or URDF",)),
+        ("asset.foot_names=[FR, FL, RR, RLL]", ("no geom or body 'RLL' in go1.xml; did you mean 'RL'?",)),
         ("control.stiffness={hip: 30}", ("control.stiffness: no value for FR_thigh_joint, ",)),
         ("init_state.default_joint_angles={joint: 0, wheel: 1}", ("init_state.default_joint_angles: no joint 'wheel'",)),
         ("rewards.scales.torqes=-1", ("rewards.scales.torqes = -1: no reward term 'torqes'", "did you mean 'torques'?")),
@@ -491,7 +491,7 @@ def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path) -> None:
     assert "Learning iteration 1/1" in result.out and "rew_calm" in result.out
     [folder] = Path(logs).iterdir()
     config = load_yaml(folder / "config.yaml")
-    assert config["asset"]["file"] == str(home / "robot/dog.xml") and config["task"] == str(home / "dog.py")
+    assert config["asset"]["file"] == "robot/dog.xml" and config["task"] == "my dog/dog.py"
     video = tmp_path / "dog.mp4"
     elsewhere = ["--video", str(video), "--time", "0.1s", "--set", "viewer.width=160", "--set", "viewer.height=120"]
     result = run("play", tmp_path, "--task", str(home / "dog.py"), *common, *elsewhere)

@@ -133,6 +133,36 @@ def test_open_section_keeps_its_methods() -> None:
         Methods().set("scales.total", 1)
 
 
+def test_an_open_section_may_start_empty() -> None:
+    class Empty(Go1):
+        class rewards(Go1.rewards):
+            class scales(Go1.rewards.scales):
+                _only = True
+                torques = -1
+                fresh = 2
+
+    class Child(Empty):
+        class rewards(Empty.rewards):
+            class scales(Empty.rewards.scales):
+                termination = -3
+
+    assert Empty().to_dict()["rewards"]["scales"] == {"torques": -1.0, "termination": 0.0, "lin_vel_z": 0.0, "fresh": 2.0}
+    assert Child().to_dict()["rewards"]["scales"] == {"torques": -1.0, "termination": -3.0, "lin_vel_z": 0.0, "fresh": 2.0}
+    assert Go1().to_dict()["rewards"]["scales"] == {"torques": -2e-4, "termination": 0.0, "lin_vel_z": -2.0}
+    cfg = Empty()
+    cfg.set("rewards.scales.lin_vel_z", "-4")
+    assert cfg.to_dict()["rewards"]["scales"]["lin_vel_z"] == -4.0
+
+
+def test_only_an_open_section_may_start_empty() -> None:
+    with says(line_of("_only = True  # here"), "Wrong.env is not an open table of numbers: leave `_only` out of it"):
+
+        class Wrong(Base):
+            class env(Base.env):
+                _only = True  # here
+                num_envs = 2
+
+
 def test_same_declaration_again_is_fine() -> None:
     class Again(Base):
         class env(Base.env):
@@ -901,7 +931,7 @@ def test_a_folder_configs_beside_the_task_wins(no_configs: None, tmp_path: Path,
     file.write_text(FAST.format(base="MyCfg"))
     task = load_task(str(file))
     assert (task.cfg.env.num_envs, task.cfg.noise.level) == (7, 0.25)
-    assert task.to_dict()["task"] == str(file)
+    assert task.to_dict()["task"] == "fast.py"  # from "/", where it runs, there is no way that another machine has too
     assert load_task("go1_flat").cfg.noise.level == 1.0  # by name it is the package's own
 
 

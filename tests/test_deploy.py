@@ -364,6 +364,13 @@ def test_it_is_driven(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert "the ranges are in" in main(capsys, SHIPPED, "--viewer", "none", "--command", "9,0,0")[2]
 
 
+def test_an_end_that_nobody_judges_is_said(export: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rewrite(export, lambda said: said["ends"].update(not_covered=["Dog._fallen"]))
+    assert read_contract(export).ends == Ends(max_tilt=90.0, not_covered=("Dog._fallen",))
+    code, out, err = main(capsys, export, "--viewer", "none", "--time", "0.1")
+    assert code == 0 and out.startswith("not judged here: Dog._fallen, which ended episodes in training\n"), out + err
+
+
 def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """The first seconds of it, with every push: written and printed."""
     monkeypatch.setattr(rules, "SECONDS", 2.6)
@@ -380,7 +387,7 @@ def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Ca
 
 def test_the_contract_brings_the_rules_of_the_exam(export: Path) -> None:
     shipped = contract_rules(read_contract(export))
-    assert shipped.peer == "playground_go1" and shipped.push_vx == 0.8 and shipped.push_speeds == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+    assert shipped.peer == "go1" and shipped.push_vx == 0.8 and shipped.push_speeds == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     rewrite(export, put("exam", {"push_speeds": [1.5], "push_mark": 1.5}))
     assert contract_rules(read_contract(export)).push_speeds == (1.5,)
     rewrite(export, put("exam", {"push_speeds": 3}))
@@ -389,7 +396,7 @@ def test_the_contract_brings_the_rules_of_the_exam(export: Path) -> None:
 
 
 def test_a_result_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    monkeypatch.setattr(program, "run_exam", lambda _: {})
+    monkeypatch.setattr(program, "run_exam", lambda *_, **__: {})
     monkeypatch.setattr(rules, "table", lambda _: "the table")
     (tmp_path / "file").write_text("")
     code, out, err = main(capsys, SHIPPED, "--eval", "--out", tmp_path / "file/exam.json")

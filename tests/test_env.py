@@ -197,16 +197,27 @@ class _Number(LeggedRobot):
             {"asset.imu_site": "FR"},
             None,
             ModelError,
-            r"^asset\.imu_site 'FR' must be on the root body 'trunk' and aligned with it$",
+            r"^asset\.imu_site: 'FR' is on body 'FR_calf', which moves against the root 'trunk' by joint 'FR_calf_joint', so what it "
+            r"senses is not the root's; take a site that is fixed to the root, or hold that joint by asset\.held_joints$",
         ),
-        ({"asset.imu_site": "imo"}, None, ModelError, r"^no site 'imo' in go1\.xml; did you mean 'imu'\? there are: .*imu"),
+        (
+            {"asset.imu_site": "imo"},
+            None,
+            ModelError,
+            r"^asset\.imu_site: no site 'imo' in go1\.xml; did you mean 'imu'\? there are: .*imu",
+        ),
         (
             {"asset.foot_names": ["FR", "FL", "RR", "RX"]},
             None,
             ModelError,
-            r"^asset.foot_names or foot_geoms: 'RX': no geom 'RX' in go1\.xml; there are: floor, .*, RL$",
+            r"^asset.foot_names or foot_geoms: 'RX': no geom or body 'RX' in go1\.xml; there are: geoms .*, RL; bodies trunk, .*, RL_calf$",
         ),
-        ({"asset.file": ""}, None, ConfigError, r"^asset\.file is empty; name the robot's MJCF, e\.g\. 'resources/robots/go1/go1\.xml'$"),
+        (
+            {"asset.file": ""},
+            None,
+            ConfigError,
+            r"^asset\.file is empty; name the robot's MJCF or URDF, e\.g\. 'resources/robots/go1/go1\.xml'$",
+        ),
         (
             {"control.damping": {"hip": 1.0}},
             None,
@@ -217,7 +228,7 @@ class _Number(LeggedRobot):
             {"asset.colliders": ["paw"]},
             None,
             ModelError,
-            r"^asset\.colliders: no colliding geom 'paw' in go1\.xml; there are: trunk_box",
+            r"^asset\.colliders: no colliding geom or body 'paw' in go1\.xml; there are: geoms trunk_box",
         ),
         (
             {"terrain.mesh_type": "heightfield", "terrain.tile_size": 7.77},
@@ -635,7 +646,7 @@ def test_model_says_what_the_config_changed(quiet: LeggedRobot) -> None:
     notes = "\n".join(quiet.robot.overrides)
     for line in ("option timestep: 0.002 -> 0.004", "option iterations: 100 -> 1", "option ls_iterations: 50 -> 5"):
         assert line in notes
-    assert "ground: plane, friction 0.6, condim 3, priority 1" in notes and "keyframe 'home' dropped" in notes
+    assert "ground: plane, friction 0.6, condim 3, priority 1" in notes and "keyframe 'home' read: pose and place of the root" in notes
 
 
 def test_camera_looks_at_the_robot_and_is_not_stepped(quiet: LeggedRobot) -> None:

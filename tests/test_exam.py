@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import copy
 import json
 import math
@@ -26,9 +27,11 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.eval import exam, grading, rules
 from legged_mw.eval.exams import EXAMS, find_exam, make_exam, require_exam
-from legged_mw.eval.peers import PEERS
+from legged_mw.eval.peers import PEERS, best_of
 from legged_mw.eval.rollout import holding, roll_out
-from legged_mw.eval.rules import ExamRules
+from legged_mw.eval.rules import ExamRules, in_common
+from legged_mw.eval.rules import table as rules_table
+from legged_mw.rl.policies import Source
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
@@ -64,7 +67,28 @@ def test_commands_of_another_range() -> None:
     ]
     assert (rules.push_vx, rules.transport_vx) == (0.5, 0.5) and rules.held() == [*rules.commands(), (0.5, 0, 0)]
     assert rules.push_speeds == (0.5, 1, 1.5, 2, 3, 4, 5, 6) and rules.worlds() == 23 + 8 * 16
-    assert (rules.marks, rules.marks_of, rules.push_mark, rules.peer_policy) == ((0.06, 0.06, 0.08), "error", 2.0, None)
+    assert (rules.marks, rules.marks_of, rules.push_mark, rules.peers) == ((0.06, 0.06, 0.08), "error", 2.0, [])
+
+
+def test_a_biped_is_asked_what_a_biped_can_do() -> None:
+    """Two feet, and a config that is silent: fewer pushes, and marks of the offset; what the config says goes first."""
+    biped, quadruped = (ExamRules.from_mapping({}, RANGES, feet) for feet in (2, 4))
+    assert biped.push_speeds == (0.5, 1, 1.5, 2, 3) and biped.worlds() == 23 + 5 * 16
+    assert (biped.marks, biped.marks_of, biped.push_mark) == ((0.06, 0.06, 0.12), "offset", 1.0)
+    assert quadruped == ExamRules.from_mapping({}, RANGES) and quadruped.push_mark == 2.0
+    silent = {"push_speeds": [], "push_mark": 0.0, "marks_of": "", "marks": []}
+    assert ExamRules.from_mapping(silent, RANGES, 2) == biped and ExamRules.from_mapping(biped.to_mapping(), feet=4) == biped
+    told = ExamRules.from_mapping({"push_speeds": [2.0, 4.0], "push_mark": 4.0, "marks_of": "error"}, RANGES, 2)
+    assert (told.push_speeds, told.push_mark, told.marks, told.marks_of) == ((2.0, 4.0), 4.0, (0.06, 0.06, 0.08), "error")
+
+
+def test_rules_know_how_many_feet_a_robot_has() -> None:
+    """In training by the config, in an export by its contract."""
+    biped = load_task(str(ROOT / "examples" / "toy_biped.py"))
+    assert ExamRules.from_config(biped.cfg).marks_of == "offset" and GO1.marks_of == "error"
+    contract = read_contract(SHIPPED)
+    feet = {name: contract.feet[name] for name in list(contract.feet)[:2]}
+    assert contract_rules(replace(contract, exam=None, feet=feet)).push_speeds == (0.5, 1, 1.5, 2, 3)
 
 
 def test_marks_follow_from_the_ranges() -> None:
@@ -80,12 +104,84 @@ def test_rules_survive_being_written() -> None:
     for asked in (GO1, ExamRules.from_mapping({"marks_of": "offset", "push_mark": 1.0}, RANGES)):
         for text in (json.dumps(asked.to_mapping()), yaml.safe_dump(asked.to_mapping())):
             assert ExamRules.from_mapping(yaml.safe_load(text)) == asked
-    assert GO1.peer_policy is PEERS["playground_go1"] and GO1.worlds() == WORLDS
+    assert GO1.peers == PEERS["go1"] and GO1.worlds() == WORLDS
 
 
 def test_a_peer_that_was_asked_something_else_is_left_out() -> None:
     for given in ({"ranges": RANGES}, {"push_vx": 0.5}, {"transport_vx": 0.5}, {"push_speeds": [1.0, 2.0]}):
-        assert ExamRules.from_mapping({**GO1.to_mapping(), **given}).peer_policy is None
+        assert ExamRules.from_mapping({**GO1.to_mapping(), **given}).peers == []
+
+
+def go2(**given: Any) -> ExamRules:
+    ranges = {"lin_vel_x": [-2.0, 2.0], "lin_vel_y": [-1.0, 1.0], "ang_vel_yaw": [-2.0, 2.0]}
+    return ExamRules.from_mapping({"peer": "go2", **given}, ranges, 4)
+
+
+def test_peers_are_of_the_robot_and_its_range() -> None:
+    """Those that were trained for the same range, or all of them in the range that all were asked; a robot has no other's peer."""
+    assert [peer.name for peer in go2().peers] == ["go2_rl_gym, CTS (rough)", "CTS (rough), later", "MoE-CTS (rough, days of training)"]
+    assert ExamRules.from_mapping({**GO1.to_mapping(), "peer": "go2"}).peers == []
+    g1 = {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_yaw": [-1.0, 1.0]}
+    names = [peer.name for peer in ExamRules.from_mapping({"peer": "g1"}, g1, 2).peers]
+    assert names == ["MuJoCo Playground", "unitree_rl_mjlab, Jan 2026", "unitree_rl_mjlab, Mar 2026"]
+    assert ExamRules.from_mapping({"peer": "g1"}, g1, 4).peers == []  # asked other pushes
+    assert [len(PEERS[robot]) for robot in ("go1", "go2", "g1")] == [1, 20, 24]
+    for robot, feet in (("go2", 4), ("g1", 2)):
+        common = ExamRules.from_mapping({"peer": robot, **in_common(robot)}, g1, feet)
+        assert 2 * len(common.peers) == len(PEERS[robot]) and common.push_vx == common.transport_vx == 0.5
+
+
+def test_the_best_is_figure_by_figure() -> None:
+    """Of three Go2 policies, worked out by hand from their lines."""
+    best = best_of(go2().peers)
+    assert best["error"] == [0.059, 0.057, 0.042] and best["worst"] == [0.14, 0.13, 0.07] and best["offset"] == [0.054, 0.050, 0.023]
+    assert best["drift"] == 0.002 and best["cost_of_transport"] == 0.43
+    assert list(best["pushes"].values()) == [1, 1, 1, 1, 1, 15 / 16, 13 / 16, 7 / 16] and next(iter(best["pushes"])) == "0.5"
+    assert best_of([]) == {}
+
+
+def test_beating_several_peers_is_beating_each() -> None:
+    rules, best = go2(), best_of(go2().peers)
+    just = {**best, "error": [0.0589, 0.0569, 0.0419], "cost_of_transport": 0.42, "joint_speed": 0.0}
+    assert rules.beats_peer(just) and rules.reached(just) == (1 + 9 + 1 + 8 + 1, 20)
+    worse = changed(changed(changed(just, "offset.1", 0.051), "drift", 0.0049), "pushes.6", 0.375)
+    assert not rules.beats_peer(worse) and rules.reached(worse) == (18, 20)
+    text = rules_table({**worse, "walks": True, "beats_peer": False, "rules": rules.to_mapping()})
+    assert (
+        text.startswith("asked: vx -2 to 2 m/s, vy -1 to 1 m/s, yaw rate -2 to 2 rad/s\n") and "best of 3\n" in text.splitlines()[1] + "\n"
+    )
+    assert "walks: yes; beats all 3 published policies (at or beyond their best in 18 of 20 figures): no" in text
+    assert "half of each policy's own highest vx" not in text and "no policy has them all" in text
+
+
+def test_what_the_common_range_did_not_ask_alike_is_said() -> None:
+    rules = go2(**in_common("go2"))
+    assert rules.asked_words() == (
+        "asked: vx -0.5 to 1 m/s, vy -0.4 to 0.4 m/s, yaw rate -1 to 1 rad/s, the one range that all published policies of this robot "
+        "were asked"
+    )
+    words = "* Their pushes and cost of transport were taken at half of each policy's own highest vx, not all at 0.5 m/s: compare"
+    assert rules.peer_words().startswith("Best of 10: ") and words in rules.peer_words()
+    with pytest.raises(ConfigError, match="--ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2, g1"):
+        in_common("go1")
+
+
+def test_the_common_range_in_training_and_in_deploy() -> None:
+    """It goes before what the config says of the ranges and speeds; the rest of the section stays."""
+    flags = argparse.Namespace(ranges="common", override=[], set=["exam.peer=go2", "exam.push_speeds=[2, 3]"])
+    graded = grading.prepare(Source(SHIPPED, SHIPPED / "model.pt", True), load_task("go1_flat"), flags)
+    asked = ExamRules.from_config(graded.task.cfg)
+    assert asked.ranges == ((-0.5, 1.0), (-0.4, 0.4), (-1.0, 1.0)) and asked.push_vx == asked.transport_vx == 0.5
+    assert asked.push_speeds == (2.0, 3.0) and asked.marks == (0.06, 0.06, 0.12)
+    contract = replace(read_contract(SHIPPED), exam={"peer": "go2", "push_vx": 0.8})
+    assert contract_rules(contract, common=True) == go2(**in_common("go2")) and contract_rules(contract).push_vx == 0.8
+    flags.set = []
+    with pytest.raises(ConfigError, match="--ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2"):
+        grading.prepare(Source(SHIPPED, SHIPPED / "model.pt", True), load_task("go1_flat"), flags)
+
+
+def test_an_older_name_of_the_peer_is_read() -> None:
+    assert ExamRules.from_mapping({**GO1.to_mapping(), "peer": "playground_go1"}) == GO1
 
 
 @pytest.mark.parametrize(
@@ -93,10 +189,10 @@ def test_a_peer_that_was_asked_something_else_is_left_out() -> None:
     [
         ({"ranges": {"base_height": [0.2, 0.3]}}, "exam.ranges: no command 'base_height' in the walking exam; there are: lin_vel_x, "),
         ({"ranges": {"lin_vel_x": [1.0, 0.0]}}, "exam.ranges: lin_vel_x is [1.0, 0.0]; it must be two numbers, the lower first"),
-        ({"push_speeds": []}, "exam.push_speeds is []; it must be one or more numbers above zero"),
+        ({"push_speeds": [0.0, 2.0]}, "exam.push_speeds is [0.0, 2.0]; it must be one or more numbers above zero"),
         ({"push_speeds": [1.0]}, "exam.push_mark is 2; it must be one of exam.push_speeds, [1.0]"),
         ({"marks": [0.1]}, "exam.marks is [0.1]; it must be three numbers, or an empty list"),
-        ({"peer": "playground_go"}, "exam.peer: no peer 'playground_go' in legged_mw/eval/peers.py; did you mean 'playground_go1'?"),
+        ({"peer": "go11"}, "exam.peer: no robot 'go11' in legged_mw/eval/peers.py; did you mean 'go1'?"),
     ],
 )
 def test_rules_that_cannot_be_applied(given: dict[str, Any], line: str) -> None:
@@ -121,7 +217,7 @@ def test_rules_of_an_export() -> None:
     ("section", "line"),
     [
         ({"push_speeds": 3.0}, "policy.yaml: exam: 'float' object is not iterable"),
-        ({"peer": "nobody"}, "policy.yaml: exam: exam.peer: no peer 'nobody' in legged_mw/eval/peers.py"),
+        ({"peer": "nobody"}, "policy.yaml: exam: exam.peer: no robot 'nobody' in legged_mw/eval/peers.py"),
     ],
 )
 def test_a_contract_with_another_section(section: dict[str, Any], line: str) -> None:
@@ -360,7 +456,7 @@ def test_a_task_without_commands_can_be_rolled_out() -> None:
 
 
 def test_falls() -> None:
-    """A fallen command leaves the means; what falls again counts once."""
+    """A command at which it fell has the error of standing still, in the means and as the worst; what falls again counts once."""
 
     def script(env: FakeRobot, step: int) -> None:
         follow(env, step)
@@ -368,8 +464,13 @@ def test_falls() -> None:
 
     result = grade(FakeRobot(script, {120: [3, 7], 300: [3]}))
     assert result["falls"] == 2 and [i for i, row in enumerate(result["commands"]) if row["fell"]] == [3, 7]
-    assert result["error"] == result["worst"] == [0, 0, 0] and result["walks"] is False
+    assert GO1.commands()[3] == (1.5, 0, 0) and GO1.commands()[7] == (0, 0.8, 0)
+    assert result["error"] == result["offset"] == pytest.approx([1.5 / 22, 0.8 / 22, 0], abs=1e-5) and result["walks"] is False
+    assert result["worst"] == [1.5, 0.8, 0] and result["commands"][7]["error"] == [0, 0.8, 0]
     assert grade(FakeRobot(script))["worst"] == pytest.approx([1, 1, 0])
+    lying = grade(FakeRobot(follow, {9: list(range(TRACKED))}))
+    assert lying["falls"] == 22 and lying["worst"] == [1.5, 0.8, 1.2] and lying["drift"] is None
+    assert "error vx [m/s]                       0.568" in rules.table(lying)  # (0.5 + 1 + 1.5 + 0.5 + 1 + 8 x 1) / 22
 
 
 def test_a_push_is_survived_if_it_stands_until_step_300() -> None:
@@ -551,5 +652,6 @@ def test_ranges_from_the_command_line(tmp_path: Path, monkeypatch: pytest.Monkey
     ):
         line = refused(tmp_path, "play", *start, *more)
         assert f"--eval sets {field} itself; an exam with other values would be another exam" in line
+    assert "--ranges says what the exam asks: add --eval" in refused(tmp_path, "play", *start[:-1], "--ranges", "common")
     for more in (["--command", "1,0,0"], ["--video", "x.mp4"], ["--export", "x"]):
         assert "one thing each" in refused(tmp_path, "play", *start, *more)

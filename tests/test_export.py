@@ -24,9 +24,10 @@ from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl import export as exporting
 from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, export
-from legged_mw.rl.export_replay import overridden
+from legged_mw.rl.export_replay import overridden, own_ends
 from legged_mw.rl.export_scene import differences, standalone
 from legged_mw.rl.policies import save_policy
 from legged_mw.sim.model import ModelError
@@ -50,8 +51,10 @@ def made(root: Path) -> Path:
     return folder
 
 
-def arguments(made: Path) -> tuple[dict[str, Any], Path]:
-    return load_yaml(made / "config.yaml"), made / "model.pt"
+def arguments(made: Path) -> tuple[LoadedTask, Path]:
+    task = load_task("go1_flat")
+    task.update_from_run(load_yaml(made / "config.yaml"), "config.yaml")
+    return task, made / "model.pt"
 
 
 def test_a_finished_training_exports(made: Path) -> None:
@@ -328,6 +331,20 @@ def test_a_row_that_nobody_can_measure_is_said(tmp_path: Path) -> None:
     assert "nothing says how to measure guess: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)" in text
 
 
+def test_ends_of_the_tasks_own_are_said(tmp_path: Path) -> None:
+    class Own(OtherRewards):
+        def _fallen(self) -> torch.Tensor:
+            return super()._fallen()
+
+        def _timed_out(self) -> torch.Tensor:
+            return super()._timed_out()
+
+    assert own_ends(LeggedRobot) == own_ends(RobotTask) == own_ends(OtherPose) == ()
+    assert own_ends(Own) == ("Own._fallen", "Own._timed_out", "OtherRewards.check_termination")
+    text = Exported(FILES, 0.0, 256, (), not_covered=own_ends(Own)[:2]).text(tmp_path)
+    assert "Own._fallen, Own._timed_out ended episodes in training; a deployed robot walks on (policy.yaml: ends: not_covered)" in text
+
+
 def test_a_picture_is_left_out_and_a_height_field_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     env = make_env(1)
     robot = env.robot
@@ -338,11 +355,11 @@ def test_a_picture_is_left_out_and_a_height_field_refused(monkeypatch: pytest.Mo
         standalone(type(robot)(**{**vars(robot), "spec": spec}), imu="imu", qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
 
 
-def untrained(path: Path, folder: Path) -> tuple[dict[str, Any], Path]:
-    """The config of a task and a checkpoint whose small networks have seen no training."""
+def untrained(path: Path, folder: Path, settings: dict[str, Any] | None = None) -> tuple[LoadedTask, Path]:
+    """A task and a checkpoint whose small networks have seen no training."""
     task = load_task(str(path))
-    task.set("env.num_envs", 1)
-    task.set("sim.engine", "mujoco")
+    for field, value in {"env.num_envs": 1, "sim.engine": "mujoco", **(settings or {})}.items():
+        task.set(field, value)
     for part in ("actor", "critic"):
         task.set(f"{part}.hidden_dims", [16, 16])
     torch.manual_seed(0)
@@ -351,7 +368,7 @@ def untrained(path: Path, folder: Path) -> tuple[dict[str, Any], Path]:
     actor_class, settings = resolve_class(copy.deepcopy(sections["actor"]))
     actor = actor_class(env.get_observations(), sections["obs_groups"], "actor", env.num_actions, **settings)
     save_policy(actor, folder / "model.pt", {"task": task.name})
-    return task.to_dict(), folder / "model.pt"
+    return task, folder / "model.pt"
 
 
 @pytest.mark.parametrize(
@@ -444,19 +461,12 @@ class OtherRewards(LeggedRobot):
 
 def export_of(env_class: type[LeggedRobot], made: Path, out: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> Exported:
     """Export the trained policy as one of another class and other settings, by their dotted paths."""
-
-    def load(name: str) -> LoadedTask:
-        task = load_task("go1_flat")
-        task.env_class = env_class
-        return task
-
-    monkeypatch.setattr(exporting, "load_task", load)
     monkeypatch.setattr(exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(made / "policy.onnx", path))
-    task = load_task("go1_flat")
-    task.update(load_yaml(made / "config.yaml"), "config.yaml")
+    task, checkpoint = arguments(made)
+    task.env_class = env_class
     for path, value in changes.items():
         task.set(path.replace("__", "."), value)
-    return export(task.to_dict(), made / "model.pt", out)
+    return export(task, checkpoint, out)
 
 
 @pytest.mark.parametrize(
@@ -505,7 +515,7 @@ def test_what_the_contract_states_is_exported(made: Path, tmp_path: Path, monkey
     export_of(OtherRewards, made, tmp_path / "out", monkeypatch, **changes)
     contract = read_contract(tmp_path / "out")
     assert contract.action.origin == "targets" and contract.action.scale.tolist() == [0.1, 0.1, 0.05] * 4
-    assert contract.ends == Ends(min_base_height=0.1)
+    assert contract.ends == Ends(min_base_height=0.1, not_covered=("OtherRewards.check_termination",))
     assert load_yaml(tmp_path / "out/config.yaml")["domain_rand"]["action_delay"] == [0, 2]  # as trained
     assert [row.noise for row in contract.rows][:2] == [0.1, 0.2]
     export_of(LeggedRobot, made, tmp_path / "joints", monkeypatch, control__action_origin="joints")

@@ -291,7 +291,7 @@ def test_trains_and_is_graded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     [
         (
             {"asset.penalize_contacts_on": ["*_thig_*"]},
-            r"^asset.penalize_contacts_on or terminate_.*: no geom '\*_thig_\*' in go1.xml; .*there are: .*trunk_box",
+            r"^asset.penalize_contacts_on or terminate_.*: no geom or body '\*_thig_\*' in go1.xml; .*there are: geoms .*trunk_box",
         ),
         (
             {"asset.colliders": ["FR", "FL", "RR", "RL"]},
@@ -375,7 +375,7 @@ def test_a_urdf_becomes_a_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         self_collisions=False,
         contact_geoms=["FR_foot", "thigh_*"],
         velocity_sites=["FR_foot"],
-        accelerometer_site="imu",
+        imu_site="imu",
     )
     assert robot.root == "base" and robot.joint_names == ("thigh_joint",) and robot.contact_geoms == ("FR_foot", "thigh_0")
     assert robot.joint_range.tolist() == [[-1.0, 2.0]] and robot.effort_range.tolist() == [[-33.5, 33.5]]

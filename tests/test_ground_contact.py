@@ -270,7 +270,7 @@ def test_too_little_room_is_seen() -> None:
     )
     sim.qpos[:, 2] = 0.099
     sim.step()
-    assert "raise nconmax (now 1)" in sim.overflow_report()
+    assert "raise `nconmax` (now 1)" in sim.overflow_report()
 
 
 @pytest.mark.parametrize("kind", ["rough_slope", "stairs_up"])

@@ -47,7 +47,7 @@ class Pair:
             self_collisions=False,
             contact_geoms=FEET,
             velocity_sites=FEET,
-            accelerometer_site="imu",
+            imu_site="imu",
         )
         model = self.robot.physics
         self.sim: Any = make_simulation(model, WORLDS, "cpu", engine=engine, nconmax=8, njmax=40)

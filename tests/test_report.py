@@ -19,7 +19,7 @@ from legged_mw.eval import exam, exams, grading, page, report
 from legged_mw.eval.page import Column
 from legged_mw.eval.peers import PEERS
 from legged_mw.eval.rollout import Case, Push, roll_out
-from legged_mw.eval.rules import ExamRules
+from legged_mw.eval.rules import ExamRules, in_common
 from legged_mw.eval.trials import make_plan
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.utils.config import load_yaml
@@ -136,7 +136,8 @@ def pages(both: tuple[dict[str, Any], ...], tmp_path_factory: pytest.TempPathFac
     """A report with a rival who fell at everything, and with the exam in another physics."""
     _, result, figures = both
     fallen, nothing = copy.deepcopy(result), copy.deepcopy(figures)
-    fallen |= {"falls": 22, "error": None, "worst": None, "drift": None, "joint_speed": None, "cost_of_transport": None, "walks": False}
+    fallen |= {"falls": 22, "error": [0.568, 0.255, 0.382], "worst": [1.5, 0.8, 1.2], "walks": False}
+    fallen |= {"drift": None, "joint_speed": None, "cost_of_transport": None}
     for gait in nothing["gait"]:
         gait |= {"duty_factor": None, "stride_frequency": None, "contact": None}
     for grid in ("vx_yaw", "vx_vy"):
@@ -172,7 +173,9 @@ def test_the_page_shows_columns_gaps_and_verdicts(pages: Path) -> None:
     row = re.search(r"<tr><th>error vx \[m/s\]</th>.*?</tr>", html)
     assert row is not None
     assert row[0].count('class="value pass"') == 2 and row[0].count('class="value fail"') == 1
-    assert "<small>+0.004</small>" in row[0] and ">fell" in row[0]
+    assert "<small>+0.004</small>" in row[0] and ">0.568<" in row[0] and ">fell<" in html
+    assert "asked: vx -1.5 to 1.5 m/s, vy -0.8 to 0.8 m/s, yaw rate -1.2 to 1.2 rad/s. A command at which the robot falls counts" in html
+    assert "Published policies" not in html
     assert "does not walk<" in html and "does not beat the peer" in html
 
 
@@ -182,7 +185,7 @@ def test_json_holds_every_figure_and_pictures_are_there(pages: Path, both: tuple
     first, numpy, rival = saved["columns"]
     assert first["exam"] == json.loads(json.dumps(result)) and first["figures"] == json.loads(json.dumps(figures))
     assert numpy["name"] == "by numpy" and numpy["figures"] is None and rival["exam"]["falls"] == 22
-    assert saved["task"] == "go1_flat" and saved["peer"] == PEERS["playground_go1"].figures
+    assert saved["task"] == "go1_flat" and saved["peer"] == PEERS["go1"][0].figures and len(saved["peers"]) == 1
     names = {"tracking", "steps", "gait", "joints", "pushes", "energy", "reward"}
     assert {path.stem for path in pages.glob("*.png")} == names
     assert all(path.stat().st_size > 5000 and path.read_bytes().startswith(b"\x89PNG") for path in pages.glob("*.png"))
@@ -198,6 +201,40 @@ def test_a_task_without_a_peer(both: tuple[dict[str, Any], ...], tmp_path: Path)
     body = html[html.index("<body>") :]
     assert "peer" not in body and "peer" not in json.loads(saved) and "beats" not in saved
     assert "survives pushes of 2 m/s" in body and body.count("<svg") == 3 * 2 + 3 + 6 + 3 + 3 + 2 + 1
+
+
+def test_several_peers_are_their_best_and_a_table(both: tuple[dict[str, Any], ...], tmp_path: Path) -> None:
+    """The best of each figure beside the policy's, all of them below; what was not asked alike is said."""
+    _, result, figures = both
+    asked = ExamRules.from_mapping({"peer": "go2", **in_common("go2")})
+    pushes = dict(zip(("0.5", "1", "1.5", "2", "3", "4", "5", "6"), [1.0] * 8, strict=True))
+    figures = copy.deepcopy(figures)
+    figures["pushes"] = {"speeds": list(asked.push_speeds), **dict.fromkeys(("walking", "standing"), [[True] * 16] * 8)}
+    graded = {**result, "pushes": pushes, "beats_peer": False, "rules": asked.to_mapping()}
+    report.write(tmp_path, "go2", [Column("mine", {}, graded, figures)])
+    html, saved = (tmp_path / "report.html").read_text(encoding="utf-8"), json.loads((tmp_path / "report.json").read_text())
+    assert (
+        "<td>0.30*</td>" in html
+        and "<td>0.034</td>" in html
+        and "<th>best of 10</th>" in html
+        and "does not beat all 10 published policies (at or beyond their best in " in html
+    )
+    assert "half of each policy&#x27;s own highest vx, not all at 0.5 m/s" in html
+    table = html[html.index("<h2>Published policies</h2>") :]
+    row = "<tr><th>DLS basic-locomotion</th><td>0</td><td>0.046, 0.037, 0.058</td><td>0.16, 0.06, 0.12</td><td>0.032, 0.019, 0.015</td>"
+    assert row + "<td>0.002</td><td>0.63</td><td>100, 69, 12, 6, 0, 0, 0, 0</td><td>0.25</td></tr>" in table
+    assert table.count("<tr>") == 1 + 1 + 10 and "<tr><th>mine</th><td>0</td>" in table
+    assert len(saved["peers"]) == 10 and saved["peer"]["cost_of_transport"] == 0.3
+    assert (tmp_path / "pushes.png").exists()
+
+
+def test_marks_of_offsets_are_no_marks_of_errors(both: tuple[dict[str, Any], ...], tmp_path: Path) -> None:
+    _, result, figures = both
+    graded = {**result, "rules": {**result["rules"], "marks_of": "offset", "peer": ""}}
+    del graded["beats_peer"]
+    report.write(tmp_path, "biped", [Column("mine", {}, graded, figures)])
+    html = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "The stroke on each scale" not in html and "vx offset" in html and "of the mean velocity" in html
 
 
 # ---- --compare

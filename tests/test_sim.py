@@ -41,7 +41,7 @@ def go1(**choices: Any) -> RobotModel:
         "self_collisions": False,
         "contact_geoms": FEET,
         "velocity_sites": FEET,
-        "accelerometer_site": "imu",
+        "imu_site": "imu",
     }
     return build_model(choices.pop("file", GO1), **{**defaults, **choices})
 
@@ -134,11 +134,14 @@ def test_table_that_does_not_fit(field: str, table: dict[str, float], parts: tup
 @pytest.mark.parametrize(
     ("choice", "parts"),
     [
-        ({"colliders": ["FR", "FL", "RR", "RLL"]}, ("no colliding geom 'RLL' in go1.xml", "did you mean 'RL'?", "trunk_box")),
-        ({"colliders": ["foot_*"]}, ("no colliding geom 'foot_*'", "there are: trunk_box", "RL_calf_2")),
-        ({"contact_geoms": ["FR", "FL", "RR", "RLL"]}, ("no geom 'RLL' in go1.xml", "did you mean 'RL'?")),
+        ({"colliders": ["FR", "FL", "RR", "RLL"]}, ("no colliding geom or body 'RLL' in go1.xml", "did you mean 'RL'?", "trunk_box")),
+        (
+            {"colliders": ["foot_*"]},
+            ("no colliding geom or body 'foot_*'", "there are: geoms trunk_box", "RL_calf_2", "; bodies trunk, FR_hip"),
+        ),
+        ({"contact_geoms": ["FR", "FL", "RR", "RLL"]}, ("no geom or body 'RLL' in go1.xml", "did you mean 'RL'?")),
         ({"velocity_sites": ["FR", "FLL"]}, ("no site 'FLL' in go1.xml", "did you mean 'FL'?", "head, imu")),
-        ({"accelerometer_site": "imuu"}, ("no site 'imuu' in go1.xml", "did you mean 'imu'?", "there are: head, imu, FR, FL, RR, RL")),
+        ({"imu_site": "imuu"}, ("no site 'imuu' in go1.xml", "did you mean 'imu'?", "there are: head, imu, FR, FL, RR, RL")),
     ],
 )
 def test_unknown_names(choice: dict[str, Any], parts: tuple[str, ...]) -> None:
@@ -182,7 +185,10 @@ def test_file_that_is_no_mjcf(tmp_path: Path, text: str, part: str) -> None:
 def test_mjcf_that_cannot_be_compiled(tmp_path: Path) -> None:
     """It parses; that a file is missing or a name is used twice comes out later."""
     mesh = toy(tmp_path, inside='<geom type="mesh" mesh="hull"/>', extra='<asset><mesh name="hull" file="hull.stl"/></asset>')
-    with pytest.raises(ModelError, match="toy.xml is not a valid MJCF: .*hull.stl") as error:
+    with pytest.raises(
+        ModelError,
+        match=r"^toy.xml: a geom of body 'base' collides as the mesh 'hull', and its file hull.stl cannot be read \(no such file; ",
+    ) as error:
         build_toy(mesh)
     one_line(error)
     twice = toy(tmp_path, inside='<site name="imu"/>')
@@ -194,14 +200,16 @@ def test_mjcf_that_cannot_be_compiled(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("parts", "text"),
     [
-        ({"root": ""}, "toy.xml: the first joint must be the root body's free joint; it is left_hip"),
         ({"root": '<joint name="rail" type="slide"/>'}, "the first joint must be the root body's free joint; it is rail"),
         (
             {"inside": '<body><joint name="neck" type="ball"/><geom size="0.1"/></body>'},
             "joint 'neck' must be a named hinge or slide joint",
         ),
         ({"inside": '<body><joint axis="0 0 1"/><geom size="0.1"/></body>'}, "joint '' must be a named hinge or slide joint"),
-        ({"world": '<geom name="floor" type="plane" size="0 0 1"/>'}, "toy.xml brings a geom 'floor'; the ground is added to the MJCF"),
+        (
+            {"world": '<body name="cart"><joint name="rail" type="slide"/><geom size="0.1"/></body>'},
+            "toy.xml has 2 bodies with joints in its world: cart, base; leave one of them, the robot",
+        ),
     ],
 )
 def test_mjcf_that_is_not_a_robot_alone(tmp_path: Path, parts: dict[str, str], text: str) -> None:
@@ -213,7 +221,7 @@ def test_mjcf_that_is_not_a_robot_alone(tmp_path: Path, parts: dict[str, str], t
 def test_mjcf_without_joints(tmp_path: Path) -> None:
     file = tmp_path / "rock.xml"
     file.write_text('<mujoco><worldbody><body><geom size="1"/></body></worldbody></mujoco>')
-    with pytest.raises(ModelError, match="rock.xml: the first joint must be the root body's free joint; it is missing"):
+    with pytest.raises(ModelError, match="^rock.xml has no hinge or slide joint, so nothing of it can be moved$"):
         go1(file=file)
 
 
@@ -246,6 +254,25 @@ def test_what_may_touch_has_a_name(tmp_path: Path) -> None:
     assert "geom of 'base' without a name is called 'base_1_'" in build_toy(taken).overrides
 
 
+def test_a_body_means_its_geoms_that_collide(tmp_path: Path) -> None:
+    looks = '<geom name="shade" size="0.3" contype="0" conaffinity="0"/><body name="hand"><geom name="palm" size="0.01"/></body>'
+    robot = build_toy(toy(tmp_path, inside=looks), colliders=["base", "*_leg"], contact_geoms=["left_leg", "ba*"])
+    assert robot.contact_geoms == ("left_shin", "left_foot", "shell"), "neither what is looked at nor what is on a child"
+    assert robot.names.find(["*"], "") == robot.names.geoms and robot.names.find(["*_foot"], "") == ("left_foot", "right_foot")
+    assert robot.names.find(["hand"], "") == ("palm",)
+    touching = {robot.physics.geom(i).name for i in range(robot.physics.ngeom) if robot.physics.geom_conaffinity[i]}
+    assert touching == {"shell", "left_shin", "left_foot", "right_shin", "right_foot"}
+    same = toy(tmp_path, inside='<body name="left_foot"><geom name="thumb" size="0.01"/></body>')
+    assert build_toy(same).names.find(["left_foot"], "") == ("left_foot",), "a geom wins over a body of its name"
+    with pytest.raises(ModelError) as error:
+        build_toy(
+            toy(tmp_path, inside='<body name="tail"><joint name="tail_hip"/><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/></body>'),
+            contact_geoms=["tail"],
+        )
+    text = "`contact_geoms`: body 'tail' of toy.xml has no geom that collides; bodies that have: base, left_leg, right_leg"
+    assert one_line(error) == text
+
+
 def test_a_missing_site_is_made_at_its_geom(tmp_path: Path) -> None:
     file = toy(tmp_path, inside='<geom name="tail" type="capsule" size="0.01" fromto="-0.1 0 0 -0.3 0 0.1"/>')
     sites = {"tail": ["tail"], "left_foot": ["left_shin"]}
@@ -276,11 +303,11 @@ def test_of_several_geoms_the_lowest_point_is_the_site(tmp_path: Path, angle: fl
     assert "site 'left_sole' made at the lowest point of left_heel, left_toe" in robot.overrides
 
 
-def test_the_lowest_point_may_be_on_another_body_and_names_may_be_patterns(tmp_path: Path) -> None:
+def test_the_lowest_point_may_be_on_a_fixed_body_and_names_may_be_patterns(tmp_path: Path) -> None:
     robot = build_soles(tmp_path, pose={"ankle": -3.0, "": 0.0}, sites={"left_sole": ["left_t*", "left_nail"]})  # upside down
     site = robot.physics.site("left_sole")
-    assert robot.site_geoms == {"left_sole": ("left_toe", "left_nail")} and robot.physics.body(site.bodyid[0]).name == "left_nail"
-    np.testing.assert_allclose(site.pos, [0.01 * math.sin(-3.0), 0, -0.01 * math.cos(-3.0)], atol=1e-6)
+    assert robot.site_geoms == {"left_sole": ("left_toe", "left_nail")} and robot.physics.body(site.bodyid[0]).name == "left_ankle"
+    np.testing.assert_allclose(site.pos, [0.1 + 0.01 * math.sin(-3.0), 0, 0.02 - 0.01 * math.cos(-3.0)], atol=1e-6)  # the nail is fused
 
 
 def test_left_and_right_soles_mirror(tmp_path: Path) -> None:
@@ -312,7 +339,7 @@ def test_the_lowest_point_of_every_shape(tmp_path: Path, shape: str, lowest: flo
 def test_a_site_of_no_geom(tmp_path: Path) -> None:
     with pytest.raises(ModelError) as error:
         build_soles(tmp_path, sites={"left_sole": ["left_heal"]})
-    assert "no geom 'left_heal' in toy.xml; did you mean 'left_heel'?" in one_line(error)
+    assert "no geom or body 'left_heal' in toy.xml; did you mean 'left_heel'?" in one_line(error)
     with pytest.raises(ModelError, match=r"^site 'left_sole' is not in toy.xml and no geom is given for it$"):
         build_soles(tmp_path, sites={"left_sole": []})
 
@@ -408,13 +435,14 @@ def test_options_are_written() -> None:
 
 
 def test_sensor_spans_after_the_mjcfs_own_sensors(tmp_path: Path) -> None:
-    own = '<sensor><gyro site="imu"/><jointpos joint="left_hip"/></sensor>'
+    own = '<sensor><gyro name="gyro" site="imu"/><jointpos joint="left_hip"/><touch name="skin" site="imu"/><force site="imu"/></sensor>'
     robot = build_toy(toy(tmp_path, extra=own))
     assert robot.sensors == {"contact": slice(4, 6), "linvel": slice(6, 12), "accelerometer": slice(12, 15)}
+    assert "sensors dropped, as nothing reads them: gyro, one without a name" in robot.overrides
     data = mujoco.MjData(robot.physics)
     mujoco.mj_forward(robot.physics, data)
     np.testing.assert_allclose(data.sensordata[robot.sensors["accelerometer"]], 0, atol=1e-9)  # falls freely
-    none = build_toy(toy(tmp_path), contact_geoms=[], velocity_sites=[], accelerometer_site=None)
+    none = build_toy(toy(tmp_path), contact_geoms=[], velocity_sites=[], imu_site=None)
     assert none.sensors == {name: slice(0, 0) for name in ("contact", "linvel", "accelerometer")}
 
 
@@ -732,9 +760,9 @@ def test_all_fits(robot: RobotModel) -> None:
 @pytest.mark.parametrize(
     ("room", "advice"),
     [
-        ({"nconmax": 1, "njmax": 4}, "raise njmax (now 4) and nconmax (now 1)"),
-        ({"nconmax": 8, "njmax": 4}, "raise njmax (now 4)"),
-        ({"nconmax": 1, "njmax": 40}, "raise nconmax (now 1)"),
+        ({"nconmax": 1, "njmax": 4}, "raise `njmax` (now 4) and `nconmax` (now 1)"),
+        ({"nconmax": 8, "njmax": 4}, "raise `njmax` (now 4)"),
+        ({"nconmax": 1, "njmax": 40}, "raise `nconmax` (now 1)"),
     ],
 )
 def test_what_does_not_fit_is_named(robot: RobotModel, room: dict[str, int], advice: str) -> None:

@@ -256,7 +256,7 @@ def made(name: str, onnx_once: None, tmp_path_factory: pytest.TempPathFactory) -
     env = task.env_class(task.cfg, "cpu")
     torch.manual_seed(0)
     make_runner(env, task.train, None, "cpu").save(str(root / "model_0.pt"))
-    return Made(task, root / "model_0.pt", root / "export", export(task.to_dict(), root / "model_0.pt", root / "export"))
+    return Made(task, root / "model_0.pt", root / "export", export(task, root / "model_0.pt", root / "export"))
 
 
 def test_export_states_what_the_policy_sees(made: Made, env: Any) -> None:

@@ -51,7 +51,7 @@ def load_robot(path: Path, xml: str) -> RobotModel:
         self_collisions=False,
         contact_geoms=[],
         velocity_sites=[],
-        accelerometer_site=None,
+        imu_site=None,
     )
 
 

@@ -31,7 +31,7 @@ from legged_mw.view.overlay import ARC_SEGMENTS, draw_velocities
 from legged_mw.view.posed_robot import Placement, PosedRobots, show_groups
 from legged_mw.view.recorder import Recorder, RobotRenderer, shrunk
 from legged_mw.view.session import Pace
-from legged_mw.view.stage import Fall, Moment
+from legged_mw.view.stage import Fall, Moment, top_speed
 from legged_mw.view.video import VideoWriter, contact_sheet, save_png
 
 LEG = """<body pos="{0} {1} 0"><joint axis="0 1 0"/><geom type="capsule" size=".02" fromto="0 0 0 0 0 -.3" group="2"/>
@@ -230,6 +230,19 @@ def test_arrow_points_along_the_body_velocity() -> None:
     assert np.allclose(arrow.mat[:, 2], [0, 1, 0], atol=1e-6)
 
 
+def test_arrows_fit_the_fastest_command() -> None:
+    """1.3 radii a m/s up to 1.5 m/s; of a faster robot the fastest command has the same arrow, and a push cannot make it much longer."""
+    scene = mujoco.MjvScene(mujoco.MjModel.from_xml_string(ROBOT), 100)
+    lengths = []
+    for speed, top in ((1.0, 1.0), (1.5, 1.5), (3.0, 3.0), (1.5, 3.0), (9.0, 1.0)):
+        scene.ngeom = 0
+        draw_velocities(scene, Placement(np.zeros(3), 0.0, 0.4, 0.1), [speed, 0.0, 0.0], np.zeros(3), top_speed=top)
+        lengths.append(float(scene.geoms[0].size[2]) / 0.4)
+    assert lengths == pytest.approx([1.3, 1.95, 1.95, 0.975, 1.1 * 1.95])
+    table = [Command("lin_vel_x", -0.5, 2.0), Command("lin_vel_y", -2.5, 1.0), Command("base_height", 0.0, 9.0)]
+    assert top_speed(table) == 2.5 and top_speed(table[2:]) == 1.0
+
+
 def test_a_task_without_a_velocity_command_has_no_arrow_for_it() -> None:
     scene = mujoco.MjvScene(mujoco.MjModel.from_xml_string(ROBOT), 100)
     place, moving = Placement(np.zeros(3), 0.0, 0.4, 0.1), np.ones(3)
@@ -341,14 +354,109 @@ def test_robots_stand_side_by_side_each_in_its_pose(model: mujoco.MjModel) -> No
     assert robots.model.nlight == 1 and robots.model.nsensor == 0 and robots.model.nmesh == 1
     contacts = np.zeros((5, 2), dtype=bool)
     contacts[3, 0] = True  # of the leg that is turned
-    assert np.allclose(robots.below_feet(contacts), [alone.data.geom("foot0.1").xpos + robots.offsets[3] - (0, 0, 0.03)])
+    [patch] = robots.patches(contacts)
+    assert np.allclose(patch.place, alone.data.geom("foot0.1").xpos + robots.offsets[3] - (0, 0, 0.03))
+    assert 0.03 < 0.15 * robots.radius < 0.066 and np.allclose(patch.half, 0.15 * robots.radius)  # 2.2 x 0.03 would be large for it
+
+
+def with_feet(geom: str, pitch: float = 0.0, yaw: float = 0.0) -> PosedRobots:
+    """The robot with other feet, its leg pitched and the robot turned."""
+    robots = PosedRobots(mujoco.MjSpec.from_string(ROBOT.replace('size=".03" pos="0 0 -.3"', geom)))
+    qpos = robots.model.qpos0.copy()
+    qpos[7] = pitch
+    qpos[3:7] = np.cos(yaw / 2), 0, 0, np.sin(yaw / 2)
+    robots.pose(qpos)
+    return robots
 
 
 def test_the_disc_of_a_flat_foot_is_below_its_sole() -> None:
-    boxes = ROBOT.replace('size=".03" pos="0 0 -.3"', 'type="box" size=".1 .04 .01" pos=".05 0 -.3"')
-    robots = PosedRobots(mujoco.MjSpec.from_string(boxes))
-    assert robots.foot_radius == pytest.approx(0.04)
-    assert np.allclose(robots.below_feet([[True, False]]), [[0.18 + 0.05, 0.1, 0.35 - 0.31]])
+    """As long and as wide as the sole and a margin, 2.2 times the sole's half height, and turned with the foot."""
+    box = 'type="box" size=".1 .04 .01" pos=".05 0 -.3"'
+    [patch] = with_feet(box).patches([[True, False]])
+    assert np.allclose(patch.place, [0.18 + 0.05, 0.1, 0.35 - 0.31]) and patch.heading == 0.0
+    assert np.allclose(patch.half, [0.1 + 0.022, 0.04 + 0.022])
+    [turned] = with_feet(box, yaw=np.pi / 2).patches([[True, False]])
+    assert np.allclose(turned.place, [-0.1, 0.18 + 0.05, 0.04]) and turned.heading == pytest.approx(np.pi / 2)
+    assert np.allclose(turned.half, patch.half)
+    robots = with_feet(box, pitch=0.5)  # on its heel or its toe: the disc lies below that edge, and is no longer than its margin
+    [edge] = robots.patches([[True, False]])
+    corner = robots.data.geom("foot0.1").xpos + robots.data.geom("foot0.1").xmat.reshape(3, 3) @ (0.1, 0.0, -0.01)
+    assert np.allclose(edge.place, corner) and np.allclose(edge.half, [0.022, 0.04 + 0.022])
+
+
+@pytest.mark.parametrize(
+    ("geom", "low"),
+    [
+        ('type="capsule" size=".01 .05" pos="0 0 -.3" euler="0 90 0"', [-0.31, 0.05]),
+        ('type="ellipsoid" size=".03 .02 .01" pos="0 0 -.3"', [-0.31, 0.0]),
+        ('type="cylinder" size=".03 .01" pos="0 0 -.3"', [-0.31, 0.03]),
+    ],
+)
+def test_discs_of_feet_of_any_shape(geom: str, low: list[float]) -> None:
+    """Height of the lowest point below the hip, and how far what touches reaches from the middle."""
+    robots = with_feet(geom)
+    [patch] = robots.patches([[True, False]])
+    margin = max(2.2 * 0.01, 0.045 * robots.radius)
+    assert np.allclose(patch.place, [0.18, 0.1, 0.35 + low[0]]) and patch.half[0] == pytest.approx(low[1] + margin)
+
+
+def test_a_foot_of_several_geoms_has_one_disc() -> None:
+    """Heel and toe of the example's biped: one disc below both, or below the one that is down."""
+    task = load_task(str(ROOT / "examples" / "toy_biped.py"))
+    task.set("env.num_envs", 1)
+    robots = PosedRobots(visual_spec(task.env_class(task.cfg, "cpu").robot))
+    both, toe = robots.patches([[True, True, False, True]])
+    sole = 0.62 - 2 * 0.28 - 0.03 - 0.015  # [m] the height of the trunk in its first pose, less its legs and a box
+    margin = 2.2 * 0.015
+    assert np.allclose(both.place, [(-0.07 + 0.12) / 2, 0.09, sole]) and np.allclose(both.half, [0.095 + margin, 0.05 + margin])
+    assert np.allclose(toe.place, [0.07, -0.09, sole]) and np.allclose(toe.half, 0.05 + margin)
+    assert robots.patches([[False] * 4]) == [] and robots.patches([[True] * 5]) == []  # more columns than sensors
+
+
+# ---- sizes
+
+
+def in_picture(camera: mujoco.MjvCamera, place: np.ndarray) -> np.ndarray:
+    """Where a point is: to the right and up, 1 at the upper edge of a picture with a height of 45 degrees."""
+    azimuth, elevation = np.deg2rad(camera.azimuth), np.deg2rad(camera.elevation)
+    ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+    right = np.array([np.sin(azimuth), -np.cos(azimuth), 0.0])
+    away = place - (camera.lookat - camera.distance * ahead)
+    return np.array([away @ right, away @ np.cross(right, ahead)]) / (away @ ahead) / np.tan(np.deg2rad(22.5))
+
+
+@pytest.mark.parametrize("mode", ["follow", "behind", "all"])
+@pytest.mark.parametrize("height", [0.3, 0.7, 1.3, 1.8])
+@pytest.mark.parametrize("wide", [False, True])
+def test_robots_of_every_height_are_in_the_picture_with_their_arrows(height: float, wide: bool, mode: str) -> None:
+    """A tall one and a long one, its base in the middle; at the fastest command, ahead and to the side."""
+    length = 1.2 * height if wide else 0.2 * height
+    text = f"""<mujoco><worldbody><body pos="0 0 {height / 2}"><freejoint/>
+    <geom type="box" size="{length / 2} {0.1 * height} {height / 2}"/></body></worldbody></mujoco>"""
+    robots = PosedRobots(mujoco.MjSpec.from_string(text))
+    camera = RobotCamera(mujoco.MjvCamera(), robots, by_hand=False).update(mode, 0)
+    scene = mujoco.MjvScene(robots.model, 100)
+    for velocity in ([2.0, 0.0, 1.0], [-2.0, 0.0, -1.0], [0.0, 2.0, 1.0]):
+        draw_velocities(scene, robots.placements[0], velocity, velocity, top_speed=2.0)
+    drawn = scene.geoms[: scene.ngeom]  # MuJoCo draws an arrow half as long as its size says
+    share = {mujoco.mjtGeom.mjGEOM_ARROW: 0.5, mujoco.mjtGeom.mjGEOM_CAPSULE: 1.0}
+    ends = [np.array(geom.pos) + np.array(geom.mat)[:, 2] * geom.size[2] * share[geom.type] for geom in drawn]
+    assert min(end[2] for end in ends) > height  # above its top
+    corners = [np.array([x, y, z]) for x in (-length / 2, length / 2) for y in (0.1 * height, -0.1 * height) for z in (0.0, height)]
+    for place in [*ends, *corners]:
+        right, up = in_picture(camera, place)
+        assert abs(up) < 1.0 and abs(right) < 16 / 9, (place, right, up)
+
+
+def test_the_camera_of_a_scene_is_as_far_as_its_robot_is_large() -> None:
+    """Go1's is where it always was; who gives a place gets that one."""
+    places = []
+    for name, camera in (("go1_flat", []), (str(ROOT / "examples" / "toy_biped.py"), []), ("go1_flat", [1.0, 2.0, 3.0])):
+        task = load_task(name)
+        task.update({"env": {"num_envs": 1}, "viewer": {"camera": camera}}, where="test")
+        env = task.env_class(task.cfg, "cpu")
+        places.append(list(visual_spec(env.robot, env.cfg.viewer.camera).camera("track").pos))
+    assert places == [[0.9, -1.1, 0.6], [1.2, -1.5, 0.8], [1.0, 2.0, 3.0]]
 
 
 def test_on_a_terrain_each_robot_stays_where_it_is() -> None:
@@ -512,7 +620,7 @@ def test_feet_are_found_among_other_contacts() -> None:
     robots = PosedRobots(spec, 1)
     assert len(robots.feet) > 4
     robots.pose(spec.compile().qpos0[None], 0)
-    assert robots.below_feet(np.array([[True, False, True, False]])).shape == (2, 3)
+    assert len(robots.patches(np.array([[True, False, True, False]]))) == 2
 
 
 def test_a_camera_that_draws_seldom_is_where_one_that_draws_always_is(model: mujoco.MjModel) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.sim.room import count_room
 from legged_mw.utils.task import LoadedTask
 
 
@@ -27,6 +28,15 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
         env.robot.joint_names, env.default_dof_pos.tolist(), env.robot.joint_range, env.robot.effort_range, strict=True
     ):
         lines.append(f"  {name:<20} {default:>7.3f}  [{low:.3f}, {high:.3f}]  {limit:g}")
+    lines.append(_room(env))
     lines.append(f"what the config changed in {task.cfg.asset.file}")
     lines += [f"  {line}" for line in env.robot.overrides]
     return "\n".join(lines)
+
+
+def _room(env: RobotTask) -> str:
+    """What mujoco-warp allocates a world, and where the numbers come from."""
+    room, sim = count_room(env.robot.physics, env.terrain is not None), env.cfg.sim
+    asked, counted = (sim.nconmax or room.contacts, sim.njmax or room.rows), (room.contacts, room.rows)
+    source = f"the model: {room.why}" if asked == counted else f"the config; the model makes {counted[0]} and {counted[1]}: {room.why}"
+    return f"room of a world on mujoco_warp: sim.nconmax {asked[0]}, sim.njmax {asked[1]}, from {source}"

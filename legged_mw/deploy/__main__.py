@@ -23,6 +23,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument("folder", metavar="DIR", help=f"an export: {made}")
     parser.add_argument("--eval", action="store_true", help=f"the walking exam; prints its table and writes DIR/{RESULT_FILE}")
     parser.add_argument("--out", metavar="FILE", help=f"where --eval writes (default: DIR/{RESULT_FILE})")
+    common = "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
+    parser.add_argument("--ranges", choices=("trained", "common"), help=common)
     parser.add_argument("--command", metavar="VALUES", help="fixed command: 0.5,0,0 in the contract's order, or base_height=0.3 by name")
     parser.add_argument("--num_envs", type=positive, default=1, metavar="N", help="robots side by side")
     parser.add_argument("--time", type=duration, metavar="T", help="how long (default: until closed; 10s of a recording)")
@@ -31,6 +33,8 @@ def parse() -> argparse.Namespace:
     args = parser.parse_args()
     if args.eval and (asked := [f"--{name}" for name in ("command", "terrain") if getattr(args, name)] + launch.asked(args)):
         parser.error(f"--eval brings its own commands, is on flat ground and shows nothing: leave {asked[0]} out")
+    if args.ranges and not args.eval:
+        parser.error("--ranges says what the exam asks: add --eval")
     if args.command is not None and args.commands:
         parser.error("--commands brings its own commands: leave --command out")
     launch.check_flags(args)
@@ -43,15 +47,17 @@ def main() -> None:
     folder = shipped if shipped.is_dir() and not Path(args.folder).exists() else Path(args.folder)
     contract, scene_file = read_contract(folder), TERRAIN_FILE if args.terrain else SCENE_FILE
     command = launch.check_drive(args, contract.commands, advice=f"the ranges are in {folder / CONTRACT_FILE}")
+    if contract.ends.not_covered:
+        print(f"not judged here: {', '.join(contract.ends.not_covered)}, which ended episodes in training")
     if args.eval:
-        examine(folder, Path(args.out) if args.out else folder / RESULT_FILE)
+        examine(folder, Path(args.out) if args.out else folder / RESULT_FILE, common=args.ranges == "common")
     else:
         launch.watch(DeployStage(folder, args.num_envs, command, scene_file=scene_file), args, folder, title=contract.task)
 
 
-def examine(folder: Path, path: Path) -> None:
+def examine(folder: Path, path: Path, common: bool = False) -> None:
     """The exam: its table, and a JSON file at ``path``."""
-    result = run_exam(folder)
+    result = run_exam(folder, common=common)
     print(rules.table(result))
     try:
         rules.save({"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)", **result}, path)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from legged_mw.utils.commands import Command
+from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import UserError, unknown
 
@@ -46,6 +46,7 @@ ROWS: dict[str, Quantity] = {
     "torques": Quantity("joint_torque", "N m", "joint"),
     "foot_contact": Quantity("foot_contact", "1", "foot; 1 where it touches the ground, else 0"),
     "last_actions": Quantity("last_action", "1", "joint; clipped, 0 before the first"),
+    "gait_clock": Quantity("gait_clock", "1", "sine of each foot's phase, then cosine of each; 0 while told to stand"),
     "commands": Quantity("command", "", "in the order of `commands`"),
     "height_scan": Quantity(
         "height_scan",
@@ -54,12 +55,13 @@ ROWS: dict[str, Quantity] = {
         "the robot stands on level ground, within 1 m; x by x from behind, in each from right to left",
     ),
 }
-COMPUTED = ("joint_offset", "last_action", "command")  # by the controller; a robot measures all others
+COMPUTED = ("joint_offset", "last_action", "command", "gait_clock")  # by the controller; a robot measures all others
 # What the sensors of a scene measure; "up" is the world's z axis in the IMU's frame, opposite to gravity.
 SENSED = ("lin_vel", "ang_vel", "up", "acceleration", "joint_pos", "joint_vel", "joint_torque")
 FALL = "fall_contact"  # contacts of `ends: falls_on` with the ground; only where there are such geoms
 SENSORS = "sensors"  # ContractRow.measured of a row that names sensors of the scene
 SCAN = "height_scan"  # ContractRow.measured of the height scan
+CLOCK = "gait_clock"  # ContractRow.measured of the gait clock
 OWN = (SENSORS, SCAN, "")  # rows that come whole, in Measurement.others, by their names
 ORIGINS = ("default", "joints", "targets")
 
@@ -93,6 +95,7 @@ class Ends(NamedTuple):
     max_tilt: float | None = None  # [deg] between the robot's z axis and the vertical
     min_base_height: float | None = None  # [m] of the root above the ground; a real robot cannot judge it, a simulated one does
     falls_on: tuple[str, ...] = ()  # geoms that must not touch the ground; judged in simulation, too
+    not_covered: tuple[str, ...] = ()  # methods of the task that ended its episodes, too; nobody judges those here
 
     def tilted(self, gravity: np.ndarray) -> np.ndarray:
         """Whether ``gravity`` (..., 3), its direction in the body frame, means a fall; NaN does."""
@@ -107,6 +110,14 @@ class HeightScan(NamedTuple):
     x: tuple[float, ...]
     y: tuple[float, ...]
     standing: float  # [m] of the root above level ground, where the scan is zero
+
+
+class Gait(NamedTuple):
+    """A clock that begins at 0 when the robot is told to move, and rests at 0 while it is told to stand."""
+
+    period: float  # [s]
+    offsets: tuple[float, ...]  # (F,) of each foot's phase, share of the period
+    min_command: float  # norm of (vx, vy, yaw rate) up to which a command means stand
 
 
 @dataclass(frozen=True)
@@ -133,6 +144,7 @@ class Contract:
     output: str  # (batch, D)
     digest: str  # SHA-256 of the network's file
     scan: HeightScan | None = None  # where a row asks for one
+    gait: Gait | None = None  # likewise
     exam: Mapping[str, Any] | None = None  # the task's section `exam`, if the walking exam grades it
 
     @property
@@ -146,7 +158,7 @@ class Contract:
 
     def to_dict(self) -> dict[str, Any]:
         """What policy.yaml holds."""
-        ends = {name: list(value) if name == "falls_on" else value for name, value in self.ends._asdict().items() if value}
+        ends = {name: list(value) if isinstance(value, tuple) else value for name, value in self.ends._asdict().items() if value}
         return {
             "format": FORMAT,
             "task": self.task,
@@ -164,6 +176,7 @@ class Contract:
             "physics": {"file": SCENE_FILE, "timestep": self.timestep, "decimation": self.decimation},
             "sensors": {name: list(names) for name, names in self.sensors.items()},
             **({SCAN: {"x": list(self.scan.x), "y": list(self.scan.y), "standing": self.scan.standing}} if self.scan else {}),
+            **({"gait": {**self.gait._asdict(), "offsets": list(self.gait.offsets)}} if self.gait else {}),
             **({"exam": dict(self.exam)} if self.exam is not None else {}),
         }
 
@@ -291,6 +304,7 @@ def _read(top: _Reader) -> Contract:
         output=network.text("output"),
         digest=network.text("sha256"),
         scan=_read_scan(top),
+        gait=_read_gait(top),
         exam=top.section("exam").values if "exam" in top.values else None,
     )
 
@@ -328,6 +342,7 @@ def _read_ends(ends: _Reader) -> Ends:
         max_tilt=ends.number("max_tilt", 0.0, 180.0) if "max_tilt" in ends.values else None,
         min_base_height=ends.number("min_base_height") if "min_base_height" in ends.values else None,
         falls_on=ends.texts("falls_on") if "falls_on" in ends.values else (),
+        not_covered=ends.texts("not_covered") if "not_covered" in ends.values else (),
     )
 
 
@@ -340,12 +355,24 @@ def _read_scan(top: _Reader) -> HeightScan | None:
     return HeightScan(x, y, scan.above_zero("standing"))
 
 
+def _read_gait(top: _Reader) -> Gait | None:
+    """The clock, if a row is one."""
+    if not any(row.values.get("measured") == CLOCK for row in top.sections("observation")):
+        return None
+    gait, names = top.section("gait"), [command.values.get("name") for command in top.sections("commands", empty=True)]
+    if missing := [name for name in VELOCITY if name not in names]:
+        raise ContractError(f"{top.where}: {CLOCK} rests by the commands {', '.join(VELOCITY)}; missing: {', '.join(missing)}")
+    feet = len(top.section("robot").section("feet").values)
+    return Gait(gait.above_zero("period"), tuple(gait.numbers("offsets", feet, "foot").tolist()), gait.number("min_command", 0.0))
+
+
 def quantity_size(contract: Contract, name: str) -> int:
     """Values of a measured or computed quantity."""
     per_joint = ("joint_pos", "joint_offset", "joint_vel", "joint_torque", "last_action")
     scan = len(contract.scan.x) * len(contract.scan.y) if contract.scan else 0
     counts = {**dict.fromkeys(per_joint, len(contract.joints)), "foot_contact": len(contract.feet), "command": len(contract.commands)}
-    return {**counts, FALL: len(contract.ends.falls_on), SCAN: scan}.get(name, 3)
+    clock = 2 * len(contract.gait.offsets) if contract.gait else 0
+    return {**counts, FALL: len(contract.ends.falls_on), SCAN: scan, CLOCK: clock}.get(name, 3)
 
 
 def _check_rows(contract: Contract) -> None:

@@ -14,14 +14,17 @@ import numpy as np
 from legged_mw.deploy.contract import CONTRACT_FILE, Contract, ContractError, Ends, read_contract
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rules
-from legged_mw.eval.rules import ExamRules
+from legged_mw.eval.rules import ExamRules, in_common
 from legged_mw.utils.commands import VELOCITY
 
 
-def run_exam(folder: Path, exam: ExamRules | None = None, threads: int = 0) -> dict[str, Any]:
-    """Grade the export in ``folder`` by the rules ``exam``, else by those of its contract. Raises ContractError, ConfigError."""
+def run_exam(folder: Path, exam: ExamRules | None = None, threads: int = 0, common: bool = False) -> dict[str, Any]:
+    """Grade the export in ``folder`` by the rules ``exam``, else by those of its contract. Raises ContractError, ConfigError.
+
+    ``common``: the contract's, but in the one range that all published policies of the robot were asked.
+    """
     contract = read_contract(folder)
-    exam, names = exam or contract_rules(contract), [command.name for command in contract.commands]
+    exam, names = exam or contract_rules(contract, common), [command.name for command in contract.commands]
     wanted = np.tile([command.default for command in contract.commands], (exam.worlds(), 1))
     pushed = [(exam.push_vx, 0.0, 0.0)] * (exam.worlds() - len(exam.held()))
     wanted[:, [names.index(name) for name in VELOCITY]] = [*exam.held(), *pushed]
@@ -41,13 +44,14 @@ def run_exam(folder: Path, exam: ExamRules | None = None, threads: int = 0) -> d
     return exam.grade(signals, last_position=stage.qpos()[:, :2], fell_at=fell_at, mass=stage.contract.mass, dt=stage.dt)
 
 
-def contract_rules(contract: Contract) -> ExamRules:
-    """The rules for an export: the section ``exam`` of its contract, if it has one, and the trained ranges."""
+def contract_rules(contract: Contract, common: bool = False) -> ExamRules:
+    """The rules for an export: the section ``exam`` of its contract, if it has one, the trained ranges, and how many feet it has."""
     trained = {command.name: (command.low, command.high) for command in contract.commands}
     if missing := [name for name in VELOCITY if name not in trained]:
         raise ContractError(f"{CONTRACT_FILE}: the walking exam needs the commands {', '.join(VELOCITY)}; missing: {', '.join(missing)}")
     try:
-        return ExamRules.from_mapping(contract.exam or {}, trained)
+        section = dict(contract.exam or {})
+        return ExamRules.from_mapping(section | (in_common(section.get("peer", "")) if common else {}), trained, len(contract.feet))
     except (AttributeError, TypeError, ValueError) as error:
         raise ContractError(f"{CONTRACT_FILE}: exam: {error}") from error
 

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.deploy.contract import CONTRACT_FILE, NETWORK_FILE, OWN, Contract, ContractError
+from legged_mw.deploy.contract import CLOCK, CONTRACT_FILE, NETWORK_FILE, OWN, Contract, ContractError
+from legged_mw.deploy.gait import GaitClock
 from legged_mw.deploy.robot import Measurement
 from legged_mw.utils.errors import UserError
 
@@ -66,6 +67,7 @@ class Controller:
         self.last_targets = np.tile(contract.default_pose, (count, 1))  # (N, D) [rad]
         self._frames = [np.zeros((count, row.history, row.size), dtype=np.float32) for row in contract.rows]  # as last observed
         self._fresh = np.ones(count, dtype=bool)  # robots that have observed nothing since their reset
+        self.clock = GaitClock(contract, count) if contract.gait else None
 
     def observe(self, measurement: Measurement, commands: Floats) -> NDArray[np.float32]:
         """The network's input (N, size) from a measurement of N robots (or of one, without the leading axis)."""
@@ -74,14 +76,17 @@ class Controller:
     def act(self, measurement: Measurement, commands: Floats) -> NDArray[np.float64]:
         """Joint targets (N, D) [rad] for the next period; ``commands`` (N, C) in the contract's order."""
         action = self.contract.action
-        self._frames, self._fresh[:] = self._look(measurement, commands), False
+        self._frames = self._look(measurement, commands)
+        if self.clock:
+            self.clock.keep(commands, self._fresh)
+        self._fresh[:] = False
         self.last_actions = np.clip(self._network(_side_by_side(self._frames)), -action.clip, action.clip)
         origins = {"default": self.contract.default_pose, "joints": np.atleast_2d(measurement.joint_pos), "targets": self.last_targets}
         self.last_targets = origins[action.origin] + action.scale * self.last_actions.astype(np.float64)
         return self.last_targets.copy()
 
     def reset(self, which: Any = slice(None)) -> None:
-        """The robots ``which`` (indices or a mask) begin again: no actions, targets or frames of theirs are remembered."""
+        """The robots ``which`` (indices or a mask) begin again: no actions, targets, frames or clocks of theirs are remembered."""
         self.last_actions[which], self.last_targets[which], self._fresh[which] = 0.0, self.contract.default_pose, True
 
     def _look(self, measurement: Measurement, commands: Floats) -> list[NDArray[np.float32]]:
@@ -91,6 +96,8 @@ class Controller:
             "last_action": self.last_actions,
             "joint_offset": measurement.joint_pos - self.contract.default_pose,
         }
+        if self.clock:
+            computed[CLOCK] = self.clock.row(commands, self._fresh)
         frames = []
         for row, before in zip(self.contract.rows, self._frames, strict=True):
             if row.measured in OWN and row.name not in measurement.others:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from legged_mw.envs.domain_rand import DomainRand
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.sim.model import per_joint
+from legged_mw.sim.model import RobotModel, per_joint
 from legged_mw.sim.simulation import Simulation
 from legged_mw.utils.math import assign
 
@@ -21,16 +21,16 @@ class Actuators:
     """
 
     def __init__(
-        self, cfg: type[RobotTaskCfg.control], names: tuple[str, ...], default: Tensor, dof_pos: Tensor, sim: Simulation, rand: DomainRand
+        self, cfg: type[RobotTaskCfg.control], robot: RobotModel, default: Tensor, dof_pos: Tensor, sim: Simulation, rand: DomainRand
     ) -> None:
-        """``default`` (D,) and ``dof_pos`` (N, D) [rad]; ``names`` (D) of the joints."""
+        """``default`` (D,) and ``dof_pos`` (N, D) [rad]."""
         self._origin, self._default, self._dof_pos, self._sim = cfg.action_origin, default, dof_pos, sim
         table = cfg.action_scale if isinstance(cfg.action_scale, Mapping) else {"": cfg.action_scale}
-        scale = per_joint(table, names, "control.action_scale")
+        scale = per_joint(table, robot.joint_names, "control.action_scale", robot.held)
         self.scale = torch.tensor(scale, device=sim.device)  # (D,) [rad]
         self._same_scale = scale[0] if len(set(scale)) == 1 else None  # one number takes one operation less
         self.encoder_offset = rand.values.get("encoder_offset")  # (N, D) [rad], measured minus true angle
-        self._delay = rand.delay("action_delay", len(names), start=0.0)
+        self._delay = rand.delay("action_delay", len(robot.joint_names), start=0.0)
         # (N, D) [rad] as the policy means them; what a servo gets is off by as much as its encoder is
         self.targets = sim.ctrl if self.encoder_offset is None else torch.zeros_like(sim.ctrl)
 

@@ -21,6 +21,7 @@ SPAN: Rule = ("two numbers above zero, the lower first", lambda v: len(v) == 2 a
 STEPS: Rule = ("two whole numbers from zero, the lower first", lambda v: len(v) == 2 and 0 <= v[0] <= v[1])
 NAMES: Rule = ("a list with at least one name", lambda v: len(v) > 0)
 POINTS: Rule = ("at least one number, all finite", lambda v: len(v) > 0 and all(map(math.isfinite, v)))
+NUMBERS: Rule = ("a table of numbers from 0", lambda v: all(0 <= number < math.inf for number in v.values()))
 PROBABILITIES: Rule = (
     "three numbers from 0 to 1, and more for further commands",
     lambda v: len(v) >= 3 and all(0 <= p <= 1 for p in v),
@@ -34,20 +35,23 @@ def or_empty(rule: Rule) -> Rule:
 
 ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys(("env.num_envs", "env.episode_length_s", "control.decimation", "normalization.clip_actions"), POSITIVE),
-    **dict.fromkeys(("sim.dt", "sim.iterations", "sim.ls_iterations", "sim.nconmax", "sim.njmax"), POSITIVE),
+    **dict.fromkeys(("sim.dt", "sim.iterations", "sim.ls_iterations"), POSITIVE),
     **dict.fromkeys(("rewards.max_reward", "termination.max_speed"), POSITIVE),
     **dict.fromkeys(("viewer.width", "viewer.height", "viewer.fps"), POSITIVE),
-    **dict.fromkeys(("terrain.friction", "noise.level", "sim.threads", "termination.min_base_height"), NOT_NEGATIVE),
+    **dict.fromkeys(("terrain.friction", "noise.level", "termination.min_base_height"), NOT_NEGATIVE),
+    **dict.fromkeys(("sim.threads", "sim.nconmax", "sim.njmax"), NOT_NEGATIVE),
     **dict.fromkeys(("perturbation.interval", "perturbation.duration"), SPAN),
     "perturbation.velocity": RANGE,
-    "init_state.dof_pos_range": RANGE,
+    **dict.fromkeys(("init_state.dof_pos_range", "init_state.dof_pos_offset"), RANGE),
+    **dict.fromkeys(("init_state.dof_vel_range", "rewards.base_height_target"), NOT_NEGATIVE),
     "perturbation.push_interval_s": POSITIVE,
     "perturbation.max_push_vel_xy": NOT_NEGATIVE,
     **{f"domain_rand.{name}": or_empty(STEPS if kind.whole else RANGE if kind.neutral == 0.0 else SPAN) for name, kind in KINDS.items()},
     "domain_rand.redraw_iterations": NOT_NEGATIVE,
     "asset.colliders": NAMES,
-    "init_state.pos": ("three numbers, x, y, z", lambda v: len(v) == 3),
-    "viewer.camera": ("three numbers, not straight above or below", lambda v: len(v) == 3 and (v[0] != 0 or v[1] != 0)),
+    "init_state.pos": or_empty(("three numbers, x, y, z", lambda v: len(v) == 3)),
+    **dict.fromkeys((f"asset.{name}" for name in ("effort", "armature", "frictionloss", "joint_speed_limits")), NUMBERS),
+    "viewer.camera": or_empty(("three numbers, not straight above or below", lambda v: len(v) == 3 and (v[0] != 0 or v[1] != 0))),
     "termination.max_tilt": ("above 0 and at most 180 degrees", lambda v: 0 < v <= 180),
     "terrain.condim": ("1, 3, 4 or 6", lambda v: v in (1, 3, 4, 6)),
 }
@@ -57,6 +61,10 @@ WALKING: dict[str, Rule] = {
     "commands.keep_probability": PROBABILITIES,
     "commands.mirror": ("1 or -1 for each command", lambda v: all(sign in (1, -1) for sign in v.values())),
     **dict.fromkeys(("rewards.tracking_sigma", "rewards.swing_height", "commands.heading_gain"), POSITIVE),
+    **dict.fromkeys(("gait.period", "rewards.min_feet_distance"), NOT_NEGATIVE),
+    "rewards.max_single_stance": POSITIVE,
+    "gait.stance": ("above 0 and below 1", lambda v: 0 < v < 1),
+    "gait.offsets": ("shares of the period, from 0 to 1", lambda v: all(0 <= share <= 1 for share in v)),
     **dict.fromkeys(("terrain.num_rows", "terrain.num_cols", "terrain.tile_size"), POSITIVE),
     **dict.fromkeys(("terrain.max_init_terrain_level", "terrain.seed"), NOT_NEGATIVE),
     "terrain.horizontal_scale": ("above 0 and at most 0.25 m, or a cell would be wider than a step of stairs", lambda v: 0 < v <= 0.25),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from fnmatch import fnmatchcase
-
 import torch
 from torch import Tensor
 
@@ -34,9 +32,8 @@ class GroundContacts:
         self.terminating = torch.tensor(fall, dtype=torch.long, device=count.device)  # columns of geoms whose contact is a fall
 
     def _columns(self, patterns: list[str], field: str) -> list[int]:
-        geoms, model = self._robot.contact_geoms, self._robot.physics
-        hits = [i for i, name in enumerate(geoms) if any(fnmatchcase(name, pattern) for pattern in patterns)]
-        for name in (geoms[i] for i in hits):
+        meant, model = self._robot.names.find(patterns, f"asset.{field}"), self._robot.physics
+        for name in meant:
             if not model.geom_conaffinity[self._robot.id("geom", name)]:
                 raise ConfigError(f"asset.{field}: '{name}' never touches the ground; add it to asset.colliders: {self._asset.colliders}")
-        return hits
+        return [i for i, name in enumerate(self._robot.contact_geoms) if name in meant]

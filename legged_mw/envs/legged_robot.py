@@ -1,7 +1,7 @@
 """A legged robot that walks by command: commands, feet, ground and their curricula, read top to bottom.
 
 What every task shares - acting, sensing of base and joints, resets, the reward machinery - is in ``robot_task``, and its
-rules hold here too. Shapes: N environments, C commands, F feet.
+rules hold here too. The reward terms are in ``legged_rewards``. Shapes: N environments, C commands, F feet.
 """
 
 from __future__ import annotations
@@ -9,6 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from legged_mw.envs.gait import GaitClock
+from legged_mw.envs.legged_rewards import LeggedRewards
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.mirror import Block, command_block, foot_blocks, scan_block
 from legged_mw.envs.observations import Row
@@ -22,7 +24,7 @@ from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign, maybe_any, wrap_to_pi, yaw_of
 
 
-class LeggedRobot(RobotTask):
+class LeggedRobot(LeggedRewards, RobotTask):
     """N legged robots that follow commands (N, C): vx, vy, yaw rate, and what a task adds to ``commands.ranges``."""
 
     cfg: LeggedRobotCfg
@@ -37,16 +39,24 @@ class LeggedRobot(RobotTask):
         torch.gt(self.foot_contact_count, 0.0, out=self.foot_contact)
         torch.logical_and(self.foot_contact, self.feet_air_time > 0.0, out=self.first_contact)
         self.feet_air_time.add_(self.dt)
+        if self._times_contacts:
+            self.feet_contact_time.add_(self.dt).masked_fill_(~self.foot_contact, 0.0)
         self._measure_ground()
         torch.maximum(self.swing_peak, self.foot_height, out=self.swing_peak)
         torch.hypot(self.foot_vel[..., 0], self.foot_vel[..., 1], out=self.foot_speed)
-        torch.gt(self.velocity_command.square().sum(dim=1), self.cfg.rewards.min_command**2, out=self.moving)
+        self.moving.copy_(self._told_to_move())
+
+    def _told_to_move(self) -> Tensor:
+        """(N,) The velocity command is more than to stand."""
+        return self.velocity_command.square().sum(dim=1) > self.cfg.rewards.min_command**2
 
     def _end_step(self) -> None:
         """What the next step remembers; the reward has seen this step's values."""
         super()._end_step()
         self.feet_air_time.masked_fill_(self.foot_contact, 0.0)
         self.swing_peak.masked_fill_(self.foot_contact, 0.0)
+        if self.gait:
+            self.gait.tick()
         if self.cfg.commands.resampling_time > 0:
             self.command_timer.sub_(1.0)
             over = self.command_timer[:, 0] <= 0.0
@@ -67,6 +77,8 @@ class LeggedRobot(RobotTask):
         """New commands, feet in the air."""
         self._reset_commands(mask)
         self.foot_contact.masked_fill_(mask[:, None], False)
+        if self.gait:
+            self.gait.restart(mask)
 
     # ---- ground -------------------------------------------------------------------------------------------------------
 
@@ -199,6 +211,7 @@ class LeggedRobot(RobotTask):
         return {
             "state": [
                 *self._measured_rows(),
+                *self._gait_rows(),
                 Row("commands", self.commands, mirror="command"),  # vx, vy [m/s], yaw rate [rad/s], body frame; further ones
                 *self._height_rows("state", self.cfg.noise.scales.height_scan),
             ],
@@ -213,12 +226,18 @@ class LeggedRobot(RobotTask):
             ],
         }
 
+    def _gait_rows(self) -> list[Row]:
+        """The gait clock, where there is one: sine of each foot's phase, then cosine; zeros while told to stand."""
+        return [Row("gait_clock", self.gait.row, mirror="foot")] if self.gait else []
+
     def _height_rows(self, group: str, noise: float = 0.0) -> list[Row]:
         """The height scan [m], x by x from behind, in each from right to left; where ``terrain.height_scan`` names the group."""
         row = Row("height_scan", self.height_scan, noise, mirror="height_scan", measured=group == "state")
         return [row] if group in self.cfg.terrain.height_scan else []
 
     def compute_observations(self) -> None:
+        if self.gait:
+            self.gait.observe(self._told_to_move())
         if self.cfg.terrain.height_scan:
             self._scan_heights()
         super().compute_observations()
@@ -240,40 +259,6 @@ class LeggedRobot(RobotTask):
 
     def _partners(self) -> Partners:
         return find_partners(self.robot, self.foot_names)
-
-    # ---- reward -------------------------------------------------------------------------------------------------------
-
-    def _reward_tracking_lin_vel(self) -> Tensor:
-        """Velocity in the plane at the IMU, body frame, as commanded. [L]"""
-        error = (self.commands[:, :2] - self.base_lin_vel[:, :2]).square().sum(dim=1)
-        return torch.exp(error / -self.cfg.rewards.tracking_sigma)
-
-    def _reward_tracking_ang_vel(self) -> Tensor:
-        """Yaw rate as commanded. [L]"""
-        error = (self.commands[:, 2] - self.base_ang_vel[:, 2]).square()
-        return torch.exp(error / -self.cfg.rewards.tracking_sigma)
-
-    def _reward_stand_still(self) -> Tensor:
-        """Joints away from the default pose while the command is to stand. [L]"""
-        return self.dof_offset.abs().sum(dim=1).masked_fill_(self.moving, 0.0)
-
-    def _reward_feet_clearance(self) -> Tensor:
-        """Feet that move fast away from the swing height. [P]"""
-        return ((self.foot_height - self.cfg.rewards.swing_height).abs() * self.foot_speed.sqrt()).sum(dim=1)
-
-    def _reward_feet_height(self) -> Tensor:
-        """At touch-down, how far the swing's peak was from the swing height, as a share of it. [P]"""
-        error = (self.swing_peak / self.cfg.rewards.swing_height - 1.0).square()
-        return (error * (self.first_contact & self.moving[:, None])).sum(dim=1)
-
-    def _reward_feet_slip(self) -> Tensor:
-        """Squared horizontal speed of feet in contact, while moving. [P]"""
-        return (self.foot_speed.square() * (self.foot_contact & self.moving[:, None])).sum(dim=1)
-
-    def _reward_feet_air_time(self) -> Tensor:
-        """At touch-down, how much longer than the minimum the foot was in the air [s], while moving. [L, P]"""
-        excess = self.feet_air_time - self.cfg.rewards.min_air_time
-        return (excess * (self.first_contact & self.moving[:, None])).sum(dim=1)
 
     # ---- statistics, checkpoint -----------------------------------------------------------------------------------------
 
@@ -347,6 +332,9 @@ class LeggedRobot(RobotTask):
         self._init_terrain()
         self.walked_off, self.moving = (self._zeros(dtype=torch.bool) for _ in range(2))
         self._init_commands()
+        clock, names = self.cfg.gait, self.foot_names
+        self.gait = GaitClock(clock, names, self.num_envs, self.dt, self.device) if clock.period > 0.0 else None
+        self._init_foot_rewards()
 
     def _init_foot_contacts(self) -> None:
         """Contacts of each foot with the ground (N, F): a column of the sensors, or of feet with several geoms their sum."""
@@ -360,7 +348,7 @@ class LeggedRobot(RobotTask):
     def _episode_columns(self) -> dict[str, int]:
         feet = len(self.foot_names)
         ground = {"progress": 1, "asked": 1, "asked_speed": 1, "farthest": 1} if self.terrain else {}
-        return {**super()._episode_columns(), "feet_air_time": feet, "swing_peak": feet, **ground}
+        return {**super()._episode_columns(), "feet_air_time": feet, "swing_peak": feet, **self._foot_reward_columns(), **ground}
 
     def _init_terrain(self) -> None:
         """Tiles and heights, where there is terrain, and the height scan's points (P,) each [m]."""

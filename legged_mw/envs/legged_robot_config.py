@@ -40,11 +40,21 @@ class LeggedRobotCfg(RobotTaskCfg):
             ang_vel_yaw: list[float] = [-1.2, 1.2]  # [rad/s] [P]
             heading: list[float] = [-3.14, 3.14]  # [rad], world; not seen by the policy, only for heading_command [L]
 
+    class gait:
+        """A clock (legged_mw/envs/gait.py): where each foot is in its step, for the policy and the terms feet_phase, contact_phase."""
+
+        period: float = 0.0  # of a step of both legs [s]; 0: no clock [unitree_rl_gym: 0.8]
+        offsets: list[float] = []  # where each foot is when the clock is at 0, share of the period; empty: of two feet [0.0, 0.5]
+        stance: float = 0.55  # share of the period that a foot stands, from its phase 0 [unitree_rl_gym]
+        random_start: bool = True  # episodes begin anywhere in the period, so that each leg learns to lead; False: at 0, as deploy does
+
     class rewards(RobotTaskCfg.rewards):
         tracking_sigma: float = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
         swing_height: float = 0.1  # wanted height of a swinging foot [m] [P]
         min_air_time: float = 0.1  # a step that lasts less is penalised [s] [P]
         min_command: float = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]
+        min_feet_distance: float = 0.2  # sideways between left and right feet, of `feet_distance` [m] [P: T1, G1]
+        max_single_stance: float = 0.4  # on one foot, from where `single_stance` grows no more [s] [Isaac Lab: G1]
 
         class scales(RobotTaskCfg.rewards.scales):
             """Reward terms by name: each number switches on the method _reward_<name>, 0 switches it off. All [P]."""
@@ -94,13 +104,14 @@ class LeggedRobotCfg(RobotTaskCfg):
         """The walking exam of --eval and of training (docs/grading.md); all [ours]."""
 
         ranges: dict[str, list[float]] = {}  # lowest and highest lin_vel_x, lin_vel_y, ang_vel_yaw asked; not named: commands.ranges
-        push_speeds: list[float] = [0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0]  # jumps of the base's velocity [m/s]; for a biped up to 3
+        push_speeds: list[float] = []  # jumps of the base's velocity [m/s]; empty: 0.5, 1, 1.5, 2, 3, and 4, 5, 6 if not on two feet
         push_vx: float = 0.0  # vx of a robot that is pushed [m/s]; 0: half of the highest
         transport_vx: float = 0.0  # vx of the cost of transport [m/s]; 0: half of the highest
-        marks: list[float] = []  # walks: mean error of vx, vy [m/s], yaw rate [rad/s]; empty: 0.06 of the highest, 0.06, 0.1 of the highest
-        marks_of: Literal["error", "offset"] = "error"  # offset: of the mean velocity, for a biped, which sways
-        push_mark: float = 2.0  # walks: all pushes of this speed are survived [m/s]; for a biped 1
-        peer: str = ""  # a policy of legged_mw/eval/peers.py that stands beside this one; empty: none
+        marks: list[float] = []  # walks: of vx, vy [m/s], yaw rate [rad/s]; empty: errors 0.06 of the highest, 0.06, 0.1 of the highest
+        # and offsets 0.06, 0.06, 0.12
+        marks_of: Literal["", "error", "offset"] = ""  # offset: of the mean velocity; empty: that on two feet, which sway, else error
+        push_mark: float = 0.0  # walks: all pushes of this speed are survived [m/s]; 0: 1 on two feet, else 2
+        peer: str = ""  # the robot (go1, go2, g1) whose published policies of legged_mw/eval/peers.py stand beside; empty: none
 
 
 class LeggedRobotCfgPPO(RobotTaskCfgPPO):

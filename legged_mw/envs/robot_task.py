@@ -2,7 +2,7 @@
 
 Everything under ``_step`` is recorded as one CUDA graph: fixed buffers, masks instead of index lists, no question to
 the host. Shapes: N environments, D joints, K reward terms. A reward is a method ``_reward_<name>``, switched on
-by a number of that name in ``cfg.rewards.scales``; it returns (N,) and only reads.
+by a number of that name in ``cfg.rewards.scales``; it returns (N,) and only reads. The terms are in ``robot_rewards``.
 
 Freshness: ``qpos`` and ``qvel`` and all that is computed from them are current. What comes from sensors (contacts,
 places and velocities of sites, accelerometer, joint torque) is one simulation step old and zero in a world just reset.
@@ -12,28 +12,28 @@ from __future__ import annotations
 
 import math
 from functools import cached_property
-from pathlib import Path
 
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_mw import ROOT
 from legged_mw.envs.actuators import Actuators
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.contacts import GroundContacts
+from legged_mw.envs.divergence import Divergence
 from legged_mw.envs.domain_rand import DomainRand, world_fields
+from legged_mw.envs.loading import load_robot, soft_limits, start_place
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
 from legged_mw.envs.observations import Observations, Row
 from legged_mw.envs.perturbation import Perturbation
+from legged_mw.envs.robot_rewards import RobotRewards
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import Statistics
 from legged_mw.envs.wording import in_config_words
 from legged_mw.sim.engines import make_simulation, pick_engine
-from legged_mw.sim.errors import ModelError
 from legged_mw.sim.mirror import Partners, find_partners
-from legged_mw.sim.model import Ground, RobotModel, Solver, build_model, per_joint
+from legged_mw.sim.model import RobotModel, per_joint
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
@@ -41,7 +41,7 @@ from legged_mw.utils.errors import unknown
 from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse
 
 
-class RobotTask(BaseTask):
+class RobotTask(RobotRewards, BaseTask):
     """N robots in N worlds of their own, as one vectorized environment. A task is a subclass with its rewards and its rows."""
 
     cfg: RobotTaskCfg
@@ -119,17 +119,14 @@ class RobotTask(BaseTask):
     def _end_step(self) -> None:
         """What the next step remembers; the reward has seen this step's values."""
         self.last_actions.copy_(self.actions)
+        self._remember_for_rewards()
 
     # ---- termination ----------------------------------------------------------------------------------------------
 
     def check_termination(self) -> None:
         """Ends episodes: fallen, out of time, or broken (a state or an action that is not finite)."""
-        speed = self.sim.qvel.abs().amax(dim=1)
-        position = self.sim.qpos.abs().amax(dim=1)
-        action = self.actions.abs().amax(dim=1)  # a servo swallows NaN, the reward does not
-        finite = (speed <= self.cfg.termination.max_speed) & (position < math.inf) & (action < math.inf)  # NaN compares false
-        torch.logical_not(finite, out=self.broken)
-        torch.logical_and(self._fallen(), finite, out=self.fell)
+        self.divergence.find(self.broken)
+        torch.logical_and(self._fallen(), ~self.broken, out=self.fell)
         ended = torch.logical_or(self.fell, self.broken)
         torch.logical_and(self._timed_out(), ~ended, out=self.time_out_buf)
         torch.logical_or(ended, self.time_out_buf, out=self.reset_buf)
@@ -191,13 +188,23 @@ class RobotTask(BaseTask):
         half = 0.5 * draw[:, 2:3]
         zero = torch.zeros_like(half)
         pose = [self._start_places(draw[:, :2]), torch.cos(half), zero, zero, torch.sin(half)]
-        joints, (low, high) = self.default_dof_pos.expand(n, -1), self.cfg.init_state.dof_pos_range
-        if (low, high) != (1.0, 1.0):
-            joints = joints * torch.empty_like(self.dof_offset).uniform_(low, high)
-        assign(self.sim.qpos, mask, torch.cat([*pose, joints], dim=1))
+        assign(self.sim.qpos, mask, torch.cat([*pose, self._start_angles()], dim=1))
         assign(self.sim.qvel[:, :6], mask, draw[:, 3:])  # the joints' velocity is zero from the reset
+        if speed := self.cfg.init_state.dof_vel_range:
+            assign(self.dof_vel, mask, torch.empty_like(self.dof_offset).uniform_(-speed, speed))
+        self._forget_for_rewards(mask)
         self.actuators.reset(mask)
         self.observations.restart(mask)
+
+    def _start_angles(self) -> Tensor:
+        """Joint angles of a new episode (N, D) [rad]: the default pose, or drawn around it and within the joints' ranges."""
+        joints, init = self.default_dof_pos.expand(self.num_envs, -1), self.cfg.init_state
+        if init.dof_pos_range != [1.0, 1.0]:
+            joints = joints * torch.empty_like(self.dof_offset).uniform_(*init.dof_pos_range)
+        if init.dof_pos_offset != [0.0, 0.0]:
+            joints = joints + torch.empty_like(self.dof_offset).uniform_(*init.dof_pos_offset)
+            joints = joints.clamp(self.joint_lower, self.joint_upper)
+        return joints
 
     def _start_places(self, offset: Tensor) -> Tensor:
         """Where an episode begins, (N, 3) [m, world], ``offset`` (N, 2) [m] away from the middle."""
@@ -310,9 +317,6 @@ class RobotTask(BaseTask):
         self.episode_return.add_(total[:, None])
         self.episode_steps.add_(1.0)
 
-    def _active_scales(self) -> dict[str, float]:
-        return {name: float(scale) for name, scale in self.cfg.to_dict()["rewards"]["scales"].items() if scale}
-
     def _prepare_reward_function(self) -> None:
         """Match scales to methods by name; every term is tried once, so that a mistake shows before training."""
         scales = self._active_scales()
@@ -333,46 +337,6 @@ class RobotTask(BaseTask):
         means = [*(f"rew_{name}" for name in self.reward_names), "reward", "episode_length"]
         self.statistics = Statistics(means, ["episodes", "fell", "broken"], self.device)
 
-    def _reward_lin_vel_z(self) -> Tensor:
-        """Square of the vertical velocity at the IMU, world frame (gravity points down, hence the same square). [P]"""
-        return (self.base_lin_vel * self.projected_gravity).sum(dim=1).square()
-
-    def _reward_ang_vel_xy(self) -> Tensor:
-        """Roll and pitch rates, world frame. [P]"""
-        return self.base_ang_vel_world[:, :2].square().sum(dim=1)
-
-    def _reward_orientation(self) -> Tensor:
-        """Tilt: gravity's share in the body's plane, equal to the xy share of the body's z axis in the world. [L, P]"""
-        return self.projected_gravity[:, :2].square().sum(dim=1)
-
-    def _reward_dof_pos_limits(self) -> Tensor:
-        """What joints exceed the soft limits by [rad]. [L]"""
-        return (self.dof_pos - self.dof_pos.clamp(self.soft_lower, self.soft_upper)).abs().sum(dim=1)
-
-    def _reward_pose(self) -> Tensor:
-        """Staying near the default pose, each joint with its weight. [P]"""
-        return torch.exp(-(self.dof_offset.square() * self.pose_weights).sum(dim=1))
-
-    def _reward_termination(self) -> Tensor:
-        """A fall. [L, P]"""
-        return self.fell.float()
-
-    def _reward_torques(self) -> Tensor:
-        """2-norm plus 1-norm of the joint torques [N m]. [P]"""
-        return self.torques.square().sum(dim=1).sqrt() + self.torques.abs().sum(dim=1)
-
-    def _reward_action_rate(self) -> Tensor:
-        """Change of the clipped action. [L]"""
-        return (self.actions - self.last_actions).square().sum(dim=1)
-
-    def _reward_energy(self) -> Tensor:
-        """Sum of |joint velocity * torque| [W]. [P]"""
-        return (self.dof_vel * self.torques).abs().sum(dim=1)
-
-    def _reward_collision(self) -> Tensor:
-        """How many bodies touch the ground that should not: ``asset.penalize_contacts_on``. [L]"""
-        return ((self.contact_count @ self.contacts.penalized) > 0.0).sum(dim=1).float()
-
     # ---- statistics: summed on the device, read once an iteration ------------------------------------------------------------
 
     def _sum_statistics(self) -> None:
@@ -382,7 +346,7 @@ class RobotTask(BaseTask):
 
     def _live_statistics(self) -> dict[str, Tensor]:
         """Values as they stand: () a sum, or (2,) a sum and what to divide it by, so that ranks can add theirs."""
-        return {"overflowed": self.sim.overflowed_worlds()}  # worlds, so far
+        return {"overflowed": self.sim.overflowed_worlds(), **self.divergence.statistics()}  # worlds, so far
 
     def take_statistics(self) -> Tensor:
         """Sums since the last call and values as they stand (S,), on the device."""
@@ -425,24 +389,7 @@ class RobotTask(BaseTask):
         return None
 
     def _load_robot(self, engine: str) -> RobotModel:
-        cfg = self.cfg
-        if not cfg.asset.file:
-            raise ConfigError("asset.file is empty; name the robot's MJCF, e.g. 'resources/robots/go1/go1.xml'")
-        sites = self._sensed_sites()
-        return build_model(
-            ROOT / Path(cfg.asset.file).expanduser(),  # an absolute path stays itself
-            solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations),
-            ground=Ground(cfg.terrain.friction, cfg.terrain.condim, self.terrain, boxes=engine == "mujoco"),
-            stiffness=cfg.control.stiffness,
-            damping=cfg.control.damping,
-            colliders=cfg.asset.colliders,
-            self_collisions=cfg.asset.self_collisions,
-            contact_geoms=self._sensed_geoms(),
-            velocity_sites=list(sites),
-            accelerometer_site=cfg.asset.imu_site,
-            sites=sites,
-            pose=cfg.init_state.default_joint_angles,
-        )
+        return load_robot(self.cfg, engine, self.terrain, self._sensed_geoms(), self._sensed_sites())
 
     def _sensed_geoms(self) -> list[str]:
         """Geoms whose contacts with the ground are counted: names or patterns."""
@@ -463,19 +410,23 @@ class RobotTask(BaseTask):
         self.base_lin_vel, self.projected_gravity, self.base_ang_vel_world = (self._zeros(3) for _ in range(3))
         self.dof_offset = self._zeros(self.num_actions)  # joint position minus default [rad]
         names = self.robot.joint_names
-        self.actuators = Actuators(self.cfg.control, names, self.default_dof_pos, self.dof_pos, sim, self.domain_rand)
+        self.actuators = Actuators(self.cfg.control, self.robot, self.default_dof_pos, self.dof_pos, sim, self.domain_rand)
         exact = self.actuators.encoder_offset is None
         self.joint_reading = self.dof_offset if exact else self._zeros(self.num_actions)  # the same, as measured
         self.base_height = self.root_pos[:, 2]  # of the root above the ground under it [m]
         self.fell, self.broken = self._zeros(dtype=torch.bool), self._zeros(dtype=torch.bool)
+        self.divergence = Divergence(sim, self.actions, names, self.cfg.termination.max_speed)
         self._episode, views = columns(n, device, **self._episode_columns())  # one matrix, so that a reset clears it in one go
         for name, view in views.items():
             setattr(self, name, view)
         self.gravity_dir = torch.tensor([0.0, 0.0, -1.0], device=device).expand(n, 3)
-        self.total_mass = float(self.robot.physics.body_subtreemass[0])  # [kg]
-        self._init_imu()
+        model = self.robot.physics
+        self.total_mass = float(model.body_subtreemass[0])  # [kg]
+        self.root_body = self.robot.id("body", self.robot.root)
+        self.imu_pos = self._tensor(model.site_pos[self.robot.id("site", self.robot.imu)]).expand(n, 3)  # body frame [m]
         needed = bool(self._active_scales().get("collision"))
         self.contacts = GroundContacts(self.robot, self.cfg.asset, self.contact_count, needed)
+        self._init_robot_rewards()
 
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
         return torch.zeros(self.num_envs, *shape, dtype=dtype, device=self.device)
@@ -484,23 +435,15 @@ class RobotTask(BaseTask):
         """What an episode remembers, as name -> width: attributes (N, width) that a reset clears."""
         return {"last_actions": self.num_actions, "episode_sums": len(self._active_scales()), "episode_return": 1, "episode_steps": 1}
 
-    def _init_imu(self) -> None:
-        robot, model = self.robot, self.robot.physics
-        imu = robot.id("site", self.cfg.asset.imu_site)
-        self.root_body = robot.id("body", robot.root)
-        if model.site_bodyid[imu] != self.root_body or abs(model.site_quat[imu][0]) < 1.0 - 1e-9:
-            raise ModelError(f"asset.imu_site '{self.cfg.asset.imu_site}' must be on the root body '{robot.root}' and aligned with it")
-        self.imu_pos = self._tensor(model.site_pos[imu]).expand(self.num_envs, 3)  # body frame [m]
-
     def _init_ranges(self) -> None:
         """Config numbers as tensors: joints' tables and ranges of a reset."""
         cfg, names, init = self.cfg, self.robot.joint_names, self.cfg.init_state
-        self.default_dof_pos = self._tensor(per_joint(init.default_joint_angles, names, "init_state.default_joint_angles"))
-        self.pose_weights = self._tensor(per_joint(cfg.rewards.pose_weights, names, "rewards.pose_weights"))
-        low, high = self._tensor(self.robot.joint_range).unbind(dim=1)
-        middle, half = (low + high) / 2, (high - low) / 2 * cfg.rewards.soft_dof_pos_limit
-        self.soft_lower, self.soft_upper = middle - half, middle + half
-        self.init_pos = self._tensor(init.pos)
+        self.default_dof_pos = self._tensor(self.robot.pose)
+        self.pose_weights = self._tensor(per_joint(cfg.rewards.pose_weights, names, "rewards.pose_weights", self.robot.held))
+        self.joint_lower, self.joint_upper = self._tensor(self.robot.joint_range).unbind(dim=1)
+        self.soft_lower, self.soft_upper = soft_limits(self.robot, cfg.rewards.soft_dof_pos_limit, self.device)
+        self.start_place = start_place(cfg, self.robot, cfg.asset.colliders)  # of the root at reset [m]
+        self.init_pos = self._tensor(self.start_place)
         self.reset_range = self._tensor([init.pos_xy_range] * 2 + [init.yaw_range] + [init.lin_vel_range] * 3 + [init.ang_vel_range] * 3)
 
     def _tensor(self, values: object) -> Tensor:

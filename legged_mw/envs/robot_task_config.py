@@ -21,18 +21,26 @@ class RobotTaskCfg(Config):
         episode_length_s: float = 20.0  # [s], then the episode times out [P]
 
     class asset:
-        file: str = ""  # MJCF of the robot alone; relative to the config file, or to the repository
-        imu_site: str = "imu"  # on the root body and aligned with it
-        colliders: list[str] = ["*"]  # geoms that touch the ground; names or patterns, of those that collide in the MJCF
+        file: str = ""  # MJCF or URDF, as its vendor wrote it; beside the file of the class that says so, or in the repository
+        imu_site: str = ""  # site, or body, that is fixed to the root; empty: the site "imu", or else the root's origin [ours]
+        # names of geoms; of bodies, which mean their own geoms that collide; or patterns. Geoms that touch the ground:
+        colliders: list[str] = ["*"]  # of those that collide in the file
         self_collisions: bool = False  # among the colliders
-        penalize_contacts_on: list[str] = []  # colliders, or patterns: `collision` counts their bodies on the ground [L]
+        penalize_contacts_on: list[str] = []  # likewise, colliders: `collision` counts their bodies on the ground [L]
         terminate_after_contacts_on: list[str] = []  # likewise: to touch the ground with one of these is a fall [L]
-        joint_speed_limits: dict[str, float] = {}  # table a joint: the motor's highest speed [rad/s]; for the report only
+        held_joints: list[str] = []  # names or patterns: welded at their default angle, so that they are no joints any more
+        # tables a joint that need not name every joint; the others keep the file's
+        effort: dict[str, float] = {}  # highest force of the servo, both ways [N m]
+        armature: dict[str, float] = {}  # inertia of the rotor at the joint [kg m^2]
+        frictionloss: dict[str, float] = {}  # dry friction [N m]
+        joint_speed_limits: dict[str, float] = {}  # the motor's highest speed [rad/s] (a URDF has it); for the report only
 
     class init_state:
-        pos: list[float] = [0.0, 0.0, 1.0]  # root at reset [m]
-        default_joint_angles: dict[str, float] = {}  # table a joint [rad]: the pose of action 0
+        pos: list[float] = []  # root at reset [m]; empty: the file's keyframe "home" or its only one, or else the lowest foot on the ground
+        default_joint_angles: dict[str, float] = {}  # table a joint [rad]: the pose of action 0; joints without a key: that keyframe's
         dof_pos_range: list[float] = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
+        dof_pos_offset: list[float] = [0.0, 0.0]  # added to each joint at reset, U(low, high), within its range [rad]
+        dof_vel_range: float = 0.0  # each joint's velocity at reset, U(-range, range) [rad/s]
         pos_xy_range: float = 0.5  # root x and y + U(-range, range) [m] [P]
         yaw_range: float = 3.141592653589793  # U(-range, range) [rad] [P]
         lin_vel_range: float = 0.5  # root velocity, world frame, each axis U(-range, range) [m/s] [P]
@@ -60,6 +68,9 @@ class RobotTaskCfg(Config):
         max_reward: float = 10000.0  # upper clip of the sum, a step [P]
         soft_dof_pos_limit: float = 0.95  # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
         pose_weights: dict[str, float] = {"": 1.0}  # table a joint: weight in `pose` [-]
+        base_height_target: float = 0.0  # of `base_height`: of the root above the ground under it [m]
+        hip_joints: list[str] = []  # of `hip_pos`: joints' names, patterns, or parts of names
+        torques_as: Literal["norms", "squares"] = "norms"  # `torques` is the 2-norm plus the 1-norm [P], or the sum of squares [L]
 
         class scales:
             """Reward terms by name: each number switches on the method _reward_<name>, 0 switches it off."""
@@ -131,13 +142,14 @@ class RobotTaskCfg(Config):
         dt: float = 0.004  # simulation step [s] [P]
         iterations: int = 1  # Newton iterations [P]
         ls_iterations: int = 5  # line-search iterations [P]
-        nconmax: int = 8  # contacts a world has room for (mujoco_warp); four feet on a plane make four
-        njmax: int = 40  # constraint rows a world has room for (mujoco_warp): 12 friction, 12 limits, 4 a contact [ours: never seen full]
+        integrator: Literal["euler", "implicitfast"] = "euler"  # implicitfast: joint damping is stable however large [P: euler]
+        nconmax: int = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model, as --check says [ours: sim/room.py]
+        njmax: int = 0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
 
     class viewer:
         width: int = 1280  # [pixel]
         height: int = 720  # [pixel]
-        camera: list[float] = [0.9, -1.1, 0.6]  # place of the camera "track", from the robot, world axes [m]
+        camera: list[float] = []  # place of the camera "track", from the robot, world axes [m]; empty: by its size, Go1's is 0.9 -1.1 0.6
         fps: int = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
 
 
@@ -220,7 +232,7 @@ class RobotTaskCfgPPO(Config):
         hidden_dims: list[int] = [128, 64, 32]  # of actor and critic
         max_iterations: int = 2600
         overrides: dict[str, Any] = {}  # fields of the environment: dotted path -> value
-        update_threads: int = 0  # of torch in an update; 0: one a core. Everything else of a step runs on one
+        update_threads: int = 0  # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one
 
     class symmetry:
         """Left-right symmetry in the update, as in Mittal et al. 2024. Rows of observations say how they mirror: envs/mirror.py."""

@@ -9,6 +9,9 @@ from legged_mw.sim.errors import EngineError, ModelError
 
 FIELDS = {
     "engine": "sim.engine",
+    "nconmax": "sim.nconmax",
+    "njmax": "sim.njmax",
+    "integrator": "sim.integrator",
     "stiffness": "control.stiffness",
     "damping": "control.damping",
     "colliders": "asset.colliders",
@@ -21,7 +24,15 @@ FIELDS = {
     "pose": "init_state.default_joint_angles",
     "sites": "asset.foot_names or foot_geoms",
     "contact_geoms": "asset.penalize_contacts_on or terminate_after_contacts_on",
+    **{name: f"asset.{name}" for name in ("imu_site", "held_joints", "effort", "armature", "frictionloss", "joint_speed_limits")},
 }
+
+
+def config_words(text: str) -> str:
+    """``text`` with the fields that the parameters in it come from."""
+    for parameter, field in FIELDS.items():
+        text = text.replace(f"`{parameter}`", field)
+    return text
 
 
 @contextmanager
@@ -30,9 +41,7 @@ def in_config_words() -> Iterator[None]:
     try:
         yield
     except (ModelError, EngineError) as error:
-        text = str(error)
-        for parameter, field in FIELDS.items():
-            text = text.replace(f"`{parameter}`", field)
+        text = config_words(str(error))
         if text == str(error):
             raise
         raise type(error)(text) from None

@@ -1,7 +1,7 @@
 """Figures from a record: numpy in, plain numbers out. Nothing here knows a simulator, and nothing is drawn here.
 
-N worlds, T control steps, D joints, F feet. What fell is None, and is not part of any mean. "Settled" is what is left after
-the exam's first seconds.
+N worlds, T control steps, D joints, F feet. What fell is None, and is not part of any mean here; the exam's own means, in ``rules``,
+count it. "Settled" is what is left after the exam's first seconds.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval.exams import Exam, require_exam
 from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
-from legged_mw.eval.rules import ExamRules
+from legged_mw.eval.rules import ExamRules, in_common
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.policies import Source, act, introduce, load_policy
 from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything
@@ -50,6 +50,8 @@ def prepare(source: Source, trained: LoadedTask, args: argparse.Namespace) -> Gr
     task, exam = copy.deepcopy(trained), require_exam(trained)
     exam.prepare(task)
     override(task, args, exam.sets)
+    if args.ranges == "common":
+        task.update({"exam": in_common(getattr(getattr(task.cfg, "exam", None), "peer", ""))}, where="--ranges common")
     exam.make_room(task)  # the ranges are known by now
     return Graded(source, trained, task, exam, prepare_crossing(trained, args))
 
@@ -108,7 +110,7 @@ def elsewhere(graded: Graded) -> list[tuple[str, dict[str, Any]]]:
         return []
     with TemporaryDirectory() as folder:
         try:
-            export(graded.task.to_dict(), graded.source.checkpoint, Path(folder) / "export")
+            export(graded.task, graded.source.checkpoint, Path(folder) / "export")
             return [("the same, deployed in MuJoCo", run_exam(Path(folder) / "export", ExamRules.from_config(graded.task.cfg)))]
         except UserError as error:  # a row that nobody can measure, no onnxruntime
             print(f"not graded through an export: {error}")

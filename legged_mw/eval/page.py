@@ -10,7 +10,7 @@ from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from legged_mw.eval.crossing import LEVELS
-from legged_mw.eval.rules import AXES, PUSH_DIRECTIONS, ExamRules, Figure
+from legged_mw.eval.rules import AXES, PUSH_DIRECTIONS, ExamRules, Figure, verdicts
 
 if TYPE_CHECKING:
     from legged_mw.eval.plots import Section
@@ -21,25 +21,26 @@ TEXTS = {
     "reached their tile's edge within 15 s. Below it the share that fell on the way; the rest got stuck or went astray. A row is a kind of "
     "ground; below it stands what makes it hard, level by level. Dark is good.",
     "tracking": "Mean absolute error of the velocity at the IMU, body frame, over the last 8 of 10 seconds, command by command over the "
-    "range that was trained. Dark is good. The stroke on each scale is what the exam allows on average; a cross is a fall.",
+    "range that was trained. Dark is good. {stroke}A cross is a fall.",
     "steps": "Walking at two thirds of the trained range, then the same backwards, then standing, then walking again. Line: mean of eight "
-    "robots, each in another phase of its gait at the step; band: lowest and highest of them.",
+    "robots, each in another phase of its gait at the step; band: lowest and highest of them. One that fell is not among them.",
     "gait": "A bar where a foot is on the ground, the last two seconds of each command. Above: strides a second, and the duty factor: "
     "the share of time that a foot is down, mean over the feet.",
-    "joints": "Where the joints are, how fast they move and what torque they need over all 22 commands. Upright strokes are limits: soft "
-    "position limits, the motors' speed, the torque that the servos are clamped to. At the right the share of samples beyond a limit "
-    "(of a torque: at 98 % of it or more), where there are any.",
+    "joints": "Where the joints are, how fast they move and what torque they need over all commands without a fall. Upright strokes are "
+    "limits: soft position limits, the motors' speed, the torque that the servos are clamped to. At the right the share of samples beyond "
+    "a limit (of a torque: at 98 % of it or more), where there are any.",
     "pushes": "The base's horizontal velocity jumps; a push is survived if the robot has not fallen three seconds later. Rings: jumps "
     "of {speeds} m/s, from the inside; sectors: where it is pushed to. Coloured tiles were survived. Walking is at {vx:g} m/s; the exam "
     "counts these.",
     "energy": "Straight ahead and backwards. Power: sum over the joints of |torque x speed|. Cost of transport: energy over weight "
     "times distance.",
-    "reward": "What each term adds to the reward in a second, before the clip at zero, mean over the 22 commands.",
+    "reward": "What each term adds to the reward in a second, before the clip at zero, mean over the commands without a fall.",
 }
 EXAM_NOTE = (
-    "22 commands of 10 s and {pushes} pushes, all from rest on flat ground, without noise. A policy walks if it passes every row that "
-    "has a mark.{peer}"
+    "22 commands of 10 s and {pushes} pushes, all from rest on flat ground, without noise; {asked}. A command at which the robot falls "
+    "counts with the error of standing still. A policy walks if it passes every row that has a mark. {peer}"
 )
+STROKE = "The stroke on each scale is what the exam allows on average. "
 
 
 class Column(NamedTuple):
@@ -53,33 +54,38 @@ class Column(NamedTuple):
 
 def html(task: str, rules: ExamRules, columns: Sequence[Column], drawn: Sequence[tuple[Section, list[str]]]) -> str:
     """The whole page; ``rules`` are those of the first column."""
-    words = {"speeds": " to ".join(f"{end(rules.push_speeds):g}" for end in (min, max)), "vx": rules.push_vx}
+    words: dict[str, Any] = {"speeds": " to ".join(f"{end(rules.push_speeds):g}" for end in (min, max)), "vx": rules.push_vx}
+    words["stroke"] = STROKE if rules.marks_of == "error" else ""
     chapters = [_chapter(section, panels, TEXTS[section.name].format(**words), _extra(section.name, columns)) for section, panels in drawn]
-    peer = f" The peer is {rules.peer_policy.about}." if rules.peer_policy else ""
-    note = EXAM_NOTE.format(pushes=len(rules.push_speeds) * PUSH_DIRECTIONS, peer=peer)
+    note = EXAM_NOTE.format(pushes=len(rules.push_speeds) * PUSH_DIRECTIONS, asked=rules.asked_words(), peer=escape(rules.peer_words()))
     figures = [rules.figures(column.exam) for column in columns]
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark"><title>{escape(task)}: walking exam</title><style>{CSS}</style></head>
 <body><main>
-<header><p class="above">Walking exam</p><h1>{escape(task)}</h1>{_names(columns)}{_cards(figures[0])}</header>
-<section><h2>Exam</h2><p class="lead">{note}</p>{_exam_table(columns, figures, bool(rules.peer_policy))}</section>
-{"".join(chapters)}
+<header><p class="above">Walking exam</p><h1>{escape(task)}</h1>{_names(columns, rules)}{_cards(figures[0])}</header>
+<section><h2>Exam</h2><p class="lead">{note}</p>{_exam_table(columns, figures, rules.peer_label)}</section>
+{"".join(chapters)}{_published(rules, columns) if len(rules.peers) > 1 else ""}
 <footer>{_about(columns)}</footer>
 </main></body></html>
 """
 
 
-def _names(columns: Sequence[Column]) -> str:
+def _names(columns: Sequence[Column], rules: ExamRules) -> str:
     """The graded policies and whether they pass, each in the colour of its curves."""
     items, drawn = [], [column.name for column in columns if column.figures]
     for column in columns:
         swatch = f'<i class="swatch c{drawn.index(column.name)}"></i>' if column.figures and len(drawn) > 1 else ""
         engine = escape(str(column.about.get("engine", "")))
-        verdicts = {"walks": ("walks", "does not walk"), "beats_peer": ("beats the peer", "does not beat the peer")}
-        pills = [_pill(*words, column.exam[key]) for key, words in verdicts.items() if key in column.exam]
+        pills = [_pill(*_said(words), yes) for words, yes in verdicts(rules, column.exam)]
         items.append(f"<li>{swatch}<b>{escape(column.name)}</b> <span class='muted'>{engine}</span> {' '.join(pills)}</li>")
     return f'<ul class="names">{"".join(items)}</ul>'
+
+
+def _said(words: str) -> tuple[str, str]:
+    """``walks`` or ``beats ...``, and that it does not."""
+    verb, _, rest = words.partition(" ")
+    return words, f"does not {verb.removesuffix('s')} {rest}".strip()
 
 
 def _pill(good: str, bad: str, yes: bool) -> str:
@@ -101,7 +107,7 @@ def _mood(figure: Figure) -> str:
     return {True: " pass", False: " fail", None: ""}[figure.passes()]
 
 
-def _exam_table(columns: Sequence[Column], figures: Sequence[Sequence[Figure]], peer: bool) -> str:
+def _exam_table(columns: Sequence[Column], figures: Sequence[Sequence[Figure]], peer: str) -> str:
     """A row a figure; from the second column on with the gap to the first."""
     lines = []
     for first, *others in zip(*figures, strict=True):
@@ -112,12 +118,40 @@ def _exam_table(columns: Sequence[Column], figures: Sequence[Sequence[Figure]], 
             cells.append(f'<td><span class="value{_mood(other)}">{other.text(other.value)}</span> <small>{gap}</small></td>')
         cells.append(f"<td>{first.mark_text()}</td>")
         if peer:
-            cells.append(f"<td>{'' if first.peer is None else first.text(first.peer)}</td>")
+            cells.append(f"<td>{first.peer_text()}</td>")
         sub = ' class="sub"' if first.name.startswith(" ") else ""
         lines.append(f"<tr{sub}><th>{escape(first.name.strip())}</th>{''.join(cells)}</tr>")
-    heads = "".join(f"<th>{escape(name)}</th>" for name in [*(column.name for column in columns), "walks at", *(["peer"] if peer else [])])
+    heads = "".join(f"<th>{escape(name)}</th>" for name in [*(column.name for column in columns), "walks at", *([peer] if peer else [])])
     head = f"<thead><tr><th></th>{heads}</tr></thead>"
     return f'<div class="scroll"><table class="exam">{head}<tbody>{"".join(lines)}</tbody></table></div>'
+
+
+def _published(rules: ExamRules, columns: Sequence[Column]) -> str:
+    """A row a policy: the graded ones, then the published ones."""
+    peers = [(peer.name, peer.figures, f"{peer.asked['push_vx']:g}") for peer in rules.peers]
+    rows = [(column.name, column.exam, f"{rules.push_vx:g}") for column in columns]
+    heads = [
+        "",
+        "falls",
+        "error vx, vy, yaw rate",
+        "worst",
+        "offset",
+        "drift [m]",
+        "cost of transport",
+        "pushes survived [%]",
+        "at vx [m/s]",
+    ]
+    cells = []
+    for name, found, vx in [*rows, *peers]:
+        digits = {"error": 3, "worst": 2, "offset": 3}
+        triples = [", ".join(f"{value:.{each}f}" for value in found[key]) for key, each in digits.items()]
+        drift = "fell" if found["drift"] is None else f"{found['drift']:.3f}"
+        cost = "none" if found["cost_of_transport"] is None else f"{found['cost_of_transport']:.2f}"
+        shares = ", ".join(f"{100 * share:.0f}" for share in found["pushes"].values())
+        cells.append([name, str(found["falls"]), *triples, drift, cost, shares, vx])
+    pushes = ", ".join(f"{speed:g}" for speed in rules.push_speeds)
+    lead = f"All were asked the same commands. Cost of transport, and pushes of {pushes} m/s: walking ahead at the last column's vx [m/s]."
+    return f'<section class="peers"><h2>Published policies</h2><p class="lead">{lead}</p>{_table(heads, cells)}</section>'
 
 
 def _chapter(section: Section, panels: list[str], lead: str, extra: str) -> str:

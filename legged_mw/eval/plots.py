@@ -9,7 +9,7 @@ from __future__ import annotations
 import io
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +23,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from legged_mw.eval.peers import best_of
 from legged_mw.eval.rules import AXES, ExamRules
 
 Figures = dict[str, Any]
@@ -82,7 +83,7 @@ def sections(columns: Columns, rules: ExamRules) -> list[Section]:
     rough = _crossing_maps(columns)
     return [
         *([Section("crossing", "Rough ground", rough, across=len(rough))] if rough else []),
-        Section("tracking", "Following the command", _heat_maps(columns, rules.marks)),
+        Section("tracking", "Following the command", _heat_maps(columns, rules)),
         Section("steps", "Steps of the command", responses),
         Section("gait", "Gait", strides),
         Section("joints", "Joints against their limits", _joint_panels(columns)),
@@ -189,19 +190,24 @@ def _percent(share: float) -> str:
 # ---- following the command
 
 
-def _heat_maps(columns: Columns, marks: Sequence[float]) -> list[Panel]:
-    """Three errors over two grids, each error on one scale: up to its largest value, but at most three times the exam's mark."""
-    panels = []
+def _heat_maps(columns: Columns, rules: ExamRules) -> list[Panel]:
+    """Three errors over two grids, each error on one scale: up to its largest value, but at most three times the exam's mark.
+
+    Where the marks are of offsets, an error has none: its scale has no stroke, and may be longer.
+    """
+    panels, strict = [], rules.marks_of == "error"
+    marks = rules.marks if strict else [3 * mark for mark in rules.marks]
     for grid, across in (("vx_yaw", "yaw"), ("vx_vy", "vy")):
         for name, figures in columns:
             for k, mark in enumerate(marks):
                 every = np.concatenate([_array(f["tracking"][g][k]).ravel() for _, f in columns for g in ("vx_yaw", "vx_vy")])
                 top = max(1.25 * mark, min(3 * mark, float(np.nanmax(every)) if np.isfinite(every).any() else mark))
-                panels.append(Panel(partial(_heat, figures["tracking"], grid, across, k, mark, top, _of(name, columns)), height=2.45))
+                stroke = mark if strict else None
+                panels.append(Panel(partial(_heat, figures["tracking"], grid, across, k, stroke, top, _of(name, columns)), height=2.45))
     return panels
 
 
-def _heat(tracking: Figures, grid: str, down: str, k: int, mark: float, top: float, suffix: str, ax: Axes) -> None:
+def _heat(tracking: Figures, grid: str, down: str, k: int, mark: float | None, top: float, suffix: str, ax: Axes) -> None:
     x, y, values = _array(tracking["axes"]["vx"]), _array(tracking["axes"][down]), _array(tracking[grid][k])
     scale = Normalize(0.0, top)
     ax.pcolormesh(_edges(x), _edges(y), values, cmap=HEAT, norm=scale, edgecolors=PAPER, linewidth=0.8)
@@ -216,11 +222,12 @@ def _heat(tracking: Figures, grid: str, down: str, k: int, mark: float, top: flo
     beside = "yaw rate [rad/s]" if down == "yaw" else "vy [m/s]"
     ax.set(title=f"error of {name} [{unit}]{suffix}", xlabel="commanded vx [m/s]", ylabel=beside)
     shape: dict[str, Any] = {"aspect": 18, "pad": 0.03, "extend": "max" if (values > top).any() else "neither", "format": "%.2f"}
-    ticks = [0.0, mark, *([top] if top > 1.4 * mark else [])]
+    ticks = [0.0, *([mark] if mark else []), *([top] if not mark or top > 1.4 * mark else [])]
     bar = ax.figure.colorbar(ScalarMappable(scale, HEAT), ax=ax, boundaries=np.linspace(0.0, top, 33), ticks=ticks, **shape)
     bar.solids.set_edgecolor("face")  # type: ignore[union-attr]
     bar.outline.set_visible(False)  # type: ignore[operator]
-    bar.ax.axhline(mark, color=PAPER, linewidth=1.2)
+    if mark:
+        bar.ax.axhline(mark, color=PAPER, linewidth=1.2)
     bar.ax.grid(False)
 
 
@@ -240,6 +247,8 @@ def _response(columns: Columns, k: int, ax: Axes) -> None:
         if i == 0:
             ax.step(time, _array(step["commanded"]), where="post", color=INK, linestyle=(0, (4, 2)), linewidth=1.0, label="commanded")
     ax.set(title=f"{name} [{unit}]", xlabel="time [s]")
+    if any(fell := [figures["steps"][("vx", "vy", "yaw")[k]]["fell"] for _, figures in columns]):
+        ax.set_title(f"{' / '.join(map(str, fell))} fell", loc="right", color=MUTED, fontsize=7.0)
     ax.margins(x=0)
     if k == 0:
         ax.legend(loc="lower right", handlelength=1.6)
@@ -305,9 +314,9 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
 
 def _push_curve(columns: Columns, rules: ExamRules, ax: Axes) -> None:
     speeds = rules.push_speeds
-    if rules.peer_policy:
-        shares = list(rules.peer_policy.figures["pushes"].values())
-        ax.plot(speeds, shares, color=GREEN, marker="D", markersize=3.2, linewidth=1.0, label="peer, walking")
+    if rules.peers:
+        shares = list(best_of(rules.peers)["pushes"].values())
+        ax.plot(speeds, shares, color=GREEN, marker="D", markersize=3.2, linewidth=1.0, label=f"{rules.peer_label}, walking")
     for i, (name, figures) in enumerate(columns):
         for which, line in (("walking", "-"), ("standing", (0, (2, 1.5)))):
             share, label = np.mean(figures["pushes"][which], axis=1), f"{which}{_of(name, columns)}"
@@ -335,9 +344,9 @@ def _push_wheel(pushes: Figures, which: str, colour: str, title: str, ax: Any) -
 def _against_speed(columns: Columns, rules: ExamRules, key: str, ax: Axes) -> None:
     for i, (name, figures) in enumerate(columns):
         ax.plot(figures["transport"]["vx"], _array(figures["transport"][key]), color=PAIR[i], marker="o", markersize=3.2, label=name)
-    if key == "cost_of_transport" and rules.peer_policy:
-        cost = rules.peer_policy.figures[key]
-        ax.plot([rules.transport_vx], [cost], color=GREEN, marker="D", markersize=4.5, linestyle="none", label="peer")
+    if key == "cost_of_transport" and rules.peers:
+        cost = best_of(rules.peers)[key]
+        ax.plot([rules.transport_vx], [cost], color=GREEN, marker="D", markersize=4.5, linestyle="none", label=rules.peer_label)
     ax.set(title="mean power [W]" if key == "power" else "cost of transport [-]", xlabel="commanded vx [m/s]", ylim=(0.0, None))
     if key == "cost_of_transport" or len(columns) > 1:
         ax.legend(loc="best", handlelength=1.6)

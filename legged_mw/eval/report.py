@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import crossing, exam, figures, page, rules
 from legged_mw.eval.page import Column
+from legged_mw.eval.peers import best_of
 from legged_mw.eval.rollout import Policy, Record, Signal, roll_out
 from legged_mw.eval.trials import NAMES, STEPS_AT, Plan, make_plan
-from legged_mw.sim.model import per_joint
 from legged_mw.utils.task import LoadedTask
 
 GAIT_SECONDS = 2.0  # that the gait diagram shows
@@ -96,11 +96,10 @@ def gather(env: LeggedRobot, asked: rules.ExamRules, plan: Plan, record: Record)
 
 def joint_limits(env: LeggedRobot) -> dict[str, tuple[NDArray[Any], NDArray[Any]]]:
     """Signal -> lowest and highest (D,): soft position limits, the motors' speed (infinite where not known) and torque."""
-    speeds = env.cfg.asset.joint_speed_limits
-    known = per_joint(speeds, env.robot.joint_names, "asset.joint_speed_limits") if speeds else [np.inf] * env.num_actions
+    speeds = np.array(env.robot.speed_limits)
     position = torch.stack([env.soft_lower, env.soft_upper]).cpu().numpy().astype(float)
     effort = env.robot.effort_range.T
-    return {"dof_pos": (position[0], position[1]), "dof_vel": (-np.array(known), np.array(known)), "torque": (effort[0], effort[1])}
+    return {"dof_pos": (position[0], position[1]), "dof_vel": (-speeds, speeds), "torque": (effort[0], effort[1])}
 
 
 def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()) -> None:
@@ -115,9 +114,9 @@ def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[t
     folder.mkdir(parents=True, exist_ok=True)
     asked = rules.ExamRules.from_mapping(columns[0].exam["rules"])
     content = {"task": task, "columns": [column._asdict() for column in columns]}
-    _write_text(
-        folder / "report.json", json.dumps(content | ({"peer": asked.peer_policy.figures} if asked.peer_policy else {}), indent=1) + "\n"
-    )
+    if asked.peers:
+        content |= {"peer": best_of(asked.peers), "peers": [peer._asdict() for peer in asked.peers]}
+    _write_text(folder / "report.json", json.dumps(content, indent=1) + "\n")
     sections = plots.sections([(column.name, column.figures) for column in columns if column.figures], asked)
     for section in sections:
         plots.write_png(section, folder / f"{section.name}.png")

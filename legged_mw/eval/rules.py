@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.eval.peers import PEERS, Peer
+from legged_mw.eval.peers import COMMON, PEERS, Peer, best_of, robot_of
 from legged_mw.utils.commands import LABELS, VELOCITY
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
@@ -25,14 +25,18 @@ PUSH_AT, PUSH_UNTIL, PUSH_DIRECTIONS = 3.0, 6.0, 16  # [s] of the first directio
 GRAVITY = 9.81  # [m/s^2]
 SLOW = 0.1  # [m/s] below which a cost of transport says nothing
 EQUAL_DRIFT = 0.005  # [m], below which drifts count as equal
-PUSH_SPEEDS = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0)  # [m/s] where no config says others
+# Where no config says others: pushes [m/s], the one that is to be survived, what the marks are of, and they [m/s, m/s, rad/s] if fixed.
+# A biped sways, and its step-by-step error holds the sway
+BIPED: dict[str, Any] = {"push_speeds": (0.5, 1.0, 1.5, 2.0, 3.0), "push_mark": 1.0, "marks_of": "offset"}
+OTHERS: dict[str, Any] = {"push_speeds": (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0), "push_mark": 2.0, "marks_of": "error"}
+OFFSET_MARKS = (0.06, 0.06, 0.12)
 AXES = tuple(zip(LABELS.values(), ("m/s", "m/s", "rad/s"), strict=True))  # vx, vy, yaw rate: name and unit
 
 Velocity = tuple[float, float, float]  # vx, vy [m/s], yaw rate [rad/s]: body frame, at the IMU
 
 
 class Figure(NamedTuple):
-    """One figure of the exam beside what walking asks and what the peer has."""
+    """One figure of the exam beside what walking asks and what the peer, or the best of several, has."""
 
     name: str
     value: float | None  # None: there is nothing to measure
@@ -42,9 +46,14 @@ class Figure(NamedTuple):
     more_is_better: bool = False
     without: str = "fell"  # stands for no value
     card: tuple[str, str] | None = None  # title and unit among the figures that one looks for first
+    equal: float = 0.0  # up to here all values count as equal
+    peer_mark: str = ""  # on the peer's value: what it means is said below the table
 
     def text(self, value: float | None) -> str:
         return self.without if value is None else f"{value:.{self.digits}f}"
+
+    def peer_text(self) -> str:
+        return "" if self.peer is None else f"{self.text(self.peer)}{self.peer_mark}"
 
     def mark_text(self) -> str:
         if self.mark is None:
@@ -56,6 +65,12 @@ class Figure(NamedTuple):
         if self.mark is None:
             return None
         return self.value is not None and (self.value >= self.mark if self.more_is_better else self.value <= self.mark)
+
+    def reaches_peer(self) -> bool:
+        """At or beyond the peer's."""
+        if self.value is None or self.peer is None:
+            return False
+        return self.value >= self.peer if self.more_is_better else self.value <= max(self.peer, self.equal)
 
 
 @dataclass(frozen=True)
@@ -69,27 +84,30 @@ class ExamRules:
     marks: tuple[float, ...]  # largest mean error, or offset, of a policy that walks [m/s, m/s, rad/s]
     marks_of: str = "error"  # or "offset": of the mean velocity
     push_mark: float = 2.0  # [m/s]: a policy that walks survives all pushes of this speed
-    peer: str = ""  # name in PEERS
+    peer: str = ""  # the robot's key in PEERS
 
     @classmethod
     def from_config(cls, cfg: Any) -> ExamRules:
         """The rules for a task that walks by command. Raises ConfigError."""
         if not hasattr(cfg, "exam"):
             raise ConfigError("the walking exam needs a config with the sections commands and exam: a subclass of LeggedRobotCfg")
-        return cls.from_mapping(vars(cfg.exam), vars(cfg.commands.ranges))
+        return cls.from_mapping(vars(cfg.exam), vars(cfg.commands.ranges), len(cfg.asset.foot_names))
 
     @classmethod
-    def from_mapping(cls, given: Mapping[str, Any], trained: Mapping[str, Sequence[float]] | None = None) -> ExamRules:
+    def from_mapping(cls, given: Mapping[str, Any], trained: Mapping[str, Sequence[float]] | None = None, feet: int = 0) -> ExamRules:
         """The rules from the fields of the config section ``exam`` or from what ``to_mapping`` returned; both may lack some.
 
-        ``trained``: command -> lowest and highest, where ``given`` has no range. Raises ConfigError.
+        ``trained``: command -> lowest and highest, where ``given`` has no range. ``feet``: how many the robot has; two make a
+        biped, which is asked less where ``given`` is silent. Raises ConfigError.
         """
-        given = {"ranges": {}, "push_speeds": PUSH_SPEEDS, "push_mark": cls.push_mark, "marks_of": cls.marks_of, "peer": "", **given}
+        said = {name: value for name, value in given.items() if value or name not in OTHERS}
+        given = {"ranges": {}, "peer": "", **(BIPED if feet == 2 else OTHERS), **said}
         ranges = {**(trained or {}), **given["ranges"]}
+        given["peer"] = robot_of(given["peer"])
         _check(given, ranges)
         vx, vy, yaw = ((float(ranges[name][0]), float(ranges[name][1])) for name in VELOCITY)
         scaled = (round(max(0.06 * vx[1], 0.04), 4), 0.06, round(0.1 * yaw[1], 4) if yaw[1] > 0 else 0.12)
-        marks = given.get("marks") or (scaled if given["marks_of"] == "error" else (0.06, 0.06, 0.12))
+        marks = given.get("marks") or (scaled if given["marks_of"] == "error" else OFFSET_MARKS)
         push_vx, transport_vx = (float(given.get(name) or round(vx[1] / 2, 4)) for name in ("push_vx", "transport_vx"))
         speeds, kept = tuple(map(float, given["push_speeds"])), {name: given[name] for name in ("marks_of", "push_mark", "peer")}
         return cls((vx, vy, yaw), speeds, push_vx, transport_vx, tuple(map(float, marks)), **kept)
@@ -100,10 +118,36 @@ class ExamRules:
         return {**plain, "ranges": {name: list(ends) for name, ends in zip(VELOCITY, self.ranges, strict=True)}}
 
     @property
-    def peer_policy(self) -> Peer | None:
-        """The peer that the task names, if it was asked the same."""
-        peer = PEERS.get(self.peer)
-        return peer if peer and all(getattr(self, name) == value for name, value in peer.asked.items()) else None
+    def peers(self) -> list[Peer]:
+        """The published policies of the robot that were asked the same."""
+        return [peer for peer in PEERS.get(self.peer, []) if peer.fits(self)]
+
+    @property
+    def peer_label(self) -> str:
+        """What stands above the peer's figures, or above the best of several peers; empty if there is none."""
+        return f"best of {len(self.peers)}" if len(self.peers) > 1 else "peer" * len(self.peers)
+
+    def asked_words(self) -> str:
+        """The ranges that are asked."""
+        spans = [f"{name} {low:g} to {high:g} {unit}" for (name, unit), (low, high) in zip(AXES, self.ranges, strict=True)]
+        common = ", the one range that all published policies of this robot were asked" if COMMON.get(self.peer) == self.ranges else ""
+        return f"asked: {', '.join(spans)}{common}"
+
+    def peer_words(self) -> str:
+        """Who the peers are, and what of their figures was asked otherwise; empty if there is none."""
+        if not self.peers:
+            return ""
+        first = self.peers[0]
+        if len(self.peers) == 1:
+            return f"The peer is {first.name}'s policy for this robot, graded by the same rules in MuJoCo's C engine."
+        apart = (
+            f"* Their pushes and cost of transport were taken at half of each policy's own highest vx, not all at {self.push_vx:g} m/s: "
+            "compare them with care."
+        )
+        return (
+            f"Best of {len(self.peers)}: figure by figure the best of any published policy for this robot that was asked these ranges, "
+            f"each in its own scene, in MuJoCo's C engine; no policy has them all. {apart if first.own_speed else ''}"
+        ).strip()
 
     def commands(self) -> list[Velocity]:
         """The 22 commands; the first is to stand."""
@@ -148,7 +192,7 @@ class ExamRules:
             "cost_of_transport": float(energy / (mass * GRAVITY * distance[ahead])) if moved else None,
             "rules": self.to_mapping(),
         }
-        beats = {"beats_peer": self.beats_peer(result)} if self.peer_policy else {}
+        beats = {"beats_peer": self.beats_peer(result)} if self.peers else {}
         return {"walks": self.walks(result), **beats, **result}
 
     def walks(self, result: Mapping[str, Any]) -> bool:
@@ -159,21 +203,18 @@ class ExamRules:
         return small and result["pushes"][f"{self.push_mark:g}"] == 1.0
 
     def beats_peer(self, result: Mapping[str, Any]) -> bool:
-        """At least as good on each of the peer's figures, better on the errors and the cost of transport."""
-        assert self.peer_policy
-        peer = self.peer_policy.figures
-        if result["falls"] > peer["falls"]:
-            return False
-        better = all(a < b for a, b in zip(result["error"], peer["error"], strict=True))
-        better = better and result["cost_of_transport"] is not None and result["cost_of_transport"] < peer["cost_of_transport"]
-        worst = all(a <= b for a, b in zip(result["worst"], peer["worst"], strict=True))
-        pushes = all(result["pushes"][speed] >= share for speed, share in peer["pushes"].items())
-        return better and worst and pushes and result["drift"] <= max(EQUAL_DRIFT, peer["drift"])
+        """At least as good on each figure of each peer, better on the errors and the cost of transport."""
+        return all(_beats(result, peer.figures) for peer in self.peers)
+
+    def reached(self, result: Mapping[str, Any]) -> tuple[int, int]:
+        """In how many figures the result is at or beyond the peers' best, and of how many."""
+        compared = [figure for figure in self.figures(result) if figure.peer is not None]
+        return sum(figure.reaches_peer() for figure in compared), len(compared)
 
     def figures(self, result: Mapping[str, Any]) -> list[Figure]:
         """The result's figures in the order of the table."""
-        peer: dict[str, Any] = self.peer_policy.figures if self.peer_policy else {}
-        fell = peer_lacks = (None, None, None)
+        peer, unknown_of_peer = best_of(self.peers), (None, None, None)
+        apart = "*" if any(peer.own_speed for peer in self.peers) else ""
         listed = [Figure("falls in 22 commands", result["falls"], 0, 0, peer.get("falls"), card=("falls", "of 22"))]
         for i, (axis, unit) in enumerate(AXES):
             card = (f"{axis.removesuffix(' rate')} {self.marks_of}", unit)
@@ -183,34 +224,51 @@ class ExamRules:
                 "offset": "  of the mean velocity",
             }.items():
                 mark, shown_first = (self.marks[i], card) if measure == self.marks_of else (None, None)
-                value, beside = (result[measure] or fell)[i], peer.get(measure, peer_lacks)[i]
-                if measure != "offset" or measure == self.marks_of:
-                    listed.append(Figure(name, value, 3, mark, beside, card=shown_first))
-        listed.append(Figure("drift standing 8 s [m]", result["drift"], 4, None, peer.get("drift")))
+                beside = peer.get(measure, unknown_of_peer)[i]
+                if measure != "offset" or measure == self.marks_of or beside is not None:
+                    listed.append(Figure(name, result[measure][i], 3, mark, beside, card=shown_first))
+        listed.append(Figure("drift standing 8 s [m]", result["drift"], 4, None, peer.get("drift"), equal=EQUAL_DRIFT))
         listed.append(Figure("joint speed standing [rad/s]", result["joint_speed"], 3))
         for speed, share in result["pushes"].items():
             mark, card = (1.0, (f"{speed} m/s pushes", "survived")) if float(speed) == self.push_mark else (None, None)
-            listed.append(Figure(f"survives pushes of {speed} m/s", share, 2, mark, peer.get("pushes", {}).get(speed), True, card=card))
+            listed.append(
+                Figure(
+                    f"survives pushes of {speed} m/s", share, 2, mark, peer.get("pushes", {}).get(speed), True, card=card, peer_mark=apart
+                )
+            )
         name, ahead = "cost_of_transport", f"at {self.transport_vx:g} m/s"
         card = ("cost of transport", ahead)
-        return [*listed, Figure(" ".join(card), result[name], 2, None, peer.get(name), without="none", card=card)]
+        return [*listed, Figure(" ".join(card), result[name], 2, None, peer.get(name), without="none", card=card, peer_mark=apart)]
 
 
 def _tracking(velocity: NDArray[Any], commands: list[Velocity], stood: NDArray[Any]) -> dict[str, Any]:
-    """How well C commands were followed: from the velocities (T, C, 3), and which worlds did not fall (C,)."""
-    difference = velocity - np.array(commands)
-    error, offset = abs(difference).mean(axis=0), abs(difference.mean(axis=0))
-    e, o = error[stood], offset[stood]
-    means = {"error": e.mean(axis=0), "worst": e.max(axis=0), "offset": o.mean(axis=0)} if stood.any() else {}
-    each = [
-        {"error": _plain(e), "offset": _plain(o)} if ok else {"error": None, "offset": None}
-        for e, o, ok in zip(error, offset, stood, strict=True)
-    ]
+    """How well C commands were followed: from the velocities (T, C, 3), and which worlds did not fall (C,).
+
+    One that fell has the error of standing still, so that no policy gains by falling at what it does worst.
+    """
+    asked = np.array(commands)
+    difference = velocity - asked
+    error = np.where(stood[:, None], abs(difference).mean(axis=0), abs(asked))
+    offset = np.where(stood[:, None], abs(difference.mean(axis=0)), abs(asked))
+    rows = zip(commands, error, offset, stood.tolist(), strict=True)
     return {
         "falls": int((~stood).sum()),
-        **{name: _plain(means[name]) if means else None for name in ("error", "worst", "offset")},  # None: all fell
-        "commands": [{"command": list(c), **row, "fell": not ok} for c, row, ok in zip(commands, each, stood.tolist(), strict=True)],
+        "error": _plain(error.mean(axis=0)),
+        "worst": _plain(error.max(axis=0)),
+        "offset": _plain(offset.mean(axis=0)),
+        "commands": [{"command": list(c), "error": _plain(e), "offset": _plain(o), "fell": not ok} for c, e, o, ok in rows],
     }
+
+
+def _beats(result: Mapping[str, Any], peer: Mapping[str, Any]) -> bool:
+    """At least as good on each of the peer's figures, better on the errors and the cost of transport."""
+    if result["falls"] > peer["falls"]:
+        return False
+    better = all(a < b for a, b in zip(result["error"], peer["error"], strict=True))
+    better = better and result["cost_of_transport"] is not None and result["cost_of_transport"] < peer["cost_of_transport"]
+    beside = [(a, b) for name in ("worst", "offset") if name in peer for a, b in zip(result[name], peer[name], strict=True)]
+    pushes = all(result["pushes"][speed] >= share for speed, share in peer["pushes"].items())
+    return better and all(a <= b for a, b in beside) and pushes and result["drift"] <= max(EQUAL_DRIFT, peer["drift"])
 
 
 def _check(given: Mapping[str, Any], ranges: Mapping[str, Sequence[float]]) -> None:
@@ -228,21 +286,38 @@ def _check(given: Mapping[str, Any], ranges: Mapping[str, Sequence[float]]) -> N
         raise ConfigError(f"exam.push_mark is {mark:g}; it must be one of exam.push_speeds, {speeds}")
     if len(given.get("marks") or "xyw") != 3:
         raise ConfigError(f"exam.marks is {list(given['marks'])}; it must be three numbers, or an empty list")
-    if given["peer"] and given["peer"] not in PEERS:
-        raise ConfigError(f"exam.peer: {unknown('peer', given['peer'], PEERS, 'legged_mw/eval/peers.py')}")
+
+
+def in_common(peer: str) -> dict[str, Any]:
+    """Fields of the config section ``exam`` that ask the range which all published policies of the robot ``peer`` were asked.
+
+    Raises ConfigError if there is none.
+    """
+    if (robot := robot_of(peer)) not in COMMON:
+        raise ConfigError(f"--ranges common: exam.peer is '{robot}'; one range for all published policies is known of: {', '.join(COMMON)}")
+    ranges = {name: list(ends) for name, ends in zip(VELOCITY, COMMON[robot], strict=True)}
+    return {"ranges": ranges, "push_vx": 0.0, "transport_vx": 0.0}
 
 
 def table(result: Mapping[str, Any]) -> str:
-    """The result as text, beside what walking asks and what the peer has if there is one."""
+    """The result as text, beside what walking asks and what the peer, or the best of several, has if there is one."""
     rules = ExamRules.from_mapping(result["rules"])
-    beside = rules.peer_policy is not None
-    lines = [f"{'':<30}{'this policy':>12}{'walks at':>10}" + f"{'peer':>8}" * beside]
+    label = rules.peer_label
+    width = max(8, len(label) + 2) if label else 0
+    lines = [rules.asked_words(), f"{'':<30}{'this policy':>12}{'walks at':>10}{label:>{width}}"]
     for figure in rules.figures(result):
-        peer = f"{'' if figure.peer is None else figure.text(figure.peer):>8}" * beside
-        lines.append(f"{figure.name:<30}{figure.text(figure.value):>12}{figure.mark_text():>10}{peer}")
-    words = {"walks": "walks", "beats_peer": "beats the peer"}
-    verdicts = [f"{words[key]}: {'yes' if result[key] else 'no'}" for key in words if key in result]
-    return "\n".join([*lines, "; ".join(verdicts)])
+        lines.append(f"{figure.name:<30}{figure.text(figure.value):>12}{figure.mark_text():>10}{figure.peer_text():>{width}}".rstrip())
+    if len(rules.peers) > 1:
+        lines.append(rules.peer_words())
+    return "\n".join([*lines, "; ".join(f"{words}: {'yes' if yes else 'no'}" for words, yes in verdicts(rules, result))])
+
+
+def verdicts(rules: ExamRules, result: Mapping[str, Any]) -> list[tuple[str, bool]]:
+    """What is said of a result, and whether it is so."""
+    several, (reached, count) = len(rules.peers) > 1, rules.reached(result)
+    beats = f"beats all {len(rules.peers)} published policies (at or beyond their best in {reached} of {count} figures)"
+    words = {"walks": "walks", "beats_peer": beats if several else "beats the peer"}
+    return [(words[key], result[key]) for key in words if key in result]
 
 
 def save(result: dict[str, Any], path: Path) -> None:

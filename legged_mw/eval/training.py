@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -35,7 +34,7 @@ class TrainingExam:
             self.env = copy.env_class(copy.cfg, device, eager=eager)
 
     def __call__(self, policy: Policy) -> dict[str, float]:
-        """``error_vx``, ``error_vy`` [m/s], ``error_yaw`` [rad/s]: NaN if all fell; ``falls`` of 22; ``pushes_survived``, a share."""
+        """``error_vx``, ``error_vy`` [m/s], ``error_yaw`` [rad/s]; ``falls`` of 22; ``pushes_survived``, a share."""
         dt = self.env.dt
         with torch.random.fork_rng(self._generators):
             cases = exam.cases(self.rules, dt, PUSH_AT)
@@ -44,13 +43,15 @@ class TrainingExam:
 
 
 def training_figures(record: Record, count: int) -> dict[str, float]:
-    """The figures of a record whose first ``count`` worlds hold a command and whose others are pushed."""
+    """The figures of a record whose first ``count`` worlds hold a command and whose others are pushed.
+
+    A command at which it fell has the error of standing still.
+    """
     settled, stood = round(SETTLING / record.dt), np.isinf(record.fell_at)
     asked = record.commands[settled:, :count, :3]
-    error = np.abs(record.signals["velocity"][settled:, :count] - asked).mean(axis=0)[stood[:count]]
-    means = error.mean(axis=0).tolist() if len(error) else [math.nan] * 3
+    missed = np.where(stood[:count, None], record.signals["velocity"][settled:, :count] - asked, asked)
     return {
-        **dict(zip(("error_vx", "error_vy", "error_yaw"), means, strict=True)),
+        **dict(zip(("error_vx", "error_vy", "error_yaw"), np.abs(missed).mean(axis=(0, 1)).tolist(), strict=True)),
         "falls": float((~stood[:count]).sum()),
         "pushes_survived": float(stood[count:].mean()),
     }

@@ -13,7 +13,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import onnx
@@ -22,6 +22,7 @@ from rsl_rl.models import MLPModel
 from torch import Tensor, nn
 
 from legged_mw.deploy.contract import (
+    CLOCK,
     CONTRACT_FILE,
     FALL,
     NETWORK_FILE,
@@ -34,19 +35,21 @@ from legged_mw.deploy.contract import (
     Contract,
     ContractRow,
     Ends,
+    Gait,
     HeightScan,
     digest,
 )
+from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.export_replay import ExportError, record, replay
+from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
 from legged_mw.rl.export_scene import among_steps, standalone
 from legged_mw.rl.policies import load_policy, save_policy
 from legged_mw.rl.runs import CONFIG_FILE
-from legged_mw.sim.model import ModelError, per_joint
+from legged_mw.sim.model import ModelError, RobotModel, per_joint
 from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import shown
-from legged_mw.utils.task import LoadedTask, load_task
+from legged_mw.utils.task import LoadedTask
 
 MODEL_FILE = "model.pt"
 FILES = (MODEL_FILE, CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
@@ -63,6 +66,7 @@ class Exported(NamedTuple):
     observations: int  # that it was tried on
     unknown: tuple[str, ...]  # observation rows without a statement of how to measure them: the export cannot be deployed
     no_terrain: str = ""  # why there is no scene among steps though training had some; else empty
+    not_covered: tuple[str, ...] = ()  # methods of the task that ended episodes in training and cannot end a walk
 
     def text(self, folder: Path) -> str:
         """What was written, in a line, and what stands in the way of its use."""
@@ -70,6 +74,9 @@ class Exported(NamedTuple):
         if self.unknown:
             names = ", ".join(self.unknown)
             lines.append(f"nothing says how to measure {names}: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)")
+        if self.not_covered:
+            names = ", ".join(self.not_covered)
+            lines.append(f"{names} ended episodes in training; a deployed robot walks on ({CONTRACT_FILE}: ends: not_covered)")
         if self.no_terrain:
             lines.append(f"no {TERRAIN_FILE}: {self.no_terrain}")
         return "\n  ".join(lines)
@@ -86,8 +93,8 @@ class ExportedPolicy(nn.Module):
         return self.policy(obs).clamp(-self.clip_actions, self.clip_actions)
 
 
-def export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
-    """Write the policy in ``checkpoint``, trained with the config ``trained``, to ``folder``: all files, or none.
+def export(trained: LoadedTask, checkpoint: Path, folder: Path) -> Exported:
+    """Write the policy in ``checkpoint``, of the task as it was ``trained``, to ``folder``: all files, or none.
 
     Raises ExportError, ContractError, ConfigError or ModelError; an earlier export in the folder stays as it was then.
     """
@@ -101,9 +108,8 @@ def export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
         torch.set_float32_matmul_precision(precision)
 
 
-def _export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported:
-    task = load_task(str(trained["task"]))
-    task.update(trained, where=CONFIG_FILE)
+def _export(trained: LoadedTask, checkpoint: Path, folder: Path) -> Exported:
+    task = copy.deepcopy(trained)
     config, noise = task.to_dict(), task.cfg.noise.level
     ground = getattr(task.cfg.terrain, "mesh_type", "plane")
     env = _small_env(task)
@@ -123,9 +129,10 @@ def _export(trained: dict[str, Any], checkpoint: Path, folder: Path) -> Exported
         observations, actions = (np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions"))
         gap = _compare(run_onnx(new / NETWORK_FILE, observations), np.clip(actions, -clip, clip))
         replay(env, contract, steps, new)
-        no_terrain = _write_terrain(task, new) if ground != "plane" else ""
+        no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
         files = (*FILES, *([TERRAIN_FILE] if (new / TERRAIN_FILE).exists() else []))
-    return Exported(files, gap, len(observations), tuple(row.name for row in contract.rows if not row.measured), no_terrain)
+    unknown_rows = tuple(row.name for row in contract.rows if not row.measured)
+    return Exported(files, gap, len(observations), unknown_rows, no_terrain, contract.ends.not_covered)
 
 
 def _small_env(task: LoadedTask) -> RobotTask:
@@ -230,10 +237,8 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
 def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) -> Contract:
     """The contract of the network in ``folder``, trained with the noise level ``noise``; writes the scene there."""
     cfg, robot, scale = task.cfg, env.robot, task.cfg.control.action_scale
-    pose = per_joint(cfg.init_state.default_joint_angles, robot.joint_names, "init_state.default_joint_angles")
-    scales = per_joint(scale if isinstance(scale, dict) else {"": scale}, robot.joint_names, "control.action_scale")
-    start = [*cfg.init_state.pos, 1.0, 0.0, 0.0, 0.0, *pose]
-    scene = standalone(robot, cfg.asset.imu_site, qpos=start, ctrl=pose, camera=cfg.viewer.camera)
+    start = [*env.start_place, 1.0, 0.0, 0.0, 0.0, *robot.pose]
+    scene = standalone(robot, robot.imu, qpos=start, ctrl=robot.pose, camera=cfg.viewer.camera)
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
     ends = _ends(env)
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))
@@ -242,21 +247,26 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
     return Contract(
         task=task.name,
         joints=robot.joint_names,
-        default_pose=np.array(pose),
-        action=Action(cfg.control.action_origin, np.array(scales), cfg.normalization.clip_actions),
-        stiffness=np.array(per_joint(cfg.control.stiffness, robot.joint_names, "control.stiffness")),
-        damping=np.array(per_joint(cfg.control.damping, robot.joint_names, "control.damping")),
+        default_pose=np.array(robot.pose),
+        action=Action(
+            cfg.control.action_origin,
+            _table(robot, scale if isinstance(scale, dict) else {"": scale}, "control.action_scale"),
+            cfg.normalization.clip_actions,
+        ),
+        stiffness=_table(robot, cfg.control.stiffness, "control.stiffness"),
+        damping=_table(robot, cfg.control.damping, "control.damping"),
         period=round(env.dt, 9),
         timestep=cfg.sim.dt,
         decimation=cfg.control.decimation,
         commands=env.command_table,
         rows=rows,
-        scan=HeightScan(tuple(ground.measured_points_x), tuple(ground.measured_points_y), cfg.init_state.pos[2]) if scanned else None,
+        scan=HeightScan(tuple(ground.measured_points_x), tuple(ground.measured_points_y), env.start_place[2]) if scanned else None,
         sensors={name: tuple(names) for name, names in scene.sensors.items()}
         | ({FALL: tuple(f"contact/{name}" for name in ends.falls_on)} if ends.falls_on else {}),
+        gait=_gait(env) if any(row.measured == CLOCK for row in rows) else None,
         feet=feet,
         ends=ends,
-        imu=cfg.asset.imu_site,
+        imu=robot.imu,
         mass=round(env.total_mass, 6),
         input=INPUT,
         output=OUTPUT,
@@ -265,10 +275,21 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
     )
 
 
+def _table(robot: RobotModel, values: dict[str, float], field: str) -> np.ndarray:
+    return np.array(per_joint(values, robot.joint_names, field, robot.held))
+
+
 def _ends(env: RobotTask) -> Ends:
     """The task's rule for a fall."""
     rule, geoms = env.cfg.termination, [env.robot.contact_geoms[i] for i in env.contacts.terminating.tolist()]
-    return Ends(rule.max_tilt if rule.max_tilt < 180.0 else None, rule.min_base_height or None, tuple(geoms))
+    tilt = rule.max_tilt if rule.max_tilt < 180.0 else None
+    return Ends(tilt, rule.min_base_height or None, tuple(geoms), own_ends(type(env)))
+
+
+def _gait(env: RobotTask) -> Gait:
+    """The clock that a row shows."""
+    assert isinstance(env, LeggedRobot) and env.gait
+    return Gait(env.cfg.gait.period, tuple(env.gait.offsets), env.cfg.rewards.min_command)
 
 
 def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]:
@@ -282,7 +303,7 @@ def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]
                 )
             rows += contract_rows(env, row.group, noise)
             continue
-        known = ROWS.get(row.name)
+        known = ROWS.get(row.name) if row.name != CLOCK or getattr(env, "gait", None) else None  # a clock of the task's own
         units = ", ".join(command.unit for command in env.command_table) if row.name == "commands" else ""
         rows.append(
             ContractRow(
@@ -300,9 +321,9 @@ def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]
     return rows
 
 
-def _write_terrain(task: LoadedTask, folder: Path) -> str:
+def _write_terrain(env: RobotTask, task: LoadedTask, folder: Path) -> str:
     """The scene among steps and blocks of the kinds that were trained, at three levels; or why there is none."""
-    cfg, ground = task.cfg.init_state, task.cfg.terrain
+    ground = task.cfg.terrain
     kinds = [kind for kind, share in ground.terrain_proportions.items() if share > 0 and kind in LEVEL - {"flat"}]
     if not kinds:
         return ""
@@ -316,7 +337,7 @@ def _write_terrain(task: LoadedTask, folder: Path) -> str:
         border=4.0,
         seed=ground.seed,
     )
-    start = terrain.origins[0, kinds.index("stairs_up") if "stairs_up" in kinds else 0] + np.array(cfg.pos)
+    start = terrain.origins[0, kinds.index("stairs_up") if "stairs_up" in kinds else 0] + np.array(env.start_place)
     try:
         xml = among_steps((folder / SCENE_FILE).read_text(encoding="utf-8"), terrain, start.tolist())
     except ModelError as error:

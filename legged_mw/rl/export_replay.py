@@ -38,6 +38,7 @@ class Step(NamedTuple):
     taken: np.ndarray  # (N, D) that the environment got
     targets: np.ndarray  # (N, D) [rad] that the servos got, by encoders that may be off
     ended: np.ndarray  # (N,) the episode ended, so that nothing of the targets is left to see
+    clock: np.ndarray  # (N,) phase of the gait clock, share of its period; 0 where there is none
 
 
 def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Contract, folder: Path) -> list[Step]:
@@ -51,6 +52,8 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
         actions = act(policy, seen)
         observation = torch.cat([seen[group] for group in groups], dim=1).numpy()
         measured, commands = _measure(env, fleet), np.zeros((env.num_envs, 0))
+        gait = getattr(env, "gait", None)
+        clock = gait.phase.numpy().copy() if gait else np.zeros(env.num_envs)
         if contract.commands:
             commands = env.commands.numpy().copy()  # type: ignore[attr-defined]
         taken = actions.clone()
@@ -58,7 +61,7 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
         seen, _, dones, _ = env.step(taken)
         targets = env.sim.ctrl if offset is None else env.sim.ctrl + offset
         arrays = (tensor.numpy().copy() for tensor in (actions, taken, targets, dones.bool()))
-        steps.append(Step(observation, measured, commands, *arrays))
+        steps.append(Step(observation, measured, commands, *arrays, clock=clock))
     return steps
 
 
@@ -99,6 +102,8 @@ def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) 
     actions = iter([step.taken for step in steps])
     controller = Controller(folder, contract, env.num_envs, network=lambda _: next(actions))
     for number, step in enumerate(steps):
+        if controller.clock:
+            controller.clock.start[:] = step.clock  # an episode of training may begin anywhere in the period
         observed, start = controller.observe(step.measured, step.commands), 0
         for row in contract.rows:
             columns = slice(start, start := start + row.size * row.history)
@@ -121,6 +126,12 @@ def _compare(env: RobotTask, step: int, what: str, names: Sequence[Any], theirs:
         f"{', '.join(overridden(type(env))) or 'no method'}. State it where the contract can take it from: an action's scale and origin "
         f"in section control, a row's scale in its Row, a value of your own as a row of another name with sensors=; nothing was written"
     )
+
+
+def own_ends(task: type[RobotTask]) -> tuple[str, ...]:
+    """Methods of the task's own classes that may end an episode, which a contract cannot state."""
+    own = [kind for kind in task.__mro__ if kind not in LeggedRobot.__mro__]
+    return tuple(f"{kind.__name__}.{name}" for kind in own for name in ("_fallen", "_timed_out", "check_termination") if name in vars(kind))
 
 
 def overridden(task: type[RobotTask]) -> list[str]:

@@ -6,8 +6,8 @@ import copy
 import importlib.util
 import math
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
+from contextlib import nullcontext
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
@@ -18,13 +18,16 @@ from rsl_rl.runners import OnPolicyRunner
 from torch import Tensor
 
 from legged_mw import ROOT
+from legged_mw.envs.divergence import Watch
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
+from legged_mw.envs.wording import config_words
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import this_rank
 from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
+from legged_mw.rl.threads import UpdateThreads
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
 
@@ -33,8 +36,9 @@ class Runner(OnPolicyRunner):
     """Trains with rsl-rl's algorithm, storage and writers.
 
     ``current_learning_iteration`` counts finished iterations: a checkpoint ``model_100.pt`` has done 100 of them, and a
-    resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after a checkpoint. Set ``examine``
-    to what grades a policy: it is called every ``exam_interval`` iterations and after the last, and its figures are logged.
+    resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after a checkpoint; ``diverged`` says
+    why the runner set it by itself. Set ``examine`` to what grades a policy: it is called every ``exam_interval`` iterations and
+    after the last, and its figures are logged.
     """
 
     env: RobotTask
@@ -44,8 +48,11 @@ class Runner(OnPolicyRunner):
         self.logger.git_status_repos = [str(ROOT)] if (ROOT / ".git").exists() else []
         self.total_steps = 0
         self.stop: str | None = None
+        self.diverged = ""  # why training had to end, in words
+        self._watch = Watch()
         self.examine: Callable[[Any], dict[str, float]] | None = None
         self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
+        self._update_threads = UpdateThreads(self.cfg["cpu"]["update_threads"], usable_cores()) if device == "cpu" else nullcontext()
         self._warned_overflow = False
         self._last_means: dict[str, float] = {}
 
@@ -88,7 +95,7 @@ class Runner(OnPolicyRunner):
                 self.alg.compute_returns(obs)
             collected = clock.mark()
             self._anneal()
-            with self.update_threads():
+            with self._update_threads:
                 losses = self.alg.update()
             report = self._report(losses, (start, collected, start := clock.mark()))
             if waiting:
@@ -115,17 +122,6 @@ class Runner(OnPolicyRunner):
         for name, (begin, end) in self.cfg["anneal"].items():
             if end and begin is not None:
                 setattr(self.alg, name, begin + (end - begin) * done)
-
-    @contextmanager
-    def update_threads(self) -> Iterator[None]:
-        """On a CPU, an update's matrices are worth torch's threads; a step's hundreds of small operations are not."""
-        if self.device == "cpu":
-            before = torch.get_num_threads()
-            torch.set_num_threads(self.cfg["cpu"]["update_threads"] or usable_cores())
-            yield
-            torch.set_num_threads(before)
-        else:
-            yield
 
     def _must_stop(self) -> bool:
         """Ranks stop together, one iteration after the first was asked to: each waits for the others in every update."""
@@ -202,6 +198,8 @@ class Runner(OnPolicyRunner):
         values, count = report.message.read(), len(report.losses)
         numbers = self.env.name_statistics(values[: -count - 3])
         self._all_stop = values[-count - 3] > 0
+        if verdict := self._watch.verdict(numbers):
+            self.diverged, self.stop = verdict, self.stop or "what it simulates is not finite"
         losses = dict(zip(report.losses, values[-count - 2 : -2], strict=True))
         self._last_means.update({name: value for name, value in numbers.items() if not math.isnan(value)})
         numbers = {name: self._last_means.get(name, math.nan) for name in numbers}
@@ -218,8 +216,8 @@ class Runner(OnPolicyRunner):
         rows["Time elapsed, left"] = ", ".join(str(timedelta(seconds=round(t))) for t in (time.time() - self._begun, left))
         print(console_block(f"Learning iteration {report.iteration}/{self._last}", rows), flush=True)
         if numbers["overflowed"] and not self._warned_overflow:
-            text = self.env.sim.overflow_report() or f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks"
-            print(f"WARNING: {text} (config section sim)", flush=True)
+            others = f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks; raise `nconmax` and `njmax`"
+            print(f"WARNING: {config_words(self.env.sim.overflow_report() or others)}", flush=True)
             self._warned_overflow = True
 
     @staticmethod
@@ -241,6 +239,11 @@ class Runner(OnPolicyRunner):
     # ---- checkpoints ----------------------------------------------------------------------------------------------
 
     def _save_checkpoint(self) -> None:
+        """Write a checkpoint, unless the networks hold what is not finite: the newest one must be good to go on from."""
+        weights = [*self.alg.get_policy().parameters(), *self.alg.critic.parameters()]
+        if not all(bool(weight.isfinite().all()) for weight in weights):
+            print(f"WARNING: after iteration {self.current_learning_iteration} the networks are not finite; not saved", flush=True)
+            return
         if self.logger.writer is not None:
             assert self.logger.log_dir is not None
             self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import os
 import re
 from datetime import datetime
@@ -10,9 +11,9 @@ from typing import Any
 
 import torch
 
-from legged_mw.utils.config import ConfigError
-from legged_mw.utils.errors import unknown
-from legged_mw.utils.task import LoadedTask
+from legged_mw.utils.config import ConfigError, load_yaml
+from legged_mw.utils.errors import shown, unknown
+from legged_mw.utils.task import LoadedTask, task_names
 
 CONFIG_FILE = "config.yaml"
 
@@ -75,6 +76,31 @@ def find_checkpoint(run: Path, iteration: int) -> Path:
     if iteration not in found:
         raise ConfigError(f"no checkpoint {iteration} in {run}; there are: {', '.join(map(str, found))}")
     return found[iteration]
+
+
+def task_of(run: Path) -> str:
+    """What ``--task`` is for the run in the folder ``run``: a name in configs/, or the path of its config file as it lies today.
+
+    A relative path is looked for from the current folder and from those above the run, then its bare name. Raises ConfigError.
+    """
+    stored = load_yaml(run / CONFIG_FILE).get("task", "")
+    if not isinstance(stored, str) or not stored:
+        raise ConfigError(f"{shown(run / CONFIG_FILE)} does not say of which task it is; say --task")
+    if Path(stored).suffix != ".py":
+        return stored
+    folders = [Path.cwd(), *run.resolve().parents[:4]]  # experiment, logs, what holds logs; of an export one more
+    for file in (folder / name for name in (stored, Path(stored).name) for folder in folders):
+        if file.is_file():
+            return str(file)
+    raise ConfigError(f"{shown(run)} is of task '{stored}', which is not there from {', '.join(map(str, folders))}; say --task FILE")
+
+
+def require_task(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
+    """Where ``--task`` is missing, take the one that the run at the path ``--load_run`` is of."""
+    if not args.task and args.load_run and (Path(args.load_run).expanduser() / CONFIG_FILE).is_file():
+        args.task = task_of(Path(args.load_run).expanduser())
+    if not args.task:
+        parser.error(f"--task is missing, and --load_run is no path of a run that would say it; tasks: {', '.join(task_names())}")
 
 
 def save_whole(content: dict[str, Any], path: Path) -> None:

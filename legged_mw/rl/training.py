@@ -24,13 +24,13 @@ from legged_mw.rl.classes import check_classes
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
-from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
+from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run, require_task
 from legged_mw.sim.engines import pick_engine
 from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.machine import usable_cores
-from legged_mw.utils.task import LoadedTask, load_task, task_names
+from legged_mw.utils.task import LoadedTask, load_task
 
 _STEPS_PER_CORE = 6500  # a second, in training with the section `cpu` as it is (docs/performance.md)
 
@@ -57,9 +57,12 @@ def parse(description: str | None) -> argparse.Namespace:
     parser.add_argument("--max_time", type=duration, metavar="T", help="end, after a checkpoint, after 90s, 5m, 1.5h ...")
     parser.add_argument("--list", action="store_true", help="show the tasks and exit")
     parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")
+    parser.add_argument("--picture", metavar="PNG", help="with --check: the robot's health page too, and a picture of the robot")
     args = parser.parse_args()
-    if not (args.task or args.list):
-        parser.error(f"--task is missing; tasks: {', '.join(task_names())}")
+    if args.picture and not args.check:
+        parser.error("--picture draws what --check shows: add --check")
+    if not args.list:
+        require_task(args, parser)
     if not args.resume and (args.load_run is not None or args.checkpoint != -1):
         parser.error("--load_run and --checkpoint say what to go on with: add --resume")
     args.deadline = time.time() + args.max_time if args.max_time else None
@@ -143,6 +146,8 @@ def train(task: LoadedTask, env: RobotTask, start: Start, examine: Examine | Non
     _learn(runner, left, rank)
     finished = folder is not None and _say_how_it_ended(runner, task, folder, rank)
     leave_together(rank)
+    if runner.diverged:
+        raise UserError(runner.diverged)
     if folder and finished and task.train.runner.export:
         _export(task, folder, export)
 
@@ -200,7 +205,7 @@ def _say_how_it_ended(runner: Runner, task: LoadedTask, folder: Path, rank: Rank
 
 def _flags(task: LoadedTask, folder: Path) -> str:
     """The flags that find a run again."""
-    name = task.to_dict()["task"]
+    name = task.name if task.ships else shown(task.path)
     home = experiment_folder(load_task(name))
     return shlex.join(["--task", name, "--load_run", folder.name if folder.parent == home else shown(folder)])
 

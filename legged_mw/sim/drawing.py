@@ -16,15 +16,15 @@ from legged_mw.sim.terrain import Terrain
 
 GROUND_MATERIAL = "ground"  # of the floor
 _ZENITH, _HORIZON = (0.22, 0.32, 0.45), (0.56, 0.63, 0.70)
-CAMERA = (0.9, -1.1, 0.6)  # place of the camera "track" relative to the robot's centre of mass [m]
+CAMERA = (1.78, -2.18, 1.19)  # place of the camera "track", from the robot's centre of mass [reach of the robot], where none is given
 
 
-def visual_model(robot: RobotModel, camera: Sequence[float] = CAMERA) -> mujoco.MjModel:
+def visual_model(robot: RobotModel, camera: Sequence[float] = ()) -> mujoco.MjModel:
     """``robot`` with its visual geoms: same qpos, qvel and bodies as what is stepped. Takes a second where the terrain is large."""
     return visual_spec(robot, camera).compile()
 
 
-def visual_spec(robot: RobotModel, camera: Sequence[float] = CAMERA) -> mujoco.MjSpec:
+def visual_spec(robot: RobotModel, camera: Sequence[float] = ()) -> mujoco.MjSpec:
     """What ``visual_model`` is compiled from."""
     spec = dressed(robot, camera)
     if robot.terrain:
@@ -32,12 +32,24 @@ def visual_spec(robot: RobotModel, camera: Sequence[float] = CAMERA) -> mujoco.M
     return spec
 
 
-def dressed(robot: RobotModel, camera: Sequence[float] = CAMERA) -> mujoco.MjSpec:
-    """A copy of the robot's spec with a scene and a camera; its terrain is still the one height field."""
+def dressed(robot: RobotModel, camera: Sequence[float] = ()) -> mujoco.MjSpec:
+    """A copy of the robot's spec with a scene and a camera; its terrain is still the one height field.
+
+    ``camera``: its place from the robot, world axes [m]; empty: by the robot's size.
+    """
     spec = robot.spec.copy()
     add_scene(spec)
-    _add_camera(spec, robot.root, camera)
+    _add_camera(spec, robot.root, camera or [round(share * reach(robot), 1) for share in CAMERA])
     return spec
+
+
+def reach(robot: RobotModel) -> float:
+    """How far the robot reaches from its root with all joints at 0 [m]."""
+    model, data = robot.physics, mujoco.MjData(robot.physics)
+    mujoco.mj_kinematics(model, data)
+    root, geoms = data.xpos[robot.id("body", robot.root)], model.geom_bodyid > 0
+    shapes = np.linalg.norm(data.geom_xpos[geoms] - root, axis=1) + model.geom_rbound[geoms]
+    return float(max(*np.linalg.norm(data.xpos[1:] - root, axis=1), *shapes, 0.1))
 
 
 def ground_model(terrain: Terrain) -> mujoco.MjModel:

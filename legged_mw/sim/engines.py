@@ -9,6 +9,7 @@ from collections.abc import Sequence
 import mujoco
 
 from legged_mw.sim.errors import EngineError
+from legged_mw.sim.room import count_room
 from legged_mw.sim.simulation import Simulation
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import unknown
@@ -33,8 +34,8 @@ def make_simulation(
     device: str,
     *,
     engine: str = "auto",
-    nconmax: int,
-    njmax: int,
+    nconmax: int = 0,
+    njmax: int = 0,
     threads: int = 0,
     world_fields: Sequence[str] = (),
     terrain: Terrain | None = None,
@@ -45,9 +46,10 @@ def make_simulation(
     ``terrain`` is what the model's height field was made from: mujoco-warp gets contacts of our own with it
     (``sim/ground_contact.py``), MuJoCo's own engine those of the model.
 
-    ``nconmax`` and ``njmax`` are the contacts and constraint rows a world has room for; MuJoCo's own engine allocates as it
-    needs and leaves them aside. ``threads`` are those of MuJoCo's own engine, 0: one a core. ``world_fields`` names model
-    fields that get a value per world (see ``field``). ``eager`` switches mujoco-warp's replay on a CPU off.
+    ``nconmax`` and ``njmax`` are the contacts and constraint rows a world has room for, 0: what ``room.count_room`` finds;
+    MuJoCo's own engine allocates as it needs and leaves them aside. ``threads`` are those of MuJoCo's own engine, 0: one a
+    core. ``world_fields`` names model fields that get a value per world (see ``field``). ``eager`` switches mujoco-warp's
+    replay on a CPU off.
     """
     # each engine is imported where it steps: importing warp takes a second
     if pick_engine(engine, device) == "mujoco":
@@ -56,4 +58,6 @@ def make_simulation(
         return MujocoSimulation(model, num_envs, threads=threads, world_fields=world_fields)
     from legged_mw.sim.warp_engine import WarpSimulation
 
+    room = count_room(model, terrain is not None)
+    nconmax, njmax = nconmax or room.contacts, njmax or room.rows
     return WarpSimulation(model, num_envs, device, nconmax=nconmax, njmax=njmax, world_fields=world_fields, terrain=terrain, eager=eager)

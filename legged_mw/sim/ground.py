@@ -14,6 +14,7 @@ from legged_mw.sim.errors import ModelError
 from legged_mw.sim.terrain import LEVEL, Heights, Terrain
 
 GROUND = "floor"  # name of the ground geom
+PROBE_SPACING = 0.1  # [m] between the spheres by which one geom touches terrain on mujoco-warp
 MOST_BOXES = 1000  # of a tile; what needs more stays a height field
 
 

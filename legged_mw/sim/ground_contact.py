@@ -26,12 +26,12 @@ from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import Contact
 from torch import Tensor
 
+from legged_mw.sim.ground import PROBE_SPACING
 from legged_mw.sim.shapes import spheres_on
 from legged_mw.sim.terrain import Terrain
 
 wp.set_module_options({"enable_backward": False})
 
-SPACING = 0.1  # [m] between probes of one geom
 _CORNER_COS = wp.constant(0.9)  # of the angle from which on a second face is another contact: 26 deg
 _DEEPEST = wp.constant(0.3)  # [m] how far around a probe under the ground its surface is looked for
 
@@ -39,13 +39,13 @@ _DEEPEST = wp.constant(0.3)  # [m] how far around a probe under the ground its s
 def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, list[float]]:
     """Spheres that stand for what can touch the geom ``ground``: their geoms, places in the geom's frame (P, 3), radii [m].
 
-    They are ``SPACING`` apart at the most, so that a thin edge of the ground may come as far in between.
+    They are ``PROBE_SPACING`` apart at the most, so that a thin edge of the ground may come as far in between.
     """
     geoms, places, radii = [], [], []
     for geom in range(model.ngeom):
         touches = model.geom_contype[ground] & model.geom_conaffinity[geom] or model.geom_contype[geom] & model.geom_conaffinity[ground]
         if geom != ground and touches:
-            found, radius = spheres_on(model, geom, SPACING)
+            found, radius = spheres_on(model, geom, PROBE_SPACING)
             geoms += [geom] * len(found)
             places.append(found)
             radii += [radius] * len(found)

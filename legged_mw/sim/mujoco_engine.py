@@ -23,7 +23,7 @@ from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import usable_cores
 
 _STATE, _WRITTEN = ("qpos", "qvel"), ("ctrl", "xfrc_applied")  # a step reads and writes the state, and reads the rest
-_READ = ("sensordata", "actuator_force", "site_xpos")  # computed by a step
+_READ = ("sensordata", "actuator_force", "site_xpos", "xquat")  # computed by a step
 _FULL = [int(mujoco.mjtWarning.mjWARN_CONTACTFULL), int(mujoco.mjtWarning.mjWARN_CNSTRFULL)]
 
 

@@ -141,14 +141,20 @@ def add_sites(spec: mujoco.MjSpec, sites: Mapping[str, Sequence[str]], angles: S
 
 def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[str]) -> tuple[str, np.ndarray]:
     """The geom whose surface is lowest, and the middle of the lowest points on its body [m, body frame]."""
-    points: dict[str, np.ndarray] = {}  # world frame
-    for name in geoms:
-        geom = model.geom(name).id
-        places, radius = spheres_on(model, geom, SPACING)
-        points[name] = data.geom_xpos[geom] + places @ data.geom_xmat[geom].reshape(3, 3).T - [0.0, 0.0, radius]
+    points = surfaces(model, data, geoms)
     lowest = min(points, key=lambda name: round(points[name][:, 2].min(), 6))  # of equal ones the first
     body = model.geom(lowest).bodyid[0]
     there = np.concatenate([places for name, places in points.items() if model.geom(name).bodyid[0] == body])
     low = there[there[:, 2] < there[:, 2].min() + LEVEL]
     middle = 0.5 * (low.min(axis=0) + low.max(axis=0))
     return lowest, (middle - data.xpos[body]) @ data.xmat[body].reshape(3, 3)
+
+
+def surfaces(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[str]) -> dict[str, Points]:
+    """Points on the undersides of geoms, by name [m, world frame]."""
+    points: dict[str, Points] = {}
+    for name in geoms:
+        geom = model.geom(name).id
+        places, radius = spheres_on(model, geom, SPACING)
+        points[name] = data.geom_xpos[geom] + places @ data.geom_xmat[geom].reshape(3, 3).T - [0.0, 0.0, radius]
+    return points

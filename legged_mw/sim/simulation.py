@@ -32,6 +32,7 @@ class Simulation(ABC):
     sensordata: Tensor  # (N, nsensordata) of the last substep
     actuator_force: Tensor  # (N, nu) [N m], clamped, of the last substep
     site_xpos: Tensor  # (N, nsite, 3) [m, world], of the last substep
+    xquat: Tensor  # (N, nbody, 4) attitude of each body, (w, x, y, z), body to world, of the last substep
     xfrc_applied: Tensor  # (N, nbody, 6) force [N] and torque [N m], world frame, at the body's centre of mass; persists
 
     _fields: dict[str, Tensor]  # of ``world_fields``

@@ -24,7 +24,7 @@ from legged_mw.utils.errors import unknown
 
 wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it loads; a first run would drown in it
 
-_STATE = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xfrc_applied", "overflow")
+_STATE = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xquat", "xfrc_applied", "overflow")
 # With 1 Newton and 5 line-search iterations these two are always set: they say "not converged", which is the plan.
 _EXPECTED = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
 # From this many Newton iterations on, a conditional loop in the graph is worth its launch.
@@ -79,7 +79,7 @@ class WarpSimulation(Simulation):
     def reset(self, mask: Tensor) -> None:
         self._reset_mask.copy_(mask)
         self._run("reset", lambda: mjw.reset_data(self._model, self._data, reset=self._reset_mask_wp))
-        for stale in (self.actuator_force, self.site_xpos):  # reset_data leaves the dead episode's values, even NaN
+        for stale in (self.actuator_force, self.site_xpos, self.xquat):  # reset_data leaves the dead episode's values, even NaN
             stale.masked_fill_(mask.view(-1, *[1] * (stale.dim() - 1)), 0.0)
 
     def set_constants(self) -> None:
@@ -97,11 +97,13 @@ class WarpSimulation(Simulation):
         bits = [bit for bit in OverflowType if bit != OverflowType.ALL and bool((seen & int(bit)).any())]
         raise_ = []
         if OverflowType.NEFC in bits:
-            raise_.append(f"njmax (now {self.njmax})")
+            raise_.append(f"`njmax` (now {self.njmax})")
         if {OverflowType.NARROWPHASE, OverflowType.BROADPHASE} & set(bits):
-            raise_.append(f"nconmax (now {self.nconmax})")
+            raise_.append(f"`nconmax` (now {self.nconmax})")
         names = ", ".join(str(bit.name) for bit in bits)
-        return f"simulator overflow ({names}) in {worlds} of {self.num_envs} worlds; raise {' and '.join(raise_) or 'nconmax and njmax'}"
+        return (
+            f"simulator overflow ({names}) in {worlds} of {self.num_envs} worlds; raise {' and '.join(raise_) or '`nconmax` and `njmax`'}"
+        )
 
     def _substeps(self, count: int) -> None:
         """Sensors feed nothing back, so only the last substep computes them: same state, a tenth less work."""

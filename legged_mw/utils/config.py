@@ -24,6 +24,7 @@ from weakref import WeakKeyDictionary
 import yaml
 
 from legged_mw.utils.errors import UserError
+from legged_mw.utils.files import note_file
 from legged_mw.utils.renamed import new_name
 
 _TYPES = (int, float, bool, str, NoneType, list, dict, Any)
@@ -55,7 +56,12 @@ def _schema(cls: type) -> dict[str, Any]:
         if _is_section(kind):
             _schema(kind)
             fields[name].__setattr__ = _guarded_setattr  # all that is ever added to a section: it stays the user's plain class
-    return _SCHEMAS.setdefault(cls, fields)
+    if vars(cls).get("_only"):  # what it inherits and does not write itself is 0
+        if not getattr(cls, "_open", False):
+            raise ConfigError(f"{_place(cls, '_only')}: {_path(cls)} is not an open table of numbers: leave `_only` out of it")
+        for name in known.keys() - vars(cls).keys():
+            setattr(cls, name, 0.0)
+    return _SCHEMAS.setdefault(note_file(cls), fields)
 
 
 def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
@@ -294,8 +300,9 @@ class Config:
     """Base of every configuration: nested plain classes are its sections, their attributes its fields.
 
     `name: type = value` declares a field; in a subclass a bare `name = value` overrides it, and `class env(Parent.env):`
-    a section. A section with `_open = True` takes any new bare `name = number` too. All of it is checked when the class
-    statement runs, and again whenever a field is set. An instance owns a copy of every default.
+    a section. A section with `_open = True` takes any new bare `name = number` too; `_only = True` in a subclass of that sets
+    to 0 what it does not write itself. All is checked when the class statement runs, and whenever a field is set. An
+    instance owns a copy of every default.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

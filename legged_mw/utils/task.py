@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import importlib
-import importlib.util
-import sys
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from importlib.machinery import PathFinder
+import os
+from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 from legged_mw import ROOT
 from legged_mw.utils.config import Config, ConfigError
 from legged_mw.utils.errors import unknown
+from legged_mw.utils.files import find_file
 from legged_mw.utils.renamed import with_new_names
-
-_loaded: dict[tuple[str, ...], dict[str, ModuleType]] = {}  # folders of `configs` -> its modules, kept while the name is another's
+from legged_mw.utils.task_module import import_task
 
 
 class Task(NamedTuple):
@@ -40,9 +35,7 @@ class LoadedTask:
         self.about = about  # the config file's first line
         self.exam: str = getattr(task.env, "exam", "") if task.exam is None else task.exam
         self.cfg, self.train = task.cfg(), task.train()
-        beside = path.resolve().parent / Path(self.cfg.asset.file).expanduser()
-        if self.cfg.asset.file and beside.is_file():
-            self.cfg.asset.file = str(beside)
+        self.cfg._folder = str(path.resolve().parent)  # where files that flags name are looked for: utils/files.py
 
     def set(self, path: str, value: Any, where: str = "--set") -> None:
         """Override one field by its dotted path; text is parsed by the field's type."""
@@ -69,7 +62,7 @@ class LoadedTask:
         A learner's section that the file lacks, since it is older than the section, is what it was then: the base class's,
         not the task's of today. Returns the names of such sections.
         """
-        saved = with_new_names(saved)
+        saved = self._with_own_file(with_new_names(saved))
         theirs = str(saved.get("task", self.name))
         if Path(theirs).stem != self.name:
             raise ConfigError(f"{where} is of task '{theirs}', not '{self.name}'; say --task {theirs}")
@@ -77,6 +70,16 @@ class LoadedTask:
         older = {name: value for name, value in base.to_dict().items() if name not in saved and isinstance(value, dict)}
         self.update({**saved, **older}, where)
         return list(older)
+
+    def _with_own_file(self, saved: Mapping[str, Any]) -> Mapping[str, Any]:
+        """``saved`` without an absolute ``asset.file`` that is the task's own: runs once stored the path of their machine."""
+        asset = saved.get("asset")
+        file = Path(str(asset.get("file", ""))) if isinstance(asset, Mapping) else Path()
+        if asset is None or not file.is_absolute() or file.name != Path(self.cfg.asset.file).name:
+            return saved
+        if file.exists() and not file.samefile(find_file(self.cfg, "asset.file")):
+            return saved
+        return {**saved, "asset": {**asset, "file": self.cfg.asset.file}}
 
     def changes_since(self, before: LoadedTask) -> dict[str, tuple[Any, Any]]:
         """Dotted path -> (value in ``before``, value now) of every field that differs; ``before`` is a copy of this task."""
@@ -95,9 +98,20 @@ class LoadedTask:
             self.set(path, value, where="cpu.overrides")
 
     def to_dict(self) -> dict[str, Any]:
-        """Both configs as one mapping, with the task's name: what ``config.yaml`` in a run folder holds."""
-        known = self.path.parent.resolve() == (ROOT / "configs").resolve()
-        return {"task": self.name if known else str(self.path.resolve()), **self.cfg.to_dict(), **self.train.to_dict()}
+        """Both configs as one mapping, with the task's name: what ``config.yaml`` in a run folder holds.
+
+        Of a file outside of configs/ that is the path from the current folder, which has logs/: both may move together.
+        """
+        name, here, file = self.name, Path.cwd().resolve(), self.path.resolve()
+        if not self.ships:
+            together = os.path.commonpath([here, file]) != here.anchor
+            name = Path(os.path.relpath(file, here)).as_posix() if together else file.name
+        return {"task": name, **self.cfg.to_dict(), **self.train.to_dict()}
+
+    @property
+    def ships(self) -> bool:
+        """Whether the file is in configs/, so that ``--task`` knows its bare name."""
+        return self.path.parent.resolve() == (ROOT / "configs").resolve()
 
     def _owner(self, section: str, where: str) -> Config:
         sections: dict[str, Config] = {name: owner for owner in (self.cfg, self.train) for name in owner.to_dict()}
@@ -119,7 +133,7 @@ def list_tasks() -> str:
 def load_task(name: str) -> LoadedTask:
     """The task called ``name`` in ``configs/``, or that of the config file at that path.
 
-    A relative ``asset.file`` is looked for beside the config file first, then in the repository.
+    The file may import its neighbours. A relative ``asset.file`` is looked for beside the file that wrote it, then in the repository.
     """
     path = Path(name).expanduser()
     if path.suffix != ".py":
@@ -129,54 +143,8 @@ def load_task(name: str) -> LoadedTask:
         path = ROOT / "configs" / f"{name}.py"
     if not path.is_file():
         raise ConfigError(f"no config file at {path.absolute()}")
-    module = _import(path)
+    module = import_task(path)
     task = getattr(module, "TASK", None)
     if not isinstance(task, Task):
         raise ConfigError(f"{path} must end with TASK = Task(Env, Cfg, CfgPPO); its TASK is {task!r}")
     return LoadedTask(path.stem, path, task, about=(module.__doc__ or "").partition("\n")[0])
-
-
-def _import(path: Path) -> ModuleType:
-    """The module of a config file. Those in configs/ are imported by name, so that they can subclass one another."""
-    folder, shipped = path.resolve().parent, (ROOT / "configs").resolve()
-    if folder == shipped:
-        with _configs(shipped):
-            return importlib.import_module(f"configs.{path.stem}")
-    spec = importlib.util.spec_from_file_location(f"legged_mw_task_{path.stem}", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # annotations are resolved through it
-    beside = folder if folder.name == "configs" else folder / "configs"
-    with _configs(*([beside] if beside.is_dir() else []), shipped):
-        spec.loader.exec_module(module)
-    return module
-
-
-@contextmanager
-def _configs(*folders: Path) -> Iterator[None]:
-    """While a task is loaded, ``configs`` is the package of these folders; the first one that has a module wins.
-
-    Afterwards the name is given back if something else on the path has it.
-    """
-    places = [str(folder) for folder in folders]
-    before = _take_out("configs")
-    if before and [str(Path(place).resolve()) for place in before["configs"].__path__] == places:
-        sys.modules.update(before)
-        yield
-        return
-    package = ModuleType("configs")
-    package.__path__ = places
-    sys.modules.update(_loaded.get(tuple(places), {"configs": package}))
-    try:
-        yield
-    finally:
-        other = PathFinder.find_spec("configs")
-        if before or (other and [*(other.submodule_search_locations or ())] != places):
-            _loaded[tuple(places)] = _take_out("configs")
-            sys.modules.update(before)
-
-
-def _take_out(package: str) -> dict[str, ModuleType]:
-    """Remove a package and its modules from those that are imported; returns them."""
-    return {name: sys.modules.pop(name) for name in [*sys.modules] if name.partition(".")[0] == package}

@@ -9,11 +9,14 @@ import math
 import mujoco
 import numpy as np
 
-from legged_mw.view.posed_robot import PosedRobots, RoughGround
+from legged_mw.view.posed_robot import Placement, PosedRobots, RoughGround
 
 AZIMUTH, ELEVATION = 130.0, -22.0  # [deg] front right of the robot, a little above it
 ELEVATION_ALL = -35.0  # [deg]
-DISTANCE = 2.4  # [robot radius] camera to base
+DISTANCE = 2.4  # [robot radius] camera to base, at least
+BEHIND = 1.3 * DISTANCE  # likewise from behind
+ARROWS = 0.45  # [robot radius] above its top: the picture has room for the arrows there
+ROOM = 0.88  # share of the picture's height that robot and arrows take, at most
 FOLLOW_XY, FOLLOW_Z = 0.12, 0.04  # share of the way to the base per frame; slower in z, so that steps do not shake the picture
 FOLLOW_ALL = 0.04  # the same for all: slow, because robots come into reach and leave it
 REACH = 14.0  # [robot radius] from the followed robot; "all" shows the robots within it
@@ -24,6 +27,18 @@ LIFT = 0.06  # share of the way to the elevation that this needs per frame
 JUMP = 3.0  # [robot radius] a base that moved this far at once was reset: the camera cuts to it
 
 
+def distance(placement: Placement, fovy: float, least: float = DISTANCE) -> float:
+    """Camera to base [m], so that all of the robot and its arrows are in the picture; ``fovy`` [deg] is the picture's height.
+
+    ``least`` [robot radius] is the distance to a robot that is not tall.
+    """
+    slope, down = ROOM * math.tan(math.radians(fovy) / 2), math.radians(-ELEVATION)
+    # seen from above, what is above the base is nearer and what is below it farther away
+    above = (placement.top + ARROWS * placement.radius) * (math.cos(down) / slope + math.sin(down))
+    below = placement.bottom * (math.cos(down) / slope - math.sin(down))
+    return max(least * placement.radius, above, below)
+
+
 class RobotCamera:
     """Moves `camera`. Where a mouse can turn it (`by_hand`), it is placed once and then tracks the robot by itself."""
 
@@ -32,6 +47,7 @@ class RobotCamera:
         self._target: tuple[str, int] | None = None  # mode, world
         self._last_position = robots.placements[0].position  # of that world's robot
         self._frames = 1.0
+        self._fovy = float(robots.model.vis.global_.fovy)
 
     def update(self, mode: str, world: int, frames: float = 1.0) -> mujoco.MjvCamera:
         """Move as `mode` says, one of drive.CAMERAS. `frames` of a video passed since the last call."""
@@ -62,7 +78,7 @@ class RobotCamera:
         placement, camera = self.robots.placements[world], self.camera
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         camera.lookat[:] = placement.position
-        camera.distance = DISTANCE * placement.radius
+        camera.distance = distance(placement, self._fovy)
         camera.azimuth = math.degrees(placement.heading) + AZIMUTH
         camera.elevation = ELEVATION
 
@@ -97,7 +113,7 @@ class RobotCamera:
         gap = (azimuth - camera.azimuth + 180.0) % 360.0 - 180.0
         camera.azimuth += gap if cut else gap * self._share(TURN)
         if cut:
-            camera.distance, camera.elevation = 1.3 * DISTANCE * self.robots.radius, ELEVATION
+            camera.distance, camera.elevation = distance(self.robots.placements[0], self._fovy, BEHIND), ELEVATION
 
     def _see_all(self, world: int, cut: bool) -> None:
         """Show all robots within reach of this one: robots walk apart, and from too far they are specks."""
@@ -109,6 +125,6 @@ class RobotCamera:
         share = 1.0 if cut else self._share(FOLLOW_ALL)
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         camera.lookat[:] += share * (middle - camera.lookat)
-        camera.distance += share * (2.5 * reach - camera.distance)
+        camera.distance += share * (max(2.5 * reach, distance(self.robots.placements[world], self._fovy)) - camera.distance)
         if cut:
             camera.azimuth, camera.elevation = AZIMUTH, ELEVATION_ALL

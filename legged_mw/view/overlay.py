@@ -22,10 +22,13 @@ VELOCITY_RGBA = (0.20, 0.62, 0.95, 1.0)
 CONTACT_RGBA = (0.00, 0.75, 0.52, 0.9)
 FALL_RGBA = (0.90, 0.20, 0.45, 0.45)
 
-ARROW_PER_SPEED = 1.3  # [robot radius per m/s] arrow length: at 1 m/s a little more than the robot is long from base to nose
+ARROW_PER_SPEED = 1.3  # [robot radius per m/s] arrow length; MuJoCo draws half of it: at 1 m/s a little more than from base to nose
+ARROW_MAX = 1.95  # [robot radius] of the fastest command: a longer arrow would leave the picture
+LEVELS = (0.36, 0.24)  # [robot radius] above its top: the commanded velocity, the measured one
 ARC_PER_RATE = 1.0  # [rad per rad/s] the turn arrow shows one second of turning, at most ARC_MAX of it
 ARC_MAX = 1.75 * math.pi  # [rad]
 ARC_SEGMENTS = 12
+DISC = 0.006  # [robot radius] half the thickness of a disc below a foot
 SPEED_MIN, RATE_MIN = 0.03, 0.05  # [m/s], [rad/s] below these an arrow is a speck that flickers
 ROBOTS_WITH_ARROWS = 32  # more of them hide the robots
 
@@ -33,37 +36,44 @@ ROBOTS_WITH_ARROWS = 32  # more of them hide the robots
 def draw(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment) -> None:
     """Append all of `moment` to `scene`, which shows the robots already."""
     for world in range(min(robots.count, ROBOTS_WITH_ARROWS)):
-        draw_velocities(scene, robots.placements[world], moment.target_velocity[world], moment.velocity[world], turn=world == moment.world)
+        target, velocity, turn = moment.target_velocity[world], moment.velocity[world], world == moment.world
+        draw_velocities(scene, robots.placements[world], target, velocity, turn, moment.top_speed)
     _draw_contacts(scene, robots, moment)
     for fall in moment.falls:
         if fall.world < robots.count:
             _draw_fall(scene, fall.place + robots.offsets[fall.world], robots.radius)
 
 
-def draw_velocities(scene: mujoco.MjvScene, placement: Placement, target: ArrayLike, velocity: ArrayLike, turn: bool = True) -> None:
-    """Append arrows for the commanded and the measured velocity, each (vx, vy, yaw rate) in the body frame, above the trunk.
+def draw_velocities(
+    scene: mujoco.MjvScene, placement: Placement, target: ArrayLike, velocity: ArrayLike, turn: bool = True, top_speed: float = 1.0
+) -> None:
+    """Append arrows for the commanded and the measured velocity, each (vx, vy, yaw rate) in the body frame, above the robot's top.
 
-    A component whose target is NaN has no arrows. `turn`: the yaw rate too.
+    A component whose target is NaN has no arrows. `turn`: the yaw rate too. `top_speed` [m/s] has the longest arrow.
     """
     target, velocity = np.asarray(target, dtype=np.float64), np.asarray(velocity, dtype=np.float64)
     for array in (target, velocity):
         if array.shape != (3,):
             raise ValueError(f"A velocity to draw is (vx, vy, yaw rate), shape (3,); got shape {array.shape}.")
-    for array, rgba, level in ((target, COMMAND_RGBA, 0.40), (velocity, VELOCITY_RGBA, 0.28)):
+    for array, rgba, level in ((target, COMMAND_RGBA, LEVELS[0]), (velocity, VELOCITY_RGBA, LEVELS[1])):
         origin = placement.position + (0.0, 0.0, placement.top + level * placement.radius)
         if not np.isnan(target[:2]).any():
-            _draw_straight(scene, placement, origin, array, rgba)
+            _draw_straight(scene, placement, origin, array, min(ARROW_PER_SPEED, ARROW_MAX / top_speed), rgba)
         if turn and not np.isnan(target[2]):
             _draw_turn(scene, placement, origin, array[2], rgba)
 
 
-def _draw_straight(scene: mujoco.MjvScene, placement: Placement, origin: FloatArray, velocity: FloatArray, rgba: tuple[float, ...]) -> None:
-    """An arrow along (vx, vy), level even when the trunk is not: commands are meant in the plane."""
-    if math.hypot(velocity[0], velocity[1]) < SPEED_MIN:
+def _draw_straight(
+    scene: mujoco.MjvScene, placement: Placement, origin: FloatArray, velocity: FloatArray, per_speed: float, rgba: tuple[float, ...]
+) -> None:
+    """An arrow along (vx, vy), level even when the trunk is not: commands are meant in the plane. `per_speed` [robot radius per m/s]."""
+    speed = math.hypot(velocity[0], velocity[1])
+    if speed < SPEED_MIN:
         return
+    per_speed = min(per_speed, 1.1 * ARROW_MAX / speed)  # a robot that was pushed is faster than any command
     cos, sin = math.cos(placement.heading), math.sin(placement.heading)
     along = np.array([cos * velocity[0] - sin * velocity[1], sin * velocity[0] + cos * velocity[1], 0.0])
-    tip = origin + ARROW_PER_SPEED * placement.radius * along
+    tip = origin + per_speed * placement.radius * along
     _connect(scene, mujoco.mjtGeom.mjGEOM_ARROW, 0.03 * placement.radius, origin, tip, rgba)
 
 
@@ -82,10 +92,14 @@ def _draw_turn(scene: mujoco.MjvScene, placement: Placement, origin: FloatArray,
 
 
 def _draw_contacts(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment) -> None:
-    """A disc under each foot on the ground."""
-    size = (2.2 * robots.foot_radius, 0.003, 0.0)
-    for place in robots.below_feet(moment.contacts):
-        _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, size, place + (0.0, 0.0, 0.004), CONTACT_RGBA)
+    """A disc under each foot on the ground, as long and as wide as what touches it."""
+    thick = DISC * robots.radius
+    for place, heading, half in robots.patches(moment.contacts):
+        disc = _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (half[0], thick, 0.0), place + (0.0, 0.0, 1.3 * thick), CONTACT_RGBA)
+        if disc is not None:
+            cos, sin = math.cos(heading), math.sin(heading)
+            disc.size[1] = half[1]
+            disc.mat[:] = [[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]
 
 
 def _draw_fall(scene: mujoco.MjvScene, place: FloatArray, radius: float) -> None:

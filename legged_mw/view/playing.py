@@ -10,9 +10,10 @@ import torch
 
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.policies import Source, act, introduce, load_policy
+from legged_mw.rl.runs import require_task
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, pick_device, seed_everything
 from legged_mw.utils.commands import Command, command_table
-from legged_mw.utils.task import LoadedTask, task_names
+from legged_mw.utils.task import LoadedTask
 from legged_mw.view import launch
 from legged_mw.view.env_stage import EnvStage
 
@@ -40,15 +41,18 @@ def parse(description: str | None) -> argparse.Namespace:
     launch.add_flags(parser)
     parser.add_argument("--eval", action="store_true", help="run the walking exam (on rough ground too), print its tables, write a report")
     parser.add_argument("--compare", metavar="RUN", help="with --eval: grade this run beside it; its name or path, or 'shipped'")
+    common = "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
+    parser.add_argument("--ranges", choices=("trained", "common"), help=common)
     parser.add_argument("--export", metavar="DIR", help="write the policy as network, contract and scene there, to deploy (docs/deploy.md)")
     args = parser.parse_args()
-    if not args.task:
-        parser.error(f"--task is missing; tasks: {', '.join(task_names())}")
+    require_task(args, parser)
     asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag)]
     if len(asked) > 1 or (args.eval and args.command is not None):
         parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
     if args.compare is not None and not args.eval:
         parser.error("--compare grades two policies side by side: add --eval")
+    if args.ranges and not args.eval:
+        parser.error("--ranges says what the exam asks: add --eval")
     if args.commands and (args.eval or args.export or args.command is not None):
         parser.error("--commands drives what is watched: it goes with neither --command nor --eval nor --export")
     if (args.eval or args.export) and (watching := launch.asked(args)):

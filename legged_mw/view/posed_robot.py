@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from legged_mw.view.feet import Patch, feet_of, patch
 from legged_mw.view.stage import FloatArray
 
 GROUPS_SHOWN = 3  # geom groups 0 ground, 1 and 2 visuals; from 3 on collision shapes
@@ -26,14 +27,15 @@ class Placement(NamedTuple):
     heading: float  # of its x axis on the ground [rad]
     radius: float  # its size [m]
     top: float  # its height above its base [m]
+    bottom: float = 0.0  # and its depth below it [m]
 
 
 class PosedRobots:
     """All robots of one picture as one `model` and its `data`, without dynamics.
 
     The followed robot is always the first one in the model: its lights and cameras follow it, and a camera can track its
-    body `base`. Robots stand side by side, `offsets` (N, 3) apart; on rough ground each stays where it is. `radius` and
-    `top` [m] are measured in the model's first pose.
+    body `base`. Robots stand side by side, `offsets` (N, 3) apart; on rough ground each stays where it is. `radius`,
+    `top` and `bottom` [m] are measured in the model's first pose.
     """
 
     def __init__(self, spec: mujoco.MjSpec, count: int = 1) -> None:
@@ -45,9 +47,8 @@ class PosedRobots:
         self.model, self._bases, self._feet = many_robots(spec, single, count)
         self.data, self.base = mujoco.MjData(self.model), self._bases[0]
         self._forward()
-        self.radius, self.top = self._measure()
+        self.radius, self.top, self.bottom = self._measure()
         self.feet = self._feet[0]
-        self.foot_radius = float(np.median(self.model.geom_aabb[self.feet[0], 3:])) if self.feet else 0.0  # of the first one [m]
         rough = has_places(self.model)
         self.offsets = np.zeros((count, 3)) if rough else side_by_side(count, SPACING * self.radius)
         if count > 1 and not rough:  # one shadow map for all; on rough ground they are too far apart
@@ -71,13 +72,18 @@ class PosedRobots:
         self._forward()
         self.placements: list[Placement] = [self._placement(self._order.index(index)) for index in range(self.count)]
 
-    def below_feet(self, contacts: ArrayLike) -> FloatArray:
-        """Points (M, 3) [m] below the geoms that `contacts` (N, G) marks, the first G with a contact sensor."""
+    def patches(self, contacts: ArrayLike) -> list[Patch]:
+        """Where feet touch: one for each foot of which `contacts` (N, G) marks a geom, the first G with a contact sensor."""
         touching = np.asarray(contacts, dtype=bool)[: self.count]
         if len(touching) < self.count or touching.shape[1] > len(self.feet):
-            return np.zeros((0, 3))  # the model has fewer contact sensors
-        points = [self._lowest(self._feet[self._order.index(world)][foot]) for world, foot in np.argwhere(touching)]
-        return np.array(points).reshape(-1, 3)
+            return []  # the model has fewer contact sensors
+        found = []
+        for world, marked in enumerate(touching):
+            geoms = self._feet[self._order.index(world)][: len(marked)]
+            for foot in feet_of(self.model, geoms):
+                if down := [geoms[place] for place in foot if marked[place]]:
+                    found.append(patch(self.model, self.data, down, self.radius))
+        return found
 
     def _forward(self) -> None:
         mujoco.mj_kinematics(self.model, self.data)
@@ -87,28 +93,23 @@ class PosedRobots:
     def _placement(self, copy: int) -> Placement:
         body = self._bases[copy]
         rotation = self.data.xmat[body]
-        return Placement(np.array(self.data.xpos[body]), math.atan2(rotation[3], rotation[0]), self.radius, self.top)
-
-    def _lowest(self, geom: int) -> FloatArray:
-        """The point (3,) below the middle of a geom, at its lowest height [m]."""
-        centre, half = self._box(geom)
-        return centre - (0.0, 0.0, min(half[2], self.model.geom_rbound[geom]))  # a sphere's box grows as it turns
+        return Placement(np.array(self.data.xpos[body]), math.atan2(rotation[3], rotation[0]), self.radius, self.top, self.bottom)
 
     def _box(self, geom: int) -> tuple[FloatArray, FloatArray]:
         """Centre and half edges of the upright box around a geom, (3,) each [m]."""
         rotation, box = self.data.geom_xmat[geom].reshape(3, 3), self.model.geom_aabb[geom]
         return self.data.geom_xpos[geom] + rotation @ box[:3], np.abs(rotation) @ box[3:]
 
-    def _measure(self) -> tuple[float, float]:
-        """Largest distance of the visible geometry of a robot from its base, and its height above the base [m]."""
-        model, radius, top = self.model, 0.0, 0.0
+    def _measure(self) -> tuple[float, float, float]:
+        """Largest distance of the visible geometry of a robot from its base, its height above the base and its depth below it [m]."""
+        model, radius, top, bottom = self.model, 0.0, 0.0, 0.0
         robot = model.body_rootid[model.geom_bodyid] == model.body_rootid[self.base]
         for geom in map(int, np.flatnonzero(robot & (model.geom_group < GROUPS_SHOWN))):
             centre, half = self._box(geom)
             centre = centre - self.data.xpos[self.base]
             radius = max(radius, float(np.linalg.norm(np.abs(centre) + half)))
-            top = max(top, float(centre[2] + half[2]))
-        return (radius or 0.5), top  # a robot without geometry still needs a camera distance
+            top, bottom = max(top, float(centre[2] + half[2])), max(bottom, float(half[2] - centre[2]))
+        return (radius or 0.5), top, bottom  # a robot without geometry still needs a camera distance
 
 
 def many_robots(spec: mujoco.MjSpec, single: mujoco.MjModel, count: int) -> tuple[mujoco.MjModel, list[int], list[list[int]]]:

@@ -14,7 +14,7 @@ import numpy as np
 from legged_mw.utils.commands import LABELS, Command, with_units
 from legged_mw.view.drive import Pilot
 from legged_mw.view.script import Script
-from legged_mw.view.stage import BoolArray, Fall, FloatArray, Moment, Stage, Viewer, target_velocity
+from legged_mw.view.stage import BoolArray, Fall, FloatArray, Moment, Stage, Viewer, target_velocity, top_speed
 
 FALL_SECONDS = 2.0  # ours: how long the place of a fall is shown
 SETTLING = 1.0  # [s] ours: left out of a segment's mean velocity if the segment is longer than twice that
@@ -177,6 +177,7 @@ class Session:
             camera=pilot.camera,
             lines=self._lines(commands[pilot.world], velocity[pilot.world]),
             help=pilot.help,
+            top_speed=top_speed(stage.command_table),
         )
 
     def _lines(self, command: FloatArray, velocity: FloatArray) -> tuple[tuple[str, str], ...]:

@@ -89,6 +89,7 @@ class Moment(NamedTuple):
     camera: str = "follow"  # one of drive.CAMERAS
     lines: tuple[tuple[str, str], ...] = ()  # text to show: (name, value)
     help: bool = False  # show the keys
+    top_speed: float = 1.0  # [m/s] the fastest that robots can be commanded to go: arrows are drawn to fit it
 
 
 class Viewer(Protocol):
@@ -108,6 +109,12 @@ class Viewer(Protocol):
 def velocity_columns(table: Sequence[Command]) -> dict[int, int]:
     """Column of the command -> column of the velocity (vx, vy, yaw rate), for the commands that are velocities."""
     return {column: VELOCITY.index(command.name) for column, command in enumerate(table) if command.name in VELOCITY}
+
+
+def top_speed(table: Sequence[Command]) -> float:
+    """The fastest [m/s] along one axis that the commands allow; 1 if none is a velocity."""
+    ends = [abs(end) for command in table if command.name in VELOCITY[:2] for end in (command.low, command.high)]
+    return max(ends, default=0.0) or 1.0
 
 
 def target_velocity(table: Sequence[Command], commands: FloatArray) -> FloatArray:

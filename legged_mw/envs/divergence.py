@@ -1,0 +1,79 @@
+"""Which worlds broke, and which of their joints did it. Recorded in the step: fixed buffers and masks.
+
+A state that is not finite ends an episode as "broken". One such world is an accident; many, step after step, are physics that
+cannot be stepped as the config has it, and a training in it must end. ``Watch`` decides that, on the host, once an iteration.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from legged_mw.sim.simulation import Simulation
+
+SHARE = 0.01  # of an iteration's finished episodes: more that are not finite, in two iterations one after the other, end a training [ours]
+JOINT, ACTION = "broken_by/", "broken_by_action"  # statistics: worlds so far that a joint broke, and that an action did
+
+
+class Divergence:
+    """Finds broken worlds and counts, since the start, the fastest joint of each."""
+
+    def __init__(self, sim: Simulation, actions: Tensor, joints: Sequence[str], max_speed: float) -> None:
+        """``actions`` (N, A) as the step has them; ``max_speed`` of any degree of freedom that still counts as finite."""
+        self._sim, self._actions, self._joints, self._max_speed = sim, actions, joints, max_speed
+        self._speed = torch.zeros_like(sim.qvel[:, 6:])  # (N, D) [rad/s] at the end of the step before
+        self.counts = torch.zeros(len(joints) + 1, device=sim.qvel.device)  # worlds by joint, and last by action
+
+    def find(self, broken: Tensor) -> None:
+        """Write the worlds that broke in this step into ``broken`` (N,), and count what broke them."""
+        qvel = self._sim.qvel
+        speed = qvel.abs().amax(dim=1)
+        position = self._sim.qpos.abs().amax(dim=1)
+        action = self._actions.abs().amax(dim=1) < math.inf  # a servo swallows NaN, the reward does not
+        torch.logical_not((speed <= self._max_speed) & (position < math.inf) & action, out=broken)  # NaN compares false
+        joints = qvel[:, 6:].abs()
+        known = torch.where(joints.amax(dim=1, keepdim=True) < math.inf, joints, self._speed)  # all NaN: as they were before
+        first = (known == known.amax(dim=1, keepdim=True)) & (known > 0.0) & (broken & action)[:, None]
+        self.counts.add_(torch.cat([first, (broken & ~action)[:, None]], dim=1).sum(dim=0))
+        self._speed.copy_(joints.masked_fill_(broken[:, None], 0.0))
+
+    def statistics(self) -> dict[str, Tensor]:
+        """Worlds so far, () each, by what broke them."""
+        return {name: self.counts[i] for i, name in enumerate([*(f"{JOINT}{joint}" for joint in self._joints), ACTION])}
+
+
+class Watch:
+    """Says when an iteration's statistics mean that a training must end."""
+
+    def __init__(self) -> None:
+        self._good: Mapping[str, float] = {}  # statistics of the last iteration that was as it should be
+        self._before: Mapping[str, float] = {}  # of the last one, if too many were not finite
+
+    def verdict(self, numbers: Mapping[str, float]) -> str:
+        """Why training must end, in words; '' to go on. ``numbers`` are an iteration's statistics."""
+        if not numbers["broken"] > SHARE * numbers["episodes"]:
+            self._good, self._before = numbers, {}
+            return ""
+        before, self._before = self._before, numbers
+        if not before:
+            return ""
+        shares = " and ".join(f"{each['broken']:.0f} of {each['episodes']:.0f}" for each in (before, numbers))
+        counts = {name: numbers[name] - self._good.get(name, 0.0) for name in numbers if name.startswith((JOINT, ACTION))}
+        return f"in the last two iterations {shares} episodes ended with a state that is not finite: {_because(counts)}"
+
+
+def _because(counts: dict[str, float]) -> str:
+    """The cause and what to change, from the worlds that each joint and the actions broke."""
+    action, total = counts.pop(ACTION, 0.0), sum(counts.values())
+    if action > total:
+        return "the policy's actions are not finite; lower algorithm.learning_rate, and look for a reward term without a bound"
+    worst = sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])[:4]
+    joints = ", ".join(f"{name.removeprefix(JOINT)} ({counts[name] / total:.0%})" for name in worst) or "none that moved before"
+    return (
+        f"physics diverges; fastest joint at the break: {joints}. Lower control.damping or control.stiffness of these joints, or give them "
+        "armature (asset.armature), or lower sim.dt and raise control.decimation, or set sim.integrator to implicitfast; "
+        "train.py --check --picture robot.png shows what each joint bears"
+    )

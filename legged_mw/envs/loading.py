@@ -1,0 +1,69 @@
+"""From a config to the robot that the simulator steps, and the place where it starts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from torch import Tensor
+
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.envs.wording import config_words
+from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
+from legged_mw.sim.pose import standing_height
+from legged_mw.sim.terrain import Terrain
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.files import find_file
+
+
+def load_robot(
+    cfg: RobotTaskCfg, engine: str, terrain: Terrain | None, contact_geoms: Sequence[str], sites: Mapping[str, Sequence[str]]
+) -> RobotModel:
+    """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors."""
+    asset = cfg.asset
+    if not asset.file:
+        raise ConfigError("asset.file is empty; name the robot's MJCF or URDF, e.g. 'resources/robots/go1/go1.xml'")
+    robot = build_model(
+        find_file(cfg, "asset.file"),
+        solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations, cfg.sim.integrator),
+        ground=Ground(cfg.terrain.friction, cfg.terrain.condim, terrain, boxes=engine == "mujoco"),
+        stiffness=cfg.control.stiffness,
+        damping=cfg.control.damping,
+        colliders=asset.colliders,
+        self_collisions=asset.self_collisions,
+        contact_geoms=contact_geoms,
+        velocity_sites=list(sites),
+        imu_site=asset.imu_site,
+        sites=sites,
+        pose=cfg.init_state.default_joint_angles,
+        held_joints=asset.held_joints,
+        partial={
+            "effort": asset.effort,
+            "armature": asset.armature,
+            "frictionloss": asset.frictionloss,
+            "joint_speed_limits": asset.joint_speed_limits,
+        },
+    )
+    robot.overrides[:] = [config_words(line) for line in robot.overrides]
+    return robot
+
+
+def start_place(cfg: RobotTaskCfg, robot: RobotModel, colliders: Sequence[str]) -> list[float]:
+    """x, y, z of the root [m]: the config's, the keyframe's, or such that the lowest foot stands on the ground in the default pose.
+
+    Without feet it is the lowest of the ``colliders``.
+    """
+    if cfg.init_state.pos:
+        return list(cfg.init_state.pos)
+    if robot.start:
+        return list(robot.start)
+    feet = [geom for geoms in robot.site_geoms.values() for geom in geoms]
+    return [0.0, 0.0, standing_height(robot, feet or robot.names.find(colliders, "asset.colliders", colliding=True))]
+
+
+def soft_limits(robot: RobotModel, share: float, device: str | torch.device) -> tuple[Tensor, Tensor]:
+    """Lowest and highest angle (D,) [rad]: ``share`` of each joint's range, about its middle; infinite where it has no limits."""
+    low, high = torch.tensor(robot.joint_range, dtype=torch.float, device=device).unbind(dim=1)
+    middle, half = (low + high) / 2, (high - low) / 2 * share
+    limited = half.isfinite()
+    return torch.where(limited, middle - half, low), torch.where(limited, middle + half, high)

@@ -1,0 +1,96 @@
+"""What tasks for real robots share: no measured velocity, randomized worlds, kicks and pushes, and a learner that suits.
+
+Config classes only: a robot's own names and numbers are in configs/. Sources as in ``legged_robot_config``, and
+[I] Isaac Lab's G1 task, [M] mjlab's velocity task, [G] MuJoCo Playground's G1 joystick task; [ours] is measured: docs/lab.md.
+"""
+
+from __future__ import annotations
+
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+
+
+class SimToRealCfg(LeggedRobotCfg):
+    """A robot that walks by command and does not know its velocity."""
+
+    class env(LeggedRobotCfg.env):
+        num_envs = 8192
+
+    class observations(LeggedRobotCfg.observations):
+        leave_out = {"state": ["base_lin_vel"]}  # no sensor gives it; the critic knows it
+
+    class rewards(LeggedRobotCfg.rewards):
+        tracking_sigma = 0.2  # [ours]
+
+        class scales(LeggedRobotCfg.rewards.scales):
+            tracking_lin_vel = 2.0  # [ours]
+            tracking_ang_vel = 1.0  # [ours]
+
+    class domain_rand(LeggedRobotCfg.domain_rand):
+        enable = True
+        base_mass = [-1.0, 2.0]  # [kg] [ours]
+        base_com = [-0.03, 0.03]  # [m] [ours]
+        friction = [0.4, 1.2]  # [-] [M 0.3 to 1.2]
+        stiffness = [0.9, 1.1]  # [ours]
+        damping = [0.9, 1.1]  # [ours]
+        strength = [0.9, 1.1]  # [ours]
+        encoder_offset = [-0.015, 0.015]  # [rad] [M]
+        observe = True  # the critic knows
+
+    class perturbation(LeggedRobotCfg.perturbation):
+        kick = True
+        velocity = [0.0, 8.0]  # [m/s] [ours: docs/lab.md]
+        curriculum = True  # [ours: kicks grow as it learns to stand]
+        push = True
+
+
+class BipedCfg(SimToRealCfg):
+    """Such a robot with two legs."""
+
+    class gait(SimToRealCfg.gait):
+        period = 0.8  # [s] [unitree_rl_gym's G1]
+
+    class rewards(SimToRealCfg.rewards):
+        swing_height = 0.08  # [m] [G 0.08 to 0.12]
+        min_feet_distance = 0.16  # [m] [ours: the feet of a G1 are 6 cm wide]
+        max_single_stance = 0.4  # [s] [I]
+
+        class scales(SimToRealCfg.rewards.scales):
+            _only = True
+            tracking_lin_vel = 2.0  # [M]
+            tracking_ang_vel = 1.5  # [ours]
+            alive = 0.2  # [unitree_rl_gym 0.15]
+            lin_vel_z = -0.2  # [I]
+            ang_vel_xy = -0.05  # [I, M]
+            orientation = -2.0  # [G]
+            dof_pos_limits = -1.0  # [I, M]
+            pose = 0.5  # [ours]
+            termination = -100.0  # [G; I -200]
+            stand_still = -0.2  # [ours]
+            energy = -0.001  # [ours]
+            dof_acc = -1e-7  # [I]
+            action_rate = -0.01  # [I -0.005, M -0.1]
+            feet_slip = -0.25  # [G]
+            feet_distance = -5.0  # [ours]
+            feet_orientation = -0.5  # [ours]
+            feet_phase = 1.0  # [G]
+
+    class perturbation(SimToRealCfg.perturbation):
+        velocity = [0.0, 4.0]  # [m/s] [ours]
+
+
+class SimToRealCfgPPO(LeggedRobotCfgPPO):
+    """The learner of such a task."""
+
+    class runner(LeggedRobotCfgPPO.runner):
+        num_steps_per_env = 16  # [ours]
+        max_iterations = 3000
+
+    class algorithm(LeggedRobotCfgPPO.algorithm):
+        gamma = 0.97  # [ours]
+
+    class anneal(LeggedRobotCfgPPO.anneal):
+        entropy_coef = 0.001  # [ours]
+        desired_kl = 0.003  # [ours]
+
+    class symmetry(LeggedRobotCfgPPO.symmetry):
+        use_data_augmentation = True  # [ours]

@@ -1,0 +1,72 @@
+"""A robot's health page: python -m legged_mw.robot FILE, an MJCF or URDF, or a task by its name or config file"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import torch
+
+from legged_mw.robot import new, picture
+from legged_mw.robot.case import Case, from_env, from_task, naming_every_missing_key
+from legged_mw.robot.draft import as_env, draft
+from legged_mw.robot.measure import Health, measure
+from legged_mw.robot.page import page
+from legged_mw.utils.cli import Parser, one_line_errors
+from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.task import LoadedTask, load_task
+
+ROBOT_FILES = (".xml", ".mjcf", ".urdf")
+
+
+def parse() -> argparse.Namespace:
+    parser = Parser(prog="python -m legged_mw.robot", description=__doc__, allow_abbrev=False)
+    parser.add_argument("file", metavar="FILE", help="the robot: .xml or .urdf; or a task")
+    parser.add_argument("--picture", metavar="PNG", help="draw it from two sides: feet, IMU, colliders, joint axes")
+    parser.add_argument("--new", metavar="NAME", help="write NAME.xml and NAME_flat.py, a first task for the robot")
+    parser.add_argument("--out", metavar="DIR", default=".", help="where --new writes (default: here)")
+    parser.add_argument("--force", action="store_true", help="--new may overwrite")
+    args = parser.parse_args()
+    if args.new and Path(args.file).suffix not in ROBOT_FILES:
+        parser.error(f"--new makes a task for a robot's file ({', '.join(ROBOT_FILES)}); {args.file} is a task already")
+    return args
+
+
+def main() -> None:
+    args = parse()
+    torch.set_num_threads(1)
+    file, image = Path(args.file), Path(args.picture) if args.picture else None
+    if file.suffix not in ROBOT_FILES:
+        print(task_page(load_task(args.file), image))
+        return
+    found = draft(file)
+    case = from_env(as_env(found, file))
+    print(case_page(case, file.name, image, found.guessed))
+    if args.new:
+        written = new.write(found, file, args.new, Path(args.out), args.force)
+        print(f"written: {' and '.join(map(shown, written))}; next:\n  python train.py --task {shown(written[1])} --check")
+
+
+def task_page(task: LoadedTask, image: Path | None) -> str:
+    """The page of a task's robot, and its picture to ``image``."""
+    with naming_every_missing_key(task):
+        case = from_task(task)
+    return case_page(case, task.name, image)
+
+
+def case_page(case: Case, title: str, image: Path | None, guessed: list[str] | None = None) -> str:
+    """The page as text; the picture goes to ``image``."""
+    health: Health = measure(case.robot, case.pose, case.place, case.speeds, case.decimation)
+    text = page(health, title, guessed or [])
+    if image is None:
+        return text
+    try:
+        picture.draw(image, case.robot, health.rest.qpos, case.feet, case.imu, title)
+    except OSError as error:
+        raise UserError(f"cannot write {image}: {error.strerror}; say --picture FILE.png") from None
+    return f"{text}\npicture: {shown(image)}"
+
+
+if __name__ == "__main__":
+    with one_line_errors("legged_mw.robot"):
+        main()

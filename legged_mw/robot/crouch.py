@@ -1,0 +1,84 @@
+"""A pose to stand in for a robot whose file has none: knees bent, each foot under its hip, soles as they were.
+
+A leg that stands straight cannot push, and its servos cannot tell which way to bend. A leg is taken to bend at its first two joints
+about the sideways axis, hip and knee, and to be straight with both at 0; a third one, the ankle, keeps the sole level.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from legged_mw.robot.feet import Foot
+from legged_mw.sim.model import RobotModel
+
+# ours: the knee's angle about the axis to the left [rad]. A quadruped's thighs lean back (Go1 0.9 and -1.8), a biped's forwards (-0.3 and 0.6)
+KNEE = {2: 0.6}
+KNEE_ELSE = -1.6
+_SIDEWAYS = 0.9  # |y| of a joint's axis
+_MARGIN = 0.05  # [rad] from the end of a range
+
+
+def bent(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> NDArray[np.float64] | None:
+    """``pose`` (D,) with all legs bent; None if a leg has no two joints that bend it."""
+    model, found = robot.physics, pose.copy()
+    data = _placed(model, pose)
+    for foot in feet:
+        legs = [joint for joint in _joints_to(model, foot) if abs(data.xaxis[joint][1]) > _SIDEWAYS]
+        if len(legs) < 2:
+            return None
+        hip, knee, *ankle = legs
+        turn = KNEE.get(len(feet), KNEE_ELSE)
+        signs = np.sign(data.xaxis[legs, 1])
+        angles = [_within(model, knee, sign * turn * signs[1]) for sign in (1.0, -1.0)]
+        found[knee - 1] = max(angles, key=abs) if abs(angles[0]) < 0.5 * abs(turn) else angles[0]
+        found[hip - 1] = _over(model, found, hip, foot)
+        for joint, sign in zip(ankle[:1], signs[2:], strict=False):
+            leaning = found[hip - 1] * signs[0] + found[knee - 1] * signs[1]
+            found[joint - 1] = _within(model, joint, -sign * leaning)
+    return found
+
+
+def _placed(model: mujoco.MjModel, pose: NDArray[np.float64]) -> mujoco.MjData:
+    data = mujoco.MjData(model)
+    data.qpos[:] = [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, *pose]
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
+def _joints_to(model: mujoco.MjModel, foot: Foot) -> list[int]:
+    """Joints from the root to the foot, without the root's."""
+    body, joints = int(model.geom(foot.geoms[0]).bodyid[0]), []
+    while body:
+        first = int(model.body_jntadr[body])
+        joints += [joint for joint in range(first, first + int(model.body_jntnum[body])) if joint > 0]
+        body = int(model.body_parentid[body])
+    return sorted(joints)
+
+
+def _within(model: mujoco.MjModel, joint: int, angle: float) -> float:
+    """The nearest angle in the joint's range."""
+    if not model.jnt_limited[joint]:
+        return float(angle)
+    low, high = model.jnt_range[joint]
+    margin = min(_MARGIN, 0.25 * (high - low))
+    return float(np.clip(angle, low + margin, high - margin))
+
+
+def _over(model: mujoco.MjModel, pose: NDArray[np.float64], hip: int, foot: Foot) -> float:
+    """The hip's angle at which the foot is under it, of 200 within a right angle."""
+    geoms = [model.geom(name).id for name in foot.geoms]
+    off = {}
+    for angle in np.linspace(-1.57, 1.57, 200):
+        trial = pose.copy()
+        trial[hip - 1] = allowed = _within(model, hip, angle)
+        data = _placed(model, trial)
+        middle = data.geom_xpos[geoms].mean(axis=0)
+        away = middle - data.xanchor[hip]
+        off[allowed] = abs(float(away[0])) + (10.0 if away[2] > 0.0 else 0.0)
+    return round(min(off, key=lambda angle: off[angle]), 2)

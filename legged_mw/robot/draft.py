@@ -1,0 +1,136 @@
+"""A first task for a robot that has none: its feet guessed, its pose, gains and height computed. As values, and as a config file.
+
+What is guessed or chosen is marked LOOK in the file.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.robot.case import TABLES, Case, from_env
+from legged_mw.robot.crouch import bent
+from legged_mw.robot.feet import Foot, guess_feet
+from legged_mw.robot.measure import Joint, mass_matrices, stand_as_statue, what_joints_bear
+from legged_mw.robot.suggest import Gains, family, suggest
+from legged_mw.sim.errors import ModelError
+from legged_mw.sim.model import per_joint
+from legged_mw.utils.config import ConfigError
+
+CLEARANCE = 0.003  # [m] above the ground at reset, so that nothing begins inside of it
+
+
+class Draft(NamedTuple):
+    """The numbers of a first task."""
+
+    case: Case  # with the guessed pose, place and feet
+    joints: tuple[Joint, ...]
+    gains: list[Gains]
+    feet: list[Foot]
+    guessed: list[str]  # what nobody said, a line each
+    pose: str  # where the default pose is from, in words
+
+
+def draft(file: Path) -> Draft:
+    """Guess what a task needs to know of the robot in ``file`` (MJCF or URDF)."""
+    env, from_file = _bare(file)
+    case = from_env(env)
+    limited = case.robot.physics.jnt_limited[1:] > 0
+    low, high = case.robot.joint_range.T
+    pose = np.array(case.pose)
+    pose = np.where(limited, np.clip(pose, low, high), pose)
+    rest = stand_as_statue(case.robot, pose, np.array(case.place))
+    feet = guess_feet(case.robot, rest.qpos)
+    bends = None if from_file else bent(case.robot, pose, feet)
+    if bends is not None:
+        pose, rest = bends, stand_as_statue(case.robot, bends, np.array(case.place))
+    joints = what_joints_bear(case.robot, mass_matrices(case.robot, pose), rest.torque, case.speeds)
+    gains = suggest(joints, float(case.robot.physics.opt.timestep))
+    how = "all joints at 0, or at the nearest end of their range" if bends is None else "knees bent, feet under the hips"
+    how = "the file's keyframe" if from_file else how
+    guessed = [
+        f"pose: {how}",
+        f"feet: {', '.join(foot.name for foot in feet)}, the lowest parts that carry no others",
+        "gains: as suggested below",
+    ]
+    pose = np.round(pose, 4)
+    place = [0.0, 0.0, round(float(rest.qpos[2]) + CLEARANCE, 3)]
+    case = case._replace(pose=pose.tolist(), place=place, feet={foot.name: foot.geoms for foot in feet})
+    return Draft(case, joints, gains, feet, guessed, how)
+
+
+def _bare(file: Path) -> tuple[RobotTask, bool]:
+    """A world with the robot that knows nothing of it; and whether its pose is the file's."""
+    cfg = RobotTaskCfg()
+    cfg.update({"env": {"num_envs": 1}, "asset": {"file": str(file.resolve())}, "sim": {"engine": "mujoco"}}, where="the health page")
+    for path, value in TABLES.items():
+        cfg.set(path, value)
+    angles = cfg.init_state.default_joint_angles
+    try:
+        cfg.init_state.default_joint_angles = {}
+        return RobotTask(cfg, "cpu"), True
+    except (ModelError, ConfigError):  # no keyframe; what else is wrong shows again
+        cfg.init_state.default_joint_angles = angles
+        return RobotTask(cfg, "cpu"), False
+
+
+def as_env(found: Draft, file: Path) -> LeggedRobot:
+    """One world of the task that the draft would be."""
+    cfg = LeggedRobotCfg()
+    cfg.update({"env": {"num_envs": 1}, "sim": {"engine": "mujoco"}, **values(found)}, where="the health page")
+    cfg.asset.file = str(file.resolve())
+    return LeggedRobot(cfg, "cpu")
+
+
+def values(found: Draft) -> dict[str, dict[str, Any]]:
+    """Section -> field -> value."""
+    names, two, height = found.case.robot.joint_names, len(found.feet) == 2, found.case.place[2]
+    asset: dict[str, Any] = {"foot_names": [foot.name for foot in found.feet]}
+    if parts := {foot.name: list(foot.geoms) for foot in found.feet if not foot.known}:
+        asset["foot_geoms"] = parts
+    asset["colliders"] = [name for foot in found.feet for name in ([foot.name] if foot.known else foot.geoms)]
+    ranges = {"lin_vel_x": [-0.5, 0.8], "lin_vel_y": [-0.3, 0.3], "ang_vel_yaw": [-0.5, 0.5]}
+    if not two:
+        ranges = {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_yaw": [-1.0, 1.0]}
+    chosen: dict[str, dict[str, Any]] = {
+        "asset": asset,
+        "init_state": {"pos": found.case.place, "default_joint_angles": table(found.case.pose, names)},
+        "control": {
+            "stiffness": table([gain.kp for gain in found.gains], names),
+            "damping": table([gain.kd for gain in found.gains], names),
+            "action_scale": 0.5,
+        },
+        "commands": {"ranges": ranges},
+        "termination": {"min_base_height": round(0.5 * height, 2)},
+        "rewards": {"swing_height": round(min(0.1, 0.3 * height), 2), "base_height_target": round(height, 2)},
+    }
+    if two:
+        chosen["exam"] = {"push_speeds": [0.5, 1.0, 1.5, 2.0, 3.0], "push_mark": 1.0, "marks_of": "offset"}
+    return chosen
+
+
+def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:
+    """``numbers`` (D,) as a short table: the most frequent one for all others, a key for a family of joints, or exact names."""
+    common = Counter(numbers).most_common(1)[0][0]
+    short, exact = {"": common}, dict(zip(names, numbers, strict=True))
+    for name, number in exact.items():
+        alike = {other for other, value in exact.items() if family(other) == family(name) and value != number}
+        key = name if alike else family(name)
+        if number != common:
+            short[key] = number
+    return short if _reads(short, names, numbers) else exact
+
+
+def _reads(short: Mapping[str, float], names: Sequence[str], numbers: Sequence[float]) -> bool:
+    try:
+        return per_joint(short, names, "") == list(numbers)
+    except ModelError:
+        return False

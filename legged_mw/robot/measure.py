@@ -1,0 +1,327 @@
+"""A robot in numbers, by plain MuJoCo on a CPU: how it stands, and what its servos ask of the simulation step.
+
+Shapes: D joints, V degrees of freedom (6 of the root first), P points. Nothing here knows a config, a task or an observation.
+
+The servo of one joint with inertia I, stepped with dt, is v' = v - d v - s x / dt, x' = x + dt v' with d = dt kd / I and
+s = dt^2 kp / I. Its characteristic polynomial is z^2 - (2 - s - d) z + (1 - d), so it is stable for 0 < d < 2 and 2 d + s < 4
+(Jury's conditions): without damping dt sqrt(kp / I) < 2, without stiffness dt kd / I < 2. From d = 1 on the damping alone turns the
+velocity's sign in every substep: it rings. The integrator implicitfast takes v' for v in the damping: any d is stable, and s < 4 + 2 d.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from legged_mw.sim.engines import make_simulation
+from legged_mw.sim.model import RobotModel
+
+FloatArray = NDArray[np.float64]
+
+STAND_SECONDS = 5.0  # [s] how long the servos are watched
+STAND_TILT = 60.0  # [deg] of the root: beyond it, it fell
+STAND_HEIGHT = 0.5  # of the height it began with: below it, it sank
+TOPPLED = 15.0  # [deg] a statue that tilts so far does not rest on its feet
+_STIFF = 1e5  # [kg m^2] armature of a joint that gravity shall not move: 100 N m turn it by 1 mrad/s in a second
+_CONTACTS = {
+    int(mujoco.mjtGeom.mjGEOM_SPHERE): 1,
+    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): 1,
+    int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2,
+}  # with a plane
+_FAST = 1.0e4  # [m/s, rad/s] beyond it a state counts as not finite (termination.max_speed)
+
+
+class Rest(NamedTuple):
+    """The robot as a statue in one pose, at rest on level ground."""
+
+    qpos: FloatArray  # (7 + D,)
+    torque: FloatArray  # (D,) [N m] that the joints need to keep the pose
+    points: FloatArray  # (P, 3) [m] of contact with the ground
+    com: FloatArray  # (3,) centre of mass [m]
+    contacts: int
+    rows: int  # constraint rows of the model that is stepped: contacts, dry friction, limits that are met
+    toppled: bool  # it tilts over; torques and points are those of a root that is held upright
+
+
+class Joint(NamedTuple):
+    """What a joint's servo works with, and what a step makes of it."""
+
+    name: str
+    low: float  # [rad]
+    high: float  # [rad]; both infinite without limits
+    effort: float  # [N m]
+    speed: float | None  # [rad/s]; None: nobody said
+    armature: float  # [kg m^2]
+    kp: float  # [N m/rad]
+    kd: float  # [N m s/rad]
+    inertia: float  # [kg m^2] smallest over the poses: what its motor turns while all else is free
+    pose: str  # the pose of that
+    held: float  # [kg m^2] in the default pose while all else is held: the diagonal of the mass matrix
+    torque: float  # [N m] at rest
+
+    def damping_step(self, dt: float) -> float:
+        """dt kd / I"""
+        return dt * self.kd / self.inertia
+
+    def stiffness_step(self, dt: float) -> float:
+        """dt sqrt(kp / I)"""
+        return dt * math.sqrt(self.kp / self.inertia)
+
+    def damping_ratio(self) -> float:
+        """kd / (2 sqrt(kp I)); infinite without stiffness."""
+        return self.kd / (2.0 * math.sqrt(self.kp * self.inertia)) if self.kp else math.inf
+
+    def sag(self) -> float:
+        """[rad] off its target at rest; infinite without stiffness."""
+        return abs(self.torque) / self.kp if self.kp else math.inf
+
+    def verdict(self, dt: float, implicit: bool) -> str:
+        """What is wrong with the step for this joint, in a word: "", "rings" or "unstable" (see the top of this file)."""
+        d, s = self.damping_step(dt), self.stiffness_step(dt) ** 2
+        if s >= 4.0 + 2.0 * d if implicit else (d >= 2.0 or 2.0 * d + s >= 4.0):
+            return "unstable"
+        return "rings" if d > 1.0 and not implicit else ""
+
+
+class Mode(NamedTuple):
+    """The mode of all servos together, in the air, that a substep makes grow the most."""
+
+    growth: float  # factor a substep; 1: the free root, which nothing damps
+    joints: tuple[str, ...]  # that move most in it
+
+
+class Stand(NamedTuple):
+    """What becomes of the robot on its servos with action zero."""
+
+    seconds: float  # until it fell, sank or broke; STAND_SECONDS if it did not
+    end: str  # "stands", "falls", "sinks" or "diverges"
+    joints: tuple[str, ...] = ()  # the fastest ones, where it diverges
+
+
+@dataclass(frozen=True)
+class Health:
+    """All numbers of the page."""
+
+    mass: float  # [kg]
+    height: float  # of the root above the ground, at rest [m]
+    top: float  # of the highest point of the robot [m]
+    margin: float  # centre of mass to the edge of what its contacts span, on the ground [m]; negative: outside
+    rest: Rest
+    joints: tuple[Joint, ...]
+    mode: Mode
+    stand: Stand
+    dt: float  # substep [s]
+    implicit: bool  # whether the integrator is implicitfast
+    nconmax: int  # contacts, if all that may touch the ground did
+    njmax: int  # constraint rows then, with every joint at a limit
+
+
+def measure(
+    robot: RobotModel, pose: Sequence[float], place: Sequence[float], speeds: Sequence[float | None], decimation: int = 5
+) -> Health:
+    """The health of ``robot`` on level ground, in ``pose`` (D,) [rad], with its root at ``place`` (3,) [m], upright.
+
+    ``speeds`` (D,) are the motors' highest [rad/s], None where not known.
+    """
+    model, angles = robot.physics, np.array(pose, dtype=float)
+    rest = stand_as_statue(robot, angles, np.array(place, dtype=float))
+    matrices = mass_matrices(robot, angles)
+    implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return Health(
+        mass=float(model.body_subtreemass[0]),
+        height=float(rest.qpos[2]),
+        top=_highest(robot, rest.qpos),
+        margin=inside_by(rest.points[:, :2], rest.com[:2]),
+        rest=rest,
+        joints=what_joints_bear(robot, matrices, rest.torque, speeds),
+        mode=max((fastest_mode(robot, matrix, implicit) for matrix in matrices.values()), key=lambda mode: mode.growth),
+        stand=stand_on_servos(robot, angles, place, decimation),
+        dt=float(model.opt.timestep),
+        implicit=implicit,
+        **dict(zip(("nconmax", "njmax"), room(robot), strict=True)),
+    )
+
+
+def room(robot: RobotModel) -> tuple[int, int]:
+    """Contacts and constraint rows, if every geom that may touch the ground lay on it and every joint were at a limit."""
+    model, ground = robot.physics, robot.ground_geoms()
+    touches = [g for g in range(model.ngeom) if g >= ground.stop and model.geom_conaffinity[g] & 1]
+    contacts = sum(_CONTACTS.get(int(model.geom_type[g]), 4) for g in touches)
+    rows_each = max(1, 2 * (int(model.geom_condim[ground.start]) - 1))  # of a pyramid
+    return contacts, int((model.dof_frictionloss > 0).sum() + model.jnt_limited.sum()) + rows_each * contacts
+
+
+# ---- at rest ----
+
+
+def stand_as_statue(robot: RobotModel, pose: FloatArray, place: FloatArray) -> Rest:
+    """Let the robot down onto level ground with its joints held in ``pose`` (D,), until it rests."""
+    free = _settle(robot, pose, place, upright=False)
+    if toppled := tilt(free.qpos[3:7]) > TOPPLED:
+        free = _settle(robot, pose, place, upright=True)
+    model, data = robot.physics, mujoco.MjData(robot.physics)
+    data.qpos[:] = free.qpos
+    mujoco.mj_forward(model, data)
+    torque = free.qfrc_bias - free.qfrc_constraint - free.qfrc_spring  # what the servos must give so that nothing moves
+    ground = robot.ground_geoms()
+    touching = [c.pos for c in free.contact if any(ground.start <= geom < ground.stop for geom in c.geom)]
+    points = np.array(touching).reshape(-1, 3)
+    return Rest(free.qpos.copy(), torque[6:].copy(), points, free.subtree_com[0].copy(), data.ncon, data.nefc, toppled)
+
+
+def _settle(robot: RobotModel, pose: FloatArray, place: FloatArray, upright: bool) -> mujoco.MjData:
+    model = copy.copy(robot.physics)
+    model.opt.timestep, model.opt.iterations, model.opt.ls_iterations = 0.002, 50, 50
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    model.dof_frictionloss[:], model.jnt_limited[:] = 0.0, 0  # what carries load in the place of a servo
+    model.dof_armature[6:] = _STIFF
+    if upright:
+        model.dof_armature[3:6] = _STIFF
+    mass, size = float(model.body_subtreemass[0]), max(float(place[2]), 0.1)
+    model.dof_damping[:6] = [10.0 * mass] * 3 + [3.0 * mass * size**2] * 3  # it comes to rest within a second
+    data = mujoco.MjData(model)
+    data.qpos[:] = [*place, 1.0, 0.0, 0.0, 0.0, *pose]
+    for _ in range(20):
+        mujoco.mj_step(model, data, 100)
+        if np.abs(data.qvel[:6]).max() < 1e-4 or tilt(data.qpos[3:7]) > TOPPLED:
+            break
+    mujoco.mj_forward(model, data)
+    return data
+
+
+def tilt(quat: FloatArray) -> float:
+    """[deg] between the z axis of ``quat`` (w, x, y, z) and the vertical."""
+    _, x, y, _ = quat / np.linalg.norm(quat)
+    return math.degrees(math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * float(x * x + y * y)))))
+
+
+def inside_by(points: FloatArray, place: FloatArray) -> float:
+    """How far ``place`` (2,) lies inside the convex hull of ``points`` (P, 2) [m]; negative: outside by so much."""
+    if not len(points):
+        return -math.inf
+    hull = _hull(points)
+    edges = list(zip(hull, [*hull[1:], hull[0]], strict=True))
+    away = min(_to_segment(place, start, end) for start, end in edges)
+    turns = [(end[0] - start[0]) * (place[1] - start[1]) - (end[1] - start[1]) * (place[0] - start[0]) for start, end in edges]
+    return away if len(hull) > 2 and min(turns) >= 0.0 else -away
+
+
+def _hull(points: FloatArray) -> list[FloatArray]:
+    """Corners of the convex hull, counter-clockwise (Andrew's monotone chain)."""
+    ordered = [np.array(p) for p in sorted({(round(float(x), 9), round(float(y), 9)) for x, y in points})]
+
+    def chain(these: list[FloatArray]) -> list[FloatArray]:
+        kept: list[FloatArray] = []
+        for p in these:
+            while len(kept) > 1 and np.linalg.det([kept[-1] - kept[-2], p - kept[-1]]) <= 1e-12:
+                kept.pop()
+            kept.append(p)
+        return kept[:-1]
+
+    return chain(ordered) + chain(ordered[::-1]) or ordered
+
+
+def _to_segment(place: FloatArray, start: FloatArray, end: FloatArray) -> float:
+    along = end - start
+    share = float(np.clip((place - start) @ along / max(float(along @ along), 1e-12), 0.0, 1.0))
+    return float(np.linalg.norm(place - start - share * along))
+
+
+def _highest(robot: RobotModel, qpos: FloatArray) -> float:
+    """[m] of the robot's geoms, looks included."""
+    model = robot.spec.copy().compile()
+    data = mujoco.MjData(model)
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    moving = np.flatnonzero(model.body_weldid[model.geom_bodyid])
+    rotation, box = data.geom_xmat[moving].reshape(-1, 3, 3), model.geom_aabb[moving]
+    tops = data.geom_xpos[moving, 2] + (rotation @ box[:, :3, None])[:, 2, 0] + (np.abs(rotation) @ box[:, 3:, None])[:, 2, 0]
+    return float(tops.max(initial=0.0))
+
+
+# ---- servos ----
+
+
+def mass_matrices(robot: RobotModel, pose: FloatArray) -> dict[str, FloatArray]:
+    """(V, V) with the root upright, armature included, by pose: ``pose`` (D,) is "default"; all joints "low", "middle", "high"."""
+    limited = robot.physics.jnt_limited[1:] > 0
+    low, high = robot.joint_range.T
+    low, high = np.where(limited, low, pose - 1.0), np.where(limited, high, pose + 1.0)
+    poses = {"default": pose, "low": low, "middle": (low + high) / 2, "high": high}
+    return {name: _mass_matrix(robot.physics, each) for name, each in poses.items()}
+
+
+def _mass_matrix(model: mujoco.MjModel, pose: FloatArray) -> FloatArray:
+    data = mujoco.MjData(model)
+    data.qpos[:] = [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, *pose]
+    mujoco.mj_forward(model, data)
+    matrix = np.zeros((model.nv, model.nv))
+    mujoco.mj_fullM(model, data, matrix)
+    return matrix
+
+
+def what_joints_bear(
+    robot: RobotModel, matrices: dict[str, FloatArray], torque: FloatArray, speeds: Sequence[float | None]
+) -> tuple[Joint, ...]:
+    """Each joint with the smallest inertia of ``mass_matrices``, and its ``torque`` (D,) at rest [N m]."""
+    model, rows = robot.physics, []
+    free = {name: 1.0 / np.diag(np.linalg.inv(matrix)) for name, matrix in matrices.items()}
+    for i, name in enumerate(robot.joint_names):
+        dof = 6 + i
+        pose = min(free, key=lambda each, dof=dof: float(free[each][dof]))
+        low, high = robot.joint_range[i] if model.jnt_limited[1 + i] else (-math.inf, math.inf)
+        rows.append(
+            Joint(
+                *(name, float(low), float(high), float(robot.effort_range[i, 1]), speeds[i], float(model.dof_armature[dof])),
+                *(float(model.actuator_gainprm[i, 0]), float(model.dof_damping[dof])),
+                *(float(free[pose][dof]), pose, float(matrices["default"][dof, dof]), float(torque[i])),
+            )
+        )
+    return tuple(rows)
+
+
+def fastest_mode(robot: RobotModel, matrix: FloatArray, implicit: bool) -> Mode:
+    """What a substep does to all joints together, in the air, from the mass ``matrix`` (V, V)."""
+    model, size = robot.physics, len(matrix)
+    dt = float(model.opt.timestep)
+    stiffness = np.diag([0.0] * 6 + [*(model.actuator_gainprm[:, 0] + model.jnt_stiffness[1:])])
+    damping = np.diag([0.0] * 6 + [*model.dof_damping[6:]])
+    left, right = (matrix + dt * damping, matrix) if implicit else (matrix, matrix - dt * damping)
+    onto_x, onto_v = np.linalg.solve(left, -dt * stiffness), np.linalg.solve(left, right)
+    step = np.block([[np.eye(size) + dt * onto_x, dt * onto_v], [onto_x, onto_v]])
+    values, vectors = np.linalg.eig(step)
+    worst = int(np.abs(values).argmax())
+    share = np.abs(vectors[size + 6 :, worst])
+    order = np.argsort(-share)[:2]
+    return Mode(float(abs(values[worst])), tuple(robot.joint_names[i] for i in order if share[i] > 0.3 * share[order[0]]))
+
+
+def stand_on_servos(robot: RobotModel, pose: FloatArray, place: Sequence[float], decimation: int) -> Stand:
+    """Step the robot from ``pose`` with its servos' targets there, as a task with action zero would."""
+    sim = make_simulation(robot.physics, 1, "cpu", engine="mujoco", nconmax=0, njmax=0)
+    qpos, qvel = sim.qpos.numpy()[0], sim.qvel.numpy()[0]
+    qpos[:], sim.ctrl.numpy()[0] = [*place, 1.0, 0.0, 0.0, 0.0, *pose], pose
+    control_step = decimation * float(robot.physics.opt.timestep)
+    speed = np.zeros(len(robot.joint_names))
+    for step in range(1, round(STAND_SECONDS / control_step) + 1):
+        sim.step(decimation)
+        now = step * control_step
+        if not np.isfinite(qpos).all() or not np.abs(qvel).max() <= _FAST:
+            joints = np.abs(qvel[6:]) if np.isfinite(qvel).all() else speed
+            return Stand(now, "diverges", tuple(robot.joint_names[i] for i in np.argsort(-joints)[:3]))
+        speed = np.abs(qvel[6:]).copy()
+        if tilt(qpos[3:7]) > STAND_TILT:
+            return Stand(now, "falls")
+        if qpos[2] < STAND_HEIGHT * place[2]:
+            return Stand(now, "sinks")
+    return Stand(STAND_SECONDS, "stands")

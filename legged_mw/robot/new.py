@@ -1,0 +1,134 @@
+"""Write a first task: NAME.xml, the robot alone, and NAME_flat.py, a config that can be trained at once."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from legged_mw.robot.draft import Draft, values
+from legged_mw.robot.plain import as_mjcf, stands_alone
+from legged_mw.utils.errors import UserError, shown
+
+WIDTH = 120  # [columns] of a line of the config
+
+_HEAD = '''"""{title} with {joints} joints ({legs}) follows a joystick on flat ground. Written by python -m legged_mw.robot {file}.
+
+Lines with LOOK were guessed or chosen: check them. What each field means: docs/tasks.md.
+"""
+
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_mw.utils.task import Task
+
+
+class {name}FlatCfg(LeggedRobotCfg):
+'''
+_COMMENTS = {
+    "foot_names": "LOOK: guessed, the lowest parts that carry no others",
+    "foot_geoms": "foot -> its geoms",
+    "colliders": "the feet alone touch the ground",
+    "pos": "[m] standing, computed",
+    "stiffness": "[N m/rad] LOOK: computed (legged_mw/robot/suggest.py)",
+    "damping": "[N m s/rad] LOOK: likewise",
+    "action_scale": "[rad] an action of 1 moves a joint so far",
+    "lin_vel_x": "[m/s] LOOK: what you want of it",
+    "lin_vel_y": "[m/s]",
+    "ang_vel_yaw": "[rad/s]",
+    "min_base_height": "[m] half of the standing height: lower, it fell",
+    "swing_height": "[m] of a swinging foot",
+    "base_height_target": "[m] of the reward base_height, if you give it a scale",
+    "push_speeds": "[m/s] for a biped",
+}
+
+
+def write(found: Draft, file: Path, name: str, folder: Path, force: bool = False) -> list[Path]:
+    """Write both files into ``folder``; raises UserError, before anything is written, if one of them is there."""
+    if not re.fullmatch(r"[A-Za-z]\w*", name):
+        raise UserError(f"--new {name}: a name begins with a letter and has letters, digits and _ only")
+    robot, config = folder / f"{name}.xml", folder / f"{name}_flat.py"
+    there = [path for path in (robot, config) if path.exists()]
+    if there and not force:
+        raise UserError(f"{' and '.join(shown(path) for path in there)} exists; say --force to overwrite, or another name or --out DIR")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if stands_alone(file):
+            if not (robot.exists() and robot.samefile(file)):
+                shutil.copyfile(file, robot)
+        else:
+            robot.write_text(as_mjcf(found.case.robot, name, file, folder))
+        config.write_text(config_text(found, file, name))
+    except OSError as error:
+        raise UserError(f"cannot write to {shown(folder)}: {error.strerror or os.strerror(error.errno or 0)}; say --out DIR") from None
+    return [robot, config]
+
+
+def config_text(found: Draft, file: Path, name: str) -> str:
+    """The config file: LOOK marks what to check."""
+    feet = len(found.feet)
+    legs = {2: "biped", 4: "quadruped"}.get(feet, f"{feet} feet")
+    title = "".join(part.capitalize() for part in name.split("_"))
+    lines = [_HEAD.format(title=name, joints=len(found.joints), legs=legs, file=file.name, name=title).rstrip("\n")]
+    sections = values(found)
+    sections["asset"] = {"file": f"{name}.xml", **sections["asset"]}
+    comments = {**_COMMENTS, "default_joint_angles": f"[rad] LOOK: {found.pose}"}
+    for section, fields in sections.items():
+        lines += [f"    class {section}(LeggedRobotCfg.{section}):"]
+        for field, value in fields.items():
+            if field == "ranges":
+                lines += ["        class ranges(LeggedRobotCfg.commands.ranges):"]
+                lines += [line for inner, span in value.items() for line in _field(inner, span, comments.get(inner, ""), 12)]
+            else:
+                lines += _field(field, value, comments.get(field, ""), 8)
+        if section == "asset":
+            lines += _force_limits(found)
+        lines.append("")
+    lines += ["", f"class {title}FlatCfgPPO(LeggedRobotCfgPPO):"]
+    lines += ["    class runner(LeggedRobotCfgPPO.runner):", "        max_iterations = 1500", "", ""]
+    return "\n".join([*lines, f"TASK = Task(LeggedRobot, {title}FlatCfg, {title}FlatCfgPPO)", ""])
+
+
+def _force_limits(found: Draft) -> list[str]:
+    """What to write where the file has none."""
+    endless = [joint.name for joint in found.joints if joint.effort == float("inf")]
+    if not endless:
+        return []
+    some = "all joints" if len(endless) == len(found.joints) else f"{endless[0]} and {len(endless) - 1} more" if endless[1:] else endless[0]
+    return [f'        # effort = {{"": 30.0}}  # [N m] LOOK: the file has no force limit for {some}; write yours']
+
+
+def _field(name: str, value: Any, comment: str, indent: int) -> list[str]:
+    """``name = value  # comment``, in several lines where it is longer than a line may be."""
+    space, note = " " * indent, f"  # {comment}" if comment else ""
+    line = f"{space}{name} = {_literal(value)}"
+    if len(line + note) <= WIDTH:
+        return [line + note]
+    opening, closing = ("{", "}") if isinstance(value, dict) else ("[", "]")
+    parts = (
+        [f"{_literal(key)}: {_literal(number)}" for key, number in value.items()] if isinstance(value, dict) else [*map(_literal, value)]
+    )
+    return [f"{space}{name} = {opening}{note}", *_filled(parts, indent + 4), space + closing]
+
+
+def _filled(parts: Sequence[str], indent: int) -> list[str]:
+    """``parts`` with commas, as many in a line as fit."""
+    lines, space = [" " * indent], " " * indent
+    for part in parts:
+        if len(lines[-1]) + len(part) + 2 > WIDTH and lines[-1].strip():
+            lines.append(space)
+        lines[-1] += ("" if not lines[-1].strip() else " ") + f"{part},"
+    return lines
+
+
+def _literal(value: Any) -> str:
+    """As ruff formats it."""
+    if isinstance(value, str):
+        return f'"{value}"'
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_literal(key)}: {_literal(inner)}" for key, inner in value.items()) + "}"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_literal, value)) + "]"
+    return repr(value + 0.0 if isinstance(value, float) else value)  # no -0.0

@@ -1,0 +1,127 @@
+"""The health page as text: numbers of ``measure``, gains of ``suggest``, and what should be looked at."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from legged_mw.robot.measure import STAND_SECONDS, STAND_TILT, Health, Joint, Stand
+from legged_mw.robot.suggest import Gains, suggest
+
+_GROWS = 1e-6  # more than 1 by so much, a mode grows; less is rounding of the root's
+_TIP = 0.3  # [rad] a joint that sags more than this does not stand as its default pose says
+_HEAD = ("joint", "inertia", "pose", "dt kd/I", "dt sqrt(kp/I)", "ratio", "sag", "range [rad]", "effort", "speed", "kp", "kd", "suggested")
+
+
+def page(health: Health, title: str, guessed: Sequence[str] = ()) -> str:
+    """Everything, as lines; ``guessed`` are lines on what nobody said and was taken."""
+    gains = suggest(health.joints, health.dt)
+    lines = [f"health of {title}", *(f"  guessed: {line}" for line in guessed), *_summary(health)]
+    lines += ["joints", *_table(health, gains), *_LEGEND]
+    found = remarks(health, gains)
+    return "\n".join([*lines, "what to look at", *(f"  - {line}" for line in found or ["nothing: all numbers are within bounds"])])
+
+
+_LEGEND = (
+    "  inertia [kg m^2] that a motor turns while all else is free: the smallest of the poses default, low, middle, high (of all ranges), "
+    "and in which;",
+    "  dt kd/I: from 1 on it rings, from 2 on it is unstable; dt sqrt(kp/I): unstable from 2 on; ratio: kd / (2 sqrt(kp I));",
+    '  sag [rad] under gravity at rest; effort [N m]; speed [rad/s]; kp [N m/rad]; kd [N m s/rad]; "cut": the step bears no more',
+)
+
+
+def _summary(health: Health) -> list[str]:
+    rest, integrator = health.rest, "implicitfast" if health.implicit else "euler"
+    upright = " (it topples; these are with its root held upright)" if rest.toppled else ""
+    over = (
+        f"{1e3 * health.margin:.0f} mm inside of what its contacts span"
+        if health.margin >= 0
+        else f"{-1e3 * health.margin:.0f} mm OUTSIDE of what its contacts span"
+        if math.isfinite(health.margin)
+        else "over nothing: no contact with the ground"
+    )
+    return [
+        f"  mass                 {health.mass:.2f} kg",
+        f"  standing height      {health.height:.3f} m of the root, {health.top:.3f} m of its highest point{upright}",
+        f"  centre of mass       {over}",
+        f"  at rest              {rest.contacts} contacts, {rest.rows} constraint rows; all that may touch at once: "
+        f"sim.nconmax = {health.nconmax}, sim.njmax = {health.njmax}",
+        f"  action zero          {standing(health.stand)}",
+        f"  substep              {1e3 * health.dt:g} ms, {integrator}; servos in the air: {_mode(health)}",
+    ]
+
+
+def standing(stand: Stand) -> str:
+    """How long it stands on its servos, in words."""
+    if stand.end == "stands":
+        return f"stands on its servos for {STAND_SECONDS:g} s"
+    what = {"falls": f"tilts beyond {STAND_TILT:g} degrees", "sinks": "sinks below half of its height"}
+    if stand.end == "diverges":
+        return f"diverges after {stand.seconds:.2f} s, fastest: {', '.join(stand.joints)}"
+    return f"{what[stand.end]} after {stand.seconds:.2f} s"
+
+
+def _mode(health: Health) -> str:
+    if health.mode.growth <= 1.0 + _GROWS:
+        return "stable"
+    return f"UNSTABLE, a mode of {', '.join(health.mode.joints)} grows {health.mode.growth:.2f}-fold a substep"
+
+
+def _table(health: Health, gains: Sequence[Gains]) -> list[str]:
+    rows = [_HEAD, *(_row(joint, gain, health) for joint, gain in zip(health.joints, gains, strict=True))]
+    widths = [max(len(row[column]) for row in rows) for column in range(len(_HEAD))]
+    return [
+        "  "
+        + "  ".join(cell.ljust(width) if i == 0 else cell.rjust(width) for i, (cell, width) in enumerate(zip(row, widths, strict=True)))
+        for row in rows
+    ]
+
+
+def _row(joint: Joint, gain: Gains, health: Health) -> tuple[str, ...]:
+    verdict = joint.verdict(health.dt, health.implicit)
+    mark = {"": "", "rings": "!", "unstable": "!!"}[verdict]
+    return (
+        *(joint.name, f"{joint.inertia:.4f}", joint.pose),
+        *(f"{mark}{joint.damping_step(health.dt):.2f}", f"{joint.stiffness_step(health.dt):.2f}"),
+        *(f"{joint.damping_ratio():.2f}", f"{joint.sag():.3f}"),
+        f"{joint.low:.2f} {joint.high:.2f}" if math.isfinite(joint.low) else "none",
+        *(f"{joint.effort:g}" if math.isfinite(joint.effort) else "none", "?" if joint.speed is None else f"{joint.speed:g}"),
+        *(f"{joint.kp:g}", f"{joint.kd:g}", f"{gain.kp:g} {gain.kd:g}{' cut' if gain.cut else ''}"),
+    )
+
+
+def remarks(health: Health, gains: Sequence[Gains]) -> list[str]:
+    """What should be looked at, a line each: what is wrong, where, and the field that mends it."""
+    dt, joints = health.dt, health.joints
+
+    def those(which: Sequence[Joint]) -> str:
+        return ", ".join(joint.name for joint in which)
+
+    lines = []
+    if bad := [joint for joint in joints if joint.verdict(dt, health.implicit) == "unstable"]:
+        lines.append(
+            f"unstable servos: {those(bad)}: lower control.damping or control.stiffness, or give them armature (asset.armature), "
+            "or lower sim.dt, or set sim.integrator to implicitfast"
+        )
+    if rings := [joint for joint in joints if joint.verdict(dt, health.implicit) == "rings"]:
+        lines.append(
+            f"damping turns the velocity's sign in every substep: {those(rings)}: lower control.damping or sim.dt, or give them armature"
+        )
+    if health.mode.growth > 1.0 + _GROWS and not bad:
+        lines.append(f"no servo is unstable alone, but all together are ({', '.join(health.mode.joints)}): lower sim.dt or the gains")
+    if bare := [joint for joint, gain in zip(joints, gains, strict=True) if not joint.armature and gain.cut]:
+        lines.append(
+            f"no armature, so that the step bears only small gains: {those(bare)}: a geared motor adds its rotor's inertia times the gear "
+            "ratio squared; write that into asset.armature"
+        )
+    if endless := [joint for joint in joints if not math.isfinite(joint.effort)]:
+        lines.append(f"no force limit: {those(endless)}: say asset.effort, or they are trained with torques that no motor has")
+    if weak := [joint for joint in joints if abs(joint.torque) > joint.effort]:
+        lines.append(f"to rest in this pose takes more than the effort of {those(weak)}: choose another init_state.default_joint_angles")
+    if soft := [joint for joint in joints if joint.sag() > _TIP]:
+        lines.append(f"sags by more than {_TIP:g} rad at rest: {those(soft)}: raise control.stiffness, or choose another pose")
+    if health.rest.toppled or health.margin < 0.0:
+        lines.append("the centre of mass is not over the feet: choose another init_state.default_joint_angles")
+    if health.stand.end != "stands":
+        lines.append(f"with action zero it {standing(health.stand)}; a task is learned sooner where it stands")
+    return lines

@@ -1,0 +1,254 @@
+"""Two pictures of the default pose side by side: feet, IMU frame, colliders and joint axes, each with its name.
+
+Names stand in columns beside the robot, with a line to what they name, so that those of 29 joints can be read.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from legged_mw.robot.suggest import family
+from legged_mw.sim.drawing import visual_spec
+from legged_mw.sim.model import RobotModel
+from legged_mw.view.posed_robot import GROUPS_SHOWN, PosedRobots
+from legged_mw.view.recorder import no_context
+from legged_mw.view.stage import FloatArray, ViewError
+from legged_mw.view.video import Frame, save_png
+
+WIDTH, HEIGHT = 1100, 1000  # [px] of one view
+VIEWS = (("front left", 225.0, -14.0), ("left side", 270.0, -4.0))  # name, azimuth and elevation of the camera [deg]
+FILL = 0.62  # of a view's smaller edge that the robot takes; names have the rest
+COLLIDER_RGBA, LOOK_ALPHA = (1.0, 0.55, 0.1, 0.42), 0.4
+FOOT_RGBA = (0.0, 0.75, 0.52, 1.0)
+AXES_RGB = ((0.95, 0.2, 0.2), (0.25, 0.85, 0.25), (0.3, 0.5, 1.0))  # x, y, z
+# of the families of joints: Okabe and Ito's palette and lighter ones, which the colour-blind tell apart
+FAMILY_RGB = (
+    (0.34, 0.71, 0.91),
+    (0.94, 0.89, 0.26),
+    (0.85, 0.55, 0.75),
+    (0.55, 0.9, 0.75),
+    (0.95, 0.6, 0.4),
+    (0.75, 0.75, 0.95),
+    (0.9, 0.9, 0.9),
+)
+LEFT_COLUMN, ROW = 12, 22  # [px] from the edge to a column of names; between two names at least
+CAPTION = "joint axes: arrows (turn by the right hand)   feet: green discs   imu: x red, y green, z blue   colliders: orange"
+
+Rgb = tuple[float, float, float]
+
+
+class Label(NamedTuple):
+    """A name, the place that it names, and arrows from there."""
+
+    text: str
+    place: FloatArray  # (3,) [m, world]
+    rgb: Rgb
+    arrows: tuple[tuple[FloatArray, Rgb], ...] = ()  # ends (3,) [m, world]; drawn over the picture, else the robot hides them
+
+
+def draw(path: Path, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]], imu: str, title: str) -> None:
+    """Write the picture to ``path`` (PNG). ``feet``: name -> its geoms; ``imu``: a site, "" for none; ``qpos`` (7 + D,)."""
+    if path.suffix.lower() != ".png":
+        raise ViewError(f"Cannot write {path.name!r}: the picture of a robot is a .png")
+    scene = _Picture(robot, qpos, feet, imu)
+    try:
+        save_png(path, np.concatenate([scene.view(*view, title) for view in VIEWS], axis=1))
+    finally:
+        scene.close()
+
+
+class _Picture:
+    """One robot in its pose, drawn from several sides."""
+
+    def __init__(self, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]], imu: str) -> None:
+        self.robot, self.feet, self.imu = robot, feet, imu
+        self.posed = PosedRobots(visual_spec(robot))
+        self.posed.pose(qpos)
+        self._paint()
+        self._measure()
+        vis = self.posed.model.vis
+        vis.global_.offwidth, vis.global_.offheight = WIDTH, HEIGHT
+        try:
+            font = mujoco.mjtFontScale.mjFONTSCALE_150
+            self._renderer = mujoco.Renderer(self.posed.model, height=HEIGHT, width=WIDTH, font_scale=font)
+        except Exception as error:  # each OpenGL backend fails with a type of its own
+            raise ViewError(no_context(error)) from error
+
+    def close(self) -> None:
+        self._renderer.close()
+
+    def view(self, name: str, azimuth: float, elevation: float, title: str) -> Frame:
+        """The robot from one side, with the names of the joints that are on the near one (of the first view, on the far one)."""
+        camera, model = mujoco.MjvCamera(), self.posed.model
+        camera.type, camera.azimuth, camera.elevation = mujoco.mjtCamera.mjCAMERA_FREE, azimuth, elevation
+        camera.lookat[:], camera.distance = self.middle, 0.5 * self.size / math.tan(math.radians(model.vis.global_.fovy) / 2) / FILL
+        option = mujoco.MjvOption()
+        option.geomgroup[:] = 1
+        option.sitegroup[:] = 0
+        self._renderer.update_scene(self.posed.data, camera, option)
+        joints = self._draw_joints()
+        marks = [*self._draw_feet(), *self._draw_imu()]
+        near = azimuth == VIEWS[1][1]
+        labels = [label for label in joints if (label.place[1] > self.middle[1] - 1e-3) == near] + marks
+        self._renderer.render()
+        frame = self._write(labels, camera, f"{title}: {name}")
+        for label in [*joints, *marks]:
+            for end, rgb in label.arrows:
+                _line(frame, self._project(label.place, camera), self._project(end, camera), rgb, wide=3)
+        return frame
+
+    # ---- what is drawn ----
+
+    def _paint(self) -> None:
+        """Colliders orange, all else of the robot half transparent; what is neither is hidden."""
+        model = self.posed.model
+        touching = {self.robot.physics.geom(g).name for g in range(self.robot.physics.ngeom) if self.robot.physics.geom_conaffinity[g]}
+        for geom in np.flatnonzero(model.body_weldid[model.geom_bodyid]):
+            collides = model.geom(geom).name in touching
+            if collides:
+                model.geom_rgba[geom], model.geom_matid[geom] = COLLIDER_RGBA, -1
+            elif model.geom_group[geom] < GROUPS_SHOWN:
+                material = int(model.geom_matid[geom])
+                rgb = model.mat_rgba[material, :3] if material >= 0 else model.geom_rgba[geom, :3]
+                model.geom_rgba[geom], model.geom_matid[geom] = [*rgb, LOOK_ALPHA], -1
+            else:
+                model.geom_rgba[geom, 3] = 0.0
+
+    def _measure(self) -> None:
+        """Middle and diagonal [m] of the upright box around the robot."""
+        model, data = self.posed.model, self.posed.data
+        moving = np.flatnonzero((model.body_weldid[model.geom_bodyid] > 0) & (model.geom_rgba[:, 3] > 0))
+        rotation, box = data.geom_xmat[moving].reshape(-1, 3, 3), model.geom_aabb[moving]
+        centre = data.geom_xpos[moving] + (rotation @ box[:, :3, None])[..., 0]
+        half = (np.abs(rotation) @ box[:, 3:, None])[..., 0]
+        places = np.concatenate([centre - half, centre + half, data.xpos[self.posed.base][None]])
+        low, high = places.min(axis=0), places.max(axis=0)
+        self.middle, self.size = (low + high) / 2, float(max(high[2] - low[2], 0.8 * np.linalg.norm((high - low)[:2])))
+
+    def _draw_joints(self) -> list[Label]:
+        families = list(dict.fromkeys(family(name) for name in self.robot.joint_names))
+        labels, length = [], 0.16 * self.size
+        for name in self.robot.joint_names:
+            joint = self.posed.model.joint(name).id
+            place, axis = self.posed.data.xanchor[joint].copy(), self.posed.data.xaxis[joint].copy()
+            rgb = FAMILY_RGB[families.index(family(name)) % len(FAMILY_RGB)]
+            self._arrow(place, axis, length, (*rgb, 1.0))
+            labels.append(Label(name, place, rgb, ((place + length * axis, rgb),)))
+        return labels
+
+    def _draw_feet(self) -> list[Label]:
+        labels, data = [], self.posed.data
+        for name, geoms in self.feet.items():
+            ids = [self.posed.model.geom(geom).id for geom in geoms]
+            place = np.mean([data.geom_xpos[geom] for geom in ids], axis=0)
+            place[2] = 0.002
+            size = 1.5 * max(float(self.posed.model.geom_rbound[geom]) for geom in ids)
+            self._geom(mujoco.mjtGeom.mjGEOM_CYLINDER, (size, 0.002, 0.0), place, FOOT_RGBA)
+            labels.append(Label(f"foot {name}", place, FOOT_RGBA[:3]))
+        return labels
+
+    def _draw_imu(self) -> list[Label]:
+        if not self.imu:
+            return []
+        site = self.posed.model.site(self.imu).id
+        place, axes = self.posed.data.site_xpos[site].copy(), self.posed.data.site_xmat[site].reshape(3, 3)
+        length = 0.2 * self.size
+        for axis, rgb in zip(axes.T, AXES_RGB, strict=True):
+            self._arrow(place, axis, length, (*rgb, 1.0))
+        ends = tuple((place + length * axis, rgb) for axis, rgb in zip(axes.T, AXES_RGB, strict=True))
+        return [Label(self.imu, place, (1.0, 1.0, 1.0), ends)]
+
+    def _arrow(self, place: FloatArray, axis: FloatArray, length: float, rgba: Sequence[float]) -> None:
+        geom = self._geom(mujoco.mjtGeom.mjGEOM_ARROW, (0.0, 0.0, 0.0), place, rgba)
+        mujoco.mjv_connector(
+            geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.009 * self.size, place, place + 2.0 * length * axis
+        )  # it draws half of it
+
+    def _geom(self, kind: int, size: Sequence[float], place: FloatArray, rgba: Sequence[float]) -> mujoco.MjvGeom:
+        scene = self._renderer.scene
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(geom, kind, np.array(size), place, np.eye(3).ravel(), np.asarray(rgba, dtype=np.float32))
+        geom.category, geom.emission = mujoco.mjtCatBit.mjCAT_DECOR, 0.6
+        scene.ngeom += 1
+        return geom
+
+    # ---- names ----
+
+    def _write(self, labels: list[Label], camera: mujoco.MjvCamera, title: str) -> Frame:
+        """Write names in two columns, and lines from them, over the picture that was just drawn; returns it."""
+        placed = _columns([(label, self._project(label.place, camera)) for label in labels])
+        context, rect = self._renderer._mjr_context, self._renderer._rect
+        lines = []
+        for label, (x, y), row, left in placed:
+            width = _width(context, label.text)
+            start = LEFT_COLUMN if left else WIDTH - LEFT_COLUMN - width
+            _text(context, label.text, start, row, label.rgb)
+            lines.append(((start + width + 6 if left else start - 6, row), (x, y), label.rgb))
+        _text(context, title, LEFT_COLUMN, 24, (1.0, 1.0, 1.0))
+        for number, part in enumerate(CAPTION.split("   ")):
+            _text(context, part, LEFT_COLUMN, HEIGHT - 24 * (4 - number) + 8, (1.0, 1.0, 1.0))
+        frame = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
+        mujoco.mjr_readPixels(frame, None, rect, context)
+        frame = np.flipud(frame).copy()
+        for start, end, rgb in lines:
+            _line(frame, start, end, rgb)
+        return frame
+
+    def _project(self, place: FloatArray, camera: mujoco.MjvCamera) -> tuple[float, float]:
+        """Pixel (x from the left, y from the top) of ``place`` (3,) [m]."""
+        azimuth, elevation = math.radians(camera.azimuth), math.radians(camera.elevation)
+        forward = np.array([math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)])
+        right = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
+        away = place - (np.array(camera.lookat) - camera.distance * forward)
+        scale = 0.5 * HEIGHT / math.tan(math.radians(self.posed.model.vis.global_.fovy) / 2) / float(away @ forward)
+        return WIDTH / 2 + scale * float(away @ right), HEIGHT / 2 - scale * float(away @ np.cross(right, forward))
+
+
+def _columns(labels: list[tuple[Label, tuple[float, float]]]) -> list[tuple[Label, tuple[float, float], float, bool]]:
+    """Each label with its pixel, the row of its name [px from the top], and whether that is in the left column."""
+    ordered, placed = sorted(labels, key=lambda each: each[1][0]), []
+    half = len(ordered) // 2
+    for left, column in ((True, ordered[:half]), (False, ordered[half:])):
+        column = sorted(column, key=lambda each: each[1][1])
+        low, high = 60.0, HEIGHT - 110.0
+        gap = min(1.6 * ROW, (high - low) / max(len(column), 1))
+        rows: list[float] = []
+        for _, (_, y) in column:
+            rows.append(max(y, rows[-1] + gap if rows else low))
+        for i in reversed(range(len(rows))):  # push up what ran out at the bottom
+            rows[i] = min(rows[i], rows[i + 1] - gap if i + 1 < len(rows) else high)
+        placed += [(label, pixel, row, left) for (label, pixel), row in zip(column, rows, strict=True)]
+    return placed
+
+
+def _width(context: mujoco.MjrContext, text: str) -> int:
+    """[px]"""
+    return sum(int(context.charWidth[ord(letter)]) for letter in text if ord(letter) < 127)
+
+
+def _text(context: mujoco.MjrContext, text: str, x: float, y: float, rgb: Rgb) -> None:
+    """Text whose first letter's middle is at the pixel (x, y from the top), with a dark edge."""
+    for shift, colour in ((1.2, (0.0, 0.0, 0.0)), (0.0, rgb)):
+        down = (HEIGHT - y - shift - 6) / HEIGHT
+        mujoco.mjr_text(mujoco.mjtFont.mjFONT_NORMAL, text, context, (x + shift) / WIDTH, down, *colour)
+
+
+def _line(frame: NDArray[np.uint8], start: tuple[float, float], end: tuple[float, float], rgb: Rgb, wide: int = 1) -> None:
+    """A line, half transparent, between two pixels; ``wide`` [px]."""
+    steps = max(2, int(np.hypot(end[0] - start[0], end[1] - start[1])))
+    x, y = (np.linspace(a, b, steps).round().astype(int) for a, b in zip(start, end, strict=True))
+    steep = abs(end[1] - start[1]) > abs(end[0] - start[0])
+    for shift in range(wide):
+        column, row = (x + shift, y) if steep else (x, y + shift)
+        inside = (column >= 0) & (column < WIDTH) & (row >= 0) & (row < HEIGHT)
+        column, row = column[inside], row[inside]
+        frame[row, column] = (0.35 * frame[row, column] + 0.65 * 255.0 * np.array(rgb)).astype(np.uint8)

@@ -1,0 +1,71 @@
+"""The joints of a robot that was read: which move, in which pose they stand, and their servos, limits and friction."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from legged_mw.sim.rigid import hold_joints, match_joints
+from legged_mw.sim.servos import Range, add_servos, set_efforts, set_joints
+from legged_mw.sim.tables import per_joint_all, some_joints
+from legged_mw.sim.vendor import Loaded
+
+PARTIAL = ("effort", "armature", "frictionloss", "joint_speed_limits")  # tables that need not name every joint
+
+
+@dataclass(frozen=True)
+class Posed:
+    """D joints that move, and what holds the others."""
+
+    model: mujoco.MjModel  # the robot alone, compiled, its held joints welded
+    joints: list[str]  # D
+    held: list[str]
+    angles: list[float]  # D, the pose [rad]
+    ranges: list[Range]  # D [rad]; infinite where there is no limit
+    gains: list[float]  # D [N m/rad]
+    dampings: list[float]  # D [N m s/rad]
+
+
+def pose_joints(robot: Loaded, gains: Mapping[str, Mapping[str, float]], pose: Mapping[str, float] | None, held: Sequence[str]) -> Posed:
+    """Weld the ``held`` joints, and give the others their numbers; ``gains`` are two tables, what -> table: stiffness and damping.
+
+    The pose is the caller's, then the keyframe's; where both are silent 0 for a held joint, and for all of them if ``pose`` is None.
+    Raises ModelError for joints that no key fits, of all tables at once.
+    """
+    every = [joint.name for joint in robot.joints]
+    welded = match_joints(every, held, "`held_joints`")
+    moving = [name for name in every if name not in welded]
+    tables = dict(gains)
+    if robot.keyframe is None and pose is not None:
+        tables["`pose`"] = pose
+    stiffness, damping, *_ = per_joint_all(tables, moving, spare=welded)
+    known = {**(robot.keyframe.angles if robot.keyframe else {}), **some_joints(pose or {}, every, "`pose`")}
+    model = robot.spec.copy().compile()
+    if welded:
+        ranges = dict(zip(welded, _ranges(model, welded), strict=True))
+        hold_joints(robot.spec, model, {name: known.get(name, float(np.clip(0.0, *ranges[name]))) for name in welded}, robot.notes)
+        model = robot.spec.copy().compile()
+    return Posed(model, moving, welded, [known.get(name, 0.0) for name in moving], _ranges(model, moving), stiffness, damping)
+
+
+def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> list[Range]:
+    each = [model.joint(name) for name in joints]
+    return [(float(j.range[0]), float(j.range[1])) if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in each]
+
+
+def set_machine(robot: Loaded, partial: Mapping[str, Mapping[str, float]], posed: Posed) -> tuple[float, ...]:
+    """Servos with their force limits, armature and dry friction; what ``partial`` (of PARTIAL) says wins over the file.
+
+    Returns the speed limits (D,) [rad/s], infinite where nothing states one.
+    """
+    said = {what: some_joints(partial.get(what, {}), posed.joints, f"`{what}`", posed.held) for what in PARTIAL}
+    set_efforts(robot.limits, said["effort"], robot.notes)
+    set_joints(robot.joints, said["armature"], said["frictionloss"], robot.notes)
+    add_servos(robot.spec, robot.joints, posed.ranges, posed.gains, posed.dampings, robot.limits, robot.notes)
+    speeds = robot.speeds | said["joint_speed_limits"]
+    return tuple(speeds.get(name, np.inf) for name in posed.joints)

@@ -1,0 +1,93 @@
+"""Meshes and pictures that are not there, or that MuJoCo cannot read: looks are left out, what the physics needs is an error."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from legged_mw.sim.errors import ModelError
+
+READABLE = (".stl", ".obj", ".msh")  # that MuJoCo has a reader for
+INSTEAD = 'give the geom a primitive shape, or let it not collide (contype="0" conaffinity="0")'
+
+
+def why_unreadable(path: Path) -> str:
+    """Why MuJoCo would not read a mesh file, as far as its name tells; "" if it may."""
+    if path.suffix.lower() not in READABLE:
+        return f"MuJoCo reads no {path.suffix or 'file without an ending'}, only {', '.join(READABLE)}"
+    return "" if path.is_file() else "no such file"
+
+
+def drop_unreadable(spec: mujoco.MjSpec, where: str, notes: list[str], instead: str = INSTEAD) -> None:
+    """Remove looks whose files cannot be read. Raises ModelError for a mesh that collides or gives a body its mass."""
+    wrong = {mesh.name: why_unreadable(_path(spec, mesh)) for mesh in spec.meshes if mesh.file}
+    if not any(wrong.values()) and _compiles(spec):
+        wrong = {}
+    elif not any(wrong.values()):
+        wrong = {mesh.name: _read_error(spec, mesh) for mesh in spec.meshes if mesh.file}
+    left_out: dict[str, list[str]] = {}
+    for mesh in [mesh for mesh in spec.meshes if wrong.get(mesh.name)]:
+        reason = wrong[mesh.name]
+        for geom in [geom for geom in spec.geoms if geom.meshname == mesh.name]:
+            _refuse_what_matters(spec, geom, mesh, reason, where, instead)
+            spec.delete(geom)
+        left_out.setdefault(reason, []).append(mesh.file)
+        spec.delete(mesh)
+    for reason, files in left_out.items():
+        notes.append(f"looks left out ({reason}): {', '.join(dict.fromkeys(files))}")
+    _drop_pictures(spec, notes)
+
+
+def _path(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> Path:
+    name = Path(mesh.file)
+    return Path(spec.modelfiledir) / spec.meshdir / (name.name if spec.strippath else name)
+
+
+def _compiles(spec: mujoco.MjSpec) -> bool:
+    try:
+        spec.copy().compile()
+    except ValueError:
+        return False
+    return True
+
+
+def _read_error(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
+    """What MuJoCo says of the mesh alone; "" if nothing is wrong with it."""
+    alone = mujoco.MjSpec()
+    alone.add_mesh(name="mesh", file=str(_path(spec, mesh).resolve()), scale=mesh.scale, inertia=mesh.inertia)
+    alone.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
+    try:
+        alone.compile()
+    except ValueError as error:
+        return " ".join(str(error).split())
+    return ""
+
+
+def _refuse_what_matters(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, mesh: mujoco.MjsMesh, reason: str, where: str, instead: str) -> None:
+    gives_mass = not geom.parent.explicitinertial and geom.mass != 0.0 and (geom.density > 0.0 or not np.isnan(geom.mass))
+    if not (geom.contype or geom.conaffinity or gives_mass):
+        return
+    name = f"geom '{geom.name}'" if geom.name else "a geom"
+    role = "collides as" if geom.contype or geom.conaffinity else "takes its mass from"
+    raise ModelError(
+        f"{where}: {name} of body '{geom.parent.name}' {role} the mesh '{mesh.name}', and its file {mesh.file} cannot be read ({reason}; "
+        f"looked for at {_path(spec, mesh)}); put the file there as one of {', '.join(READABLE)}, or {instead}"
+    )
+
+
+def _drop_pictures(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Textures from files that are missing: the materials keep their colours."""
+    folder = Path(spec.modelfiledir) / spec.texturedir
+    files = {t.name: [file for file in (t.file, *t.cubefiles) if file] for t in spec.textures}
+    missing = {name: gone for name, every in files.items() if (gone := [file for file in every if not (folder / file).is_file()])}
+    for material in spec.materials:
+        if any(name in missing for name in material.textures):
+            material.textures = ["" if name in missing else name for name in material.textures]
+    for texture in [texture for texture in spec.textures if texture.name in missing]:
+        spec.delete(texture)
+    if missing:
+        notes.append(f"looks left out (no such file): {', '.join(dict.fromkeys(file for gone in missing.values() for file in gone))}")

@@ -1,0 +1,41 @@
+"""Where the parts of a robot are in a pose that stands upright: geometry of a compiled model, nothing is stepped."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from legged_mw.sim.model import RobotModel
+from legged_mw.sim.shapes import surfaces
+
+
+class Upright(NamedTuple):
+    """S sites of a robot whose root is upright at the world's origin, and the bodies that they are on."""
+
+    places: np.ndarray  # (S, 3) of the sites in the root's frame [m]
+    bodies: np.ndarray  # (S,) index of each site's body
+    up: np.ndarray  # (S, 3) the vertical in the frame of each site's body
+
+
+def upright(robot: RobotModel, joints: Sequence[float], sites: Sequence[str]) -> Upright:
+    """``sites`` with the joints at the angles ``joints`` (D,) [rad]."""
+    model = robot.physics
+    data = mujoco.MjData(model)
+    data.qpos[:7], data.qpos[7:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), joints
+    mujoco.mj_kinematics(model, data)
+    where = [robot.id("site", name) for name in sites]
+    bodies = model.site_bodyid[where]
+    return Upright(data.site_xpos[where].copy(), bodies.copy(), data.xmat[bodies].reshape(-1, 3, 3)[:, 2].copy())
+
+
+def standing_height(robot: RobotModel, geoms: Sequence[str]) -> float:
+    """How high the root is above a plane that the lowest of ``geoms`` touches, upright and in the robot's pose [m]."""
+    data = mujoco.MjData(robot.physics)
+    data.qpos[:7], data.qpos[7:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), robot.pose
+    mujoco.mj_kinematics(robot.physics, data)
+    return -float(min(points[:, 2].min() for points in surfaces(robot.physics, data, geoms).values()))

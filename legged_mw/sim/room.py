@@ -1,0 +1,76 @@
+"""How much room a world needs on mujoco-warp: contacts (``nconmax``) and constraint rows (``njmax``), counted from the model.
+
+mujoco-warp allocates before it steps. Too little room drops contacts, which is reported; too many rows cost memory and time.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from legged_mw.sim.ground import GROUND, PROBE_SPACING
+from legged_mw.sim.shapes import spheres_on
+
+_TYPE, _EQUALITY = mujoco.mjtGeom, mujoco.mjtEq
+# Contacts of one geom with a plane, as mujoco-warp 4.0.0's collision_primitive.py writes them.
+_ON_PLANE = {_TYPE.mjGEOM_SPHERE: 1, _TYPE.mjGEOM_ELLIPSOID: 1, _TYPE.mjGEOM_CAPSULE: 2}  # others lie on a face: 4
+_ROWS = {1: 1, 3: 4, 4: 6, 6: 10}  # of a contact with a pyramidal cone, by condim
+_EQUALITY_ROWS = {_EQUALITY.mjEQ_CONNECT: 3, _EQUALITY.mjEQ_WELD: 6}  # others: 1
+_LEAST = 8  # contacts, which cost little: worlds share the room of all, rows they do not
+_REST = 0.25  # ours: share of the contacts of links between the root and the last ones, which rarely touch all at once
+
+
+class Room(NamedTuple):
+    """Room of a world, and what it was counted from."""
+
+    contacts: int
+    rows: int
+    why: str
+
+
+def count_room(model: mujoco.MjModel, terrain: bool) -> Room:
+    """The room that ``model`` needs on its plane, or on ``terrain``.
+
+    The last links of each limb touch with all they have, the others with a quarter of it. Every joint with dry friction or
+    limits has a row of its own. Where parts of the robot may touch one another, half of them do, and as many more are near,
+    which takes the room of a contact too.
+    """
+    geoms = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] and model.geom_conaffinity[geom] & 1]
+    last = _last_links(model, {int(model.geom_bodyid[geom]) for geom in geoms})
+    shares = [_contacts(model, geom, terrain) * (1.0 if model.geom_bodyid[geom] in last else _REST) for geom in geoms]
+    on_ground = int(np.ceil(sum(shares)))
+    own = len(geoms) // 2 if any(model.geom_contype[geom] for geom in geoms) else 0
+    friction = int((model.dof_frictionloss > 0).sum() + (model.tendon_frictionloss > 0).sum())
+    limits = int(model.jnt_limited.sum() + model.tendon_limited.sum())
+    equalities = sum(_EQUALITY_ROWS.get(_EQUALITY(kind), 1) for kind in model.eq_type)
+    each = _ROWS[int(model.geom(GROUND).condim[0])]
+    parts = {"dry friction": friction, "limits": limits, "equalities": equalities}
+    rows = sum(parts.values()) + on_ground * each + own * _ROWS[3]
+    why = [f"{count} {name}" for name, count in parts.items() if count]
+    why += [f"{each} a contact with the ground ({on_ground})", *([f"4 a contact of its own ({own})"] if own else [])]
+    return Room(max(on_ground + 2 * own, _LEAST), rows, ", ".join(why))
+
+
+def _last_links(model: mujoco.MjModel, bodies: set[int]) -> set[int]:
+    """Those of ``bodies`` that no other one of them hangs on."""
+    above: set[int] = set()
+    for body in bodies:
+        while (body := int(model.body_parentid[body])) > 0:
+            above.add(body)
+    return bodies - above
+
+
+def _contacts(model: mujoco.MjModel, geom: int, terrain: bool) -> int:
+    """The most contacts that ``geom`` has with the ground; on terrain a sphere in a corner has two, other shapes one a probe of a side."""
+    kind = _TYPE(model.geom_type[geom])
+    plane = _ON_PLANE.get(kind, 4)
+    if not terrain:
+        return plane
+    if kind == _TYPE.mjGEOM_SPHERE:
+        return 2
+    probes = len(spheres_on(model, geom, PROBE_SPACING)[0])
+    return max(plane, probes + 1 if kind == _TYPE.mjGEOM_CAPSULE else probes // 2)

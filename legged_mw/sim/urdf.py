@@ -1,0 +1,118 @@
+"""A URDF made ready for MuJoCo's own reader: mesh files found, unreadable looks left out, links without mass kept so."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element
+
+import mujoco
+
+from legged_mw.sim.errors import ModelError
+from legged_mw.sim.meshes import READABLE, why_unreadable
+
+_KNOWN = ("link", "joint", "material", "mujoco")  # what the reader needs; the rest is for other programs
+_COMPILER = {"fusestatic": "false", "discardvisual": "false", "strippath": "false"}
+SHAPES = "give the <collision> a <box>, <cylinder> or <sphere>"
+
+
+def is_urdf(text: str) -> bool:
+    """Whether the first element is a <robot>."""
+    first = re.search(r"<\s*([A-Za-z_]\w*)", re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL))
+    return bool(first and first[1] == "robot")
+
+
+def read_urdf(file: Path, text: str, notes: list[str]) -> tuple[mujoco.MjSpec, dict[str, float]]:
+    """The spec, every link a body of its own, and joint -> speed limit [rad/s].
+
+    Raises ValueError for what is no URDF, ModelError for a mesh that collides and cannot be read.
+    """
+    if "<xacro:" in text:
+        raise ModelError(f"{file.name} holds xacro macros; write them out first: xacro {file.name} > robot.urdf")
+    try:
+        robot = ElementTree.fromstring(text)
+    except ElementTree.ParseError as error:
+        raise ValueError(str(error)) from None
+    for other in [child for child in robot if child.tag not in _KNOWN]:
+        robot.remove(other)
+    _drop_world(robot, notes)
+    files = _find_meshes(robot, file, notes)
+    extension = robot.find("mujoco")
+    extension = ElementTree.SubElement(robot, "mujoco") if extension is None else extension
+    compiler = extension.find("compiler")
+    compiler = ElementTree.SubElement(extension, "compiler") if compiler is None else compiler
+    compiler.attrib |= _COMPILER
+    compiler.attrib.pop("meshdir", None)
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, encoding="unicode"))
+    for mesh in spec.meshes:
+        mesh.file = str(files[mesh.file])
+    _set_looks(spec)
+    limits = {joint.get("name", ""): joint.find("limit") for joint in robot.findall("joint")}
+    speeds = {name: float(limit.get("velocity", 0.0)) for name, limit in limits.items() if limit is not None}
+    return spec, {name: speed for name, speed in speeds.items() if speed > 0.0}
+
+
+def _drop_world(robot: Element, notes: list[str]) -> None:
+    """A link "world" is where some other program puts the robot."""
+    for world in [link for link in robot.findall("link") if link.get("name") == "world"]:
+        robot.remove(world)
+        for joint in robot.findall("joint"):
+            parent = joint.find("parent")
+            if parent is not None and parent.get("link") == "world":
+                robot.remove(joint)
+                notes.append(f"link 'world' and joint '{joint.get('name')}' dropped: the root is free")
+
+
+def _find_meshes(robot: Element, file: Path, notes: list[str]) -> dict[str, Path]:
+    """Give each mesh a name of its own, and return name -> file; looks without a readable file are removed."""
+    names: dict[Path, str] = {}
+    left_out: dict[str, list[str]] = {}
+    for link in robot.findall("link"):
+        for part in [*link.findall("visual"), *link.findall("collision")]:
+            mesh = part.find("geometry/mesh")
+            if mesh is None:
+                continue
+            asked = mesh.get("filename", "")
+            path = _resolve(asked, file, (robot.find("mujoco/compiler") or Element("none")).get("meshdir", ""))
+            reason = why_unreadable(path)
+            if reason and part.tag == "collision":
+                raise ModelError(
+                    f"{file.name}: link '{link.get('name')}' collides as the mesh {asked}, which cannot be read ({reason}; looked for it "
+                    f"beside {file.name} and in the folders above); put it there as one of {', '.join(READABLE)}, or {SHAPES}"
+                )
+            if reason:
+                left_out.setdefault(reason, []).append(asked)
+                link.remove(part)
+                continue
+            mesh.set("filename", names.setdefault(path, f"{path.stem}_{len(names)}{path.suffix}"))
+    for reason, files in left_out.items():
+        notes.append(f"looks left out ({reason}): {', '.join(dict.fromkeys(files))}")
+    return {name: path for path, name in names.items()}
+
+
+def _resolve(asked: str, file: Path, meshdir: str) -> Path:
+    """The file that a URDF means: package:// is the folder of that name above it, or else any folder above it."""
+    here = file.resolve().parent
+    scheme, _, rest = asked.rpartition("://")
+    if scheme == "file":
+        return Path(rest)
+    package, _, inside = rest.partition("/") if scheme == "package" else ("", "", rest)
+    name = Path(inside).name
+    above = [here, *here.parents]
+    places = [folder / inside for folder in above if folder.name == package] + [folder / package / inside for folder in above]
+    places += [folder / inside for folder in above[:3]] + [here / meshdir / inside, here / name, here / "meshes" / name]
+    return next((place for place in places if place.is_file()), here / inside)
+
+
+def _set_looks(spec: mujoco.MjSpec) -> None:
+    """What collides is drawn only where a link has no other looks; a link without <inertial> has no mass."""
+    for body in spec.bodies:
+        seen = any(not (geom.contype or geom.conaffinity) for geom in body.geoms)
+        for geom in body.geoms:
+            if seen and (geom.contype or geom.conaffinity):
+                geom.group = 3
+            if not body.explicitinertial:
+                geom.mass = 0.0

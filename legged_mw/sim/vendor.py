@@ -1,0 +1,233 @@
+"""A robot's file as its vendor wrote it, read for a simulation that brings its own ground, servos and sensors.
+
+Whatever is dropped, added or renamed is a line of ``Loaded.notes``. Host only; nothing is stepped.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from legged_mw.sim.errors import ModelError
+from legged_mw.sim.meshes import drop_unreadable
+from legged_mw.sim.servos import Range, take_limits
+from legged_mw.sim.urdf import is_urdf, read_urdf
+
+_SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_FREE = mujoco.mjtJoint.mjJNT_FREE
+_COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # of qpos; all other joints have one
+_ADDED = {  # what a default may say of what is added to the robot
+    "geom": "type contype conaffinity condim priority friction solmix solref solimp margin gap rgba group density material",
+    "site": "type size group rgba material",
+    "actuator": "gaintype gainprm biastype biasprm dyntype dynprm gear ctrllimited ctrlrange forcelimited forcerange actlimited actrange",
+}
+_KEPT_SENSORS = ("TOUCH", "FORCE", "TORQUE", "RANGEFINDER", "CONTACT", "GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "USER", "PLUGIN", "TACTILE")
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A pose that the file holds."""
+
+    name: str
+    root: tuple[float, ...]  # x, y, z [m]; empty: the file has no free joint
+    angles: dict[str, float]  # joint -> [rad]
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """A robot alone: one root with a free joint, named joints, no actuators, sensors of its own only where they feel contact."""
+
+    spec: mujoco.MjSpec
+    where: str  # the file's name
+    notes: list[str]
+    limits: dict[str, Range]  # joint -> force [N m], of those that the file limits
+    speeds: dict[str, float]  # joint -> highest speed [rad/s], likewise
+    keyframe: Keyframe | None  # "home", or the only one
+
+    @property
+    def root(self) -> str:
+        """Name of the body that carries the free joint."""
+        return self.spec.joints[0].parent.name
+
+    @property
+    def joints(self) -> list[mujoco.MjsJoint]:
+        """The scalar joints, in order of qpos[7:]."""
+        return list(self.spec.joints)[1:]
+
+
+def read_robot(file: Path) -> Loaded:
+    """Read an MJCF or URDF. Raises ModelError for what is none, and for what cannot be a robot alone."""
+    if not file.is_file():
+        raise ModelError(f"no MJCF at {file}")
+    where, notes = file.name, []
+    text = file.read_text(encoding="utf-8", errors="replace")
+    urdf, speeds = is_urdf(text), {}
+    with naming(file):
+        if urdf:
+            spec, speeds = read_urdf(file, text, notes)
+        else:
+            spec = mujoco.MjSpec.from_file(str(file))
+        limits = take_limits(spec, notes)
+        keyframe = _take_keyframe(spec, notes)
+        _drop_sensors(spec, notes)
+        _drop_world(spec, where, notes)
+        _forget_defaults(spec)
+        _free_root(spec, where, notes)
+        _balance(spec, notes)
+        drop_unreadable(spec, where, notes)
+    _check_joints(spec, where)
+    return Loaded(spec, where, notes, limits, speeds, keyframe)
+
+
+@contextmanager
+def naming(file: Path) -> Iterator[None]:
+    """MuJoCo's errors in one line, with the file's name."""
+    try:
+        yield
+    except ModelError:
+        raise
+    except ValueError as error:  # parsing does not see a name that is used twice, compiling does
+        kind = "URDF" if file.suffix == ".urdf" else "MJCF"
+        raise ModelError(f"{file.name} is not a valid {kind}: {' '.join(str(error).split())}") from None
+
+
+def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
+    """The keyframe "home", or the only one; none stays in the file, as it would have to fit the servos."""
+    keys, taken = list(spec.keys), None
+    chosen = next((key for key in keys if key.name == "home"), keys[0] if len(keys) == 1 else None)
+    qpos = list(chosen.qpos) if chosen else []
+    starts = np.cumsum([0, *(_COLUMNS.get(joint.type, 1) for joint in spec.joints)])
+    if chosen and len(qpos) == starts[-1]:
+        angles = {joint.name: qpos[start] for joint, start in zip(spec.joints, starts[:-1], strict=True) if joint.type in _SCALAR_JOINTS}
+        first = next(iter(spec.joints), None)
+        taken = Keyframe(chosen.name, tuple(qpos[:3]) if first and first.type == _FREE else (), angles)
+        notes.append(f"keyframe '{chosen.name}' read: pose and place of the root, where nothing else states them")
+    for key in keys:
+        if key is not chosen or not taken:
+            notes.append(f"keyframe '{key.name}' dropped")
+        spec.delete(key)
+    spec.nkey = 0
+    return taken
+
+
+def _drop_sensors(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """What the state tells needs no sensor. Those that feel contact stay."""
+    kept = {getattr(mujoco.mjtSensor, f"mjSENS_{name}", None) for name in _KEPT_SENSORS}
+    if dropped := [sensor for sensor in spec.sensors if sensor.type not in kept]:
+        notes.append(f"sensors dropped, as nothing reads them: {', '.join(sensor.name or 'one without a name' for sensor in dropped)}")
+    for sensor in dropped:
+        spec.delete(sensor)
+
+
+def _drop_world(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
+    """Ground, things, lights, cameras and sky of the file; and what ties the robot to them."""
+    for body in [body for body in spec.worldbody.bodies if not _has_joints(body) and _has_joints(spec.worldbody)]:
+        notes.append(f"body '{body.name}' of the world dropped: it has no joint")
+        spec.delete(body)
+    if not spec.worldbody.bodies:
+        raise ModelError(f"{where} has no body; it must hold a robot")
+    if len(moving := [body.name for body in spec.worldbody.bodies]) > 1:
+        raise ModelError(f"{where} has {len(moving)} bodies with joints in its world: {', '.join(moving)}; leave one of them, the robot")
+    geoms = list(spec.worldbody.geoms)
+    skies = [texture for texture in spec.textures if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX]
+    dropped = {"world geoms": geoms, "lights": list(spec.lights), "cameras": list(spec.cameras), "skybox": skies}
+    for what, things in dropped.items():
+        if things:
+            why = ", as the ground is added" if things is geoms else ""
+            notes.append(f"{what} dropped{why}: {', '.join(thing.name or 'one without a name' for thing in things)}")
+        for thing in things:
+            spec.delete(thing)
+    if geoms or skies:
+        _drop_unused(spec)
+    _drop_ties(spec, notes)
+
+
+def _has_joints(body: mujoco.MjsBody) -> bool:
+    return bool(body.joints) or any(_has_joints(child) for child in body.bodies)
+
+
+def _drop_unused(spec: mujoco.MjSpec) -> None:
+    """What only the ground wore."""
+    for hfield in [field for field in spec.hfields if field.name not in {geom.hfieldname for geom in spec.geoms}]:
+        spec.delete(hfield)
+    worn = {thing.material for thing in (*spec.geoms, *spec.sites, *spec.meshes, *spec.skins, *spec.tendons)}
+    for material in [material for material in spec.materials if material.name not in worn]:
+        spec.delete(material)
+    shown = {name for material in spec.materials for name in material.textures}
+    for texture in [texture for texture in spec.textures if texture.name not in shown]:
+        spec.delete(texture)
+
+
+def _drop_ties(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Explicit pairs of geoms, and whatever holds the robot to the world or to what was dropped."""
+    bodies, sites = {body.name for body in spec.bodies} - {"world"}, {site.name for site in spec.sites}
+    for pair in list(spec.pairs):
+        notes.append(f"contact pair of '{pair.geomname1}' and '{pair.geomname2}' dropped")
+        spec.delete(pair)
+    for exclude in list(spec.excludes):
+        if not {exclude.bodyname1, exclude.bodyname2} <= bodies:
+            spec.delete(exclude)
+    for tie in list(spec.equalities):
+        kinds = {mujoco.mjtObj.mjOBJ_BODY: bodies, mujoco.mjtObj.mjOBJ_SITE: sites}
+        known = kinds.get(tie.objtype)
+        if known is not None and tie.type != mujoco.mjtEq.mjEQ_JOINT and not {tie.name1, tie.name2} <= known:
+            notes.append(f"equality '{tie.name}' dropped: it holds '{tie.name1}' to the world")
+            spec.delete(tie)
+
+
+def _forget_defaults(spec: mujoco.MjSpec) -> None:
+    """The file's defaults are in its elements by now; what is added later starts from MuJoCo's own."""
+    fresh = mujoco.MjSpec().default
+    for kind, names in _ADDED.items():
+        for name in names.split():
+            setattr(getattr(spec.default, kind), name, getattr(getattr(fresh, kind), name))
+
+
+def _free_root(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
+    """One free joint, at the root, that the air does not brake."""
+    root = spec.worldbody.first_body()
+    if not root.joints:
+        root.add_freejoint()
+        notes.append(f"free joint added to '{root.name}'")
+    first = root.joints[0]
+    if first.type != _FREE:
+        raise ModelError(f"{where}: the first joint must be the root body's free joint; it is {first.name or 'one without a name'}")
+    for name in ("armature", "frictionloss"):
+        if old := getattr(first, name):
+            notes.append(f"free joint {name}: {old:g} -> 0")
+            setattr(first, name, 0.0)
+    if np.any(first.damping):
+        notes.append(f"free joint damping: {float(np.atleast_1d(first.damping)[0]):g} -> 0")
+        first.damping = np.zeros_like(first.damping)
+
+
+def _balance(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Principal moments of a body obey A + B >= C; those that do not become their mean."""
+    for body in [body for body in spec.bodies if body.explicitinertial]:
+        full = body.fullinertia
+        if np.isnan(full[0]):
+            moments = np.sort(body.inertia)
+        else:
+            xx, yy, zz, xy, xz, yz = full
+            moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        short = moments[2] - moments[0] - moments[1]
+        if short > -1e-9 * moments[2]:
+            spec.compiler.balanceinertia = True
+        if short > 1e-9 * moments[2]:
+            figures = ", ".join(f"{moment:g}" for moment in moments)
+            notes.append(f"inertia of '{body.name}' balanced: no body has the moments {figures} kg m^2, so each becomes their mean")
+
+
+def _check_joints(spec: mujoco.MjSpec, where: str) -> None:
+    if len(joints := list(spec.joints)[1:]) == 0:
+        raise ModelError(f"{where} has no hinge or slide joint, so nothing of it can be moved")
+    for joint in joints:
+        if joint.type not in _SCALAR_JOINTS or not joint.name:
+            raise ModelError(f"{where}: joint '{joint.name}' must be a named hinge or slide joint")

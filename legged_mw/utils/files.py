@@ -1,0 +1,46 @@
+"""Files that a config names: found by where the name was written, so that a task and its robot may be moved together."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+from weakref import WeakKeyDictionary
+
+from legged_mw import ROOT
+from legged_mw.utils.errors import UserError
+
+_FILES: WeakKeyDictionary[type, Path] = WeakKeyDictionary()  # class -> the Python file with its body
+
+
+def note_file(cls: type) -> type:
+    """Remember which file ``cls`` is written in; returns it. Called as its statement runs: later its module's name may be another's."""
+    if file := getattr(sys.modules.get(cls.__module__), "__file__", None):
+        _FILES.setdefault(cls, Path(file).resolve())
+    return cls
+
+
+def find_file(cfg: Any, path: str) -> Path:
+    """The file that the config field ``path`` ("asset.file") names. Raises UserError.
+
+    A relative name that a class body wrote is looked for beside that body's file. One that came later, by a flag or from a
+    run, is looked for in the current folder, beside the task and beside the classes that it extends. Last comes the repository.
+    """
+    section, _, name = path.rpartition(".")
+    owner = getattr(cfg, section)
+    written = Path(getattr(owner, name)).expanduser()
+    author = next(cls for cls in type(owner).__mro__ if name in vars(cls))
+    folders = [_folder(author)]
+    if getattr(owner, name) != getattr(author, name):
+        folders = [Path.cwd(), Path(getattr(cfg, "_folder", "")), *map(_folder, [*type(owner).__mro__, *type(cfg).__mro__])]
+    places = list(dict.fromkeys(folder for folder in (*folders, ROOT) if folder and folder.is_absolute()))
+    for file in (place / written for place in places):  # an absolute path stays itself
+        if file.is_file():
+            return file
+    if written.is_absolute():
+        raise UserError(f"{path}: no file at {written}; an absolute path is of one machine: name the file relative to the task's")
+    raise UserError(f"{path}: no file '{written}' in {', '.join(map(str, places))}")
+
+
+def _folder(cls: type) -> Path | None:
+    return _FILES[cls].parent if cls in _FILES else None

@@ -1,0 +1,425 @@
+"""The health page: its numbers against a robot of one joint that can be worked out by hand, its texts, and the task that it writes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from legged_mw import ROOT
+from legged_mw.envs.divergence import Divergence, Watch
+from legged_mw.robot import __main__ as program
+from legged_mw.robot.draft import Draft, as_env, draft, table
+from legged_mw.robot.measure import Health, Joint, inside_by, measure, tilt
+from legged_mw.robot.new import config_text
+from legged_mw.robot.page import page
+from legged_mw.robot.picture import HEIGHT, WIDTH, Label, _columns
+from legged_mw.robot.suggest import family, suggest
+from legged_mw.sim.errors import ModelError
+from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
+from legged_mw.utils.cli import one_line_errors
+from legged_mw.utils.task import load_task
+from tests.program import SMALL, refused, run
+
+GO1, TOY = ROOT / "resources" / "robots" / "go1" / "go1.xml", ROOT / "examples" / "toy_biped.xml"
+DT, KP, KD = 0.004, 5.0, 0.1
+# A slab of 2 kg that stands on the ground, and on it a wheel of 1 kg about the slab's centre of mass; each turns about y.
+WHEEL = """
+<mujoco><compiler angle="radian"/><worldbody><body name="slab" pos="0 0 0.1"><freejoint/>
+  <inertial pos="0 0 0" mass="2" diaginertia="0.2 0.2 0.2"/><site name="imu"/>
+  <geom name="slab" type="box" size="{half} 0.2 0.1"/>
+  <body name="wheel"><joint name="wheel" axis="0 1 0" armature="0.01" range="-2 2" limited="true" {more}/>
+    <inertial pos="{offset} 0 0" mass="1" diaginertia="0.05 0.05 0.05"/></body>
+</body></worldbody></mujoco>"""
+
+
+def wheel(folder: Path, *, half: float = 0.2, offset: float = 0.0, more: str = 'actuatorfrcrange="-3 3"', **choices: Any) -> RobotModel:
+    file = folder / "wheel.xml"
+    file.write_text(WHEEL.format(half=half, offset=offset, more=more))
+    plain = {
+        **{"solver": Solver(DT, 10, 20), "ground": Ground(), "stiffness": {"": KP}, "damping": {"": KD}, "colliders": ["*"]},
+        **{"self_collisions": False, "contact_geoms": ["slab"], "velocity_sites": [], "accelerometer_site": "imu"},
+    }
+    return build_model(file, **{**plain, **choices})
+
+
+def health(robot: RobotModel, height: float = 0.1) -> Health:
+    return measure(robot, [0.0] * len(robot.joint_names), [0.0, 0.0, height], [None] * len(robot.joint_names))
+
+
+def test_a_robot_of_one_joint(tmp_path: Path) -> None:
+    """Two bodies that turn about one axis: to its motor the pair is I1 I2 / (I1 + I2) = 0.04, and the armature is 0.01."""
+    found = health(wheel(tmp_path))
+    [joint] = found.joints
+    assert (joint.name, joint.low, joint.high, joint.effort, joint.kp, joint.kd) == ("wheel", -2.0, 2.0, 3.0, KP, KD)
+    assert joint.inertia == pytest.approx(0.04 + 0.01) and joint.held == pytest.approx(0.06)
+    assert joint.damping_step(DT) == pytest.approx(0.004 * 0.1 / 0.05)
+    assert joint.stiffness_step(DT) == pytest.approx(0.004 * 10.0)
+    assert joint.damping_ratio() == pytest.approx(0.1 / (2 * 0.5))
+    assert found.mass == pytest.approx(3.0)
+    assert found.height == pytest.approx(0.1, abs=2e-3) and found.top == pytest.approx(0.2, abs=2e-3)
+    assert found.margin == pytest.approx(0.2, abs=1e-3)
+    assert (found.rest.contacts, found.rest.rows, found.rest.toppled) == (4, 16, False)
+    assert (found.nconmax, found.njmax) == (4, 1 + 16)
+    assert found.stand.end == "stands" and found.mode.growth == pytest.approx(1.0, abs=1e-6)
+    assert joint.torque == pytest.approx(0.0, abs=1e-6)
+
+
+def test_sag_is_the_torque_at_rest_over_kp(tmp_path: Path) -> None:
+    found = health(wheel(tmp_path, offset=0.1))
+    assert found.joints[0].torque == pytest.approx(-1.0 * 9.81 * 0.1, rel=1e-3)  # the weight turns it forwards, about +y
+    assert found.joints[0].sag() == pytest.approx(0.981 / KP, rel=1e-3)
+    assert found.margin == pytest.approx(0.2 - 0.1 / 3.0, abs=1e-3)  # 1 kg of 3 is 0.1 m ahead
+
+
+def test_a_centre_of_mass_beside_the_ground_that_it_stands_on(tmp_path: Path) -> None:
+    found = health(wheel(tmp_path, half=0.02, offset=0.15))
+    assert found.rest.toppled and found.margin == pytest.approx(0.02 - 0.05, abs=1e-3)
+    assert found.stand.end == "falls" and 0.1 < found.stand.seconds < 3.0
+    text = page(found, "it")
+    assert "30 mm OUTSIDE of what its contacts span" in text and "tilts beyond 60 degrees after" in text
+    assert "the centre of mass is not over the feet: choose another init_state.default_joint_angles" in text
+
+
+@pytest.mark.parametrize(("kp", "kd"), [(5.0, 0.1), (5.0, 20.0), (5.0, 30.0), (5e4, 0.0), (3e3, 26.0)])
+@pytest.mark.parametrize("integrator", ["euler", "implicitfast"])
+def test_growth_and_verdict_are_those_of_the_step_itself(tmp_path: Path, kp: float, kd: float, integrator: str) -> None:
+    """One servo's characteristic polynomial by hand; what MuJoCo makes of a velocity of 1 rad/s in 8 substeps agrees."""
+    robot = wheel(tmp_path, solver=Solver(DT, 10, 20, integrator), stiffness={"": kp}, damping={"": kd}, more="")
+    found = health(robot)
+    inertia, d, s = 0.05, DT * kd / 0.05, DT * DT * kp / 0.05
+    implicit = integrator == "implicitfast"
+    roots = np.roots([1 + d, -(2 + d - s), 1]) if implicit else np.roots([1, -(2 - s - d), 1 - d])
+    growth = np.abs(roots).max()
+    assert found.joints[0].inertia == pytest.approx(inertia)
+    assert found.mode.growth == pytest.approx(max(growth, 1.0), rel=1e-5)
+    assert (found.joints[0].verdict(DT, implicit) == "unstable") == (growth > 1.0)
+    assert found.mode.joints == ("wheel",) or growth <= 1.0
+    model = robot.physics
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    model.jnt_limited[:], model.actuator_ctrllimited[:] = 0, 0
+    data = mujoco.MjData(model)
+    data.qpos[2], data.qvel[6] = 10.0, 1.0
+    data.qvel[4] = -0.2  # of the slab, so that the pair turns as a mode of its own
+    mujoco.mj_step(model, data, 8)
+    assert (abs(data.qvel[6]) > 3.0) == (growth > 1.1)
+
+
+@pytest.mark.parametrize("implicit", [False, True])
+def test_verdicts_hold_where_the_polynomial_does(implicit: bool) -> None:
+    for d, s in itertools.product(np.linspace(0.05, 3.0, 40), np.linspace(0.05, 8.0, 40)):
+        joint = Joint("j", -1, 1, 1, None, 0.1, s * 0.5 / DT**2, d * 0.5 / DT, 0.5, "default", 0.5, 0.0)
+        roots = np.roots([1 + d, -(2 + d - s), 1]) if implicit else np.roots([1, -(2 - s - d), 1 - d])
+        assert (joint.verdict(DT, implicit) == "unstable") == (np.abs(roots).max() >= 1.0), (d, s)
+        if not implicit and joint.verdict(DT, False) != "unstable":
+            assert (joint.verdict(DT, False) == "rings") == (d > 1.0)
+
+
+def test_a_damping_that_the_step_does_not_bear(tmp_path: Path) -> None:
+    found = health(wheel(tmp_path, damping={"": 40.0}, more=""))
+    assert found.stand.end == "diverges" and found.stand.joints[0] == "wheel"
+    text = page(found, "it")
+    assert "servos in the air: UNSTABLE, a mode of wheel grows 2.20-fold a substep" in text  # d = 3.2: |1 - d|
+    assert "unstable servos: wheel: lower control.damping or control.stiffness, or give them armature (asset.armature)" in text
+    assert "no force limit: wheel: say asset.effort" in text
+    assert "!!3.20" in text and "action zero          diverges after" in text
+    calm = health(wheel(tmp_path, damping={"": 40.0}, solver=Solver(DT, 10, 20, "implicitfast")))
+    assert calm.stand.end == "stands" and "implicitfast; servos in the air: stable" in page(calm, "it")
+
+
+def health_of(found: Draft) -> Health:
+    case = found.case
+    env = as_env(found, GO1)
+    return measure(env.robot, case.pose, case.place, case.speeds)
+
+
+def test_inside_by() -> None:
+    square = np.array([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0], [1.0, 1.0], [1.0, 0.0]])
+    assert inside_by(square, np.array([1.0, 0.5])) == pytest.approx(0.5)
+    assert inside_by(square, np.array([3.0, 3.0])) == pytest.approx(-math.sqrt(2.0))
+    assert inside_by(square[:2], np.array([1.0, 0.25])) == pytest.approx(-0.25)  # two points span a line
+    assert inside_by(square[:1], np.array([0.0, 1.0])) == pytest.approx(-1.0)
+    assert inside_by(square[:0], np.zeros(2)) == -math.inf
+    assert tilt(np.array([math.cos(0.4), 0.0, math.sin(0.4), 0.0])) == pytest.approx(math.degrees(0.8))
+
+
+# ---- suggested gains ----
+
+
+def joint(name: str, **other: Any) -> Joint:
+    plain = {"low": -1.0, "high": 1.0, "effort": 40.0, "speed": None, "armature": 0.01, "kp": 1.0, "kd": 0.0}
+    return Joint(**{"name": name, **plain, "inertia": 0.1, "pose": "default", "held": 0.2, "torque": 0.0, **other})
+
+
+def test_suggested_gains() -> None:
+    assert suggest([joint("a")], DT) == [(40.0, 1.0, False)]  # full effort at 1 rad, 25 ms of it
+    assert suggest([joint("a", torque=-9.0)], DT)[0].kp == 60.0  # twice the load within 0.3 rad
+    assert suggest([joint("a", effort=math.inf)], DT)[0].kp == pytest.approx(0.2 * (4 * math.pi) ** 2, rel=0.02)
+    cut = suggest([joint("a", inertia=0.001)], DT)[0]  # dt sqrt(kp / I) = 0.5 at 15.6, dt kd / I = 0.5 at 0.125
+    assert cut == (16.0, 0.12, True)
+    both = suggest([joint("left_hip", torque=-9.0), joint("right_hip"), joint("right_knee")], DT)
+    assert [gain.kp for gain in both] == [60.0, 60.0, 40.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "same"),
+    [
+        ("FR_hip_joint", "hip_joint"),
+        ("left_hip_yaw_joint", "hip_yaw_joint"),
+        ("LF_HAA", "HAA"),
+        ("Left_Knee_Pitch", "Knee_Pitch"),
+        ("waist", "waist"),
+        ("L", "L"),
+    ],
+)
+def test_families_of_joints(name: str, same: str) -> None:
+    assert family(name) == same
+
+
+def test_short_tables() -> None:
+    names = ["FL_hip", "FR_hip", "FL_knee", "FR_knee", "waist"]
+    assert table([0.0] * 5, names) == {"": 0.0}
+    assert table([0.1, -0.1, 0.9, 0.9, 0.9], names) == {"": 0.9, "FL_hip": 0.1, "FR_hip": -0.1}
+    assert table([0.0, 0.0, 0.9, 0.9, 0.0], names) == {"": 0.0, "knee": 0.9}
+    awkward = ["hip", "left_hip", "right_hip"]  # "hip" is a part of the others' names
+    assert table([1.0, 0.0, 0.0], awkward) == {"hip": 1.0, "left_hip": 0.0, "right_hip": 0.0}
+
+
+# ---- the programs ----
+
+
+def show(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *args: object) -> str:
+    """What ``python -m legged_mw.robot`` prints."""
+    monkeypatch.setattr(sys, "argv", ["robot", *map(str, args)])
+    with one_line_errors("legged_mw.robot"):
+        program.main()
+    return capsys.readouterr().out
+
+
+def complaint(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *args: object) -> str:
+    with pytest.raises(SystemExit) as end:
+        show(monkeypatch, capsys, *args)
+    assert end.value.code == 2
+    return capsys.readouterr().err
+
+
+def png_size(path: Path) -> tuple[int, int]:
+    head = path.read_bytes()[:24]
+    assert head[:8] == b"\x89PNG\r\n\x1a\n"
+    return int.from_bytes(head[16:20], "big"), int.from_bytes(head[20:24], "big")
+
+
+def test_check_prints_the_page_and_draws_the_robot(tmp_path: Path) -> None:
+    picture = tmp_path / "robot.png"
+    result = run("train", tmp_path, "--task", "go1_rough", "--check", "--device", "cpu", "--picture", str(picture))
+    assert result.code == 0, result.err
+    assert result.out.index("observation state") < result.out.index("health of go1_rough")
+    for text in (
+        "mass                 12.74 kg",
+        "at rest              4 contacts, 28 constraint rows; all that may touch at once: sim.nconmax = 4, sim.njmax = 40",
+        "stands on its servos for 5 s",
+        "substep              4 ms, euler; servos in the air: stable",
+        "nothing: all numbers are within bounds",
+    ):
+        assert text in result.out, result.out
+    row = next(line for line in result.out.splitlines() if line.startswith("  FL_calf_joint") and "35.55" in line and "20.06" in line)
+    assert row.split()[-2:] == ["36", "0.89"]
+    assert png_size(picture) == (2 * WIDTH, HEIGHT)
+
+
+def test_picture_wants_check_and_a_png(tmp_path: Path) -> None:
+    assert "--picture draws what --check shows: add --check" in refused(tmp_path, "train", *SMALL, "--picture", "a.png")
+    text = refused(tmp_path, "train", *SMALL, "--check", "--picture", "robot.jpg")
+    assert "Cannot write 'robot.jpg': the picture of a robot is a .png" in text
+    lost = refused(tmp_path, "train", *SMALL, "--check", "--picture", "/proc/none/robot.png")
+    assert "cannot write /proc/none/robot.png: " in lost and "say --picture FILE.png" in lost
+
+
+def test_all_joints_without_a_key_at_once(tmp_path: Path) -> None:
+    """From every table of the config in one line, not a table at a time."""
+    task = tmp_path / "bare.py"
+    task.write_text(
+        "from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO\n"
+        "from legged_mw.envs.legged_robot import LeggedRobot\nfrom legged_mw.utils.task import Task\n"
+        "class Cfg(Go1FlatCfg):\n"
+        "    class control(Go1FlatCfg.control):\n        stiffness, damping = {'calf': 1.0}, {'hip': 1.0, 'calf': 1.0}\n"
+        "    class rewards(Go1FlatCfg.rewards):\n        pose_weights = {'thigh': 1.0}\n"
+        "TASK = Task(LeggedRobot, Cfg, Go1FlatCfgPPO)\n"
+    )
+    text = refused(tmp_path, "train", "--task", str(task), "--check", "--device", "cpu")
+    hips, thighs, calves = ([f"{leg}_{part}_joint" for leg in ("FR", "FL", "RR", "RL")] for part in ("hip", "thigh", "calf"))
+    both, either = (", ".join(joint for pair in zip(hips, other, strict=True) for joint in pair) for other in (thighs, calves))
+    assert f"control.stiffness: no value for {both}: none of ['calf']" in text
+    assert f"control.damping: no value for {', '.join(thighs)}: none of ['hip', 'calf']" in text
+    assert f"rewards.pose_weights: no value for {either}: none of ['thigh']" in text
+
+
+@pytest.mark.parametrize("file", [GO1], ids=lambda file: file.stem)
+def test_a_new_task_checks_and_trains(
+    file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = show(monkeypatch, capsys, file, "--new", "mine", "--out", tmp_path / "made")
+    assert "guessed: feet: " in out and "python train.py --task " in out
+    robot, config = tmp_path / "made" / "mine.xml", tmp_path / "made" / "mine_flat.py"
+    text = config.read_text()
+    assert len(text.splitlines()) <= 60 and text.count("LOOK") >= 4
+    assert str(ROOT) not in robot.read_text() + text and str(tmp_path) not in robot.read_text() + text
+    moved = tmp_path / "moved"
+    (tmp_path / "made").rename(moved)
+    task = ["--task", str(moved / "mine_flat.py"), "--device", "cpu"]
+    checked = run("train", tmp_path, *task, "--check")
+    assert checked.code == 0, checked.err
+    assert "the step can be recorded as a CUDA graph" in checked.out
+    result = run("train", tmp_path, *task, *SMALL[2:], "--max_iterations", "2", "--set", "runner.exam_interval=0")
+    assert result.code == 0 and "Learning iteration 2/2" in result.out, result.err
+    assert [*(tmp_path / "logs").glob("*/*/model_2.pt")]
+
+
+def test_a_new_task_overwrites_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    mine = tmp_path / "mine_flat.py"
+    mine.write_text("of mine")
+    text = complaint(monkeypatch, capsys, GO1, "--new", "mine", "--out", tmp_path)
+    assert "mine_flat.py exists; say --force to overwrite, or another name or --out DIR" in text
+    assert mine.read_text() == "of mine" and [*tmp_path.iterdir()] == [mine]
+    show(monkeypatch, capsys, GO1, "--new", "mine", "--out", tmp_path, "--force")
+    assert mine.read_text() != "of mine" and (tmp_path / "mine.xml").read_bytes() == GO1.read_bytes()
+    assert "a name begins with a letter" in complaint(monkeypatch, capsys, GO1, "--new", "a/b", "--out", tmp_path)
+    assert "go1_flat is a task already" in complaint(monkeypatch, capsys, "go1_flat", "--new", "mine")
+
+
+def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
+    found = draft(GO1)
+    assert [foot.name for foot in found.feet] == ["FR", "FL", "RR", "RL"]
+    assert found.guessed[0] == "pose: knees bent, feet under the hips"
+    assert found.case.pose[:3] == pytest.approx([0.0, 0.8, -1.6], abs=0.02)  # two links of 0.213 m: half of the knee's angle
+    assert found.case.place[2] == pytest.approx(2 * 0.213 * math.cos(0.8) + 0.023, abs=0.01)
+    assert health_of(found).stand.end == "stands"
+    text = config_text(found, GO1, "my_go")
+    assert "class MyGoFlatCfg(LeggedRobotCfg):" in text and 'foot_names = ["FR", "FL", "RR", "RL"]  # LOOK: guessed' in text
+    assert "(quadruped)" in text and "effort" not in text
+    free = tmp_path / "free.xml"
+    free.write_text(GO1.read_text().replace("actuatorfrcrange", "user"))
+    assert 'effort = {"": 30.0}  # [N m] LOOK: the file has no force limit for all joints' in config_text(draft(free), free, "free")
+
+
+def test_a_file_without_feet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    file = tmp_path / "wheel.xml"
+    file.write_text(WHEEL.format(half=0.2, offset=0.0, more=""))
+    assert "no part that ends a limb collides, so that no feet can be guessed" in complaint(monkeypatch, capsys, file)
+
+
+def test_names_beside_the_robot_do_not_overlap() -> None:
+    labels = [(Label(f"joint {i}", np.zeros(3), (1.0, 1.0, 1.0)), (500.0 + i, 480.0)) for i in range(29)]
+    rows = _columns(labels)
+    for side in (True, False):
+        heights = sorted(row for _, _, row, left in rows if left == side)
+        assert len(heights) >= 14 and min(np.diff(heights)) > 20.0 and heights[0] > 40.0 and heights[-1] < HEIGHT - 100.0
+
+
+# ---- physics that diverges stops a training ----
+
+
+class FakeSim:
+    def __init__(self, qpos: torch.Tensor, qvel: torch.Tensor) -> None:
+        self.qpos, self.qvel = qpos, qvel
+
+
+def test_what_broke_a_world_is_counted() -> None:
+    sim, actions, broken = FakeSim(torch.zeros(5, 9), torch.zeros(5, 8)), torch.zeros(5, 2), torch.zeros(5, dtype=torch.bool)
+    found = Divergence(sim, actions, ["hip", "knee"], 100.0)  # pyright: ignore[reportArgumentType]
+    sim.qvel[:, 6:] = torch.tensor([1.0, 2.0])
+    found.find(broken)
+    assert not broken.any() and found.counts.tolist() == [0, 0, 0]
+    sim.qvel[1, 6], sim.qvel[2] = 101.0, math.nan  # one joint too fast; all is lost, and the knee was faster a step ago
+    actions[3, 0], sim.qpos[4, 0] = math.nan, math.inf  # the policy's fault; the root is lost, and the knee is the fastest
+    found.find(broken)
+    assert broken.tolist() == [False, True, True, True, True] and found.counts.tolist() == [1, 2, 1]
+    assert {name: float(value) for name, value in found.statistics().items()} == {
+        **{"broken_by/hip": 1, "broken_by/knee": 2, "broken_by_action": 1}
+    }
+    found.find(broken)  # the second time it is NaN: nothing is known of its speed
+    assert found.counts.tolist() == [2, 3, 2]
+
+
+def numbers(broken: float, episodes: float = 200.0, hip: float = 0.0, knee: float = 0.0, action: float = 0.0) -> dict[str, float]:
+    return {"broken": broken, "episodes": episodes, "broken_by/hip": hip, "broken_by/knee": knee, "broken_by_action": action}
+
+
+def test_twice_in_a_row_over_one_percent() -> None:
+    watch = Watch()
+    assert watch.verdict(numbers(2.0, hip=2.0)) == ""  # 1 % is not over 1 %
+    assert watch.verdict(numbers(3.0, hip=5.0)) == ""
+    assert watch.verdict(numbers(0.0, hip=5.0)) == ""
+    assert watch.verdict(numbers(3.0, hip=5.0, knee=3.0)) == ""
+    text = watch.verdict(numbers(5.0, episodes=100.0, hip=7.0, knee=6.0))
+    assert text.startswith(
+        "in the last two iterations 3 of 200 and 5 of 100 episodes ended with a state that is not finite: physics diverges"
+    )
+    assert "fastest joint at the break: knee (75%), hip (25%). Lower control.damping or control.stiffness of these joints" in text
+    assert "asset.armature" in text and "sim.dt" in text and "set sim.integrator to implicitfast" in text and "--check --picture" in text
+    policy = Watch()
+    policy.verdict(numbers(9.0, action=9.0))
+    assert "the policy's actions are not finite; lower algorithm.learning_rate" in policy.verdict(numbers(9.0, action=18.0))
+    assert watch.verdict(numbers(0.0, episodes=0.0)) == ""
+
+
+def test_a_training_whose_physics_diverges_ends_with_the_joints_that_did_it(tmp_path: Path) -> None:
+    run_of = [*SMALL, "--max_iterations", "9", "--set", "control.damping={'': 0.5, 'calf': 14.0}", "--set", "runner.save_interval=1"]
+    result = run("train", tmp_path, *run_of)
+    assert result.code == 2 and result.err.count("\n") == 1
+    assert "physics diverges; fastest joint at the break: " in result.err and "_calf_joint (" in result.err.partition("Lower")[0]
+    assert "Learning iteration 2/9" in result.out and "Learning iteration 3/9" not in result.out
+    assert "stopped: what it simulates is not finite" in result.out
+    [*_, newest] = sorted((tmp_path / "logs").glob("*/*/model_*.pt"))
+    weights = torch.load(newest, weights_only=True)["actor_state_dict"]
+    assert newest.name == "model_2.pt" and all(bool(value.isfinite().all()) for value in weights.values())
+
+
+def test_networks_that_are_not_finite_are_not_saved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    from legged_mw.rl.runner import make_runner
+
+    task = load_task("go1_flat")
+    for path, value in {"env.num_envs": 4, "actor.hidden_dims": [8], "critic.hidden_dims": [8]}.items():
+        task.set(path, value)
+    runner = make_runner(task.env_class(task.cfg, "cpu"), task.train, tmp_path, "cpu")
+    next(runner.alg.critic.parameters()).data.fill_(math.nan)
+    runner._save_checkpoint()
+    assert "the networks are not finite; not saved" in capsys.readouterr().out and not [*tmp_path.glob("*.pt")]
+
+
+# ---- the integrator ----
+
+
+@pytest.mark.parametrize("engine", ["mujoco", "mujoco_warp"])
+def test_implicitfast_bears_what_euler_does_not(tmp_path: Path, engine: str) -> None:
+    """The wheel turns at 1 rad/s with dt kd / I = 3.2: explicit damping makes it faster, implicit damping stops it."""
+    from legged_mw.sim.engines import make_simulation
+
+    speeds = {}
+    for integrator in ("euler", "implicitfast"):
+        robot = wheel(tmp_path, solver=Solver(DT, 1, 5, integrator), damping={"": 40.0})
+        assert robot.physics.opt.integrator == getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+        sim = make_simulation(robot.physics, 1, "cpu", engine=engine, nconmax=4, njmax=20)
+        sim.qpos[:, 2], sim.qvel[:, 6] = 10.0, 1.0
+        sim.step(1)
+        speeds[integrator] = float(sim.qvel[0, 6])
+    assert speeds["euler"] == pytest.approx(1.0 - DT * 40.0 / 0.05, rel=1e-3)  # the motor turns the slab the other way
+    assert speeds["implicitfast"] == pytest.approx(1.0 / (1.0 + DT * 40.0 / 0.05), rel=1e-3)
+
+
+def test_integrator_is_a_field_and_euler_is_as_it_was(tmp_path: Path) -> None:
+    assert load_task("go1_flat").cfg.sim.integrator == "euler"
+    flags = wheel(tmp_path).physics.opt.disableflags
+    assert flags == wheel(tmp_path, solver=Solver(integrator="implicitfast")).physics.opt.disableflags
+    assert flags == mujoco.mjtDisableBit.mjDSBL_EULERDAMP
+    with pytest.raises(ModelError, match=r"no integrator 'rk4' in `integrator`; there are: euler, implicitfast|did you mean"):
+        wheel(tmp_path, solver=Solver(integrator="rk4"))
+    result = run("train", tmp_path, "--task", "go1_flat", "--device", "cpu", "--check", "--set", "sim.integrator=implicitfast")
+    assert result.code == 0 and "option integrator: 0 -> mjINT_IMPLICITFAST" in result.out
