@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from legged_mw.robot.feet import Foot
 from legged_mw.sim.model import RobotModel
 
-# ours: the knee's angle about the axis to the left [rad]. A quadruped's thighs lean back (Go1 0.9 and -1.8), a biped's forwards (-0.3 and 0.6)
+# ours: the knee's angle about the axis to the left [rad]
+# a quadruped's thighs lean back (Go1 0.9 and -1.8), a biped's forwards (-0.3 and 0.6)
 KNEE = {2: 0.6}
 KNEE_ELSE = -1.6
 _SIDEWAYS = 0.9  # |y| of a joint's axis
