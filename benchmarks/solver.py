@@ -4,7 +4,7 @@
     python benchmarks/solver.py --task g1_flat --load_run shipped --settings 3/5 3/10 3/20 50/50
     python benchmarks/solver.py --task go1_flat --device cpu --num_envs 64
 
-For each setting, unless told else 1 / 5 to 50 / 50 Newton / line-search iterations a substep, the policy walks in an environment stepped with
+For each setting, unless told else 1 / 5 to 50 / 50 Newton / line-search iterations, the policy walks in an environment stepped with
 that setting (without ``--load_run``: random actions). Then:
 
 - penetration: depth of the contacts with the ground [mm], mean and worst, over the worlds as the walk left them;
