@@ -13,7 +13,7 @@ from legged_mw.robot.draft import Draft, values
 from legged_mw.robot.plain import as_mjcf, stands_alone
 from legged_mw.utils.errors import UserError, shown
 
-WIDTH = 120  # [columns] of a line of the config
+WIDTH = 140  # [columns] of a line of the config
 
 _HEAD = '''"""{title} with {joints} joints ({legs}) follows a joystick on flat ground. Written by python -m legged_mw.robot {file}.
 
@@ -28,7 +28,7 @@ from legged_mw.utils.task import Task
 class {name}FlatCfg(LeggedRobotCfg):
 '''
 _COMMENTS = {
-    "foot_names": "LOOK: guessed, the lowest parts that carry no others",
+    "foot_names": "LOOK: guessed",
     "foot_geoms": "foot -> its geoms",
     "colliders": "the feet alone touch the ground",
     "pos": "[m] standing, computed",
@@ -59,7 +59,7 @@ def write(found: Draft, file: Path, name: str, folder: Path, force: bool = False
             if not (robot.exists() and robot.samefile(file)):
                 shutil.copyfile(file, robot)
         else:
-            robot.write_text(as_mjcf(found.case.robot, name, file, folder))
+            robot.write_text(as_mjcf(name, file, folder))
         config.write_text(config_text(found, file, name))
     except OSError as error:
         raise UserError(f"cannot write to {shown(folder)}: {error.strerror or os.strerror(error.errno or 0)}; say --out DIR") from None
