@@ -19,7 +19,7 @@ from legged_mw.envs.divergence import Divergence, Watch
 from legged_mw.robot import __main__ as program
 from legged_mw.robot.draft import Draft, as_env, draft, table
 from legged_mw.robot.measure import Health, Joint, inside_by, measure, tilt
-from legged_mw.robot.new import config_text
+from legged_mw.robot.new import config_text, write
 from legged_mw.robot.page import page
 from legged_mw.robot.picture import HEIGHT, WIDTH, Label, _columns
 from legged_mw.robot.suggest import family, suggest
@@ -307,7 +307,7 @@ def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
     assert health_of(found, bare).stand.end == "stands"
     text = config_text(found, GO1, "my_go")
     assert "class MyGoFlatCfg(LeggedRobotCfg):" in text and 'foot_names = ["FR", "FL", "RR", "RL"]  # LOOK: guessed' in text
-    assert "(quadruped)" in text and "effort" not in text
+    assert "(quadruped, 12 joints; " in text and "effort" not in text
     free = tmp_path / "free.xml"
     free.write_text(GO1.read_text().replace("actuatorfrcrange", "user"))
     assert 'effort = {"": 30.0}  # [N m] LOOK: the file has no force limit for all joints' in config_text(draft(free), free, "free")
@@ -427,3 +427,29 @@ def test_integrator_is_a_field_and_euler_is_as_it_was(tmp_path: Path) -> None:
         wheel(tmp_path, solver=Solver(integrator="rk4"))
     result = run("train", tmp_path, "--task", "go1_flat", "--device", "cpu", "--check", "--set", "sim.integrator=implicitfast")
     assert result.code == 0 and "option integrator: 0 -> mjINT_IMPLICITFAST" in result.out
+
+
+# ---- meshes ----
+
+OCTAHEDRON = "".join(f"v {x} {y} {z}\n" for x, y, z in [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]) + "".join(
+    f"f {a} {b} {c}\n" for a, b, c in [(1, 3, 5), (3, 2, 5), (2, 4, 5), (4, 1, 5), (3, 1, 6), (2, 3, 6), (4, 2, 6), (1, 4, 6)]
+)
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+def test_meshes_are_named_relative_to_the_new_file(tmp_path: Path, absolute: bool) -> None:
+    """So that both folders may move together; a copy of the file alone would look for them beside itself."""
+    theirs, ours = tmp_path / "all" / "theirs", tmp_path / "all" / "ours"
+    (theirs / "looks").mkdir(parents=True)
+    (theirs / "looks" / "hull.obj").write_text(OCTAHEDRON)
+    folder = f"{theirs}/looks" if absolute else "looks"
+    text = TOY.read_text().replace('<compiler angle="radian"/>', f'<compiler angle="radian" meshdir="{folder}"/>')
+    text = text.replace("<worldbody>", '<asset><mesh name="hull" file="hull.obj" scale="0.1 0.1 0.1"/></asset><worldbody>')
+    text = text.replace('<site name="imu"', '<geom class="look" type="mesh" mesh="hull" mass="0"/><site name="imu"')
+    (theirs / "toy.xml").write_text(text)
+    robot, _ = write(draft(theirs / "toy.xml"), theirs / "toy.xml", "mine", ours)
+    assert 'file="../theirs/looks/hull.obj"' in robot.read_text() and str(tmp_path) not in robot.read_text()
+    (tmp_path / "all").rename(tmp_path / "moved")
+    moved = mujoco.MjModel.from_xml_path(str(tmp_path / "moved" / "ours" / "mine.xml"))
+    assert moved.nmesh == 1 and moved.nu == 0 and moved.body_subtreemass[0] == pytest.approx(12.0)
+    assert [moved.jnt_actfrcrange[i, 1] for i in range(1, 7)] == [60.0] * 6

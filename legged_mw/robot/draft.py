@@ -24,7 +24,9 @@ from legged_mw.robot.suggest import Gains, family, suggest
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import per_joint
 from legged_mw.sim.vendor import read_robot
+from legged_mw.utils.config import ConfigError
 
+LOW = 0.33  # [m] a root that stands lower than this cannot swing its feet as high as others
 CLEARANCE = 0.003  # [m] above the ground at reset, so that nothing begins inside of it
 
 
@@ -86,6 +88,14 @@ def as_env(found: Draft, file: Path) -> LeggedRobot:
     return LeggedRobot(cfg, "cpu")
 
 
+def has_mirror(env: LeggedRobot) -> bool:
+    """Whether the robot and its pose are the same left and right, so that learning may use it."""
+    try:
+        return env.mirror is not None
+    except (ModelError, ConfigError):
+        return False
+
+
 def values(found: Draft) -> dict[str, dict[str, Any]]:
     """Section -> field -> value."""
     names, two, height = found.case.robot.joint_names, len(found.feet) == 2, found.case.place[2]
@@ -106,10 +116,13 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         },
         "commands": {"ranges": ranges},
         "termination": {"min_base_height": round(0.5 * height, 2)},
-        "rewards": {"swing_height": round(min(0.1, 0.3 * height), 2), "base_height_target": round(height, 2)},
     }
+    if height < LOW:
+        chosen["rewards"] = {"swing_height": round(0.3 * height, 2)}
     if two:
-        chosen["exam"] = {"push_speeds": [0.5, 1.0, 1.5, 2.0, 3.0], "push_mark": 1.0, "marks_of": "offset"}
+        chosen["rewards"] = {**chosen.get("rewards", {}), "scales": {"single_stance": 0.75}}
+        chosen["sim"] = {"iterations": 3}
+        chosen["exam"] = {"push_mark": 1.0, "marks_of": "offset"}
     return chosen
 
 
