@@ -433,8 +433,10 @@ def test_a_clock_that_runs_otherwise_is_not_exported(exported: Path, monkeypatch
     monkeypatch.setattr(GaitClock, "tick", late)
     monkeypatch.setattr(exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(exported / "out/policy.onnx", path))
     text = "^legged_mw.deploy would act otherwise than the environment: observation row 'gait_clock' "
+    trained = load_task(str(ROOT / BIPED))
+    trained.update_from_run(load_yaml(exported / "out/config.yaml"), where="config.yaml")
     with pytest.raises(ExportError, match=text):
-        export(load_yaml(exported / "out/config.yaml"), exported / "model.pt", exported / "late")
+        export(trained, exported / "model.pt", exported / "late")
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,10 @@ WALKING: dict[str, Rule] = {
     "terrain.difficulty": ("two numbers from 0 to 1, the lower first", lambda v: len(v) == 2 and 0 <= v[0] <= v[1] <= 1),
     "terrain.height_scan": ("a list of groups: state, privileged_state", lambda v: {*v} <= {"state", "privileged_state"}),
     **dict.fromkeys(("terrain.measured_points_x", "terrain.measured_points_y"), POINTS),
-    **dict.fromkeys(("commands.curriculum_start", "commands.curriculum_step"), ("above 0 and at most 1", lambda v: 0 < v <= 1)),
+    **dict.fromkeys(
+        ("commands.curriculum_start", "commands.curriculum_step", "perturbation.curriculum_rate"),
+        ("above 0 and at most 1", lambda v: 0 < v <= 1),
+    ),
 }
 LEARNER: dict[str, Rule] = {
     **dict.fromkeys(("runner.num_steps_per_env", "runner.max_iterations", "runner.save_interval"), POSITIVE),
