@@ -22,7 +22,7 @@ class RobotTaskCfg(Config):
 
     class asset:
         file: str = ""  # MJCF or URDF, as its vendor wrote it; beside the file of the class that says so, or in the repository
-        imu_site: str = ""  # site, or body, that is fixed to the root; empty: the site "imu", or else the root's origin [ours]
+        imu_site: str = ""  # site, or body, that is fixed to the root; empty: "imu" if it is so, or else the root's origin [ours]
         # names of geoms; of bodies, which mean their own geoms that collide; or patterns. Geoms that touch the ground:
         colliders: list[str] = ["*"]  # of those that collide in the file
         self_collisions: bool = False  # among the colliders
