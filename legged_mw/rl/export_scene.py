@@ -1,6 +1,6 @@
 """A robot with its ground, servos and named sensors as one MJCF text that needs no other file. Host only; nothing is stepped.
 
-Sensors and a keyframe are added here, meshes are written out; what is stepped stays the same, which is checked.
+Sensors and a keyframe are added here, meshes from files are written out; what is stepped stays the same, which is checked.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from legged_mw.rl.built_in import shorten
 from legged_mw.sim.drawing import dressed
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND, MOST_BOXES, Box, add_ground_box, as_boxes, feel_all_ground
@@ -48,9 +49,12 @@ class Scene:
     sensors: dict[str, list[str]]  # quantity -> names of the sensors whose values, side by side, are it
 
 
-def standalone(robot: RobotModel, imu: str, qpos: Sequence[float], ctrl: Sequence[float], camera: Sequence[float] = ()) -> Scene:
+def standalone(
+    robot: RobotModel, imu: str, qpos: Sequence[float], ctrl: Sequence[float], camera: Sequence[float] = (), source: str = ""
+) -> Scene:
     """``robot`` as MJCF text, with a sensor for each quantity that a controller may read and ``qpos``, ``ctrl`` as keyframe "home".
 
+    ``source``: text of the file that it was read from, which tells a mesh that MuJoCo builds from one that must be written out.
     Raises ModelError if the text cannot be made, or is another machine than the one that was trained.
     """
     spec = dressed(robot, camera)
@@ -67,7 +71,7 @@ def standalone(robot: RobotModel, imu: str, qpos: Sequence[float], ctrl: Sequenc
     try:
         _write_out_files(spec)
         spec.compile()
-        xml = spec.to_xml()
+        xml = shorten(spec.to_xml(), source)
         model = mujoco.MjModel.from_xml_string(xml)
     except ValueError as error:
         raise ModelError(f"the robot cannot be written as one MJCF: {' '.join(str(error).split())}") from None
@@ -109,7 +113,7 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
     for key in spec.keys:
         key.qpos = [*start, *list(key.qpos)[3:]]
     spec.compile()
-    return spec.to_xml()
+    return shorten(spec.to_xml(), xml)
 
 
 def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str) -> dict[str, list[str]]:
