@@ -22,7 +22,7 @@ def shorten(xml: str, source: str) -> str:
     As it was, where that would be another model: a mesh may have been renamed, or come from a file that ``source`` includes.
     """
     short = xml
-    for name, numbers in _numbers(source).items():
+    for name, numbers in built_meshes(source).items():
         start = f"<mesh name={quoteattr(name)}"
         element = re.search(rf"{re.escape(start)}[^>]*>", short)
         if element and " vertex=" in element[0]:
@@ -31,8 +31,8 @@ def shorten(xml: str, source: str) -> str:
     return short if short == xml or _same(short, xml) else xml
 
 
-def _numbers(source: str) -> dict[str, str]:
-    """Mesh -> the attributes that build it."""
+def built_meshes(source: str) -> dict[str, str]:
+    """Mesh -> the attributes that build it, of the MJCF ``source``; none of what is no MJCF."""
     try:
         meshes = [mesh for mesh in ElementTree.fromstring(source).iter("mesh") if mesh.get("name") and mesh.get("builtin")]
     except ElementTree.ParseError:
