@@ -96,6 +96,7 @@ def test_scene_is_the_machine_that_was_trained(made: Path) -> None:
     trained_model = make_env(1).robot.physics
     scene = mujoco.MjModel.from_xml_path(str(made / "scene.xml"))
     assert differences(trained_model, scene) == []
+    assert (made / "scene.xml").stat().st_size < 60_000, "meshes that MuJoCo builds are a line each"
     ends = []
     for model in (trained_model, scene):
         data = mujoco.MjData(model)

@@ -1,18 +1,19 @@
 """A robot with its ground, servos and named sensors as one MJCF text that needs no other file. Host only; nothing is stepped.
 
-Sensors and a keyframe are added here, meshes are written out; what is stepped stays the same, which is checked.
+Sensors and a keyframe are added here, meshes from files are written out; what is stepped stays the same, which is checked.
 """
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
+from legged_mw.rl.built_in import built_meshes, shorten
 from legged_mw.sim.drawing import dressed
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND, MOST_BOXES, Box, add_ground_box, as_boxes, feel_all_ground
@@ -49,9 +50,12 @@ class Scene:
     sensors: dict[str, list[str]]  # quantity -> names of the sensors whose values, side by side, are it
 
 
-def standalone(robot: RobotModel, imu: str, qpos: Sequence[float], ctrl: Sequence[float], camera: Sequence[float] = ()) -> Scene:
+def standalone(
+    robot: RobotModel, imu: str, qpos: Sequence[float], ctrl: Sequence[float], camera: Sequence[float] = (), source: str = ""
+) -> Scene:
     """``robot`` as MJCF text, with a sensor for each quantity that a controller may read and ``qpos``, ``ctrl`` as keyframe "home".
 
+    ``source``: text of the file that it was read from, which tells a mesh that MuJoCo builds from one that must be written out.
     Raises ModelError if the text cannot be made, or is another machine than the one that was trained.
     """
     spec = dressed(robot, camera)
@@ -67,9 +71,9 @@ def standalone(robot: RobotModel, imu: str, qpos: Sequence[float], ctrl: Sequenc
     spec.add_key(name=HOME, qpos=list(qpos), ctrl=list(ctrl))
     try:
         _write_out_files(spec)
-        shorten_looks(spec)
+        shorten_looks(spec, built_meshes(source))
         spec.compile()
-        xml = spec.to_xml()
+        xml = shorten(spec.to_xml(), source)
         model = mujoco.MjModel.from_xml_string(xml)
     except ValueError as error:
         raise ModelError(f"the robot cannot be written as one MJCF: {' '.join(str(error).split())}") from None
@@ -111,7 +115,7 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
     for key in spec.keys:
         key.qpos = [*start, *list(key.qpos)[3:]]
     spec.compile()
-    return spec.to_xml()
+    return shorten(spec.to_xml(), xml)
 
 
 def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str) -> dict[str, list[str]]:
@@ -160,17 +164,17 @@ def _write_out_files(spec: mujoco.MjSpec) -> None:
     spec.meshdir = spec.texturedir = ""
 
 
-def shorten_looks(spec: mujoco.MjSpec) -> None:
+def shorten_looks(spec: mujoco.MjSpec, but: Collection[str] = ()) -> None:
     """Convex meshes that are only looked at keep their corners, to ``LOOK_DIGITS``, and no faces: MuJoCo spans those itself.
 
-    Built-in shapes come out of the spec as corners and faces, which would be nine tenths of the text.
+    A vendor's meshes would be nine tenths of the text. ``but``: meshes to leave alone.
     """
     solid = {
         geom.meshname for geom in spec.geoms if geom.contype or geom.conaffinity or not (geom.mass == 0 or geom.parent.explicitinertial)
     }
     for mesh in spec.meshes:
         corners, faces = np.array(mesh.uservert).reshape(-1, 3), np.array(mesh.userface, dtype=int).reshape(-1, 3)
-        if mesh.name in solid or len(mesh.usertexcoord) or len(mesh.usernormal) or not _convex(corners, faces):
+        if mesh.name in solid or mesh.name in but or len(mesh.usertexcoord) or len(mesh.usernormal) or not _convex(corners, faces):
             continue
         unit = 10.0 ** np.ceil(np.log10(np.abs(corners).max()))
         mesh.uservert = (np.unique(np.round(corners / unit, LOOK_DIGITS), axis=0) * unit).round(9).ravel() + 0.0  # + 0: no "-0"
