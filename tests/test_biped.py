@@ -387,8 +387,8 @@ def test_one_foot_has_no_neighbour() -> None:
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An untrained biped's export; commands changed and episodes ended while it was tried."""
     folder, often = tmp_path_factory.mktemp("biped"), {"commands.resampling_time": 0.2, "env.episode_length_s": 0.4, "gait.period": 0.5}
-    config, checkpoint = untrained(ROOT / BIPED, folder, {**ON, **often})
-    export(config, checkpoint, folder / "out")
+    task, checkpoint = untrained(ROOT / BIPED, folder, {**ON, **often})
+    export(task, checkpoint, folder / "out")
     return folder
 
 
@@ -433,8 +433,10 @@ def test_a_clock_that_runs_otherwise_is_not_exported(exported: Path, monkeypatch
     monkeypatch.setattr(GaitClock, "tick", late)
     monkeypatch.setattr(exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(exported / "out/policy.onnx", path))
     text = "^legged_mw.deploy would act otherwise than the environment: observation row 'gait_clock' "
+    trained = load_task(str(ROOT / BIPED))
+    trained.update_from_run(load_yaml(exported / "out/config.yaml"), where="config.yaml")
     with pytest.raises(ExportError, match=text):
-        export(load_yaml(exported / "out/config.yaml"), exported / "model.pt", exported / "late")
+        export(trained, exported / "model.pt", exported / "late")
 
 
 @pytest.mark.parametrize(

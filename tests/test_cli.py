@@ -76,10 +76,10 @@ def first(root: Path) -> Path:
 @pytest.mark.parametrize(
     ("args", "parts"),
     [
-        ([], ("--task is missing", "tasks: go1_flat")),
+        ([], ("--task is missing", "go1_flat, go1_flat_dr")),
         (
             ["--task", "go1_falt"],
-            ("no task 'go1_falt' in configs/; did you mean 'go1_flat'?", "there are: go1_flat", "or give the path of a config file"),
+            ("no task 'go1_falt' in configs/; did you mean 'go1_flat'?", "go1_flat, go1_flat_dr", "or give the path of a config file"),
         ),
         (["--task", "dog/dog.py"], ("no config file at ", "dog/dog.py")),
         (

@@ -198,13 +198,13 @@ class _Number(LeggedRobot):
             None,
             ModelError,
             r"^asset\.imu_site: 'FR' is on body 'FR_calf', which moves against the root 'trunk' by joint 'FR_calf_joint', so what it "
-            r"senses is not the root's; take a site that is fixed to the root, or hold that joint by asset\.held_joints$",
+            r"senses is not the root's; take a site or body that is fixed to the root, or hold that joint by asset\.held_joints$",
         ),
         (
             {"asset.imu_site": "imo"},
             None,
             ModelError,
-            r"^asset\.imu_site: no site 'imo' in go1\.xml; did you mean 'imu'\? there are: .*imu",
+            r"^asset\.imu_site: no site or body 'imo' in go1\.xml; did you mean 'imu'\? there are: .*imu",
         ),
         (
             {"asset.foot_names": ["FR", "FL", "RR", "RX"]},

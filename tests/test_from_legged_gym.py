@@ -360,22 +360,22 @@ URDF = """<robot name="mini">
 </robot>"""
 
 
-def test_a_urdf_becomes_a_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("robot.urdf").write_text(URDF)
-    code = next(block for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), flags=re.DOTALL) if "urdf" in block)
-    exec(code, {})
+def test_a_urdf_is_a_robot(tmp_path: Path) -> None:
+    """As the page says: a free joint, fixed links fused but known by name, effort and velocity read."""
+    (tmp_path / "robot.urdf").write_text(URDF)
     robot = build_model(
-        tmp_path / "robot.xml",
+        tmp_path / "robot.urdf",
         solver=Solver(),
         ground=Ground(),
         stiffness={"": 20.0},
         damping={"": 0.5},
         colliders=["*"],
         self_collisions=False,
-        contact_geoms=["FR_foot", "thigh_*"],
+        contact_geoms=["FR_foot", "thigh"],
         velocity_sites=["FR_foot"],
-        imu_site="imu",
+        imu_site="",
+        sites={"FR_foot": ["FR_foot"]},
     )
-    assert robot.root == "base" and robot.joint_names == ("thigh_joint",) and robot.contact_geoms == ("FR_foot", "thigh_0")
+    assert robot.root == "base" and robot.joint_names == ("thigh_joint",) and robot.contact_geoms == ("FR_foot_0", "thigh_0")
     assert robot.joint_range.tolist() == [[-1.0, 2.0]] and robot.effort_range.tolist() == [[-33.5, 33.5]]
+    assert robot.speed_limits == (21.0,) and "fused into 'thigh', to which they are fixed: FR_foot" in robot.overrides

@@ -141,7 +141,10 @@ def test_table_that_does_not_fit(field: str, table: dict[str, float], parts: tup
         ),
         ({"contact_geoms": ["FR", "FL", "RR", "RLL"]}, ("no geom or body 'RLL' in go1.xml", "did you mean 'RL'?")),
         ({"velocity_sites": ["FR", "FLL"]}, ("no site 'FLL' in go1.xml", "did you mean 'FL'?", "head, imu")),
-        ({"imu_site": "imuu"}, ("no site 'imuu' in go1.xml", "did you mean 'imu'?", "there are: head, imu, FR, FL, RR, RL")),
+        (
+            {"imu_site": "imuu"},
+            ("no site or body 'imuu' in go1.xml", "did you mean 'imu'?", "there are: head, imu, FR, FL, RR, RL, trunk, FR_hip"),
+        ),
     ],
 )
 def test_unknown_names(choice: dict[str, Any], parts: tuple[str, ...]) -> None:

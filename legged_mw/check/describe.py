@@ -29,7 +29,7 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
     ):
         lines.append(f"  {name:<20} {default:>7.3f}  [{low:.3f}, {high:.3f}]  {limit:g}")
     lines.append(_room(env))
-    lines.append(f"what the config changed in {task.cfg.asset.file}")
+    lines.append(f"what was dropped, added or changed in {task.cfg.asset.file}")
     lines += [f"  {line}" for line in env.robot.overrides]
     return "\n".join(lines)
 

@@ -40,11 +40,11 @@ class Perturbation:
             self._push_robots()
 
     def update_level(self, mask: Tensor, survived: Tensor) -> None:
-        """Where ``mask`` (N,) is true: halfway from the level so far to the share of an episode that was ``survived`` (N,).
+        """Where ``mask`` (N,) is true: go from the level so far towards the share of an episode that was ``survived`` (N,).
 
         A negative share leaves the level as it is.
         """
-        assign(self.kick_level, mask & (survived >= 0.0), 0.5 * (self.kick_level + survived))
+        assign(self.kick_level, mask & (survived >= 0.0), torch.lerp(self.kick_level, survived, self.cfg.curriculum_rate))
 
     def reset(self, mask: Tensor) -> None:
         """An episode begins where ``mask`` (N,) is true."""

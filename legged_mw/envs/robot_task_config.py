@@ -22,7 +22,7 @@ class RobotTaskCfg(Config):
 
     class asset:
         file: str = ""  # MJCF or URDF, as its vendor wrote it; beside the file of the class that says so, or in the repository
-        imu_site: str = ""  # site, or body, that is fixed to the root; empty: the site "imu", or else the root's origin [ours]
+        imu_site: str = ""  # site, or body, that is fixed to the root; empty: "imu" if it is so, or else the root's origin [ours]
         # names of geoms; of bodies, which mean their own geoms that collide; or patterns. Geoms that touch the ground:
         colliders: list[str] = ["*"]  # of those that collide in the file
         self_collisions: bool = False  # among the colliders
@@ -103,6 +103,7 @@ class RobotTaskCfg(Config):
         duration: list[float] = [0.05, 0.2]  # [s] [P]
         velocity: list[float] = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
         curriculum: bool = False  # a world's dv grows with the share of an episode that it survives, from 0 [ours]
+        curriculum_rate: float = 0.5  # by which share of the way it does, at the end of an episode, from above 0 to 1 [ours]
         push: bool = False  # the root's horizontal velocity becomes a random one; beside kicks or alone [L]
         push_interval_s: float = 15.0  # between pushes, each world's clock its own [s] [L]
         max_push_vel_xy: float = 1.0  # each axis U(-max, max) [m/s] [L]

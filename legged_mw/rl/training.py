@@ -127,6 +127,9 @@ def build(task: LoadedTask, device: str, eager: bool, check_recordable: Check) -
         check_recordable(task)
     env = task.env_class(task.cfg, device, eager=eager)
     check_mirror(env, task.train)
+    for line in env.robot.overrides if this_rank().leads else ():
+        if line.startswith("warning:"):
+            print(line, flush=True)
     return env
 
 

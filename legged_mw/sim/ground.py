@@ -31,7 +31,7 @@ class Ground:
 def add_ground(spec: mujoco.MjSpec, ground: Ground, where: str, notes: list[str]) -> None:
     """Add the plane or the height field to ``spec``."""
     if any(geom.name == GROUND for geom in spec.geoms):
-        raise ModelError(f"{where} brings a geom '{GROUND}'; the ground is added to the MJCF, so leave its own out")
+        raise ModelError(f"{where} calls a geom of the robot '{GROUND}', which is the name of the ground; give it another")
     floor = spec.worldbody.add_geom(name=GROUND, contype=1, conaffinity=0, priority=1, condim=ground.condim)
     floor.friction = [ground.friction, 0.005, 0.0001]
     if ground.terrain:

@@ -45,12 +45,15 @@ def pose_joints(robot: Loaded, gains: Mapping[str, Mapping[str, float]], pose: M
         tables["`pose`"] = pose
     stiffness, damping, *_ = per_joint_all(tables, moving, spare=welded)
     known = {**(robot.keyframe.angles if robot.keyframe else {}), **some_joints(pose or {}, every, "`pose`")}
-    model = robot.spec.copy().compile()
+    model = robot.model
     if welded:
-        ranges = dict(zip(welded, _ranges(model, welded), strict=True))
-        hold_joints(robot.spec, model, {name: known.get(name, float(np.clip(0.0, *ranges[name]))) for name in welded}, robot.notes)
+        nearest = {name: float(np.clip(0.0, *span)) for name, span in zip(welded, _ranges(model, welded), strict=True)}  # to 0
+        hold_joints(robot.spec, model, {name: known.get(name, nearest[name]) for name in welded}, robot.notes)
         model = robot.spec.copy().compile()
-    return Posed(model, moving, welded, [known.get(name, 0.0) for name in moving], _ranges(model, moving), stiffness, damping)
+    ranges = _ranges(model, moving)
+    if free := [name for name, span in zip(moving, ranges, strict=True) if not np.isfinite(span).all()]:
+        robot.notes.append(f"joints without limits: {', '.join(free)}")
+    return Posed(model, moving, welded, [known.get(name, 0.0) for name in moving], ranges, stiffness, damping)
 
 
 def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> list[Range]:

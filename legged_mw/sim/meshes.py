@@ -4,6 +4,7 @@
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import mujoco
@@ -22,24 +23,41 @@ def why_unreadable(path: Path) -> str:
     return "" if path.is_file() else "no such file"
 
 
-def drop_unreadable(spec: mujoco.MjSpec, where: str, notes: list[str], instead: str = INSTEAD) -> None:
-    """Remove looks whose files cannot be read. Raises ModelError for a mesh that collides or gives a body its mass."""
-    wrong = {mesh.name: why_unreadable(_path(spec, mesh)) for mesh in spec.meshes if mesh.file}
-    if not any(wrong.values()) and _compiles(spec):
-        wrong = {}
-    elif not any(wrong.values()):
-        wrong = {mesh.name: _read_error(spec, mesh) for mesh in spec.meshes if mesh.file}
+def compile_readable(spec: mujoco.MjSpec, where: str, notes: list[str]) -> mujoco.MjModel:
+    """Compile ``spec`` without the looks whose files cannot be read; they are removed from it.
+
+    Raises ModelError for a mesh that collides or gives a body its mass, ValueError for what else is wrong.
+    """
+    _drop(spec, {mesh.name: why_unreadable(_path(spec, mesh)) for mesh in spec.meshes if mesh.file}, where, notes)
+    _drop_pictures(spec, notes)
+    try:
+        return _compile(spec)
+    except ValueError:
+        broken = {mesh.name: _read_error(spec, mesh) for mesh in spec.meshes if mesh.file}
+        if not any(broken.values()):
+            raise
+    _drop(spec, broken, where, notes)
+    return _compile(spec)
+
+
+def _compile(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Looks take most of the time, and only files can be wrong."""
+    copy = spec.copy()
+    copy.compiler.discardvisual = not any(mesh.file for mesh in spec.meshes)
+    return copy.compile()
+
+
+def _drop(spec: mujoco.MjSpec, reasons: Mapping[str, str], where: str, notes: list[str]) -> None:
+    """Remove meshes, name -> why, and the geoms that show them; one whose reason is empty stays."""
     left_out: dict[str, list[str]] = {}
-    for mesh in [mesh for mesh in spec.meshes if wrong.get(mesh.name)]:
-        reason = wrong[mesh.name]
+    for mesh in [mesh for mesh in spec.meshes if reasons.get(mesh.name)]:
         for geom in [geom for geom in spec.geoms if geom.meshname == mesh.name]:
-            _refuse_what_matters(spec, geom, mesh, reason, where, instead)
+            _refuse_what_matters(spec, geom, mesh, reasons[mesh.name], where)
             spec.delete(geom)
-        left_out.setdefault(reason, []).append(mesh.file)
+        left_out.setdefault(reasons[mesh.name], []).append(mesh.file)
         spec.delete(mesh)
     for reason, files in left_out.items():
         notes.append(f"looks left out ({reason}): {', '.join(dict.fromkeys(files))}")
-    _drop_pictures(spec, notes)
 
 
 def _path(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> Path:
@@ -47,19 +65,11 @@ def _path(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> Path:
     return Path(spec.modelfiledir) / spec.meshdir / (name.name if spec.strippath else name)
 
 
-def _compiles(spec: mujoco.MjSpec) -> bool:
-    try:
-        spec.copy().compile()
-    except ValueError:
-        return False
-    return True
-
-
 def _read_error(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
     """What MuJoCo says of the mesh alone; "" if nothing is wrong with it."""
     alone = mujoco.MjSpec()
     alone.add_mesh(name="mesh", file=str(_path(spec, mesh).resolve()), scale=mesh.scale, inertia=mesh.inertia)
-    alone.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh")
+    alone.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh", contype=0, conaffinity=0, density=0.0)
     try:
         alone.compile()
     except ValueError as error:
@@ -67,7 +77,7 @@ def _read_error(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
     return ""
 
 
-def _refuse_what_matters(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, mesh: mujoco.MjsMesh, reason: str, where: str, instead: str) -> None:
+def _refuse_what_matters(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, mesh: mujoco.MjsMesh, reason: str, where: str) -> None:
     gives_mass = not geom.parent.explicitinertial and geom.mass != 0.0 and (geom.density > 0.0 or not np.isnan(geom.mass))
     if not (geom.contype or geom.conaffinity or gives_mass):
         return
@@ -75,7 +85,7 @@ def _refuse_what_matters(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, mesh: mujoco
     role = "collides as" if geom.contype or geom.conaffinity else "takes its mass from"
     raise ModelError(
         f"{where}: {name} of body '{geom.parent.name}' {role} the mesh '{mesh.name}', and its file {mesh.file} cannot be read ({reason}; "
-        f"looked for at {_path(spec, mesh)}); put the file there as one of {', '.join(READABLE)}, or {instead}"
+        f"looked for at {_path(spec, mesh)}); put the file there as one of {', '.join(READABLE)}, or {INSTEAD}"
     )
 
 

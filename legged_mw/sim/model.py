@@ -185,7 +185,7 @@ def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
     for name, value in wanted.items():
         old = getattr(spec.option, name)
         if old != value:
-            notes.append(f"option {name}: {old:g} -> {getattr(value, 'name', value)}")
+            notes.append(f"option {name}: {old:g} -> {value.name if hasattr(value, 'name') else f'{value:g}'}")
             setattr(spec.option, name, value)
 
 

@@ -82,26 +82,30 @@ def fuse_fixed(spec: mujoco.MjSpec, notes: list[str]) -> None:
 
 
 def sensed_site(spec: mujoco.MjSpec, model: mujoco.MjModel, root: str, asked: str, where: str, notes: list[str]) -> str:
-    """Name of a site on the root with the root's axes: the one ``asked`` for, or a new one at its place. Empty: "imu".
+    """Name of a site on the root with the root's axes: the one ``asked`` for, or a new one at its place.
 
-    What is asked for may be turned, may be on any body that does not move against the root, and may be a body, which means its
-    origin. ``model`` is ``spec`` compiled. Raises ModelError if there is none, or a joint is between it and the root.
+    What is asked for may be turned, may be on any body that does not move against the root, and may be a body, which means its origin.
+    Empty: "imu"; if there is none, or only one that moves against the root, a new one at the root's origin. ``model`` is ``spec``
+    compiled. Raises ModelError for a site that there is not, or that moves.
     """
     name, base = asked or IMU, spec.body(root)
     is_site = spec.site(name) is not None
-    if not is_site and not asked:
-        base.add_site(name=name, group=3)
-        notes.append(f"site '{name}' made at the origin of '{root}'")
-        return name
-    if not is_site and spec.body(name) is None:
-        raise ModelError(f"`imu_site`: {unknown('site', name, [site.name for site in spec.sites if site.name], where)}")
-    body = int(model.site(name).bodyid[0]) if is_site else model.body(name).id
-    if (welded := int(model.body_weldid[body])) != model.body_weldid[model.body(root).id]:
-        joint = model.joint(int(model.body_jntadr[welded])).name
+    if not is_site and asked and spec.body(name) is None:
+        known = [thing.name for thing in (*spec.sites, *spec.bodies) if thing.name and thing.name != "world"]
+        raise ModelError(f"`imu_site`: {unknown('site or body', name, known, where)}")
+    beyond = _what_moves(model, root, name, is_site) if is_site or asked else ""
+    if asked and beyond:
         raise ModelError(
-            f"`imu_site`: '{name}' is on body '{model.body(body).name}', which moves against the root '{root}' by joint '{joint}', so what "
-            "it senses is not the root's; take a site that is fixed to the root, or hold that joint by `held_joints`"
+            f"`imu_site`: '{name}' is on {beyond}, so what it senses is not the root's; take a site or body that is fixed to the root, or "
+            "hold that joint by `held_joints`"
         )
+    if not asked and (beyond or not is_site):
+        made = f"{name}_root" if is_site else name
+        base.add_site(name=made, group=3)
+        why = f": '{name}' is on {beyond}; `imu_site` may name another" if beyond else ""
+        notes.append(f"site '{made}' made at the origin of '{root}'{why}")
+        return made
+    body = int(model.site(name).bodyid[0]) if is_site else model.body(name).id
     place, turn = _pose_in_root(model, root, name, is_site)
     if is_site and model.body(body).name == root and turn < ALIGNED:
         return name
@@ -109,6 +113,15 @@ def sensed_site(spec: mujoco.MjSpec, model: mujoco.MjModel, root: str, asked: st
     base.add_site(name=made, pos=place, group=3)
     notes.append(f"site '{made}' made at the place of '{name}' on '{model.body(body).name}', with the axes of the root '{root}'")
     return made
+
+
+def _what_moves(model: mujoco.MjModel, root: str, name: str, is_site: bool) -> str:
+    """Which body a site is on (or is), and the joint by which that moves against the root; "" if it does not."""
+    body = int(model.site(name).bodyid[0]) if is_site else model.body(name).id
+    if (welded := int(model.body_weldid[body])) == model.body_weldid[model.body(root).id]:
+        return ""
+    joint = model.joint(int(model.body_jntadr[welded])).name
+    return f"body '{model.body(body).name}', which moves against the root '{root}' by joint '{joint}'"
 
 
 def _pose_in_root(model: mujoco.MjModel, root: str, name: str, is_site: bool) -> tuple[np.ndarray, float]:

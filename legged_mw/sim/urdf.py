@@ -68,7 +68,8 @@ def _drop_world(robot: Element, notes: list[str]) -> None:
 
 def _find_meshes(robot: Element, file: Path, notes: list[str]) -> dict[str, Path]:
     """Give each mesh a name of its own, and return name -> file; looks without a readable file are removed."""
-    names: dict[Path, str] = {}
+    compiler, names = robot.find("mujoco/compiler"), dict[Path, str]()
+    meshdir = "" if compiler is None else compiler.get("meshdir", "")
     left_out: dict[str, list[str]] = {}
     for link in robot.findall("link"):
         for part in [*link.findall("visual"), *link.findall("collision")]:
@@ -76,7 +77,7 @@ def _find_meshes(robot: Element, file: Path, notes: list[str]) -> dict[str, Path
             if mesh is None:
                 continue
             asked = mesh.get("filename", "")
-            path = _resolve(asked, file, (robot.find("mujoco/compiler") or Element("none")).get("meshdir", ""))
+            path = _resolve(asked, file, meshdir)
             reason = why_unreadable(path)
             if reason and part.tag == "collision":
                 raise ModelError(

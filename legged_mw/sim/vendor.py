@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.sim.errors import ModelError
-from legged_mw.sim.meshes import drop_unreadable
+from legged_mw.sim.meshes import compile_readable
 from legged_mw.sim.servos import Range, take_limits
 from legged_mw.sim.urdf import is_urdf, read_urdf
 
@@ -45,6 +45,7 @@ class Loaded:
     """A robot alone: one root with a free joint, named joints, no actuators, sensors of its own only where they feel contact."""
 
     spec: mujoco.MjSpec
+    model: mujoco.MjModel  # the same, compiled
     where: str  # the file's name
     notes: list[str]
     limits: dict[str, Range]  # joint -> force [N m], of those that the file limits
@@ -81,9 +82,9 @@ def read_robot(file: Path) -> Loaded:
         _forget_defaults(spec)
         _free_root(spec, where, notes)
         _balance(spec, notes)
-        drop_unreadable(spec, where, notes)
+        model = compile_readable(spec, where, notes)
     _check_joints(spec, where)
-    return Loaded(spec, where, notes, limits, speeds, keyframe)
+    return Loaded(spec, model, where, notes, limits, speeds, keyframe)
 
 
 @contextmanager
@@ -110,8 +111,10 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
         taken = Keyframe(chosen.name, tuple(qpos[:3]) if first and first.type == _FREE else (), angles)
         notes.append(f"keyframe '{chosen.name}' read: pose and place of the root, where nothing else states them")
     for key in keys:
-        if key is not chosen or not taken:
+        if key is not chosen:
             notes.append(f"keyframe '{key.name}' dropped")
+        elif not taken:
+            notes.append(f"keyframe '{key.name}' dropped: its qpos has {len(qpos)} numbers, the joints of the file have {starts[-1]}")
         spec.delete(key)
     spec.nkey = 0
     return taken
