@@ -387,8 +387,8 @@ def test_one_foot_has_no_neighbour() -> None:
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An untrained biped's export; commands changed and episodes ended while it was tried."""
     folder, often = tmp_path_factory.mktemp("biped"), {"commands.resampling_time": 0.2, "env.episode_length_s": 0.4, "gait.period": 0.5}
-    config, checkpoint = untrained(ROOT / BIPED, folder, {**ON, **often})
-    export(config, checkpoint, folder / "out")
+    task, checkpoint = untrained(ROOT / BIPED, folder, {**ON, **often})
+    export(task, checkpoint, folder / "out")
     return folder
 
 

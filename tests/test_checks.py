@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
+from worlds import make_env
 
 from legged_mw.envs.checks import ENVIRONMENT, LEARNER, WALKING, check_values
+from legged_mw.sim.errors import ModelError
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task, task_names
 
@@ -49,6 +51,27 @@ def test_mistake_is_named(path: str, value: Any, wanted: str) -> None:
     with pytest.raises(ConfigError) as error:
         check_values(task.cfg, task.train)
     assert str(error.value).startswith(f"{path} is {value!r}; it must be {wanted}")
+
+
+def test_no_number_is_cut_off_in_silence() -> None:
+    task = load_task("go1_flat")
+    task.set("commands.keep_probability", [0.9, 0.25, 0.5, 0.5])
+    text = "^commands.keep_probability has 4 numbers, but there are 3 commands: lin_vel_x, lin_vel_y, ang_vel_yaw$"
+    with pytest.raises(ConfigError, match=text):
+        check_values(task.cfg)
+
+
+@pytest.mark.parametrize("name", ["stiffness", "damping", "action_scale", "pose_weights", "default_joint_angles", "joint_speed_limits"])
+def test_a_table_of_joints_is_checked_when_the_environment_is_made(name: str) -> None:
+    """Not where it is read, which may be at the end of an exam; all joints are named."""
+    section = {"pose_weights": "rewards", "default_joint_angles": "init_state", "joint_speed_limits": "asset"}.get(name, "control")
+    legs = [f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")]
+    with pytest.raises(ModelError, match=rf"^{section}\.{name}: no joint 'wheel' in the MJCF; there are: {', '.join(legs)} "):
+        make_env(1, {f"{section}.{name}": {"": 1.0, "wheel": 2.0}})
+    if name in ("stiffness", "damping", "action_scale", "pose_weights"):  # the other tables may be silent
+        thighs = ", ".join(joint for joint in legs if "thigh" in joint)
+        with pytest.raises(ModelError, match=rf"^{section}\.{name}: no value for {thighs}: none of \['hip', 'calf'\] is a part of these"):
+            make_env(1, {f"{section}.{name}": {"hip": 1.0, "calf": 1.0}})
 
 
 def test_rules_name_fields_that_exist() -> None:

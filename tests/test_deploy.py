@@ -18,13 +18,14 @@ import onnx
 import pytest
 import torch
 import yaml
+from recorder import Recorder
 
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import Contract, ContractError, ContractRow, Ends, read_contract
 from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.policy import Controller
-from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
+from legged_mw.deploy.robot import Floats, Measurement, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.simulated import Fleet, MujocoRobot, read_scene
 from legged_mw.deploy.stage import DeployStage
@@ -385,6 +386,14 @@ def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Ca
     assert all(error < 0.12 for error in saved["error"]) and 0.5 < saved["cost_of_transport"] < 1.2
 
 
+def test_the_common_range_of_published_policies(capsys: pytest.CaptureFixture[str]) -> None:
+    """Asked of a robot that has none, and without an exam."""
+    code, _, err = main(capsys, SHIPPED, "--eval", "--ranges", "common")
+    assert code == 2 and "exam: --ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2, g1" in err
+    code, _, err = main(capsys, SHIPPED, "--ranges", "common")
+    assert code == 2 and "--ranges says what the exam asks: add --eval" in err
+
+
 def test_the_contract_brings_the_rules_of_the_exam(export: Path) -> None:
     shipped = contract_rules(read_contract(export))
     assert shipped.peer == "go1" and shipped.push_vx == 0.8 and shipped.push_speeds == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
@@ -404,26 +413,6 @@ def test_a_result_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 
 # ---- the seam
-
-
-class Recorder(Robot):
-    """Passes on to a robot and keeps what went through."""
-
-    def __init__(self, robot: Robot) -> None:
-        self.robot, self.targets, self.closed = robot, [], 0
-        self.measured: list[Measurement] = []
-
-    def read(self) -> Measurement:
-        self.measured.append(self.robot.read())
-        return self.measured[-1]
-
-    def write(self, targets: Floats) -> None:
-        self.targets.append(np.array(targets))
-        self.robot.write(targets)
-
-    def close(self) -> None:
-        self.closed += 1
-        self.robot.close()
 
 
 def test_a_robot_walks_behind_the_seam(contract: Contract) -> None:

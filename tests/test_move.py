@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 from program import SMALL, refused, run
+from rsl_rl.utils import resolve_callable
 
 from legged_mw import ROOT
 from legged_mw.rl.runs import task_of
@@ -221,6 +222,20 @@ def test_neighbours_of_one_name_are_not_mixed_up(tmp_path: Path, monkeypatch: py
     assert type(tasks[0].cfg).__mro__[1] is type(tasks[2].cfg).__mro__[1]  # imported once
 
 
+def test_a_neighbours_class_is_found_by_its_module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """rsl-rl imports what class_name says, after the task was loaded."""
+    for name in ("my_nets", "my_base"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    for folder in (tmp_path / "a", tmp_path / "b"):
+        file = kennel(folder)
+        (folder / "my_nets.py").write_text(f"class Net:\n    folder = {folder.name!r}\n")
+        file.write_text("import my_nets\n" + DOG)
+        load_task(str(file))
+        assert resolve_callable("my_nets:Net").folder == folder.name  # type: ignore[attr-defined]
+    load_task(str(tmp_path / "a/dog.py"))
+    assert resolve_callable("my_nets:Net").folder == "a"  # type: ignore[attr-defined]
+
+
 def test_a_neighbour_takes_no_librarys_name(tmp_path: Path) -> None:
     """What is imported already keeps its meaning: torch is torch, and legged_mw is the one that runs."""
     kennel(tmp_path)
@@ -230,7 +245,8 @@ def test_a_neighbour_takes_no_librarys_name(tmp_path: Path) -> None:
     assert load_task(str(tmp_path / "dog.py")).cfg.env.episode_length_s == 7.0
 
 
-def test_a_neighbour_that_fails_leaves_nothing_behind(tmp_path: Path) -> None:
+def test_a_neighbour_that_fails_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "my_base", raising=False)
     (tmp_path / "my_base.py").write_text("from nowhere_at_all import thing\n")
     (tmp_path / "dog.py").write_text(DOG)
     path = [*sys.path]

@@ -15,7 +15,7 @@ from tensordict import TensorDict
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import exam, exams, grading, page, report
+from legged_mw.eval import exam, exams, grading, page, plots, report
 from legged_mw.eval.page import Column
 from legged_mw.eval.peers import PEERS
 from legged_mw.eval.rollout import Case, Push, roll_out
@@ -203,9 +203,13 @@ def test_a_task_without_a_peer(both: tuple[dict[str, Any], ...], tmp_path: Path)
     assert "survives pushes of 2 m/s" in body and body.count("<svg") == 3 * 2 + 3 + 6 + 3 + 3 + 2 + 1
 
 
-def test_several_peers_are_their_best_and_a_table(both: tuple[dict[str, Any], ...], tmp_path: Path) -> None:
+def test_several_peers_are_their_best_and_a_table(
+    both: tuple[dict[str, Any], ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The best of each figure beside the policy's, all of them below; what was not asked alike is said."""
     _, result, figures = both
+    draw = plots.sections
+    monkeypatch.setattr(plots, "sections", lambda *args: [each for each in draw(*args) if each.name in ("pushes", "energy")])
     asked = ExamRules.from_mapping({"peer": "go2", **in_common("go2")})
     pushes = dict(zip(("0.5", "1", "1.5", "2", "3", "4", "5", "6"), [1.0] * 8, strict=True))
     figures = copy.deepcopy(figures)
@@ -225,16 +229,25 @@ def test_several_peers_are_their_best_and_a_table(both: tuple[dict[str, Any], ..
     assert row + "<td>0.002</td><td>0.63</td><td>100, 69, 12, 6, 0, 0, 0, 0</td><td>0.25</td></tr>" in table
     assert table.count("<tr>") == 1 + 1 + 10 and "<tr><th>mine</th><td>0</td>" in table
     assert len(saved["peers"]) == 10 and saved["peer"]["cost_of_transport"] == 0.3
-    assert (tmp_path / "pushes.png").exists()
+    assert {path.stem for path in tmp_path.glob("*.png")} == {"pushes", "energy"} and html.count("best of 10") == 1 + 2
 
 
-def test_marks_of_offsets_are_no_marks_of_errors(both: tuple[dict[str, Any], ...], tmp_path: Path) -> None:
+def test_marks_of_offsets_are_no_marks_of_errors(both: tuple[dict[str, Any], ...]) -> None:
+    """No stroke on the scale of an error, and no word of one; how many fell stands above the steps."""
     _, result, figures = both
-    graded = {**result, "rules": {**result["rules"], "marks_of": "offset", "peer": ""}}
-    del graded["beats_peer"]
-    report.write(tmp_path, "biped", [Column("mine", {}, graded, figures)])
-    html = (tmp_path / "report.html").read_text(encoding="utf-8")
+    asked = ExamRules.from_mapping({**result["rules"], "marks_of": "offset", "peer": ""})
+    figures = copy.deepcopy(figures)
+    figures["steps"]["vx"]["fell"] = 2
+    graded = {**{name: value for name, value in result.items() if name != "beats_peer"}, "rules": asked.to_mapping()}
+    drawn = []
+    for rules in (asked, GO1):
+        sections = {section.name: section for section in plots.sections([("mine", figures)], rules)}
+        drawn.append("".join(plots.svgs(sections["tracking"]._replace(panels=sections["tracking"].panels[:1]))))
+    assert ">0.06</text>" in drawn[1] and ">0.06</text>" not in drawn[0]
+    html = page.html("biped", asked, [Column("mine", {}, graded, figures)], [(sections["tracking"], [])])
     assert "The stroke on each scale" not in html and "vx offset" in html and "of the mean velocity" in html
+    assert "The stroke on each scale" in page.html("go1", GO1, [Column("mine", {}, result, figures)], [(sections["tracking"], [])])
+    assert ">2 fell</text>" in "".join(plots.svgs(sections["steps"]._replace(panels=sections["steps"].panels[:1])))
 
 
 # ---- --compare

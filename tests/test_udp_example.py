@@ -15,11 +15,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from recorder import Recorder
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.policy import Controller
-from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
+from legged_mw.deploy.robot import RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.utils.errors import UserError
@@ -37,25 +38,6 @@ _spec.loader.exec_module(udp)
 @pytest.fixture(scope="module")
 def contract() -> Contract:
     return read_contract(SHIPPED)
-
-
-class Recorded(Robot):
-    """Passes on to a robot and keeps what went through."""
-
-    def __init__(self, robot: Robot) -> None:
-        self.robot, self.targets = robot, []
-        self.measured: list[Measurement] = []
-
-    def read(self) -> Measurement:
-        self.measured.append(self.robot.read())
-        return self.measured[-1]
-
-    def write(self, targets: Floats) -> None:
-        self.targets.append(np.array(targets))
-        self.robot.write(targets)
-
-    def close(self) -> None:
-        self.robot.close()
 
 
 @pytest.fixture
@@ -77,7 +59,7 @@ def test_the_walk_is_the_same_over_udp(served: Any, contract: Contract) -> None:
     server, _, said = served
     runs = []
     for robot in (MujocoRobot(SHIPPED, contract), udp.UdpRobot(contract, server.address, timeout=5.0)):
-        recorder = Recorded(robot)
+        recorder = Recorder(robot)
         run(recorder, Controller(SHIPPED, contract), lambda _: AHEAD, 1.0, live=False)
         runs.append(recorder)
     here, there = runs

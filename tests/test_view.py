@@ -413,6 +413,19 @@ def test_a_foot_of_several_geoms_has_one_disc() -> None:
     assert robots.patches([[False] * 4]) == [] and robots.patches([[True] * 5]) == []  # more columns than sensors
 
 
+def test_links_without_looks_show_their_collision_shapes(model: mujoco.MjModel) -> None:
+    """Feet in a hidden group are seen where their link has no looks, and count as a part of the robot where it has."""
+    hidden = ROBOT.replace('fromto="0 0 0 0 0 -.3" group="2"', 'fromto="0 0 0 0 0 -.3" group="3"')
+    hidden = hidden.replace('size=".03" pos="0 0 -.3" group="2"', 'size=".03" pos="0 0 -.3" group="3"')
+    robots = PosedRobots(mujoco.MjSpec.from_string(hidden))
+    groups = {robots.model.geom(i).name: int(robots.model.geom_group[i]) for i in range(robots.model.ngeom)}
+    assert groups["foot0.1"] == groups["foot-0.1"] == 2 and sorted(robots.model.geom_group) == [0, 2, 2, 2, 2, 2, 2, 3]
+    assert robots.radius == pytest.approx(PosedRobots(SPEC).radius) and robots.bottom == pytest.approx(0.33)
+    feet = ROBOT.replace('size=".03" pos="0 0 -.3" group="2"', 'size=".03" pos="0 0 -.3" group="3"')
+    below = PosedRobots(mujoco.MjSpec.from_string(feet))
+    assert below.model.geom("foot0.1").group == 3 and below.bottom == pytest.approx(0.33)
+
+
 # ---- sizes
 
 

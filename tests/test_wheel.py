@@ -84,7 +84,7 @@ def test_an_installed_package_trains_the_readmes_task_and_logs_where_it_is_start
         "runner.export=false",
     ]
     out = start(installed, tmp_path, "train", "--task", str(home / "go1_gentle.py"), *small)
-    assert "rew_base_height" in out and "watch it with\n  legged-mw play --task " in out
+    assert "rew_crouch" in out and "watch it with\n  legged-mw play --task " in out
     [config] = tmp_path.glob("logs/go1_gentle/*/config.yaml")
     assert f"file: {installed}" not in config.read_text()  # a run can be played in a clone
 

@@ -9,6 +9,7 @@ from typing import Any
 from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, active
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
+from legged_mw.utils.commands import HEADING
 from legged_mw.utils.config import Config, ConfigError
 from legged_mw.utils.errors import unknown
 
@@ -111,6 +112,9 @@ def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None) -> Non
 
 def _check_walking(cfg: LeggedRobotCfg) -> None:
     _check(cfg, {**WALKING, **dict.fromkeys((f"commands.ranges.{name}" for name in vars(cfg.commands.ranges)), RANGE)})
+    names = [name for name in vars(cfg.commands.ranges) if name != HEADING]
+    if len(keep := cfg.commands.keep_probability) > len(names):
+        raise ConfigError(f"commands.keep_probability has {len(keep)} numbers, but there are {len(names)} commands: {', '.join(names)}")
     for foot in cfg.asset.foot_geoms:
         if foot not in cfg.asset.foot_names:
             raise ConfigError(f"asset.foot_geoms: {unknown('foot', foot, cfg.asset.foot_names, 'asset.foot_names')}")

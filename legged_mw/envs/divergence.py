@@ -24,21 +24,16 @@ class Divergence:
     def __init__(self, sim: Simulation, actions: Tensor, joints: Sequence[str], max_speed: float) -> None:
         """``actions`` (N, A) as the step has them; ``max_speed`` of any degree of freedom that still counts as finite."""
         self._sim, self._actions, self._joints, self._max_speed = sim, actions, joints, max_speed
-        self._speed = torch.zeros_like(sim.qvel[:, 6:])  # (N, D) [rad/s] at the end of the step before
         self.counts = torch.zeros(len(joints) + 1, device=sim.qvel.device)  # worlds by joint, and last by action
 
     def find(self, broken: Tensor) -> None:
-        """Write the worlds that broke in this step into ``broken`` (N,), and count what broke them."""
-        qvel = self._sim.qvel
-        speed = qvel.abs().amax(dim=1)
-        position = self._sim.qpos.abs().amax(dim=1)
+        """Write the worlds that broke in this step into ``broken`` (N,), and count what broke them: no joint where a speed is NaN."""
+        speed = self._sim.qvel.abs()
+        joints, position = speed[:, 6:], self._sim.qpos.abs().amax(dim=1)
         action = self._actions.abs().amax(dim=1) < math.inf  # a servo swallows NaN, the reward does not
-        torch.logical_not((speed <= self._max_speed) & (position < math.inf) & action, out=broken)  # NaN compares false
-        joints = qvel[:, 6:].abs()
-        known = torch.where(joints.amax(dim=1, keepdim=True) < math.inf, joints, self._speed)  # all NaN: as they were before
-        first = (known == known.amax(dim=1, keepdim=True)) & (known > 0.0) & (broken & action)[:, None]
-        self.counts.add_(torch.cat([first, (broken & ~action)[:, None]], dim=1).sum(dim=0))
-        self._speed.copy_(joints.masked_fill_(broken[:, None], 0.0))
+        torch.logical_not((speed.amax(dim=1) <= self._max_speed) & (position < math.inf) & action, out=broken)  # NaN compares false
+        fastest = (joints == joints.amax(dim=1, keepdim=True)) & (broken & action)[:, None]
+        self.counts.add_(torch.cat([fastest, (broken & ~action)[:, None]], dim=1).sum(dim=0))
 
     def statistics(self) -> dict[str, Tensor]:
         """Worlds so far, () each, by what broke them."""
@@ -71,7 +66,7 @@ def _because(counts: dict[str, float]) -> str:
     if action > total:
         return "the policy's actions are not finite; lower algorithm.learning_rate, and look for a reward term without a bound"
     worst = sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])[:4]
-    joints = ", ".join(f"{name.removeprefix(JOINT)} ({counts[name] / total:.0%})" for name in worst) or "none that moved before"
+    joints = ", ".join(f"{name.removeprefix(JOINT)} ({counts[name] / total:.0%})" for name in worst) or "none, all was lost at once"
     return (
         f"physics diverges; fastest joint at the break: {joints}. Lower control.damping or control.stiffness of these joints, or give them "
         "armature (asset.armature), or lower sim.dt and raise control.decimation, or set sim.integrator to implicitfast; "

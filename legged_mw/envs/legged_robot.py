@@ -373,8 +373,7 @@ class LeggedRobot(LeggedRewards, RobotTask):
         self.command_ranges = self.full_command_ranges.clone()
         self._narrowest = default.expand(2, count)
         self.rest_command = self._tensor([0.0 if command.name in VELOCITY else command.default for command in self.command_table])
-        keep = [*cfg.keep_probability, *[1.0] * count][:count]
-        self.keep_probability = self._tensor(keep)
+        self.keep_probability = self._tensor([*cfg.keep_probability, *[1.0] * (count - len(cfg.keep_probability))])
         self.command_curriculum = self._tensor([cfg.curriculum_start if cfg.curriculum else 1.0, 0.0, 0.0])
         if cfg.curriculum:
             self._set_command_ranges()

@@ -35,7 +35,8 @@ class Graded(NamedTuple):
 def grade(policies: list[tuple[Source, LoadedTask]], args: argparse.Namespace) -> None:
     """Grade policies, each by the config that it was trained with; print their tables and write a report beside the first."""
     device = pick_device(args.device)
-    graded = [prepare(source, trained, args) for source, trained in policies]
+    first, *rivals = policies
+    graded = [prepare(*first, args, common=args.ranges == "common"), *(prepare(*rival, args) for rival in rivals)]
     graded[0].exam.ask_alike([each.task for each in graded])
     introduce(graded[0].source, graded[0].task.changes_since(graded[0].trained))
     built = [(each, *build(each, args, device)) for each in graded]  # all, before one is graded in vain
@@ -45,12 +46,15 @@ def grade(policies: list[tuple[Source, LoadedTask]], args: argparse.Namespace) -
     print(f"written to {shown(folder / 'report.html')}, with report.json and pictures beside it")
 
 
-def prepare(source: Source, trained: LoadedTask, args: argparse.Namespace) -> Graded:
-    """The trained task with what the exam changes, the user's overrides last."""
+def prepare(source: Source, trained: LoadedTask, args: argparse.Namespace, common: bool = False) -> Graded:
+    """The trained task with what the exam changes, the user's overrides last.
+
+    ``common``: in the one range that all published policies of the robot were asked.
+    """
     task, exam = copy.deepcopy(trained), require_exam(trained)
     exam.prepare(task)
     override(task, args, exam.sets)
-    if args.ranges == "common":
+    if common:
         task.update({"exam": in_common(getattr(getattr(task.cfg, "exam", None), "peer", ""))}, where="--ranges common")
     exam.make_room(task)  # the ranges are known by now
     return Graded(source, trained, task, exam, prepare_crossing(trained, args))

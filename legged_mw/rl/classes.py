@@ -5,6 +5,7 @@ rsl-rl imports and calls what ``class_name`` says. A run folder may come from a 
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,7 +17,7 @@ from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.utils.config import Config, ConfigError
 
 _NETWORKS = (MLPModel, CNNModel, RNNModel)
-_DISTRIBUTIONS = (GaussianDistribution, HeteroscedasticGaussianDistribution, BetaDistribution)
+_DISTRIBUTIONS = (GaussianDistribution, HeteroscedasticGaussianDistribution)
 ALLOWED: dict[str, tuple[type, ...]] = {
     "actor.class_name": _NETWORKS,
     "critic.class_name": _NETWORKS,
@@ -29,6 +30,8 @@ _IMPORTED = ("class_name", "data_augmentation_func")  # rsl-rl imports and calls
 
 def check_classes(cfg: Config) -> None:
     """Refuse a class that neither the task's own Python file nor ``ALLOWED`` names. Imports nothing. Raises ConfigError."""
+    for network in ("actor", "critic"):
+        _check_distribution(cfg.to_dict().get(network, {}).get("distribution_cfg"), f"{network}.distribution_cfg")
     own = dict(_class_names(type(cfg)().to_dict()))
     for path, name in _class_names(cfg.to_dict()):
         if path in own and name == own[path]:
@@ -40,6 +43,16 @@ def check_classes(cfg: Config) -> None:
                 f"{path} is {name!r}: only the task's own Python file, which --task names, may choose that; "
                 f"a run's config.yaml, --set and --override may name {', '.join(shortest) or 'nothing else there'}"
             )
+
+
+def _check_distribution(section: dict[str, Any] | None, path: str) -> None:
+    """rsl-rl makes a distribution of its own from all fields of the section, so it must take them."""
+    name = (section or {}).get("class_name")
+    for kind in (*_DISTRIBUTIONS, BetaDistribution):
+        surplus = sorted((section or {}).keys() - inspect.signature(kind).parameters.keys() - {"class_name"})
+        if surplus and name in _spellings(kind):
+            fit = ", ".join(other.__name__ for other in _DISTRIBUTIONS)
+            raise ConfigError(f"{path}.class_name is {name!r}, which takes no {', '.join(surplus)}, fields of {path}; there fit: {fit}")
 
 
 def _spellings(kind: type) -> list[str]:

@@ -9,7 +9,7 @@ import torch
 
 from legged_mw.robot import new, picture
 from legged_mw.robot.case import Case, from_env, from_task, naming_every_missing_key
-from legged_mw.robot.draft import as_env, draft
+from legged_mw.robot.draft import as_env, draft, has_mirror
 from legged_mw.robot.measure import Health, measure
 from legged_mw.robot.page import page
 from legged_mw.utils.cli import Parser, one_line_errors
@@ -40,10 +40,10 @@ def main() -> None:
         print(task_page(load_task(args.file), image))
         return
     found = draft(file)
-    case = from_env(as_env(found, file))
-    print(case_page(case, file.name, image, found.guessed))
+    env = as_env(found, file)
+    print(case_page(from_env(env), file.name, image, found.guessed))
     if args.new:
-        written = new.write(found, file, args.new, Path(args.out), args.force)
+        written = new.write(found, file, args.new, Path(args.out), args.force, has_mirror(env))
         print(f"written: {' and '.join(map(shown, written))}; next:\n  python train.py --task {shown(written[1])} --check")
 
 

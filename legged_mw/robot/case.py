@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -47,8 +48,8 @@ def from_env(env: RobotTask) -> Case:
         env.default_dof_pos.tolist(),
         env.init_pos.tolist(),
         feet,
-        env.cfg.asset.imu_site,
-        _speeds(env),
+        env.robot.imu,
+        [speed if math.isfinite(speed) else None for speed in env.robot.speed_limits],
         env.cfg.control.decimation,
     )
 
@@ -61,13 +62,6 @@ def _small(task: LoadedTask, tables: Mapping[str, Any] | None = None) -> RobotTa
     if isinstance(one.cfg.to_dict()["terrain"].get("mesh_type"), str):
         one.set("terrain.mesh_type", "plane")
     return one.env_class(one.cfg, "cpu")
-
-
-def _speeds(env: RobotTask) -> list[float | None]:
-    """Of the config's table, (D,) [rad/s]; None where no key fits."""
-    table = env.cfg.asset.joint_speed_limits
-    keys = [max((key for key in table if key in name), key=len, default=None) for name in env.robot.joint_names]
-    return [None if key is None else float(table[key]) for key in keys]
 
 
 @contextmanager

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from legged_mw.robot.feet import Foot
 from legged_mw.sim.model import RobotModel
 
-# ours: the knee's angle about the axis to the left [rad]
-# a quadruped's thighs lean back (Go1 0.9 and -1.8), a biped's forwards (-0.3 and 0.6)
+# ours: the knee's angle about the axis to the left [rad]; a quadruped leans its thighs back (Go1 0.9 and -1.8), a biped forwards
 KNEE = {2: 0.6}
 KNEE_ELSE = -1.6
 _SIDEWAYS = 0.9  # |y| of a joint's axis
+_BEHIND = 0.03  # [m] a foot so far behind the knee belongs to a leg that bends the other way (ANYmal's hind legs)
 _MARGIN = 0.05  # [rad] from the end of a range
 
 
@@ -34,7 +34,7 @@ def bent(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> 
         if len(legs) < 2:
             return None
         hip, knee, *ankle = legs
-        turn = KNEE.get(len(feet), KNEE_ELSE)
+        turn = KNEE.get(len(feet)) or KNEE_ELSE * _forward(data, model, knee, foot)
         signs = np.sign(data.xaxis[legs, 1])
         angles = [_within(model, knee, sign * turn * signs[1]) for sign in (1.0, -1.0)]
         found[knee - 1] = max(angles, key=abs) if abs(angles[0]) < 0.5 * abs(turn) else angles[0]
@@ -43,6 +43,12 @@ def bent(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> 
             leaning = found[hip - 1] * signs[0] + found[knee - 1] * signs[1]
             found[joint - 1] = _within(model, joint, -sign * leaning)
     return found
+
+
+def _forward(data: mujoco.MjData, model: mujoco.MjModel, knee: int, foot: Foot) -> float:
+    """1.0 if a straight leg's foot is ahead of its knee or below it, and goes ahead of it; -1.0 if it is behind."""
+    ahead = data.geom_xpos[model.geom(foot.geoms[0]).id, 0] - data.xanchor[knee, 0]
+    return -1.0 if ahead < -_BEHIND else 1.0
 
 
 def _placed(model: mujoco.MjModel, pose: NDArray[np.float64]) -> mujoco.MjData:

@@ -18,13 +18,15 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.robot.case import TABLES, Case, from_env
 from legged_mw.robot.crouch import bent
-from legged_mw.robot.feet import Foot, guess_feet
+from legged_mw.robot.feet import Foot, guess_feet, height_over
 from legged_mw.robot.measure import Joint, mass_matrices, stand_as_statue, what_joints_bear
 from legged_mw.robot.suggest import Gains, family, suggest
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import per_joint
+from legged_mw.sim.vendor import read_robot
 from legged_mw.utils.config import ConfigError
 
+LOW = 0.33  # [m] a root that stands lower than this cannot swing its feet as high as others
 CLEARANCE = 0.003  # [m] above the ground at reset, so that nothing begins inside of it
 
 
@@ -41,8 +43,8 @@ class Draft(NamedTuple):
 
 def draft(file: Path) -> Draft:
     """Guess what a task needs to know of the robot in ``file`` (MJCF or URDF)."""
-    env, from_file = _bare(file)
-    case = from_env(env)
+    from_file = read_robot(file).keyframe is not None
+    case = from_env(_bare(file, from_file))
     limited = case.robot.physics.jnt_limited[1:] > 0
     low, high = case.robot.joint_range.T
     pose = np.array(case.pose)
@@ -58,28 +60,24 @@ def draft(file: Path) -> Draft:
     how = "the file's keyframe" if from_file else how
     guessed = [
         f"pose: {how}",
-        f"feet: {', '.join(foot.name for foot in feet)}, the lowest parts that carry no others",
+        f"feet: {', '.join(foot.name for foot in feet)}, the lowest ends of limbs",
         "gains: as suggested below",
     ]
     pose = np.round(pose, 4)
-    place = [0.0, 0.0, round(float(rest.qpos[2]) + CLEARANCE, 3)]
+    place = [0.0, 0.0, round(height_over(case.robot, pose, feet) + CLEARANCE, 3)]
     case = case._replace(pose=pose.tolist(), place=place, feet={foot.name: foot.geoms for foot in feet})
     return Draft(case, joints, gains, feet, guessed, how)
 
 
-def _bare(file: Path) -> tuple[RobotTask, bool]:
-    """A world with the robot that knows nothing of it; and whether its pose is the file's."""
+def _bare(file: Path, keyframe: bool) -> RobotTask:
+    """A world with the robot and nothing else, in the pose of the file's ``keyframe`` or with all joints at 0."""
     cfg = RobotTaskCfg()
     cfg.update({"env": {"num_envs": 1}, "asset": {"file": str(file.resolve())}, "sim": {"engine": "mujoco"}}, where="the health page")
     for path, value in TABLES.items():
         cfg.set(path, value)
-    angles = cfg.init_state.default_joint_angles
-    try:
+    if keyframe:
         cfg.init_state.default_joint_angles = {}
-        return RobotTask(cfg, "cpu"), True
-    except (ModelError, ConfigError):  # no keyframe; what else is wrong shows again
-        cfg.init_state.default_joint_angles = angles
-        return RobotTask(cfg, "cpu"), False
+    return RobotTask(cfg, "cpu")
 
 
 def as_env(found: Draft, file: Path) -> LeggedRobot:
@@ -88,6 +86,14 @@ def as_env(found: Draft, file: Path) -> LeggedRobot:
     cfg.update({"env": {"num_envs": 1}, "sim": {"engine": "mujoco"}, **values(found)}, where="the health page")
     cfg.asset.file = str(file.resolve())
     return LeggedRobot(cfg, "cpu")
+
+
+def has_mirror(env: LeggedRobot) -> bool:
+    """Whether the robot and its pose are the same left and right, so that learning may use it."""
+    try:
+        return env.mirror is not None
+    except (ModelError, ConfigError):
+        return False
 
 
 def values(found: Draft) -> dict[str, dict[str, Any]]:
@@ -110,10 +116,13 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         },
         "commands": {"ranges": ranges},
         "termination": {"min_base_height": round(0.5 * height, 2)},
-        "rewards": {"swing_height": round(min(0.1, 0.3 * height), 2), "base_height_target": round(height, 2)},
     }
+    if height < LOW:
+        chosen["rewards"] = {"swing_height": round(0.3 * height, 2)}
     if two:
-        chosen["exam"] = {"push_speeds": [0.5, 1.0, 1.5, 2.0, 3.0], "push_mark": 1.0, "marks_of": "offset"}
+        chosen["rewards"] = {**chosen.get("rewards", {}), "scales": {"single_stance": 0.75}}
+        chosen["sim"] = {"iterations": 3}
+        chosen["exam"] = {"push_mark": 1.0, "marks_of": "offset"}
     return chosen
 
 

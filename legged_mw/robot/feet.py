@@ -4,6 +4,7 @@
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -42,7 +43,21 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
     lowest = min(min(these.values()) for these in of_body.values())
     near = lowest + max(_SAME, _SAME_SHARE * (float(qpos[2]) - lowest))
     feet = [(body, these) for body, these in of_body.items() if min(these.values()) <= near]
-    return [_foot(robot, body, [g for g, z in these.items() if z <= min(these.values()) + _SOLE]) for body, these in feet]
+    return [_foot(robot, body, _sole(model, these)) for body, these in feet]
+
+
+def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:
+    """Of a body's geoms, ``low`` [m, world] each, the lowest one and those of its kind that are about as low."""
+    lowest = min(low, key=lambda geom: low[geom])
+    return [g for g, z in low.items() if z <= low[lowest] + _SOLE and model.geom_type[g] == model.geom_type[lowest]]
+
+
+def height_over(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> float:
+    """[m] of the upright root when the lowest of ``feet`` touches the ground, with the joints at ``pose`` (D,)."""
+    data = mujoco.MjData(robot.physics)
+    data.qpos[:] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *pose]
+    mujoco.mj_kinematics(robot.physics, data)
+    return -min(_lowest(robot.physics, data, robot.id("geom", geom)) for foot in feet for geom in foot.geoms)
 
 
 def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
@@ -54,7 +69,7 @@ def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
 def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:
     """A name for these geoms of ``body``."""
     names = tuple(robot.physics.geom(geom).name for geom in geoms)
-    for part in robot.spec.bodies:  # as the file has them: some of them are fused in what is stepped
-        if part.name and {g.name for g in part.geoms if g.contype or g.conaffinity} == {*names}:
-            return Foot(part.name, names, True)
+    parts = [part for part, geoms in robot.names.bodies.items() if {*geoms} == {*names}]  # also such as are fused in what is stepped
+    if parts:
+        return Foot(parts[-1], names, True)
     return Foot(names[0], names, True) if len(names) == 1 else Foot(robot.physics.body(body).name, names, False)

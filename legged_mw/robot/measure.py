@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from legged_mw.sim.engines import make_simulation
 from legged_mw.sim.model import RobotModel
+from legged_mw.sim.room import Room, count_room
 
 FloatArray = NDArray[np.float64]
 
@@ -32,11 +33,6 @@ STAND_TILT = 60.0  # [deg] of the root: beyond it, it fell
 STAND_HEIGHT = 0.5  # of the height it began with: below it, it sank
 TOPPLED = 15.0  # [deg] a statue that tilts so far does not rest on its feet
 _STIFF = 1e5  # [kg m^2] armature of a joint that gravity shall not move: 100 N m turn it by 1 mrad/s in a second
-_CONTACTS = {
-    int(mujoco.mjtGeom.mjGEOM_SPHERE): 1,
-    int(mujoco.mjtGeom.mjGEOM_ELLIPSOID): 1,
-    int(mujoco.mjtGeom.mjGEOM_CAPSULE): 2,
-}  # with a plane
 _FAST = 1.0e4  # [m/s, rad/s] beyond it a state counts as not finite (termination.max_speed)
 
 
@@ -121,8 +117,7 @@ class Health:
     stand: Stand
     dt: float  # substep [s]
     implicit: bool  # whether the integrator is implicitfast
-    nconmax: int  # contacts, if all that may touch the ground did
-    njmax: int  # constraint rows then, with every joint at a limit
+    room: Room  # for contacts and constraint rows on mujoco-warp
 
 
 def measure(
@@ -147,17 +142,8 @@ def measure(
         stand=stand_on_servos(robot, angles, place, decimation),
         dt=float(model.opt.timestep),
         implicit=implicit,
-        **dict(zip(("nconmax", "njmax"), room(robot), strict=True)),
+        room=count_room(model, terrain=False),
     )
-
-
-def room(robot: RobotModel) -> tuple[int, int]:
-    """Contacts and constraint rows, if every geom that may touch the ground lay on it and every joint were at a limit."""
-    model, ground = robot.physics, robot.ground_geoms()
-    touches = [g for g in range(model.ngeom) if g >= ground.stop and model.geom_conaffinity[g] & 1]
-    contacts = sum(_CONTACTS.get(int(model.geom_type[g]), 4) for g in touches)
-    rows_each = max(1, 2 * (int(model.geom_condim[ground.start]) - 1))  # of a pyramid
-    return contacts, int((model.dof_frictionloss > 0).sum() + model.jnt_limited.sum()) + rows_each * contacts
 
 
 # ---- at rest ----

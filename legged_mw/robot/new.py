@@ -13,12 +13,9 @@ from legged_mw.robot.draft import Draft, values
 from legged_mw.robot.plain import as_mjcf, stands_alone
 from legged_mw.utils.errors import UserError, shown
 
-WIDTH = 120  # [columns] of a line of the config
+WIDTH = 140  # [columns] of a line of the config
 
-_HEAD = '''"""{title} with {joints} joints ({legs}) follows a joystick on flat ground. Written by python -m legged_mw.robot {file}.
-
-Lines with LOOK were guessed or chosen: check them. What each field means: docs/tasks.md.
-"""
+_HEAD = '''"""{title} ({legs}, {joints} joints; {file}) follows a joystick on flat ground. Check what is marked LOOK."""
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
@@ -28,7 +25,7 @@ from legged_mw.utils.task import Task
 class {name}FlatCfg(LeggedRobotCfg):
 '''
 _COMMENTS = {
-    "foot_names": "LOOK: guessed, the lowest parts that carry no others",
+    "foot_names": "LOOK: guessed",
     "foot_geoms": "foot -> its geoms",
     "colliders": "the feet alone touch the ground",
     "pos": "[m] standing, computed",
@@ -40,13 +37,17 @@ _COMMENTS = {
     "ang_vel_yaw": "[rad/s]",
     "min_base_height": "[m] half of the standing height: lower, it fell",
     "swing_height": "[m] of a swinging foot",
-    "base_height_target": "[m] of the reward base_height, if you give it a scale",
-    "push_speeds": "[m/s] for a biped",
+    "single_stance": "a biped that steps stands on one foot at a time [Isaac Lab: G1]",
+    "iterations": "a biped's soles want more than 1 [ours]",
+    "push_mark": "[m/s] for a biped",
 }
 
 
-def write(found: Draft, file: Path, name: str, folder: Path, force: bool = False) -> list[Path]:
-    """Write both files into ``folder``; raises UserError, before anything is written, if one of them is there."""
+def write(found: Draft, file: Path, name: str, folder: Path, force: bool = False, mirrors: bool = False) -> list[Path]:
+    """Write both files into ``folder``; ``mirrors`` says whether learning may mirror the robot.
+
+    Raises UserError, before anything is written, if one of them is there.
+    """
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise UserError(f"--new {name}: a name begins with a letter and has letters, digits and _ only")
     robot, config = folder / f"{name}.xml", folder / f"{name}_flat.py"
@@ -59,14 +60,14 @@ def write(found: Draft, file: Path, name: str, folder: Path, force: bool = False
             if not (robot.exists() and robot.samefile(file)):
                 shutil.copyfile(file, robot)
         else:
-            robot.write_text(as_mjcf(found.case.robot, name, file, folder))
-        config.write_text(config_text(found, file, name))
+            robot.write_text(as_mjcf(name, file, folder))
+        config.write_text(config_text(found, file, name, mirrors))
     except OSError as error:
         raise UserError(f"cannot write to {shown(folder)}: {error.strerror or os.strerror(error.errno or 0)}; say --out DIR") from None
     return [robot, config]
 
 
-def config_text(found: Draft, file: Path, name: str) -> str:
+def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> str:
     """The config file: LOOK marks what to check."""
     feet = len(found.feet)
     legs = {2: "biped", 4: "quadruped"}.get(feet, f"{feet} feet")
@@ -78,8 +79,9 @@ def config_text(found: Draft, file: Path, name: str) -> str:
     for section, fields in sections.items():
         lines += [f"    class {section}(LeggedRobotCfg.{section}):"]
         for field, value in fields.items():
-            if field == "ranges":
-                lines += ["        class ranges(LeggedRobotCfg.commands.ranges):"]
+            if field in ("ranges", "scales"):
+                lines += [""] * (field != next(iter(fields)))
+                lines += [f"        class {field}(LeggedRobotCfg.{section}.{field}):"]
                 lines += [line for inner, span in value.items() for line in _field(inner, span, comments.get(inner, ""), 12)]
             else:
                 lines += _field(field, value, comments.get(field, ""), 8)
@@ -87,7 +89,10 @@ def config_text(found: Draft, file: Path, name: str) -> str:
             lines += _force_limits(found)
         lines.append("")
     lines += ["", f"class {title}FlatCfgPPO(LeggedRobotCfgPPO):"]
-    lines += ["    class runner(LeggedRobotCfgPPO.runner):", "        max_iterations = 1500", "", ""]
+    lines += ["    class runner(LeggedRobotCfgPPO.runner):", "        max_iterations = 1500"]
+    if mirrors:
+        lines += ["", "    class symmetry(LeggedRobotCfgPPO.symmetry):", "        use_data_augmentation = True  # left and right are alike"]
+    lines += ["", ""]
     return "\n".join([*lines, f"TASK = Task(LeggedRobot, {title}FlatCfg, {title}FlatCfgPPO)", ""])
 
 

@@ -44,8 +44,8 @@ def _summary(health: Health) -> list[str]:
         f"  mass                 {health.mass:.2f} kg",
         f"  standing height      {health.height:.3f} m of the root, {health.top:.3f} m of its highest point{upright}",
         f"  centre of mass       {over}",
-        f"  at rest              {rest.contacts} contacts, {rest.rows} constraint rows; all that may touch at once: "
-        f"sim.nconmax = {health.nconmax}, sim.njmax = {health.njmax}",
+        f"  at rest              {rest.contacts} contacts, {rest.rows} constraint rows; room for more (sim.nconmax, sim.njmax): "
+        f"{health.room.contacts}, {health.room.rows}",
         f"  action zero          {standing(health.stand)}",
         f"  substep              {1e3 * health.dt:g} ms, {integrator}; servos in the air: {_mode(health)}",
     ]
@@ -111,8 +111,8 @@ def remarks(health: Health, gains: Sequence[Gains]) -> list[str]:
         lines.append(f"no servo is unstable alone, but all together are ({', '.join(health.mode.joints)}): lower sim.dt or the gains")
     if bare := [joint for joint, gain in zip(joints, gains, strict=True) if not joint.armature and gain.cut]:
         lines.append(
-            f"no armature, so that the step bears only small gains: {those(bare)}: a geared motor adds its rotor's inertia times the gear "
-            "ratio squared; write that into asset.armature"
+            f"no armature, which limits the gains that the step bears: {those(bare)}: a geared motor adds its rotor's inertia times "
+            "the gear ratio squared; write that into asset.armature"
         )
     if endless := [joint for joint in joints if not math.isfinite(joint.effort)]:
         lines.append(f"no force limit: {those(endless)}: say asset.effort, or they are trained with torques that no motor has")
@@ -123,5 +123,5 @@ def remarks(health: Health, gains: Sequence[Gains]) -> list[str]:
     if health.rest.toppled or health.margin < 0.0:
         lines.append("the centre of mass is not over the feet: choose another init_state.default_joint_angles")
     if health.stand.end != "stands":
-        lines.append(f"with action zero it {standing(health.stand)}; a task is learned sooner where it stands")
+        lines.append(f"with action zero it {standing(health.stand)}: a biped may, others should stand")
     return lines

@@ -26,7 +26,7 @@ from legged_mw.view.video import Frame, save_png
 
 WIDTH, HEIGHT = 1100, 1000  # [px] of one view
 VIEWS = (("front left", 225.0, -14.0), ("left side", 270.0, -4.0))  # name, azimuth and elevation of the camera [deg]
-FILL = 0.62  # of a view's smaller edge that the robot takes; names have the rest
+FILL = 0.7  # of a view's smaller edge that the robot takes; names have the rest
 COLLIDER_RGBA, LOOK_ALPHA = (1.0, 0.55, 0.1, 0.42), 0.4
 FOOT_RGBA = (0.0, 0.75, 0.52, 1.0)
 AXES_RGB = ((0.95, 0.2, 0.2), (0.25, 0.85, 0.25), (0.3, 0.5, 1.0))  # x, y, z
@@ -40,6 +40,7 @@ FAMILY_RGB = (
     (0.75, 0.75, 0.95),
     (0.9, 0.9, 0.9),
 )
+MANY = 16  # joints: of more, arrows are shorter
 LEFT_COLUMN, ROW = 12, 22  # [px] from the edge to a column of names; between two names at least
 CAPTION = "joint axes: arrows (turn by the right hand)   feet: green discs   imu: x red, y green, z blue   colliders: orange"
 
@@ -132,11 +133,11 @@ class _Picture:
         half = (np.abs(rotation) @ box[:, 3:, None])[..., 0]
         places = np.concatenate([centre - half, centre + half, data.xpos[self.posed.base][None]])
         low, high = places.min(axis=0), places.max(axis=0)
-        self.middle, self.size = (low + high) / 2, float(max(high[2] - low[2], 0.8 * np.linalg.norm((high - low)[:2])))
+        self.middle, self.size = (low + high) / 2, float(max(high[2] - low[2], 0.95 * np.linalg.norm((high - low)[:2])))
 
     def _draw_joints(self) -> list[Label]:
         families = list(dict.fromkeys(family(name) for name in self.robot.joint_names))
-        labels, length = [], 0.16 * self.size
+        labels, length = [], (0.16 if len(self.robot.joint_names) <= MANY else 0.1) * self.size
         for name in self.robot.joint_names:
             joint = self.posed.model.joint(name).id
             place, axis = self.posed.data.xanchor[joint].copy(), self.posed.data.xaxis[joint].copy()
@@ -151,7 +152,8 @@ class _Picture:
             ids = [self.posed.model.geom(geom).id for geom in geoms]
             place = np.mean([data.geom_xpos[geom] for geom in ids], axis=0)
             place[2] = 0.002
-            size = 1.5 * max(float(self.posed.model.geom_rbound[geom]) for geom in ids)
+            reach = [np.linalg.norm(data.geom_xpos[geom, :2] - place[:2]) + self.posed.model.geom_rbound[geom] for geom in ids]
+            size = float(max(reach)) * (1.5 if len(ids) == 1 else 1.1)
             self._geom(mujoco.mjtGeom.mjGEOM_CYLINDER, (size, 0.002, 0.0), place, FOOT_RGBA)
             labels.append(Label(f"foot {name}", place, FOOT_RGBA[:3]))
         return labels

@@ -1,4 +1,4 @@
-"""A robot alone as MJCF text: without the ground, servos and sensors that were added to it. No path in it is absolute."""
+"""A robot alone as MJCF text, for one that is not an MJCF without other files already. No path in it is absolute."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -10,8 +10,7 @@ from pathlib import Path
 
 import mujoco
 
-from legged_mw.sim.ground import GROUND
-from legged_mw.sim.model import RobotModel
+from legged_mw.sim.vendor import naming, read_robot
 
 
 def stands_alone(file: Path) -> bool:
@@ -22,18 +21,19 @@ def stands_alone(file: Path) -> bool:
     )
 
 
-def as_mjcf(robot: RobotModel, name: str, file: Path, folder: Path) -> str:
-    """``robot``, which was read from ``file``, as text to be written into ``folder``; meshes are named relative to that."""
-    spec = robot.spec.copy()
-    for added in [*spec.actuators, *spec.sensors, *spec.keys, *[geom for geom in spec.geoms if geom.name.partition("/")[0] == GROUND]]:
-        spec.delete(added)
-    for joint, effort in zip([joint for joint in spec.joints if joint.type != mujoco.mjtJoint.mjJNT_FREE], robot.effort_range, strict=True):
-        if effort[1] < float("inf"):
-            joint.actfrclimited, joint.actfrcrange = True, [float(effort[0]), float(effort[1])]
-    _name_files(spec, file.resolve().parent, folder.resolve())
+def as_mjcf(name: str, file: Path, folder: Path) -> str:
+    """The robot in ``file`` as text to be written into ``folder``; meshes are named relative to that."""
+    robot = read_robot(file)
+    spec = robot.spec
+    for joint in robot.joints:
+        if joint.name in robot.limits:
+            joint.actfrclimited, joint.actfrcrange = True, [*robot.limits[joint.name]]
     spec.modelname = name
     spec.comment = f"\n    {name}: facts of the machine, from {file.name}. Ground, servos and sensors are added where it is loaded.\n  "
-    return spec.to_xml()
+    with naming(file):
+        spec.compile()
+        _name_files(spec, file.resolve().parent, folder.resolve())
+        return spec.to_xml()
 
 
 def _name_files(spec: mujoco.MjSpec, beside: Path, folder: Path) -> None:

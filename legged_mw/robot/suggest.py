@@ -2,7 +2,7 @@
 
 kp: full effort at 1 rad off the target. That is within a factor of two of what is published: ANYmal 80 at 80 N m (legged_gym), G1's hip
 and knee 100 and 150 at 88 and 139 N m (unitree_rl_gym), Go2 20 and 40 at 23.5 and 45 N m (unitree_rl_mjlab), Go1 35 at 23.7 N m (MuJoCo
-Playground). It is at least what holds twice the load at rest, as half of the feet do in a walk, within 0.3 rad. Where nobody states an
+Playground). It is at least what holds twice the load at rest, as half of the feet do in a walk, within 0.4 rad. Where nobody states an
 effort, it is that, and at least what swings the limb at 2 Hz.
 kd: 25 ms of kp: ANYmal 2 of 80, Go2 0.5 of 20, G1 2 of 100, Booster T1 5 of 200.
 Both are cut where the step would not bear them: dt sqrt(kp / I) at most 0.5 and dt kd / I at most 0.5, with the joint's smallest inertia.
@@ -17,32 +17,12 @@ from typing import NamedTuple
 from legged_mw.robot.measure import Joint
 
 FULL_EFFORT_AT = 1.0  # [rad]
-LOAD, SAG = 2.0, 0.3  # times the torque at rest, held within so much [rad]
+LOAD, SAG = 2.0, 0.4  # times the torque at rest, held within so much [rad]
 SWING = 2.0  # [Hz]
 DAMPING_TIME = 0.025  # [s] kd / kp
 MOST = 0.5  # of dt sqrt(kp / I) and of dt kd / I
-_SIDES = {
-    "l",
-    "r",
-    "left",
-    "right",
-    "fl",
-    "fr",
-    "rl",
-    "rr",
-    "lf",
-    "rf",
-    "lh",
-    "rh",
-    "hl",
-    "hr",
-    "bl",
-    "br",
-    "front",
-    "rear",
-    "hind",
-    "back",
-}
+_NO_KIND = {"joint", "l", "r", "left", "right", "fl", "fr", "rl", "rr", "lf", "rf", "lh", "rh", "hl", "hr", "bl", "br"}
+_NO_KIND |= {"front", "rear", "hind", "back"}
 
 
 class Gains(NamedTuple):
@@ -62,14 +42,14 @@ def suggest(joints: Sequence[Joint], dt: float) -> list[Gains]:
         alike = [i for i, other in enumerate(joints) if family(other.name) == family(joint.name)]
         kp, most_kp = max(wanted[i] for i in alike), min(MOST**2 * most[i] / dt for i in alike)
         cut_kp = min(kp, most_kp)
-        kd, most_kd = DAMPING_TIME * cut_kp, min(MOST * most[i] for i in alike)
+        kd, most_kd = DAMPING_TIME * _round(cut_kp), min(MOST * most[i] for i in alike)
         gains.append(Gains(_round(cut_kp), _round(min(kd, most_kd)), kp > most_kp or kd > most_kd))
     return gains
 
 
 def family(name: str) -> str:
-    """A joint's name without its side: "hip_joint" of "FR_hip_joint"; the whole name, if nothing else is left."""
-    return "_".join(part for part in name.split("_") if part.lower() not in _SIDES) or name
+    """A joint's name without its side and the word joint: "hip" of "FR_hip_joint"; the whole name, if nothing is left."""
+    return "_".join(part for part in name.split("_") if part.lower() not in _NO_KIND) or name
 
 
 def _wanted(joint: Joint) -> float:

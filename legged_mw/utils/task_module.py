@@ -1,4 +1,4 @@
-"""Importing a task's file: its neighbours by their names, ``configs`` as one package, and nothing left behind on ``sys.path``."""
+"""Importing a task's file: its neighbours by their names, ``configs`` as one package; ``sys.path`` is as it was before."""
 
 from __future__ import annotations
 
@@ -36,23 +36,28 @@ def import_task(path: Path) -> ModuleType:
 
 @contextmanager
 def _neighbours(folder: Path) -> Iterator[None]:
-    """While a task is loaded, what lies in its ``folder`` can be imported by its bare name, and wins over another task's of that name.
+    """While a task is loaded, what lies in its ``folder`` can be imported by its bare name, and wins over another's of that name.
 
-    Afterwards the path and the names are given back. Libraries and what is imported from the folder already keep theirs.
+    Afterwards the path is given back, and a name that is another's outside of tasks. Else a neighbour keeps its name until the
+    next task wants it, since a config may name a class by its module. Libraries, and what comes from the folder already, stay.
     """
     names = {entry.stem for entry in folder.iterdir() if entry.suffix == ".py" or (entry / "__init__.py").is_file()}
-    strangers = {name for name in names & sys.modules.keys() if _may_be_hidden(name, folder)}
-    hidden = {key: module for name in strangers for key, module in _take_out(name).items()}
+    hidden = {key: it for name in names & sys.modules.keys() if _may_be_hidden(name, folder) for key, it in _take_out(name).items()}
     before = {name.partition(".")[0] for name in sys.modules}
-    sys.modules.update(_neighbours_of.get(folder, {}))
+    mine = _neighbours_of.setdefault(folder, {})
+    sys.modules.update(mine)
     sys.path.insert(0, str(folder))
     importlib.invalidate_caches()  # a file that was written a moment ago
     try:
         yield
     finally:
         sys.path.remove(str(folder))
-        _neighbours_of[folder] = {key: module for name in names - before for key, module in _take_out(name).items()}
-        sys.modules.update(hidden)
+        mine |= {key: it for key, it in sys.modules.items() if key.partition(".")[0] in names - before}
+        of_tasks = {id(it) for modules in _neighbours_of.values() for it in modules.values()}
+        strangers = {key: it for key, it in hidden.items() if id(it) not in of_tasks}
+        for name in {key.partition(".")[0] for key in strangers}:
+            _take_out(name)
+        sys.modules.update(strangers)
 
 
 def _may_be_hidden(name: str, folder: Path) -> bool:

@@ -17,6 +17,7 @@ from legged_mw.view.stage import FloatArray
 GROUPS_SHOWN = 3  # geom groups 0 ground, 1 and 2 visuals; from 3 on collision shapes
 SHADOW_MAX, SHADOW_SIZE = 8.0, 4096  # [extent] half-width of the shadow map, [px] its edge: 4 mm a pixel at the most
 SEVERAL_WITHOUT = ("sensors", "actuators", "equalities", "tendons", "pairs", "excludes")  # each copy of a body would copy them too
+PLAIN = (0.55, 0.57, 0.60, 1.0)  # colour of a link that has no looks
 SPACING = 3.0  # [robot radius] between robots that stand side by side
 
 
@@ -101,10 +102,10 @@ class PosedRobots:
         return self.data.geom_xpos[geom] + rotation @ box[:3], np.abs(rotation) @ box[3:]
 
     def _measure(self) -> tuple[float, float, float]:
-        """Largest distance of the visible geometry of a robot from its base, its height above the base and its depth below it [m]."""
+        """Of what is seen of a robot, and its feet: largest distance from its base, height above it and depth below it [m]."""
         model, radius, top, bottom = self.model, 0.0, 0.0, 0.0
         robot = model.body_rootid[model.geom_bodyid] == model.body_rootid[self.base]
-        for geom in map(int, np.flatnonzero(robot & (model.geom_group < GROUPS_SHOWN))):
+        for geom in {*map(int, np.flatnonzero(robot & (model.geom_group < GROUPS_SHOWN))), *self._feet[0]}:
             centre, half = self._box(geom)
             centre = centre - self.data.xpos[self.base]
             radius = max(radius, float(np.linalg.norm(np.abs(centre) + half)))
@@ -123,6 +124,10 @@ def many_robots(spec: mujoco.MjSpec, single: mujoco.MjModel, count: int) -> tupl
     for kind in ("keys", *(SEVERAL_WITHOUT if count > 1 else ())):
         for element in getattr(spec, kind):
             spec.delete(element)
+    for body in spec.bodies[1:]:
+        if all(shape.group >= GROUPS_SHOWN for shape in body.geoms):  # it has no looks: its collision shapes are better than nothing
+            for shape in body.geoms:
+                shape.group, shape.rgba = GROUPS_SHOWN - 1, PLAIN
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     spec.stat.extent, spec.stat.center, spec.stat.meansize = single.stat.extent, single.stat.center, single.stat.meansize
     spec.copy_during_attach = True

@@ -52,7 +52,8 @@ class StudioPlugin(plugin.ViewerPlugin):
             return
         show_groups(self.viewer.vis_options)
         self._scene = mujoco.MjvScene(event.model, state_payload.MAX_EXTRA_GEOMS)
-        self._camera = RobotCamera(self.viewer.camera, self.robots, by_hand=True)
+        with self.lock:
+            self._camera = RobotCamera(self.viewer.camera, self.robots, by_hand=True)
 
     @messages.handler
     def on_update(self, _: messages.UpdateEvent) -> None:

@@ -1,0 +1,27 @@
+"""A robot of ``legged_mw.deploy`` that keeps what passes through it: shared by the tests of the seam and of the network link."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from legged_mw.deploy.robot import Floats, Measurement, Robot
+
+
+class Recorder(Robot):
+    """Passes on to a robot and keeps what went through."""
+
+    def __init__(self, robot: Robot) -> None:
+        self.robot, self.targets, self.closed = robot, [], 0
+        self.measured: list[Measurement] = []
+
+    def read(self) -> Measurement:
+        self.measured.append(self.robot.read())
+        return self.measured[-1]
+
+    def write(self, targets: Floats) -> None:
+        self.targets.append(np.array(targets))
+        self.robot.write(targets)
+
+    def close(self) -> None:
+        self.closed += 1
+        self.robot.close()
