@@ -1,0 +1,245 @@
+"""resources/robots/go2/go2.xml against the published figures of the machine.
+
+Source of every figure: Unitree's go2_description as published in MuJoCo Menagerie (BSD-3-Clause). They are repeated
+here by hand, leg by leg where legs differ, so that a slip in the MJCF and its defaults cannot hide.
+Units m, kg, kg m^2, rad, N m; quaternions w x y z; inertia = principal moments at the com in the frame of the quaternion.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+XML = Path(__file__).parents[1] / "resources" / "robots" / "go2" / "go2.xml"
+LEGS, LINKS = ("FL", "FR", "RL", "RR"), ("hip", "thigh", "calf")
+LINK_NAMES = [f"{leg}_{link}" for leg in LEGS for link in LINKS]
+TOTAL_MASS = 15.20641
+FOOT_RADIUS, FOOT_POS = 0.022, (-0.002, 0.0, -0.213)
+IMU = (-0.02557, 0.0, 0.04232)
+STANCE = {"hip": (0.1, -0.1), "thigh": (0.8, 1.0), "calf": (-1.5, -1.5)}  # hip: left, right; else front, rear
+
+# mass, com, quaternion of the inertia, principal moments
+_HIP, _THIGH, _CALF = (0.00088403, 0.000596003, 0.000479967), (0.00594973, 0.00584149, 0.000878787), (0.0014901, 0.00146356, 5.31397e-05)
+_THIGH_L = (1.152, (-0.00374, -0.0223, -0.0327), (0.829532869, 0.0847634866, -0.0200631968, 0.551622913), _THIGH)
+_THIGH_R = (1.152, (-0.00374, 0.0223, -0.0327), (0.551622913, -0.0200631968, 0.0847634866, 0.829532869), _THIGH)
+_CALF_L = (
+    0.241352,
+    (0.00629595, -0.000622121, -0.141417),
+    (0.710671705, 0.00154098936, -0.00450086813, 0.703507708),
+    _CALF,
+)
+_CALF_R = (
+    0.241352,
+    (0.00629595, 0.000622121, -0.141417),
+    (0.703507708, -0.00450086813, 0.00154098936, 0.710671705),
+    _CALF,
+)
+INERTIALS = {
+    "base": (
+        6.921,
+        (0.021112, 0.0, -0.005366),
+        (-0.000543471019, 0.713435025, -0.00173769006, 0.700719024),
+        (0.107027, 0.0980771, 0.0244531),
+    ),
+    "FL_hip": (0.678, (-0.0054, 0.00194, -0.000105), (0.497013894, 0.499244893, 0.505461892, 0.498236893), _HIP),
+    "FR_hip": (0.678, (-0.0054, -0.00194, -0.000105), (0.498236893, 0.505461892, 0.499244893, 0.497013894), _HIP),
+    "RL_hip": (0.678, (0.0054, 0.00194, -0.000105), (0.505461892, 0.498236893, 0.497013894, 0.499244893), _HIP),
+    "RR_hip": (0.678, (0.0054, -0.00194, -0.000105), (0.499244893, 0.497013894, 0.498236893, 0.505461892), _HIP),
+    "FL_thigh": _THIGH_L,
+    "FR_thigh": _THIGH_R,
+    "RL_thigh": _THIGH_L,
+    "RR_thigh": _THIGH_R,
+    "FL_calf": _CALF_L,
+    "FR_calf": _CALF_R,
+    "RL_calf": _CALF_L,
+    "RR_calf": _CALF_R,
+}
+# axis, range in front, range behind, force limit
+JOINTS = {
+    "hip": ((1, 0, 0), (-1.0472, 1.0472), (-1.0472, 1.0472), 23.7),
+    "thigh": ((0, 1, 0), (-1.5708, 3.4907), (-0.5236, 4.5379), 23.7),
+    "calf": ((0, 1, 0), (-2.7227, -0.83776), (-2.7227, -0.83776), 45.43),
+}
+_ONE, _Y, _X = (1.0, 0.0, 0.0, 0.0), (0.707107, 0.707107, 0.0, 0.0), (0.707107, 0.0, 0.707107, 0.0)
+
+
+def shapes(body: str) -> list[tuple[str, tuple, tuple, tuple]]:
+    """Type, size, pos, quat of what collides, in the order of the file."""
+    if body == "base":
+        return [
+            ("box", (0.1881, 0.04675, 0.057), (0.0, 0.0, 0.0), _ONE),
+            ("cylinder", (0.05, 0.045), (0.285, 0.0, 0.01), _ONE),
+            ("sphere", (0.047,), (0.293, 0.0, -0.06), _ONE),
+        ]
+    leg, link = body.split("_")
+    if link == "hip":
+        return [("cylinder", (0.046, 0.02), (0.0, 0.08 if leg[1] == "L" else -0.08, 0.0), _Y)]
+    if link == "thigh":
+        return [("box", (0.1065, 0.01225, 0.017), (0.0, 0.0, -0.1065), _X)]
+    upper = ("cylinder", (0.013, 0.06), (0.01, 0.0, -0.06), (0.995004, 0.0, -0.0998334, 0.0))
+    if leg == "FL":  # published so, unlike the other three
+        upper = ("cylinder", (0.012, 0.06), (0.008, 0.0, -0.06), (0.994493, 0.0, -0.104807, 0.0))
+    lower = ("cylinder", (0.011, 0.0325), (0.02, 0.0, -0.148), (0.999688, 0.0, 0.0249974, 0.0))
+    return [upper, lower, ("sphere", (FOOT_RADIUS,), FOOT_POS, _ONE)]
+
+
+def rotation(quat: np.ndarray | tuple) -> np.ndarray:
+    q, matrix = np.array(quat, float), np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, q / np.linalg.norm(q))
+    return matrix.reshape(3, 3)
+
+
+def tensor(quat: np.ndarray | tuple, moments: np.ndarray | tuple) -> np.ndarray:
+    """Inertia (3, 3) at the com, in the axes of the body."""
+    r = rotation(quat)
+    return r @ np.diag(moments) @ r.T
+
+
+def compiled_tensor(model: mujoco.MjModel, body: str) -> np.ndarray:
+    return tensor(model.body(body).iquat, model.body(body).inertia)
+
+
+@pytest.fixture(scope="module")
+def model() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_path(str(XML))
+
+
+def test_it_states_facts_only(model: mujoco.MjModel) -> None:
+    """Servos, sensors, ground, lights, cameras and the pose to stand in are the choices of whoever loads it."""
+    assert (model.nu, model.nsensor, model.nlight, model.ncam, model.neq, model.nexclude, model.nkey) == (0,) * 7
+    assert not np.any(model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    assert (model.nq, model.nv) == (19, 18)
+    text = XML.read_text()
+    for word in ("file=", "<option", "<include", "<actuator", "<sensor"):
+        assert word not in text
+
+
+def test_order_and_frames(model: mujoco.MjModel) -> None:
+    """Bodies and joints as published: left before right, unlike the motors' order."""
+    assert [model.body(i).name for i in range(model.nbody)] == ["world", "base", *LINK_NAMES]
+    assert [model.joint(i).name for i in range(1, model.njnt)] == [f"{name}_joint" for name in LINK_NAMES]
+    np.testing.assert_array_equal(model.body("base").pos, (0.0, 0.0, 0.445))
+    for leg in LEGS:
+        x, y = 1 if leg[0] == "F" else -1, 1 if leg[1] == "L" else -1
+        frames = {
+            "hip": ("base", (x * 0.1934, y * 0.0465, 0.0)),
+            "thigh": ("hip", (0.0, y * 0.0955, 0.0)),
+            "calf": ("thigh", (0.0, 0.0, -0.213)),
+        }
+        for link, (parent, pos) in frames.items():
+            body = model.body(f"{leg}_{link}")
+            assert model.body(body.parentid[0]).name == (parent if parent == "base" else f"{leg}_{parent}")
+            np.testing.assert_array_equal(body.pos, pos)
+    np.testing.assert_array_equal(model.body_quat, np.tile(_ONE, (model.nbody, 1)))
+    np.testing.assert_array_equal(model.jnt_pos, 0.0)
+
+
+def test_masses(model: mujoco.MjModel) -> None:
+    assert model.body_mass.sum() == pytest.approx(TOTAL_MASS, abs=5e-6)
+    for name, (mass, com, quat, moments) in INERTIALS.items():
+        assert model.body(name).mass[0] == mass
+        np.testing.assert_array_equal(model.body(name).ipos, com)
+        expected = tensor(quat, moments)
+        np.testing.assert_allclose(compiled_tensor(model, name), expected, rtol=0, atol=1e-9 * np.trace(expected), err_msg=name)
+
+
+@pytest.mark.parametrize("name", LINK_NAMES)
+def test_joint(model: mujoco.MjModel, name: str) -> None:
+    axis, front, rear, force = JOINTS[name.split("_")[1]]
+    joint = model.joint(f"{name}_joint")
+    assert model.body(joint.bodyid[0]).name == name and joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE
+    np.testing.assert_array_equal(joint.axis, axis)
+    assert joint.limited[0] == 1 and model.jnt_actfrclimited[joint.id] == 1
+    np.testing.assert_array_equal(joint.range, front if name[0] == "F" else rear)
+    np.testing.assert_array_equal(model.jnt_actfrcrange[joint.id], (-force, force))
+    assert (joint.armature[0], joint.damping[0], joint.frictionloss[0], joint.stiffness[0]) == (0.01, 2.0, 0.2, 0.0)
+
+
+def test_the_free_joint_is_free(model: mujoco.MjModel) -> None:
+    """The defaults of the hinges must not leak into it."""
+    for values in (model.dof_armature, model.dof_damping, model.dof_frictionloss):
+        np.testing.assert_array_equal(values[:6], 0.0)
+    assert model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE and model.jnt_limited[0] == model.jnt_actfrclimited[0] == 0
+
+
+def test_what_collides(model: mujoco.MjModel) -> None:
+    assert np.count_nonzero(model.geom_contype) == sum(len(shapes(body)) for body in INERTIALS) == 23
+    for body in INERTIALS:
+        geoms = [model.geom(i) for i in range(model.ngeom) if model.geom_bodyid[i] == model.body(body).id and model.geom_contype[i]]
+        for geom, (kind, size, pos, quat) in zip(geoms, shapes(body), strict=True):
+            assert geom.name and geom.group[0] == 3 and (geom.contype[0], geom.conaffinity[0]) == (1, 1)
+            assert geom.type[0] == getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
+            np.testing.assert_array_equal(geom.size[: len(size)], size)
+            np.testing.assert_allclose(geom.pos, pos, rtol=0, atol=1e-12)
+            np.testing.assert_allclose(rotation(geom.quat), rotation(quat), rtol=0, atol=1e-12)
+
+
+def test_feet_and_sites(model: mujoco.MjModel) -> None:
+    assert {model.site(i).name for i in range(model.nsite)} == {*LEGS, "imu"}
+    for leg in LEGS:
+        for point in (model.geom(leg), model.site(leg)):
+            assert model.body(point.bodyid[0]).name == f"{leg}_calf"
+            np.testing.assert_array_equal(point.pos, FOOT_POS)
+    assert model.body(model.site("imu").bodyid[0]).name == "base"
+    np.testing.assert_array_equal(model.site("imu").pos, IMU)
+    np.testing.assert_array_equal(model.site_quat, np.tile(_ONE, (model.nsite, 1)))
+
+
+@pytest.mark.parametrize("pair", [("FL", "FR"), ("RL", "RR")])
+def test_legs_are_mirror_images(model: mujoco.MjModel, pair: tuple[str, str]) -> None:
+    """Across the plane y = 0, all links; only the upper calf cylinder of the front left leg differs, which weighs nothing by itself."""
+    mirror = np.diag([1.0, -1.0, 1.0])
+    for link in LINKS:
+        left, right = (f"{leg}_{link}" for leg in pair)
+        assert model.body(right).mass == model.body(left).mass
+        np.testing.assert_array_equal(mirror @ model.body(right).ipos, model.body(left).ipos)
+        expected = mirror @ compiled_tensor(model, right) @ mirror
+        np.testing.assert_allclose(compiled_tensor(model, left), expected, rtol=0, atol=1e-9)
+
+
+def test_visual_geoms_weigh_nothing_and_touch_nothing(model: mujoco.MjModel) -> None:
+    spec = mujoco.MjSpec.from_file(str(XML))
+    visual = [g for g in spec.geoms if g.group == 2]
+    assert {g.parent.name for g in visual} == set(INERTIALS), "every body is to be seen"
+    for geom in visual:
+        assert geom.mass == 0.0 and (geom.contype, geom.conaffinity) == (0, 0)
+        assert geom.material, "a colour by name, not by chance"
+    spec.compiler.discardvisual = True
+    bare = spec.compile()
+    assert (bare.ngeom, bare.nmesh, bare.nmat) == (23, 0, 0)
+    for field in ("body_mass", "body_ipos", "body_iquat", "body_inertia", "body_invweight0", "dof_invweight0", "site_pos"):
+        np.testing.assert_array_equal(getattr(bare, field), getattr(model, field), err_msg=field)
+
+
+def test_an_exported_scene_stays_small() -> None:
+    """A built-in mesh is written out vertex by vertex: few and coarse ones only."""
+    spec = mujoco.MjSpec.from_file(str(XML))
+    spec.compile()
+    assert len(spec.to_xml()) < 45_000
+
+
+def test_it_looks_the_same_from_left_and_right(model: mujoco.MjModel) -> None:
+    """Every visible geom has a mirror image of the same material: compared by bounding boxes in a stance."""
+    data = mujoco.MjData(model)
+    for name in LINK_NAMES:
+        leg, link = name.split("_")
+        data.joint(f"{name}_joint").qpos = STANCE[link][leg[1] == "R" if link == "hip" else leg[0] == "R"]
+    mujoco.mj_kinematics(model, data)
+    boxes = []
+    for i in np.flatnonzero(model.geom_group == 2):
+        if (mesh := model.geom_dataid[i]) >= 0:
+            start, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
+            points = model.mesh_vert[start : start + count]
+        else:
+            center, half = model.geom_aabb[i, :3], model.geom_aabb[i, 3:]
+            points = center + half * np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
+        world = data.geom_xpos[i] + points @ data.geom_xmat[i].reshape(3, 3).T
+        boxes.append([model.geom_matid[i], *world.min(0), *world.max(0)])
+    boxes = np.array(boxes)
+    mirrored = boxes.copy()
+    mirrored[:, 2], mirrored[:, 5] = -boxes[:, 5], -boxes[:, 2]
+    # 0.2 mm: the facets of a round shape need not be mirrored
+    assert np.abs(boxes[:, None] - mirrored[None]).max(-1).min(1).max() < 2e-4
