@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import NamedTuple
 
@@ -9,6 +10,8 @@ import torch
 from torch import Tensor
 
 CURRICULA = ("terrain_level", "command_share")  # what such statistics begin with
+
+_OF_EPISODES = {"reward": ("Mean reward", ".2f"), "episode_length": ("Mean episode length", ".1f")}
 
 Mark = torch.cuda.Event | float
 
@@ -74,17 +77,15 @@ def console_block(title: str, rows: dict[str, str]) -> str:
 
 
 def console_rows(numbers: dict[str, float], losses: dict[str, float], speed: float, collect: float, learn: float) -> dict[str, str]:
-    """What an iteration shows of its numbers: name -> text."""
+    """What an iteration shows of its numbers: name -> text. A mean over episodes is left out until one has ended."""
+    means = {name: value for name, value in numbers.items() if not math.isnan(value)}
     return {
         "Computation": f"{speed:.0f} steps/s (collection {collect:.3f} s, learning {learn:.3f} s)",
         **{f"{name.capitalize()} loss": f"{value:.4f}" for name, value in losses.items()},
         "Learning rate": f"{numbers['learning_rate']:.1e}",
         "Action std": f"{numbers['action_std']:.2f}",
-        "Mean reward": f"{numbers['reward']:.2f}",
-        "Mean episode length": f"{numbers['episode_length']:.1f}",
-        **{name: f"{value:.4f}" for name, value in numbers.items() if name.startswith("rew_")},
-        **{
-            name.replace("_", " ").replace("/", ", ").capitalize(): f"{numbers[name]:.2f}" for name in numbers if name.startswith(CURRICULA)
-        },
+        **{text: f"{means[name]:{form}}" for name, (text, form) in _OF_EPISODES.items() if name in means},
+        **{name: f"{value:.4f}" for name, value in means.items() if name.startswith("rew_")},
+        **{name.replace("_", " ").replace("/", ", ").capitalize(): f"{means[name]:.2f}" for name in means if name.startswith(CURRICULA)},
         "Episodes ended": f"{numbers['episodes']:.0f} ({numbers['fell']:.0f} falls, {numbers['broken']:.0f} not finite)",
     }
