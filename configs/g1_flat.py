@@ -45,6 +45,9 @@ class G1FlatCfg(BipedCfg):
     class rewards(BipedCfg.rewards):
         pose_weights = {"": 0.3, "hip_pitch": 0.02, "knee": 0.02, "ankle": 0.05, "hip_roll": 0.5, "hip_yaw": 0.5, "waist": 1.0}
 
+    class exam(BipedCfg.exam):
+        peer = "g1"
+
     class sim(BipedCfg.sim):
         dt, iterations, ls_iterations = 0.005, 3, 10  # [s]
 

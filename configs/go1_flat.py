@@ -56,7 +56,7 @@ class Go1FlatCfg(LeggedRobotCfg):
         push_vx = 0.8  # [m/s]
         transport_vx = 1.0  # [m/s]
         marks = [0.06, 0.06, 0.12]  # [m/s, m/s, rad/s]
-        peer = "playground_go1"
+        peer = "go1"
 
 
 class Go1FlatCfgPPO(LeggedRobotCfgPPO):

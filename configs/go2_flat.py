@@ -25,7 +25,7 @@ class Go2FlatCfg(SimToRealCfg):
         action_scale = 0.25  # [rad] [U]
 
     class normalization(SimToRealCfg.normalization):
-        clip_actions = 5.0  # [ours: 25 N m from the default pose, what the motors have]
+        clip_actions = 5.0  # [ours: 25 N m, what the motors have]
 
     class commands(SimToRealCfg.commands):
         class ranges(SimToRealCfg.commands.ranges):
@@ -33,6 +33,9 @@ class Go2FlatCfg(SimToRealCfg):
 
     class rewards(SimToRealCfg.rewards):
         pose_weights = {"hip": 1.0, "thigh": 1.0, "calf": 0.1}  # [P]
+
+    class exam(SimToRealCfg.exam):
+        peer = "go2"
 
 
 TASK = Task(LeggedRobot, Go2FlatCfg, SimToRealCfgPPO)

@@ -28,7 +28,7 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl import export as exporting
 from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, export
 from legged_mw.rl.export_replay import overridden, own_ends
-from legged_mw.rl.export_scene import differences, shorten_looks, standalone
+from legged_mw.rl.export_scene import differences, standalone
 from legged_mw.rl.policies import save_policy
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import load_yaml
@@ -96,6 +96,7 @@ def test_scene_is_the_machine_that_was_trained(made: Path) -> None:
     trained_model = make_env(1).robot.physics
     scene = mujoco.MjModel.from_xml_path(str(made / "scene.xml"))
     assert differences(trained_model, scene) == []
+    assert (made / "scene.xml").stat().st_size < 60_000, "meshes that MuJoCo builds are a line each"
     ends = []
     for model in (trained_model, scene):
         data = mujoco.MjData(model)
@@ -138,28 +139,6 @@ def test_meshes_from_files_are_written_out(tmp_path: Path) -> None:
     for name in ("geom_pos", "geom_quat", "geom_size"):
         index = model.geom("trunk_box").id, whole.geom("trunk_box").id
         np.testing.assert_allclose(getattr(model, name)[index[0]], getattr(whole, name)[index[1]], atol=1e-5)
-
-
-def test_convex_looks_are_written_as_corners_alone() -> None:
-    """A ball that is only looked at loses its faces and keeps its shape; a bowl and a solid ball are written as they are."""
-    env = make_env(1)
-    spec = env.robot.spec.copy()
-    spec.add_mesh(name="bowl").make_supertorus(resolution=8, radius=0.4, s=1.0, t=1.0)
-    spec.add_mesh(name="ball").make_supersphere(resolution=12, e=1.0, n=1.0)
-    spec.add_mesh(name="solid").make_supersphere(resolution=12, e=1.0, n=1.0)
-    for mesh, touch in (("bowl", 0), ("ball", 0), ("solid", 1)):
-        spec.body("trunk").add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname=mesh, contype=touch, conaffinity=touch, mass=0, group=2)
-    long = spec.copy().to_xml()
-    before = spec.copy().compile()
-    shorten_looks(spec)
-    after = spec.compile()
-    kept = {mesh.name: len(mesh.userface) > 0 for mesh in spec.meshes}
-    assert (kept["bowl"], kept["ball"], kept["solid"]) == (True, False, True)
-    assert len(spec.to_xml()) < 0.65 * len(long)
-    for name in ("ball", "drum"):
-        here, there = (model.mesh_vert[model.mesh(name).vertadr[0] :][: model.mesh(name).vertnum[0]] for model in (before, after))
-        np.testing.assert_allclose(np.ptp(here, axis=0), np.ptp(there, axis=0), rtol=0, atol=1e-3 * np.ptp(here))
-    assert differences(before, after) == []
 
 
 def test_the_export_is_replaced_whole_or_not_at_all(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -313,6 +313,32 @@ def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
     assert 'effort = {"": 30.0}  # [N m] LOOK: the file has no force limit for all joints' in config_text(draft(free), free, "free")
 
 
+FEET = {
+    "a1_style": ["FR_foot", "FL_foot", "RR_foot", "RL_foot"],
+    "anymal_c_style": ["LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT"],
+    "g1_12dof_style": ["left_ankle_roll_link", "right_ankle_roll_link"],
+    "g1_29dof_style": ["left_ankle_roll_link", "right_ankle_roll_link"],
+    "go2_style": ["FL", "FR", "RL", "RR"],
+    "t1_style": ["left_foot_link", "right_foot_link"],
+}
+
+
+@pytest.mark.parametrize("file", DATA, ids=lambda file: file.stem)
+def test_feet_and_poses_of_vendors_files(file: Path) -> None:
+    """Feet by the bodies' names; soles level; a quadruped stands on its servos, a biped over its feet."""
+    found = draft(file)
+    assert [foot.name for foot in found.feet] == FEET[file.stem]
+    health = health_of(found, file)
+    assert health.margin > 0.05 and not health.rest.toppled and health.mode.growth < 1.0 + 1e-6
+    assert health.stand.end == ("stands" if len(found.feet) == 4 else "falls")
+    angle = dict(zip(found.case.robot.joint_names, found.case.pose, strict=True))
+    if file.stem.startswith("anymal"):  # its hind legs are its front legs, turned round
+        assert angle["LF_HFE"] == pytest.approx(-angle["LH_HFE"]) and angle["LF_KFE"] == -angle["LH_KFE"] == -1.6
+    if file.stem.startswith("g1"):
+        assert angle["left_knee_joint"] == 0.6
+        assert sum(angle[f"left_{part}_joint"] for part in ("hip_pitch", "knee", "ankle_pitch")) == pytest.approx(0.0, abs=1e-6)
+
+
 def test_a_file_without_feet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "wheel.xml"
     file.write_text(WHEEL.format(half=0.2, offset=0.0, more=""))

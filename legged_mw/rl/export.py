@@ -49,6 +49,7 @@ from legged_mw.sim.model import ModelError, RobotModel, per_joint
 from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import shown
+from legged_mw.utils.files import find_file
 from legged_mw.utils.task import LoadedTask
 
 MODEL_FILE = "model.pt"
@@ -238,7 +239,8 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
     """The contract of the network in ``folder``, trained with the noise level ``noise``; writes the scene there."""
     cfg, robot, scale = task.cfg, env.robot, task.cfg.control.action_scale
     start = [*env.start_place, 1.0, 0.0, 0.0, 0.0, *robot.pose]
-    scene = standalone(robot, robot.imu, qpos=start, ctrl=robot.pose, camera=cfg.viewer.camera)
+    source = find_file(cfg, "asset.file").read_text(encoding="utf-8", errors="replace")
+    scene = standalone(robot, robot.imu, qpos=start, ctrl=robot.pose, camera=cfg.viewer.camera, source=source)
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
     ends = _ends(env)
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))

@@ -1,6 +1,6 @@
 """A robot with its ground, servos and named sensors as one MJCF text that needs no other file. Host only; nothing is stepped.
 
-Sensors and a keyframe are added here, meshes are written out; what is stepped stays the same, which is checked.
+Sensors and a keyframe are added here, meshes from files are written out; what is stepped stays the same, which is checked.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from legged_mw.rl.built_in import shorten
 from legged_mw.sim.drawing import dressed
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND, MOST_BOXES, Box, add_ground_box, as_boxes, feel_all_ground
@@ -23,7 +24,6 @@ from legged_mw.sim.terrain import Terrain
 AROUND = 1000.0  # [m] of level ground around tiles of steps, more than a robot walks
 HOME = "home"  # the keyframe: the pose to start in, and the servos holding it
 TOLERANCE = 1e-5  # relative, absolute below 1: MuJoCo writes MJCF with six digits
-LOOK_DIGITS = 3  # of the size of a mesh: a fifth of a millimetre on a Go1's trunk
 _OPTION = (
     *("timestep", "integrator", "cone", "solver", "iterations", "ls_iterations", "tolerance"),
     *("disableflags", "enableflags", "gravity", "impratio"),
@@ -49,9 +49,12 @@ class Scene:
     sensors: dict[str, list[str]]  # quantity -> names of the sensors whose values, side by side, are it
 
 
-def standalone(robot: RobotModel, imu: str, qpos: Sequence[float], ctrl: Sequence[float], camera: Sequence[float] = ()) -> Scene:
+def standalone(
+    robot: RobotModel, imu: str, qpos: Sequence[float], ctrl: Sequence[float], camera: Sequence[float] = (), source: str = ""
+) -> Scene:
     """``robot`` as MJCF text, with a sensor for each quantity that a controller may read and ``qpos``, ``ctrl`` as keyframe "home".
 
+    ``source``: text of the file that it was read from, which tells a mesh that MuJoCo builds from one that must be written out.
     Raises ModelError if the text cannot be made, or is another machine than the one that was trained.
     """
     spec = dressed(robot, camera)
@@ -67,9 +70,8 @@ def standalone(robot: RobotModel, imu: str, qpos: Sequence[float], ctrl: Sequenc
     spec.add_key(name=HOME, qpos=list(qpos), ctrl=list(ctrl))
     try:
         _write_out_files(spec)
-        shorten_looks(spec)
         spec.compile()
-        xml = spec.to_xml()
+        xml = shorten(spec.to_xml(), source)
         model = mujoco.MjModel.from_xml_string(xml)
     except ValueError as error:
         raise ModelError(f"the robot cannot be written as one MJCF: {' '.join(str(error).split())}") from None
@@ -111,7 +113,7 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
     for key in spec.keys:
         key.qpos = [*start, *list(key.qpos)[3:]]
     spec.compile()
-    return spec.to_xml()
+    return shorten(spec.to_xml(), xml)
 
 
 def _add_sensors(spec: mujoco.MjSpec, joints: Sequence[str], imu: str) -> dict[str, list[str]]:
@@ -158,37 +160,6 @@ def _write_out_files(spec: mujoco.MjSpec) -> None:
             mesh.file, mesh.scale, mesh.refpos, mesh.refquat = "", [1, 1, 1], [0, 0, 0], [1, 0, 0, 0]
             mesh.uservert, mesh.userface = places.ravel(), model.mesh_face[faces].ravel()
     spec.meshdir = spec.texturedir = ""
-
-
-def shorten_looks(spec: mujoco.MjSpec) -> None:
-    """Convex meshes that are only looked at keep their corners, to ``LOOK_DIGITS``, and no faces: MuJoCo spans those itself.
-
-    Built-in shapes come out of the spec as corners and faces, which would be nine tenths of the text.
-    """
-    solid = {
-        geom.meshname for geom in spec.geoms if geom.contype or geom.conaffinity or not (geom.mass == 0 or geom.parent.explicitinertial)
-    }
-    for mesh in spec.meshes:
-        corners, faces = np.array(mesh.uservert).reshape(-1, 3), np.array(mesh.userface, dtype=int).reshape(-1, 3)
-        if mesh.name in solid or len(mesh.usertexcoord) or len(mesh.usernormal) or not _convex(corners, faces):
-            continue
-        unit = 10.0 ** np.ceil(np.log10(np.abs(corners).max()))
-        mesh.uservert = (np.unique(np.round(corners / unit, LOOK_DIGITS), axis=0) * unit).round(9).ravel() + 0.0  # + 0: no "-0"
-        mesh.userface = []
-
-
-def _convex(corners: np.ndarray, faces: np.ndarray) -> bool:
-    """Whether no corner lies outside of any face, and the whole is not flat; too many of them count as not convex."""
-    if not len(faces) or len(corners) * len(faces) > 1e7:
-        return False
-    a, b, c = (corners[faces[:, i]] for i in range(3))
-    normals = np.cross(b - a, c - a)
-    area = np.linalg.norm(normals, axis=1)
-    slack = 10.0**-LOOK_DIGITS * np.abs(corners).max()
-    faced = area > slack**2
-    normals = normals[faced] / area[faced, None]
-    outside = corners @ normals.T - np.einsum("ij,ij->i", a[faced], normals)  # (corners, faces)
-    return bool(faced.any() and outside.max() < slack and outside.min(0).max() < -slack)
 
 
 def differences(trained: mujoco.MjModel, model: mujoco.MjModel) -> list[str]:

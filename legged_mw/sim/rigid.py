@@ -71,7 +71,7 @@ def fuse_fixed(spec: mujoco.MjSpec, notes: list[str]) -> None:
         while carrier.name != "world" and not carrier.joints:
             carrier = carrier.parent
         if carrier.name != body.name:
-            fixed.setdefault(carrier.name, []).append(body.name)
+            fixed.setdefault(carrier.name, []).append(body.name or "one without a name")
     if not fixed:
         return
     spec.fuse_static()

@@ -1,0 +1,13 @@
+"""go2_rough with eyes: the policy sees the height of the ground on a grid around it, with noise."""
+
+from configs.go2_rough import Go2RoughCfg, Go2RoughCfgPPO
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.utils.task import Task
+
+
+class Go2RoughScanCfg(Go2RoughCfg):
+    class terrain(Go2RoughCfg.terrain):
+        height_scan = ["state", "privileged_state"]
+
+
+TASK = Task(LeggedRobot, Go2RoughScanCfg, Go2RoughCfgPPO)
