@@ -129,6 +129,7 @@ SAID = {
         "geom of 'base_link' without a name is called 'base_link_1'",
         "option impratio: 100 -> 1",
         "option cone: elliptic -> pyramidal",
+        "option disableflags: none -> eulerdamp",
         "actuator 'FR_hip' replaced by a position servo",
     ],
     "g1_29dof_style": [
