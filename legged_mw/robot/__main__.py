@@ -14,9 +14,7 @@ from legged_mw.robot.measure import Health, measure
 from legged_mw.robot.page import page
 from legged_mw.utils.cli import Parser, command, one_line_errors
 from legged_mw.utils.errors import UserError, shown
-from legged_mw.utils.task import LoadedTask, load_task
-
-ROBOT_FILES = (".xml", ".mjcf", ".urdf")
+from legged_mw.utils.task import ROBOT_FILES, LoadedTask, load_task
 
 
 def parse() -> argparse.Namespace:
