@@ -88,7 +88,7 @@ def measure(runner: Runner, iterations: int, rounds: int, eager: bool) -> Times:
             obs = result[0]
             returns = seconds(lambda: alg.compute_returns(obs), device)  # noqa: B023 (called at once)
         parts["step"].append(step)
-        with runner.update_threads():
+        with runner.update_threads:
             parts["update"].append(returns + seconds(alg.update, device))
     bare = physics_only(env, eager)
     physics = statistics.median(seconds(bare, device, steps) * steps for _ in range(rounds))

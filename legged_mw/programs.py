@@ -57,16 +57,16 @@ def play() -> None:
         return
     task, commands = playing.prepare(source, trained, args)
     if args.export:
-        print(export(trained, source.checkpoint, Path(args.export)))
+        print(export(trained, source.checkpoint, Path(args.export), args.half))
     else:
         playing.watch(source, task, commands, args)
 
 
-def export(task: LoadedTask, checkpoint: Path, folder: Path) -> str:
+def export(task: LoadedTask, checkpoint: Path, folder: Path, half: bool = False) -> str:
     """Export a policy with the config that it was trained with; returns what was written, in words."""
     from legged_mw.rl.export import export  # onnx takes a while to import
 
-    return export(task, checkpoint, folder).text(folder)
+    return export(task, checkpoint, folder, half).text(folder)
 
 
 def deploy() -> None:

@@ -722,6 +722,20 @@ def test_a_command_is_written_where_the_policy_sees_it_also_in_a_group_of_a_grou
     assert np.allclose(seen[1]["state"][:, older], wanted)  # its history is of what the policy saw
 
 
+def test_a_gait_clock_runs_or_rests_by_the_command_that_is_seen_with_it() -> None:
+    settings = {**QUIET, "gait.period": 0.8, "gait.offsets": [0.0, 0.5, 0.5, 0.0], "gait.random_start": False}
+    env = make_env(2, settings)
+    seen: list[Any] = []
+    stage = EnvStage(env, lambda obs: seen.append(obs["state"].clone()) or env.actions * 0.0)
+    clock = env.observations.newest("state", "gait_clock")
+    walk_and_stand = np.array([[0.5, 0.0, 0.0], [0.0, 0.0, 0.0]])
+    for commands in (0.0 * walk_and_stand, walk_and_stand, 0.0 * walk_and_stand):
+        stage.step(commands)
+    starts = [0.0] * 4 + [1.0, -1.0, -1.0, 1.0]  # sines, then cosines, of phases 0, 0.5, 0.5, 0
+    for at, wanted in enumerate([[0.0] * 8, starts, [0.0] * 8]):
+        assert np.allclose(seen[at][0, clock], wanted, atol=1e-6) and not seen[at][1, clock].any()
+
+
 def test_a_task_without_commands_and_feet_is_a_stage_too() -> None:
     go1 = load_task("go1_flat").cfg
 

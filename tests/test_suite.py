@@ -51,6 +51,7 @@ NOMINAL = {  # the robot as its contract states it
     "domain_rand.enable": False,
     "perturbation.kick": False,
     "perturbation.push": False,
+    "gait.random_start": False,
 }
 
 
@@ -166,7 +167,8 @@ def test_restart_touches_the_masked_worlds_only(env: Any) -> None:
     mask = torch.arange(N) % 3 == 0
     before = snapshot(env)
     env.restart(mask)
-    assert changed(env, before, worlds=~mask) == []
+    of_all = {"env.command_curriculum"}  # counts the episodes of all worlds
+    assert set(changed(env, before, worlds=~mask)) <= of_all
     touched = {"sim.qpos", "sim.qvel", "sim.ctrl", "sim.sensordata", "env._episode", "env._episode_length_buf", "env.base_lin_vel"}
     assert touched <= set(changed(env, before, worlds=mask))
     assert {f"env.obs_buf.{group}" for group in env.obs_buf} <= set(changed(env, before, worlds=mask))

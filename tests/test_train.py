@@ -29,7 +29,7 @@ from tensordict import TensorDict
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl.export import save_onnx
+from legged_mw.rl.network import save_onnx
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.rl.report import console_rows
 from legged_mw.rl.runner import Runner, make_runner, rsl_rl_config

@@ -44,9 +44,9 @@ class LeggedRobot(LeggedRewards, RobotTask):
         self._measure_ground()
         torch.maximum(self.swing_peak, self.foot_height, out=self.swing_peak)
         torch.hypot(self.foot_vel[..., 0], self.foot_vel[..., 1], out=self.foot_speed)
-        self.moving.copy_(self._told_to_move())
+        self.moving.copy_(self.told_to_move())
 
-    def _told_to_move(self) -> Tensor:
+    def told_to_move(self) -> Tensor:
         """(N,) The velocity command is more than to stand."""
         return self.velocity_command.square().sum(dim=1) > self.cfg.rewards.min_command**2
 
@@ -237,7 +237,7 @@ class LeggedRobot(LeggedRewards, RobotTask):
 
     def compute_observations(self) -> None:
         if self.gait:
-            self.gait.observe(self._told_to_move())
+            self.gait.observe(self.told_to_move())
         if self.cfg.terrain.height_scan:
             self._scan_heights()
         super().compute_observations()

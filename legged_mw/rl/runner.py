@@ -52,7 +52,7 @@ class Runner(OnPolicyRunner):
         self._watch = Watch()
         self.examine: Callable[[Any], dict[str, float]] | None = None
         self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
-        self._update_threads = UpdateThreads(self.cfg["cpu"]["update_threads"], usable_cores()) if device == "cpu" else nullcontext()
+        self.update_threads = UpdateThreads(self.cfg["cpu"]["update_threads"], usable_cores()) if device == "cpu" else nullcontext()
         self._warned_overflow = False
         self._last_means: dict[str, float] = {}
 
@@ -95,7 +95,7 @@ class Runner(OnPolicyRunner):
                 self.alg.compute_returns(obs)
             collected = clock.mark()
             self._anneal()
-            with self._update_threads:
+            with self.update_threads:
                 losses = self.alg.update()
             report = self._report(losses, (start, collected, start := clock.mark()))
             if waiting:

@@ -22,8 +22,8 @@ class EnvStage:
     """Robots of a task under `policy`; see `stage.Stage`. `command_table` has the ranges as trained, by default the task's own.
 
     The environment's step may be a recorded graph, so a pilot's changes are written into its buffers between two steps.
-    The policy sees a command in the same step: the observations' row "commands" is written again. That row only, because
-    noise and delays of the others belong to the step.
+    The policy sees a command in the same step: the observations' rows "commands" and "gait_clock" are written again. Those
+    only, because noise and delays of the others belong to the step.
     """
 
     def __init__(self, env: RobotTask, policy: Callable[[TensorDict], Tensor], command_table: Sequence[Command] | None = None) -> None:
@@ -32,7 +32,8 @@ class EnvStage:
         self.command_table = env.command_table if command_table is None else tuple(command_table)
         # a task with a table has a buffer for it, (N, C)
         self._commands: Tensor = env.commands if env.command_table else env.actions[:, :0]
-        self._command_columns = _command_columns(env)
+        self._gait = env.gait if isinstance(env, LeggedRobot) else None
+        self._command_columns, self._clock_columns = _columns_of(env, "commands"), _columns_of(env, "gait_clock")
         geoms = len({geom for geoms in env.foot_geoms.values() for geom in geoms}) if isinstance(env, LeggedRobot) else 0
         self._foot_contacts = env.contact_count[:, :geoms]
         self._obs = env.get_observations()
@@ -44,6 +45,10 @@ class EnvStage:
             self._commands.copy_(torch.as_tensor(commands, dtype=torch.float, device=env.device))
             for group, columns, scales in self._command_columns:
                 env.obs_buf[group][:, columns] = self._commands * scales
+            if self._gait and isinstance(env, LeggedRobot):
+                self._gait.observe(env.told_to_move())
+                for group, columns, scales in self._clock_columns:
+                    env.obs_buf[group][:, columns] = self._gait.row * scales
             self._obs = env.get_observations()
         self._obs, *_ = env.step(self.policy(self._obs))
 
@@ -81,13 +86,13 @@ class EnvStage:
         self._obs = self.env.get_observations()
 
 
-def _command_columns(env: RobotTask) -> list[tuple[str, slice, Tensor]]:
-    """Where the observations hold the newest command, also inside of a group in a group: (group, columns, scales (C,))."""
+def _columns_of(env: RobotTask, wanted: str) -> list[tuple[str, slice, Tensor]]:
+    """Where the observations hold the newest of a row, also inside of a group in a group: (group, columns, scales)."""
     found: list[tuple[str, slice, Tensor]] = []
     for group, rows in env.observations.groups.items():
         for row in rows:
             newest = env.observations.newest(group, row.name)
-            if row.name == "commands":
+            if row.name == wanted:
                 found.append((group, newest, torch.tensor(row.column_scales(), device=env.device)))
             elif row.group:
                 inside = [(columns, scales) for name, columns, scales in found if name == row.group]
