@@ -1,4 +1,4 @@
-"""The programs: legged-mw train, play and deploy. train.py and play.py of a clone are the first two.
+"""The programs: legged-mw train, play, deploy and robot. train.py and play.py of a clone are the first two.
 
 Each imports what it needs when it starts: deploy also runs where torch is not installed.
 """
@@ -77,7 +77,15 @@ def deploy() -> None:
         main()
 
 
-PROGRAMS = {"train": train, "play": play, "deploy": deploy}
+def robot() -> None:
+    """A robot's health page, and a first task for it."""
+    from legged_mw.robot.__main__ import main
+
+    with one_line_errors():
+        main()
+
+
+PROGRAMS = {"train": train, "play": play, "deploy": deploy, "robot": robot}
 
 
 def main() -> None:

@@ -9,14 +9,12 @@ import torch
 
 from legged_mw.robot import new, picture
 from legged_mw.robot.case import Case, from_env, from_task, naming_every_missing_key
-from legged_mw.robot.draft import as_env, draft, has_mirror
+from legged_mw.robot.draft import Draft, as_env, draft, has_mirror
 from legged_mw.robot.measure import Health, measure
 from legged_mw.robot.page import page
-from legged_mw.utils.cli import Parser, one_line_errors
+from legged_mw.utils.cli import Parser, command, one_line_errors
 from legged_mw.utils.errors import UserError, shown
-from legged_mw.utils.task import LoadedTask, load_task
-
-ROBOT_FILES = (".xml", ".mjcf", ".urdf")
+from legged_mw.utils.task import ROBOT_FILES, LoadedTask, load_task
 
 
 def parse() -> argparse.Namespace:
@@ -41,10 +39,10 @@ def main() -> None:
         return
     found = draft(file)
     env = as_env(found, file)
-    print(case_page(from_env(env), file.name, image, found.guessed))
+    print(case_page(from_env(env), file.name, image, found))
     if args.new:
         written = new.write(found, file, args.new, Path(args.out), args.force, has_mirror(env))
-        print(f"written: {' and '.join(map(shown, written))}; next:\n  python train.py --task {shown(written[1])} --check")
+        print(f"written: {' and '.join(map(shown, written))}; next:\n  {command('train')} --task {shown(written[1])} --check")
 
 
 def task_page(task: LoadedTask, image: Path | None) -> str:
@@ -54,10 +52,10 @@ def task_page(task: LoadedTask, image: Path | None) -> str:
     return case_page(case, task.name, image)
 
 
-def case_page(case: Case, title: str, image: Path | None, guessed: list[str] | None = None) -> str:
-    """The page as text; the picture goes to ``image``."""
+def case_page(case: Case, title: str, image: Path | None, found: Draft | None = None) -> str:
+    """The page as text, with what was guessed if the task is a draft; the picture goes to ``image``."""
     health: Health = measure(case.robot, case.pose, case.place, case.speeds, case.decimation)
-    text = page(health, title, guessed or [])
+    text = page(health, title, found.guessed, found.notes) if found else page(health, title)
     if image is None:
         return text
     try:

@@ -39,11 +39,13 @@ class Draft(NamedTuple):
     feet: list[Foot]
     guessed: list[str]  # what nobody said, a line each
     pose: str  # where the default pose is from, in words
+    notes: list[str]  # what was dropped, added or changed in the file as it was read, a line each
 
 
 def draft(file: Path) -> Draft:
     """Guess what a task needs to know of the robot in ``file`` (MJCF or URDF)."""
-    from_file = read_robot(file).keyframe is not None
+    read = read_robot(file)
+    from_file = read.keyframe is not None
     case = from_env(_bare(file, from_file))
     limited = case.robot.physics.jnt_limited[1:] > 0
     low, high = case.robot.joint_range.T
@@ -66,7 +68,7 @@ def draft(file: Path) -> Draft:
     pose = np.round(pose, 4)
     place = [0.0, 0.0, round(height_over(case.robot, pose, feet) + CLEARANCE, 3)]
     case = case._replace(pose=pose.tolist(), place=place, feet={foot.name: foot.geoms for foot in feet})
-    return Draft(case, joints, gains, feet, guessed, how)
+    return Draft(case, joints, gains, feet, guessed, how, read.notes)
 
 
 def _bare(file: Path, keyframe: bool) -> RobotTask:
@@ -102,6 +104,8 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     asset: dict[str, Any] = {"foot_names": [foot.name for foot in found.feet]}
     if parts := {foot.name: list(foot.geoms) for foot in found.feet if not foot.known}:
         asset["foot_geoms"] = parts
+    if said := {name: speed for name, speed in zip(names, found.case.speeds, strict=True) if speed is not None}:
+        asset["joint_speed_limits"] = table([*said.values()], names) if len(said) == len(names) else said
     asset["colliders"] = [name for foot in found.feet for name in ([foot.name] if foot.known else foot.geoms)]
     ranges = {"lin_vel_x": [-0.5, 0.8], "lin_vel_y": [-0.3, 0.3], "ang_vel_yaw": [-0.5, 0.5]}
     if not two:
@@ -122,7 +126,6 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     if two:
         chosen["rewards"] = {**chosen.get("rewards", {}), "scales": {"single_stance": 0.75}}
         chosen["sim"] = {"iterations": 3}
-        chosen["exam"] = {"push_mark": 1.0, "marks_of": "offset"}
     return chosen
 
 
