@@ -23,8 +23,8 @@ pytestmark = pytest.mark.gpu
 DEVICE = "cuda:0"
 
 
-def make_env(eager: bool, **overrides: object) -> LeggedRobot:
-    task = load_task("go1_flat")
+def make_env(eager: bool, task_name: str = "go1_flat", **overrides: object) -> LeggedRobot:
+    task = load_task(task_name)
     task.set("env.num_envs", 64)
     task.set("perturbation.kick", False)
     for path, value in overrides.items():
@@ -74,12 +74,36 @@ ROUGH: dict[str, object] = {
 }
 
 
-@pytest.mark.parametrize("randomized", [{}, RANDOMIZED, ROUGH], ids=["nominal", "randomized", "rough"])
-def test_replay_equals_eager_over_100_steps(randomized: dict[str, object]) -> None:
+BIPED: dict[str, object] = {
+    **{f"rewards__scales__{name}": 0.1 for name in ("base_height", "dof_vel", "hip_pos", "single_stance", "contact_phase", "no_fly")},
+    "rewards__base_height_target": 0.78,
+    "rewards__hip_joints": ["hip_roll", "hip_yaw"],
+    "rewards__torques_as": "squares",
+    "init_state__dof_pos_offset": [-0.1, 0.1],
+    "init_state__dof_vel_range": 0.5,
+    "sim__integrator": "implicitfast",
+    "commands__resampling_time": 0.4,
+}
+
+
+@pytest.mark.parametrize(
+    ("task", "settings"),
+    [
+        ("go1_flat", {}),
+        ("go1_flat", RANDOMIZED),
+        ("go1_flat", ROUGH),
+        ("go2_flat", {}),
+        ("g1_flat", BIPED),
+        ("g1_12dof_flat", {}),
+        ("g1_rough", {}),
+    ],
+    ids=["nominal", "randomized", "rough", "go2", "biped", "held joints", "biped on rough ground"],
+)
+def test_replay_equals_eager_over_100_steps(task: str, settings: dict[str, object]) -> None:
     """Bit for bit, with noise, kicks, falls, time outs and resets: the same random numbers are drawn in both."""
-    actions = torch.randn(100, 64, 12, generator=torch.Generator().manual_seed(0)).to(DEVICE)
-    overrides = {"perturbation__kick": True, "env__episode_length_s": 1.0, "termination__max_tilt": 10.0, **randomized}
-    eager, recorded = (without_constraints(make_env(eager, **overrides)) for eager in (True, False))
+    overrides = {"perturbation__kick": True, "env__episode_length_s": 1.0, "termination__max_tilt": 10.0, **settings}
+    eager, recorded = (without_constraints(make_env(eager, task, **overrides)) for eager in (True, False))
+    actions = torch.randn(100, 64, eager.num_actions, generator=torch.Generator().manual_seed(0)).to(DEVICE)
     expected, got = roll_out(eager, actions), roll_out(recorded, actions)
     assert recorded._graph.recorded and not eager._graph.recorded
     assert any(done.any() for done in expected[3::5])

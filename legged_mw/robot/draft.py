@@ -120,6 +120,7 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         },
         "commands": {"ranges": ranges},
         "termination": {"min_base_height": round(0.5 * height, 2)},
+        "perturbation": {"kick": True, "velocity": [0.0, 4.0 if two else 8.0]},
     }
     if height < LOW:
         chosen["rewards"] = {"swing_height": round(0.3 * height, 2)}

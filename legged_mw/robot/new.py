@@ -38,6 +38,8 @@ _COMMENTS = {
     "ang_vel_yaw": "[rad/s]",
     "min_base_height": "[m] half of the standing height: lower, it fell",
     "swing_height": "[m] of a swinging foot",
+    "kick": "without kicks a push topples it [ours: docs/lab.md]",
+    "velocity": "[m/s]",
     "single_stance": "a biped that steps stands on one foot at a time [Isaac Lab: G1]",
     "iterations": "a biped's soles want more than 1 [ours]",
 }
