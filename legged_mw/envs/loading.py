@@ -20,7 +20,7 @@ def load_robot(
     cfg: RobotTaskCfg, engine: str, terrain: Terrain | None, contact_geoms: Sequence[str], sites: Mapping[str, Sequence[str]]
 ) -> RobotModel:
     """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors."""
-    asset = cfg.asset
+    asset, scale = cfg.asset, cfg.control.action_scale
     if not asset.file:
         raise ConfigError("asset.file is empty; name the robot's MJCF or URDF, e.g. 'resources/robots/go1/go1.xml'")
     robot = build_model(
@@ -36,6 +36,10 @@ def load_robot(
         imu_site=asset.imu_site,
         sites=sites,
         pose=cfg.init_state.default_joint_angles,
+        tables={
+            "control.action_scale": scale if isinstance(scale, Mapping) else {"": scale},
+            "rewards.pose_weights": cfg.rewards.pose_weights,
+        },
         held_joints=asset.held_joints,
         partial={
             "effort": asset.effort,
@@ -58,7 +62,7 @@ def start_place(cfg: RobotTaskCfg, robot: RobotModel, colliders: Sequence[str]) 
     if robot.start:
         return list(robot.start)
     feet = [geom for geoms in robot.site_geoms.values() for geom in geoms]
-    return [0.0, 0.0, standing_height(robot, feet or robot.names.find(colliders, "asset.colliders", colliding=True))]
+    return [0.0, 0.0, standing_height(robot, feet or robot.names.find(colliders, "asset.colliders", colliding=True), robot.pose)]
 
 
 def soft_limits(robot: RobotModel, share: float, device: str | torch.device) -> tuple[Tensor, Tensor]:

@@ -75,7 +75,7 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
     lines = [_HEAD.format(title=name, joints=len(found.joints), legs=legs, file=file.name, name=title).rstrip("\n")]
     sections = values(found)
     sections["asset"] = {"file": f"{name}.xml", **sections["asset"]}
-    comments = {**_COMMENTS, "default_joint_angles": f"[rad] LOOK: {found.pose}"}
+    comments = {**_COMMENTS, "default_joint_angles": f"[rad] LOOK: {found.pose_from}"}
     for section, fields in sections.items():
         lines += [f"    class {section}(LeggedRobotCfg.{section}):"]
         for field, value in fields.items():

@@ -85,7 +85,7 @@ def _row(joint: Joint, gain: Gains, health: Health) -> tuple[str, ...]:
         *(f"{mark}{joint.damping_step(health.dt):.2f}", f"{joint.stiffness_step(health.dt):.2f}"),
         *(f"{joint.damping_ratio():.2f}", f"{joint.sag():.3f}"),
         f"{joint.low:.2f} {joint.high:.2f}" if math.isfinite(joint.low) else "none",
-        *(f"{joint.effort:g}" if math.isfinite(joint.effort) else "none", "?" if joint.speed is None else f"{joint.speed:g}"),
+        *(f"{joint.effort:g}" if math.isfinite(joint.effort) else "none", f"{joint.speed:g}" if math.isfinite(joint.speed) else "?"),
         *(f"{joint.kp:g}", f"{joint.kd:g}", f"{gain.kp:g} {gain.kd:g}{' cut' if gain.cut else ''}"),
     )
 

@@ -56,11 +56,11 @@ class Label(NamedTuple):
     arrows: tuple[tuple[FloatArray, Rgb], ...] = ()  # ends (3,) [m, world]; drawn over the picture, else the robot hides them
 
 
-def draw(path: Path, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]], imu: str, title: str) -> None:
-    """Write the picture to ``path`` (PNG). ``feet``: name -> its geoms; ``imu``: a site, "" for none; ``qpos`` (7 + D,)."""
+def draw(path: Path, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]], title: str) -> None:
+    """Write the picture to ``path`` (PNG). ``feet``: name -> its geoms; ``qpos`` (7 + D,)."""
     if path.suffix.lower() != ".png":
         raise ViewError(f"Cannot write {path.name!r}: the picture of a robot is a .png")
-    scene = _Picture(robot, qpos, feet, imu)
+    scene = _Picture(robot, qpos, feet)
     try:
         save_png(path, np.concatenate([scene.view(*view, title) for view in VIEWS], axis=1))
     finally:
@@ -70,8 +70,8 @@ def draw(path: Path, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Seq
 class _Picture:
     """One robot in its pose, drawn from several sides."""
 
-    def __init__(self, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]], imu: str) -> None:
-        self.robot, self.feet, self.imu = robot, feet, imu
+    def __init__(self, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]]) -> None:
+        self.robot, self.feet = robot, feet
         self.posed = PosedRobots(visual_spec(robot))
         self.posed.pose(qpos)
         self._paint()
@@ -159,15 +159,13 @@ class _Picture:
         return labels
 
     def _draw_imu(self) -> list[Label]:
-        if not self.imu:
-            return []
-        site = self.posed.model.site(self.imu).id
+        site = self.posed.model.site(self.robot.imu).id
         place, axes = self.posed.data.site_xpos[site].copy(), self.posed.data.site_xmat[site].reshape(3, 3)
         length = 0.2 * self.size
         for axis, rgb in zip(axes.T, AXES_RGB, strict=True):
             self._arrow(place, axis, length, (*rgb, 1.0))
         ends = tuple((place + length * axis, rgb) for axis, rgb in zip(axes.T, AXES_RGB, strict=True))
-        return [Label(self.imu, place, (1.0, 1.0, 1.0), ends)]
+        return [Label(self.robot.imu, place, (1.0, 1.0, 1.0), ends)]
 
     def _arrow(self, place: FloatArray, axis: FloatArray, length: float, rgba: Sequence[float]) -> None:
         geom = self._geom(mujoco.mjtGeom.mjGEOM_ARROW, (0.0, 0.0, 0.0), place, rgba)

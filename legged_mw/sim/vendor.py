@@ -196,6 +196,9 @@ def _forget_defaults(spec: mujoco.MjSpec) -> None:
 def _free_root(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
     """One free joint, at the root, that the air does not brake."""
     root = spec.worldbody.first_body()
+    if not root.name:
+        root.name = next(name for name in ("base", "root", "base_0") if spec.body(name) is None)
+        notes.append(f"body without a name, the root, is called '{root.name}'")
     if not root.joints:
         root.add_freejoint()
         notes.append(f"free joint added to '{root.name}'")
