@@ -131,7 +131,7 @@ def walked(task_name: str, num_envs: int, device: str) -> LeggedRobot:
     task.set("perturbation.push", False)
     task.set("terrain.height_scan", [])
     env = task.env_class(task.cfg, device)
-    policy = load_policy(ROOT / "resources/policies/go1_flat/model.pt", env, task.train, device)
+    policy = load_policy(ROOT / "resources/policies/go1_flat/policy.onnx", env, task.train, device)
     obs = env.get_observations()
     for _ in range(100):
         obs, *_ = env.step(act(policy, obs))

@@ -1,4 +1,4 @@
-"""The programs: legged-mw train, play and deploy. train.py and play.py of a clone are the first two.
+"""The programs: legged-mw train, play, deploy and robot. train.py and play.py of a clone are the first two.
 
 Each imports what it needs when it starts: deploy also runs where torch is not installed.
 """
@@ -55,16 +55,16 @@ def play() -> None:
         return
     task, commands = playing.prepare(source, trained, args)
     if args.export:
-        print(export(trained, source.checkpoint, Path(args.export)))
+        print(export(trained, source.checkpoint, Path(args.export), args.half))
     else:
         playing.watch(source, task, commands, args)
 
 
-def export(task: LoadedTask, checkpoint: Path, folder: Path) -> str:
+def export(task: LoadedTask, checkpoint: Path, folder: Path, half: bool = False) -> str:
     """Export a policy with the config that it was trained with; returns what was written, in words."""
     from legged_mw.rl.export import export  # onnx takes a while to import
 
-    return export(task, checkpoint, folder).text(folder)
+    return export(task, checkpoint, folder, half).text(folder)
 
 
 def deploy() -> None:
@@ -75,7 +75,15 @@ def deploy() -> None:
         main()
 
 
-PROGRAMS = {"train": train, "play": play, "deploy": deploy}
+def robot() -> None:
+    """A robot's health page, and a first task for it."""
+    from legged_mw.robot.__main__ import main
+
+    with one_line_errors():
+        main()
+
+
+PROGRAMS = {"train": train, "play": play, "deploy": deploy, "robot": robot}
 
 
 def main() -> None:

@@ -42,7 +42,7 @@ ONLY_IN = {
     ],
     "legged_mw.rl.export": ["legged_mw/rl/export.py", "legged_mw/eval/*", "legged_mw/programs.py"],
     "legged_mw.programs": ["train.py", "play.py"],
-    "onnxruntime": ["legged_mw/deploy/*", "legged_mw/rl/export.py"],
+    "onnxruntime": ["legged_mw/deploy/*", "legged_mw/rl/network.py"],
     "configs": ["configs/*", "examples/*"],
     "train": [],
     "play": [],

@@ -238,7 +238,7 @@ def test_walks_as_in_the_environment(contract: Contract) -> None:
     commands = np.array(rules.ExamRules.from_config(task.cfg).commands())
     task.cfg.env.num_envs = len(commands)
     env = task.env_class(task.cfg, "cpu")
-    policy = load_policy(SHIPPED / "model.pt", env, task.train, "cpu")
+    policy = load_policy(SHIPPED / "policy.onnx", env, task.train, "cpu")
     stage = DeployStage(SHIPPED, len(commands))
     env.reset()
     env.commands[:] = torch.tensor(commands)

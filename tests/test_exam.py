@@ -169,7 +169,7 @@ def test_what_the_common_range_did_not_ask_alike_is_said() -> None:
 def test_the_common_range_in_training_and_in_deploy() -> None:
     """It goes before what the config says of the ranges and speeds; the rest of the section stays."""
     flags = argparse.Namespace(override=[], set=["exam.peer=go2", "exam.push_speeds=[2, 3]"])
-    graded = grading.prepare(Source(SHIPPED, SHIPPED / "model.pt", True), load_task("go1_flat"), flags, common=True)
+    graded = grading.prepare(Source(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags, common=True)
     asked = ExamRules.from_config(graded.task.cfg)
     assert asked.ranges == ((-0.5, 1.0), (-0.4, 0.4), (-1.0, 1.0)) and asked.push_vx == asked.transport_vx == 0.5
     assert asked.push_speeds == (2.0, 3.0) and asked.marks == (0.06, 0.06, 0.12)
@@ -177,8 +177,8 @@ def test_the_common_range_in_training_and_in_deploy() -> None:
     assert contract_rules(contract, common=True) == go2(**in_common("go2")) and contract_rules(contract).push_vx == 0.8
     flags.set = []
     with pytest.raises(ConfigError, match="--ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2"):
-        grading.prepare(Source(SHIPPED, SHIPPED / "model.pt", True), load_task("go1_flat"), flags, common=True)
-    rival = grading.prepare(Source(SHIPPED, SHIPPED / "model.pt", True), load_task("go1_flat"), flags)
+        grading.prepare(Source(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags, common=True)
+    rival = grading.prepare(Source(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags)
     report.ask_alike([graded.task, rival.task])  # a rival is asked what the first one is, whatever it knows of peers
     assert ExamRules.from_config(rival.task.cfg) == asked and rival.task.cfg.env.num_envs == graded.task.cfg.env.num_envs
 

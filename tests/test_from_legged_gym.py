@@ -361,7 +361,9 @@ URDF = """<robot name="mini">
 
 
 def test_a_urdf_is_a_robot(tmp_path: Path) -> None:
-    """As the page says: a free joint, fixed links fused but known by name, effort and velocity read."""
+    """As the page says: no script converts it; a free joint, fixed links fused but known by name, effort and velocity read."""
+    page = PAGE.read_text(encoding="utf-8")
+    assert '`asset.file = "robot.urdf"` works, as the vendor wrote it' in page and "MjSpec" not in page
     (tmp_path / "robot.urdf").write_text(URDF)
     robot = build_model(
         tmp_path / "robot.urdf",

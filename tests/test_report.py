@@ -44,7 +44,7 @@ def both() -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
         task = shipped()
         exam.prepare(task)
         env = task.env_class(task.cfg, "cpu")
-        policy = load_policy(SHIPPED / "model.pt", env, task.train, "cpu")
+        policy = load_policy(SHIPPED / "policy.onnx", env, task.train, "cpu")
         plain = exam.run_exam(env, lambda obs: act(policy, obs))
         report.prepare(task)
         return plain, *report.examine(task.env_class(task.cfg, "cpu"), lambda obs: act(policy, obs))

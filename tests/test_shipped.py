@@ -14,12 +14,13 @@ from legged_mw import ROOT
 from legged_mw.deploy.contract import digest, read_contract
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.eval import exam, rules
-from legged_mw.rl.export import FILES, ExportedPolicy
+from legged_mw.rl.export import FILES
+from legged_mw.rl.network import ExportedPolicy
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import load_task
 
-POLICIES = sorted(path.parent for path in (ROOT / "resources/policies").glob("*/model.pt"))
+POLICIES = sorted(path.parent for path in (ROOT / "resources/policies").glob("*/policy.onnx"))
 
 
 def test_there_are_some() -> None:
@@ -32,7 +33,7 @@ def test_walks_and_both_formats_agree(folder: Path) -> None:
     task.update_from_run(load_yaml(folder / "config.yaml"), where="config.yaml")
     exam.prepare(task)
     env = task.env_class(task.cfg, "cpu")
-    policy = load_policy(folder / "model.pt", env, task.train, "cpu")
+    policy = load_policy(folder / "policy.onnx", env, task.train, "cpu")
 
     obs = torch.randn(32, policy.obs_dim, generator=torch.Generator().manual_seed(0)) * 2.0
     with torch.inference_mode():
@@ -54,5 +55,5 @@ def test_play_takes_the_shipped_policy_where_nothing_is_trained(tmp_path: Path) 
     (tmp_path / "resources").symlink_to(ROOT / "resources")
     result = run("play", tmp_path, "--task", "go1_flat", "--device", "cpu", "--export", str(tmp_path / "out"))
     assert result.code == 0, result.err
-    assert result.out.startswith("shipped policy: ") and "resources/policies/go1_flat/model.pt" in result.out.splitlines()[0]
+    assert result.out.startswith("shipped policy: ") and "resources/policies/go1_flat/policy.onnx" in result.out.splitlines()[0]
     assert (tmp_path / "out/policy.onnx").stat().st_size > 100_000

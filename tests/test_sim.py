@@ -167,6 +167,8 @@ def test_ids_by_name() -> None:
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match="no MJCF at .*/dog.xml"):
         go1(file=tmp_path / "dog.xml")
+    with pytest.raises(ModelError, match="no URDF at .*/dog.urdf"):
+        go1(file=tmp_path / "dog.urdf")
 
 
 @pytest.mark.parametrize(

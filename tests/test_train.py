@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import logging
+import math
 import os
 import re
 import shlex
@@ -28,8 +29,9 @@ from tensordict import TensorDict
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl.export import save_onnx
+from legged_mw.rl.network import save_onnx
 from legged_mw.rl.policies import act, load_policy
+from legged_mw.rl.report import console_rows
 from legged_mw.rl.runner import Runner, make_runner, rsl_rl_config
 from legged_mw.rl.runs import checkpoints, find_checkpoint, find_run, new_run, runs
 from legged_mw.utils.config import ConfigError, load_yaml
@@ -515,3 +517,14 @@ def test_numbers_go_to_their_end_in_a_straight_line(monkeypatch: pytest.MonkeyPa
     runner.learn(5)
     assert [kl for kl, _ in seen] == pytest.approx([0.01, 0.008, 0.006, 0.004, 0.002])
     assert [entropy for _, entropy in seen] == [0.005] * 5
+
+
+def test_before_an_episode_has_ended_its_means_are_dashes() -> None:
+    """They are not known, which is not the same as not finite: a loss that is not finite is shown."""
+    numbers = dict.fromkeys(("learning_rate", "action_std", "episodes", "fell", "broken"), 0.0)
+    unknown = dict.fromkeys(("reward", "episode_length", "rew_pose", "terrain_level"), math.nan)
+    means = ("Mean reward", "Mean episode length", "rew_pose", "Terrain level")
+    rows = console_rows({**numbers, **unknown}, {"value": math.nan}, 9.0, 1.0, 1.0)
+    assert [rows[name] for name in means] == ["-"] * 4 and rows["Value loss"] == "nan"
+    rows = console_rows({**numbers, **dict.fromkeys(unknown, 2.0)}, {}, 9.0, 1.0, 1.0)
+    assert [rows[name] for name in means] == ["2.00", "2.0", "2.0000", "2.00"]

@@ -129,7 +129,8 @@ SAID = {
         "skybox dropped: one without a name",
         "geom of 'base_link' without a name is called 'base_link_1'",
         "option impratio: 100 -> 1",
-        "option cone: 1 -> mjCONE_PYRAMIDAL",
+        "option cone: elliptic -> pyramidal",
+        "option disableflags: none -> eulerdamp",
         "actuator 'FR_hip' replaced by a position servo",
     ],
     "g1_29dof_style": [
@@ -145,7 +146,7 @@ SAID = {
         "site 'imu_in_torso_aligned' made at the place of 'imu_in_torso' on 'torso_link', with the axes of the root 'pelvis'",
     ],
     "g1_12dof_style": [
-        "option integrator: 3 -> mjINT_EULER",
+        "option integrator: implicitfast -> euler",
         "fused into 'pelvis', to which they are fixed: torso_link, left_arm_link, right_arm_link",
         "site 'imu_aligned' made at the place of 'imu' on 'torso_link', with the axes of the root 'pelvis'",
     ],

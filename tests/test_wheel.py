@@ -94,8 +94,17 @@ def test_an_installed_package_deploys_the_shipped_policy_by_name(installed: Path
     assert "0.1 s, 0 falls" in out
 
 
+def test_an_installed_package_drafts_a_task(installed: Path, tmp_path: Path) -> None:
+    out = start(installed, tmp_path, "robot", str(ROOT / "tests/data/go2_style.xml"), "--new", "mine")
+    assert out.endswith("written: mine.xml and mine_flat.py; next:\n  legged-mw train --task mine_flat.py --check\n")
+    assert (tmp_path / "mine.xml").exists() and (tmp_path / "mine_flat.py").exists()
+
+
 def test_without_a_program_the_programs_are_named(tmp_path: Path) -> None:
-    for words, said in (([], "there are: train, play, deploy"), (["trian"], "no program 'trian'; there are: train, play, deploy")):
+    for words, said in (
+        ([], "there are: train, play, deploy, robot"),
+        (["trian"], "no program 'trian'; there are: train, play, deploy, robot"),
+    ):
         command = [sys.executable, "-m", "legged_mw.programs", *words]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
         assert (done.returncode, done.stderr) == (2, f"legged-mw: {said}; e.g. legged-mw train --task go1_flat\n")
@@ -104,4 +113,4 @@ def test_without_a_program_the_programs_are_named(tmp_path: Path) -> None:
 def test_help_names_the_programs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["legged-mw", "--help"])
     programs.main()
-    assert capsys.readouterr().out.startswith("legged-mw train | play | deploy ...; each has --help")
+    assert capsys.readouterr().out.startswith("legged-mw train | play | deploy | robot ...; each has --help")

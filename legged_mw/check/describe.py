@@ -24,10 +24,11 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
     scales = task.cfg.to_dict()["rewards"]["scales"]
     lines += [f"  {name:<20} {scales[name]:g}" for name in env.reward_names]
     lines.append("joints: default, range [rad], force limit [N m]")
+    width = max(map(len, env.robot.joint_names))
     for name, default, (low, high), (_, limit) in zip(
         env.robot.joint_names, env.default_dof_pos.tolist(), env.robot.joint_range, env.robot.effort_range, strict=True
     ):
-        lines.append(f"  {name:<20} {default:>7.3f}  [{low:.3f}, {high:.3f}]  {limit:g}")
+        lines.append(f"  {name:<{width}} {default:>7.3f}  [{low:.3f}, {high:.3f}]  {limit:g}")
     lines.append(_room(env))
     lines.append(f"what was dropped, added or changed in {task.cfg.asset.file}")
     lines += [f"  {line}" for line in env.robot.overrides]

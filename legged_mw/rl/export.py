@@ -6,20 +6,16 @@ What the files mean is in ``legged_mw.deploy.contract``; nothing here is needed 
 from __future__ import annotations
 
 import copy
-import logging
 import os
 import shutil
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import onnx
 import torch
 from rsl_rl.models import MLPModel
-from torch import Tensor, nn
 
 from legged_mw.deploy.contract import (
     CLOCK,
@@ -43,7 +39,8 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
 from legged_mw.rl.export_scene import among_steps, standalone
-from legged_mw.rl.policies import load_policy, save_policy
+from legged_mw.rl.network import INPUT, OUTPUT, ExportedPolicy, halve, round_weights, run_onnx, save_onnx
+from legged_mw.rl.policies import load_policy
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.sim.model import ModelError, RobotModel, per_joint
 from legged_mw.sim.terrain import LEVEL, make_terrain
@@ -52,9 +49,7 @@ from legged_mw.utils.errors import shown
 from legged_mw.utils.files import find_file
 from legged_mw.utils.task import LoadedTask
 
-MODEL_FILE = "model.pt"
-FILES = (MODEL_FILE, CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
-INPUT, OUTPUT = "obs", "actions"
+FILES = (CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
 WORLDS = 8  # of the roll-out that the export is tried on
 TOLERANCE = 1e-4  # between actions of the same observation, relative above 1: float32 sums in another order
 
@@ -68,10 +63,13 @@ class Exported(NamedTuple):
     unknown: tuple[str, ...]  # observation rows without a statement of how to measure them: the export cannot be deployed
     no_terrain: str = ""  # why there is no scene among steps though training had some; else empty
     not_covered: tuple[str, ...] = ()  # methods of the task that ended episodes in training and cannot end a walk
+    half: bool = False  # the weights are rounded to float16
 
     def text(self, folder: Path) -> str:
         """What was written, in a line, and what stands in the way of its use."""
-        lines = [f"written to {shown(folder)}: {', '.join(self.files)}; actions differ from the trained policy's by {self.gap:.0e} at most"]
+        rounded = ", its weights rounded to half precision" if self.half else ""
+        lines = [f"written to {shown(folder)}: {', '.join(self.files)}{rounded}"]
+        lines[0] += f"; actions differ from the trained policy's by {self.gap:.0e} at most"
         if self.unknown:
             names = ", ".join(self.unknown)
             lines.append(f"nothing says how to measure {names}: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)")
@@ -83,20 +81,10 @@ class Exported(NamedTuple):
         return "\n  ".join(lines)
 
 
-class ExportedPolicy(nn.Module):
-    """Observations (N, size) in their plain units -> clipped mean actions (N, A); the normaliser is inside."""
-
-    def __init__(self, policy: MLPModel, clip_actions: float) -> None:
-        super().__init__()
-        self.policy, self.clip_actions = copy.deepcopy(policy).cpu().as_onnx(verbose=False), clip_actions
-
-    def forward(self, obs: Tensor) -> Tensor:
-        return self.policy(obs).clamp(-self.clip_actions, self.clip_actions)
-
-
-def export(trained: LoadedTask, checkpoint: Path, folder: Path) -> Exported:
+def export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool = False) -> Exported:
     """Write the policy in ``checkpoint``, of the task as it was ``trained``, to ``folder``: all files, or none.
 
+    ``half``: round its weights to float16 first, and store them so: half the size. What is tried is the rounded policy.
     Raises ExportError, ContractError, ConfigError or ModelError; an earlier export in the folder stays as it was then.
     """
     precision = torch.get_float32_matmul_precision()
@@ -104,36 +92,36 @@ def export(trained: LoadedTask, checkpoint: Path, folder: Path) -> Exported:
     try:
         with torch.random.fork_rng(devices=[]):  # the roll-out must not change the caller's draws
             torch.default_generator.manual_seed(0)
-            return _export(trained, checkpoint, folder)
+            return _export(trained, checkpoint, folder, half)
     finally:
         torch.set_float32_matmul_precision(precision)
 
 
-def _export(trained: LoadedTask, checkpoint: Path, folder: Path) -> Exported:
+def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> Exported:
     task = copy.deepcopy(trained)
     config, noise = task.to_dict(), task.cfg.noise.level
     ground = getattr(task.cfg.terrain, "mesh_type", "plane")
     env = _small_env(task)
     policy = load_policy(checkpoint, env, task.train, "cpu")
-    groups, clip = task.train.obs_groups.actor, task.cfg.normalization.clip_actions
+    groups, clip, exact = task.train.obs_groups.actor, task.cfg.normalization.clip_actions, copy.deepcopy(policy)
+    if half:
+        round_weights(policy)
     with _all_or_nothing(folder) as new:
-        save_policy(policy, new / MODEL_FILE, {"task": task.name})
         save_yaml(new / CONFIG_FILE, config)
-        try:
-            save_onnx(policy, clip, new / NETWORK_FILE)
-        except Exception as error:  # the exporter's own, one for each thing that a network may do and it may not
-            first = next(iter(str(error).strip().splitlines()), type(error).__name__)
-            raise ExportError(f"the network ({type(policy).__name__}) cannot be exported: {first}") from error
+        _write_network(policy, clip, new / NETWORK_FILE, half)
         contract = make_contract(env, task, new, noise)
         save_yaml(new / CONTRACT_FILE, contract.to_dict())
         steps = record(env, policy, groups, contract, new)
         observations, actions = (np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions"))
-        gap = _compare(run_onnx(new / NETWORK_FILE, observations), np.clip(actions, -clip, clip))
+        acted = run_onnx(new / NETWORK_FILE, observations)
+        gap = _compare(acted, np.clip(actions, -clip, clip))
+        if half:
+            gap = _gap(acted, ExportedPolicy(exact, clip)(torch.from_numpy(observations)).detach().numpy())
         replay(env, contract, steps, new)
         no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
         files = (*FILES, *([TERRAIN_FILE] if (new / TERRAIN_FILE).exists() else []))
     unknown_rows = tuple(row.name for row in contract.rows if not row.measured)
-    return Exported(files, gap, len(observations), unknown_rows, no_terrain, contract.ends.not_covered)
+    return Exported(files, gap, len(observations), unknown_rows, no_terrain, contract.ends.not_covered, half)
 
 
 def _small_env(task: LoadedTask) -> RobotTask:
@@ -147,9 +135,24 @@ def _small_env(task: LoadedTask) -> RobotTask:
     return task.env_class(task.cfg, "cpu", eager=True)
 
 
+def _write_network(policy: MLPModel, clip: float, path: Path, half: bool) -> None:
+    try:
+        save_onnx(policy, clip, path)
+    except Exception as error:  # the exporter's own, one for each thing that a network may do and it may not
+        first = next(iter(str(error).strip().splitlines()), type(error).__name__)
+        raise ExportError(f"the network ({type(policy).__name__}) cannot be exported: {first}") from error
+    if half:
+        halve(policy, path)
+
+
+def _gap(got: np.ndarray, wanted: np.ndarray) -> float:
+    """The largest difference, relative above 1."""
+    return float((np.abs(got - wanted) / np.maximum(1.0, np.abs(wanted))).max()) if got.shape == wanted.shape else float("inf")
+
+
 def _compare(got: np.ndarray, wanted: np.ndarray) -> float:
     """The largest difference; refuses a network that acts otherwise than the policy."""
-    gap = float((np.abs(got - wanted) / np.maximum(1.0, np.abs(wanted))).max()) if got.shape == wanted.shape else float("inf")
+    gap = _gap(got, wanted)
     if not gap <= TOLERANCE:  # NaN too
         raise ExportError(
             f"{NETWORK_FILE} acts otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
@@ -159,55 +162,6 @@ def _compare(got: np.ndarray, wanted: np.ndarray) -> float:
 
 
 # ---- files ---------------------------------------------------------------------------------------------------------
-
-
-def run_onnx(path: Path, observations: np.ndarray) -> np.ndarray:
-    """Actions (B, A) of the network in an ONNX file, by onnxruntime, or where it is not installed by onnx's own evaluator."""
-    try:
-        import onnxruntime
-    except ImportError:
-        from onnx.reference import ReferenceEvaluator
-
-        [actions] = ReferenceEvaluator(onnx.load(path)).run([OUTPUT], {INPUT: observations})
-        return np.asarray(actions)
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    return np.asarray(session.run([OUTPUT], {INPUT: observations})[0])
-
-
-def save_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
-    """Write one self-contained ONNX file: input ``obs`` (batch, size), output ``actions`` (batch, A)."""
-    example = torch.zeros(2, policy.obs_dim)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the exporter warns of its own internals, and logs that torchvision is missing
-        logging.getLogger("torch.onnx").setLevel(logging.ERROR)
-        torch.onnx.export(
-            ExportedPolicy(policy, clip_actions).eval(),
-            (example,),
-            path,
-            input_names=[INPUT],
-            output_names=[OUTPUT],
-            opset_version=18,
-            dynamic_shapes={INPUT: {0: torch.export.Dim("batch", min=1)}},
-            external_data=False,
-            dynamo=True,
-            verbose=False,
-        )
-    _strip(path)
-
-
-def _strip(path: Path) -> None:
-    """Drop what the exporter notes for debugging: stack traces, with the folders of the machine that it ran on."""
-    model = onnx.load(path)
-    graph = model.graph
-    for part in (model, graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
-        part.doc_string = ""
-        if hasattr(part, "metadata_props"):
-            del part.metadata_props[:]
-    for value in (*graph.input, *graph.output, *graph.value_info):
-        for dim in value.type.tensor_type.shape.dim:
-            if dim.dim_param:
-                dim.dim_param = "batch"  # the one free dimension, which the exporter names as it likes
-    onnx.save(model, path)
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from typing import NamedTuple
 
@@ -74,17 +75,19 @@ def console_block(title: str, rows: dict[str, str]) -> str:
 
 
 def console_rows(numbers: dict[str, float], losses: dict[str, float], speed: float, collect: float, learn: float) -> dict[str, str]:
-    """What an iteration shows of its numbers: name -> text."""
+    """What an iteration shows of its numbers: name -> text. A mean over episodes is "-" until one has ended."""
+
+    def mean(name: str, digits: int) -> str:
+        return "-" if math.isnan(numbers[name]) else f"{numbers[name]:.{digits}f}"
+
     return {
         "Computation": f"{speed:.0f} steps/s (collection {collect:.3f} s, learning {learn:.3f} s)",
         **{f"{name.capitalize()} loss": f"{value:.4f}" for name, value in losses.items()},
         "Learning rate": f"{numbers['learning_rate']:.1e}",
         "Action std": f"{numbers['action_std']:.2f}",
-        "Mean reward": f"{numbers['reward']:.2f}",
-        "Mean episode length": f"{numbers['episode_length']:.1f}",
-        **{name: f"{value:.4f}" for name, value in numbers.items() if name.startswith("rew_")},
-        **{
-            name.replace("_", " ").replace("/", ", ").capitalize(): f"{numbers[name]:.2f}" for name in numbers if name.startswith(CURRICULA)
-        },
+        "Mean reward": mean("reward", 2),
+        "Mean episode length": mean("episode_length", 1),
+        **{name: mean(name, 4) for name in numbers if name.startswith("rew_")},
+        **{name.replace("_", " ").replace("/", ", ").capitalize(): mean(name, 2) for name in numbers if name.startswith(CURRICULA)},
         "Episodes ended": f"{numbers['episodes']:.0f} ({numbers['fell']:.0f} falls, {numbers['broken']:.0f} not finite)",
     }

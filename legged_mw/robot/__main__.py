@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import copy
 import shlex
-from collections.abc import Sequence
 from pathlib import Path
 
 import torch
@@ -13,14 +12,12 @@ import torch
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.robot import new, picture
-from legged_mw.robot.draft import as_env, draft, has_mirror
+from legged_mw.robot.draft import Draft, as_env, draft, has_mirror
 from legged_mw.robot.measure import measure
 from legged_mw.robot.page import page
-from legged_mw.utils.cli import Parser, one_line_errors
+from legged_mw.utils.cli import Parser, command, one_line_errors
 from legged_mw.utils.errors import UserError, shown
-from legged_mw.utils.task import LoadedTask, load_task
-
-ROBOT_FILES = (".xml", ".mjcf", ".urdf")
+from legged_mw.utils.task import ROBOT_FILES, LoadedTask, load_task
 
 
 def parse() -> argparse.Namespace:
@@ -45,11 +42,11 @@ def main() -> None:
         return
     found = draft(file)
     env = as_env(found, file)
-    print(env_page(env, file.name, image, found.guessed))
+    print(env_page(env, file.name, image, found))
     if args.new:
         written = new.write(found, file, args.new, Path(args.out), args.force, has_mirror(env))
         flags = shlex.join(["--task", shown(written[1]), "--check"])
-        print(f"written: {' and '.join(map(shown, written))}; next:\n  python train.py {flags}")
+        print(f"written: {' and '.join(map(shown, written))}; next:\n  {command('train')} {flags}")
 
 
 def task_page(task: LoadedTask, image: Path | None) -> str:
@@ -62,11 +59,11 @@ def task_page(task: LoadedTask, image: Path | None) -> str:
     return env_page(one.env_class(one.cfg, "cpu"), task.name, image)
 
 
-def env_page(env: RobotTask, title: str, image: Path | None, guessed: Sequence[str] = ()) -> str:
-    """The page as text; the picture goes to ``image``."""
+def env_page(env: RobotTask, title: str, image: Path | None, found: Draft | None = None) -> str:
+    """The page as text, with what was guessed if the task is a draft; the picture goes to ``image``."""
     robot, feet = env.robot, env.foot_geoms if isinstance(env, LeggedRobot) else {}
     health = measure(robot, robot.pose, env.start_place, env.cfg.control.decimation)
-    text = page(health, title, guessed)
+    text = page(health, title, found.guessed, found.notes) if found else page(health, title)
     if image is None:
         return text
     try:

@@ -5,6 +5,7 @@ What is guessed or chosen is marked LOOK in the file.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -42,11 +43,13 @@ class Draft(NamedTuple):
     feet: list[Foot]
     guessed: list[str]  # what nobody said, a line each
     pose_from: str  # where the default pose is from, in words
+    notes: list[str]  # what was dropped, added or changed in the file as it was read, a line each
 
 
 def draft(file: Path) -> Draft:
     """Guess what a task needs to know of the robot in ``file`` (MJCF or URDF)."""
-    from_file = read_robot(file).keyframe is not None
+    read = read_robot(file)
+    from_file = read.keyframe is not None
     env = _bare(file, from_file)
     robot, place = env.robot, np.array(env.start_place)
     pose = np.clip(robot.pose, *robot.joint_range.T)
@@ -66,7 +69,7 @@ def draft(file: Path) -> Draft:
     ]
     pose = np.round(pose, 4).tolist()
     height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
-    return Draft(robot, pose, [0.0, 0.0, round(height + CLEARANCE, 3)], joints, gains, feet, guessed, how)
+    return Draft(robot, pose, [0.0, 0.0, round(height + CLEARANCE, 3)], joints, gains, feet, guessed, how, read.notes)
 
 
 def _bare(file: Path, keyframe: bool) -> RobotTask:
@@ -103,6 +106,8 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     asset: dict[str, Any] = {"foot_names": [foot.name for foot in found.feet]}
     if parts := {foot.name: list(foot.geoms) for foot in found.feet if not foot.known}:
         asset["foot_geoms"] = parts
+    if said := {name: speed for name, speed in zip(names, found.robot.speed_limits, strict=True) if math.isfinite(speed)}:
+        asset["joint_speed_limits"] = table([*said.values()], names) if len(said) == len(names) else said
     asset["colliders"] = [name for foot in found.feet for name in ([foot.name] if foot.known else foot.geoms)]
     ranges = {"lin_vel_x": [-0.5, 0.8], "lin_vel_y": [-0.3, 0.3], "ang_vel_yaw": [-0.5, 0.5]}
     if not two:
@@ -123,7 +128,6 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     if two:
         chosen["rewards"] = {**chosen.get("rewards", {}), "scales": {"single_stance": 0.75}}
         chosen["sim"] = {"iterations": 3}
-        chosen["exam"] = {"push_mark": 1.0, "marks_of": "offset"}
     return chosen
 
 

@@ -27,6 +27,7 @@ class {name}FlatCfg(LeggedRobotCfg):
 _COMMENTS = {
     "foot_names": "LOOK: guessed",
     "foot_geoms": "foot -> its geoms",
+    "joint_speed_limits": "[rad/s] the file's",
     "colliders": "the feet alone touch the ground",
     "pos": "[m] standing, computed",
     "stiffness": "[N m/rad] LOOK: computed (legged_mw/robot/suggest.py)",
@@ -39,7 +40,6 @@ _COMMENTS = {
     "swing_height": "[m] of a swinging foot",
     "single_stance": "a biped that steps stands on one foot at a time [Isaac Lab: G1]",
     "iterations": "a biped's soles want more than 1 [ours]",
-    "push_mark": "[m/s] for a biped",
 }
 
 

@@ -42,7 +42,7 @@ FAMILY_RGB = (
 )
 MANY = 16  # joints: of more, arrows are shorter
 LEFT_COLUMN, ROW = 12, 22  # [px] from the edge to a column of names; between two names at least
-CAPTION = "joint axes: arrows (turn by the right hand)   feet: green discs   imu: x red, y green, z blue   colliders: orange"
+CAPTION = "joint axes: arrows (turn by the right hand)   feet: green   imu: x red, y green, z blue   colliders: orange"
 
 Rgb = tuple[float, float, float]
 
@@ -154,9 +154,22 @@ class _Picture:
             place[2] = 0.002
             reach = [np.linalg.norm(data.geom_xpos[geom, :2] - place[:2]) + self.posed.model.geom_rbound[geom] for geom in ids]
             size = float(max(reach)) * (1.5 if len(ids) == 1 else 1.1)
-            self._geom(mujoco.mjtGeom.mjGEOM_CYLINDER, (size, 0.002, 0.0), place, FOOT_RGBA)
+            if not (len(ids) == 1 and self._draw_sole(ids[0], place)):
+                self._geom(mujoco.mjtGeom.mjGEOM_CYLINDER, (size, 0.002, 0.0), place, FOOT_RGBA)
             labels.append(Label(f"foot {name}", place, FOOT_RGBA[:3]))
         return labels
+
+    def _draw_sole(self, geom: int, place: FloatArray) -> bool:
+        """A sheet under a foot that is a box, wider by 2 cm on each side; False if it is none."""
+        model = self.posed.model
+        if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_BOX:
+            return False
+        axes = self.posed.data.geom_xmat[geom].reshape(3, 3)
+        size = model.geom_size[geom] + 0.02
+        size[np.abs(axes[2]).argmax()] = 0.002  # along the axis that is upright
+        sheet = self._geom(mujoco.mjtGeom.mjGEOM_BOX, size, place, FOOT_RGBA)
+        sheet.mat[:] = axes
+        return True
 
     def _draw_imu(self) -> list[Label]:
         site = self.posed.model.site(self.robot.imu).id

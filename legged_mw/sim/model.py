@@ -27,6 +27,8 @@ from legged_mw.sim.terrain import Terrain
 from legged_mw.sim.vendor import Loaded, naming, read_robot
 from legged_mw.utils.errors import unknown
 
+_CHOICES = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone, "solver": mujoco.mjtSolver}  # option -> its values
+_FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}
 _INTEGRATORS = {"euler": mujoco.mjtIntegrator.mjINT_EULER, "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST}
 
 
@@ -188,8 +190,18 @@ def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
     for name, value in wanted.items():
         old = getattr(spec.option, name)
         if old != value:
-            notes.append(f"option {name}: {old:g} -> {value.name if hasattr(value, 'name') else f'{value:g}'}")
+            notes.append(f"option {name}: {_option(name, old)} -> {_option(name, value)}")
             setattr(spec.option, name, value)
+
+
+def _option(name: str, value: float) -> str:
+    """A value of an option in MuJoCo's own words, as an MJCF has them."""
+    if name in _CHOICES:
+        return _CHOICES[name](value).name.split("_")[1].lower()
+    if name in _FLAGS:
+        flags = [text.split("_")[1].lower() for text, flag in _FLAGS[name].__members__.items() if "_" in text and int(value) & flag.value]
+        return " ".join(flags) or "none"
+    return f"{value:g}"
 
 
 def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisions: bool, notes: list[str]) -> None:

@@ -66,7 +66,7 @@ class Loaded:
 def read_robot(file: Path) -> Loaded:
     """Read an MJCF or URDF. Raises ModelError for what is none, and for what cannot be a robot alone."""
     if not file.is_file():
-        raise ModelError(f"no MJCF at {file}")
+        raise ModelError(f"no {_kind(file)} at {file}")
     where, notes = file.name, []
     text = file.read_text(encoding="utf-8", errors="replace")
     urdf, speeds = is_urdf(text), {}
@@ -95,8 +95,12 @@ def naming(file: Path) -> Iterator[None]:
     except ModelError:
         raise
     except ValueError as error:  # parsing does not see a name that is used twice, compiling does
-        kind = "URDF" if file.suffix == ".urdf" else "MJCF"
-        raise ModelError(f"{file.name} is not a valid {kind}: {' '.join(str(error).split())}") from None
+        raise ModelError(f"{file.name} is not a valid {_kind(file)}: {' '.join(str(error).split())}") from None
+
+
+def _kind(file: Path) -> str:
+    """What its name says that it is."""
+    return "URDF" if file.suffix == ".urdf" else "MJCF"
 
 
 def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:

@@ -14,6 +14,8 @@ from legged_mw.utils.files import find_file
 from legged_mw.utils.renamed import with_new_names
 from legged_mw.utils.task_module import import_task
 
+ROBOT_FILES = (".xml", ".mjcf", ".urdf")
+
 
 class Task(NamedTuple):
     """What the last line of a config file names: three classes, and how its policies are graded."""
@@ -136,6 +138,8 @@ def load_task(name: str) -> LoadedTask:
     The file may import its neighbours. A relative ``asset.file`` is looked for beside the file that wrote it, then in the repository.
     """
     path = Path(name).expanduser()
+    if path.suffix in ROBOT_FILES:
+        raise ConfigError(f"{name} is a robot, not a task; make a task for it: python -m legged_mw.robot {name} --new NAME")
     if path.suffix != ".py":
         known = task_names()
         if name not in known:

@@ -44,6 +44,7 @@ def parse(description: str | None) -> argparse.Namespace:
     common = "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
     parser.add_argument("--export", metavar="DIR", help="write the policy as network, contract and scene there, to deploy (docs/deploy.md)")
+    parser.add_argument("--half", action="store_true", help="with --export: round the weights to float16; the network takes half the space")
     args = parser.parse_args()
     require_task(args, parser)
     asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag)]
@@ -53,6 +54,8 @@ def parse(description: str | None) -> argparse.Namespace:
         parser.error("--compare grades two policies side by side: add --eval")
     if args.ranges and not args.eval:
         parser.error("--ranges says what the exam asks: add --eval")
+    if args.half and not args.export:
+        parser.error("--half rounds what is exported: add --export DIR")
     if args.commands and (args.eval or args.export or args.command is not None):
         parser.error("--commands drives what is watched: it goes with neither --command nor --eval nor --export")
     if (args.eval or args.export) and (watching := launch.asked(args)):

@@ -1,0 +1,131 @@
+"""docs/your_own_robot.md: every command of it runs, on a quadruped's URDF and a biped's MJCF; what it names exists."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from program import Result, run
+
+from legged_mw import ROOT
+from legged_mw.eval import exam, grading, plots
+from legged_mw.robot import __main__ as robot_program
+from legged_mw.utils.task import load_task
+
+PAGE = ROOT / "docs/your_own_robot.md"
+DATA = ROOT / "tests/data"
+TRAIN = ["--num_envs", "16", "--max_iterations", "2"]
+WATCH = ["--viewer", "none", "--time", "0.5s"]
+COMMANDS = [
+    shlex.split(line, comments=True)
+    for block in re.findall(r"```bash\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    for line in block.splitlines()
+]
+
+
+def start(words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) -> Result:
+    """What ``words``, a command of the page, print; long ones with the flags that the page says the tests add."""
+    python, *rest = words
+    assert python == "python"
+    if rest[:2] == ["-m", "legged_mw.robot"]:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(sys, "argv", ["robot", *rest[2:]])
+            robot_program.main()
+        return Result(0, capsys.readouterr().out, "")
+    if rest[:2] == ["-m", "legged_mw.deploy"]:
+        return run("deploy", folder, *rest[2:], *WATCH)
+    program, flags = rest[0].removesuffix(".py"), [*rest[1:], "--device", "cpu"]
+    if program == "train" and not {"--check", "--max_iterations"} & {*flags}:
+        flags += TRAIN
+    if program == "play" and not {"--eval", "--export"} & {*flags}:
+        flags += WATCH
+    return run(program, folder, *flags)
+
+
+@pytest.mark.parametrize("file", ["a1_style.urdf", "g1_12dof_style.xml"])
+def test_every_command_runs(file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    robots = tmp_path / "robots"
+    robots.mkdir()
+    mine = shutil.copyfile(DATA / file, robots / f"robot{Path(file).suffix}")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(exam, "SECONDS", 2.1)
+    monkeypatch.setattr(grading, "elsewhere", lambda *_: [])  # the exam on the other engine, in a process of its own
+    draw = plots.sections  # one picture of the report is enough here
+    monkeypatch.setattr(plots, "sections", lambda *args: [each for each in draw(*args) if each.name == "pushes"])
+    said = []
+    for words in COMMANDS:
+        result = start([os.path.expanduser(word.replace("robot.urdf", mine.name)) for word in words], tmp_path, capsys)
+        assert result.code == 0, (words, result.err)
+        said.append(result.out)
+    page, new, check, trial, training, watched, graded, exported, deployed = said
+    assert "health of robot." in page and "what to look at" in page and "picture: robot.png" in page
+    assert "written: " in new and (robots / "mine.xml").exists()
+    assert "the step can be recorded as a CUDA graph" in check and "health of mine_flat" in check
+    assert "Learning iteration 2/2" in trial and "Learning iteration 2/2" in training and "watch it with" in training
+    assert "0.5 s, " in watched and "walks: no" in graded and "report.html" in graded
+    assert "written to my_policy: " in exported and "0.5 s, " in deployed
+    wrong = [
+        path
+        for path in (robots / "mine.xml", robots / "mine_flat.py", tmp_path / "my_policy/policy.yaml")
+        if str(tmp_path) in path.read_text()
+    ]
+    assert wrong == []
+
+
+@pytest.mark.parametrize(
+    ("file", "parent", "row"), [("a1_style.urdf", "SimToRealCfg", "domain_rand"), ("g1_12dof_style.xml", "BipedCfg", "gait_clock")]
+)
+def test_other_parents_for_a_real_robot(
+    file: str, parent: str, row: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As the page says: in the import line and everywhere below."""
+    assert f"| `sim_to_real_config`, `{parent}`, `{parent}PPO` |" in PAGE.read_text()
+    monkeypatch.setattr(sys, "argv", ["robot", str(DATA / file), "--new", "mine", "--out", str(tmp_path)])
+    robot_program.main()
+    config = tmp_path / "mine_flat.py"
+    config.write_text(config.read_text().replace("legged_robot_config", "sim_to_real_config").replace("LeggedRobotCfg", parent))
+    result = run("train", tmp_path, "--task", str(config), "--device", "cpu", *TRAIN, "--set", "runner.export=false")
+    assert result.code == 0 and "Learning iteration 2/2" in result.out, result.err
+    cfg = load_task(str(config)).cfg
+    assert cfg.domain_rand.enable and cfg.observations.leave_out == {"state": ["base_lin_vel"]}
+    assert bool(cfg.gait.period) == (row == "gait_clock")
+
+
+def test_the_page_names_fields_that_exist() -> None:
+    config = load_task("go1_flat").cfg.to_dict()
+    named = re.findall(r"`((?:asset|init_state|control|rewards|sim|termination|domain_rand|perturbation)\.[a-z_]+)", PAGE.read_text())
+    assert len({*named}) > 25
+    assert [name for name in named if name.split(".")[1] not in config[name.split(".")[0]]] == []
+
+
+def test_pictures_are_small() -> None:
+    pictures = re.findall(r"!\[.*?\]\((.*?)\)", PAGE.read_text())
+    assert len(pictures) == 2 and all((PAGE.parent / picture).stat().st_size < 50_000 for picture in pictures)
+
+
+# ---- links of all pages
+
+
+def anchors(page: Path) -> set[str]:
+    """Of its headlines, as GitHub makes them."""
+    heads = re.findall(r"^#+ (.*)$", re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))], ids=lambda page: page.name)
+def test_links_lead_somewhere(page: Path) -> None:
+    lost = []
+    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if link.startswith(("http", "mailto")):
+            continue
+        name, _, anchor = link.partition("#")
+        target = (page.parent / name) if name else page
+        if not target.exists() or (anchor and anchor not in anchors(target)):
+            lost.append(link)
+    assert lost == []
