@@ -131,7 +131,7 @@ SAID = {
         "option impratio: 100 -> 1",
         "option cone: elliptic -> pyramidal",
         "option disableflags: none -> eulerdamp",
-        "actuator 'FR_hip' replaced by a position servo",
+        "12 actuators replaced by position servos",
     ],
     "g1_29dof_style": [
         "looks left out (no such file): pelvis.STL, torso_link.STL, head_link.STL",

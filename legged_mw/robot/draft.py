@@ -67,7 +67,7 @@ def draft(file: Path) -> Draft:
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest ends of limbs",
         "gains: as suggested below",
     ]
-    pose = np.round(pose, 4).tolist()
+    pose = (np.round(pose, 4) + 0.0).tolist()  # no -0.0
     height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
     return Draft(robot, pose, [0.0, 0.0, round(height + CLEARANCE, 3)], joints, gains, feet, guessed, how, read.notes)
 

@@ -4,7 +4,7 @@
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -24,7 +24,7 @@ class Upright(NamedTuple):
     up: np.ndarray  # (S, 3) the vertical in the frame of each site's body
 
 
-def posed(model: mujoco.MjModel, joints: Sequence[float], root: Sequence[float] = _UPRIGHT) -> mujoco.MjData:
+def posed(model: mujoco.MjModel, joints: Iterable[float], root: Iterable[float] = _UPRIGHT) -> mujoco.MjData:
     """Places of bodies, geoms and sites with the joints at the angles ``joints`` (D,) [rad] and the ``root`` (7,) there."""
     data = mujoco.MjData(model)
     data.qpos[:] = [*root, *joints]
