@@ -9,6 +9,7 @@ from torch import Tensor
 
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.wording import config_words
+from legged_mw.sim.joints import PARTIAL
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
 from legged_mw.sim.pose import standing_height
 from legged_mw.sim.terrain import Terrain
@@ -41,12 +42,7 @@ def load_robot(
             "rewards.pose_weights": cfg.rewards.pose_weights,
         },
         held_joints=asset.held_joints,
-        partial={
-            "effort": asset.effort,
-            "armature": asset.armature,
-            "frictionloss": asset.frictionloss,
-            "joint_speed_limits": asset.joint_speed_limits,
-        },
+        partial={name: getattr(asset, name) for name in PARTIAL},
     )
     robot.overrides[:] = [config_words(line) for line in robot.overrides]
     return robot
