@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from legged_mw.robot.suggest import family
 from legged_mw.sim.drawing import visual_spec
 from legged_mw.sim.model import RobotModel
+from legged_mw.view.feet import patch
 from legged_mw.view.posed_robot import GROUPS_SHOWN, PosedRobots
 from legged_mw.view.recorder import no_context
 from legged_mw.view.stage import FloatArray, ViewError
@@ -147,29 +148,16 @@ class _Picture:
         return labels
 
     def _draw_feet(self) -> list[Label]:
-        labels, data = [], self.posed.data
+        """A disc under each foot, as the viewer draws one that stands."""
+        labels, model = [], self.posed.model
         for name, geoms in self.feet.items():
-            ids = [self.posed.model.geom(geom).id for geom in geoms]
-            place = np.mean([data.geom_xpos[geom] for geom in ids], axis=0)
+            place, turn, half = patch(model, self.posed.data, [model.geom(geom).id for geom in geoms], self.posed.radius)
             place[2] = 0.002
-            reach = [np.linalg.norm(data.geom_xpos[geom, :2] - place[:2]) + self.posed.model.geom_rbound[geom] for geom in ids]
-            size = float(max(reach)) * (1.5 if len(ids) == 1 else 1.1)
-            if not (len(ids) == 1 and self._draw_sole(ids[0], place)):
-                self._geom(mujoco.mjtGeom.mjGEOM_CYLINDER, (size, 0.002, 0.0), place, FOOT_RGBA)
+            disc = self._geom(mujoco.mjtGeom.mjGEOM_CYLINDER, (half[0], 0.002, 0.0), place, FOOT_RGBA)
+            disc.size[1] = half[1]
+            disc.mat[:] = turn
             labels.append(Label(f"foot {name}", place, FOOT_RGBA[:3]))
         return labels
-
-    def _draw_sole(self, geom: int, place: FloatArray) -> bool:
-        """A sheet under a foot that is a box, wider by 2 cm on each side; False if it is none."""
-        model = self.posed.model
-        if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_BOX:
-            return False
-        axes = self.posed.data.geom_xmat[geom].reshape(3, 3)
-        size = model.geom_size[geom] + 0.02
-        size[np.abs(axes[2]).argmax()] = 0.002  # along the axis that is upright
-        sheet = self._geom(mujoco.mjtGeom.mjGEOM_BOX, size, place, FOOT_RGBA)
-        sheet.mat[:] = axes
-        return True
 
     def _draw_imu(self) -> list[Label]:
         site = self.posed.model.site(self.robot.imu).id
