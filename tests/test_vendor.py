@@ -20,6 +20,8 @@ from worlds import QUIET
 from legged_mw import ROOT
 from legged_mw.check.describe import describe
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.envs.loading import start_place
 from legged_mw.rl.export_scene import standalone
 from legged_mw.sim.drawing import visual_model
 from legged_mw.sim.errors import ModelError
@@ -122,7 +124,7 @@ def test_its_mirror_image_moves_as_the_mirror_says(name: str) -> None:
 
 SAID = {
     "go2_style": [
-        "keyframe 'home' read: pose and place of the root, where nothing else states them",
+        "keyframe 'home' read: pose and height of the root, where nothing else states them",
         "sensors dropped, as nothing reads them: FR_hip_angle, FR_hip_speed, imu_quat, imu_gyro, imu_acc",
         "world geoms dropped, as the ground is added: floor, one without a name",
         "lights dropped: one without a name",
@@ -150,7 +152,7 @@ SAID = {
         "fused into 'pelvis', to which they are fixed: torso_link, left_arm_link, right_arm_link",
         "site 'imu_aligned' made at the place of 'imu' on 'torso_link', with the axes of the root 'pelvis'",
     ],
-    "t1_style": ["keyframe 'stand' read: pose and place of the root, where nothing else states them", "cameras dropped: track"],
+    "t1_style": ["keyframe 'stand' read: pose and height of the root, where nothing else states them", "cameras dropped: track"],
     "anymal_c_style": [
         "free joint added to 'base'",
         "fused into 'base', to which they are fixed: base_inertia, face_front, battery, imu_link",
@@ -236,6 +238,15 @@ def test_the_config_wins_over_the_keyframe() -> None:
     changed = make("go2_style", **{"init_state.pos": [0.0, 0.0, 0.5], "init_state.default_joint_angles": {"hip": 0.1, "FR_calf": -1.7}})
     assert changed.start_place == [0.0, 0.0, 0.5]
     assert changed.robot.pose == (0.1, 0.9, -1.8, 0.1, 0.9, -1.7, 0.1, 0.9, -1.8, 0.1, 0.9, -1.8)
+    lower = make("go2_style", **{"init_state.default_joint_angles": {"calf": -2.4}}).start_place
+    assert lower[2] < 0.22, "the keyframe's height of 0.27 m is that of its own pose"
+
+
+def test_a_keyframe_states_a_height_and_no_place(tmp_path: Path) -> None:
+    """On terrain the root would stand beside the middle of its tile."""
+    key = '<keyframe><key qpos="1 2 0.4 1 0 0 0 0 0"/></keyframe>'
+    robot = build_toy(toy(tmp_path, extra=key))
+    assert start_place(LeggedRobotCfg(), robot, []) == [0.0, 0.0, 0.4]
 
 
 # ---- trouble by trouble
@@ -341,7 +352,7 @@ def test_of_keyframes_home_or_the_only_one_is_read(tmp_path: Path) -> None:
         return build_toy(toy(tmp_path, extra=f"<keyframe>{''.join(f'<key name={name!r} qpos={qpos!r}/>' for name in names)}</keyframe>"))
 
     for robot in (keys("sit", "home"), keys("sit")):
-        assert robot.pose == (0.1, 0.2) and robot.start == (0.0, 0.0, 0.4)
+        assert robot.pose == (0.1, 0.2) and robot.height == 0.4
     assert keys("sit", "lie").pose == (0.0, 0.0) and "keyframe 'lie' dropped" in keys("sit", "lie").overrides
     assert "keyframe 'home' dropped" in " ".join(keys("home", qpos="0 0 1").overrides)
 

@@ -49,14 +49,14 @@ def load_robot(
 
 
 def start_place(cfg: RobotTaskCfg, robot: RobotModel, colliders: Sequence[str]) -> list[float]:
-    """x, y, z of the root [m]: the config's, the keyframe's, or such that the lowest foot stands on the ground in the default pose.
+    """x, y, z of the root [m]: the config's; or as high as in the keyframe whose pose it has; or with the lowest foot on the ground.
 
     Without feet it is the lowest of the ``colliders``.
     """
     if cfg.init_state.pos:
         return list(cfg.init_state.pos)
-    if robot.start:
-        return list(robot.start)
+    if robot.height is not None:
+        return [0.0, 0.0, robot.height]
     feet = [geom for geoms in robot.site_geoms.values() for geom in geoms]
     return [0.0, 0.0, standing_height(robot, feet or robot.names.find(colliders, "asset.colliders", colliding=True), robot.pose)]
 

@@ -61,7 +61,7 @@ class RobotModel:
     held: tuple[str, ...] = ()  # joints of the file that are welded
     speed_limits: tuple[float, ...] = ()  # (D,) of the motors, unknown to the physics [rad/s]; infinite where nothing states one
     tables: dict[str, list[float]] = field(default_factory=dict)  # (D,) each, of the tables that were given
-    start: tuple[float, ...] = ()  # the root's x, y, z in the file's keyframe [m]; empty: it has none
+    height: float | None = None  # of the root in the file's keyframe [m]; None: it has none, or the pose is another
 
     @property
     def joint_range(self) -> np.ndarray:
@@ -139,7 +139,8 @@ def _compile(
 ) -> RobotModel:
     """Add the sensors, and compile what is stepped."""
     _add_sensors(robot.spec, touching, velocity_sites, imu, robot.where)
-    whole = robot.spec.copy()
+    whole, keyframe = robot.spec.copy(), robot.keyframe
+    kept = keyframe is not None and posed.angles == [keyframe.angles.get(name) for name in posed.joints]
     physics = _compile_bare(robot.spec, ground, robot.notes)
     return RobotModel(
         physics=physics,
@@ -157,7 +158,7 @@ def _compile(
         held=tuple(posed.held),
         speed_limits=speeds,
         tables=posed.tables,
-        start=robot.keyframe.root if robot.keyframe else (),
+        height=keyframe.height if keyframe and kept else None,
     )
 
 

@@ -36,7 +36,7 @@ class Keyframe:
     """A pose that the file holds."""
 
     name: str
-    root: tuple[float, ...]  # x, y, z [m]; empty: the file has no free joint
+    height: float | None  # of the root [m]; None: the file has no free joint
     angles: dict[str, float]  # joint -> [rad]
 
 
@@ -112,8 +112,8 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
     if chosen and len(qpos) == starts[-1]:
         angles = {joint.name: qpos[start] for joint, start in zip(spec.joints, starts[:-1], strict=True) if joint.type in _SCALAR_JOINTS}
         first = next(iter(spec.joints), None)
-        taken = Keyframe(chosen.name, tuple(qpos[:3]) if first and first.type == _FREE else (), angles)
-        notes.append(f"keyframe '{chosen.name}' read: pose and place of the root, where nothing else states them")
+        taken = Keyframe(chosen.name, qpos[2] if first and first.type == _FREE else None, angles)
+        notes.append(f"keyframe '{chosen.name}' read: pose and height of the root, where nothing else states them")
     for key in keys:
         if key is not chosen:
             notes.append(f"keyframe '{key.name}' dropped")
