@@ -2,7 +2,7 @@
 
 from configs.g1_flat import G1FlatCfg
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.sim_to_real_config import BipedCfgPPO
+from legged_mw.envs.sim_to_real_config import BipedRoughCfgPPO
 from legged_mw.utils.task import Task
 
 
@@ -19,9 +19,4 @@ class G1RoughCfg(G1FlatCfg):
         swing_height = 0.12  # [m]
 
 
-class G1RoughCfgPPO(BipedCfgPPO):
-    class runner(BipedCfgPPO.runner):
-        num_steps_per_env = 24
-
-
-TASK = Task(LeggedRobot, G1RoughCfg, G1RoughCfgPPO)
+TASK = Task(LeggedRobot, G1RoughCfg, BipedRoughCfgPPO)

@@ -6,7 +6,7 @@ Sources: as configs/go1_rough.py, whose ground it walks on.
 from configs.go1_rough import Go1RoughCfg
 from configs.go2_flat import Go2FlatCfg
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.sim_to_real_config import SimToRealCfgPPO
+from legged_mw.envs.sim_to_real_config import SimToRealRoughCfgPPO
 from legged_mw.utils.task import Task
 
 
@@ -20,24 +20,15 @@ class Go2RoughCfg(Go2FlatCfg):
     class terrain(Go1RoughCfg.terrain):
         pass
 
-    class termination(Go2FlatCfg.termination):
-        min_base_height = 0.12  # [m] the feet alone touch the ground, so that a trunk would sink into a step unpunished
+    class termination(Go1RoughCfg.termination):
+        pass
 
     class rewards(Go2FlatCfg.rewards):
-        tracking_sigma = 0.25  # [P]
+        tracking_sigma, swing_height = 0.25, 0.15  # [-], [m]
         pose_weights = {"hip": 1.0, "thigh": 0.5, "calf": 0.1}
-        swing_height = 0.15  # [m]
 
         class scales(Go2FlatCfg.rewards.scales):
             orientation, lin_vel_z, feet_clearance = -1.0, -0.2, -1.0
 
 
-class Go2RoughCfgPPO(SimToRealCfgPPO):
-    class runner(SimToRealCfgPPO.runner):
-        num_steps_per_env = 24
-
-    class algorithm(SimToRealCfgPPO.algorithm):
-        gamma = 0.99
-
-
-TASK = Task(LeggedRobot, Go2RoughCfg, Go2RoughCfgPPO)
+TASK = Task(LeggedRobot, Go2RoughCfg, SimToRealRoughCfgPPO)

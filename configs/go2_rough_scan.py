@@ -1,7 +1,8 @@
 """go2_rough with eyes: the policy sees the height of the ground on a grid around it, with noise."""
 
-from configs.go2_rough import Go2RoughCfg, Go2RoughCfgPPO
+from configs.go2_rough import Go2RoughCfg
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.sim_to_real_config import SimToRealRoughCfgPPO
 from legged_mw.utils.task import Task
 
 
@@ -10,4 +11,4 @@ class Go2RoughScanCfg(Go2RoughCfg):
         height_scan = ["state", "privileged_state"]
 
 
-TASK = Task(LeggedRobot, Go2RoughScanCfg, Go2RoughCfgPPO)
+TASK = Task(LeggedRobot, Go2RoughScanCfg, SimToRealRoughCfgPPO)

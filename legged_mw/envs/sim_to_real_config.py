@@ -71,6 +71,16 @@ class SimToRealCfgPPO(LeggedRobotCfgPPO):
         use_data_augmentation = True  # [ours]
 
 
+class SimToRealRoughCfgPPO(SimToRealCfgPPO):
+    """Its learner on rough ground: longer pieces of walks, and a longer sight."""
+
+    class runner(SimToRealCfgPPO.runner):
+        num_steps_per_env = 24  # [legged_gym]
+
+    class algorithm(SimToRealCfgPPO.algorithm):
+        gamma = 0.99  # [legged_gym]
+
+
 class BipedCfg(SimToRealCfg):
     """Such a robot with two legs."""
 
@@ -78,7 +88,10 @@ class BipedCfg(SimToRealCfg):
         period = 0.8  # [s] [U]
 
     class commands(SimToRealCfg.commands):
-        curriculum = False
+        curriculum = False  # [ours: no gain, docs/lab.md]
+
+        class ranges(SimToRealCfg.commands.ranges):
+            lin_vel_x, lin_vel_y, ang_vel_yaw = [-1.0, 1.0], [-0.5, 0.5], [-1.0, 1.0]  # [m/s], [m/s], [rad/s] [G, M]
 
     class rewards(SimToRealCfg.rewards):
         swing_height = 0.08  # [m] [G 0.08 to 0.12]
@@ -110,3 +123,10 @@ class BipedCfgPPO(SimToRealCfgPPO):
 
     class algorithm(SimToRealCfgPPO.algorithm):
         desired_kl = 0.02  # [ours: of 29 joints together; at 0.01 the rate falls to 1e-5]
+
+
+class BipedRoughCfgPPO(BipedCfgPPO):
+    """Its learner on rough ground."""
+
+    class runner(BipedCfgPPO.runner):
+        num_steps_per_env = 24  # [legged_gym]
