@@ -290,6 +290,7 @@ def test_a_new_task_overwrites_nothing(tmp_path: Path, monkeypatch: pytest.Monke
     assert mine.read_text() == "of mine" and [*tmp_path.iterdir()] == [mine]
     show(monkeypatch, capsys, GO1, "--new", "mine", "--out", tmp_path, "--force")
     assert mine.read_text() != "of mine" and (tmp_path / "mine.xml").read_bytes() == GO1.read_bytes()
+    assert "a b/mine_flat.py' --check" in show(monkeypatch, capsys, GO1, "--new", "mine", "--out", tmp_path / "a b"), "can be pasted"
     assert "a name begins with a letter" in complaint(monkeypatch, capsys, GO1, "--new", "a/b", "--out", tmp_path)
     assert "go1_flat is a task already" in complaint(monkeypatch, capsys, "go1_flat", "--new", "mine")
 
