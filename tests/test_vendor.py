@@ -238,15 +238,16 @@ def test_the_config_wins_over_the_keyframe() -> None:
     changed = make("go2_style", **{"init_state.pos": [0.0, 0.0, 0.5], "init_state.default_joint_angles": {"hip": 0.1, "FR_calf": -1.7}})
     assert changed.start_place == [0.0, 0.0, 0.5]
     assert changed.robot.pose == (0.1, 0.9, -1.8, 0.1, 0.9, -1.7, 0.1, 0.9, -1.8, 0.1, 0.9, -1.8)
+    legs = [0.213 * math.cos(0.9) + 0.213 * math.cos(0.9 + calf) for calf in (-1.8, -2.4)]
     lower = make("go2_style", **{"init_state.default_joint_angles": {"calf": -2.4}}).start_place
-    assert lower[2] < 0.22, "the keyframe's height of 0.27 m is that of its own pose"
+    assert lower[2] == pytest.approx(0.27 - legs[0] + legs[1], abs=0.01), "feet are as high above the ground as in the keyframe"
 
 
 def test_a_keyframe_states_a_height_and_no_place(tmp_path: Path) -> None:
     """On terrain the root would stand beside the middle of its tile."""
     key = '<keyframe><key qpos="1 2 0.4 1 0 0 0 0 0"/></keyframe>'
     robot = build_toy(toy(tmp_path, extra=key))
-    assert start_place(LeggedRobotCfg(), robot, []) == [0.0, 0.0, 0.4]
+    assert start_place(LeggedRobotCfg(), robot, ["left_foot"]) == [0.0, 0.0, 0.4]
 
 
 # ---- trouble by trouble
@@ -352,7 +353,7 @@ def test_of_keyframes_home_or_the_only_one_is_read(tmp_path: Path) -> None:
         return build_toy(toy(tmp_path, extra=f"<keyframe>{''.join(f'<key name={name!r} qpos={qpos!r}/>' for name in names)}</keyframe>"))
 
     for robot in (keys("sit", "home"), keys("sit")):
-        assert robot.pose == (0.1, 0.2) and robot.height == 0.4
+        assert robot.pose == (0.1, 0.2) and robot.keyframe is not None and robot.keyframe.height == 0.4
     assert keys("sit", "lie").pose == (0.0, 0.0) and "keyframe 'lie' dropped" in keys("sit", "lie").overrides
     assert "keyframe 'home' dropped" in " ".join(keys("home", qpos="0 0 1").overrides)
 

@@ -49,16 +49,19 @@ def load_robot(
 
 
 def start_place(cfg: RobotTaskCfg, robot: RobotModel, colliders: Sequence[str]) -> list[float]:
-    """x, y, z of the root [m]: the config's; or as high as in the keyframe whose pose it has; or with the lowest foot on the ground.
+    """x, y, z of the root [m]: the config's; or with its feet as high above the ground as in the keyframe; or with the lowest foot on it.
 
     Without feet it is the lowest of the ``colliders``.
     """
     if cfg.init_state.pos:
         return list(cfg.init_state.pos)
-    if robot.height is not None:
-        return [0.0, 0.0, robot.height]
     feet = [geom for geoms in robot.site_geoms.values() for geom in geoms]
-    return [0.0, 0.0, standing_height(robot, feet or robot.names.find(colliders, "asset.colliders", colliding=True), robot.pose)]
+    feet = feet or robot.names.find(colliders, "asset.colliders", colliding=True)
+    if robot.keyframe is None or robot.keyframe.height is None:
+        return [0.0, 0.0, standing_height(robot, feet, robot.pose)]
+    read = tuple(robot.keyframe.angles[name] for name in robot.joint_names)
+    lower = 0.0 if read == robot.pose else standing_height(robot, feet, read) - standing_height(robot, feet, robot.pose)
+    return [0.0, 0.0, robot.keyframe.height - lower]
 
 
 def soft_limits(robot: RobotModel, share: float, device: str | torch.device) -> tuple[Tensor, Tensor]:

@@ -24,7 +24,7 @@ from legged_mw.sim.rigid import fuse_fixed, sensed_site
 from legged_mw.sim.shapes import add_sites
 from legged_mw.sim.tables import per_joint as per_joint
 from legged_mw.sim.terrain import Terrain
-from legged_mw.sim.vendor import Loaded, naming, read_robot
+from legged_mw.sim.vendor import Keyframe, Loaded, naming, read_robot
 from legged_mw.utils.errors import unknown
 
 _CHOICES = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone, "solver": mujoco.mjtSolver}  # option -> its values
@@ -61,7 +61,7 @@ class RobotModel:
     held: tuple[str, ...] = ()  # joints of the file that are welded
     speed_limits: tuple[float, ...] = ()  # (D,) of the motors, unknown to the physics [rad/s]; infinite where nothing states one
     tables: dict[str, list[float]] = field(default_factory=dict)  # (D,) each, of the tables that were given
-    height: float | None = None  # of the root in the file's keyframe [m]; None: it has none, or the pose is another
+    keyframe: Keyframe | None = None  # the file's
 
     @property
     def joint_range(self) -> np.ndarray:
@@ -139,8 +139,7 @@ def _compile(
 ) -> RobotModel:
     """Add the sensors, and compile what is stepped."""
     _add_sensors(robot.spec, touching, velocity_sites, imu, robot.where)
-    whole, keyframe = robot.spec.copy(), robot.keyframe
-    kept = keyframe is not None and posed.angles == [keyframe.angles.get(name) for name in posed.joints]
+    whole = robot.spec.copy()
     physics = _compile_bare(robot.spec, ground, robot.notes)
     return RobotModel(
         physics=physics,
@@ -158,7 +157,7 @@ def _compile(
         held=tuple(posed.held),
         speed_limits=speeds,
         tables=posed.tables,
-        height=keyframe.height if keyframe and kept else None,
+        keyframe=robot.keyframe,
     )
 
 
