@@ -19,7 +19,6 @@ def train() -> None:
     from legged_mw.check.guard import check_recordable
     from legged_mw.eval.exams import make_exam
     from legged_mw.rl import training
-    from legged_mw.robot.case import naming_every_missing_key
 
     args = training.parse(train.__doc__)
     if args.list:
@@ -27,8 +26,7 @@ def train() -> None:
         return
     task = load_task(args.task)
     start, device = training.configure(task, args)
-    with naming_every_missing_key(task):
-        env = training.build(task, device, args.eager, check_recordable)
+    env = training.build(task, device, args.eager, check_recordable)
     if args.check:
         print(describe(env, task) + ("" if args.eager else "\nthe step can be recorded as a CUDA graph"))
         if args.picture:

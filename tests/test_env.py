@@ -646,7 +646,7 @@ def test_model_says_what_the_config_changed(quiet: LeggedRobot) -> None:
     notes = "\n".join(quiet.robot.overrides)
     for line in ("option timestep: 0.002 -> 0.004", "option iterations: 100 -> 1", "option ls_iterations: 50 -> 5"):
         assert line in notes
-    assert "ground: plane, friction 0.6, condim 3, priority 1" in notes and "keyframe 'home' read: pose and place of the root" in notes
+    assert "ground: plane, friction 0.6, condim 3, priority 1" in notes and "keyframe 'home' read: pose and height of the root" in notes
 
 
 def test_camera_looks_at_the_robot_and_is_not_stepped(quiet: LeggedRobot) -> None:

@@ -1,8 +1,8 @@
 """resources/robots/g1/g1.xml, link by link, against the published figures; its pose, its look and its export.
 
-Source of every figure: Unitree's g1_description, 29 DoF rev 1.0, as published in MuJoCo Menagerie (BSD-3-Clause). Joints,
-ranges and the whole machine's inertia are in test_robots.py. Typed here: the middle and the left side; the right side is its
-mirror image but for what RIGHT_... say. Units m, kg, kg m^2, rad, N m; quaternions w x y z.
+Source of every figure: Unitree's g1_description, 29 DoF rev 1.0, as published in MuJoCo Menagerie (BSD-3-Clause). Typed
+here: the middle and the left side; the right side is its mirror image but for what _RIGHT and RIGHT_... say.
+Units m, kg, kg m^2, rad, N m; quaternions w x y z.
 """
 
 from __future__ import annotations
@@ -18,7 +18,38 @@ from legged_mw.sim.model import Ground, Solver, build_model
 
 XML = Path(__file__).parents[1] / "resources" / "robots" / "g1" / "g1.xml"
 MIRROR = np.diag([1.0, -1.0, 1.0])
-MOTORS = {0.00425: 5.0, 0.003609725: 25.0, 0.00721945: 50.0, 0.01017752004: 88.0, 0.025101925: 139.0}  # armature -> force limit
+# joint, in the file's order: axis, range, armature, force limit
+_LEG = {
+    "hip_pitch": ("y", -2.5307, 2.8798, 0.01017752004, 88),
+    "hip_roll": ("x", -0.5236, 2.9671, 0.025101925, 139),
+    "hip_yaw": ("z", -2.7576, 2.7576, 0.01017752004, 88),
+    "knee": ("y", -0.087267, 2.8798, 0.025101925, 139),
+    "ankle_pitch": ("y", -0.87267, 0.5236, 0.00721945, 50),
+    "ankle_roll": ("x", -0.2618, 0.2618, 0.00721945, 50),
+}
+_WAIST = {
+    "waist_yaw": ("z", -2.618, 2.618, 0.01017752004, 88),
+    "waist_roll": ("x", -0.52, 0.52, 0.00721945, 50),
+    "waist_pitch": ("y", -0.52, 0.52, 0.00721945, 50),
+}
+_ARM = {
+    "shoulder_pitch": ("y", -3.0892, 2.6704, 0.003609725, 25),
+    "shoulder_roll": ("x", -1.5882, 2.2515, 0.003609725, 25),
+    "shoulder_yaw": ("z", -2.618, 2.618, 0.003609725, 25),
+    "elbow": ("y", -1.0472, 2.0944, 0.003609725, 25),
+    "wrist_roll": ("x", -1.97222, 1.97222, 0.003609725, 25),
+    "wrist_pitch": ("y", -1.61443, 1.61443, 0.00425, 5),
+    "wrist_yaw": ("z", -1.61443, 1.61443, 0.00425, 5),
+}
+_RIGHT = {"hip_roll": (-2.9671, 0.5236), "shoulder_roll": (-2.2515, 1.5882)}  # the only ranges that are not the left one's
+
+
+def _side(side: str, rows: dict[str, tuple]) -> dict[str, tuple]:
+    turned = {name: (row[0], *_RIGHT[name], *row[3:]) if side == "right" and name in _RIGHT else row for name, row in rows.items()}
+    return {f"{side}_{name}": row for name, row in turned.items()}
+
+
+JOINTS = _side("left", _LEG) | _side("right", _LEG) | _WAIST | _side("left", _ARM) | _side("right", _ARM)
 HOME = (0.0, 0.0, 0.785, 1.0, 0.0, 0.0, 0.0)
 BENT = {"hip_pitch": -0.1, "knee": 0.3, "ankle_pitch": -0.2, "shoulder_pitch": 0.2, "elbow": 1.28}
 _ONE = (1.0, 0.0, 0.0, 0.0)
@@ -264,10 +295,53 @@ def test_colliding_geom(model: mujoco.MjModel, shape: str) -> None:
         assert abs(rotation(geom.quat)[:, 2] @ flip @ rotation(quat)[:, 2]) == pytest.approx(1.0, abs=1e-9), name
 
 
-def test_force_limits_by_kind_of_motor(model: mujoco.MjModel) -> None:
-    kinds = {(model.dof_armature[5 + i], *model.jnt_actfrcrange[i]) for i in range(1, model.njnt)}
-    assert kinds == {(armature, -force, force) for armature, force in MOTORS.items()}
-    assert model.njnt == 1 + 29
+def test_it_states_facts_only(model: mujoco.MjModel) -> None:
+    """Servos, sensors, ground, lights and cameras are the choices of whoever loads it."""
+    assert (model.nu, model.nsensor, model.nlight, model.ncam, model.neq, model.nexclude) == (0,) * 6
+    text = XML.read_text()
+    for word in ("file=", "<option", "<include", "<actuator", "<sensor"):
+        assert word not in text
+    assert "Menagerie" in text and "BSD-3-Clause" in text and len(text) < 60_000
+
+
+def test_joints(model: mujoco.MjModel) -> None:
+    assert model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE and len(JOINTS) == 29
+    assert [model.joint(i).name for i in range(1, model.njnt)] == [f"{name}_joint" for name in JOINTS]
+    for name, (axis, low, high, armature, force) in JOINTS.items():
+        joint = model.joint(f"{name}_joint")
+        assert joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE and joint.limited[0] == 1 and model.jnt_actfrclimited[joint.id] == 1
+        np.testing.assert_array_equal(joint.axis, np.eye(3)["xyz".index(axis)], err_msg=name)
+        np.testing.assert_array_equal(joint.range, (low, high), err_msg=name)
+        np.testing.assert_array_equal(model.jnt_actfrcrange[joint.id], (-force, force), err_msg=name)
+        assert (joint.armature[0], joint.frictionloss[0], joint.damping[0]) == (armature, 0.1, 0.0), name
+
+
+def test_the_free_joint_is_free(model: mujoco.MjModel) -> None:
+    """The defaults of the hinges must not leak into it."""
+    for values in (model.dof_armature, model.dof_damping, model.dof_frictionloss):
+        np.testing.assert_array_equal(values[:6], 0.0)
+    assert model.jnt_limited[0] == 0 and model.jnt_actfrclimited[0] == 0
+
+
+def test_sites(model: mujoco.MjModel) -> None:
+    places = {"imu_in_pelvis": ("pelvis", (0.04525, 0.0, -0.08339))}
+    places |= {f"{side}_foot": (f"{side}_ankle_roll_link", (0.04, 0.0, -0.037)) for side in ("left", "right")}
+    for name, (body, place) in places.items():
+        assert model.body(model.site(name).bodyid[0]).name == body
+        np.testing.assert_array_equal(model.site(name).pos, place)
+        np.testing.assert_array_equal(model.site(name).quat, _ONE)
+
+
+def test_looks_weigh_nothing_and_touch_nothing(model: mujoco.MjModel) -> None:
+    spec = mujoco.MjSpec.from_file(str(XML))
+    looks = [geom for geom in spec.geoms if geom.group == 2]
+    assert all(geom.mass == 0.0 and (geom.contype, geom.conaffinity) == (0, 0) and geom.material for geom in looks)
+    assert {geom.group for geom in spec.geoms} == {2, 3}
+    spec.compiler.discardvisual = True
+    bare = spec.compile()
+    assert bare.ngeom == 33
+    for field in ("body_mass", "body_ipos", "body_iquat", "body_inertia", "dof_invweight0"):
+        np.testing.assert_array_equal(getattr(bare, field), getattr(model, field), err_msg=field)
 
 
 def test_home(model: mujoco.MjModel, home: mujoco.MjData) -> None:

@@ -115,6 +115,7 @@ def test_it_states_facts_only(model: mujoco.MjModel) -> None:
     text = XML.read_text()
     for word in ("file=", "<option", "<include", "<actuator", "<sensor"):
         assert word not in text
+    assert "Menagerie" in text and "BSD-3-Clause" in text
 
 
 def test_order_and_frames(model: mujoco.MjModel) -> None:

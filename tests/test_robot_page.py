@@ -53,7 +53,7 @@ def wheel(folder: Path, *, half: float = 0.2, offset: float = 0.0, more: str = '
 
 
 def health(robot: RobotModel, height: float = 0.1) -> Health:
-    return measure(robot, [0.0] * len(robot.joint_names), [0.0, 0.0, height], [None] * len(robot.joint_names))
+    return measure(robot, [0.0] * len(robot.joint_names), [0.0, 0.0, height])
 
 
 def test_a_robot_of_one_joint(tmp_path: Path) -> None:
@@ -117,7 +117,7 @@ def test_growth_and_verdict_are_those_of_the_step_itself(tmp_path: Path, kp: flo
 @pytest.mark.parametrize("implicit", [False, True])
 def test_verdicts_hold_where_the_polynomial_does(implicit: bool) -> None:
     for d, s in itertools.product(np.linspace(0.05, 3.0, 40), np.linspace(0.05, 8.0, 40)):
-        joint = Joint("j", -1, 1, 1, None, 0.1, s * 0.5 / DT**2, d * 0.5 / DT, 0.5, "default", 0.5, 0.0)
+        joint = Joint("j", -1, 1, 1, math.inf, 0.1, s * 0.5 / DT**2, d * 0.5 / DT, 0.5, "default", 0.5, 0.0)
         roots = np.roots([1 + d, -(2 + d - s), 1]) if implicit else np.roots([1, -(2 - s - d), 1 - d])
         assert (joint.verdict(DT, implicit) == "unstable") == (np.abs(roots).max() >= 1.0), (d, s)
         if not implicit and joint.verdict(DT, False) != "unstable":
@@ -137,8 +137,7 @@ def test_a_damping_that_the_step_does_not_bear(tmp_path: Path) -> None:
 
 
 def health_of(found: Draft, file: Path) -> Health:
-    case, env = found.case, as_env(found, file)
-    return measure(env.robot, case.pose, case.place, case.speeds)
+    return measure(as_env(found, file).robot, found.pose, found.place)
 
 
 def test_inside_by() -> None:
@@ -155,7 +154,7 @@ def test_inside_by() -> None:
 
 
 def joint(name: str, **other: Any) -> Joint:
-    plain = {"low": -1.0, "high": 1.0, "effort": 40.0, "speed": None, "armature": 0.01, "kp": 1.0, "kd": 0.0}
+    plain = {"low": -1.0, "high": 1.0, "effort": 40.0, "speed": math.inf, "armature": 0.01, "kp": 1.0, "kd": 0.0}
     return Joint(**{"name": name, **plain, "inertia": 0.1, "pose": "default", "held": 0.2, "torque": 0.0, **other})
 
 
@@ -291,19 +290,20 @@ def test_a_new_task_overwrites_nothing(tmp_path: Path, monkeypatch: pytest.Monke
     assert mine.read_text() == "of mine" and [*tmp_path.iterdir()] == [mine]
     show(monkeypatch, capsys, GO1, "--new", "mine", "--out", tmp_path, "--force")
     assert mine.read_text() != "of mine" and (tmp_path / "mine.xml").read_bytes() == GO1.read_bytes()
+    assert "a b/mine_flat.py' --check" in show(monkeypatch, capsys, GO1, "--new", "mine", "--out", tmp_path / "a b"), "can be pasted"
     assert "a name begins with a letter" in complaint(monkeypatch, capsys, GO1, "--new", "a/b", "--out", tmp_path)
     assert "go1_flat is a task already" in complaint(monkeypatch, capsys, "go1_flat", "--new", "mine")
 
 
 def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
-    assert draft(GO1).guessed[0] == "pose: the file's keyframe" and draft(GO1).case.pose[:3] == pytest.approx([0.1, 0.9, -1.8])
+    assert draft(GO1).guessed[0] == "pose: the file's keyframe" and draft(GO1).pose[:3] == pytest.approx([0.1, 0.9, -1.8])
     bare = tmp_path / "bare.xml"
     bare.write_text(re.sub(r"<keyframe>.*</keyframe>", "", GO1.read_text(), flags=re.DOTALL))
     found = draft(bare)
     assert [foot.name for foot in found.feet] == ["FR", "FL", "RR", "RL"]
     assert found.guessed[0] == "pose: knees bent, feet under the hips"
-    assert found.case.pose[:3] == pytest.approx([0.0, 0.8, -1.6], abs=0.02)  # two links of 0.213 m: half of the knee's angle
-    assert found.case.place[2] == pytest.approx(2 * 0.213 * math.cos(0.8) + 0.023, abs=0.01)
+    assert found.pose[:3] == pytest.approx([0.0, 0.8, -1.6], abs=0.02)  # two links of 0.213 m: half of the knee's angle
+    assert found.place[2] == pytest.approx(2 * 0.213 * math.cos(0.8) + 0.023, abs=0.01)
     assert health_of(found, bare).stand.end == "stands"
     text = config_text(found, GO1, "my_go")
     assert "class MyGoFlatCfg(LeggedRobotCfg):" in text and 'foot_names = ["FR", "FL", "RR", "RL"]  # LOOK: guessed' in text
@@ -331,7 +331,7 @@ def test_feet_and_poses_of_vendors_files(file: Path) -> None:
     health = health_of(found, file)
     assert health.margin > 0.05 and not health.rest.toppled and health.mode.growth < 1.0 + 1e-6
     assert health.stand.end == ("stands" if len(found.feet) == 4 else "falls")
-    angle = dict(zip(found.case.robot.joint_names, found.case.pose, strict=True))
+    angle = dict(zip(found.robot.joint_names, found.pose, strict=True))
     if file.stem.startswith("anymal"):  # its hind legs are its front legs, turned round
         assert angle["LF_HFE"] == pytest.approx(-angle["LH_HFE"]) and angle["LF_KFE"] == -angle["LH_KFE"] == -1.6
     if file.stem.startswith("g1"):

@@ -20,11 +20,14 @@ from worlds import QUIET
 from legged_mw import ROOT
 from legged_mw.check.describe import describe
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.envs.loading import start_place
 from legged_mw.rl.export_scene import standalone
 from legged_mw.sim.drawing import visual_model
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import RobotModel
 from legged_mw.utils.config import ConfigError
+from legged_mw.view.video import save_png
 
 EXACT = {"sim.iterations": 100, "sim.ls_iterations": 50}
 STILL = {"init_state.lin_vel_range": 0.0, "init_state.ang_vel_range": 0.0, "init_state.yaw_range": 0.0, "init_state.pos_xy_range": 0.0}
@@ -121,7 +124,7 @@ def test_its_mirror_image_moves_as_the_mirror_says(name: str) -> None:
 
 SAID = {
     "go2_style": [
-        "keyframe 'home' read: pose and place of the root, where nothing else states them",
+        "keyframe 'home' read: pose and height of the root, where nothing else states them",
         "sensors dropped, as nothing reads them: FR_hip_angle, FR_hip_speed, imu_quat, imu_gyro, imu_acc",
         "world geoms dropped, as the ground is added: floor, one without a name",
         "lights dropped: one without a name",
@@ -130,7 +133,7 @@ SAID = {
         "option impratio: 100 -> 1",
         "option cone: elliptic -> pyramidal",
         "option disableflags: none -> eulerdamp",
-        "actuator 'FR_hip' replaced by a position servo",
+        "12 actuators replaced by position servos",
     ],
     "g1_29dof_style": [
         "looks left out (no such file): pelvis.STL, torso_link.STL, head_link.STL",
@@ -149,7 +152,7 @@ SAID = {
         "fused into 'pelvis', to which they are fixed: torso_link, left_arm_link, right_arm_link",
         "site 'imu_aligned' made at the place of 'imu' on 'torso_link', with the axes of the root 'pelvis'",
     ],
-    "t1_style": ["keyframe 'stand' read: pose and place of the root, where nothing else states them", "cameras dropped: track"],
+    "t1_style": ["keyframe 'stand' read: pose and height of the root, where nothing else states them", "cameras dropped: track"],
     "anymal_c_style": [
         "free joint added to 'base'",
         "fused into 'base', to which they are fixed: base_inertia, face_front, battery, imu_link",
@@ -235,6 +238,16 @@ def test_the_config_wins_over_the_keyframe() -> None:
     changed = make("go2_style", **{"init_state.pos": [0.0, 0.0, 0.5], "init_state.default_joint_angles": {"hip": 0.1, "FR_calf": -1.7}})
     assert changed.start_place == [0.0, 0.0, 0.5]
     assert changed.robot.pose == (0.1, 0.9, -1.8, 0.1, 0.9, -1.7, 0.1, 0.9, -1.8, 0.1, 0.9, -1.8)
+    legs = [0.213 * math.cos(0.9) + 0.213 * math.cos(0.9 + calf) for calf in (-1.8, -2.4)]
+    lower = make("go2_style", **{"init_state.default_joint_angles": {"calf": -2.4}}).start_place
+    assert lower[2] == pytest.approx(0.27 - legs[0] + legs[1], abs=0.01), "feet are as high above the ground as in the keyframe"
+
+
+def test_a_keyframe_states_a_height_and_no_place(tmp_path: Path) -> None:
+    """On terrain the root would stand beside the middle of its tile."""
+    key = '<keyframe><key qpos="1 2 0.4 1 0 0 0 0 0"/></keyframe>'
+    robot = build_toy(toy(tmp_path, extra=key))
+    assert start_place(LeggedRobotCfg(), robot, ["left_foot"]) == [0.0, 0.0, 0.4]
 
 
 # ---- trouble by trouble
@@ -286,8 +299,9 @@ def test_a_urdfs_speed_limits_are_known() -> None:
 def test_a_table_with_a_wrong_key_or_number(field: str) -> None:
     with pytest.raises(ModelError, match=rf"^asset\.{field}: no joint 'kneee' in the MJCF; there are: FL_hip_joint, .* a part of"):
         make("go2_style", **{f"asset.{field}": {"kneee": 3.0}})
-    with pytest.raises(ConfigError, match=rf"^asset\.{field} is {{'hip': -1.0}}; it must be a table of numbers from 0$"):
-        make("go2_style", **{f"asset.{field}": {"hip": -1.0}})
+    wrong, least = (-1.0, "from") if field in ("armature", "frictionloss") else (0.0, "above")
+    with pytest.raises(ConfigError, match=rf"^asset\.{field} is {{'hip': {wrong}}}; it must be a table of numbers {least} 0$"):
+        make("go2_style", **{f"asset.{field}": {"hip": wrong}})
 
 
 def test_all_joints_without_a_number_are_named_at_once() -> None:
@@ -339,7 +353,7 @@ def test_of_keyframes_home_or_the_only_one_is_read(tmp_path: Path) -> None:
         return build_toy(toy(tmp_path, extra=f"<keyframe>{''.join(f'<key name={name!r} qpos={qpos!r}/>' for name in names)}</keyframe>"))
 
     for robot in (keys("sit", "home"), keys("sit")):
-        assert robot.pose == (0.1, 0.2) and robot.start == (0.0, 0.0, 0.4)
+        assert robot.pose == (0.1, 0.2) and robot.keyframe is not None and robot.keyframe.height == 0.4
     assert keys("sit", "lie").pose == (0.0, 0.0) and "keyframe 'lie' dropped" in keys("sit", "lie").overrides
     assert "keyframe 'home' dropped" in " ".join(keys("home", qpos="0 0 1").overrides)
 
@@ -568,6 +582,7 @@ def test_a_urdf_that_is_none(tmp_path: Path) -> None:
     (tmp_path / "mini.urdf").write_text('<robot xmlns:xacro="x"><xacro:leg/></robot>')
     with pytest.raises(ModelError, match=r"^mini.urdf holds xacro macros; write them out first: xacro mini.urdf > robot.urdf$"):
         build(tmp_path / "mini.urdf")
+    assert build(urdf(tmp_path / "mini.urdf", more="<!-- from <xacro:include/> -->")).root == "base", "a comment is no macro"
 
 
 def test_a_link_world_is_dropped(tmp_path: Path) -> None:
@@ -575,6 +590,67 @@ def test_a_link_world_is_dropped(tmp_path: Path) -> None:
     robot = build(urdf(tmp_path / "mini.urdf", more=world))
     assert robot.root == "base" and robot.physics.nq == 8
     assert {"link 'world' and joint 'stand' dropped: the root is free", "free joint added to 'base'"} <= set(robot.overrides)
+
+
+@pytest.mark.parametrize(
+    ("kind", "origin", "root"), [("floating", "", "base"), ("fixed", '<origin xyz="0 0 0.4"/>', "base"), ("fixed", "", "odom")]
+)
+def test_an_empty_link_that_is_elsewhere_is_dropped(tmp_path: Path, kind: str, origin: str, root: str) -> None:
+    """As base_footprint is, on the ground: heights are of the base. A dummy root in the same place stays."""
+    odom = f'<link name="odom"/><joint name="there" type="{kind}"><parent link="odom"/><child link="base"/>{origin}</joint>'
+    world = '<link name="world"/><joint name="stand" type="fixed"><parent link="world"/><child link="odom"/></joint>'
+    for more in (odom, odom + world):
+        robot = build(urdf(tmp_path / "mini.urdf", more=more))
+        assert robot.root == root and robot.physics.nq == 8
+        assert ("link 'odom' and joint 'there' dropped: the root is free" in robot.overrides) == (root == "base")
+
+
+def test_a_joint_that_mimics_moves_by_itself(tmp_path: Path) -> None:
+    file = urdf(tmp_path / "mini.urdf")
+    name = build(file).joint_names[0]
+    file.write_text(file.read_text().replace("</joint>", '<mimic joint="other"/></joint>'))
+    assert f"mimic dropped: {name} move by themselves" in build(file).overrides
+
+
+def test_a_root_without_a_name_gets_one(tmp_path: Path) -> None:
+    file = toy(tmp_path)
+    file.write_text(file.read_text().replace('<body name="base"', "<body"))
+    robot = build_toy(file)
+    assert robot.root == "base" and "body without a name, the root, is called 'base'" in robot.overrides
+
+
+def test_a_pose_beyond_a_range_is_a_warning(tmp_path: Path) -> None:
+    file = toy(tmp_path)
+    file.write_text(file.read_text().replace("<worldbody>", '<compiler angle="radian"/><worldbody>'))
+    over = build_toy(file, pose={"": 0.0, "left": 1.5}).overrides
+    assert [line for line in over if "beyond" in line] == ["warning: `pose`: left_hip stands at 1.5 rad, beyond its range from -1 to 1 rad"]
+    assert not any("beyond" in line for line in build_toy(file, pose={"": 1.0001}).overrides)
+
+
+def test_foot_names_are_no_patterns() -> None:
+    with pytest.raises(ConfigError, match=r"^asset.foot_names is \['F\*'\]; it must be a list with at least one name, one for each foot"):
+        make("go2_style", **{"asset.foot_names": ["F*"]})
+
+
+def test_files_of_an_attached_robot_and_of_a_stripped_path_are_found(tmp_path: Path) -> None:
+    """They are not where the file's own meshdir and texturedir say."""
+    brick(tmp_path / "arm/parts/hull.stl")
+    (tmp_path / "arm/arm.xml").write_text(
+        '<mujoco model="arm"><compiler meshdir="parts"/><asset><mesh name="hull" file="hull.stl"/></asset><worldbody><body name="arm">'
+        '<geom type="mesh" mesh="hull" mass="0.1"/></body></worldbody></mujoco>'
+    )
+    inside = '<frame><attach model="arm" body="arm" prefix="its_"/></frame>'
+    robot = build_toy(toy(tmp_path, inside=inside, extra='<asset><model name="arm" file="arm/arm.xml"/></asset>'))
+    assert robot.spec.compile().nmesh == 1 and not any("left out" in line for line in robot.overrides)
+    (tmp_path / "own").mkdir()
+    save_png(tmp_path / "own/wood.png", np.full((4, 4, 3), 255, dtype=np.uint8))
+    looks = '<geom type="box" size="0.1 0.1 0.1" material="wood" mass="0" contype="0" conaffinity="0"/>'
+    asset = '<asset><texture name="wood" type="2d" file="theirs/wood.png"/><material name="wood" texture="wood"/></asset>'
+    file = toy(tmp_path, inside=looks, extra='<compiler strippath="true" texturedir="own"/>' + asset)
+    robot = build_toy(file)
+    assert visual_model(robot).ntex and not any("left out" in line for line in robot.overrides)
+    (tmp_path / "own/wood.png").unlink()
+    assert "looks left out (no such file): theirs/wood.png" in build_toy(file).overrides
 
 
 def test_a_training_says_its_warnings_once(tmp_path: Path) -> None:

@@ -373,10 +373,10 @@ def test_the_disc_of_a_flat_foot_is_below_its_sole() -> None:
     """As long and as wide as the sole and a margin, 2.2 times the sole's half height, and turned with the foot."""
     box = 'type="box" size=".1 .04 .01" pos=".05 0 -.3"'
     [patch] = with_feet(box).patches([[True, False]])
-    assert np.allclose(patch.place, [0.18 + 0.05, 0.1, 0.35 - 0.31]) and patch.heading == 0.0
+    assert np.allclose(patch.place, [0.18 + 0.05, 0.1, 0.35 - 0.31]) and np.array_equal(patch.turn, np.eye(3))
     assert np.allclose(patch.half, [0.1 + 0.022, 0.04 + 0.022])
     [turned] = with_feet(box, yaw=np.pi / 2).patches([[True, False]])
-    assert np.allclose(turned.place, [-0.1, 0.18 + 0.05, 0.04]) and turned.heading == pytest.approx(np.pi / 2)
+    assert np.allclose(turned.place, [-0.1, 0.18 + 0.05, 0.04]) and np.allclose(turned.turn[:, 0], [0, 1, 0])
     assert np.allclose(turned.half, patch.half)
     robots = with_feet(box, pitch=0.5)  # on its heel or its toe: the disc lies below that edge, and is no longer than its margin
     [edge] = robots.patches([[True, False]])

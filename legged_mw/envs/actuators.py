@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from torch import Tensor
 
 from legged_mw.envs.domain_rand import DomainRand
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.sim.model import RobotModel, per_joint
+from legged_mw.sim.model import RobotModel
 from legged_mw.sim.simulation import Simulation
 from legged_mw.utils.math import assign
 
@@ -25,8 +23,7 @@ class Actuators:
     ) -> None:
         """``default`` (D,) and ``dof_pos`` (N, D) [rad]."""
         self._origin, self._default, self._dof_pos, self._sim = cfg.action_origin, default, dof_pos, sim
-        table = cfg.action_scale if isinstance(cfg.action_scale, Mapping) else {"": cfg.action_scale}
-        scale = per_joint(table, robot.joint_names, "control.action_scale", robot.held)
+        scale = robot.tables["control.action_scale"]
         self.scale = torch.tensor(scale, device=sim.device)  # (D,) [rad]
         self._same_scale = scale[0] if len(set(scale)) == 1 else None  # one number takes one operation less
         self.encoder_offset = rand.values.get("encoder_offset")  # (N, D) [rad], measured minus true angle

@@ -23,6 +23,7 @@ STEPS: Rule = ("two whole numbers from zero, the lower first", lambda v: len(v) 
 NAMES: Rule = ("a list with at least one name", lambda v: len(v) > 0)
 POINTS: Rule = ("at least one number, all finite", lambda v: len(v) > 0 and all(map(math.isfinite, v)))
 NUMBERS: Rule = ("a table of numbers from 0", lambda v: all(0 <= number < math.inf for number in v.values()))
+LIMITS: Rule = ("a table of numbers above 0", lambda v: all(0 < number < math.inf for number in v.values()))
 PROBABILITIES: Rule = (
     "three numbers from 0 to 1, and more for further commands",
     lambda v: len(v) >= 3 and all(0 <= p <= 1 for p in v),
@@ -51,13 +52,17 @@ ENVIRONMENT: dict[str, Rule] = {
     "domain_rand.redraw_iterations": NOT_NEGATIVE,
     "asset.colliders": NAMES,
     "init_state.pos": or_empty(("three numbers, x, y, z", lambda v: len(v) == 3)),
-    **dict.fromkeys((f"asset.{name}" for name in ("effort", "armature", "frictionloss", "joint_speed_limits")), NUMBERS),
+    **dict.fromkeys(("asset.armature", "asset.frictionloss"), NUMBERS),
+    **dict.fromkeys(("asset.effort", "asset.joint_speed_limits"), LIMITS),
     "viewer.camera": or_empty(("three numbers, not straight above or below", lambda v: len(v) == 3 and (v[0] != 0 or v[1] != 0))),
     "termination.max_tilt": ("above 0 and at most 180 degrees", lambda v: 0 < v <= 180),
     "terrain.condim": ("1, 3, 4 or 6", lambda v: v in (1, 3, 4, 6)),
 }
 WALKING: dict[str, Rule] = {
-    "asset.foot_names": NAMES,
+    "asset.foot_names": (
+        "a list with at least one name, one for each foot (patterns are for foot_geoms)",
+        lambda v: len(v) > 0 and "*" not in "".join(v),
+    ),
     "commands.resampling_time": NOT_NEGATIVE,
     "commands.keep_probability": PROBABILITIES,
     "commands.mirror": ("1 or -1 for each command", lambda v: all(sign in (1, -1) for sign in v.values())),

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.wording import config_words
+from legged_mw.sim.joints import PARTIAL
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
 from legged_mw.sim.pose import standing_height
 from legged_mw.sim.terrain import Terrain
@@ -20,7 +21,7 @@ def load_robot(
     cfg: RobotTaskCfg, engine: str, terrain: Terrain | None, contact_geoms: Sequence[str], sites: Mapping[str, Sequence[str]]
 ) -> RobotModel:
     """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors."""
-    asset = cfg.asset
+    asset, scale = cfg.asset, cfg.control.action_scale
     if not asset.file:
         raise ConfigError("asset.file is empty; name the robot's MJCF or URDF, e.g. 'resources/robots/go1/go1.xml'")
     robot = build_model(
@@ -36,29 +37,31 @@ def load_robot(
         imu_site=asset.imu_site,
         sites=sites,
         pose=cfg.init_state.default_joint_angles,
-        held_joints=asset.held_joints,
-        partial={
-            "effort": asset.effort,
-            "armature": asset.armature,
-            "frictionloss": asset.frictionloss,
-            "joint_speed_limits": asset.joint_speed_limits,
+        tables={
+            "control.action_scale": scale if isinstance(scale, Mapping) else {"": scale},
+            "rewards.pose_weights": cfg.rewards.pose_weights,
         },
+        held_joints=asset.held_joints,
+        partial={name: getattr(asset, name) for name in PARTIAL},
     )
     robot.overrides[:] = [config_words(line) for line in robot.overrides]
     return robot
 
 
 def start_place(cfg: RobotTaskCfg, robot: RobotModel, colliders: Sequence[str]) -> list[float]:
-    """x, y, z of the root [m]: the config's, the keyframe's, or such that the lowest foot stands on the ground in the default pose.
+    """x, y, z of the root [m]: the config's; or with its feet as high above the ground as in the keyframe; or with the lowest foot on it.
 
     Without feet it is the lowest of the ``colliders``.
     """
     if cfg.init_state.pos:
         return list(cfg.init_state.pos)
-    if robot.start:
-        return list(robot.start)
     feet = [geom for geoms in robot.site_geoms.values() for geom in geoms]
-    return [0.0, 0.0, standing_height(robot, feet or robot.names.find(colliders, "asset.colliders", colliding=True))]
+    feet = feet or robot.names.find(colliders, "asset.colliders", colliding=True)
+    if robot.keyframe is None or robot.keyframe.height is None:
+        return [0.0, 0.0, standing_height(robot, feet, robot.pose)]
+    read = tuple(robot.keyframe.angles[name] for name in robot.joint_names)
+    lower = 0.0 if read == robot.pose else standing_height(robot, feet, read) - standing_height(robot, feet, robot.pose)
+    return [0.0, 0.0, robot.keyframe.height - lower]
 
 
 def soft_limits(robot: RobotModel, share: float, device: str | torch.device) -> tuple[Tensor, Tensor]:

@@ -33,7 +33,7 @@ from legged_mw.envs.statistics import Statistics
 from legged_mw.envs.wording import in_config_words
 from legged_mw.sim.engines import make_simulation, pick_engine
 from legged_mw.sim.mirror import Partners, find_partners
-from legged_mw.sim.model import RobotModel, per_joint
+from legged_mw.sim.model import RobotModel
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
@@ -437,9 +437,9 @@ class RobotTask(RobotRewards, BaseTask):
 
     def _init_ranges(self) -> None:
         """Config numbers as tensors: joints' tables and ranges of a reset."""
-        cfg, names, init = self.cfg, self.robot.joint_names, self.cfg.init_state
+        cfg, init = self.cfg, self.cfg.init_state
         self.default_dof_pos = self._tensor(self.robot.pose)
-        self.pose_weights = self._tensor(per_joint(cfg.rewards.pose_weights, names, "rewards.pose_weights", self.robot.held))
+        self.pose_weights = self._tensor(self.robot.tables["rewards.pose_weights"])
         self.joint_lower, self.joint_upper = self._tensor(self.robot.joint_range).unbind(dim=1)
         self.soft_lower, self.soft_upper = soft_limits(self.robot, cfg.rewards.soft_dof_pos_limit, self.device)
         self.start_place = start_place(cfg, self.robot, cfg.asset.colliders)  # of the root at reset [m]

@@ -36,7 +36,7 @@ class RobotTaskCfg(Config):
         joint_speed_limits: dict[str, float] = {}  # the motor's highest speed [rad/s] (a URDF has it); for the report only
 
     class init_state:
-        pos: list[float] = []  # root at reset [m]; empty: the file's keyframe "home" or its only one, or else the lowest foot on the ground
+        pos: list[float] = []  # root at reset [m]; empty: feet as high as in the keyframe "home" or the only one, or on the ground
         default_joint_angles: dict[str, float] = {}  # table a joint [rad]: the pose of action 0; joints without a key: that keyframe's
         dof_pos_range: list[float] = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
         dof_pos_offset: list[float] = [0.0, 0.0]  # added to each joint at reset, U(low, high), within its range [rad]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from legged_mw.rl.built_in import shorten
+from legged_mw.rl.export_meshes import shorten
 from legged_mw.sim.drawing import dressed
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND, MOST_BOXES, Box, add_ground_box, as_boxes, feel_all_ground

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import copy
+import shlex
 from pathlib import Path
 
 import torch
 
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.robot import new, picture
-from legged_mw.robot.case import Case, from_env, from_task, naming_every_missing_key
 from legged_mw.robot.draft import Draft, as_env, draft, has_mirror
-from legged_mw.robot.measure import Health, measure
+from legged_mw.robot.measure import measure
 from legged_mw.robot.page import page
 from legged_mw.utils.cli import Parser, command, one_line_errors
 from legged_mw.utils.errors import UserError, shown
@@ -39,27 +42,32 @@ def main() -> None:
         return
     found = draft(file)
     env = as_env(found, file)
-    print(case_page(from_env(env), file.name, image, found))
+    print(env_page(env, file.name, image, found))
     if args.new:
         written = new.write(found, file, args.new, Path(args.out), args.force, has_mirror(env))
-        print(f"written: {' and '.join(map(shown, written))}; next:\n  {command('train')} --task {shown(written[1])} --check")
+        flags = shlex.join(["--task", shown(written[1]), "--check"])
+        print(f"written: {' and '.join(map(shown, written))}; next:\n  {command('train')} {flags}")
 
 
 def task_page(task: LoadedTask, image: Path | None) -> str:
-    """The page of a task's robot, and its picture to ``image``."""
-    with naming_every_missing_key(task):
-        case = from_task(task)
-    return case_page(case, task.name, image)
+    """The page of a task's robot, one on a plane, and its picture to ``image``."""
+    one = copy.deepcopy(task)
+    one.set("env.num_envs", 1)
+    one.set("sim.engine", "mujoco")
+    if isinstance(one.cfg.to_dict()["terrain"].get("mesh_type"), str):
+        one.set("terrain.mesh_type", "plane")
+    return env_page(one.env_class(one.cfg, "cpu"), task.name, image)
 
 
-def case_page(case: Case, title: str, image: Path | None, found: Draft | None = None) -> str:
+def env_page(env: RobotTask, title: str, image: Path | None, found: Draft | None = None) -> str:
     """The page as text, with what was guessed if the task is a draft; the picture goes to ``image``."""
-    health: Health = measure(case.robot, case.pose, case.place, case.speeds, case.decimation)
+    robot, feet = env.robot, env.foot_geoms if isinstance(env, LeggedRobot) else {}
+    health = measure(robot, robot.pose, env.start_place, env.cfg.control.decimation)
     text = page(health, title, found.guessed, found.notes) if found else page(health, title)
     if image is None:
         return text
     try:
-        picture.draw(image, case.robot, health.rest.qpos, case.feet, case.imu, title)
+        picture.draw(image, robot, health.rest.qpos, feet, title)
     except OSError as error:
         raise UserError(f"cannot write {image}: {error.strerror}; say --picture FILE.png") from None
     return f"{text}\npicture: {shown(image)}"

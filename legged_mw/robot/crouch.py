@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from legged_mw.robot.feet import Foot
 from legged_mw.sim.model import RobotModel
+from legged_mw.sim.pose import posed
 
 # ours: the knee's angle about the axis to the left [rad]; a quadruped leans its thighs back (Go1 0.9 and -1.8), a biped forwards
 KNEE = {2: 0.6}
@@ -28,7 +29,7 @@ _MARGIN = 0.05  # [rad] from the end of a range
 def bent(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> NDArray[np.float64] | None:
     """``pose`` (D,) with all legs bent; None if a leg has no two joints that bend it."""
     model, found = robot.physics, pose.copy()
-    data = _placed(model, pose)
+    data = posed(model, pose)
     for foot in feet:
         legs = [joint for joint in _joints_to(model, foot) if abs(data.xaxis[joint][1]) > _SIDEWAYS]
         if len(legs) < 2:
@@ -49,13 +50,6 @@ def _forward(data: mujoco.MjData, model: mujoco.MjModel, knee: int, foot: Foot) 
     """1.0 if a straight leg's foot is ahead of its knee or below it, and goes ahead of it; -1.0 if it is behind."""
     ahead = data.geom_xpos[model.geom(foot.geoms[0]).id, 0] - data.xanchor[knee, 0]
     return -1.0 if ahead < -_BEHIND else 1.0
-
-
-def _placed(model: mujoco.MjModel, pose: NDArray[np.float64]) -> mujoco.MjData:
-    data = mujoco.MjData(model)
-    data.qpos[:] = [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, *pose]
-    mujoco.mj_kinematics(model, data)
-    return data
 
 
 def _joints_to(model: mujoco.MjModel, foot: Foot) -> list[int]:
@@ -84,7 +78,7 @@ def _over(model: mujoco.MjModel, pose: NDArray[np.float64], hip: int, foot: Foot
     for angle in np.linspace(-1.57, 1.57, 200):
         trial = pose.copy()
         trial[hip - 1] = allowed = _within(model, hip, angle)
-        data = _placed(model, trial)
+        data = posed(model, trial)
         middle = data.geom_xpos[geoms].mean(axis=0)
         away = middle - data.xanchor[hip]
         off[allowed] = abs(float(away[0])) + (10.0 if away[2] > 0.0 else 0.0)

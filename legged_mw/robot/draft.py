@@ -5,6 +5,7 @@ What is guessed or chosen is marked LOOK in the file.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,13 +17,14 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.robot.case import TABLES, Case, from_env
 from legged_mw.robot.crouch import bent
-from legged_mw.robot.feet import Foot, guess_feet, height_over
+from legged_mw.robot.feet import Foot, guess_feet
 from legged_mw.robot.measure import Joint, mass_matrices, stand_as_statue, what_joints_bear
 from legged_mw.robot.suggest import Gains, family, suggest
 from legged_mw.sim.errors import ModelError
-from legged_mw.sim.model import per_joint
+from legged_mw.sim.model import RobotModel
+from legged_mw.sim.pose import standing_height
+from legged_mw.sim.tables import per_joint
 from legged_mw.sim.vendor import read_robot
 from legged_mw.utils.config import ConfigError
 
@@ -33,12 +35,14 @@ CLEARANCE = 0.003  # [m] above the ground at reset, so that nothing begins insid
 class Draft(NamedTuple):
     """The numbers of a first task."""
 
-    case: Case  # with the guessed pose, place and feet
+    robot: RobotModel
+    pose: list[float]  # (D,) [rad]
+    place: list[float]  # (3,) [m] of the root
     joints: tuple[Joint, ...]
     gains: list[Gains]
     feet: list[Foot]
     guessed: list[str]  # what nobody said, a line each
-    pose: str  # where the default pose is from, in words
+    pose_from: str  # where the default pose is from, in words
     notes: list[str]  # what was dropped, added or changed in the file as it was read, a line each
 
 
@@ -46,18 +50,16 @@ def draft(file: Path) -> Draft:
     """Guess what a task needs to know of the robot in ``file`` (MJCF or URDF)."""
     read = read_robot(file)
     from_file = read.keyframe is not None
-    case = from_env(_bare(file, from_file))
-    limited = case.robot.physics.jnt_limited[1:] > 0
-    low, high = case.robot.joint_range.T
-    pose = np.array(case.pose)
-    pose = np.where(limited, np.clip(pose, low, high), pose)
-    rest = stand_as_statue(case.robot, pose, np.array(case.place))
-    feet = guess_feet(case.robot, rest.qpos)
-    bends = None if from_file else bent(case.robot, pose, feet)
+    env = _bare(file, from_file)
+    robot, place = env.robot, np.array(env.start_place)
+    pose = np.clip(robot.pose, *robot.joint_range.T)
+    rest = stand_as_statue(robot, pose, place)
+    feet = guess_feet(robot, rest.qpos)
+    bends = None if from_file else bent(robot, pose, feet)
     if bends is not None:
-        pose, rest = bends, stand_as_statue(case.robot, bends, np.array(case.place))
-    joints = what_joints_bear(case.robot, mass_matrices(case.robot, pose), rest.torque, case.speeds)
-    gains = suggest(joints, float(case.robot.physics.opt.timestep))
+        pose, rest = bends, stand_as_statue(robot, bends, place)
+    joints = what_joints_bear(robot, mass_matrices(robot, pose), rest.torque)
+    gains = suggest(joints, float(robot.physics.opt.timestep))
     how = "all joints at 0, or at the nearest end of their range" if bends is None else "knees bent, feet under the hips"
     how = "the file's keyframe" if from_file else how
     guessed = [
@@ -65,20 +67,20 @@ def draft(file: Path) -> Draft:
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest ends of limbs",
         "gains: as suggested below",
     ]
-    pose = np.round(pose, 4)
-    place = [0.0, 0.0, round(height_over(case.robot, pose, feet) + CLEARANCE, 3)]
-    case = case._replace(pose=pose.tolist(), place=place, feet={foot.name: foot.geoms for foot in feet})
-    return Draft(case, joints, gains, feet, guessed, how, read.notes)
+    pose = (np.round(pose, 4) + 0.0).tolist()  # no -0.0
+    height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
+    return Draft(robot, pose, [0.0, 0.0, round(height + CLEARANCE, 3)], joints, gains, feet, guessed, how, read.notes)
 
 
 def _bare(file: Path, keyframe: bool) -> RobotTask:
     """A world with the robot and nothing else, in the pose of the file's ``keyframe`` or with all joints at 0."""
     cfg = RobotTaskCfg()
-    cfg.update({"env": {"num_envs": 1}, "asset": {"file": str(file.resolve())}, "sim": {"engine": "mujoco"}}, where="the health page")
-    for path, value in TABLES.items():
-        cfg.set(path, value)
-    if keyframe:
-        cfg.init_state.default_joint_angles = {}
+    fields = {
+        **{"env": {"num_envs": 1}, "asset": {"file": str(file.resolve())}, "sim": {"engine": "mujoco"}},
+        "control": {"stiffness": {"": 1.0}, "damping": {"": 0.0}, "action_scale": 1.0},
+        "init_state": {"default_joint_angles": {} if keyframe else {"": 0.0}},
+    }
+    cfg.update(fields, where="the health page")
     return RobotTask(cfg, "cpu")
 
 
@@ -100,11 +102,11 @@ def has_mirror(env: LeggedRobot) -> bool:
 
 def values(found: Draft) -> dict[str, dict[str, Any]]:
     """Section -> field -> value."""
-    names, two, height = found.case.robot.joint_names, len(found.feet) == 2, found.case.place[2]
+    names, two, height = found.robot.joint_names, len(found.feet) == 2, found.place[2]
     asset: dict[str, Any] = {"foot_names": [foot.name for foot in found.feet]}
     if parts := {foot.name: list(foot.geoms) for foot in found.feet if not foot.known}:
         asset["foot_geoms"] = parts
-    if said := {name: speed for name, speed in zip(names, found.case.speeds, strict=True) if speed is not None}:
+    if said := {name: speed for name, speed in zip(names, found.robot.speed_limits, strict=True) if math.isfinite(speed)}:
         asset["joint_speed_limits"] = table([*said.values()], names) if len(said) == len(names) else said
     asset["colliders"] = [name for foot in found.feet for name in ([foot.name] if foot.known else foot.geoms)]
     ranges = {"lin_vel_x": [-0.5, 0.8], "lin_vel_y": [-0.3, 0.3], "ang_vel_yaw": [-0.5, 0.5]}
@@ -112,7 +114,7 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
         ranges = {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_yaw": [-1.0, 1.0]}
     chosen: dict[str, dict[str, Any]] = {
         "asset": asset,
-        "init_state": {"pos": found.case.place, "default_joint_angles": table(found.case.pose, names)},
+        "init_state": {"pos": found.place, "default_joint_angles": table(found.pose, names)},
         "control": {
             "stiffness": table([gain.kp for gain in found.gains], names),
             "damping": table([gain.kd for gain in found.gains], names),

@@ -4,7 +4,6 @@
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -13,11 +12,11 @@ from numpy.typing import NDArray
 
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.shapes import spheres_on
+from legged_mw.sim.pose import posed
+from legged_mw.sim.shapes import surfaces
 
 _SAME, _SAME_SHARE = 0.03, 0.08  # [m], and of the robot's height: ends of limbs that are so much higher than the lowest are feet too
 _SOLE = 0.015  # [m] parts of a foot that are so much higher than its lowest are of its sole
-_SPACING = 0.02  # [m] between points on a surface
 
 
 class Foot(NamedTuple):
@@ -30,14 +29,13 @@ class Foot(NamedTuple):
 
 def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
     """Feet in the order of the file, with the robot at ``qpos`` (7 + D,). Raises ModelError if nothing touches."""
-    model, data = robot.physics, mujoco.MjData(robot.physics)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(model, data)
-    ground = robot.ground_geoms()
-    low = {g: _lowest(model, data, g) for g in range(ground.stop, model.ngeom) if model.geom_conaffinity[g]}
-    parents = {int(p) for p in model.body_parentid[1:]}
-    ends = {int(model.geom_bodyid[g]) for g in low} - parents
-    of_body = {body: {g: z for g, z in low.items() if model.geom_bodyid[g] == body} for body in sorted(ends)}
+    model, parents = robot.physics, {*robot.physics.body_parentid[1:]}
+    colliding = [g for g in range(robot.ground_geoms().stop, model.ngeom) if model.geom_conaffinity[g]]
+    names = [model.geom(g).name for g in colliding if model.geom_bodyid[g] not in parents]
+    of_body: dict[int, dict[int, float]] = {}
+    for name, points in surfaces(model, posed(model, qpos[7:], qpos[:7]), names).items():
+        geom = model.geom(name)
+        of_body.setdefault(int(geom.bodyid[0]), {})[geom.id] = float(points[:, 2].min())
     if not of_body:
         raise ModelError("no part that ends a limb collides, so that no feet can be guessed; give the feet colliding geoms")
     lowest = min(min(these.values()) for these in of_body.values())
@@ -50,20 +48,6 @@ def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:
     """Of a body's geoms, ``low`` [m, world] each, the lowest one and those of its kind that are about as low."""
     lowest = min(low, key=lambda geom: low[geom])
     return [g for g, z in low.items() if z <= low[lowest] + _SOLE and model.geom_type[g] == model.geom_type[lowest]]
-
-
-def height_over(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> float:
-    """[m] of the upright root when the lowest of ``feet`` touches the ground, with the joints at ``pose`` (D,)."""
-    data = mujoco.MjData(robot.physics)
-    data.qpos[:] = [0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, *pose]
-    mujoco.mj_kinematics(robot.physics, data)
-    return -min(_lowest(robot.physics, data, robot.id("geom", geom)) for foot in feet for geom in foot.geoms)
-
-
-def _lowest(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> float:
-    """[m, world] of the geom's surface."""
-    points, radius = spheres_on(model, geom, _SPACING)
-    return float((data.geom_xpos[geom] + points @ data.geom_xmat[geom].reshape(3, 3).T)[:, 2].min()) - radius
 
 
 def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:

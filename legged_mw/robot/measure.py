@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from legged_mw.sim.engines import make_simulation
 from legged_mw.sim.model import RobotModel
+from legged_mw.sim.pose import posed
 from legged_mw.sim.room import Room, count_room
 
 FloatArray = NDArray[np.float64]
@@ -55,7 +56,7 @@ class Joint(NamedTuple):
     low: float  # [rad]
     high: float  # [rad]; both infinite without limits
     effort: float  # [N m]
-    speed: float | None  # [rad/s]; None: nobody said
+    speed: float  # [rad/s]; infinite: nobody said
     armature: float  # [kg m^2]
     kp: float  # [N m/rad]
     kd: float  # [N m s/rad]
@@ -120,13 +121,8 @@ class Health:
     room: Room  # for contacts and constraint rows on mujoco-warp
 
 
-def measure(
-    robot: RobotModel, pose: Sequence[float], place: Sequence[float], speeds: Sequence[float | None], decimation: int = 5
-) -> Health:
-    """The health of ``robot`` on level ground, in ``pose`` (D,) [rad], with its root at ``place`` (3,) [m], upright.
-
-    ``speeds`` (D,) are the motors' highest [rad/s], None where not known.
-    """
+def measure(robot: RobotModel, pose: Sequence[float], place: Sequence[float], decimation: int = 5) -> Health:
+    """The health of ``robot`` on level ground, in ``pose`` (D,) [rad], with its root at ``place`` (3,) [m], upright."""
     model, angles = robot.physics, np.array(pose, dtype=float)
     rest = stand_as_statue(robot, angles, np.array(place, dtype=float))
     matrices = mass_matrices(robot, angles)
@@ -137,7 +133,7 @@ def measure(
         top=_highest(robot, rest.qpos),
         margin=inside_by(rest.points[:, :2], rest.com[:2]),
         rest=rest,
-        joints=what_joints_bear(robot, matrices, rest.torque, speeds),
+        joints=what_joints_bear(robot, matrices, rest.torque),
         mode=max((fastest_mode(robot, matrix, implicit) for matrix in matrices.values()), key=lambda mode: mode.growth),
         stand=stand_on_servos(robot, angles, place, decimation),
         dt=float(model.opt.timestep),
@@ -226,9 +222,7 @@ def _to_segment(place: FloatArray, start: FloatArray, end: FloatArray) -> float:
 def _highest(robot: RobotModel, qpos: FloatArray) -> float:
     """[m] of the robot's geoms, looks included."""
     model = robot.spec.copy().compile()
-    data = mujoco.MjData(model)
-    data.qpos[:] = qpos
-    mujoco.mj_kinematics(model, data)
+    data = posed(model, qpos[7:], qpos[:7])
     moving = np.flatnonzero(model.body_weldid[model.geom_bodyid])
     rotation, box = data.geom_xmat[moving].reshape(-1, 3, 3), model.geom_aabb[moving]
     tops = data.geom_xpos[moving, 2] + (rotation @ box[:, :3, None])[:, 2, 0] + (np.abs(rotation) @ box[:, 3:, None])[:, 2, 0]
@@ -248,27 +242,23 @@ def mass_matrices(robot: RobotModel, pose: FloatArray) -> dict[str, FloatArray]:
 
 
 def _mass_matrix(model: mujoco.MjModel, pose: FloatArray) -> FloatArray:
-    data = mujoco.MjData(model)
-    data.qpos[:] = [0.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0, *pose]
+    data, matrix = posed(model, pose), np.zeros((model.nv, model.nv))
     mujoco.mj_forward(model, data)
-    matrix = np.zeros((model.nv, model.nv))
     mujoco.mj_fullM(model, data, matrix)
     return matrix
 
 
-def what_joints_bear(
-    robot: RobotModel, matrices: dict[str, FloatArray], torque: FloatArray, speeds: Sequence[float | None]
-) -> tuple[Joint, ...]:
+def what_joints_bear(robot: RobotModel, matrices: dict[str, FloatArray], torque: FloatArray) -> tuple[Joint, ...]:
     """Each joint with the smallest inertia of ``mass_matrices``, and its ``torque`` (D,) at rest [N m]."""
     model, rows = robot.physics, []
     free = {name: 1.0 / np.diag(np.linalg.inv(matrix)) for name, matrix in matrices.items()}
     for i, name in enumerate(robot.joint_names):
         dof = 6 + i
         pose = min(free, key=lambda each, dof=dof: float(free[each][dof]))
-        low, high = robot.joint_range[i] if model.jnt_limited[1 + i] else (-math.inf, math.inf)
+        low, high = robot.joint_range[i]
         rows.append(
             Joint(
-                *(name, float(low), float(high), float(robot.effort_range[i, 1]), speeds[i], float(model.dof_armature[dof])),
+                *(name, float(low), float(high), float(robot.effort_range[i, 1]), robot.speed_limits[i], float(model.dof_armature[dof])),
                 *(float(model.actuator_gainprm[i, 0]), float(model.dof_damping[dof])),
                 *(float(free[pose][dof]), pose, float(matrices["default"][dof, dof]), float(torque[i])),
             )

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shutil
-from collections.abc import Sequence
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
     lines = [_HEAD.format(title=name, joints=len(found.joints), legs=legs, file=file.name, name=title).rstrip("\n")]
     sections = values(found)
     sections["asset"] = {"file": f"{name}.xml", **sections["asset"]}
-    comments = {**_COMMENTS, "default_joint_angles": f"[rad] LOOK: {found.pose}"}
+    comments = {**_COMMENTS, "default_joint_angles": f"[rad] LOOK: {found.pose_from}"}
     for section, fields in sections.items():
         lines += [f"    class {section}(LeggedRobotCfg.{section}):"]
         for field, value in fields.items():
@@ -110,32 +111,10 @@ def _force_limits(found: Draft) -> list[str]:
 def _field(name: str, value: Any, comment: str, indent: int) -> list[str]:
     """``name = value  # comment``, in several lines where it is longer than a line may be."""
     space, note = " " * indent, f"  # {comment}" if comment else ""
-    line = f"{space}{name} = {_literal(value)}"
+    line = f"{space}{name} = {json.dumps(value)}"  # of these values as Python has them
     if len(line + note) <= WIDTH:
         return [line + note]
     opening, closing = ("{", "}") if isinstance(value, dict) else ("[", "]")
-    parts = (
-        [f"{_literal(key)}: {_literal(number)}" for key, number in value.items()] if isinstance(value, dict) else [*map(_literal, value)]
-    )
-    return [f"{space}{name} = {opening}{note}", *_filled(parts, indent + 4), space + closing]
-
-
-def _filled(parts: Sequence[str], indent: int) -> list[str]:
-    """``parts`` with commas, as many in a line as fit."""
-    lines, space = [" " * indent], " " * indent
-    for part in parts:
-        if len(lines[-1]) + len(part) + 2 > WIDTH and lines[-1].strip():
-            lines.append(space)
-        lines[-1] += ("" if not lines[-1].strip() else " ") + f"{part},"
-    return lines
-
-
-def _literal(value: Any) -> str:
-    """As ruff formats it."""
-    if isinstance(value, str):
-        return f'"{value}"'
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{_literal(key)}: {_literal(inner)}" for key, inner in value.items()) + "}"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_literal, value)) + "]"
-    return repr(value + 0.0 if isinstance(value, float) else value)  # no -0.0
+    parts = json.dumps(value)[1:-1].replace(": ", ":\0") + ","  # a key and its number stay in one line
+    lines = textwrap.wrap(parts, WIDTH - indent - 4, break_long_words=False, break_on_hyphens=False)
+    return [f"{space}{name} = {opening}{note}", *(f"{space}    {line}".replace("\0", " ") for line in lines), space + closing]

@@ -10,7 +10,6 @@ from legged_mw.robot.suggest import Gains, suggest
 
 _GROWS = 1e-6  # more than 1 by so much, a mode grows; less is rounding of the root's
 _TIP = 0.3  # [rad] a joint that sags more than this does not stand as its default pose says
-SERVO = " replaced by a position servo"  # what notes on an actuator end with
 _HEAD = ("joint", "inertia", "pose", "dt kd/I", "dt sqrt(kp/I)", "ratio", "sag", "range [rad]", "effort", "speed", "kp", "kd", "suggested")
 
 
@@ -20,7 +19,7 @@ def page(health: Health, title: str, guessed: Sequence[str] = (), changed: Seque
     lines = [f"health of {title}", *(f"  guessed: {line}" for line in guessed), *_summary(health)]
     lines += ["joints", *_table(health, gains), *_LEGEND]
     if changed:
-        lines += ["what was dropped, added or changed in the file", *(f"  {line}" for line in _in_short(changed))]
+        lines += ["what was dropped, added or changed in the file", *(f"  {line}" for line in changed)]
     found = remarks(health, gains)
     return "\n".join([*lines, "what to look at", *(f"  - {line}" for line in found or ["nothing: all numbers are within bounds"])])
 
@@ -31,13 +30,6 @@ _LEGEND = (
     "  dt kd/I: from 1 on it rings, from 2 on it is unstable; dt sqrt(kp/I): unstable from 2 on; ratio: kd / (2 sqrt(kp I));",
     '  sag [rad] under gravity at rest; effort [N m]; speed [rad/s]; kp [N m/rad]; kd [N m s/rad]; "cut": the step bears no more',
 )
-
-
-def _in_short(changed: Sequence[str]) -> list[str]:
-    """Actuators, of which there is one a joint, in one line."""
-    servos = [line for line in changed if line.endswith(SERVO)]
-    others = [line for line in changed if line not in servos]
-    return [f"{len(servos)} actuators{SERVO.replace(' a ', ' ')}s", *others] if len(servos) > 1 else [*changed]
 
 
 def _summary(health: Health) -> list[str]:
@@ -95,7 +87,7 @@ def _row(joint: Joint, gain: Gains, health: Health) -> tuple[str, ...]:
         *(f"{mark}{joint.damping_step(health.dt):.2f}", f"{joint.stiffness_step(health.dt):.2f}"),
         *(f"{joint.damping_ratio():.2f}", f"{joint.sag():.3f}"),
         f"{joint.low:.2f} {joint.high:.2f}" if math.isfinite(joint.low) else "none",
-        *(f"{joint.effort:g}" if math.isfinite(joint.effort) else "none", "?" if joint.speed is None else f"{joint.speed:g}"),
+        *(f"{joint.effort:g}" if math.isfinite(joint.effort) else "none", f"{joint.speed:g}" if math.isfinite(joint.speed) else "?"),
         *(f"{joint.kp:g}", f"{joint.kd:g}", f"{gain.kp:g} {gain.kd:g}{' cut' if gain.cut else ''}"),
     )
 

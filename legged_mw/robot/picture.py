@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from legged_mw.robot.suggest import family
 from legged_mw.sim.drawing import visual_spec
 from legged_mw.sim.model import RobotModel
+from legged_mw.view.feet import patch
 from legged_mw.view.posed_robot import GROUPS_SHOWN, PosedRobots
 from legged_mw.view.recorder import no_context
 from legged_mw.view.stage import FloatArray, ViewError
@@ -56,11 +57,11 @@ class Label(NamedTuple):
     arrows: tuple[tuple[FloatArray, Rgb], ...] = ()  # ends (3,) [m, world]; drawn over the picture, else the robot hides them
 
 
-def draw(path: Path, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]], imu: str, title: str) -> None:
-    """Write the picture to ``path`` (PNG). ``feet``: name -> its geoms; ``imu``: a site, "" for none; ``qpos`` (7 + D,)."""
+def draw(path: Path, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]], title: str) -> None:
+    """Write the picture to ``path`` (PNG). ``feet``: name -> its geoms; ``qpos`` (7 + D,)."""
     if path.suffix.lower() != ".png":
         raise ViewError(f"Cannot write {path.name!r}: the picture of a robot is a .png")
-    scene = _Picture(robot, qpos, feet, imu)
+    scene = _Picture(robot, qpos, feet)
     try:
         save_png(path, np.concatenate([scene.view(*view, title) for view in VIEWS], axis=1))
     finally:
@@ -70,8 +71,8 @@ def draw(path: Path, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Seq
 class _Picture:
     """One robot in its pose, drawn from several sides."""
 
-    def __init__(self, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]], imu: str) -> None:
-        self.robot, self.feet, self.imu = robot, feet, imu
+    def __init__(self, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]]) -> None:
+        self.robot, self.feet = robot, feet
         self.posed = PosedRobots(visual_spec(robot))
         self.posed.pose(qpos)
         self._paint()
@@ -147,40 +148,25 @@ class _Picture:
         return labels
 
     def _draw_feet(self) -> list[Label]:
-        labels, data = [], self.posed.data
+        """A disc under each foot, as the viewer draws one that stands."""
+        labels, model = [], self.posed.model
         for name, geoms in self.feet.items():
-            ids = [self.posed.model.geom(geom).id for geom in geoms]
-            place = np.mean([data.geom_xpos[geom] for geom in ids], axis=0)
+            place, turn, half = patch(model, self.posed.data, [model.geom(geom).id for geom in geoms], self.posed.radius)
             place[2] = 0.002
-            reach = [np.linalg.norm(data.geom_xpos[geom, :2] - place[:2]) + self.posed.model.geom_rbound[geom] for geom in ids]
-            size = float(max(reach)) * (1.5 if len(ids) == 1 else 1.1)
-            if not (len(ids) == 1 and self._draw_sole(ids[0], place)):
-                self._geom(mujoco.mjtGeom.mjGEOM_CYLINDER, (size, 0.002, 0.0), place, FOOT_RGBA)
+            disc = self._geom(mujoco.mjtGeom.mjGEOM_CYLINDER, (half[0], 0.002, 0.0), place, FOOT_RGBA)
+            disc.size[1] = half[1]
+            disc.mat[:] = turn
             labels.append(Label(f"foot {name}", place, FOOT_RGBA[:3]))
         return labels
 
-    def _draw_sole(self, geom: int, place: FloatArray) -> bool:
-        """A sheet under a foot that is a box, wider by 2 cm on each side; False if it is none."""
-        model = self.posed.model
-        if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_BOX:
-            return False
-        axes = self.posed.data.geom_xmat[geom].reshape(3, 3)
-        size = model.geom_size[geom] + 0.02
-        size[np.abs(axes[2]).argmax()] = 0.002  # along the axis that is upright
-        sheet = self._geom(mujoco.mjtGeom.mjGEOM_BOX, size, place, FOOT_RGBA)
-        sheet.mat[:] = axes
-        return True
-
     def _draw_imu(self) -> list[Label]:
-        if not self.imu:
-            return []
-        site = self.posed.model.site(self.imu).id
+        site = self.posed.model.site(self.robot.imu).id
         place, axes = self.posed.data.site_xpos[site].copy(), self.posed.data.site_xmat[site].reshape(3, 3)
         length = 0.2 * self.size
         for axis, rgb in zip(axes.T, AXES_RGB, strict=True):
             self._arrow(place, axis, length, (*rgb, 1.0))
         ends = tuple((place + length * axis, rgb) for axis, rgb in zip(axes.T, AXES_RGB, strict=True))
-        return [Label(self.imu, place, (1.0, 1.0, 1.0), ends)]
+        return [Label(self.robot.imu, place, (1.0, 1.0, 1.0), ends)]
 
     def _arrow(self, place: FloatArray, axis: FloatArray, length: float, rgba: Sequence[float]) -> None:
         geom = self._geom(mujoco.mjtGeom.mjGEOM_ARROW, (0.0, 0.0, 0.0), place, rgba)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import mujoco
 
+from legged_mw.sim.meshes import path_of
 from legged_mw.sim.vendor import naming, read_robot
 
 
@@ -32,14 +33,13 @@ def as_mjcf(name: str, file: Path, folder: Path) -> str:
     spec.comment = f"\n    {name}: facts of the machine, from {file.name}. Ground, servos and sensors are added where it is loaded.\n  "
     with naming(file):
         spec.compile()
-        _name_files(spec, file.resolve().parent, folder.resolve())
+        _name_files(spec, folder.resolve())
         return spec.to_xml()
 
 
-def _name_files(spec: mujoco.MjSpec, beside: Path, folder: Path) -> None:
+def _name_files(spec: mujoco.MjSpec, folder: Path) -> None:
     """Meshes and pictures are named relative to ``folder``; what is not there is left as it was written."""
-    for items, home in ((spec.meshes, spec.meshdir), (spec.textures, spec.texturedir), (spec.hfields, "")):
-        for item in items:
-            if item.file and (path := beside / home / item.file).is_file():
-                item.file = os.path.relpath(path, folder)
-    spec.meshdir = spec.texturedir = ""
+    for item in (*spec.meshes, *spec.textures):
+        if item.file and (path := path_of(spec, item).resolve()).is_file():
+            item.file = os.path.relpath(path, folder)
+    spec.meshdir, spec.texturedir, spec.strippath = "", "", False

@@ -11,6 +11,7 @@ import numpy as np
 
 from legged_mw.sim.ground import GROUND, Ground, add_ground
 from legged_mw.sim.model import RobotModel
+from legged_mw.sim.pose import posed
 from legged_mw.sim.relief import add_relief, add_squares
 from legged_mw.sim.terrain import Terrain
 
@@ -45,11 +46,10 @@ def dressed(robot: RobotModel, camera: Sequence[float] = ()) -> mujoco.MjSpec:
 
 def reach(robot: RobotModel) -> float:
     """How far the robot reaches from its root with all joints at 0 [m]."""
-    model, data = robot.physics, mujoco.MjData(robot.physics)
-    mujoco.mj_kinematics(model, data)
-    root, geoms = data.xpos[robot.id("body", robot.root)], model.geom_bodyid > 0
-    shapes = np.linalg.norm(data.geom_xpos[geoms] - root, axis=1) + model.geom_rbound[geoms]
-    return float(max(*np.linalg.norm(data.xpos[1:] - root, axis=1), *shapes, 0.1))
+    model, data = robot.physics, posed(robot.physics, np.zeros(len(robot.joint_names)))
+    geoms = model.geom_bodyid > 0
+    shapes = np.linalg.norm(data.geom_xpos[geoms], axis=1) + model.geom_rbound[geoms]
+    return float(max(*np.linalg.norm(data.xpos[1:], axis=1), *shapes, 0.1))
 
 
 def ground_model(terrain: Terrain) -> mujoco.MjModel:

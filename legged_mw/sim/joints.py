@@ -15,6 +15,7 @@ from legged_mw.sim.servos import Range, add_servos, set_efforts, set_joints
 from legged_mw.sim.tables import per_joint_all, some_joints
 from legged_mw.sim.vendor import Loaded
 
+_BEYOND = 1e-3  # [rad] that a pose may be beyond a range by rounding
 PARTIAL = ("effort", "armature", "frictionloss", "joint_speed_limits")  # tables that need not name every joint
 
 
@@ -27,12 +28,11 @@ class Posed:
     held: list[str]
     angles: list[float]  # D, the pose [rad]
     ranges: list[Range]  # D [rad]; infinite where there is no limit
-    gains: list[float]  # D [N m/rad]
-    dampings: list[float]  # D [N m s/rad]
+    tables: dict[str, list[float]]  # D each: "`stiffness`" [N m/rad], "`damping`" [N m s/rad], and what else the caller asked for
 
 
-def pose_joints(robot: Loaded, gains: Mapping[str, Mapping[str, float]], pose: Mapping[str, float] | None, held: Sequence[str]) -> Posed:
-    """Weld the ``held`` joints, and give the others their numbers; ``gains`` are two tables, what -> table: stiffness and damping.
+def pose_joints(robot: Loaded, tables: Mapping[str, Mapping[str, float]], pose: Mapping[str, float] | None, held: Sequence[str]) -> Posed:
+    """Weld the ``held`` joints, and give the others their numbers from ``tables``, what -> table.
 
     The pose is the caller's, then the keyframe's; where both are silent 0 for a held joint, and for all of them if ``pose`` is None.
     Raises ModelError for joints that no key fits, of all tables at once.
@@ -40,10 +40,8 @@ def pose_joints(robot: Loaded, gains: Mapping[str, Mapping[str, float]], pose: M
     every = [joint.name for joint in robot.joints]
     welded = match_joints(every, held, "`held_joints`")
     moving = [name for name in every if name not in welded]
-    tables = dict(gains)
-    if robot.keyframe is None and pose is not None:
-        tables["`pose`"] = pose
-    stiffness, damping, *_ = per_joint_all(tables, moving, spare=welded)
+    needed = {"`pose`": pose} if robot.keyframe is None and pose is not None else {}
+    values = per_joint_all({**tables, **needed}, moving, spare=welded)
     known = {**(robot.keyframe.angles if robot.keyframe else {}), **some_joints(pose or {}, every, "`pose`")}
     model = robot.model
     if welded:
@@ -53,7 +51,11 @@ def pose_joints(robot: Loaded, gains: Mapping[str, Mapping[str, float]], pose: M
     ranges = _ranges(model, moving)
     if free := [name for name, span in zip(moving, ranges, strict=True) if not np.isfinite(span).all()]:
         robot.notes.append(f"joints without limits: {', '.join(free)}")
-    return Posed(model, moving, welded, [known.get(name, 0.0) for name in moving], ranges, stiffness, damping)
+    angles = [known.get(name, 0.0) for name in moving]
+    for name, angle, (low, high) in zip(moving, angles, ranges, strict=True):
+        if pose is not None and not low - _BEYOND <= angle <= high + _BEYOND:
+            robot.notes.append(f"warning: `pose`: {name} stands at {angle:g} rad, beyond its range from {low:g} to {high:g} rad")
+    return Posed(model, moving, welded, angles, ranges, values)
 
 
 def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> list[Range]:
@@ -69,6 +71,7 @@ def set_machine(robot: Loaded, partial: Mapping[str, Mapping[str, float]], posed
     said = {what: some_joints(partial.get(what, {}), posed.joints, f"`{what}`", posed.held) for what in PARTIAL}
     set_efforts(robot.limits, said["effort"], robot.notes)
     set_joints(robot.joints, said["armature"], said["frictionloss"], robot.notes)
-    add_servos(robot.spec, robot.joints, posed.ranges, posed.gains, posed.dampings, robot.limits, robot.notes)
+    gains, dampings = posed.tables["`stiffness`"], posed.tables["`damping`"]
+    add_servos(robot.spec, robot.joints, posed.ranges, gains, dampings, robot.limits, robot.notes)
     speeds = robot.speeds | said["joint_speed_limits"]
     return tuple(speeds.get(name, np.inf) for name in posed.joints)

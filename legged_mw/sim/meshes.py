@@ -28,22 +28,21 @@ def compile_readable(spec: mujoco.MjSpec, where: str, notes: list[str]) -> mujoc
 
     Raises ModelError for a mesh that collides or gives a body its mass, ValueError for what else is wrong.
     """
-    _drop(spec, {mesh.name: why_unreadable(_path(spec, mesh)) for mesh in spec.meshes if mesh.file}, where, notes)
-    _drop_pictures(spec, notes)
     try:
         return _compile(spec)
-    except ValueError:
-        broken = {mesh.name: _read_error(spec, mesh) for mesh in spec.meshes if mesh.file}
-        if not any(broken.values()):
+    except ValueError:  # only then files are looked at: those of an attached model are not where the others are
+        broken = {mesh.name: why_unreadable(path_of(spec, mesh)) or _read_error(spec, mesh) for mesh in spec.meshes if mesh.file}
+        if not any(broken.values()) and not _missing_pictures(spec):
             raise
     _drop(spec, broken, where, notes)
+    _drop_pictures(spec, notes)
     return _compile(spec)
 
 
 def _compile(spec: mujoco.MjSpec) -> mujoco.MjModel:
     """Looks take most of the time, and only files can be wrong."""
     copy = spec.copy()
-    copy.compiler.discardvisual = not any(mesh.file for mesh in spec.meshes)
+    copy.compiler.discardvisual = not any(item.file for item in (*spec.meshes, *spec.textures))
     return copy.compile()
 
 
@@ -60,15 +59,16 @@ def _drop(spec: mujoco.MjSpec, reasons: Mapping[str, str], where: str, notes: li
         notes.append(f"looks left out ({reason}): {', '.join(dict.fromkeys(files))}")
 
 
-def _path(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> Path:
-    name = Path(mesh.file)
-    return Path(spec.modelfiledir) / spec.meshdir / (name.name if spec.strippath else name)
+def path_of(spec: mujoco.MjSpec, item: mujoco.MjsMesh | mujoco.MjsTexture, file: str = "") -> Path:
+    """The file of a mesh or picture, or another ``file`` in its place."""
+    folder, name = spec.meshdir if isinstance(item, mujoco.MjsMesh) else spec.texturedir, Path(file or item.file)
+    return Path(spec.modelfiledir) / folder / (name.name if spec.strippath else name)
 
 
 def _read_error(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
     """What MuJoCo says of the mesh alone; "" if nothing is wrong with it."""
     alone = mujoco.MjSpec()
-    alone.add_mesh(name="mesh", file=str(_path(spec, mesh).resolve()), scale=mesh.scale, inertia=mesh.inertia)
+    alone.add_mesh(name="mesh", file=str(path_of(spec, mesh).resolve()), scale=mesh.scale, inertia=mesh.inertia)
     alone.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_MESH, meshname="mesh", contype=0, conaffinity=0, density=0.0)
     try:
         alone.compile()
@@ -85,15 +85,19 @@ def _refuse_what_matters(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, mesh: mujoco
     role = "collides as" if geom.contype or geom.conaffinity else "takes its mass from"
     raise ModelError(
         f"{where}: {name} of body '{geom.parent.name}' {role} the mesh '{mesh.name}', and its file {mesh.file} cannot be read ({reason}; "
-        f"looked for at {_path(spec, mesh)}); put the file there as one of {', '.join(READABLE)}, or {INSTEAD}"
+        f"looked for at {path_of(spec, mesh)}); put the file there as one of {', '.join(READABLE)}, or {INSTEAD}"
     )
+
+
+def _missing_pictures(spec: mujoco.MjSpec) -> dict[str, list[str]]:
+    """Texture -> those of its files that are not there."""
+    files = {t.name: [file for file in (t.file, *t.cubefiles) if file and not path_of(spec, t, file).is_file()] for t in spec.textures}
+    return {name: gone for name, gone in files.items() if gone}
 
 
 def _drop_pictures(spec: mujoco.MjSpec, notes: list[str]) -> None:
     """Textures from files that are missing: the materials keep their colours."""
-    folder = Path(spec.modelfiledir) / spec.texturedir
-    files = {t.name: [file for file in (t.file, *t.cubefiles) if file] for t in spec.textures}
-    missing = {name: gone for name, every in files.items() if (gone := [file for file in every if not (folder / file).is_file()])}
+    missing = _missing_pictures(spec)
     for material in spec.materials:
         if any(name in missing for name in material.textures):
             material.textures = ["" if name in missing else name for name in material.textures]

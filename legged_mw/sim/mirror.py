@@ -16,6 +16,7 @@ import numpy as np
 
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import RobotModel
+from legged_mw.sim.pose import posed
 
 POLAR = np.array([1.0, -1.0, 1.0])  # a place, a velocity, a force; what turns (an axis, an angular velocity) is axial: -POLAR
 TOLERANCE = 0.001  # [m] between a mirrored place and its partner's
@@ -37,14 +38,9 @@ def find_partners(robot: RobotModel, sites: Sequence[str] = (), tolerance: float
     Raises ModelError for a joint or site without a partner.
     """
     model = robot.physics
-    data = mujoco.MjData(model)
-    data.qpos[7:] = 0.0  # the pose about which q -> sign * q is the mirror image
-    mujoco.mj_kinematics(model, data)
-    root = robot.id("body", robot.root)
-    origin, rotation = data.xpos[root], data.xmat[root].reshape(3, 3)
+    data = posed(model, np.zeros(len(robot.joint_names)))  # the pose about which q -> sign * q is the mirror image
     joint_ids, site_ids = [model.joint(name).id for name in robot.joint_names], [robot.id("site", name) for name in sites]
-    anchors, axes = (data.xanchor[joint_ids] - origin) @ rotation, data.xaxis[joint_ids] @ rotation  # (D, 3) in the root's frame
-    places = (data.site_xpos[site_ids] - origin) @ rotation  # (S, 3) in the root's frame
+    anchors, axes, places = data.xanchor[joint_ids], data.xaxis[joint_ids], data.site_xpos[site_ids]  # (., 3) in the root's frame
     slides = model.jnt_type[joint_ids] == mujoco.mjtJoint.mjJNT_SLIDE
     images = np.where(slides[:, None], axes * POLAR, axes * -POLAR)  # mirrored axes
     signs = np.where(images @ axes.T < 0.0, -1, 1)  # (D, D) of the mirrored joint i along joint j

@@ -24,7 +24,7 @@ from legged_mw.sim.rigid import fuse_fixed, sensed_site
 from legged_mw.sim.shapes import add_sites
 from legged_mw.sim.tables import per_joint as per_joint
 from legged_mw.sim.terrain import Terrain
-from legged_mw.sim.vendor import Loaded, naming, read_robot
+from legged_mw.sim.vendor import Keyframe, Loaded, naming, read_robot
 from legged_mw.utils.errors import unknown
 
 _CHOICES = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone, "solver": mujoco.mjtSolver}  # option -> its values
@@ -60,7 +60,8 @@ class RobotModel:
     pose: tuple[float, ...] = ()  # (D,) the caller's, or else the keyframe's [rad]
     held: tuple[str, ...] = ()  # joints of the file that are welded
     speed_limits: tuple[float, ...] = ()  # (D,) of the motors, unknown to the physics [rad/s]; infinite where nothing states one
-    start: tuple[float, ...] = ()  # the root's x, y, z in the file's keyframe [m]; empty: it has none
+    tables: dict[str, list[float]] = field(default_factory=dict)  # (D,) each, of the tables that were given
+    keyframe: Keyframe | None = None  # the file's
 
     @property
     def joint_range(self) -> np.ndarray:
@@ -104,6 +105,7 @@ def build_model(
     imu_site: str | None,  # sensed: proper acceleration in the root's axes [m/s^2]; as for rigid.sensed_site; None: not at all
     sites: Mapping[str, Sequence[str]] | None = None,  # name -> geoms, likewise; a site that the MJCF lacks is made there
     pose: Mapping[str, float] | None = None,  # as for per_joint: angles [rad]; where it is silent the keyframe's; None without one: all 0
+    tables: Mapping[str, Mapping[str, float]] = {},  # what -> a table, as for per_joint: for ``RobotModel.tables``
     held_joints: Sequence[str] = (),  # names or patterns: welded at the pose
     partial: Mapping[str, Mapping[str, float]] | None = None,  # of PARTIAL, as for some_joints: what the caller knows better than the file
 ) -> RobotModel:
@@ -111,7 +113,7 @@ def build_model(
     robot = read_robot(file)
     spec, notes = robot.spec, robot.notes
     with naming(file):
-        posed = pose_joints(robot, {"`stiffness`": stiffness, "`damping`": damping}, pose, held_joints)
+        posed = pose_joints(robot, {"`stiffness`": stiffness, "`damping`": damping, **tables}, pose, held_joints)
         names = name_geoms(spec, robot.where, notes)
         imu = "" if imu_site is None else sensed_site(spec, posed.model, robot.root, imu_site, robot.where, notes)
         fuse_fixed(spec, notes)
@@ -154,7 +156,8 @@ def _compile(
         pose=tuple(posed.angles),
         held=tuple(posed.held),
         speed_limits=speeds,
-        start=robot.keyframe.root if robot.keyframe else (),
+        tables=posed.tables,
+        keyframe=robot.keyframe,
     )
 
 

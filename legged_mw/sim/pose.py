@@ -4,7 +4,7 @@
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -12,6 +12,8 @@ import numpy as np
 
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.shapes import surfaces
+
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # place and attitude of a root
 
 
 class Upright(NamedTuple):
@@ -22,20 +24,23 @@ class Upright(NamedTuple):
     up: np.ndarray  # (S, 3) the vertical in the frame of each site's body
 
 
+def posed(model: mujoco.MjModel, joints: Iterable[float], root: Iterable[float] = _UPRIGHT) -> mujoco.MjData:
+    """Places of bodies, geoms and sites with the joints at the angles ``joints`` (D,) [rad] and the ``root`` (7,) there."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = [*root, *joints]
+    mujoco.mj_kinematics(model, data)
+    return data
+
+
 def upright(robot: RobotModel, joints: Sequence[float], sites: Sequence[str]) -> Upright:
     """``sites`` with the joints at the angles ``joints`` (D,) [rad]."""
-    model = robot.physics
-    data = mujoco.MjData(model)
-    data.qpos[:7], data.qpos[7:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), joints
-    mujoco.mj_kinematics(model, data)
+    model, data = robot.physics, posed(robot.physics, joints)
     where = [robot.id("site", name) for name in sites]
     bodies = model.site_bodyid[where]
     return Upright(data.site_xpos[where].copy(), bodies.copy(), data.xmat[bodies].reshape(-1, 3, 3)[:, 2].copy())
 
 
-def standing_height(robot: RobotModel, geoms: Sequence[str]) -> float:
-    """How high the root is above a plane that the lowest of ``geoms`` touches, upright and in the robot's pose [m]."""
-    data = mujoco.MjData(robot.physics)
-    data.qpos[:7], data.qpos[7:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0), robot.pose
-    mujoco.mj_kinematics(robot.physics, data)
-    return -float(min(points[:, 2].min() for points in surfaces(robot.physics, data, geoms).values()))
+def standing_height(robot: RobotModel, geoms: Sequence[str], joints: Sequence[float]) -> float:
+    """How high the root is above a plane that the lowest of ``geoms`` touches, upright, with the joints at ``joints`` (D,) [m]."""
+    points = surfaces(robot.physics, posed(robot.physics, joints), geoms)
+    return -float(min(places[:, 2].min() for places in points.values()))

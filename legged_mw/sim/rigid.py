@@ -13,7 +13,7 @@ import numpy as np
 from legged_mw.sim.errors import ModelError
 from legged_mw.utils.errors import unknown
 
-ALIGNED = 1e-9  # of 1 minus a quaternion's first number: less is no turn
+ALIGNED = 1e-4  # [rad] less is no turn
 IMU = "imu"  # name of the site that is taken, or made, where none is asked for
 
 
@@ -88,48 +88,37 @@ def sensed_site(spec: mujoco.MjSpec, model: mujoco.MjModel, root: str, asked: st
     Empty: "imu"; if there is none, or only one that moves against the root, a new one at the root's origin. ``model`` is ``spec``
     compiled. Raises ModelError for a site that there is not, or that moves.
     """
-    name, base = asked or IMU, spec.body(root)
-    is_site = spec.site(name) is not None
-    if not is_site and asked and spec.body(name) is None:
+    name, is_site = asked or IMU, spec.site(asked or IMU) is not None
+    if asked and not is_site and spec.body(name) is None:
         known = [thing.name for thing in (*spec.sites, *spec.bodies) if thing.name and thing.name != "world"]
         raise ModelError(f"`imu_site`: {unknown('site or body', name, known, where)}")
-    beyond = _what_moves(model, root, name, is_site) if is_site or asked else ""
-    if asked and beyond:
-        raise ModelError(
-            f"`imu_site`: '{name}' is on {beyond}, so what it senses is not the root's; take a site or body that is fixed to the root, or "
-            "hold that joint by `held_joints`"
-        )
-    if not asked and (beyond or not is_site):
-        made = f"{name}_root" if is_site else name
-        base.add_site(name=made, group=3)
-        why = f": '{name}' is on {beyond}; `imu_site` may name another" if beyond else ""
-        notes.append(f"site '{made}' made at the origin of '{root}'{why}")
-        return made
-    body = int(model.site(name).bodyid[0]) if is_site else model.body(name).id
-    place, turn = _pose_in_root(model, root, name, is_site)
-    if is_site and model.body(body).name == root and turn < ALIGNED:
-        return name
-    made = name if not is_site else f"{name}_aligned"
-    base.add_site(name=made, pos=place, group=3)
-    notes.append(f"site '{made}' made at the place of '{name}' on '{model.body(body).name}', with the axes of the root '{root}'")
+    made, place, why = name, np.zeros(3), f"at the origin of '{root}'"
+    if asked or is_site:
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        base, there = data.body(root), data.site(name) if is_site else data.body(name)
+        body = model.body(model.site_bodyid[there.id] if is_site else there.id)
+        axes = base.xmat.reshape(3, 3).T
+        if beyond := _what_moves(model, root, body.id):
+            if asked:
+                raise ModelError(
+                    f"`imu_site`: '{name}' is on {beyond}, so what it senses is not the root's; take a site or body that is fixed to the "
+                    "root, or hold that joint by `held_joints`"
+                )
+            made, why = f"{name}_root", f"{why}: '{name}' is on {beyond}; `imu_site` may name another"
+        elif is_site and body.name == root and np.allclose(axes @ there.xmat.reshape(3, 3), np.eye(3), rtol=0.0, atol=ALIGNED):
+            return name
+        else:
+            made, place = f"{name}_aligned" if is_site else name, axes @ (there.xpos - base.xpos)
+            why = f"at the place of '{name}' on '{body.name}', with the axes of the root '{root}'"
+    spec.body(root).add_site(name=made, pos=place, group=3)
+    notes.append(f"site '{made}' made {why}")
     return made
 
 
-def _what_moves(model: mujoco.MjModel, root: str, name: str, is_site: bool) -> str:
-    """Which body a site is on (or is), and the joint by which that moves against the root; "" if it does not."""
-    body = int(model.site(name).bodyid[0]) if is_site else model.body(name).id
+def _what_moves(model: mujoco.MjModel, root: str, body: int) -> str:
+    """The ``body`` and the joint by which it moves against the root; "" if it does not."""
     if (welded := int(model.body_weldid[body])) == model.body_weldid[model.body(root).id]:
         return ""
     joint = model.joint(int(model.body_jntadr[welded])).name
     return f"body '{model.body(body).name}', which moves against the root '{root}' by joint '{joint}'"
-
-
-def _pose_in_root(model: mujoco.MjModel, root: str, name: str, is_site: bool) -> tuple[np.ndarray, float]:
-    """Place (3,) [m] of a site or body in the root's frame, and 1 minus the first number of its quaternion there: 0 is aligned."""
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    base, there = data.body(root), data.site(name) if is_site else data.body(name)
-    rotation = base.xmat.reshape(3, 3).T
-    quat = np.zeros(4)
-    mujoco.mju_mat2Quat(quat, (rotation @ there.xmat.reshape(3, 3)).ravel())
-    return rotation @ (there.xpos - base.xpos), 1.0 - abs(float(quat[0]))

@@ -22,12 +22,13 @@ def take_limits(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, Range]:
     through its gear, a motor's ctrlrange through gain and gear.
     """
     limits = {j.name: (j.actfrcrange[0], j.actfrcrange[1]) for j in spec.joints if _limited(j.actfrclimited, j.actfrcrange)}
-    for actuator in list(spec.actuators):
+    if actuators := list(spec.actuators):
+        notes.append(f"{len(actuators)} actuator{'s' * (len(actuators) > 1)} replaced by position servos")
+    for actuator in actuators:
         if actuator.trntype in _JOINTS and actuator.target not in limits:
             force = _force(actuator)
             if force is not None:
                 limits[actuator.target] = (float(min(force)), float(max(force)))
-        notes.append(f"actuator '{actuator.name}' replaced by a position servo")
         spec.delete(actuator)
     return limits
 

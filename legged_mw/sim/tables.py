@@ -38,12 +38,12 @@ def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str, spar
     return list(found.values())
 
 
-def per_joint_all(tables: Mapping[str, Mapping[str, float]], joints: Sequence[str], spare: Sequence[str] = ()) -> list[list[float]]:
-    """``per_joint`` of several tables, what -> table; the error is about all of them at once."""
-    values, wrong = [], []
+def per_joint_all(tables: Mapping[str, Mapping[str, float]], joints: Sequence[str], spare: Sequence[str] = ()) -> dict[str, list[float]]:
+    """``per_joint`` of several tables, by what they are; the error is about all of them at once."""
+    values, wrong = dict[str, list[float]](), []
     for what, table in tables.items():
         try:
-            values.append(per_joint(table, joints, what, spare))
+            values[what] = per_joint(table, joints, what, spare)
         except ModelError as error:
             wrong.append(str(error))
     if wrong:

@@ -21,8 +21,12 @@ SHAPES = "give the <collision> a <box>, <cylinder> or <sphere>"
 
 def is_urdf(text: str) -> bool:
     """Whether the first element is a <robot>."""
-    first = re.search(r"<\s*([A-Za-z_]\w*)", re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL))
+    first = re.search(r"<\s*([A-Za-z_]\w*)", _without_comments(text))
     return bool(first and first[1] == "robot")
+
+
+def _without_comments(text: str) -> str:
+    return re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
 
 
 def read_urdf(file: Path, text: str, notes: list[str]) -> tuple[mujoco.MjSpec, dict[str, float]]:
@@ -30,7 +34,7 @@ def read_urdf(file: Path, text: str, notes: list[str]) -> tuple[mujoco.MjSpec, d
 
     Raises ValueError for what is no URDF, ModelError for a mesh that collides and cannot be read.
     """
-    if "<xacro:" in text:
+    if "<xacro:" in _without_comments(text):
         raise ModelError(f"{file.name} holds xacro macros; write them out first: xacro {file.name} > robot.urdf")
     try:
         robot = ElementTree.fromstring(text)
@@ -38,7 +42,10 @@ def read_urdf(file: Path, text: str, notes: list[str]) -> tuple[mujoco.MjSpec, d
         raise ValueError(str(error)) from None
     for other in [child for child in robot if child.tag not in _KNOWN]:
         robot.remove(other)
-    _drop_world(robot, notes)
+    _drop_places(robot, notes)
+    joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
+    if mimics := [name for name, joint in joints.items() if joint.find("mimic") is not None]:
+        notes.append(f"mimic dropped: {', '.join(mimics)} move by themselves")
     files = _find_meshes(robot, file, notes)
     extension = robot.find("mujoco")
     extension = ElementTree.SubElement(robot, "mujoco") if extension is None else extension
@@ -50,20 +57,34 @@ def read_urdf(file: Path, text: str, notes: list[str]) -> tuple[mujoco.MjSpec, d
     for mesh in spec.meshes:
         mesh.file = str(files[mesh.file])
     _set_looks(spec)
-    limits = {joint.get("name", ""): joint.find("limit") for joint in robot.findall("joint")}
+    limits = {name: joint.find("limit") for name, joint in joints.items()}
     speeds = {name: float(limit.get("velocity", 0.0)) for name, limit in limits.items() if limit is not None}
     return spec, {name: speed for name, speed in speeds.items() if speed > 0.0}
 
 
-def _drop_world(robot: Element, notes: list[str]) -> None:
-    """A link "world" is where some other program puts the robot."""
-    for world in [link for link in robot.findall("link") if link.get("name") == "world"]:
-        robot.remove(world)
-        for joint in robot.findall("joint"):
-            parent = joint.find("parent")
-            if parent is not None and parent.get("link") == "world":
-                robot.remove(joint)
-                notes.append(f"link 'world' and joint '{joint.get('name')}' dropped: the root is free")
+def _drop_places(robot: Element, notes: list[str]) -> None:
+    """Leave out root links that only say where other programs put the robot, one after the other."""
+    children = {_end(joint, "child") for joint in robot.findall("joint")}
+    for link in [link for link in robot.findall("link") if link.get("name") not in children]:
+        held = [joint for joint in robot.findall("joint") if _end(joint, "parent") == link.get("name")]
+        if held and (link.get("name") == "world" or (len(held) == 1 and not len(link) and _leads_elsewhere(held[0]))):
+            for thing in (link, *held):
+                robot.remove(thing)
+            names = ", ".join(f"'{joint.get('name')}'" for joint in held)
+            notes.append(f"link '{link.get('name')}' and joint {names} dropped: the root is free")
+            _drop_places(robot, notes)
+
+
+def _end(joint: Element, which: str) -> str | None:
+    end = joint.find(which)
+    return None if end is None else end.get("link")
+
+
+def _leads_elsewhere(joint: Element) -> bool:
+    """Whether an empty link above the joint, as base_footprint is on the ground, is not where the robot is."""
+    origin = joint.find("origin")
+    numbers = [] if origin is None else f"{origin.get('xyz', '')} {origin.get('rpy', '')}".split()
+    return joint.get("type") == "floating" or (joint.get("type") == "fixed" and any(float(number) for number in numbers))
 
 
 def _find_meshes(robot: Element, file: Path, notes: list[str]) -> dict[str, Path]:

@@ -36,7 +36,7 @@ class Keyframe:
     """A pose that the file holds."""
 
     name: str
-    root: tuple[float, ...]  # x, y, z [m]; empty: the file has no free joint
+    height: float | None  # of the root [m]; None: the file has no free joint
     angles: dict[str, float]  # joint -> [rad]
 
 
@@ -112,8 +112,8 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
     if chosen and len(qpos) == starts[-1]:
         angles = {joint.name: qpos[start] for joint, start in zip(spec.joints, starts[:-1], strict=True) if joint.type in _SCALAR_JOINTS}
         first = next(iter(spec.joints), None)
-        taken = Keyframe(chosen.name, tuple(qpos[:3]) if first and first.type == _FREE else (), angles)
-        notes.append(f"keyframe '{chosen.name}' read: pose and place of the root, where nothing else states them")
+        taken = Keyframe(chosen.name, qpos[2] if first and first.type == _FREE else None, angles)
+        notes.append(f"keyframe '{chosen.name}' read: pose and height of the root, where nothing else states them")
     for key in keys:
         if key is not chosen:
             notes.append(f"keyframe '{key.name}' dropped")
@@ -200,6 +200,9 @@ def _forget_defaults(spec: mujoco.MjSpec) -> None:
 def _free_root(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
     """One free joint, at the root, that the air does not brake."""
     root = spec.worldbody.first_body()
+    if not root.name:
+        root.name = next(name for name in ("base", "root", "base_0") if spec.body(name) is None)
+        notes.append(f"body without a name, the root, is called '{root.name}'")
     if not root.joints:
         root.add_freejoint()
         notes.append(f"free joint added to '{root.name}'")

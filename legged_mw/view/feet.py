@@ -24,7 +24,7 @@ class Patch(NamedTuple):
     """An upright ellipse on the ground."""
 
     place: FloatArray  # (3,) of its middle, at the foot's lowest height [m]
-    heading: float  # of the foot's x axis [rad]
+    turn: FloatArray  # (3, 3) from its axes to the world's: x is the foot's, on the ground, z is up
     half: FloatArray  # (2,) half its length and its width [m]
 
 
@@ -45,11 +45,12 @@ def patch(model: mujoco.MjModel, data: mujoco.MjData, geoms: Sequence[int], radi
     axis = data.xmat[model.geom_bodyid[geoms[0]]]
     heading = math.atan2(axis[3], axis[0])
     cos, sin = math.cos(heading), math.sin(heading)
-    turn = np.array([[cos, sin], [-sin, cos]])  # world -> foot
-    touching = points[points[:, 2] <= low + FLAT * margin, :2] @ turn.T
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    touching = points[points[:, 2] <= low + FLAT * margin] @ turn
     ends = np.stack([touching.min(axis=0), touching.max(axis=0)])
-    middle = turn.T @ ends.mean(axis=0)
-    return Patch(np.array([*middle, low]), heading, (ends[1] - ends[0]) / 2 + margin)
+    place = turn @ ends.mean(axis=0)
+    place[2] = low
+    return Patch(place, turn, (ends[1] - ends[0])[:2] / 2 + margin)
 
 
 def lowest_points(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> FloatArray:

@@ -94,12 +94,11 @@ def _draw_turn(scene: mujoco.MjvScene, placement: Placement, origin: FloatArray,
 def _draw_contacts(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment) -> None:
     """A disc under each foot on the ground, as long and as wide as what touches it."""
     thick = DISC * robots.radius
-    for place, heading, half in robots.patches(moment.contacts):
+    for place, turn, half in robots.patches(moment.contacts):
         disc = _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (half[0], thick, 0.0), place + (0.0, 0.0, 1.3 * thick), CONTACT_RGBA)
         if disc is not None:
-            cos, sin = math.cos(heading), math.sin(heading)
             disc.size[1] = half[1]
-            disc.mat[:] = [[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]]
+            disc.mat[:] = turn
 
 
 def _draw_fall(scene: mujoco.MjvScene, place: FloatArray, radius: float) -> None:
