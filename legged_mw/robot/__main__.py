@@ -40,6 +40,8 @@ def main() -> None:
     if file.suffix not in ROBOT_FILES:
         print(task_page(load_task(args.file), image))
         return
+    if args.new:
+        new.targets(args.new, Path(args.out), args.force)  # refused before the page, not after it
     found = draft(file)
     env = as_env(found, file)
     print(env_page(env, file.name, image, found))

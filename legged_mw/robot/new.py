@@ -46,17 +46,20 @@ _COMMENTS = {
 }
 
 
-def write(found: Draft, file: Path, name: str, folder: Path, force: bool = False, mirrors: bool = False) -> list[Path]:
-    """Write both files into ``folder``; ``mirrors`` says whether learning may mirror the robot.
-
-    Raises UserError, before anything is written, if one of them is there.
-    """
+def targets(name: str, folder: Path, force: bool = False) -> tuple[Path, Path]:
+    """The files that a task called ``name`` is written to. Raises UserError for a bad name, or if one of them is there."""
     if not re.fullmatch(r"[A-Za-z]\w*", name):
         raise UserError(f"--new {name}: a name begins with a letter and has letters, digits and _ only")
     robot, config = folder / f"{name}.xml", folder / f"{name}_flat.py"
     there = [path for path in (robot, config) if path.exists()]
     if there and not force:
         raise UserError(f"{' and '.join(shown(path) for path in there)} exists; say --force to overwrite, or another name or --out DIR")
+    return robot, config
+
+
+def write(found: Draft, file: Path, name: str, folder: Path, force: bool = False, mirrors: bool = False) -> list[Path]:
+    """Write both files into ``folder``; ``mirrors`` says whether learning may mirror the robot. Raises UserError as ``targets`` does."""
+    robot, config = targets(name, folder, force)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if stands_alone(file):
@@ -111,7 +114,8 @@ def _force_limits(found: Draft) -> list[str]:
 def _field(name: str, value: Any, comment: str, indent: int) -> list[str]:
     """``name = value  # comment``, in several lines where it is longer than a line may be."""
     space, note = " " * indent, f"  # {comment}" if comment else ""
-    line = f"{space}{name} = {json.dumps(value)}"  # of these values as Python has them
+    text = str(value) if isinstance(value, bool) else json.dumps(value)  # of the others as Python has them, in ruff's quotes
+    line = f"{space}{name} = {text}"
     if len(line + note) <= WIDTH:
         return [line + note]
     opening, closing = ("{", "}") if isinstance(value, dict) else ("[", "]")
