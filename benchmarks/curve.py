@@ -43,7 +43,7 @@ def write_csv(curve: dict[str, dict[int, float]], path: Path, every: int) -> Non
     """Every so many iterations, and each with an exam; a column is empty where nothing was measured."""
     exams = set(curve.get("falls", {}))
     with path.open("w", newline="", encoding="utf-8") as file:
-        rows = csv.writer(file)
+        rows = csv.writer(file, lineterminator="\n")
         rows.writerow(["iteration", *curve])
         for step in curve["seconds"]:
             if step % every == 0 or step in exams:
