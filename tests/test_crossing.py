@@ -61,11 +61,11 @@ def test_robots_begin_in_the_middle_of_their_tile_and_walk_ahead(monkeypatch: py
     """The same number on each tile, each in a direction of its own; on stairs from the pit up, and from the top down."""
     monkeypatch.setattr(crossing, "SECONDS", 0.06)
     env = make_env({"stairs_up": 0.5, "stairs_down": 0.1}, 3)
-    places, told = [], []
+    places, asked = [], []
 
     def policy(obs: TensorDict) -> Tensor:
         places.append(env.sim.qpos[:, :7].clone())
-        told.append(obs["state"][:, COMMANDS].clone())
+        asked.append(obs["state"][:, COMMANDS].clone())
         return stand(obs)
 
     result = crossing.run_crossing(env, policy)
@@ -80,7 +80,7 @@ def test_robots_begin_in_the_middle_of_their_tile_and_walk_ahead(monkeypatch: py
     torch.testing.assert_close(middles[:TILES, :, 0, 2], -8 * steps.expand(TILES, LEVELS))
     yaw = 2.0 * torch.atan2(places[0][:, 6], places[0][:, 3])
     assert len(yaw.unique()) == env.num_envs == 60 * TILES and yaw.min() < -2.5 and yaw.max() > 2.5
-    assert all((seen == torch.tensor([crossing.SPEED, 0.0, 0.0])).all() for seen in told) and len(told) == 3
+    assert all((seen == torch.tensor([crossing.SPEED, 0.0, 0.0])).all() for seen in asked) and len(asked) == 3
 
 
 def test_the_same_whatever_the_seed_and_nothing_drawn_outside(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -299,6 +299,14 @@ def test_kicks_grow_with_what_a_world_survives() -> None:
     assert env.perturbation.kick_level.tolist() == [0.5, 0.125, 0.375]
 
 
+def test_kicks_grow_by_a_share_of_the_way() -> None:
+    settings = {**QUIET, "perturbation.kick": True, "perturbation.curriculum": True, "perturbation.curriculum_rate": 0.25}
+    env = make_env(2, settings)
+    for level in (0.25, 0.4375):  # a quarter of what is left to 1
+        env.perturbation.update_level(torch.tensor([True, False]), torch.ones(2))
+        assert env.perturbation.kick_level.tolist() == [level, 0.0]
+
+
 def test_kicks_are_at_full_strength_without_the_curriculum() -> None:
     env = make_env(4, {"perturbation.kick": True, "perturbation.velocity": [2.0, 2.0]})
     env.reset()

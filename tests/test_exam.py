@@ -78,8 +78,8 @@ def test_a_biped_is_asked_what_a_biped_can_do() -> None:
     assert quadruped == ExamRules.from_mapping({}, RANGES) and quadruped.push_mark == 2.0
     silent = {"push_speeds": [], "push_mark": 0.0, "marks_of": "", "marks": []}
     assert ExamRules.from_mapping(silent, RANGES, 2) == biped and ExamRules.from_mapping(biped.to_mapping(), feet=4) == biped
-    told = ExamRules.from_mapping({"push_speeds": [2.0, 4.0], "push_mark": 4.0, "marks_of": "error"}, RANGES, 2)
-    assert (told.push_speeds, told.push_mark, told.marks, told.marks_of) == ((2.0, 4.0), 4.0, (0.06, 0.06, 0.08), "error")
+    stated = ExamRules.from_mapping({"push_speeds": [2.0, 4.0], "push_mark": 4.0, "marks_of": "error"}, RANGES, 2)
+    assert (stated.push_speeds, stated.push_mark, stated.marks, stated.marks_of) == ((2.0, 4.0), 4.0, (0.06, 0.06, 0.08), "error")
 
 
 def test_rules_know_how_many_feet_a_robot_has() -> None:

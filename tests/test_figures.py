@@ -68,12 +68,12 @@ def test_a_twitch_is_no_response() -> None:
 
 
 def test_responses_to_each_step() -> None:
-    """Three worlds told 1, 0, 1 at 2 s and 4 s, which they follow after 0.1 s; one falls and is left out."""
-    told, moved = np.zeros((300, 3, 3)), np.zeros((300, 3, 3))
-    told[:100, :, 1] = told[200:, :, 1] = 1.0
+    """Three worlds asked for 1, 0, 1 at 2 s and 4 s, which they follow after 0.1 s; one falls and is left out."""
+    asked, moved = np.zeros((300, 3, 3)), np.zeros((300, 3, 3))
+    asked[:100, :, 1] = asked[200:, :, 1] = 1.0
     for world in range(3):
         moved[:105, world, 1] = moved[205:, world, 1] = 1.0 + 0.1 * (world - 1)
-    found = figures.responses(make(3, 300, {2: 50}, velocity=moved)._replace(commands=told), axis=1, begin=75)
+    found = figures.responses(make(3, 300, {2: 50}, velocity=moved)._replace(commands=asked), axis=1, begin=75)
     assert found["fell"] == 1 and found["time"][:2] == [0.0, DT] and len(found["mean"]) == 225
     assert found["commanded"][24:26] == [1.0, 0.0] and found["commanded"][124:126] == [0.0, 1.0]
     assert found["mean"][29:31] == [pytest.approx(0.95), 0.0]
@@ -82,7 +82,7 @@ def test_responses_to_each_step() -> None:
     assert (stop["from"], stop["to"], start["from"], start["to"]) == (1.0, 0.0, 0.0, 1.0)
     assert start["rise_time"] == pytest.approx(0.8 * DT / 0.95) and start["left"] == pytest.approx(-0.05)
     assert (
-        figures.responses(make(3, 300, {0: 1, 1: 1, 2: 1}, velocity=moved)._replace(commands=told), 1, 75)["numbers"][0]["rise_time"]
+        figures.responses(make(3, 300, {0: 1, 1: 1, 2: 1}, velocity=moved)._replace(commands=asked), 1, 75)["numbers"][0]["rise_time"]
         is None
     )
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from inertia import compiled_tensor, rotation, tensor
 
 from legged_mw.rl.export_scene import standalone
 from legged_mw.sim.model import Ground, Solver, build_model
@@ -230,18 +231,6 @@ RIGHT_INERTIA = {"right_knee_link": ((0.923438887, 0.0345275958, 0.0116332986, -
 RIGHT_SHAPE = {"right_foot1_collision": ((0.01, 0.025), (0.075, -0.026, -0.025), (0.707107, 0.0, 0.707107, 0.0))}
 
 
-def rotation(quat: np.ndarray | tuple) -> np.ndarray:
-    q, matrix = np.array(quat, float), np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, q / np.linalg.norm(q))
-    return matrix.reshape(3, 3)
-
-
-def tensor(quat: np.ndarray | tuple, moments: np.ndarray | tuple) -> np.ndarray:
-    """Inertia (3, 3) at the com, in the axes of the body."""
-    r = rotation(quat)
-    return r @ np.diag(moments) @ r.T
-
-
 def sides(name: str) -> list[tuple[str, np.ndarray]]:
     """The names of a link or a shape, each with what turns the typed figures into its own."""
     return [(name, np.eye(3)), (name.replace("left_", "right_"), MIRROR)] if name.startswith("left_") else [(name, np.eye(3))]
@@ -270,7 +259,7 @@ def test_frame_and_inertia(model: mujoco.MjModel, link: str) -> None:
         assert body.mass[0] == mass, name
         np.testing.assert_array_equal(body.ipos, flip @ com, err_msg=name)
         expected = tensor(*RIGHT_INERTIA[name]) if name in RIGHT_INERTIA else flip @ tensor(turned, moments) @ flip
-        found = tensor(body.iquat, body.inertia)
+        found = compiled_tensor(model, name)
         np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * np.trace(expected), err_msg=name)
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from inertia import compiled_tensor, rotation, tensor
 
 from legged_mw.sim.drawing import add_scene
 
@@ -84,22 +85,6 @@ def shapes(body: str) -> list[tuple[str, tuple, tuple, tuple]]:
         ("capsule", (0.01, 0.0364005494), (0.01, 0.0, -0.165), (0.990334, 0.0, 0.138701, 0.0)),
         ("sphere", (FOOT_RADIUS,), FOOT_POS, _ONE),
     ]
-
-
-def rotation(quat: np.ndarray | tuple) -> np.ndarray:
-    q, matrix = np.array(quat, float), np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, q / np.linalg.norm(q))
-    return matrix.reshape(3, 3)
-
-
-def tensor(quat: np.ndarray | tuple, moments: np.ndarray | tuple) -> np.ndarray:
-    """Inertia (3, 3) at the com, in the axes of the body."""
-    r = rotation(quat)
-    return r @ np.diag(moments) @ r.T
-
-
-def compiled_tensor(model: mujoco.MjModel, body: str) -> np.ndarray:
-    return tensor(model.body(body).iquat, model.body(body).inertia)
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from inertia import compiled_tensor, rotation, tensor
 
 XML = Path(__file__).parents[1] / "resources" / "robots" / "go2" / "go2.xml"
 LEGS, LINKS = ("FL", "FR", "RL", "RR"), ("hip", "thigh", "calf")
@@ -84,22 +85,6 @@ def shapes(body: str) -> list[tuple[str, tuple, tuple, tuple]]:
         upper = ("cylinder", (0.012, 0.06), (0.008, 0.0, -0.06), (0.994493, 0.0, -0.104807, 0.0))
     lower = ("cylinder", (0.011, 0.0325), (0.02, 0.0, -0.148), (0.999688, 0.0, 0.0249974, 0.0))
     return [upper, lower, ("sphere", (FOOT_RADIUS,), FOOT_POS, _ONE)]
-
-
-def rotation(quat: np.ndarray | tuple) -> np.ndarray:
-    q, matrix = np.array(quat, float), np.zeros(9)
-    mujoco.mju_quat2Mat(matrix, q / np.linalg.norm(q))
-    return matrix.reshape(3, 3)
-
-
-def tensor(quat: np.ndarray | tuple, moments: np.ndarray | tuple) -> np.ndarray:
-    """Inertia (3, 3) at the com, in the axes of the body."""
-    r = rotation(quat)
-    return r @ np.diag(moments) @ r.T
-
-
-def compiled_tensor(model: mujoco.MjModel, body: str) -> np.ndarray:
-    return tensor(model.body(body).iquat, model.body(body).inertia)
 
 
 @pytest.fixture(scope="module")

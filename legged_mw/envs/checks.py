@@ -17,6 +17,7 @@ Rule = tuple[str, Callable[[Any], bool]]
 
 POSITIVE: Rule = ("positive", lambda v: 0 < v < math.inf)
 NOT_NEGATIVE: Rule = ("zero or more", lambda v: 0 <= v < math.inf)
+PART: Rule = ("above 0 and at most 1", lambda v: 0 < v <= 1)
 RANGE: Rule = ("two numbers, the lower first", lambda v: len(v) == 2 and v[0] <= v[1])
 SPAN: Rule = ("two numbers above zero, the lower first", lambda v: len(v) == 2 and 0 < v[0] <= v[1])
 STEPS: Rule = ("two whole numbers from zero, the lower first", lambda v: len(v) == 2 and 0 <= v[0] <= v[1])
@@ -44,6 +45,7 @@ ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys(("sim.threads", "sim.nconmax", "sim.njmax"), NOT_NEGATIVE),
     **dict.fromkeys(("perturbation.interval", "perturbation.duration"), SPAN),
     "perturbation.velocity": RANGE,
+    "perturbation.curriculum_rate": PART,
     **dict.fromkeys(("init_state.dof_pos_range", "init_state.dof_pos_offset"), RANGE),
     **dict.fromkeys(("init_state.dof_vel_range", "rewards.base_height_target"), NOT_NEGATIVE),
     "perturbation.push_interval_s": POSITIVE,
@@ -79,10 +81,7 @@ WALKING: dict[str, Rule] = {
     "terrain.difficulty": ("two numbers from 0 to 1, the lower first", lambda v: len(v) == 2 and 0 <= v[0] <= v[1] <= 1),
     "terrain.height_scan": ("a list of groups: state, privileged_state", lambda v: {*v} <= {"state", "privileged_state"}),
     **dict.fromkeys(("terrain.measured_points_x", "terrain.measured_points_y"), POINTS),
-    **dict.fromkeys(
-        ("commands.curriculum_start", "commands.curriculum_step", "perturbation.curriculum_rate"),
-        ("above 0 and at most 1", lambda v: 0 < v <= 1),
-    ),
+    **dict.fromkeys(("commands.curriculum_start", "commands.curriculum_step"), PART),
 }
 LEARNER: dict[str, Rule] = {
     **dict.fromkeys(("runner.num_steps_per_env", "runner.max_iterations", "runner.save_interval"), POSITIVE),

@@ -44,11 +44,11 @@ class LeggedRobot(LeggedRewards, RobotTask):
         self._measure_ground()
         torch.maximum(self.swing_peak, self.foot_height, out=self.swing_peak)
         torch.hypot(self.foot_vel[..., 0], self.foot_vel[..., 1], out=self.foot_speed)
-        self.moving.copy_(self.told_to_move())
+        self.told_to_move(out=self.moving)
 
-    def told_to_move(self) -> Tensor:
-        """(N,) The velocity command is more than to stand."""
-        return self.velocity_command.square().sum(dim=1) > self.cfg.rewards.min_command**2
+    def told_to_move(self, out: Tensor | None = None) -> Tensor:
+        """(N,) The velocity command is more than to stand; written into ``out``, if there is one."""
+        return torch.gt(self.velocity_command.square().sum(dim=1), self.cfg.rewards.min_command**2, out=out)
 
     def _end_step(self) -> None:
         """What the next step remembers; the reward has seen this step's values."""

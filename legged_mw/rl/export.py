@@ -42,7 +42,7 @@ from legged_mw.rl.export_scene import among_steps, standalone
 from legged_mw.rl.network import INPUT, OUTPUT, ExportedPolicy, halve, round_weights, run_onnx, save_onnx
 from legged_mw.rl.policies import load_policy
 from legged_mw.rl.runs import CONFIG_FILE
-from legged_mw.sim.model import ModelError, RobotModel, per_joint
+from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import shown
@@ -191,7 +191,7 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
 
 def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) -> Contract:
     """The contract of the network in ``folder``, trained with the noise level ``noise``; writes the scene there."""
-    cfg, robot, scale = task.cfg, env.robot, task.cfg.control.action_scale
+    cfg, robot = task.cfg, env.robot
     start = [*env.start_place, 1.0, 0.0, 0.0, 0.0, *robot.pose]
     source = find_file(cfg, "asset.file").read_text(encoding="utf-8", errors="replace")
     scene = standalone(robot, robot.imu, qpos=start, ctrl=robot.pose, camera=cfg.viewer.camera, source=source)
@@ -206,11 +206,11 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         default_pose=np.array(robot.pose),
         action=Action(
             cfg.control.action_origin,
-            _table(robot, scale if isinstance(scale, dict) else {"": scale}, "control.action_scale"),
+            np.array(robot.tables["control.action_scale"]),
             cfg.normalization.clip_actions,
         ),
-        stiffness=_table(robot, cfg.control.stiffness, "control.stiffness"),
-        damping=_table(robot, cfg.control.damping, "control.damping"),
+        stiffness=np.array(robot.tables["`stiffness`"]),
+        damping=np.array(robot.tables["`damping`"]),
         period=round(env.dt, 9),
         timestep=cfg.sim.dt,
         decimation=cfg.control.decimation,
@@ -229,10 +229,6 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         digest=digest(folder / NETWORK_FILE),
         exam=cfg.to_dict().get("exam") if task.exam == "walking" else None,
     )
-
-
-def _table(robot: RobotModel, values: dict[str, float], field: str) -> np.ndarray:
-    return np.array(per_joint(values, robot.joint_names, field, robot.held))
 
 
 def _ends(env: RobotTask) -> Ends:

@@ -35,8 +35,8 @@ REACH = 200.0  # of the flat ground beyond the tiles [m]; a camera sees as far a
 def add_relief(spec: mujoco.MjSpec, terrain: Terrain, ground: str, squares: bool = True) -> None:
     """Dress the geom ``ground``, a height field of ``terrain``, in a ``spec`` that has a scene; ``squares``: for speed to be judged by.
 
-    It is cut into its tiles, each of them there twice: as it is, and coarse and hidden, for who draws slowly and shows that one
-    instead where a tile is far away (view/rough_ground.py).
+    It is cut into its tiles, each of them there twice: as it is, and coarse and hidden, for a slow renderer, which shows that one
+    instead where a tile is far away (view/posed_robot.py).
     """
     floor, picture = spec.geom(ground), relief(terrain, squares)
     spec.delete(spec.hfield(floor.hfieldname))
