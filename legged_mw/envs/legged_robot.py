@@ -219,12 +219,18 @@ class LeggedRobot(LeggedRewards, RobotTask):
                 "state",  # the same noisy sample
                 *self._body_rows(),
                 Row("foot_contact", self.foot_contact, mirror="foot"),  # 0 or 1
-                Row("foot_lin_vel", self.foot_vel.flatten(1), mirror="foot_polar"),  # world frame [m/s]
-                Row("feet_air_time", self.feet_air_time, mirror="foot"),  # [s]
+                Row("foot_lin_vel", self.foot_vel.flatten(1), mirror="foot_polar", unit="m/s", frame="world"),
+                Row("feet_air_time", self.feet_air_time, mirror="foot", unit="s"),
+                *self._foot_height_rows(),
                 *self._disturbance_rows(),
                 *self._height_rows("privileged_state"),
             ],
         }
+
+    def _foot_height_rows(self) -> list[Row]:
+        """Each foot's height above the ground under it, where ``observations.foot_height`` asks for it."""
+        row = Row("foot_height", self.foot_height, mirror="foot", unit="m", frame="above the ground under it, of the foot's site")
+        return [row] if self.cfg.observations.foot_height else []
 
     def _gait_rows(self) -> list[Row]:
         """The gait clock, where there is one: sine of each foot's phase, then cosine; zeros while told to stand."""

@@ -17,6 +17,9 @@ class LeggedRobotCfg(RobotTaskCfg):
         foot_names: list[str] = []  # of sites, and of geoms if foot_geoms says nothing; the order is the order in observations
         foot_geoms: dict[str, list[str]] = {}  # foot -> its geoms, names or patterns, where a foot is not one geom of its name
 
+    class observations(RobotTaskCfg.observations):
+        foot_height: bool = False  # a row of `privileged_state`: each foot's height above the ground under it [m]
+
     class commands:
         resampling_time: float = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]
         change_probability: float = 0.5  # that a component changes at all when the timer ends [P]
