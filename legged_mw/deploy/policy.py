@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legged_mw.deploy.contract import CLOCK, CONTRACT_FILE, NETWORK_FILE, OWN, Contract, ContractError
+from legged_mw.deploy.estimate import ESTIMATE, columns_of
 from legged_mw.deploy.gait import GaitClock
 from legged_mw.deploy.robot import Measurement
 from legged_mw.utils.errors import UserError
@@ -18,7 +19,7 @@ Floats = NDArray[np.floating[Any]]
 
 
 class Network:
-    """``policy.onnx`` on one thread: observations (N, size) -> actions (N, D), float32."""
+    """``policy.onnx`` on one thread: observations (N, size) -> actions (N, D), float32. ``estimate`` (N, E) is of the last call."""
 
     def __init__(self, folder: Path, contract: Contract) -> None:
         """Load it; raises ContractError if its inputs and outputs are not the contract's."""
@@ -33,28 +34,36 @@ class Network:
             self._session = onnxruntime.InferenceSession((folder / NETWORK_FILE).read_bytes(), options, providers=["CPUExecutionProvider"])
         except Exception:  # onnxruntime raises a type of its own for each way that a file is broken
             raise ContractError(f"{NETWORK_FILE} cannot be read as an ONNX network: it is damaged; export the policy again") from None
-        self._input, self._output = contract.input, contract.output
+        self._input, self._outputs = contract.input, [contract.output, *([ESTIMATE] if contract.estimate else [])]
         self._one_by_one = self._check(contract)
+        self.estimate = np.zeros((0, 0), dtype=np.float32)
 
     def _check(self, contract: Contract) -> bool:
-        """One input and one output of the contract's names and sizes; returns whether the batch is fixed to 1."""
+        """One input, and the outputs, of the contract's names and sizes; returns whether the batch is fixed to 1."""
         names = ", ".join(f"{row.name} {row.size * row.history}" for row in contract.rows)
-        for what, ports, name, size, why in (
-            ("input", self._session.get_inputs(), contract.input, contract.size, f"the rows of `observation`: {names}"),
-            ("output", self._session.get_outputs(), contract.output, len(contract.joints), "one action a joint"),
+        sizes, why = {contract.output: len(contract.joints)}, "one action a joint"
+        if contract.estimate:
+            sizes[ESTIMATE] = sum(row.size for row in contract.estimate)
+            why += f"; the rows of `estimate`: {', '.join(f'{row.name} {row.size}' for row in contract.estimate)}"
+        for what, ports, wanted, reason in (
+            ("input", self._session.get_inputs(), {contract.input: contract.size}, f"the rows of `observation`: {names}"),
+            ("output", self._session.get_outputs(), sizes, why),
         ):
-            found = ", ".join(f"'{port.name}' {port.shape}" for port in ports)
-            if len(ports) != 1 or ports[0].name != name or len(ports[0].shape) != 2 or ports[0].shape[1] != size:
+            if [(port.name, *port.shape[1:]) for port in ports] != [*wanted.items()]:
+                found = ", ".join(f"'{port.name}' {port.shape}" for port in ports)
+                stated = ", ".join(f"'{name}' [1, {size}]" for name, size in wanted.items())
                 raise ContractError(
-                    f"{NETWORK_FILE} does not fit {CONTRACT_FILE}: its {what} is {found}, the contract's is '{name}' [1, {size}] ({why})"
+                    f"{NETWORK_FILE} does not fit {CONTRACT_FILE}: its {what} is {found}, the contract's is {stated} ({reason})"
                 )
         return self._session.get_inputs()[0].shape[0] == 1
 
     def __call__(self, obs: Floats) -> NDArray[np.float32]:
         rows = np.ascontiguousarray(obs, dtype=np.float32)
-        if self._one_by_one and len(rows) != 1:
-            return np.concatenate([self(row[None]) for row in rows])
-        return np.asarray(self._session.run([self._output], {self._input: rows})[0])
+        batches = [row[None] for row in rows] if self._one_by_one else [rows]
+        found = [self._session.run(self._outputs, {self._input: batch}) for batch in batches]
+        actions, *estimate = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        self.estimate = estimate[0] if estimate else self.estimate
+        return actions
 
 
 class Controller:
@@ -84,6 +93,11 @@ class Controller:
         origins = {"default": self.contract.default_pose, "joints": np.atleast_2d(measurement.joint_pos), "targets": self.last_targets}
         self.last_targets = origins[action.origin] + action.scale * self.last_actions.astype(np.float64)
         return self.last_targets.copy()
+
+    def estimate(self, row: str) -> NDArray[np.float64] | None:
+        """What the policy believed of ``row`` when it acted last (N, size), in the contract's unit; None if it does not estimate that."""
+        columns = columns_of(self.contract.estimate, row)
+        return None if columns is None else self._network.estimate[:, columns].astype(np.float64)  # type: ignore[attr-defined]
 
     def reset(self, which: Any = slice(None)) -> None:
         """The robots ``which`` (indices or a mask) begin again: no actions, targets, frames or clocks of theirs are remembered."""

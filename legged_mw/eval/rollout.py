@@ -65,6 +65,8 @@ def roll_out(
 
     The first ``alone`` worlds act as a batch of their own: a matrix product may round differently in a larger batch, and
     what is computed of these worlds must not depend on how many others there are.
+
+    Of a policy that estimates its velocity there is a further signal, "estimate": vx, vy [m/s].
     """
     if len(cases) != env.num_envs:
         raise ValueError(f"{len(cases)} cases need as many worlds; this environment has {env.num_envs}")
@@ -74,6 +76,8 @@ def roll_out(
     commands = getattr(env, "commands", asked[0])  # a task without commands has no buffer for them
     commands.copy_(asked[0])
     obs = env.first_observations()
+    if columns := estimated_velocity(policy):
+        signals = {**signals, "estimate": lambda _: _act(policy.estimate, obs, alone)[:, columns]}  # type: ignore[attr-defined]
     fell_at = torch.full((env.num_envs,), math.inf, device=env.device)
     kept: dict[str, Tensor] = {}
     for step in range(steps):
@@ -98,6 +102,12 @@ def roll_out(
         last_position=env.root_pos[:, :2].cpu().numpy().copy(),
         signals={name: values.cpu().numpy() for name, values in kept.items()},
     )
+
+
+def estimated_velocity(policy: Policy) -> slice | None:
+    """Columns of vx, vy in what the policy estimates; None if it does not estimate its velocity."""
+    columns = policy.columns_of("base_lin_vel") if hasattr(policy, "columns_of") else None  # type: ignore[attr-defined]
+    return columns and slice(columns.start, columns.start + 2)
 
 
 def _act(policy: Policy, obs: TensorDict, alone: int | None) -> Tensor:

@@ -48,16 +48,18 @@ class EstimatingModel(MLPModel):
     """rsl-rl's MLPModel whose network reads normalised observations and, beside them, the normalised estimate of E values."""
 
     def __init__(
-        self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str, output_dim: int, *, estimator: dict[str, Any], **settings: Any
+        self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str, output_dim: int, *, estimator: dict[str, Any], **more: Any
     ) -> None:
-        """``estimator``: the config section, its ``targets`` as ``Target``s."""
+        """``estimator``: the config section, its ``targets`` as ``Target``s; the rest is MLPModel's."""
         targets = [Target(*target) for target in estimator["targets"]]
         scales = [scale for target in targets for scale in target.scale]
         self._targets, self._size, self.learning_rate = targets, len(scales), estimator["learning_rate"]
-        super().__init__(obs, obs_groups, obs_set, output_dim, **settings)
+        super().__init__(obs, obs_groups, obs_set, output_dim, **more)
         self.estimator = MLP(self.obs_dim, self._size, estimator["hidden_dims"], estimator["activation"])
         self.target_normalizer = TargetNormalizer(self._size)
         self.register_buffer("_scales", torch.tensor(scales), persistent=False)
+
+    _scales: Tensor
 
     def _get_latent_dim(self) -> int:
         return self.obs_dim + self._size
@@ -68,6 +70,11 @@ class EstimatingModel(MLPModel):
         with torch.no_grad():
             estimate = self.estimator(seen)
         return torch.cat([seen, estimate], dim=-1)
+
+    @torch.no_grad()
+    def targets(self, obs: TensorDict) -> Tensor:
+        """The targets (B, E), normalised: what the estimator is to say."""
+        return self.target_normalizer(self.truth(obs))
 
     def truth(self, obs: TensorDict) -> Tensor:
         """The targets (B, E) in their units, as the groups of ``obs`` hold them."""
@@ -109,11 +116,13 @@ class _OnnxEstimatingModel(nn.Module):
         return actions, estimate * self.target_normalizer._std + self.target_normalizer._mean
 
 
-def trained_parts(actor: MLPModel, critic: MLPModel) -> list[list[nn.Parameter]]:
-    """Parameters whose gradients are clipped together: the policy's, the critic's, and the estimator's where there is one."""
-    estimators = [[*actor.estimator.parameters()]] if isinstance(actor, EstimatingModel) else []
-    own = {id(parameter) for part in estimators for parameter in part}
-    return [[p for p in actor.parameters() if id(p) not in own], [*critic.parameters()], *estimators]
+def trained_parts(actor: MLPModel, critic: MLPModel) -> tuple[list[list[nn.Parameter]], list[Tensor]]:
+    """Parameters whose gradients are clipped together: the policy's, the critic's, the estimator's if there is one; and its rate ()."""
+    if not isinstance(actor, EstimatingModel):
+        return [[*actor.parameters()], [*critic.parameters()]], []
+    policy = [parameter for name, parameter in actor.named_parameters() if not name.startswith("estimator.")]
+    rate = torch.tensor(actor.learning_rate, dtype=torch.float32, device=policy[0].device)
+    return [policy, [*critic.parameters()], [*actor.estimator.parameters()]], [rate]
 
 
 # ---- what the config means ------------------------------------------------------------------------------------------
@@ -128,13 +137,13 @@ def actor_settings(sections: dict[str, Any], env: RobotTask | None) -> dict[str,
     if actor["class_name"] != "MLPModel":
         raise ConfigError(f"{FIELD}: an estimator goes with actor.class_name 'MLPModel', not '{actor['class_name']}'")
     assert env is not None
-    estimator["targets"] = [tuple(target) for target, _ in find_targets(estimator["targets"], sections["obs_groups"], env)]
+    estimator["targets"] = [tuple(target) for target, _ in find_targets(sections, env)]
     return {**actor, "class_name": f"{__name__}:EstimatingModel", "estimator": estimator}
 
 
-def find_targets(names: list[str], obs_groups: dict[str, list[str]], env: RobotTask) -> list[tuple[Target, Row]]:
+def find_targets(sections: dict[str, Any], env: RobotTask) -> list[tuple[Target, Row]]:
     """Each target and its row: of the critic's groups first, then of others, never of one that the actor reads. Raises ConfigError."""
-    groups = env.observations.groups
+    names, obs_groups, groups = sections["actor"]["estimator"]["targets"], sections["obs_groups"], env.observations.groups
     order = [group for group in dict.fromkeys([*obs_groups["critic"], *groups]) if group in groups and group not in obs_groups["actor"]]
     rows = {row.name: (group, row) for group in reversed(order) for row in groups[group] if not row.group}
     found = []

@@ -35,11 +35,13 @@ from legged_mw.deploy.contract import (
     HeightScan,
     digest,
 )
+from legged_mw.deploy.estimate import Estimated
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.estimator import EstimatingModel, find_targets
 from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
 from legged_mw.rl.export_scene import among_steps, standalone
-from legged_mw.rl.network import INPUT, OUTPUT, ExportedPolicy, halve, round_weights, run_onnx, save_onnx
+from legged_mw.rl.network import ESTIMATE, INPUT, OUTPUT, ExportedPolicy, halve, round_weights, run_onnx, save_onnx
 from legged_mw.rl.policies import load_policy
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.sim.model import ModelError
@@ -115,8 +117,10 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
         observations, actions = (np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions"))
         acted = run_onnx(new / NETWORK_FILE, observations)
         gap = _compare(acted, np.clip(actions, -clip, clip))
+        if isinstance(policy, EstimatingModel):
+            _compare(run_onnx(new / NETWORK_FILE, observations, ESTIMATE), _run(policy, clip, observations)[1], does="estimates")
         if half:
-            gap = _gap(acted, ExportedPolicy(exact, clip)(torch.from_numpy(observations)).detach().numpy())
+            gap = _gap(acted, _run(exact, clip, observations)[0])
         replay(env, contract, steps, new)
         no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
         files = (*FILES, *([TERRAIN_FILE] if (new / TERRAIN_FILE).exists() else []))
@@ -145,17 +149,24 @@ def _write_network(policy: MLPModel, clip: float, path: Path, half: bool) -> Non
         halve(policy, path)
 
 
+def _run(policy: MLPModel, clip: float, observations: np.ndarray) -> list[np.ndarray]:
+    """What an exported network should give: actions, and the estimate if there is one."""
+    with torch.inference_mode():
+        outputs = ExportedPolicy(policy, clip)(torch.from_numpy(observations))
+    return [output.numpy() for output in (outputs if isinstance(outputs, tuple) else (outputs,))]
+
+
 def _gap(got: np.ndarray, wanted: np.ndarray) -> float:
     """The largest difference, relative above 1."""
     return float((np.abs(got - wanted) / np.maximum(1.0, np.abs(wanted))).max()) if got.shape == wanted.shape else float("inf")
 
 
-def _compare(got: np.ndarray, wanted: np.ndarray) -> float:
-    """The largest difference; refuses a network that acts otherwise than the policy."""
+def _compare(got: np.ndarray, wanted: np.ndarray, does: str = "acts") -> float:
+    """The largest difference; refuses a network that acts or estimates otherwise than the policy."""
     gap = _gap(got, wanted)
     if not gap <= TOLERANCE:  # NaN too
         raise ExportError(
-            f"{NETWORK_FILE} acts otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
+            f"{NETWORK_FILE} {does} otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
             f"(at most {TOLERANCE:g} is allowed); nothing was written"
         )
     return gap
@@ -228,6 +239,16 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         output=OUTPUT,
         digest=digest(folder / NETWORK_FILE),
         exam=cfg.to_dict().get("exam") if task.exam == "walking" else None,
+        estimate=_estimated(env, task),
+    )
+
+
+def _estimated(env: RobotTask, task: LoadedTask) -> tuple[Estimated, ...]:
+    """The rows of the network's second output."""
+    rows = [(row, ROWS.get(row.name)) for _, row in find_targets(task.train.to_dict(), env)]
+    return tuple(
+        Estimated(row.name, row.value.shape[1], row.unit or (known.unit if known else ""), row.frame or (known.frame if known else ""))
+        for row, known in rows
     )
 
 

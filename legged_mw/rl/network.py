@@ -14,50 +14,58 @@ from onnx import numpy_helper
 from rsl_rl.models import MLPModel
 from torch import Tensor, nn
 
+from legged_mw.rl.estimator import EstimatingModel
 from legged_mw.utils.config import ConfigError
 
-INPUT, OUTPUT = "obs", "actions"
+INPUT, OUTPUT, ESTIMATE = "obs", "actions", "estimate"
 PREFIX = "policy."  # of the weights' names in the file: the attribute of ExportedPolicy
 MEAN, STD = "obs_normalizer._mean", "obs_normalizer._std"
-UNWRITTEN = ("obs_normalizer._var", "obs_normalizer.count", "distribution.")  # no mean action needs them
+# neither a mean action nor an estimate needs them
+UNWRITTEN = ("distribution.", *(f"{of}_normalizer.{name}" for of in ("obs", "target") for name in ("_var", "count")))
 
 
 class ExportedPolicy(nn.Module):
-    """Observations (N, size) in their plain units -> clipped mean actions (N, A); the normaliser is inside."""
+    """Observations (N, size) in their plain units -> clipped mean actions (N, A), then the estimate (N, E) if there is an estimator.
+
+    Normalisers are inside.
+    """
 
     def __init__(self, policy: MLPModel, clip_actions: float) -> None:
         super().__init__()
         self.policy, self.clip_actions = copy.deepcopy(policy).cpu().as_onnx(verbose=False), clip_actions
+        self.outputs = [OUTPUT, ESTIMATE] if isinstance(policy, EstimatingModel) else [OUTPUT]
 
-    def forward(self, obs: Tensor) -> Tensor:
-        return self.policy(obs).clamp(-self.clip_actions, self.clip_actions)
+    def forward(self, obs: Tensor) -> Tensor | tuple[Tensor, ...]:
+        actions, *more = self.policy(obs) if len(self.outputs) > 1 else (self.policy(obs),)
+        actions = actions.clamp(-self.clip_actions, self.clip_actions)
+        return (actions, *more) if more else actions
 
 
-def run_onnx(path: Path, observations: np.ndarray) -> np.ndarray:
-    """Actions (B, A) of the network in an ONNX file, by onnxruntime, or where it is not installed by onnx's own evaluator."""
+def run_onnx(path: Path, observations: np.ndarray, output: str = OUTPUT) -> np.ndarray:
+    """Actions (B, A), or another output, of the network in an ONNX file, by onnxruntime or where it is not installed onnx's evaluator."""
     try:
         import onnxruntime
     except ImportError:
         from onnx.reference import ReferenceEvaluator
 
-        [actions] = ReferenceEvaluator(onnx.load(path)).run([OUTPUT], {INPUT: observations})
-        return np.asarray(actions)
+        [found] = ReferenceEvaluator(onnx.load(path)).run([output], {INPUT: observations})
+        return np.asarray(found)
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    return np.asarray(session.run([OUTPUT], {INPUT: observations})[0])
+    return np.asarray(session.run([output], {INPUT: observations})[0])
 
 
 def save_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
-    """Write one self-contained ONNX file: input ``obs`` (batch, size), output ``actions`` (batch, A)."""
-    example = torch.zeros(2, policy.obs_dim)
+    """Write one self-contained ONNX file: input ``obs`` (batch, size), output ``actions`` (batch, A), of an estimator ``estimate`` too."""
+    example, exported = torch.zeros(2, policy.obs_dim), ExportedPolicy(policy, clip_actions).eval()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter warns of its own internals, and logs that torchvision is missing
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         torch.onnx.export(
-            ExportedPolicy(policy, clip_actions).eval(),
+            exported,
             (example,),
             path,
             input_names=[INPUT],
-            output_names=[OUTPUT],
+            output_names=exported.outputs,
             opset_version=18,
             dynamic_shapes={INPUT: {0: torch.export.Dim("batch", min=1)}},
             external_data=False,
