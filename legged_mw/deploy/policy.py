@@ -36,7 +36,7 @@ class Network:
             raise ContractError(f"{NETWORK_FILE} cannot be read as an ONNX network: it is damaged; export the policy again") from None
         self._input, self._outputs = contract.input, [contract.output, *([ESTIMATE] if contract.estimate else [])]
         self._one_by_one = self._check(contract)
-        self.estimate = np.zeros((0, 0), dtype=np.float32)
+        self.estimate: NDArray[np.float32] | None = None
 
     def _check(self, contract: Contract) -> bool:
         """One input, and the outputs, of the contract's names and sizes; returns whether the batch is fixed to 1."""
@@ -62,7 +62,7 @@ class Network:
         batches = [row[None] for row in rows] if self._one_by_one else [rows]
         found = [self._session.run(self._outputs, {self._input: batch}) for batch in batches]
         actions, *estimate = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        self.estimate = estimate[0] if estimate else self.estimate
+        self.estimate = estimate[0] if estimate else None
         return actions
 
 
@@ -96,8 +96,8 @@ class Controller:
 
     def estimate(self, row: str) -> NDArray[np.float64] | None:
         """What the policy believed of ``row`` when it acted last (N, size), in the contract's unit; None if it does not estimate that."""
-        columns = columns_of(self.contract.estimate, row)
-        return None if columns is None else self._network.estimate[:, columns].astype(np.float64)  # type: ignore[attr-defined]
+        columns, believed = columns_of(self.contract.estimate, row), getattr(self._network, "estimate", None)
+        return None if columns is None or believed is None else believed[:, columns].astype(np.float64)
 
     def reset(self, which: Any = slice(None)) -> None:
         """The robots ``which`` (indices or a mask) begin again: no actions, targets, frames or clocks of theirs are remembered."""

@@ -77,6 +77,8 @@ class LeggedRobot(LeggedRewards, RobotTask):
         """New commands, feet in the air."""
         self._reset_commands(mask)
         self.foot_contact.masked_fill_(mask[:, None], False)
+        if self.cfg.observations.foot_height:
+            self.foot_height.masked_fill_(mask[:, None], 0.0)  # not that of the last episode
         if self.gait:
             self.gait.restart(mask)
 

@@ -15,10 +15,12 @@ def draw(estimate: dict[str, Any], k: int, colours: tuple[str, str, str], title:
     """Axis ``k`` of ``figures.estimates``: the commands side by side; ``colours`` of truth, estimate and the borders between commands."""
     ink, colour, faint = colours
     commands, seconds = estimate["commands"], estimate["seconds"]
-    truth, believed = (np.array(estimate[key][k], dtype=float) for key in ("truth", "estimate"))
-    time = np.linspace(0.0, seconds * len(commands), len(truth), endpoint=False)
-    ax.plot(time, truth, color=ink, linewidth=1.0, label="true")
-    ax.plot(time, believed, color=colour, linewidth=1.0, label="estimated")
+    for key, tone, label in (("truth", ink, "true"), ("estimate", colour, "estimated")):
+        values = np.array(estimate[key][k], dtype=float).reshape(len(commands), -1)
+        time = np.linspace(0.0, seconds, values.shape[1]) + seconds * np.arange(len(commands))[:, None]
+        apart = ((0, 0), (0, 1))  # no line from one command to the next
+        lines = (np.pad(rows, apart, constant_values=np.nan).ravel() for rows in (time, values))
+        ax.plot(*lines, color=tone, linewidth=1.0, label=label)
     for i in range(1, len(commands)):
         ax.axvline(i * seconds, color=faint, linewidth=0.8)
     places = (np.arange(len(commands)) + 0.5) * seconds
@@ -26,4 +28,4 @@ def draw(estimate: dict[str, Any], k: int, colours: tuple[str, str, str], title:
     name, unit = AXES[k]
     ax.set(title=f"{name} [{unit}]{title}", xlabel="command: vx, vy, yaw rate", xlim=(0.0, seconds * len(commands)))
     ax.grid(False, axis="x")
-    ax.legend(loc="upper right", ncols=2, handlelength=1.6)
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0, ncols=2, handlelength=1.6)
