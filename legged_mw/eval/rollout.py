@@ -65,8 +65,6 @@ def roll_out(
 
     The first ``alone`` worlds act as a batch of their own: a matrix product may round differently in a larger batch, and
     what is computed of these worlds must not depend on how many others there are.
-
-    Of a policy that estimates its velocity there is a further signal, "estimate": vx, vy [m/s].
     """
     if len(cases) != env.num_envs:
         raise ValueError(f"{len(cases)} cases need as many worlds; this environment has {env.num_envs}")
@@ -76,13 +74,11 @@ def roll_out(
     commands = getattr(env, "commands", asked[0])  # a task without commands has no buffer for them
     commands.copy_(asked[0])
     obs = env.first_observations()
-    if columns := estimated_velocity(policy):
-        signals = {**signals, "estimate": lambda _: _act(policy.estimate, obs, alone)[:, columns]}  # type: ignore[attr-defined]
     fell_at = torch.full((env.num_envs,), math.inf, device=env.device)
     kept: dict[str, Tensor] = {}
     for step in range(steps):
-        for name, signal in signals.items():
-            value = signal(env)
+        sampled = {name: signal(env) for name, signal in signals.items()} | _believed(policy, obs, alone)
+        for name, value in sampled.items():
             if name not in kept:
                 kept[name] = torch.empty(steps, *value.shape, dtype=value.dtype, device=value.device)
             kept[name][step] = value
@@ -104,10 +100,12 @@ def roll_out(
     )
 
 
-def estimated_velocity(policy: Policy) -> slice | None:
-    """Columns of vx, vy in what the policy estimates; None if it does not estimate its velocity."""
+def _believed(policy: Policy, obs: TensorDict, alone: int | None) -> dict[str, Tensor]:
+    """A further signal, "estimate", of a policy that estimates its velocity: vx, vy (N, 2) [m/s]."""
     columns = policy.columns_of("base_lin_vel") if hasattr(policy, "columns_of") else None  # type: ignore[attr-defined]
-    return columns and slice(columns.start, columns.start + 2)
+    if columns is None:
+        return {}
+    return {"estimate": _act(policy.estimate, obs, alone)[:, columns.start : columns.start + 2]}  # type: ignore[attr-defined]
 
 
 def _act(policy: Policy, obs: TensorDict, alone: int | None) -> Tensor:
