@@ -208,6 +208,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
     scene = standalone(robot, robot.imu, qpos=start, ctrl=robot.pose, camera=cfg.viewer.camera, source=source)
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
     ends = _ends(env)
+    action = Action(cfg.control.action_origin, np.array(robot.tables["control.action_scale"]), cfg.normalization.clip_actions)
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))
     ground, scanned = cfg.terrain, any(row.measured == SCAN for row in rows)
     feet = {foot: tuple(f"contact/{geom}" for geom in geoms) for foot, geoms in getattr(env, "foot_geoms", {}).items()}
@@ -215,11 +216,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         task=task.name,
         joints=robot.joint_names,
         default_pose=np.array(robot.pose),
-        action=Action(
-            cfg.control.action_origin,
-            np.array(robot.tables["control.action_scale"]),
-            cfg.normalization.clip_actions,
-        ),
+        action=action,
         stiffness=np.array(robot.tables["`stiffness`"]),
         damping=np.array(robot.tables["`damping`"]),
         period=round(env.dt, 9),
