@@ -17,6 +17,7 @@ from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
 from legged_mw.eval.training import TrainingExam
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
+from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.task import load_task
 
 pytestmark = pytest.mark.gpu
@@ -205,6 +206,21 @@ def test_recorded_update_is_rsl_rls_own(settings: dict) -> None:
     assert ours._update_graph.recorded
 
 
+@pytest.mark.parametrize("settings", [{}, VARIANTS["symmetric samples"]], ids=["plain", "mirrored"])
+def test_recorded_estimator_learns_as_step_by_step(settings: dict) -> None:
+    """Six updates, the last three replayed, beside a learner that records none, from equal states and experience."""
+    eager, ours = (make(GraphedPPO, DEVICE, estimator={}, **settings) for _ in range(2))
+    eager._update_graph = StepGraph(eager._update, DEVICE, eager=True)
+    for seed in range(6):
+        collect(eager, DEVICE, seed=seed)
+        share_experience(eager, ours)
+        take_over(ours, eager)
+        expected, got = update(eager), update(ours)
+        assert difference(parameters(eager), parameters(ours)) < 1e-4
+        assert got == pytest.approx(expected, rel=1e-3, abs=1e-5) and got["estimate"] > 0.0
+    assert ours._update_graph.recorded and not eager._update_graph.recorded
+
+
 def test_checkpoints_go_both_ways_on_a_gpu(tmp_path: Path) -> None:
     """Also from a learner that replays into one that has not recorded, and back into one that has."""
     replaying, stock, fresh = make(GraphedPPO, DEVICE), make(PPO, DEVICE), make(GraphedPPO, DEVICE)
@@ -226,9 +242,12 @@ def test_checkpoints_go_both_ways_on_a_gpu(tmp_path: Path) -> None:
     assert difference(parameters(stock), parameters(replaying)) < 1e-4
 
 
-def test_iteration_never_waits_for_the_host() -> None:
+@pytest.mark.parametrize("estimates", [False, True], ids=["plain", "estimator"])
+def test_iteration_never_waits_for_the_host(estimates: bool) -> None:
     """Rollout, returns, update and the report, once everything is recorded."""
-    runner = make_runner(make_env(eager=False), small_learner(), None, DEVICE)
+    learner = small_learner()
+    learner.actor.estimator.targets = ["base_lin_vel", "foot_contact"] if estimates else []
+    runner = make_runner(make_env(eager=False), learner, None, DEVICE)
     runner.learn(5)
     obs = runner.env.get_observations()
     torch.cuda.set_sync_debug_mode("error")
