@@ -20,10 +20,12 @@ from test_train import assert_equal, copy_world, load, small_task
 from torch import Tensor, nn
 from worlds import QUIET, layout, make_env
 
+from legged_mw.check.describe import describe
 from legged_mw.check.recordable import recordable
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.exam import run_exam
 from legged_mw.deploy.stage import DeployStage
+from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exam, figures, page, plots, rules
 from legged_mw.eval.page import Column
@@ -200,6 +202,24 @@ def test_an_estimator_that_cannot_be(changes: dict[str, Any], said: str) -> None
     task = task_with(**changes)
     with pytest.raises(ConfigError, match=f"^actor.estimator.targets:? {said}"):
         make_runner(LeggedRobot(task.cfg, "cpu"), task.train, None, "cpu")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"actor__estimator__learning_rate": 0.0}, "actor.estimator.learning_rate is 0.0; it must be positive"),
+        ({"actor__estimator__hidden_dims": []}, r"actor.estimator.hidden_dims is \[\]; it must be whole numbers from 1, at least one"),
+    ],
+)
+def test_numbers_that_cannot_work(change: dict[str, Any], said: str) -> None:
+    task = task_with(**change)
+    with pytest.raises(ConfigError, match=said):
+        check_values(task.cfg, task.train)
+
+
+def test_check_says_what_is_estimated() -> None:
+    task = task_with()
+    assert "\nthe actor estimates foot_height (4), base_lin_vel (3)\n" in describe(LeggedRobot(task.cfg, "cpu"), task)
 
 
 def test_it_is_one_line_of_the_program(tmp_path: Path) -> None:
