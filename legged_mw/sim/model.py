@@ -21,6 +21,7 @@ from legged_mw.sim.ground import GROUND, Ground, add_ground, replace_level_piece
 from legged_mw.sim.joints import Posed, pose_joints, set_machine
 from legged_mw.sim.names import Names, name_geoms
 from legged_mw.sim.rigid import fuse_fixed, sensed_site
+from legged_mw.sim.self_contact import leave_out_neighbours
 from legged_mw.sim.sensors import add_more_sensors, add_sensors, sensor_spans
 from legged_mw.sim.shapes import add_sites
 from legged_mw.sim.tables import per_joint as per_joint
@@ -122,6 +123,8 @@ def build_model(
         _set_options(spec, solver, notes)
         add_ground(spec, ground, robot.where, notes)
         _set_collisions(spec, names.find(colliders, "`colliders`", colliding=True), self_collisions, notes)
+        if self_collisions:
+            leave_out_neighbours(spec, posed.joints, posed.angles, notes)
         speeds = set_machine(robot, partial or {}, posed)
         made = {name: names.find(geoms, f"`sites`: '{name}'") for name, geoms in (sites or {}).items()}
         add_sites(spec, made, posed.angles, robot.where, notes)
