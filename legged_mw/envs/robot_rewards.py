@@ -14,6 +14,7 @@ from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from typing import ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -113,8 +114,11 @@ class RobotRewards:
         if "joint_deviation" in on:
             self.deviation_weights = self._row(robot.tables["rewards.deviation_weights"])
         if "torque_limits" in on:
+            need(bool(np.isfinite(robot.effort_range).any()), "torque_limits", "no joint has a force limit; write asset.effort")
             self.soft_effort = self._row(robot.effort_range.T * rewards.soft_torque_limit)
         if "dof_vel_limits" in on:
+            needed = "no joint has a highest speed; write asset.joint_speed_limits"
+            need(bool(np.isfinite(robot.speed_limits).any()), "dof_vel_limits", needed)
             self.soft_speed = self._row(robot.speed_limits) * rewards.soft_dof_vel_limit
 
     def _row(self, values: object) -> Tensor:
@@ -214,12 +218,10 @@ class RobotRewards:
 
     def _reward_dof_vel_limits(self) -> Tensor:
         """What joints exceed ``rewards.soft_dof_vel_limit`` of their highest speed by, at most 1 each [rad/s]. [L]"""
-        need(bool(self.soft_speed.isfinite().any()), "dof_vel_limits", "no joint has a highest speed; write asset.joint_speed_limits")
         return (self.dof_vel.abs() - self.soft_speed).clamp(0.0, 1.0).sum(dim=1)
 
     def _reward_torque_limits(self) -> Tensor:
         """What torques exceed ``rewards.soft_torque_limit`` of the servo's limit by [N m]. [L]"""
-        need(bool(self.soft_effort.isfinite().any()), "torque_limits", "no joint has a force limit; write asset.effort")
         return (self.torques - self.torques.clamp(*self.soft_effort)).abs().sum(dim=1)
 
     def _reward_torques(self) -> Tensor:
