@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,6 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from program import run
 from test_export import untrained
 from torch import Tensor
 from worlds import QUIET, make_env, only_scales
@@ -361,6 +364,12 @@ def test_links_that_overlap_in_the_pose_do_not_collide() -> None:
     mujoco.mj_forward(robot.physics, data)
     assert data.ncon > 0
     assert not any("self-coll" in line for line in make_env(1, task="g1_flat").robot.overrides)
+
+
+def test_the_command_of_the_page(tmp_path: Path) -> None:
+    (command,) = re.findall(r"```sh\n(.*?)\n```", (ROOT / "docs/your_own_robot.md").read_text(), re.DOTALL)
+    said = run("train", tmp_path, *shlex.split(command)[2:], "--device", "cpu").out
+    assert "sim.nconmax 72, sim.njmax 282, from the model" in said and "self-collisions left out, as they overlap in the pose: 'pel" in said
 
 
 def test_what_is_exported_senses_what_deploy_reads(tmp_path: Path) -> None:
