@@ -16,6 +16,8 @@ def leave_out_neighbours(spec: mujoco.MjSpec, joints: Sequence[str], angles: Seq
 
     Bodies that a joint joins are left out by MuJoCo itself.
     """
+    for geom in [geom for geom in spec.geoms if geom.contype]:  # an exclusion needs names
+        geom.parent.name = geom.parent.name or f"body_of_{geom.name}"
     copy = spec.copy()
     copy.delete(copy.geom(GROUND))
     model = copy.compile()
