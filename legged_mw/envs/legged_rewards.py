@@ -57,8 +57,16 @@ class LeggedRewards(RobotRewards):
     foot_names: tuple[str, ...]
     _partners: Callable[[], Partners]
 
+    tracking_sigma: Tensor  # () [m^2/s^2, rad^2/s^2]
+
+    def anneal(self, done: float) -> None:
+        """A training is ``done`` so far, from 0 to 1: ``tracking_sigma`` on its way to ``rewards.tracking_sigma_end``."""
+        begin, end = self.cfg.rewards.tracking_sigma, self.cfg.rewards.tracking_sigma_end
+        self.tracking_sigma.fill_(begin + (end - begin) * done if end else begin)
+
     def _init_foot_rewards(self) -> None:
         """What terms need beside the state, where they are on."""
+        self.tracking_sigma = torch.tensor(self.cfg.rewards.tracking_sigma, device=self.device)
         on = self._active_scales()
         if not {"feet_orientation", "feet_distance"} & on.keys():
             return
@@ -105,12 +113,12 @@ class LeggedRewards(RobotRewards):
     def _reward_tracking_lin_vel(self) -> Tensor:
         """Velocity in the plane at the IMU, body frame, as commanded. [L]"""
         error = (self.commands[:, :2] - self.base_lin_vel[:, :2]).square().sum(dim=1)
-        return torch.exp(error / -self.cfg.rewards.tracking_sigma)
+        return torch.exp(error / -self.tracking_sigma)
 
     def _reward_tracking_ang_vel(self) -> Tensor:
         """Yaw rate as commanded. [L]"""
         error = (self.commands[:, 2] - self.base_ang_vel[:, 2]).square()
-        return torch.exp(error / -self.cfg.rewards.tracking_sigma)
+        return torch.exp(error / -self.tracking_sigma)
 
     def _reward_stand_still(self) -> Tensor:
         """Joints away from the default pose while the command is to stand. [L]"""
@@ -159,7 +167,7 @@ class LeggedRewards(RobotRewards):
         return swings + stances
 
     def _reward_feet_contact_without_cmd(self) -> Tensor:
-        """How many feet are on the ground while told to stand. [UL 0.1]"""
+        """How many feet are on the ground while told to stand. [UL]"""
         return self.foot_contact.sum(dim=1).float().masked_fill_(self.moving, 0.0)
 
     def _reward_feet_impact_vel(self) -> Tensor:

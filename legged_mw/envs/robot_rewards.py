@@ -78,7 +78,7 @@ class RobotRewards:
             if name not in self.ON_DEMAND:
                 raise ConfigError(f"asset.sense: {unknown('value', name, self.ON_DEMAND, type(self).__name__)}")
         terms = [inspect.unwrap(getattr(type(self), f"_reward_{name}", need)) for name in self._active_scales()]
-        read = {word for term in terms for word in term.__code__.co_names}
+        read = {word for term in terms for word in getattr(term, "__code__", need.__code__).co_names}
         return [sensor for name, sensor in self.ON_DEMAND.items() if name in read or name in asked]
 
     def _sensed_value(self, name: str) -> Tensor:
@@ -136,6 +136,9 @@ class RobotRewards:
             if not hits[word]:
                 raise ConfigError(f"rewards.{field}: {unknown('joint', word, names, 'the robot')}")
         return torch.tensor(sorted({i for found in hits.values() for i in found}), dtype=torch.long, device=self.device)
+
+    def anneal(self, done: float) -> None:
+        """A training is ``done`` so far, from 0 to 1: what changes with it."""
 
     def _remember_for_rewards(self) -> None:
         """The end of a step: what the next one compares with. ``last_actions`` are still those of the step before."""
