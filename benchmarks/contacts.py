@@ -16,7 +16,7 @@ import torch
 from step import timed
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.sim.engines import pick_engine
+from legged_mw.sim.engines import ENGINES, pick_engine
 from legged_mw.sim.room import count_room
 from legged_mw.utils.cli import pick_device
 from legged_mw.utils.task import load_task
@@ -49,6 +49,7 @@ def main() -> None:
     parser.add_argument("--task", default="g1_flat")
     parser.add_argument("--num_envs", type=int, default=None, help="worlds; 256 on a CPU, else 4096")
     parser.add_argument("--device", default=None)
+    parser.add_argument("--engine", choices=ENGINES, default="auto")
     parser.add_argument("--colliders", nargs="+", default=["*"], help="geoms of the whole body, as asset.colliders")
     parser.add_argument("--calls", type=int, default=40, help="calls a round")
     parser.add_argument("--rounds", type=int, default=5)
@@ -57,8 +58,9 @@ def main() -> None:
     torch.set_num_threads(1 if device == "cpu" else torch.get_num_threads())  # as train.py does
     num_envs = args.num_envs or (256 if device == "cpu" else 4096)
     name = torch.cuda.get_device_name(device) if device != "cpu" else "CPU"
-    print(f"{args.task}, {num_envs} worlds on {name}, engine {pick_engine('auto', device)}")
-    envs = {what: make_env(args.task, num_envs, device, overrides) for what, overrides in variants(args.colliders).items()}
+    print(f"{args.task}, {num_envs} worlds on {name}, engine {pick_engine(args.engine, device)}")
+    engine = {"sim.engine": args.engine}
+    envs = {what: make_env(args.task, num_envs, device, engine | overrides) for what, overrides in variants(args.colliders).items()}
     times: dict[str, list[float]] = {what: [] for what in envs}
     with torch.inference_mode():
         actions = 0.3 * torch.randn(num_envs, next(iter(envs.values())).num_actions, device=device)
