@@ -293,7 +293,7 @@ def test_both_outputs_of_the_onnx_are_torchs(policy: EstimatingModel, run_folder
 def test_the_contract_names_the_rows(run_folder: Path) -> None:
     said = load_yaml(run_folder / "export/policy.yaml")
     assert said["format"] == 3 and said["estimate"] == [
-        {"name": "foot_height", "size": 4, "unit": "m", "frame": "above the ground under it, of the foot's site"},
+        {"name": "foot_height", "size": 4, "unit": "m", "frame": "site above the ground under it"},
         {"name": "base_lin_vel", "size": 3, "unit": "m/s", "frame": "body, at the IMU"},
     ]
     assert [row.name for row in read_contract(run_folder / "export").estimate] == ["foot_height", "base_lin_vel"]

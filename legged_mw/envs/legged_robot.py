@@ -238,9 +238,7 @@ class LeggedRobot(LeggedRewards, RobotTask):
         """Of each foot, where ``observations`` asks for it: height above the ground under it; the ground's force, in 100 N."""
         rows, asked = [], self.cfg.observations
         if asked.foot_height:
-            rows.append(
-                Row("foot_height", self.foot_height, mirror="foot", unit="m", frame="above the ground under it, of the foot's site")
-            )
+            rows.append(Row("foot_height", self.foot_height, mirror="foot", unit="m", frame="site above the ground under it"))
         if asked.contact_forces:
             rows.append(Row("contact_forces", self.contact_forces.flatten(1), mirror="foot_polar", scale=0.01, unit="N", frame="world"))
         return rows
