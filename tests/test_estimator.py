@@ -302,13 +302,13 @@ def test_the_contract_names_the_rows(run_folder: Path) -> None:
 def test_deploy_believes_what_training_would(policy: EstimatingModel, run_folder: Path) -> None:
     """From the same observations; of several robots, and before the first step."""
     stage = DeployStage(run_folder / "export", 3)
-    assert stage.controller.estimate("foot_height") is None and stage.estimated_velocity() is None
+    assert stage.controller.estimate("foot_height") is None and stage.believed_velocity() is None
     for _ in range(3):
         seen = stage.controller.observe(stage.measured, stage.commands())
         stage.step()
     with torch.no_grad():
         believed = policy.estimate(TensorDict({"state": torch.from_numpy(seen)}, [3])).numpy()
-    velocity, height = stage.estimated_velocity(), stage.controller.estimate("foot_height")
+    velocity, height = stage.believed_velocity(), stage.controller.estimate("foot_height")
     assert velocity is not None and height is not None and stage.controller.estimate("commands") is None
     np.testing.assert_allclose(velocity, believed[:, 4:6], atol=1e-5)
     np.testing.assert_allclose(height, believed[:, :4], atol=1e-5)

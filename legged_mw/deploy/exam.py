@@ -39,7 +39,7 @@ def run_exam(folder: Path, exam: ExamRules | None = None, threads: int = 0, comm
         sampled["joint_speed"].append(np.abs(stage.measured.joint_vel).mean(axis=1))
         _push(stage, exam, step)  # the policy decides on what was measured before
         stage.step(wanted)
-        estimate = stage.estimated_velocity()  # from that measurement
+        estimate = stage.believed_velocity()  # from that measurement
         sampled["estimate"] += [] if estimate is None else [estimate]
         fell_at[stage.fell() & np.isinf(fell_at)] = step
     signals = {name: np.stack(values) for name, values in sampled.items() if values}

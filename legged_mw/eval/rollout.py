@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.estimator import believed_velocity
 
 Policy = Callable[[TensorDict], Tensor]
 Signal = Callable[[Any], Tensor]  # a value a world, (N, ...)
@@ -100,19 +101,20 @@ def roll_out(
     )
 
 
-def _believed(policy: Policy, obs: TensorDict, alone: int | None) -> dict[str, Tensor]:
-    """A further signal, "estimate", of a policy that estimates its velocity: vx, vy (N, 2) [m/s]."""
-    columns = policy.columns_of("base_lin_vel") if hasattr(policy, "columns_of") else None  # type: ignore[attr-defined]
-    if columns is None:
-        return {}
-    return {"estimate": _act(policy.estimate, obs, alone)[:, columns.start : columns.start + 2]}  # type: ignore[attr-defined]
-
-
 def _act(policy: Policy, obs: TensorDict, alone: int | None) -> Tensor:
     with torch.inference_mode():
-        if alone is None or alone == len(obs):
-            return policy(obs)
-        return torch.cat([policy(obs[:alone]), policy(obs[alone:])])
+        return torch.cat([policy(batch) for batch in _batches(obs, alone)])
+
+
+def _believed(policy: Policy, obs: TensorDict, alone: int | None) -> dict[str, Tensor]:
+    """A further signal, "estimate", of a policy that estimates its velocity: vx, vy (N, 2) [m/s]."""
+    with torch.inference_mode():
+        found = [value for batch in _batches(obs, alone) if (value := believed_velocity(policy, batch)) is not None]
+    return {"estimate": torch.cat(found)} if found else {}
+
+
+def _batches(obs: TensorDict, alone: int | None) -> list[TensorDict]:
+    return [obs] if alone is None or alone == len(obs) else [obs[:alone], obs[alone:]]
 
 
 def _timeline(cases: Sequence[Case], steps: int, default: Sequence[float]) -> NDArray[Any]:

@@ -98,6 +98,12 @@ class EstimatingModel(MLPModel):
         return _OnnxEstimatingModel(self)
 
 
+def believed_velocity(policy: Any, obs: TensorDict) -> Tensor | None:
+    """vx, vy (N, 2) [m/s] that ``policy`` believes of its robots; None if it does not estimate their velocity."""
+    columns = policy.columns_of("base_lin_vel") if hasattr(policy, "columns_of") else None
+    return None if columns is None else policy.estimate(obs)[:, columns][:, :2]
+
+
 class _OnnxEstimatingModel(nn.Module):
     """Observations (B, size) in their units -> mean actions (B, A), and the estimate (B, E) in the targets' units."""
 
