@@ -217,6 +217,26 @@ def test_numbers_that_cannot_work(change: dict[str, Any], said: str) -> None:
         check_values(task.cfg, task.train)
 
 
+def test_what_is_randomized_can_be_estimated_and_the_policy_acts_in_nominal_worlds(tmp_path: Path) -> None:
+    task = task_with(
+        **{
+            "domain_rand__enable": True,
+            "domain_rand__observe": True,
+            "actor__estimator__targets": ["encoder_offset", "friction", "base_lin_vel"],
+        }
+    )
+    runner = make_runner(LeggedRobot(task.cfg, "cpu"), task.train, None, "cpu")
+    runner.learn(1)
+    runner.save(str(tmp_path / "model_1.pt"))
+    task.set("domain_rand.enable", False)
+    env = LeggedRobot(task.cfg, "cpu")
+    policy, obs = load_policy(tmp_path / "model_1.pt", env, task.train, "cpu"), env.get_observations()
+    assert isinstance(policy, EstimatingModel) and policy.columns_of("base_lin_vel") == slice(13, 16)
+    assert policy.estimate(obs).shape == (16, 16) and act(policy, obs).shape == (16, 12)
+    with pytest.raises(ConfigError, match="no observation row 'encoder_offset' in 'privileged_state'"):
+        make_runner(env, task.train, None, "cpu")
+
+
 def test_check_says_what_is_estimated() -> None:
     task = task_with()
     assert "\nthe actor estimates foot_height (4), base_lin_vel (3)\n" in describe(LeggedRobot(task.cfg, "cpu"), task)

@@ -134,8 +134,11 @@ def trained_parts(actor: MLPModel, critic: MLPModel) -> tuple[list[list[nn.Param
 # ---- what the config means ------------------------------------------------------------------------------------------
 
 
-def actor_settings(sections: dict[str, Any], env: RobotTask | None) -> dict[str, Any]:
-    """Section ``actor`` of the learner's ``sections`` as rsl-rl takes it; with targets it is an EstimatingModel's. Raises ConfigError."""
+def actor_settings(sections: dict[str, Any], env: RobotTask | None, learns: bool = True) -> dict[str, Any]:
+    """Section ``actor`` of the learner's ``sections`` as rsl-rl takes it; with targets it is an EstimatingModel's. Raises ConfigError.
+
+    ``learns``: False for an actor that only acts, in worlds that may be without what ``domain_rand`` showed the critic.
+    """
     actor = copy.deepcopy(sections["actor"])
     estimator = actor.pop("estimator", {"targets": []})
     if not estimator["targets"]:
@@ -143,17 +146,20 @@ def actor_settings(sections: dict[str, Any], env: RobotTask | None) -> dict[str,
     if actor["class_name"] != "MLPModel":
         raise ConfigError(f"{FIELD}: an estimator goes with actor.class_name 'MLPModel', not '{actor['class_name']}'")
     assert env is not None
-    estimator["targets"] = [tuple(target) for target, _ in find_targets(sections, env)]
+    estimator["targets"] = [tuple(target) for target, _ in find_targets(sections, env, learns)]
     return {**actor, "class_name": f"{__name__}:EstimatingModel", "estimator": estimator}
 
 
-def find_targets(sections: dict[str, Any], env: RobotTask) -> list[tuple[Target, Row]]:
+def find_targets(sections: dict[str, Any], env: RobotTask, learns: bool = True) -> list[tuple[Target, Row]]:
     """Each target and its row: of the critic's groups first, then of others, never of one that the actor reads. Raises ConfigError."""
     names, obs_groups, groups = sections["actor"]["estimator"]["targets"], sections["obs_groups"], env.observations.groups
     order = [group for group in dict.fromkeys([*obs_groups["critic"], *groups]) if group in groups and group not in obs_groups["actor"]]
     rows = {row.name: (group, row) for group in reversed(order) for row in groups[group] if not row.group}
     found = []
     for i, name in enumerate(names):
+        if name not in rows and not learns and (width := env.domain_rand.widths.get(name)):
+            found.append((Target(name, "", 0, [1.0] * width), Row(name, torch.zeros(1, width))))
+            continue
         if name not in rows:
             hint = f" (observations.{name} = True adds it)" if getattr(env.cfg.observations, name, None) is False else ""
             where = ", ".join(f"'{group}'" for group in order) or "any group that the actor does not read"

@@ -242,7 +242,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
 
 def _estimated(env: RobotTask, task: LoadedTask) -> tuple[Estimated, ...]:
     """The rows of the network's second output."""
-    rows = [(row, ROWS.get(row.name)) for _, row in find_targets(task.train.to_dict(), env)]
+    rows = [(row, ROWS.get(row.name)) for _, row in find_targets(task.train.to_dict(), env, learns=False)]
     return tuple(
         Estimated(row.name, row.value.shape[1], row.unit or (known.unit if known else ""), row.frame or (known.frame if known else ""))
         for row, known in rows

@@ -97,7 +97,7 @@ def load_policy(path: Path, env: RobotTask, cfg: Config, device: str) -> MLPMode
     """
     check_classes(cfg)
     sections: dict[str, Any] = copy.deepcopy(cfg.to_dict())
-    actor_class, actor_cfg = resolve_class(actor_settings(sections, env))
+    actor_class, actor_cfg = resolve_class(actor_settings(sections, env, learns=False))
     actor = actor_class(env.get_observations(), sections["obs_groups"], "actor", env.num_actions, **actor_cfg).to(device)
     saved = read_parameters(path, actor) if path.suffix == ".onnx" else load_tensors(path, device)["actor_state_dict"]
     check_fit(saved, actor.state_dict(), path, "actor")
