@@ -7,6 +7,7 @@ the same values and gradients. cuDNN cannot change a state on the way, so each s
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -66,9 +67,16 @@ def states_of(model: RNNModel) -> tuple[int, int]:
 
 def forget(policy: Any, ended: Tensor | None = None) -> None:
     """Tell a policy in which worlds (N,) an episode ended; None: in all. What has no memory has nothing to forget."""
-    if hasattr(policy, "reset"):
+    if getattr(policy, "is_recurrent", False):
         with torch.inference_mode():  # its state may have been made there
             policy.reset(ended)
+
+
+def another(policy: Any) -> Any:
+    """The same policy with a memory of its own; itself, if it has none."""
+    if not getattr(policy, "is_recurrent", False):
+        return policy
+    return copy.deepcopy(policy).apply(lambda part: part.flatten_parameters() if isinstance(part, nn.RNNBase) else None)
 
 
 def step(rnn: nn.RNNBase, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
