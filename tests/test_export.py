@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import re
 import shutil
@@ -25,6 +24,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl import export as exporting
+from legged_mw.rl.classes import network_section
 from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, export
 from legged_mw.rl.export_replay import overridden, own_ends
 from legged_mw.rl.export_scene import differences, standalone
@@ -144,7 +144,7 @@ def test_the_export_is_replaced_whole_or_not_at_all(made: Path, tmp_path: Path, 
     monkeypatch.setattr(exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(made / "policy.onnx", path))
     (out / "README.md").write_text("mine")
     before = files(tmp_path)
-    for name, fails in (("run_onnx", lambda path, obs: np.ones((len(obs), 12))), ("make_contract", lambda *_: 1 / 0)):
+    for name, fails in (("run_onnx", lambda path, obs, **_: np.ones((len(obs), 12))), ("make_contract", lambda *_: 1 / 0)):
         with monkeypatch.context() as patch:
             patch.setattr(exporting, name, fails)
             with pytest.raises((ExportError, ZeroDivisionError)) as error:
@@ -361,7 +361,7 @@ def untrained(path: Path, folder: Path, settings: dict[str, Any] | None = None) 
     torch.manual_seed(0)
     env = task.env_class(task.cfg, "cpu")
     sections = task.train.to_dict()
-    actor_class, settings = resolve_class(copy.deepcopy(sections["actor"]))
+    actor_class, settings = resolve_class(network_section(sections["actor"]))
     actor = actor_class(env.get_observations(), sections["obs_groups"], "actor", env.num_actions, **settings)
     torch.save({"actor_state_dict": actor.state_dict()}, folder / "model.pt")
     return task, folder / "model.pt"

@@ -248,13 +248,10 @@ class GraphedPPO(PPO):
     @torch.no_grad()
     def _input(self, model: MLPModel, obs: Any, indices: Tensor) -> Tensor | Sequence:
         """What the network sees of observations, normalised, with columns of zeros up to a multiple of four."""
-        latent = MLPModel.get_latent(model, obs)
+        memory = self._memories.get(model)
+        latent = memory.normalised(obs) if memory else model.get_latent(obs)
         padded = nn.functional.pad(latent, (0, -latent.shape[1] % 4))
-        if model not in self._memories:
-            return padded
-        keep = torch.ones_like(self.storage.returns)
-        keep[1:] = self.storage.dones[:-1] == 0
-        return self._memories[model].sequence(padded, indices, keep)
+        return memory.sequence(padded, indices, self.storage.dones) if memory else padded
 
     def _minibatch(self, minibatch: Minibatch) -> None:
         """One gradient step."""

@@ -40,9 +40,13 @@ class Memory:
 
     def look(self, obs: Any) -> Tensor:
         """Take in observations (N,), or (2N,) with their images; returns what the MLP reads (N, H)."""
-        seen, after = step(self._model.rnn.rnn, MLPModel.get_latent(self._model, obs), self.now.flatten(1, 2))
+        seen, after = step(self._model.rnn.rnn, self.normalised(obs), self.now.flatten(1, 2))
         self.now.copy_(after.view_as(self.now))
         return seen[: self.now.shape[2]]
+
+    def normalised(self, obs: Any) -> Tensor:
+        """What the recurrent part reads of observations (B,): (B, size)."""
+        return MLPModel.get_latent(self._model, obs)
 
     def forget(self, ended: Tensor) -> None:
         """The state becomes 0 where ``ended`` (N,)."""
@@ -53,10 +57,19 @@ class Memory:
         parts = self.now[:, 0].clone().split(self._model.rnn.rnn.num_layers)
         return parts[0] if len(parts) == 1 else parts
 
-    def sequence(self, inputs: Tensor, worlds: Tensor, keep: Tensor) -> Sequence:
-        """The rollout of ``worlds`` (B,) from ``inputs`` (S * T * B, size) and ``keep`` (T, N, 1)."""
-        shaped = inputs.view(-1, len(keep), len(worlds), inputs.shape[1])
-        return Sequence(shaped, self.start.index_select(2, worlds), keep.index_select(1, worlds))
+    def sequence(self, inputs: Tensor, worlds: Tensor, dones: Tensor) -> Sequence:
+        """The rollout of ``worlds`` (B,) from ``inputs`` (S * T * B, size) and where a step ended an episode, ``dones`` (T, N, 1)."""
+        ended = dones.index_select(1, worlds).to(inputs.dtype)
+        keep = torch.cat([torch.ones_like(ended[:1]), 1.0 - ended[:-1]])
+        return Sequence(inputs.view(-1, len(keep), len(worlds), inputs.shape[1]), self.start.index_select(2, worlds), keep)
+
+
+def memory_of(policy: MLPModel, worlds: int) -> Tensor:
+    """What an rsl-rl network remembers (N, states, H), zeros at first; (N, 0, 0) without a memory."""
+    held = policy.get_hidden_state()
+    if held is None:
+        return torch.zeros(worlds, *(states_of(policy) if isinstance(policy, RNNModel) else (0, 0)))
+    return (torch.cat(held) if isinstance(held, tuple) else held).transpose(0, 1)
 
 
 def states_of(model: RNNModel) -> tuple[int, int]:
