@@ -18,6 +18,8 @@ from worlds import make_env
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import ROWS, ContractError, Ends, read_contract
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.legged_robot import LeggedRobot
@@ -319,6 +321,41 @@ def test_a_further_command_and_history_are_deployed(tmp_path: Path) -> None:
     stage.step()
     np.testing.assert_array_equal(stage.commands(), [[0, 0, 0, 0.25]] * 2)
     np.testing.assert_allclose(stage.controller.observe(stage.measured, stage.commands())[:, -1], 0.25)
+
+
+def test_where_history_stands_in_the_network(tmp_path: Path) -> None:
+    """By hand: in the exported network action i is column COLUMNS[i] of the observation, which the contract lays out so:
+
+    base_ang_vel 0-2, projected_gravity 3-5, dof_pos 6-17, then dof_vel of two steps ago 18-29, of the last 30-41 and of now
+    42-53, then last_actions of the step before 54-65 and of now 66-77, then commands 78-80.
+    """
+    columns = [0, 5, 6, 18, 29, 30, 42, 53, 54, 66, 78, 80]
+    history = {"state.dof_vel": 3, "state.last_actions": 2}
+    settings = {"observations.history": history, "observations.leave_out": {"state": ["base_lin_vel"]}, "actor.activation": "identity"}
+    task, checkpoint = untrained(ROOT / "configs/go1_flat.py", tmp_path, settings | {"actor.obs_normalization": False})
+    saved = torch.load(checkpoint, weights_only=True)
+    for layer in (0, 2, 4):
+        for part in ("weight", "bias"):
+            saved["actor_state_dict"][f"mlp.{layer}.{part}"].zero_()
+        saved["actor_state_dict"][f"mlp.{layer}.weight"].fill_diagonal_(1.0)
+    saved["actor_state_dict"]["mlp.0.weight"].zero_()
+    saved["actor_state_dict"]["mlp.0.weight"][range(12), columns] = 1.0
+    torch.save(saved, checkpoint)
+    export(task, checkpoint, tmp_path / "out")
+    contract = read_contract(tmp_path / "out")
+    controller, acted = Controller(tmp_path / "out", contract), []
+    for step in (0.1, 0.2, 0.3):
+        speeds = step + 0.001 * np.arange(12)
+        vectors = {"lin_vel": np.zeros(3), "ang_vel": np.full(3, step), "gravity": np.array([0.0, 0.0, -1.0]), "acceleration": np.zeros(3)}
+        measured = Measurement(
+            **vectors, joint_pos=contract.default_pose + step, joint_vel=speeds, joint_torque=speeds, foot_contact=np.zeros(4)
+        )
+        controller.act(measured, np.array([[step, 0.0, -step]]))
+        acted.append(controller.last_actions[0].copy())
+    first = [0.1, -1.0, 0.1, 0.1, 0.111, 0.1, 0.1, 0.111, 0.0, 0.0, 0.1, -0.1]  # all frames are the first one
+    second = [0.2, -1.0, 0.2, 0.1, 0.111, 0.1, 0.2, 0.211, 0.0, 0.1, 0.2, -0.2]
+    third = [0.3, -1.0, 0.3, 0.1, 0.111, 0.2, 0.3, 0.311, 0.1, 0.2, 0.3, -0.3]
+    np.testing.assert_allclose(acted, [first, second, third], atol=1e-6)
 
 
 def test_a_row_that_nobody_can_measure_is_said(tmp_path: Path) -> None:
