@@ -25,9 +25,8 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from legged_mw.rl.layers import run_mlp, update_normalizer
-from legged_mw.rl.recurrent import Memory, Sequence, unroll
+from legged_mw.rl.recurrent import Memory, Sequence, check_recurrent, unroll
 from legged_mw.sim.graph import StepGraph
-from legged_mw.utils.config import ConfigError
 
 _MIN_RATE, _MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
 
@@ -60,7 +59,8 @@ class GraphedPPO(PPO):
         reason = self._why_stock()
         self.graphed = reason is None
         if self._recurrent:
-            self._check_recurrent(symmetry)
+            check_recurrent(storage.num_envs, self.num_mini_batches, symmetry, self.graphed)
+            self.symmetry = Symmetry(**symmetry) if symmetry else None  # rsl-rl refuses mirror images here
         if reason:
             print(f"PPO: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
             return
@@ -84,20 +84,6 @@ class GraphedPPO(PPO):
         if type(self.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
             return f"the optimizer is {type(self.optimizer).__name__}"
         return None
-
-    def _check_recurrent(self, symmetry: dict[str, Any] | None) -> None:
-        """Refuse what does not go with a memory; the mirror images that rsl-rl refuses, too, are run through the network like the rest."""
-        if self.storage.num_envs < self.num_mini_batches:
-            raise ConfigError(
-                f"algorithm.num_mini_batches is {self.num_mini_batches}, but a recurrent network learns from whole worlds, and "
-                f"env.num_envs is {self.storage.num_envs}: raise the latter or lower the former"
-            )
-        if symmetry and not (self.graphed and symmetry["use_data_augmentation"]):
-            raise ConfigError(
-                "the section symmetry goes with a recurrent network only where symmetry.use_data_augmentation is on, and "
-                "the recorded update (algorithm.class_name of this project) is used: switch it on, or use_mirror_loss off"
-            )
-        self.symmetry = Symmetry(**symmetry) if symmetry else None
 
     def _adam_flags(self) -> dict[str, bool]:
         return {"fused": True, "capturable": str(self.device).startswith("cuda")}

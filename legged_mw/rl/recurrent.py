@@ -16,6 +16,7 @@ from rsl_rl.models import MLPModel, RNNModel
 from torch import Tensor, nn
 
 from legged_mw.rl.layers import Linear, sum_rows
+from legged_mw.utils.config import ConfigError
 
 
 class Sequence(NamedTuple):
@@ -62,6 +63,20 @@ class Memory:
         ended = dones.index_select(1, worlds).to(inputs.dtype)
         keep = torch.cat([torch.ones_like(ended[:1]), 1.0 - ended[:-1]])
         return Sequence(inputs.view(-1, len(keep), len(worlds), inputs.shape[1]), self.start.index_select(2, worlds), keep)
+
+
+def check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | None, recorded: bool) -> None:
+    """Refuse what does not go with a memory. Raises ConfigError."""
+    if worlds < minibatches:
+        raise ConfigError(
+            f"algorithm.num_mini_batches is {minibatches}, but a recurrent network learns from whole worlds, and env.num_envs is {worlds}: "
+            "raise the latter or lower the former"
+        )
+    if symmetry and not (recorded and symmetry["use_data_augmentation"]):
+        raise ConfigError(
+            "the section symmetry goes with a recurrent network only where symmetry.use_data_augmentation is on, and "
+            "the recorded update (algorithm.class_name of this project) is used: switch it on, or use_mirror_loss off"
+        )
 
 
 def memory_of(policy: MLPModel, worlds: int) -> Tensor:
