@@ -24,7 +24,6 @@ from legged_mw.eval import crossing
 from legged_mw.eval.exam import OVERRIDES
 from legged_mw.eval.rollout import holding, roll_out
 from legged_mw.rl import export_replay
-from legged_mw.rl.classes import network_section
 from legged_mw.rl.export import ExportError, export
 from legged_mw.rl.policies import load_policy
 from legged_mw.rl.recurrent import forget, memory_of
@@ -50,7 +49,7 @@ def saved(task: LoadedTask, path: Path) -> MLPModel:
     """Networks that have seen no training, in a checkpoint; returns the actor, its normaliser not the identity."""
     torch.manual_seed(0)
     env = make_env(1)
-    actor_class, settings = resolve_class(network_section(task.train.to_dict()["actor"]))
+    actor_class, settings = resolve_class(rsl_rl_config(task.train)["actor"])
     actor = actor_class(env.get_observations(), task.train.to_dict()["obs_groups"], "actor", env.num_actions, **settings)
     actor.obs_normalizer.update(torch.randn(50, 48) * 2.0 + 0.5)
     torch.save({"actor_state_dict": actor.state_dict()}, path)
