@@ -200,9 +200,9 @@ def test_symmetric_samples_teach_a_recurrent_policy_symmetry(coefficient: float)
         ),
         (
             {"symmetry_cfg": IMAGES | {"use_data_augmentation": False, "use_mirror_loss": True}},
-            "only where symmetry.use_data_augmentation is",
+            "needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, ",
         ),
-        ({"symmetry_cfg": IMAGES, "optimizer": "sgd"}, "the recorded update .* is used: switch it on, or use_mirror_loss off"),
+        ({"symmetry_cfg": IMAGES, "optimizer": "sgd"}, "and for both this project.s recorded update; switch the former on, or both off"),
     ],
 )
 def test_what_does_not_go_with_a_memory(settings: dict[str, Any], text: str) -> None:

@@ -74,8 +74,8 @@ def check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | No
         )
     if symmetry and not (recorded and symmetry["use_data_augmentation"]):
         raise ConfigError(
-            "the section symmetry goes with a recurrent network only where symmetry.use_data_augmentation is on, and "
-            "the recorded update (algorithm.class_name of this project) is used: switch it on, or use_mirror_loss off"
+            "a recurrent network needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, and for both this project's recorded "
+            "update; switch the former on, or both off"
         )
 
 
