@@ -39,9 +39,13 @@ def make(
     device: str = "cpu",
     distribution: dict[str, Any] | None = None,
     estimator: dict[str, Any] | None = None,
+    memory: dict[str, dict[str, Any]] | None = None,
     **settings: Any,
 ) -> Any:
-    """A learner whose networks come from a fixed seed. ``estimator``: what an actor that has one differs in from ESTIMATOR."""
+    """A learner whose networks come from a fixed seed.
+
+    ``estimator``: what an actor that has one differs in from ESTIMATOR; ``memory``: what makes "actor" or "critic" recurrent.
+    """
     torch.manual_seed(1)
     distribution = {"class_name": "GaussianDistribution", "init_std": 0.7} | (distribution or {})
     if distribution["class_name"] == "BetaDistribution":
@@ -50,8 +54,8 @@ def make(
     more = {} if estimator is None else {"class_name": EstimatingModel, "estimator": {**ESTIMATOR, **estimator}}
     cfg = {
         "obs_groups": {"actor": ["state"], "critic": ["state", "privileged_state"]},
-        "actor": {**network, "distribution_cfg": distribution, **more},
-        "critic": dict(network),
+        "actor": {**network, "distribution_cfg": distribution, **more, **(memory or {}).get("actor", {})},
+        "critic": network | (memory or {}).get("critic", {}),
         "algorithm": {"class_name": kind, "rnd_cfg": None, "symmetry_cfg": None, **settings},
         "num_steps_per_env": STEPS,
         "multi_gpu": None,

@@ -87,8 +87,7 @@ def build(graded: Graded, args: argparse.Namespace, device: str) -> tuple[Policy
     seed_everything(task.train.seed)
     env = task.env_class(task.cfg, device, eager=args.eager)
     ground = rough.env_class(rough.cfg, device, eager=args.eager) if rough else None
-    policy = load_policy(graded.source.checkpoint, env, task.train, device)
-    return policy, env, ground
+    return load_policy(graded.source.checkpoint, env, task.train, device), env, ground
 
 
 def make_column(graded: Graded, policy: Policy, env: LeggedRobot, rough: LeggedRobot | None) -> Column:

@@ -6,6 +6,7 @@ What the files mean is in ``legged_mw.deploy.contract``; nothing here is needed 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import os
 import shutil
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from rsl_rl.models import MLPModel
+from rsl_rl.models import MLPModel, RNNModel
 
 from legged_mw.deploy.contract import (
     CLOCK,
@@ -36,13 +37,26 @@ from legged_mw.deploy.contract import (
     digest,
 )
 from legged_mw.deploy.estimate import Estimated
+from legged_mw.deploy.memory import Memory
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.estimator import EstimatingModel, find_targets
 from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
 from legged_mw.rl.export_scene import among_steps, standalone
-from legged_mw.rl.network import ESTIMATE, INPUT, OUTPUT, ExportedPolicy, halve, round_weights, run_onnx, save_onnx
+from legged_mw.rl.network import (
+    ESTIMATE,
+    INPUT,
+    MEMORY_INPUT,
+    MEMORY_OUTPUT,
+    OUTPUT,
+    ExportedPolicy,
+    halve,
+    round_weights,
+    run_onnx,
+    save_onnx,
+)
 from legged_mw.rl.policies import load_policy
+from legged_mw.rl.recurrent import states_of
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import LEVEL, make_terrain
@@ -111,16 +125,18 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
     with _all_or_nothing(folder) as new:
         save_yaml(new / CONFIG_FILE, config)
         _write_network(policy, clip, new / NETWORK_FILE, half)
-        contract = make_contract(env, task, new, noise)
+        memory = Memory(MEMORY_INPUT, MEMORY_OUTPUT, states_of(policy)) if isinstance(policy, RNNModel) else None
+        contract = dataclasses.replace(make_contract(env, task, new, noise), memory=memory)
         save_yaml(new / CONTRACT_FILE, contract.to_dict())
         steps = record(env, policy, groups, contract, new)
         observations, actions = (np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions"))
-        acted = run_onnx(new / NETWORK_FILE, observations)
+        remembered = np.concatenate([step.memory for step in steps]) if memory else None
+        acted = run_onnx(new / NETWORK_FILE, observations, memory=remembered)
         gap = _compare(acted, np.clip(actions, -clip, clip))
         if isinstance(policy, EstimatingModel):
             _compare(run_onnx(new / NETWORK_FILE, observations, ESTIMATE), _run(policy, clip, observations)[1], does="estimates")
         if half:
-            gap = _gap(acted, _run(exact, clip, observations)[0])
+            gap = _gap(acted, _run(exact, clip, observations, remembered)[0])
         replay(env, contract, steps, new)
         no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
         files = (*FILES, *([TERRAIN_FILE] if (new / TERRAIN_FILE).exists() else []))
@@ -149,10 +165,10 @@ def _write_network(policy: MLPModel, clip: float, path: Path, half: bool) -> Non
         halve(policy, path)
 
 
-def _run(policy: MLPModel, clip: float, observations: np.ndarray) -> list[np.ndarray]:
-    """What an exported network should give: actions, and the estimate if there is one."""
+def _run(policy: MLPModel, clip: float, *inputs: np.ndarray | None) -> list[np.ndarray]:
+    """What an exported network should give: actions, and its memory or its estimate if there is one."""
     with torch.inference_mode():
-        outputs = ExportedPolicy(policy, clip)(torch.from_numpy(observations))
+        outputs = ExportedPolicy(policy, clip)(*(torch.from_numpy(values) for values in inputs if values is not None))
     return [output.numpy() for output in (outputs if isinstance(outputs, tuple) else (outputs,))]
 
 

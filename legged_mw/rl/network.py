@@ -6,18 +6,20 @@ import copy
 import logging
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import torch
 from onnx import numpy_helper
-from rsl_rl.models import MLPModel
+from rsl_rl.models import MLPModel, RNNModel
 from torch import Tensor, nn
 
 from legged_mw.rl.estimator import EstimatingModel
+from legged_mw.rl.recurrent import states_of, step
 from legged_mw.utils.config import ConfigError
 
-INPUT, OUTPUT, ESTIMATE = "obs", "actions", "estimate"
+INPUT, OUTPUT, MEMORY_INPUT, MEMORY_OUTPUT, ESTIMATE = "obs", "actions", "state_in", "state_out", "estimate"
 PREFIX = "policy."  # of the weights' names in the file: the attribute of ExportedPolicy
 MEAN, STD = "obs_normalizer._mean", "obs_normalizer._std"
 # neither a mean action nor an estimate needs them
@@ -25,49 +27,64 @@ UNWRITTEN = ("distribution.", *(f"{of}_normalizer.{name}" for of in ("obs", "tar
 
 
 class ExportedPolicy(nn.Module):
-    """Observations (N, size) in their plain units -> clipped mean actions (N, A), then the estimate (N, E) if there is an estimator.
+    """Observations (N, size) in their plain units -> clipped mean actions (N, A); the normaliser is inside.
 
-    Normalisers are inside.
+    Of a recurrent policy the state (N, states, H) goes in beside the observations and comes out beside the actions. Of one that
+    estimates, the estimate (N, E) comes out beside them.
     """
+
+    policy: Any
 
     def __init__(self, policy: MLPModel, clip_actions: float) -> None:
         super().__init__()
-        self.policy, self.clip_actions = copy.deepcopy(policy).cpu().as_onnx(verbose=False), clip_actions
-        self.outputs = [OUTPUT, ESTIMATE] if isinstance(policy, EstimatingModel) else [OUTPUT]
+        self.policy, self.clip_actions = copy.deepcopy(policy).cpu(), clip_actions
+        self.inputs, self.outputs, self.examples = [INPUT], [OUTPUT], [torch.zeros(2, policy.obs_dim)]
+        if not isinstance(policy, RNNModel):
+            self.policy = self.policy.as_onnx(verbose=False)
+            self.outputs += [ESTIMATE] if isinstance(policy, EstimatingModel) else []
+            return
+        self.inputs, self.outputs = [INPUT, MEMORY_INPUT], [OUTPUT, MEMORY_OUTPUT]
+        self.examples.append(torch.zeros(2, *states_of(policy)))
 
-    def forward(self, obs: Tensor) -> Tensor | tuple[Tensor, ...]:
-        actions, *more = self.policy(obs) if len(self.outputs) > 1 else (self.policy(obs),)
-        actions = actions.clamp(-self.clip_actions, self.clip_actions)
-        return (actions, *more) if more else actions
+    def forward(self, obs: Tensor, state_in: Tensor | None = None) -> Any:
+        policy, clip = self.policy, self.clip_actions
+        if ESTIMATE in self.outputs:
+            actions, estimate = policy(obs)
+            return actions.clamp(-clip, clip), estimate
+        if state_in is None:
+            return policy(obs).clamp(-clip, clip)
+        seen, state = step(policy.rnn.rnn, policy.obs_normalizer(obs), state_in.transpose(0, 1))
+        return policy.distribution.deterministic_output(policy.mlp(seen)).clamp(-clip, clip), state.transpose(0, 1)
 
 
-def run_onnx(path: Path, observations: np.ndarray, output: str = OUTPUT) -> np.ndarray:
+def run_onnx(path: Path, observations: np.ndarray, output: str = OUTPUT, memory: np.ndarray | None = None) -> np.ndarray:
     """Actions (B, A), or another output, of the network in an ONNX file, by onnxruntime or where it is not installed onnx's evaluator."""
+    inputs = {INPUT: observations} | ({} if memory is None else {MEMORY_INPUT: memory})
     try:
         import onnxruntime
     except ImportError:
         from onnx.reference import ReferenceEvaluator
 
-        [found] = ReferenceEvaluator(onnx.load(path)).run([output], {INPUT: observations})
+        [found] = ReferenceEvaluator(onnx.load(path)).run([output], inputs)
         return np.asarray(found)
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    return np.asarray(session.run([output], {INPUT: observations})[0])
+    return np.asarray(session.run([output], inputs)[0])
 
 
 def save_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
-    """Write one self-contained ONNX file: input ``obs`` (batch, size), output ``actions`` (batch, A), of an estimator ``estimate`` too."""
-    example, exported = torch.zeros(2, policy.obs_dim), ExportedPolicy(policy, clip_actions).eval()
+    """Write one self-contained ONNX file: input ``obs`` (batch, size), output ``actions`` (batch, A); see ``ExportedPolicy``."""
+    exported = ExportedPolicy(policy, clip_actions).eval()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter warns of its own internals, and logs that torchvision is missing
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         torch.onnx.export(
             exported,
-            (example,),
+            tuple(exported.examples),
             path,
-            input_names=[INPUT],
+            input_names=exported.inputs,
             output_names=exported.outputs,
             opset_version=18,
-            dynamic_shapes={INPUT: {0: torch.export.Dim("batch", min=1)}},
+            dynamic_shapes={name: {0: torch.export.Dim("batch", min=1)} for name in exported.inputs},
             external_data=False,
             dynamo=True,
             verbose=False,

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.classes import check_classes
+from legged_mw.rl.classes import check_classes, network_section
 from legged_mw.rl.estimator import actor_settings
 from legged_mw.rl.network import read_parameters
 from legged_mw.rl.runs import CONFIG_FILE, check_fit, experiment_folder, find_checkpoint, find_run, load_tensors, runs
@@ -97,7 +97,7 @@ def load_policy(path: Path, env: RobotTask, cfg: Config, device: str) -> MLPMode
     """
     check_classes(cfg)
     sections: dict[str, Any] = copy.deepcopy(cfg.to_dict())
-    actor_class, actor_cfg = resolve_class(actor_settings(sections, env, learns=False))
+    actor_class, actor_cfg = resolve_class(network_section(actor_settings(sections, env, learns=False)))
     actor = actor_class(env.get_observations(), sections["obs_groups"], "actor", env.num_actions, **actor_cfg).to(device)
     saved = read_parameters(path, actor) if path.suffix == ".onnx" else load_tensors(path, device)["actor_state_dict"]
     check_fit(saved, actor.state_dict(), path, "actor")
