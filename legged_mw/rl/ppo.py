@@ -24,6 +24,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from legged_mw.rl.adam import make_recordable, plain_state
 from legged_mw.sim.graph import StepGraph
 
 _SUM_ROWS = 128  # summed by a thread; the rest of the rows is summed side by side
@@ -71,6 +72,7 @@ class GraphedPPO(PPO):
     On a CPU nothing is recorded.
     """
 
+    critic_only = False  # of a warm start: the actor stays as it is
     _plain_rate: float  # the learning rate where nothing is recorded
     _rate: Tensor | None = None  # else: () float64, as precise as rsl-rl's Python number
 
@@ -84,7 +86,8 @@ class GraphedPPO(PPO):
         self._adam_rate = torch.tensor(self.learning_rate, dtype=torch.float32, device=self.device)
         self._rate = torch.tensor(self.learning_rate, dtype=torch.float64, device=self.device)
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self.optimizer = type(self.optimizer)(parameters, lr=self._adam_rate, **self._adam_flags())
+        self.optimizer = type(self.optimizer)(parameters, lr=self._adam_rate)
+        make_recordable(self.optimizer, self._adam_rate, str(self.device))
         self._begin()
 
     def _why_stock(self) -> str | None:
@@ -101,9 +104,6 @@ class GraphedPPO(PPO):
         if type(self.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
             return f"the optimizer is {type(self.optimizer).__name__}"
         return None
-
-    def _adam_flags(self) -> dict[str, bool]:
-        return {"fused": True, "capturable": str(self.device).startswith("cuda")}
 
     def _begin(self) -> None:
         """Fixed tensors, and graphs that are not recorded yet."""
@@ -124,6 +124,11 @@ class GraphedPPO(PPO):
         """Drop what is recorded: NCCL does not close a connection that a CUDA graph still names. The next calls record again."""
         if self.graphed:
             self._begin()
+
+    def learn_critic_only(self, on: bool) -> None:
+        """From the next update on the critic learns and the actor stays as it is, or both learn again."""
+        if on != self.critic_only:
+            self.critic_only, self._update_graph = on, StepGraph(self._update, str(self.device))
 
     @contextmanager
     def _beside(self) -> Iterator[None]:
@@ -237,7 +242,10 @@ class GraphedPPO(PPO):
             value_loss = self._value_loss(batch, _forward(self.critic, critic_input))
             (self.value_loss_coef * value_loss).backward()
         loss, parts, kl = self._policy_loss(batch, _forward(self.actor, actor_input))
-        loss.backward()
+        if self.critic_only:
+            kl = None  # of an actor that stands still it is rounding noise
+        else:
+            loss.backward()
         self._meet()
         if self.is_multi_gpu:
             self._average_over_ranks(kl)
@@ -300,7 +308,7 @@ class GraphedPPO(PPO):
 
     def _update_normalizers(self) -> None:
         obs = self.storage.observations.flatten(0, 1)
-        for model in (self.actor, self.critic):
+        for model in (self.critic,) if self.critic_only else (self.actor, self.critic):
             if isinstance(model.obs_normalizer, EmpiricalNormalization):
                 inputs = torch.cat([obs[group] for group in model.obs_groups], dim=-1)
                 _update_normalizer(model.obs_normalizer, inputs, self.gpu_world_size)
@@ -339,22 +347,14 @@ class GraphedPPO(PPO):
         """The networks' and the optimizer's state, in the form that rsl-rl's own PPO writes."""
         content = super().save()
         if self.graphed:
-            state, groups = content["optimizer_state_dict"]["state"], content["optimizer_state_dict"]["param_groups"]
-            plain = {"lr": self.learning_rate, "fused": None, "capturable": False}
-            content["optimizer_state_dict"] = {
-                "state": {i: {**memory, "step": memory["step"].cpu()} for i, memory in state.items()},
-                "param_groups": [{**group, **plain} for group in groups],
-            }
+            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], self.learning_rate)
         return content
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Take over a checkpoint of this class or of rsl-rl's own PPO."""
         iteration = super().load(loaded_dict, load_cfg, strict)
         if self.graphed:
-            for group in self.optimizer.param_groups:  # Adam takes these from the file
-                group.update(lr=self._adam_rate, **self._adam_flags())
-            for memory in self.optimizer.state.values():
-                memory["step"] = memory["step"].to(self.device, torch.float32)
+            make_recordable(self.optimizer, self._adam_rate, str(self.device))
             self._begin()  # Adam's memory has moved
         return iteration
 
