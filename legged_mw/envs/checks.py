@@ -89,7 +89,9 @@ LEARNER: dict[str, Rule] = {
     **dict.fromkeys(("cpu.envs_per_core", "cpu.num_steps_per_env", "cpu.max_iterations"), POSITIVE),
     **dict.fromkeys(("cpu.num_learning_epochs", "cpu.num_mini_batches", "cpu.desired_kl"), POSITIVE),
     **dict.fromkeys(("symmetry.mirror_loss_coeff", "anneal.entropy_coef", "anneal.desired_kl", "cpu.update_threads"), NOT_NEGATIVE),
-    "runner.exam_interval": NOT_NEGATIVE,
+    **dict.fromkeys(("distillation.learning_rate", "distillation.num_learning_epochs", "distillation.gradient_length"), POSITIVE),
+    **dict.fromkeys(("distillation.init_std", "warm_start.init_std"), POSITIVE),
+    **dict.fromkeys(("runner.exam_interval", "distillation.max_grad_norm", "warm_start.critic_warmup"), NOT_NEGATIVE),
     "runner.run_name": ("part of a folder's name, without / or \\", lambda v: "/" not in v and "\\" not in v),
 }
 
@@ -107,6 +109,13 @@ def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None) -> Non
             raise ConfigError(
                 f"an iteration has {samples} samples ({cfg.env.num_envs} worlds x {train.runner.num_steps_per_env} steps), fewer than "
                 f"algorithm.num_mini_batches = {train.algorithm.num_mini_batches}; raise one of the former or lower the latter"
+            )
+        steps, length = train.runner.num_steps_per_env, train.distillation.gradient_length
+        if train.distillation.teacher and steps % length:
+            divisors = ", ".join(str(i) for i in range(1, steps + 1) if steps % i == 0)
+            raise ConfigError(
+                f"distillation.gradient_length is {length}, which leaves {steps % length} of runner.num_steps_per_env = {steps} steps "
+                f"unused; take one of {divisors}"
             )
         if train.symmetry.use_mirror_loss and not train.symmetry.mirror_loss_coeff:
             raise ConfigError(

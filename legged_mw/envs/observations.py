@@ -71,6 +71,11 @@ class Observations:
                 part.delay = make_delay(part.frame.shape[1])
             self._parts[group], self.buffers[group] = part, part.buffer
 
+    def attach(self, other: Observations, group: str, name: str) -> None:
+        """Show ``group`` of ``other``, made of the same worlds, as the group ``name``; from now on ``other`` is computed here."""
+        self._parts |= {f"{name}/{each}": part for each, part in other._parts.items()}
+        self.groups[name], self.buffers[name] = other.groups[group], other.buffers[group]
+
     def compute(self) -> None:
         """Fill the buffers: rows side by side, plus noise, times scale, as late as they are measured, with their history."""
         for part in self._parts.values():

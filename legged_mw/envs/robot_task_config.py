@@ -215,6 +215,26 @@ class RobotTaskCfgPPO(Config):
         desired_kl: float = 0.01  # between updates, for the adaptive schedule [R]
         normalize_advantage_per_mini_batch: bool = False  # [R]
 
+    class distillation:
+        """Takes the place of `algorithm` where there is a teacher: the actor learns to act like it. After init_std rsl-rl's own keys."""
+
+        teacher: str = ""  # its run, checkpoint or export, or a task for its last or shipped policy (train.py --teacher)
+        init_std: float = 0.1  # of the student's noise while it learns; nothing changes it [Isaac Lab]
+        class_name: str = "legged_mw.rl.distillation:GraphedDistillation"  # or "Distillation": rsl-rl's own, same results, slower
+        num_learning_epochs: int = 1  # [R]
+        gradient_length: int = 4  # steps a gradient; it divides num_steps_per_env [ours: R 15 leaves 9 of 24 unused]
+        learning_rate: float = 1e-3  # [R]
+        max_grad_norm: float = 1.0  # 0: no bound [R none; ours: as in PPO]
+        loss_type: Literal["mse", "huber"] = "mse"  # [R]
+        optimizer: str = "adam"  # [R]
+
+    class warm_start:
+        """Training that begins with the actor of another run: `train.py --init`."""
+
+        policy: str = ""  # the run, checkpoint or export, or a task for its last or shipped policy
+        init_std: float = 0.2  # of exploration at the start [ours: less than from nothing, as it can walk]
+        critic_warmup: int = 20  # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
+
     class anneal:
         """What a number of `algorithm` goes to, in a straight line over max_iterations; 0: it stays [ours]."""
 

@@ -1,0 +1,97 @@
+"""A policy that another task trained, in this one: what it reads here, and why its actions may mean something else."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from legged_mw.envs.loading import load_robot
+from legged_mw.envs.observations import Observations, Row
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.utils.commands import command_table
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
+
+# Fields that must be equal, since an action or a row means something else where they are not; those that a task has.
+_SAME = ("control.action_origin", "normalization.clip_actions", "gait.period", "gait.offsets")
+_SAME_SCAN = ("terrain.measured_points_x", "terrain.measured_points_y")
+
+
+def observe_as(env: RobotTask, cfg: RobotTaskCfg, groups: Sequence[str], name: str) -> Observations:
+    """Observations of ``env`` as the config ``cfg`` has them, exact and without delay; ``name`` is what a policy reads in ``groups``.
+
+    Noise would only blur what a student is to learn from it. Raises ConfigError for a group that the task has not.
+    """
+    own, env.cfg = env.cfg, cfg  # the rows go by the section noise and others
+    try:
+        table = env.observation_rows()
+    finally:
+        env.cfg = own
+    for group in groups:
+        if group not in table:
+            raise ConfigError(unknown("observation group", group, table, type(env).__name__))
+    exact = {group: [row if isinstance(row, str) else row._replace(noise=0.0) for row in rows] for group, rows in table.items()}
+    return Observations({**exact, name: [*groups]}, cfg.observations, 0.0, env.num_envs, env.device, lambda width: None)
+
+
+def rows_of(observations: Observations, groups: Iterable[str]) -> list[Row]:
+    """The rows of ``groups`` in order; a row that is a group is written out."""
+    rows: list[Row] = []
+    for group in groups:
+        for row in observations.groups[group]:
+            rows += rows_of(observations, [row.group]) if row.group and row.history == 1 else [row]
+    return rows
+
+
+def in_words(rows: Iterable[Row]) -> str:
+    """``base_ang_vel 3, dof_pos 12 x 5 frames``"""
+    return ", ".join(f"{row.name} {row.value.shape[1]}" + (f" x {row.history} frames" if row.history > 1 else "") for row in rows)
+
+
+def differences(env: RobotTask, kind: type[Any], cfg: RobotTaskCfg) -> list[str]:
+    """What keeps a policy of a ``kind`` with the config ``cfg`` from meaning the same in ``env``: a clause for each."""
+    if not isinstance(env, kind):
+        return [f"its task is a {kind.__name__}, whose rows a {type(env).__name__} does not have"]
+    theirs, ours = load_robot(cfg, "mujoco", None, [], {}), env.robot
+    if theirs.joint_names != ours.joint_names:
+        return [f"its robot is another one, with the joints {_few(theirs.joint_names)}; here they are {_few(ours.joint_names)}"]
+    found = [_joint("default angle", ours.joint_names, theirs.pose, ours.pose, " rad")]
+    there, here = (robot.tables["control.action_scale"] for robot in (theirs, ours))
+    found.append(_joint("control.action_scale", ours.joint_names, there, here, ""))
+    there, here = (f"{1.0 / (each.sim.dt * each.control.decimation):g} Hz" for each in (cfg, env.cfg))
+    found.append(_differ("the control rate", there, here))
+    found.append(_differ("asset.imu_site", theirs.imu, ours.imu))
+    there, here = (", ".join(command.name for command in table) or "none" for table in (command_table(cfg), env.command_table))
+    found.append(_differ("the list of commands", there, here))
+    scans = bool(_field(cfg, "terrain.height_scan"))
+    if scans and not _field(env.cfg, "terrain.height_scan"):
+        found.append("it may read the height scan, which is off here: terrain.height_scan must name a group, such as privileged_state")
+    for path in (*_SAME, *(_SAME_SCAN if scans else ())):
+        found.append(_differ(path, _field(cfg, path), _field(env.cfg, path)))
+    return [text for text in found if text]
+
+
+def _field(cfg: RobotTaskCfg, path: str) -> Any:
+    """A field by its path; None where the task has none of that name."""
+    value: Any = cfg
+    for name in path.split("."):
+        value = getattr(value, name, None)
+    return value
+
+
+def _differ(what: str, there: Any, here: Any) -> str:
+    return "" if there == here else f"{what} is {there} there and {here} here"
+
+
+def _joint(what: str, names: Sequence[str], there: Sequence[float], here: Sequence[float], unit: str) -> str:
+    """The first joint that differs."""
+    for name, theirs, ours in zip(names, there, here, strict=True):
+        if abs(theirs - ours) > 1e-6:
+            return f"{what} of joint {name} is {theirs:g}{unit} there and {ours:g}{unit} here"
+    return ""
+
+
+def _few(names: Sequence[str]) -> str:
+    """The first three names and how many there are."""
+    return f"{', '.join(names[:3])} ... ({len(names)})" if len(names) > 3 else ", ".join(names)
