@@ -18,30 +18,22 @@ _SAME = ("control.action_origin", "normalization.clip_actions", "gait.period", "
 _SAME_SCAN = ("terrain.measured_points_x", "terrain.measured_points_y")
 
 
-def observe_as(env: RobotTask, cfg: RobotTaskCfg, groups: Sequence[str], name: str) -> Observations:
-    """Observations of ``env`` as the config ``cfg`` has them, exact and without delay; ``name`` is what a policy reads in ``groups``.
+def observe_as(env: RobotTask, kind: type[RobotTask], cfg: RobotTaskCfg, groups: Sequence[str], name: str) -> Observations:
+    """Observations of ``env`` as a ``kind`` with the config ``cfg`` has them; ``name`` is what a policy reads in ``groups``.
 
-    Noise would only blur what a student is to learn from it. Raises ConfigError for a group that the task has not.
+    They are exact and not delayed: noise would only blur what is to be learned from the policy. Raises ConfigError for a
+    group that the table does not have.
     """
     own, env.cfg = env.cfg, cfg  # the rows go by the section noise and others
     try:
-        table = env.observation_rows()
+        table = kind.observation_rows(env)
     finally:
         env.cfg = own
     for group in groups:
         if group not in table:
-            raise ConfigError(unknown("observation group", group, table, type(env).__name__))
+            raise ConfigError(unknown("observation group", group, table, kind.__name__))
     exact = {group: [row if isinstance(row, str) else row._replace(noise=0.0) for row in rows] for group, rows in table.items()}
     return Observations({**exact, name: [*groups]}, cfg.observations, 0.0, env.num_envs, env.device, lambda width: None)
-
-
-def rows_of(observations: Observations, groups: Iterable[str]) -> list[Row]:
-    """The rows of ``groups`` in order; a row that is a group is written out."""
-    rows: list[Row] = []
-    for group in groups:
-        for row in observations.groups[group]:
-            rows += rows_of(observations, [row.group]) if row.group and row.history == 1 else [row]
-    return rows
 
 
 def in_words(rows: Iterable[Row]) -> str:
@@ -49,10 +41,8 @@ def in_words(rows: Iterable[Row]) -> str:
     return ", ".join(f"{row.name} {row.value.shape[1]}" + (f" x {row.history} frames" if row.history > 1 else "") for row in rows)
 
 
-def differences(env: RobotTask, kind: type[Any], cfg: RobotTaskCfg) -> list[str]:
-    """What keeps a policy of a ``kind`` with the config ``cfg`` from meaning the same in ``env``: a clause for each."""
-    if not isinstance(env, kind):
-        return [f"its task is a {kind.__name__}, whose rows a {type(env).__name__} does not have"]
+def differences(env: RobotTask, cfg: RobotTaskCfg, rows: Iterable[Row]) -> list[str]:
+    """What keeps a policy of the config ``cfg``, which reads ``rows``, from meaning the same in ``env``: a clause for each."""
     theirs, ours = load_robot(cfg, "mujoco", None, [], {}), env.robot
     if theirs.joint_names != ours.joint_names:
         return [f"its robot is another one, with the joints {_few(theirs.joint_names)}; here they are {_few(ours.joint_names)}"]
@@ -64,11 +54,10 @@ def differences(env: RobotTask, kind: type[Any], cfg: RobotTaskCfg) -> list[str]
     found.append(_differ("asset.imu_site", theirs.imu, ours.imu))
     there, here = (", ".join(command.name for command in table) or "none" for table in (command_table(cfg), env.command_table))
     found.append(_differ("the list of commands", there, here))
-    scans = bool(_field(cfg, "terrain.height_scan"))
-    if scans and not _field(env.cfg, "terrain.height_scan"):
-        found.append("it may read the height scan, which is off here: terrain.height_scan must name a group, such as privileged_state")
-    for path in (*_SAME, *(_SAME_SCAN if scans else ())):
-        found.append(_differ(path, _field(cfg, path), _field(env.cfg, path)))
+    scan = [row for row in rows if row.name == "height_scan"]
+    if scan and not scan[0].value.shape[1]:
+        found.append("it reads the height scan, which is off here: name a group in terrain.height_scan, such as privileged_state")
+    found += [_differ(path, _field(cfg, path), _field(env.cfg, path)) for path in (*_SAME, *(_SAME_SCAN if scan else ()))]
     return [text for text in found if text]
 
 

@@ -65,7 +65,9 @@ def find_trained(asked: str, experiment: Path, flag: str) -> Trained:
             source = _run_or_export(experiment, asked)
         return Trained(source, load_trained(task_of(source.folder), source))
     except ConfigError as error:
-        raise ConfigError(f"{flag} {asked}: {error}") from None
+        raise ConfigError(
+            f"{flag} {asked}: {error}; name a run by its path or as TASK/RUN, or a task for its last or shipped policy"
+        ) from None
 
 
 def find_rival(task: LoadedTask, run: str, experiment: str | None = None) -> Source:

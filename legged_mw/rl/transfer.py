@@ -8,8 +8,8 @@ from pathlib import Path
 import torch
 from rsl_rl.models import MLPModel
 
-from legged_mw.envs.observations import Row
-from legged_mw.envs.other_task import differences, in_words, observe_as, rows_of
+from legged_mw.envs.observations import Observations, Row
+from legged_mw.envs.other_task import differences, in_words, observe_as
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.policies import Trained, read_actor
 from legged_mw.rl.runs import CONFIG_FILE
@@ -24,9 +24,7 @@ _EXPORTED_COUNT = 10**8  # samples that an exported normalizer stands for, as th
 
 def seat_teacher(env: RobotTask, teacher: Trained) -> None:
     """Give ``env`` the observation group that the teacher reads. Raises ConfigError if its actions mean something else here."""
-    _check_meaning(env, teacher, "the teacher")
-    train = teacher.task.train
-    env.observations.attach(observe_as(env, teacher.task.cfg, train.obs_groups.actor, TEACHER), TEACHER, TEACHER)
+    env.observations.attach(_observe(env, teacher, "the teacher"), TEACHER, TEACHER)
     env.first_observations()
 
 
@@ -36,16 +34,14 @@ def load_teacher(model: MLPModel, teacher: Trained, env: RobotTask) -> None:
     try:
         model.load_state_dict(read_actor(path, model, TEACHER))
     except ConfigError as error:
-        rows = rows_of(env.observations, [TEACHER])
+        rows = env.observations.groups[TEACHER]
         raise ConfigError(f"{error}; it is shown {sum(row.size for row in rows)} values: {in_words(rows)}") from None
 
 
 def check_start(env: RobotTask, task: LoadedTask, policy: Trained) -> None:
     """Raise ConfigError if ``policy`` reads other rows than the actor of ``task``, or its actions mean something else."""
-    _check_meaning(env, policy, "the policy to begin with")
-    train = policy.task.train
-    theirs = rows_of(observe_as(env, policy.task.cfg, train.obs_groups.actor, TEACHER), train.obs_groups.actor)
-    ours = rows_of(env.observations, task.train.obs_groups.actor)
+    theirs = _observe(env, policy, "the policy to begin with").rows(TEACHER)
+    ours = [row for group in task.train.obs_groups.actor for row in env.observations.rows(group)]
     if [*map(_layout, theirs)] != [*map(_layout, ours)]:
         raise ConfigError(
             f"{shown(policy.source.checkpoint)}: it reads {in_words(theirs)}; the actor of {task.name} reads {in_words(ours)}"
@@ -70,9 +66,16 @@ def keep_teacher(teacher: Trained, run: Path) -> None:
         shutil.copy(teacher.source.checkpoint, folder)
 
 
-def _check_meaning(env: RobotTask, policy: Trained, who: str) -> None:
-    if found := differences(env, policy.task.env_class, policy.task.cfg):
-        raise ConfigError(f"{shown(policy.source.checkpoint)} cannot be {who} here: {'; '.join(found)}")
+def _observe(env: RobotTask, policy: Trained, who: str) -> Observations:
+    """What the policy reads in ``env``, as the group TEACHER. Raises ConfigError if something means something else there."""
+    kind, cfg = policy.task.env_class, policy.task.cfg
+    found = [f"its task is a {kind.__name__}, whose rows a {type(env).__name__} does not have"] if not isinstance(env, kind) else []
+    if not found:
+        seen = observe_as(env, kind, cfg, policy.task.train.obs_groups.actor, TEACHER)
+        found = differences(env, cfg, seen.rows(TEACHER))
+        if not found:
+            return seen
+    raise ConfigError(f"{shown(policy.source.checkpoint)} cannot be {who} here: {'; '.join(found)}")
 
 
 def _layout(row: Row) -> tuple[str, int, int, list[float]]:
