@@ -132,8 +132,9 @@ def _note_others(task: LoadedTask, start: Start) -> None:
     """Say which policies they are, and write it into the config."""
     for trained, section, field in ((start.teacher, "distillation", "teacher"), (start.policy, "warm_start", "policy")):
         if trained and not start.run:
-            task.update({section: {field: shown(trained.source.checkpoint)}}, where="train")
-            print(f"{'teacher' if trained is start.teacher else 'begins with the actor of'}: {shown(trained.source.checkpoint)}")
+            file = shown(trained.source.checkpoint)
+            task.update({section: {field: trained.task.name if trained.source.shipped else file}}, where="train")
+            print(f"{'teacher' if trained is start.teacher else 'begins with the actor of'}: {file}")
 
 
 def _announce(task: LoadedTask, device: str, rank: Rank) -> None:
