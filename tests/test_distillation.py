@@ -73,6 +73,16 @@ def share_experience(source: Any, target: Any) -> None:
         target.storage.observations[group].copy_(source.storage.observations[group])
 
 
+@torch.no_grad()
+def take_over(target: Any, source: Any) -> None:
+    """``target`` gets the student and Adam's memory of ``source``, in place: what is recorded stays recorded."""
+    for mine, other in zip(target.student.state_dict().values(), source.student.state_dict().values(), strict=True):
+        mine.copy_(other)
+    for mine, other in zip(target.student.parameters(), source.student.parameters(), strict=True):
+        for name, memory in target.optimizer.state[mine].items():
+            memory.copy_(source.optimizer.state[other][name])
+
+
 def parameters(alg: Any) -> dict[str, torch.Tensor]:
     return {f"{which}.{k}": v.clone() for which in ("student", "teacher") for k, v in getattr(alg, which).state_dict().items()}
 

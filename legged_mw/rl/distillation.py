@@ -35,7 +35,7 @@ class GraphedDistillation(Distillation):
         if reason:
             print(f"Distillation: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
             return
-        make_recordable(self.optimizer, self.learning_rate, str(self.device))
+        make_recordable(self.optimizer, [self.learning_rate], str(self.device))
         seen = storage.observations.select(*student.obs_groups, *teacher.obs_groups)
         self._obs = TensorDict({name: value[0].clone() for name, value in seen.items()}, [storage.num_envs], device=self.device)
         storage.observations = storage.observations.select(*student.obs_groups)  # what the teacher sees is not learned from
@@ -134,13 +134,13 @@ class GraphedDistillation(Distillation):
         """The networks' and the optimizer's state, in the form that rsl-rl's own Distillation writes."""
         content = super().save()
         if self.graphed:
-            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], self.learning_rate)
+            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], [self.learning_rate])
         return content
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Take over a checkpoint of this class or of rsl-rl's own Distillation, or a teacher from one of PPO."""
         iteration = super().load(loaded_dict, load_cfg, strict)
         if self.graphed:
-            make_recordable(self.optimizer, self.learning_rate, str(self.device))
+            make_recordable(self.optimizer, [self.learning_rate], str(self.device))
             self._begin()  # Adam's memory has moved
         return iteration

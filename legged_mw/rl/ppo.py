@@ -87,7 +87,7 @@ class GraphedPPO(PPO):
         self._rate = torch.tensor(self.learning_rate, dtype=torch.float64, device=self.device)
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
         self.optimizer = type(self.optimizer)(parameters, lr=self._adam_rate)
-        make_recordable(self.optimizer, self._adam_rate, str(self.device))
+        make_recordable(self.optimizer, [self._adam_rate], str(self.device))
         self._begin()
 
     def _why_stock(self) -> str | None:
@@ -347,14 +347,14 @@ class GraphedPPO(PPO):
         """The networks' and the optimizer's state, in the form that rsl-rl's own PPO writes."""
         content = super().save()
         if self.graphed:
-            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], self.learning_rate)
+            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], [self.learning_rate])
         return content
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Take over a checkpoint of this class or of rsl-rl's own PPO."""
         iteration = super().load(loaded_dict, load_cfg, strict)
         if self.graphed:
-            make_recordable(self.optimizer, self._adam_rate, str(self.device))
+            make_recordable(self.optimizer, [self._adam_rate], str(self.device))
             self._begin()  # Adam's memory has moved
         return iteration
 
