@@ -69,7 +69,7 @@ WALKING: dict[str, Rule] = {
     "commands.keep_probability": PROBABILITIES,
     "commands.mirror": ("1 or -1 for each command", lambda v: all(sign in (1, -1) for sign in v.values())),
     **dict.fromkeys(("rewards.tracking_sigma", "rewards.swing_height", "commands.heading_gain"), POSITIVE),
-    **dict.fromkeys(("gait.period", "rewards.min_feet_distance"), NOT_NEGATIVE),
+    **dict.fromkeys(("gait.period", "rewards.min_feet_distance", "rewards.tracking_sigma_end"), NOT_NEGATIVE),
     "rewards.max_single_stance": POSITIVE,
     "gait.stance": ("above 0 and below 1", lambda v: 0 < v < 1),
     "gait.offsets": ("shares of the period, from 0 to 1", lambda v: all(0 <= share <= 1 for share in v)),

@@ -51,8 +51,16 @@ class LeggedRewards(RobotRewards):
     _partners: Callable[[], Partners]
     _times_contacts: bool  # `single_stance` is on
 
+    tracking_sigma: Tensor  # () [m^2/s^2, rad^2/s^2]
+
+    def anneal(self, done: float) -> None:
+        """A training is ``done`` so far, from 0 to 1: ``tracking_sigma`` on its way to ``rewards.tracking_sigma_end``."""
+        begin, end = self.cfg.rewards.tracking_sigma, self.cfg.rewards.tracking_sigma_end
+        self.tracking_sigma.fill_(begin + (end - begin) * done if end else begin)
+
     def _init_foot_rewards(self) -> None:
         """What terms need beside the state, where they are on."""
+        self.tracking_sigma = torch.tensor(self.cfg.rewards.tracking_sigma, device=self.device)
         on = self._active_scales()
         self._times_contacts = "single_stance" in on
         if not {"feet_orientation", "feet_distance"} & on.keys():
@@ -74,12 +82,12 @@ class LeggedRewards(RobotRewards):
     def _reward_tracking_lin_vel(self) -> Tensor:
         """Velocity in the plane at the IMU, body frame, as commanded. [L]"""
         error = (self.commands[:, :2] - self.base_lin_vel[:, :2]).square().sum(dim=1)
-        return torch.exp(error / -self.cfg.rewards.tracking_sigma)
+        return torch.exp(error / -self.tracking_sigma)
 
     def _reward_tracking_ang_vel(self) -> Tensor:
         """Yaw rate as commanded. [L]"""
         error = (self.commands[:, 2] - self.base_ang_vel[:, 2]).square()
-        return torch.exp(error / -self.cfg.rewards.tracking_sigma)
+        return torch.exp(error / -self.tracking_sigma)
 
     def _reward_stand_still(self) -> Tensor:
         """Joints away from the default pose while the command is to stand. [L]"""

@@ -50,6 +50,7 @@ class LeggedRobotCfg(RobotTaskCfg):
 
     class rewards(RobotTaskCfg.rewards):
         tracking_sigma: float = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
+        tracking_sigma_end: float = 0.0  # where it goes in a straight line over max_iterations; 0: it stays [ours]
         swing_height: float = 0.1  # wanted height of a swinging foot [m] [P]
         min_air_time: float = 0.1  # a step that lasts less is penalised [s] [P]
         min_command: float = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]

@@ -71,6 +71,9 @@ class RobotRewards:
                 raise ConfigError(f"rewards.hip_joints: {unknown('joint', word, names, 'the robot')}")
         return sorted({i for found in hits.values() for i in found})
 
+    def anneal(self, done: float) -> None:
+        """A training is ``done`` so far, from 0 to 1: what changes with it."""
+
     def _remember_for_rewards(self) -> None:
         """The end of a step: what the next one compares with."""
         if self.last_dof_vel is not None:
