@@ -17,7 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from legged_mw.rl.adam import make_recordable, plain_state
-from legged_mw.rl.ppo import _forward, _update_normalizer
+from legged_mw.rl.layers import run_mlp, update_normalizer
 from legged_mw.sim.graph import StepGraph
 
 
@@ -113,12 +113,12 @@ class GraphedDistillation(Distillation):
         self._loss /= self.num_learning_epochs * len(batches)
         if isinstance(self.student.obs_normalizer, EmpiricalNormalization):
             with torch.no_grad():
-                _update_normalizer(self.student.obs_normalizer, seen, self.gpu_world_size)
+                update_normalizer(self.student.obs_normalizer, seen, self.gpu_world_size)
 
     def _gradient_step(self, inputs: Tensor, wanted: Tensor) -> None:
         """One step towards ``wanted`` (B, A); the loss is a sum over steps of their means, as in rsl-rl."""
         assert self.student.distribution is not None
-        loss = self.loss_fn(self.student.distribution.deterministic_output(_forward(self.student, inputs)), wanted)
+        loss = self.loss_fn(self.student.distribution.deterministic_output(run_mlp(self.student.mlp, inputs)), wanted)
         self.optimizer.zero_grad()
         (loss * self.gradient_length).backward()
         if self.is_multi_gpu:

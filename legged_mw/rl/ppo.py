@@ -24,7 +24,6 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from legged_mw.rl.adam import make_recordable, plain_state
 from legged_mw.sim.graph import StepGraph
 
 _SUM_ROWS = 128  # summed by a thread; the rest of the rows is summed side by side
@@ -86,8 +85,7 @@ class GraphedPPO(PPO):
         self._adam_rate = torch.tensor(self.learning_rate, dtype=torch.float32, device=self.device)
         self._rate = torch.tensor(self.learning_rate, dtype=torch.float64, device=self.device)
         parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self.optimizer = type(self.optimizer)(parameters, lr=self._adam_rate)
-        make_recordable(self.optimizer, [self._adam_rate], str(self.device))
+        self.optimizer = type(self.optimizer)(parameters, lr=self._adam_rate, **self._adam_flags())
         self._begin()
 
     def _why_stock(self) -> str | None:
@@ -104,6 +102,9 @@ class GraphedPPO(PPO):
         if type(self.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
             return f"the optimizer is {type(self.optimizer).__name__}"
         return None
+
+    def _adam_flags(self) -> dict[str, bool]:
+        return {"fused": True, "capturable": str(self.device).startswith("cuda")}
 
     def _begin(self) -> None:
         """Fixed tensors, and graphs that are not recorded yet."""
@@ -347,14 +348,22 @@ class GraphedPPO(PPO):
         """The networks' and the optimizer's state, in the form that rsl-rl's own PPO writes."""
         content = super().save()
         if self.graphed:
-            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], [self.learning_rate])
+            state, groups = content["optimizer_state_dict"]["state"], content["optimizer_state_dict"]["param_groups"]
+            plain = {"lr": self.learning_rate, "fused": None, "capturable": False}
+            content["optimizer_state_dict"] = {
+                "state": {i: {**memory, "step": memory["step"].cpu()} for i, memory in state.items()},
+                "param_groups": [{**group, **plain} for group in groups],
+            }
         return content
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Take over a checkpoint of this class or of rsl-rl's own PPO."""
         iteration = super().load(loaded_dict, load_cfg, strict)
         if self.graphed:
-            make_recordable(self.optimizer, [self._adam_rate], str(self.device))
+            for group in self.optimizer.param_groups:  # Adam takes these from the file
+                group.update(lr=self._adam_rate, **self._adam_flags())
+            for memory in self.optimizer.state.values():
+                memory["step"] = memory["step"].to(self.device, torch.float32)
             self._begin()  # Adam's memory has moved
         return iteration
 

@@ -29,7 +29,7 @@ from legged_mw.rl.ranks import this_rank
 from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
 from legged_mw.rl.threads import UpdateThreads
-from legged_mw.rl.transfer import TEACHER
+from legged_mw.rl.transfer import adapt
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
 
@@ -121,7 +121,7 @@ class Runner(OnPolicyRunner):
     def _anneal(self) -> None:
         """Move what has an end value towards it, in a straight line from the first iteration to the last; end a critic's warm-up."""
         if isinstance(self.alg, GraphedPPO):
-            self.alg.learn_critic_only(self.current_learning_iteration < self.cfg["critic_warmup"])
+            self.alg.learn_critic_only(self.current_learning_iteration < self.cfg.get("critic_warmup", 0))
         done = self.current_learning_iteration / max(self._last - 1, 1)
         for name, (begin, end) in self.cfg["anneal"].items():
             if end and begin is not None:
@@ -277,9 +277,8 @@ class Runner(OnPolicyRunner):
         check_fit(content[f"{second}_state_dict"], other.state_dict(), Path(path), second)
         if self.alg.load(content, load_cfg, strict):
             self.current_learning_iteration = content["iter"]
-        if (
-            getattr(self.alg, "schedule", "fixed") == "fixed"
-        ):  # the config's number, which the user may have changed; an adaptive rate goes on
+        # the config's number, which the user may have changed; an adaptive rate goes on
+        if getattr(self.alg, "schedule", "fixed") == "fixed":
             self.alg.learning_rate = self.cfg["algorithm"]["learning_rate"]
             for group in self.alg.optimizer.param_groups:
                 if not isinstance(group["lr"], Tensor):  # a recorded optimizer reads the algorithm's
@@ -304,11 +303,12 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
     torch.set_float32_matmul_precision(cfg.runner.matmul_precision)
     check_mirror(env, cfg)
     try:
-        runner = Runner(env, rsl_rl_config(cfg, teacher), str(log_dir) if log_dir else None, device)
+        settings = adapt(rsl_rl_config(cfg), cfg, rsl_rl_config(teacher) if teacher else None)
+        runner = Runner(env, settings, str(log_dir) if log_dir else None, device)
     except ValueError as error:  # a class, activation, optimizer or observation group that does not exist
         raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None
-    if runner.cfg["critic_warmup"] and not getattr(runner.alg, "graphed", False):
-        raise ConfigError(f"warm_start.critic_warmup is {runner.cfg['critic_warmup']}, but only the recorded PPO knows it; set it to 0")
+    if settings["critic_warmup"] and not getattr(runner.alg, "graphed", False):
+        raise ConfigError(f"warm_start.critic_warmup is {settings['critic_warmup']}, but only the recorded PPO knows it; set it to 0")
     return runner
 
 
@@ -318,11 +318,11 @@ def check_mirror(env: RobotTask, cfg: RobotTaskCfgPPO) -> None:
         _ = env.mirror
 
 
-def rsl_rl_config(cfg: RobotTaskCfgPPO, teacher: RobotTaskCfgPPO | None = None) -> dict[str, Any]:
+def rsl_rl_config(cfg: RobotTaskCfgPPO) -> dict[str, Any]:
     """The learner's config as rsl-rl's flat dict; a deep copy, since rsl-rl writes into it. Raises ConfigError."""
     check_classes(cfg)
     sections = copy.deepcopy(cfg.to_dict())
-    runner, distillation, start = (sections.pop(name) for name in ("runner", "distillation", "warm_start"))
+    runner = sections.pop("runner")
     logger = runner["logger"]
     if logger == "wandb":
         if importlib.util.find_spec("wandb") is None:
@@ -334,29 +334,8 @@ def rsl_rl_config(cfg: RobotTaskCfgPPO, teacher: RobotTaskCfgPPO | None = None) 
     symmetry_cfg = {"data_augmentation_func": "legged_mw.rl.symmetry:mirror", **symmetry} if mirrors else None
     algorithm = {"rnd_cfg": None, "symmetry_cfg": symmetry_cfg, **sections.pop("algorithm")}
     anneal = {name: (algorithm[name], end) for name, end in sections.pop("anneal").items()}
-    flat = {key: runner[key] for key in keys} | {"critic_warmup": 0, "logger": logger, "check_for_nan": False}
-    if teacher is not None:
-        return {**flat, **_distil(sections, distillation, teacher)}
-    if start["policy"]:
-        flat["critic_warmup"] = start["critic_warmup"]
-        _set_std(sections["actor"], start["init_std"])
-    return {**sections, **flat, "algorithm": algorithm, "anneal": anneal}
-
-
-def _distil(sections: dict[str, Any], distillation: dict[str, Any], teacher: RobotTaskCfgPPO) -> dict[str, Any]:
-    """What the config is with a teacher: the actor is the student, and there is no critic."""
-    check_classes(teacher)
-    _set_std(sections["actor"], distillation["init_std"])
-    groups = {"student": sections["obs_groups"]["actor"], "teacher": [TEACHER]}
-    networks = {"student": sections["actor"], "teacher": copy.deepcopy(teacher.to_dict()["actor"])}
-    algorithm = {name: value for name, value in distillation.items() if name not in ("teacher", "init_std")}
-    return {**sections, **networks, "obs_groups": groups, "algorithm": algorithm, "anneal": {}}
-
-
-def _set_std(actor: dict[str, Any], std: float) -> None:
-    """The noise that a new actor begins with, where its distribution has a number for it."""
-    if "init_std" in actor.get("distribution_cfg", {}):
-        actor["distribution_cfg"]["init_std"] = std
+    flat = {key: runner[key] for key in keys}
+    return {**sections, **flat, "algorithm": algorithm, "anneal": anneal, "logger": logger, "check_for_nan": False}
 
 
 def _random_state(device: str) -> dict[str, Tensor]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
+from typing import Any
 
 import torch
 from rsl_rl.models import MLPModel
@@ -11,6 +12,7 @@ from rsl_rl.models import MLPModel
 from legged_mw.envs.observations import Observations, Row
 from legged_mw.envs.other_task import differences, in_words, observe_as
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.rl.policies import Trained, read_actor
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.utils.config import ConfigError, save_yaml
@@ -20,6 +22,20 @@ from legged_mw.utils.task import LoadedTask
 TEACHER = "teacher"  # the observation group that it reads, and its folder in a student's run
 _MEAN, _STD, _VAR, _COUNT = (f"obs_normalizer.{name}" for name in ("_mean", "_std", "_var", "count"))
 _EXPORTED_COUNT = 10**8  # samples that an exported normalizer stands for, as the file does not say [ours: as most have seen]
+
+
+def adapt(settings: dict[str, Any], cfg: RobotTaskCfgPPO, teacher: dict[str, Any] | None) -> dict[str, Any]:
+    """rsl-rl's ``settings`` of the learner's config ``cfg``, for a student of a ``teacher`` with those settings, or a warm start."""
+    distillation, start = cfg.to_dict()["distillation"], cfg.warm_start
+    settings["critic_warmup"] = start.critic_warmup if start.policy and not teacher else 0
+    noise = settings["actor"].get("distribution_cfg", {})
+    if "init_std" in noise and (teacher or start.policy):
+        noise["init_std"] = distillation["init_std"] if teacher else start.init_std
+    if teacher:
+        groups = {"student": settings["obs_groups"]["actor"], "teacher": [TEACHER]}
+        algorithm = {name: value for name, value in distillation.items() if name not in ("teacher", "init_std")}
+        settings |= {"student": settings["actor"], "teacher": teacher["actor"], "obs_groups": groups, "algorithm": algorithm, "anneal": {}}
+    return settings
 
 
 def seat_teacher(env: RobotTask, teacher: Trained) -> None:
