@@ -219,6 +219,47 @@ def test_a_teacher_may_read_the_privileged_group() -> None:
     torch.testing.assert_close(seen[:, :3], env.base_lin_vel)
 
 
+OWN = """
+import torch
+from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.observations import Row
+from legged_mw.utils.task import Task
+
+class Mine(LeggedRobot):
+    def observation_rows(self):
+        rows = super().observation_rows()
+        rows["state"].append(Row("mine", self._zeros(2) + 7.0))
+        return rows
+
+TASK = Task(Mine, Go1FlatCfg, Go1FlatCfgPPO)
+"""
+CHILD = """
+from own import Mine, TASK as OWN
+from legged_mw.utils.task import Task
+
+class Child(Mine):
+    def observation_rows(self):
+        return {"state": [row for row in super().observation_rows()["state"] if row.name != "mine"], "privileged_state": ["state"]}
+
+TASK = Task(Child, OWN.cfg, OWN.train)
+"""
+
+
+def test_a_teacher_of_a_class_of_ones_own(tmp_path: Path) -> None:
+    """The student's task may add to it or take from it: the teacher sees its own rows. Its file was imported twice by then."""
+    (tmp_path / "own.py").write_text(OWN)
+    (tmp_path / "child.py").write_text(CHILD)
+    student, task = load_task(str(tmp_path / "child.py")), load_task(str(tmp_path / "own.py"))
+    student.set("env.num_envs", 2)
+    env = student.env_class(student.cfg, "cpu")
+    assert not isinstance(env, task.env_class) and env.obs_buf["state"].shape == (2, 48)
+    seen = seated(env, task)
+    assert seen.shape == (2, 50) and (seen[:, 48:] == 7.0).all()
+    with pytest.raises(ConfigError, match="its task is a Child, whose rows a LeggedRobot does not have"):
+        seated(make_env(2), student)
+
+
 def test_a_new_episode_forgets_what_the_teacher_saw() -> None:
     env, task = make_env(2), load_task("go1_flat")
     task.set("observations.history", {"state.dof_pos": 2})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from inspect import getfile
 from typing import Any
 
 from legged_mw.envs.loading import load_robot
@@ -16,6 +17,11 @@ from legged_mw.utils.errors import unknown
 # Fields that must be equal, since an action or a row means something else where they are not; those that a task has.
 _SAME = ("control.action_origin", "normalization.clip_actions", "gait.period", "gait.offsets")
 _SAME_SCAN = ("terrain.measured_points_x", "terrain.measured_points_y")
+
+
+def class_in(env: RobotTask, kind: type[RobotTask]) -> type[RobotTask] | None:
+    """``kind`` among the classes of ``env``; by its name and file, since a task's file may have been imported twice."""
+    return next((each for each in type(env).__mro__ if each.__qualname__ == kind.__qualname__ and getfile(each) == getfile(kind)), None)
 
 
 def observe_as(env: RobotTask, kind: type[RobotTask], cfg: RobotTaskCfg, groups: Sequence[str], name: str) -> Observations:

@@ -10,7 +10,7 @@ import torch
 from rsl_rl.models import MLPModel
 
 from legged_mw.envs.observations import Observations, Row
-from legged_mw.envs.other_task import differences, in_words, observe_as
+from legged_mw.envs.other_task import class_in, differences, in_words, observe_as
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.rl.policies import Trained, read_actor
@@ -84,11 +84,11 @@ def keep_teacher(teacher: Trained, run: Path) -> None:
 
 def _observe(env: RobotTask, policy: Trained, who: str) -> Observations:
     """What the policy reads in ``env``, as the group TEACHER. Raises ConfigError if something means something else there."""
-    kind, cfg = policy.task.env_class, policy.task.cfg
-    found = [f"its task is a {kind.__name__}, whose rows a {type(env).__name__} does not have"] if not isinstance(env, kind) else []
-    if not found:
-        seen = observe_as(env, kind, cfg, policy.task.train.obs_groups.actor, TEACHER)
-        found = differences(env, cfg, seen.rows(TEACHER))
+    task, kind = policy.task, class_in(env, policy.task.env_class)
+    found = [f"its task is a {task.env_class.__name__}, whose rows a {type(env).__name__} does not have"]
+    if kind:
+        seen = observe_as(env, kind, task.cfg, task.train.obs_groups.actor, TEACHER)
+        found = differences(env, task.cfg, seen.rows(TEACHER))
         if not found:
             return seen
     raise ConfigError(f"{shown(policy.source.checkpoint)} cannot be {who} here: {'; '.join(found)}")
