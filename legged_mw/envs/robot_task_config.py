@@ -221,7 +221,7 @@ class RobotTaskCfgPPO(Config):
         teacher: str = ""  # its run, checkpoint or export, or a task for its last or shipped policy (train.py --teacher)
         init_std: float = 0.1  # of the student's noise while it learns; nothing changes it [Isaac Lab]
         class_name: str = "legged_mw.rl.distillation:GraphedDistillation"  # or "Distillation": rsl-rl's own, same results, slower
-        num_learning_epochs: int = 1  # [R]
+        num_learning_epochs: int = 5  # [R 1; ours: docs/lab.md]
         gradient_length: int = 4  # steps a gradient; it divides num_steps_per_env [ours: R 15 leaves 9 of 24 unused]
         learning_rate: float = 1e-3  # [R]
         max_grad_norm: float = 1.0  # 0: no bound [R none; ours: as in PPO]
