@@ -32,11 +32,7 @@ class Go2FlatCfg(SimToRealCfg):
             lin_vel_x, lin_vel_y, ang_vel_yaw = [-2.0, 2.0], [-1.0, 1.0], [-2.0, 2.0]  # [m/s], [m/s], [rad/s]
 
     class rewards(SimToRealCfg.rewards):
-        tracking_sigma_end = 0.05  # [ours]
         pose_weights = {"hip": 1.0, "thigh": 1.0, "calf": 0.1}  # [P]
-
-    class perturbation(SimToRealCfg.perturbation):
-        velocity, curriculum_rate = [0.0, 10.0], 0.2  # [m/s], [-] [ours]
 
     class exam(SimToRealCfg.exam):
         peer = "go2"

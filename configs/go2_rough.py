@@ -6,7 +6,7 @@ Sources: as configs/go1_rough.py, whose ground it walks on.
 from configs.go1_rough import Go1RoughCfg
 from configs.go2_flat import Go2FlatCfg
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.sim_to_real_config import SimToRealCfg, SimToRealRoughCfgPPO
+from legged_mw.envs.sim_to_real_config import SimToRealRoughCfgPPO
 from legged_mw.utils.task import Task
 
 
@@ -23,11 +23,8 @@ class Go2RoughCfg(Go2FlatCfg):
     class termination(Go1RoughCfg.termination):
         pass
 
-    class perturbation(SimToRealCfg.perturbation):
-        pass
-
     class rewards(Go2FlatCfg.rewards):
-        tracking_sigma, tracking_sigma_end, swing_height = 0.25, 0.0, 0.15  # [-], [-], [m]
+        tracking_sigma, swing_height = 0.25, 0.15  # [-], [m]
         pose_weights = {"hip": 1.0, "thigh": 0.5, "calf": 0.1}
 
         class scales(Go2FlatCfg.rewards.scales):
