@@ -127,9 +127,14 @@ class GraphedPPO(PPO):
             self._begin()
 
     def learn_critic_only(self, on: bool) -> None:
-        """From the next update on the critic learns and the actor stays as it is, or both learn again."""
+        """From the next update on the critic learns and the actor stays as it is, or both learn again.
+
+        An adaptive learning rate then begins at its lowest, and is within an update where it should be: nothing is unlearned.
+        """
         if on != self.critic_only:
             self.critic_only, self._update_graph = on, StepGraph(self._update, str(self.device))
+            if not on and self.schedule == "adaptive":
+                self.learning_rate = _MIN_RATE
 
     @contextmanager
     def _beside(self) -> Iterator[None]:
