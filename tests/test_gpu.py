@@ -250,56 +250,9 @@ def test_checkpoints_go_both_ways_on_a_gpu(tmp_path: Path) -> None:
     assert difference(parameters(stock), parameters(replaying)) < 1e-4
 
 
-@pytest.mark.parametrize("settings", distilling.VARIANTS.values(), ids=distilling.VARIANTS.keys())
-def test_recorded_distillation_is_rsl_rls_own(settings: dict) -> None:
-    """Each of six updates, the last two replayed, from equal states and the stock learner's experience."""
-    stock, ours = (distilling.make(kind, DEVICE, **settings) for kind in (Distillation, GraphedDistillation))
-    for seed in range(6):
-        distilling.collect(stock, DEVICE, seed=seed)
-        distilling.share_experience(stock, ours)
-        distilling.take_over(ours, stock)
-        expected, got = stock.update(), ours.update()
-        assert difference(distilling.parameters(stock), distilling.parameters(ours)) < 1e-4
-        assert float(got["behavior"]) == pytest.approx(expected["behavior"], rel=1e-3)
-    assert ours._update_graph.recorded
-
-
-def test_recorded_student_acts_with_noise_beside_its_teacher() -> None:
-    alg = distilling.make(GraphedDistillation, DEVICE, gradient_length=1)
-    obs = observations(torch.Generator().manual_seed(0), DEVICE)
-    with torch.inference_mode():
-        drawn = torch.stack([alg.act(obs) for _ in range(200)])
-        assert alg._act_graph.recorded
-        assert drawn[5:].std(dim=0).mean().item() == pytest.approx(0.1, rel=0.05)
-        torch.testing.assert_close(alg.transition.privileged_actions, alg.teacher(obs), rtol=1e-3, atol=1e-4)
-
-
-def test_a_recorded_warm_up_ends() -> None:
-    """The actor stands to the bit while the critic learns, replayed too; then both learn, recorded anew."""
-    alg = make(GraphedPPO, DEVICE)
-    alg.learn_critic_only(True)
-    before = parameters(alg)
-    for seed in range(5):
-        collect(alg, DEVICE, seed=seed)
-        update(alg)
-    assert alg._update_graph.recorded
-    warm = parameters(alg)
-    assert all(torch.equal(warm[name], before[name]) for name in before if name.startswith("actor."))
-    assert not torch.equal(warm["critic.mlp.0.weight"], before["critic.mlp.0.weight"])
-    alg.learn_critic_only(False)
-    for seed in range(5):
-        collect(alg, DEVICE, seed=seed)
-        update(alg)
-    assert alg._update_graph.recorded and not torch.equal(parameters(alg)["actor.mlp.0.weight"], warm["actor.mlp.0.weight"])
-
-
-@pytest.mark.parametrize("taught", [False, True], ids=["ppo", "distillation"])
-def test_iteration_never_waits_for_the_host(taught: bool) -> None:
+def test_iteration_never_waits_for_the_host() -> None:
     """Rollout, returns, update and the report, once everything is recorded."""
-    env, teacher = make_env(eager=False), load_task("go1_flat")
-    if taught:
-        seat_teacher(env, Trained(Source(Path(), Path("model_1.pt"), False), teacher))
-    runner = make_runner(env, small_learner(), None, DEVICE, teacher.train if taught else None)
+    runner = make_runner(make_env(eager=False), small_learner(), None, DEVICE)
     runner.learn(5)
     obs = runner.env.get_observations()
     torch.cuda.set_sync_debug_mode("error")
@@ -343,3 +296,65 @@ def test_an_exam_leaves_the_gpus_generator_as_it_was() -> None:
     found = examine(lambda obs: torch.zeros(len(obs), 12, device=DEVICE))
     assert examine.env._graph.recorded and found["falls"] == 0
     assert torch.equal(torch.cuda.get_rng_state(DEVICE), before)
+
+
+# ---- teacher and student ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("settings", distilling.VARIANTS.values(), ids=distilling.VARIANTS.keys())
+def test_recorded_distillation_is_rsl_rls_own(settings: dict) -> None:
+    """Each of six updates, the last two replayed, from equal states and the stock learner's experience."""
+    stock, ours = (distilling.make(kind, DEVICE, **settings) for kind in (Distillation, GraphedDistillation))
+    for seed in range(6):
+        distilling.collect(stock, DEVICE, seed=seed)
+        distilling.share_experience(stock, ours)
+        distilling.take_over(ours, stock)
+        expected, got = stock.update(), ours.update()
+        assert difference(distilling.parameters(stock), distilling.parameters(ours)) < 1e-4
+        assert float(got["behavior"]) == pytest.approx(expected["behavior"], rel=1e-3)
+    assert ours._update_graph.recorded
+
+
+def test_recorded_student_acts_with_noise_beside_its_teacher() -> None:
+    alg = distilling.make(GraphedDistillation, DEVICE, gradient_length=1)
+    obs = observations(torch.Generator().manual_seed(0), DEVICE)
+    with torch.inference_mode():
+        drawn = torch.stack([alg.act(obs) for _ in range(200)])
+        assert alg._act_graph.recorded
+        assert drawn[5:].std(dim=0).mean().item() == pytest.approx(0.1, rel=0.05)
+        torch.testing.assert_close(alg.transition.privileged_actions, alg.teacher(obs), rtol=1e-3, atol=1e-4)
+
+
+def test_a_recorded_warm_up_ends() -> None:
+    """The actor stands to the bit while the critic learns, replayed too; then both learn, recorded anew."""
+    alg = make(GraphedPPO, DEVICE)
+    alg.learn_critic_only(True)
+    before = parameters(alg)
+    for seed in range(5):
+        collect(alg, DEVICE, seed=seed)
+        update(alg)
+    assert alg._update_graph.recorded
+    warm = parameters(alg)
+    assert all(torch.equal(warm[name], before[name]) for name in before if name.startswith("actor."))
+    assert not torch.equal(warm["critic.mlp.0.weight"], before["critic.mlp.0.weight"])
+    alg.learn_critic_only(False)
+    for seed in range(5):
+        collect(alg, DEVICE, seed=seed)
+        update(alg)
+    assert alg._update_graph.recorded and not torch.equal(parameters(alg)["actor.mlp.0.weight"], warm["actor.mlp.0.weight"])
+
+
+def test_a_students_iteration_never_waits_for_the_host() -> None:
+    env, teacher = make_env(eager=False), load_task("go1_flat")
+    seat_teacher(env, Trained(Source(Path(), Path("model_1.pt"), False), teacher))
+    runner = make_runner(env, small_learner(), None, DEVICE, teacher.train)
+    runner.learn(5)
+    obs = env.get_observations()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(2):
+            obs = runner._rollout(obs)
+            report = runner._report(runner.alg.update(), (0.0, 0.0, 0.0))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert all(math.isfinite(value) for value in report.message.read()[-3:])
