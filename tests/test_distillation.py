@@ -9,7 +9,7 @@ import pytest
 import torch
 from learner import ACTIONS, SIZES, STEPS, WORLDS, Env, difference, observations
 from rsl_rl.algorithms import Distillation
-from rsl_rl.models import MLPModel
+from rsl_rl.models import MLPModel, RNNModel
 
 from legged_mw.check.recordable import recordable
 from legged_mw.rl.distillation import GraphedDistillation
@@ -20,6 +20,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "a bound on the gradient": {"gradient_length": 3, "max_grad_norm": 0.05},
     "huber": {"gradient_length": 2, "loss_type": "huber"},
     "adamw": {"gradient_length": 1, "optimizer": "adamw"},
+    "gru": {"gradient_length": 2, "memory": "gru"},
+    "lstm": {"gradient_length": 3, "num_learning_epochs": 2, "memory": "lstm"},
 }
 
 
@@ -28,15 +30,17 @@ def make(
     device: str = "cpu",
     distribution: dict[str, Any] | None = None,
     sees: tuple[str, ...] = (*SIZES,),
+    memory: str | None = None,
     **settings: Any,
 ) -> Any:
-    """A learner whose networks come from a fixed seed; the teacher sees more than the student's "state"."""
+    """A learner whose networks come from a fixed seed; the teacher sees more than the student's "state". ``memory``: the student's."""
     torch.manual_seed(1)
+    recurrent = {"class_name": RNNModel, "rnn_type": memory, "rnn_hidden_dim": 12, "rnn_num_layers": 2} if memory else {}
     network = {"class_name": MLPModel, "hidden_dims": [32, 16], "activation": "elu", "obs_normalization": True}
     gaussian = {"class_name": "GaussianDistribution", "init_std": 0.1}
     cfg = {
         "obs_groups": {"student": ["state"], "teacher": [*sees]},
-        "student": {**network, "distribution_cfg": distribution or gaussian},
+        "student": {**network, **recurrent, "distribution_cfg": distribution or gaussian},
         "teacher": {**network, "distribution_cfg": dict(gaussian)},
         "algorithm": {"class_name": kind, **settings},
         "num_steps_per_env": STEPS,
@@ -69,6 +73,8 @@ def share_experience(source: Any, target: Any) -> None:
     """``target`` learns from what ``source`` has seen."""
     for name in ("actions", "privileged_actions", "dones"):
         getattr(target.storage, name).copy_(getattr(source.storage, name))
+    for memory in target._memories.values():
+        memory.start.copy_(memory.now)  # as the first step of a rollout does
     for group in target.storage.observations.keys():  # noqa: SIM118  (a TensorDict iterates over its rows)
         target.storage.observations[group].copy_(source.storage.observations[group])
 
@@ -112,9 +118,10 @@ def test_same_parameters_in_float32() -> None:
     assert difference(parameters(stock), parameters(ours)) < 1e-4
 
 
-def test_same_rollout_as_rsl_rl() -> None:
+@pytest.mark.parametrize("memory", [None, "gru", "lstm"])
+def test_same_rollout_as_rsl_rl(memory: str | None) -> None:
     """The student's noisy actions and the teacher's exact ones, from equal random numbers; what the teacher saw is not kept."""
-    stock, ours = make(Distillation, gradient_length=2), make(GraphedDistillation, gradient_length=2)
+    stock, ours = (make(kind, gradient_length=2, memory=memory) for kind in (Distillation, GraphedDistillation))
     for expected, got in zip(collect(stock), collect(ours), strict=True):
         torch.testing.assert_close(got, expected)
     for name in ("actions", "privileged_actions", "dones"):
@@ -132,9 +139,12 @@ def test_the_student_comes_nearer() -> None:
     assert losses[-1] < 0.1 * losses[0]
 
 
-def test_nothing_asks_the_host() -> None:
+@pytest.mark.parametrize("memory", [None, "gru", "lstm"])
+def test_nothing_asks_the_host(memory: str | None) -> None:
     """The guard that watches a task's step watches acting and the update, which a GPU records."""
-    alg = make(GraphedDistillation, gradient_length=2)  # torch clips by a .to() of the same device, which the guard takes for a copy
+    alg = make(
+        GraphedDistillation, gradient_length=2, memory=memory
+    )  # torch clips by a .to() of the same device, which the guard takes for a copy
     collect(alg)
     alg.update()  # Adam's memory is made in the first update
     with recordable():
