@@ -293,6 +293,17 @@ def no_rows(task: LoadedTask) -> None:
     task.env_class = Hopper
 
 
+def one_command_more(task: LoadedTask) -> None:
+    base: Any = type(task.cfg)
+
+    class More(base):
+        class commands(base.commands):
+            class ranges(base.commands.ranges):
+                base_height: list[float] = [0.2, 0.3]
+
+    task.cfg = More()
+
+
 CHANGES: dict[str, tuple[str | Callable[[LoadedTask], None], Any, str]] = {
     "pose": (
         "init_state.default_joint_angles",
@@ -305,6 +316,11 @@ CHANGES: dict[str, tuple[str | Callable[[LoadedTask], None], Any, str]] = {
     "clip": ("normalization.clip_actions", 5.0, "normalization.clip_actions is 5.0 there and 2.0 here"),
     "clock": ("gait.period", 0.8, "gait.period is 0.8 there and 0.0 here"),
     "scan": ("terrain.height_scan", ["state"], "it reads the height scan, which is off here: name a group in terrain.height_scan, such as"),
+    "commands": (
+        one_command_more,
+        None,
+        "the list of commands is lin_vel_x, lin_vel_y, ang_vel_yaw, base_height there and lin_vel_x, lin_v",
+    ),
     "class": (no_rows, None, "its task is a Hopper, whose rows a LeggedRobot does not have"),
 }
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from inspect import getfile
 from typing import Any
 
-from legged_mw.envs.loading import load_robot
 from legged_mw.envs.observations import Observations, Row
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
@@ -30,11 +30,8 @@ def observe_as(env: RobotTask, kind: type[RobotTask], cfg: RobotTaskCfg, groups:
     They are exact and not delayed: noise would only blur what is to be learned from the policy. Raises ConfigError for a
     group that the table does not have.
     """
-    own, env.cfg = env.cfg, cfg  # the rows go by the section noise and others
-    try:
+    with _config_of(env, cfg):  # the rows go by the section noise and others
         table = kind.observation_rows(env)
-    finally:
-        env.cfg = own
     for group in groups:
         if group not in table:
             raise ConfigError(unknown("observation group", group, table, kind.__name__))
@@ -49,7 +46,14 @@ def in_words(rows: Iterable[Row]) -> str:
 
 def differences(env: RobotTask, cfg: RobotTaskCfg, rows: Iterable[Row]) -> list[str]:
     """What keeps a policy of the config ``cfg``, which reads ``rows``, from meaning the same in ``env``: a clause for each."""
-    theirs, ours = load_robot(cfg, "mujoco", None, [], {}), env.robot
+    kinds = [_field(each, "control.actuator") for each in (cfg, env.cfg)]
+    found = [_differ("control.actuator", *kinds)] if "torque" in kinds else []
+    there, here = (", ".join(command.name for command in table) or "none" for table in (command_table(cfg), env.command_table))
+    found.append(_differ("the list of commands", there, here))
+    if any(found):
+        return [text for text in found if text]
+    with _config_of(env, cfg):
+        theirs, ours = env._load_robot("mujoco"), env.robot
     if theirs.joint_names != ours.joint_names:
         return [f"its robot is another one, with the joints {_few(theirs.joint_names)}; here they are {_few(ours.joint_names)}"]
     found = [_joint("default angle", ours.joint_names, theirs.pose, ours.pose, " rad")]
@@ -58,13 +62,22 @@ def differences(env: RobotTask, cfg: RobotTaskCfg, rows: Iterable[Row]) -> list[
     there, here = (f"{1.0 / (each.sim.dt * each.control.decimation):g} Hz" for each in (cfg, env.cfg))
     found.append(_differ("the control rate", there, here))
     found.append(_differ("asset.imu_site", theirs.imu, ours.imu))
-    there, here = (", ".join(command.name for command in table) or "none" for table in (command_table(cfg), env.command_table))
-    found.append(_differ("the list of commands", there, here))
     scan = [row for row in rows if row.name == "height_scan"]
     if scan and not scan[0].value.shape[1]:
         found.append("it reads the height scan, which is off here: name a group in terrain.height_scan, such as privileged_state")
     found += [_differ(path, _field(cfg, path), _field(env.cfg, path)) for path in (*_SAME, *(_SAME_SCAN if scan else ()))]
     return [text for text in found if text]
+
+
+@contextmanager
+def _config_of(env: RobotTask, cfg: RobotTaskCfg) -> Iterator[None]:
+    """``env`` with another config, on a plane, for what only reads it."""
+    own = env.cfg, env.terrain
+    env.cfg, env.terrain = cfg, None
+    try:
+        yield
+    finally:
+        env.cfg, env.terrain = own
 
 
 def _field(cfg: RobotTaskCfg, path: str) -> Any:
