@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from legged_mw.rl.adam import make_recordable, plain_state
+from legged_mw.rl.estimator import EstimatingModel
 from legged_mw.rl.layers import run_mlp, update_normalizer
 from legged_mw.rl.recurrent import Memory, step
 from legged_mw.sim.graph import StepGraph
@@ -45,8 +46,8 @@ class GraphedDistillation(Distillation):
 
     def _why_stock(self) -> str | None:
         """What keeps this configuration from being recorded, or None."""
-        for model in (self.student, self.teacher):
-            if type(model) not in (MLPModel, RNNModel):
+        for model, more in ((self.student, ()), (self.teacher, (EstimatingModel,))):  # an estimate of a teacher's is not learned
+            if type(model) not in (MLPModel, RNNModel, *more):
                 return f"a network is a {type(model).__name__}"
         if self.use_mixed_precision:
             return "use_mixed_precision is set"
