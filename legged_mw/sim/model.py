@@ -21,6 +21,7 @@ from legged_mw.sim.ground import GROUND, Ground, add_ground, replace_level_piece
 from legged_mw.sim.joints import Posed, pose_joints, set_machine
 from legged_mw.sim.names import Names, name_geoms
 from legged_mw.sim.rigid import fuse_fixed, sensed_site
+from legged_mw.sim.servos import Drive
 from legged_mw.sim.shapes import add_sites
 from legged_mw.sim.tables import per_joint as per_joint
 from legged_mw.sim.terrain import Terrain
@@ -108,6 +109,7 @@ def build_model(
     tables: Mapping[str, Mapping[str, float]] = {},  # what -> a table, as for per_joint: for ``RobotModel.tables``
     held_joints: Sequence[str] = (),  # names or patterns: welded at the pose
     partial: Mapping[str, Mapping[str, float]] | None = None,  # of PARTIAL, as for some_joints: what the caller knows better than the file
+    drive: Drive = "angle",  # what `ctrl` means; with joints.CURVE in `tables` motors have torque-speed curves
 ) -> RobotModel:
     """Compile the MJCF or URDF at ``file`` for stepping."""
     robot = read_robot(file)
@@ -120,7 +122,7 @@ def build_model(
         _set_options(spec, solver, notes)
         add_ground(spec, ground, robot.where, notes)
         _set_collisions(spec, names.find(colliders, "`colliders`", colliding=True), self_collisions, notes)
-        speeds = set_machine(robot, partial or {}, posed)
+        speeds = set_machine(robot, partial or {}, posed, drive)
         made = {name: names.find(geoms, f"`sites`: '{name}'") for name, geoms in (sites or {}).items()}
         add_sites(spec, made, posed.angles, robot.where, notes)
         return _compile(robot, posed, names, ground, made, names.find(contact_geoms, "`contact_geoms`"), velocity_sites, imu, speeds)
