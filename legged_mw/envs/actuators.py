@@ -93,6 +93,10 @@ class Actuators:
             self._network = make_motor_network(read_network(find_file(cfg, "control.network")), sim)
         self.targets = self._sent if self._offset is None else torch.zeros_like(sim.ctrl)  # (N, D) as the policy means them
 
+    def told(self) -> Tensor:
+        """(N, D) what the motors were told last, as the policy means it."""
+        return self._sent if self._offset is None else self._sent + self._offset
+
     def gain(self, name: str) -> Tensor:
         """ "stiffness" or "damping", (D,), or (N, D) where it is drawn."""
         return self._gains[name] * self._rand.values[name] if name in self._rand.values else self._gains[name]

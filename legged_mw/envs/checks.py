@@ -144,7 +144,7 @@ def _check_motors(cfg: RobotTaskCfg) -> None:
             "torque: leave action_origin out"
         )
     for name in ("stall_torque", "no_load_speed"):
-        if getattr(cfg.domain_rand, name) and cfg.domain_rand.enable and not curve:
+        if cfg.domain_rand.enable and getattr(cfg.domain_rand, name) not in ([], [1.0, 1.0]) and not curve:
             raise ConfigError(f"domain_rand.{name} is a factor on control.{name}, which is empty: fill it, or leave the range out ([])")
 
 

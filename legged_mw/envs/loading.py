@@ -27,7 +27,7 @@ def load_robot(
 ) -> RobotModel:
     """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors, and motors of ``law``."""
     asset, scale, control = cfg.asset, cfg.control.action_scale, cfg.control
-    gains = ({"": 0.0}, {"": 0.0}) if law in ("torque", "network") else (control.stiffness, control.damping)
+    none = {"": 0.0} if law in ("torque", "network") else {}
     curve = {name: getattr(control, name) for name in ("stall_torque", "no_load_speed", "gear")}
     if not asset.file:
         raise ConfigError("asset.file is empty; name the robot's MJCF or URDF, e.g. 'resources/robots/go1/go1.xml'")
@@ -35,8 +35,8 @@ def load_robot(
         find_file(cfg, "asset.file"),
         solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations, cfg.sim.integrator),
         ground=Ground(cfg.terrain.friction, cfg.terrain.condim, terrain, boxes=engine == "mujoco"),
-        stiffness=gains[0],
-        damping=gains[1],
+        stiffness=control.stiffness or none,
+        damping=control.damping or none,
         colliders=asset.colliders,
         self_collisions=asset.self_collisions,
         contact_geoms=contact_geoms,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from typing import Protocol
 
 from torch import Tensor
 
@@ -10,13 +10,11 @@ from legged_mw.sim.simulation import Simulation
 from legged_mw.utils.motor_network import MotorNetwork, NetworkMotors
 
 
-class SimulatedNetwork(ABC):
+class SimulatedNetwork(Protocol):
     """Called before a substep with the joints' targets (N, D) [rad], it writes their torques to ``ctrl``."""
 
-    @abstractmethod
     def __call__(self, targets: Tensor) -> None: ...
 
-    @abstractmethod
     def reset(self, mask: Tensor) -> None:
         """Where ``mask`` (N,) is true nothing was ever off its target."""
 
@@ -30,7 +28,7 @@ def make_motor_network(network: MotorNetwork, sim: Simulation) -> SimulatedNetwo
     return WarpNetwork(network, sim)
 
 
-class _OnHost(SimulatedNetwork):
+class _OnHost:
     def __init__(self, network: MotorNetwork, sim: Simulation) -> None:
         joints = sim.ctrl.shape[1]
         self._motors = NetworkMotors(network, sim.num_envs, joints)
