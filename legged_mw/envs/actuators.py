@@ -132,8 +132,11 @@ class Actuators:
         heard = self._late.heard[k] if self._late else self._sent
         if self._network:
             self._network(heard)
-        else:
-            self._sim.ctrl.copy_(self._compute(heard) if self._compute else heard)
+            return
+        told = self._compute(heard) if self._compute else heard
+        if told.shape != heard.shape:
+            raise ConfigError(f"_compute_torques must return a tensor {tuple(heard.shape)}, a torque a joint; it returned {(*told.shape,)}")
+        self._sim.ctrl.copy_(told)
 
     def reset(self, mask: Tensor) -> None:
         """Targets at the default pose, or torques zero, where ``mask`` (N,) is true; of delays and networks nothing is left."""

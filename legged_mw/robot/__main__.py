@@ -56,6 +56,7 @@ def task_page(task: LoadedTask, image: Path | None) -> str:
     one = copy.deepcopy(task)
     one.set("env.num_envs", 1)
     one.set("sim.engine", "mujoco")
+    one.set("control.actuator", "servo")  # what the page is about: gains, and what a simulation step makes of them
     if isinstance(one.cfg.to_dict()["terrain"].get("mesh_type"), str):
         one.set("terrain.mesh_type", "plane")
     return env_page(one.env_class(one.cfg, "cpu"), task.name, image)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Protocol
 
+import torch
 from torch import Tensor
 
 from legged_mw.sim.simulation import Simulation
@@ -32,10 +33,14 @@ class _OnHost:
     def __init__(self, network: MotorNetwork, sim: Simulation) -> None:
         joints = sim.ctrl.shape[1]
         self._motors = NetworkMotors(network, sim.num_envs, joints)
-        self._angle, self._speed, self._ctrl = (x.numpy() for x in (sim.qpos[:, -joints:], sim.qvel[:, -joints:], sim.ctrl))
+        self._error, self._mask = torch.zeros_like(sim.ctrl), torch.zeros(sim.num_envs, dtype=torch.bool)
+        self._angle, self._speed, self._ctrl = sim.qpos[:, -joints:], sim.qvel[:, -joints:].numpy(), sim.ctrl.numpy()
+        self._arrays = self._error.numpy(), self._mask.numpy()  # the same memory
 
     def __call__(self, targets: Tensor) -> None:
-        self._ctrl[:] = self._motors.torque(targets.numpy() - self._angle, self._speed)
+        torch.sub(targets, self._angle, out=self._error)
+        self._ctrl[:] = self._motors.torque(self._arrays[0], self._speed)
 
     def reset(self, mask: Tensor) -> None:
-        self._motors.reset(mask.numpy())
+        self._mask.copy_(mask)
+        self._motors.reset(self._arrays[1])
