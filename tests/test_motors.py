@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from worlds import QUIET, make_env
 
+from legged_mw.check.describe import describe
 from legged_mw.check.guard import check_recordable
 from legged_mw.check.recordable import recordable
 from legged_mw.deploy.contract import ContractError, digest, read_contract
@@ -148,6 +149,12 @@ def test_delays_are_rounded_to_the_nearest_simulation_step_a_half_up() -> None:
     for span, wanted in (([1.9, 1.9], {0.0}), ([2.0, 2.0], {4.0}), ([6.0, 6.0], {8.0}), ([0.0, 8.0], {0.0, 4.0, 8.0})):
         env = make_env(200, {**QUIET, "domain_rand.enable": True, "domain_rand.delay_ms": span})
         assert {*env.domain_rand.values["delay_ms"].flatten().tolist()} == wanted
+
+
+def test_check_tells_what_a_delay_is_rounded_to() -> None:
+    env = make_env(2, {**DC, "domain_rand.enable": True, "domain_rand.delay_ms": [3.0, 7.0]})
+    said = "motors: dc_motor; what they are told takes 4 to 8 ms: domain_rand.delay_ms [3, 7] to the nearest simulation step, of 4 ms"
+    assert said in describe(env, load_task("go1_flat"))
 
 
 # ---- torques and a law in code
@@ -441,6 +448,7 @@ def test_networks_beside_an_export(exported: Callable[[dict[str, Any]], Path], t
         Fleet(folder, contract)
 
 
+@pytest.mark.usefixtures("exported")
 def test_a_law_in_code_is_not_exported(made: Path, tmp_path: Path) -> None:
     task = small_task({})
     task.env_class = Springs

@@ -9,7 +9,7 @@ nothing is computed.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -116,13 +116,12 @@ class DomainRand:
         """The delay line of ``delay_ms``, for control steps of ``substeps``."""
         if "delay_ms" not in self.values:
             return None
-        column = self.values["delay_ms"].storage_offset()
-        longest = float(self._rounded(self._high[column]))
+        longest = self.rounded_delay(float(self._high[self.values["delay_ms"].storage_offset()]))
         return SubstepDelay(self.values["delay_ms"], self._substep_ms, longest, substeps, width)
 
-    def _rounded(self, delay: Tensor) -> Tensor:
-        """[ms], to the nearest whole number of simulation steps, a half up."""
-        return (delay / self._substep_ms + 0.5).floor_() * self._substep_ms
+    def rounded_delay(self, delay: Any) -> Any:
+        """[ms], a number or a tensor, to the nearest whole number of simulation steps, a half up."""
+        return (delay / self._substep_ms + 0.5) // 1.0 * self._substep_ms
 
     def redraw(self) -> None:
         """Draw everything again in every world, and what the model derives from it. Not for inside a recorded step."""
@@ -149,7 +148,7 @@ class DomainRand:
         for name, drawn in self.values.items():
             column = drawn.storage_offset()
             if name == "delay_ms" and column >= first:
-                fresh[:, column - first] = self._rounded(fresh[:, column - first])
+                fresh[:, column - first] = self.rounded_delay(fresh[:, column - first])
             if name in self._whole and column >= first:
                 low, high = self._low[column], self._high[column]
                 fresh[:, column - first] = (low + share[:, column - first] * (high - low + 1.0)).floor_().minimum(high)
