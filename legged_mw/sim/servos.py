@@ -26,7 +26,7 @@ def take_limits(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, Range]:
     """
     limits = {j.name: (j.actfrcrange[0], j.actfrcrange[1]) for j in spec.joints if _limited(j.actfrclimited, j.actfrcrange)}
     if actuators := list(spec.actuators):
-        notes.append(f"{len(actuators)} actuator{'s' * (len(actuators) > 1)} replaced by position servos")
+        notes.append(f"{len(actuators)} actuator{'s' * (len(actuators) > 1)} replaced")
     for actuator in actuators:
         if actuator.trntype in _JOINTS and actuator.target not in limits:
             force = _force(actuator)
