@@ -27,6 +27,7 @@ OWN = "own"  # the law of a class with a _compute_torques of its own
 class TorqueLaw:
     """The place for a motor law of one's own: what overrides ``_compute_torques`` makes the joints' torques itself."""
 
+    cfg: RobotTaskCfg
     actuators: Actuators
     default_dof_pos: Tensor  # (D,) [rad]
     dof_pos: Tensor  # (N, D) [rad]
@@ -41,6 +42,19 @@ class TorqueLaw:
         return self.p_gains * (target - self.dof_pos) - self.d_gains * self.dof_vel
 
     @property
+    def motor_law(self) -> str:
+        """``control.actuator``, or OWN."""
+        law, task = self.cfg.control.actuator, type(self)
+        if task._compute_torques is TorqueLaw._compute_torques:
+            return law
+        if law != "servo":
+            raise ConfigError(
+                f"control.actuator is {law!r}, but {task.__name__}._compute_torques is a motor law of its own: "
+                "leave control.actuator out, or remove the method"
+            )
+        return OWN
+
+    @property
     def p_gains(self) -> Tensor:
         """``control.stiffness`` as drawn, (D,) or (N, D) [N m/rad]."""
         return self.actuators.gain("stiffness")
@@ -51,18 +65,6 @@ class TorqueLaw:
         return self.actuators.gain("damping")
 
 
-def motor_law(task: type[TorqueLaw], cfg: RobotTaskCfg) -> str:
-    """``control.actuator``, or OWN."""
-    if task._compute_torques is TorqueLaw._compute_torques:
-        return cfg.control.actuator
-    if cfg.control.actuator != "servo":
-        raise ConfigError(
-            f"control.actuator is {cfg.control.actuator!r}, but {task.__name__}._compute_torques is a motor law of its own: "
-            "leave control.actuator out, or remove the method"
-        )
-    return OWN
-
-
 class Actuators:
     """Motors of N robots with D joints. An action means a target, origin + scale * action, or under the law "torque" scale * action.
 
@@ -71,9 +73,10 @@ class Actuators:
 
     before: Callable[[int], None] | None = None  # what ``Simulation.step`` calls before each substep; None: nothing changes within a step
 
-    def __init__(self, task: TorqueLaw, cfg: RobotTaskCfg, robot: RobotModel, sim: Simulation, rand: DomainRand) -> None:
+    def __init__(self, task: TorqueLaw, robot: RobotModel, sim: Simulation, rand: DomainRand) -> None:
+        cfg = task.cfg
         self._origin, self._default, self._dof_pos, self._sim = cfg.control.action_origin, task.default_dof_pos, task.dof_pos, sim
-        self.law, self._rand = motor_law(type(task), cfg), rand
+        self.law, self._rand = task.motor_law, rand
         scale = robot.tables["control.action_scale"]
         self.scale = torch.tensor(scale, device=sim.device)  # (D,) [rad], or [N m]
         self._gains = {name: torch.tensor(robot.tables[f"`{name}`"], device=sim.device) for name in ("stiffness", "damping")}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -23,7 +23,13 @@ def has_curve(cfg: RobotTaskCfg, law: str) -> bool:
 
 
 def load_robot(
-    cfg: RobotTaskCfg, law: str, engine: str, terrain: Terrain | None, contact_geoms: Sequence[str], sites: Mapping[str, Sequence[str]]
+    cfg: RobotTaskCfg,
+    law: str,
+    engine: str,
+    terrain: Terrain | None,
+    contact_geoms: Sequence[str],
+    sites: Mapping[str, Sequence[str]],
+    more_sensors: Collection[str] = (),
 ) -> RobotModel:
     """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors, and motors of ``law``."""
     asset, scale, control = cfg.asset, cfg.control.action_scale, cfg.control
@@ -48,9 +54,11 @@ def load_robot(
             "control.action_scale": scale if isinstance(scale, Mapping) else {"": scale},
             "rewards.pose_weights": cfg.rewards.pose_weights,
             **({f"`{name}`": table for name, table in curve.items()} if has_curve(cfg, law) else {}),
+            "rewards.deviation_weights": cfg.rewards.deviation_weights,
         },
         held_joints=asset.held_joints,
         partial={name: getattr(asset, name) for name in PARTIAL},
+        more_sensors=more_sensors,
         drive="angle" if law in ("servo", "dc_motor") else "torque",
     )
     robot.overrides[:] = [config_words(line) for line in robot.overrides]

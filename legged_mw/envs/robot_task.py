@@ -17,7 +17,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_mw.envs.actuators import Actuators, TorqueLaw, motor_law
+from legged_mw.envs.actuators import Actuators, TorqueLaw
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.contacts import GroundContacts
@@ -64,11 +64,11 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
             nconmax=cfg.sim.nconmax,
             njmax=cfg.sim.njmax,
             threads=cfg.sim.threads,
-            world_fields=world_fields(cfg, motor_law(type(self), cfg)),
+            world_fields=world_fields(cfg, self.motor_law),
             terrain=self.terrain,
             eager=eager,
         )
-        self.domain_rand = DomainRand(cfg, self.robot, self.sim, motor_law(type(self), cfg))
+        self.domain_rand = DomainRand(cfg, self.robot, self.sim, self.motor_law)
         self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
         self._init_ranges()
@@ -118,8 +118,8 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
 
     def _end_step(self) -> None:
         """What the next step remembers; the reward has seen this step's values."""
-        self.last_actions.copy_(self.actions)
         self._remember_for_rewards()
+        self.last_actions.copy_(self.actions)
 
     # ---- termination ----------------------------------------------------------------------------------------------
 
@@ -389,7 +389,8 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         return None
 
     def _load_robot(self, engine: str) -> RobotModel:
-        return load_robot(self.cfg, motor_law(type(self), self.cfg), engine, self.terrain, self._sensed_geoms(), self._sensed_sites())
+        sensed = self._sensed_geoms(), self._sensed_sites(), self._sensed_on_demand()
+        return load_robot(self.cfg, self.motor_law, engine, self.terrain, *sensed)
 
     def _sensed_geoms(self) -> list[str]:
         """Geoms whose contacts with the ground are counted: names or patterns."""
@@ -409,13 +410,12 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         self.accelerometer = sim.sensordata[:, spans["accelerometer"]]  # view (N, 3) [m/s^2]
         self.base_lin_vel, self.projected_gravity, self.base_ang_vel_world = (self._zeros(3) for _ in range(3))
         self.dof_offset = self._zeros(self.num_actions)  # joint position minus default [rad]
-        names = self.robot.joint_names
-        self.actuators = Actuators(self, self.cfg, self.robot, sim, self.domain_rand)
+        self.actuators = Actuators(self, self.robot, sim, self.domain_rand)
         exact = self.actuators.encoder_offset is None
         self.joint_reading = self.dof_offset if exact else self._zeros(self.num_actions)  # the same, as measured
         self.base_height = self.root_pos[:, 2]  # of the root above the ground under it [m]
         self.fell, self.broken = self._zeros(dtype=torch.bool), self._zeros(dtype=torch.bool)
-        self.divergence = Divergence(sim, self.actions, names, self.cfg.termination.max_speed)
+        self.divergence = Divergence(sim, self.actions, self.robot.joint_names, self.cfg.termination.max_speed)
         self._episode, views = columns(n, device, **self._episode_columns())  # one matrix, so that a reset clears it in one go
         for name, view in views.items():
             setattr(self, name, view)
@@ -424,8 +424,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         self.total_mass = float(model.body_subtreemass[0])  # [kg]
         self.root_body = self.robot.id("body", self.robot.root)
         self.imu_pos = self._tensor(model.site_pos[self.robot.id("site", self.robot.imu)]).expand(n, 3)  # body frame [m]
-        needed = bool(self._active_scales().get("collision"))
-        self.contacts = GroundContacts(self.robot, self.cfg.asset, self.contact_count, needed)
+        self.contacts = GroundContacts(self.robot, self.cfg.asset, self.contact_count, "collision" in self._active_scales())
         self._init_robot_rewards()
 
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
@@ -433,7 +432,8 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
 
     def _episode_columns(self) -> dict[str, int]:
         """What an episode remembers, as name -> width: attributes (N, width) that a reset clears."""
-        return {"last_actions": self.num_actions, "episode_sums": len(self._active_scales()), "episode_return": 1, "episode_steps": 1}
+        sums = {"episode_sums": len(self._active_scales()), "episode_return": 1, "episode_steps": 1}
+        return {"last_actions": self.num_actions, **sums, **self._columns_for_rewards()}
 
     def _init_ranges(self) -> None:
         """Config numbers as tensors: joints' tables and ranges of a reset."""
