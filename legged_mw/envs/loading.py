@@ -17,6 +17,9 @@ from legged_mw.utils.config import ConfigError
 from legged_mw.utils.files import find_file
 
 
+CURVE = ("stall_torque", "no_load_speed", "gear")  # tables of a torque-speed curve, in section `control`
+
+
 def has_curve(cfg: RobotTaskCfg, law: str) -> bool:
     """Whether motors of ``law`` have a torque-speed curve: ``dc_motor`` must, a servo never has one, others may."""
     return law == "dc_motor" or (law != "servo" and bool(cfg.control.stall_torque or cfg.control.no_load_speed))
@@ -34,7 +37,6 @@ def load_robot(
     """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors, and motors of ``law``."""
     asset, scale, control = cfg.asset, cfg.control.action_scale, cfg.control
     none = {"": 0.0} if law in ("torque", "network") else {}
-    curve = {name: getattr(control, name) for name in ("stall_torque", "no_load_speed", "gear")}
     if not asset.file:
         raise ConfigError("asset.file is empty; name the robot's MJCF or URDF, e.g. 'resources/robots/go1/go1.xml'")
     robot = build_model(
@@ -53,7 +55,7 @@ def load_robot(
         tables={
             "control.action_scale": scale if isinstance(scale, Mapping) else {"": scale},
             "rewards.pose_weights": cfg.rewards.pose_weights,
-            **({f"`{name}`": table for name, table in curve.items()} if has_curve(cfg, law) else {}),
+            **({f"`{name}`": getattr(control, name) for name in CURVE} if has_curve(cfg, law) else {}),
             "rewards.deviation_weights": cfg.rewards.deviation_weights,
         },
         held_joints=asset.held_joints,
