@@ -57,6 +57,7 @@ def test_the_torque_speed_curve(engine: str, law: str, kp: float, kd: float) -> 
     """Figures by hand: 20 N m at rest, none at 25 rad/s, and never more than 15 N m."""
     gains = {"control.stiffness": {"": kp}, "control.damping": {"": kd}, "asset.effort": {"": 15.0}}
     env = make_env(1, {**DC, **STILL, **gains, "control.actuator": law, "sim.engine": engine})
+    speeds = env.sim.actuator_velocity()
     for speed, asked, given in [
         (0.0, 12.0, 12.0),  # within the curve
         (0.0, 100.0, 15.0),  # the force limit
@@ -71,7 +72,7 @@ def test_the_torque_speed_curve(engine: str, law: str, kp: float, kd: float) -> 
         env.sim.ctrl[0, 4] = env.dof_pos[0, 4] + (asked + kd * speed) / kp if kp else asked
         env.sim.step()
         assert env.torques[0, 4].item() == pytest.approx(given, abs=2e-3), (speed, asked)
-        assert env.sim.actuator_velocity()[0, 4].item() == pytest.approx(speed, abs=1e-5)
+        assert speeds[0, 4].item() == pytest.approx(speed, abs=1e-5)
 
 
 def test_far_from_its_limits_a_dc_motor_is_a_servo() -> None:

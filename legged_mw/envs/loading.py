@@ -16,7 +16,6 @@ from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.files import find_file
 
-
 CURVE = ("stall_torque", "no_load_speed", "gear")  # tables of a torque-speed curve, in section `control`
 
 

@@ -47,7 +47,10 @@ class Simulation(ABC):
 
     @abstractmethod
     def actuator_velocity(self) -> Tensor:
-        """(N, nu) speed [rad/s] that went into ``actuator_force``: of the same moment. Not for inside a recorded step."""
+        """(N, nu) speed [rad/s] that went into ``actuator_force``: of the same moment. Not for inside a recorded step.
+
+        Ask for it before the steps that it is wanted of: MuJoCo's own engine fills it from then on.
+        """
 
     @abstractmethod
     def reset(self, mask: Tensor) -> None:
