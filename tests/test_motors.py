@@ -467,6 +467,14 @@ def test_a_law_in_code_is_not_exported(made: Path, tmp_path: Path) -> None:
         ({"control.no_load_speed": {"": 0.0}}, r"control.no_load_speed is \{'': 0.0\}; it must be a table of numbers above 0"),
         ({"control.gear": {"": -1.0}}, "control.gear is .* a table of numbers above 0"),
         ({"control.stall_torque": {"hip": 20.0}}, "control.stall_torque: no value for FR_thigh_joint, .*add keys, or '' for all others"),
+        (
+            {"control.stall_torque": {}},
+            r"control.actuator is 'dc_motor' with a torque-speed curve, but control.stall_torque is empty: fill the table \[N m\] a joint",
+        ),
+        (
+            {"control.actuator": "torque", "control.no_load_speed": {}},
+            r"control.actuator is 'torque' with a torque-speed curve, but control.no_load_speed is empty: fill the table \[rad/s\]",
+        ),
         ({"control.no_load_speed": {"": 20.0, "knee": 1.0}}, "control.no_load_speed: no joint 'knee'"),
         ({"control.actuator": "torque", "control.action_origin": "joints"}, "control.action_origin is 'joints', an origin of angles, but "),
         ({"control.actuator": "network"}, "control.actuator is 'network', but control.network names no file of weights"),
@@ -474,7 +482,13 @@ def test_a_law_in_code_is_not_exported(made: Path, tmp_path: Path) -> None:
         ({"control.actuator": "motor"}, "control.actuator"),
         ({"domain_rand.delay_ms": [-1.0, 2.0]}, "domain_rand.delay_ms is .* two numbers from zero, the lower first, or an empty list"),
         (
-            {"control.stall_torque": {}, "control.no_load_speed": {}, "domain_rand.enable": True, "domain_rand.stall_torque": [0.9, 1.1]},
+            {
+                "control.actuator": "servo",
+                "control.stall_torque": {},
+                "control.no_load_speed": {},
+                "domain_rand.enable": True,
+                "domain_rand.stall_torque": [0.9, 1.1],
+            },
             "domain_rand.stall_torque is a factor on control.stall_torque, which is empty: fill it, or leave the range out",
         ),
     ],

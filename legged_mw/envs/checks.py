@@ -147,7 +147,12 @@ def _check_motors(cfg: RobotTaskCfg) -> None:
             f"control.action_origin is {control.action_origin!r}, an origin of angles, but under control.actuator 'torque' an action is a "
             "torque: leave action_origin out"
         )
-    for name in ("stall_torque", "no_load_speed"):
+    for name, unit in (("stall_torque", "N m"), ("no_load_speed", "rad/s")):
+        if not getattr(control, name) and (control.actuator == "dc_motor" or (control.actuator != "servo" and curve)):
+            raise ConfigError(
+                f"control.actuator is {control.actuator!r} with a torque-speed curve, but control.{name} is empty: fill the table [{unit}] "
+                "a joint, '' for all (docs/motors.md)"
+            )
         if cfg.domain_rand.enable and getattr(cfg.domain_rand, name) not in ([], [1.0, 1.0]) and not curve:
             raise ConfigError(f"domain_rand.{name} is a factor on control.{name}, which is empty: fill it, or leave the range out ([])")
 
