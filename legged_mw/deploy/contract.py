@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from legged_mw.deploy.estimate import ESTIMATE, Estimated, read_estimated
+from legged_mw.deploy.memory import MEMORY, Memory, read_memory
 from legged_mw.deploy.motors import MOTORS, SERVOS, Motors, read_motors
 from legged_mw.deploy.reader import ContractError as ContractError
 from legged_mw.deploy.reader import Reader, is_list, is_number
@@ -21,7 +23,7 @@ from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import unknown
 
-FORMATS = (2, 3)  # 3: other motors than servos. A file has the lowest that suffices, so that old readers read what they can
+FORMATS = (2, 3)  # 3: a memory, an estimate, motors. A file has the lowest that suffices: old readers read what they can
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"
 TERRAIN_FILE = "terrain.xml"  # the same robot among steps and blocks; only of policies that were trained on such ground
 
@@ -145,6 +147,8 @@ class Contract:
     scan: HeightScan | None = None  # where a row asks for one
     gait: Gait | None = None  # likewise
     exam: Mapping[str, Any] | None = None  # the task's section `exam`, if the walking exam grades it
+    memory: Memory | None = None  # of a recurrent network
+    estimate: tuple[Estimated, ...] = ()  # the network's second output, row by row
     motors: Motors = SERVOS
 
     @property
@@ -159,10 +163,11 @@ class Contract:
     def to_dict(self) -> dict[str, Any]:
         """What policy.yaml holds."""
         ends = {name: list(value) if isinstance(value, tuple) else value for name, value in self.ends._asdict().items() if value}
+        network = {"file": NETWORK_FILE, "sha256": self.digest, "input": self.input, "output": self.output}
         return {
-            "format": FORMATS[0] if self.motors == SERVOS else FORMATS[1],
+            "format": FORMATS[1] if self.memory or self.estimate or self.motors != SERVOS else FORMATS[0],
             "task": self.task,
-            "network": {"file": NETWORK_FILE, "sha256": self.digest, "input": self.input, "output": self.output},
+            "network": network | ({MEMORY: self.memory.to_dict()} if self.memory else {}),
             "period": self.period,
             "joints": list(self.joints),
             "default_pose": self.default_pose.tolist(),
@@ -178,14 +183,14 @@ class Contract:
             **({SCAN: {"x": list(self.scan.x), "y": list(self.scan.y), "standing": self.scan.standing}} if self.scan else {}),
             **({"gait": {**self.gait._asdict(), "offsets": list(self.gait.offsets)}} if self.gait else {}),
             **({"exam": dict(self.exam)} if self.exam is not None else {}),
+            **({ESTIMATE: [row._asdict() for row in self.estimate]} if self.estimate else {}),
             **self.motors.to_dict(),
         }
 
 
 def _row_to_dict(row: ContractRow) -> dict[str, Any]:
     entry = {name: getattr(row, name) for name in ("name", "size", "unit", "frame", "noise", "measured")}
-    entry |= {"scale": _short(row.scale)}
-    entry |= {"sensors": list(row.sensors)} if row.sensors else {}
+    entry |= {"scale": _short(row.scale), **({"sensors": list(row.sensors)} if row.sensors else {})}
     return entry | ({"history": row.history} if row.history > 1 else {})
 
 
@@ -222,8 +227,7 @@ def read_contract(folder: Path) -> Contract:
 
 
 def _read(top: Reader) -> Contract:
-    known = f"{' or '.join(map(str, FORMATS))}, which this version reads; export the policy again"
-    top.take("format", known, lambda v: v in FORMATS)
+    top.take("format", f"{' or '.join(map(str, FORMATS))}, which this version reads; export the policy again", lambda v: v in FORMATS)
     network, action, robot, physics, measured = (top.section(name) for name in ("network", "action", "robot", "physics", "sensors"))
     joints, feet = top.texts("joints"), robot.section("feet")
     top.take("joints", "names, each once", lambda names: len(set(names)) == len(names))
@@ -253,6 +257,8 @@ def _read(top: Reader) -> Contract:
         scan=_read_scan(top),
         gait=_read_gait(top),
         exam=top.section("exam").values if "exam" in top.values else None,
+        memory=read_memory(network.section(MEMORY)) if MEMORY in network.values else None,
+        estimate=read_estimated(top.sections(ESTIMATE)) if ESTIMATE in top.values else (),
         motors=read_motors(top.section(MOTORS), count) if MOTORS in top.values else SERVOS,
     )
 

@@ -6,6 +6,7 @@ What the files mean is in ``legged_mw.deploy.contract``; nothing here is needed 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import os
 import shutil
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from rsl_rl.models import MLPModel
+from rsl_rl.models import MLPModel, RNNModel
 
 from legged_mw.deploy.contract import (
     CLOCK,
@@ -35,14 +36,29 @@ from legged_mw.deploy.contract import (
     HeightScan,
     digest,
 )
+from legged_mw.deploy.estimate import Estimated
+from legged_mw.deploy.memory import Memory
 from legged_mw.deploy.motors import MOTORS_FILE, Motors
 from legged_mw.envs.actuators import OWN as OWN_LAW
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.estimator import EstimatingModel, find_targets
 from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
 from legged_mw.rl.export_scene import Scene, among_steps, standalone
-from legged_mw.rl.network import INPUT, OUTPUT, ExportedPolicy, halve, round_weights, run_onnx, save_onnx
+from legged_mw.rl.network import (
+    ESTIMATE,
+    INPUT,
+    MEMORY_INPUT,
+    MEMORY_OUTPUT,
+    OUTPUT,
+    ExportedPolicy,
+    halve,
+    round_weights,
+    run_onnx,
+    save_onnx,
+)
 from legged_mw.rl.policies import load_policy
+from legged_mw.rl.recurrent import states_of
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.sim.joints import CURVE
 from legged_mw.sim.model import ModelError
@@ -113,14 +129,18 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
     with _all_or_nothing(folder) as new:
         save_yaml(new / CONFIG_FILE, config)
         _write_network(policy, clip, new / NETWORK_FILE, half)
-        contract = make_contract(env, task, new, noise)
+        memory = Memory(MEMORY_INPUT, MEMORY_OUTPUT, states_of(policy)) if isinstance(policy, RNNModel) else None
+        contract = dataclasses.replace(make_contract(env, task, new, noise), memory=memory)
         save_yaml(new / CONTRACT_FILE, contract.to_dict())
         steps = record(env, policy, groups, contract, new)
         observations, actions = (np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions"))
-        acted = run_onnx(new / NETWORK_FILE, observations)
+        remembered = np.concatenate([step.memory for step in steps]) if memory else None
+        acted = run_onnx(new / NETWORK_FILE, observations, memory=remembered)
         gap = _compare(acted, np.clip(actions, -clip, clip))
+        if isinstance(policy, EstimatingModel):
+            _compare(run_onnx(new / NETWORK_FILE, observations, ESTIMATE), _run(policy, clip, observations)[1], does="estimates")
         if half:
-            gap = _gap(acted, ExportedPolicy(exact, clip)(torch.from_numpy(observations)).detach().numpy())
+            gap = _gap(acted, _run(exact, clip, observations, remembered)[0])
         replay(env, contract, steps, new)
         no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
         files = (*FILES, *(name for name in SOMETIMES if (new / name).exists()))
@@ -149,17 +169,24 @@ def _write_network(policy: MLPModel, clip: float, path: Path, half: bool) -> Non
         halve(policy, path)
 
 
+def _run(policy: MLPModel, clip: float, *inputs: np.ndarray | None) -> list[np.ndarray]:
+    """What an exported network should give: actions, and its memory or its estimate if there is one."""
+    with torch.inference_mode():
+        outputs = ExportedPolicy(policy, clip)(*(torch.from_numpy(values) for values in inputs if values is not None))
+    return [output.numpy() for output in (outputs if isinstance(outputs, tuple) else (outputs,))]
+
+
 def _gap(got: np.ndarray, wanted: np.ndarray) -> float:
     """The largest difference, relative above 1."""
     return float((np.abs(got - wanted) / np.maximum(1.0, np.abs(wanted))).max()) if got.shape == wanted.shape else float("inf")
 
 
-def _compare(got: np.ndarray, wanted: np.ndarray) -> float:
-    """The largest difference; refuses a network that acts otherwise than the policy."""
+def _compare(got: np.ndarray, wanted: np.ndarray, does: str = "acts") -> float:
+    """The largest difference; refuses a network that acts or estimates otherwise than the policy."""
     gap = _gap(got, wanted)
     if not gap <= TOLERANCE:  # NaN too
         raise ExportError(
-            f"{NETWORK_FILE} acts otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
+            f"{NETWORK_FILE} {does} otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
             f"(at most {TOLERANCE:g} is allowed); nothing was written"
         )
     return gap
@@ -198,6 +225,8 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
     cfg, robot = task.cfg, env.robot
     scene = _write_scene(env, folder)
     ends = _ends(env)
+    origin = "torque" if env.actuators.law == "torque" else cfg.control.action_origin
+    action = Action(origin, np.array(robot.tables["control.action_scale"]), cfg.normalization.clip_actions)
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))
     ground, scanned = cfg.terrain, any(row.measured == SCAN for row in rows)
     feet = {foot: tuple(f"contact/{geom}" for geom in geoms) for foot, geoms in getattr(env, "foot_geoms", {}).items()}
@@ -205,11 +234,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         task=task.name,
         joints=robot.joint_names,
         default_pose=np.array(robot.pose),
-        action=Action(
-            "torque" if env.actuators.law == "torque" else cfg.control.action_origin,
-            np.array(robot.tables["control.action_scale"]),
-            cfg.normalization.clip_actions,
-        ),
+        action=action,
         stiffness=np.array(robot.tables["`stiffness`"]),
         damping=np.array(robot.tables["`damping`"]),
         period=round(env.dt, 9),
@@ -230,6 +255,16 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         digest=digest(folder / NETWORK_FILE),
         exam=cfg.to_dict().get("exam") if task.exam == "walking" else None,
         motors=_motors(env, folder),
+        estimate=_estimated(env, task),
+    )
+
+
+def _estimated(env: RobotTask, task: LoadedTask) -> tuple[Estimated, ...]:
+    """The rows of the network's second output."""
+    rows = [(row, ROWS.get(row.name)) for _, row in find_targets(task.train.to_dict(), env, learns=False)]
+    return tuple(
+        Estimated(row.name, row.value.shape[1], row.unit or (known.unit if known else ""), row.frame or (known.frame if known else ""))
+        for row, known in rows
     )
 
 

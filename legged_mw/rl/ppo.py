@@ -10,23 +10,25 @@ normalisers' std) is copied into tensors that stay. Actor and critic share nothi
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
 from rsl_rl.algorithms import PPO
-from rsl_rl.models import MLPModel
+from rsl_rl.extensions import Symmetry
+from rsl_rl.models import MLPModel, RNNModel
 from rsl_rl.modules import EmpiricalNormalization
 from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from legged_mw.rl.estimator import EstimatingModel, trained_parts
+from legged_mw.rl.layers import run_mlp, update_normalizer
+from legged_mw.rl.recurrent import Memory, Sequence, check_recurrent, unroll
 from legged_mw.sim.graph import StepGraph
 
-_SUM_ROWS = 128  # summed by a thread; the rest of the rows is summed side by side
 _MIN_RATE, _MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
 
 
@@ -34,38 +36,16 @@ class Minibatch(NamedTuple):
     """Samples of an update, and what the networks see of them."""
 
     batch: RolloutStorage.Batch
-    actor_input: Tensor  # (B, size), normalised
-    critic_input: Tensor
-
-
-class Linear(torch.autograd.Function):
-    """``x W^T + b`` for many rows, faster than torch's own in two places.
-
-    Torch sums the bias gradient in one pass that leaves most of a GPU idle, this in two. ``x`` may have more columns than
-    the weight, of zeros: a multiple of four of them is what TF32 products want.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        if x.shape[1] > weight.shape[1]:
-            ctx.columns = weight.shape[1]
-            weight = nn.functional.pad(weight, (0, x.shape[1] - weight.shape[1]))
-        ctx.save_for_backward(x, weight)
-        return torch.addmm(bias, x, weight.t())
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
-        (grad,), (x, weight) = grads, ctx.saved_tensors
-        chunk = math.gcd(len(grad), _SUM_ROWS)
-        sums = grad.view(-1, chunk, grad.shape[1]).sum(dim=1).sum(dim=0)
-        columns = getattr(ctx, "columns", None)
-        return grad @ weight if ctx.needs_input_grad[0] else None, (grad.t() @ x)[:, :columns], sums
+    actor_input: Tensor | Sequence  # (B, size), normalised; a sequence for a network with a memory
+    critic_input: Tensor | Sequence
+    targets: Tensor | None = None  # (B, E) of the actor's estimator, normalised
 
 
 class GraphedPPO(PPO):
     """PPO whose update and acting are replayed CUDA graphs.
 
-    What cannot be recorded (a network that is not a plain MLPModel or shares parameters, RND, mixed precision, an optimizer
+    A network with a memory (RNNModel) learns from whole worlds, in the order that is drawn; else from samples.
+    What cannot be recorded (a network that is not a plain MLPModel or RNNModel or shares parameters, RND, mixed precision, an optimizer
     other than Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. The first
     three updates of a run are launched step by step and the fourth is recorded: nothing is warmed up on a throw-away step.
     On a CPU nothing is recorded.
@@ -75,22 +55,30 @@ class GraphedPPO(PPO):
     _rate: Tensor | None = None  # else: () float64, as precise as rsl-rl's Python number
 
     def __init__(self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> None:
-        super().__init__(actor, critic, storage, **settings)
+        self._recurrent = actor.is_recurrent or critic.is_recurrent
+        symmetry = settings.pop("symmetry_cfg", None)
+        super().__init__(actor, critic, storage, symmetry_cfg=None if self._recurrent else symmetry, **settings)
         reason = self._why_stock()
         self.graphed = reason is None
+        if self._recurrent:
+            check_recurrent(storage.num_envs, self.num_mini_batches, symmetry, self.graphed)
+            self.symmetry = Symmetry(**symmetry) if symmetry else None  # rsl-rl refuses mirror images here
         if reason:
             print(f"PPO: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
             return
         self._adam_rate = torch.tensor(self.learning_rate, dtype=torch.float32, device=self.device)
         self._rate = torch.tensor(self.learning_rate, dtype=torch.float64, device=self.device)
-        parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self.optimizer = type(self.optimizer)(parameters, lr=self._adam_rate, **self._adam_flags())
+        self._parts, own_rates = trained_parts(self.actor, self.critic)
+        self._rates = [self._adam_rate, *own_rates]
+        learners = [self._parts[0] + self._parts[1], *self._parts[2:]]
+        groups = [{"params": part, "lr": rate} for part, rate in zip(learners, self._rates, strict=True)]
+        self.optimizer = type(self.optimizer)(groups, **self._adam_flags())
         self._begin()
 
     def _why_stock(self) -> str | None:
         """What keeps this configuration from being recorded, or None."""
         for model in (self.actor, self.critic):
-            if type(model) is not MLPModel:
+            if type(model) not in (MLPModel, RNNModel, EstimatingModel):
                 return f"a network is a {type(model).__name__}"
         if self.rnd or self.use_mixed_precision:
             return f"{'rnd_cfg' if self.rnd else 'use_mixed_precision'} is set"
@@ -108,11 +96,19 @@ class GraphedPPO(PPO):
     def _begin(self) -> None:
         """Fixed tensors, and graphs that are not recorded yet."""
         st, device = self.storage, self.device
-        self._size = st.num_envs * st.num_transitions_per_env // self.num_mini_batches  # of a minibatch
+        drawn = st.num_envs if self._recurrent else st.num_envs * st.num_transitions_per_env
+        self._share = drawn // self.num_mini_batches  # of a minibatch, in samples or in whole worlds
+        self._size = self._share * (st.num_transitions_per_env if self._recurrent else 1)  # in samples
         self._obs = TensorDict({name: value[0].clone() for name, value in st.observations.items()}, [st.num_envs], device=device)
-        self._order = torch.zeros(self._size * self.num_mini_batches, dtype=torch.long, device=device)
+        self._order = torch.zeros(self._share * self.num_mini_batches, dtype=torch.long, device=device)
+        self._memories: dict[nn.Module, Memory] = {
+            model: Memory(model, st.num_envs, 2 if self.symmetry else 1, device)
+            for model in (self.actor, self.critic)
+            if isinstance(model, RNNModel)
+        }
         self._advantages = torch.zeros_like(st.returns)
-        self._loss_names = ("value", "surrogate", "entropy", *(["symmetry"] if self.symmetry else []))
+        more = {"symmetry": self.symmetry, "estimate": len(self._parts) > 2}
+        self._loss_names = ("value", "surrogate", "entropy", *(name for name, there in more.items() if there))
         self._losses = torch.zeros(len(self._loss_names), device=device)
         self._entropy_coef, self._desired_kl = torch.zeros((), device=device), torch.zeros((), dtype=torch.float64, device=device)
         self._side = torch.cuda.Stream(device) if str(device).startswith("cuda") else None
@@ -145,6 +141,9 @@ class GraphedPPO(PPO):
         """Sampled actions (N, A); what the transition needs is noted until ``process_env_step``."""
         if not self.graphed:
             return super().act(obs)
+        if self.storage.step == 0:
+            for memory in self._memories.values():
+                memory.start.copy_(memory.now)
         self._obs.copy_(obs)
         self._act_graph()
         self.transition.observations = self._obs
@@ -153,16 +152,28 @@ class GraphedPPO(PPO):
         return self._acted[0].clone()
 
     def _act(self) -> None:
-        actor = self.actor
+        actor, seen = self.actor, self._obs
+        if self._memories and self.symmetry:
+            seen, _ = self.symmetry.data_augmentation_func(env=self.symmetry.env, obs=seen, actions=None)
         with self._beside():
-            values = self.critic(self._obs)
+            values = self.critic.mlp(self._latent(self.critic, seen))
         assert actor.distribution is not None
-        actor.distribution.update(actor.mlp(actor.get_latent(self._obs)))  # the forward pass without its sample
+        actor.distribution.update(actor.mlp(self._latent(actor, seen)))  # the forward pass without its sample
         mean, std = actor.output_mean, actor.output_std
         actions = mean + std * torch.randn_like(mean)  # torch.normal would check std on the host
         self._acted = (actions, values, actor.get_output_log_prob(actions))
         self._acted_params = tuple(actor.output_distribution_params)
         self._meet()
+
+    def _latent(self, model: MLPModel, seen: TensorDict) -> Tensor:
+        """What a network's MLP reads; a memory takes in what is ``seen``, with mirror images where it is to learn from those."""
+        return self._memories[model].look(seen) if model in self._memories else model.get_latent(self._obs)
+
+    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
+        """Store the transition; worlds whose episode ended are forgotten."""
+        super().process_env_step(obs, rewards, dones, extras)
+        for memory in self._memories.values() if self.graphed else ():
+            memory.forget(dones)
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Returns and advantages of the stored transitions, into the storage."""
@@ -174,7 +185,10 @@ class GraphedPPO(PPO):
             self.storage.advantages = self._advantages
 
     def _compute_returns(self) -> None:
+        memory = self._memories.get(self.critic)
+        self.critic.reset(hidden_state=memory.for_rsl_rl() if memory else None)  # rsl-rl looks once more, and so does not change ours
         super().compute_returns(self._obs)
+        self.critic.reset()
         self._advantages.copy_(self.storage.advantages)
 
     # ---- the update -----------------------------------------------------------------------------------------------
@@ -192,7 +206,7 @@ class GraphedPPO(PPO):
 
     def _update(self) -> None:
         self._losses.zero_()
-        batches = [self._prepare(indices) for indices in self._order.split(self._size)]
+        batches = [self._prepare(indices) for indices in self._order.split(self._share)]
         for _ in range(self.num_learning_epochs):
             for batch in batches:
                 self._minibatch(batch)
@@ -205,7 +219,7 @@ class GraphedPPO(PPO):
         st = self.storage
 
         def take(stored: Any) -> Tensor:
-            return stored.flatten(0, 1).index_select(0, indices)
+            return stored.index_select(1, indices).flatten(0, 1) if self._recurrent else stored.flatten(0, 1).index_select(0, indices)
 
         assert st.distribution_params is not None
         batch = RolloutStorage.Batch(
@@ -221,30 +235,37 @@ class GraphedPPO(PPO):
             batch.advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)  # type: ignore[operator]
         if self.symmetry:
             self.symmetry.augment_batch(batch, self._size)
-        return Minibatch(batch, self._input(self.actor, batch.observations), self._input(self.critic, batch.observations))
+        targets = self.actor.targets(batch.observations) if isinstance(self.actor, EstimatingModel) else None
+        actor_input, critic_input = (self._input(model, batch.observations, indices) for model in (self.actor, self.critic))
+        return Minibatch(batch, actor_input, critic_input, targets)
 
     @torch.no_grad()
-    def _input(self, model: MLPModel, obs: Any) -> Tensor:
+    def _input(self, model: MLPModel, obs: Any, indices: Tensor) -> Tensor | Sequence:
         """What the network sees of observations, normalised, with columns of zeros up to a multiple of four."""
-        latent = model.get_latent(obs)
-        return nn.functional.pad(latent, (0, -latent.shape[1] % 4))
+        memory = self._memories.get(model)
+        latent = memory.normalised(obs) if memory else model.get_latent(obs)
+        padded = nn.functional.pad(latent, (0, -latent.shape[1] % 4))
+        return memory.sequence(padded, indices, self.storage.dones) if memory else padded
 
     def _minibatch(self, minibatch: Minibatch) -> None:
         """One gradient step."""
-        batch, actor_input, critic_input = minibatch
+        batch, actor_input, critic_input, targets = minibatch
         self.optimizer.zero_grad()
         with self._beside():
             value_loss = self._value_loss(batch, _forward(self.critic, critic_input))
             (self.value_loss_coef * value_loss).backward()
         loss, parts, kl = self._policy_loss(batch, _forward(self.actor, actor_input))
         loss.backward()
+        if targets is not None and isinstance(self.actor, EstimatingModel) and isinstance(actor_input, Tensor):
+            parts.append(nn.functional.mse_loss(run_mlp(self.actor.estimator, actor_input), targets))
+            parts[-1].backward()
         self._meet()
         if self.is_multi_gpu:
             self._average_over_ranks(kl)
         if kl is not None:
             self._adapt_rate(kl)
-        nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
-        nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
+        for part in self._parts:
+            nn.utils.clip_grad_norm_(part, self.max_grad_norm)
         self.optimizer.step()
         self._losses.add_(torch.stack([value.detach() for value in (value_loss, *parts)]))
 
@@ -303,16 +324,18 @@ class GraphedPPO(PPO):
         for model in (self.actor, self.critic):
             if isinstance(model.obs_normalizer, EmpiricalNormalization):
                 inputs = torch.cat([obs[group] for group in model.obs_groups], dim=-1)
-                _update_normalizer(model.obs_normalizer, inputs, self.gpu_world_size)
+                update_normalizer(model.obs_normalizer, inputs, self.gpu_world_size)
+        if isinstance(self.actor, EstimatingModel):
+            update_normalizer(self.actor.target_normalizer, self.actor.truth(obs), self.gpu_world_size)
 
     def _symmetry_loss(self, batch: Any) -> Tensor:
         """How far the policy is from its own mirror image; of an augmented batch, the forward pass is already made."""
         symmetry, size = self.symmetry, self._size
         assert symmetry is not None
-        if symmetry.use_mirror_loss or not symmetry.use_data_augmentation:
+        if not self._recurrent and (symmetry.use_mirror_loss or not symmetry.use_data_augmentation):
             return symmetry.compute_loss(self.actor, copy.copy(batch), size)  # it puts mirror images into what it is given
-        means = self.actor.output_mean.detach()
-        _, mirrored = symmetry.data_augmentation_func(env=symmetry.env, obs=None, actions=means[:size])
+        means = self.actor.output_mean
+        _, mirrored = symmetry.data_augmentation_func(env=symmetry.env, obs=None, actions=means[:size].detach())
         return nn.functional.mse_loss(means[size:], mirrored[size:])
 
     # ---- learning rate and checkpoints: rsl-rl's own PPO reads and writes the same -----------------------------------------
@@ -340,10 +363,10 @@ class GraphedPPO(PPO):
         content = super().save()
         if self.graphed:
             state, groups = content["optimizer_state_dict"]["state"], content["optimizer_state_dict"]["param_groups"]
-            plain = {"lr": self.learning_rate, "fused": None, "capturable": False}
+            rates, plain = [self.learning_rate, *map(float, self._rates[1:])], {"fused": None, "capturable": False}
             content["optimizer_state_dict"] = {
                 "state": {i: {**memory, "step": memory["step"].cpu()} for i, memory in state.items()},
-                "param_groups": [{**group, **plain} for group in groups],
+                "param_groups": [{**group, "lr": rate, **plain} for group, rate in zip(groups, rates, strict=True)],
             }
         return content
 
@@ -351,37 +374,14 @@ class GraphedPPO(PPO):
         """Take over a checkpoint of this class or of rsl-rl's own PPO."""
         iteration = super().load(loaded_dict, load_cfg, strict)
         if self.graphed:
-            for group in self.optimizer.param_groups:  # Adam takes these from the file
-                group.update(lr=self._adam_rate, **self._adam_flags())
+            for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):  # Adam takes these from the file
+                group.update(lr=rate, **self._adam_flags())
             for memory in self.optimizer.state.values():
                 memory["step"] = memory["step"].to(self.device, torch.float32)
             self._begin()  # Adam's memory has moved
         return iteration
 
 
-def _forward(model: MLPModel, inputs: Tensor) -> Tensor:
-    """The network's output for normalised inputs (B, size)."""
-    for layer in model.mlp:
-        inputs = Linear.apply(inputs, layer.weight, layer.bias) if type(layer) is nn.Linear else layer(inputs)  # type: ignore[misc]
-    return inputs
-
-
-def _update_normalizer(normalizer: EmpiricalNormalization, x: Tensor, world_size: int) -> None:
-    """rsl-rl's running mean and variance over ``x`` (B, size), in place and without its copy from the host."""
-    if not normalizer.training:
-        return
-    count = x.shape[0] * world_size
-    var, mean = torch.var_mean(x, dim=0, unbiased=False, keepdim=True)
-    if world_size > 1:  # every rank brings as many samples
-        own_mean = mean.clone()
-        torch.distributed.all_reduce(mean)
-        mean /= world_size
-        var += (own_mean - mean).square()
-        torch.distributed.all_reduce(var)
-        var /= world_size
-    normalizer.count += count
-    rate = count / normalizer.count
-    delta = mean - normalizer._mean
-    normalizer._mean += rate * delta
-    normalizer._var += rate * (var - normalizer._var + delta * (mean - normalizer._mean))
-    normalizer._std.copy_(normalizer._var.sqrt())
+def _forward(model: MLPModel, inputs: Tensor | Sequence) -> Tensor:
+    """The network's output for normalised inputs (B, size), or over a sequence."""
+    return run_mlp(model.mlp, unroll(model.rnn.rnn, inputs) if isinstance(inputs, Sequence) else inputs)  # type: ignore[attr-defined]
