@@ -80,14 +80,6 @@ def test_a_vendors_file_is_stepped_unedited(name: str) -> None:
     assert not any(line.startswith("warning:") for line in env.robot.overrides)
 
 
-@pytest.mark.parametrize("name", ["g1_held_style", "anymal_c_style"])
-def test_a_vendors_file_is_stepped_by_mujoco_warp(name: str) -> None:
-    env = make(name, 2, **{"sim.engine": "mujoco_warp"})
-    for _ in range(3):
-        observations, _, _, _ = env.step(torch.zeros(2, env.num_actions))
-    assert torch.isfinite(observations["state"]).all() and env.sim.overflow_report() == ""
-
-
 @pytest.mark.parametrize("name", TASKS)
 def test_it_is_drawn_and_exported_as_one_text(name: str) -> None:
     env = env_of(name)
