@@ -242,6 +242,20 @@ def test_a_keyframe_states_a_height_and_no_place(tmp_path: Path) -> None:
     assert start_place(LeggedRobotCfg(), robot, ["left_foot"]) == [0.0, 0.0, 0.4]
 
 
+def test_a_keyframes_tilt_is_a_warning(tmp_path: Path) -> None:
+    """The root begins upright, whatever the file says; a turn about the vertical is nothing to say."""
+
+    def made(quat: str) -> RobotModel:
+        return build_toy(toy(tmp_path, extra=f'<keyframe><key name="sit" qpos="0 0 0.4 {quat} 0 0"/></keyframe>'))
+
+    said = "warning: keyframe 'sit' tilts the root by 30 degrees; that and its height are not read, the root begins upright: "
+    tilted = made("0.9659258 0 0.258819 0")
+    assert said + "state a pose for that by `pose`" in tilted.overrides and tilted.keyframe and tilted.keyframe.height is None
+    for quat in ("0.7 0 0 0.7", "2 0 0 0"):
+        level = made(quat)
+        assert level.keyframe and level.keyframe.height == 0.4 and not any("tilt" in line for line in level.overrides)
+
+
 # ---- trouble by trouble
 
 
