@@ -430,6 +430,19 @@ def test_held_joints_within_frames_and_with_others_on_their_body(tmp_path: Path)
         build_toy(file, held_joints=["b"], **table)
 
 
+def test_a_reward_about_held_joints_leaves_them_out() -> None:
+    """So that one config serves 29 joints and 12."""
+    hips = {"rewards.scales.hip_pos": -1.0, "rewards.hip_joints": ["hip_roll", "waist_*", "wrist"]}
+    env, whole = make("g1_held_style", **hips), make("g1_29dof_style", **hips)
+    named = [[robot.joint_names[i] for i in indices] for robot, indices in ((env.robot, env.hips), (whole.robot, whole.hips))]
+    assert named[0] == ["left_hip_roll_joint", "right_hip_roll_joint"] and len(named[1]) == 2 + 3 + 6
+    said = "rewards.hip_joints: 'waist_*' left out, as waist_yaw_joint, waist_roll_joint, waist_pitch_joint are held"
+    assert said in env.robot.overrides and not any("hip_joints" in line for line in whole.robot.overrides)
+    nothing = make("g1_held_style", **{**hips, "rewards.hip_joints": ["wrist"]})
+    nothing.step(torch.ones(2, 12))
+    assert nothing._reward_hip_pos().tolist() == [0.0, 0.0]
+
+
 def test_held_joints_that_are_none() -> None:
     with pytest.raises(ModelError, match=r"^asset\.held_joints: no joint 'neck' in the MJCF; there are: FL_hip_joint, "):
         make("go2_style", **{"asset.held_joints": ["neck"]})

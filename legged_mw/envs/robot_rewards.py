@@ -63,13 +63,15 @@ class RobotRewards:
             self.hips = torch.tensor(self._joints_called(self.cfg.rewards.hip_joints), dtype=torch.long, device=self.device)
 
     def _joints_called(self, wanted: list[str]) -> list[int]:
-        """Joints whose name fits one of ``wanted``, patterns or parts of names."""
-        names = self.robot.joint_names
-        hits = {word: [i for i, name in enumerate(names) if fnmatchcase(name, word) or word in name] for word in wanted}
-        for word in wanted:
-            if not hits[word]:
+        """Joints whose name fits one of ``wanted``, patterns or parts of names. One may fit held joints alone, which are not punished."""
+        names, held = self.robot.joint_names, self.robot.held
+        fits = {word: [name for name in (*names, *held) if fnmatchcase(name, word) or word in name] for word in wanted}
+        for word, found in fits.items():
+            if not found:
                 raise ConfigError(f"rewards.hip_joints: {unknown('joint', word, names, 'the robot')}")
-        return sorted({i for found in hits.values() for i in found})
+            if {*found} <= {*held}:
+                self.robot.overrides.append(f"rewards.hip_joints: '{word}' left out, as {', '.join(found)} are held")
+        return [i for i, name in enumerate(names) if any(name in found for found in fits.values())]
 
     def _remember_for_rewards(self) -> None:
         """The end of a step: what the next one compares with."""
