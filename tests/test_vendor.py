@@ -19,11 +19,11 @@ from worlds import QUIET
 
 from legged_mw import ROOT
 from legged_mw.check.describe import describe
+from legged_mw.drawing.scene import visual_model
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.loading import start_place
 from legged_mw.rl.export_scene import standalone
-from legged_mw.sim.drawing import visual_model
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import RobotModel
 from legged_mw.utils.config import ConfigError
