@@ -1,6 +1,7 @@
 """The learning curve of a run as curve.csv and curve.png: python benchmarks/curve.py logs/go2_flat/<time> resources/policies/go2_flat
 
-Seconds are of training: from the end of its first iteration, which records the step and compiles kernels that are not cached.
+Seconds are of training: from the end of its first iteration, which records the step and compiles kernels that are not cached. Pauses are
+left out: where a run was resumed, or an iteration took over 5 s for another reason.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import argparse
 import csv
 import io
+from itertools import accumulate, pairwise
 from pathlib import Path
 
 import matplotlib
@@ -17,6 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 matplotlib.use("agg")
 from matplotlib import pyplot as plt
 
+PAUSE = 5.0  # [s]
 COLUMNS = {
     "steps": "Train/total_steps",
     "reward": "Train/mean_reward",
@@ -36,7 +39,9 @@ def read(run: Path) -> dict[str, dict[int, float]]:
     tags = events.Tags()["scalars"]
     curve = {column: {event.step: event.value for event in events.Scalars(tag)} for column, tag in COLUMNS.items() if tag in tags}
     rewards = events.Scalars(COLUMNS["reward"])
-    return {"seconds": {event.step: event.wall_time - rewards[0].wall_time for event in rewards}, **curve}
+    took = [0.0, *(after.wall_time - before.wall_time for before, after in pairwise(rewards))]
+    seconds = accumulate(spent if spent < PAUSE else 0.0 for spent in took)
+    return {"seconds": dict(zip((event.step for event in rewards), seconds, strict=True)), **curve}
 
 
 def write_csv(curve: dict[str, dict[int, float]], path: Path, every: int) -> None:

@@ -20,10 +20,6 @@ class LeggedGymRobot(LeggedRobot):
 
     cfg: Go1LeggedGymCfg
 
-    def _init_buffers(self) -> None:
-        super()._init_buffers()
-        self.effort_limit = torch.tensor(self.robot.effort_range[:, 1], dtype=torch.float, device=self.device)  # (D,) [N m]
-
     # ---- commands
 
     def _draw_timers(self) -> Tensor:
@@ -67,10 +63,6 @@ class LeggedGymRobot(LeggedRobot):
     def _reward_ang_vel_xy(self) -> Tensor:
         """Roll and pitch rates, body frame."""
         return self.base_ang_vel[:, :2].square().sum(dim=1)
-
-    def _reward_torque_limits(self) -> Tensor:
-        """What torques exceed a share of their limits by [N m]."""
-        return (self.torques.abs() - self.cfg.rewards.soft_torque_limit * self.effort_limit).clamp(min=0.0).sum(dim=1)
 
     def _reward_feet_air_time(self) -> Tensor:
         """At touch-down, how much longer than ``min_air_time`` the foot was in the air [s], unless commanded to stand or turn."""
@@ -130,7 +122,7 @@ class Go1LeggedGymCfg(LeggedRobotCfg):
 
     class rewards(LeggedRobotCfg.rewards):
         soft_dof_pos_limit = 0.9
-        soft_torque_limit: float = 1.0  # share of a joint's torque limit
+        soft_torque_limit = 1.0
         base_height_target = 0.25  # [m]
         torques_as = "squares"
         min_air_time = 0.5

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import test_forces
 import test_rewards
 import torch
 from test_export import untrained
@@ -55,7 +56,7 @@ def touch(env: LeggedRobot, *feet: tuple[float, float]) -> None:
 
 def test_every_term_has_a_figure() -> None:
     methods = {name.removeprefix("_reward_") for name in dir(LeggedRobot) if name.startswith("_reward_")}
-    assert methods == {*test_rewards.EXPECTED, *TERMS, *FEET}
+    assert methods == {*test_rewards.EXPECTED, *TERMS, *FEET, *test_forces.SCALES}
 
 
 # ---- base and joints

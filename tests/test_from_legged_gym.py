@@ -49,8 +49,6 @@ EXPECTED = {
     "base_height": (0.01, 0.0025),
     # (4, 3, -12); twelve of 1
     "torques": (169.0, 12.0),
-    # limits 23.7, 23.7 and 35.55 of hip, thigh and calf: nothing over
-    "torque_limits": (0.0, 0.0),
     "dof_vel": (4.0 + 9.0, 12 * 0.25),
     # from (1, 0, ...) to (2, 0, ..., -3): (1^2 + 3^2) / 0.02^2; from 0 to -0.5 twelve times
     "dof_acc": (10.0 / 4e-4, 3.0 / 4e-4),
@@ -135,7 +133,7 @@ def test_on_rough_ground_heights_are_above_the_ground() -> None:
 
 
 def test_torque_beyond_its_share_of_the_limit() -> None:
-    env = ported(1, {"rewards.soft_torque_limit": 0.5})
+    env = ported(1, {"rewards.soft_torque_limit": 0.5, "rewards.scales.torque_limits": -1.0})
     env.sim.actuator_force[0] = torch.tensor([20.0, 0.0, -20.0] + [0.0] * 9)  # hip 20 - 11.85, calf 20 - 17.775
     assert env._reward_torque_limits().tolist() == pytest.approx([8.15 + 2.225])
 

@@ -10,6 +10,7 @@ import torch
 from learner import collect, difference, make, observations, parameters, share_experience, take_over
 from mujoco_warp import DisableBit
 from rsl_rl.algorithms import PPO
+from test_forces import SCALES, SETTINGS
 from test_ppo import VARIANTS, update
 
 from legged_mw.envs.legged_robot import LeggedRobot
@@ -85,6 +86,12 @@ BIPED: dict[str, object] = {
     "commands__resampling_time": 0.4,
 }
 
+FORCES: dict[str, object] = {
+    **{f"rewards__scales__{name}": scale for name, scale in SCALES.items()},
+    **{name.replace(".", "__"): value for name, value in SETTINGS.items()},
+    "observations__contact_forces": True,
+}
+
 
 @pytest.mark.parametrize(
     ("task", "settings"),
@@ -92,12 +99,13 @@ BIPED: dict[str, object] = {
         ("go1_flat", {}),
         ("go1_flat", RANDOMIZED),
         ("go1_flat", ROUGH),
+        ("go1_flat", FORCES),
         ("go2_flat", {}),
         ("g1_flat", BIPED),
         ("g1_12dof_flat", {}),
         ("g1_rough", {}),
     ],
-    ids=["nominal", "randomized", "rough", "go2", "biped", "held joints", "biped on rough ground"],
+    ids=["nominal", "randomized", "rough", "forces", "go2", "biped", "held joints", "biped on rough ground"],
 )
 def test_replay_equals_eager_over_100_steps(task: str, settings: dict[str, object]) -> None:
     """Bit for bit, with noise, kicks, falls, time outs and resets: the same random numbers are drawn in both."""
@@ -149,6 +157,18 @@ def test_replay_equals_eager_with_contacts() -> None:
     expected, got = roll_out(make_env(True), actions), roll_out(make_env(False), actions)
     for a, b in zip(expected[0::5], got[0::5], strict=True):
         assert torch.quantile((a - b).abs(), 0.99) < 1e-3
+
+
+def test_feet_carry_the_weight() -> None:
+    """Forces of a recorded step, with what terms and the critic read of them."""
+    still = {f"init_state__{name}": 0.0 for name in ("lin_vel_range", "ang_vel_range")}
+    env = make_env(eager=False, **FORCES, **still)
+    for _ in range(100):
+        env.step(torch.zeros(64, 12, device=DEVICE))
+    weight = 9.81 * env.total_mass
+    assert env._graph.recorded and (env.contact_forces.sum(dim=1)[:, 2] - weight).abs().max() < 0.02 * weight
+    seen = env.obs_buf["privileged_state"][:, env.observations.span("privileged_state", "contact_forces")]
+    torch.testing.assert_close(100.0 * seen, env.contact_forces.flatten(1))
 
 
 def test_step_never_waits_for_the_host() -> None:

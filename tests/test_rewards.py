@@ -217,6 +217,18 @@ def test_clip(settings: dict[str, object], walking: float, lying: float) -> None
     assert env.rew_buf.tolist() == pytest.approx([walking * DT, lying * DT], rel=1e-5, abs=1e-7)
 
 
+def test_tracking_sigma_goes_to_its_end_over_a_training() -> None:
+    env = make_env(2, {**HAND, "rewards.tracking_sigma_end": 0.05})
+    paint(env)
+    squared = 0.62896507 * 0.25  # [m^2/s^2], as above
+    for done, sigma in ((0.0, 0.25), (0.5, 0.15), (1.0, 0.05)):
+        env.anneal(done)
+        assert env._reward_tracking_lin_vel()[0].item() == pytest.approx(math.exp(-squared / sigma), rel=1e-5)
+    fixed = make_env(2, HAND)
+    fixed.anneal(1.0)
+    assert fixed.tracking_sigma.item() == 0.25
+
+
 def test_reward_is_for_a_control_step_of_any_length() -> None:
     env = make_env(2, {**HAND, **TWO, "control.decimation": 10})
     paint(env)

@@ -19,7 +19,7 @@ from legged_mw.sim.model import Ground, Solver, build_model
 from legged_mw.sim.room import count_room
 from legged_mw.utils.task import load_task
 
-GO1 = ROOT / "resources/robots/go1/go1.xml"
+GO1, G1 = (ROOT / f"resources/robots/{name}/{name}.xml" for name in ("go1", "g1"))
 
 
 def walker(foot: str, *, shin: str = "", condim: int = 3, own: bool = False, more: str = "") -> mujoco.MjModel:
@@ -82,7 +82,7 @@ def test_the_go1_gets_what_was_found_by_hand(task: str, counted: tuple[int, int]
 
 
 @pytest.mark.parametrize("own", [False, True])
-@pytest.mark.parametrize("file", [GO1, *sorted((ROOT / "tests/data").glob("*_style.*"))], ids=lambda file: file.stem)
+@pytest.mark.parametrize("file", [GO1, G1, *sorted((ROOT / "tests/data").glob("*_style.*"))], ids=lambda file: file.stem)
 def test_robots_that_thrash_find_room(file: Path, own: bool) -> None:
     """All that collides may touch, and the robot is thrown about: MuJoCo makes no more contacts and rows than were counted."""
     gains: dict[str, Any] = {"stiffness": {"": 30.0}, "damping": {"": 1.0}, "pose": {"": 0.0}}

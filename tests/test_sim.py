@@ -439,6 +439,15 @@ def test_options_are_written() -> None:
     assert (floor.friction[0], floor.condim[0], floor.priority[0]) == (0.8, 6, 1)
 
 
+def test_links_without_a_name_may_overlap(tmp_path: Path) -> None:
+    """They get one, for MuJoCo leaves out pairs by name."""
+    hand = '<body pos="0 0 0.05"><joint name="hip_3" axis="0 1 0"/><geom name="hand" size="0.02"/></body>'
+    arm = f'<body><joint name="hip_2"/><geom size="0.01" contype="0" conaffinity="0"/>{hand}</body>'
+    robot = build_toy(toy(tmp_path, inside=arm), colliders=["*"], self_collisions=True)
+    assert robot.physics.nexclude == 1
+    assert "self-collisions left out, as they overlap in the pose: 'base' and 'body_of_hand'" in robot.overrides
+
+
 def test_sensor_spans_after_the_mjcfs_own_sensors(tmp_path: Path) -> None:
     own = '<sensor><gyro name="gyro" site="imu"/><jointpos joint="left_hip"/><touch name="skin" site="imu"/><force site="imu"/></sensor>'
     robot = build_toy(toy(tmp_path, extra=own))

@@ -511,12 +511,17 @@ def test_numbers_go_to_their_end_in_a_straight_line(monkeypatch: pytest.MonkeyPa
     task.set("algorithm.entropy_coef", 0.005)
     task.set("anneal.desired_kl", 0.002)
     task.set("anneal.entropy_coef", 0.0)
-    runner = make_runner(LeggedRobot(task.cfg, "cpu"), task.train, None, "cpu")
-    update = runner.alg.update
-    monkeypatch.setattr(runner.alg, "update", lambda: (seen.append((runner.alg.desired_kl, runner.alg.entropy_coef)), update())[1])
+    task.set("rewards.tracking_sigma", 0.25)
+    task.set("rewards.tracking_sigma_end", 0.05)
+    env = LeggedRobot(task.cfg, "cpu")
+    runner = make_runner(env, task.train, None, "cpu")
+    alg, update = runner.alg, runner.alg.update
+    monkeypatch.setattr(alg, "update", lambda: (seen.append((alg.desired_kl, alg.entropy_coef, env.tracking_sigma.item())), update())[1])
     runner.learn(5)
-    assert [kl for kl, _ in seen] == pytest.approx([0.01, 0.008, 0.006, 0.004, 0.002])
-    assert [entropy for _, entropy in seen] == [0.005] * 5
+    kl, entropy, sigma = zip(*seen, strict=True)
+    assert kl == pytest.approx([0.01, 0.008, 0.006, 0.004, 0.002])
+    assert entropy == (0.005,) * 5
+    assert sigma == pytest.approx([0.25, 0.2, 0.15, 0.1, 0.05])
 
 
 def test_before_an_episode_has_ended_its_means_are_dashes() -> None:

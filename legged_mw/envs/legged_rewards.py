@@ -1,11 +1,13 @@
 """The reward terms of walking by command: ``LeggedRobot`` inherits them. Rules as in ``robot_rewards``.
 
-Sources: [P] MuJoCo Playground; [L] legged_gym; [U] unitree_rl_gym; [I] Isaac Lab's velocity tasks; [H] holosoma.
+Sources: [P] MuJoCo Playground; [L] legged_gym; [U] unitree_rl_gym; [UL] unitree_rl_lab; [I] Isaac Lab's velocity tasks; [M] mjlab;
+[H] holosoma; [W] walk-these-ways.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -15,7 +17,7 @@ from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_rewards import RobotRewards, need
 from legged_mw.sim.mirror import Partners
 from legged_mw.sim.pose import upright
-from legged_mw.sim.simulation import Simulation
+from legged_mw.sim.sensors import CONTACT_FORCE
 from legged_mw.utils.math import quat_rotate, yaw_of
 
 PHASE_SIGMA = 0.01  # [m^2] of feet_phase: 0.1 m beside the wanted height leave a share of 1/e [P]
@@ -26,7 +28,6 @@ class LeggedRewards(RobotRewards):
 
     # what the terms read: LeggedRobot makes it
     cfg: LeggedRobotCfg
-    sim: Simulation
     num_feet: int
     root_quat: Tensor  # (N, 4)
     base_ang_vel: Tensor  # (N, 3) body frame [rad/s]
@@ -35,6 +36,7 @@ class LeggedRewards(RobotRewards):
     default_dof_pos: Tensor  # (D,) [rad]
     foot_pos: Tensor  # (N, F, 3) [m, world]
     foot_height: Tensor  # (N, F) above the ground [m]
+    foot_vel: Tensor  # (N, F, 3) world frame [m/s]
     foot_speed: Tensor  # (N, F) horizontal [m/s]
     foot_contact: Tensor  # (N, F) bool
     first_contact: Tensor  # (N, F) bool
@@ -42,19 +44,30 @@ class LeggedRewards(RobotRewards):
     swing_peak: Tensor  # (N, F) [m]
     gait: GaitClock | None
 
-    feet_contact_time: Tensor  # (N, F) since touch-down [s]; only with `single_stance`
+    ON_DEMAND: ClassVar[Mapping[str, str]] = {**RobotRewards.ON_DEMAND, "contact_forces": CONTACT_FORCE}
+
+    feet_contact_time: Tensor  # (N, F) since touch-down [s]; only with `single_stance` or `air_time_variance`
+    last_air_time: Tensor  # (N, F) of the last swing that ended [s]; only with `air_time_variance`
+    last_contact_time: Tensor  # (N, F) of the last stance that ended [s]; likewise
+    last_foot_vel_z: Tensor  # (N, F) of the step before [m/s]; only with `feet_impact_vel`
     foot_bodies: Tensor  # (F,) index of each foot's body; only with `feet_orientation`
     foot_up: Tensor  # (F, 3) the vertical in each foot's frame, in the default pose; likewise
     neighbours: Tensor  # (2, pairs) feet to the left and to the right of each other; only with `feet_distance`
 
     foot_names: tuple[str, ...]
     _partners: Callable[[], Partners]
-    _times_contacts: bool  # `single_stance` is on
+
+    tracking_sigma: Tensor  # () [m^2/s^2, rad^2/s^2]
+
+    def anneal(self, done: float) -> None:
+        """A training is ``done`` so far, from 0 to 1: ``tracking_sigma`` on its way to ``rewards.tracking_sigma_end``."""
+        begin, end = self.cfg.rewards.tracking_sigma, self.cfg.rewards.tracking_sigma_end
+        self.tracking_sigma.fill_(begin + (end - begin) * done if end else begin)
 
     def _init_foot_rewards(self) -> None:
         """What terms need beside the state, where they are on."""
+        self.tracking_sigma = torch.tensor(self.cfg.rewards.tracking_sigma, device=self.device)
         on = self._active_scales()
-        self._times_contacts = "single_stance" in on
         if not {"feet_orientation", "feet_distance"} & on.keys():
             return
         stands = upright(self.robot, self.default_dof_pos.tolist(), self.foot_names)
@@ -65,21 +78,47 @@ class LeggedRewards(RobotRewards):
             pairs = [(i, j) for i, j in enumerate(other) if stands.places[i, 1] > stands.places[j, 1]]
             self.neighbours = torch.tensor(pairs, dtype=torch.long, device=self.device).view(-1, 2).T.contiguous()
 
-    def _foot_reward_columns(self) -> dict[str, int]:
-        """What an episode remembers for terms that are on."""
-        return {"feet_contact_time": len(self.foot_names)} if "single_stance" in self._active_scales() else {}
+    def _columns_for_rewards(self) -> dict[str, int]:
+        times = ["feet_contact_time", "last_air_time", "last_contact_time"]
+        wanted = {"single_stance": times[:1], "air_time_variance": times, "feet_impact_vel": ["last_foot_vel_z"]}
+        names = [name for term in self._active_scales() for name in wanted.get(term, [])]
+        return {**super()._columns_for_rewards(), **dict.fromkeys(names, len(self.foot_names))}
+
+    def _sensed_on_demand(self) -> list[str]:
+        row = [CONTACT_FORCE] if self.cfg.observations.contact_forces else []
+        return list(dict.fromkeys([*super()._sensed_on_demand(), *row]))
+
+    @property
+    def contact_forces(self) -> Tensor:
+        """(N, F, 3) Force of the ground on each foot in the last substep, world frame [N]; 0 in a world just reset."""
+        return self._sensed_value("contact_forces")
+
+    def _time_contacts(self) -> None:
+        """How long feet stood and swung, where a term that is on reads it; ``feet_air_time`` has this step's already."""
+        own = vars(self)
+        if "last_air_time" in own:
+            lifted = ~self.foot_contact & (self.feet_contact_time > 0.0)
+            self.last_air_time.copy_(torch.where(self.first_contact, self.feet_air_time, self.last_air_time))
+            self.last_contact_time.copy_(torch.where(lifted, self.feet_contact_time, self.last_contact_time))
+        if "feet_contact_time" in own:
+            self.feet_contact_time.add_(self.dt).masked_fill_(~self.foot_contact, 0.0)
+
+    def _remember_for_rewards(self) -> None:
+        super()._remember_for_rewards()
+        if "last_foot_vel_z" in vars(self):
+            self.last_foot_vel_z.copy_(self.foot_vel[..., 2])
 
     # ---- commands
 
     def _reward_tracking_lin_vel(self) -> Tensor:
         """Velocity in the plane at the IMU, body frame, as commanded. [L]"""
         error = (self.commands[:, :2] - self.base_lin_vel[:, :2]).square().sum(dim=1)
-        return torch.exp(error / -self.cfg.rewards.tracking_sigma)
+        return torch.exp(error / -self.tracking_sigma)
 
     def _reward_tracking_ang_vel(self) -> Tensor:
         """Yaw rate as commanded. [L]"""
         error = (self.commands[:, 2] - self.base_ang_vel[:, 2]).square()
-        return torch.exp(error / -self.cfg.rewards.tracking_sigma)
+        return torch.exp(error / -self.tracking_sigma)
 
     def _reward_stand_still(self) -> Tensor:
         """Joints away from the default pose while the command is to stand. [L]"""
@@ -120,6 +159,35 @@ class LeggedRewards(RobotRewards):
         """Sum over feet of the squared sine of their tilt; a foot is flat as it is in the default pose. [H -5]"""
         up = quat_rotate(self.sim.xquat.index_select(1, self.foot_bodies), self.foot_up.expand(len(self.foot_contact), -1, -1))
         return up[..., :2].square().sum(dim=(1, 2))
+
+    def _reward_air_time_variance(self) -> Tensor:
+        """How unlike the feet's last swings were, and their last stances: variances of their times, up to 0.5 s each [s^2]. [I, UL -1]"""
+        need(self.num_feet > 1, "air_time_variance", "asset.foot_names has one foot")
+        swings, stances = (time.clamp(max=0.5).var(dim=1) for time in (self.last_air_time, self.last_contact_time))
+        return swings + stances
+
+    def _reward_feet_contact_without_cmd(self) -> Tensor:
+        """How many feet are on the ground while told to stand. [UL]"""
+        return self.foot_contact.sum(dim=1).float().masked_fill_(self.moving, 0.0)
+
+    def _reward_feet_impact_vel(self) -> Tensor:
+        """At touch-down, the square of how fast the foot sank a step before [m^2/s^2]. [W, which counts feet that stand too]"""
+        return (self.last_foot_vel_z.clamp(max=0.0).square() * self.first_contact).sum(dim=1)
+
+    # ---- forces on feet
+
+    def _reward_feet_contact_forces(self) -> Tensor:
+        """What the ground's forces on feet exceed ``rewards.max_contact_force`` by [N]. [L]"""
+        return (self.contact_forces.norm(dim=2) - self.cfg.rewards.max_contact_force).clamp(min=0.0).sum(dim=1)
+
+    def _reward_soft_landing(self) -> Tensor:
+        """At touch-down, the ground's force on the foot [N], while moving. [M -1e-5]"""
+        return (self.contact_forces.norm(dim=2) * (self.first_contact & self.moving[:, None])).sum(dim=1)
+
+    def _reward_stumble(self) -> Tensor:
+        """1 where a foot hits something upright: a horizontal force of more than five times the vertical one. [L]"""
+        forces = self.contact_forces
+        return (forces[..., :2].norm(dim=2) > 5.0 * forces[..., 2].abs()).any(dim=1).float()
 
     # ---- two legs
 

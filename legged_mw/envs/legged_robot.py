@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from legged_mw.envs.contacts import FootContacts
 from legged_mw.envs.gait import GaitClock
 from legged_mw.envs.legged_rewards import LeggedRewards
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
@@ -34,13 +35,11 @@ class LeggedRobot(LeggedRewards, RobotTask):
 
     def _update_state(self) -> None:
         super()._update_state()
-        if self._foot_of_geom is not None:
-            torch.mm(self.contact_count[:, : len(self._foot_of_geom)], self._foot_of_geom, out=self.foot_contact_count)
-        torch.gt(self.foot_contact_count, 0.0, out=self.foot_contact)
+        self.feet.update()
+        torch.gt(self.feet.count, 0.0, out=self.foot_contact)
         torch.logical_and(self.foot_contact, self.feet_air_time > 0.0, out=self.first_contact)
         self.feet_air_time.add_(self.dt)
-        if self._times_contacts:
-            self.feet_contact_time.add_(self.dt).masked_fill_(~self.foot_contact, 0.0)
+        self._time_contacts()
         self._measure_ground()
         torch.maximum(self.swing_peak, self.foot_height, out=self.swing_peak)
         torch.hypot(self.foot_vel[..., 0], self.foot_vel[..., 1], out=self.foot_speed)
@@ -77,6 +76,8 @@ class LeggedRobot(LeggedRewards, RobotTask):
         """New commands, feet in the air."""
         self._reset_commands(mask)
         self.foot_contact.masked_fill_(mask[:, None], False)
+        if self.feet.forces is not None:
+            self.feet.forces.masked_fill_(mask[:, None, None], 0.0)
         if self.gait:
             self.gait.restart(mask)
 
@@ -221,6 +222,7 @@ class LeggedRobot(LeggedRewards, RobotTask):
                 Row("foot_contact", self.foot_contact, mirror="foot"),  # 0 or 1
                 Row("foot_lin_vel", self.foot_vel.flatten(1), mirror="foot_polar"),  # world frame [m/s]
                 Row("feet_air_time", self.feet_air_time, mirror="foot"),  # [s]
+                *self._force_rows(),
                 *self._disturbance_rows(),
                 *self._height_rows("privileged_state"),
             ],
@@ -229,6 +231,11 @@ class LeggedRobot(LeggedRewards, RobotTask):
     def _gait_rows(self) -> list[Row]:
         """The gait clock, where there is one: sine of each foot's phase, then cosine; zeros while told to stand."""
         return [Row("gait_clock", self.gait.row, mirror="foot")] if self.gait else []
+
+    def _force_rows(self) -> list[Row]:
+        """The ground's force on each foot, world frame, in 100 N: where ``observations.contact_forces`` asks for it."""
+        on = self.cfg.observations.contact_forces
+        return [Row("contact_forces", self.contact_forces.flatten(1), mirror="foot_polar", scale=0.01)] if on else []
 
     def _height_rows(self, group: str, noise: float = 0.0) -> list[Row]:
         """The height scan [m], x by x from behind, in each from right to left; where ``terrain.height_scan`` names the group."""
@@ -326,7 +333,9 @@ class LeggedRobot(LeggedRewards, RobotTask):
         self.foot_vel = self.sim.sensordata[:, self.robot.sensors["linvel"]].unflatten(1, (feet, 3))  # view, world frame [m/s]
         self.foot_sites = torch.tensor([self.robot.id("site", name) for name in self.foot_names], device=self.device)
         self.foot_pos = self._zeros(feet, 3)  # [m, world]
-        self._init_foot_contacts()
+        self.feet = FootContacts(self.robot, self.foot_geoms.values(), self.sim.sensordata, self.contact_count)
+        if self.feet.forces is not None:
+            self._sensed["contact_forces"] = self.feet.forces  # not the columns of the sensors
         self.foot_contact, self.first_contact = (self._zeros(feet, dtype=torch.bool) for _ in range(2))
         self.foot_speed = self._zeros(feet)  # horizontal [m/s]
         self._init_terrain()
@@ -336,19 +345,10 @@ class LeggedRobot(LeggedRewards, RobotTask):
         self.gait = GaitClock(clock, names, self.num_envs, self.dt, self.device) if clock.period > 0.0 else None
         self._init_foot_rewards()
 
-    def _init_foot_contacts(self) -> None:
-        """Contacts of each foot with the ground (N, F): a column of the sensors, or of feet with several geoms their sum."""
-        self.foot_contact_count, self._foot_of_geom = self.contact_count[:, : self.num_feet], None
-        feet = self.foot_geoms.values()
-        geoms = list(dict.fromkeys(geom for each in feet for geom in each))  # G, the first columns of the sensors
-        if [(geom,) for geom in geoms] != [*feet]:
-            self.foot_contact_count = self._zeros(self.num_feet)
-            self._foot_of_geom = self._tensor([[float(geom in each) for each in feet] for geom in geoms])  # (G, F)
-
     def _episode_columns(self) -> dict[str, int]:
         feet = len(self.foot_names)
         ground = {"progress": 1, "asked": 1, "asked_speed": 1, "farthest": 1} if self.terrain else {}
-        return {**super()._episode_columns(), "feet_air_time": feet, "swing_peak": feet, **self._foot_reward_columns(), **ground}
+        return {**super()._episode_columns(), "feet_air_time": feet, "swing_peak": feet, **ground}
 
     def _init_terrain(self) -> None:
         """Tiles and heights, where there is terrain, and the height scan's points (P,) each [m]."""

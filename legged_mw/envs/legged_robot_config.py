@@ -17,6 +17,9 @@ class LeggedRobotCfg(RobotTaskCfg):
         foot_names: list[str] = []  # of sites, and of geoms if foot_geoms says nothing; the order is the order in observations
         foot_geoms: dict[str, list[str]] = {}  # foot -> its geoms, names or patterns, where a foot is not one geom of its name
 
+    class observations(RobotTaskCfg.observations):
+        contact_forces: bool = False  # a row of `privileged_state`: the ground's force on each foot, world frame [N] [ours: off]
+
     class commands:
         resampling_time: float = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]
         change_probability: float = 0.5  # that a component changes at all when the timer ends [P]
@@ -50,10 +53,12 @@ class LeggedRobotCfg(RobotTaskCfg):
 
     class rewards(RobotTaskCfg.rewards):
         tracking_sigma: float = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
+        tracking_sigma_end: float = 0.0  # where it goes in a straight line over max_iterations; 0: it stays [ours]
         swing_height: float = 0.1  # wanted height of a swinging foot [m] [P]
         min_air_time: float = 0.1  # a step that lasts less is penalised [s] [P]
         min_command: float = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]
         min_feet_distance: float = 0.2  # sideways between left and right feet, of `feet_distance` [m] [P: T1, G1]
+        max_contact_force: float = 100.0  # on a foot, above which `feet_contact_forces` counts [N] [L]
         max_single_stance: float = 0.4  # on one foot, from where `single_stance` grows no more [s] [Isaac Lab: G1]
 
         class scales(RobotTaskCfg.rewards.scales):

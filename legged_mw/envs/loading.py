@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -18,7 +18,12 @@ from legged_mw.utils.files import find_file
 
 
 def load_robot(
-    cfg: RobotTaskCfg, engine: str, terrain: Terrain | None, contact_geoms: Sequence[str], sites: Mapping[str, Sequence[str]]
+    cfg: RobotTaskCfg,
+    engine: str,
+    terrain: Terrain | None,
+    contact_geoms: Sequence[str],
+    sites: Mapping[str, Sequence[str]],
+    more_sensors: Collection[str] = (),
 ) -> RobotModel:
     """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors."""
     asset, scale = cfg.asset, cfg.control.action_scale
@@ -40,9 +45,11 @@ def load_robot(
         tables={
             "control.action_scale": scale if isinstance(scale, Mapping) else {"": scale},
             "rewards.pose_weights": cfg.rewards.pose_weights,
+            "rewards.deviation_weights": cfg.rewards.deviation_weights,
         },
         held_joints=asset.held_joints,
         partial={name: getattr(asset, name) for name in PARTIAL},
+        more_sensors=more_sensors,
     )
     robot.overrides[:] = [config_words(line) for line in robot.overrides]
     return robot

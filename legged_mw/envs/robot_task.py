@@ -118,8 +118,8 @@ class RobotTask(RobotRewards, BaseTask):
 
     def _end_step(self) -> None:
         """What the next step remembers; the reward has seen this step's values."""
-        self.last_actions.copy_(self.actions)
         self._remember_for_rewards()
+        self.last_actions.copy_(self.actions)
 
     # ---- termination ----------------------------------------------------------------------------------------------
 
@@ -389,7 +389,7 @@ class RobotTask(RobotRewards, BaseTask):
         return None
 
     def _load_robot(self, engine: str) -> RobotModel:
-        return load_robot(self.cfg, engine, self.terrain, self._sensed_geoms(), self._sensed_sites())
+        return load_robot(self.cfg, engine, self.terrain, self._sensed_geoms(), self._sensed_sites(), self._sensed_on_demand())
 
     def _sensed_geoms(self) -> list[str]:
         """Geoms whose contacts with the ground are counted: names or patterns."""
@@ -424,8 +424,7 @@ class RobotTask(RobotRewards, BaseTask):
         self.total_mass = float(model.body_subtreemass[0])  # [kg]
         self.root_body = self.robot.id("body", self.robot.root)
         self.imu_pos = self._tensor(model.site_pos[self.robot.id("site", self.robot.imu)]).expand(n, 3)  # body frame [m]
-        needed = bool(self._active_scales().get("collision"))
-        self.contacts = GroundContacts(self.robot, self.cfg.asset, self.contact_count, needed)
+        self.contacts = GroundContacts(self.robot, self.cfg.asset, self.contact_count, "collision" in self._active_scales())
         self._init_robot_rewards()
 
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
@@ -433,7 +432,8 @@ class RobotTask(RobotRewards, BaseTask):
 
     def _episode_columns(self) -> dict[str, int]:
         """What an episode remembers, as name -> width: attributes (N, width) that a reset clears."""
-        return {"last_actions": self.num_actions, "episode_sums": len(self._active_scales()), "episode_return": 1, "episode_steps": 1}
+        sums = {"episode_sums": len(self._active_scales()), "episode_return": 1, "episode_steps": 1}
+        return {"last_actions": self.num_actions, **sums, **self._columns_for_rewards()}
 
     def _init_ranges(self) -> None:
         """Config numbers as tensors: joints' tables and ranges of a reset."""

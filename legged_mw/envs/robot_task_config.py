@@ -28,12 +28,13 @@ class RobotTaskCfg(Config):
         self_collisions: bool = False  # among the colliders
         penalize_contacts_on: list[str] = []  # likewise, colliders: `collision` counts their bodies on the ground [L]
         terminate_after_contacts_on: list[str] = []  # likewise: to touch the ground with one of these is a fall [L]
+        sense: list[str] = []  # of contact_forces, self_contacts, angular_momentum, what code of yours reads outside of reward terms
         held_joints: list[str] = []  # names or patterns: welded at their default angle, so that they are no joints any more
         # tables a joint that need not name every joint; the others keep the file's
         effort: dict[str, float] = {}  # highest force of the servo, both ways [N m]
         armature: dict[str, float] = {}  # inertia of the rotor at the joint [kg m^2]
         frictionloss: dict[str, float] = {}  # dry friction [N m]
-        joint_speed_limits: dict[str, float] = {}  # the motor's highest speed [rad/s] (a URDF has it); for the report only
+        joint_speed_limits: dict[str, float] = {}  # the motor's highest speed [rad/s] (a URDF has it); for report and rewards only
 
     class init_state:
         pos: list[float] = []  # root at reset [m]; empty: feet as high as in the keyframe "home" or the only one, or on the ground
@@ -70,6 +71,10 @@ class RobotTaskCfg(Config):
         pose_weights: dict[str, float] = {"": 1.0}  # table a joint: weight in `pose` [-]
         base_height_target: float = 0.0  # of `base_height`: of the root above the ground under it [m]
         hip_joints: list[str] = []  # of `hip_pos`: joints' names, patterns, or parts of names
+        mirror_joints: list[list[str]] = []  # of `joint_mirror`: pairs of joints, likewise: [["FR_", "RL_"], ["FL_", "RR_"]]
+        deviation_weights: dict[str, float] = {"": 1.0}  # table a joint: weight in `joint_deviation` [-]
+        soft_torque_limit: float = 0.9  # share of the servo's force limit, of `torque_limits` [L: Cassie; L 1.0, which none exceeds]
+        soft_dof_vel_limit: float = 0.9  # share of asset.joint_speed_limits, of `dof_vel_limits` [L: Cassie; L 1.0]
         torques_as: Literal["norms", "squares"] = "norms"  # `torques` is the 2-norm plus the 1-norm [P], or the sum of squares [L]
 
         class scales:

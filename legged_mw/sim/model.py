@@ -9,7 +9,7 @@ something in the file, and what a choice changes is recorded in ``RobotModel.ove
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -21,6 +21,8 @@ from legged_mw.sim.ground import GROUND, Ground, add_ground, replace_level_piece
 from legged_mw.sim.joints import Posed, pose_joints, set_machine
 from legged_mw.sim.names import Names, name_geoms
 from legged_mw.sim.rigid import fuse_fixed, sensed_site
+from legged_mw.sim.self_contact import leave_out_neighbours
+from legged_mw.sim.sensors import add_more_sensors, add_sensors, sensor_spans
 from legged_mw.sim.shapes import add_sites
 from legged_mw.sim.tables import per_joint as per_joint
 from legged_mw.sim.terrain import Terrain
@@ -49,8 +51,8 @@ class RobotModel:
     physics: mujoco.MjModel  # what is stepped: no visual geoms
     root: str  # name of the body that carries the free joint
     joint_names: tuple[str, ...]  # scalar joints, in order of qpos[7:], qvel[6:] and ctrl
-    sensors: dict[str, slice]  # "contact", "linvel", "accelerometer" -> span of sensordata
-    spec: mujoco.MjSpec  # the same with visual geoms: to copy, never to change
+    sensors: dict[str, slice]  # "contact", "linvel", "accelerometer", and what more was asked for -> span of sensordata
+    spec: mujoco.MjSpec  # the same with visual geoms, without ``more_sensors``: to copy, never to change
     names: Names  # of geoms and bodies, as a caller may ask for them
     contact_geoms: tuple[str, ...] = ()  # in order of the span "contact"
     site_geoms: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of each site that was asked for with geoms
@@ -108,6 +110,7 @@ def build_model(
     tables: Mapping[str, Mapping[str, float]] = {},  # what -> a table, as for per_joint: for ``RobotModel.tables``
     held_joints: Sequence[str] = (),  # names or patterns: welded at the pose
     partial: Mapping[str, Mapping[str, float]] | None = None,  # of PARTIAL, as for some_joints: what the caller knows better than the file
+    more_sensors: Collection[str] = (),  # names of sensors.py: what else is sensed
 ) -> RobotModel:
     """Compile the MJCF or URDF at ``file`` for stepping."""
     robot = read_robot(file)
@@ -120,10 +123,13 @@ def build_model(
         _set_options(spec, solver, notes)
         add_ground(spec, ground, robot.where, notes)
         _set_collisions(spec, names.find(colliders, "`colliders`", colliding=True), self_collisions, notes)
+        if self_collisions:
+            leave_out_neighbours(spec, posed.joints, posed.angles, notes)
         speeds = set_machine(robot, partial or {}, posed)
         made = {name: names.find(geoms, f"`sites`: '{name}'") for name, geoms in (sites or {}).items()}
         add_sites(spec, made, posed.angles, robot.where, notes)
-        return _compile(robot, posed, names, ground, made, names.find(contact_geoms, "`contact_geoms`"), velocity_sites, imu, speeds)
+        touching = names.find(contact_geoms, "`contact_geoms`")
+        return _compile(robot, posed, names, ground, made, touching, velocity_sites, imu, speeds, more_sensors)
 
 
 def _compile(
@@ -136,16 +142,18 @@ def _compile(
     velocity_sites: Sequence[str],
     imu: str,
     speeds: tuple[float, ...],
+    more_sensors: Collection[str],
 ) -> RobotModel:
     """Add the sensors, and compile what is stepped."""
-    _add_sensors(robot.spec, touching, velocity_sites, imu, robot.where)
+    add_sensors(robot.spec, touching, velocity_sites, imu, robot.where)
     whole = robot.spec.copy()
+    add_more_sensors(robot.spec, robot.root, touching, more_sensors)
     physics = _compile_bare(robot.spec, ground, robot.notes)
     return RobotModel(
         physics=physics,
         root=robot.root,
         joint_names=tuple(posed.joints),
-        sensors=_sensor_spans(physics, len(touching), len(velocity_sites), bool(imu)),
+        sensors=sensor_spans(physics, len(touching), len(velocity_sites), bool(imu), more_sensors),
         spec=whole,
         names=names,
         contact_geoms=touching,
@@ -219,33 +227,3 @@ def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisio
             off.append(geom.name)
     if off:
         notes.append(f"collisions off: {', '.join(off)}")
-
-
-def _add_sensors(spec: mujoco.MjSpec, contact_geoms: Sequence[str], velocity_sites: Sequence[str], imu: str, where: str) -> None:
-    """In an order that makes each group one span of sensordata."""
-    sites = [s.name for s in spec.sites if s.name]
-    for name in contact_geoms:
-        spec.add_sensor(
-            name=f"contact/{name}",
-            type=mujoco.mjtSensor.mjSENS_CONTACT,
-            objtype=mujoco.mjtObj.mjOBJ_GEOM,
-            objname=name,
-            reftype=mujoco.mjtObj.mjOBJ_GEOM,
-            refname=GROUND,
-            intprm=[1 << mujoco.mjtConDataField.mjCONDATA_FOUND.value, 0, 1],  # data, no reduction, one slot
-        )
-    for name in [*velocity_sites, *([imu] if imu else [])]:
-        if name not in sites:
-            raise ModelError(unknown("site", name, sites, where))
-    site = mujoco.mjtObj.mjOBJ_SITE
-    for name in velocity_sites:
-        spec.add_sensor(name=f"linvel/{name}", type=mujoco.mjtSensor.mjSENS_FRAMELINVEL, objtype=site, objname=name)
-    if imu:
-        spec.add_sensor(name=f"accelerometer/{imu}", type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=site, objname=imu)
-
-
-def _sensor_spans(mj: mujoco.MjModel, contacts: int, velocities: int, accelerometer: bool) -> dict[str, slice]:
-    """The sensors that were added last lie last."""
-    sizes = {"contact": contacts, "linvel": 3 * velocities, "accelerometer": 3 if accelerometer else 0}
-    ends = mj.nsensordata - sum(sizes.values()) + np.cumsum(list(sizes.values()))
-    return {name: slice(int(end) - size, int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
