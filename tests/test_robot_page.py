@@ -269,7 +269,7 @@ def test_a_new_task_checks_and_trains(
     assert "guessed: feet: " in out and "python train.py --task " in out
     robot, config = tmp_path / "made" / "mine.xml", tmp_path / "made" / "mine_flat.py"
     text = config.read_text()
-    assert len(text.splitlines()) <= 60 and text.count("LOOK") >= 4
+    assert len(text.splitlines()) <= 80 and text.count("LOOK") >= 4
     assert str(ROOT) not in robot.read_text() + text and str(tmp_path) not in robot.read_text() + text
     moved = tmp_path / "moved"
     (tmp_path / "made").rename(moved)
@@ -308,6 +308,10 @@ def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
     text = config_text(found, GO1, "my_go")
     assert "class MyGoFlatCfg(LeggedRobotCfg):" in text and 'foot_names = ["FR", "FL", "RR", "RL"]  # LOOK: guessed' in text
     assert "(quadruped, 12 joints; " in text and "effort" not in text
+    biped = config_text(draft(TOY), TOY, "toy", mirrors=True)
+    assert "class ToyFlatCfg(BipedCfg):" in biped and "class ToyFlatCfgPPO(BipedCfgPPO):" in biped and "use_data" not in biped
+    assert 'pose_weights = {"": 0.02, "ankle": 0.05}' in biped and "min_feet_distance = 0.12" in biped
+    assert "use_data_augmentation = False  # left and right are not alike" in config_text(draft(TOY), TOY, "toy")
     free = tmp_path / "free.xml"
     free.write_text(GO1.read_text().replace("actuatorfrcrange", "user"))
     assert 'effort = {"": 30.0}  # [N m] LOOK: the file has no force limit for all joints' in config_text(draft(free), free, "free")
