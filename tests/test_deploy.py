@@ -136,7 +136,7 @@ WRONG = [
         put("network.memory", {"input": "state_in", "output": "state_out", "shape": [1, 8]}),
         "its input is 'obs' ['batch', 48], the contract's is 'obs' [1, 48], 'state_in' [1, 1, 8] (the rows",
     ),
-    (without("format"), "policy.yaml: 'format' is missing; it must be 2"),
+    (without("format"), "policy.yaml: 'format' is missing; it must be 2 or 3, which"),
     (without("action.scale"), "policy.yaml: action: 'scale' is missing; it must be a number, or 12 numbers, one a joint"),
     (put("action.scale", [0.5] * 11), "it must be a number, or 12 numbers, one a joint"),
     (put("action.origin", "pose"), "policy.yaml: action: 'origin' is 'pose'; it must be one of default, joints, targets"),

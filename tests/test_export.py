@@ -27,6 +27,7 @@ from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl import export as exporting
 from legged_mw.rl.classes import network_section
+from legged_mw.rl.estimator import actor_settings
 from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, export
 from legged_mw.rl.export_replay import overridden, own_ends
 from legged_mw.rl.export_scene import differences, standalone
@@ -384,7 +385,7 @@ def untrained(path: Path, folder: Path, settings: dict[str, Any] | None = None) 
     torch.manual_seed(0)
     env = task.env_class(task.cfg, "cpu")
     sections = task.train.to_dict()
-    actor_class, settings = resolve_class(network_section(sections["actor"]))
+    actor_class, settings = resolve_class(network_section(actor_settings(sections, env)))
     actor = actor_class(env.get_observations(), sections["obs_groups"], "actor", env.num_actions, **settings)
     torch.save({"actor_state_dict": actor.state_dict()}, folder / "model.pt")
     return task, folder / "model.pt"

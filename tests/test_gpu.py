@@ -20,6 +20,7 @@ from legged_mw.eval.training import TrainingExam
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.recurrent import memory_of
 from legged_mw.rl.runner import make_runner
+from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.task import load_task
 
 pytestmark = pytest.mark.gpu
@@ -227,6 +228,21 @@ def test_recorded_update_is_rsl_rls_own(settings: dict) -> None:
     assert ours._update_graph.recorded
 
 
+@pytest.mark.parametrize("settings", [{}, VARIANTS["symmetric samples"]], ids=["plain", "mirrored"])
+def test_recorded_estimator_learns_as_step_by_step(settings: dict) -> None:
+    """Six updates, the last three replayed, beside a learner that records none, from equal states and experience."""
+    eager, ours = (make(GraphedPPO, DEVICE, estimator={}, **settings) for _ in range(2))
+    eager._update_graph = StepGraph(eager._update, DEVICE, eager=True)
+    for seed in range(6):
+        collect(eager, DEVICE, seed=seed)
+        share_experience(eager, ours)
+        take_over(ours, eager)
+        expected, got = update(eager), update(ours)
+        assert difference(parameters(eager), parameters(ours)) < 1e-4
+        assert got == pytest.approx(expected, rel=1e-3, abs=1e-5) and got["estimate"] > 0.0
+    assert ours._update_graph.recorded and not eager._update_graph.recorded
+
+
 @pytest.mark.parametrize("memory", NETWORKS.values(), ids=NETWORKS.keys())
 def test_recorded_recurrent_update_is_rsl_rls_own(memory: dict, monkeypatch: pytest.MonkeyPatch) -> None:
     """As above; cuDNN multiplies in float32, and worlds come in their order."""
@@ -290,11 +306,14 @@ def test_checkpoints_go_both_ways_on_a_gpu(tmp_path: Path) -> None:
     assert difference(parameters(stock), parameters(replaying)) < 1e-4
 
 
-@pytest.mark.parametrize("network", ["MLPModel", "RNNModel"])
+@pytest.mark.parametrize("network", ["MLPModel", "RNNModel", "with an estimator"])
 def test_iteration_never_waits_for_the_host(network: str) -> None:
     """Rollout, returns, update and the report, once everything is recorded."""
     train = small_learner()
-    train.actor.class_name = train.critic.class_name = network
+    if network == "with an estimator":
+        train.actor.estimator.targets = ["base_lin_vel", "foot_contact"]
+    else:
+        train.actor.class_name = train.critic.class_name = network
     runner = make_runner(make_env(eager=False), train, None, DEVICE)
     runner.learn(5)
     obs = runner.env.get_observations()

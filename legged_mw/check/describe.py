@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.estimator import find_targets
 from legged_mw.sim.room import count_room
 from legged_mw.utils.task import LoadedTask
 
@@ -17,6 +18,8 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
             line = f"  {start:>4}  {row.name:<20} {row.size:>3}" + (f"   noise +-{noise:g}" if noise else "")
             line += f"   scale {row.scale}" if row.scale != 1.0 else ""
             lines.append(line + (f"   {row.history} frames" if row.history > 1 else ""))
+    if targets := find_targets(task.train.to_dict(), env):
+        lines.append(f"the actor estimates {', '.join(f'{target.name} ({len(target.scale)})' for target, _ in targets)}")
     for command in env.command_table:
         lines.append(f"command {command.label:<14} [{command.low:g}, {command.high:g}] {command.unit}")
     lines.append(f"actions ({env.num_actions}), clipped at +-{task.cfg.normalization.clip_actions:g}, {1 / env.dt:g} Hz")

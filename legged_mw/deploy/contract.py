@@ -14,12 +14,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from legged_mw.deploy.estimate import ESTIMATE, Estimated, read_estimated
 from legged_mw.deploy.memory import MEMORY, Memory, read_memory
 from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import UserError, unknown
 
-FORMATS = (2, 3)  # 3: the network has a memory. A file has the lowest that suffices, so that old readers read what they can
+FORMATS = (2, 3)  # 3: the network has a memory or an estimate. A file has the lowest that suffices: old readers read what they can
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"
 TERRAIN_FILE = "terrain.xml"  # the same robot among steps and blocks; only of policies that were trained on such ground
 
@@ -148,6 +149,7 @@ class Contract:
     gait: Gait | None = None  # likewise
     exam: Mapping[str, Any] | None = None  # the task's section `exam`, if the walking exam grades it
     memory: Memory | None = None  # of a recurrent network
+    estimate: tuple[Estimated, ...] = ()  # the network's second output, row by row
 
     @property
     def size(self) -> int:
@@ -163,7 +165,7 @@ class Contract:
         ends = {name: list(value) if isinstance(value, tuple) else value for name, value in self.ends._asdict().items() if value}
         network = {"file": NETWORK_FILE, "sha256": self.digest, "input": self.input, "output": self.output}
         return {
-            "format": FORMATS[1] if self.memory else FORMATS[0],
+            "format": FORMATS[1] if self.memory or self.estimate else FORMATS[0],
             "task": self.task,
             "network": network | ({MEMORY: self.memory.to_dict()} if self.memory else {}),
             "period": self.period,
@@ -181,13 +183,13 @@ class Contract:
             **({SCAN: {"x": list(self.scan.x), "y": list(self.scan.y), "standing": self.scan.standing}} if self.scan else {}),
             **({"gait": {**self.gait._asdict(), "offsets": list(self.gait.offsets)}} if self.gait else {}),
             **({"exam": dict(self.exam)} if self.exam is not None else {}),
+            **({ESTIMATE: [row._asdict() for row in self.estimate]} if self.estimate else {}),
         }
 
 
 def _row_to_dict(row: ContractRow) -> dict[str, Any]:
     entry = {name: getattr(row, name) for name in ("name", "size", "unit", "frame", "noise", "measured")}
-    entry |= {"scale": _short(row.scale)}
-    entry |= {"sensors": list(row.sensors)} if row.sensors else {}
+    entry |= {"scale": _short(row.scale), **({"sensors": list(row.sensors)} if row.sensors else {})}
     return entry | ({"history": row.history} if row.history > 1 else {})
 
 
@@ -279,8 +281,7 @@ def read_contract(folder: Path) -> Contract:
 
 
 def _read(top: _Reader) -> Contract:
-    known = f"{' or '.join(map(str, FORMATS))}, which this version reads; export the policy again"
-    top.take("format", known, lambda v: v in FORMATS)
+    top.take("format", f"{' or '.join(map(str, FORMATS))}, which this version reads; export the policy again", lambda v: v in FORMATS)
     network, action, robot, physics, measured = (top.section(name) for name in ("network", "action", "robot", "physics", "sensors"))
     joints, feet = top.texts("joints"), robot.section("feet")
     top.take("joints", "names, each once", lambda names: len(set(names)) == len(names))
@@ -311,6 +312,7 @@ def _read(top: _Reader) -> Contract:
         gait=_read_gait(top),
         exam=top.section("exam").values if "exam" in top.values else None,
         memory=read_memory(network.section(MEMORY)) if MEMORY in network.values else None,
+        estimate=read_estimated(top.sections(ESTIMATE)) if ESTIMATE in top.values else (),
     )
 
 

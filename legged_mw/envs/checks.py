@@ -94,6 +94,8 @@ LEARNER: dict[str, Rule] = {
     **dict.fromkeys(("cpu.envs_per_core", "cpu.num_steps_per_env", "cpu.max_iterations", "cpu.rnn_hidden_dim"), POSITIVE),
     **dict.fromkeys(("cpu.num_learning_epochs", "cpu.num_mini_batches", "cpu.desired_kl"), POSITIVE),
     **dict.fromkeys(("symmetry.mirror_loss_coeff", "anneal.entropy_coef", "anneal.desired_kl", "cpu.update_threads"), NOT_NEGATIVE),
+    "actor.estimator.learning_rate": POSITIVE,
+    "actor.estimator.hidden_dims": ("whole numbers from 1, at least one", lambda v: len(v) > 0 and min(v) >= 1),
     "runner.exam_interval": NOT_NEGATIVE,
     "runner.run_name": ("part of a folder's name, without / or \\", lambda v: "/" not in v and "\\" not in v),
 }

@@ -76,6 +76,7 @@ class DomainRand:
         order = [name for name in kinds if name not in again] + again
         joints = len(robot.joint_names)
         count = {"world": 1, "axis": 3, "joint": joints, "link": 1 + joints}
+        self.widths = {name: count[kind.per] for name, kind in KINDS.items()}  # of each draw, drawn here or not
         widths = [count[kinds[name][0].per] for name in order]
         self._draws = torch.zeros(sim.num_envs, sum(widths), device=sim.device)
         self.values: dict[str, Tensor] = dict(zip(order, self._draws.split(widths, dim=1), strict=True)) if order else {}

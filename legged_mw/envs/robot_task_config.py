@@ -200,6 +200,14 @@ class RobotTaskCfgPPO(Config):
             std_type: Literal["scalar", "log"] = "scalar"  # [R]
             std_range: list[float] = [1e-6, 1e6]  # [R]
 
+        class estimator:
+            """A network from what the actor reads to rows that it does not; the actor reads its estimate, too (rl/estimator.py)."""
+
+            targets: list[str] = []  # rows of the critic's groups: ["base_lin_vel", "foot_contact"]; empty: no estimator
+            hidden_dims: list[int] = [256, 128]  # [genesis_lr's explicit estimator of a Go2]
+            activation: str = "elu"
+            learning_rate: float = 1e-3  # fixed [HIMLoco]
+
     class critic:
         class_name: str = "MLPModel"
         hidden_dims: list[int] = [512, 256, 128]  # [P]

@@ -23,6 +23,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from legged_mw.eval import estimate_panel
 from legged_mw.eval.peers import best_of
 from legged_mw.eval.rules import AXES, ExamRules
 
@@ -80,11 +81,12 @@ def sections(columns: Columns, rules: ExamRules) -> list[Section]:
     strides = [Panel(partial(_gait, columns, i), height=1.75 + 0.25 * len(columns)) for i in GAITS]
     energy = [Panel(partial(_against_speed, columns, rules, key)) for key in ("power", "cost_of_transport")]
     terms = len(columns[0][1]["reward"])
-    rough = _crossing_maps(columns)
+    rough, believed = _crossing_maps(columns), _estimates(columns)
     return [
         *([Section("crossing", "Rough ground", rough, across=len(rough))] if rough else []),
         Section("tracking", "Following the command", _heat_maps(columns, rules)),
         Section("steps", "Steps of the command", responses),
+        *([Section("estimate", "What it believes of its velocity", believed, across=1)] if believed else []),
         Section("gait", "Gait", strides),
         Section("joints", "Joints against their limits", _joint_panels(columns)),
         Section("pushes", "Pushes", pushes),
@@ -252,6 +254,16 @@ def _response(columns: Columns, k: int, ax: Axes) -> None:
     ax.margins(x=0)
     if k == 0:
         ax.legend(loc="lower right", handlelength=1.6)
+
+
+def _estimates(columns: Columns) -> list[Panel]:
+    """A panel an axis of each policy that estimates its velocity."""
+    panels = []
+    for i, (name, figures) in enumerate(columns):
+        for k in range(2 if "estimate" in figures else 0):
+            draw = partial(estimate_panel.draw, figures["estimate"], k, (INK, PAIR[i], FAINT), _of(name, columns))
+            panels.append(Panel(draw, estimate_panel.WIDTH, estimate_panel.HEIGHT))
+    return panels
 
 
 # ---- gait

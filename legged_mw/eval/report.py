@@ -19,7 +19,7 @@ from legged_mw.eval.rollout import Policy, Record, Signal, roll_out
 from legged_mw.eval.trials import NAMES, STEPS_AT, Plan, make_plan
 from legged_mw.utils.task import LoadedTask
 
-GAIT_SECONDS = 2.0  # that the gait diagram shows
+GAIT_SECONDS = ESTIMATE_SECONDS = 2.0  # of each command, that the gait diagram and the estimate's picture show
 BEFORE_STEP = 0.5  # [s] that a step response shows before the step
 
 SIGNALS: dict[str, Signal] = {
@@ -83,6 +83,7 @@ def gather(env: LeggedRobot, asked: rules.ExamRules, plan: Plan, record: Record)
         },
         "steps": {name: figures.responses(parts[f"step_{name}"], i, first) for i, name in enumerate(NAMES)},
         "gait": figures.gaits(held, settled, asked.commands(), GAIT_SECONDS),
+        **({"estimate": figures.estimates(held, asked.commands(), ESTIMATE_SECONDS)} if "estimate" in held.signals else {}),
         "joints": figures.joints(held, settled, joint_limits(env)),
         "pushes": {
             "speeds": list(asked.push_speeds),

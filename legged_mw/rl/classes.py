@@ -47,9 +47,9 @@ def check_classes(cfg: Config) -> None:
 
 
 def network_section(section: dict[str, Any]) -> dict[str, Any]:
-    """The section of a network without the fields of a memory, if its class has none. Imports the class: check it first."""
+    """The section of a network without the fields of a memory or an estimator, if its class has none. Imports the class: check it first."""
     taken = inspect.signature(resolve_class(section)[0]).parameters
-    return {name: value for name, value in section.items() if name in taken or not name.startswith("rnn_")}
+    return {name: value for name, value in section.items() if name in taken or not name.startswith(("rnn_", "estimator"))}
 
 
 def _check_distribution(section: dict[str, Any] | None, path: str) -> None:

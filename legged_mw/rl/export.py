@@ -36,12 +36,25 @@ from legged_mw.deploy.contract import (
     HeightScan,
     digest,
 )
+from legged_mw.deploy.estimate import Estimated
 from legged_mw.deploy.memory import Memory
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.estimator import EstimatingModel, find_targets
 from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
 from legged_mw.rl.export_scene import among_steps, standalone
-from legged_mw.rl.network import INPUT, MEMORY_INPUT, MEMORY_OUTPUT, OUTPUT, ExportedPolicy, halve, round_weights, run_onnx, save_onnx
+from legged_mw.rl.network import (
+    ESTIMATE,
+    INPUT,
+    MEMORY_INPUT,
+    MEMORY_OUTPUT,
+    OUTPUT,
+    ExportedPolicy,
+    halve,
+    round_weights,
+    run_onnx,
+    save_onnx,
+)
 from legged_mw.rl.policies import load_policy
 from legged_mw.rl.recurrent import states_of
 from legged_mw.rl.runs import CONFIG_FILE
@@ -120,9 +133,10 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
         remembered = np.concatenate([step.memory for step in steps]) if memory else None
         acted = run_onnx(new / NETWORK_FILE, observations, memory=remembered)
         gap = _compare(acted, np.clip(actions, -clip, clip))
+        if isinstance(policy, EstimatingModel):
+            _compare(run_onnx(new / NETWORK_FILE, observations, ESTIMATE), _run(policy, clip, observations)[1], does="estimates")
         if half:
-            outputs = ExportedPolicy(exact, clip)(*(torch.from_numpy(x) for x in (observations, remembered) if x is not None))
-            gap = _gap(acted, (outputs[0] if memory else outputs).detach().numpy())
+            gap = _gap(acted, _run(exact, clip, observations, remembered)[0])
         replay(env, contract, steps, new)
         no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
         files = (*FILES, *([TERRAIN_FILE] if (new / TERRAIN_FILE).exists() else []))
@@ -151,17 +165,24 @@ def _write_network(policy: MLPModel, clip: float, path: Path, half: bool) -> Non
         halve(policy, path)
 
 
+def _run(policy: MLPModel, clip: float, *inputs: np.ndarray | None) -> list[np.ndarray]:
+    """What an exported network should give: actions, and its memory or its estimate if there is one."""
+    with torch.inference_mode():
+        outputs = ExportedPolicy(policy, clip)(*(torch.from_numpy(values) for values in inputs if values is not None))
+    return [output.numpy() for output in (outputs if isinstance(outputs, tuple) else (outputs,))]
+
+
 def _gap(got: np.ndarray, wanted: np.ndarray) -> float:
     """The largest difference, relative above 1."""
     return float((np.abs(got - wanted) / np.maximum(1.0, np.abs(wanted))).max()) if got.shape == wanted.shape else float("inf")
 
 
-def _compare(got: np.ndarray, wanted: np.ndarray) -> float:
-    """The largest difference; refuses a network that acts otherwise than the policy."""
+def _compare(got: np.ndarray, wanted: np.ndarray, does: str = "acts") -> float:
+    """The largest difference; refuses a network that acts or estimates otherwise than the policy."""
     gap = _gap(got, wanted)
     if not gap <= TOLERANCE:  # NaN too
         raise ExportError(
-            f"{NETWORK_FILE} acts otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
+            f"{NETWORK_FILE} {does} otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
             f"(at most {TOLERANCE:g} is allowed); nothing was written"
         )
     return gap
@@ -203,6 +224,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
     scene = standalone(robot, robot.imu, qpos=start, ctrl=robot.pose, camera=cfg.viewer.camera, source=source)
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
     ends = _ends(env)
+    action = Action(cfg.control.action_origin, np.array(robot.tables["control.action_scale"]), cfg.normalization.clip_actions)
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))
     ground, scanned = cfg.terrain, any(row.measured == SCAN for row in rows)
     feet = {foot: tuple(f"contact/{geom}" for geom in geoms) for foot, geoms in getattr(env, "foot_geoms", {}).items()}
@@ -210,11 +232,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         task=task.name,
         joints=robot.joint_names,
         default_pose=np.array(robot.pose),
-        action=Action(
-            cfg.control.action_origin,
-            np.array(robot.tables["control.action_scale"]),
-            cfg.normalization.clip_actions,
-        ),
+        action=action,
         stiffness=np.array(robot.tables["`stiffness`"]),
         damping=np.array(robot.tables["`damping`"]),
         period=round(env.dt, 9),
@@ -234,6 +252,16 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         output=OUTPUT,
         digest=digest(folder / NETWORK_FILE),
         exam=cfg.to_dict().get("exam") if task.exam == "walking" else None,
+        estimate=_estimated(env, task),
+    )
+
+
+def _estimated(env: RobotTask, task: LoadedTask) -> tuple[Estimated, ...]:
+    """The rows of the network's second output."""
+    rows = [(row, ROWS.get(row.name)) for _, row in find_targets(task.train.to_dict(), env, learns=False)]
+    return tuple(
+        Estimated(row.name, row.value.shape[1], row.unit or (known.unit if known else ""), row.frame or (known.frame if known else ""))
+        for row, known in rows
     )
 
 

@@ -13,8 +13,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw import ROOT
-from legged_mw.envs.base_task import BaseTask
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import check_classes, network_section
+from legged_mw.rl.estimator import actor_settings
 from legged_mw.rl.network import read_parameters
 from legged_mw.rl.runs import CONFIG_FILE, check_fit, experiment_folder, find_checkpoint, find_run, load_tensors, runs
 from legged_mw.utils.config import Config, ConfigError, load_yaml
@@ -88,7 +89,7 @@ def introduce(source: Source, changes: dict[str, tuple[Any, Any]]) -> None:
         print(f"  {path}: {before} -> {now}")
 
 
-def load_policy(path: Path, env: BaseTask, cfg: Config, device: str) -> MLPModel:
+def load_policy(path: Path, env: RobotTask, cfg: Config, device: str) -> MLPModel:
     """The actor in a checkpoint or a ``policy.onnx``, ready to act on ``env``'s observations: ``policy(obs)`` is its mean action (N, A).
 
     ``cfg`` is the learner's config. Raises ConfigError if the file cannot be read, its networks are not those of the config,
@@ -96,7 +97,7 @@ def load_policy(path: Path, env: BaseTask, cfg: Config, device: str) -> MLPModel
     """
     check_classes(cfg)
     sections: dict[str, Any] = copy.deepcopy(cfg.to_dict())
-    actor_class, actor_cfg = resolve_class(network_section(sections["actor"]))
+    actor_class, actor_cfg = resolve_class(network_section(actor_settings(sections, env, learns=False)))
     actor = actor_class(env.get_observations(), sections["obs_groups"], "actor", env.num_actions, **actor_cfg).to(device)
     saved = read_parameters(path, actor) if path.suffix == ".onnx" else load_tensors(path, device)["actor_state_dict"]
     check_fit(saved, actor.state_dict(), path, "actor")

@@ -23,6 +23,7 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.envs.wording import config_words
 from legged_mw.rl.classes import check_classes, network_section
+from legged_mw.rl.estimator import FIELD, EstimatingModel, actor_settings
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import this_rank
 from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
@@ -290,9 +291,12 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
     torch.set_float32_matmul_precision(cfg.runner.matmul_precision)
     check_mirror(env, cfg)
     try:
-        return Runner(env, rsl_rl_config(cfg), str(log_dir) if log_dir else None, device)
+        runner = Runner(env, rsl_rl_config(cfg, env), str(log_dir) if log_dir else None, device)
     except ValueError as error:  # a class, activation, optimizer or observation group that does not exist
         raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None
+    if isinstance(runner.alg.get_policy(), EstimatingModel) and not getattr(runner.alg, "graphed", False):
+        raise ConfigError(f"{FIELD}: only the recorded update of GraphedPPO trains an estimator, and rsl-rl's own is used here")
+    return runner
 
 
 def check_mirror(env: RobotTask, cfg: RobotTaskCfgPPO) -> None:
@@ -301,10 +305,14 @@ def check_mirror(env: RobotTask, cfg: RobotTaskCfgPPO) -> None:
         _ = env.mirror
 
 
-def rsl_rl_config(cfg: RobotTaskCfgPPO) -> dict[str, Any]:
-    """The learner's config as rsl-rl's flat dict; a deep copy, since rsl-rl writes into it. Raises ConfigError."""
+def rsl_rl_config(cfg: RobotTaskCfgPPO, env: RobotTask | None = None) -> dict[str, Any]:
+    """The learner's config as rsl-rl's flat dict; a deep copy, since rsl-rl writes into it. Raises ConfigError.
+
+    ``env`` has the rows that ``actor.estimator`` names; without one there is no estimator.
+    """
     check_classes(cfg)
     sections = copy.deepcopy(cfg.to_dict())
+    sections["actor"] = actor_settings(sections, env)
     runner = sections.pop("runner")
     logger = runner["logger"]
     if logger == "wandb":
