@@ -24,6 +24,7 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from legged_mw.rl.adam import make_recordable, plain_state
 from legged_mw.rl.estimator import EstimatingModel, trained_parts
 from legged_mw.rl.layers import run_mlp, update_normalizer
 from legged_mw.rl.recurrent import Memory, Sequence, check_recurrent, unroll
@@ -51,6 +52,7 @@ class GraphedPPO(PPO):
     On a CPU nothing is recorded.
     """
 
+    critic_only = False  # of a warm start: the actor stays as it is
     _plain_rate: float  # the learning rate where nothing is recorded
     _rate: Tensor | None = None  # else: () float64, as precise as rsl-rl's Python number
 
@@ -72,7 +74,8 @@ class GraphedPPO(PPO):
         self._rates = [self._adam_rate, *own_rates]
         learners = [self._parts[0] + self._parts[1], *self._parts[2:]]
         groups = [{"params": part, "lr": rate} for part, rate in zip(learners, self._rates, strict=True)]
-        self.optimizer = type(self.optimizer)(groups, **self._adam_flags())
+        self.optimizer = type(self.optimizer)(groups)
+        make_recordable(self.optimizer, self._rates, str(self.device))
         self._begin()
 
     def _why_stock(self) -> str | None:
@@ -89,9 +92,6 @@ class GraphedPPO(PPO):
         if type(self.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
             return f"the optimizer is {type(self.optimizer).__name__}"
         return None
-
-    def _adam_flags(self) -> dict[str, bool]:
-        return {"fused": True, "capturable": str(self.device).startswith("cuda")}
 
     def _begin(self) -> None:
         """Fixed tensors, and graphs that are not recorded yet."""
@@ -120,6 +120,16 @@ class GraphedPPO(PPO):
         """Drop what is recorded: NCCL does not close a connection that a CUDA graph still names. The next calls record again."""
         if self.graphed:
             self._begin()
+
+    def learn_critic_only(self, on: bool) -> None:
+        """From the next update on the critic learns and the actor stays as it is, or both learn again.
+
+        An adaptive learning rate then begins at its lowest, and is within an update where it should be: nothing is unlearned.
+        """
+        if on != self.critic_only:
+            self.critic_only, self._update_graph = on, StepGraph(self._update, str(self.device))
+            if not on and self.schedule == "adaptive":
+                self.learning_rate = _MIN_RATE
 
     @contextmanager
     def _beside(self) -> Iterator[None]:
@@ -255,10 +265,13 @@ class GraphedPPO(PPO):
             value_loss = self._value_loss(batch, _forward(self.critic, critic_input))
             (self.value_loss_coef * value_loss).backward()
         loss, parts, kl = self._policy_loss(batch, _forward(self.actor, actor_input))
-        loss.backward()
         if targets is not None and isinstance(self.actor, EstimatingModel) and isinstance(actor_input, Tensor):
             parts.append(nn.functional.mse_loss(run_mlp(self.actor.estimator, actor_input), targets))
-            parts[-1].backward()
+            loss = loss + parts[-1]  # of other parameters
+        if self.critic_only:
+            kl = None  # of an actor that stands still it is rounding noise
+        else:
+            loss.backward()
         self._meet()
         if self.is_multi_gpu:
             self._average_over_ranks(kl)
@@ -321,11 +334,11 @@ class GraphedPPO(PPO):
 
     def _update_normalizers(self) -> None:
         obs = self.storage.observations.flatten(0, 1)
-        for model in (self.actor, self.critic):
+        for model in (self.critic,) if self.critic_only else (self.actor, self.critic):
             if isinstance(model.obs_normalizer, EmpiricalNormalization):
                 inputs = torch.cat([obs[group] for group in model.obs_groups], dim=-1)
                 update_normalizer(model.obs_normalizer, inputs, self.gpu_world_size)
-        if isinstance(self.actor, EstimatingModel):
+        if isinstance(self.actor, EstimatingModel) and not self.critic_only:
             update_normalizer(self.actor.target_normalizer, self.actor.truth(obs), self.gpu_world_size)
 
     def _symmetry_loss(self, batch: Any) -> Tensor:
@@ -362,22 +375,15 @@ class GraphedPPO(PPO):
         """The networks' and the optimizer's state, in the form that rsl-rl's own PPO writes."""
         content = super().save()
         if self.graphed:
-            state, groups = content["optimizer_state_dict"]["state"], content["optimizer_state_dict"]["param_groups"]
-            rates, plain = [self.learning_rate, *map(float, self._rates[1:])], {"fused": None, "capturable": False}
-            content["optimizer_state_dict"] = {
-                "state": {i: {**memory, "step": memory["step"].cpu()} for i, memory in state.items()},
-                "param_groups": [{**group, "lr": rate, **plain} for group, rate in zip(groups, rates, strict=True)],
-            }
+            rates = [self.learning_rate, *map(float, self._rates[1:])]
+            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], rates)
         return content
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Take over a checkpoint of this class or of rsl-rl's own PPO."""
         iteration = super().load(loaded_dict, load_cfg, strict)
         if self.graphed:
-            for group, rate in zip(self.optimizer.param_groups, self._rates, strict=True):  # Adam takes these from the file
-                group.update(lr=rate, **self._adam_flags())
-            for memory in self.optimizer.state.values():
-                memory["step"] = memory["step"].to(self.device, torch.float32)
+            make_recordable(self.optimizer, self._rates, str(self.device))
             self._begin()  # Adam's memory has moved
         return iteration
 
