@@ -69,6 +69,7 @@ CONFIGS_MAY = ["legged_mw.envs", "legged_mw.utils", "configs", "math", "__future
 DEPLOY_MAY = [
     *("numpy", "mujoco", "onnxruntime", "yaml", "legged_mw.ROOT", "legged_mw.deploy", "legged_mw.view", "legged_mw.eval.rules"),
     *("legged_mw.utils.cli", "legged_mw.utils.config", "legged_mw.utils.errors", "legged_mw.utils.machine", "legged_mw.utils.commands"),
+    "legged_mw.utils.motor_network",
     *sys.stdlib_module_names,
 ]
 

@@ -12,6 +12,7 @@ from learner import collect, difference, make, observations, parameters, share_e
 from mujoco_warp import DisableBit
 from rsl_rl.algorithms import PPO, Distillation
 from test_forces import SCALES, SETTINGS
+from test_motors import CURVE, Springs, mlp, save
 from test_ppo import VARIANTS, update
 from test_recurrent import IMAGES, NETWORKS, share_memory
 
@@ -123,6 +124,28 @@ def test_replay_equals_eager_over_100_steps(task: str, settings: dict[str, objec
     assert recorded._graph.recorded and not eager._graph.recorded
     assert any(done.any() for done in expected[3::5])
     for i, (a, b) in enumerate(zip(expected, got, strict=True)):
+        assert torch.equal(a, b), f"step {i // 5}, output {i % 5}: largest difference {(a.float() - b.float()).abs().max():g}"
+
+
+@pytest.mark.parametrize("law", ["servo", "dc_motor", "torque", "network", "own"])
+def test_motors_replay_as_they_run_eager(law: str, tmp_path: Path) -> None:
+    """Bit for bit, delayed by 0 to 30 ms, with drawn gains and curves, and episodes that end."""
+    net = save(mlp(torque_scale=20.0)[1], tmp_path)
+    drawn = {f"domain_rand.{name}": [0.8, 1.2] for name in ("stiffness", "damping", "strength", "stall_torque", "no_load_speed")}
+    fields: dict[str, object] = {**CURVE, **drawn, "domain_rand.enable": True, "domain_rand.delay_ms": [0.0, 30.0]}
+    fields |= {"control.actuator": "servo" if law == "own" else law, "control.network": net, "env.episode_length_s": 0.5}
+    fields |= {"control.action_scale": 5.0} if law == "torque" else {}
+    task = load_task("go1_flat")
+    for path, value in {"env.num_envs": 64, **fields}.items():
+        task.set(path, value)
+    outs = []
+    for eager in (True, False):
+        torch.manual_seed(3)
+        env = without_constraints((Springs if law == "own" else task.env_class)(task.cfg, DEVICE, eager=eager))
+        actions = torch.randn(60, 64, 12, generator=torch.Generator().manual_seed(0)).to(DEVICE)
+        outs.append(roll_out(env, actions))
+        assert env._graph.recorded != eager and env.actuators.law == law
+    for i, (a, b) in enumerate(zip(*outs, strict=True)):
         assert torch.equal(a, b), f"step {i // 5}, output {i % 5}: largest difference {(a.float() - b.float()).abs().max():g}"
 
 

@@ -133,7 +133,7 @@ SAID = {
         "option impratio: 100 -> 1",
         "option cone: elliptic -> pyramidal",
         "option disableflags: none -> eulerdamp",
-        "12 actuators replaced by position servos",
+        "12 actuators replaced",
     ],
     "g1_29dof_style": [
         "looks left out (no such file): pelvis.STL, torso_link.STL, head_link.STL",

@@ -32,10 +32,22 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
         env.robot.joint_names, env.default_dof_pos.tolist(), env.robot.joint_range, env.robot.effort_range, strict=True
     ):
         lines.append(f"  {name:<{width}} {default:>7.3f}  [{low:.3f}, {high:.3f}]  {limit:g}")
-    lines.append(_room(env))
+    lines += [_motors(env), _room(env)]
     lines.append(f"what was dropped, added or changed in {task.cfg.asset.file}")
     lines += [f"  {line}" for line in env.robot.overrides]
     return "\n".join(lines)
+
+
+def _motors(env: RobotTask) -> str:
+    """Their law, and the delays that a world may have."""
+    text = f"motors: {env.actuators.law}"
+    if "delay_ms" not in env.domain_rand.values:
+        return text
+    span, step = env.cfg.domain_rand.delay_ms, 1e3 * env.cfg.sim.dt
+    low, high = (env.domain_rand.rounded_delay(end) for end in span)
+    asked = ", ".join(f"{end:g}" for end in span)
+    rounded = f"domain_rand.delay_ms [{asked}] to the nearest simulation step, of {step:g} ms"
+    return f"{text}; what they are told takes {low:g} to {high:g} ms: {rounded}"
 
 
 def _room(env: RobotTask) -> str:

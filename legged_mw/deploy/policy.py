@@ -88,7 +88,7 @@ class Controller:
         return _side_by_side(self._look(measurement, commands))
 
     def act(self, measurement: Measurement, commands: Floats) -> NDArray[np.float64]:
-        """Joint targets (N, D) [rad] for the next period; ``commands`` (N, C) in the contract's order."""
+        """Joint targets (N, D) [rad], or torques [N m], for the next period; ``commands`` (N, C) in the contract's order."""
         action = self.contract.action
         self._frames = self._look(measurement, commands)
         if self.clock:
@@ -101,7 +101,7 @@ class Controller:
             actions, self.memory = self._network(seen, self.memory)
         self.last_actions = np.clip(actions, -action.clip, action.clip)
         origins = {"default": self.contract.default_pose, "joints": np.atleast_2d(measurement.joint_pos), "targets": self.last_targets}
-        self.last_targets = origins[action.origin] + action.scale * self.last_actions.astype(np.float64)
+        self.last_targets = origins.get(action.origin, 0.0) + action.scale * self.last_actions.astype(np.float64)
         return self.last_targets.copy()
 
     def estimate(self, row: str) -> NDArray[np.float64] | None:

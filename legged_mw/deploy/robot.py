@@ -62,7 +62,10 @@ class Robot(ABC):
 
     @abstractmethod
     def write(self, targets: Floats) -> None:
-        """Servo targets (D,) [rad] for the next period, held by position servos with the contract's stiffness and damping."""
+        """Servo targets (D,) [rad] for the next period, held by position servos with the contract's stiffness and damping.
+
+        Where the contract's action has the origin "torque" they are torques [N m].
+        """
 
     @abstractmethod
     def close(self) -> None:

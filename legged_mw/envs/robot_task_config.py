@@ -48,8 +48,17 @@ class RobotTaskCfg(Config):
         ang_vel_range: float = 0.5  # root angular velocity, body frame, each axis U(-range, range) [rad/s] [P]
 
     class control:
+        # servo: kp (target - angle), damped in the joint; dc_motor: kp (target - angle) - kd speed within a torque-speed curve;
+        # torque: the action is one, scaled; network: a file's weights make the torque (docs/motors.md)
+        actuator: Literal["servo", "dc_motor", "torque", "network"] = "servo"  # [P]
         stiffness: dict[str, float] = {}  # table a joint: position gain [N m/rad]
-        damping: dict[str, float] = {}  # table a joint: passive damping [N m s/rad]
+        damping: dict[str, float] = {}  # table a joint: passive damping; of a dc_motor its velocity gain, within its curve [N m s/rad]
+        # tables a joint of a torque-speed curve, which dc_motor needs and torque and network may have: at angular velocity w a motor
+        # gives from -stall_torque (1 + w / no_load_speed) to stall_torque (1 - w / no_load_speed), and at most asset.effort
+        stall_torque: dict[str, float] = {}  # [N m]
+        no_load_speed: dict[str, float] = {}  # [rad/s]
+        gear: dict[str, float] = {"": 1.0}  # turns of the motor a turn of the joint; 1: the two tables are the joint's own
+        network: str = ""  # of `network`: an .npz, as `python -m legged_mw.robot.actuator_net` writes it
         action_scale: float | dict[str, float] = 0.5  # target = origin + scale * action [rad]; a number, or a table a joint [P]
         action_origin: Literal["default", "joints", "targets"] = "default"  # the default pose, the measured angles or the last targets [P]
         decimation: int = 5  # simulation steps a control step [P]
@@ -126,14 +135,17 @@ class RobotTaskCfg(Config):
         frictionloss: list[float] = [0.9, 1.1]  # factor on each joint's dry friction [P]
         stiffness: list[float] = []  # factor on each servo's position gain
         damping: list[float] = []  # factor on each joint's damping
-        strength: list[float] = []  # factor on each servo's force limit
+        strength: list[float] = []  # factor on each motor's force limit, asset.effort or the file's
         encoder_offset: list[float] = [-0.05, 0.05]  # what each encoder reads beside the true angle [rad] [P]
+        stall_torque: list[float] = []  # factor on each motor's, of control.stall_torque
+        no_load_speed: list[float] = []  # factor on each motor's, of control.no_load_speed
         action_delay: list[int] = []  # control steps from an action to its servo, whole numbers, both ends included
+        delay_ms: list[float] = []  # from an action to its motor [ms], rounded to the nearest simulation step, a half up
         observation_delay: list[int] = []  # control steps that what `state` measures is old
         model_factors: dict[str, list[float]] = {}  # any other field of the model that may differ: a factor per world on all of it
         redraw_at_reset: list[str] = [  # drawn at every reset of a world; the others once, at the start
-            *["friction", "contact_time", "frictionloss", "stiffness", "damping", "strength"],
-            *["encoder_offset", "action_delay", "observation_delay"],
+            *["friction", "contact_time", "frictionloss", "stiffness", "damping", "strength", "stall_torque", "no_load_speed"],
+            *["encoder_offset", "action_delay", "delay_ms", "observation_delay"],
         ]
         redraw_iterations: int = 0  # draw everything again every so many iterations of training, and when it is resumed; 0: never
         observe: bool = False  # rows in `privileged_state` with what was drawn

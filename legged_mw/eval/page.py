@@ -31,6 +31,9 @@ TEXTS = {
     "joints": "Where the joints are, how fast they move and what torque they need over all commands without a fall. Upright strokes are "
     "limits: soft position limits, the motors' speed, the torque that the servos are clamped to. At the right the share of samples beyond "
     "a limit (of a torque: at 98 % of it or more), where there are any.",
+    "motors": "Torque against speed of each kind of joint over all commands without a fall: the more often, the darker. The lines are the "
+    "motor's envelope: its force limit, and its torque-speed curve if control.actuator has one. Above: the share of samples at the "
+    "envelope, by 2 % of the highest torque.",
     "pushes": "The base's horizontal velocity jumps; a push is survived if the robot has not fallen three seconds later. Rings: jumps "
     "of {speeds} m/s, from the inside; sectors: where it is pushed to. Coloured tiles were survived. Walking is at {vx:g} m/s; the exam "
     "counts these.",

@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
 from legged_mw.eval import estimate_panel
+from legged_mw.eval.motors import draw as draw_motor
 from legged_mw.eval.peers import best_of
 from legged_mw.eval.rules import AXES, ExamRules
 
@@ -89,6 +91,7 @@ def sections(columns: Columns, rules: ExamRules) -> list[Section]:
         *([Section("estimate", "What it believes of its velocity", believed, across=1)] if believed else []),
         Section("gait", "Gait", strides),
         Section("joints", "Joints against their limits", _joint_panels(columns)),
+        *([Section("motors", "Torque against speed", motors)] if (motors := _motor_panels(columns)) else []),
         Section("pushes", "Pushes", pushes),
         Section("energy", "Energy", energy, across=2),
         Section("reward", "Reward", [Panel(partial(_reward, columns), width=7.2, height=0.9 + 0.21 * terms)], across=1),
@@ -319,6 +322,12 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
     ax.set(title=label, ylim=(len(names) - 0.6, -1.05))
     ax.spines["left"].set_visible(False)
     ax.margins(x=0.04)
+
+
+def _motor_panels(columns: Columns) -> list[Panel]:
+    """A picture a kind of joint and policy; figures that were saved before there were any have none."""
+    rows = zip_longest(*([(_of(name, columns), motor) for motor in figures.get("motors", [])] for name, figures in columns))
+    return [Panel(partial(draw_motor, motor, colormaps[HEAT], (INK, MUTED), suffix)) for row in rows for suffix, motor in filter(None, row)]
 
 
 # ---- pushes

@@ -38,11 +38,13 @@ from legged_mw.deploy.contract import (
 )
 from legged_mw.deploy.estimate import Estimated
 from legged_mw.deploy.memory import Memory
+from legged_mw.deploy.motors import MOTORS_FILE, Motors
+from legged_mw.envs.actuators import OWN as OWN_LAW
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.estimator import EstimatingModel, find_targets
 from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
-from legged_mw.rl.export_scene import among_steps, standalone
+from legged_mw.rl.export_scene import Scene, among_steps, standalone
 from legged_mw.rl.network import (
     ESTIMATE,
     INPUT,
@@ -58,6 +60,7 @@ from legged_mw.rl.network import (
 from legged_mw.rl.policies import load_policy
 from legged_mw.rl.recurrent import states_of
 from legged_mw.rl.runs import CONFIG_FILE
+from legged_mw.sim.joints import CURVE
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.utils.config import save_yaml
@@ -66,6 +69,7 @@ from legged_mw.utils.files import find_file
 from legged_mw.utils.task import LoadedTask
 
 FILES = (CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
+SOMETIMES = (TERRAIN_FILE, MOTORS_FILE)
 WORLDS = 8  # of the roll-out that the export is tried on
 TOLERANCE = 1e-4  # between actions of the same observation, relative above 1: float32 sums in another order
 
@@ -139,7 +143,7 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
             gap = _gap(acted, _run(exact, clip, observations, remembered)[0])
         replay(env, contract, steps, new)
         no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
-        files = (*FILES, *([TERRAIN_FILE] if (new / TERRAIN_FILE).exists() else []))
+        files = (*FILES, *(name for name in SOMETIMES if (new / name).exists()))
     unknown_rows = tuple(row.name for row in contract.rows if not row.measured)
     return Exported(files, gap, len(observations), unknown_rows, no_terrain, contract.ends.not_covered, half)
 
@@ -147,7 +151,7 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
 def _small_env(task: LoadedTask) -> RobotTask:
     """The task as trained, kicks and pushes too, but small, on a CPU, and without what stands between a robot and its policy."""
     settings = {"env.num_envs": WORLDS, "sim.engine": "mujoco", "noise.level": 0.0}
-    settings |= {"domain_rand.action_delay": [], "domain_rand.observation_delay": []}
+    settings |= {f"domain_rand.{name}": [] for name in ("action_delay", "delay_ms", "observation_delay")}
     if hasattr(task.cfg.terrain, "mesh_type"):
         settings["terrain.mesh_type"] = "plane"  # the scene is the robot's alone
     for path, value in settings.items():
@@ -201,9 +205,9 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
         new.mkdir(parents=True)
         yield new
         if folder.exists():
-            if not (new / TERRAIN_FILE).exists():  # one of an earlier export would be another policy's
-                (folder / TERRAIN_FILE).unlink(missing_ok=True)
-            for name in [name for name in (TERRAIN_FILE, *FILES) if (new / name).exists()]:
+            for name in (name for name in SOMETIMES if not (new / name).exists()):  # one of an earlier export would be another policy's
+                (folder / name).unlink(missing_ok=True)
+            for name in [name for name in (*SOMETIMES, *FILES) if (new / name).exists()]:
                 os.replace(new / name, folder / name)
         else:
             os.replace(new, folder)
@@ -219,12 +223,10 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
 def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) -> Contract:
     """The contract of the network in ``folder``, trained with the noise level ``noise``; writes the scene there."""
     cfg, robot = task.cfg, env.robot
-    start = [*env.start_place, 1.0, 0.0, 0.0, 0.0, *robot.pose]
-    source = find_file(cfg, "asset.file").read_text(encoding="utf-8", errors="replace")
-    scene = standalone(robot, robot.imu, qpos=start, ctrl=robot.pose, camera=cfg.viewer.camera, source=source)
-    (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
+    scene = _write_scene(env, folder)
     ends = _ends(env)
-    action = Action(cfg.control.action_origin, np.array(robot.tables["control.action_scale"]), cfg.normalization.clip_actions)
+    origin = "torque" if env.actuators.law == "torque" else cfg.control.action_origin
+    action = Action(origin, np.array(robot.tables["control.action_scale"]), cfg.normalization.clip_actions)
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))
     ground, scanned = cfg.terrain, any(row.measured == SCAN for row in rows)
     feet = {foot: tuple(f"contact/{geom}" for geom in geoms) for foot, geoms in getattr(env, "foot_geoms", {}).items()}
@@ -252,6 +254,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         output=OUTPUT,
         digest=digest(folder / NETWORK_FILE),
         exam=cfg.to_dict().get("exam") if task.exam == "walking" else None,
+        motors=_motors(env, folder),
         estimate=_estimated(env, task),
     )
 
@@ -263,6 +266,30 @@ def _estimated(env: RobotTask, task: LoadedTask) -> tuple[Estimated, ...]:
         Estimated(row.name, row.value.shape[1], row.unit or (known.unit if known else ""), row.frame or (known.frame if known else ""))
         for row, known in rows
     )
+
+
+def _write_scene(env: RobotTask, folder: Path) -> Scene:
+    """The robot in its start, as MJCF."""
+    cfg, robot, law = env.cfg, env.robot, env.actuators.law
+    if law == OWN_LAW:
+        raise ExportError(
+            f"{type(env).__name__}._compute_torques is a motor law in code, which no export can state; train the policy that is to be "
+            "exported with a law of control.actuator (docs/motors.md)"
+        )
+    start = [*env.start_place, 1.0, 0.0, 0.0, 0.0, *robot.pose]
+    held = robot.pose if law in ("servo", "dc_motor") else [0.0] * len(robot.pose)
+    source = find_file(cfg, "asset.file").read_text(encoding="utf-8", errors="replace")
+    scene = standalone(robot, robot.imu, qpos=start, ctrl=held, camera=cfg.viewer.camera, source=source)
+    (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
+    return scene
+
+
+def _motors(env: RobotTask, folder: Path) -> Motors:
+    """The law of the motors; a network is copied to ``folder``."""
+    curve = (tuple(env.robot.tables.get(name, ())) for name in CURVE)
+    if env.actuators.law == "network":
+        shutil.copyfile(find_file(env.cfg, "control.network"), folder / MOTORS_FILE)
+    return Motors(env.actuators.law, *curve, digest=digest(folder / MOTORS_FILE) if env.actuators.law == "network" else "")
 
 
 def _ends(env: RobotTask) -> Ends:

@@ -32,6 +32,7 @@ _FIELDS = (
     *("qpos0", "body_parentid", "body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat"),
     *("jnt_type", "jnt_axis", "jnt_pos", "jnt_range", "jnt_limited", "jnt_stiffness", "jnt_solref", "jnt_solimp"),
     *("dof_armature", "dof_damping", "dof_frictionloss", "dof_solref", "dof_solimp"),
+    *("actuator_dyntype", "actuator_gaintype", "actuator_biastype", "actuator_ctrlspec"),
     *("actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange", "actuator_forcerange", "actuator_gear", "actuator_trnid"),
     *("actuator_ctrllimited", "actuator_forcelimited", "jnt_actfrclimited", "jnt_actfrcrange"),
 )

@@ -20,11 +20,11 @@ from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.robot.crouch import bent
 from legged_mw.robot.feet import Foot, guess_feet
 from legged_mw.robot.measure import Joint, mass_matrices, stand_as_statue, what_joints_bear
-from legged_mw.robot.suggest import Gains, family, suggest
+from legged_mw.robot.suggest import Gains, suggest
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.pose import standing_height
-from legged_mw.sim.tables import per_joint
+from legged_mw.sim.tables import family, per_joint
 from legged_mw.sim.vendor import read_robot
 from legged_mw.utils.config import ConfigError
 
