@@ -119,12 +119,16 @@ def load_policy(path: Path, env: RobotTask, cfg: Config, device: str) -> MLPMode
     ``cfg`` is the learner's config. Raises ConfigError if the file cannot be read, its networks are not those of the config,
     or the config names a class that it may not.
     """
-    check_classes(cfg)
-    sections: dict[str, Any] = copy.deepcopy(cfg.to_dict())
-    actor_class, actor_cfg = resolve_class(network_section(actor_settings(sections, env, learns=False)))
-    actor = actor_class(env.get_observations(), sections["obs_groups"], "actor", env.num_actions, **actor_cfg).to(device)
+    actor_class, actor_cfg = resolve_class(acting(cfg, env))
+    actor = actor_class(env.get_observations(), cfg.to_dict()["obs_groups"], "actor", env.num_actions, **actor_cfg).to(device)
     actor.load_state_dict(read_actor(path, actor))
     return actor.eval()
+
+
+def acting(cfg: Config, env: RobotTask) -> dict[str, Any]:
+    """Section ``actor`` of the learner's config as rsl-rl takes it, of an actor that only acts in ``env``. Raises ConfigError."""
+    check_classes(cfg)
+    return network_section(actor_settings(copy.deepcopy(cfg.to_dict()), env, learns=False))
 
 
 def read_actor(path: Path, model: MLPModel, what: str = "actor") -> dict[str, Tensor]:

@@ -25,6 +25,7 @@ from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.envs.wording import config_words
 from legged_mw.rl.classes import check_classes, network_section
 from legged_mw.rl.estimator import FIELD, EstimatingModel, actor_settings
+from legged_mw.rl.policies import acting
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import this_rank
 from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
@@ -305,7 +306,7 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
     torch.set_float32_matmul_precision(cfg.runner.matmul_precision)
     check_mirror(env, cfg)
     try:
-        settings = adapt(rsl_rl_config(cfg, env), cfg, rsl_rl_config(teacher, env) if teacher else None)
+        settings = adapt(rsl_rl_config(cfg, env), cfg, acting(teacher, env) if teacher else None)
         runner = Runner(env, settings, str(log_dir) if log_dir else None, device)
     except ValueError as error:  # a class, activation, optimizer or observation group that does not exist
         raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None

@@ -122,8 +122,7 @@ def _find_others(task: LoadedTask, start: Start) -> Start:
     asked, begin = task.train.distillation.teacher, task.train.warm_start.policy
     if asked:
         asked = str(start.run / TEACHER) if start.run else asked
-        start = start._replace(teacher=(teacher := find_trained(asked, start.experiment, "--teacher")))
-        teacher.task.train.runner.logger = task.train.runner.logger  # what it was logged with need not be installed
+        start = start._replace(teacher=find_trained(asked, start.experiment, "--teacher"))
     if begin and not start.run:
         start = start._replace(policy=find_trained(begin, start.experiment, "--init"))
     return start

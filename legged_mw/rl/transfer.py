@@ -25,7 +25,7 @@ _EXPORTED_COUNT = 10**8  # samples that an exported normalizer stands for, as th
 
 
 def adapt(settings: dict[str, Any], cfg: RobotTaskCfgPPO, teacher: dict[str, Any] | None) -> dict[str, Any]:
-    """rsl-rl's ``settings`` of the learner's config ``cfg``, for a student of a ``teacher`` with those settings, or a warm start."""
+    """rsl-rl's ``settings`` of the learner's config ``cfg``, for the student of a ``teacher``, its network's settings, or a warm start."""
     distillation, start = cfg.to_dict()["distillation"], cfg.warm_start
     settings["critic_warmup"] = start.critic_warmup if start.policy and not teacher else 0
     noise = settings["actor"].get("distribution_cfg", {})
@@ -34,7 +34,7 @@ def adapt(settings: dict[str, Any], cfg: RobotTaskCfgPPO, teacher: dict[str, Any
     if teacher:
         groups = {"student": settings["obs_groups"]["actor"], "teacher": [TEACHER]}
         algorithm = {name: value for name, value in distillation.items() if name not in ("teacher", "init_std")}
-        settings |= {"student": settings["actor"], "teacher": teacher["actor"], "obs_groups": groups, "algorithm": algorithm, "anneal": {}}
+        settings |= {"student": settings["actor"], "teacher": teacher, "obs_groups": groups, "algorithm": algorithm, "anneal": {}}
     return settings
 
 
