@@ -34,9 +34,10 @@ from legged_mw.eval.rules import ExamRules
 from legged_mw.eval.training import training_figures
 from legged_mw.rl.estimator import SMALLEST, EstimatingModel
 from legged_mw.rl.network import ESTIMATE, ExportedPolicy, run_onnx
-from legged_mw.rl.policies import act, load_policy
+from legged_mw.rl.policies import act, find_trained, load_policy
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner, rsl_rl_config
+from legged_mw.rl.transfer import begin_with
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 
@@ -308,6 +309,18 @@ def test_both_outputs_of_the_onnx_are_torchs(policy: EstimatingModel, run_folder
     assert torch.equal(again.estimate(groups), policy.estimate(groups)) and torch.equal(act(again, groups), act(policy, groups))
     actions, estimate = ExportedPolicy(policy, 2.0)(obs)
     assert actions.shape == (40, 12) and estimate.shape == (40, 7)
+
+
+def test_training_goes_on_from_an_exported_estimate(policy: EstimatingModel, run_folder: Path) -> None:
+    """The file holds no variance and no count of the targets: the next update must not forget what the estimate is measured in."""
+    model, wanted = copy.deepcopy(policy), policy.state_dict()
+    for value in model.state_dict().values():
+        value.zero_()
+    begin_with(model, find_trained(str(run_folder / "export"), run_folder.parent, "--init"))
+    got = model.state_dict()
+    torch.testing.assert_close(got["target_normalizer._mean"], wanted["target_normalizer._mean"])
+    torch.testing.assert_close(got["target_normalizer._var"], wanted["target_normalizer._var"].clamp(min=SMALLEST**2))
+    assert got["target_normalizer.count"] == got["obs_normalizer.count"] == 10**8
 
 
 def test_the_contract_names_the_rows(run_folder: Path) -> None:

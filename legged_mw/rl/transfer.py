@@ -13,14 +13,13 @@ from legged_mw.envs.observations import Observations, Row
 from legged_mw.envs.other_task import class_in, differences, in_words, observe_as
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
-from legged_mw.rl.policies import Trained, read_actor
-from legged_mw.rl.runs import CONFIG_FILE
+from legged_mw.rl.policies import NETWORK_FILE, Trained, read_actor
+from legged_mw.rl.runs import CONFIG_FILE, checkpoints
 from legged_mw.utils.config import ConfigError, save_yaml
 from legged_mw.utils.errors import shown
 from legged_mw.utils.task import LoadedTask
 
 TEACHER = "teacher"  # the observation group that it reads, and its folder in a student's run
-_MEAN, _STD, _VAR, _COUNT = (f"obs_normalizer.{name}" for name in ("_mean", "_std", "_var", "count"))
 _EXPORTED_COUNT = 10**8  # samples that an exported normalizer stands for, as the file does not say [ours: as most have seen]
 
 
@@ -68,8 +67,9 @@ def begin_with(model: MLPModel, policy: Trained) -> None:
     """Give ``model`` the actor's parameters; its noise stays its own."""
     path, own = policy.source.checkpoint, model.state_dict()
     saved = read_actor(path, model)
-    if path.suffix == ".onnx" and _STD in saved:
-        saved |= {_VAR: saved[_STD].square(), _COUNT: torch.full_like(own[_COUNT], _EXPORTED_COUNT)}
+    for name in [name for name in saved if name.endswith("_normalizer._std") and path.suffix == ".onnx"]:  # of observations, of targets
+        of = name.removesuffix("_std")
+        saved |= {f"{of}_var": saved[name].square(), f"{of}count": torch.full_like(own[f"{of}count"], _EXPORTED_COUNT)}
     model.load_state_dict({**saved, **{name: value for name, value in own.items() if name.startswith("distribution.")}})
 
 
@@ -79,7 +79,9 @@ def keep_teacher(teacher: Trained, run: Path) -> None:
     if not folder.exists():
         folder.mkdir()
         save_yaml(folder / CONFIG_FILE, teacher.task.to_dict())
-        shutil.copy(teacher.source.checkpoint, folder)
+        file = teacher.source.checkpoint  # of any name, if a flag named it; a resumed run finds it by one of these
+        known = file.name if file in checkpoints(file.parent).values() else "model_0.pt"
+        shutil.copy(file, folder / (NETWORK_FILE if file.suffix == ".onnx" else known))
 
 
 def _observe(env: RobotTask, policy: Trained, who: str) -> Observations:
