@@ -24,7 +24,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.policies import Source, Trained, find_trained, load_policy
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.transfer import TEACHER, begin_with, check_start, load_teacher, seat_teacher
+from legged_mw.rl.transfer import TEACHER, begin_with, check_start, keep_teacher, load_teacher, seat_teacher
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 
@@ -153,6 +153,29 @@ def test_a_warm_up_goes_on_when_it_is_resumed(tuned: Path, tmp_path: Path) -> No
     assert_equal(dict(second["actor_state_dict"]), dict(first["actor_state_dict"]))
     assert not torch.equal(second["critic_state_dict"]["mlp.0.weight"], first["critic_state_dict"]["mlp.0.weight"])
     assert not torch.equal(third["actor_state_dict"]["mlp.0.weight"], first["actor_state_dict"]["mlp.0.weight"])
+
+
+def test_the_end_of_a_warm_up_is_not_lost_when_it_is_resumed(tuned: Path, env: LeggedRobot) -> None:
+    """A checkpoint of the last iteration of the warm-up: what follows begins at the lowest learning rate, as it would have."""
+    task = load_task("go1_rough_student")
+    task.update_from_run(load_yaml(tuned / "config.yaml"), where="config.yaml")
+    task.set("env.num_envs", 16)
+    runner = make_runner(task.env_class(task.cfg, "cpu"), task.train, None, "cpu")
+    runner.load(str(tuned / "model_1.pt"))
+    assert runner.alg.critic_only and runner.alg.learning_rate == pytest.approx(1e-3)
+    rates: list[float] = []
+    runner._rollout = lambda obs: rates.append(runner.alg.learning_rate) or setattr(runner, "stop", "seen") or obs  # type: ignore[func-returns-value]
+    runner.learn(1)
+    assert rates == [pytest.approx(1e-5)] and not runner.alg.critic_only
+
+
+@pytest.mark.parametrize(("name", "kept"), [("best.pt", "model_0.pt"), ("walks.onnx", "policy.onnx"), ("model_2.pt", "model_2.pt")])
+def test_a_resumed_student_finds_a_teacher_of_any_name(name: str, kept: str, teacher: Path, tmp_path: Path) -> None:
+    shutil.copy(teacher / "config.yaml", tmp_path)
+    shutil.copy(teacher / "model_2.pt", tmp_path / name)
+    (tmp_path / "run").mkdir()
+    keep_teacher(find_trained(str(tmp_path / name), tmp_path, "--teacher"), tmp_path / "run")
+    assert find_trained(str(tmp_path / "run" / TEACHER), tmp_path, "--teacher").source.checkpoint.name == kept
 
 
 def test_an_exported_actor_has_a_normalizer_that_has_seen_much(student: Path) -> None:

@@ -91,6 +91,7 @@ class Runner(OnPolicyRunner):
         self._all_stop = False
         start = clock.mark()
         while self.current_learning_iteration < self._last and not self._must_stop():
+            self._anneal()
             obs = self._rollout(obs)
             if self._must_stop():
                 self.alg.storage.clear()  # an unfinished rollout is dropped
@@ -98,7 +99,6 @@ class Runner(OnPolicyRunner):
             with torch.inference_mode():
                 self.alg.compute_returns(obs)
             collected = clock.mark()
-            self._anneal()
             with self.update_threads:
                 losses = self.alg.update()
             report = self._report(losses, (start, collected, start := clock.mark()))
@@ -123,7 +123,7 @@ class Runner(OnPolicyRunner):
     def _anneal(self) -> None:
         """Move what has an end value towards it, in a straight line from the first iteration to the last; end a critic's warm-up."""
         if isinstance(self.alg, GraphedPPO):
-            self.alg.learn_critic_only(self.current_learning_iteration < self.cfg.get("critic_warmup", 0))
+            self.alg.learn_critic_only(self.current_learning_iteration < self.cfg["critic_warmup"])
         done = self.current_learning_iteration / max(self._last - 1, 1)
         for name, (begin, end) in self.cfg["anneal"].items():
             if end and begin is not None:
@@ -189,7 +189,7 @@ class Runner(OnPolicyRunner):
         if self.is_distributed:
             torch.distributed.all_reduce(summed)
         own = torch.stack([torch.as_tensor(value, dtype=torch.float, device=self.device) for value in losses.values()])
-        rate = self.alg.rate if isinstance(self.alg, GraphedPPO) else torch.tensor(self.alg.learning_rate)
+        rate = self.alg.rate if isinstance(self.alg, GraphedPPO) else torch.full((), self.alg.learning_rate, device=self.device)
         own = torch.cat([own, rate.to(own)[None], self._action_std()[None]])
         message = Message(torch.cat([summed, own]))
         return Report(self.current_learning_iteration, self.total_steps, steps, list(losses), message, marks)
@@ -280,6 +280,8 @@ class Runner(OnPolicyRunner):
         check_fit(content[f"{second}_state_dict"], other.state_dict(), Path(path), second)
         if self.alg.load(content, load_cfg, strict):
             self.current_learning_iteration = content["iter"]
+        if isinstance(self.alg, GraphedPPO):  # as in the last update: the first one may be the first after a warm-up
+            self.alg.critic_only = 0 < self.current_learning_iteration <= self.cfg["critic_warmup"]
         # the config's number, which the user may have changed; an adaptive rate goes on
         if getattr(self.alg, "schedule", "fixed") == "fixed":
             self.alg.learning_rate = self.cfg["algorithm"]["learning_rate"]
