@@ -124,25 +124,27 @@ class GraphedDistillation(Distillation):
             seen = torch.cat([st.observations[group] for group in self.student.obs_groups], dim=-1).flatten(0, 1)
             inputs = self.student.obs_normalizer(seen).unflatten(0, st.rewards.shape[:2])
         chunks = [*zip(*(each.split(self.gradient_length) for each in (inputs, st.privileged_actions, st.dones.bool())), strict=True)]
-        state = self._loss.zero_()  # of a student without memory: anything
+        state = None
+        self._loss.zero_()
         for _ in range(self.num_learning_epochs):
-            state = memory.start[:, 0] if memory else state
+            state = memory.start[:, 0] if memory else None
             for inputs, wanted, ended in chunks:
-                latent, state = self._remember(inputs, ended, state) if memory else (inputs.flatten(0, 1), state)
+                latent, state = self._unroll(inputs, ended, state)
                 self._gradient_step(latent, wanted.flatten(0, 1))
         self._loss /= self.num_learning_epochs * len(chunks)
-        if memory:
+        if memory and state is not None:
             memory.now[:, 0].copy_(state)  # as in rsl-rl: of the student as it is now
         if isinstance(self.student.obs_normalizer, EmpiricalNormalization):
             with torch.no_grad():
                 update_normalizer(self.student.obs_normalizer, seen, self.gpu_world_size)
 
-    def _remember(self, inputs: Tensor, ended: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """What a recurrent student's MLP reads (S * N, H) of S steps (S, N, size), and its state after them, detached.
+    def _unroll(self, inputs: Tensor, ended: Tensor, state: Tensor | None) -> tuple[Tensor, Tensor | None]:
+        """What the student's MLP reads (S * N, size) of S steps (S, N, size), and its hidden state after them, detached.
 
         ``ended`` (S, N, 1): the episode ended in that step.
         """
-        assert isinstance(self.student, RNNModel)
+        if state is None or not isinstance(self.student, RNNModel):
+            return nn.functional.pad(inputs.flatten(0, 1), (0, -inputs.shape[2] % 4)), None  # what TF32 products want
         seen = []
         for x, over in zip(inputs, ended, strict=True):
             latent, state = step(self.student.rnn.rnn, x, state)
@@ -152,8 +154,6 @@ class GraphedDistillation(Distillation):
 
     def _gradient_step(self, latent: Tensor, wanted: Tensor) -> None:
         """One step towards ``wanted`` (B, A); the loss is a sum over steps of their means, as in rsl-rl."""
-        if type(self.student) is MLPModel:
-            latent = nn.functional.pad(latent, (0, -latent.shape[1] % 4))  # what TF32 products want
         loss = self.loss_fn(self._mean(self.student, latent), wanted)
         self.optimizer.zero_grad()
         (loss * self.gradient_length).backward()
