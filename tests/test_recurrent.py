@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from legged_mw.check.recordable import recordable
 from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.recurrent import Memory, Sequence, step, unroll
+from legged_mw.rl.recurrent import HiddenState, SequenceInput, step, unroll
 from legged_mw.utils.config import ConfigError
 
 
@@ -130,7 +130,7 @@ def test_an_unrolled_layer_is_torchs_own(kind: Any, double: None) -> None:
     states = 4 if kind is nn.LSTM else 2
     x, state, weight = torch.randn(1, 6, 3, 5), torch.randn(states, 1, 3, 7), torch.randn(18, 7)
     expected, after = network(x[0], tuple(state[:, 0].split(2)) if kind is nn.LSTM else state[:, 0])
-    got = unroll(network, Sequence(x, state, torch.ones(6, 3, 1)))
+    got = unroll(network, SequenceInput(x, state, torch.ones(6, 3, 1)))
     torch.testing.assert_close(got, expected.flatten(0, 1))
     gradients = [torch.autograd.grad((y.reshape(18, 7) * weight).sum(), network.parameters()) for y in (expected, got)]  # type: ignore[arg-type]
     torch.testing.assert_close(*gradients)
@@ -147,7 +147,7 @@ def test_a_gru_by_hand(double: None) -> None:
     for parameter, value in zip(network.parameters(), (1.0, 1.0, 0.0, 0.0), strict=True):
         parameter.data.fill_(value)
     keep = torch.tensor([1.0, 1.0, 0.0]).view(3, 1, 1)
-    got = unroll(network, Sequence(torch.ones(1, 3, 1, 1), torch.zeros(1, 1, 1, 1), keep)).flatten().tolist()
+    got = unroll(network, SequenceInput(torch.ones(1, 3, 1, 1), torch.zeros(1, 1, 1, 1), keep)).flatten().tolist()
     # z = r = sigmoid(1) = 0.731059, n = tanh(1) = 0.761594: h = 0.268941 * 0.761594
     # then z = r = sigmoid(1.204824) = 0.769382, n = tanh(1 + 0.769382 * 0.204824) = 0.820252: h = 0.230618 * 0.820252 + 0.769382 * 0.204824
     assert got == pytest.approx([0.204824, 0.346753, 0.204824], abs=1e-6)
@@ -243,7 +243,7 @@ def test_rollout_and_update_can_be_recorded(symmetry: dict[str, Any] | None, mon
 
 
 def test_a_world_that_is_not_finite_is_forgotten() -> None:
-    memory = Memory(make(GraphedPPO, memory=NETWORKS["gru"]).actor, 3, 1, "cpu")
+    memory = HiddenState(make(GraphedPPO, memory=NETWORKS["gru"]).actor, 3, 1, "cpu")
     memory.now.fill_(float("nan"))
     memory.forget(torch.tensor([True, False, True]))
     finite: Tensor = memory.now.isfinite().all(dim=(0, 1, 3))  # type: ignore[call-overload]

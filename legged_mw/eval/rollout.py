@@ -18,7 +18,7 @@ from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.estimator import believed_velocity
-from legged_mw.rl.recurrent import another, forget
+from legged_mw.rl.recurrent import forget, with_own_state
 
 Policy = Callable[[TensorDict], Tensor]  # one with a memory is an rsl-rl network
 Signal = Callable[[Any], Tensor]  # a value a world, (N, ...)
@@ -109,7 +109,7 @@ class _Actor:
         forget(policy)
         self._parts = [(policy, slice(alone or worlds))]
         if alone not in (None, worlds):
-            self._parts.append((another(policy), slice(alone, worlds)))
+            self._parts.append((with_own_state(policy), slice(alone, worlds)))
 
     def act(self, obs: TensorDict) -> Tensor:
         """Its actions (N, A)."""

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from legged_mw.rl.adam import make_recordable, plain_state
 from legged_mw.rl.estimator import EstimatingModel
 from legged_mw.rl.layers import run_mlp, update_normalizer
-from legged_mw.rl.recurrent import Memory, step
+from legged_mw.rl.recurrent import HiddenState, step
 from legged_mw.sim.graph import StepGraph
 
 
@@ -62,7 +62,9 @@ class GraphedDistillation(Distillation):
     def _begin(self) -> None:
         """Empty memories, and graphs that are not recorded yet."""
         recurrent = [model for model in (self.student, self.teacher) if isinstance(model, RNNModel)]
-        self._memories: dict[MLPModel, Memory] = {model: Memory(model, self.storage.num_envs, 1, str(self.device)) for model in recurrent}
+        self._memories: dict[MLPModel, HiddenState] = {
+            model: HiddenState(model, self.storage.num_envs, 1, str(self.device)) for model in recurrent
+        }
         self._act_graph, self._update_graph = (StepGraph(fn, str(self.device)) for fn in (self._act, self._update))
 
     def release(self) -> None:
@@ -95,7 +97,7 @@ class GraphedDistillation(Distillation):
 
     def _latent(self, model: MLPModel) -> Tensor:
         """What a network's MLP reads; a memory takes in the observations."""
-        return self._memories[model].look(self._obs) if model in self._memories else model.get_latent(self._obs)
+        return self._memories[model].advance(self._obs) if model in self._memories else model.get_latent(self._obs)
 
     def _mean(self, model: MLPModel, latent: Tensor) -> Tensor:
         output = run_mlp(model.mlp, latent)

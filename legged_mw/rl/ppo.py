@@ -27,7 +27,7 @@ from torch import Tensor, nn
 from legged_mw.rl.adam import make_recordable, plain_state
 from legged_mw.rl.estimator import EstimatingModel, trained_parts
 from legged_mw.rl.layers import run_mlp, update_normalizer
-from legged_mw.rl.recurrent import Memory, Sequence, check_recurrent, unroll
+from legged_mw.rl.recurrent import HiddenState, SequenceInput, check_recurrent, unroll
 from legged_mw.sim.graph import StepGraph
 
 _MIN_RATE, _MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
@@ -37,8 +37,8 @@ class Minibatch(NamedTuple):
     """Samples of an update, and what the networks see of them."""
 
     batch: RolloutStorage.Batch
-    actor_input: Tensor | Sequence  # (B, size), normalised; a sequence for a network with a memory
-    critic_input: Tensor | Sequence
+    actor_input: Tensor | SequenceInput  # (B, size), normalised; a sequence for a network with a memory
+    critic_input: Tensor | SequenceInput
     targets: Tensor | None = None  # (B, E) of the actor's estimator, normalised
 
 
@@ -101,8 +101,8 @@ class GraphedPPO(PPO):
         self._size = self._share * (st.num_transitions_per_env if self._recurrent else 1)  # in samples
         self._obs = TensorDict({name: value[0].clone() for name, value in st.observations.items()}, [st.num_envs], device=device)
         self._order = torch.zeros(self._share * self.num_mini_batches, dtype=torch.long, device=device)
-        self._memories: dict[nn.Module, Memory] = {
-            model: Memory(model, st.num_envs, 2 if self.symmetry else 1, device)
+        self._memories: dict[nn.Module, HiddenState] = {
+            model: HiddenState(model, st.num_envs, 2 if self.symmetry else 1, device)
             for model in (self.actor, self.critic)
             if isinstance(model, RNNModel)
         }
@@ -177,7 +177,7 @@ class GraphedPPO(PPO):
 
     def _latent(self, model: MLPModel, seen: TensorDict) -> Tensor:
         """What a network's MLP reads; a memory takes in what is ``seen``, with mirror images where it is to learn from those."""
-        return self._memories[model].look(seen) if model in self._memories else model.get_latent(self._obs)
+        return self._memories[model].advance(seen) if model in self._memories else model.get_latent(self._obs)
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
         """Store the transition; worlds whose episode ended are forgotten."""
@@ -250,7 +250,7 @@ class GraphedPPO(PPO):
         return Minibatch(batch, actor_input, critic_input, targets)
 
     @torch.no_grad()
-    def _input(self, model: MLPModel, obs: Any, indices: Tensor) -> Tensor | Sequence:
+    def _input(self, model: MLPModel, obs: Any, indices: Tensor) -> Tensor | SequenceInput:
         """What the network sees of observations, normalised, with columns of zeros up to a multiple of four."""
         memory = self._memories.get(model)
         latent = memory.normalised(obs) if memory else model.get_latent(obs)
@@ -388,6 +388,6 @@ class GraphedPPO(PPO):
         return iteration
 
 
-def _forward(model: MLPModel, inputs: Tensor | Sequence) -> Tensor:
+def _forward(model: MLPModel, inputs: Tensor | SequenceInput) -> Tensor:
     """The network's output for normalised inputs (B, size), or over a sequence."""
-    return run_mlp(model.mlp, unroll(model.rnn.rnn, inputs) if isinstance(inputs, Sequence) else inputs)  # type: ignore[attr-defined]
+    return run_mlp(model.mlp, unroll(model.rnn.rnn, inputs) if isinstance(inputs, SequenceInput) else inputs)  # type: ignore[attr-defined]

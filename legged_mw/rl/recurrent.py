@@ -19,7 +19,7 @@ from legged_mw.rl.layers import Linear, sum_rows
 from legged_mw.utils.config import ConfigError
 
 
-class Sequence(NamedTuple):
+class SequenceInput(NamedTuple):
     """What a recurrent network sees in an update: S is 2 with mirror images, else 1; B worlds over T steps."""
 
     inputs: Tensor  # (S, T, B, size), normalised
@@ -27,7 +27,7 @@ class Sequence(NamedTuple):
     keep: Tensor  # (T, B, 1): 0 where an episode begins, else 1
 
 
-class Memory:
+class HiddenState:
     """The state of a recurrent network in each of N worlds, in tensors that stay.
 
     With ``images`` 2 it also holds the state of the network that has seen the mirror images only: a learned state has no mirror image
@@ -39,7 +39,7 @@ class Memory:
         self.now = torch.zeros(states_of(model)[0], images, worlds, states_of(model)[1], device=device)
         self.start = torch.zeros_like(self.now)  # when the rollout began
 
-    def look(self, obs: Any) -> Tensor:
+    def advance(self, obs: Any) -> Tensor:
         """Take in observations (N,), or (2N,) with their images; returns what the MLP reads (N, H)."""
         seen, after = step(self._model.rnn.rnn, self.normalised(obs), self.now.flatten(1, 2))
         self.now.copy_(after.view_as(self.now))
@@ -58,11 +58,11 @@ class Memory:
         parts = self.now[:, 0].clone().split(self._model.rnn.rnn.num_layers)
         return parts[0] if len(parts) == 1 else parts
 
-    def sequence(self, inputs: Tensor, worlds: Tensor, dones: Tensor) -> Sequence:
+    def sequence(self, inputs: Tensor, worlds: Tensor, dones: Tensor) -> SequenceInput:
         """The rollout of ``worlds`` (B,) from ``inputs`` (S * T * B, size) and where a step ended an episode, ``dones`` (T, N, 1)."""
         ended = dones.index_select(1, worlds).to(inputs.dtype)
         keep = torch.cat([torch.ones_like(ended[:1]), 1.0 - ended[:-1]])
-        return Sequence(inputs.view(-1, len(keep), len(worlds), inputs.shape[1]), self.start.index_select(2, worlds), keep)
+        return SequenceInput(inputs.view(-1, len(keep), len(worlds), inputs.shape[1]), self.start.index_select(2, worlds), keep)
 
 
 def check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | None, recorded: bool) -> None:
@@ -100,7 +100,7 @@ def forget(policy: Any, ended: Tensor | None = None) -> None:
             policy.reset(ended)
 
 
-def another(policy: Any) -> Any:
+def with_own_state(policy: Any) -> Any:
     """The same policy with a memory of its own; itself, if it has none."""
     if not getattr(policy, "is_recurrent", False):
         return policy
@@ -120,7 +120,7 @@ def step(rnn: nn.RNNBase, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
     return x, torch.stack([*hidden, *cells])
 
 
-def unroll(rnn: nn.RNNBase, sequence: Sequence) -> Tensor:
+def unroll(rnn: nn.RNNBase, sequence: SequenceInput) -> Tensor:
     """The outputs (S * T * B, H) of a GRU or LSTM over a sequence; gradients reach back to the start of each episode or of the rollout."""
     x, state, keep = sequence
     layer_of: Callable[..., Tensor] = LSTM.apply if isinstance(rnn, nn.LSTM) else GRU.apply  # type: ignore[assignment]
