@@ -299,6 +299,7 @@ def test_what_a_teacher_sees_can_be_recorded() -> None:
     seated(env, task)
     with recordable():
         env.compute_observations()
+    assert "teacher/state" in env.observations._parts and "teacher/privileged_state" not in env.observations._parts  # it reads no more
 
 
 # ---- bad input: one line each
@@ -344,6 +345,7 @@ CHANGES: dict[str, tuple[str | Callable[[LoadedTask], None], Any, str]] = {
         None,
         "the list of commands is lin_vel_x, lin_vel_y, ang_vel_yaw, base_height there and lin_vel_x, lin_v",
     ),
+    "forces": ("observations.contact_forces", True, "contact_forces is not sensed, for no reward term that is on reads it"),
     "class": (no_rows, None, "its task is a Hopper, whose rows a LeggedRobot does not have"),
 }
 

@@ -73,7 +73,10 @@ class Observations:
 
     def attach(self, other: Observations, group: str, name: str) -> None:
         """Show ``group`` of ``other``, made of the same worlds, as the group ``name``; from now on ``other`` is computed here."""
-        self._parts |= {f"{name}/{each}": part for each, part in other._parts.items()}
+        read = {group}
+        for each in reversed(other.groups):  # a group comes after those that it contains
+            read |= {row.group for row in other.groups[each] if each in read}
+        self._parts |= {f"{name}/{each}": part for each, part in other._parts.items() if each in read}
         self.groups[name], self.buffers[name] = other.rows(group), other.buffers[group]
 
     def rows(self, group: str) -> list[Row]:

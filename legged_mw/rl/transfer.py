@@ -89,10 +89,12 @@ def _observe(env: RobotTask, policy: Trained, who: str) -> Observations:
     task, kind = policy.task, class_in(env, policy.task.env_class)
     found = [f"its task is a {task.env_class.__name__}, whose rows a {type(env).__name__} does not have"]
     if kind:
-        seen = observe_as(env, kind, task.cfg, task.train.obs_groups.actor, TEACHER)
-        found = differences(env, task.cfg, seen.rows(TEACHER))
-        if not found:
-            return seen
+        try:
+            seen = observe_as(env, kind, task.cfg, task.train.obs_groups.actor, TEACHER)
+            if not (found := differences(env, task.cfg, seen.rows(TEACHER))):
+                return seen
+        except ConfigError as error:  # a row of what is not sensed here
+            found = [str(error)]
     raise ConfigError(f"{shown(policy.source.checkpoint)} cannot be {who} here: {'; '.join(found)}")
 
 
