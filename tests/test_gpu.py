@@ -415,9 +415,10 @@ def test_recorded_student_acts_with_noise_beside_its_teacher() -> None:
         torch.testing.assert_close(alg.transition.privileged_actions, alg.teacher(obs), rtol=1e-3, atol=1e-4)
 
 
-def test_a_recorded_warm_up_ends() -> None:
+@pytest.mark.parametrize("networks", [{}, {"estimator": {}}, {"memory": NETWORKS["gru"]}], ids=["plain", "estimator", "memory"])
+def test_a_recorded_warm_up_ends(networks: dict) -> None:
     """The actor stands to the bit while the critic learns, replayed too; then both learn, recorded anew."""
-    alg = make(GraphedPPO, DEVICE)
+    alg = make(GraphedPPO, DEVICE, **networks)
     alg.learn_critic_only(True)
     before = parameters(alg)
     for seed in range(5):

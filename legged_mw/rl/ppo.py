@@ -264,10 +264,11 @@ class GraphedPPO(PPO):
         with self._beside():
             value_loss = self._value_loss(batch, _forward(self.critic, critic_input))
             (self.value_loss_coef * value_loss).backward()
-        loss, parts, kl = self._policy_loss(batch, _forward(self.actor, actor_input))
-        if targets is not None and isinstance(self.actor, EstimatingModel) and isinstance(actor_input, Tensor):
-            parts.append(nn.functional.mse_loss(run_mlp(self.actor.estimator, actor_input), targets))
-            loss = loss + parts[-1]  # of other parameters
+        with torch.set_grad_enabled(not self.critic_only):  # an actor that stands keeps nothing for a gradient
+            loss, parts, kl = self._policy_loss(batch, _forward(self.actor, actor_input))
+            if targets is not None and isinstance(self.actor, EstimatingModel) and isinstance(actor_input, Tensor):
+                parts.append(nn.functional.mse_loss(run_mlp(self.actor.estimator, actor_input), targets))
+                loss = loss + parts[-1]  # of other parameters
         if self.critic_only:
             kl = None  # of an actor that stands still it is rounding noise
         else:
