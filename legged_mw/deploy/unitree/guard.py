@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -80,8 +81,9 @@ class Guarded:
             with theirs:
                 told = {"package": package, "interface": interface, "domain": domain, "late": late}
                 told |= {"channel": theirs.fileno(), "board": file.fileno()}
+                program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
                 self.process = subprocess.Popen(
-                    [sys.executable, "-c", f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()", json.dumps(told)],
+                    [sys.executable, "-c", program, json.dumps(told)],
                     pass_fds=(theirs.fileno(), file.fileno()),
                     start_new_session=True,  # a Ctrl-C in the terminal is not for the guard
                 )
@@ -151,14 +153,15 @@ class Guard:
     def __init__(self, wire: Any, channel: socket.socket, board: Board, package: str, late: float) -> None:
         self.wire, self.channel, self.board, self.late = wire, channel, board, late
         self._size = _FRAME.size + LAYOUTS[package, "LowCmd_"].size
-        self._buffer, self._latencies = b"", list[float]()
+        self._buffer, self._latencies = b"", deque[float](maxlen=1 << 16)
         self._command, self._damping = b"", b""  # what is sent again and again; what is sent instead of it
         self._moving, self._heard, self._until = False, 0.0, float("inf")
         self.tripped, self._stop = "", ""
         channel.setblocking(False)
-        for number in (signal.SIGINT, signal.SIGHUP):
-            signal.signal(number, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, lambda *_: setattr(self, "_stop", "the guard was told to end"))
+
+    def stop(self, *_: object) -> None:
+        """Damp, and end; a signal's handler."""
+        self._stop = "the guard was told to end"
 
     def run(self) -> None:
         """Until the other side closes, or AFTER a trip for which there is nobody to tell."""
@@ -207,7 +210,7 @@ class Guard:
             self._damping = body
         elif kind == CLOSE:
             self._command, self._moving, self._until = body, False, now + AFTER
-            self._tell({"report": self._report()})
+            self.tell({"report": self._report()})
         elif not self.tripped:
             self._command, self._moving, self._heard = body, kind == MOVE, now
             self.wire.send(body)
@@ -231,7 +234,7 @@ class Guard:
         middle, most = (1000 * float(value) for value in np.percentile(self._latencies, (50, 99)))
         return f"from a measurement to its target: median {middle:.1f} ms, p99 {most:.1f} ms ({len(self._latencies)} targets)"
 
-    def _tell(self, what: dict[str, Any]) -> None:
+    def tell(self, what: dict[str, Any]) -> None:
         with contextlib.suppress(OSError):
             self.channel.sendall(json.dumps(what).encode() + b"\n")
 
@@ -250,7 +253,9 @@ def main() -> None:
     board = Board(told["board"], len(first.body))
     board.put(first.body, first.stamp)
     guard = Guard(wire, channel, board, told["package"], told["late"])
-    guard._tell({"ready": True})
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, guard.stop)
+    guard.tell({"ready": True})
     gc.freeze()
     gc.disable()
     guard.run()

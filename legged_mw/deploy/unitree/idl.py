@@ -59,18 +59,21 @@ def _raw(base: Any, size: int) -> Any:
         little = not has_header or data[:2] == HEADER[:2]
         return cls(body[:size] if little else b"")  # another encoding shows as a message of the wrong size
 
+    def deserialize_key(cls: Any, *_: Any, **__: Any) -> Any:
+        return cls(b"")  # of a writer that has gone
+
     methods: dict[str, Any] = {
         "__init__": __init__,
         "serialize": lambda self, *_, **__: HEADER + self.body,
         "deserialize": classmethod(deserialize),
-        "deserialize_key": classmethod(lambda cls, *_, **__: cls(b"")),  # of a writer that has gone
+        "deserialize_key": classmethod(deserialize_key),
     }
     for name, method in methods.items():
         setattr(base, name, method)
     return base
 
 
-_copies = _types()
+_copies: dict[tuple[str, str], Any] = _types()
 RAW: dict[tuple[str, str], Any] = {key: _raw(_copies[key], layout.size) for key, layout in LAYOUTS.items()}
 
 

@@ -93,9 +93,17 @@ class Received(NamedTuple):
 class Wire:
     """The program's end: states come in, commands go out. Nothing is sent before ``send``."""
 
-    def __init__(self, package: str, interface: str, domain: int, wait: Callable[[], None] = lambda: time.sleep(0.001)) -> None:
-        """``wait`` passes a moment while nothing comes; a test in one process lets the simulated robot move on there."""
-        self.package, self._wait, self._where = package, wait, f"domain {domain} on {interface}"
+    def __init__(
+        self,
+        package: str,
+        interface: str,
+        domain: int,
+        wait: Callable[[], None] = lambda: time.sleep(0.001),
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``wait`` passes a moment while nothing comes. In one process with a simulated robot, that moves on there, by its own clock."""
+        self.package, self._wait, self.clock = package, wait, clock
+        self._where = f"domain {domain} on {interface}"
         self._participant = join(interface, domain)
         self._size = LAYOUTS[package, "LowState_"].size
         command = RAW[package, "LowCmd_"]
@@ -110,7 +118,7 @@ class Wire:
         """The newest state since the last call."""
         for sample in _taken(self._states):
             if len(sample.body) == self._size:
-                return Received(sample.body, time.monotonic())
+                return Received(sample.body, self.clock())
         return None
 
     def send(self, body: bytes) -> None:
@@ -133,8 +141,8 @@ class Wire:
         return self._until(self.receive, 0.1) or state
 
     def _until(self, found: Callable[[], Any], seconds: float) -> Any:
-        end = time.monotonic() + seconds
-        while not (result := found()) and time.monotonic() < end:
+        end = self.clock() + seconds
+        while not (result := found()) and self.clock() < end:
             self._wait()
         return result
 

@@ -37,18 +37,27 @@ class Machine:
     motors: dict[str, int]  # joint -> slot in LowCmd_ and LowState_ [unitree_sdk2's headers and examples]
     modes: dict[int, int] = field(default_factory=dict)  # slot -> motor mode where it is not 1
     feet: tuple[str, ...] = ()  # order of foot_force
+    cells: int = 0  # of the battery, in a row [Unitree's data sheets]; 0: not known
     machines: tuple[int, ...] = ()  # LowState_.mode_machine of this body; 0: a simulation that sets none
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Limits of the safety layer that are this machine's: 3 V a cell, where lithium batteries are called empty."""
+        return {"voltage": 3.0 * self.cells} if self.cells else {}
 
     @property
     def slots(self) -> int:
         return {"unitree_go": 20, "unitree_hg": 35}[self.package]
 
 
-GO2 = Machine("go2", "unitree_go", _named(_legs(("FR", "FL", "RR", "RL"), ("hip", "thigh", "calf"))), feet=("FR", "FL", "RR", "RL"))
+GO2 = Machine(
+    "go2", "unitree_go", _named(_legs(("FR", "FL", "RR", "RL"), ("hip", "thigh", "calf"))), feet=("FR", "FL", "RR", "RL"), cells=8
+)
 G1 = Machine(
     "g1",
     "unitree_hg",
     _named([*_legs(("left", "right"), _G1_LEG), *_legs(("waist",), ("yaw", "roll", "pitch")), *_legs(("left", "right"), _G1_ARM)]),
+    cells=13,
     machines=(0, 2, 3, 5, 6),  # of 29 joints [unitree_rl_lab]; 1 and 4 have 23
 )
 H1 = Machine(

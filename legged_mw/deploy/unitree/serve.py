@@ -30,6 +30,7 @@ POSITION_STOP, VELOCITY_STOP = 2.146e9, 16000.0  # in q and dq: no control of th
 LOW_LEVEL = (0xFE, 0xEF, 0xFF)  # head and level_flag of unitree_go
 _MACHINE = {"g1": 5}  # mode_machine that a simulated one says
 _TOUCH = 60  # foot_force of a foot that touches the ground, in the robot's own unit; ours
+_FULL = 4.1  # [V] of a full battery's cell
 _FAULT = 0x1  # motorstate of a motor with a fault
 _HOIST, _HOIST_DAMPING, _LOWERING = 12.0, 1.2, 1.0  # [weights/m], [weights s/m], [s] ours: a soft rope and how long it gives way
 
@@ -45,7 +46,7 @@ class Faults:
     gyro_bias: Floats | float = 0.0  # (3,) [rad/s]
     dead_motors: set[str] = field(default_factory=set)  # joints whose motors give no torque and say so
     temperature: float = 35.0  # [deg C] of every motor
-    voltage: float = 28.8  # [V]
+    voltage: float | None = None  # [V]; None: of a full battery
     frozen: bool = False  # the same state again and again
     silent: bool = False  # no states
     corrupt: bool = False  # states with a wrong checksum
@@ -117,7 +118,7 @@ class SimulatedUnitree:
         self.remote = encode()
         self.command: Message | None = None  # the last one that was taken
         self.acted = dict.fromkeys(("q", "dq", "tau", "kp", "kd"), np.zeros(len(contract.joints)))  # (D,) what the motors obey
-        self.ticks, self._last = 0, -math.inf
+        self._last = -math.inf
         self._fill()
 
     def _make_motors(self) -> None:
@@ -135,6 +136,11 @@ class SimulatedUnitree:
     @property
     def time(self) -> float:
         return float(self.data.time)
+
+    @property
+    def tick(self) -> int:
+        """Of the state that was sent last [ms]."""
+        return int(self._state["tick"])
 
     @property
     def joint_pos(self) -> Floats:
@@ -168,15 +174,11 @@ class SimulatedUnitree:
         if body := self.end.receive():
             self._in.put(self.time, body)
         for body in self._in.due(self.time):
-            self._take(Message(self._state_of_commands(), body))
+            self._take(Message(LAYOUTS[self.machine.package, "LowCmd_"], body))
         self._move()
         self._pull()
         mujoco.mj_step2(self.model, self.data)
         mujoco.mj_step1(self.model, self.data)
-        self.ticks += 1
-
-    def _state_of_commands(self) -> Any:
-        return LAYOUTS[self.machine.package, "LowCmd_"]
 
     def _take(self, command: Message) -> None:
         """Obey a command from now on, if it is one."""
@@ -233,16 +235,17 @@ class SimulatedUnitree:
         state["motor_state.temperature"] = int(faults.temperature)
         state["wireless_remote"] = 0 if faults.no_remote else list(self.remote)
         state["tick"] = round(data.time * 1000)
+        voltage = _FULL * self.machine.cells if faults.voltage is None else faults.voltage
         dead = self._in_slots([name in faults.dead_motors for name in self.contract.joints]).astype(int)
         if self.machine.package == "unitree_go":
-            state["head"], state["level_flag"], state["power_v"] = LOW_LEVEL[:2], LOW_LEVEL[2], faults.voltage
+            state["head"], state["level_flag"], state["power_v"] = LOW_LEVEL[:2], LOW_LEVEL[2], voltage
             state["motor_state.lost"] = state["motor_state.lost"] + dead  # no message reaches them any more
             feet = zip(self.contract.feet, self._scene.contacts, strict=True)
             touch = {foot: (data.sensordata[where] > 0.0).any() for foot, where in feet}
             state["foot_force"] = [_TOUCH * touch.get(foot, False) for foot in self.machine.feet] or 0
         else:
             state["mode_machine"] = _MACHINE.get(self.machine.name, 0)
-            state["motor_state.vol"], state["motor_state.motorstate"] = faults.voltage, dead * _FAULT
+            state["motor_state.vol"], state["motor_state.motorstate"] = voltage, dead * _FAULT
         state.seal()
         if faults.corrupt:
             state["crc"] = int(state["crc"]) ^ 1
