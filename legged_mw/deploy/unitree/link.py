@@ -115,7 +115,7 @@ class Wire:
         self._answers = _reader(self._participant, MOTION[1], TYPES["unitree_api", "Response_"], depth=10)
 
     def receive(self) -> Received | None:
-        """The newest state since the last call."""
+        """The newest state since the last call, with the moment of this call: ask often."""
         for sample in _taken(self._states):
             if len(sample.body) == self._size:
                 return Received(sample.body, self.clock())
