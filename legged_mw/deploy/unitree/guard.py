@@ -71,15 +71,15 @@ class Board:
 class Guarded:
     """The wire as the policy's process sees it, through a guard (see ``client.Owner``)."""
 
-    def __init__(self, package: str, interface: str, domain: int, late: float = LATE) -> None:
-        """Start a guard, which takes the robot over. Raises RobotError with what it says."""
+    def __init__(self, package: str, interface: str, domain: int, late: float = LATE, find: float = 5.0) -> None:
+        """Start a guard, which takes the robot over; ``find``: [s] for a robot to be heard. Raises RobotError with what it says."""
         size = LAYOUTS[package, "LowState_"].size
         with tempfile.TemporaryFile() as file:
             file.truncate(_BOARD.size + size)
             self._board = Board(file.fileno(), size)
             self._channel, theirs = socket.socketpair()
             with theirs:
-                told = {"package": package, "interface": interface, "domain": domain, "late": late}
+                told = {"package": package, "interface": interface, "domain": domain, "late": late, "find": find}
                 told |= {"channel": theirs.fileno(), "board": file.fileno()}
                 program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
                 self.process = subprocess.Popen(
@@ -246,7 +246,7 @@ def main() -> None:
     channel = socket.socket(fileno=told["channel"])
     try:
         wire = Wire(told["package"], told["interface"], told["domain"])
-        first = wire.prepare()
+        first = wire.prepare(told["find"])
     except RobotError as error:
         channel.sendall(json.dumps({"error": str(error)}).encode() + b"\n")
         return
