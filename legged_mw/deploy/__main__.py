@@ -78,7 +78,6 @@ def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
         handset=handset.Handset(script, keys),
         faults=serve.Faults(**wire_faults(args.wire)),
         watchdog=args.watchdog or math.inf,
-        hoist=None if args.hoist is None else args.hoist == "yes",
     )
     print(served.text())
 

@@ -11,7 +11,7 @@ from legged_mw.utils.errors import UserError, unknown
 
 ROBOTS = ("simulated", "unitree")
 _WIRE = {"delay": ("delay_ms", 1.0), "jitter": ("jitter_ms", 1.0), "loss": ("loss", 0.01)}  # name -> field of Faults, unit
-_OF_A_ROBOT, _OF_SERVING = ("interface", "domain"), ("remote", "wire", "watchdog", "hoist")
+_OF_A_ROBOT, _OF_SERVING = ("interface", "domain"), ("remote", "wire", "watchdog")
 
 
 def add_robot_flags(parser: argparse.ArgumentParser) -> None:
@@ -24,7 +24,6 @@ def add_robot_flags(parser: argparse.ArgumentParser) -> None:
     served.add_argument("--remote", metavar="FILE", help="a YAML script of its remote (default: the keys of this terminal)")
     served.add_argument("--wire", metavar="FAULTS", help="delay=10,jitter=2,loss=5: [ms], [ms] and [%%] of each message, each way")
     served.add_argument("--watchdog", type=float, metavar="S", help="it damps after S seconds without a command (default: never)")
-    served.add_argument("--hoist", choices=("yes", "no"), help="it begins on a hoist (default: if it has two feet)")
 
 
 def check_robot_flags(args: argparse.Namespace) -> None:

@@ -109,7 +109,6 @@ def serve(
     handset: Handset | None = None,
     faults: Faults | None = None,
     watchdog: float = math.inf,
-    hoist: bool | None = None,
 ) -> Served:
     """A simulated robot of the export on a network interface."""
     need_dds()
@@ -118,7 +117,7 @@ def serve(
     domain = default_domain(interface) if domain is None else domain
     machine = machine_of(contract.joints)
     end = RobotEnd(machine.package, interface, domain)
-    sim = SimulatedUnitree(folder, contract, end, faults=faults, watchdog=watchdog, hoist=hoist)
+    sim = SimulatedUnitree(folder, contract, end, faults=faults, watchdog=watchdog)
     how = "on a hoist" if sim.hoist else "on the ground"
     print(f"a simulated {machine.name}, limp, {how}, in domain {domain} on {interface}; Ctrl-C ends it", flush=True)
     return run(sim, handset or Handset(), seconds)
