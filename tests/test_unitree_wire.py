@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from legged_mw import ROOT
+from legged_mw.deploy import __main__ as deploy
 from legged_mw.deploy import unitree
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.options import wire_faults
@@ -19,6 +21,7 @@ from legged_mw.deploy.unitree import handset, idl, link
 from legged_mw.deploy.unitree.codec import LAYOUTS, STRUCTS, Message, crc32, fields
 from legged_mw.deploy.unitree.remote import decode, encode
 from legged_mw.deploy.unitree.robots import G1, GO2, H1, check_body, machine_of, order
+from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.errors import UserError
 
 POLICIES = ROOT / "resources" / "policies"
@@ -243,3 +246,30 @@ def test_without_the_extra_one_command_installs_it(monkeypatch: pytest.MonkeyPat
     with pytest.raises(UserError, match=r"needs cyclonedds: pip install 'legged_mw\[unitree\]'"):
         unitree.need_dds()
     assert importlib.util.find_spec("cyclonedds")
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("--interface", "lo"), "--interface is of a robot on a network: add --robot unitree or --serve unitree"),
+        (
+            ("--robot", "unitree"),
+            "say on which network the robot is: --interface eth0, or --interface lo for one that --serve simulates here",
+        ),
+        (("--robot", "unitree", "--interface", "lo", "--wire", "loss=5"), "--wire is of a robot that is simulated for others: add --serve"),
+        (
+            ("--serve", "unitree", "--robot", "unitree", "--interface", "lo"),
+            "--serve is the robot and --robot drives one: start them as two",
+        ),
+        (("--serve", "unitree", "--interface", "lo", "--num_envs", "3"), "--num_envs is of simulated robots in this program: leave it out"),
+        (("--serve", "unitree", "--interface", "nowhere"), "no network interface 'nowhere' in this machine"),
+    ],
+)
+def test_flags_that_do_not_go_together(
+    flags: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["legged_mw.deploy", "go2_flat", *flags])
+    with pytest.raises(SystemExit) as ended, one_line_errors("legged_mw.deploy"):
+        deploy.main()
+    error = capsys.readouterr().err
+    assert ended.value.code == 2 and said in error and error.count("\n") == 1

@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import math
-import sys
 from pathlib import Path
 
 from legged_mw import ROOT
-from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, Contract, read_contract
+from legged_mw.deploy import options
+from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, read_contract
 from legged_mw.deploy.exam import run_exam
-from legged_mw.deploy.options import add_robot_flags, check_robot_flags, remote_script, wire_faults
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rules
 from legged_mw.utils.cli import Parser, duration, one_line_errors, positive
@@ -34,7 +31,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--time", type=duration, metavar="T", help="how long (default: until closed; 10s of a recording)")
     parser.add_argument("--terrain", action="store_true", help=f"among the steps and blocks of {TERRAIN_FILE}, if the export has it")
     launch.add_flags(parser)
-    add_robot_flags(parser)
+    options.add_flags(parser)
     args = parser.parse_args()
     if args.eval and (asked := [f"--{name}" for name in ("command", "terrain") if getattr(args, name)] + launch.asked(args)):
         parser.error(f"--eval brings its own commands, is on flat ground and shows nothing: leave {asked[0]} out")
@@ -43,7 +40,7 @@ def parse() -> argparse.Namespace:
     if args.command is not None and args.commands:
         parser.error("--commands brings its own commands: leave --command out")
     launch.check_flags(args)
-    check_robot_flags(args)
+    options.check_flags(args)
     return args
 
 
@@ -56,41 +53,13 @@ def main() -> None:
     if contract.ends.not_covered:
         print(f"not judged here: {', '.join(contract.ends.not_covered)}, which ended episodes in training")
     if args.serve:
-        serve(folder, contract, args)
+        options.serve(folder, contract, args)
     elif args.robot != "simulated":
-        drive(folder, contract, args, command)
+        options.drive(folder, contract, args, command)
     elif args.eval:
         examine(folder, Path(args.out) if args.out else folder / RESULT_FILE, common=args.ranges == "common")
     else:
         launch.watch(DeployStage(folder, args.num_envs, command, scene_file=scene_file), args, folder, title=contract.task)
-
-
-def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
-    """A simulated robot on the wire."""
-    from legged_mw.deploy.unitree import handset, program, serve
-
-    script, keys = remote_script(args.remote), args.remote is None and sys.stdin.isatty()
-    if keys:
-        print(handset.KEYS_HELP)
-    served = program.serve(
-        *(folder, contract, args.interface, args.domain),
-        seconds=args.time or math.inf,
-        handset=handset.Handset(script, keys),
-        faults=serve.Faults(**wire_faults(args.wire)),
-        watchdog=args.watchdog or math.inf,
-    )
-    print(served.text())
-
-
-def drive(folder: Path, contract: Contract, args: argparse.Namespace, command: list[float] | None) -> None:
-    """A robot on the wire."""
-    from legged_mw.deploy.unitree import client
-
-    controller = Controller(folder, contract)  # before the robot: it may not wait
-    with client.connect(contract, args.interface, args.domain) as robot:
-        print(f"{robot.machine.name} at {args.interface}: {len(contract.joints)} joints, {robot.health().voltage or 0:.1f} V", flush=True)
-        client.walk(robot, controller, command, args.time or math.inf)
-    print(robot.report)
 
 
 def examine(folder: Path, path: Path, common: bool = False) -> None:

@@ -1,12 +1,15 @@
-"""The flags that say which robot a policy drives, and which one is simulated for somebody else to drive."""
+"""Which robot a policy drives, and which one is simulated for another program to drive: their flags, and what they start."""
 
 from __future__ import annotations
 
 import argparse
 import math
+import sys
 from pathlib import Path
 from typing import Any
 
+from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.policy import Controller
 from legged_mw.utils.errors import UserError, unknown
 
 ROBOTS = ("simulated", "unitree")
@@ -14,7 +17,7 @@ _WIRE = {"delay": ("delay_ms", 1.0), "jitter": ("jitter_ms", 1.0), "loss": ("los
 _OF_A_ROBOT, _OF_SERVING = ("interface", "domain"), ("remote", "wire", "watchdog")
 
 
-def add_robot_flags(parser: argparse.ArgumentParser) -> None:
+def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add --robot, --serve and what goes with them."""
     parser.add_argument("--robot", choices=ROBOTS, default="simulated", help="unitree: a Go2 or G1 at --interface")
     parser.add_argument("--serve", choices=ROBOTS[1:], help="simulate such a robot at --interface, for --robot to drive")
@@ -26,7 +29,7 @@ def add_robot_flags(parser: argparse.ArgumentParser) -> None:
     served.add_argument("--watchdog", type=float, metavar="S", help="it damps after S seconds without a command (default: never)")
 
 
-def check_robot_flags(args: argparse.Namespace) -> None:
+def check_flags(args: argparse.Namespace) -> None:
     """Refuse what does not go together. Raises UserError."""
     wire = args.robot == "unitree" or args.serve
     for name in _OF_A_ROBOT:
@@ -63,8 +66,29 @@ def wire_faults(text: str | None) -> dict[str, Any]:
     return found
 
 
-def remote_script(file: str | None) -> list[Any]:
-    """The script of --remote."""
-    from legged_mw.deploy.unitree.handset import load_remote
+def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
+    """A simulated robot on the wire."""
+    from legged_mw.deploy.unitree import handset, program, serve
 
-    return load_remote(Path(file)) if file else []
+    script, keys = handset.load_remote(Path(args.remote)) if args.remote else [], args.remote is None and sys.stdin.isatty()
+    if keys:
+        print(handset.KEYS_HELP)
+    served = program.serve(
+        *(folder, contract, args.interface, args.domain),
+        seconds=args.time or math.inf,
+        handset=handset.Handset(script, keys),
+        faults=serve.Faults(**wire_faults(args.wire)),
+        watchdog=args.watchdog or math.inf,
+    )
+    print(served.text())
+
+
+def drive(folder: Path, contract: Contract, args: argparse.Namespace, command: list[float] | None) -> None:
+    """A robot on the wire."""
+    from legged_mw.deploy.unitree import client
+
+    controller = Controller(folder, contract)  # before the robot: it may not wait
+    with client.connect(contract, args.interface, args.domain) as robot:
+        print(f"{robot.machine.name} at {args.interface}: {len(contract.joints)} joints, {robot.health().voltage or 0:.1f} V", flush=True)
+        client.walk(robot, controller, command, args.time or math.inf)
+    print(robot.report)
