@@ -62,7 +62,8 @@ class Controller:
 
     def __init__(self, folder: Path, contract: Contract, count: int = 1, network: Callable[[Floats], Floats] | None = None) -> None:
         """``network``: observations (N, size) to actions (N, D), instead of the one in ``folder``."""
-        self.contract, self._network = contract, network or Network(folder, contract)
+        self.folder, self.contract, self._network = folder, contract, network or Network(folder, contract)
+        self.last_observation = np.zeros((count, contract.size), dtype=np.float32)
         self.last_actions = np.zeros((count, len(contract.joints)), dtype=np.float32)
         self.last_targets = np.tile(contract.default_pose, (count, 1))  # (N, D) [rad]
         self._frames = [np.zeros((count, row.history, row.size), dtype=np.float32) for row in contract.rows]  # as last observed
@@ -80,7 +81,8 @@ class Controller:
         if self.clock:
             self.clock.keep(commands, self._fresh)
         self._fresh[:] = False
-        self.last_actions = np.clip(self._network(_side_by_side(self._frames)), -action.clip, action.clip)
+        self.last_observation = _side_by_side(self._frames)
+        self.last_actions = np.clip(self._network(self.last_observation), -action.clip, action.clip)
         origins = {"default": self.contract.default_pose, "joints": np.atleast_2d(measurement.joint_pos), "targets": self.last_targets}
         self.last_targets = origins[action.origin] + action.scale * self.last_actions.astype(np.float64)
         return self.last_targets.copy()

@@ -27,15 +27,21 @@ from legged_mw.utils.machine import usable_cores
 _NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # sensors of position and velocity describe the new state
 
 _GROUND_GROUP = [1, 0, 0, 0, 0, 0]  # geom groups that a height scan sees: a robot's own are others
+_SHAPES = 3  # geom group of a robot's collision shapes
 _ABOVE = 2.0  # [m] over the root, where its rays begin
 
 
 class Fleet:
     """``count`` robots, each in a world of its own, stepped together on ``threads`` threads (0: one a core)."""
 
-    def __init__(self, folder: Path, contract: Contract, count: int = 1, threads: int = 0, scene_file: str = SCENE_FILE) -> None:
-        """Load the scene and put every robot into its first keyframe. Raises ContractError."""
-        scene = read_scene(folder, contract, scene_file)
+    def __init__(
+        self, folder: Path, contract: Contract, count: int = 1, threads: int = 0, scene_file: str = SCENE_FILE, whole: bool = False
+    ) -> None:
+        """Load the scene and put every robot into its first keyframe. ``whole``: its body touches the ground too, not only its feet.
+
+        Raises ContractError.
+        """
+        scene = read_scene(folder, contract, scene_file, whole)
         self.contract, self.count, self.spec, self.model = contract, count, scene.spec, scene.model
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world counts as fallen; nothing is printed
         _keep_quiet()
@@ -85,10 +91,14 @@ class Fleet:
         self.broken[which] = False
 
     def set_gains(self, stiffness: Floats, damping: Floats) -> None:
-        """Servos of every robot from now on: (D,) [N m/rad], (D,) [N m s/rad], in the contract's order."""
+        """Servos of every robot from now on: (D,) [N m/rad], (D,) [N m s/rad], in the contract's order.
+
+        Damping is held to what these physics steps can take, half of inertia / timestep; drives run faster.
+        """
+        stable = np.maximum(self.contract.damping, 0.5 / (self.model.dof_invweight0[self._dofs] * self.contract.timestep))
         self._batch.expand("actuator_gainprm")[:, self._actuators, 0] = stiffness
         self._batch.expand("actuator_biasprm")[:, self._actuators, 1] = -stiffness
-        self._batch.expand("dof_damping")[:, self._dofs] = damping
+        self._batch.expand("dof_damping")[:, self._dofs] = np.minimum(damping, stable)
 
     def _value(self, name: str) -> Floats:
         if name == "gravity":
@@ -127,16 +137,20 @@ class MujocoRobot(Robot):
 
     can_change_gains = True
 
-    def __init__(self, folder: Path, contract: Contract, scene_file: str = SCENE_FILE) -> None:
-        self.fleet = Fleet(folder, contract, 1, threads=1, scene_file=scene_file)
+    def __init__(
+        self, folder: Path, contract: Contract, scene_file: str = SCENE_FILE, *, whole: bool = False, hoisted: bool = False
+    ) -> None:
+        """``whole``: its body touches the ground too. ``hoisted``: its base hangs at its start until targets come at its own gains."""
+        self.fleet, self.hoisted = Fleet(folder, contract, 1, threads=1, scene_file=scene_file, whole=whole), hoisted
         self._targets, self._gains, self._closed = contract.default_pose, (contract.stiffness, contract.damping), False
+        self._start = self.fleet.qpos[0, :7].copy()
 
     def read(self) -> Measurement:
         many = self.fleet.read()
         return Measurement(**{n: getattr(many, n)[0] for n in QUANTITIES}, others={n: v[0] for n, v in many.others.items()})
 
     def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
-        contract = self.fleet.contract
+        contract, self.hoisted = self.fleet.contract, self.hoisted and stiffness is not None
         wanted = (contract.stiffness if stiffness is None else stiffness, contract.damping if damping is None else damping)
         self._move(np.asarray(targets), *wanted)
 
@@ -160,6 +174,9 @@ class MujocoRobot(Robot):
             self._set(stiffness, damping)
         self._targets = targets
         self.fleet.write(targets.reshape(1, -1))
+        if self.hoisted:
+            self.fleet.qpos[0, :7], self.fleet.qvel[0, :6] = self._start, 0.0
+            self.fleet.refresh()
 
     def _set(self, *gains: Floats) -> None:
         """Nothing is touched while the gains stay those of the scene."""
@@ -190,12 +207,18 @@ class Scene:
     contacts: list[np.ndarray]  # the same of each foot
 
 
-def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE) -> Scene:
-    """``scene.xml`` of an export, or another ``file`` in it, which must be the robot of the contract. Raises ContractError."""
+def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: bool = False) -> Scene:
+    """``scene.xml`` of an export, or another ``file`` in it, which must be the robot of the contract. Raises ContractError.
+
+    ``whole``: the robot's body touches the ground too, not only its feet.
+    """
     if not (folder / file).is_file():
         raise ContractError(f"no {file} in {folder}; an export has one if its task was trained on ground with steps or blocks")
     try:
         spec = mujoco.MjSpec.from_file(str(folder / file))
+        for geom in spec.geoms if whole else ():
+            if geom.group == _SHAPES and geom.parent.name != "world":
+                geom.conaffinity = 1
         model = spec.compile()
     except ValueError as error:
         raise ContractError(f"{file} is not a valid MJCF: {' '.join(str(error).split())}") from None
