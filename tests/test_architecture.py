@@ -30,7 +30,7 @@ ONLY_IN = {
     "mujoco_warp": ["legged_mw/sim/*"],
     "rsl_rl": ["legged_mw/rl/*"],
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
-    "matplotlib": ["legged_mw/eval/plots.py"],  # a second to import, and only for a report
+    "matplotlib": ["legged_mw/eval/plots.py", "legged_mw/deploy/replay.py"],  # a second to import, and only for a report
     "legged_mw.view": ["legged_mw/view/*", "legged_mw/deploy/*", "legged_mw/robot/*", "legged_mw/programs.py"],
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/studio.py"],  # young, and not on every platform
     "legged_mw.check": ["legged_mw/check/*", "legged_mw/programs.py"],
@@ -67,7 +67,17 @@ MAY_ALL_THE_SAME = ["legged_mw/view/env_stage.py", "legged_mw/view/playing.py"]
 CONFIGS_MAY = ["legged_mw.envs", "legged_mw.utils", "configs", "math", "__future__"]  # numbers and names only
 # What runs on a robot's computer: neither torch nor warp, nor anything of ours that needs them.
 DEPLOY_MAY = [
-    *("numpy", "mujoco", "onnxruntime", "yaml", "legged_mw.ROOT", "legged_mw.deploy", "legged_mw.view", "legged_mw.eval.rules"),
+    *(
+        "numpy",
+        "mujoco",
+        "onnxruntime",
+        "yaml",
+        "matplotlib",
+        "legged_mw.ROOT",
+        "legged_mw.deploy",
+        "legged_mw.view",
+        "legged_mw.eval.rules",
+    ),
     *("legged_mw.utils.cli", "legged_mw.utils.config", "legged_mw.utils.errors", "legged_mw.utils.machine", "legged_mw.utils.commands"),
     *sys.stdlib_module_names,
 ]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -62,16 +62,17 @@ def run(
         loop = stack.enter_context(Loop(contract.period, live))
         stack.enter_context(robot)
         controller.reset()
-        for now in loop.ticks(seconds):
-            measured = one.take(loop)
-            if one.fell and not states:
-                summary.fell = now
-                break
-            summary.steps += 1
-            if measured:
-                velocities.append([*measured.lin_vel[:2], measured.ang_vel[2]])
-                if watch:
-                    watch(now, measured)
+        with suppress(*([KeyboardInterrupt] if states else [])):  # a person ends a run with states so
+            for now in loop.ticks(seconds):
+                measured = one.take(loop)
+                if one.fell and not states:
+                    summary.fell = now
+                    break
+                summary.steps += 1
+                if measured:
+                    velocities.append([*measured.lin_vel[:2], measured.ang_vel[2]])
+                    if watch:
+                        watch(now, measured)
         if log and live:
             log.event(loop.now, str(loop.timing()))
     if velocities:

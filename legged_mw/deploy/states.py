@@ -37,7 +37,7 @@ class Order(NamedTuple):
 class States:
     """The states of one robot, and who may change them.
 
-    ``command`` gives (C,) at a time [s] while nobody drives; ``say`` gets a line for each change.
+    ``command`` gives (C,) at a time [s] since the policy began, while nobody drives; ``say`` gets a line for each change.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class States:
         """Ask everyone who may drive; an emergency stop comes back."""
         wishes = [source.poll(health) for source in self.sources]
         driving = next((i for i, wish in enumerate(wishes) if wish.command is not None), None)
-        command = self._own(now) if driving is None else wishes[driving].command
+        command = self._own(now - self.since if self.state == POLICY else 0.0) if driving is None else wishes[driving].command
         for i, source in enumerate(self.sources):
             if driving is not None and i > driving:
                 source.let_go()
@@ -110,7 +110,9 @@ class States:
         off = np.abs(measured.joint_pos - contract.default_pose)
         if now - self.since < RISE or contract.ends.tilted(measured.gravity) or off.max() > STANDS:
             joint = contract.joints[int(off.argmax())]
-            self._tell(f"{WALK} has to wait: the robot does not stand yet, {joint} is {off.max():.2f} rad from its pose")
+            self._tell(
+                f"{WALK} has to wait until the robot stands: {joint} is {off.max():.2f} rad from its pose after {now - self.since:.1f} s"
+            )
             return
         self.controller.reset()
         self._enter(POLICY, now, f"{END}: damping")
