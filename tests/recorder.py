@@ -18,9 +18,9 @@ class Recorder(Robot):
         self.measured.append(self.robot.read())
         return self.measured[-1]
 
-    def write(self, targets: Floats) -> None:
+    def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
         self.targets.append(np.array(targets))
-        self.robot.write(targets)
+        self.robot.write(targets, stiffness=stiffness, damping=damping)
 
     def close(self) -> None:
         self.closed += 1

@@ -30,7 +30,7 @@ ONLY_IN = {
     "mujoco_warp": ["legged_mw/sim/*"],
     "rsl_rl": ["legged_mw/rl/*"],
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
-    "matplotlib": ["legged_mw/eval/plots.py"],  # a second to import, and only for a report
+    "matplotlib": ["legged_mw/eval/plots.py", "legged_mw/deploy/replay.py"],  # a second to import, and only for a report
     "legged_mw.view": ["legged_mw/view/*", "legged_mw/deploy/*", "legged_mw/robot/*", "legged_mw/programs.py"],
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/studio.py"],  # young, and not on every platform
     "legged_mw.check": ["legged_mw/check/*", "legged_mw/programs.py"],
@@ -74,6 +74,7 @@ DEPLOY_MAY = [
         "onnxruntime",
         "yaml",
         "cyclonedds",
+        "matplotlib",
         "legged_mw.ROOT",
         "legged_mw.deploy",
         "legged_mw.view",

@@ -148,6 +148,7 @@ class Contract:
     gait: Gait | None = None  # likewise
     exam: Mapping[str, Any] | None = None  # the task's section `exam`, if the walking exam grades it
     memory: Memory | None = None  # of a recurrent network
+    safety: Mapping[str, Any] | None = None  # limits by name, other than the defaults of safety.Limits
 
     @property
     def size(self) -> int:
@@ -181,6 +182,7 @@ class Contract:
             **({SCAN: {"x": list(self.scan.x), "y": list(self.scan.y), "standing": self.scan.standing}} if self.scan else {}),
             **({"gait": {**self.gait._asdict(), "offsets": list(self.gait.offsets)}} if self.gait else {}),
             **({"exam": dict(self.exam)} if self.exam is not None else {}),
+            **({"safety": dict(self.safety)} if self.safety is not None else {}),
         }
 
 
@@ -311,6 +313,7 @@ def _read(top: _Reader) -> Contract:
         gait=_read_gait(top),
         exam=top.section("exam").values if "exam" in top.values else None,
         memory=read_memory(network.section(MEMORY)) if MEMORY in network.values else None,
+        safety=top.section("safety").values if "safety" in top.values else None,
     )
 
 

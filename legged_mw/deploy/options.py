@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from legged_mw.deploy.contract import Contract
-from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.unitree import client
+from legged_mw.deploy.unitree.client import UnitreeRobot
 from legged_mw.utils.errors import UserError, unknown
 
 ROBOTS = ("simulated", "unitree")
@@ -83,12 +84,8 @@ def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
     print(served.text())
 
 
-def drive(folder: Path, contract: Contract, args: argparse.Namespace, command: list[float] | None) -> None:
-    """A robot on the wire."""
-    from legged_mw.deploy.unitree import client
-
-    controller = Controller(folder, contract)  # before the robot: it may not wait
-    with client.connect(contract, args.interface, args.domain) as robot:
-        print(f"{robot.machine.name} at {args.interface}: {len(contract.joints)} joints, {robot.health().voltage or 0:.1f} V", flush=True)
-        client.walk(robot, controller, command, args.time or math.inf)
-    print(robot.report)
+def connect(contract: Contract, args: argparse.Namespace) -> UnitreeRobot:
+    """The robot on the wire."""
+    robot = client.connect(contract, args.interface, args.domain)
+    print(f"{robot.machine.name} at {args.interface}: {len(contract.joints)} joints, {robot.health().voltage or 0:.1f} V", flush=True)
+    return robot

@@ -70,7 +70,8 @@ class Controller:
 
     def __init__(self, folder: Path, contract: Contract, count: int = 1, network: Callable[..., Any] | None = None) -> None:
         """``network``: what stands for the one in ``folder``; see ``Network``."""
-        self.contract, self._network = contract, network or Network(folder, contract)
+        self.folder, self.contract, self._network = folder, contract, network or Network(folder, contract)
+        self.last_observation = np.zeros((count, contract.size), dtype=np.float32)
         self.last_actions = np.zeros((count, len(contract.joints)), dtype=np.float32)
         self.last_targets = np.tile(contract.default_pose, (count, 1))  # (N, D) [rad]
         self._frames = [np.zeros((count, row.history, row.size), dtype=np.float32) for row in contract.rows]  # as last observed
@@ -89,7 +90,7 @@ class Controller:
         if self.clock:
             self.clock.keep(commands, self._fresh)
         self._fresh[:] = False
-        seen = _side_by_side(self._frames)
+        self.last_observation = seen = _side_by_side(self._frames)
         if self.memory is None:
             actions = self._network(seen)
         else:

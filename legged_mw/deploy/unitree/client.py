@@ -6,15 +6,13 @@ Motors are found by the names of their joints. What the robot must be asked or t
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, Protocol
 
 import numpy as np
 
 from legged_mw.deploy.contract import COMPUTED, CONTRACT_FILE, Contract
-from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError, damped
-from legged_mw.deploy.runner import run
 from legged_mw.deploy.unitree import need_dds
 from legged_mw.deploy.unitree.codec import LAYOUTS, Message
 from legged_mw.deploy.unitree.remote import decode
@@ -22,7 +20,6 @@ from legged_mw.deploy.unitree.robots import Machine, check_body, machine_of, ord
 
 TOO_OLD = 0.1  # [s] ours: a measurement older than this is none
 TOUCH = 20  # foot_force from which a foot touches the ground, in the robot's own unit; ours
-STAND = 2.0  # [s] to stand up [unitree_rl_gym]
 LOST = 5  # messages that a motor may lose between two looks; ours
 _MEASURED = ("ang_vel", "gravity", "joint_pos", "joint_vel", "joint_torque", "acceleration")
 _PARTS = ("q", "dq", "tau", "kp", "kd")
@@ -213,29 +210,3 @@ def connect(contract: Contract, interface: str, domain: int | None = None) -> Un
     except BaseException:
         owner.close(b"")
         raise
-
-
-def walk(robot: UnitreeRobot, controller: Controller, command: Sequence[float] | None, seconds: float) -> None:
-    """Stand up, then follow the policy for ``seconds``: by ``command`` (C,), or by the sticks of the robot's remote."""
-    contract, begin = robot.contract, robot.read().joint_pos
-    steps = round(STAND / contract.period)
-    start = time.perf_counter()
-    for step in range(1, steps + 1):
-        share = step / steps
-        robot.read()
-        robot.write(begin + share * (contract.default_pose - begin), stiffness=(0.1 + 0.9 * share) * contract.stiffness)
-        time.sleep(max(0.0, start + step * contract.period - time.perf_counter()))
-    asked = None if command is None else np.array(command)
-    run(robot, controller, lambda _: sticks(robot) if asked is None else asked, seconds)
-
-
-def sticks(robot: UnitreeRobot) -> Floats:
-    """(C,) that the remote asks for: a stick's end is the end of the trained range."""
-    remote = robot.health().remote
-    wanted = np.array([command.default for command in robot.contract.commands])
-    for i, command in enumerate(robot.contract.commands):
-        stick = {"lin_vel_x": "ly", "lin_vel_y": "lx", "ang_vel_yaw": "rx"}.get(command.name)
-        if remote and stick:
-            value = getattr(remote, stick) * (1.0 if stick == "ly" else -1.0)
-            wanted[i] = value * (command.high if value > 0 else -command.low)
-    return wanted
