@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections import defaultdict
+from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -27,6 +28,7 @@ from legged_mw.deploy.unitree.link import RobotEnd, Wire
 from legged_mw.deploy.unitree.robots import machine_of
 from legged_mw.deploy.unitree.serve import STEP, Faults, SimulatedUnitree
 from legged_mw.eval import rules
+from legged_mw.eval.rules import ExamRules
 
 
 def begin(sim: SimulatedUnitree, robot: UnitreeRobot) -> None:
@@ -39,17 +41,19 @@ def begin(sim: SimulatedUnitree, robot: UnitreeRobot) -> None:
     sim.step()
 
 
-def examine(folder: Path, contract: Contract, domain: int, faults: Faults) -> dict[str, object]:
-    """Every command that is held, one after the other."""
-    exam, package = contract_rules(contract), machine_of(contract.joints).package
+def examine(folder: Path, contract: Contract, exam: ExamRules, domain: int, faults: Faults) -> dict[str, object]:
+    """Every command that is held, one after the other, then pushes at the speed of its mark."""
+    package = machine_of(contract.joints).package
     sim = SimulatedUnitree(folder, contract, RobotEnd(package, "lo", domain), faults=faults, hoist=False)
     wire = Wire(package, "lo", domain, wait=sim.step, clock=lambda: sim.time)
     robot = UnitreeRobot(contract, Direct(wire), wire.prepare(), clock=lambda: sim.time)
     controller, names = Controller(folder, contract), [command.name for command in contract.commands]
     signals, fell_at, last = defaultdict(list), [], []
-    for held in exam.held():
+    pushed = [(exam.push_vx, 0.0, 0.0)] * rules.PUSH_DIRECTIONS
+    for world, held in enumerate([*exam.held(), *pushed]):
         command = np.array([each.default for each in contract.commands])
         command[[names.index(name) for name in rules.VELOCITY]] = held
+        direction = world - len(exam.held())
         begin(sim, robot)
         controller.reset()
         one, fell = defaultdict(list), math.inf
@@ -58,6 +62,9 @@ def examine(folder: Path, contract: Contract, domain: int, faults: Faults) -> di
             values = velocity, sim.data.qpos[:2].copy(), np.abs(sim.torque * sim.joint_vel).sum(), np.abs(sim.joint_vel).mean()
             for name, value in zip(("velocity", "position", "power", "joint_speed"), values, strict=True):
                 one[name].append(value)
+            if direction >= 0 and step == round(rules.PUSH_AT / contract.period) + direction:
+                angle = 2 * math.pi * direction / rules.PUSH_DIRECTIONS
+                sim.data.qvel[:2] += exam.push_mark * np.array([math.cos(angle), math.sin(angle)])
             robot.write(controller.act(robot.read(), command)[0])
             for _ in range(round(contract.period / STEP)):
                 sim.step()
@@ -73,16 +80,18 @@ def examine(folder: Path, contract: Contract, domain: int, faults: Faults) -> di
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("policy", help="a shipped policy without pushes in its exam, or the folder of an export")
+    parser.add_argument("policy", help="a shipped policy, or the folder of an export")
     parser.add_argument("--wire", help="faults, as `--serve` has them")
     parser.add_argument("--domain", type=int, default=99)
     args = parser.parse_args()
     folder = Path(args.policy) if Path(args.policy).is_dir() else ROOT / "resources" / "policies" / args.policy
     contract = read_contract(folder)
-    print("over the wire")
-    print(rules.table(examine(folder, contract, args.domain, Faults(**wire_faults(args.wire)))))
-    print("through --eval")
-    print(rules.table(run_exam(folder)))
+    exam = replace(contract_rules(contract), push_speeds=(2.0,), push_mark=2.0)
+    for where, result in (
+        ("over the wire", examine(folder, contract, exam, args.domain, Faults(**wire_faults(args.wire)))),
+        ("through --eval", run_exam(folder, exam)),
+    ):
+        print(f"{where}\n{rules.table(result)}", flush=True)
 
 
 if __name__ == "__main__":
