@@ -16,7 +16,7 @@ from typing import Any
 
 from legged_mw.eval import crossing, exam
 from legged_mw.eval.rules import in_common
-from legged_mw.rl.policies import act, load_policy
+from legged_mw.rl.policies import load_policy
 from legged_mw.rl.runs import CONFIG_FILE, checkpoints, task_of
 from legged_mw.utils.cli import pick_device, seed_everything
 from legged_mw.utils.config import load_yaml
@@ -32,7 +32,7 @@ def graded(
     for iteration, path in checkpoints(run).items():
         if iteration in wanted:
             policy = load_policy(path, env, task.train, device)
-            result = grade(env, lambda obs, policy=policy: act(policy, obs))
+            result = grade(env, policy)
             results.append({"iteration": iteration, "seconds": round(path.stat().st_mtime - begun, 1), **result})
             print(line(results[-1]), flush=True)
     return results

@@ -1,5 +1,9 @@
 """How fast a task trains, and what an iteration's time is spent on: python benchmarks/train.py --worlds 4096 16384
 
+With --beside_rsl_rl each number of worlds is measured again with rsl-rl's own PPO. Of networks with a memory:
+python benchmarks/train.py --worlds 4096 --set actor.class_name=RNNModel --set critic.class_name=RNNModel --set
+runner.num_steps_per_env=24 --set symmetry.use_data_augmentation=false --beside_rsl_rl
+
 The whole iteration is timed as training runs it (`Runner.learn`); then its parts are timed alone, in the same process:
 physics (the substeps, recorded), the rest of `env.step`, the policy (acting, storing), the update (returns, minibatches,
 normalisers). What is left of the iteration is called rest: waiting for the host, logging, the tails of kernels.
@@ -96,6 +100,27 @@ def measure(runner: Runner, iterations: int, rounds: int, eager: bool) -> Times:
     return Times(whole, physics, step - physics, policy, update)
 
 
+def run(args: argparse.Namespace, device: str, worlds: int | None, algorithm: str | None = None) -> Times:
+    """Measure the task as the flags say, perhaps with another algorithm, and print a line."""
+    task = load_task(args.task)
+    if device == "cpu":
+        task.fit_cpu(usable_cores())  # as train.py does
+    apply_overrides(task, args)
+    if worlds is not None:
+        task.cfg.env.num_envs = worlds
+    if algorithm:
+        task.train.algorithm.class_name = algorithm
+    seed_everything(task.train.seed)
+    with contextlib.redirect_stdout(io.StringIO()):
+        env = task.env_class(task.cfg, device, eager=args.eager)
+        runner = make_runner(env, task.train, None, device)
+    times = measure(runner, args.iterations, args.rounds, args.eager)
+    speed = env.num_envs * runner.cfg["num_steps_per_env"] / times.whole
+    parts = "".join(f"{1e3 * t:>{w}.1f}" for t, w in zip((*times, times.rest), (11, 9, 8, 8, 8, 8), strict=True))
+    print(f"{env.num_envs:>8}{speed:>12.0f}{parts}", flush=True)
+    return times
+
+
 def main() -> None:
     parser = make_parser(__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
@@ -103,6 +128,7 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, nargs="+", help="worlds to measure, one after the other (default: the task's)")
     parser.add_argument("--iterations", type=int, default=10, help="in one call of learn")
     parser.add_argument("--rounds", type=int, default=5)
+    parser.add_argument("--beside_rsl_rl", action="store_true", help="measure with rsl-rl's own PPO too")
     args = parser.parse_args()
     device = pick_device(args.device)
     if device == "cpu":
@@ -113,21 +139,11 @@ def main() -> None:
     header = f"{'worlds':>8}{'steps/s':>12}{'iteration':>11}{'physics':>9}{'step':>8}{'policy':>8}{'update':>8}{'rest':>8}   [ms]"
     print(f"{args.task} on {name}; torch {torch.__version__}\n{header}")
     for worlds in args.worlds or [None]:
-        task = load_task(args.task)
-        if device == "cpu":
-            task.fit_cpu(usable_cores())  # as train.py does
-        apply_overrides(task, args)
-        if worlds is not None:
-            task.cfg.env.num_envs = worlds
-        seed_everything(task.train.seed)
-        with contextlib.redirect_stdout(io.StringIO()):
-            env = task.env_class(task.cfg, device, eager=args.eager)
-            runner = make_runner(env, task.train, None, device)
-        times = measure(runner, args.iterations, args.rounds, args.eager)
-        speed = env.num_envs * runner.cfg["num_steps_per_env"] / times.whole
-        parts = "".join(f"{1e3 * t:>{w}.1f}" for t, w in zip((*times, times.rest), (11, 9, 8, 8, 8, 8), strict=True))
-        print(f"{env.num_envs:>8}{speed:>12.0f}{parts}", flush=True)
-        del env, runner
+        ours = run(args, device, worlds)
+        if args.beside_rsl_rl:
+            theirs = run(args, device, worlds, "PPO")
+            ratios = theirs.whole / ours.whole, (theirs.policy + theirs.update) / (ours.policy + ours.update), theirs.update / ours.update
+            print("rsl-rl's own PPO, above, takes {:.2f} times as long an iteration; its learner {:.2f}, its update {:.2f}".format(*ratios))
 
 
 if __name__ == "__main__":

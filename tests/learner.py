@@ -30,8 +30,14 @@ def observations(generator: torch.Generator, device: str) -> TensorDict:
     return TensorDict(values, [WORLDS], device=device)
 
 
-def make(kind: type[PPO], device: str = "cpu", distribution: dict[str, Any] | None = None, **settings: Any) -> Any:
-    """A learner whose networks come from a fixed seed."""
+def make(
+    kind: type[PPO],
+    device: str = "cpu",
+    distribution: dict[str, Any] | None = None,
+    memory: dict[str, dict[str, Any]] | None = None,
+    **settings: Any,
+) -> Any:
+    """A learner whose networks come from a fixed seed; ``memory``: what makes "actor" or "critic" recurrent."""
     torch.manual_seed(1)
     distribution = {"class_name": "GaussianDistribution", "init_std": 0.7} | (distribution or {})
     if distribution["class_name"] == "BetaDistribution":
@@ -39,8 +45,8 @@ def make(kind: type[PPO], device: str = "cpu", distribution: dict[str, Any] | No
     network = {"class_name": MODEL, "hidden_dims": [32, 16], "activation": "elu", "obs_normalization": True}
     cfg = {
         "obs_groups": {"actor": ["state"], "critic": ["state", "privileged_state"]},
-        "actor": {**network, "distribution_cfg": distribution},
-        "critic": dict(network),
+        "actor": {**network, "distribution_cfg": distribution, **(memory or {}).get("actor", {})},
+        "critic": network | (memory or {}).get("critic", {}),
         "algorithm": {"class_name": kind, "rnd_cfg": None, "symmetry_cfg": None, **settings},
         "num_steps_per_env": STEPS,
         "multi_gpu": None,

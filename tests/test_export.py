@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import re
 import shutil
@@ -19,12 +18,15 @@ from worlds import make_env
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import ROWS, ContractError, Ends, read_contract
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl import export as exporting
+from legged_mw.rl.classes import network_section
 from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, export
 from legged_mw.rl.export_replay import overridden, own_ends
 from legged_mw.rl.export_scene import differences, standalone
@@ -144,7 +146,7 @@ def test_the_export_is_replaced_whole_or_not_at_all(made: Path, tmp_path: Path, 
     monkeypatch.setattr(exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(made / "policy.onnx", path))
     (out / "README.md").write_text("mine")
     before = files(tmp_path)
-    for name, fails in (("run_onnx", lambda path, obs: np.ones((len(obs), 12))), ("make_contract", lambda *_: 1 / 0)):
+    for name, fails in (("run_onnx", lambda path, obs, **_: np.ones((len(obs), 12))), ("make_contract", lambda *_: 1 / 0)):
         with monkeypatch.context() as patch:
             patch.setattr(exporting, name, fails)
             with pytest.raises((ExportError, ZeroDivisionError)) as error:
@@ -321,6 +323,41 @@ def test_a_further_command_and_history_are_deployed(tmp_path: Path) -> None:
     np.testing.assert_allclose(stage.controller.observe(stage.measured, stage.commands())[:, -1], 0.25)
 
 
+def test_where_history_stands_in_the_network(tmp_path: Path) -> None:
+    """By hand: in the exported network action i is column COLUMNS[i] of the observation, which the contract lays out so:
+
+    base_ang_vel 0-2, projected_gravity 3-5, dof_pos 6-17, then dof_vel of two steps ago 18-29, of the last 30-41 and of now
+    42-53, then last_actions of the step before 54-65 and of now 66-77, then commands 78-80.
+    """
+    columns = [0, 5, 6, 18, 29, 30, 42, 53, 54, 66, 78, 80]
+    history = {"state.dof_vel": 3, "state.last_actions": 2}
+    settings = {"observations.history": history, "observations.leave_out": {"state": ["base_lin_vel"]}, "actor.activation": "identity"}
+    task, checkpoint = untrained(ROOT / "configs/go1_flat.py", tmp_path, settings | {"actor.obs_normalization": False})
+    saved = torch.load(checkpoint, weights_only=True)
+    for layer in (0, 2, 4):
+        for part in ("weight", "bias"):
+            saved["actor_state_dict"][f"mlp.{layer}.{part}"].zero_()
+        saved["actor_state_dict"][f"mlp.{layer}.weight"].fill_diagonal_(1.0)
+    saved["actor_state_dict"]["mlp.0.weight"].zero_()
+    saved["actor_state_dict"]["mlp.0.weight"][range(12), columns] = 1.0
+    torch.save(saved, checkpoint)
+    export(task, checkpoint, tmp_path / "out")
+    contract = read_contract(tmp_path / "out")
+    controller, acted = Controller(tmp_path / "out", contract), []
+    for step in (0.1, 0.2, 0.3):
+        speeds = step + 0.001 * np.arange(12)
+        vectors = {"lin_vel": np.zeros(3), "ang_vel": np.full(3, step), "gravity": np.array([0.0, 0.0, -1.0]), "acceleration": np.zeros(3)}
+        measured = Measurement(
+            **vectors, joint_pos=contract.default_pose + step, joint_vel=speeds, joint_torque=speeds, foot_contact=np.zeros(4)
+        )
+        controller.act(measured, np.array([[step, 0.0, -step]]))
+        acted.append(controller.last_actions[0].copy())
+    first = [0.1, -1.0, 0.1, 0.1, 0.111, 0.1, 0.1, 0.111, 0.0, 0.0, 0.1, -0.1]  # all frames are the first one
+    second = [0.2, -1.0, 0.2, 0.1, 0.111, 0.1, 0.2, 0.211, 0.0, 0.1, 0.2, -0.2]
+    third = [0.3, -1.0, 0.3, 0.1, 0.111, 0.2, 0.3, 0.311, 0.1, 0.2, 0.3, -0.3]
+    np.testing.assert_allclose(acted, [first, second, third], atol=1e-6)
+
+
 def test_a_row_that_nobody_can_measure_is_said(tmp_path: Path) -> None:
     text = Exported(FILES, 2e-7, 256, ("guess",)).text(tmp_path)
     assert "policy.onnx" in text and "differ from the trained policy's by 2e-07 at most" in text
@@ -361,7 +398,7 @@ def untrained(path: Path, folder: Path, settings: dict[str, Any] | None = None) 
     torch.manual_seed(0)
     env = task.env_class(task.cfg, "cpu")
     sections = task.train.to_dict()
-    actor_class, settings = resolve_class(copy.deepcopy(sections["actor"]))
+    actor_class, settings = resolve_class(network_section(sections["actor"]))
     actor = actor_class(env.get_observations(), sections["obs_groups"], "actor", env.num_actions, **settings)
     torch.save({"actor_state_dict": actor.state_dict()}, folder / "model.pt")
     return task, folder / "model.pt"

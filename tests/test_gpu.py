@@ -12,11 +12,13 @@ from mujoco_warp import DisableBit
 from rsl_rl.algorithms import PPO
 from test_forces import SCALES, SETTINGS
 from test_ppo import VARIANTS, update
+from test_recurrent import IMAGES, NETWORKS, share_memory
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
 from legged_mw.eval.training import TrainingExam
 from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.recurrent import memory_of
 from legged_mw.rl.runner import make_runner
 from legged_mw.utils.task import load_task
 
@@ -225,6 +227,48 @@ def test_recorded_update_is_rsl_rls_own(settings: dict) -> None:
     assert ours._update_graph.recorded
 
 
+@pytest.mark.parametrize("memory", NETWORKS.values(), ids=NETWORKS.keys())
+def test_recorded_recurrent_update_is_rsl_rls_own(memory: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As above; cuDNN multiplies in float32, and worlds come in their order."""
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+    monkeypatch.setattr(torch, "randperm", lambda count, out: out.copy_(torch.arange(count, device=out.device)))
+    stock, ours = make(PPO, DEVICE, memory=memory), make(GraphedPPO, DEVICE, memory=memory)
+    for seed in range(6):
+        collect(stock, DEVICE, seed=seed)
+        share_experience(stock, ours)
+        share_memory(stock, ours)
+        take_over(ours, stock)
+        expected, got = update(stock), update(ours)
+        assert difference(parameters(stock), parameters(ours)) < 1e-3
+        assert got == pytest.approx(expected, rel=1e-3, abs=1e-5)
+    assert ours._update_graph.recorded
+
+
+@pytest.mark.parametrize("images", [None, IMAGES], ids=["plain", "mirrored"])
+def test_recorded_acting_remembers_as_rsl_rls_networks_do(images: dict | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four rollouts with ends of episodes and returns between, most of them replayed."""
+    monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
+    ours = make(GraphedPPO, DEVICE, memory=NETWORKS["two layers"], symmetry_cfg=images)
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(4):
+        with torch.inference_mode():
+            for _ in range(6):
+                obs, ended = observations(generator, DEVICE), (torch.rand(32, generator=generator) < 0.2).to(DEVICE)
+                ours.act(obs)
+                for model in (ours.actor, ours.critic):
+                    held = ours._memories[model].now[:, 0].transpose(0, 1)
+                    model(obs)
+                    torch.testing.assert_close(held, memory_of(model, 32), rtol=1e-4, atol=1e-5)
+                    model.reset(ended)
+                ours.process_env_step(obs, torch.randn(32, device=DEVICE), ended, {"time_outs": ended})
+            kept = {model: model.get_hidden_state() for model in (ours.actor, ours.critic)}
+            ours.compute_returns(obs)
+        ours.storage.clear()
+        for model, state in kept.items():
+            model.reset(hidden_state=state)
+    assert ours._act_graph.recorded and ours._returns_graph.recorded
+
+
 def test_checkpoints_go_both_ways_on_a_gpu(tmp_path: Path) -> None:
     """Also from a learner that replays into one that has not recorded, and back into one that has."""
     replaying, stock, fresh = make(GraphedPPO, DEVICE), make(PPO, DEVICE), make(GraphedPPO, DEVICE)
@@ -246,9 +290,12 @@ def test_checkpoints_go_both_ways_on_a_gpu(tmp_path: Path) -> None:
     assert difference(parameters(stock), parameters(replaying)) < 1e-4
 
 
-def test_iteration_never_waits_for_the_host() -> None:
+@pytest.mark.parametrize("network", ["MLPModel", "RNNModel"])
+def test_iteration_never_waits_for_the_host(network: str) -> None:
     """Rollout, returns, update and the report, once everything is recorded."""
-    runner = make_runner(make_env(eager=False), small_learner(), None, DEVICE)
+    train = small_learner()
+    train.actor.class_name = train.critic.class_name = network
+    runner = make_runner(make_env(eager=False), train, None, DEVICE)
     runner.learn(5)
     obs = runner.env.get_observations()
     torch.cuda.set_sync_debug_mode("error")

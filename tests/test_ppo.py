@@ -12,7 +12,8 @@ from learner import SIZES, collect, difference, make, parameters, share_experien
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 
-from legged_mw.rl.ppo import GraphedPPO, Linear
+from legged_mw.rl.layers import Linear
+from legged_mw.rl.ppo import GraphedPPO
 
 SYMMETRY = {"data_augmentation_func": turned, "use_data_augmentation": True, "env": None}
 VARIANTS: dict[str, dict[str, Any]] = {

@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from legged_mw.deploy.memory import MEMORY, Memory, read_memory
 from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import UserError, unknown
 
-FORMAT = 2  # raised when a reader of the old format would misread the new one
+FORMATS = (2, 3)  # 3: the network has a memory. A file has the lowest that suffices, so that old readers read what they can
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"
 TERRAIN_FILE = "terrain.xml"  # the same robot among steps and blocks; only of policies that were trained on such ground
 
@@ -147,6 +148,7 @@ class Contract:
     gait: Gait | None = None  # likewise
     exam: Mapping[str, Any] | None = None  # the task's section `exam`, if the walking exam grades it
     safety: Mapping[str, Any] | None = None  # limits by name, other than the defaults of safety.Limits
+    memory: Memory | None = None  # of a recurrent network
 
     @property
     def size(self) -> int:
@@ -160,10 +162,11 @@ class Contract:
     def to_dict(self) -> dict[str, Any]:
         """What policy.yaml holds."""
         ends = {name: list(value) if isinstance(value, tuple) else value for name, value in self.ends._asdict().items() if value}
+        network = {"file": NETWORK_FILE, "sha256": self.digest, "input": self.input, "output": self.output}
         return {
-            "format": FORMAT,
+            "format": FORMATS[1] if self.memory else FORMATS[0],
             "task": self.task,
-            "network": {"file": NETWORK_FILE, "sha256": self.digest, "input": self.input, "output": self.output},
+            "network": network | ({MEMORY: self.memory.to_dict()} if self.memory else {}),
             "period": self.period,
             "joints": list(self.joints),
             "default_pose": self.default_pose.tolist(),
@@ -178,8 +181,7 @@ class Contract:
             "sensors": {name: list(names) for name, names in self.sensors.items()},
             **({SCAN: {"x": list(self.scan.x), "y": list(self.scan.y), "standing": self.scan.standing}} if self.scan else {}),
             **({"gait": {**self.gait._asdict(), "offsets": list(self.gait.offsets)}} if self.gait else {}),
-            **({"exam": dict(self.exam)} if self.exam is not None else {}),
-            **({"safety": dict(self.safety)} if self.safety is not None else {}),
+            **{name: dict(said) for name, said in (("exam", self.exam), ("safety", self.safety)) if said is not None},
         }
 
 
@@ -278,7 +280,8 @@ def read_contract(folder: Path) -> Contract:
 
 
 def _read(top: _Reader) -> Contract:
-    top.take("format", f"{FORMAT}, the one that this version reads; export the policy again", lambda v: v == FORMAT)
+    known = f"{' or '.join(map(str, FORMATS))}, which this version reads; export the policy again"
+    top.take("format", known, lambda v: v in FORMATS)
     network, action, robot, physics, measured = (top.section(name) for name in ("network", "action", "robot", "physics", "sensors"))
     joints, feet = top.texts("joints"), robot.section("feet")
     top.take("joints", "names, each once", lambda names: len(set(names)) == len(names))
@@ -307,8 +310,8 @@ def _read(top: _Reader) -> Contract:
         digest=network.text("sha256"),
         scan=_read_scan(top),
         gait=_read_gait(top),
-        exam=top.section("exam").values if "exam" in top.values else None,
-        safety=top.section("safety").values if "safety" in top.values else None,
+        **{name: top.section(name).values for name in ("exam", "safety") if name in top.values},
+        memory=read_memory(network.section(MEMORY)) if MEMORY in network.values else None,
     )
 
 

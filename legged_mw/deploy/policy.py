@@ -18,7 +18,10 @@ Floats = NDArray[np.floating[Any]]
 
 
 class Network:
-    """``policy.onnx`` on one thread: observations (N, size) -> actions (N, D), float32."""
+    """``policy.onnx`` on one thread: observations (N, size) -> actions (N, D), float32.
+
+    A recurrent one also takes what it remembers, and returns it after the actions: (N, *shape) of ``contract.memory``.
+    """
 
     def __init__(self, folder: Path, contract: Contract) -> None:
         """Load it; raises ContractError if its inputs and outputs are not the contract's."""
@@ -33,35 +36,40 @@ class Network:
             self._session = onnxruntime.InferenceSession((folder / NETWORK_FILE).read_bytes(), options, providers=["CPUExecutionProvider"])
         except Exception:  # onnxruntime raises a type of its own for each way that a file is broken
             raise ContractError(f"{NETWORK_FILE} cannot be read as an ONNX network: it is damaged; export the policy again") from None
-        self._input, self._output = contract.input, contract.output
+        memory = contract.memory
+        self._inputs = {contract.input: [contract.size]} | ({memory.input: [*memory.shape]} if memory else {})  # name -> shape
+        self._outputs = {contract.output: [len(contract.joints)]} | ({memory.output: [*memory.shape]} if memory else {})
         self._one_by_one = self._check(contract)
 
     def _check(self, contract: Contract) -> bool:
-        """One input and one output of the contract's names and sizes; returns whether the batch is fixed to 1."""
+        """Inputs and outputs of the contract's names and sizes; returns whether the batch is fixed to 1."""
         names = ", ".join(f"{row.name} {row.size * row.history}" for row in contract.rows)
-        for what, ports, name, size, why in (
-            ("input", self._session.get_inputs(), contract.input, contract.size, f"the rows of `observation`: {names}"),
-            ("output", self._session.get_outputs(), contract.output, len(contract.joints), "one action a joint"),
+        for what, ports, shapes, why in (
+            ("input", self._session.get_inputs(), self._inputs, f"the rows of `observation`: {names}"),
+            ("output", self._session.get_outputs(), self._outputs, "one action a joint"),
         ):
-            found = ", ".join(f"'{port.name}' {port.shape}" for port in ports)
-            if len(ports) != 1 or ports[0].name != name or len(ports[0].shape) != 2 or ports[0].shape[1] != size:
+            if {port.name: port.shape[1:] for port in ports} != shapes:
+                found = ", ".join(f"'{port.name}' {port.shape}" for port in ports)
+                stated = ", ".join(f"'{name}' {[1, *shape]}" for name, shape in shapes.items())
                 raise ContractError(
-                    f"{NETWORK_FILE} does not fit {CONTRACT_FILE}: its {what} is {found}, the contract's is '{name}' [1, {size}] ({why})"
+                    f"{NETWORK_FILE} does not fit {CONTRACT_FILE}: its {what} is {found}, the contract's is {stated} ({why})"
                 )
         return self._session.get_inputs()[0].shape[0] == 1
 
-    def __call__(self, obs: Floats) -> NDArray[np.float32]:
-        rows = np.ascontiguousarray(obs, dtype=np.float32)
-        if self._one_by_one and len(rows) != 1:
-            return np.concatenate([self(row[None]) for row in rows])
-        return np.asarray(self._session.run([self._output], {self._input: rows})[0])
+    def __call__(self, *inputs: Floats) -> Any:
+        whole = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in zip(self._inputs, inputs, strict=True)}
+        count = len(inputs[0])
+        batches = [{name: value[i : i + 1] for name, value in whole.items()} for i in range(count)] if self._one_by_one else [whole]
+        found = [self._session.run([*self._outputs], batch) for batch in batches]
+        outputs = [np.concatenate(parts) for parts in zip(*found, strict=True)]
+        return outputs if len(outputs) > 1 else outputs[0]
 
 
 class Controller:
     """A policy at work on ``count`` robots: observations and joint targets as the contract states them, and the memory they need."""
 
-    def __init__(self, folder: Path, contract: Contract, count: int = 1, network: Callable[[Floats], Floats] | None = None) -> None:
-        """``network``: observations (N, size) to actions (N, D), instead of the one in ``folder``."""
+    def __init__(self, folder: Path, contract: Contract, count: int = 1, network: Callable[..., Any] | None = None) -> None:
+        """``network``: what stands for the one in ``folder``; see ``Network``."""
         self.folder, self.contract, self._network = folder, contract, network or Network(folder, contract)
         self.last_observation = np.zeros((count, contract.size), dtype=np.float32)
         self.last_actions = np.zeros((count, len(contract.joints)), dtype=np.float32)
@@ -69,6 +77,7 @@ class Controller:
         self._frames = [np.zeros((count, row.history, row.size), dtype=np.float32) for row in contract.rows]  # as last observed
         self._fresh = np.ones(count, dtype=bool)  # robots that have observed nothing since their reset
         self.clock = GaitClock(contract, count) if contract.gait else None
+        self.memory = contract.memory.start(count) if contract.memory else None  # (N, *shape)
 
     def observe(self, measurement: Measurement, commands: Floats) -> NDArray[np.float32]:
         """The network's input (N, size) from a measurement of N robots (or of one, without the leading axis)."""
@@ -81,15 +90,21 @@ class Controller:
         if self.clock:
             self.clock.keep(commands, self._fresh)
         self._fresh[:] = False
-        self.last_observation = _side_by_side(self._frames)
-        self.last_actions = np.clip(self._network(self.last_observation), -action.clip, action.clip)
+        seen = self.last_observation = _side_by_side(self._frames)
+        if self.memory is None:
+            actions = self._network(seen)
+        else:
+            actions, self.memory = self._network(seen, self.memory)
+        self.last_actions = np.clip(actions, -action.clip, action.clip)
         origins = {"default": self.contract.default_pose, "joints": np.atleast_2d(measurement.joint_pos), "targets": self.last_targets}
         self.last_targets = origins[action.origin] + action.scale * self.last_actions.astype(np.float64)
         return self.last_targets.copy()
 
     def reset(self, which: Any = slice(None)) -> None:
-        """The robots ``which`` (indices or a mask) begin again: no actions, targets, frames or clocks of theirs are remembered."""
+        """The robots ``which`` (indices or a mask) begin again: nothing of theirs is remembered."""
         self.last_actions[which], self.last_targets[which], self._fresh[which] = 0.0, self.contract.default_pose, True
+        if self.memory is not None:
+            self.memory[which] = 0.0
 
     def _look(self, measurement: Measurement, commands: Floats) -> list[NDArray[np.float32]]:
         """Frames (N, history, size) of each row, the newest last."""

@@ -90,7 +90,8 @@ WALKING: dict[str, Rule] = {
 LEARNER: dict[str, Rule] = {
     **dict.fromkeys(("runner.num_steps_per_env", "runner.max_iterations", "runner.save_interval"), POSITIVE),
     **dict.fromkeys(("algorithm.learning_rate", "algorithm.num_learning_epochs", "algorithm.num_mini_batches"), POSITIVE),
-    **dict.fromkeys(("cpu.envs_per_core", "cpu.num_steps_per_env", "cpu.max_iterations"), POSITIVE),
+    **dict.fromkeys((f"{network}.rnn_{size}" for network in ("actor", "critic") for size in ("hidden_dim", "num_layers")), POSITIVE),
+    **dict.fromkeys(("cpu.envs_per_core", "cpu.num_steps_per_env", "cpu.max_iterations", "cpu.rnn_hidden_dim"), POSITIVE),
     **dict.fromkeys(("cpu.num_learning_epochs", "cpu.num_mini_batches", "cpu.desired_kl"), POSITIVE),
     **dict.fromkeys(("symmetry.mirror_loss_coeff", "anneal.entropy_coef", "anneal.desired_kl", "cpu.update_threads"), NOT_NEGATIVE),
     "runner.exam_interval": NOT_NEGATIVE,

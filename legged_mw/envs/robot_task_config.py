@@ -186,10 +186,13 @@ class RobotTaskCfgPPO(Config):
         critic: list[str] = ["privileged_state"]
 
     class actor:
-        class_name: str = "MLPModel"
+        class_name: str = "MLPModel"  # or "RNNModel": a GRU or LSTM before the MLP, a memory (docs/training.md)
         hidden_dims: list[int] = [512, 256, 128]  # [P]
         activation: str = "elu"  # [P]
         obs_normalization: bool = True  # [P]
+        rnn_type: Literal["gru", "lstm"] = "gru"  # of RNNModel alone, as the next two [ours: three quarters of an LSTM's work; R lstm]
+        rnn_hidden_dim: int = 256  # values that a layer remembers [R]
+        rnn_num_layers: int = 1  # [R]
 
         class distribution_cfg:
             class_name: str = "GaussianDistribution"
@@ -202,6 +205,9 @@ class RobotTaskCfgPPO(Config):
         hidden_dims: list[int] = [512, 256, 128]  # [P]
         activation: str = "elu"  # [P]
         obs_normalization: bool = True  # [P]
+        rnn_type: Literal["gru", "lstm"] = "gru"  # as the actor's
+        rnn_hidden_dim: int = 256
+        rnn_num_layers: int = 1
 
     class algorithm:
         class_name: str = "legged_mw.rl.ppo:GraphedPPO"  # or "PPO": rsl-rl's own, same results, slower on a GPU
@@ -236,6 +242,7 @@ class RobotTaskCfgPPO(Config):
         num_mini_batches: int = 4
         desired_kl: float = 0.02
         hidden_dims: list[int] = [128, 64, 32]  # of actor and critic
+        rnn_hidden_dim: int = 64  # likewise
         max_iterations: int = 2600
         overrides: dict[str, Any] = {}  # fields of the environment: dotted path -> value
         update_threads: int = 0  # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one

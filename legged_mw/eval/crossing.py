@@ -16,6 +16,7 @@ from torch import Tensor
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exam
 from legged_mw.eval.rollout import Policy
+from legged_mw.rl.recurrent import forget
 from legged_mw.sim.terrain import KINDS, MEASURES, measure
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask
@@ -77,10 +78,12 @@ def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor
     crossed, fell, over = (torch.zeros(env.num_envs, dtype=torch.bool, device=env.device) for _ in range(3))
     env.commands.copy_(command)
     obs = env.first_observations()
+    forget(policy)
     for _ in range(round(SECONDS / env.dt)):
         with torch.inference_mode():
             actions = policy(obs)
         obs, _, dones, extras = env.step(actions)
+        forget(policy, dones)
         fell |= dones & ~extras["time_outs"] & ~over
         over |= dones
         crossed |= (env.farthest[:, 0] > edge) & ~over

@@ -15,7 +15,7 @@ from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
 from legged_mw.eval.rules import ExamRules, in_common
 from legged_mw.rl.classes import check_classes
-from legged_mw.rl.policies import Source, act, introduce, load_policy
+from legged_mw.rl.policies import Source, introduce, load_policy
 from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import UserError, shown
@@ -87,8 +87,7 @@ def build(graded: Graded, args: argparse.Namespace, device: str) -> tuple[Policy
     seed_everything(task.train.seed)
     env = task.env_class(task.cfg, device, eager=args.eager)
     ground = rough.env_class(rough.cfg, device, eager=args.eager) if rough else None
-    policy = load_policy(graded.source.checkpoint, env, task.train, device)
-    return lambda obs: act(policy, obs), env, ground
+    return load_policy(graded.source.checkpoint, env, task.train, device), env, ground
 
 
 def make_column(graded: Graded, policy: Policy, env: LeggedRobot, rough: LeggedRobot | None) -> Column:

@@ -17,8 +17,9 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.recurrent import another, forget
 
-Policy = Callable[[TensorDict], Tensor]
+Policy = Callable[[TensorDict], Tensor]  # one with a memory is an rsl-rl network
 Signal = Callable[[Any], Tensor]  # a value a world, (N, ...)
 
 
@@ -63,8 +64,7 @@ def roll_out(
 ) -> Record:
     """Run each case in a world of its own for ``steps`` control steps.
 
-    The first ``alone`` worlds act as a batch of their own: a matrix product may round differently in a larger batch, and
-    what is computed of these worlds must not depend on how many others there are.
+    What is computed of the first ``alone`` worlds does not depend on how many others there are.
     """
     if len(cases) != env.num_envs:
         raise ValueError(f"{len(cases)} cases need as many worlds; this environment has {env.num_envs}")
@@ -73,7 +73,7 @@ def roll_out(
     asked, pushes = torch.tensor(timeline, dtype=torch.float, device=env.device), _pushes_by_step(cases, env.device)
     commands = getattr(env, "commands", asked[0])  # a task without commands has no buffer for them
     commands.copy_(asked[0])
-    obs = env.first_observations()
+    obs, actor = env.first_observations(), _Actor(policy, env.num_envs, alone)
     fell_at = torch.full((env.num_envs,), math.inf, device=env.device)
     kept: dict[str, Tensor] = {}
     for step in range(steps):
@@ -82,13 +82,14 @@ def roll_out(
             if name not in kept:
                 kept[name] = torch.empty(steps, *value.shape, dtype=value.dtype, device=value.device)
             kept[name][step] = value
-        actions = _act(policy, obs, alone)
+        actions = actor.act(obs)
         if step in pushes:
             worlds, jumps = pushes[step]
             env.root_lin_vel[worlds, :2] += jumps
         if step + 1 < steps:  # the observation at the end of this step shows the next command: a second one would be a step of delay
             commands.copy_(asked[step + 1])
         obs, _, dones, _ = env.step(actions)
+        actor.forget(dones)
         fell_at = torch.where(dones & (fell_at == math.inf), torch.full_like(fell_at, step), fell_at)
     return Record(
         dt=env.dt,
@@ -100,11 +101,24 @@ def roll_out(
     )
 
 
-def _act(policy: Policy, obs: TensorDict, alone: int | None) -> Tensor:
-    with torch.inference_mode():
-        if alone is None or alone == len(obs):
-            return policy(obs)
-        return torch.cat([policy(obs[:alone]), policy(obs[alone:])])
+class _Actor:
+    """A policy in all worlds. The first ``alone`` are a batch of their own: a matrix product may round differently in a larger one."""
+
+    def __init__(self, policy: Policy, worlds: int, alone: int | None) -> None:
+        forget(policy)
+        self._parts = [(policy, slice(alone or worlds))]
+        if alone not in (None, worlds):
+            self._parts.append((another(policy), slice(alone, worlds)))
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """Its actions (N, A)."""
+        with torch.inference_mode():
+            return torch.cat([policy(obs[worlds]) for policy, worlds in self._parts])
+
+    def forget(self, ended: Tensor) -> None:
+        """Nothing is remembered where ``ended`` (N,)."""
+        for policy, worlds in self._parts:
+            forget(policy, ended[worlds])
 
 
 def _timeline(cases: Sequence[Case], steps: int, default: Sequence[float]) -> NDArray[Any]:

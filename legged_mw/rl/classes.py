@@ -12,6 +12,7 @@ from typing import Any
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import CNNModel, MLPModel, RNNModel
 from rsl_rl.modules import BetaDistribution, GaussianDistribution, HeteroscedasticGaussianDistribution
+from rsl_rl.utils import resolve_class
 
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.utils.config import Config, ConfigError
@@ -43,6 +44,12 @@ def check_classes(cfg: Config) -> None:
                 f"{path} is {name!r}: only the task's own Python file, which --task names, may choose that; "
                 f"a run's config.yaml, --set and --override may name {', '.join(shortest) or 'nothing else there'}"
             )
+
+
+def network_section(section: dict[str, Any]) -> dict[str, Any]:
+    """The section of a network without the fields of a memory, if its class has none. Imports the class: check it first."""
+    taken = inspect.signature(resolve_class(section)[0]).parameters
+    return {name: value for name, value in section.items() if name in taken or not name.startswith("rnn_")}
 
 
 def _check_distribution(section: dict[str, Any] | None, path: str) -> None:

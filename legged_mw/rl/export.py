@@ -6,6 +6,7 @@ What the files mean is in ``legged_mw.deploy.contract``; nothing here is needed 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import os
 import shutil
 from collections.abc import Iterator
@@ -15,7 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from rsl_rl.models import MLPModel
+from rsl_rl.models import MLPModel, RNNModel
 
 from legged_mw.deploy.contract import (
     CLOCK,
@@ -35,12 +36,14 @@ from legged_mw.deploy.contract import (
     HeightScan,
     digest,
 )
+from legged_mw.deploy.memory import Memory
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
 from legged_mw.rl.export_scene import among_steps, standalone
-from legged_mw.rl.network import INPUT, OUTPUT, ExportedPolicy, halve, round_weights, run_onnx, save_onnx
+from legged_mw.rl.network import INPUT, MEMORY_INPUT, MEMORY_OUTPUT, OUTPUT, ExportedPolicy, halve, round_weights, run_onnx, save_onnx
 from legged_mw.rl.policies import load_policy
+from legged_mw.rl.recurrent import states_of
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import LEVEL, make_terrain
@@ -109,14 +112,17 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
     with _all_or_nothing(folder) as new:
         save_yaml(new / CONFIG_FILE, config)
         _write_network(policy, clip, new / NETWORK_FILE, half)
-        contract = make_contract(env, task, new, noise)
+        memory = Memory(MEMORY_INPUT, MEMORY_OUTPUT, states_of(policy)) if isinstance(policy, RNNModel) else None
+        contract = dataclasses.replace(make_contract(env, task, new, noise), memory=memory)
         save_yaml(new / CONTRACT_FILE, contract.to_dict())
         steps = record(env, policy, groups, contract, new)
         observations, actions = (np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions"))
-        acted = run_onnx(new / NETWORK_FILE, observations)
+        remembered = np.concatenate([step.memory for step in steps]) if memory else None
+        acted = run_onnx(new / NETWORK_FILE, observations, memory=remembered)
         gap = _compare(acted, np.clip(actions, -clip, clip))
         if half:
-            gap = _gap(acted, ExportedPolicy(exact, clip)(torch.from_numpy(observations)).detach().numpy())
+            outputs = ExportedPolicy(exact, clip)(*(torch.from_numpy(x) for x in (observations, remembered) if x is not None))
+            gap = _gap(acted, (outputs[0] if memory else outputs).detach().numpy())
         replay(env, contract, steps, new)
         no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
         files = (*FILES, *([TERRAIN_FILE] if (new / TERRAIN_FILE).exists() else []))

@@ -11,13 +11,15 @@ import numpy as np
 import torch
 from rsl_rl.models import MLPModel
 
-from legged_mw.deploy.contract import CONTRACT_FILE, Contract
+from legged_mw.deploy.contract import CONTRACT_FILE, NETWORK_FILE, Contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.network import MEMORY_OUTPUT, run_onnx
 from legged_mw.rl.policies import act
+from legged_mw.rl.recurrent import forget, memory_of
 from legged_mw.utils.errors import UserError
 
 STEPS = 32
@@ -39,6 +41,7 @@ class Step(NamedTuple):
     targets: np.ndarray  # (N, D) [rad] that the servos got, by encoders that may be off
     ended: np.ndarray  # (N,) the episode ended, so that nothing of the targets is left to see
     clock: np.ndarray  # (N,) phase of the gait clock, share of its period; 0 where there is none
+    memory: np.ndarray  # (N, states, H) what the policy remembered before it acted; (N, 0, 0) without a memory
 
 
 def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Contract, folder: Path) -> list[Step]:
@@ -49,6 +52,7 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
     fleet, offset, steps = Fleet(folder, contract, env.num_envs, threads=1), env.actuators.encoder_offset, []
     seen = env.get_observations()
     for _ in range(STEPS):
+        memory = memory_of(policy, env.num_envs).numpy().copy()
         actions = act(policy, seen)
         observation = torch.cat([seen[group] for group in groups], dim=1).numpy()
         measured, commands = _measure(env, fleet), np.zeros((env.num_envs, 0))
@@ -60,8 +64,9 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
         taken[-2:] += contract.action.clip * torch.randn_like(taken[-2:])
         seen, _, dones, _ = env.step(taken)
         targets = env.sim.ctrl if offset is None else env.sim.ctrl + offset
+        forget(policy, dones)
         arrays = (tensor.numpy().copy() for tensor in (actions, taken, targets, dones.bool()))
-        steps.append(Step(observation, measured, commands, *arrays, clock=clock))
+        steps.append(Step(observation, measured, commands, *arrays, clock=clock, memory=memory))
     return steps
 
 
@@ -98,9 +103,16 @@ def _measure(env: RobotTask, fleet: Fleet) -> Measurement:
 
 
 def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) -> None:
-    """Play ``steps`` through deploy's controller. Raises ExportError at the first observation or joint target that differs."""
-    actions = iter([step.taken for step in steps])
-    controller = Controller(folder, contract, env.num_envs, network=lambda _: next(actions))
+    """Play ``steps`` through deploy's controller. Raises ExportError at the first observation, memory or joint target that differs."""
+    recorded = iter(steps)
+
+    def network(_: Any, memory: np.ndarray | None = None) -> Any:
+        step = next(recorded)
+        if memory is None:
+            return step.taken
+        return step.taken, run_onnx(folder / NETWORK_FILE, step.observation, MEMORY_OUTPUT, memory)
+
+    controller = Controller(folder, contract, env.num_envs, network)
     for number, step in enumerate(steps):
         if controller.clock:
             controller.clock.start[:] = step.clock  # an episode of training may begin anywhere in the period
@@ -109,6 +121,9 @@ def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) 
             columns = slice(start, start := start + row.size * row.history)
             what = f"observation row '{row.name}'"
             _compare(env, number, what, range(row.size * row.history), step.observation[:, columns], observed[:, columns])
+        if controller.memory is not None:
+            flat = step.memory.reshape(env.num_envs, -1)
+            _compare(env, number, "memory", range(flat.shape[1]), flat, controller.memory.reshape(flat.shape))
         targets = controller.act(step.measured, step.commands)
         _compare(env, number, "joint target", contract.joints, step.targets[~step.ended], targets[~step.ended])
         controller.reset(step.ended)

@@ -6,60 +6,78 @@ import copy
 import logging
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
 import torch
 from onnx import numpy_helper
-from rsl_rl.models import MLPModel
+from rsl_rl.models import MLPModel, RNNModel
 from torch import Tensor, nn
 
+from legged_mw.rl.recurrent import states_of, step
 from legged_mw.utils.config import ConfigError
 
-INPUT, OUTPUT = "obs", "actions"
+INPUT, OUTPUT, MEMORY_INPUT, MEMORY_OUTPUT = "obs", "actions", "state_in", "state_out"
 PREFIX = "policy."  # of the weights' names in the file: the attribute of ExportedPolicy
 MEAN, STD = "obs_normalizer._mean", "obs_normalizer._std"
 UNWRITTEN = ("obs_normalizer._var", "obs_normalizer.count", "distribution.")  # no mean action needs them
 
 
 class ExportedPolicy(nn.Module):
-    """Observations (N, size) in their plain units -> clipped mean actions (N, A); the normaliser is inside."""
+    """Observations (N, size) in their plain units -> clipped mean actions (N, A); the normaliser is inside.
+
+    Of a recurrent policy the state (N, states, H) goes in beside the observations and comes out beside the actions.
+    """
+
+    policy: Any
 
     def __init__(self, policy: MLPModel, clip_actions: float) -> None:
         super().__init__()
-        self.policy, self.clip_actions = copy.deepcopy(policy).cpu().as_onnx(verbose=False), clip_actions
+        self.policy, self.clip_actions = copy.deepcopy(policy).cpu(), clip_actions
+        self.inputs, self.outputs, self.examples = [INPUT], [OUTPUT], [torch.zeros(2, policy.obs_dim)]
+        if not isinstance(policy, RNNModel):
+            self.policy = self.policy.as_onnx(verbose=False)
+            return
+        self.inputs, self.outputs = [INPUT, MEMORY_INPUT], [OUTPUT, MEMORY_OUTPUT]
+        self.examples.append(torch.zeros(2, *states_of(policy)))
 
-    def forward(self, obs: Tensor) -> Tensor:
-        return self.policy(obs).clamp(-self.clip_actions, self.clip_actions)
+    def forward(self, obs: Tensor, state_in: Tensor | None = None) -> Any:
+        policy, clip = self.policy, self.clip_actions
+        if state_in is None:
+            return policy(obs).clamp(-clip, clip)
+        seen, state = step(policy.rnn.rnn, policy.obs_normalizer(obs), state_in.transpose(0, 1))
+        return policy.distribution.deterministic_output(policy.mlp(seen)).clamp(-clip, clip), state.transpose(0, 1)
 
 
-def run_onnx(path: Path, observations: np.ndarray) -> np.ndarray:
-    """Actions (B, A) of the network in an ONNX file, by onnxruntime, or where it is not installed by onnx's own evaluator."""
+def run_onnx(path: Path, observations: np.ndarray, output: str = OUTPUT, memory: np.ndarray | None = None) -> np.ndarray:
+    """Actions (B, A), or another output, of the network in an ONNX file, by onnxruntime or where it is not installed onnx's evaluator."""
+    inputs = {INPUT: observations} | ({} if memory is None else {MEMORY_INPUT: memory})
     try:
         import onnxruntime
     except ImportError:
         from onnx.reference import ReferenceEvaluator
 
-        [actions] = ReferenceEvaluator(onnx.load(path)).run([OUTPUT], {INPUT: observations})
-        return np.asarray(actions)
+        [found] = ReferenceEvaluator(onnx.load(path)).run([output], inputs)
+        return np.asarray(found)
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    return np.asarray(session.run([OUTPUT], {INPUT: observations})[0])
+    return np.asarray(session.run([output], inputs)[0])
 
 
 def save_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
-    """Write one self-contained ONNX file: input ``obs`` (batch, size), output ``actions`` (batch, A)."""
-    example = torch.zeros(2, policy.obs_dim)
+    """Write one self-contained ONNX file: input ``obs`` (batch, size), output ``actions`` (batch, A); see ``ExportedPolicy``."""
+    exported = ExportedPolicy(policy, clip_actions).eval()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the exporter warns of its own internals, and logs that torchvision is missing
         logging.getLogger("torch.onnx").setLevel(logging.ERROR)
         torch.onnx.export(
-            ExportedPolicy(policy, clip_actions).eval(),
-            (example,),
+            exported,
+            tuple(exported.examples),
             path,
-            input_names=[INPUT],
-            output_names=[OUTPUT],
+            input_names=exported.inputs,
+            output_names=exported.outputs,
             opset_version=18,
-            dynamic_shapes={INPUT: {0: torch.export.Dim("batch", min=1)}},
+            dynamic_shapes={name: {0: torch.export.Dim("batch", min=1)} for name in exported.inputs},
             external_data=False,
             dynamo=True,
             verbose=False,

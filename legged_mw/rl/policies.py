@@ -14,7 +14,7 @@ from torch import Tensor
 
 from legged_mw import ROOT
 from legged_mw.envs.base_task import BaseTask
-from legged_mw.rl.classes import check_classes
+from legged_mw.rl.classes import check_classes, network_section
 from legged_mw.rl.network import read_parameters
 from legged_mw.rl.runs import CONFIG_FILE, check_fit, experiment_folder, find_checkpoint, find_run, load_tensors, runs
 from legged_mw.utils.config import Config, ConfigError, load_yaml
@@ -96,7 +96,7 @@ def load_policy(path: Path, env: BaseTask, cfg: Config, device: str) -> MLPModel
     """
     check_classes(cfg)
     sections: dict[str, Any] = copy.deepcopy(cfg.to_dict())
-    actor_class, actor_cfg = resolve_class(sections["actor"])
+    actor_class, actor_cfg = resolve_class(network_section(sections["actor"]))
     actor = actor_class(env.get_observations(), sections["obs_groups"], "actor", env.num_actions, **actor_cfg).to(device)
     saved = read_parameters(path, actor) if path.suffix == ".onnx" else load_tensors(path, device)["actor_state_dict"]
     check_fit(saved, actor.state_dict(), path, "actor")

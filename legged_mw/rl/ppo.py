@@ -10,23 +10,24 @@ normalisers' std) is copied into tensors that stay. Actor and critic share nothi
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import torch
 from rsl_rl.algorithms import PPO
-from rsl_rl.models import MLPModel
+from rsl_rl.extensions import Symmetry
+from rsl_rl.models import MLPModel, RNNModel
 from rsl_rl.modules import EmpiricalNormalization
 from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from legged_mw.rl.layers import run_mlp, update_normalizer
+from legged_mw.rl.recurrent import Memory, Sequence, check_recurrent, unroll
 from legged_mw.sim.graph import StepGraph
 
-_SUM_ROWS = 128  # summed by a thread; the rest of the rows is summed side by side
 _MIN_RATE, _MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
 
 
@@ -34,38 +35,15 @@ class Minibatch(NamedTuple):
     """Samples of an update, and what the networks see of them."""
 
     batch: RolloutStorage.Batch
-    actor_input: Tensor  # (B, size), normalised
-    critic_input: Tensor
-
-
-class Linear(torch.autograd.Function):
-    """``x W^T + b`` for many rows, faster than torch's own in two places.
-
-    Torch sums the bias gradient in one pass that leaves most of a GPU idle, this in two. ``x`` may have more columns than
-    the weight, of zeros: a multiple of four of them is what TF32 products want.
-    """
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-        if x.shape[1] > weight.shape[1]:
-            ctx.columns = weight.shape[1]
-            weight = nn.functional.pad(weight, (0, x.shape[1] - weight.shape[1]))
-        ctx.save_for_backward(x, weight)
-        return torch.addmm(bias, x, weight.t())
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, Tensor, Tensor]:
-        (grad,), (x, weight) = grads, ctx.saved_tensors
-        chunk = math.gcd(len(grad), _SUM_ROWS)
-        sums = grad.view(-1, chunk, grad.shape[1]).sum(dim=1).sum(dim=0)
-        columns = getattr(ctx, "columns", None)
-        return grad @ weight if ctx.needs_input_grad[0] else None, (grad.t() @ x)[:, :columns], sums
+    actor_input: Tensor | Sequence  # (B, size), normalised; a sequence for a network with a memory
+    critic_input: Tensor | Sequence
 
 
 class GraphedPPO(PPO):
     """PPO whose update and acting are replayed CUDA graphs.
 
-    What cannot be recorded (a network that is not a plain MLPModel or shares parameters, RND, mixed precision, an optimizer
+    A network with a memory (RNNModel) learns from whole worlds, in the order that is drawn; else from samples.
+    What cannot be recorded (a network that is not a plain MLPModel or RNNModel or shares parameters, RND, mixed precision, an optimizer
     other than Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. The first
     three updates of a run are launched step by step and the fourth is recorded: nothing is warmed up on a throw-away step.
     On a CPU nothing is recorded.
@@ -75,9 +53,14 @@ class GraphedPPO(PPO):
     _rate: Tensor | None = None  # else: () float64, as precise as rsl-rl's Python number
 
     def __init__(self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> None:
-        super().__init__(actor, critic, storage, **settings)
+        self._recurrent = actor.is_recurrent or critic.is_recurrent
+        symmetry = settings.pop("symmetry_cfg", None)
+        super().__init__(actor, critic, storage, symmetry_cfg=None if self._recurrent else symmetry, **settings)
         reason = self._why_stock()
         self.graphed = reason is None
+        if self._recurrent:
+            check_recurrent(storage.num_envs, self.num_mini_batches, symmetry, self.graphed)
+            self.symmetry = Symmetry(**symmetry) if symmetry else None  # rsl-rl refuses mirror images here
         if reason:
             print(f"PPO: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
             return
@@ -90,7 +73,7 @@ class GraphedPPO(PPO):
     def _why_stock(self) -> str | None:
         """What keeps this configuration from being recorded, or None."""
         for model in (self.actor, self.critic):
-            if type(model) is not MLPModel:
+            if type(model) not in (MLPModel, RNNModel):
                 return f"a network is a {type(model).__name__}"
         if self.rnd or self.use_mixed_precision:
             return f"{'rnd_cfg' if self.rnd else 'use_mixed_precision'} is set"
@@ -108,9 +91,16 @@ class GraphedPPO(PPO):
     def _begin(self) -> None:
         """Fixed tensors, and graphs that are not recorded yet."""
         st, device = self.storage, self.device
-        self._size = st.num_envs * st.num_transitions_per_env // self.num_mini_batches  # of a minibatch
+        drawn = st.num_envs if self._recurrent else st.num_envs * st.num_transitions_per_env
+        self._share = drawn // self.num_mini_batches  # of a minibatch, in samples or in whole worlds
+        self._size = self._share * (st.num_transitions_per_env if self._recurrent else 1)  # in samples
         self._obs = TensorDict({name: value[0].clone() for name, value in st.observations.items()}, [st.num_envs], device=device)
-        self._order = torch.zeros(self._size * self.num_mini_batches, dtype=torch.long, device=device)
+        self._order = torch.zeros(self._share * self.num_mini_batches, dtype=torch.long, device=device)
+        self._memories: dict[nn.Module, Memory] = {
+            model: Memory(model, st.num_envs, 2 if self.symmetry else 1, device)
+            for model in (self.actor, self.critic)
+            if isinstance(model, RNNModel)
+        }
         self._advantages = torch.zeros_like(st.returns)
         self._loss_names = ("value", "surrogate", "entropy", *(["symmetry"] if self.symmetry else []))
         self._losses = torch.zeros(len(self._loss_names), device=device)
@@ -145,6 +135,9 @@ class GraphedPPO(PPO):
         """Sampled actions (N, A); what the transition needs is noted until ``process_env_step``."""
         if not self.graphed:
             return super().act(obs)
+        if self.storage.step == 0:
+            for memory in self._memories.values():
+                memory.start.copy_(memory.now)
         self._obs.copy_(obs)
         self._act_graph()
         self.transition.observations = self._obs
@@ -153,16 +146,28 @@ class GraphedPPO(PPO):
         return self._acted[0].clone()
 
     def _act(self) -> None:
-        actor = self.actor
+        actor, seen = self.actor, self._obs
+        if self._memories and self.symmetry:
+            seen, _ = self.symmetry.data_augmentation_func(env=self.symmetry.env, obs=seen, actions=None)
         with self._beside():
-            values = self.critic(self._obs)
+            values = self.critic.mlp(self._latent(self.critic, seen))
         assert actor.distribution is not None
-        actor.distribution.update(actor.mlp(actor.get_latent(self._obs)))  # the forward pass without its sample
+        actor.distribution.update(actor.mlp(self._latent(actor, seen)))  # the forward pass without its sample
         mean, std = actor.output_mean, actor.output_std
         actions = mean + std * torch.randn_like(mean)  # torch.normal would check std on the host
         self._acted = (actions, values, actor.get_output_log_prob(actions))
         self._acted_params = tuple(actor.output_distribution_params)
         self._meet()
+
+    def _latent(self, model: MLPModel, seen: TensorDict) -> Tensor:
+        """What a network's MLP reads; a memory takes in what is ``seen``, with mirror images where it is to learn from those."""
+        return self._memories[model].look(seen) if model in self._memories else model.get_latent(self._obs)
+
+    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
+        """Store the transition; worlds whose episode ended are forgotten."""
+        super().process_env_step(obs, rewards, dones, extras)
+        for memory in self._memories.values() if self.graphed else ():
+            memory.forget(dones)
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Returns and advantages of the stored transitions, into the storage."""
@@ -174,7 +179,10 @@ class GraphedPPO(PPO):
             self.storage.advantages = self._advantages
 
     def _compute_returns(self) -> None:
+        memory = self._memories.get(self.critic)
+        self.critic.reset(hidden_state=memory.for_rsl_rl() if memory else None)  # rsl-rl looks once more, and so does not change ours
         super().compute_returns(self._obs)
+        self.critic.reset()
         self._advantages.copy_(self.storage.advantages)
 
     # ---- the update -----------------------------------------------------------------------------------------------
@@ -192,7 +200,7 @@ class GraphedPPO(PPO):
 
     def _update(self) -> None:
         self._losses.zero_()
-        batches = [self._prepare(indices) for indices in self._order.split(self._size)]
+        batches = [self._prepare(indices) for indices in self._order.split(self._share)]
         for _ in range(self.num_learning_epochs):
             for batch in batches:
                 self._minibatch(batch)
@@ -205,7 +213,7 @@ class GraphedPPO(PPO):
         st = self.storage
 
         def take(stored: Any) -> Tensor:
-            return stored.flatten(0, 1).index_select(0, indices)
+            return stored.index_select(1, indices).flatten(0, 1) if self._recurrent else stored.flatten(0, 1).index_select(0, indices)
 
         assert st.distribution_params is not None
         batch = RolloutStorage.Batch(
@@ -221,13 +229,15 @@ class GraphedPPO(PPO):
             batch.advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)  # type: ignore[operator]
         if self.symmetry:
             self.symmetry.augment_batch(batch, self._size)
-        return Minibatch(batch, self._input(self.actor, batch.observations), self._input(self.critic, batch.observations))
+        return Minibatch(batch, *(self._input(model, batch.observations, indices) for model in (self.actor, self.critic)))
 
     @torch.no_grad()
-    def _input(self, model: MLPModel, obs: Any) -> Tensor:
+    def _input(self, model: MLPModel, obs: Any, indices: Tensor) -> Tensor | Sequence:
         """What the network sees of observations, normalised, with columns of zeros up to a multiple of four."""
-        latent = model.get_latent(obs)
-        return nn.functional.pad(latent, (0, -latent.shape[1] % 4))
+        memory = self._memories.get(model)
+        latent = memory.normalised(obs) if memory else model.get_latent(obs)
+        padded = nn.functional.pad(latent, (0, -latent.shape[1] % 4))
+        return memory.sequence(padded, indices, self.storage.dones) if memory else padded
 
     def _minibatch(self, minibatch: Minibatch) -> None:
         """One gradient step."""
@@ -303,16 +313,16 @@ class GraphedPPO(PPO):
         for model in (self.actor, self.critic):
             if isinstance(model.obs_normalizer, EmpiricalNormalization):
                 inputs = torch.cat([obs[group] for group in model.obs_groups], dim=-1)
-                _update_normalizer(model.obs_normalizer, inputs, self.gpu_world_size)
+                update_normalizer(model.obs_normalizer, inputs, self.gpu_world_size)
 
     def _symmetry_loss(self, batch: Any) -> Tensor:
         """How far the policy is from its own mirror image; of an augmented batch, the forward pass is already made."""
         symmetry, size = self.symmetry, self._size
         assert symmetry is not None
-        if symmetry.use_mirror_loss or not symmetry.use_data_augmentation:
+        if not self._recurrent and (symmetry.use_mirror_loss or not symmetry.use_data_augmentation):
             return symmetry.compute_loss(self.actor, copy.copy(batch), size)  # it puts mirror images into what it is given
-        means = self.actor.output_mean.detach()
-        _, mirrored = symmetry.data_augmentation_func(env=symmetry.env, obs=None, actions=means[:size])
+        means = self.actor.output_mean
+        _, mirrored = symmetry.data_augmentation_func(env=symmetry.env, obs=None, actions=means[:size].detach())
         return nn.functional.mse_loss(means[size:], mirrored[size:])
 
     # ---- learning rate and checkpoints: rsl-rl's own PPO reads and writes the same -----------------------------------------
@@ -359,29 +369,6 @@ class GraphedPPO(PPO):
         return iteration
 
 
-def _forward(model: MLPModel, inputs: Tensor) -> Tensor:
-    """The network's output for normalised inputs (B, size)."""
-    for layer in model.mlp:
-        inputs = Linear.apply(inputs, layer.weight, layer.bias) if type(layer) is nn.Linear else layer(inputs)  # type: ignore[misc]
-    return inputs
-
-
-def _update_normalizer(normalizer: EmpiricalNormalization, x: Tensor, world_size: int) -> None:
-    """rsl-rl's running mean and variance over ``x`` (B, size), in place and without its copy from the host."""
-    if not normalizer.training:
-        return
-    count = x.shape[0] * world_size
-    var, mean = torch.var_mean(x, dim=0, unbiased=False, keepdim=True)
-    if world_size > 1:  # every rank brings as many samples
-        own_mean = mean.clone()
-        torch.distributed.all_reduce(mean)
-        mean /= world_size
-        var += (own_mean - mean).square()
-        torch.distributed.all_reduce(var)
-        var /= world_size
-    normalizer.count += count
-    rate = count / normalizer.count
-    delta = mean - normalizer._mean
-    normalizer._mean += rate * delta
-    normalizer._var += rate * (var - normalizer._var + delta * (mean - normalizer._mean))
-    normalizer._std.copy_(normalizer._var.sqrt())
+def _forward(model: MLPModel, inputs: Tensor | Sequence) -> Tensor:
+    """The network's output for normalised inputs (B, size), or over a sequence."""
+    return run_mlp(model.mlp, unroll(model.rnn.rnn, inputs) if isinstance(inputs, Sequence) else inputs)  # type: ignore[attr-defined]

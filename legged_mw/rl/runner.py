@@ -22,7 +22,7 @@ from legged_mw.envs.divergence import Watch
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.envs.wording import config_words
-from legged_mw.rl.classes import check_classes
+from legged_mw.rl.classes import check_classes, network_section
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import this_rank
 from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
@@ -152,7 +152,7 @@ class Runner(OnPolicyRunner):
         if self.device != "cpu":
             torch.cuda.synchronize(self.device)  # what is still queued is not the exam's time
         policy, begun = self.alg.get_policy(), time.time()
-        training = policy.training
+        training, memory = policy.training, policy.get_hidden_state()
         try:
             figures = self.examine(policy.eval())
         except Exception as error:  # hours of training are not to be lost to a figure in TensorBoard
@@ -161,6 +161,7 @@ class Runner(OnPolicyRunner):
             return
         finally:
             policy.train(training)
+            policy.reset(hidden_state=memory)  # of the worlds in training
         self.last_exam = self.current_learning_iteration, figures
         if self.logger.writer is not None:
             curves = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
@@ -316,7 +317,7 @@ def rsl_rl_config(cfg: RobotTaskCfgPPO) -> dict[str, Any]:
     symmetry_cfg = {"data_augmentation_func": "legged_mw.rl.symmetry:mirror", **symmetry} if mirrors else None
     algorithm = {"rnd_cfg": None, "symmetry_cfg": symmetry_cfg, **sections.pop("algorithm")}
     anneal = {name: (algorithm[name], end) for name, end in sections.pop("anneal").items()}
-    flat = {key: runner[key] for key in keys}
+    flat = {key: runner[key] for key in keys} | {name: network_section(sections[name]) for name in ("actor", "critic")}
     return {**sections, **flat, "algorithm": algorithm, "anneal": anneal, "logger": logger, "check_for_nan": False}
 
 

@@ -96,6 +96,7 @@ class LoadedTask:
         train.algorithm.num_learning_epochs, train.algorithm.num_mini_batches = few.num_learning_epochs, few.num_mini_batches
         train.algorithm.desired_kl = few.desired_kl
         train.actor.hidden_dims = train.critic.hidden_dims = few.hidden_dims
+        train.actor.rnn_hidden_dim = train.critic.rnn_hidden_dim = few.rnn_hidden_dim
         for path, value in few.overrides.items():
             self.set(path, value, where="cpu.overrides")
 

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.recurrent import forget
 from legged_mw.sim.drawing import visual_spec
 from legged_mw.sim.terrain import name_tile
 from legged_mw.utils.commands import Command
@@ -50,7 +51,8 @@ class EnvStage:
                 for group, columns, scales in self._clock_columns:
                     env.obs_buf[group][:, columns] = self._gait.row * scales
             self._obs = env.get_observations()
-        self._obs, *_ = env.step(self.policy(self._obs))
+        self._obs, _, dones, _ = env.step(self.policy(self._obs))
+        forget(self.policy, dones)
 
     def commands(self) -> FloatArray:
         return _array(self._commands)
@@ -83,6 +85,7 @@ class EnvStage:
         mask = torch.zeros(self.num_worlds, dtype=torch.bool, device=self.env.device)
         mask[world] = True
         self.env.restart(mask)
+        forget(self.policy, mask)
         self._obs = self.env.get_observations()
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from legged_mw.rl.classes import check_classes
-from legged_mw.rl.policies import Source, act, introduce, load_policy
+from legged_mw.rl.policies import Source, introduce, load_policy
 from legged_mw.rl.runs import require_task
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, pick_device, seed_everything
 from legged_mw.utils.commands import Command, command_table
@@ -115,5 +115,5 @@ def watch(source: Source, task: LoadedTask, commands: tuple[Command, ...], args:
     env = task.env_class(task.cfg, device, eager=args.eager)
     policy = load_policy(source.checkpoint, env, task.train, device)
     sizes = {name: getattr(task.cfg.viewer, name) for name in ("width", "height", "fps")}
-    stage = EnvStage(env, lambda obs: act(policy, obs), commands)
+    stage = EnvStage(env, policy, commands)
     launch.watch(stage, args, source.results(task), title=task.name, **sizes)

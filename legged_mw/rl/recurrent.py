@@ -1,0 +1,213 @@
+"""GRU and LSTM networks in a recorded rollout and update, and what a policy with a memory needs wherever it acts.
+
+rsl-rl cuts a rollout into episodes and pads them to one length: a shape that depends on data. Here the network runs over the
+T steps of the rollout with all worlds side by side, and the state of a world becomes 0 before the step that begins an episode:
+the same values and gradients. cuDNN cannot change a state on the way, so each step is a product and a few kernels of its own.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from rsl_rl.models import MLPModel, RNNModel
+from torch import Tensor, nn
+
+from legged_mw.rl.layers import Linear, sum_rows
+from legged_mw.utils.config import ConfigError
+
+
+class Sequence(NamedTuple):
+    """What a recurrent network sees in an update: S is 2 with mirror images, else 1; B worlds over T steps."""
+
+    inputs: Tensor  # (S, T, B, size), normalised
+    state: Tensor  # (states, S, B, H), at the first step
+    keep: Tensor  # (T, B, 1): 0 where an episode begins, else 1
+
+
+class Memory:
+    """The state of a recurrent network in each of N worlds, in tensors that stay.
+
+    With ``images`` 2 it also holds the state of the network that has seen the mirror images only: a learned state has no mirror image
+    of its own.
+    """
+
+    def __init__(self, model: RNNModel, worlds: int, images: int, device: str) -> None:
+        self._model = model
+        self.now = torch.zeros(states_of(model)[0], images, worlds, states_of(model)[1], device=device)
+        self.start = torch.zeros_like(self.now)  # when the rollout began
+
+    def look(self, obs: Any) -> Tensor:
+        """Take in observations (N,), or (2N,) with their images; returns what the MLP reads (N, H)."""
+        seen, after = step(self._model.rnn.rnn, self.normalised(obs), self.now.flatten(1, 2))
+        self.now.copy_(after.view_as(self.now))
+        return seen[: self.now.shape[2]]
+
+    def normalised(self, obs: Any) -> Tensor:
+        """What the recurrent part reads of observations (B,): (B, size)."""
+        return MLPModel.get_latent(self._model, obs)
+
+    def forget(self, ended: Tensor) -> None:
+        """The state becomes 0 where ``ended`` (N,)."""
+        self.now.masked_fill_(ended.bool()[:, None], 0.0)
+
+    def for_rsl_rl(self) -> Any:
+        """A copy of the state in rsl-rl's form: h, or (h, c), each (layers, N, H)."""
+        parts = self.now[:, 0].clone().split(self._model.rnn.rnn.num_layers)
+        return parts[0] if len(parts) == 1 else parts
+
+    def sequence(self, inputs: Tensor, worlds: Tensor, dones: Tensor) -> Sequence:
+        """The rollout of ``worlds`` (B,) from ``inputs`` (S * T * B, size) and where a step ended an episode, ``dones`` (T, N, 1)."""
+        ended = dones.index_select(1, worlds).to(inputs.dtype)
+        keep = torch.cat([torch.ones_like(ended[:1]), 1.0 - ended[:-1]])
+        return Sequence(inputs.view(-1, len(keep), len(worlds), inputs.shape[1]), self.start.index_select(2, worlds), keep)
+
+
+def check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | None, recorded: bool) -> None:
+    """Refuse what does not go with a memory. Raises ConfigError."""
+    if worlds < minibatches:
+        raise ConfigError(
+            f"algorithm.num_mini_batches is {minibatches}, but a recurrent network learns from whole worlds, and env.num_envs is {worlds}: "
+            "raise the latter or lower the former"
+        )
+    if symmetry and not (recorded and symmetry["use_data_augmentation"]):
+        raise ConfigError(
+            "a recurrent network needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, and for both this project's recorded "
+            "update; switch the former on, or both off"
+        )
+
+
+def memory_of(policy: MLPModel, worlds: int) -> Tensor:
+    """What an rsl-rl network remembers (N, states, H), zeros at first; (N, 0, 0) without a memory."""
+    held = policy.get_hidden_state()
+    if held is None:
+        return torch.zeros(worlds, *(states_of(policy) if isinstance(policy, RNNModel) else (0, 0)))
+    return (torch.cat(held) if isinstance(held, tuple) else held).transpose(0, 1)
+
+
+def states_of(model: RNNModel) -> tuple[int, int]:
+    """How many states it has, each layer's h, of an LSTM then each layer's c; and the size H of each."""
+    rnn = model.rnn.rnn
+    return rnn.num_layers * (2 if isinstance(rnn, nn.LSTM) else 1), rnn.hidden_size
+
+
+def forget(policy: Any, ended: Tensor | None = None) -> None:
+    """Tell a policy in which worlds (N,) an episode ended; None: in all. What has no memory has nothing to forget."""
+    if getattr(policy, "is_recurrent", False):
+        with torch.inference_mode():  # its state may have been made there
+            policy.reset(ended)
+
+
+def another(policy: Any) -> Any:
+    """The same policy with a memory of its own; itself, if it has none."""
+    if not getattr(policy, "is_recurrent", False):
+        return policy
+    return copy.deepcopy(policy).apply(lambda part: part.flatten_parameters() if isinstance(part, nn.RNNBase) else None)
+
+
+def step(rnn: nn.RNNBase, x: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    """One step of a GRU or LSTM from inputs (N, size) and state (states, N, H): its output (N, H) and the next state."""
+    hidden, cells = [], []
+    for layer, weights in enumerate(rnn.all_weights):
+        if isinstance(rnn, nn.LSTM):
+            x, cell = torch.lstm_cell(x, [state[layer], state[rnn.num_layers + layer]], *weights)
+            cells.append(cell)
+        else:
+            x = torch.gru_cell(x, state[layer], *weights)
+        hidden.append(x)
+    return x, torch.stack([*hidden, *cells])
+
+
+def unroll(rnn: nn.RNNBase, sequence: Sequence) -> Tensor:
+    """The outputs (S * T * B, H) of a GRU or LSTM over a sequence; gradients reach back to the start of each episode or of the rollout."""
+    x, state, keep = sequence
+    layer_of: Callable[..., Tensor] = LSTM.apply if isinstance(rnn, nn.LSTM) else GRU.apply  # type: ignore[assignment]
+    for layer, (into, onward, bias, onward_bias) in enumerate(rnn.all_weights):
+        gates = Linear.apply(x.flatten(0, 2), into, bias).unflatten(0, x.shape[:3])  # type: ignore[union-attr]
+        x = layer_of(gates, state[layer :: rnn.num_layers], keep, onward, onward_bias)
+    return x.flatten(0, 2)
+
+
+# The two layers below take what torch's GRU and LSTM make of the inputs, (S, T, B, gates * H), and run the rest, the state's part,
+# step by step. In the backward pass the gradient of every gate is that of h (or c) times a factor: all factors are made at once.
+
+
+class GRU(torch.autograd.Function):
+    """r, z = sigmoid(gates + W h + b); n = tanh(gate + r (W h + b)); next h = (1 - z) n + z h."""
+
+    @staticmethod
+    def forward(ctx: Any, gates: Tensor, start: Tensor, keep: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        (images, steps, worlds, _), size = gates.shape, weight.shape[1]
+        out = gates.new_empty(images, steps, worlds, size)
+        before, new, rz, onward = (gates.new_empty(steps, images, worlds, k * size) for k in (1, 1, 2, 3))
+        h = start[0]
+        for t in range(steps):
+            torch.mul(h, keep[t], out=before[t])
+            torch.addmm(bias, before[t].flatten(0, 1), weight.t(), out=onward[t].flatten(0, 1))
+            torch.add(gates[:, t, :, : 2 * size], onward[t, ..., : 2 * size], out=rz[t]).sigmoid_()
+            torch.addcmul(gates[:, t, :, 2 * size :], rz[t, ..., :size], onward[t, ..., 2 * size :], out=new[t]).tanh_()
+            h = torch.lerp(new[t], before[t], rz[t, ..., size:], out=out[:, t])
+        ctx.save_for_backward(before, new, rz, onward, keep, weight)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        (grad,), (before, new, rz, onward, keep, weight) = grads, ctx.saved_tensors
+        size = weight.shape[1]
+        r, z = rz.chunk(2, dim=-1)
+        to_new = (1.0 - z) * (1.0 - new.square())
+        into = torch.cat([to_new * onward[..., 2 * size :] * r * (1.0 - r), (before - new) * z * (1.0 - z), to_new * r], dim=-1)
+        of_h = torch.empty_like(before)
+        of_h[-1] = grad[:, -1]
+        for t in reversed(range(len(keep))):
+            into[t].unflatten(-1, (3, size)).mul_(of_h[t].unsqueeze(-2))  # from here on a gradient
+            if t:
+                back = (into[t].flatten(0, 1) @ weight).view_as(of_h[t]).addcmul_(of_h[t], z[t])
+                torch.addcmul(grad[:, t - 1], back, keep[t], out=of_h[t - 1])
+        of_gates = torch.cat([into[..., : 2 * size], to_new * of_h], dim=-1).transpose(0, 1)
+        rows = into.flatten(0, 2)
+        return of_gates, None, None, rows.t() @ before.flatten(0, 2), sum_rows(rows)
+
+
+class LSTM(torch.autograd.Function):
+    """i, f, o = sigmoid(gates + W h + b), g = tanh(gate + W h + b); next c = f c + i g; next h = o tanh(c)."""
+
+    @staticmethod
+    def forward(ctx: Any, gates: Tensor, start: Tensor, keep: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+        (images, steps, worlds, _), size = gates.shape, weight.shape[1]
+        out = gates.new_empty(images, steps, worlds, size)
+        before, cell, squashed, ifgo = (gates.new_empty(steps, images, worlds, k * size) for k in (1, 1, 1, 4))
+        h, c = start
+        for t in range(steps):
+            torch.mul(h, keep[t], out=before[t])
+            torch.mul(c, keep[t], out=cell[t])
+            torch.addmm(bias, before[t].flatten(0, 1), weight.t(), out=ifgo[t].flatten(0, 1))
+            i, f, g, o = ifgo[t].add_(gates[:, t]).chunk(4, dim=-1)
+            ifgo[t, ..., : 2 * size].sigmoid_()
+            g.tanh_()
+            o.sigmoid_()
+            c = torch.mul(f, cell[t]).addcmul_(i, g)
+            h = torch.mul(o, torch.tanh(c, out=squashed[t]), out=out[:, t])
+        ctx.save_for_backward(before, cell, squashed, ifgo, keep, weight)
+        return out
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        (grad,), (before, cell, squashed, ifgo, keep, weight) = grads, ctx.saved_tensors
+        size = weight.shape[1]
+        i, f, g, o = ifgo.chunk(4, dim=-1)
+        to_cell, onward = o * (1.0 - squashed.square()), f * keep.unsqueeze(1)
+        factors = [g * i * (1.0 - i), cell * f * (1.0 - f), i * (1.0 - g.square()), squashed * o * (1.0 - o)]
+        into = torch.cat(factors, dim=-1)
+        of_h, of_c = grad[:, -1], torch.zeros_like(cell[0])  # of c only what comes from the step after
+        for t in reversed(range(len(keep))):
+            of_c = torch.addcmul(of_c, of_h, to_cell[t])
+            into[t, ..., : 3 * size].unflatten(-1, (3, size)).mul_(of_c.unsqueeze(-2))  # from here on a gradient
+            into[t, ..., 3 * size :].mul_(of_h)
+            if t:
+                of_c = of_c * onward[t]
+                of_h = torch.addcmul(grad[:, t - 1], (into[t].flatten(0, 1) @ weight).view_as(of_c), keep[t])
+        rows = into.flatten(0, 2)
+        return into.transpose(0, 1), None, None, rows.t() @ before.flatten(0, 2), sum_rows(rows)
