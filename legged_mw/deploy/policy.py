@@ -90,7 +90,7 @@ class Controller:
         if self.clock:
             self.clock.keep(commands, self._fresh)
         self._fresh[:] = False
-        self.last_observation = seen = _side_by_side(self._frames)
+        seen = self.last_observation = _side_by_side(self._frames)
         if self.memory is None:
             actions = self._network(seen)
         else:

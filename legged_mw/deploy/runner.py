@@ -6,7 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -53,32 +53,39 @@ def run(
     """
     contract = controller.contract
     safety = safety or Safety(contract, Limits.of(controller.folder, contract, robot.limits))
-    summary, velocities = Summary(), deque(maxlen=math.ceil(min(seconds, 2 * _RECENT) / contract.period / 2) + 1)
-    one = _Step(robot, controller, command, safety, states, log)
+    one, velocities = _Step(robot, controller, command, safety, states, log), _Velocities(contract.period, seconds)
     with ExitStack() as stack:
-        for each in (states, log):
-            if each:
-                stack.callback(each.close)
+        for each in filter(None, (states, log)):
+            stack.callback(each.close)
         loop = stack.enter_context(Loop(contract.period, live))
         stack.enter_context(robot)
         controller.reset()
         with suppress(*([KeyboardInterrupt] if states else [])):  # a person ends a run with states so
             for now in loop.ticks(seconds):
                 measured = one.take(loop)
-                if one.fell and not states:
-                    summary.fell = now
+                if one.summary.fell is not None:
                     break
-                summary.steps += 1
                 if measured:
-                    velocities.append([*measured.lin_vel[:2], measured.ang_vel[2]])
+                    velocities.add(measured)
                     if watch:
                         watch(now, measured)
         if log and live:
             log.event(loop.now, str(loop.timing()))
-    if velocities:
-        summary.velocity = np.mean(list(velocities)[-(summary.steps - summary.steps // 2) :], axis=0)
-    summary.late, summary.timing, summary.trips = loop.late, loop.timing() if live else None, one.trips
-    return summary
+    return replace(one.summary, velocity=velocities.mean(one.summary.steps), late=loop.late, timing=loop.timing() if live else None)
+
+
+class _Velocities:
+    """The last half of a run's velocities, of a run without an end its last seconds: memory is fixed."""
+
+    def __init__(self, period: float, seconds: float) -> None:
+        self._kept: deque[list[float]] = deque(maxlen=math.ceil(min(seconds, 2 * _RECENT) / period / 2) + 1)
+
+    def add(self, measured: Measurement) -> None:
+        self._kept.append([*measured.lin_vel[:2], measured.ang_vel[2]])
+
+    def mean(self, steps: int) -> Floats | None:
+        """(3,) over the second half of ``steps``."""
+        return np.mean(list(self._kept)[-max(1, steps - steps // 2) :], axis=0) if self._kept else None
 
 
 class _Step:
@@ -94,14 +101,16 @@ class _Step:
         log: Log | None,
     ) -> None:
         self.robot, self.controller, self.command, self.safety, self.states, self.log = robot, controller, command, safety, states, log
-        self.trips: list[Trip] = []
-        self.fell = False
+        self.summary = Summary()
+        if states and (type(robot).damp is Robot.damp or type(robot).limp is Robot.limp):
+            raise RobotError(f"{type(robot).__name__} has no damp() and limp() of its own, which the states need")
 
     def take(self, loop: Loop) -> Measurement | None:
         """One step; returns what was measured, None if nothing could be."""
         measured, health, trip = self._sense(loop)
-        if self.fell and not self.states:
+        if self.summary.fell is not None:
             return measured
+        self.summary.steps += 1
         if trip or measured is None:
             order = self._trip(trip, loop.now)
         else:
@@ -126,10 +135,12 @@ class _Step:
         stop = self.states.listen(health, loop.now) if self.states else None
         if measured is None or stop:
             return measured, health, stop or trip
-        self.fell = self.controller.contract.ends.tilted(measured.gravity) or self.robot.fell()
-        if self.fell and (not self.states or self.states.state == POLICY):
-            return measured, health, Trip("fall", "the robot fell")
-        if not self.states or self.states.armed:
+        if self.controller.contract.ends.tilted(measured.gravity) or self.robot.fell():
+            if not self.states:
+                self.summary.fell = loop.now
+            elif self.states.state == POLICY:
+                return measured, health, Trip("fall", "the robot fell")
+        if self.states is None or self.states.armed:
             trip = self.safety.sensed(measured, health, loop.now, loop.behind)
         return measured, health, trip
 
@@ -147,7 +158,7 @@ class _Step:
             assert trip
             raise Tripped(trip)
         if trip and self.states.state != DAMPING:
-            self.trips.append(trip)
+            self.summary.trips.append(trip)
             if self.log:
                 self.log.event(now, f"{trip.limit}: {trip.text}")
             return self.states.trip(trip, now)
