@@ -261,13 +261,14 @@ class SimulatedUnitree:
 
 
 def _whole(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """The scene with all its geoms of collision (group 3) on the ground, and a solver that gets along with a robot that lies there.
+    """The scene with every body on the ground that has shapes of collision (group 3), and a solver for a robot that lies there.
 
-    Training leaves most of them out, and stops after the first iterations.
+    Training leaves most bodies out, and stops after the first iterations. Bodies that were on the ground stay as they were: feet.
     """
-    for geom in spec.geoms:
-        if geom.group == 3:
-            geom.conaffinity |= 1
+    for body in spec.bodies:
+        shapes = [geom for geom in body.geoms if geom.group == 3]
+        for geom in shapes if not any(geom.conaffinity for geom in shapes) else ():
+            geom.conaffinity = 1
     model = spec.compile()
     model.opt.iterations, model.opt.ls_iterations = 100, 50  # MuJoCo's own
     return model
