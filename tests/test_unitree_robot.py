@@ -13,11 +13,11 @@ import pytest
 from legged_mw.deploy.contract import ContractRow, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import RobotError, damped
-from legged_mw.deploy.unitree.client import check_rows
+from legged_mw.deploy.unitree.client import UnitreeRobot, check_rows
 from legged_mw.deploy.unitree.codec import LAYOUTS, Message
-from legged_mw.deploy.unitree.link import Received, RobotEnd, Wire
+from legged_mw.deploy.unitree.link import CHECK_MODE, RELEASE_MODE, STAND_DOWN, Received, RobotEnd, Wire
 from legged_mw.deploy.unitree.robots import G1, GO2, H1
-from legged_mw.deploy.unitree.serve import Faults
+from legged_mw.deploy.unitree.serve import Faults, SimulatedUnitree
 from tests.wires import POLICIES, pair
 from tests.wires import domain as domain
 
@@ -184,8 +184,6 @@ def test_h1_on_the_wire() -> None:
         joints=tuple(H1.motors),
         **{name: np.arange(19.0) for name in ("default_pose", "stiffness", "damping")},
     )
-    from legged_mw.deploy.unitree.client import UnitreeRobot
-
     owner = Once(Message(LAYOUTS["unitree_go", "LowState_"]).seal())
     robot = UnitreeRobot(contract, owner, owner.receive(), clock=lambda: 0.0)
     robot.write(np.arange(19.0))
@@ -242,8 +240,6 @@ def test_no_robot(domain: int) -> None:
 def test_the_wrong_robot(domain: int) -> None:
     """A Go2's policy where a G1 is."""
     folder = POLICIES / "g1_flat"
-    from legged_mw.deploy.unitree.serve import SimulatedUnitree
-
     sim = SimulatedUnitree(folder, read_contract(folder), RobotEnd("unitree_hg", "lo", domain))
     wire = Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time)
     with pytest.raises(RobotError, match="the robot there speaks unitree_hg::msg::dds_::LowState_: it is not the contract's"):
@@ -266,9 +262,15 @@ def test_another_commander(domain: int) -> None:
         both.robot.read()
 
 
+def test_it_is_laid_down_before_its_own_program_lets_go(domain: int) -> None:
+    folder = POLICIES / "go2_flat"
+    sim = SimulatedUnitree(folder, read_contract(folder), RobotEnd("unitree_go", "lo", domain))
+    Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time).prepare(lies_down=True)
+    assert sim.end.calls == [CHECK_MODE, STAND_DOWN, RELEASE_MODE, CHECK_MODE] and sim.end.program == ""
+
+
 def test_a_motion_program_that_does_not_let_go(domain: int) -> None:
     folder = POLICIES / "go2_flat"
-    from legged_mw.deploy.unitree.serve import SimulatedUnitree
 
     class Stubborn(RobotEnd):
         program = property(lambda self: "ai", lambda self, name: None)  # type: ignore[assignment]

@@ -207,7 +207,8 @@ def connect(contract: Contract, interface: str, domain: int | None = None) -> Un
 
     machine = machine_of(contract.joints)
     check_rows(contract, machine)
-    owner = Guarded(machine.package, interface, default_domain(interface) if domain is None else domain)
+    domain = default_domain(interface) if domain is None else domain
+    owner = Guarded(machine.package, interface, domain, lies_down=machine.lies_down)
     try:
         return UnitreeRobot(contract, owner, owner.first, echo=interface in LOOPBACK)
     except BaseException:
