@@ -88,7 +88,7 @@ def drive(folder: Path, contract: Contract, args: argparse.Namespace, command: l
     from legged_mw.deploy.unitree import client
 
     controller = Controller(folder, contract)  # before the robot: it may not wait
-    with client.connect(contract, args.interface, args.domain) as robot:
+    with client.connect(folder, contract, args.interface, args.domain) as robot:
         print(f"{robot.machine.name} at {args.interface}: {len(contract.joints)} joints, {robot.health().voltage or 0:.1f} V", flush=True)
         client.walk(robot, controller, command, args.time or math.inf)
     print(robot.report)
