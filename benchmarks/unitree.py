@@ -23,7 +23,7 @@ from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.options import wire_faults
 from legged_mw.deploy.policy import Controller
-from legged_mw.deploy.unitree.client import Direct, UnitreeRobot
+from legged_mw.deploy.unitree.client import Direct, UnitreeRobot, servo_ranges
 from legged_mw.deploy.unitree.link import RobotEnd, Wire
 from legged_mw.deploy.unitree.robots import machine_of
 from legged_mw.deploy.unitree.serve import STEP, Faults, SimulatedUnitree
@@ -46,7 +46,7 @@ def examine(folder: Path, contract: Contract, exam: ExamRules, domain: int, faul
     package = machine_of(contract.joints).package
     sim = SimulatedUnitree(folder, contract, RobotEnd(package, "lo", domain), faults=faults, hoist=False)
     wire = Wire(package, "lo", domain, wait=sim.step, clock=lambda: sim.time)
-    robot = UnitreeRobot(contract, Direct(wire), wire.prepare(), clock=lambda: sim.time)
+    robot = UnitreeRobot(contract, Direct(wire), wire.prepare(), ranges=servo_ranges(folder, contract), clock=lambda: sim.time)
     controller, names = Controller(folder, contract), [command.name for command in contract.commands]
     signals, fell_at, last = defaultdict(list), [], []
     pushed = [(exam.push_vx, 0.0, 0.0)] * rules.PUSH_DIRECTIONS

@@ -167,7 +167,7 @@ from pathlib import Path
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.unitree.client import connect
 contract = read_contract(Path(sys.argv[1]))
-robot = connect(contract, "lo", int(sys.argv[2]))
+robot = connect(Path(sys.argv[1]), contract, "lo", int(sys.argv[2]))
 print("pid", robot._owner.process.pid, flush=True)
 while True:
     robot.read()
@@ -231,7 +231,7 @@ def test_a_guard_says_what_is_wrong(domain: int, monkeypatch: pytest.MonkeyPatch
         Guarded("unitree_go", "lo", domain, find=0.2)
     contract = read_contract(POLICIES / "go1_flat")
     with pytest.raises(RobotError, match="which a go2 does not measure"):
-        client.connect(contract, "lo", domain)
+        client.connect(POLICIES / "go1_flat", contract, "lo", domain)
 
 
 def test_the_programs(domain: int, tmp_path: Path) -> None:

@@ -13,11 +13,11 @@ import pytest
 from legged_mw.deploy.contract import ContractRow, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import RobotError, damped
-from legged_mw.deploy.unitree.client import check_rows
+from legged_mw.deploy.unitree.client import UnitreeRobot, check_rows, servo_ranges
 from legged_mw.deploy.unitree.codec import LAYOUTS, Message
-from legged_mw.deploy.unitree.link import Received, RobotEnd, Wire
+from legged_mw.deploy.unitree.link import CHECK_MODE, RELEASE_MODE, STAND_DOWN, Received, RobotEnd, Wire
 from legged_mw.deploy.unitree.robots import G1, GO2, H1
-from legged_mw.deploy.unitree.serve import Faults
+from legged_mw.deploy.unitree.serve import Faults, SimulatedUnitree
 from tests.wires import POLICIES, pair
 from tests.wires import domain as domain
 
@@ -158,7 +158,7 @@ def test_states_without_a_checksum_are_taken(domain: int) -> None:
 def test_commands(domain: int) -> None:
     both = pair("go2_flat", domain)
     robot, owner = both.robot, Once(b"")
-    robot._owner, targets = owner, np.linspace(-1, 1, 12)
+    robot._owner, targets = owner, both.contract.default_pose + np.linspace(-0.5, 0.5, 12)
     robot.write(targets)
     robot.write(targets, stiffness=np.full(12, 7.0), damping=np.full(12, 0.7))
     robot.damp()
@@ -177,6 +177,18 @@ def test_commands(domain: int) -> None:
     assert len(owner.sent) == 4
 
 
+def test_targets_are_held_within_what_was_trained(domain: int) -> None:
+    """The scene's servos hold targets within the joints' ranges, so the policy may ask for more than a joint can do; drives would obey."""
+    both = pair("g1_flat", domain)
+    low, high = servo_ranges(POLICIES / "g1_flat", both.contract)
+    knee = both.contract.joints.index("left_knee_joint")
+    assert (low[knee], high[knee]) == (pytest.approx(-0.087267), pytest.approx(2.8798))
+    owner = both.robot._owner = Once(b"")
+    both.robot.write(np.full(29, -9.0))
+    sent = Message(LAYOUTS["unitree_hg", "LowCmd_"], owner.sent[0])
+    assert np.allclose(sent["motor_cmd.q"][[G1.motors[name] for name in both.contract.joints]], low)
+
+
 def test_h1_on_the_wire() -> None:
     """Its table alone: there is no policy for it here."""
     contract = replace(
@@ -184,10 +196,8 @@ def test_h1_on_the_wire() -> None:
         joints=tuple(H1.motors),
         **{name: np.arange(19.0) for name in ("default_pose", "stiffness", "damping")},
     )
-    from legged_mw.deploy.unitree.client import UnitreeRobot
-
     owner = Once(Message(LAYOUTS["unitree_go", "LowState_"]).seal())
-    robot = UnitreeRobot(contract, owner, owner.receive(), clock=lambda: 0.0)
+    robot = UnitreeRobot(contract, owner, owner.receive(), ranges=(np.full(19, -20.0), np.full(19, 20.0)), clock=lambda: 0.0)
     robot.write(np.arange(19.0))
     message = Message(LAYOUTS["unitree_go", "LowCmd_"], owner.sent[-1])
     assert message["motor_cmd.mode"].tolist() == [10] * 9 + [0] + [1] * 10
@@ -242,8 +252,6 @@ def test_no_robot(domain: int) -> None:
 def test_the_wrong_robot(domain: int) -> None:
     """A Go2's policy where a G1 is."""
     folder = POLICIES / "g1_flat"
-    from legged_mw.deploy.unitree.serve import SimulatedUnitree
-
     sim = SimulatedUnitree(folder, read_contract(folder), RobotEnd("unitree_hg", "lo", domain))
     wire = Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time)
     with pytest.raises(RobotError, match="the robot there speaks unitree_hg::msg::dds_::LowState_: it is not the contract's"):
@@ -266,9 +274,15 @@ def test_another_commander(domain: int) -> None:
         both.robot.read()
 
 
+def test_it_is_laid_down_before_its_own_program_lets_go(domain: int) -> None:
+    folder = POLICIES / "go2_flat"
+    sim = SimulatedUnitree(folder, read_contract(folder), RobotEnd("unitree_go", "lo", domain))
+    Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time).prepare(lies_down=True)
+    assert sim.end.calls == [CHECK_MODE, STAND_DOWN, RELEASE_MODE, CHECK_MODE] and sim.end.program == ""
+
+
 def test_a_motion_program_that_does_not_let_go(domain: int) -> None:
     folder = POLICIES / "go2_flat"
-    from legged_mw.deploy.unitree.serve import SimulatedUnitree
 
     class Stubborn(RobotEnd):
         program = property(lambda self: "ai", lambda self, name: None)  # type: ignore[assignment]

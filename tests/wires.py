@@ -14,7 +14,7 @@ import pytest
 from legged_mw import ROOT
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.robot import Floats
-from legged_mw.deploy.unitree.client import Direct, UnitreeRobot
+from legged_mw.deploy.unitree.client import Direct, UnitreeRobot, servo_ranges
 from legged_mw.deploy.unitree.link import RobotEnd, Wire
 from legged_mw.deploy.unitree.robots import machine_of
 from legged_mw.deploy.unitree.serve import STEP, SimulatedUnitree
@@ -76,4 +76,4 @@ def pair(task: str, domain: int, **settings: Any) -> Pair:
     sim = SimulatedUnitree(folder, contract, RobotEnd(package, "lo", domain), **settings)
     wire = Wire(package, "lo", domain, wait=sim.step, clock=lambda: sim.time)
     first = wire.prepare(listen=0.1)
-    return Pair(sim, UnitreeRobot(contract, Direct(wire), first, clock=lambda: sim.time), contract)
+    return Pair(sim, UnitreeRobot(contract, Direct(wire), first, ranges=servo_ranges(folder, contract), clock=lambda: sim.time), contract)

@@ -62,7 +62,7 @@ def main() -> None:
     if args.serve:
         options.serve(folder, contract, args)
     elif args.robot != "simulated":
-        robot = options.connect(contract, args)
+        robot = options.connect(folder, contract, args)
         drive.drive(robot, folder, contract, args, command, args.robot)
         print(robot.report)
     elif args.drive:

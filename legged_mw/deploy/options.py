@@ -84,8 +84,8 @@ def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
     print(served.text())
 
 
-def connect(contract: Contract, args: argparse.Namespace) -> UnitreeRobot:
+def connect(folder: Path, contract: Contract, args: argparse.Namespace) -> UnitreeRobot:
     """The robot on the wire."""
-    robot = client.connect(contract, args.interface, args.domain)
+    robot = client.connect(folder, contract, args.interface, args.domain)
     print(f"{robot.machine.name} at {args.interface}: {len(contract.joints)} joints, {robot.health().voltage or 0:.1f} V", flush=True)
     return robot

@@ -31,7 +31,7 @@ from legged_mw.deploy.unitree.codec import LAYOUTS
 LATE = 0.06  # [s] ours: three periods at 50 Hz without a command. With what it takes to notice, joints are damped within 100 ms
 REPEAT = 0.002  # [s] between two messages to the robot [unitree_sdk2's examples]
 AFTER = 1.0  # [s] ours: how long damping is sent before the wire is let go
-START = 20.0  # [s] for a guard to find the robot
+START = 60.0  # [s] for a guard to find the robot
 _TURN = 0.001  # [s] at most between two looks at the wire
 _BOARD = struct.Struct("<QdI512s")  # changes of the board (odd: one is going on), stamp of the state, bytes of the text, text
 _FRAME = struct.Struct("<Bd")  # kind, stamp of the state that a command answers
@@ -71,8 +71,13 @@ class Board:
 class Guarded:
     """The wire as the policy's process sees it, through a guard (see ``client.Owner``)."""
 
-    def __init__(self, package: str, interface: str, domain: int, late: float = LATE, find: float = 5.0) -> None:
-        """Start a guard, which takes the robot over; ``find``: [s] for a robot to be heard. Raises RobotError with what it says."""
+    def __init__(
+        self, package: str, interface: str, domain: int, *, lies_down: bool = False, late: float = LATE, find: float = 5.0
+    ) -> None:
+        """Start a guard, which takes the robot over (``lies_down`` as in ``link.Wire.prepare``).
+
+        ``find``: [s] for a robot to be heard. Raises RobotError with what the guard says.
+        """
         size = LAYOUTS[package, "LowState_"].size
         with tempfile.TemporaryFile() as file:
             file.truncate(_BOARD.size + size)
@@ -80,6 +85,7 @@ class Guarded:
             self._channel, theirs = socket.socketpair()
             with theirs:
                 told = {"package": package, "interface": interface, "domain": domain, "late": late, "find": find}
+                told |= {"lies_down": lies_down}
                 told |= {"channel": theirs.fileno(), "board": file.fileno()}
                 program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
                 self.process = subprocess.Popen(
@@ -246,7 +252,7 @@ def main() -> None:
     channel = socket.socket(fileno=told["channel"])
     try:
         wire = Wire(told["package"], told["interface"], told["domain"])
-        first = wire.prepare(told["find"])
+        first = wire.prepare(told["find"], lies_down=told["lies_down"])
     except RobotError as error:
         channel.sendall(json.dumps({"error": str(error)}).encode() + b"\n")
         return

@@ -24,7 +24,9 @@ from legged_mw.utils.errors import unknown
 
 COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
 MOTION = "rt/api/motion_switcher/request", "rt/api/motion_switcher/response"
+SPORT = "rt/api/sport/request"
 CHECK_MODE, RELEASE_MODE = 1001, 1003  # of the motion service
+STAND_DOWN = 1005  # of the sport service [unitree_sdk2]
 LOOPBACK = ("lo", "lo0")
 _INTERFACE = "<General><Interfaces><NetworkInterface name='{name}' {multicast}/></Interfaces>{more}</General>"
 # Loopback interfaces know no multicast, so the processes look for each other at 127.0.0.1, one port after the other.
@@ -83,6 +85,14 @@ def _taken(reader: Any, count: int = 1) -> list[Any]:
     return [sample for sample in reader.take(count) if sample.sample_info.valid_data]
 
 
+def _request(call: int) -> Any:
+    """A call of one of the robot's services."""
+    kinds = {name: TYPES["unitree_api", f"Request{name}_"] for name in ("", "Header", "Identity", "Lease", "Policy")}
+    identity = kinds["Identity"](id=time.monotonic_ns(), api_id=call)
+    header = kinds["Header"](identity=identity, lease=kinds["Lease"](id=0), policy=kinds["Policy"](priority=0, noreply=False))
+    return kinds[""](header=header, parameter="{}", binary=[])
+
+
 class Received(NamedTuple):
     """One message, and when it came."""
 
@@ -113,6 +123,7 @@ class Wire:
         self._states = _reader(self._participant, STATES, RAW[package, "LowState_"])
         self._requests = _writer(self._participant, MOTION[0], TYPES["unitree_api", "Request_"])
         self._answers = _reader(self._participant, MOTION[1], TYPES["unitree_api", "Response_"], depth=10)
+        self._sport = _writer(self._participant, SPORT, TYPES["unitree_api", "Request_"])
 
     def receive(self) -> Received | None:
         """The newest state since the last call, with the moment of this call: ask often."""
@@ -128,14 +139,15 @@ class Wire:
         """Whether somebody else sent a command since the last call."""
         return bool(_taken(self._others))
 
-    def prepare(self, seconds: float = 5.0, listen: float = 0.5) -> Received:
+    def prepare(self, seconds: float = 5.0, listen: float = 0.5, lies_down: bool = False) -> Received:
         """Wait for the robot, take it from its own motion service, and listen for other commanders; returns its state.
 
-        Raises RobotError with what is wrong; nothing was sent then.
+        ``lies_down``: it can be asked to, so that it does not fall when its own program lets go. Raises RobotError with what is
+        wrong; no command was sent then.
         """
         if not (state := self._until(self.receive, seconds)):
             raise RobotError(self._nobody(seconds))
-        self._release()
+        self._release(lies_down)
         if self._until(self.other_commander, listen):
             raise RobotError(f"another program sends {COMMANDS} in {self._where}: end it first; nothing was sent")
         return self._until(self.receive, 0.1) or state
@@ -155,25 +167,27 @@ class Wire:
             return f"{text}; the robot there speaks {', '.join(kinds)}: it is not the contract's"
         return f"{text}; is it on, is this the right network interface, and can it be pinged (192.168.123.161)?"
 
-    def _release(self, tries: int = 8) -> None:
+    def _release(self, lies_down: bool, tries: int = 8) -> None:
         """Switch the robot's own motion programs off; without such a service there is nothing to switch off."""
         if not self._until(self._requests.get_matched_subscriptions, 0.5):
             return
-        name = ""
-        for _ in range(tries):
+        name, moment = "", 0.2 if self._where.endswith(LOOPBACK) else 3.0  # [s; unitree_sdk2's examples wait 1 to 5 s]
+        for attempt in range(tries):
             if not (name := json.loads(self._ask(CHECK_MODE) or "{}").get("name", "")):
                 return
+            if lies_down and attempt == 0 and self._sport.get_matched_subscriptions():
+                self._sport.write(_request(STAND_DOWN))
+                self._until(lambda: False, moment)
             self._ask(RELEASE_MODE)
-            self._until(lambda: False, 0.2 if self._where.endswith(LOOPBACK) else 2.0)  # [unitree_sdk2's examples wait 1 to 5 s]
+            self._until(lambda: False, moment)
         raise RobotError(f"the robot's own program '{name}' does not let go of the motors: end it with the remote (L2+A, then L2+R2)")
 
     def _ask(self, call: int) -> str:
         """One call of the motion service; returns its data."""
-        kinds = {name: TYPES["unitree_api", f"Request{name}_"] for name in ("", "Header", "Identity", "Lease", "Policy")}
-        identity = kinds["Identity"](id=time.monotonic_ns(), api_id=call)
-        header = kinds["Header"](identity=identity, lease=kinds["Lease"](id=0), policy=kinds["Policy"](priority=0, noreply=False))
-        self._requests.write(kinds[""](header=header, parameter="{}", binary=[]))
-        found = self._until(lambda: [a for a in _taken(self._answers, 10) if a.header.identity.id == identity.id], 2.0)
+        request = _request(call)
+        self._requests.write(request)
+        mine = request.header.identity.id
+        found = self._until(lambda: [a for a in _taken(self._answers, 10) if a.header.identity.id == mine], 2.0)
         if not found:
             raise RobotError("the robot's motion service does not answer: nothing was sent; restart the robot")
         return found[0].data
@@ -189,7 +203,9 @@ class RobotEnd:
         self._commands = _reader(self._participant, COMMANDS, RAW[package, "LowCmd_"])
         self._requests = _reader(self._participant, MOTION[0], TYPES["unitree_api", "Request_"], depth=10)
         self._answers = _writer(self._participant, MOTION[1], TYPES["unitree_api", "Response_"])
+        self._sport = _reader(self._participant, SPORT, TYPES["unitree_api", "Request_"], depth=10)
         self.program = "normal"  # the motion program that holds the motors; "" once released
+        self.calls: list[int] = []  # of its services, in their order
 
     def send(self, body: bytes) -> None:
         self._out.write(self._sample(body))
@@ -200,10 +216,12 @@ class RobotEnd:
         return taken[-1].body if taken else None
 
     def answer(self) -> None:
-        """Answer the calls of the motion service."""
+        """Answer the calls of the motion service; a call of the sport service needs no answer."""
+        self.calls += [request.header.identity.api_id for request in _taken(self._sport, 10)]
         header, status = TYPES["unitree_api", "ResponseHeader_"], TYPES["unitree_api", "ResponseStatus_"]
         for request in _taken(self._requests, 10):
             call, data = request.header.identity.api_id, ""
+            self.calls.append(call)
             if call == CHECK_MODE:
                 data = json.dumps({"form": "0", "name": self.program})
             elif call == RELEASE_MODE:

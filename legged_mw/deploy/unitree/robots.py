@@ -37,6 +37,7 @@ class Machine:
     motors: dict[str, int]  # joint -> slot in LowCmd_ and LowState_ [unitree_sdk2's headers and examples]
     modes: dict[int, int] = field(default_factory=dict)  # slot -> motor mode where it is not 1
     feet: tuple[str, ...] = ()  # order of foot_force
+    lies_down: bool = False  # whether its own program can be asked to lay it down
     cells: int = 0  # of the battery, in a row [Unitree's data sheets]; 0: not known
     machines: tuple[int, ...] = ()  # LowState_.mode_machine of this body; 0: a simulation that sets none
 
