@@ -26,7 +26,7 @@ class Served:
 
     seconds: float = 0.0  # simulated
     wall: float = 0.0  # [s]
-    upright: float = 1.0  # cosine of its largest tilt
+    upright: float = 1.0  # cosine of its largest tilt while its servos were on
     latencies: list[float] = field(default_factory=list)  # [s] from a state that it sent to the first command that answers it
     commands: int = 0
     refused: int = 0
@@ -41,7 +41,10 @@ class Served:
             lines.append(f"from a state to the first command that answers it: median {middle:.1f} ms, p99 {most:.1f} ms")
         if self.watchdog:
             lines.append(f"the watchdog damped it {self.watchdog} times")
-        fell = "it fell" if self.upright < UPRIGHT else f"at most {math.degrees(math.acos(self.upright)):.0f} degrees from upright"
+        tilt = math.degrees(math.acos(min(1.0, self.upright)))
+        fell = (
+            "it fell while its servos were on" if self.upright < UPRIGHT else f"with its servos on at most {tilt:.0f} degrees from upright"
+        )
         lines.append(f"{fell}; at the end at {self.place[0]:.1f}, {self.place[1]:.1f} m, {self.height:.2f} m high")
         return "\n".join(lines)
 
@@ -79,7 +82,8 @@ def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf) -> S
             sim.hoist = sim.hoist if handset.hoist is None else handset.hoist
             sim.step()
             latency.watch(sim)
-            served.upright = min(served.upright, sim.upright)
+            if sim.acted["kp"].any():
+                served.upright = min(served.upright, sim.upright)
             steps += 1
             ahead = start + steps * STEP - time.monotonic()
             if ahead > 0:
