@@ -58,7 +58,7 @@ def main() -> None:
     if contract.ends.not_covered:
         print(f"not judged here: {', '.join(contract.ends.not_covered)}, which ended episodes in training")
     if args.drive:
-        robot = MujocoRobot(folder, contract, scene_file, whole=True, hoisted=args.hoist)
+        robot = MujocoRobot(folder, contract, scene_file, whole=True, hoisted=drive.hoisted(args, contract))
         drive.drive(robot, folder, contract, args, command, "simulated")
     elif args.eval:
         examine(folder, Path(args.out) if args.out else folder / RESULT_FILE, common=args.ranges == "common")

@@ -95,6 +95,7 @@ class Controller:
             actions = self._network(seen)
         else:
             actions, self.memory = self._network(seen, self.memory)
+        actions = np.where(np.isfinite(actions), actions, np.nan)  # a clipped infinity would look like a wish
         self.last_actions = np.clip(actions, -action.clip, action.clip)
         origins = {"default": self.contract.default_pose, "joints": np.atleast_2d(measurement.joint_pos), "targets": self.last_targets}
         self.last_targets = origins[action.origin] + action.scale * self.last_actions.astype(np.float64)
