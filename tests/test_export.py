@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from program import SMALL, files, run, trained
+from program import SMALL, files, run
 from rsl_rl.utils import resolve_class
 from worlds import make_env
 
@@ -36,20 +36,6 @@ from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 
 TASK = ["--task", "go1_flat", "--device", "cpu"]
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished training that exported by itself."""
-    root = tmp_path_factory.mktemp("root")
-    trained(root, "--max_iterations", "1", "--set", "runner.export=true")
-    return root
-
-
-@pytest.fixture(scope="module")
-def made(root: Path) -> Path:
-    [folder] = root.glob("logs/*/*/export")
-    return folder
 
 
 def arguments(made: Path) -> tuple[LoadedTask, Path]:

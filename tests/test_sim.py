@@ -13,7 +13,7 @@ import torch
 from mujoco_warp import OverflowType
 
 from legged_mw import ROOT
-from legged_mw.sim.drawing import visual_model
+from legged_mw.drawing.scene import visual_model
 from legged_mw.sim.engines import make_simulation, pick_engine
 from legged_mw.sim.errors import EngineError, ModelError
 from legged_mw.sim.ground import GROUND, Ground

@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from legged_mw.drawing.relief import STEEP_LIGHT
+from legged_mw.drawing.scene import dressed
 from legged_mw.rl.export_meshes import shorten
-from legged_mw.sim.drawing import dressed
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND, MOST_BOXES, Box, add_ground_box, as_boxes, feel_all_ground
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.relief import STEEP_LIGHT
 from legged_mw.sim.terrain import Terrain
 
 AROUND = 1000.0  # [m] of level ground around tiles of steps, more than a robot walks

@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.sim.drawing import visual_spec
+from legged_mw.drawing.scene import visual_spec
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.tables import family
 from legged_mw.view.feet import patch

@@ -10,11 +10,11 @@ from numpy.typing import ArrayLike
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_mw.drawing.scene import visual_spec
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.estimator import believed_velocity
 from legged_mw.rl.recurrent import forget
-from legged_mw.sim.drawing import visual_spec
 from legged_mw.sim.terrain import name_tile
 from legged_mw.utils.commands import Command
 from legged_mw.view.stage import BoolArray, FloatArray
