@@ -133,6 +133,19 @@ def test_gains_count_in_the_torque(contract: Contract, limits: Limits) -> None:
     )
 
 
+def test_a_policy_of_torques(contract: Contract, limits: Limits) -> None:
+    """Its targets are torques: the motor's limit is theirs, and no servo stands such a robot up."""
+    torques = replace(contract, action=contract.action._replace(origin="torque"))
+    safety = Safety(torques, limits)
+    assert safety.asked(at_rest(contract), put(np.zeros(12), 2, -45.4)) is None
+    assert safety.asked(at_rest(contract), put(np.zeros(12), 2, -45.5)) == Trip(
+        "torque", "FL_calf_joint is asked for 45.5 N m, more than 45.4"
+    )
+    controller = Controller(GO2, torques)
+    with pytest.raises(RobotError, match="a policy of torques cannot stand a robot up: its states need servos; run it without them"):
+        driven(Watched(GO2, contract), controller, Script({}), 0.1)
+
+
 def test_steps_that_are_late(contract: Contract, limits: Limits) -> None:
     """Five within a second, each by more than half a period; four, or half a period, are fine."""
     off = limits.but({"frozen": "off"}, "test")

@@ -21,6 +21,7 @@ from legged_mw.deploy.loop import LATE
 from legged_mw.deploy.robot import Floats, Health, Measurement, RobotError
 from legged_mw.utils.errors import UserError, unknown
 
+TORQUE = "torque"  # an action's origin: its targets are torques
 OFF = math.inf  # a limit that is never passed
 
 
@@ -147,10 +148,13 @@ class Safety:
         )
 
     def asked(self, measured: Measurement, targets: Floats, stiffness: Floats | None = None, damping: Floats | None = None) -> Trip | None:
-        """The first limit that targets (D,) [rad] pass, for servos with these gains (D,); None: the contract's."""
+        """The first limit that targets (D,) [rad], or torques [N m], pass, for servos with these gains (D,); None: the contract's."""
         limits, contract = self.limits, self.contract
+        strong = "is asked for {value:.1f} N m, more than {most:.1f}"
         if not (finite := np.isfinite(targets)).all():
             return Trip("finite", f"the target of {self._name(finite)} is not finite: {targets[_first(~finite)]}")
+        if contract.action.origin == TORQUE and stiffness is None:
+            return self._most("torque", strong, np.abs(targets), limits.torque * limits.motor)
         stiffness = contract.stiffness if stiffness is None else stiffness
         damping = contract.damping if damping is None else damping
         torque = np.abs(stiffness * (targets - measured.joint_pos) - damping * measured.joint_vel)
@@ -160,7 +164,7 @@ class Safety:
             or self._most(
                 "step", "is told to step by {value:.2f} rad from one target to the next, more than {most:.2f}", stepped, limits.step
             )
-            or self._most("torque", "is asked for {value:.1f} N m, more than {most:.1f}", torque, limits.torque * limits.motor)
+            or self._most("torque", strong, torque, limits.torque * limits.motor)
         )
         self._last = np.array(targets)
         return trip
