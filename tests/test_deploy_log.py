@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import shutil
 import sys
+import threading
+import time
 import tracemalloc
 from collections.abc import Iterator
 from dataclasses import replace
@@ -22,6 +24,7 @@ from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.replay import draw, figures, latency, replay, table
 from legged_mw.deploy.robot import Health
 from legged_mw.deploy.runner import run
+from legged_mw.deploy.safety import Limits
 from legged_mw.deploy.states import States
 from legged_mw.utils.cli import one_line_errors
 
@@ -58,7 +61,9 @@ def test_a_log_holds_the_run(logged: tuple[Path, Watched], contract: Contract) -
     np.testing.assert_allclose(rows["time"][:, 0], 0.02 * np.arange(250), atol=1e-9)
     np.testing.assert_allclose(rows["joint_pos"][1:], np.array(robot.joints)[:-1], atol=1e-6)
     assert rows["observation"].shape == (250, 45) and np.isfinite(rows["observation"][states == 2]).all()
-    np.testing.assert_allclose(rows["target"][states == 2], contract.default_pose + 0.25 * rows["action"][states == 2], atol=1e-6)
+    limits = Limits.of(GO2, contract)
+    wanted = np.clip(contract.default_pose + 0.25 * rows["action"][states == 2], limits.low, limits.high)
+    np.testing.assert_allclose(rows["target"][states == 2], wanted, atol=1e-6)
     assert np.isnan(rows["target"][(states == 0) | (states == 3)]).all() and np.isnan(rows["action"][states == 1]).all()
     assert (rows["stiffness"][states == 2] == 20.0).all() and rows["stiffness"][6, 0] < 3.0
     assert np.isnan(rows["voltage"]).all() and rows["age"][0, 0] == np.float32(0.004) and rows["temperature"][240, 3] == 90.0
@@ -105,12 +110,30 @@ def test_memory_is_flat_while_it_logs(contract: Contract, tmp_path: Path) -> Non
         for step, _ in enumerate(loop.ticks(60.0)):
             log.add(loop, controller, measured, health, states.step(measured, loop.now), states.command)
             if step in (1050, 2950):
+                while log.backlog():
+                    time.sleep(0.01)
                 sizes.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()
         log.close()
         log.close()
     assert sizes[1] - sizes[0] < 500_000 and len(read_log(log.path).rows["time"]) == 3000
+
+
+def test_a_disk_that_hangs_costs_steps_of_the_log_alone(contract: Contract, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("legged_mw.deploy.log.BACKLOG", 2)
+    hangs = threading.Event()
+    monkeypatch.setattr(np, "savez_compressed", lambda file, **block: (hangs.wait(), np.savez(file, **block)))
+    robot, controller = Watched(GO2, contract), Controller(GO2, contract)
+    log = Log(tmp_path / "hangs.lmwlog", contract, GO2, "")
+    states = States(controller, [], lambda _: np.zeros(3), lambda _: None)
+    loop, measured = Loop(0.02, live=False), robot.read()
+    for _ in loop.ticks(20.0):
+        log.add(loop, controller, measured, Health(), states.step(measured, loop.now), states.command)
+    hangs.set()
+    log.close()
+    found = read_log(log.path)
+    assert len(found.rows["time"]) in (200, 300) and found.events[-1][1].endswith(" steps were not logged: the disk is too slow")
 
 
 # ---- replay

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from drivers import Script, Watched, beyond, driven
+from recorder import Recorder
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import Contract, read_contract
@@ -122,6 +123,15 @@ def test_targets(contract: Contract, limits: Limits) -> None:
     assert check(put(pose, 0, 0.1 + 0.94), measured=fast) == Trip("torque", "FL_hip_joint is asked for 23.8 N m, more than 23.7")
     for value in (math.nan, math.inf):
         assert check(put(pose, 7, value)) == Trip("finite", f"the target of RL_thigh_joint is not finite: {value}")
+
+
+def test_targets_are_held_within_the_servos_range(contract: Contract) -> None:
+    """As MuJoCo's servos hold them in training: a robot's drives do not."""
+    robot, controller = Recorder(MujocoRobot(GO2, contract)), Controller(GO2, contract)
+    beyond_it = put(contract.default_pose, 5, -0.5)
+    controller.act = lambda *_: beyond_it[None]  # type: ignore[method-assign]
+    run(robot, controller, lambda _: np.zeros(3), 0.04, live=False)
+    np.testing.assert_array_equal(robot.targets, [put(beyond_it, 5, Limits.of(GO2, contract).high[5])] * 2)
 
 
 def test_gains_count_in_the_torque(contract: Contract, limits: Limits) -> None:

@@ -120,7 +120,8 @@ class _Step:
             order = self._decide(measured, loop.now)
             if order.targets is not None:
                 trip = self.safety.asked(measured, order.targets, order.stiffness, order.damping)
-                order = self._trip(trip, loop.now) if trip else order
+                held = self.safety.held(order.targets)
+                order = self._trip(trip, loop.now) if trip else order._replace(targets=held)
         self._do(order)
         if self.log and measured:
             self.log.add(loop, self.controller, measured, health, order, self.states.command if self.states else self._command(loop.now))

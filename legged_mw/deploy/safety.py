@@ -46,7 +46,7 @@ class Tripped(RobotError):
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of D joints in the contract's order. The first three are the machine's; the others can be set by their names.
+    """Limits of D joints in the contract's order. The first five are the machine's; the others can be set by their names.
 
     Where no source is named the default is ours: what the shipped policies of Go1, Go2 and G1 need in the walking exam with its
     pushes of 2 m/s (the figure in brackets), and a margin. Narrower ones for one robot or policy belong in its contract.
@@ -55,6 +55,8 @@ class Limits:
     low: Floats  # (D,) [rad] the joints' range
     high: Floats  # (D,) [rad]
     motor: Floats  # (D,) [N m] what the motors can give
+    lowest: Floats  # (D,) [rad] the servos' range: targets are held within it, as in training; no drive does it
+    highest: Floats  # (D,) [rad]
     position: float = 0.25  # [rad] of a measured angle beyond the range [0.15: simulated end stops give]
     target: float = 0.9  # [rad] of a target beyond the range [0.62]
     step: float = 2.5  # [rad] between two targets of a joint [1.85]
@@ -83,7 +85,7 @@ class Limits:
         return replace(self, **{name: _value(name, value, where) for name, value in values.items()})
 
 
-NAMES = tuple(f.name for f in fields(Limits) if f.name not in ("low", "high", "motor"))
+NAMES = tuple(f.name for f in fields(Limits) if f.name not in ("low", "high", "motor", "lowest", "highest"))
 
 
 def parse_limits(texts: Sequence[str]) -> dict[str, str]:
@@ -118,7 +120,8 @@ def _machine(folder: Path, contract: Contract) -> Limits:
     low, high = np.where(model.jnt_limited[joints, None] > 0, model.jnt_range[joints], [-OFF, OFF]).T
     servo = np.where(model.actuator_forcelimited[servos] > 0, model.actuator_forcerange[servos, 1], OFF)
     joint = np.where(model.jnt_actfrclimited[joints] > 0, model.jnt_actfrcrange[joints, 1], OFF)
-    return Limits(low, high, np.minimum(servo, joint))
+    lowest, highest = np.where(model.actuator_ctrllimited[servos, None] > 0, model.actuator_ctrlrange[servos], [-OFF, OFF]).T
+    return Limits(low, high, np.minimum(servo, joint), lowest, highest)
 
 
 class Safety:
@@ -147,6 +150,10 @@ class Safety:
             or self._heard(health, now)
         )
 
+    def held(self, targets: Floats) -> Floats:
+        """``targets`` (D,) within the servos' range; torques within that of the motors, if their actuators have one."""
+        return np.clip(targets, self.limits.lowest, self.limits.highest)
+
     def asked(self, measured: Measurement, targets: Floats, stiffness: Floats | None = None, damping: Floats | None = None) -> Trip | None:
         """The first limit that targets (D,) [rad], or torques [N m], pass, for servos with these gains (D,); None: the contract's."""
         limits, contract = self.limits, self.contract
@@ -157,7 +164,7 @@ class Safety:
             return self._most("torque", strong, np.abs(targets), limits.torque * limits.motor)
         stiffness = contract.stiffness if stiffness is None else stiffness
         damping = contract.damping if damping is None else damping
-        torque = np.abs(stiffness * (targets - measured.joint_pos) - damping * measured.joint_vel)
+        torque = np.abs(stiffness * (self.held(targets) - measured.joint_pos) - damping * measured.joint_vel)
         stepped = np.zeros_like(targets) if self._last is None else np.abs(targets - self._last)
         trip = (
             self._range("target", "is told to go to", targets, limits.target)
