@@ -53,7 +53,11 @@ def check_flags(args: argparse.Namespace) -> None:
     if args.drive and (given := [name for name, value in several.items() if value] + watched):
         raise FlagError(f"--drive is one robot in real time: leave --{given[0]} out")
     alone = {"hoist": args.hoist, "limit": args.limit, "gamepad": args.gamepad, "stop_fd": args.stop_fd is not None, "log": args.log}
-    if not args.drive and (given := [name for name, value in alone.items() if value]):
+    if (
+        not args.drive
+        and getattr(args, "robot", "simulated") == "simulated"
+        and (given := [name for name, value in alone.items() if value])
+    ):
         raise FlagError(f"--{given[0]} is of a robot that is driven: add --drive")
     parse_limits(args.limit)
 
