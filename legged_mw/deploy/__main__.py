@@ -66,7 +66,7 @@ def main() -> None:
         drive.drive(robot, folder, contract, args, command, args.robot)
         print(robot.report)
     elif args.drive:
-        robot = MujocoRobot(folder, contract, scene_file, whole=True, hoisted=args.hoist)
+        robot = MujocoRobot(folder, contract, scene_file, whole=True, hoisted=drive.hoisted(args, contract))
         drive.drive(robot, folder, contract, args, command, args.robot)
     elif args.eval:
         examine(folder, Path(args.out) if args.out else folder / RESULT_FILE, common=args.ranges == "common")

@@ -24,6 +24,7 @@ from legged_mw.deploy.safety import Limits, Safety, parse_limits
 from legged_mw.deploy.states import States
 from legged_mw.utils.commands import with_units
 from legged_mw.utils.errors import shown
+from legged_mw.view import launch
 from legged_mw.view.launch import FlagError
 from legged_mw.view.script import load_script
 
@@ -34,7 +35,9 @@ STATUS = 0.2  # [s] between two status lines
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of driving a robot, and of its log."""
     parser.add_argument("--drive", action="store_true", help="from the terminal as on a robot: states, safety limits, a log; in real time")
-    parser.add_argument("--hoist", action="store_true", help="of --drive with the simulated robot: it hangs until the policy starts")
+    parser.add_argument(
+        "--hoist", choices=("yes", "no"), help="a simulated robot hangs until the policy starts (default: if it has two feet)"
+    )
     limits = "another limit of the safety layer, e.g. tilt=45 or frozen=off (docs/on_the_robot.md has them all)"
     parser.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE", help=limits)
     parser.add_argument("--gamepad", type=Path, metavar="FILE", help="drive by a gamepad too, e.g. /dev/input/js0")
@@ -44,11 +47,20 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def check_flags(args: argparse.Namespace) -> None:
-    """Refuse flags that do nothing without --drive. Raises FlagError or LimitError."""
+    """Refuse flags that do not go together. Raises FlagError or LimitError."""
+    several = {"eval": args.eval, "num_envs": args.num_envs != 1, "replay": args.replay}
+    watched = [flag.removeprefix("--") for flag in launch.asked(args) if flag != "--commands"]
+    if args.drive and (given := [name for name, value in several.items() if value] + watched):
+        raise FlagError(f"--drive is one robot in real time: leave --{given[0]} out")
     alone = {"hoist": args.hoist, "limit": args.limit, "gamepad": args.gamepad, "stop_fd": args.stop_fd is not None, "log": args.log}
     if not args.drive and args.robot == "simulated" and (given := [name for name, value in alone.items() if value]):
         raise FlagError(f"--{given[0]} is of a robot that is driven: add --drive")
     parse_limits(args.limit)
+
+
+def hoisted(args: argparse.Namespace, contract: Contract) -> bool:
+    """Whether a simulated robot begins on a hoist."""
+    return args.hoist == "yes" or (args.hoist is None and len(contract.feet) == 2)
 
 
 def drive(robot: Robot, folder: Path, contract: Contract, args: argparse.Namespace, fixed: Sequence[float] | None, kind: str) -> None:

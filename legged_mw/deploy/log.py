@@ -28,6 +28,7 @@ from legged_mw.utils.errors import UserError
 
 FORMAT = 1
 CHUNK = 100  # steps a block
+BACKLOG = 60  # blocks that wait to be written: a slow disk must not fill the memory
 SUFFIX = ".lmwlog"
 _LENGTH = struct.Struct("<Q")
 
@@ -67,6 +68,7 @@ class Log:
         self._blocks: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         self._blocks.put({"header": json.dumps({**said, "began": time.strftime("%Y-%m-%d %H:%M:%S"), "contract": contract.to_dict()})})
         self._events: list[tuple[float, str]] = []
+        self._lost = 0  # steps
         self._begin()
         self._thread = threading.Thread(target=self._write, name="log", daemon=True)
         self._thread.start()
@@ -100,7 +102,7 @@ class Log:
     def close(self) -> None:
         """Write the rest; again is allowed."""
         if self._thread.is_alive():
-            self._hand_over()
+            self._hand_over(last=True)
             self._blocks.put(None)
             self._thread.join()
 
@@ -111,7 +113,17 @@ class Log:
     def _sizes(self) -> dict[str, int]:
         return _columns(self.contract)
 
-    def _hand_over(self) -> None:
+    def backlog(self) -> int:
+        """Blocks that wait to be written."""
+        return self._blocks.qsize()
+
+    def _hand_over(self, last: bool = False) -> None:
+        if not last and self.backlog() >= BACKLOG:
+            self._lost, self._count = self._lost + self._count, 0
+            return
+        if self._lost:
+            self.event(float(self._rows["time"][0, 0]), f"{self._lost} steps were not logged: the disk is too slow")
+            self._lost = 0
         if self._count or self._events:
             rows = {name: column[: self._count] for name, column in self._rows.items()}
             self._blocks.put({**rows, "events": json.dumps(self._events)})

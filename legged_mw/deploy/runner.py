@@ -14,7 +14,7 @@ from legged_mw.deploy.log import Log
 from legged_mw.deploy.loop import Loop, Timing
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError
-from legged_mw.deploy.safety import Limits, Safety, Trip, Tripped
+from legged_mw.deploy.safety import TORQUE, Limits, Safety, Trip, Tripped
 from legged_mw.deploy.states import DAMPING, POLICY, ZERO, Order, States
 
 _RECENT = 10.0  # [s] of velocities that are kept of a run without an end
@@ -105,6 +105,9 @@ class _Step:
         if states and (type(robot).damp is Robot.damp or type(robot).limp is Robot.limp):
             raise RobotError(f"{type(robot).__name__} has no damp() and limp() of its own, which the states need")
 
+        if states and controller.contract.action.origin == TORQUE:
+            raise RobotError("a policy of torques cannot stand a robot up: its states need servos; run it without them")
+
     def take(self, loop: Loop) -> Measurement | None:
         """One step; returns what was measured, None if nothing could be."""
         measured, health, trip = self._sense(loop)
@@ -117,7 +120,8 @@ class _Step:
             order = self._decide(measured, loop.now)
             if order.targets is not None:
                 trip = self.safety.asked(measured, order.targets, order.stiffness, order.damping)
-                order = self._trip(trip, loop.now) if trip else order
+                held = self.safety.held(order.targets)
+                order = self._trip(trip, loop.now) if trip else order._replace(targets=held)
         self._do(order)
         if self.log and measured:
             self.log.add(loop, self.controller, measured, health, order, self.states.command if self.states else self._command(loop.now))

@@ -21,6 +21,7 @@ from legged_mw.deploy.loop import LATE
 from legged_mw.deploy.robot import Floats, Health, Measurement, RobotError
 from legged_mw.utils.errors import UserError, unknown
 
+TORQUE = "torque"  # an action's origin: its targets are torques
 OFF = math.inf  # a limit that is never passed
 
 
@@ -45,7 +46,7 @@ class Tripped(RobotError):
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits of D joints in the contract's order. The first three are the machine's; the others can be set by their names.
+    """Limits of D joints in the contract's order. The first five are the machine's; the others can be set by their names.
 
     Where no source is named the default is ours: what the shipped policies of Go1, Go2 and G1 need in the walking exam with its
     pushes of 2 m/s (the figure in brackets), and a margin. Narrower ones for one robot or policy belong in its contract.
@@ -54,6 +55,8 @@ class Limits:
     low: Floats  # (D,) [rad] the joints' range
     high: Floats  # (D,) [rad]
     motor: Floats  # (D,) [N m] what the motors can give
+    lowest: Floats  # (D,) [rad] the servos' range: targets are held within it, as in training; no drive does it
+    highest: Floats  # (D,) [rad]
     position: float = 0.25  # [rad] of a measured angle beyond the range [0.15: simulated end stops give]
     target: float = 0.9  # [rad] of a target beyond the range [0.62]
     step: float = 2.5  # [rad] between two targets of a joint [1.85]
@@ -82,7 +85,7 @@ class Limits:
         return replace(self, **{name: _value(name, value, where) for name, value in values.items()})
 
 
-NAMES = tuple(f.name for f in fields(Limits) if f.name not in ("low", "high", "motor"))
+NAMES = tuple(f.name for f in fields(Limits) if f.name not in ("low", "high", "motor", "lowest", "highest"))
 
 
 def parse_limits(texts: Sequence[str]) -> dict[str, str]:
@@ -117,7 +120,8 @@ def _machine(folder: Path, contract: Contract) -> Limits:
     low, high = np.where(model.jnt_limited[joints, None] > 0, model.jnt_range[joints], [-OFF, OFF]).T
     servo = np.where(model.actuator_forcelimited[servos] > 0, model.actuator_forcerange[servos, 1], OFF)
     joint = np.where(model.jnt_actfrclimited[joints] > 0, model.jnt_actfrcrange[joints, 1], OFF)
-    return Limits(low, high, np.minimum(servo, joint))
+    lowest, highest = np.where(model.actuator_ctrllimited[servos, None] > 0, model.actuator_ctrlrange[servos], [-OFF, OFF]).T
+    return Limits(low, high, np.minimum(servo, joint), lowest, highest)
 
 
 class Safety:
@@ -146,21 +150,28 @@ class Safety:
             or self._heard(health, now)
         )
 
+    def held(self, targets: Floats) -> Floats:
+        """``targets`` (D,) within the servos' range; torques within that of the motors, if their actuators have one."""
+        return np.clip(targets, self.limits.lowest, self.limits.highest)
+
     def asked(self, measured: Measurement, targets: Floats, stiffness: Floats | None = None, damping: Floats | None = None) -> Trip | None:
-        """The first limit that targets (D,) [rad] pass, for servos with these gains (D,); None: the contract's."""
+        """The first limit that targets (D,) [rad], or torques [N m], pass, for servos with these gains (D,); None: the contract's."""
         limits, contract = self.limits, self.contract
+        strong = "is asked for {value:.1f} N m, more than {most:.1f}"
         if not (finite := np.isfinite(targets)).all():
             return Trip("finite", f"the target of {self._name(finite)} is not finite: {targets[_first(~finite)]}")
+        if contract.action.origin == TORQUE and stiffness is None:
+            return self._most("torque", strong, np.abs(targets), limits.torque * limits.motor)
         stiffness = contract.stiffness if stiffness is None else stiffness
         damping = contract.damping if damping is None else damping
-        torque = np.abs(stiffness * (targets - measured.joint_pos) - damping * measured.joint_vel)
+        torque = np.abs(stiffness * (self.held(targets) - measured.joint_pos) - damping * measured.joint_vel)
         stepped = np.zeros_like(targets) if self._last is None else np.abs(targets - self._last)
         trip = (
             self._range("target", "is told to go to", targets, limits.target)
             or self._most(
                 "step", "is told to step by {value:.2f} rad from one target to the next, more than {most:.2f}", stepped, limits.step
             )
-            or self._most("torque", "is asked for {value:.1f} N m, more than {most:.1f}", torque, limits.torque * limits.motor)
+            or self._most("torque", strong, torque, limits.torque * limits.motor)
         )
         self._last = np.array(targets)
         return trip
