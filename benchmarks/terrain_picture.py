@@ -18,9 +18,9 @@ import legged_mw  # noqa: F401  (chooses what draws without a screen, before muj
 import mujoco
 import numpy as np
 
+from legged_mw.drawing.scene import ground_model
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.terrain import build_terrain
-from legged_mw.sim.drawing import ground_model
 from legged_mw.sim.terrain import KINDS, MEASURES, Terrain, measure
 from legged_mw.utils.cli import Parser, apply_overrides, one_line_errors
 from legged_mw.utils.config import ConfigError

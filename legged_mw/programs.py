@@ -26,7 +26,7 @@ def train() -> None:
         return
     task = load_task(args.task)
     start, device = training.configure(task, args)
-    env = training.build(task, device, args.eager, check_recordable)
+    env = training.build(task, start, device, args.eager, check_recordable)
     if args.check:
         print(describe(env, task) + ("" if args.eager else "\nthe step can be recorded as a CUDA graph"))
         if args.picture:

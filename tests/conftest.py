@@ -1,9 +1,11 @@
 """Shared by all tests: one torch thread; tests that need a GPU or a screen are left out where there is none."""
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
+from program import trained
 
 from legged_mw.view.native import has_display
 
@@ -26,6 +28,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 def device(request: pytest.FixtureRequest) -> str:
     """The test runs on a CPU, and again on a GPU where there is one."""
     return request.param
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The export of a finished training of two iterations, in its run's folder: to look at, not to change."""
+    return trained(tmp_path_factory.mktemp("made"), "--max_iterations", "2", "--set", "runner.export=true") / "export"
 
 
 @pytest.fixture(autouse=True)

@@ -30,6 +30,8 @@ task.train.runner.save_interval = 1
 task.train.runner.num_steps_per_env = 12
 seed_everything(10 + rank.index)
 env = task.env_class(task.cfg, device)
+if kind == "ours" and dies_in < 0:
+    task.train.actor.estimator.targets = ["base_lin_vel"]
 task.train.algorithm.class_name = {"ours": "legged_mw.rl.ppo:GraphedPPO", "stock": "PPO"}[kind]
 runner = make_runner(env, task.train, folder if rank.leads else None, device)
 assert type(runner.alg) is {"ours": GraphedPPO, "stock": PPO}[kind]

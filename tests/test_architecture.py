@@ -24,7 +24,7 @@ LONG = {
 
 # Imports run one way: train, play -> rl -> envs -> sim -> utils; configs -> envs, utils.
 LAYERS = ("utils", "sim", "envs", "rl")
-TOOLS = ("legged_mw.check", "legged_mw.view", "legged_mw.eval", "legged_mw.deploy", "legged_mw.robot")
+TOOLS = ("legged_mw.check", "legged_mw.view", "legged_mw.eval", "legged_mw.deploy", "legged_mw.robot", "legged_mw.drawing")
 ONLY_IN = {
     "warp": ["legged_mw/sim/*"],
     "mujoco_warp": ["legged_mw/sim/*"],
@@ -35,6 +35,12 @@ ONLY_IN = {
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/studio.py"],  # young, and not on every platform
     "legged_mw.check": ["legged_mw/check/*", "legged_mw/programs.py"],
     "legged_mw.robot": ["legged_mw/robot/*", "legged_mw/programs.py"],
+    "legged_mw.drawing": [
+        "legged_mw/drawing/*",
+        "legged_mw/view/env_stage.py",
+        "legged_mw/rl/export_scene.py",
+        "legged_mw/robot/picture.py",
+    ],
     "legged_mw.eval": ["legged_mw/eval/*", "legged_mw/deploy/*", "legged_mw/programs.py"],
     "legged_mw.deploy": [
         *("legged_mw/deploy/*", "legged_mw/rl/export*.py", "legged_mw/eval/*", "legged_mw/programs.py"),
@@ -80,6 +86,7 @@ DEPLOY_MAY = [
         "legged_mw.eval.rules",
     ),
     *("legged_mw.utils.cli", "legged_mw.utils.config", "legged_mw.utils.errors", "legged_mw.utils.machine", "legged_mw.utils.commands"),
+    "legged_mw.utils.motor_network",
     *sys.stdlib_module_names,
 ]
 
@@ -211,6 +218,8 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/rl/training.py", "from legged_mw.robot.measure import measure", True),
         ("legged_mw/check/describe.py", "from legged_mw.robot.measure import measure", True),
         ("legged_mw/robot/picture.py", "from legged_mw.view.video import save_png", False),
+        ("legged_mw/sim/ground.py", "from legged_mw.drawing.relief import relief", True),
+        ("legged_mw/view/recorder.py", "from legged_mw.drawing.scene import visual_spec", True),
         ("legged_mw/envs/robot_task.py", "from legged_mw.deploy import contract", True),
         ("legged_mw/utils/cli.py", "import legged_mw.eval.report", True),
         ("legged_mw/view/env_stage.py", "from legged_mw.envs.legged_robot import LeggedRobot", False),

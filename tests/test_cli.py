@@ -76,10 +76,10 @@ def first(root: Path) -> Path:
 @pytest.mark.parametrize(
     ("args", "parts"),
     [
-        ([], ("--task is missing", "go1_flat, go1_flat_dr")),
+        ([], ("--task is missing", "go1_flat, go1_flat_blind")),
         (
             ["--task", "go1_falt"],
-            ("no task 'go1_falt' in configs/; did you mean 'go1_flat'?", "go1_flat, go1_flat_dr", "or give the path of a config file"),
+            ("no task 'go1_falt' in configs/; did you mean 'go1_flat'?", "go1_flat, go1_flat_blind", "or give the path of a config file"),
         ),
         (["--task", "dog.urdf"], ("dog.urdf is a robot, not a task; make a task for it: python -m legged_mw.robot dog.urdf --new NAME",)),
         (["--task", "dog/dog.py"], ("no config file at ", "dog/dog.py")),

@@ -280,7 +280,9 @@ def test_the_whole_step_asks_the_host_nothing_with_everything_on() -> None:
 
 
 def test_what_was_drawn_is_readable() -> None:
-    env = make_env(3, ALL)
+    motors = {"control.actuator": "dc_motor", "control.stall_torque": {"": 23.7}, "control.no_load_speed": {"": 30.1}}
+    curves = {"domain_rand.stall_torque": [0.9, 1.1], "domain_rand.no_load_speed": [0.9, 1.1], "domain_rand.delay_ms": [0.0, 20.0]}
+    env = make_env(3, {**ALL, **motors, **curves})
     table = layout(env)["privileged_state"]
     assert {name: table[name] for name in KINDS} == {name: env.domain_rand.values[name].shape[1] for name in KINDS}
     assert env.obs_buf["privileged_state"].shape[1] == 123 + sum(value.shape[1] for value in env.domain_rand.values.values())

@@ -227,6 +227,7 @@ class FakeStage:
         self.steps, self.own = 0, np.full((num_worlds, len(table)), 0.1)
         self.now, self.events = self.own.copy(), []
         self.given: list[Any] = []
+        self.believed: Any = None
 
     def step(self, commands: Any) -> None:
         self.given.append(commands)
@@ -238,6 +239,9 @@ class FakeStage:
 
     def velocity(self) -> Any:
         return np.resize(self.now, (self.num_worlds, 3)) + 0.01 if len(self.command_table) == 3 else np.full((self.num_worlds, 3), 0.11)
+
+    def believed_velocity(self) -> Any:
+        return self.believed
 
     def qpos(self) -> Any:
         return np.tile([self.steps * 1.0, 0, 1, 1, 0, 0, 0], (self.num_worlds, 1))
@@ -298,6 +302,14 @@ def test_a_stage_without_commands_is_watched_pushed_and_reset() -> None:
     assert [dict(moment.lines).get("note", "") for moment in viewer.moments[1:5]] == ["", NO_COMMANDS, NO_COMMANDS, ""]
     assert [name for name, _ in viewer.moments[0].lines] == ["measured", "robot", "falls, all", "time"]
     assert np.isnan(viewer.moments[0].target_velocity).all() and "commanded: nothing" in outcome.text()
+
+
+def test_what_a_policy_believes_of_its_velocity_stands_below_the_measured_one() -> None:
+    stage = FakeStage(2)
+    stage.believed = np.array([[0.5, -0.25], [0.0, 0.0]])
+    viewer = FakeViewer(Pilot(stage.command_table, 2), until=1)
+    Session(stage, viewer, viewer.pilot, real_time=False).run()
+    assert viewer.moments[0].lines[1:3] == (("measured", "+0.11 +0.11 +0.11"), ("estimated", "+0.50 -0.25"))
 
 
 def test_velocities_are_found_among_the_commands_by_name() -> None:

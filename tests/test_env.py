@@ -652,7 +652,7 @@ def test_model_says_what_the_config_changed(quiet: LeggedRobot) -> None:
 def test_camera_looks_at_the_robot_and_is_not_stepped(quiet: LeggedRobot) -> None:
     import mujoco
 
-    from legged_mw.sim.drawing import visual_model
+    from legged_mw.drawing.scene import visual_model
 
     visual = visual_model(quiet.robot, quiet.cfg.viewer.camera)
     data = mujoco.MjData(visual)

@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from program import SMALL, files, run, trained
+from program import SMALL, files, run
 from rsl_rl.utils import resolve_class
 from worlds import make_env
 
@@ -27,6 +27,7 @@ from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl import export as exporting
 from legged_mw.rl.classes import network_section
+from legged_mw.rl.estimator import actor_settings
 from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, export
 from legged_mw.rl.export_replay import overridden, own_ends
 from legged_mw.rl.export_scene import differences, standalone
@@ -35,20 +36,6 @@ from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 
 TASK = ["--task", "go1_flat", "--device", "cpu"]
-
-
-@pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished training that exported by itself."""
-    root = tmp_path_factory.mktemp("root")
-    trained(root, "--max_iterations", "1", "--set", "runner.export=true")
-    return root
-
-
-@pytest.fixture(scope="module")
-def made(root: Path) -> Path:
-    [folder] = root.glob("logs/*/*/export")
-    return folder
 
 
 def arguments(made: Path) -> tuple[LoadedTask, Path]:
@@ -398,7 +385,7 @@ def untrained(path: Path, folder: Path, settings: dict[str, Any] | None = None) 
     torch.manual_seed(0)
     env = task.env_class(task.cfg, "cpu")
     sections = task.train.to_dict()
-    actor_class, settings = resolve_class(network_section(sections["actor"]))
+    actor_class, settings = resolve_class(network_section(actor_settings(sections, env)))
     actor = actor_class(env.get_observations(), sections["obs_groups"], "actor", env.num_actions, **settings)
     torch.save({"actor_state_dict": actor.state_dict()}, folder / "model.pt")
     return task, folder / "model.pt"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from legged_mw.eval import figures
+from legged_mw.eval import figures, motors
 from legged_mw.eval.rollout import Record
 
 DT = 0.02
@@ -144,6 +144,24 @@ def test_what_fell_is_not_counted() -> None:
     limits = {"torque": (np.array([-20.0]), np.array([20.0]))}
     assert figures.joints(make(2, 100, {1: 5}, torque=torque), 0, limits)["torque"]["saturated"] == [0.0]
     assert figures.joints(make(2, 100, {0: 5, 1: 5}, torque=torque), 0, limits)["torque"]["saturated"] == []
+
+
+def test_share_of_time_at_a_motors_envelope() -> None:
+    """20 N m at rest, none at 25 rad/s, at most 15 N m: of 100 samples 20 are at its force limit, 30 on its curve, 50 within."""
+    speed = np.repeat([0.0, 15.0, 15.0], [20, 30, 50])[:, None, None].repeat(3, axis=2)
+    torque = np.repeat([-15.0, 8.0, 7.0], [20, 30, 50])[:, None, None].repeat(3, axis=2)
+    torque[:, :, 1] = 0.0
+    limits = motors.Limits(
+        *(np.array([sign * 15.0, sign * 15.0, sign * np.inf]) for sign in (-1.0, 1.0)),
+        *(np.array([value, value, np.inf]) for value in (20.0, 25.0)),
+    )
+    knee, ankle = motors.envelopes(make(1, 100, torque=torque, motor_speed=speed), 0, ["knee", "knee", "ankle"], limits)
+    assert knee["kind"] == "knee" and knee["at_limit"] == pytest.approx(0.25), "one of two joints in half of the time"
+    assert np.sum(knee["counts"]) == 200 and np.sum(ankle["counts"]) == 100
+    assert (ankle["at_limit"], ankle["envelope"]) == (None, None)
+    line = knee["envelope"]
+    at = np.interp([0.0, 12.5], line["speed"], line["high"])
+    assert at == pytest.approx([15.0, 10.0], abs=0.01) and min(line["high"]) < 0.0
 
 
 # ---- pushes, energy, reward

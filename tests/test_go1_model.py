@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from inertia import compiled_tensor, rotation, tensor
 
-from legged_mw.sim.drawing import add_scene
+from legged_mw.drawing.scene import add_scene
 
 XML = Path(__file__).parents[1] / "resources" / "robots" / "go1" / "go1.xml"
 LEGS, LINKS = ("FR", "FL", "RR", "RL"), ("hip", "thigh", "calf")

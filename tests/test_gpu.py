@@ -6,20 +6,26 @@ import math
 from pathlib import Path
 
 import pytest
+import test_distillation as distilling
 import torch
 from learner import collect, difference, make, observations, parameters, share_experience, take_over
 from mujoco_warp import DisableBit
-from rsl_rl.algorithms import PPO
+from rsl_rl.algorithms import PPO, Distillation
 from test_forces import SCALES, SETTINGS
+from test_motors import CURVE, Springs, mlp, save
 from test_ppo import VARIANTS, update
 from test_recurrent import IMAGES, NETWORKS, share_memory
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
 from legged_mw.eval.training import TrainingExam
+from legged_mw.rl.distillation import GraphedDistillation
+from legged_mw.rl.policies import Source, Trained
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.recurrent import memory_of
 from legged_mw.rl.runner import make_runner
+from legged_mw.rl.transfer import seat_teacher
+from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.task import load_task
 
 pytestmark = pytest.mark.gpu
@@ -118,6 +124,28 @@ def test_replay_equals_eager_over_100_steps(task: str, settings: dict[str, objec
     assert recorded._graph.recorded and not eager._graph.recorded
     assert any(done.any() for done in expected[3::5])
     for i, (a, b) in enumerate(zip(expected, got, strict=True)):
+        assert torch.equal(a, b), f"step {i // 5}, output {i % 5}: largest difference {(a.float() - b.float()).abs().max():g}"
+
+
+@pytest.mark.parametrize("law", ["servo", "dc_motor", "torque", "network", "own"])
+def test_motors_replay_as_they_run_eager(law: str, tmp_path: Path) -> None:
+    """Bit for bit, delayed by 0 to 30 ms, with drawn gains and curves, and episodes that end."""
+    net = save(mlp(torque_scale=20.0)[1], tmp_path)
+    drawn = {f"domain_rand.{name}": [0.8, 1.2] for name in ("stiffness", "damping", "strength", "stall_torque", "no_load_speed")}
+    fields: dict[str, object] = {**CURVE, **drawn, "domain_rand.enable": True, "domain_rand.delay_ms": [0.0, 30.0]}
+    fields |= {"control.actuator": "servo" if law == "own" else law, "control.network": net, "env.episode_length_s": 0.5}
+    fields |= {"control.action_scale": 5.0} if law == "torque" else {}
+    task = load_task("go1_flat")
+    for path, value in {"env.num_envs": 64, **fields}.items():
+        task.set(path, value)
+    outs = []
+    for eager in (True, False):
+        torch.manual_seed(3)
+        env = without_constraints((Springs if law == "own" else task.env_class)(task.cfg, DEVICE, eager=eager))
+        actions = torch.randn(60, 64, 12, generator=torch.Generator().manual_seed(0)).to(DEVICE)
+        outs.append(roll_out(env, actions))
+        assert env._graph.recorded != eager and env.actuators.law == law
+    for i, (a, b) in enumerate(zip(*outs, strict=True)):
         assert torch.equal(a, b), f"step {i // 5}, output {i % 5}: largest difference {(a.float() - b.float()).abs().max():g}"
 
 
@@ -227,6 +255,21 @@ def test_recorded_update_is_rsl_rls_own(settings: dict) -> None:
     assert ours._update_graph.recorded
 
 
+@pytest.mark.parametrize("settings", [{}, VARIANTS["symmetric samples"]], ids=["plain", "mirrored"])
+def test_recorded_estimator_learns_as_step_by_step(settings: dict) -> None:
+    """Six updates, the last three replayed, beside a learner that records none, from equal states and experience."""
+    eager, ours = (make(GraphedPPO, DEVICE, estimator={}, **settings) for _ in range(2))
+    eager._update_graph = StepGraph(eager._update, DEVICE, eager=True)
+    for seed in range(6):
+        collect(eager, DEVICE, seed=seed)
+        share_experience(eager, ours)
+        take_over(ours, eager)
+        expected, got = update(eager), update(ours)
+        assert difference(parameters(eager), parameters(ours)) < 1e-4
+        assert got == pytest.approx(expected, rel=1e-3, abs=1e-5) and got["estimate"] > 0.0
+    assert ours._update_graph.recorded and not eager._update_graph.recorded
+
+
 @pytest.mark.parametrize("memory", NETWORKS.values(), ids=NETWORKS.keys())
 def test_recorded_recurrent_update_is_rsl_rls_own(memory: dict, monkeypatch: pytest.MonkeyPatch) -> None:
     """As above; cuDNN multiplies in float32, and worlds come in their order."""
@@ -290,11 +333,14 @@ def test_checkpoints_go_both_ways_on_a_gpu(tmp_path: Path) -> None:
     assert difference(parameters(stock), parameters(replaying)) < 1e-4
 
 
-@pytest.mark.parametrize("network", ["MLPModel", "RNNModel"])
+@pytest.mark.parametrize("network", ["MLPModel", "RNNModel", "with an estimator"])
 def test_iteration_never_waits_for_the_host(network: str) -> None:
     """Rollout, returns, update and the report, once everything is recorded."""
     train = small_learner()
-    train.actor.class_name = train.critic.class_name = network
+    if network == "with an estimator":
+        train.actor.estimator.targets = ["base_lin_vel", "foot_contact"]
+    else:
+        train.actor.class_name = train.critic.class_name = network
     runner = make_runner(make_env(eager=False), train, None, DEVICE)
     runner.learn(5)
     obs = runner.env.get_observations()
@@ -339,3 +385,65 @@ def test_an_exam_leaves_the_gpus_generator_as_it_was() -> None:
     found = examine(lambda obs: torch.zeros(len(obs), 12, device=DEVICE))
     assert examine.env._graph.recorded and found["falls"] == 0
     assert torch.equal(torch.cuda.get_rng_state(DEVICE), before)
+
+
+# ---- teacher and student ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("settings", distilling.VARIANTS.values(), ids=distilling.VARIANTS.keys())
+def test_recorded_distillation_is_rsl_rls_own(settings: dict) -> None:
+    """Each of six updates, the last two replayed, from equal states and the stock learner's experience."""
+    stock, ours = (distilling.make(kind, DEVICE, **settings) for kind in (Distillation, GraphedDistillation))
+    for seed in range(6):
+        distilling.collect(stock, DEVICE, seed=seed)
+        distilling.share_experience(stock, ours)
+        distilling.take_over(ours, stock)
+        expected, got = stock.update(), ours.update()
+        assert difference(distilling.parameters(stock), distilling.parameters(ours)) < 1e-4
+        assert float(got["behavior"]) == pytest.approx(expected["behavior"], rel=1e-3)
+    assert ours._update_graph.recorded
+
+
+def test_recorded_student_acts_with_noise_beside_its_teacher() -> None:
+    alg = distilling.make(GraphedDistillation, DEVICE, gradient_length=1)
+    obs = observations(torch.Generator().manual_seed(0), DEVICE)
+    with torch.inference_mode():
+        drawn = torch.stack([alg.act(obs) for _ in range(200)])
+        assert alg._act_graph.recorded
+        assert drawn[5:].std(dim=0).mean().item() == pytest.approx(0.1, rel=0.05)
+        torch.testing.assert_close(alg.transition.privileged_actions, alg.teacher(obs), rtol=1e-3, atol=1e-4)
+
+
+def test_a_recorded_warm_up_ends() -> None:
+    """The actor stands to the bit while the critic learns, replayed too; then both learn, recorded anew."""
+    alg = make(GraphedPPO, DEVICE)
+    alg.learn_critic_only(True)
+    before = parameters(alg)
+    for seed in range(5):
+        collect(alg, DEVICE, seed=seed)
+        update(alg)
+    assert alg._update_graph.recorded
+    warm = parameters(alg)
+    assert all(torch.equal(warm[name], before[name]) for name in before if name.startswith("actor."))
+    assert not torch.equal(warm["critic.mlp.0.weight"], before["critic.mlp.0.weight"])
+    alg.learn_critic_only(False)
+    for seed in range(5):
+        collect(alg, DEVICE, seed=seed)
+        update(alg)
+    assert alg._update_graph.recorded and not torch.equal(parameters(alg)["actor.mlp.0.weight"], warm["actor.mlp.0.weight"])
+
+
+def test_a_students_iteration_never_waits_for_the_host() -> None:
+    env, teacher = make_env(eager=False), load_task("go1_flat")
+    seat_teacher(env, Trained(Source(Path(), Path("model_1.pt"), False), teacher))
+    runner = make_runner(env, small_learner(), None, DEVICE, teacher.train)
+    runner.learn(5)
+    obs = env.get_observations()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        for _ in range(2):
+            obs = runner._rollout(obs)
+            report = runner._report(runner.alg.update(), (0.0, 0.0, 0.0))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert all(math.isfinite(value) for value in report.message.read()[-3:])

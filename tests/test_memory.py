@@ -26,6 +26,7 @@ from legged_mw.eval.rollout import holding, roll_out
 from legged_mw.rl import export_replay
 from legged_mw.rl.export import ExportError, export
 from legged_mw.rl.policies import load_policy
+from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.recurrent import forget, memory_of
 from legged_mw.rl.runner import make_runner, rsl_rl_config
 from legged_mw.utils.config import ConfigError
@@ -35,12 +36,18 @@ from legged_mw.view.env_stage import EnvStage
 RECURRENT = {"class_name": "RNNModel", "rnn_hidden_dim": 8, "hidden_dims": [16, 16]}
 
 
-def small_task(kind: str = "gru", layers: int = 1, **settings: Any) -> LoadedTask:
+def small_task(kind: str = "gru", layers: int = 1, settings: dict[str, Any] | None = None) -> LoadedTask:
     """go1_flat with its symmetry, small recurrent networks, few worlds and short episodes."""
     task = load_task("go1_flat")
     recurrent = RECURRENT | {"rnn_type": kind, "rnn_num_layers": layers}
     fields = {f"{network}.{name}": value for network in ("actor", "critic") for name, value in recurrent.items()}
-    for path, value in {**fields, "env.num_envs": 8, "runner.num_steps_per_env": 6, "env.episode_length_s": 0.1, **settings}.items():
+    for path, value in {
+        **fields,
+        "env.num_envs": 8,
+        "runner.num_steps_per_env": 6,
+        "env.episode_length_s": 0.1,
+        **(settings or {}),
+    }.items():
         task.set(path, value)
     return task
 
@@ -65,7 +72,7 @@ def test_resumed_learning_is_the_uninterrupted_one(tmp_path: Path) -> None:
     torch.manual_seed(0)
     one, two = (LeggedRobot(task.cfg, "cpu") for _ in range(2))
     uninterrupted, resumed = (make_runner(env, task.train, None, "cpu") for env in (one, two))
-    assert uninterrupted.alg.graphed
+    assert isinstance(uninterrupted.alg, GraphedPPO) and isinstance(resumed.alg, GraphedPPO) and uninterrupted.alg.graphed
     uninterrupted.learn(1)
     uninterrupted.save(str(tmp_path / "model_1.pt"))
     copy_world(one, two)
@@ -82,7 +89,7 @@ def test_resumed_learning_is_the_uninterrupted_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize("algorithm", ["legged_mw.rl.ppo:GraphedPPO", "PPO"])
 def test_an_exam_does_not_touch_what_training_remembers(algorithm: str) -> None:
     """It has other worlds, and begins with an empty memory."""
-    task = small_task(**{"algorithm.class_name": algorithm, "symmetry.use_data_augmentation": False})
+    task = small_task(settings={"algorithm.class_name": algorithm, "symmetry.use_data_augmentation": False})
     env = LeggedRobot(task.cfg, "cpu")
     runner = make_runner(env, task.train, None, "cpu")
     began: list[torch.Tensor] = []
@@ -280,7 +287,7 @@ def test_a_memory_of_another_size_is_refused(tmp_path: Path) -> None:
     task = small_task()
     saved(task, tmp_path / "model.pt")
     with pytest.raises(ConfigError, match=r"does not fit this task: actor mlp.0.weight is \(16, 8\) there and \(16, 9\) here"):
-        load_policy(tmp_path / "model.pt", make_env(1), small_task(**{"actor.rnn_hidden_dim": 9}).train, "cpu")
+        load_policy(tmp_path / "model.pt", make_env(1), small_task(settings={"actor.rnn_hidden_dim": 9}).train, "cpu")
     with pytest.raises(ConfigError, match=r"does not fit this task: actor rnn.rnn.weight_ih_l0 is \(24, 48\) there and \(32, 48\) here"):
         load_policy(tmp_path / "model.pt", make_env(1), small_task("lstm").train, "cpu")
 

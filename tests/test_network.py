@@ -10,7 +10,7 @@ import onnx
 import pytest
 import torch
 from onnx import numpy_helper
-from program import SMALL, refused, run, trained
+from program import SMALL, refused, run
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from worlds import make_env
@@ -44,23 +44,14 @@ def actions(policy: MLPModel) -> torch.Tensor:
 
 
 @pytest.fixture(scope="module")
-def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A finished training that exported by itself."""
-    root = tmp_path_factory.mktemp("root")
-    trained(root, "--max_iterations", "2", "--set", "runner.export=true")
-    return root
-
-
-@pytest.fixture(scope="module")
 def half(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Exported]:
     folder = tmp_path_factory.mktemp("half") / "out"
     return folder, export(task_of(SHIPPED), SHIPPED / "policy.onnx", folder, half=True)
 
 
-def test_the_policy_of_an_export_is_the_one_of_the_checkpoint(root: Path) -> None:
+def test_the_policy_of_an_export_is_the_one_of_the_checkpoint(made: Path) -> None:
     """Bit for bit: weights, biases, mean, and every action, though the file holds std + eps and not std."""
-    [run_folder] = root.glob("logs/*/*")
-    ours, theirs = (loaded(run_folder / file, run_folder) for file in ("export/policy.onnx", "model_2.pt"))
+    ours, theirs = loaded(made / "policy.onnx", made), loaded(made.parent / "model_2.pt", made)
     mine, other = ours.state_dict(), theirs.state_dict()
     same = [name for name in other if name.startswith("mlp.") or name == "obs_normalizer._mean"]
     assert len(same) == 7 and all(torch.equal(mine[name], other[name]) for name in same) and mine["obs_normalizer._mean"].any()
@@ -68,9 +59,8 @@ def test_the_policy_of_an_export_is_the_one_of_the_checkpoint(root: Path) -> Non
     assert torch.equal(actions(ours), actions(theirs)) and policies.NETWORK_FILE == contract.NETWORK_FILE
 
 
-def test_an_export_is_played_by_its_path(root: Path, tmp_path: Path) -> None:
+def test_an_export_is_played_by_its_path(made: Path, tmp_path: Path) -> None:
     """--task is read from it; what is exported again is the same file."""
-    [made] = root.glob("logs/*/*/export")
     result = run("play", tmp_path, "--load_run", str(made), "--device", "cpu", "--export", str(tmp_path / "again"))
     assert result.code == 0 and result.out.startswith(f"policy: {made}/policy.onnx\n"), result.err
     assert (tmp_path / "again/policy.onnx").read_bytes() == (made / "policy.onnx").read_bytes()
@@ -104,8 +94,8 @@ def test_half_precision_is_deployed(half: tuple[Path, Exported]) -> None:
     assert not stage.fell().any()
 
 
-def test_half_needs_an_export(root: Path) -> None:
-    line = refused(root, "play", *SMALL[:2], "--half")
+def test_half_needs_an_export(tmp_path: Path) -> None:
+    line = refused(tmp_path, "play", *SMALL[:2], "--half")
     assert "--half rounds what is exported: add --export DIR" in line
 
 

@@ -173,3 +173,25 @@ def test_a_network_of_ones_own_is_left_to_rsl_rl(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(learner, "MODEL", Encoder)
     assert not make(GraphedPPO).graphed
     assert "not the recorded one: a network is a Encoder" in capsys.readouterr().out
+
+
+def test_a_critics_warm_up() -> None:
+    """The actor stands to the bit, its normalizer and Adam's memory too; afterwards an adaptive rate begins at its lowest."""
+    ours = make(GraphedPPO)
+    ours.learn_critic_only(True)
+    before = parameters(ours)
+    for seed in range(2):
+        collect(ours, seed=seed)
+        assert update(ours).keys() == {"value", "surrogate", "entropy"}
+    warm = parameters(ours)
+    assert {name for name in warm if not torch.equal(warm[name], before[name])} == {name for name in warm if name.startswith("critic.")}
+    assert ours.learning_rate == 1e-3 and not any(id(p) in map(id, ours.optimizer.state) for p in ours.actor.parameters())
+    ours.learn_critic_only(False)
+    assert ours.learning_rate == 1e-5
+    collect(ours)
+    update(ours)
+    assert not torch.equal(parameters(ours)["actor.mlp.0.weight"], warm["actor.mlp.0.weight"]) and ours.learning_rate > 1e-5
+    fixed = make(GraphedPPO, schedule="fixed", learning_rate=3e-4)
+    for on in (True, False):
+        fixed.learn_critic_only(on)
+    assert fixed.learning_rate == 3e-4

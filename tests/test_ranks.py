@@ -68,11 +68,14 @@ def test_same_update_as_rsl_rls_own_on_two_ranks(ours: Path, tmp_path: Path) -> 
 
 
 def test_one_asked_to_stop_stops_all(tmp_path: Path) -> None:
+    """Until then they learned one policy, with the estimator that these have."""
     result = learn("ours", tmp_path / "asked", -1)
     assert result.returncode == 0, result.stderr
     one, other = ends(tmp_path / "asked")
     assert (one["stop"], other["stop"]) == ("another rank was asked to", "asked")
     assert one["iteration"] == other["iteration"] == 1
+    assert difference(one["parameters"], other["parameters"]) == 0.0
+    assert one["parameters"]["actor.target_normalizer.count"] == 2 * 12 * 8 and "actor.estimator.0.weight" in one["parameters"]
 
 
 def test_train_writes_one_run_folder(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from program import SMALL, refused, run, trained
@@ -74,6 +75,8 @@ def test_figures_of_a_policy_that_walks(both: tuple[dict[str, Any], ...]) -> Non
     assert figures["joints"]["torque"]["high"][2] == pytest.approx(35.55)
     [shares] = {len(figures["joints"][key]["saturated"]) for key in ("dof_pos", "dof_vel", "torque")}
     assert shares == 12
+    assert [motor["kind"] for motor in figures["motors"]] == ["hip", "thigh", "calf"]
+    assert all(motor["at_limit"] < 0.01 and np.sum(motor["counts"]) == 4 * 22 * 20 for motor in figures["motors"])
     assert [sum(row) / 16 for row in figures["pushes"]["walking"]] == pytest.approx(list(result["pushes"].values()), abs=1e-4)
     assert figures["steps"]["vx"]["commanded"] == [1.0] * 20 and figures["steps"]["vx"]["fell"] == 0
     assert figures["steps"]["vx"]["mean"] == pytest.approx([1.0] * 20, abs=0.15)
@@ -161,7 +164,7 @@ def test_the_page_needs_nothing_but_itself(pages: Path) -> None:
     assert re.findall(r'\b(?:src|href)="(?!#)[^"]*"', html) == [] and set(re.findall(r"url\((.)", html)) <= {"#"}
     for path in (str(ROOT), str(Path.home()), str(pages), "site-packages"):
         assert path not in html
-    assert html.count("<svg") == html.count("</svg>") == 32
+    assert html.count("<svg") == html.count("</svg>") == 38
     assert len(html) < 4e6
 
 
@@ -186,7 +189,7 @@ def test_json_holds_every_figure_and_pictures_are_there(pages: Path, both: tuple
     assert first["exam"] == json.loads(json.dumps(result)) and first["figures"] == json.loads(json.dumps(figures))
     assert numpy["name"] == "by numpy" and numpy["figures"] is None and rival["exam"]["falls"] == 22
     assert saved["task"] == "go1_flat" and saved["peer"] == PEERS["go1"][0].figures and len(saved["peers"]) == 1
-    names = {"tracking", "steps", "gait", "joints", "pushes", "energy", "reward"}
+    names = {"tracking", "steps", "gait", "joints", "motors", "pushes", "energy", "reward"}
     assert {path.stem for path in pages.glob("*.png")} == names
     assert all(path.stat().st_size > 5000 and path.read_bytes().startswith(b"\x89PNG") for path in pages.glob("*.png"))
 
@@ -200,7 +203,7 @@ def test_a_task_without_a_peer(both: tuple[dict[str, Any], ...], tmp_path: Path)
     html, saved = (tmp_path / "report.html").read_text(encoding="utf-8"), (tmp_path / "report.json").read_text()
     body = html[html.index("<body>") :]
     assert "peer" not in body and "peer" not in json.loads(saved) and "beats" not in saved
-    assert "survives pushes of 2 m/s" in body and body.count("<svg") == 3 * 2 + 3 + 6 + 3 + 3 + 2 + 1
+    assert "survives pushes of 2 m/s" in body and body.count("<svg") == 3 * 2 + 3 + 6 + 3 + 3 + 3 + 2 + 1
 
 
 def test_several_peers_are_their_best_and_a_table(

@@ -269,7 +269,7 @@ def test_a_new_task_checks_and_trains(
     assert "guessed: feet: " in out and "python train.py --task " in out
     robot, config = tmp_path / "made" / "mine.xml", tmp_path / "made" / "mine_flat.py"
     text = config.read_text()
-    assert len(text.splitlines()) <= 60 and text.count("LOOK") >= 4
+    assert len(text.splitlines()) <= 80 and text.count("LOOK") >= 4
     assert str(ROOT) not in robot.read_text() + text and str(tmp_path) not in robot.read_text() + text
     moved = tmp_path / "moved"
     (tmp_path / "made").rename(moved)
@@ -308,6 +308,10 @@ def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
     text = config_text(found, GO1, "my_go")
     assert "class MyGoFlatCfg(LeggedRobotCfg):" in text and 'foot_names = ["FR", "FL", "RR", "RL"]  # LOOK: guessed' in text
     assert "(quadruped, 12 joints; " in text and "effort" not in text
+    biped = config_text(draft(TOY), TOY, "toy", mirrors=True)
+    assert "class ToyFlatCfg(BipedCfg):" in biped and "class ToyFlatCfgPPO(BipedCfgPPO):" in biped and "use_data" not in biped
+    assert 'pose_weights = {"": 0.02, "ankle": 0.05}' in biped and "min_feet_distance = 0.12" in biped
+    assert "use_data_augmentation = False  # left and right are not alike" in config_text(draft(TOY), TOY, "toy")
     free = tmp_path / "free.xml"
     free.write_text(GO1.read_text().replace("actuatorfrcrange", "user"))
     assert 'effort = {"": 30.0}  # [N m] LOOK: the file has no force limit for all joints' in config_text(draft(free), free, "free")
@@ -344,7 +348,7 @@ def test_what_of_the_file_is_changed_is_on_its_page(monkeypatch: pytest.MonkeyPa
     a1, t1 = ROOT / "tests/data/a1_style.urdf", ROOT / "tests/data/t1_style.xml"
     text = show(monkeypatch, capsys, a1)
     assert "in the file\n  looks left out (MuJoCo reads no .dae, " in text and "\n  free joint added to 'base'\n" in text
-    assert "\n  12 actuators replaced by position servos\n  keyframe 'stand' read" in show(monkeypatch, capsys, t1)
+    assert "\n  12 actuators replaced\n  keyframe 'stand' read" in show(monkeypatch, capsys, t1)
     assert 'joint_speed_limits = {"": 28.6, "hip": 52.0}  # [rad/s] the file\'s' in config_text(draft(a1), a1, "mine")
     assert "joint_speed_limits" not in config_text(draft(t1), t1, "mine")
 
@@ -489,3 +493,25 @@ def test_meshes_are_named_relative_to_the_new_file(tmp_path: Path, absolute: boo
     moved = mujoco.MjModel.from_xml_path(str(tmp_path / "moved" / "ours" / "mine.xml"))
     assert moved.nmesh == 1 and moved.nu == 0 and moved.body_subtreemass[0] == pytest.approx(12.0)
     assert [moved.jnt_actfrcrange[i, 1] for i in range(1, 7)] == [60.0] * 6
+
+
+def test_meshes_of_an_attached_robot_are_named_relative_too(tmp_path: Path) -> None:
+    """Its own meshdir is beside its own file: they were written as if they were beside the robot's."""
+    parts = tmp_path / "theirs/arms/left/parts"
+    parts.mkdir(parents=True)
+    (parts / "hull.obj").write_text(OCTAHEDRON)
+    hand = '<asset><mesh name="hull" file="hull.obj" scale="0.1 0.1 0.1"/></asset><worldbody><body name="hand">'
+    hand = f'<mujoco model="hand"><compiler meshdir="parts"/>{hand}<geom type="mesh" mesh="hull" mass="0.1"/></body></worldbody></mujoco>'
+    (tmp_path / "theirs/arms/left/hand.xml").write_text(hand)
+    arm = '<worldbody><body name="arm"><geom size="0.02" mass="0.1"/><attach model="hand" body="hand" prefix="left_"/></body></worldbody>'
+    arm = f'<mujoco model="arm"><asset><model name="hand" file="left/hand.xml"/></asset>{arm}</mujoco>'
+    (tmp_path / "theirs/arms/arm.xml").write_text(arm)
+    text = TOY.read_text().replace("<worldbody>", '<asset><model name="arm" file="arms/arm.xml"/></asset><worldbody>')
+    (tmp_path / "theirs/toy.xml").write_text(
+        text.replace('<site name="imu"', '<attach model="arm" body="arm" prefix="right_"/><site name="imu"')
+    )
+    robot, config = write(draft(tmp_path / "theirs/toy.xml"), tmp_path / "theirs/toy.xml", "mine", tmp_path / "ours/here")
+    assert 'file="../../theirs/arms/left/parts/hull.obj"' in robot.read_text() and str(tmp_path) not in robot.read_text()
+    assert mujoco.MjModel.from_xml_path(str(robot)).nmesh == 1
+    task = load_task(str(config))
+    assert task.env_class(task.cfg, "cpu").robot.physics.body_subtreemass[0] == pytest.approx(12.2)

@@ -13,7 +13,7 @@ import torch
 from mujoco_warp import OverflowType
 
 from legged_mw import ROOT
-from legged_mw.sim.drawing import visual_model
+from legged_mw.drawing.scene import visual_model
 from legged_mw.sim.engines import make_simulation, pick_engine
 from legged_mw.sim.errors import EngineError, ModelError
 from legged_mw.sim.ground import GROUND, Ground
@@ -393,7 +393,7 @@ def test_actuators_of_the_mjcf_are_replaced(tmp_path: Path) -> None:
     assert [model.actuator(i).name for i in range(model.nu)] == ["left_hip", "right_hip"]
     assert model.actuator_gainprm[:, 0].tolist() == [10, 10] and (model.actuator_gear[:, 0] == 1).all()
     assert model.actuator_forcerange.tolist() == [[-7, 7], [-8, 8]] and robot.effort_range[:, 1].tolist() == [7, 8]
-    assert "2 actuators replaced by position servos" in robot.overrides
+    assert "2 actuators replaced" in robot.overrides
 
 
 def test_limit_of_the_joint_wins_over_the_actuators(tmp_path: Path) -> None:

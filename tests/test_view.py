@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from legged_mw import ROOT
-from legged_mw.sim.drawing import visual_spec
+from legged_mw.drawing.scene import visual_spec
 from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.task import load_task
 from legged_mw.view import native

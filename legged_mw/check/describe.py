@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.estimator import find_targets
 from legged_mw.sim.room import count_room
 from legged_mw.utils.task import LoadedTask
 
@@ -17,6 +18,8 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
             line = f"  {start:>4}  {row.name:<20} {row.size:>3}" + (f"   noise +-{noise:g}" if noise else "")
             line += f"   scale {row.scale}" if row.scale != 1.0 else ""
             lines.append(line + (f"   {row.history} frames" if row.history > 1 else ""))
+    if targets := find_targets(task.train.to_dict(), env):
+        lines.append(f"the actor estimates {', '.join(f'{target.name} ({len(target.scale)})' for target, _ in targets)}")
     for command in env.command_table:
         lines.append(f"command {command.label:<14} [{command.low:g}, {command.high:g}] {command.unit}")
     lines.append(f"actions ({env.num_actions}), clipped at +-{task.cfg.normalization.clip_actions:g}, {1 / env.dt:g} Hz")
@@ -29,10 +32,22 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
         env.robot.joint_names, env.default_dof_pos.tolist(), env.robot.joint_range, env.robot.effort_range, strict=True
     ):
         lines.append(f"  {name:<{width}} {default:>7.3f}  [{low:.3f}, {high:.3f}]  {limit:g}")
-    lines.append(_room(env))
+    lines += [_motors(env), _room(env)]
     lines.append(f"what was dropped, added or changed in {task.cfg.asset.file}")
     lines += [f"  {line}" for line in env.robot.overrides]
     return "\n".join(lines)
+
+
+def _motors(env: RobotTask) -> str:
+    """Their law, and the delays that a world may have."""
+    text = f"motors: {env.actuators.law}"
+    if "delay_ms" not in env.domain_rand.values:
+        return text
+    span, step = env.cfg.domain_rand.delay_ms, 1e3 * env.cfg.sim.dt
+    low, high = (env.domain_rand.rounded_delay(end) for end in span)
+    asked = ", ".join(f"{end:g}" for end in span)
+    rounded = f"domain_rand.delay_ms [{asked}] to the nearest simulation step, of {step:g} ms"
+    return f"{text}; what they are told takes {low:g} to {high:g} ms: {rounded}"
 
 
 def _room(env: RobotTask) -> str:

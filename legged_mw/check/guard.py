@@ -94,10 +94,13 @@ def _watched(env_class: type[RobotTask], guard: Guard) -> type[Any]:
     return type(env_class.__name__, (env_class,), body)
 
 
-def _unwatched(method: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
-    def call(*args: Any, **kwargs: Any) -> Any:
-        with guard.set(on=False):
-            return method(*args, **kwargs)
+def _unwatched(method: Callable[..., Any], guard: Guard, on: bool = False) -> Callable[..., Any]:
+    """``method``, not watched; what it calls back is, as before: a motor law in code is called by the engine's step."""
+
+    def call(*args: Any) -> Any:
+        back = [_unwatched(arg, guard, guard.on) if callable(arg) else arg for arg in args]
+        with guard.set(on=on):
+            return method(*back)
 
     return call
 

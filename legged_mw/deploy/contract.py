@@ -7,25 +7,25 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from legged_mw.deploy.estimate import ESTIMATE, Estimated, read_estimated
 from legged_mw.deploy.memory import MEMORY, Memory, read_memory
+from legged_mw.deploy.motors import MOTORS, SERVOS, Motors, read_motors
+from legged_mw.deploy.reader import ContractError as ContractError
+from legged_mw.deploy.reader import Reader, is_list, is_number
 from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import load_yaml
-from legged_mw.utils.errors import UserError, unknown
+from legged_mw.utils.errors import unknown
 
-FORMATS = (2, 3)  # 3: the network has a memory. A file has the lowest that suffices, so that old readers read what they can
+FORMATS = (2, 3)  # 3: a memory, an estimate, motors. A file has the lowest that suffices: old readers read what they can
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"
 TERRAIN_FILE = "terrain.xml"  # the same robot among steps and blocks; only of policies that were trained on such ground
-
-
-class ContractError(UserError, ValueError):
-    """An export that cannot be deployed; the text names the file, what it states, what was expected and what to do."""
 
 
 class Quantity(NamedTuple):
@@ -64,7 +64,7 @@ SENSORS = "sensors"  # ContractRow.measured of a row that names sensors of the s
 SCAN = "height_scan"  # ContractRow.measured of the height scan
 CLOCK = "gait_clock"  # ContractRow.measured of the gait clock
 OWN = (SENSORS, SCAN, "")  # rows that come whole, in Measurement.others, by their names
-ORIGINS = ("default", "joints", "targets")
+ORIGINS = ("default", "joints", "targets", "torque")
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,10 @@ class ContractRow:
 
 
 class Action(NamedTuple):
-    """What an action means: joint target = origin + scale * action [rad]."""
+    """What an action means: joint target = origin + scale * action [rad], or torque = scale * action [N m]."""
 
-    origin: str  # "default": the default pose; "joints": the measured angles; "targets": the last targets, at first the default pose
-    scale: np.ndarray  # (D,) [rad]
+    origin: str  # "default": the default pose; "joints": the measured angles; "targets": the last targets; "torque": none
+    scale: np.ndarray  # (D,) [rad], or [N m]
     clip: float  # |action| at most [-]
 
 
@@ -148,6 +148,8 @@ class Contract:
     gait: Gait | None = None  # likewise
     exam: Mapping[str, Any] | None = None  # the task's section `exam`, if the walking exam grades it
     memory: Memory | None = None  # of a recurrent network
+    estimate: tuple[Estimated, ...] = ()  # the network's second output, row by row
+    motors: Motors = SERVOS
 
     @property
     def size(self) -> int:
@@ -163,7 +165,7 @@ class Contract:
         ends = {name: list(value) if isinstance(value, tuple) else value for name, value in self.ends._asdict().items() if value}
         network = {"file": NETWORK_FILE, "sha256": self.digest, "input": self.input, "output": self.output}
         return {
-            "format": FORMATS[1] if self.memory else FORMATS[0],
+            "format": FORMATS[1] if self.memory or self.estimate or self.motors != SERVOS else FORMATS[0],
             "task": self.task,
             "network": network | ({MEMORY: self.memory.to_dict()} if self.memory else {}),
             "period": self.period,
@@ -181,13 +183,14 @@ class Contract:
             **({SCAN: {"x": list(self.scan.x), "y": list(self.scan.y), "standing": self.scan.standing}} if self.scan else {}),
             **({"gait": {**self.gait._asdict(), "offsets": list(self.gait.offsets)}} if self.gait else {}),
             **({"exam": dict(self.exam)} if self.exam is not None else {}),
+            **({ESTIMATE: [row._asdict() for row in self.estimate]} if self.estimate else {}),
+            **self.motors.to_dict(),
         }
 
 
 def _row_to_dict(row: ContractRow) -> dict[str, Any]:
     entry = {name: getattr(row, name) for name in ("name", "size", "unit", "frame", "noise", "measured")}
-    entry |= {"scale": _short(row.scale)}
-    entry |= {"sensors": list(row.sensors)} if row.sensors else {}
+    entry |= {"scale": _short(row.scale), **({"sensors": list(row.sensors)} if row.sensors else {})}
     return entry | ({"history": row.history} if row.history > 1 else {})
 
 
@@ -204,61 +207,6 @@ def digest(path: Path) -> str:
 # ---- reading -------------------------------------------------------------------------------------------------------
 
 
-class _Reader:
-    """Takes typed values out of a mapping; a missing or ill-typed one is one clear line."""
-
-    def __init__(self, values: Mapping[str, Any], where: str) -> None:
-        self.values, self.where = values, where
-
-    def take(self, key: str, wanted: str, fits: Callable[[Any], bool]) -> Any:
-        """The value of ``key`` if it fits; ``wanted`` are the words for what does."""
-        if key not in self.values or not fits(self.values[key]):
-            found = f"is {self.values[key]!r}" if key in self.values else "is missing"
-            raise ContractError(f"{self.where}: '{key}' {found}; it must be {wanted}")
-        return self.values[key]
-
-    def section(self, key: str) -> _Reader:
-        return _Reader(self.take(key, "a mapping", lambda v: isinstance(v, dict)), f"{self.where}: {key}")
-
-    def sections(self, key: str, empty: bool = False) -> list[_Reader]:
-        items = self.take(key, "a list of mappings", lambda v: _is_list(v, lambda item: isinstance(item, dict), empty))
-        return [_Reader(item, f"{self.where}: {key}[{i}]") for i, item in enumerate(items)]
-
-    def text(self, key: str, empty: bool = False) -> str:
-        return self.take(key, "text", lambda v: isinstance(v, str) and (empty or v != ""))
-
-    def texts(self, key: str, empty: bool = False) -> tuple[str, ...]:
-        return tuple(self.take(key, "a list of names", lambda v: _is_list(v, lambda item: isinstance(item, str), empty)))
-
-    def count(self, key: str) -> int:
-        return self.take(key, "a whole number from 1", lambda v: isinstance(v, int) and not isinstance(v, bool) and v >= 1)
-
-    def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
-        limits = (f" from {low:g}" if low > -math.inf else "") + (f" to {high:g}" if high < math.inf else "")
-        return float(self.take(key, f"a number{limits}", lambda v: _is_number(v) and low <= v <= high))
-
-    def above_zero(self, key: str) -> float:
-        self.number(key)
-        return float(self.take(key, "above zero", lambda v: v > 0))
-
-    def numbers(self, key: str, count: int, of: str) -> np.ndarray:
-        return np.array(self.take(key, f"{count} numbers, one a {of}", lambda v: _is_list(v, _is_number) and len(v) == count), dtype=float)
-
-    def scale(self, count: int, of: str) -> np.ndarray:
-        """``scale`` as one number a value; one for all may stand for them."""
-        wanted = f"a number, or {count} numbers, one a {of}"
-        value = self.take("scale", wanted, lambda v: _is_number(v) or (_is_list(v, _is_number) and len(v) == count))
-        return np.full(count, value, dtype=float) if _is_number(value) else np.array(value, dtype=float)
-
-
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_list(value: object, fits: Callable[[Any], bool], empty: bool = False) -> bool:
-    return isinstance(value, list) and (empty or len(value) > 0) and all(map(fits, value))
-
-
 def read_contract(folder: Path) -> Contract:
     """The contract in ``folder``: complete, typed, and of the network that lies beside it.
 
@@ -268,7 +216,7 @@ def read_contract(folder: Path) -> Contract:
     for file in (path, folder / NETWORK_FILE, folder / SCENE_FILE):
         if not file.is_file():
             raise ContractError(f"no {file.name} in {folder}; make an export with: python play.py --task <task> --export {folder}")
-    contract = _read(_Reader(load_yaml(path), CONTRACT_FILE))
+    contract = _read(Reader(load_yaml(path), CONTRACT_FILE))
     _check_rows(contract)
     if digest(folder / NETWORK_FILE) != contract.digest:
         raise ContractError(
@@ -278,15 +226,14 @@ def read_contract(folder: Path) -> Contract:
     return contract
 
 
-def _read(top: _Reader) -> Contract:
-    known = f"{' or '.join(map(str, FORMATS))}, which this version reads; export the policy again"
-    top.take("format", known, lambda v: v in FORMATS)
+def _read(top: Reader) -> Contract:
+    top.take("format", f"{' or '.join(map(str, FORMATS))}, which this version reads; export the policy again", lambda v: v in FORMATS)
     network, action, robot, physics, measured = (top.section(name) for name in ("network", "action", "robot", "physics", "sensors"))
     joints, feet = top.texts("joints"), robot.section("feet")
     top.take("joints", "names, each once", lambda names: len(set(names)) == len(names))
     count, timestep, decimation = len(joints), physics.above_zero("timestep"), physics.count("decimation")
     step = timestep * decimation
-    top.take("period", f"physics: timestep * decimation = {step:g}", lambda v: _is_number(v) and math.isclose(v, step, rel_tol=1e-6))
+    top.take("period", f"physics: timestep * decimation = {step:g}", lambda v: is_number(v) and math.isclose(v, step, rel_tol=1e-6))
     return Contract(
         task=top.text("task"),
         joints=joints,
@@ -311,20 +258,22 @@ def _read(top: _Reader) -> Contract:
         gait=_read_gait(top),
         exam=top.section("exam").values if "exam" in top.values else None,
         memory=read_memory(network.section(MEMORY)) if MEMORY in network.values else None,
+        estimate=read_estimated(top.sections(ESTIMATE)) if ESTIMATE in top.values else (),
+        motors=read_motors(top.section(MOTORS), count) if MOTORS in top.values else SERVOS,
     )
 
 
-def _read_action(action: _Reader, joints: int) -> Action:
+def _read_action(action: Reader, joints: int) -> Action:
     origin = action.take("origin", f"one of {', '.join(ORIGINS)}", lambda v: v in ORIGINS)
     return Action(origin, action.scale(joints, "joint"), action.above_zero("clip"))
 
 
-def _read_command(command: _Reader) -> Command:
+def _read_command(command: Reader) -> Command:
     low, high = command.number("lowest"), command.number("highest")
     return Command(command.text("name"), low, high, command.text("unit", empty=True), default=command.number("default", low, high))
 
 
-def _read_row(row: _Reader) -> ContractRow:
+def _read_row(row: Reader) -> ContractRow:
     return ContractRow(
         name=row.text("name"),
         size=row.count("size"),
@@ -338,7 +287,7 @@ def _read_row(row: _Reader) -> ContractRow:
     )
 
 
-def _read_ends(ends: _Reader) -> Ends:
+def _read_ends(ends: Reader) -> Ends:
     """A misspelt rule would silently end nothing, so it is an error."""
     for name in ends.values:
         if name not in Ends._fields:
@@ -351,16 +300,16 @@ def _read_ends(ends: _Reader) -> Ends:
     )
 
 
-def _read_scan(top: _Reader) -> HeightScan | None:
+def _read_scan(top: Reader) -> HeightScan | None:
     """Where the height scan looks, if a row is one."""
     if not any(row.values.get("measured") == SCAN for row in top.sections("observation")):
         return None
     scan = top.section(SCAN)
-    x, y = (tuple(map(float, scan.take(key, "a list of numbers", lambda v: _is_list(v, _is_number)))) for key in "xy")
+    x, y = (tuple(map(float, scan.take(key, "a list of numbers", lambda v: is_list(v, is_number)))) for key in "xy")
     return HeightScan(x, y, scan.above_zero("standing"))
 
 
-def _read_gait(top: _Reader) -> Gait | None:
+def _read_gait(top: Reader) -> Gait | None:
     """The clock, if a row is one."""
     if not any(row.values.get("measured") == CLOCK for row in top.sections("observation")):
         return None

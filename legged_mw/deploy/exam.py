@@ -31,7 +31,7 @@ def run_exam(folder: Path, exam: ExamRules | None = None, threads: int = 0, comm
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # what counts as a fall in legged_mw.eval.exam
     stage = DeployStage(folder, len(wanted), threads=threads, ends=ends)
     fell_at = np.full(len(wanted), math.inf)
-    sampled: dict[str, list[Any]] = {"velocity": [], "position": [], "power": [], "joint_speed": []}
+    sampled: dict[str, list[Any]] = {"velocity": [], "position": [], "power": [], "joint_speed": [], "estimate": []}
     for step in range(round(rules.SECONDS / stage.dt)):
         sampled["velocity"].append(stage.velocity())
         sampled["position"].append(stage.qpos()[:, :2])
@@ -39,8 +39,10 @@ def run_exam(folder: Path, exam: ExamRules | None = None, threads: int = 0, comm
         sampled["joint_speed"].append(np.abs(stage.measured.joint_vel).mean(axis=1))
         _push(stage, exam, step)  # the policy decides on what was measured before
         stage.step(wanted)
+        estimate = stage.believed_velocity()  # from that measurement
+        sampled["estimate"] += [] if estimate is None else [estimate]
         fell_at[stage.fell() & np.isinf(fell_at)] = step
-    signals = {name: np.stack(values) for name, values in sampled.items()}
+    signals = {name: np.stack(values) for name, values in sampled.items() if values}
     return exam.grade(signals, last_position=stage.qpos()[:, :2], fell_at=fell_at, mass=stage.contract.mass, dt=stage.dt)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legged_mw.deploy.contract import CLOCK, CONTRACT_FILE, NETWORK_FILE, OWN, Contract, ContractError
+from legged_mw.deploy.estimate import ESTIMATE, columns_of
 from legged_mw.deploy.gait import GaitClock
 from legged_mw.deploy.robot import Measurement
 from legged_mw.utils.errors import UserError
@@ -18,7 +19,7 @@ Floats = NDArray[np.floating[Any]]
 
 
 class Network:
-    """``policy.onnx`` on one thread: observations (N, size) -> actions (N, D), float32.
+    """``policy.onnx`` on one thread: observations (N, size) -> actions (N, D), float32. ``estimate`` (N, E) is of the last call.
 
     A recurrent one also takes what it remembers, and returns it after the actions: (N, *shape) of ``contract.memory``.
     """
@@ -36,17 +37,20 @@ class Network:
             self._session = onnxruntime.InferenceSession((folder / NETWORK_FILE).read_bytes(), options, providers=["CPUExecutionProvider"])
         except Exception:  # onnxruntime raises a type of its own for each way that a file is broken
             raise ContractError(f"{NETWORK_FILE} cannot be read as an ONNX network: it is damaged; export the policy again") from None
-        memory = contract.memory
+        memory, guessed = contract.memory, sum(row.size for row in contract.estimate)
         self._inputs = {contract.input: [contract.size]} | ({memory.input: [*memory.shape]} if memory else {})  # name -> shape
         self._outputs = {contract.output: [len(contract.joints)]} | ({memory.output: [*memory.shape]} if memory else {})
+        self._outputs |= {ESTIMATE: [guessed]} if guessed else {}
         self._one_by_one = self._check(contract)
+        self.estimate: NDArray[np.float32] | None = None
 
     def _check(self, contract: Contract) -> bool:
         """Inputs and outputs of the contract's names and sizes; returns whether the batch is fixed to 1."""
         names = ", ".join(f"{row.name} {row.size * row.history}" for row in contract.rows)
+        guessed = "".join(f", {row.name} {row.size}" for row in contract.estimate)
         for what, ports, shapes, why in (
             ("input", self._session.get_inputs(), self._inputs, f"the rows of `observation`: {names}"),
-            ("output", self._session.get_outputs(), self._outputs, "one action a joint"),
+            ("output", self._session.get_outputs(), self._outputs, f"one action a joint{guessed}"),
         ):
             if {port.name: port.shape[1:] for port in ports} != shapes:
                 found = ", ".join(f"'{port.name}' {port.shape}" for port in ports)
@@ -61,8 +65,9 @@ class Network:
         count = len(inputs[0])
         batches = [{name: value[i : i + 1] for name, value in whole.items()} for i in range(count)] if self._one_by_one else [whole]
         found = [self._session.run([*self._outputs], batch) for batch in batches]
-        outputs = [np.concatenate(parts) for parts in zip(*found, strict=True)]
-        return outputs if len(outputs) > 1 else outputs[0]
+        outputs = dict(zip(self._outputs, (np.concatenate(parts) for parts in zip(*found, strict=True)), strict=True))
+        self.estimate = outputs.pop(ESTIMATE, None)
+        return list(outputs.values()) if len(outputs) > 1 else outputs.popitem()[1]
 
 
 class Controller:
@@ -83,7 +88,7 @@ class Controller:
         return _side_by_side(self._look(measurement, commands))
 
     def act(self, measurement: Measurement, commands: Floats) -> NDArray[np.float64]:
-        """Joint targets (N, D) [rad] for the next period; ``commands`` (N, C) in the contract's order."""
+        """Joint targets (N, D) [rad], or torques [N m], for the next period; ``commands`` (N, C) in the contract's order."""
         action = self.contract.action
         self._frames = self._look(measurement, commands)
         if self.clock:
@@ -96,8 +101,13 @@ class Controller:
             actions, self.memory = self._network(seen, self.memory)
         self.last_actions = np.clip(actions, -action.clip, action.clip)
         origins = {"default": self.contract.default_pose, "joints": np.atleast_2d(measurement.joint_pos), "targets": self.last_targets}
-        self.last_targets = origins[action.origin] + action.scale * self.last_actions.astype(np.float64)
+        self.last_targets = origins.get(action.origin, 0.0) + action.scale * self.last_actions.astype(np.float64)
         return self.last_targets.copy()
+
+    def estimate(self, row: str) -> NDArray[np.float64] | None:
+        """What the policy believed of ``row`` when it acted last (N, size), in the contract's unit; None if it does not estimate that."""
+        columns, believed = columns_of(self.contract.estimate, row), getattr(self._network, "estimate", None)
+        return None if columns is None or believed is None else believed[:, columns].astype(np.float64)
 
     def reset(self, which: Any = slice(None)) -> None:
         """The robots ``which`` (indices or a mask) begin again: nothing of theirs is remembered."""

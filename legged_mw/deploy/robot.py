@@ -102,6 +102,7 @@ class Robot(ABC):
 
         ``stiffness`` (D,) [N m/rad] and ``damping`` (D,) [N m s/rad]; None: the contract's. A robot that cannot change them
         takes the contract's, and says so by `can_change_gains`.
+        Where the contract's action has the origin "torque" the targets are torques [N m].
         """
 
     @abstractmethod

@@ -20,6 +20,7 @@ from mujoco.batch import Batch, SimulationError
 from numpy.typing import ArrayLike, NDArray
 
 from legged_mw.deploy.contract import CONTRACT_FILE, FALL, SCAN, SCENE_FILE, SENSED, Contract, ContractError, quantity_size
+from legged_mw.deploy.motors import make_network
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, layout
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import usable_cores
@@ -46,6 +47,8 @@ class Fleet:
         self._ctrl, self._actuators = self._batch.bind("ctrl"), scene.actuators
         self._where, self._contacts = scene.sensordata, scene.contacts
         self.broken: NDArray[np.bool_] = np.zeros(count, dtype=bool)  # robots that MuJoCo could not step since their reset
+        self._network = make_network(folder, contract.motors, count, len(contract.joints))
+        self._joints = [(int(joint.qposadr[0]), int(joint.dofadr[0])) for joint in map(self.model.joint, contract.joints)]
         self.reset()
 
     def read(self) -> Measurement:
@@ -54,10 +57,19 @@ class Fleet:
         return Measurement(**{n: values[n] for n in QUANTITIES}, others={n: v for n, v in values.items() if n not in QUANTITIES})
 
     def write(self, targets: Floats) -> None:
-        """Step every robot by one period with servo targets (N, D) [rad]."""
+        """Step every robot by one period with servo targets (N, D) [rad], or torques where an action is one."""
         self._ctrl[:, self._actuators] = targets
+        if not self._network:
+            self._step(self.contract.decimation, _NOW)
+            return
+        angles, speeds = zip(*self._joints, strict=True)
+        for left in reversed(range(self.contract.decimation)):
+            self._ctrl[:, self._actuators] = self._network.torque(targets - self.qpos[:, angles], self.qvel[:, speeds])
+            self._step(1, 0 if left else _NOW)
+
+    def _step(self, count: int, stage: int) -> None:
         try:
-            self._batch.step(nstep=self.contract.decimation, stage=_NOW)
+            self._batch.step(nstep=count, stage=stage)
         except SimulationError as error:  # the others are stepped all the same
             self.broken[error.ids] = True
 
@@ -83,11 +95,12 @@ class Fleet:
         which = np.arange(self.count) if which is None else np.asarray(which)
         self._batch.reset(which, keyframe=0, stage=_NOW)
         self.broken[which] = False
+        if self._network:
+            self._network.reset(which)
 
     def limp(self) -> None:
-        """Servos off: the joints' own damping is all that is left."""
-        for name in ("actuator_gainprm", "actuator_biasprm"):
-            self._batch.expand(name)[:] = 0.0
+        """Motors off: damping is all that is left."""
+        self.contract.motors.limp(self._batch)
 
     def _value(self, name: str) -> Floats:
         if name == "gravity":
@@ -218,14 +231,15 @@ def _check_machine(model: mujoco.MjModel, file: str, contract: Contract, joints:
     if model.nq != 7 + len(joints) or model.nu != len(joints):
         have = [name for name in _names(model, "joint") if name not in contract.joints]
         raise ContractError(f"{file} has joints that {CONTRACT_FILE} does not: {', '.join(have[1:]) or f'{model.nu} servos'}")
-    dofs = model.jnt_dofadr[list(joints)]
+    dofs, motors = model.jnt_dofadr[list(joints)], contract.motors
+    stated = {"stiffness": contract.stiffness, "damping": contract.damping}
+    stated |= {"motors: stall_torque": motors.stall_torque, "motors: no_load_speed": motors.no_load_speed}
     checks = {
-        "stiffness": (contract.stiffness, model.actuator_gainprm[list(actuators), 0]),
-        "damping": (contract.damping, model.dof_damping[dofs].reshape(len(joints), -1)[:, 0]),
+        **{name: (stated[name], found) for name, found in contract.motors.gains(model, list(actuators), dofs).items()},
         "robot: mass": (contract.mass, model.body_subtreemass[0]),
         "physics: timestep": (contract.timestep, model.opt.timestep),
     }
     for name, values in checks.items():
         if not np.allclose(*values, rtol=1e-4, atol=1e-6):
-            stated, found = (np.array2string(np.asarray(x), precision=6, separator=", ", max_line_width=10_000) for x in values)
-            raise ContractError(f"{CONTRACT_FILE}: {name} is {stated}, but {file} has {found}; export the policy again")
+            said, found = (np.array2string(np.asarray(x), precision=6, separator=", ", max_line_width=10_000) for x in values)
+            raise ContractError(f"{CONTRACT_FILE}: {name} is {said}, but {file} has {found}; export the policy again")

@@ -69,6 +69,11 @@ class DeployStage:
         """(N, 3) vx, vy [m/s] of the IMU, yaw rate [rad/s], body frame."""
         return np.concatenate([self.measured.lin_vel[:, :2], self.measured.ang_vel[:, 2:]], axis=1)
 
+    def believed_velocity(self) -> Floats | None:
+        """(N, 2) vx, vy [m/s] that the policy believed when it acted last; None if it does not estimate them."""
+        estimate = self.controller.estimate("base_lin_vel")
+        return None if estimate is None else estimate[:, :2]
+
     def qpos(self) -> Floats:
         """(N, nq)."""
         return self.fleet.qpos.copy()

@@ -1,6 +1,12 @@
-"""From actions to servo targets, with what stands between a policy and its motors: scale, delay, encoders that are off."""
+"""From actions to what motors are told, with what stands between a policy and its motors: scale, delays, encoders that are off.
+
+The laws of the motors: ``control.actuator``, or a task's own ``_compute_torques``. Servos, DC motors and plain torques are MuJoCo's
+actuators. What is computed anew in every simulation step goes through ``Actuators.before``.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -8,48 +14,141 @@ from torch import Tensor
 from legged_mw.envs.domain_rand import DomainRand
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.sim.model import RobotModel
+from legged_mw.sim.motor_network import make_motor_network
 from legged_mw.sim.simulation import Simulation
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.files import find_file
 from legged_mw.utils.math import assign
+from legged_mw.utils.motor_network import read_network
+
+OWN = "own"  # the law of a class with a _compute_torques of its own
+
+
+class TorqueLaw:
+    """The place for a motor law of one's own: what overrides ``_compute_torques`` makes the joints' torques itself."""
+
+    cfg: RobotTaskCfg
+    actuators: Actuators
+    default_dof_pos: Tensor  # (D,) [rad]
+    dof_pos: Tensor  # (N, D) [rad]
+    dof_vel: Tensor  # (N, D) [rad/s]
+
+    def _compute_torques(self, actions: Tensor) -> Tensor:
+        """Torques (N, D) [N m] from ``actions`` (N, D), clipped and delayed; held to the force limits afterwards.
+
+        An override is called before every simulation step and is recorded with it. This one is legged_gym's position law.
+        """
+        target = self.default_dof_pos + self.actuators.scale * actions
+        return self.p_gains * (target - self.dof_pos) - self.d_gains * self.dof_vel
+
+    @property
+    def motor_law(self) -> str:
+        """``control.actuator``, or OWN."""
+        law, task = self.cfg.control.actuator, type(self)
+        if task._compute_torques is TorqueLaw._compute_torques:
+            return law
+        if law != "servo":
+            raise ConfigError(
+                f"control.actuator is {law!r}, but {task.__name__}._compute_torques is a motor law of its own: "
+                "leave control.actuator out, or remove the method"
+            )
+        return OWN
+
+    @property
+    def p_gains(self) -> Tensor:
+        """``control.stiffness`` as drawn, (D,) or (N, D) [N m/rad]."""
+        return self.actuators.gain("stiffness")
+
+    @property
+    def d_gains(self) -> Tensor:
+        """``control.damping`` as drawn, (D,) or (N, D) [N m s/rad]."""
+        return self.actuators.gain("damping")
 
 
 class Actuators:
-    """Position servos of N robots with D joints: target = origin + scale * action.
+    """Motors of N robots with D joints. An action means a target, origin + scale * action, or under the law "torque" scale * action.
 
     ``control.action_origin`` is the origin: "default" the default pose, "joints" the measured joint angles, "targets" the last targets.
     """
 
-    def __init__(
-        self, cfg: type[RobotTaskCfg.control], robot: RobotModel, default: Tensor, dof_pos: Tensor, sim: Simulation, rand: DomainRand
-    ) -> None:
-        """``default`` (D,) and ``dof_pos`` (N, D) [rad]."""
-        self._origin, self._default, self._dof_pos, self._sim = cfg.action_origin, default, dof_pos, sim
+    before: Callable[[int], None] | None = None  # what ``Simulation.step`` calls before each substep; None: nothing changes within a step
+
+    def __init__(self, task: TorqueLaw, robot: RobotModel, sim: Simulation, rand: DomainRand) -> None:
+        cfg = task.cfg
+        self._origin, self._default, self._dof_pos, self._sim = cfg.control.action_origin, task.default_dof_pos, task.dof_pos, sim
+        self.law, self._rand = task.motor_law, rand
         scale = robot.tables["control.action_scale"]
-        self.scale = torch.tensor(scale, device=sim.device)  # (D,) [rad]
+        self.scale = torch.tensor(scale, device=sim.device)  # (D,) [rad], or [N m]
+        self._gains = {name: torch.tensor(robot.tables[f"`{name}`"], device=sim.device) for name in ("stiffness", "damping")}
         self._same_scale = scale[0] if len(set(scale)) == 1 else None  # one number takes one operation less
+        by_angle = self.law not in ("torque", OWN)
         self.encoder_offset = rand.values.get("encoder_offset")  # (N, D) [rad], measured minus true angle
+        self._offset = self.encoder_offset if by_angle else None
+        self._start: Tensor | float = self._default if by_angle else 0.0  # targets of a new episode
         self._delay = rand.delay("action_delay", len(robot.joint_names), start=0.0)
-        # (N, D) [rad] as the policy means them; what a servo gets is off by as much as its encoder is
-        self.targets = sim.ctrl if self.encoder_offset is None else torch.zeros_like(sim.ctrl)
+        self._late = rand.substep_delay(cfg.control.decimation, len(robot.joint_names))
+        self._network, self._compute = None, task._compute_torques if self.law == OWN else None
+        # (N, D) what motors are told: targets less what their encoders are off, torques, or under OWN actions
+        self._sent = sim.ctrl
+        if self._late or self.law in ("network", OWN):
+            self._sent, self.before = torch.zeros_like(sim.ctrl), self._before_substep
+        if self.law == "network":
+            self._network = make_motor_network(read_network(find_file(cfg, "control.network")), sim)
+        self.targets = self._sent if self._offset is None else torch.zeros_like(sim.ctrl)  # (N, D) as the policy means them
+
+    def told(self) -> Tensor:
+        """(N, D) what the motors were told last, as the policy means it."""
+        return self._sent if self._offset is None else self._sent + self._offset
+
+    def gain(self, name: str) -> Tensor:
+        """ "stiffness" or "damping", (D,), or (N, D) where it is drawn."""
+        return self._gains[name] * self._rand.values[name] if name in self._rand.values else self._gains[name]
 
     def apply(self, actions: Tensor) -> None:
-        """Write the servo targets for ``actions`` (N, D)."""
+        """Tell the motors what ``actions`` (N, D) mean."""
         late = self._delay(actions) if self._delay else actions
+        if self.law == OWN:
+            self._sent.copy_(late)
+        elif self.law == "torque":
+            torch.mul(late, self.scale, out=self.targets)
+        else:
+            self._aim(late)
+        if self._late:
+            self._late(self._sent)
+
+    def _aim(self, actions: Tensor) -> None:
+        """Targets from ``actions`` (N, D)."""
         origin = self._default
         if self._origin == "targets":
             origin = self.targets
         elif self._origin == "joints":
-            origin = self._dof_pos if self.encoder_offset is None else self._dof_pos + self.encoder_offset
+            origin = self._dof_pos if self._offset is None else self._dof_pos + self._offset
         if self._same_scale is None:
-            torch.addcmul(origin, late, self.scale, out=self.targets)
+            torch.addcmul(origin, actions, self.scale, out=self.targets)
         else:
-            torch.add(origin, late, alpha=self._same_scale, out=self.targets)
-        if self.encoder_offset is not None:
-            torch.sub(self.targets, self.encoder_offset, out=self._sim.ctrl)
+            torch.add(origin, actions, alpha=self._same_scale, out=self.targets)
+        if self._offset is not None:
+            torch.sub(self.targets, self._offset, out=self._sent)
+
+    def _before_substep(self, k: int) -> None:
+        """Write ``ctrl`` for substep ``k``."""
+        heard = self._late.heard[k] if self._late else self._sent
+        if self._network:
+            self._network(heard)
+            return
+        told = self._compute(heard) if self._compute else heard
+        if told.shape != heard.shape:
+            raise ConfigError(f"_compute_torques must return a tensor {tuple(heard.shape)}, a torque a joint; it returned {(*told.shape,)}")
+        self._sim.ctrl.copy_(told)
 
     def reset(self, mask: Tensor) -> None:
-        """Targets at the default pose where ``mask`` (N,) is true."""
-        assign(self.targets, mask, self._default)
-        if self.encoder_offset is not None:
-            assign(self._sim.ctrl, mask, self._default - self.encoder_offset)
+        """Targets at the default pose, or torques zero, where ``mask`` (N,) is true; of delays and networks nothing is left."""
+        assign(self.targets, mask, self._start)
+        if self._offset is not None:
+            assign(self._sent, mask, self._default - self._offset)
         if self._delay:
             self._delay.restart(mask)
+        if self._late:
+            self._late.restart(mask, self._sent)
+        if self._network:
+            self._network.reset(mask)

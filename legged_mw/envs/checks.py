@@ -21,6 +21,7 @@ PART: Rule = ("above 0 and at most 1", lambda v: 0 < v <= 1)
 RANGE: Rule = ("two numbers, the lower first", lambda v: len(v) == 2 and v[0] <= v[1])
 SPAN: Rule = ("two numbers above zero, the lower first", lambda v: len(v) == 2 and 0 < v[0] <= v[1])
 STEPS: Rule = ("two whole numbers from zero, the lower first", lambda v: len(v) == 2 and 0 <= v[0] <= v[1])
+TIMES: Rule = ("two numbers from zero, the lower first", lambda v: len(v) == 2 and 0 <= v[0] <= v[1] < math.inf)
 NAMES: Rule = ("a list with at least one name", lambda v: len(v) > 0)
 POINTS: Rule = ("at least one number, all finite", lambda v: len(v) > 0 and all(map(math.isfinite, v)))
 NUMBERS: Rule = ("a table of numbers from 0", lambda v: all(0 <= number < math.inf for number in v.values()))
@@ -55,6 +56,8 @@ ENVIRONMENT: dict[str, Rule] = {
     "perturbation.max_push_vel_xy": NOT_NEGATIVE,
     **{f"domain_rand.{name}": or_empty(STEPS if kind.whole else RANGE if kind.neutral == 0.0 else SPAN) for name, kind in KINDS.items()},
     "domain_rand.redraw_iterations": NOT_NEGATIVE,
+    "domain_rand.delay_ms": or_empty(TIMES),
+    **dict.fromkeys(("control.stall_torque", "control.no_load_speed", "control.gear"), LIMITS),
     "asset.colliders": NAMES,
     "init_state.pos": or_empty(("three numbers, x, y, z", lambda v: len(v) == 3)),
     **dict.fromkeys(("asset.armature", "asset.frictionloss"), NUMBERS),
@@ -94,7 +97,11 @@ LEARNER: dict[str, Rule] = {
     **dict.fromkeys(("cpu.envs_per_core", "cpu.num_steps_per_env", "cpu.max_iterations", "cpu.rnn_hidden_dim"), POSITIVE),
     **dict.fromkeys(("cpu.num_learning_epochs", "cpu.num_mini_batches", "cpu.desired_kl"), POSITIVE),
     **dict.fromkeys(("symmetry.mirror_loss_coeff", "anneal.entropy_coef", "anneal.desired_kl", "cpu.update_threads"), NOT_NEGATIVE),
-    "runner.exam_interval": NOT_NEGATIVE,
+    "actor.estimator.learning_rate": POSITIVE,
+    "actor.estimator.hidden_dims": ("whole numbers from 1, at least one", lambda v: len(v) > 0 and min(v) >= 1),
+    **dict.fromkeys(("distillation.learning_rate", "distillation.num_learning_epochs", "distillation.gradient_length"), POSITIVE),
+    **dict.fromkeys(("distillation.init_std", "warm_start.init_std"), POSITIVE),
+    **dict.fromkeys(("runner.exam_interval", "distillation.max_grad_norm", "warm_start.critic_warmup"), NOT_NEGATIVE),
     "runner.run_name": ("part of a folder's name, without / or \\", lambda v: "/" not in v and "\\" not in v),
 }
 
@@ -103,6 +110,7 @@ def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None) -> Non
     """Raise ConfigError at the first value that cannot work."""
     _check(cfg, ENVIRONMENT)
     _check_redraws(cfg)
+    _check_motors(cfg)
     if isinstance(cfg, LeggedRobotCfg):
         _check_walking(cfg)
     if train is not None:
@@ -112,6 +120,13 @@ def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None) -> Non
             raise ConfigError(
                 f"an iteration has {samples} samples ({cfg.env.num_envs} worlds x {train.runner.num_steps_per_env} steps), fewer than "
                 f"algorithm.num_mini_batches = {train.algorithm.num_mini_batches}; raise one of the former or lower the latter"
+            )
+        steps, length = train.runner.num_steps_per_env, train.distillation.gradient_length
+        if train.distillation.teacher and steps % length:
+            divisors = ", ".join(str(i) for i in range(1, steps + 1) if steps % i == 0)
+            raise ConfigError(
+                f"distillation.gradient_length is {length}, which leaves {steps % length} of runner.num_steps_per_env = {steps} steps "
+                f"unused; take one of {divisors}"
             )
         if train.symmetry.use_mirror_loss and not train.symmetry.mirror_loss_coeff:
             raise ConfigError(
@@ -133,6 +148,25 @@ def _check_walking(cfg: LeggedRobotCfg) -> None:
         raise ConfigError(
             "commands.curriculum goes by how well tracking_lin_vel is met: give rewards.scales.tracking_lin_vel a number above 0"
         )
+
+
+def _check_motors(cfg: RobotTaskCfg) -> None:
+    control, curve = cfg.control, cfg.control.stall_torque or cfg.control.no_load_speed
+    if control.actuator == "network" and not control.network:
+        raise ConfigError("control.actuator is 'network', but control.network names no file of weights (docs/motors.md)")
+    if control.actuator == "torque" and control.action_origin != "default":
+        raise ConfigError(
+            f"control.action_origin is {control.action_origin!r}, an origin of angles, but under control.actuator 'torque' an action is a "
+            "torque: leave action_origin out"
+        )
+    for name, unit in (("stall_torque", "N m"), ("no_load_speed", "rad/s")):
+        if not getattr(control, name) and (control.actuator == "dc_motor" or (control.actuator != "servo" and curve)):
+            raise ConfigError(
+                f"control.actuator is {control.actuator!r} with a torque-speed curve, but control.{name} is empty: fill the table [{unit}] "
+                "a joint, '' for all (docs/motors.md)"
+            )
+        if cfg.domain_rand.enable and getattr(cfg.domain_rand, name) not in ([], [1.0, 1.0]) and not curve:
+            raise ConfigError(f"domain_rand.{name} is a factor on control.{name}, which is empty: fill it, or leave the range out ([])")
 
 
 def _check_redraws(cfg: RobotTaskCfg) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -32,3 +34,30 @@ class Delay:
             self._new.fill_(False)
         index = self.steps.long()[:, :, None].expand(-1, 1, now.shape[1])
         return self.past.gather(1, index)[:, 0]
+
+
+class SubstepDelay:
+    """What motors hear of what they are told once a control step, late by whole simulation steps; each world has its own delay.
+
+    A delay of d steps changes what is heard before substep d of those that follow. 7 ms in steps of 4 ms, the nearest being
+    d = 2: physics from t + 8 ms on hears what is told at t.
+    """
+
+    def __init__(self, delay: Tensor, step_ms: float, longest: float, substeps: int, width: int) -> None:
+        """``delay`` (N, 1) [ms], whole steps of ``step_ms`` and at most ``longest``, is read at each call."""
+        self._delay, self._step_ms = delay, step_ms
+        self._past = torch.zeros(math.ceil(round(longest / step_ms) / substeps) + 1, len(delay), width, device=delay.device)  # newest first
+        self._substep = torch.arange(substeps, device=delay.device)[:, None, None]
+        self.heard = torch.zeros(substeps, len(delay), width, device=delay.device)  # in each substep
+
+    def restart(self, mask: Tensor, told: Tensor) -> None:
+        """Where ``mask`` (N,) is true ``told`` (N, width) is all that was ever told."""
+        self._past.copy_(torch.where(mask[:, None], told, self._past))
+
+    def __call__(self, told: Tensor) -> None:
+        """Fill ``heard`` for the control step that begins, in which motors are told ``told`` (N, width)."""
+        self._past[1:] = self._past[:-1].clone()
+        self._past[0] = told
+        steps, count = torch.round(self._delay / self._step_ms).long(), len(self._substep)
+        age = (steps - self._substep + count - 1).clamp_(min=0) // count  # control steps since it was told, (substeps, N, 1)
+        torch.gather(self._past, 0, age.expand_as(self.heard), out=self.heard)

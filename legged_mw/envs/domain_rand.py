@@ -9,12 +9,13 @@ nothing is computed.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from legged_mw.envs.delay import Delay
+from legged_mw.envs.delay import Delay, SubstepDelay
+from legged_mw.envs.loading import has_curve
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
@@ -43,39 +44,54 @@ KINDS: dict[str, Kind] = {
     "stiffness": Kind("joint", 1.0, "joint_factor", ("actuator_gainprm", "actuator_biasprm")),
     "damping": Kind("joint", 1.0, "joint_factor", ("dof_damping",)),
     "strength": Kind("joint", 1.0, "joint_factor", ("actuator_forcerange",)),
+    "stall_torque": Kind("joint", 1.0, "joint_factor", ("actuator_gainprm",)),
+    "no_load_speed": Kind("joint", 1.0, "joint_factor", ("actuator_gainprm",)),
     "encoder_offset": Kind("joint", 0.0, "joint"),
     "action_delay": Kind("world", 0.0, "scalar", whole=True),
+    "delay_ms": Kind("world", 0.0, "scalar"),
     "observation_delay": Kind("world", 0.0, "scalar", whole=True),
 }
 # Constants of the model depend on them: derived once they are drawn, never within a recorded step.
+# Places in actuator_gainprm of MuJoCo's DC motor.
+_RESISTANCE, _CONSTANT, _STIFFNESS, _DAMPING = 0, 1, 4, 6
 ONLY_AT_START = tuple(name for name, kind in KINDS.items() if {*kind.fields} & {*CONSTANTS_READ})
 
 
-def active(cfg: RobotTaskCfg) -> dict[str, tuple[Kind, float, float]]:
-    """Name -> kind, lowest, highest of all that the config randomizes: what is given and is not neutral."""
-    rand = cfg.domain_rand
+def active(cfg: RobotTaskCfg, law: str = "") -> dict[str, tuple[Kind, float, float]]:
+    """Name -> kind, lowest, highest of all that the config randomizes: what is given, is not neutral, and motors of ``law`` have.
+
+    ``law`` is ``control.actuator``, unless said otherwise.
+    """
+    rand, law = cfg.domain_rand, law or cfg.control.actuator
     if not rand.enable:
         return {}
-    given = {name: (kind, getattr(rand, name)) for name, kind in KINDS.items()}
+    lacks = {"stiffness", "damping"} if law in ("torque", "network") else set()
+    lacks |= set() if has_curve(cfg, law) else {"stall_torque", "no_load_speed"}
+    given = {name: (kind, getattr(rand, name)) for name, kind in KINDS.items() if name not in lacks}
+    if law not in ("servo", "torque", "network"):
+        fields = ("actuator_gainprm",) if law == "dc_motor" else ()  # else a law in code reads them
+        given |= {name: (KINDS[name]._replace(fields=fields), given[name][1]) for name in ("stiffness", "damping")}
     given |= {field: (Kind("world", 1.0, "scalar", (field,)), span) for field, span in rand.model_factors.items()}
     return {name: (kind, span[0], span[1]) for name, (kind, span) in given.items() if span and not span[0] == span[1] == kind.neutral}
 
 
-def world_fields(cfg: RobotTaskCfg) -> list[str]:
+def world_fields(cfg: RobotTaskCfg, law: str = "") -> list[str]:
     """Model fields that need a value per world."""
-    return list(dict.fromkeys(field for kind, _, _ in active(cfg).values() for field in kind.fields))
+    return list(dict.fromkeys(field for kind, _, _ in active(cfg, law).values() for field in kind.fields))
 
 
 class DomainRand:
     """The draws of N worlds and what they write. ``values[name]`` (N, width): the numbers drawn, in the config's units."""
 
-    def __init__(self, cfg: RobotTaskCfg, robot: RobotModel, sim: Simulation) -> None:
+    def __init__(self, cfg: RobotTaskCfg, robot: RobotModel, sim: Simulation, law: str = "") -> None:
+        self._substep_ms, self._has_curves = 1e3 * cfg.sim.dt, "`stall_torque`" in robot.tables
         self._sim, self._mask = sim, torch.ones(sim.num_envs, dtype=torch.bool, device=sim.device)
-        kinds = active(cfg)
+        kinds = active(cfg, law)
         again = [name for name in kinds if name in cfg.domain_rand.redraw_at_reset]
         order = [name for name in kinds if name not in again] + again
         joints = len(robot.joint_names)
         count = {"world": 1, "axis": 3, "joint": joints, "link": 1 + joints}
+        self.widths = {name: count[kind.per] for name, kind in KINDS.items()}  # of each draw, drawn here or not
         widths = [count[kinds[name][0].per] for name in order]
         self._draws = torch.zeros(sim.num_envs, sum(widths), device=sim.device)
         self.values: dict[str, Tensor] = dict(zip(order, self._draws.split(widths, dim=1), strict=True)) if order else {}
@@ -84,7 +100,7 @@ class DomainRand:
         bounds = [list(kinds[name][1:]) for name, width in zip(order, widths, strict=True) for _ in range(width)]
         self._low, self._high = torch.tensor(bounds or [[0.0, 0.0]], dtype=torch.float, device=sim.device).T.contiguous()
         self._whole = [name for name in order if kinds[name][0].whole]
-        self._nominal = {field: sim.field(field)[:1].clone() for field in world_fields(cfg)}
+        self._nominal = {field: sim.field(field)[:1].clone() for field in world_fields(cfg, law)}
         _check_mass(cfg, robot)
         self._root, self._ground = robot.id("body", robot.root), robot.ground_geoms()
         self._link_of_body = _links(robot).to(sim.device)
@@ -96,6 +112,17 @@ class DomainRand:
     def delay(self, name: str, width: int, start: float | None = None) -> Delay | None:
         """The delay line of ``action_delay`` or ``observation_delay``, or None if the config has none."""
         return Delay(self.values[name], self._longest[name], width, start) if name in self.values else None
+
+    def substep_delay(self, substeps: int, width: int) -> SubstepDelay | None:
+        """The delay line of ``delay_ms``, for control steps of ``substeps``."""
+        if "delay_ms" not in self.values:
+            return None
+        longest = self.rounded_delay(float(self._high[self.values["delay_ms"].storage_offset()]))
+        return SubstepDelay(self.values["delay_ms"], self._substep_ms, longest, substeps, width)
+
+    def rounded_delay(self, delay: Any) -> Any:
+        """[ms], a number or a tensor, to the nearest whole number of simulation steps, a half up."""
+        return (delay / self._substep_ms + 0.5) // 1.0 * self._substep_ms
 
     def redraw(self) -> None:
         """Draw everything again in every world, and what the model derives from it. Not for inside a recorded step."""
@@ -119,9 +146,11 @@ class DomainRand:
             return
         share = torch.rand_like(draws)
         fresh = torch.lerp(self._low[first:], self._high[first:], share)
-        for name in self._whole:
-            column = self.values[name].storage_offset()
-            if column >= first:
+        for name, drawn in self.values.items():
+            column = drawn.storage_offset()
+            if name == "delay_ms" and column >= first:
+                fresh[:, column - first] = self.rounded_delay(fresh[:, column - first])
+            if name in self._whole and column >= first:
                 low, high = self._low[column], self._high[column]
                 fresh[:, column - first] = (low + share[:, column - first] * (high - low + 1.0)).floor_().minimum(high)
         assign(draws, mask, fresh)
@@ -132,7 +161,7 @@ class DomainRand:
         special = {
             "body_mass": self._write_masses,
             "body_ipos": self._write_com,
-            "actuator_gainprm": self._write_stiffness,
+            "actuator_gainprm": self._write_motors if self._has_curves else self._write_stiffness,
         }
         if name in KINDS and field in special:
             return special[field]
@@ -164,6 +193,16 @@ class DomainRand:
     def _write_stiffness(self, mask: Tensor) -> None:
         for field, place in (("actuator_gainprm", 0), ("actuator_biasprm", 1)):
             assign(self._sim.field(field)[:, :, place], mask, self._nominal[field][:, :, place] * self.values["stiffness"])
+
+    def _write_motors(self, mask: Tensor) -> None:
+        """Gains and curve of MuJoCo's DC motor: its no-load speed is 1 over its constant, its stall torque constant over resistance."""
+        gains, one = self._nominal["actuator_gainprm"].repeat(self._sim.num_envs, 1, 1), torch.ones((), device=self._draws.device)
+        speed, stall = (self.values.get(name, one) for name in ("no_load_speed", "stall_torque"))
+        gains[:, :, _CONSTANT] /= speed
+        gains[:, :, _RESISTANCE] /= speed * stall
+        for place, name in ((_STIFFNESS, "stiffness"), (_DAMPING, "damping")):
+            gains[:, :, place] *= self.values.get(name, one)
+        assign(self._sim.field("actuator_gainprm"), mask, gains)
 
 
 def _check_mass(cfg: RobotTaskCfg, robot: RobotModel) -> None:

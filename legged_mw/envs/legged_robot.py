@@ -76,6 +76,8 @@ class LeggedRobot(LeggedRewards, RobotTask):
         """New commands, feet in the air."""
         self._reset_commands(mask)
         self.foot_contact.masked_fill_(mask[:, None], False)
+        if self.cfg.observations.foot_height:
+            self.foot_height.masked_fill_(mask[:, None], 0.0)  # not that of the last episode
         if self.feet.forces is not None:
             self.feet.forces.masked_fill_(mask[:, None, None], 0.0)
         if self.gait:
@@ -220,9 +222,9 @@ class LeggedRobot(LeggedRewards, RobotTask):
                 "state",  # the same noisy sample
                 *self._body_rows(),
                 Row("foot_contact", self.foot_contact, mirror="foot"),  # 0 or 1
-                Row("foot_lin_vel", self.foot_vel.flatten(1), mirror="foot_polar"),  # world frame [m/s]
-                Row("feet_air_time", self.feet_air_time, mirror="foot"),  # [s]
-                *self._force_rows(),
+                Row("foot_lin_vel", self.foot_vel.flatten(1), mirror="foot_polar", unit="m/s", frame="world"),
+                Row("feet_air_time", self.feet_air_time, mirror="foot", unit="s"),
+                *self._asked_foot_rows(),
                 *self._disturbance_rows(),
                 *self._height_rows("privileged_state"),
             ],
@@ -232,10 +234,14 @@ class LeggedRobot(LeggedRewards, RobotTask):
         """The gait clock, where there is one: sine of each foot's phase, then cosine; zeros while told to stand."""
         return [Row("gait_clock", self.gait.row, mirror="foot")] if self.gait else []
 
-    def _force_rows(self) -> list[Row]:
-        """The ground's force on each foot, world frame, in 100 N: where ``observations.contact_forces`` asks for it."""
-        on = self.cfg.observations.contact_forces
-        return [Row("contact_forces", self.contact_forces.flatten(1), mirror="foot_polar", scale=0.01)] if on else []
+    def _asked_foot_rows(self) -> list[Row]:
+        """Of each foot, where ``observations`` asks for it: height above the ground under it; the ground's force, in 100 N."""
+        rows, asked = [], self.cfg.observations
+        if asked.foot_height:
+            rows.append(Row("foot_height", self.foot_height, mirror="foot", unit="m", frame="site above the ground under it"))
+        if asked.contact_forces:
+            rows.append(Row("contact_forces", self.contact_forces.flatten(1), mirror="foot_polar", scale=0.01, unit="N", frame="world"))
+        return rows
 
     def _height_rows(self, group: str, noise: float = 0.0) -> list[Row]:
         """The height scan [m], x by x from behind, in each from right to left; where ``terrain.height_scan`` names the group."""

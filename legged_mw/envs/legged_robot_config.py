@@ -18,6 +18,7 @@ class LeggedRobotCfg(RobotTaskCfg):
         foot_geoms: dict[str, list[str]] = {}  # foot -> its geoms, names or patterns, where a foot is not one geom of its name
 
     class observations(RobotTaskCfg.observations):
+        foot_height: bool = False  # a row of `privileged_state`: each foot's height above the ground under it [m]
         contact_forces: bool = False  # a row of `privileged_state`: the ground's force on each foot, world frame [N] [ours: off]
 
     class commands:

@@ -16,25 +16,34 @@ from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.files import find_file
 
+CURVE = ("stall_torque", "no_load_speed", "gear")  # tables of a torque-speed curve, in section `control`
+
+
+def has_curve(cfg: RobotTaskCfg, law: str) -> bool:
+    """Whether motors of ``law`` have a torque-speed curve: ``dc_motor`` must, a servo never has one, others may."""
+    return law == "dc_motor" or (law != "servo" and bool(cfg.control.stall_torque or cfg.control.no_load_speed))
+
 
 def load_robot(
     cfg: RobotTaskCfg,
+    law: str,
     engine: str,
     terrain: Terrain | None,
     contact_geoms: Sequence[str],
     sites: Mapping[str, Sequence[str]],
     more_sensors: Collection[str] = (),
 ) -> RobotModel:
-    """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors."""
-    asset, scale = cfg.asset, cfg.control.action_scale
+    """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors, and motors of ``law``."""
+    asset, scale, control = cfg.asset, cfg.control.action_scale, cfg.control
+    none = {"": 0.0} if law in ("torque", "network") else {}
     if not asset.file:
         raise ConfigError("asset.file is empty; name the robot's MJCF or URDF, e.g. 'resources/robots/go1/go1.xml'")
     robot = build_model(
         find_file(cfg, "asset.file"),
         solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations, cfg.sim.integrator),
         ground=Ground(cfg.terrain.friction, cfg.terrain.condim, terrain, boxes=engine == "mujoco"),
-        stiffness=cfg.control.stiffness,
-        damping=cfg.control.damping,
+        stiffness=control.stiffness or none,
+        damping=control.damping or none,
         colliders=asset.colliders,
         self_collisions=asset.self_collisions,
         contact_geoms=contact_geoms,
@@ -45,11 +54,13 @@ def load_robot(
         tables={
             "control.action_scale": scale if isinstance(scale, Mapping) else {"": scale},
             "rewards.pose_weights": cfg.rewards.pose_weights,
+            **({f"`{name}`": getattr(control, name) for name in CURVE} if has_curve(cfg, law) else {}),
             "rewards.deviation_weights": cfg.rewards.deviation_weights,
         },
         held_joints=asset.held_joints,
         partial={name: getattr(asset, name) for name in PARTIAL},
         more_sensors=more_sensors,
+        drive="angle" if law in ("servo", "dc_motor") else "torque",
     )
     robot.overrides[:] = [config_words(line) for line in robot.overrides]
     return robot

@@ -71,6 +71,16 @@ class Observations:
                 part.delay = make_delay(part.frame.shape[1])
             self._parts[group], self.buffers[group] = part, part.buffer
 
+    def attach(self, other: Observations, group: str, name: str) -> None:
+        """Show ``group`` of ``other``, made of the same worlds, as the group ``name``; from now on ``other`` is computed here."""
+        self._parts |= {f"{name}/{each}": part for each, part in other._parts.items()}
+        self.groups[name], self.buffers[name] = other.rows(group), other.buffers[group]
+
+    def rows(self, group: str) -> list[Row]:
+        """The rows of ``group`` in order; a row that is a group is written out."""
+        plain = [[row] if not row.group or row.history > 1 else self.rows(row.group) for row in self.groups[group]]
+        return [row for rows in plain for row in rows]
+
     def compute(self) -> None:
         """Fill the buffers: rows side by side, plus noise, times scale, as late as they are measured, with their history."""
         for part in self._parts.values():

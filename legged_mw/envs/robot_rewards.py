@@ -129,13 +129,16 @@ class RobotRewards:
         return {"last_last_actions": len(self.robot.joint_names)} if "action_smoothness" in self._active_scales() else {}
 
     def _joints_called(self, wanted: list[str], field: str) -> Tensor:
-        """Indices of the joints whose name fits one of ``wanted``, patterns or parts of names."""
-        names = self.robot.joint_names
-        hits = {word: [i for i, name in enumerate(names) if fnmatchcase(name, word) or word in name] for word in wanted}
-        for word in wanted:
-            if not hits[word]:
+        """Indices of the joints whose name fits one of ``wanted``, patterns or parts of names. Held joints are left out."""
+        names, held = self.robot.joint_names, self.robot.held
+        fits = {word: [name for name in (*names, *held) if fnmatchcase(name, word) or word in name] for word in wanted}
+        for word, found in fits.items():
+            if not found:
                 raise ConfigError(f"rewards.{field}: {unknown('joint', word, names, 'the robot')}")
-        return torch.tensor(sorted({i for found in hits.values() for i in found}), dtype=torch.long, device=self.device)
+            if {*found} <= {*held}:
+                self.robot.overrides.append(f"rewards.{field}: '{word}' left out, as {', '.join(found)} are held")
+        indices = [i for i, name in enumerate(names) if any(name in found for found in fits.values())]
+        return torch.tensor(indices, dtype=torch.long, device=self.device)
 
     def anneal(self, done: float) -> None:
         """A training is ``done`` so far, from 0 to 1: what changes with it."""

@@ -17,7 +17,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_mw.envs.actuators import Actuators
+from legged_mw.envs.actuators import Actuators, TorqueLaw
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.contacts import GroundContacts
@@ -41,7 +41,7 @@ from legged_mw.utils.errors import unknown
 from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse
 
 
-class RobotTask(RobotRewards, BaseTask):
+class RobotTask(TorqueLaw, RobotRewards, BaseTask):
     """N robots in N worlds of their own, as one vectorized environment. A task is a subclass with its rewards and its rows."""
 
     cfg: RobotTaskCfg
@@ -64,11 +64,11 @@ class RobotTask(RobotRewards, BaseTask):
             nconmax=cfg.sim.nconmax,
             njmax=cfg.sim.njmax,
             threads=cfg.sim.threads,
-            world_fields=world_fields(cfg),
+            world_fields=world_fields(cfg, self.motor_law),
             terrain=self.terrain,
             eager=eager,
         )
-        self.domain_rand = DomainRand(cfg, self.robot, self.sim)
+        self.domain_rand = DomainRand(cfg, self.robot, self.sim, self.motor_law)
         self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
         self._init_ranges()
@@ -86,7 +86,7 @@ class RobotTask(RobotRewards, BaseTask):
         self.actions.clamp_(-clip, clip)
         self.perturbation.apply()
         self._apply_actions()
-        self.sim.step(self.cfg.control.decimation)
+        self.sim.step(self.cfg.control.decimation, self.actuators.before)
         self._update_state()
         self.check_termination()
         self.compute_reward()
@@ -97,7 +97,7 @@ class RobotTask(RobotRewards, BaseTask):
         self.compute_observations()
 
     def _apply_actions(self) -> None:
-        """Servo targets from the actions."""
+        """What the motors are told, from the actions."""
         self.actuators.apply(self.actions)
 
     def _update_state(self) -> None:
@@ -389,7 +389,8 @@ class RobotTask(RobotRewards, BaseTask):
         return None
 
     def _load_robot(self, engine: str) -> RobotModel:
-        return load_robot(self.cfg, engine, self.terrain, self._sensed_geoms(), self._sensed_sites(), self._sensed_on_demand())
+        sensed = self._sensed_geoms(), self._sensed_sites(), self._sensed_on_demand()
+        return load_robot(self.cfg, self.motor_law, engine, self.terrain, *sensed)
 
     def _sensed_geoms(self) -> list[str]:
         """Geoms whose contacts with the ground are counted: names or patterns."""
@@ -409,13 +410,12 @@ class RobotTask(RobotRewards, BaseTask):
         self.accelerometer = sim.sensordata[:, spans["accelerometer"]]  # view (N, 3) [m/s^2]
         self.base_lin_vel, self.projected_gravity, self.base_ang_vel_world = (self._zeros(3) for _ in range(3))
         self.dof_offset = self._zeros(self.num_actions)  # joint position minus default [rad]
-        names = self.robot.joint_names
-        self.actuators = Actuators(self.cfg.control, self.robot, self.default_dof_pos, self.dof_pos, sim, self.domain_rand)
+        self.actuators = Actuators(self, self.robot, sim, self.domain_rand)
         exact = self.actuators.encoder_offset is None
         self.joint_reading = self.dof_offset if exact else self._zeros(self.num_actions)  # the same, as measured
         self.base_height = self.root_pos[:, 2]  # of the root above the ground under it [m]
         self.fell, self.broken = self._zeros(dtype=torch.bool), self._zeros(dtype=torch.bool)
-        self.divergence = Divergence(sim, self.actions, names, self.cfg.termination.max_speed)
+        self.divergence = Divergence(sim, self.actions, self.robot.joint_names, self.cfg.termination.max_speed)
         self._episode, views = columns(n, device, **self._episode_columns())  # one matrix, so that a reset clears it in one go
         for name, view in views.items():
             setattr(self, name, view)

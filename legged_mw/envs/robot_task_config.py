@@ -48,8 +48,17 @@ class RobotTaskCfg(Config):
         ang_vel_range: float = 0.5  # root angular velocity, body frame, each axis U(-range, range) [rad/s] [P]
 
     class control:
+        # servo: kp (target - angle), damped in the joint; dc_motor: kp (target - angle) - kd speed within a torque-speed curve;
+        # torque: the action is one, scaled; network: a file's weights make the torque (docs/motors.md)
+        actuator: Literal["servo", "dc_motor", "torque", "network"] = "servo"  # [P]
         stiffness: dict[str, float] = {}  # table a joint: position gain [N m/rad]
-        damping: dict[str, float] = {}  # table a joint: passive damping [N m s/rad]
+        damping: dict[str, float] = {}  # table a joint: passive damping; of a dc_motor its velocity gain, within its curve [N m s/rad]
+        # tables a joint of a torque-speed curve, which dc_motor needs and torque and network may have: at angular velocity w a motor
+        # gives from -stall_torque (1 + w / no_load_speed) to stall_torque (1 - w / no_load_speed), and at most asset.effort
+        stall_torque: dict[str, float] = {}  # [N m]
+        no_load_speed: dict[str, float] = {}  # [rad/s]
+        gear: dict[str, float] = {"": 1.0}  # turns of the motor a turn of the joint; 1: the two tables are the joint's own
+        network: str = ""  # of `network`: an .npz, as `python -m legged_mw.robot.actuator_net` writes it
         action_scale: float | dict[str, float] = 0.5  # target = origin + scale * action [rad]; a number, or a table a joint [P]
         action_origin: Literal["default", "joints", "targets"] = "default"  # the default pose, the measured angles or the last targets [P]
         decimation: int = 5  # simulation steps a control step [P]
@@ -126,14 +135,17 @@ class RobotTaskCfg(Config):
         frictionloss: list[float] = [0.9, 1.1]  # factor on each joint's dry friction [P]
         stiffness: list[float] = []  # factor on each servo's position gain
         damping: list[float] = []  # factor on each joint's damping
-        strength: list[float] = []  # factor on each servo's force limit
+        strength: list[float] = []  # factor on each motor's force limit, asset.effort or the file's
         encoder_offset: list[float] = [-0.05, 0.05]  # what each encoder reads beside the true angle [rad] [P]
+        stall_torque: list[float] = []  # factor on each motor's, of control.stall_torque
+        no_load_speed: list[float] = []  # factor on each motor's, of control.no_load_speed
         action_delay: list[int] = []  # control steps from an action to its servo, whole numbers, both ends included
+        delay_ms: list[float] = []  # from an action to its motor [ms], rounded to the nearest simulation step, a half up
         observation_delay: list[int] = []  # control steps that what `state` measures is old
         model_factors: dict[str, list[float]] = {}  # any other field of the model that may differ: a factor per world on all of it
         redraw_at_reset: list[str] = [  # drawn at every reset of a world; the others once, at the start
-            *["friction", "contact_time", "frictionloss", "stiffness", "damping", "strength"],
-            *["encoder_offset", "action_delay", "observation_delay"],
+            *["friction", "contact_time", "frictionloss", "stiffness", "damping", "strength", "stall_torque", "no_load_speed"],
+            *["encoder_offset", "action_delay", "delay_ms", "observation_delay"],
         ]
         redraw_iterations: int = 0  # draw everything again every so many iterations of training, and when it is resumed; 0: never
         observe: bool = False  # rows in `privileged_state` with what was drawn
@@ -200,6 +212,14 @@ class RobotTaskCfgPPO(Config):
             std_type: Literal["scalar", "log"] = "scalar"  # [R]
             std_range: list[float] = [1e-6, 1e6]  # [R]
 
+        class estimator:
+            """A network from what the actor reads to rows that it does not; the actor reads its estimate, too (rl/estimator.py)."""
+
+            targets: list[str] = []  # rows of the critic's groups: ["base_lin_vel", "foot_contact"]; empty: no estimator
+            hidden_dims: list[int] = [256, 128]  # [genesis_lr's explicit estimator of a Go2]
+            activation: str = "elu"
+            learning_rate: float = 1e-3  # fixed [HIMLoco]
+
     class critic:
         class_name: str = "MLPModel"
         hidden_dims: list[int] = [512, 256, 128]  # [P]
@@ -225,6 +245,26 @@ class RobotTaskCfgPPO(Config):
         schedule: Literal["adaptive", "fixed"] = "adaptive"  # fixed: `learning_rate` throughout [R; P fixed]
         desired_kl: float = 0.01  # between updates, for the adaptive schedule [R]
         normalize_advantage_per_mini_batch: bool = False  # [R]
+
+    class distillation:
+        """Takes the place of `algorithm` where there is a teacher: the actor learns to act like it. After init_std rsl-rl's own keys."""
+
+        teacher: str = ""  # its run, checkpoint or export, or a task for its last or shipped policy (train.py --teacher)
+        init_std: float = 0.1  # of the student's noise while it learns; nothing changes it [Isaac Lab]
+        class_name: str = "legged_mw.rl.distillation:GraphedDistillation"  # or "Distillation": rsl-rl's own, same results, slower
+        num_learning_epochs: int = 5  # [R 1; ours: docs/lab.md]
+        gradient_length: int = 4  # steps a gradient; it divides num_steps_per_env [ours: R 15 leaves 9 of 24 unused]
+        learning_rate: float = 1e-3  # [R]
+        max_grad_norm: float = 1.0  # 0: no bound [R none; ours: as in PPO]
+        loss_type: Literal["mse", "huber"] = "mse"  # [R]
+        optimizer: str = "adam"  # [R]
+
+    class warm_start:
+        """Training that begins with the actor of another run: `train.py --init`."""
+
+        policy: str = ""  # the run, checkpoint or export, or a task for its last or shipped policy
+        init_std: float = 0.2  # of exploration at the start [ours: less than from nothing, as it can walk]
+        critic_warmup: int = 20  # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
 
     class anneal:
         """What a number of `algorithm` goes to, in a straight line over max_iterations; 0: it stays [ours]."""

@@ -13,7 +13,7 @@ FIELDS = {
     "njmax": "sim.njmax",
     "integrator": "sim.integrator",
     "stiffness": "control.stiffness",
-    "damping": "control.damping",
+    **{name: f"control.{name}" for name in ("damping", "stall_torque", "no_load_speed", "gear")},
     "colliders": "asset.colliders",
     "proportions": "terrain.terrain_proportions",
     "levels": "terrain.num_rows",

@@ -89,6 +89,17 @@ def _each_step(time: Array, commanded: Array, mean: Array) -> list[dict[str, Any
     return found
 
 
+def estimates(record: Record, commands: Sequence[Sequence[float]], seconds: float) -> dict[str, Any]:
+    """True and estimated vx, vy [m/s] (2, T) in the last ``seconds`` of each command's world, one after another; None where it fell."""
+    last = round(seconds / record.dt)
+    found: dict[str, Any] = {"commands": [list(command) for command in commands], "seconds": last * record.dt}
+    for name, signal in (("truth", "velocity"), ("estimate", "estimate")):
+        values = record.signals[signal][-last:, :, :2].astype(float)
+        values[:, np.isfinite(record.fell_at)] = np.nan
+        found[name] = plain(values.transpose(2, 1, 0).reshape(2, -1).round(4))
+    return found
+
+
 # ---- the gait
 
 

@@ -24,11 +24,16 @@ TEXTS = {
     "range that was trained. Dark is good. {stroke}A cross is a fall.",
     "steps": "Walking at two thirds of the trained range, then the same backwards, then standing, then walking again. Line: mean of eight "
     "robots, each in another phase of its gait at the step; band: lowest and highest of them. One that fell is not among them.",
+    "estimate": "What the policy believes of its velocity, body frame at the IMU, beside what the simulator knows: the last "
+    "two seconds of each command, side by side. The exam's table has the root mean square of the difference over the last 8 of 10 seconds.",
     "gait": "A bar where a foot is on the ground, the last two seconds of each command. Above: strides a second, and the duty factor: "
     "the share of time that a foot is down, mean over the feet.",
     "joints": "Where the joints are, how fast they move and what torque they need over all commands without a fall. Upright strokes are "
     "limits: soft position limits, the motors' speed, the torque that the servos are clamped to. At the right the share of samples beyond "
     "a limit (of a torque: at 98 % of it or more), where there are any.",
+    "motors": "Torque against speed of each kind of joint over all commands without a fall: the more often, the darker. The lines are the "
+    "motor's envelope: its force limit, and its torque-speed curve if control.actuator has one. Above: the share of samples at the "
+    "envelope, by 2 % of the highest torque.",
     "pushes": "The base's horizontal velocity jumps; a push is survived if the robot has not fallen three seconds later. Rings: jumps "
     "of {speeds} m/s, from the inside; sectors: where it is pushed to. Coloured tiles were survived. Walking is at {vx:g} m/s; the exam "
     "counts these.",
@@ -58,7 +63,8 @@ def html(task: str, rules: ExamRules, columns: Sequence[Column], drawn: Sequence
     words["stroke"] = STROKE if rules.marks_of == "error" else ""
     chapters = [_chapter(section, panels, TEXTS[section.name].format(**words), _extra(section.name, columns)) for section, panels in drawn]
     note = EXAM_NOTE.format(pushes=len(rules.push_speeds) * PUSH_DIRECTIONS, asked=rules.asked_words(), peer=escape(rules.peer_words()))
-    figures = [rules.figures(column.exam) for column in columns]
+    results = [column.exam for column in columns]
+    figures = [rules.figures(result, others=results) for result in results]
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
 <meta name="color-scheme" content="light dark"><title>{escape(task)}: walking exam</title><style>{CSS}</style></head>

@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Callable
 from functools import partial
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +24,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 
+from legged_mw.eval import estimate_panel
+from legged_mw.eval.motors import draw as draw_motor
 from legged_mw.eval.peers import best_of
 from legged_mw.eval.rules import AXES, ExamRules
 
@@ -80,13 +83,15 @@ def sections(columns: Columns, rules: ExamRules) -> list[Section]:
     strides = [Panel(partial(_gait, columns, i), height=1.75 + 0.25 * len(columns)) for i in GAITS]
     energy = [Panel(partial(_against_speed, columns, rules, key)) for key in ("power", "cost_of_transport")]
     terms = len(columns[0][1]["reward"])
-    rough = _crossing_maps(columns)
+    rough, believed = _crossing_maps(columns), _estimates(columns)
     return [
         *([Section("crossing", "Rough ground", rough, across=len(rough))] if rough else []),
         Section("tracking", "Following the command", _heat_maps(columns, rules)),
         Section("steps", "Steps of the command", responses),
+        *([Section("estimate", "What it believes of its velocity", believed, across=1)] if believed else []),
         Section("gait", "Gait", strides),
         Section("joints", "Joints against their limits", _joint_panels(columns)),
+        *([Section("motors", "Torque against speed", motors)] if (motors := _motor_panels(columns)) else []),
         Section("pushes", "Pushes", pushes),
         Section("energy", "Energy", energy, across=2),
         Section("reward", "Reward", [Panel(partial(_reward, columns), width=7.2, height=0.9 + 0.21 * terms)], across=1),
@@ -254,6 +259,16 @@ def _response(columns: Columns, k: int, ax: Axes) -> None:
         ax.legend(loc="lower right", handlelength=1.6)
 
 
+def _estimates(columns: Columns) -> list[Panel]:
+    """A panel an axis of each policy that estimates its velocity."""
+    panels = []
+    for i, (name, figures) in enumerate(columns):
+        for k in range(2 if "estimate" in figures else 0):
+            draw = partial(estimate_panel.draw, figures["estimate"], k, (INK, PAIR[i], FAINT), _of(name, columns))
+            panels.append(Panel(draw, estimate_panel.WIDTH, estimate_panel.HEIGHT))
+    return panels
+
+
 # ---- gait
 
 
@@ -307,6 +322,12 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
     ax.set(title=label, ylim=(len(names) - 0.6, -1.05))
     ax.spines["left"].set_visible(False)
     ax.margins(x=0.04)
+
+
+def _motor_panels(columns: Columns) -> list[Panel]:
+    """A picture a kind of joint and policy; figures that were saved before there were any have none."""
+    rows = zip_longest(*([(_of(name, columns), motor) for motor in figures.get("motors", [])] for name, figures in columns))
+    return [Panel(partial(draw_motor, motor, colormaps[HEAT], (INK, MUTED), suffix)) for row in rows for suffix, motor in filter(None, row)]
 
 
 # ---- pushes

@@ -12,14 +12,16 @@ import torch
 from numpy.typing import NDArray
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import crossing, exam, figures, page, rules
+from legged_mw.eval import crossing, exam, figures, motors, page, rules
 from legged_mw.eval.page import Column
 from legged_mw.eval.peers import best_of
 from legged_mw.eval.rollout import Policy, Record, Signal, roll_out
 from legged_mw.eval.trials import NAMES, STEPS_AT, Plan, make_plan
+from legged_mw.sim.joints import CURVE
+from legged_mw.sim.tables import family
 from legged_mw.utils.task import LoadedTask
 
-GAIT_SECONDS = 2.0  # that the gait diagram shows
+GAIT_SECONDS = ESTIMATE_SECONDS = 2.0  # of each command, that the gait diagram and the estimate's picture show
 BEFORE_STEP = 0.5  # [s] that a step response shows before the step
 
 SIGNALS: dict[str, Signal] = {
@@ -28,6 +30,7 @@ SIGNALS: dict[str, Signal] = {
     "dof_pos": lambda env: env.dof_pos,  # (N, D) [rad]
     "dof_vel": lambda env: env.dof_vel,  # [rad/s]
     "torque": lambda env: env.torques,  # [N m], one simulation step old
+    "motor_speed": lambda env: env.sim.actuator_velocity(),  # (N, D) [rad/s], of the same moment
     "reward": lambda env: env.episode_sums,  # (N, K), scale * term * dt since the start
 }
 
@@ -83,7 +86,9 @@ def gather(env: LeggedRobot, asked: rules.ExamRules, plan: Plan, record: Record)
         },
         "steps": {name: figures.responses(parts[f"step_{name}"], i, first) for i, name in enumerate(NAMES)},
         "gait": figures.gaits(held, settled, asked.commands(), GAIT_SECONDS),
+        **({"estimate": figures.estimates(held, asked.commands(), ESTIMATE_SECONDS)} if "estimate" in held.signals else {}),
         "joints": figures.joints(held, settled, joint_limits(env)),
+        "motors": motors.envelopes(held, settled, [family(name) for name in env.robot.joint_names], motor_limits(env)),
         "pushes": {
             "speeds": list(asked.push_speeds),
             "walking": figures.survival(parts["pushes"].fell_at, until),
@@ -100,6 +105,12 @@ def joint_limits(env: LeggedRobot) -> dict[str, tuple[NDArray[Any], NDArray[Any]
     position = torch.stack([env.soft_lower, env.soft_upper]).cpu().numpy().astype(float)
     effort = env.robot.effort_range.T
     return {"dof_pos": (position[0], position[1]), "dof_vel": (-speeds, speeds), "torque": (effort[0], effort[1])}
+
+
+def motor_limits(env: LeggedRobot) -> motors.Limits:
+    """Force limits and torque-speed curves; what is not known is infinite."""
+    curve = (np.array(env.robot.tables.get(name, [np.inf] * env.num_actions)) for name in CURVE)
+    return motors.Limits(*env.robot.effort_range.T, *curve)
 
 
 def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()) -> None:

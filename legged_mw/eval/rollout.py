@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.estimator import believed_velocity
 from legged_mw.rl.recurrent import another, forget
 
 Policy = Callable[[TensorDict], Tensor]  # one with a memory is an rsl-rl network
@@ -77,8 +78,8 @@ def roll_out(
     fell_at = torch.full((env.num_envs,), math.inf, device=env.device)
     kept: dict[str, Tensor] = {}
     for step in range(steps):
-        for name, signal in signals.items():
-            value = signal(env)
+        sampled = {name: signal(env) for name, signal in signals.items()} | actor.believed(obs)
+        for name, value in sampled.items():
             if name not in kept:
                 kept[name] = torch.empty(steps, *value.shape, dtype=value.dtype, device=value.device)
             kept[name][step] = value
@@ -114,6 +115,12 @@ class _Actor:
         """Its actions (N, A)."""
         with torch.inference_mode():
             return torch.cat([policy(obs[worlds]) for policy, worlds in self._parts])
+
+    def believed(self, obs: TensorDict) -> dict[str, Tensor]:
+        """A further signal, "estimate", of a policy that estimates its velocity: vx, vy (N, 2) [m/s]."""
+        with torch.inference_mode():
+            found = [value for policy, worlds in self._parts if (value := believed_velocity(policy, obs[worlds])) is not None]
+        return {"estimate": torch.cat(found)} if found else {}
 
     def forget(self, ended: Tensor) -> None:
         """Nothing is remembered where ``ended`` (N,)."""

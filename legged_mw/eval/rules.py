@@ -174,7 +174,8 @@ class ExamRules:
         """The exam's result from samples of its N worlds before each of T control steps of ``dt`` [s].
 
         ``signals``: velocity (T, N, 3) [m/s, m/s, rad/s]; position (T, N, 2) [m]; power (T, N), the sum of |torque * joint speed|
-        [W]; joint_speed (T, N), the mean over the joints [rad/s]. ``last_position`` (N, 2) after the last step [m];
+        [W]; joint_speed (T, N), the mean over the joints [rad/s]; of a policy that estimates its velocity, estimate (T, N, 2) [m/s].
+        ``last_position`` (N, 2) after the last step [m];
         ``fell_at`` (N,): control step of the first fall, or inf; ``mass`` [kg].
         """
         velocity, position, power, joint_speed = (signals[name] for name in ("velocity", "position", "power", "joint_speed"))
@@ -192,6 +193,9 @@ class ExamRules:
             "cost_of_transport": float(energy / (mass * GRAVITY * distance[ahead])) if moved else None,
             "rules": self.to_mapping(),
         }
+        if "estimate" in signals:
+            missed = (signals["estimate"] - velocity[..., :2])[settled:, : len(commands)][:, stood[: len(commands)]]
+            result["estimate_rms"] = _plain(np.sqrt((missed.astype(float) ** 2).mean(axis=(0, 1)))) if missed.size else None
         beats = {"beats_peer": self.beats_peer(result)} if self.peers else {}
         return {"walks": self.walks(result), **beats, **result}
 
@@ -211,8 +215,8 @@ class ExamRules:
         compared = [figure for figure in self.figures(result) if figure.peer is not None]
         return sum(figure.reaches_peer() for figure in compared), len(compared)
 
-    def figures(self, result: Mapping[str, Any]) -> list[Figure]:
-        """The result's figures in the order of the table."""
+    def figures(self, result: Mapping[str, Any], others: Sequence[Mapping[str, Any]] = ()) -> list[Figure]:
+        """The result's figures in the order of the table, with a line for what only ``others`` have that stand beside it."""
         peer, unknown_of_peer = best_of(self.peers), (None, None, None)
         apart = "*" if any(peer.own_speed for peer in self.peers) else ""
         listed = [Figure("falls in 22 commands", result["falls"], 0, 0, peer.get("falls"), card=("falls", "of 22"))]
@@ -227,6 +231,9 @@ class ExamRules:
                 beside = peer.get(measure, unknown_of_peer)[i]
                 if measure != "offset" or measure == self.marks_of or beside is not None:
                     listed.append(Figure(name, result[measure][i], 3, mark, beside, card=shown_first))
+        if any("estimate_rms" in each for each in (result, *others)):
+            rms = result.get("estimate_rms") or (None, None)
+            listed += [Figure(f"estimate of {AXES[i][0]}, rms [m/s]", rms[i], 3, without="none") for i in range(2)]
         listed.append(Figure("drift standing 8 s [m]", result["drift"], 4, None, peer.get("drift"), equal=EQUAL_DRIFT))
         listed.append(Figure("joint speed standing [rad/s]", result["joint_speed"], 3))
         for speed, share in result["pushes"].items():

@@ -34,7 +34,10 @@ class TrainingExam:
             self.env = copy.env_class(copy.cfg, device, eager=eager)
 
     def __call__(self, policy: Policy) -> dict[str, float]:
-        """``error_vx``, ``error_vy`` [m/s], ``error_yaw`` [rad/s]; ``falls`` of 22; ``pushes_survived``, a share."""
+        """``error_vx``, ``error_vy`` [m/s], ``error_yaw`` [rad/s]; ``falls`` of 22; ``pushes_survived``, a share.
+
+        Of a policy that estimates its velocity also ``estimate_vx``, ``estimate_vy`` [m/s], root mean square errors.
+        """
         dt = self.env.dt
         with torch.random.fork_rng(self._generators):
             cases = exam.cases(self.rules, dt, PUSH_AT)
@@ -49,9 +52,13 @@ def training_figures(record: Record, count: int) -> dict[str, float]:
     """
     settled, stood = round(SETTLING / record.dt), np.isinf(record.fell_at)
     asked = record.commands[settled:, :count, :3]
-    missed = np.where(stood[:count, None], record.signals["velocity"][settled:, :count] - asked, asked)
+    velocity = record.signals["velocity"][settled:, :count]
+    missed = np.where(stood[:count, None], velocity - asked, asked)
+    believed = record.signals["estimate"][settled:, :count] if "estimate" in record.signals else velocity[..., :0]
+    rms = np.sqrt(((believed - velocity[..., : believed.shape[-1]]) ** 2).mean(axis=(0, 1)))
     return {
         **dict(zip(("error_vx", "error_vy", "error_yaw"), np.abs(missed).mean(axis=(0, 1)).tolist(), strict=True)),
         "falls": float((~stood[:count]).sum()),
         "pushes_survived": float(stood[count:].mean()),
+        **dict(zip(("estimate_vx", "estimate_vy"), rms.tolist(), strict=False)),
     }

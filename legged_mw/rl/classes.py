@@ -9,11 +9,12 @@ import inspect
 from collections.abc import Iterator
 from typing import Any
 
-from rsl_rl.algorithms import PPO
+from rsl_rl.algorithms import PPO, Distillation
 from rsl_rl.models import CNNModel, MLPModel, RNNModel
 from rsl_rl.modules import BetaDistribution, GaussianDistribution, HeteroscedasticGaussianDistribution
 from rsl_rl.utils import resolve_class
 
+from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.utils.config import Config, ConfigError
 
@@ -25,6 +26,7 @@ ALLOWED: dict[str, tuple[type, ...]] = {
     "actor.distribution_cfg.class_name": _DISTRIBUTIONS,
     "critic.distribution_cfg.class_name": _DISTRIBUTIONS,
     "algorithm.class_name": (GraphedPPO, PPO),
+    "distillation.class_name": (GraphedDistillation, Distillation),
 }
 _IMPORTED = ("class_name", "data_augmentation_func")  # rsl-rl imports and calls what these keys name
 
@@ -47,9 +49,9 @@ def check_classes(cfg: Config) -> None:
 
 
 def network_section(section: dict[str, Any]) -> dict[str, Any]:
-    """The section of a network without the fields of a memory, if its class has none. Imports the class: check it first."""
+    """The section of a network without the fields of a memory or an estimator, if its class has none. Imports the class: check it first."""
     taken = inspect.signature(resolve_class(section)[0]).parameters
-    return {name: value for name, value in section.items() if name in taken or not name.startswith("rnn_")}
+    return {name: value for name, value in section.items() if name in taken or not name.startswith(("rnn_", "estimator"))}
 
 
 def _check_distribution(section: dict[str, Any] | None, path: str) -> None:

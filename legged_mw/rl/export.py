@@ -36,15 +36,31 @@ from legged_mw.deploy.contract import (
     HeightScan,
     digest,
 )
+from legged_mw.deploy.estimate import Estimated
 from legged_mw.deploy.memory import Memory
+from legged_mw.deploy.motors import MOTORS_FILE, Motors
+from legged_mw.envs.actuators import OWN as OWN_LAW
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.estimator import EstimatingModel, find_targets
 from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
-from legged_mw.rl.export_scene import among_steps, standalone
-from legged_mw.rl.network import INPUT, MEMORY_INPUT, MEMORY_OUTPUT, OUTPUT, ExportedPolicy, halve, round_weights, run_onnx, save_onnx
+from legged_mw.rl.export_scene import Scene, among_steps, standalone
+from legged_mw.rl.network import (
+    ESTIMATE,
+    INPUT,
+    MEMORY_INPUT,
+    MEMORY_OUTPUT,
+    OUTPUT,
+    ExportedPolicy,
+    halve,
+    round_weights,
+    run_onnx,
+    save_onnx,
+)
 from legged_mw.rl.policies import load_policy
 from legged_mw.rl.recurrent import states_of
 from legged_mw.rl.runs import CONFIG_FILE
+from legged_mw.sim.joints import CURVE
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.utils.config import save_yaml
@@ -53,6 +69,7 @@ from legged_mw.utils.files import find_file
 from legged_mw.utils.task import LoadedTask
 
 FILES = (CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
+SOMETIMES = (TERRAIN_FILE, MOTORS_FILE)
 WORLDS = 8  # of the roll-out that the export is tried on
 TOLERANCE = 1e-4  # between actions of the same observation, relative above 1: float32 sums in another order
 
@@ -120,12 +137,13 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
         remembered = np.concatenate([step.memory for step in steps]) if memory else None
         acted = run_onnx(new / NETWORK_FILE, observations, memory=remembered)
         gap = _compare(acted, np.clip(actions, -clip, clip))
+        if isinstance(policy, EstimatingModel):
+            _compare(run_onnx(new / NETWORK_FILE, observations, ESTIMATE), _run(policy, clip, observations)[1], does="estimates")
         if half:
-            outputs = ExportedPolicy(exact, clip)(*(torch.from_numpy(x) for x in (observations, remembered) if x is not None))
-            gap = _gap(acted, (outputs[0] if memory else outputs).detach().numpy())
+            gap = _gap(acted, _run(exact, clip, observations, remembered)[0])
         replay(env, contract, steps, new)
         no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
-        files = (*FILES, *([TERRAIN_FILE] if (new / TERRAIN_FILE).exists() else []))
+        files = (*FILES, *(name for name in SOMETIMES if (new / name).exists()))
     unknown_rows = tuple(row.name for row in contract.rows if not row.measured)
     return Exported(files, gap, len(observations), unknown_rows, no_terrain, contract.ends.not_covered, half)
 
@@ -133,7 +151,7 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
 def _small_env(task: LoadedTask) -> RobotTask:
     """The task as trained, kicks and pushes too, but small, on a CPU, and without what stands between a robot and its policy."""
     settings = {"env.num_envs": WORLDS, "sim.engine": "mujoco", "noise.level": 0.0}
-    settings |= {"domain_rand.action_delay": [], "domain_rand.observation_delay": []}
+    settings |= {f"domain_rand.{name}": [] for name in ("action_delay", "delay_ms", "observation_delay")}
     if hasattr(task.cfg.terrain, "mesh_type"):
         settings["terrain.mesh_type"] = "plane"  # the scene is the robot's alone
     for path, value in settings.items():
@@ -151,17 +169,24 @@ def _write_network(policy: MLPModel, clip: float, path: Path, half: bool) -> Non
         halve(policy, path)
 
 
+def _run(policy: MLPModel, clip: float, *inputs: np.ndarray | None) -> list[np.ndarray]:
+    """What an exported network should give: actions, and its memory or its estimate if there is one."""
+    with torch.inference_mode():
+        outputs = ExportedPolicy(policy, clip)(*(torch.from_numpy(values) for values in inputs if values is not None))
+    return [output.numpy() for output in (outputs if isinstance(outputs, tuple) else (outputs,))]
+
+
 def _gap(got: np.ndarray, wanted: np.ndarray) -> float:
     """The largest difference, relative above 1."""
     return float((np.abs(got - wanted) / np.maximum(1.0, np.abs(wanted))).max()) if got.shape == wanted.shape else float("inf")
 
 
-def _compare(got: np.ndarray, wanted: np.ndarray) -> float:
-    """The largest difference; refuses a network that acts otherwise than the policy."""
+def _compare(got: np.ndarray, wanted: np.ndarray, does: str = "acts") -> float:
+    """The largest difference; refuses a network that acts or estimates otherwise than the policy."""
     gap = _gap(got, wanted)
     if not gap <= TOLERANCE:  # NaN too
         raise ExportError(
-            f"{NETWORK_FILE} acts otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
+            f"{NETWORK_FILE} {does} otherwise than the trained policy: up to {gap:g} apart on {len(wanted)} recorded observations "
             f"(at most {TOLERANCE:g} is allowed); nothing was written"
         )
     return gap
@@ -180,9 +205,9 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
         new.mkdir(parents=True)
         yield new
         if folder.exists():
-            if not (new / TERRAIN_FILE).exists():  # one of an earlier export would be another policy's
-                (folder / TERRAIN_FILE).unlink(missing_ok=True)
-            for name in [name for name in (TERRAIN_FILE, *FILES) if (new / name).exists()]:
+            for name in (name for name in SOMETIMES if not (new / name).exists()):  # one of an earlier export would be another policy's
+                (folder / name).unlink(missing_ok=True)
+            for name in [name for name in (*SOMETIMES, *FILES) if (new / name).exists()]:
                 os.replace(new / name, folder / name)
         else:
             os.replace(new, folder)
@@ -198,11 +223,10 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
 def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) -> Contract:
     """The contract of the network in ``folder``, trained with the noise level ``noise``; writes the scene there."""
     cfg, robot = task.cfg, env.robot
-    start = [*env.start_place, 1.0, 0.0, 0.0, 0.0, *robot.pose]
-    source = find_file(cfg, "asset.file").read_text(encoding="utf-8", errors="replace")
-    scene = standalone(robot, robot.imu, qpos=start, ctrl=robot.pose, camera=cfg.viewer.camera, source=source)
-    (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
+    scene = _write_scene(env, folder)
     ends = _ends(env)
+    origin = "torque" if env.actuators.law == "torque" else cfg.control.action_origin
+    action = Action(origin, np.array(robot.tables["control.action_scale"]), cfg.normalization.clip_actions)
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))
     ground, scanned = cfg.terrain, any(row.measured == SCAN for row in rows)
     feet = {foot: tuple(f"contact/{geom}" for geom in geoms) for foot, geoms in getattr(env, "foot_geoms", {}).items()}
@@ -210,11 +234,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         task=task.name,
         joints=robot.joint_names,
         default_pose=np.array(robot.pose),
-        action=Action(
-            cfg.control.action_origin,
-            np.array(robot.tables["control.action_scale"]),
-            cfg.normalization.clip_actions,
-        ),
+        action=action,
         stiffness=np.array(robot.tables["`stiffness`"]),
         damping=np.array(robot.tables["`damping`"]),
         period=round(env.dt, 9),
@@ -234,7 +254,42 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         output=OUTPUT,
         digest=digest(folder / NETWORK_FILE),
         exam=cfg.to_dict().get("exam") if task.exam == "walking" else None,
+        motors=_motors(env, folder),
+        estimate=_estimated(env, task),
     )
+
+
+def _estimated(env: RobotTask, task: LoadedTask) -> tuple[Estimated, ...]:
+    """The rows of the network's second output."""
+    rows = [(row, ROWS.get(row.name)) for _, row in find_targets(task.train.to_dict(), env, learns=False)]
+    return tuple(
+        Estimated(row.name, row.value.shape[1], row.unit or (known.unit if known else ""), row.frame or (known.frame if known else ""))
+        for row, known in rows
+    )
+
+
+def _write_scene(env: RobotTask, folder: Path) -> Scene:
+    """The robot in its start, as MJCF."""
+    cfg, robot, law = env.cfg, env.robot, env.actuators.law
+    if law == OWN_LAW:
+        raise ExportError(
+            f"{type(env).__name__}._compute_torques is a motor law in code, which no export can state; train the policy that is to be "
+            "exported with a law of control.actuator (docs/motors.md)"
+        )
+    start = [*env.start_place, 1.0, 0.0, 0.0, 0.0, *robot.pose]
+    held = robot.pose if law in ("servo", "dc_motor") else [0.0] * len(robot.pose)
+    source = find_file(cfg, "asset.file").read_text(encoding="utf-8", errors="replace")
+    scene = standalone(robot, robot.imu, qpos=start, ctrl=held, camera=cfg.viewer.camera, source=source)
+    (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
+    return scene
+
+
+def _motors(env: RobotTask, folder: Path) -> Motors:
+    """The law of the motors; a network is copied to ``folder``."""
+    curve = (tuple(env.robot.tables.get(name, ())) for name in CURVE)
+    if env.actuators.law == "network":
+        shutil.copyfile(find_file(env.cfg, "control.network"), folder / MOTORS_FILE)
+    return Motors(env.actuators.law, *curve, digest=digest(folder / MOTORS_FILE) if env.actuators.law == "network" else "")
 
 
 def _ends(env: RobotTask) -> Ends:

@@ -38,7 +38,7 @@ class Step(NamedTuple):
     commands: np.ndarray  # (N, C)
     actions: np.ndarray  # (N, D) of the policy, not clipped
     taken: np.ndarray  # (N, D) that the environment got
-    targets: np.ndarray  # (N, D) [rad] that the servos got, by encoders that may be off
+    targets: np.ndarray  # (N, D) [rad] that the motors got, by encoders that may be off; or torques [N m]
     ended: np.ndarray  # (N,) the episode ended, so that nothing of the targets is left to see
     clock: np.ndarray  # (N,) phase of the gait clock, share of its period; 0 where there is none
     memory: np.ndarray  # (N, states, H) what the policy remembered before it acted; (N, 0, 0) without a memory
@@ -49,7 +49,7 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
 
     The last two worlds get large random actions on top, so that some actions are clipped and some robots fall.
     """
-    fleet, offset, steps = Fleet(folder, contract, env.num_envs, threads=1), env.actuators.encoder_offset, []
+    fleet, steps = Fleet(folder, contract, env.num_envs, threads=1), []
     seen = env.get_observations()
     for _ in range(STEPS):
         memory = memory_of(policy, env.num_envs).numpy().copy()
@@ -63,9 +63,8 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
         taken = actions.clone()
         taken[-2:] += contract.action.clip * torch.randn_like(taken[-2:])
         seen, _, dones, _ = env.step(taken)
-        targets = env.sim.ctrl if offset is None else env.sim.ctrl + offset
         forget(policy, dones)
-        arrays = (tensor.numpy().copy() for tensor in (actions, taken, targets, dones.bool()))
+        arrays = (tensor.numpy().copy() for tensor in (actions, taken, env.actuators.told(), dones.bool()))
         steps.append(Step(observation, measured, commands, *arrays, clock=clock, memory=memory))
     return steps
 

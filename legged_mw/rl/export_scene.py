@@ -13,12 +13,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from legged_mw.drawing.relief import STEEP_LIGHT
+from legged_mw.drawing.scene import dressed
 from legged_mw.rl.export_meshes import shorten
-from legged_mw.sim.drawing import dressed
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND, MOST_BOXES, Box, add_ground_box, as_boxes, feel_all_ground
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.relief import STEEP_LIGHT
 from legged_mw.sim.terrain import Terrain
 
 AROUND = 1000.0  # [m] of level ground around tiles of steps, more than a robot walks
@@ -32,6 +32,7 @@ _FIELDS = (
     *("qpos0", "body_parentid", "body_mass", "body_inertia", "body_pos", "body_quat", "body_ipos", "body_iquat"),
     *("jnt_type", "jnt_axis", "jnt_pos", "jnt_range", "jnt_limited", "jnt_stiffness", "jnt_solref", "jnt_solimp"),
     *("dof_armature", "dof_damping", "dof_frictionloss", "dof_solref", "dof_solimp"),
+    *("actuator_dyntype", "actuator_gaintype", "actuator_biastype", "actuator_ctrlspec"),
     *("actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange", "actuator_forcerange", "actuator_gear", "actuator_trnid"),
     *("actuator_ctrllimited", "actuator_forcelimited", "jnt_actfrclimited", "jnt_actfrcrange"),
 )

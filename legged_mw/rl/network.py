@@ -15,19 +15,22 @@ from onnx import numpy_helper
 from rsl_rl.models import MLPModel, RNNModel
 from torch import Tensor, nn
 
+from legged_mw.rl.estimator import EstimatingModel
 from legged_mw.rl.recurrent import states_of, step
 from legged_mw.utils.config import ConfigError
 
-INPUT, OUTPUT, MEMORY_INPUT, MEMORY_OUTPUT = "obs", "actions", "state_in", "state_out"
+INPUT, OUTPUT, MEMORY_INPUT, MEMORY_OUTPUT, ESTIMATE = "obs", "actions", "state_in", "state_out", "estimate"
 PREFIX = "policy."  # of the weights' names in the file: the attribute of ExportedPolicy
 MEAN, STD = "obs_normalizer._mean", "obs_normalizer._std"
-UNWRITTEN = ("obs_normalizer._var", "obs_normalizer.count", "distribution.")  # no mean action needs them
+# neither a mean action nor an estimate needs them
+UNWRITTEN = ("distribution.", *(f"{of}_normalizer.{name}" for of in ("obs", "target") for name in ("_var", "count")))
 
 
 class ExportedPolicy(nn.Module):
     """Observations (N, size) in their plain units -> clipped mean actions (N, A); the normaliser is inside.
 
-    Of a recurrent policy the state (N, states, H) goes in beside the observations and comes out beside the actions.
+    Of a recurrent policy the state (N, states, H) goes in beside the observations and comes out beside the actions. Of one that
+    estimates, the estimate (N, E) comes out beside them.
     """
 
     policy: Any
@@ -38,12 +41,16 @@ class ExportedPolicy(nn.Module):
         self.inputs, self.outputs, self.examples = [INPUT], [OUTPUT], [torch.zeros(2, policy.obs_dim)]
         if not isinstance(policy, RNNModel):
             self.policy = self.policy.as_onnx(verbose=False)
+            self.outputs += [ESTIMATE] if isinstance(policy, EstimatingModel) else []
             return
         self.inputs, self.outputs = [INPUT, MEMORY_INPUT], [OUTPUT, MEMORY_OUTPUT]
         self.examples.append(torch.zeros(2, *states_of(policy)))
 
     def forward(self, obs: Tensor, state_in: Tensor | None = None) -> Any:
         policy, clip = self.policy, self.clip_actions
+        if ESTIMATE in self.outputs:
+            actions, estimate = policy(obs)
+            return actions.clamp(-clip, clip), estimate
         if state_in is None:
             return policy(obs).clamp(-clip, clip)
         seen, state = step(policy.rnn.rnn, policy.obs_normalizer(obs), state_in.transpose(0, 1))

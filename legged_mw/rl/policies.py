@@ -13,13 +13,14 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw import ROOT
-from legged_mw.envs.base_task import BaseTask
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import check_classes, network_section
+from legged_mw.rl.estimator import actor_settings
 from legged_mw.rl.network import read_parameters
-from legged_mw.rl.runs import CONFIG_FILE, check_fit, experiment_folder, find_checkpoint, find_run, load_tensors, runs
+from legged_mw.rl.runs import CONFIG_FILE, check_fit, experiment_folder, find_checkpoint, find_run, load_tensors, runs, task_of
 from legged_mw.utils.config import Config, ConfigError, load_yaml
 from legged_mw.utils.errors import shown
-from legged_mw.utils.task import LoadedTask, load_task
+from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 NETWORK_FILE = "policy.onnx"  # of an export: legged_mw.deploy, which imports nothing from here, calls it so too
 
@@ -44,6 +45,30 @@ def find_policy(task: LoadedTask, run: str | None = None, checkpoint: int = -1, 
     if run is not None or checkpoint != -1 or runs(folder):
         return _run_or_export(folder, run or "-1", checkpoint)
     return shipped_policy(task, f"nothing to play: no run in {shown(folder)} and no policy shipped for {task.name}; train first")
+
+
+class Trained(NamedTuple):
+    """A policy of another run, and its task as it was trained."""
+
+    source: Source
+    task: LoadedTask
+
+
+def find_trained(asked: str, experiment: Path, flag: str) -> Trained:
+    """The policy that a flag names: a file, a run of this or any ``experiment``, an export, a task, or a run of it as TASK/RUN."""
+    path, (task, _, run) = Path(asked).expanduser(), asked.partition("/")
+    try:
+        if path.is_file():
+            source = Source(path.parent, path, shipped=False)
+        elif task in task_names():
+            source = find_policy(load_task(task), run or None)
+        else:
+            source = _run_or_export(experiment, asked)
+        return Trained(source, load_trained(task_of(source.folder), source))
+    except ConfigError as error:
+        raise ConfigError(
+            f"{flag} {asked}: {error}; name a run by its path or as TASK/RUN, or a task for its last or shipped policy"
+        ) from None
 
 
 def find_rival(task: LoadedTask, run: str, experiment: str | None = None) -> Source:
@@ -88,20 +113,33 @@ def introduce(source: Source, changes: dict[str, tuple[Any, Any]]) -> None:
         print(f"  {path}: {before} -> {now}")
 
 
-def load_policy(path: Path, env: BaseTask, cfg: Config, device: str) -> MLPModel:
+def load_policy(path: Path, env: RobotTask, cfg: Config, device: str) -> MLPModel:
     """The actor in a checkpoint or a ``policy.onnx``, ready to act on ``env``'s observations: ``policy(obs)`` is its mean action (N, A).
 
     ``cfg`` is the learner's config. Raises ConfigError if the file cannot be read, its networks are not those of the config,
     or the config names a class that it may not.
     """
-    check_classes(cfg)
-    sections: dict[str, Any] = copy.deepcopy(cfg.to_dict())
-    actor_class, actor_cfg = resolve_class(network_section(sections["actor"]))
-    actor = actor_class(env.get_observations(), sections["obs_groups"], "actor", env.num_actions, **actor_cfg).to(device)
-    saved = read_parameters(path, actor) if path.suffix == ".onnx" else load_tensors(path, device)["actor_state_dict"]
-    check_fit(saved, actor.state_dict(), path, "actor")
-    actor.load_state_dict(saved)
+    actor_class, actor_cfg = resolve_class(acting(cfg, env))
+    actor = actor_class(env.get_observations(), cfg.to_dict()["obs_groups"], "actor", env.num_actions, **actor_cfg).to(device)
+    actor.load_state_dict(read_actor(path, actor))
     return actor.eval()
+
+
+def acting(cfg: Config, env: RobotTask) -> dict[str, Any]:
+    """Section ``actor`` of the learner's config as rsl-rl takes it, of an actor that only acts in ``env``. Raises ConfigError."""
+    check_classes(cfg)
+    return network_section(actor_settings(copy.deepcopy(cfg.to_dict()), env, learns=False))
+
+
+def read_actor(path: Path, model: MLPModel, what: str = "actor") -> dict[str, Tensor]:
+    """The parameters for ``model`` in a checkpoint, of PPO or of a student, or in a ``policy.onnx``. Raises ConfigError for others."""
+    if path.suffix == ".onnx":
+        saved = read_parameters(path, model)
+    else:
+        content = load_tensors(path, str(next(model.parameters()).device))
+        saved = content["student_state_dict" if "student_state_dict" in content else "actor_state_dict"]
+    check_fit(saved, model.state_dict(), path, what)
+    return saved
 
 
 def act(policy: MLPModel, obs: TensorDict) -> Tensor:

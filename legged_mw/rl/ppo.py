@@ -24,6 +24,8 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
+from legged_mw.rl.adam import make_recordable, plain_state
+from legged_mw.rl.estimator import EstimatingModel, trained_parts
 from legged_mw.rl.layers import run_mlp, update_normalizer
 from legged_mw.rl.recurrent import Memory, Sequence, check_recurrent, unroll
 from legged_mw.sim.graph import StepGraph
@@ -37,6 +39,7 @@ class Minibatch(NamedTuple):
     batch: RolloutStorage.Batch
     actor_input: Tensor | Sequence  # (B, size), normalised; a sequence for a network with a memory
     critic_input: Tensor | Sequence
+    targets: Tensor | None = None  # (B, E) of the actor's estimator, normalised
 
 
 class GraphedPPO(PPO):
@@ -49,6 +52,7 @@ class GraphedPPO(PPO):
     On a CPU nothing is recorded.
     """
 
+    critic_only = False  # of a warm start: the actor stays as it is
     _plain_rate: float  # the learning rate where nothing is recorded
     _rate: Tensor | None = None  # else: () float64, as precise as rsl-rl's Python number
 
@@ -66,14 +70,18 @@ class GraphedPPO(PPO):
             return
         self._adam_rate = torch.tensor(self.learning_rate, dtype=torch.float32, device=self.device)
         self._rate = torch.tensor(self.learning_rate, dtype=torch.float64, device=self.device)
-        parameters = [*self.actor.parameters(), *self.critic.parameters()]
-        self.optimizer = type(self.optimizer)(parameters, lr=self._adam_rate, **self._adam_flags())
+        self._parts, own_rates = trained_parts(self.actor, self.critic)
+        self._rates = [self._adam_rate, *own_rates]
+        learners = [self._parts[0] + self._parts[1], *self._parts[2:]]
+        groups = [{"params": part, "lr": rate} for part, rate in zip(learners, self._rates, strict=True)]
+        self.optimizer = type(self.optimizer)(groups)
+        make_recordable(self.optimizer, self._rates, str(self.device))
         self._begin()
 
     def _why_stock(self) -> str | None:
         """What keeps this configuration from being recorded, or None."""
         for model in (self.actor, self.critic):
-            if type(model) not in (MLPModel, RNNModel):
+            if type(model) not in (MLPModel, RNNModel, EstimatingModel):
                 return f"a network is a {type(model).__name__}"
         if self.rnd or self.use_mixed_precision:
             return f"{'rnd_cfg' if self.rnd else 'use_mixed_precision'} is set"
@@ -84,9 +92,6 @@ class GraphedPPO(PPO):
         if type(self.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
             return f"the optimizer is {type(self.optimizer).__name__}"
         return None
-
-    def _adam_flags(self) -> dict[str, bool]:
-        return {"fused": True, "capturable": str(self.device).startswith("cuda")}
 
     def _begin(self) -> None:
         """Fixed tensors, and graphs that are not recorded yet."""
@@ -102,7 +107,8 @@ class GraphedPPO(PPO):
             if isinstance(model, RNNModel)
         }
         self._advantages = torch.zeros_like(st.returns)
-        self._loss_names = ("value", "surrogate", "entropy", *(["symmetry"] if self.symmetry else []))
+        more = {"symmetry": self.symmetry, "estimate": len(self._parts) > 2}
+        self._loss_names = ("value", "surrogate", "entropy", *(name for name, there in more.items() if there))
         self._losses = torch.zeros(len(self._loss_names), device=device)
         self._entropy_coef, self._desired_kl = torch.zeros((), device=device), torch.zeros((), dtype=torch.float64, device=device)
         self._side = torch.cuda.Stream(device) if str(device).startswith("cuda") else None
@@ -114,6 +120,16 @@ class GraphedPPO(PPO):
         """Drop what is recorded: NCCL does not close a connection that a CUDA graph still names. The next calls record again."""
         if self.graphed:
             self._begin()
+
+    def learn_critic_only(self, on: bool) -> None:
+        """From the next update on the critic learns and the actor stays as it is, or both learn again.
+
+        An adaptive learning rate then begins at its lowest, and is within an update where it should be: nothing is unlearned.
+        """
+        if on != self.critic_only:
+            self.critic_only, self._update_graph = on, StepGraph(self._update, str(self.device))
+            if not on and self.schedule == "adaptive":
+                self.learning_rate = _MIN_RATE
 
     @contextmanager
     def _beside(self) -> Iterator[None]:
@@ -229,7 +245,9 @@ class GraphedPPO(PPO):
             batch.advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)  # type: ignore[operator]
         if self.symmetry:
             self.symmetry.augment_batch(batch, self._size)
-        return Minibatch(batch, *(self._input(model, batch.observations, indices) for model in (self.actor, self.critic)))
+        targets = self.actor.targets(batch.observations) if isinstance(self.actor, EstimatingModel) else None
+        actor_input, critic_input = (self._input(model, batch.observations, indices) for model in (self.actor, self.critic))
+        return Minibatch(batch, actor_input, critic_input, targets)
 
     @torch.no_grad()
     def _input(self, model: MLPModel, obs: Any, indices: Tensor) -> Tensor | Sequence:
@@ -241,20 +259,26 @@ class GraphedPPO(PPO):
 
     def _minibatch(self, minibatch: Minibatch) -> None:
         """One gradient step."""
-        batch, actor_input, critic_input = minibatch
+        batch, actor_input, critic_input, targets = minibatch
         self.optimizer.zero_grad()
         with self._beside():
             value_loss = self._value_loss(batch, _forward(self.critic, critic_input))
             (self.value_loss_coef * value_loss).backward()
         loss, parts, kl = self._policy_loss(batch, _forward(self.actor, actor_input))
-        loss.backward()
+        if targets is not None and isinstance(self.actor, EstimatingModel) and isinstance(actor_input, Tensor):
+            parts.append(nn.functional.mse_loss(run_mlp(self.actor.estimator, actor_input), targets))
+            loss = loss + parts[-1]  # of other parameters
+        if self.critic_only:
+            kl = None  # of an actor that stands still it is rounding noise
+        else:
+            loss.backward()
         self._meet()
         if self.is_multi_gpu:
             self._average_over_ranks(kl)
         if kl is not None:
             self._adapt_rate(kl)
-        nn.utils.clip_grad_norm_(self.actor.parameters(), self.max_grad_norm)
-        nn.utils.clip_grad_norm_(self.critic.parameters(), self.max_grad_norm)
+        for part in self._parts:
+            nn.utils.clip_grad_norm_(part, self.max_grad_norm)
         self.optimizer.step()
         self._losses.add_(torch.stack([value.detach() for value in (value_loss, *parts)]))
 
@@ -310,10 +334,12 @@ class GraphedPPO(PPO):
 
     def _update_normalizers(self) -> None:
         obs = self.storage.observations.flatten(0, 1)
-        for model in (self.actor, self.critic):
+        for model in (self.critic,) if self.critic_only else (self.actor, self.critic):
             if isinstance(model.obs_normalizer, EmpiricalNormalization):
                 inputs = torch.cat([obs[group] for group in model.obs_groups], dim=-1)
                 update_normalizer(model.obs_normalizer, inputs, self.gpu_world_size)
+        if isinstance(self.actor, EstimatingModel) and not self.critic_only:
+            update_normalizer(self.actor.target_normalizer, self.actor.truth(obs), self.gpu_world_size)
 
     def _symmetry_loss(self, batch: Any) -> Tensor:
         """How far the policy is from its own mirror image; of an augmented batch, the forward pass is already made."""
@@ -349,22 +375,15 @@ class GraphedPPO(PPO):
         """The networks' and the optimizer's state, in the form that rsl-rl's own PPO writes."""
         content = super().save()
         if self.graphed:
-            state, groups = content["optimizer_state_dict"]["state"], content["optimizer_state_dict"]["param_groups"]
-            plain = {"lr": self.learning_rate, "fused": None, "capturable": False}
-            content["optimizer_state_dict"] = {
-                "state": {i: {**memory, "step": memory["step"].cpu()} for i, memory in state.items()},
-                "param_groups": [{**group, **plain} for group in groups],
-            }
+            rates = [self.learning_rate, *map(float, self._rates[1:])]
+            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], rates)
         return content
 
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Take over a checkpoint of this class or of rsl-rl's own PPO."""
         iteration = super().load(loaded_dict, load_cfg, strict)
         if self.graphed:
-            for group in self.optimizer.param_groups:  # Adam takes these from the file
-                group.update(lr=self._adam_rate, **self._adam_flags())
-            for memory in self.optimizer.state.values():
-                memory["step"] = memory["step"].to(self.device, torch.float32)
+            make_recordable(self.optimizer, self._rates, str(self.device))
             self._begin()  # Adam's memory has moved
         return iteration
 

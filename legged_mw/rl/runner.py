@@ -13,9 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from rsl_rl.algorithms import Distillation
 from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.runners import OnPolicyRunner
-from torch import Tensor
+from torch import Tensor, nn
 
 from legged_mw import ROOT
 from legged_mw.envs.divergence import Watch
@@ -23,11 +24,14 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.envs.wording import config_words
 from legged_mw.rl.classes import check_classes, network_section
+from legged_mw.rl.estimator import FIELD, EstimatingModel, actor_settings
+from legged_mw.rl.policies import acting
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import this_rank
 from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
 from legged_mw.rl.threads import UpdateThreads
+from legged_mw.rl.transfer import adapt
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
 
@@ -117,7 +121,9 @@ class Runner(OnPolicyRunner):
         self.logger.stop_logging_writer()
 
     def _anneal(self) -> None:
-        """Move what has an end value towards it, in a straight line from the first iteration to the last."""
+        """Move what has an end value towards it, in a straight line from the first iteration to the last; end a critic's warm-up."""
+        if isinstance(self.alg, GraphedPPO):
+            self.alg.learn_critic_only(self.current_learning_iteration < self.cfg.get("critic_warmup", 0))
         done = self.current_learning_iteration / max(self._last - 1, 1)
         for name, (begin, end) in self.cfg["anneal"].items():
             if end and begin is not None:
@@ -190,7 +196,7 @@ class Runner(OnPolicyRunner):
 
     def _action_std(self) -> Tensor:
         """Mean standard deviation of the actions of the last rollout, or of another distribution than a Gaussian as it is now, ()."""
-        policy, params = self.alg.get_policy(), self.alg.storage.distribution_params
+        policy, params = self.alg.get_policy(), getattr(self.alg.storage, "distribution_params", None)
         if isinstance(policy.distribution, GaussianDistribution) and params is not None:
             return params[1].mean()
         return policy.output_std.detach().mean()
@@ -240,9 +246,14 @@ class Runner(OnPolicyRunner):
 
     # ---- checkpoints ----------------------------------------------------------------------------------------------
 
+    def _networks(self) -> dict[str, nn.Module]:
+        """What a checkpoint holds, by rsl-rl's names: what acts, and what it learns with."""
+        names = ("student", "teacher") if isinstance(self.alg, Distillation) else ("actor", "critic")
+        return {name: getattr(self.alg, name) for name in names}
+
     def _save_checkpoint(self) -> None:
         """Write a checkpoint, unless the networks hold what is not finite: the newest one must be good to go on from."""
-        weights = [*self.alg.get_policy().parameters(), *self.alg.critic.parameters()]
+        weights = [weight for network in self._networks().values() for weight in network.parameters()]
         if not all(bool(weight.isfinite().all()) for weight in weights):
             print(f"WARNING: after iteration {self.current_learning_iteration} the networks are not finite; not saved", flush=True)
             return
@@ -262,13 +273,15 @@ class Runner(OnPolicyRunner):
     def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
         """Go on from a checkpoint: networks, normalisers, optimizer, learning rate, counters and random state."""
         content = load_tensors(Path(path), map_location or self.device)
-        check_fit(content["actor_state_dict"], self.alg.get_policy().state_dict(), Path(path), "actor")
-        if "optimizer_state_dict" not in content:
+        (first, actor), (second, other) = self._networks().items()
+        check_fit(content.get(f"{first}_state_dict", {}), actor.state_dict(), Path(path), first)
+        if not {f"{second}_state_dict", "optimizer_state_dict"} <= content.keys():
             raise ConfigError(f"{path} holds an actor only; it can be played, but not resumed")
-        check_fit(content["critic_state_dict"], self.alg.critic.state_dict(), Path(path), "critic")
+        check_fit(content[f"{second}_state_dict"], other.state_dict(), Path(path), second)
         if self.alg.load(content, load_cfg, strict):
             self.current_learning_iteration = content["iter"]
-        if self.alg.schedule == "fixed":  # the config's number, which the user may have changed; an adaptive rate goes on
+        # the config's number, which the user may have changed; an adaptive rate goes on
+        if getattr(self.alg, "schedule", "fixed") == "fixed":
             self.alg.learning_rate = self.cfg["algorithm"]["learning_rate"]
             for group in self.alg.optimizer.param_groups:
                 if not isinstance(group["lr"], Tensor):  # a recorded optimizer reads the algorithm's
@@ -285,26 +298,40 @@ class Runner(OnPolicyRunner):
         return infos
 
 
-def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, device: str) -> Runner:
-    """A runner over ``env`` from the learner's config; it writes below ``log_dir``, or nothing if that is None."""
+def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, device: str, teacher: RobotTaskCfgPPO | None = None) -> Runner:
+    """A runner over ``env`` from the learner's config; it writes below ``log_dir``, or nothing if that is None.
+
+    With a ``teacher``, of which this is the learner's config, it distils.
+    """
     torch.set_float32_matmul_precision(cfg.runner.matmul_precision)
     check_mirror(env, cfg)
     try:
-        return Runner(env, rsl_rl_config(cfg), str(log_dir) if log_dir else None, device)
+        settings = adapt(rsl_rl_config(cfg, env), cfg, acting(teacher, env) if teacher else None)
+        runner = Runner(env, settings, str(log_dir) if log_dir else None, device)
     except ValueError as error:  # a class, activation, optimizer or observation group that does not exist
         raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None
+    graphed = isinstance(runner.alg, GraphedPPO) and runner.alg.graphed
+    if settings["critic_warmup"] and not graphed:
+        raise ConfigError(f"warm_start.critic_warmup is {settings['critic_warmup']}, but only the recorded PPO knows it; set it to 0")
+    if isinstance(runner.alg.get_policy(), EstimatingModel) and not graphed:
+        raise ConfigError(f"{FIELD}: only the recorded update of GraphedPPO trains an estimator, and rsl-rl's own is used here")
+    return runner
 
 
 def check_mirror(env: RobotTask, cfg: RobotTaskCfgPPO) -> None:
     """Name what has no mirror image now, not after a rollout, if learning wants one. Raises ConfigError."""
-    if cfg.symmetry.use_data_augmentation or cfg.symmetry.use_mirror_loss:
+    if (cfg.symmetry.use_data_augmentation or cfg.symmetry.use_mirror_loss) and not cfg.distillation.teacher:
         _ = env.mirror
 
 
-def rsl_rl_config(cfg: RobotTaskCfgPPO) -> dict[str, Any]:
-    """The learner's config as rsl-rl's flat dict; a deep copy, since rsl-rl writes into it. Raises ConfigError."""
+def rsl_rl_config(cfg: RobotTaskCfgPPO, env: RobotTask | None = None) -> dict[str, Any]:
+    """The learner's config as rsl-rl's flat dict; a deep copy, since rsl-rl writes into it. Raises ConfigError.
+
+    ``env`` has the rows that ``actor.estimator`` names; without one there is no estimator.
+    """
     check_classes(cfg)
     sections = copy.deepcopy(cfg.to_dict())
+    sections["actor"] = actor_settings(sections, env)
     runner = sections.pop("runner")
     logger = runner["logger"]
     if logger == "wandb":

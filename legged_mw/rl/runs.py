@@ -124,7 +124,7 @@ def load_tensors(path: Path, device: str) -> dict[str, Any]:
         raise ConfigError(f"no checkpoint at {path}") from None
     except Exception:  # a zip, pickle or tensor error, by how the file is broken; torch's own advice is to load it unsafely
         raise ConfigError(f"{path} cannot be read as a checkpoint: it is damaged, or holds more than tensors and numbers") from None
-    if not isinstance(content, dict) or "actor_state_dict" not in content:
+    if not isinstance(content, dict) or not {"actor_state_dict", "student_state_dict"} & content.keys():
         raise ConfigError(f"{path} is not a checkpoint of this project: it has no actor_state_dict")
     return content
 

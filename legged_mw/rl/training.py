@@ -17,14 +17,18 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
+from rsl_rl.algorithms import Distillation
 
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import check_classes
+from legged_mw.rl.distillation import GraphedDistillation
+from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run, require_task
+from legged_mw.rl.transfer import TEACHER, begin_with, check_start, keep_teacher, load_teacher, seat_teacher
 from legged_mw.sim.engines import pick_engine
 from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
@@ -45,6 +49,8 @@ class Start(NamedTuple):
     experiment: Path  # folder for a new run
     run: Path | None = None  # the run to go on with
     checkpoint: Path | None = None
+    teacher: Trained | None = None  # the policy to distil
+    policy: Trained | None = None  # the policy whose actor a new run begins with
 
 
 def parse(description: str | None) -> argparse.Namespace:
@@ -53,6 +59,9 @@ def parse(description: str | None) -> argparse.Namespace:
     parser.add_argument("--max_iterations", type=positive, metavar="N", help="train until this iteration, resumed or not")
     parser.add_argument("--run_name", metavar="NAME", help="appended to the run folder's name")
     parser.add_argument("--resume", action="store_true", help="go on with the last run, or the one of --load_run")
+    source = "its run, checkpoint or export, or a task for its last or shipped policy"
+    parser.add_argument("--teacher", metavar="RUN", help=f"distil: learn to act like a policy that may see more; {source}")
+    parser.add_argument("--init", metavar="RUN", help="begin with the actor of another policy, named as a teacher is")
     parser.add_argument("--headless", action="store_true", help="accepted as in legged_gym; training never opens a window")
     parser.add_argument("--max_time", type=duration, metavar="T", help="end, after a checkpoint, after 90s, 5m, 1.5h ...")
     parser.add_argument("--list", action="store_true", help="show the tasks and exit")
@@ -65,6 +74,8 @@ def parse(description: str | None) -> argparse.Namespace:
         require_task(args, parser)
     if not args.resume and (args.load_run is not None or args.checkpoint != -1):
         parser.error("--load_run and --checkpoint say what to go on with: add --resume")
+    if args.resume and (args.teacher is not None or args.init is not None):
+        parser.error("--resume goes on with what a run began with: leave --teacher and --init out")
     args.deadline = time.time() + args.max_time if args.max_time else None
     quiet(this_rank())
     if not torch.cuda.is_available():
@@ -76,13 +87,17 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     """Give ``task`` its final config: the resumed run's, the user's, a CPU's. Returns what to begin with and the device."""
     start = _resume(task, args) if args.resume else None
     apply_overrides(task, args)
-    start = start or Start(experiment_folder(task))
+    start = _find_others(task, start or Start(experiment_folder(task)))
     rank = this_rank()
     device = pick_device(rank_device(rank, args.device))
-    if device == "cpu" and task.train.cpu.enable and not start.run:
+    if fitted := device == "cpu" and task.train.cpu.enable and not start.run:
         task.fit_cpu(usable_cores())
-        apply_overrides(task, args)  # again: what the user says wins
         print("on a CPU the section cpu sets worlds, networks and learner; flags win, --set cpu.enable=false keeps the task's own")
+    if start.policy:
+        task.update({"actor": start.policy.task.train.to_dict()["actor"]}, where="--init")
+    if fitted or start.policy:
+        apply_overrides(task, args)  # again: what the user says wins
+    _note_others(task, start)
     check_classes(task.train)
     check_values(task.cfg, task.train)
     if device != "cpu":
@@ -100,6 +115,26 @@ def _resume(task: LoadedTask, args: argparse.Namespace) -> Start:
     for section in task.update_from_run(load_yaml(config), where=shown(config)):
         print(f"{shown(config)} is older than the section {section}: left as it was then")
     return start
+
+
+def _find_others(task: LoadedTask, start: Start) -> Start:
+    """Add the teacher and the policy to begin with, where the config names them. A resumed run has its teacher beside it."""
+    asked, begin = task.train.distillation.teacher, task.train.warm_start.policy
+    if asked:
+        asked = str(start.run / TEACHER) if start.run else asked
+        start = start._replace(teacher=find_trained(asked, start.experiment, "--teacher"))
+    if begin and not start.run:
+        start = start._replace(policy=find_trained(begin, start.experiment, "--init"))
+    return start
+
+
+def _note_others(task: LoadedTask, start: Start) -> None:
+    """Say which policies they are, and write it into the config."""
+    for trained, section, field in ((start.teacher, "distillation", "teacher"), (start.policy, "warm_start", "policy")):
+        if trained and not start.run:
+            file = shown(trained.source.checkpoint)
+            task.update({section: {field: trained.task.name if trained.source.shipped else file}}, where="train")
+            print(f"{'teacher' if trained is start.teacher else 'begins with the actor of'}: {file}")
 
 
 def _announce(task: LoadedTask, device: str, rank: Rank) -> None:
@@ -121,12 +156,16 @@ def _announce(task: LoadedTask, device: str, rank: Rank) -> None:
     print(f"{cores} cores: {plan}", flush=True)
 
 
-def build(task: LoadedTask, device: str, eager: bool, check_recordable: Check) -> Any:
+def build(task: LoadedTask, start: Start, device: str, eager: bool, check_recordable: Check) -> Any:
     """The environment, if its step can be recorded and learning can work in it. With ``eager`` nothing is recorded."""
     if this_rank().leads and not eager:
         check_recordable(task)
     env = task.env_class(task.cfg, device, eager=eager)
     check_mirror(env, task.train)
+    if start.policy:
+        check_start(env, task, start.policy)
+    if start.teacher:
+        seat_teacher(env, start.teacher)
     for line in env.robot.overrides if this_rank().leads else ():
         if line.startswith("warning:"):
             print(line, flush=True)
@@ -140,7 +179,8 @@ def wants_exam(task: LoadedTask) -> bool:
 
 def train(task: LoadedTask, env: RobotTask, start: Start, examine: Examine | None, export: Export, deadline: float | None = None) -> None:
     """Train from ``start`` to the last iteration or until stopped (at ``deadline`` [s], a time of the clock), then export."""
-    rank, runner = this_rank(), make_runner(env, task.train, None, str(env.device))
+    teacher = start.teacher.task.train if start.teacher else None
+    rank, runner = this_rank(), make_runner(env, task.train, None, str(env.device), teacher)
     runner.examine = examine
     left = _load(runner, task, start)
     _stop_on_signals(runner, deadline)
@@ -160,6 +200,8 @@ def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
     if start.checkpoint:
         runner.load(str(start.checkpoint))
         print(f"resuming {shown(start.checkpoint)}")
+    else:
+        _begin(runner, start)
     done, wanted = runner.current_learning_iteration, task.train.runner.max_iterations
     if done >= wanted:
         what = shown(start.checkpoint or start.experiment)
@@ -167,11 +209,25 @@ def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
     return wanted - done
 
 
+def _begin(runner: Runner, start: Start) -> None:
+    """Give the networks of a new run what another one has learned."""
+    if start.teacher:
+        assert isinstance(runner.alg, Distillation)
+        load_teacher(runner.alg.teacher, start.teacher, runner.env)
+        runner.alg.teacher_loaded = True
+    if start.policy:
+        begin_with(runner.alg.get_policy(), start.policy)
+        if warmup := runner.cfg["critic_warmup"]:
+            print(f"the critic learns alone for {warmup} iterations (warm_start.critic_warmup)", flush=True)
+
+
 def _open_run(runner: Runner, task: LoadedTask, start: Start) -> Path:
     """The folder that this training writes to, with the config in it; an earlier checkpoint begins a folder of its own."""
     newest = start.run is not None and start.checkpoint == find_checkpoint(start.run, -1)
     folder = start.run if start.run and newest else new_run(start.experiment, task.train.runner.run_name)
     save_yaml(folder / CONFIG_FILE, task.to_dict())
+    if start.teacher:
+        keep_teacher(start.teacher, folder)
     runner.logger.log_dir = str(folder)
     print(f"writing to {shown(folder)}", flush=True)
     return folder
@@ -181,7 +237,7 @@ def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
     """Learn; if another rank is lost on the way, say so in a line."""
     try:
         runner.learn(iterations)
-        if isinstance(runner.alg, GraphedPPO):
+        if isinstance(runner.alg, GraphedPPO | GraphedDistillation):
             runner.alg.release()
     except RuntimeError as error:
         lost = r"(closed|reset|aborted) by|connection (was )?(closed|reset|refused)|remote process|remoteerror"

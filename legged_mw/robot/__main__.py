@@ -6,6 +6,7 @@ import argparse
 import copy
 import shlex
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -56,6 +57,9 @@ def task_page(task: LoadedTask, image: Path | None) -> str:
     one = copy.deepcopy(task)
     one.set("env.num_envs", 1)
     one.set("sim.engine", "mujoco")
+    one.set("control.actuator", "servo")  # what the page is about: gains, and what a simulation step makes of them
+    on_servos: type[Any] = type(one.env_class.__name__, (one.env_class,), {"_compute_torques": RobotTask._compute_torques})
+    one.env_class = on_servos
     if isinstance(one.cfg.to_dict()["terrain"].get("mesh_type"), str):
         one.set("terrain.mesh_type", "plane")
     return env_page(one.env_class(one.cfg, "cpu"), task.name, image)

@@ -21,6 +21,7 @@ from legged_mw.sim.pose import posed
 # ours: the knee's angle about the axis to the left [rad]; a quadruped leans its thighs back (Go1 0.9 and -1.8), a biped forwards
 KNEE = {2: 0.6}
 KNEE_ELSE = -1.6
+WALKS, ANKLE, HELD = 0.02, 0.05, 0.5  # as configs/g1_flat.py has them
 _SIDEWAYS = 0.9  # |y| of a joint's axis
 _BEHIND = 0.03  # [m] a foot so far behind the knee belongs to a leg that bends the other way (ANYmal's hind legs)
 _MARGIN = 0.05  # [rad] from the end of a range
@@ -44,6 +45,20 @@ def bent(robot: RobotModel, pose: NDArray[np.float64], feet: Sequence[Foot]) -> 
             leaning = found[hip - 1] * signs[0] + found[knee - 1] * signs[1]
             found[joint - 1] = _within(model, joint, -sign * leaning)
     return found
+
+
+def pose_weights(robot: RobotModel, pose: Sequence[float], feet: Sequence[Foot]) -> list[float]:
+    """(D,) How near the default pose a biped's joints are to stay: hip and knee free to walk, ankles nearly, all others not."""
+    model, data = robot.physics, posed(robot.physics, pose)
+    weights = [HELD] * len(robot.joint_names)
+    for foot in feet:
+        legs = _joints_to(model, foot)
+        sideways = [joint for joint in legs if abs(data.xaxis[joint][1]) > _SIDEWAYS]
+        for joint in sideways[:2]:
+            weights[joint - 1] = WALKS
+        for joint in legs[legs.index(sideways[1]) + 1 :] if len(sideways) > 1 else ():
+            weights[joint - 1] = ANKLE
+    return weights
 
 
 def _forward(data: mujoco.MjData, model: mujoco.MjModel, knee: int, foot: Foot) -> float:

@@ -14,17 +14,18 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.robot.crouch import bent
+from legged_mw.envs.sim_to_real_config import BipedCfg, BipedCfgPPO
+from legged_mw.robot.crouch import bent, pose_weights
 from legged_mw.robot.feet import Foot, guess_feet
 from legged_mw.robot.measure import Joint, mass_matrices, stand_as_statue, what_joints_bear
-from legged_mw.robot.suggest import Gains, family, suggest
+from legged_mw.robot.suggest import Gains, suggest
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.pose import standing_height
-from legged_mw.sim.tables import per_joint
+from legged_mw.sim.pose import posed, standing_height
+from legged_mw.sim.tables import family, per_joint
 from legged_mw.sim.vendor import read_robot
 from legged_mw.utils.config import ConfigError
 
@@ -86,10 +87,15 @@ def _bare(file: Path, keyframe: bool) -> RobotTask:
 
 def as_env(found: Draft, file: Path) -> LeggedRobot:
     """One world of the task that the draft would be."""
-    cfg = LeggedRobotCfg()
+    cfg = parents(found)[0]()
     cfg.update({"env": {"num_envs": 1}, "sim": {"engine": "mujoco"}, **values(found)}, where="the health page")
     cfg.asset.file = str(file.resolve())
     return LeggedRobot(cfg, "cpu")
+
+
+def parents(found: Draft) -> tuple[type[LeggedRobotCfg], type[LeggedRobotCfgPPO]]:
+    """What the task subclasses."""
+    return (BipedCfg, BipedCfgPPO) if len(found.feet) == 2 else (LeggedRobotCfg, LeggedRobotCfgPPO)
 
 
 def has_mirror(env: LeggedRobot) -> bool:
@@ -102,16 +108,13 @@ def has_mirror(env: LeggedRobot) -> bool:
 
 def values(found: Draft) -> dict[str, dict[str, Any]]:
     """Section -> field -> value."""
-    names, two, height = found.robot.joint_names, len(found.feet) == 2, found.place[2]
+    names, height = found.robot.joint_names, found.place[2]
     asset: dict[str, Any] = {"foot_names": [foot.name for foot in found.feet]}
     if parts := {foot.name: list(foot.geoms) for foot in found.feet if not foot.known}:
         asset["foot_geoms"] = parts
     if said := {name: speed for name, speed in zip(names, found.robot.speed_limits, strict=True) if math.isfinite(speed)}:
         asset["joint_speed_limits"] = table([*said.values()], names) if len(said) == len(names) else said
     asset["colliders"] = [name for foot in found.feet for name in ([foot.name] if foot.known else foot.geoms)]
-    ranges = {"lin_vel_x": [-0.5, 0.8], "lin_vel_y": [-0.3, 0.3], "ang_vel_yaw": [-0.5, 0.5]}
-    if not two:
-        ranges = {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_yaw": [-1.0, 1.0]}
     chosen: dict[str, dict[str, Any]] = {
         "asset": asset,
         "init_state": {"pos": found.place, "default_joint_angles": table(found.pose, names)},
@@ -120,16 +123,33 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
             "damping": table([gain.kd for gain in found.gains], names),
             "action_scale": 0.5,
         },
-        "commands": {"ranges": ranges},
+        "commands": {"ranges": {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_yaw": [-1.0, 1.0]}},
         "termination": {"min_base_height": round(0.5 * height, 2)},
-        "perturbation": {"kick": True, "velocity": [0.0, 4.0 if two else 8.0]},
     }
-    if height < LOW:
-        chosen["rewards"] = {"swing_height": round(0.3 * height, 2)}
-    if two:
-        chosen["rewards"] = {**chosen.get("rewards", {}), "scales": {"single_stance": 0.75}}
-        chosen["sim"] = {"iterations": 3}
-    return chosen
+    low = {"swing_height": round(0.3 * height, 2)} if height < LOW else {}
+    if len(found.feet) == 2:
+        return {**chosen, **_of_a_biped(found, low)}
+    return {**chosen, "perturbation": {"kick": True, "velocity": [0.0, 8.0]}, **({"rewards": low} if low else {})}
+
+
+def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """What else a task for two feet states: where BipedCfg's numbers are a G1's, and what a beginner on a few cores does without."""
+    robot, mass = found.robot, float(found.robot.physics.body_subtreemass[0])
+    data = posed(robot.physics, found.pose)
+    left, right = (data.geom_xpos[[robot.id("geom", name) for name in foot.geoms]].mean(axis=0) for foot in found.feet)
+    return {
+        "commands": {"ranges": {"lin_vel_x": [-0.5, 0.8], "lin_vel_y": [-0.3, 0.3], "ang_vel_yaw": [-0.5, 0.5]}},
+        "observations": {"leave_out": {}},
+        "domain_rand": {"enable": False, "base_mass": [round(share * mass, 2) for share in (-0.03, 0.06)]},
+        "perturbation": {"push": False, "velocity": [0.0, 4.0]},
+        "rewards": {
+            **low,
+            "min_feet_distance": round(0.67 * abs(float(left[1] - right[1])), 2),
+            "pose_weights": table(pose_weights(robot, found.pose, found.feet), robot.joint_names),
+            "scales": {"contact_phase": 1.0, "no_fly": 0.5},
+        },
+        "sim": {"iterations": 3},
+    }
 
 
 def table(numbers: Sequence[float], names: Sequence[str]) -> dict[str, float]:

@@ -10,7 +10,7 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
-from legged_mw.robot.draft import Draft, values
+from legged_mw.robot.draft import Draft, parents, values
 from legged_mw.robot.plain import as_mjcf, stands_alone
 from legged_mw.utils.errors import UserError, shown
 
@@ -19,11 +19,11 @@ WIDTH = 140  # [columns] of a line of the config
 _HEAD = '''"""{title} ({legs}, {joints} joints; {file}) follows a joystick on flat ground. Check what is marked LOOK."""
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from {module} import {cfg}, {train}
 from legged_mw.utils.task import Task
 
 
-class {name}FlatCfg(LeggedRobotCfg):
+class {name}FlatCfg({cfg}):
 '''
 _COMMENTS = {
     "foot_names": "LOOK: guessed",
@@ -41,7 +41,13 @@ _COMMENTS = {
     "swing_height": "[m] of a swinging foot",
     "kick": "without kicks a push topples it [ours: docs/lab.md]",
     "velocity": "[m/s]",
-    "single_stance": "a biped that steps stands on one foot at a time [Isaac Lab: G1]",
+    "leave_out": "the policy is told its velocity; for a real robot leave this out",
+    "enable": "worlds are alike; likewise",
+    "base_mass": "[kg] more or less of it",
+    "push": "kicks alone; likewise",
+    "min_feet_distance": "[m] between the feet, sideways: less is punished",
+    "pose_weights": "how near the default pose each joint is to stay",
+    "contact_phase": "one foot after the other; without it and no_fly a beginner hops [ours: docs/lab.md]",
     "iterations": "a biped's soles want more than 1 [ours]",
 }
 
@@ -78,26 +84,32 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
     feet = len(found.feet)
     legs = {2: "biped", 4: "quadruped"}.get(feet, f"{feet} feet")
     title = "".join(part.capitalize() for part in name.split("_"))
-    lines = [_HEAD.format(title=name, joints=len(found.joints), legs=legs, file=file.name, name=title).rstrip("\n")]
+    base, train = (parent.__name__ for parent in parents(found))
+    names = {"module": parents(found)[0].__module__, "cfg": base, "train": train}
+    lines = [_HEAD.format(title=name, joints=len(found.joints), legs=legs, file=file.name, name=title, **names).rstrip("\n")]
     sections = values(found)
     sections["asset"] = {"file": f"{name}.xml", **sections["asset"]}
     comments = {**_COMMENTS, "default_joint_angles": f"[rad] LOOK: {found.pose_from}"}
     for section, fields in sections.items():
-        lines += [f"    class {section}(LeggedRobotCfg.{section}):"]
+        lines += [f"    class {section}({base}.{section}):"]
         for field, value in fields.items():
             if field in ("ranges", "scales"):
                 lines += [""] * (field != next(iter(fields)))
-                lines += [f"        class {field}(LeggedRobotCfg.{section}.{field}):"]
+                lines += [f"        class {field}({base}.{section}.{field}):"]
                 lines += [line for inner, span in value.items() for line in _field(inner, span, comments.get(inner, ""), 12)]
             else:
                 lines += _field(field, value, comments.get(field, ""), 8)
         if section == "asset":
             lines += _force_limits(found)
         lines.append("")
-    lines += ["", f"class {title}FlatCfgPPO(LeggedRobotCfgPPO):"]
-    lines += ["    class runner(LeggedRobotCfgPPO.runner):", "        max_iterations = 1500"]
-    if mirrors:
-        lines += ["", "    class symmetry(LeggedRobotCfgPPO.symmetry):", "        use_data_augmentation = True  # left and right are alike"]
+    lines += ["", f"class {title}FlatCfgPPO({train}):"]
+    lines += [f"    class runner({train}.runner):", "        max_iterations = 1500"]
+    if feet == 2:
+        lines += ["", f"    class actor({train}.actor):", f"        class distribution_cfg({train}.actor.distribution_cfg):"]
+        lines += ["            init_std = 0.6  # at 1.0 it does not learn to follow on a few cores [ours: docs/lab.md]"]
+    if mirrors != parents(found)[1].symmetry.use_data_augmentation:
+        comment = f"left and right are {'alike' if mirrors else 'not alike'}"
+        lines += ["", f"    class symmetry({train}.symmetry):", f"        use_data_augmentation = {mirrors}  # {comment}"]
     lines += ["", ""]
     return "\n".join([*lines, f"TASK = Task(LeggedRobot, {title}FlatCfg, {title}FlatCfgPPO)", ""])
 

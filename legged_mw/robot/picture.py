@@ -16,9 +16,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.robot.suggest import family
-from legged_mw.sim.drawing import visual_spec
+from legged_mw.drawing.scene import visual_spec
 from legged_mw.sim.model import RobotModel
+from legged_mw.sim.tables import family
 from legged_mw.view.feet import patch
 from legged_mw.view.posed_robot import GROUPS_SHOWN, PosedRobots
 from legged_mw.view.recorder import no_context

@@ -15,14 +15,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from legged_mw.robot.measure import Joint
+from legged_mw.sim.tables import family
 
 FULL_EFFORT_AT = 1.0  # [rad]
 LOAD, SAG = 2.0, 0.4  # times the torque at rest, held within so much [rad]
 SWING = 2.0  # [Hz]
 DAMPING_TIME = 0.025  # [s] kd / kp
 MOST = 0.5  # of dt sqrt(kp / I) and of dt kd / I
-_NO_KIND = {"joint", "l", "r", "left", "right", "fl", "fr", "rl", "rr", "lf", "rf", "lh", "rh", "hl", "hr", "bl", "br"}
-_NO_KIND |= {"front", "rear", "hind", "back"}
 
 
 class Gains(NamedTuple):
@@ -45,11 +44,6 @@ def suggest(joints: Sequence[Joint], dt: float) -> list[Gains]:
         kd, most_kd = DAMPING_TIME * _round(cut_kp), min(MOST * most[i] for i in alike)
         gains.append(Gains(_round(cut_kp), _round(min(kd, most_kd)), kp > most_kp or kd > most_kd))
     return gains
-
-
-def family(name: str) -> str:
-    """A joint's name without its side and the word joint: "hip" of "FR_hip_joint"; the whole name, if nothing is left."""
-    return "_".join(part for part in name.split("_") if part.lower() not in _NO_KIND) or name
 
 
 def _wanted(joint: Joint) -> float:

@@ -11,11 +11,12 @@ import mujoco
 import numpy as np
 
 from legged_mw.sim.rigid import hold_joints, match_joints
-from legged_mw.sim.servos import Range, add_servos, set_efforts, set_joints
+from legged_mw.sim.servos import Drive, Motor, Range, add_motors, set_efforts, set_joints
 from legged_mw.sim.tables import per_joint_all, some_joints
 from legged_mw.sim.vendor import Loaded
 
 _BEYOND = 1e-3  # [rad] that a pose may be beyond a range by rounding
+CURVE = ("`stall_torque`", "`no_load_speed`")  # tables of motors with a torque-speed curve, before a "`gear`": [N m], [rad/s]
 PARTIAL = ("effort", "armature", "frictionloss", "joint_speed_limits")  # tables that need not name every joint
 
 
@@ -28,7 +29,7 @@ class Posed:
     held: list[str]
     angles: list[float]  # D, the pose [rad]
     ranges: list[Range]  # D [rad]; infinite where there is no limit
-    tables: dict[str, list[float]]  # D each: "`stiffness`" [N m/rad], "`damping`" [N m s/rad], and what else the caller asked for
+    tables: dict[str, list[float]]  # D each: "`stiffness`" [N m/rad], "`damping`" [N m s/rad], CURVE at the joint, what else was asked
 
 
 def pose_joints(robot: Loaded, tables: Mapping[str, Mapping[str, float]], pose: Mapping[str, float] | None, held: Sequence[str]) -> Posed:
@@ -55,6 +56,9 @@ def pose_joints(robot: Loaded, tables: Mapping[str, Mapping[str, float]], pose: 
     for name, angle, (low, high) in zip(moving, angles, ranges, strict=True):
         if pose is not None and not low - _BEYOND <= angle <= high + _BEYOND:
             robot.notes.append(f"warning: `pose`: {name} stands at {angle:g} rad, beyond its range from {low:g} to {high:g} rad")
+    for name, gear in zip(CURVE, (1.0, -1.0), strict=True):  # a motor's torque grows by its gear, its speed shrinks
+        if name in values and "`gear`" in values:
+            values[name] = [value * ratio**gear for value, ratio in zip(values[name], values["`gear`"], strict=True)]
     return Posed(model, moving, welded, angles, ranges, values)
 
 
@@ -63,15 +67,15 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> list[Range]:
     return [(float(j.range[0]), float(j.range[1])) if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in each]
 
 
-def set_machine(robot: Loaded, partial: Mapping[str, Mapping[str, float]], posed: Posed) -> tuple[float, ...]:
-    """Servos with their force limits, armature and dry friction; what ``partial`` (of PARTIAL) says wins over the file.
+def set_machine(robot: Loaded, partial: Mapping[str, Mapping[str, float]], posed: Posed, drive: Drive) -> tuple[float, ...]:
+    """Motors with their force limits, armature and dry friction; what ``partial`` (of PARTIAL) says wins over the file.
 
     Returns the speed limits (D,) [rad/s], infinite where nothing states one.
     """
     said = {what: some_joints(partial.get(what, {}), posed.joints, f"`{what}`", posed.held) for what in PARTIAL}
     set_efforts(robot.limits, said["effort"], robot.notes)
     set_joints(robot.joints, said["armature"], said["frictionloss"], robot.notes)
-    gains, dampings = posed.tables["`stiffness`"], posed.tables["`damping`"]
-    add_servos(robot.spec, robot.joints, posed.ranges, gains, dampings, robot.limits, robot.notes)
-    speeds = robot.speeds | said["joint_speed_limits"]
+    motors = map(Motor, *(posed.tables[name] for name in ("`stiffness`", "`damping`", *CURVE) if name in posed.tables))
+    add_motors(robot.spec, robot.joints, posed.ranges, list(motors), drive, robot.limits, robot.notes)
+    speeds = robot.speeds | dict(zip(posed.joints, posed.tables.get(CURVE[1], ()), strict=False)) | said["joint_speed_limits"]
     return tuple(speeds.get(name, np.inf) for name in posed.joints)

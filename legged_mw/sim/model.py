@@ -23,6 +23,7 @@ from legged_mw.sim.names import Names, name_geoms
 from legged_mw.sim.rigid import fuse_fixed, sensed_site
 from legged_mw.sim.self_contact import leave_out_neighbours
 from legged_mw.sim.sensors import add_more_sensors, add_sensors, sensor_spans
+from legged_mw.sim.servos import Drive
 from legged_mw.sim.shapes import add_sites
 from legged_mw.sim.tables import per_joint as per_joint
 from legged_mw.sim.terrain import Terrain
@@ -111,6 +112,7 @@ def build_model(
     held_joints: Sequence[str] = (),  # names or patterns: welded at the pose
     partial: Mapping[str, Mapping[str, float]] | None = None,  # of PARTIAL, as for some_joints: what the caller knows better than the file
     more_sensors: Collection[str] = (),  # names of sensors.py: what else is sensed
+    drive: Drive = "angle",  # what `ctrl` means; with joints.CURVE in `tables` motors have torque-speed curves
 ) -> RobotModel:
     """Compile the MJCF or URDF at ``file`` for stepping."""
     robot = read_robot(file)
@@ -125,7 +127,7 @@ def build_model(
         _set_collisions(spec, names.find(colliders, "`colliders`", colliding=True), self_collisions, notes)
         if self_collisions:
             leave_out_neighbours(spec, posed.joints, posed.angles, notes)
-        speeds = set_machine(robot, partial or {}, posed)
+        speeds = set_machine(robot, partial or {}, posed, drive)
         made = {name: names.find(geoms, f"`sites`: '{name}'") for name, geoms in (sites or {}).items()}
         add_sites(spec, made, posed.angles, robot.where, notes)
         touching = names.find(contact_geoms, "`contact_geoms`")

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import copy
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -53,7 +53,12 @@ class MujocoSimulation(Simulation):
         self._failed, self._reason = np.zeros(num_envs, dtype=bool), ""  # worlds that MuJoCo ever refused to step
         self._qpos0 = torch.tensor(model.qpos0, dtype=torch.float)
 
-    def step(self, substeps: int = 1) -> None:
+    def step(self, substeps: int = 1, before: Callable[[int], None] | None = None) -> None:
+        if before is not None:  # between substeps the state is float32, as for who reads it
+            for i in range(substeps):
+                before(i)
+                self.step()
+            return
         for tensor, rows in self._into:
             rows.copy_(tensor)
         self._write_fields()
@@ -80,6 +85,9 @@ class MujocoSimulation(Simulation):
     def set_constants(self) -> None:
         self._write_fields()
         self._batch.set_const()
+
+    def actuator_velocity(self) -> Tensor:
+        return _tensor(self._batch.bind("actuator_velocity"))
 
     def overflowed_worlds(self) -> Tensor:
         return torch.tensor(float((self._failed | self._full()).sum()))

@@ -1,4 +1,4 @@
-"""A position servo a joint in place of the file's actuators: gains are the caller's, force limits the machine's."""
+"""A motor a joint in place of the file's actuators: its law and gains are the caller's, its force limits the machine's."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -6,12 +6,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
 
 Range = tuple[float, float]
+Drive = Literal["angle", "torque"]  # what ctrl is: an angle that the motor turns to [rad], or its torque [N m]
 _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+_INPUTS = {"angle": 1, "torque": 4}  # of a DC motor: bits "pos" and "ff" of its input signature
 _NEVER, _ALWAYS = mujoco.mjtLimited.mjLIMITED_FALSE, mujoco.mjtLimited.mjLIMITED_TRUE
 
 
@@ -23,7 +26,7 @@ def take_limits(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, Range]:
     """
     limits = {j.name: (j.actfrcrange[0], j.actfrcrange[1]) for j in spec.joints if _limited(j.actfrclimited, j.actfrcrange)}
     if actuators := list(spec.actuators):
-        notes.append(f"{len(actuators)} actuator{'s' * (len(actuators) > 1)} replaced by position servos")
+        notes.append(f"{len(actuators)} actuator{'s' * (len(actuators) > 1)} replaced")
     for actuator in actuators:
         if actuator.trntype in _JOINTS and actuator.target not in limits:
             force = _force(actuator)
@@ -47,30 +50,61 @@ def _force(actuator: mujoco.MjsActuator) -> np.ndarray | None:
     return None
 
 
-def add_servos(
+class Motor(NamedTuple):
+    """What drives one joint; both speed and torques are the joint's, behind the gear."""
+
+    stiffness: float  # [N m/rad] of a motor that is driven by an angle
+    damping: float  # [N m s/rad] of a servo: in the joint; of a motor with a curve that is driven by an angle: in its law, under its limits
+    stall_torque: float = 0.0  # [N m] that it gives at rest
+    no_load_speed: float = 0.0  # [rad/s] at which it gives none; 0: it has no torque-speed curve
+
+    def add_to(self, spec: mujoco.MjSpec, joint: mujoco.MjsJoint, drive: Drive) -> mujoco.MjsActuator:
+        """The actuator: MuJoCo's DC motor at a supply of 1 V where there is a curve, else its position servo or its plain motor."""
+        motor = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+        if self.no_load_speed:
+            gains = (self.stiffness, self.damping) if drive == "angle" else (0.0, 0.0)
+            motor.set_to_dcmotor(
+                motorconst=[0.0, 0.0],
+                resistance=0.0,
+                nominal=[1.0, self.stall_torque, self.no_load_speed],
+                controller=[gains[0], 0.0, gains[1], 0.0, 0.0, 1.0],
+                ctrlspec=_INPUTS[drive],
+            )
+        elif drive == "angle":
+            motor.set_to_position(self.stiffness)
+        else:
+            motor.set_to_motor()
+        return motor
+
+
+def add_motors(
     spec: mujoco.MjSpec,
     joints: Sequence[mujoco.MjsJoint],
     angles: Sequence[Range],  # where each joint may be [rad]; infinite: anywhere
-    gains: Sequence[float],  # [N m/rad]
-    dampings: Sequence[float],  # [N m s/rad]
+    motors: Sequence[Motor],
+    drive: Drive,
     limits: Mapping[str, Range],  # joint -> force [N m]
     notes: list[str],
 ) -> None:
-    """One position servo a joint, clamped to the joint's range and to its force limit."""
-    for joint, (low, high), kp, kd in zip(joints, angles, gains, dampings, strict=True):
+    """One motor a joint, held to its force limit, and to the joint's range if an angle drives it."""
+    for joint, (low, high), motor in zip(joints, angles, motors, strict=True):
+        kp, kd, stall, speed = motor
+        passive = kd if drive == "angle" and not speed else 0.0
         old = float(np.atleast_1d(joint.damping)[0])
-        if old != kd:
-            notes.append(f"{joint.name} damping: {old:g} -> {kd:g} N m s/rad")
-        joint.damping = np.array([kd, *np.atleast_1d(joint.damping)[1:]]) if np.ndim(joint.damping) else kd
-        servo = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        servo.set_to_position(kp)
-        notes.append(f"{joint.name} servo: kp {kp:g} N m/rad")
-        if math.isfinite(low) and math.isfinite(high):
+        if old != passive:
+            notes.append(f"{joint.name} damping: {old:g} -> {passive:g} N m s/rad")
+        joint.damping = np.array([passive, *np.atleast_1d(joint.damping)[1:]]) if np.ndim(joint.damping) else passive
+        servo = motor.add_to(spec, joint, drive)
+        law = f"kp {kp:g} N m/rad" + (f", kd {kd:g} N m s/rad" if passive != kd else "") if drive == "angle" else "a torque"
+        curve = f", {stall:g} N m at rest, none at {speed:g} rad/s" if speed else ""
+        notes.append(f"{joint.name} {'motor' if speed or drive == 'torque' else 'servo'}: {law}{curve}")
+        if drive == "angle" and math.isfinite(low) and math.isfinite(high):
             servo.ctrllimited, servo.ctrlrange = True, [low, high]
-        if joint.name in limits:  # on the servo and not on the joint, so that actuator_force is the clamped force
+        if joint.name in limits:  # on the motor and not on the joint, so that actuator_force is the clamped force
             servo.forcelimited, servo.forcerange = True, list(limits[joint.name])
             joint.actfrclimited, joint.actfrcrange = False, [0.0, 0.0]
-    if endless := [joint.name for joint in joints if joint.name not in limits]:
+    endless = [joint.name for joint, motor in zip(joints, motors, strict=True) if joint.name not in limits and not motor.no_load_speed]
+    if endless:
         notes.append(f"warning: nothing limits the force of {', '.join(endless)}: these servos are stronger than any motor; set `effort`")
 
 

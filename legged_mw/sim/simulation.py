@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 
 from torch import Tensor
 
@@ -28,7 +29,7 @@ class Simulation(ABC):
 
     qpos: Tensor  # (N, nq) root position [m, world], quaternion wxyz, joint angles [rad]
     qvel: Tensor  # (N, nv) root linear [m/s, world], root angular [rad/s, body], joints [rad/s]
-    ctrl: Tensor  # (N, nu) servo targets [rad]
+    ctrl: Tensor  # (N, nu) servo targets [rad], or torques of motors that take those [N m]
     sensordata: Tensor  # (N, nsensordata) of the last substep
     actuator_force: Tensor  # (N, nu) [N m], clamped, of the last substep
     site_xpos: Tensor  # (N, nsite, 3) [m, world], of the last substep
@@ -38,8 +39,18 @@ class Simulation(ABC):
     _fields: dict[str, Tensor]  # of ``world_fields``
 
     @abstractmethod
-    def step(self, substeps: int = 1) -> None:
-        """Advance every world by ``substeps`` time steps, with ``ctrl`` and ``xfrc_applied`` as they stand."""
+    def step(self, substeps: int = 1, before: Callable[[int], None] | None = None) -> None:
+        """Advance every world by ``substeps`` time steps, with ``ctrl`` and ``xfrc_applied`` as they stand.
+
+        ``before(k)`` is called before substep k, with the state current, and may write ``ctrl``; on a GPU it must be recordable.
+        """
+
+    @abstractmethod
+    def actuator_velocity(self) -> Tensor:
+        """(N, nu) speed [rad/s] that went into ``actuator_force``: of the same moment. Not for inside a recorded step.
+
+        Ask for it before the steps that it is wanted of: MuJoCo's own engine fills it from then on.
+        """
 
     @abstractmethod
     def reset(self, mask: Tensor) -> None:

@@ -7,6 +7,9 @@ from collections.abc import Mapping, Sequence
 from legged_mw.sim.errors import ModelError
 from legged_mw.utils.errors import unknown
 
+_NO_KIND = {"joint", "l", "r", "left", "right", "fl", "fr", "rl", "rr", "lf", "rf", "lh", "rh", "hl", "hr", "bl", "br"}
+_NO_KIND |= {"front", "rear", "hind", "back"}
+
 
 def some_joints(table: Mapping[str, float], joints: Sequence[str], what: str, spare: Sequence[str] = ()) -> dict[str, float]:
     """Joint -> value, of those ``joints`` that a key fits: a key fits if it is the joint's name or a part of it.
@@ -49,3 +52,8 @@ def per_joint_all(tables: Mapping[str, Mapping[str, float]], joints: Sequence[st
     if wrong:
         raise ModelError("; ".join(wrong))
     return values
+
+
+def family(name: str) -> str:
+    """A joint's name without its side and the word joint: "hip" of "FR_hip_joint"; the whole name, if nothing is left."""
+    return "_".join(part for part in name.split("_") if part.lower() not in _NO_KIND) or name

@@ -28,6 +28,7 @@ _ADDED = {  # what a default may say of what is added to the robot
     "site": "type size group rgba material",
     "actuator": "gaintype gainprm biastype biasprm dyntype dynprm gear ctrllimited ctrlrange forcelimited forcerange actlimited actrange",
 }
+_UPRIGHT = 0.5  # [degrees] of tilt that are rounding
 _KEPT_SENSORS = ("TOUCH", "FORCE", "TORQUE", "RANGEFINDER", "CONTACT", "GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "USER", "PLUGIN", "TACTILE")
 
 
@@ -36,7 +37,7 @@ class Keyframe:
     """A pose that the file holds."""
 
     name: str
-    height: float | None  # of the root [m]; None: the file has no free joint
+    height: float | None  # of the upright root [m]; None: the file has no free joint, or tilts it
     angles: dict[str, float]  # joint -> [rad]
 
 
@@ -112,8 +113,13 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
     if chosen and len(qpos) == starts[-1]:
         angles = {joint.name: qpos[start] for joint, start in zip(spec.joints, starts[:-1], strict=True) if joint.type in _SCALAR_JOINTS}
         first = next(iter(spec.joints), None)
-        taken = Keyframe(chosen.name, qpos[2] if first and first.type == _FREE else None, angles)
+        free = bool(first and first.type == _FREE)
+        tilt = _tilt(qpos[3:7]) if free else 0.0
+        taken = Keyframe(chosen.name, qpos[2] if free and tilt < _UPRIGHT else None, angles)
         notes.append(f"keyframe '{chosen.name}' read: pose and height of the root, where nothing else states them")
+        if tilt > _UPRIGHT:
+            text = f"warning: keyframe '{chosen.name}' tilts the root by {tilt:.0f} degrees; that and its height are not read, the root "
+            notes.append(f"{text}begins upright: state a pose for that by `pose`")
     for key in keys:
         if key is not chosen:
             notes.append(f"keyframe '{key.name}' dropped")
@@ -122,6 +128,12 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
         spec.delete(key)
     spec.nkey = 0
     return taken
+
+
+def _tilt(quat: list[float]) -> float:
+    """Between the root's z axis and the vertical [degrees]; ``quat`` wxyz."""
+    w, x, y, z = np.array(quat) / (np.linalg.norm(quat) or 1.0)
+    return float(np.degrees(np.arccos(np.clip(w * w - x * x - y * y + z * z, -1.0, 1.0))))
 
 
 def _drop_sensors(spec: mujoco.MjSpec, notes: list[str]) -> None:

@@ -53,6 +53,7 @@ def apply_overrides(task: LoadedTask, args: argparse.Namespace) -> None:
             raise ConfigError(f"--set {item}: write it as path=value, e.g. rewards.scales.torques=-1e-4")
         task.set(path.strip(), value.strip(), where=f"--set {item}")
     flags = {"num_envs": "env.num_envs", "seed": "seed", "engine": "sim.engine"}
+    flags |= {"teacher": "distillation.teacher", "init": "warm_start.policy"}
     flags |= {name: f"runner.{name}" for name in ("max_iterations", "experiment_name", "run_name")}
     for flag, path in flags.items():
         value = getattr(args, flag, None)

@@ -10,10 +10,11 @@ from numpy.typing import ArrayLike
 from tensordict import TensorDict
 from torch import Tensor
 
+from legged_mw.drawing.scene import visual_spec
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.estimator import believed_velocity
 from legged_mw.rl.recurrent import forget
-from legged_mw.sim.drawing import visual_spec
 from legged_mw.sim.terrain import name_tile
 from legged_mw.utils.commands import Command
 from legged_mw.view.stage import BoolArray, FloatArray
@@ -38,6 +39,7 @@ class EnvStage:
         geoms = len({geom for geoms in env.foot_geoms.values() for geom in geoms}) if isinstance(env, LeggedRobot) else 0
         self._foot_contacts = env.contact_count[:, :geoms]
         self._obs = env.get_observations()
+        self._believed: Tensor | None = None  # vx, vy (N, 2) when it acted last
 
     @torch.no_grad()
     def step(self, commands: FloatArray | None) -> None:
@@ -51,6 +53,7 @@ class EnvStage:
                 for group, columns, scales in self._clock_columns:
                     env.obs_buf[group][:, columns] = self._gait.row * scales
             self._obs = env.get_observations()
+        self._believed = believed_velocity(self.policy, self._obs)
         self._obs, _, dones, _ = env.step(self.policy(self._obs))
         forget(self.policy, dones)
 
@@ -59,6 +62,9 @@ class EnvStage:
 
     def velocity(self) -> FloatArray:
         return _array(torch.cat([self.env.base_lin_vel[:, :2], self.env.base_ang_vel[:, 2:]], dim=1))
+
+    def believed_velocity(self) -> FloatArray | None:
+        return None if self._believed is None else _array(self._believed)
 
     def qpos(self) -> FloatArray:
         return _array(self.env.sim.qpos)

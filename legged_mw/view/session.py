@@ -182,7 +182,9 @@ class Session:
 
     def _lines(self, command: FloatArray, velocity: FloatArray) -> tuple[tuple[str, str], ...]:
         pilot, stage = self.pilot, self.stage
-        lines = [("measured", signed(velocity))]
+        lines, believed = [("measured", signed(velocity))], stage.believed_velocity()
+        if believed is not None:
+            lines.append(("estimated", signed(believed[pilot.world])))
         if stage.command_table:
             lines = [("command", signed(command)), *lines, ("driven by", self._driver())]
         if stage.num_worlds > 1:

@@ -45,6 +45,10 @@ class Stage(Protocol):
         """The measured velocity of each robot (N, 3): vx, vy, yaw rate at the IMU, body frame."""
         ...
 
+    def believed_velocity(self) -> FloatArray | None:
+        """vx, vy (N, 2) that the policy believed when it acted last, as in `velocity`; None if it estimates none."""
+        ...
+
     def qpos(self) -> FloatArray:
         """Pose of each robot (N, nq), world frame."""
         ...

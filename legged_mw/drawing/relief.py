@@ -1,6 +1,6 @@
 """What makes steps and slopes of a height field seen: a picture laid over it, light from above, flat ground around it to the horizon.
 
-For drawing alone: nothing that is stepped changes. The plane's looks are in drawing.py.
+For drawing alone: nothing that is stepped changes. The plane's looks are in scene.py.
 """
 
 # pyright: reportAttributeAccessIssue=false

@@ -1,0 +1,17 @@
+"""go1_flat with what a robot measures: 45 rows, no velocity; the critic keeps what it sees."""
+
+from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.utils.task import Task
+
+
+class Go1FlatBlindCfg(Go1FlatCfg):
+    class observations(Go1FlatCfg.observations):
+        leave_out = {"state": ["base_lin_vel"]}  # no sensor measures it
+
+
+class Go1FlatBlindCfgPPO(Go1FlatCfgPPO):
+    pass
+
+
+TASK = Task(LeggedRobot, Go1FlatBlindCfg, Go1FlatBlindCfgPPO)

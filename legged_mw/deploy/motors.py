@@ -1,0 +1,81 @@
+"""The motors that an exported policy was trained with: the contract's section ``motors``, and those that MuJoCo does not have itself."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from legged_mw.deploy.reader import ContractError, Reader
+from legged_mw.utils.motor_network import NetworkMotors, read_network
+
+MOTORS, MOTORS_FILE = "motors", "motors.npz"
+LAWS = ("servo", "dc_motor", "torque", "network")  # docs/motors.md
+_RESISTANCE, _CONSTANT, _STIFFNESS, _DAMPING = 0, 1, 4, 6  # places in actuator_gainprm of MuJoCo's DC motor
+
+
+class Motors(NamedTuple):
+    """What turns a joint target into a torque; a real robot's motors are their own law."""
+
+    law: str = "servo"
+    stall_torque: tuple[float, ...] = ()  # (D,) [N m] at the joint; empty: no torque-speed curve
+    no_load_speed: tuple[float, ...] = ()  # (D,) [rad/s] likewise
+    digest: str = ""  # SHA-256 of the network's file
+
+    def to_dict(self) -> dict[str, Any]:
+        """The section; nothing for servos."""
+        curve = {"stall_torque": list(self.stall_torque), "no_load_speed": list(self.no_load_speed)} if self.stall_torque else {}
+        network = {"file": MOTORS_FILE, "sha256": self.digest} if self.digest else {}
+        return {MOTORS: {"law": self.law, **curve, **network}} if self.law != "servo" else {}
+
+    def gains(self, model: mujoco.MjModel, actuators: list[int], dofs: np.ndarray) -> dict[str, np.ndarray]:
+        """What ``model`` has of gains and curve, one a joint each, by the contract's names."""
+        prm = model.actuator_gainprm[actuators]
+        found = {}
+        if self.law == "servo":
+            found = {"stiffness": prm[:, 0], "damping": model.dof_damping[dofs].reshape(len(dofs), -1)[:, 0]}
+        elif self.law == "dc_motor":
+            found = {"stiffness": prm[:, _STIFFNESS], "damping": prm[:, _DAMPING]}
+        if self.stall_torque:
+            constant, resistance = np.maximum(prm[:, _CONSTANT], 1e-12), np.maximum(prm[:, _RESISTANCE], 1e-12)
+            found |= {"motors: stall_torque": constant / resistance, "motors: no_load_speed": 1.0 / constant}
+        return found
+
+    def limp(self, batch: Any) -> None:
+        """Switch the motors of ``batch`` off: what is left is damping, if there is any."""
+        if self.law == "servo":
+            for name in ("actuator_gainprm", "actuator_biasprm"):
+                batch.expand(name)[:] = 0.0
+        elif self.law == "dc_motor":
+            batch.expand("actuator_gainprm")[:, :, _STIFFNESS] = 0.0
+        else:
+            batch.expand("actuator_gear")[:] = 0.0
+
+
+SERVOS = Motors()
+
+
+def read_motors(section: Reader, joints: int) -> Motors:
+    """The motors from the contract's reader of the section ``motors``."""
+    law = section.take("law", f"one of {', '.join(LAWS)}", lambda value: value in LAWS)
+    names = ("stall_torque", "no_load_speed") if law == "dc_motor" or "stall_torque" in section.values else ()
+    curve = {name: tuple(section.numbers(name, joints, "joint").tolist()) for name in names}
+    for name in names:
+        section.take(name, "numbers above zero", lambda value: min(value) > 0)
+    return Motors(law, digest=section.text("sha256") if law == "network" else "", **curve)
+
+
+def make_network(folder: Path, motors: Motors, count: int, joints: int) -> NetworkMotors | None:
+    """The motors of ``count`` robots, where they are a network. Raises ContractError, or UserError for a broken one."""
+    if motors.law != "network":
+        return None
+    if not (folder / MOTORS_FILE).is_file():
+        raise ContractError(f"no {MOTORS_FILE} in {folder}, the network of its motors; export the policy again")
+    if hashlib.sha256((folder / MOTORS_FILE).read_bytes()).hexdigest() != motors.digest:
+        raise ContractError(f"{MOTORS_FILE} is not the file that policy.yaml was written for: its SHA-256 differs; export the policy again")
+    return NetworkMotors(read_network(folder / MOTORS_FILE), count, joints)

@@ -1,0 +1,1 @@
+"""How a robot and its ground look: sky, light, camera, relief. A tool: nothing here is stepped."""

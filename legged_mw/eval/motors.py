@@ -1,0 +1,90 @@
+"""Torque against speed of each kind of joint, and the motor's envelope around it: the report's numbers and its picture of them.
+
+Numpy in, plain numbers out; the picture is drawn on the axes that it is given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from legged_mw.eval.rollout import Record
+
+Array = NDArray[Any]
+BINS = (40, 32)  # of speed and torque
+NEAR = 0.02  # of the highest torque: so near to the envelope counts as at it
+MARGIN = 1.08  # of what is drawn around samples and envelope
+
+
+class Limits(NamedTuple):
+    """What motors can do, (D,) each; infinite where nothing is known."""
+
+    low: Array  # [N m]
+    high: Array  # [N m]
+    stall_torque: Array  # [N m]
+    no_load_speed: Array  # [rad/s]
+
+    def at(self, speed: Array) -> tuple[Array, Array]:
+        """Lowest and highest torque at ``speed`` (..., D)."""
+        share = speed / self.no_load_speed
+        return np.maximum(self.low, -self.stall_torque * (1.0 + share)), np.minimum(self.high, self.stall_torque * (1.0 - share))
+
+    def of(self, joint: int) -> Limits:
+        """Of one joint, (1,) each."""
+        return Limits(*(values[joint : joint + 1] for values in self))
+
+
+def envelopes(record: Record, settled: int, kinds: Sequence[str], limits: Limits) -> list[dict[str, Any]]:
+    """Of each kind of joint how often which torque came at which speed, where its motor ends, and the share of time that it is there.
+
+    ``kinds`` (D,): joints of one kind share a picture; their motors are alike. Worlds that fell do not count.
+    """
+    stood = np.isinf(record.fell_at)
+    torque, speed = (record.signals[name][settled:, stood].astype(float) for name in ("torque", "motor_speed"))
+    low, high = limits.at(speed)
+    most = np.minimum(limits.high, limits.stall_torque)
+    near = np.where(np.isfinite(most), NEAR * most, 0.0)
+    at_limit = (torque >= high - near) | (torque <= low + near)
+    found = []
+    for kind in dict.fromkeys(kinds):
+        joints = [i for i, name in enumerate(kinds) if name == kind]
+        drawn = {"kind": kind, **_picture(torque[..., joints].ravel(), speed[..., joints].ravel(), limits.of(joints[0]))}
+        known = bool(np.isfinite(most[joints]).all()) and stood.any()
+        found.append({**drawn, "at_limit": float(at_limit[..., joints].mean()) if known else None})
+    return found
+
+
+def _picture(torque: Array, speed: Array, limits: Limits) -> dict[str, Any]:
+    """Counts of samples on a grid, and the envelope over its speeds."""
+    free = float(limits.no_load_speed[0])
+    widest = max(float(np.abs(speed).max(initial=1.0)), min(free, 1e3) if np.isfinite(free) else 0.0) * MARGIN
+    strong = float(np.minimum(limits.high, limits.stall_torque)[0])
+    highest = max(float(np.abs(torque).max(initial=1.0)), strong if np.isfinite(strong) else 0.0) * MARGIN
+    counts, speeds, torques = np.histogram2d(speed, torque, BINS, [[-widest, widest], [-highest, highest]])
+    line = np.linspace(-widest, widest, 97)
+    low, high = (np.clip(side, -highest, highest).round(4).tolist() for side in limits.at(line))
+    bounded = bool(np.isfinite(strong))
+    return {
+        "speeds": speeds.round(4).tolist(),
+        "torques": torques.round(4).tolist(),
+        "counts": counts.T.astype(int).tolist(),  # torque by speed
+        "envelope": {"speed": line.round(4).tolist(), "low": low, "high": high} if bounded else None,
+    }
+
+
+def draw(motor: dict[str, Any], heat: Any, ink: tuple[str, str], suffix: str, ax: Any) -> None:
+    """One kind of joint: the more often, the darker by the colour map ``heat``; ``ink`` of the envelope and of remarks."""
+    counts, speeds, torques = (np.array(motor[key], dtype=float) for key in ("counts", "speeds", "torques"))
+    rows, columns = np.nonzero(counts)  # a mesh would draw the empty cells, too, and make a page of megabytes
+    often = np.log1p(counts[rows, columns]) / np.log1p(counts.max(initial=1.0))
+    ax.bar(speeds[columns], np.diff(torques)[0], np.diff(speeds)[0], torques[rows], align="edge", color=heat(1.0 - often), linewidth=0)
+    if motor["envelope"]:
+        for side in ("low", "high"):
+            ax.plot(motor["envelope"]["speed"], motor["envelope"][side], color=ink[0], linewidth=1.2)
+    share = motor["at_limit"]
+    ax.set(title=f"{motor['kind'].replace('_', ' ')}{suffix}", xlabel="speed [rad/s]", ylabel="torque [N m]")
+    ax.set_title("no limit known" if share is None else f"{share:.1%} at the limit", loc="right", color=ink[1], fontsize=7.0)

@@ -1,0 +1,182 @@
+"""rsl-rl's Distillation recorded as CUDA graphs: the same keys, mathematics and checkpoints, and no question to the host.
+
+A student learns to act like a teacher that sees more, in the states that the student's own actions lead to (DAgger).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from rsl_rl.algorithms import Distillation
+from rsl_rl.models import MLPModel, RNNModel
+from rsl_rl.modules import EmpiricalNormalization
+from rsl_rl.modules.distribution import GaussianDistribution
+from rsl_rl.storage import RolloutStorage
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from legged_mw.rl.adam import make_recordable, plain_state
+from legged_mw.rl.estimator import EstimatingModel
+from legged_mw.rl.layers import run_mlp, update_normalizer
+from legged_mw.rl.recurrent import Memory, step
+from legged_mw.sim.graph import StepGraph
+
+
+class GraphedDistillation(Distillation):
+    """Distillation whose acting and update are replayed CUDA graphs.
+
+    What cannot be recorded (a network that is neither a plain MLPModel nor an RNNModel, mixed precision, an optimizer other than
+    Adam or AdamW, a distribution that is not Gaussian) is left to rsl-rl's own code, and a line says so. On a CPU nothing is recorded.
+    """
+
+    def __init__(self, student: MLPModel, teacher: MLPModel, storage: RolloutStorage, **settings: Any) -> None:
+        super().__init__(student, teacher, storage, **settings)
+        reason = self._why_stock()
+        self.graphed = reason is None
+        if reason:
+            print(f"Distillation: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
+            return
+        make_recordable(self.optimizer, [self.learning_rate], str(self.device))
+        seen = storage.observations.select(*student.obs_groups, *teacher.obs_groups)
+        self._obs = TensorDict({name: value[0].clone() for name, value in seen.items()}, [storage.num_envs], device=self.device)
+        storage.observations = storage.observations.select(*student.obs_groups)  # what the teacher sees is not learned from
+        self._loss = torch.zeros((), device=self.device)
+        self._begin()
+
+    def _why_stock(self) -> str | None:
+        """What keeps this configuration from being recorded, or None."""
+        for model, more in ((self.student, ()), (self.teacher, (EstimatingModel,))):  # an estimate of a teacher's is not learned
+            if type(model) not in (MLPModel, RNNModel, *more):
+                return f"a network is a {type(model).__name__}"
+        if self.use_mixed_precision:
+            return "use_mixed_precision is set"
+        if getattr(type(self.student.distribution), "sample", None) is not GaussianDistribution.sample:
+            return f"actions are drawn from a {type(self.student.distribution).__name__}"
+        if type(self.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
+            return f"the optimizer is {type(self.optimizer).__name__}"
+        if self.storage.num_transitions_per_env % self.gradient_length:
+            return f"gradient_length {self.gradient_length} does not divide a rollout of {self.storage.num_transitions_per_env} steps"
+        return None
+
+    def _begin(self) -> None:
+        """Empty memories, and graphs that are not recorded yet."""
+        recurrent = [model for model in (self.student, self.teacher) if isinstance(model, RNNModel)]
+        self._memories: dict[MLPModel, Memory] = {model: Memory(model, self.storage.num_envs, 1, str(self.device)) for model in recurrent}
+        self._act_graph, self._update_graph = (StepGraph(fn, str(self.device)) for fn in (self._act, self._update))
+
+    def release(self) -> None:
+        """Drop what is recorded: NCCL does not close a connection that a CUDA graph still names. The next calls record again."""
+        if self.graphed:
+            self._begin()
+
+    # ---- the rollout ----------------------------------------------------------------------------------------------
+
+    def act(self, obs: TensorDict) -> Tensor:
+        """The student's sampled actions (N, A); the teacher's are noted until ``process_env_step``."""
+        if not self.graphed:
+            return super().act(obs)
+        if self.storage.step == 0:
+            for memory in self._memories.values():
+                memory.start.copy_(memory.now)
+        self._obs.copy_(obs.select(*self._obs.keys()))
+        self._act_graph()
+        self.transition.observations = self._obs.select(*self.student.obs_groups)
+        self.transition.actions, self.transition.privileged_actions = self._acted
+        return self._acted[0].clone()
+
+    def _act(self) -> None:
+        student = self.student
+        assert student.distribution is not None
+        student.distribution.update(student.mlp(self._latent(student)))  # the forward pass without its sample
+        mean, std = student.output_mean, student.output_std
+        # torch.normal would check std on the host
+        self._acted = (mean + std * torch.randn_like(mean)).detach(), self._mean(self.teacher, self._latent(self.teacher)).detach()
+
+    def _latent(self, model: MLPModel) -> Tensor:
+        """What a network's MLP reads; a memory takes in the observations."""
+        return self._memories[model].look(self._obs) if model in self._memories else model.get_latent(self._obs)
+
+    def _mean(self, model: MLPModel, latent: Tensor) -> Tensor:
+        output = run_mlp(model.mlp, latent)
+        return model.distribution.deterministic_output(output) if model.distribution else output
+
+    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
+        """Store the transition; worlds whose episode ended are forgotten."""
+        super().process_env_step(obs, rewards, dones, extras)
+        for memory in self._memories.values() if self.graphed else ():
+            memory.forget(dones)
+
+    # ---- the update -----------------------------------------------------------------------------------------------
+
+    def update(self) -> dict[str, Any]:
+        """Epochs over the storage, step by step; returns the mean loss, a tensor () whose reading waits for the device."""
+        if not self.graphed:
+            return super().update()
+        self.num_updates += 1
+        self._update_graph()
+        self.storage.clear()
+        return {"behavior": self._loss.clone()}
+
+    def _update(self) -> None:
+        st, memory = self.storage, self._memories.get(self.student)
+        with torch.no_grad():
+            seen = torch.cat([st.observations[group] for group in self.student.obs_groups], dim=-1).flatten(0, 1)
+            inputs = self.student.obs_normalizer(seen).unflatten(0, st.rewards.shape[:2])
+        chunks = [*zip(*(each.split(self.gradient_length) for each in (inputs, st.privileged_actions, st.dones.bool())), strict=True)]
+        state = self._loss.zero_()  # of a student without memory: anything
+        for _ in range(self.num_learning_epochs):
+            state = memory.start[:, 0] if memory else state
+            for inputs, wanted, ended in chunks:
+                latent, state = self._remember(inputs, ended, state) if memory else (inputs.flatten(0, 1), state)
+                self._gradient_step(latent, wanted.flatten(0, 1))
+        self._loss /= self.num_learning_epochs * len(chunks)
+        if memory:
+            memory.now[:, 0].copy_(state)  # as in rsl-rl: of the student as it is now
+        if isinstance(self.student.obs_normalizer, EmpiricalNormalization):
+            with torch.no_grad():
+                update_normalizer(self.student.obs_normalizer, seen, self.gpu_world_size)
+
+    def _remember(self, inputs: Tensor, ended: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """What a recurrent student's MLP reads (S * N, H) of S steps (S, N, size), and its state after them, detached.
+
+        ``ended`` (S, N, 1): the episode ended in that step.
+        """
+        assert isinstance(self.student, RNNModel)
+        seen = []
+        for x, over in zip(inputs, ended, strict=True):
+            latent, state = step(self.student.rnn.rnn, x, state)
+            seen.append(latent)
+            state = state.masked_fill(over, 0.0)
+        return torch.cat(seen), state.detach()
+
+    def _gradient_step(self, latent: Tensor, wanted: Tensor) -> None:
+        """One step towards ``wanted`` (B, A); the loss is a sum over steps of their means, as in rsl-rl."""
+        if type(self.student) is MLPModel:
+            latent = nn.functional.pad(latent, (0, -latent.shape[1] % 4))  # what TF32 products want
+        loss = self.loss_fn(self._mean(self.student, latent), wanted)
+        self.optimizer.zero_grad()
+        (loss * self.gradient_length).backward()
+        if self.is_multi_gpu:
+            self.reduce_parameters()
+        if self.max_grad_norm:
+            nn.utils.clip_grad_norm_(self.student.parameters(), self.max_grad_norm)
+        self.optimizer.step()
+        self._loss += loss.detach()
+
+    # ---- checkpoints: rsl-rl's own Distillation reads and writes the same -----------------------------------------------
+
+    def save(self) -> dict[str, Any]:
+        """The networks' and the optimizer's state, in the form that rsl-rl's own Distillation writes."""
+        content = super().save()
+        if self.graphed:
+            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], [self.learning_rate])
+        return content
+
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Take over a checkpoint of this class or of rsl-rl's own Distillation, or a teacher from one of PPO."""
+        iteration = super().load(loaded_dict, load_cfg, strict)
+        if self.graphed:
+            make_recordable(self.optimizer, [self.learning_rate], str(self.device))
+            self._begin()  # Adam's memory has moved
+        return iteration

@@ -1,0 +1,171 @@
+"""An actor that reads its own estimate of what a robot cannot measure, and the regression that trains the estimator.
+
+The estimator goes from the actor's observations to rows that only the simulator knows. The policy reads the estimate beside its
+observations, but no gradient of the policy reaches the estimator, and none of the estimator the policy. During an update the policy
+reads the estimate that it acted with; the estimator learns beside it.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any, NamedTuple
+
+import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.modules import MLP, EmpiricalNormalization
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from legged_mw.envs.observations import Row
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
+
+SMALLEST = 0.01  # standard deviation of a target, in its unit, that counts: as rsl-rl's eps for observations
+FIELD = "actor.estimator.targets"
+
+
+class Target(NamedTuple):
+    """A row that is estimated, and where an observation group holds it."""
+
+    name: str
+    group: str
+    start: int  # column of its newest frame in the group
+    scale: list[float]  # the group holds scale * value
+
+
+class TargetNormalizer(EmpiricalNormalization):
+    """Nothing is added to its standard deviation, so that an export can hold it as it is."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return (x - self._mean) / self._std.clamp(min=SMALLEST)
+
+    def inverse(self, y: Tensor) -> Tensor:
+        return y * self._std.clamp(min=SMALLEST) + self._mean
+
+
+class EstimatingModel(MLPModel):
+    """rsl-rl's MLPModel whose network reads normalised observations and, beside them, the normalised estimate of E values."""
+
+    def __init__(
+        self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str, output_dim: int, *, estimator: dict[str, Any], **more: Any
+    ) -> None:
+        """``estimator``: the config section, its ``targets`` as ``Target``s; the rest is MLPModel's."""
+        targets = [Target(*target) for target in estimator["targets"]]
+        scales = [scale for target in targets for scale in target.scale]
+        self._targets, self._size, self.learning_rate = targets, len(scales), estimator["learning_rate"]
+        super().__init__(obs, obs_groups, obs_set, output_dim, **more)
+        self.estimator = MLP(self.obs_dim, self._size, estimator["hidden_dims"], estimator["activation"])
+        self.target_normalizer = TargetNormalizer(self._size)
+        self.register_buffer("_scales", torch.tensor(scales), persistent=False)
+
+    _scales: Tensor
+
+    def _get_latent_dim(self) -> int:
+        return self.obs_dim + self._size
+
+    def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
+        """What the network reads (B, obs + E): the estimate comes without its gradient."""
+        seen = super().get_latent(obs, masks, hidden_state)
+        with torch.no_grad():
+            estimate = self.estimator(seen)
+        return torch.cat([seen, estimate], dim=-1)
+
+    @torch.no_grad()
+    def targets(self, obs: TensorDict) -> Tensor:
+        """The targets (B, E), normalised: what the estimator is to say."""
+        return self.target_normalizer(self.truth(obs))
+
+    def truth(self, obs: TensorDict) -> Tensor:
+        """The targets (B, E) in their units, as the groups of ``obs`` hold them."""
+        parts = [obs[each.group][:, each.start : each.start + len(each.scale)] for each in self._targets]
+        return torch.cat(parts, dim=1) / self._scales
+
+    def estimate(self, obs: TensorDict) -> Tensor:
+        """The estimate (B, E) in the targets' units."""
+        return self.target_normalizer.inverse(self.estimator(super().get_latent(obs)))
+
+    def columns_of(self, row: str) -> slice | None:
+        """Columns of a row in the estimate; None if it is not estimated."""
+        start = 0
+        for target in self._targets:
+            if target.name == row:
+                return slice(start, start + len(target.scale))
+            start += len(target.scale)
+        return None
+
+    def as_onnx(self, verbose: bool) -> nn.Module:
+        return _OnnxEstimatingModel(self)
+
+
+def believed_velocity(policy: Any, obs: TensorDict) -> Tensor | None:
+    """vx, vy (N, 2) [m/s] that ``policy`` believes of its robots; None if it does not estimate their velocity."""
+    columns = policy.columns_of("base_lin_vel") if hasattr(policy, "columns_of") else None
+    return None if columns is None else policy.estimate(obs)[:, columns][:, :2]
+
+
+class _OnnxEstimatingModel(nn.Module):
+    """Observations (B, size) in their units -> mean actions (B, A), and the estimate (B, E) in the targets' units."""
+
+    def __init__(self, model: EstimatingModel) -> None:
+        super().__init__()
+        parts = copy.deepcopy((model.obs_normalizer, model.mlp, model.estimator, model.target_normalizer))
+        self.obs_normalizer, self.mlp, self.estimator, self.target_normalizer = parts
+        self.target_normalizer._std.clamp_(min=SMALLEST)
+        assert model.distribution is not None
+        self.deterministic_output = model.distribution.as_deterministic_output_module()
+
+    def forward(self, obs: Tensor) -> tuple[Tensor, Tensor]:
+        seen = self.obs_normalizer(obs)
+        estimate = self.estimator(seen)
+        actions = self.deterministic_output(self.mlp(torch.cat([seen, estimate], dim=-1)))
+        return actions, estimate * self.target_normalizer._std + self.target_normalizer._mean
+
+
+def trained_parts(actor: MLPModel, critic: MLPModel) -> tuple[list[list[nn.Parameter]], list[Tensor]]:
+    """Parameters whose gradients are clipped together: the policy's, the critic's, the estimator's if there is one; and its rate ()."""
+    if not isinstance(actor, EstimatingModel):
+        return [[*actor.parameters()], [*critic.parameters()]], []
+    policy = [parameter for name, parameter in actor.named_parameters() if not name.startswith("estimator.")]
+    rate = torch.tensor(actor.learning_rate, dtype=torch.float32, device=policy[0].device)
+    return [policy, [*critic.parameters()], [*actor.estimator.parameters()]], [rate]
+
+
+# ---- what the config means ------------------------------------------------------------------------------------------
+
+
+def actor_settings(sections: dict[str, Any], env: RobotTask | None, learns: bool = True) -> dict[str, Any]:
+    """Section ``actor`` of the learner's ``sections`` as rsl-rl takes it; with targets it is an EstimatingModel's. Raises ConfigError.
+
+    ``learns``: False for an actor that only acts, in worlds that may be without what ``domain_rand`` showed the critic.
+    """
+    actor = copy.deepcopy(sections["actor"])
+    estimator = actor.pop("estimator", {"targets": []})
+    if not estimator["targets"]:
+        return actor
+    if actor["class_name"] != "MLPModel":
+        raise ConfigError(f"{FIELD}: an estimator goes with actor.class_name 'MLPModel', not '{actor['class_name']}'")
+    assert env is not None
+    estimator["targets"] = [tuple(target) for target, _ in find_targets(sections, env, learns)]
+    return {**actor, "class_name": f"{__name__}:EstimatingModel", "estimator": estimator}
+
+
+def find_targets(sections: dict[str, Any], env: RobotTask, learns: bool = True) -> list[tuple[Target, Row]]:
+    """Each target and its row: of the critic's groups first, then of others, never of one that the actor reads. Raises ConfigError."""
+    names, obs_groups, groups = sections["actor"]["estimator"]["targets"], sections["obs_groups"], env.observations.groups
+    order = [group for group in dict.fromkeys([*obs_groups["critic"], *groups]) if group in groups and group not in obs_groups["actor"]]
+    rows = {row.name: (group, row) for group in reversed(order) for row in groups[group] if not row.group}
+    found = []
+    for i, name in enumerate(names):
+        if name not in rows and not learns and (width := env.domain_rand.widths.get(name)):
+            found.append((Target(name, "", 0, [1.0] * width), Row(name, torch.zeros(1, width))))
+            continue
+        if name not in rows:
+            hint = f" (observations.{name} = True adds it)" if getattr(env.cfg.observations, name, None) is False else ""
+            where = ", ".join(f"'{group}'" for group in order) or "any group that the actor does not read"
+            raise ConfigError(f"{FIELD}: {unknown('observation row', name, rows, where)}{hint}")
+        if name in names[:i]:
+            raise ConfigError(f"{FIELD} names '{name}' twice")
+        group, row = rows[name]
+        found.append((Target(name, group, env.observations.newest(group, name).start, row.column_scales()), row))
+    return found

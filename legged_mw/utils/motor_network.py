@@ -1,0 +1,142 @@
+"""A motor as a small network of numbers: from how far a joint is off its target and how fast it turns, lately, to its torque.
+
+The same network serves each joint. It is read from an .npz without running code, and evaluated here in numpy.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from legged_mw.utils.errors import UserError, unknown
+
+Floats = NDArray[Any]  # float32
+ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {
+    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
+    "relu": lambda x: np.maximum(x, 0),
+    "softsign": lambda x: x / (1 + np.abs(x)),
+    "tanh": np.tanh,
+}
+_RECURRENT = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
+_SCALES = ("error_scale", "speed_scale", "torque_scale")
+
+
+@dataclass(frozen=True)
+class MotorNetwork:
+    """LSTM layers, if there are any, then linear layers with an activation between them; weights are (out, in), as torch has them.
+
+    Input of a joint: error_scale * (target - angle) [rad] of each of ``frames``, then speed_scale * speed [rad/s] of each; or in turns,
+    with ``in_turns``. ``frames`` are ages in simulation steps, 0 is now. Output: torque [N m], times torque_scale.
+    """
+
+    recurrent: list[tuple[Floats, Floats, Floats, Floats]]  # a layer: (4 H, in), (4 H, H), (4 H,), (4 H,); gates i, f, g, o
+    linear: list[tuple[Floats, Floats]]  # a layer: (out, in), (out,)
+    activation: str
+    frames: tuple[int, ...]
+    in_turns: bool = False
+    error_scale: float = 1.0
+    speed_scale: float = 1.0
+    torque_scale: float = 1.0
+
+    @property
+    def hidden(self) -> list[int]:
+        """Units of each LSTM layer."""
+        return [layer[1].shape[1] for layer in self.recurrent]
+
+    def to_arrays(self) -> dict[str, Any]:
+        """What the .npz holds."""
+        layers = {f"{name}_l{i}": value for i, layer in enumerate(self.recurrent) for name, value in zip(_RECURRENT, layer, strict=True)}
+        for i, (weight, bias) in enumerate(self.linear):
+            layers |= {f"weight{i}": weight, f"bias{i}": bias}
+        scales = {name: getattr(self, name) for name in _SCALES}
+        return {**layers, "activation": self.activation, "frames": np.array(self.frames), "in_turns": self.in_turns, **scales}
+
+
+def read_network(file: Path) -> MotorNetwork:
+    """The network in ``file``. Raises UserError for what is none, in one line."""
+    try:
+        with np.load(file, allow_pickle=False) as archive:
+            arrays = dict(archive)
+    except (ValueError, OSError, zipfile.BadZipFile):
+        raise UserError(
+            f"{file.name} is no .npz of plain arrays; a torchscript file becomes one by: python -m legged_mw.robot.actuator_net {file.name}"
+        ) from None
+    try:
+        return _read(arrays)
+    except (KeyError, ValueError, TypeError) as error:
+        raise UserError(f"{file.name}: {error.args[0]}") from None
+
+
+def _read(arrays: Mapping[str, Any]) -> MotorNetwork:
+    frames = tuple(int(age) for age in np.atleast_1d(arrays.get("frames", 0)))
+    if list(frames) != sorted({*frames}) or frames[0] < 0:
+        raise ValueError(f"frames is {list(frames)}; they must be ages in simulation steps, the newest first")
+    activation = str(arrays.get("activation", "elu"))
+    if activation not in ACTIVATIONS:
+        raise ValueError(unknown("activation", activation, ACTIVATIONS, "motor networks"))
+    width, recurrent, linear = 2 * len(frames), [], []
+    while f"weight_ih_l{len(recurrent)}" in arrays:
+        names = [f"{name}_l{len(recurrent)}" for name in _RECURRENT]
+        units = _take(arrays, names[1]).shape[-1]
+        shapes = ((4 * units, width), (4 * units, units), (4 * units,), (4 * units,))
+        recurrent.append(tuple(_take(arrays, name, shape) for name, shape in zip(names, shapes, strict=True)))
+        width = units
+    while f"weight{len(linear)}" in arrays:
+        weight = _take(arrays, f"weight{len(linear)}")
+        linear.append((_take(arrays, f"weight{len(linear)}", (len(weight), width)), _take(arrays, f"bias{len(linear)}", (len(weight),))))
+        width = len(weight)
+    if not linear or width != 1:
+        found = width if linear else "none: there is no weight0"
+        raise ValueError(f"the last layer must give one value, a joint's torque; it gives {found}")
+    scales = {name: float(arrays.get(name, 1.0)) for name in _SCALES}
+    return MotorNetwork(recurrent, linear, activation, frames, bool(arrays.get("in_turns", False)), **scales)
+
+
+def _take(arrays: Mapping[str, Any], name: str, shape: tuple[int, ...] | None = None) -> Floats:
+    if name not in arrays:
+        raise ValueError(f"array '{name}' is missing")
+    value = np.asarray(arrays[name], dtype=np.float32)
+    if shape is not None and value.shape != shape:
+        raise ValueError(f"array '{name}' has shape {value.shape}, it must be {shape}: (out, in), in from the layer before or the frames")
+    return value
+
+
+class NetworkMotors:
+    """The motors of N robots with D joints: ``torque`` is called once a simulation step."""
+
+    def __init__(self, network: MotorNetwork, robots: int, joints: int) -> None:
+        self.network = network
+        self._past = np.zeros((network.frames[-1] + 1, 2, robots, joints), dtype=np.float32)  # newest first; errors, speeds, scaled
+        self._memory = [np.zeros((2, robots, joints, units), dtype=np.float32) for units in network.hidden]  # h and c of each layer
+
+    def reset(self, which: Any = slice(None)) -> None:
+        """The robots ``which`` (indices or a mask) begin again: nothing was ever off its target."""
+        for memory in (self._past, *self._memory):
+            memory[(slice(None), slice(None), which) if memory is self._past else (slice(None), which)] = 0.0
+
+    def torque(self, error: NDArray[Any], speed: NDArray[Any]) -> Floats:
+        """Torques (N, D) [N m] from target minus angle [rad] and speed [rad/s], (N, D) each."""
+        net, past = self.network, self._past
+        past[1:] = past[:-1].copy()
+        past[0] = net.error_scale * error, net.speed_scale * speed
+        x = np.moveaxis(past[list(net.frames)], (0, 1), (-2, -1) if net.in_turns else (-1, -2))
+        x = x.reshape(*error.shape, -1)
+        for memory, (w_x, w_h, b_x, b_h) in zip(self._memory, net.recurrent, strict=True):
+            i, f, g, o = np.split(x @ w_x.T + b_x + memory[0] @ w_h.T + b_h, 4, axis=-1)
+            memory[1] = _sigmoid(f) * memory[1] + _sigmoid(i) * np.tanh(g)
+            x = memory[0] = _sigmoid(o) * np.tanh(memory[1])
+        for layer, (weight, bias) in enumerate(net.linear):
+            x = x @ weight.T + bias
+            if layer < len(net.linear) - 1:
+                x = ACTIVATIONS[net.activation](x)
+        return net.torque_scale * x[..., 0]
+
+
+def _sigmoid(x: Floats) -> Floats:
+    return 1 / (1 + np.exp(-np.clip(x, -80.0, 80.0)))
