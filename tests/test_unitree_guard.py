@@ -236,17 +236,20 @@ def test_a_guard_says_what_is_wrong(domain: int, monkeypatch: pytest.MonkeyPatch
 
 def test_the_programs(domain: int, tmp_path: Path) -> None:
     """Two programs over loopback: the remote of the robot's side stands the robot up, starts the policy, walks and ends it."""
-    press = [f"{{time: {0.5 * k}, press: [{button}]}}" for k, button in enumerate(["start", "A"] * 12, start=4)]
+    press = [f"{{time: {0.5 * k}, press: [{button}]}}" for k, button in enumerate(["start", "A"] * 20, start=4)]
     (tmp_path / "remote.yaml").write_text(f"remote: [{{time: 0, ly: 0.4}}, {', '.join(press)}]")
     command = [sys.executable, "-m", "legged_mw.deploy", "go2_flat", "--interface", "lo", "--domain", str(domain)]
     where: dict[str, Any] = {"cwd": POLICIES.parents[1], "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    robot = subprocess.Popen([*command, "--serve", "unitree", "--remote", str(tmp_path / "remote.yaml")], **where)
-    policy = subprocess.Popen([*command, "--robot", "unitree", "--time", "6s", "--log", str(tmp_path / "log.npz")], **where)
-    said, errors = policy.communicate(timeout=60)
-    assert policy.returncode == 0, errors
-    assert "go2 at lo: 12 joints, 32.8 V" in said and "from a measurement to its target: median " in said
-    assert "zero torque: " in said and "stand: " in said and "policy: select: damping" in said
-    robot.send_signal(signal.SIGINT)
-    said, errors = robot.communicate(timeout=60)
-    assert "from a state to the first command that answers it: median " in said and "0 refused" in said, errors
-    assert "degrees from upright" in said
+    with contextlib.ExitStack() as stack:
+        robot = subprocess.Popen([*command, "--serve", "unitree", "--remote", str(tmp_path / "remote.yaml")], **where)
+        stack.callback(robot.kill)
+        policy = subprocess.Popen([*command, "--robot", "unitree", "--time", "6s", "--log", "off"], **where)
+        stack.callback(policy.kill)
+        said, errors = policy.communicate(timeout=60)
+        assert policy.returncode == 0, errors
+        assert "go2 at lo: 12 joints, 32.8 V" in said and "from a measurement to its target: median " in said
+        assert "zero torque: " in said and "stand: " in said and "policy: select: damping" in said
+        robot.send_signal(signal.SIGINT)
+        said, errors = robot.communicate(timeout=60)
+        assert "from a state to the first command that answers it: median " in said and "0 refused" in said, errors
+        assert "degrees from upright" in said

@@ -305,3 +305,9 @@ def test_rows_that_a_robot_does_not_measure() -> None:
         check_rows(replace(contract, rows=(*contract.rows, *rows)), G1)
     assert "the policy observes base_lin_vel, touch, which a g1 does not measure; train one without: " in str(error.value)
     assert "observations.leave_out = {'state': ['base_lin_vel', 'touch']}" in str(error.value)
+
+
+def test_a_policy_of_torques() -> None:
+    contract = read_contract(POLICIES / "go2_flat")
+    with pytest.raises(RobotError, match="the policy commands torques; a go2 is driven by angles here"):
+        check_rows(replace(contract, action=contract.action._replace(origin="torque")), GO2)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import fcntl
 import gc
+import itertools
+import os
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -22,10 +24,13 @@ from legged_mw.deploy.unitree.serve import STEP, SimulatedUnitree
 POLICIES = ROOT / "resources" / "policies"
 
 
+_next = itertools.count(os.getpid())
+
+
 @pytest.fixture
 def domain() -> Iterator[int]:
-    """Locked while the test runs."""
-    for number in range(100, 232):
+    """Locked while the test runs, and another one for each test: a guard goes on for a second after it has damped."""
+    for number in (100 + each % 130 for each in itertools.islice(_next, 130)):
         with (Path(tempfile.gettempdir()) / f"legged_mw-dds-{number}").open("w") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
