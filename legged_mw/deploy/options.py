@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -69,18 +70,20 @@ def wire_faults(text: str | None) -> dict[str, Any]:
 
 def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
     """A simulated robot on the wire."""
-    from legged_mw.deploy.unitree import handset, program, serve
+    from legged_mw.deploy.unitree import handset, need_dds, program, serve
 
+    need_dds()
     script, keys = handset.load_remote(Path(args.remote)) if args.remote else [], args.remote is None and sys.stdin.isatty()
     if keys:
         print(handset.KEYS_HELP)
-    served = program.serve(
-        *(folder, contract, args.interface, args.domain),
-        seconds=args.time or math.inf,
-        handset=handset.Handset(script, keys),
-        faults=serve.Faults(**wire_faults(args.wire)),
-        watchdog=args.watchdog or math.inf,
-    )
+    with closing(handset.Handset(script, keys)) as hand:
+        served = program.serve(
+            *(folder, contract, args.interface, args.domain),
+            seconds=args.time or math.inf,
+            handset=hand,
+            faults=serve.Faults(**wire_faults(args.wire)),
+            watchdog=args.watchdog or math.inf,
+        )
     print(served.text())
 
 
