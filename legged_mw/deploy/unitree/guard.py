@@ -12,6 +12,7 @@ import contextlib
 import gc
 import json
 import mmap
+import os
 import select
 import signal
 import socket
@@ -32,6 +33,7 @@ LATE = 0.06  # [s] ours: three periods at 50 Hz without a command. With what it 
 REPEAT = 0.002  # [s] between two messages to the robot [unitree_sdk2's examples]
 AFTER = 1.0  # [s] ours: how long damping is sent before the wire is let go
 START = 60.0  # [s] for a guard to find the robot
+PRIORITY = 30  # ours, of a real-time process: before the policy's, which it must outlive
 _TURN = 0.001  # [s] at most between two looks at the wire
 _BOARD = struct.Struct("<QdI512s")  # changes of the board (odd: one is going on), stamp of the state, bytes of the text, text
 _FRAME = struct.Struct("<Bd")  # kind, stamp of the state that a command answers
@@ -250,6 +252,8 @@ def main() -> None:
 
     told = json.loads(sys.argv[1])
     channel = socket.socket(fileno=told["channel"])
+    with contextlib.suppress(OSError, AttributeError):  # not allowed, or not Linux
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))  # before DDS starts its threads, which then have it too
     try:
         wire = Wire(told["package"], told["interface"], told["domain"])
         first = wire.prepare(told["find"], lies_down=told["lies_down"])
