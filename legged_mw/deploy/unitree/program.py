@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import math
+import os
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,6 +19,7 @@ from legged_mw.deploy.unitree.robots import machine_of
 from legged_mw.deploy.unitree.serve import STEP, Faults, SimulatedUnitree
 
 BEHIND = 0.1  # [s] by which the simulation may be late before it gives the time up
+PRIORITY = 10  # ours, of a real-time process: below those of a policy
 UPRIGHT = 0.5  # cosine of the tilt from which it lies
 
 
@@ -118,6 +121,8 @@ def serve(
     need_dds()
     from legged_mw.deploy.unitree.link import RobotEnd, default_domain
 
+    with contextlib.suppress(OSError, AttributeError):  # not allowed, or not Linux
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))  # a robot's own computer does nothing else either
     domain = default_domain(interface) if domain is None else domain
     machine = machine_of(contract.joints)
     end = RobotEnd(machine.package, interface, domain)
