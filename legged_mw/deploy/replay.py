@@ -154,7 +154,8 @@ def table(shown_: Replay) -> str:
         pairs = "".join(f"{robot[key][i]:>10.{n}f}{simulated[key][i]:>8.{n}f}" for key, n in (("torque", 2), ("error", 3), ("latency", 0)))
         lines.append(f"{name:<28}{pairs}")
     for i, axis in enumerate(("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")):
-        lines.append(f"{axis + ', mean':<28}{robot['velocity'][i]:>10.3f}{simulated['velocity'][i]:>8.3f}")
+        measured = f"{robot['velocity'][i]:.3f}" if i == 2 or rows["lin_vel"].any() else "-"
+        lines.append(f"{axis + ', mean':<28}{measured:>10}{simulated['velocity'][i]:>8.3f}")
     age = rows["age"][np.isfinite(rows["age"])]
     for name, values in (("age of a measurement", age), ("work of a step", rows["work"]), ("step began late by", rows["behind"])):
         if len(values):
@@ -212,5 +213,7 @@ def _velocities(many: list[Any], contract: Contract, rows: Rows, simulated: Rows
             axes.plot(time, rows["command"][:, names.index(VELOCITY[i])], color="0.6", label="command")
         for each, label in ((rows, "robot"), (simulated, "simulated")):
             values = each["ang_vel"][:, 2] if i == 2 else each["lin_vel"][:, i]
+            if not values.any():  # not measured
+                continue
             axes.plot(time[:made] if each is simulated else time, values, linewidth=0.8, label=label)
         axes.legend(fontsize=6)
