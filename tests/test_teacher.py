@@ -337,6 +337,7 @@ CHANGES: dict[str, tuple[str | Callable[[LoadedTask], None], Any, str]] = {
     "scale": ("control.action_scale", {"": 0.5, "RL_calf": 0.25}, "action_scale of joint RL_calf_joint is 0.25 there and 0.5 here"),
     "rate": ("control.decimation", 10, "the control rate is 25 Hz there and 50 Hz here"),
     "origin": ("control.action_origin", "joints", "control.action_origin is joints there and default here"),
+    "torque": ("control.actuator", "torque", "control.actuator is torque there and servo here"),
     "clip": ("normalization.clip_actions", 5.0, "normalization.clip_actions is 5.0 there and 2.0 here"),
     "clock": ("gait.period", 0.8, "gait.period is 0.8 there and 0.0 here"),
     "scan": ("terrain.height_scan", ["state"], "it reads the height scan, which is off here: name a group in terrain.height_scan, such as"),
