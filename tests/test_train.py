@@ -516,7 +516,7 @@ def test_numbers_go_to_their_end_in_a_straight_line(monkeypatch: pytest.MonkeyPa
     env = LeggedRobot(task.cfg, "cpu")
     runner = make_runner(env, task.train, None, "cpu")
     alg, update = runner.alg, runner.alg.update
-    monkeypatch.setattr(alg, "update", lambda: (seen.append((alg.desired_kl, alg.entropy_coef, env.tracking_sigma.item())), update())[1])
+    monkeypatch.setattr(alg, "update", lambda: (seen.append((alg.desired_kl, alg.entropy_coef, float(env.tracking_sigma))), update())[1])
     runner.learn(5)
     kl, entropy, sigma = zip(*seen, strict=True)
     assert kl == pytest.approx([0.01, 0.008, 0.006, 0.004, 0.002])
