@@ -51,9 +51,8 @@ KINDS: dict[str, Kind] = {
     "delay_ms": Kind("world", 0.0, "scalar"),
     "observation_delay": Kind("world", 0.0, "scalar", whole=True),
 }
+_RESISTANCE, _CONSTANT, _STIFFNESS, _DAMPING = 0, 1, 4, 6  # places in actuator_gainprm of MuJoCo's DC motor
 # Constants of the model depend on them: derived once they are drawn, never within a recorded step.
-# Places in actuator_gainprm of MuJoCo's DC motor.
-_RESISTANCE, _CONSTANT, _STIFFNESS, _DAMPING = 0, 1, 4, 6
 ONLY_AT_START = tuple(name for name, kind in KINDS.items() if {*kind.fields} & {*CONSTANTS_READ})
 
 
