@@ -502,6 +502,8 @@ def test_mistakes_are_named(fields: dict[str, Any], message: str) -> None:
 def test_two_laws_at_once_are_refused() -> None:
     with pytest.raises(ConfigError, match="control.actuator is 'dc_motor', but Springs._compute_torques is a motor law of its own"):
         make_env(2, DC, env_class=Springs)
+    with pytest.raises(ConfigError, match="control.action_origin is 'joints', but Springs._compute_torques is a motor law of its own"):
+        make_env(2, {"control.action_origin": "joints"}, env_class=Springs)
 
 
 def changed_arrays(**changes: Any) -> dict[str, Any]:
