@@ -94,7 +94,7 @@ class UdpRobot(Robot):
     def read(self) -> Measurement:
         return self._measured
 
-    def write(self, targets: Floats) -> None:
+    def write(self, targets: Floats, **_: Floats | None) -> None:
         self._count += 1
         self._measured = self._exchange(TARGETS, np.asarray(targets, dtype="<f8").tobytes())
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from legged_mw.deploy.robot import Floats, Measurement, Robot
+from legged_mw.deploy.robot import Floats, Health, Measurement, Robot
 
 
 class Recorder(Robot):
@@ -13,14 +13,28 @@ class Recorder(Robot):
     def __init__(self, robot: Robot) -> None:
         self.robot, self.targets, self.closed = robot, [], 0
         self.measured: list[Measurement] = []
+        self.orders: list[str] = []  # "write", "damp" or "limp" of each period
+        self.can_change_gains = robot.can_change_gains
 
     def read(self) -> Measurement:
         self.measured.append(self.robot.read())
         return self.measured[-1]
 
-    def write(self, targets: Floats) -> None:
+    def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
         self.targets.append(np.array(targets))
-        self.robot.write(targets)
+        self.orders.append("write")
+        self.robot.write(targets, stiffness=stiffness, damping=damping)
+
+    def damp(self) -> None:
+        self.orders.append("damp")
+        self.robot.damp()
+
+    def limp(self) -> None:
+        self.orders.append("limp")
+        self.robot.limp()
+
+    def health(self) -> Health:
+        return self.robot.health()
 
     def close(self) -> None:
         self.closed += 1

@@ -30,7 +30,7 @@ ONLY_IN = {
     "mujoco_warp": ["legged_mw/sim/*"],
     "rsl_rl": ["legged_mw/rl/*"],
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
-    "matplotlib": ["legged_mw/eval/plots.py"],  # a second to import, and only for a report
+    "matplotlib": ["legged_mw/eval/plots.py", "legged_mw/deploy/replay.py"],  # a second to import, and only for a report
     "legged_mw.view": ["legged_mw/view/*", "legged_mw/deploy/*", "legged_mw/robot/*", "legged_mw/programs.py"],
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/studio.py"],  # young, and not on every platform
     "legged_mw.check": ["legged_mw/check/*", "legged_mw/programs.py"],
@@ -49,6 +49,7 @@ ONLY_IN = {
     "legged_mw.rl.export": ["legged_mw/rl/export.py", "legged_mw/eval/*", "legged_mw/programs.py"],
     "legged_mw.programs": ["train.py", "play.py"],
     "onnxruntime": ["legged_mw/deploy/*", "legged_mw/rl/network.py"],
+    "cyclonedds": ["legged_mw/deploy/unitree/idl.py", "legged_mw/deploy/unitree/link.py"],
     "configs": ["configs/*", "examples/*"],
     "train": [],
     "play": [],
@@ -73,7 +74,18 @@ MAY_ALL_THE_SAME = ["legged_mw/view/env_stage.py", "legged_mw/view/playing.py"]
 CONFIGS_MAY = ["legged_mw.envs", "legged_mw.utils", "configs", "math", "__future__"]  # numbers and names only
 # What runs on a robot's computer: neither torch nor warp, nor anything of ours that needs them.
 DEPLOY_MAY = [
-    *("numpy", "mujoco", "onnxruntime", "yaml", "legged_mw.ROOT", "legged_mw.deploy", "legged_mw.view", "legged_mw.eval.rules"),
+    *(
+        "numpy",
+        "mujoco",
+        "onnxruntime",
+        "yaml",
+        "cyclonedds",
+        "matplotlib",
+        "legged_mw.ROOT",
+        "legged_mw.deploy",
+        "legged_mw.view",
+        "legged_mw.eval.rules",
+    ),
     *("legged_mw.utils.cli", "legged_mw.utils.config", "legged_mw.utils.errors", "legged_mw.utils.machine", "legged_mw.utils.commands"),
     "legged_mw.utils.motor_network",
     *sys.stdlib_module_names,
@@ -228,6 +240,9 @@ def test_imports_run_one_way(path: str) -> None:
         ("legged_mw/deploy/runner.py", "from legged_mw.eval import exam", True),
         ("legged_mw/deploy/runner.py", "from legged_mw.eval import rules", False),
         ("legged_mw/deploy/runner.py", "from legged_mw.sim.model import unknown", True),
+        ("legged_mw/deploy/runner.py", "import cyclonedds", True),
+        ("legged_mw/deploy/unitree/client.py", "def f():\n    from cyclonedds.domain import Domain", True),
+        ("legged_mw/deploy/unitree/link.py", "from cyclonedds.domain import Domain", False),
         ("legged_mw/deploy/runner.py", "import socket\nimport numpy as np\nimport mujoco", False),
         ("legged_mw/rl/export.py", "from legged_mw.deploy.contract import Contract", False),
         ("legged_mw/rl/runner.py", "from legged_mw.deploy.contract import Contract", True),

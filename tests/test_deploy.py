@@ -27,6 +27,7 @@ from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement, RobotError
 from legged_mw.deploy.runner import run
+from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.simulated import Fleet, MujocoRobot, read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import exam, rules
@@ -576,30 +577,29 @@ def test_a_robot_without_feet_and_a_task_without_commands(export: Path) -> None:
 def test_targets_that_are_not_finite_close_the_robot(contract: Contract, monkeypatch: pytest.MonkeyPatch) -> None:
     robot, controller = Recorder(MujocoRobot(SHIPPED, contract)), Controller(SHIPPED, contract)
     monkeypatch.setattr(controller, "_network", lambda obs: np.full((1, 12), np.nan, dtype=np.float32))
-    with pytest.raises(RobotError, match="the policy's targets are not finite"):
+    with pytest.raises(RobotError, match="the target of FR_hip_joint is not finite: nan; the joints are damped"):
         run(robot, controller, lambda _: AHEAD, 1.0, live=False)
     assert robot.closed == 1 and not robot.targets
 
 
 def test_live_keeps_time(contract: Contract, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Against a made-up clock: it sleeps until each period begins, and counts a step that begins late."""
-    clock, slept, written = [0.0], [], []
+    """Against a made-up clock: it sleeps until each deadline, and counts a step that begins late."""
+    clock, written = [0.0], []
 
     def sleep(seconds: float) -> None:
-        slept.append(seconds)
         clock[0] += seconds
 
     class Slow(MujocoRobot):
-        def write(self, targets: Floats) -> None:
+        def write(self, targets: Floats, **_: Any) -> None:
             written.append(clock[0])
-            clock[0] += 0.05 if len(written) == 3 else 0.005
+            clock[0] += 0.055 if len(written) == 3 else 0.005
 
     monkeypatch.setattr("time.perf_counter", lambda: clock[0])
     monkeypatch.setattr("time.sleep", sleep)
-    done = run(Slow(SHIPPED, contract), Controller(SHIPPED, contract), lambda _: AHEAD, 0.2)
-    assert done.steps == 10 and done.late == 1  # and what was lost is not made up for
-    np.testing.assert_allclose(slept, [0, *[0.015] * 8], atol=1e-9)
-    np.testing.assert_allclose(written[:5], [0, 0.02, 0.04, 0.09, 0.11], atol=1e-9)
+    safety = Safety(contract, Limits.of(SHIPPED, contract, {"frozen": "off"}))  # nothing moves this robot
+    done = run(Slow(SHIPPED, contract), Controller(SHIPPED, contract), lambda _: AHEAD, 0.2, safety=safety)
+    assert done.steps == 9 and done.late == 1 and done.timing and done.timing.lost == 1  # what was lost is not made up for
+    np.testing.assert_allclose(written[:6], [0, 0.02, 0.04, 0.095, 0.1, 0.12], atol=1e-9)  # and the deadlines stay where they were
 
 
 # ---- where torch is not installed

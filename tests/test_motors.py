@@ -410,11 +410,14 @@ def test_deploys_robot_has_the_same_motors(law: str, exported: Callable[[dict[st
         fleet.write(env.actuators.told().double().numpy())
         np.testing.assert_allclose(fleet.qpos, env.sim.qpos, atol=3e-4)
     np.testing.assert_allclose(fleet.read().joint_torque, env.torques, atol=0.1)
-    fleet.limp()
+    fleet.set_gains(np.zeros(12), np.full(12, 3.0))  # off, damped
     fleet.write(np.ones((2, 12)))
     assert np.isfinite(fleet.qpos).all()
     if law != "dc_motor":
         assert not fleet._batch.bind("qfrc_actuator").any()
+    fleet.set_gains(contract.stiffness, contract.damping)  # and on again, at their own gains
+    for name in ("actuator_gainprm", "actuator_biasprm", "actuator_gear", "dof_damping"):
+        np.testing.assert_array_equal(fleet._batch.expand(name), [getattr(fleet.model, name)] * 2)
 
 
 def test_an_export_with_servos_is_as_it_was(made: Path) -> None:

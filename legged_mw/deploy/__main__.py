@@ -6,8 +6,10 @@ import argparse
 from pathlib import Path
 
 from legged_mw import ROOT
+from legged_mw.deploy import drive, options, replay
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, read_contract
 from legged_mw.deploy.exam import run_exam
+from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rules
 from legged_mw.utils.cli import Parser, duration, one_line_errors, positive
@@ -20,7 +22,7 @@ RESULT_FILE = "exam.json"
 def parse() -> argparse.Namespace:
     parser = Parser(prog="python -m legged_mw.deploy", description=__doc__, allow_abbrev=False)
     made = "play.py --export DIR makes one, a finished training too, in its run folder; or the name of a shipped policy"
-    parser.add_argument("folder", metavar="DIR", help=f"an export: {made}")
+    parser.add_argument("folder", metavar="DIR", nargs="?", help=f"an export: {made}")
     parser.add_argument("--eval", action="store_true", help=f"the walking exam; prints its table and writes DIR/{RESULT_FILE}")
     parser.add_argument("--out", metavar="FILE", help=f"where --eval writes (default: DIR/{RESULT_FILE})")
     common = "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
@@ -30,7 +32,11 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--time", type=duration, metavar="T", help="how long (default: until closed; 10s of a recording)")
     parser.add_argument("--terrain", action="store_true", help=f"among the steps and blocks of {TERRAIN_FILE}, if the export has it")
     launch.add_flags(parser)
+    options.add_flags(parser)
+    drive.add_flags(parser)
     args = parser.parse_args()
+    if args.folder is None and args.replay is None:
+        parser.error("the following arguments are required: DIR")
     if args.eval and (asked := [f"--{name}" for name in ("command", "terrain") if getattr(args, name)] + launch.asked(args)):
         parser.error(f"--eval brings its own commands, is on flat ground and shows nothing: leave {asked[0]} out")
     if args.ranges and not args.eval:
@@ -38,21 +44,48 @@ def parse() -> argparse.Namespace:
     if args.command is not None and args.commands:
         parser.error("--commands brings its own commands: leave --command out")
     launch.check_flags(args)
+    options.check_flags(args)
+    drive.check_flags(args)
     return args
 
 
 def main() -> None:
     args = parse()
-    shipped = ROOT / "resources" / "policies" / args.folder
-    folder = shipped if shipped.is_dir() and not Path(args.folder).exists() else Path(args.folder)
+    if args.replay:
+        show_log(args.replay, find(args.folder) if args.folder else None)
+        return
+    folder = find(args.folder)
     contract, scene_file = read_contract(folder), TERRAIN_FILE if args.terrain else SCENE_FILE
     command = launch.check_drive(args, contract.commands, advice=f"the ranges are in {folder / CONTRACT_FILE}")
     if contract.ends.not_covered:
         print(f"not judged here: {', '.join(contract.ends.not_covered)}, which ended episodes in training")
-    if args.eval:
+    if args.serve:
+        options.serve(folder, contract, args)
+    elif args.robot != "simulated":
+        robot = options.connect(folder, contract, args)
+        drive.drive(robot, folder, contract, args, command, args.robot)
+        print(robot.report)
+    elif args.drive:
+        robot = MujocoRobot(folder, contract, scene_file, whole=True, hoisted=drive.hoisted(args, contract))
+        drive.drive(robot, folder, contract, args, command, args.robot)
+    elif args.eval:
         examine(folder, Path(args.out) if args.out else folder / RESULT_FILE, common=args.ranges == "common")
     else:
         launch.watch(DeployStage(folder, args.num_envs, command, scene_file=scene_file), args, folder, title=contract.task)
+
+
+def find(name: str) -> Path:
+    """The folder of an export, or of the shipped policy of this name."""
+    shipped = ROOT / "resources" / "policies" / name
+    return shipped if shipped.is_dir() and not Path(name).exists() else Path(name)
+
+
+def show_log(path: Path, folder: Path | None) -> None:
+    """A log beside its simulation: the table, and a picture beside the log."""
+    replayed = replay.replay(path, folder)
+    print(replay.table(replayed))
+    replay.draw(replayed, path.with_suffix(".png"))
+    print(f"written to {shown(path.with_suffix('.png'))}")
 
 
 def examine(folder: Path, path: Path, common: bool = False) -> None:

@@ -147,6 +147,7 @@ class Contract:
     scan: HeightScan | None = None  # where a row asks for one
     gait: Gait | None = None  # likewise
     exam: Mapping[str, Any] | None = None  # the task's section `exam`, if the walking exam grades it
+    safety: Mapping[str, Any] | None = None  # limits by name, other than the defaults of safety.Limits
     memory: Memory | None = None  # of a recurrent network
     estimate: tuple[Estimated, ...] = ()  # the network's second output, row by row
     motors: Motors = SERVOS
@@ -182,7 +183,7 @@ class Contract:
             "sensors": {name: list(names) for name, names in self.sensors.items()},
             **({SCAN: {"x": list(self.scan.x), "y": list(self.scan.y), "standing": self.scan.standing}} if self.scan else {}),
             **({"gait": {**self.gait._asdict(), "offsets": list(self.gait.offsets)}} if self.gait else {}),
-            **({"exam": dict(self.exam)} if self.exam is not None else {}),
+            **{name: dict(said) for name, said in (("exam", self.exam), ("safety", self.safety)) if said is not None},
             **({ESTIMATE: [row._asdict() for row in self.estimate]} if self.estimate else {}),
             **self.motors.to_dict(),
         }
@@ -256,7 +257,7 @@ def _read(top: Reader) -> Contract:
         digest=network.text("sha256"),
         scan=_read_scan(top),
         gait=_read_gait(top),
-        exam=top.section("exam").values if "exam" in top.values else None,
+        **{name: top.section(name).values for name in ("exam", "safety") if name in top.values},
         memory=read_memory(network.section(MEMORY)) if MEMORY in network.values else None,
         estimate=read_estimated(top.sections(ESTIMATE)) if ESTIMATE in top.values else (),
         motors=read_motors(top.section(MOTORS), count) if MOTORS in top.values else SERVOS,

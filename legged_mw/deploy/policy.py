@@ -75,7 +75,8 @@ class Controller:
 
     def __init__(self, folder: Path, contract: Contract, count: int = 1, network: Callable[..., Any] | None = None) -> None:
         """``network``: what stands for the one in ``folder``; see ``Network``."""
-        self.contract, self._network = contract, network or Network(folder, contract)
+        self.folder, self.contract, self._network = folder, contract, network or Network(folder, contract)
+        self.last_observation = np.zeros((count, contract.size), dtype=np.float32)
         self.last_actions = np.zeros((count, len(contract.joints)), dtype=np.float32)
         self.last_targets = np.tile(contract.default_pose, (count, 1))  # (N, D) [rad]
         self._frames = [np.zeros((count, row.history, row.size), dtype=np.float32) for row in contract.rows]  # as last observed
@@ -94,11 +95,12 @@ class Controller:
         if self.clock:
             self.clock.keep(commands, self._fresh)
         self._fresh[:] = False
-        seen = _side_by_side(self._frames)
+        seen = self.last_observation = _side_by_side(self._frames)
         if self.memory is None:
             actions = self._network(seen)
         else:
             actions, self.memory = self._network(seen, self.memory)
+        actions = np.where(np.isfinite(actions), actions, np.nan)  # a clipped infinity would look like a wish
         self.last_actions = np.clip(actions, -action.clip, action.clip)
         origins = {"default": self.contract.default_pose, "joints": np.atleast_2d(measurement.joint_pos), "targets": self.last_targets}
         self.last_targets = origins.get(action.origin, 0.0) + action.scale * self.last_actions.astype(np.float64)

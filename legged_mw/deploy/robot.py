@@ -41,6 +41,33 @@ class Measurement:
     others: Mapping[str, Floats] = field(default_factory=dict)  # rows with sensors of their own, a height scan: row -> (size,)
 
 
+@dataclass(frozen=True)
+class Remote:
+    """A remote or gamepad as it is held now."""
+
+    buttons: frozenset[str] = frozenset()  # pressed, of BUTTONS
+    lx: float = 0.0  # left stick to the right, in -1..1, as the others
+    ly: float = 0.0  # left stick ahead
+    rx: float = 0.0  # right stick to the right
+    ry: float = 0.0  # right stick ahead
+
+
+# [Unitree] names and order of the buttons on its remotes
+BUTTONS = ("R1", "L1", "start", "select", "R2", "L2", "F1", "F2", "A", "B", "X", "Y", "up", "right", "down", "left")
+
+
+@dataclass(frozen=True)
+class Health:
+    """What a robot tells about itself beside its measurement; None: it does not tell."""
+
+    age_s: float | None = None  # of the newest measurement [s]
+    temperatures: Floats | None = None  # (D,) of the motors [deg C]
+    voltage: float | None = None  # of the battery [V]
+    remote: Remote | None = None  # None too where a remote is switched off or out of reach
+    motor_faults: Mapping[str, str] = field(default_factory=dict)  # joint -> what its motor reports
+
+
+DAMPING = 3.0  # [N m s/rad] at least, of a joint that is only damped [unitree_rl_lab, Passive]
 QUANTITIES = tuple(f.name for f in fields(Measurement) if f.name != "others")
 
 
@@ -50,26 +77,49 @@ def layout(contract: Contract) -> dict[str, int]:
     return {**{name: quantity_size(contract, name) for name in QUANTITIES}, **own}
 
 
+def damped(contract: Contract) -> Floats:
+    """(D,) [N m s/rad] of joints that are only damped: the contract's, and at least DAMPING."""
+    return np.maximum(contract.damping, DAMPING)
+
+
 class Robot(ABC):
     """One robot. The caller calls ``read``, then ``write``, once a ``contract.period``, and keeps the time.
 
     Both calls must return well within the period. Joints are in the contract's order, not in the machine's own.
+    The methods that are not abstract are there for robots that have no more to offer.
     """
+
+    can_change_gains = False  # whether `write` obeys stiffness and damping
+    limits: Mapping[str, float] = {}  # of this machine, which no contract knows: names and units as in safety.Limits
 
     @abstractmethod
     def read(self) -> Measurement:
         """The newest measurement. Raises RobotError if there is none younger than the robot can be trusted with."""
 
     @abstractmethod
-    def write(self, targets: Floats) -> None:
-        """Servo targets (D,) [rad] for the next period, held by position servos with the contract's stiffness and damping.
+    def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
+        """Servo targets (D,) [rad] for the next period, held by position servos.
 
-        Where the contract's action has the origin "torque" they are torques [N m].
+        ``stiffness`` (D,) [N m/rad] and ``damping`` (D,) [N m s/rad]; None: the contract's. A robot that cannot change them
+        takes the contract's, and says so by `can_change_gains`.
+        Where the contract's action has the origin "torque" the targets are torques [N m].
         """
 
     @abstractmethod
     def close(self) -> None:
         """Switch the servos off, so that joints are only damped, and close links. Safe to call twice, and after an error."""
+
+    def damp(self) -> None:
+        """For the next period: no stiffness, joints only damped. Here it closes the robot, which ends the run."""
+        self.close()
+
+    def limp(self) -> None:
+        """For the next period: no torque at all. Here as ``damp``."""
+        self.damp()
+
+    def health(self) -> Health:
+        """What it tells about itself, now; nothing by default."""
+        return Health()
 
     def fell(self) -> bool:
         """Whether it fell by a rule of the contract that only the robot can judge; the tilt is judged from ``read``."""

@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import math
-import time
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from legged_mw.deploy.log import Log
+from legged_mw.deploy.loop import Loop, Timing
 from legged_mw.deploy.policy import Controller
-from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
+from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError
+from legged_mw.deploy.safety import TORQUE, Limits, Safety, Trip, Tripped
+from legged_mw.deploy.states import DAMPING, POLICY, ZERO, Order, States
 
-LATE = 0.5  # [periods] by which a step may be late before it is counted
+_RECENT = 10.0  # [s] of velocities that are kept of a run without an end
 
 
 @dataclass
@@ -20,9 +25,11 @@ class Summary:
     """What happened."""
 
     steps: int = 0
-    late: int = 0  # steps that began more than LATE periods after their time
+    late: int = 0  # steps that began more than half a period after their time
     fell: float | None = None  # [s] of the fall that ended the walk, by the contract's `ends`
     velocity: Floats | None = None  # (3,) mean of vx, vy [m/s], yaw rate [rad/s] over the second half
+    timing: Timing | None = None  # of a live run
+    trips: list[Trip] = field(default_factory=list)  # of a run with states, which goes on damped
 
 
 def run(
@@ -33,43 +40,141 @@ def run(
     *,
     live: bool = True,
     watch: Callable[[float, Measurement], None] | None = None,
+    safety: Safety | None = None,
+    states: States | None = None,
+    log: Log | None = None,
 ) -> Summary:
     """Run for ``seconds``, or until the robot falls: read, decide, write, once a period; then close the robot, also after an error.
 
     ``command`` gives (C,), in the contract's order, at a time [s] since the start; it is held within the trained ranges.
     ``live``: in real time, as a robot needs it; else as fast as the robot answers. ``watch`` gets each measurement.
+    ``safety``: other limits than the export's. A limit that is passed damps the robot and raises Tripped.
+    ``states``: begin at zero torque and do what they say, with their own commands; a trip or a fall damps and the run goes on.
     """
-    contract, summary, velocities = controller.contract, Summary(), []
-    period = contract.period
-    controller.reset()
-    with robot:
-        due = time.perf_counter()
-        while summary.steps * period < seconds - 1e-9:
-            now = summary.steps * period
-            if live:
-                due = _wait(due, period, summary) + period
-            measured = robot.read()
-            if contract.ends.tilted(measured.gravity) or robot.fell():
-                summary.fell = now
-                break
-            targets = controller.act(measured, contract.held(command(now)))[0]
-            if not np.isfinite(targets).all():
-                raise RobotError("the policy's targets are not finite: is what the robot measures? its servos were switched off")
-            robot.write(targets)
-            velocities.append([*measured.lin_vel[:2], measured.ang_vel[2]])
-            if watch:
-                watch(now, measured)
-            summary.steps += 1
-    if velocities:
-        summary.velocity = np.mean(velocities[len(velocities) // 2 :], axis=0)
-    return summary
+    contract = controller.contract
+    safety = safety or Safety(contract, Limits.of(controller.folder, contract, robot.limits))
+    one, velocities = _Step(robot, controller, command, safety, states, log), _Velocities(contract.period, seconds)
+    with ExitStack() as stack:
+        for each in filter(None, (states, log)):
+            stack.callback(each.close)
+        loop = stack.enter_context(Loop(contract.period, live))
+        stack.enter_context(robot)
+        controller.reset()
+        with suppress(*([KeyboardInterrupt] if states else [])):  # a person ends a run with states so
+            for now in loop.ticks(seconds):
+                measured = one.take(loop)
+                if one.summary.fell is not None:
+                    break
+                if measured:
+                    velocities.add(measured)
+                    if watch:
+                        watch(now, measured)
+        if log and live:
+            log.event(loop.now, str(loop.timing()))
+    return replace(one.summary, velocity=velocities.mean(one.summary.steps), late=loop.late, timing=loop.timing() if live else None)
 
 
-def _wait(due: float, period: float, summary: Summary) -> float:
-    """Sleep until ``due``; returns when the step really begins. A late loop does not hurry afterwards: lost time stays lost."""
-    behind = time.perf_counter() - due
-    if behind > LATE * period:
-        summary.late += 1
-        return due + behind
-    time.sleep(max(0.0, -behind))
-    return due
+class _Velocities:
+    """The last half of a run's velocities, of a run without an end its last seconds: memory is fixed."""
+
+    def __init__(self, period: float, seconds: float) -> None:
+        self._kept: deque[list[float]] = deque(maxlen=math.ceil(min(seconds, 2 * _RECENT) / period / 2) + 1)
+
+    def add(self, measured: Measurement) -> None:
+        self._kept.append([*measured.lin_vel[:2], measured.ang_vel[2]])
+
+    def mean(self, steps: int) -> Floats | None:
+        """(3,) over the second half of ``steps``."""
+        return np.mean(list(self._kept)[-max(1, steps - steps // 2) :], axis=0) if self._kept else None
+
+
+class _Step:
+    """What happens once a period. Without states the policy acts at once, a trip raises and a fall ends the run."""
+
+    def __init__(
+        self,
+        robot: Robot,
+        controller: Controller,
+        command: Callable[[float], Floats],
+        safety: Safety,
+        states: States | None,
+        log: Log | None,
+    ) -> None:
+        self.robot, self.controller, self.command, self.safety, self.states, self.log = robot, controller, command, safety, states, log
+        self.summary = Summary()
+        if states and (type(robot).damp is Robot.damp or type(robot).limp is Robot.limp):
+            raise RobotError(f"{type(robot).__name__} has no damp() and limp() of its own, which the states need")
+
+        if states and controller.contract.action.origin == TORQUE:
+            raise RobotError("a policy of torques cannot stand a robot up: its states need servos; run it without them")
+
+    def take(self, loop: Loop) -> Measurement | None:
+        """One step; returns what was measured, None if nothing could be."""
+        measured, health, trip = self._sense(loop)
+        if self.summary.fell is not None:
+            return measured
+        self.summary.steps += 1
+        if trip or measured is None:
+            order = self._trip(trip, loop.now)
+        else:
+            order = self._decide(measured, loop.now)
+            if order.targets is not None:
+                trip = self.safety.asked(measured, order.targets, order.stiffness, order.damping)
+                held = self.safety.held(order.targets)
+                order = self._trip(trip, loop.now) if trip else order._replace(targets=held)
+        self._do(order)
+        if self.log and measured:
+            self.log.add(loop, self.controller, measured, health, order, self.states.command if self.states else self._command(loop.now))
+        return measured
+
+    def _sense(self, loop: Loop) -> tuple[Measurement | None, Health, Trip | None]:
+        """What is measured, and why the robot must stop."""
+        measured, health, trip = None, Health(), None
+        try:
+            measured, health = self.robot.read(), self.robot.health()
+        except RobotError as error:
+            if not self.states:
+                raise
+            trip = Trip("robot", str(error))
+        stop = self.states.listen(health, loop.now) if self.states else None
+        if measured is None or stop:
+            return measured, health, stop or trip
+        if self.controller.contract.ends.tilted(measured.gravity) or self.robot.fell():
+            if not self.states:
+                self.summary.fell = loop.now
+            elif self.states.state == POLICY:
+                return measured, health, Trip("fall", "the robot fell")
+        if self.states is None or self.states.armed:
+            trip = self.safety.sensed(measured, health, loop.now, loop.behind)
+        return measured, health, trip
+
+    def _decide(self, measured: Measurement, now: float) -> Order:
+        if self.states is None:
+            return Order(POLICY, self.controller.act(measured, self._command(now))[0])
+        before, order = self.states.armed, self.states.step(measured, now)
+        if self.states.armed and not before:
+            self.safety.reset()
+        return order
+
+    def _trip(self, trip: Trip | None, now: float) -> Order:
+        """Damping, or the end of the run."""
+        if self.states is None:
+            assert trip
+            raise Tripped(trip)
+        if trip and self.states.state != DAMPING:
+            self.summary.trips.append(trip)
+            if self.log:
+                self.log.event(now, f"{trip.limit}: {trip.text}")
+            return self.states.trip(trip, now)
+        return Order(self.states.state)
+
+    def _do(self, order: Order) -> None:
+        if order.targets is None:
+            self.robot.limp() if order.state == ZERO else self.robot.damp()
+        elif order.stiffness is None or not self.robot.can_change_gains:
+            self.robot.write(order.targets)
+        else:
+            self.robot.write(order.targets, stiffness=order.stiffness, damping=order.damping)
+
+    def _command(self, now: float) -> Floats:
+        return self.controller.contract.held(self.command(now))

@@ -21,22 +21,28 @@ from numpy.typing import ArrayLike, NDArray
 
 from legged_mw.deploy.contract import CONTRACT_FILE, FALL, SCAN, SCENE_FILE, SENSED, Contract, ContractError, quantity_size
 from legged_mw.deploy.motors import make_network
-from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, layout
+from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, damped, layout
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import usable_cores
 
 _NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # sensors of position and velocity describe the new state
 
 _GROUND_GROUP = [1, 0, 0, 0, 0, 0]  # geom groups that a height scan sees: a robot's own are others
+_SHAPES = 3  # geom group of a robot's collision shapes
 _ABOVE = 2.0  # [m] over the root, where its rays begin
 
 
 class Fleet:
     """``count`` robots, each in a world of its own, stepped together on ``threads`` threads (0: one a core)."""
 
-    def __init__(self, folder: Path, contract: Contract, count: int = 1, threads: int = 0, scene_file: str = SCENE_FILE) -> None:
-        """Load the scene and put every robot into its first keyframe. Raises ContractError."""
-        scene = read_scene(folder, contract, scene_file)
+    def __init__(
+        self, folder: Path, contract: Contract, count: int = 1, threads: int = 0, scene_file: str = SCENE_FILE, whole: bool = False
+    ) -> None:
+        """Load the scene and put every robot into its first keyframe. ``whole``: its body touches the ground too, not only its feet.
+
+        Raises ContractError.
+        """
+        scene = read_scene(folder, contract, scene_file, whole)
         self.contract, self.count, self.spec, self.model = contract, count, scene.spec, scene.model
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world counts as fallen; nothing is printed
         _keep_quiet()
@@ -44,7 +50,7 @@ class Fleet:
         self._sensors, self._layout = self._batch.bind("sensordata"), layout(contract)
         self.qpos: Floats = self._batch.bind("qpos")  # (N, nq), a view: position [m], quaternion, joints in MuJoCo's order
         self.qvel: Floats = self._batch.bind("qvel")  # (N, nv), a view: the next step starts from what is written
-        self._ctrl, self._actuators = self._batch.bind("ctrl"), scene.actuators
+        self._ctrl, self._actuators, self._dofs = self._batch.bind("ctrl"), scene.actuators, scene.dofs
         self._where, self._contacts = scene.sensordata, scene.contacts
         self.broken: NDArray[np.bool_] = np.zeros(count, dtype=bool)  # robots that MuJoCo could not step since their reset
         self._network = make_network(folder, contract.motors, count, len(contract.joints))
@@ -98,9 +104,24 @@ class Fleet:
         if self._network:
             self._network.reset(which)
 
-    def limp(self) -> None:
-        """Motors off: damping is all that is left."""
-        self.contract.motors.limp(self._batch)
+    def set_gains(self, stiffness: Floats, damping: Floats) -> None:
+        """Servos of every robot from now on: (D,) [N m/rad], (D,) [N m s/rad], in the contract's order.
+
+        Damping is held to what these physics steps can take, half of inertia / timestep; drives run faster. Motors that are no servos
+        are on at their own gains, or, without stiffness, off.
+        """
+        scene, dofs, motors = self.model.dof_damping[self._dofs].ravel(), self._dofs, self.contract.motors
+        stable = np.maximum(scene, 0.5 / (self.model.dof_invweight0[dofs] * self.contract.timestep))
+        if motors.law == "servo":
+            self._batch.expand("actuator_gainprm")[:, self._actuators, 0] = stiffness
+            self._batch.expand("actuator_biasprm")[:, self._actuators, 1] = -stiffness
+        else:
+            for name in ("actuator_gainprm", "actuator_biasprm", "actuator_gear"):
+                self._batch.expand(name)[:] = getattr(self.model, name)
+            if not stiffness.any():
+                motors.limp(self._batch)
+        off = motors.law == "servo" or not stiffness.any()
+        self._batch.expand("dof_damping")[:, dofs] = np.minimum(damping, stable) if off else scene
 
     def _value(self, name: str) -> Floats:
         if name == "gravity":
@@ -135,23 +156,54 @@ class Fleet:
 
 
 class MujocoRobot(Robot):
-    """One simulated robot behind the seam. Simulated time moves on in ``write``, by one period."""
+    """One simulated robot behind the seam. Simulated time moves on in ``write``, ``damp`` and ``limp``, by one period."""
 
-    def __init__(self, folder: Path, contract: Contract, scene_file: str = SCENE_FILE) -> None:
-        self.fleet = Fleet(folder, contract, 1, threads=1, scene_file=scene_file)
+    def __init__(
+        self, folder: Path, contract: Contract, scene_file: str = SCENE_FILE, *, whole: bool = False, hoisted: bool = False
+    ) -> None:
+        """``whole``: its body touches the ground too. ``hoisted``: its base hangs at its start until targets come at its own gains."""
+        self.fleet, self.hoisted = Fleet(folder, contract, 1, threads=1, scene_file=scene_file, whole=whole), hoisted
+        self._targets, self._gains, self._closed = contract.default_pose, (contract.stiffness, contract.damping), False
+        self._start, self.can_change_gains = self.fleet.qpos[0, :7].copy(), contract.motors.law == "servo"
 
     def read(self) -> Measurement:
         many = self.fleet.read()
         return Measurement(**{n: getattr(many, n)[0] for n in QUANTITIES}, others={n: v[0] for n, v in many.others.items()})
 
-    def write(self, targets: Floats) -> None:
-        self.fleet.write(np.asarray(targets).reshape(1, -1))
+    def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
+        contract, self.hoisted = self.fleet.contract, self.hoisted and stiffness is not None
+        wanted = (contract.stiffness if stiffness is None else stiffness, contract.damping if damping is None else damping)
+        self._move(np.asarray(targets), *wanted)
+
+    def damp(self) -> None:
+        self._move(self._targets, 0.0 * self._gains[0], damped(self.fleet.contract))
+
+    def limp(self) -> None:
+        self._move(self._targets, 0.0 * self._gains[0], 0.0 * self._gains[1])
 
     def close(self) -> None:
-        self.fleet.limp()
+        """From now on its joints are damped, whatever is written."""
+        self._set(0.0 * self._gains[0], damped(self.fleet.contract))
+        self._closed = True
 
     def fell(self) -> bool:
         return bool(self.fleet.fell()[0])
+
+    def _move(self, targets: Floats, stiffness: Floats, damping: Floats) -> None:
+        """One period."""
+        if not self._closed:
+            self._set(stiffness, damping)
+        self._targets = targets
+        self.fleet.write(targets.reshape(1, -1))
+        if self.hoisted:
+            self.fleet.qpos[0, :7], self.fleet.qvel[0, :6] = self._start, 0.0
+            self.fleet.refresh()
+
+    def _set(self, *gains: Floats) -> None:
+        """Nothing is touched while the gains stay those of the scene."""
+        if any((new != old).any() for new, old in zip(gains, self._gains, strict=True)):
+            self.fleet.set_gains(*gains)
+            self._gains = gains
 
 
 def _keep_quiet() -> None:
@@ -171,16 +223,23 @@ class Scene:
     spec: mujoco.MjSpec
     model: mujoco.MjModel  # compiled from it
     actuators: np.ndarray  # (D,) index of each joint's servo in ctrl
+    dofs: np.ndarray  # (D,) index of each joint in qvel
     sensordata: dict[str, np.ndarray]  # quantity, or name of a row with sensors of its own -> indices in sensordata
     contacts: list[np.ndarray]  # the same of each foot
 
 
-def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE) -> Scene:
-    """``scene.xml`` of an export, or another ``file`` in it, which must be the robot of the contract. Raises ContractError."""
+def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: bool = False) -> Scene:
+    """``scene.xml`` of an export, or another ``file`` in it, which must be the robot of the contract. Raises ContractError.
+
+    ``whole``: the robot's body touches the ground too, not only its feet.
+    """
     if not (folder / file).is_file():
         raise ContractError(f"no {file} in {folder}; an export has one if its task was trained on ground with steps or blocks")
     try:
         spec = mujoco.MjSpec.from_file(str(folder / file))
+        for geom in spec.geoms if whole else ():
+            if geom.group == _SHAPES and geom.parent.name != "world":
+                geom.conaffinity = 1
         model = spec.compile()
     except ValueError as error:
         raise ContractError(f"{file} is not a valid MJCF: {' '.join(str(error).split())}") from None
@@ -199,7 +258,8 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE) -> Scen
         size = own[name].size if name in own else quantity_size(contract, name)
         if len(places[name]) != size:
             raise ContractError(f"{file}: the sensors of '{name}' ({', '.join(sensors)}) have {len(places[name])} values, not {size}")
-    return Scene(spec, model, np.array(actuators), places, [_places(model, file, names, foot) for foot, names in contract.feet.items()])
+    feet = [_places(model, file, names, foot) for foot, names in contract.feet.items()]
+    return Scene(spec, model, np.array(actuators), model.jnt_dofadr[joints], places, feet)
 
 
 def _index(model: mujoco.MjModel, file: str, kind: str, name: str, word: str) -> int:

@@ -1,0 +1,98 @@
+"""The walking exam over the wire: a policy drives a simulated Unitree robot through its DDS messages, both in this process.
+
+    python benchmarks/unitree.py go2_flat
+    python benchmarks/unitree.py g1_flat --wire delay=10,jitter=2,loss=5
+
+Beside it stands the exam of `python -m legged_mw.deploy go2_flat --eval`: another servo law's rate (2 ms), all shapes of the robot on
+the ground, MuJoCo's own number of solver iterations. Nothing waits for real time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections import defaultdict
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from legged_mw import ROOT
+from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.exam import contract_rules, run_exam
+from legged_mw.deploy.options import wire_faults
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.unitree.client import Direct, UnitreeRobot, servo_ranges
+from legged_mw.deploy.unitree.link import RobotEnd, Wire
+from legged_mw.deploy.unitree.robots import machine_of
+from legged_mw.deploy.unitree.serve import STEP, Faults, SimulatedUnitree
+from legged_mw.eval import rules
+from legged_mw.eval.rules import ExamRules
+
+
+def begin(sim: SimulatedUnitree, robot: UnitreeRobot) -> None:
+    """Put the robot into its first keyframe, its servos on."""
+    mujoco.mj_resetDataKeyframe(sim.model, sim.data, 0)  # pyright: ignore[reportAttributeAccessIssue]
+    sim.data.time = robot._stamp + 1.0
+    mujoco.mj_step1(sim.model, sim.data)  # pyright: ignore[reportAttributeAccessIssue]
+    sim.step()
+    robot.write(robot.contract.default_pose)
+    sim.step()
+
+
+def examine(folder: Path, contract: Contract, exam: ExamRules, domain: int, faults: Faults) -> dict[str, object]:
+    """Every command that is held, one after the other, then pushes at the speed of its mark."""
+    package = machine_of(contract.joints).package
+    sim = SimulatedUnitree(folder, contract, RobotEnd(package, "lo", domain), faults=faults, hoist=False)
+    wire = Wire(package, "lo", domain, wait=sim.step, clock=lambda: sim.time)
+    robot = UnitreeRobot(contract, Direct(wire), wire.prepare(), ranges=servo_ranges(folder, contract), clock=lambda: sim.time)
+    controller, names = Controller(folder, contract), [command.name for command in contract.commands]
+    signals, fell_at, last = defaultdict(list), [], []
+    pushed = [(exam.push_vx, 0.0, 0.0)] * rules.PUSH_DIRECTIONS
+    for world, held in enumerate([*exam.held(), *pushed]):
+        command = np.array([each.default for each in contract.commands])
+        command[[names.index(name) for name in rules.VELOCITY]] = held
+        direction = world - len(exam.held())
+        begin(sim, robot)
+        controller.reset()
+        one, fell = defaultdict(list), math.inf
+        for step in range(round(rules.SECONDS / contract.period)):
+            velocity = [*sim._sensor("lin_vel")[:2], sim._sensor("ang_vel")[2]]
+            values = velocity, sim.data.qpos[:2].copy(), np.abs(sim.torque * sim.joint_vel).sum(), np.abs(sim.joint_vel).mean()
+            for name, value in zip(("velocity", "position", "power", "joint_speed"), values, strict=True):
+                one[name].append(value)
+            if direction >= 0 and step == round(rules.PUSH_AT / contract.period) + direction:
+                angle = 2 * math.pi * direction / rules.PUSH_DIRECTIONS
+                sim.data.qvel[:2] += exam.push_mark * np.array([math.cos(angle), math.sin(angle)])
+            robot.write(controller.act(robot.read(), command)[0])
+            for _ in range(round(contract.period / STEP)):
+                sim.step()
+            if sim.upright < 0.0:
+                fell = min(fell, step)
+        for name, values in one.items():
+            signals[name].append(values)
+        fell_at.append(fell)
+        last.append(sim.data.qpos[:2].copy())
+    stacked = {name: np.swapaxes(np.array(values), 0, 1) for name, values in signals.items()}
+    return exam.grade(stacked, last_position=np.array(last), fell_at=np.array(fell_at), mass=contract.mass, dt=contract.period)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("policy", help="a shipped policy, or the folder of an export")
+    parser.add_argument("--wire", help="faults, as `--serve` has them")
+    parser.add_argument("--domain", type=int, default=99)
+    args = parser.parse_args()
+    folder = Path(args.policy) if Path(args.policy).is_dir() else ROOT / "resources" / "policies" / args.policy
+    contract = read_contract(folder)
+    exam = replace(contract_rules(contract), push_speeds=(2.0,), push_mark=2.0)
+    for where, result in (
+        ("over the wire", examine(folder, contract, exam, args.domain, Faults(**wire_faults(args.wire)))),
+        ("through --eval", run_exam(folder, exam)),
+    ):
+        print(f"{where}\n{rules.table(result)}", flush=True)
+
+
+if __name__ == "__main__":
+    main()

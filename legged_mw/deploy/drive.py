@@ -1,0 +1,157 @@
+"""A person drives one robot from a terminal: states, safety, log and loop put together. Prints happen on a thread of their own."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import queue
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+
+from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.inputs import Gamepad, Keys, RobotRemote, Source, StopFile
+from legged_mw.deploy.log import Log, log_path
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.robot import Floats, Measurement, Robot
+from legged_mw.deploy.runner import run
+from legged_mw.deploy.safety import Limits, Safety, parse_limits
+from legged_mw.deploy.states import States
+from legged_mw.utils.commands import with_units
+from legged_mw.utils.errors import shown
+from legged_mw.view import launch
+from legged_mw.view.launch import FlagError
+from legged_mw.view.script import load_script
+
+KEYS = "keys: s start, a policy, x damping, Esc emergency stop, Ctrl-C end; arrows, q, e drive, space stops walking"
+STATUS = 0.2  # [s] between two status lines
+
+
+def add_flags(parser: argparse.ArgumentParser) -> None:
+    """Add the flags of driving a robot, and of its log."""
+    parser.add_argument("--drive", action="store_true", help="from the terminal as on a robot: states, safety limits, a log; in real time")
+    parser.add_argument(
+        "--hoist", choices=("yes", "no"), help="a simulated robot hangs until the policy starts (default: if it has two feet)"
+    )
+    limits = "another limit of the safety layer, e.g. tilt=45 or frozen=off (docs/on_the_robot.md has them all)"
+    parser.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE", help=limits)
+    parser.add_argument("--gamepad", type=Path, metavar="FILE", help="drive by a gamepad too, e.g. /dev/input/js0")
+    parser.add_argument("--stop_fd", type=int, metavar="N", help="damp the robot when this file descriptor can be read or is closed")
+    parser.add_argument("--log", metavar="FILE", help="where the run is logged (default: a new file in logs/deploy), or off")
+    parser.add_argument("--replay", type=Path, metavar="LOG", help="draw a log beside the simulation of the same commands")
+
+
+def check_flags(args: argparse.Namespace) -> None:
+    """Refuse flags that do not go together. Raises FlagError or LimitError."""
+    several = {"eval": args.eval, "num_envs": args.num_envs != 1, "replay": args.replay}
+    watched = [flag.removeprefix("--") for flag in launch.asked(args) if flag != "--commands"]
+    if args.drive and (given := [name for name, value in several.items() if value] + watched):
+        raise FlagError(f"--drive is one robot in real time: leave --{given[0]} out")
+    alone = {"hoist": args.hoist, "limit": args.limit, "gamepad": args.gamepad, "stop_fd": args.stop_fd is not None, "log": args.log}
+    if not args.drive and args.robot == "simulated" and (given := [name for name, value in alone.items() if value]):
+        raise FlagError(f"--{given[0]} is of a robot that is driven: add --drive")
+    parse_limits(args.limit)
+
+
+def hoisted(args: argparse.Namespace, contract: Contract) -> bool:
+    """Whether a simulated robot begins on a hoist."""
+    return args.hoist == "yes" or (args.hoist is None and len(contract.feet) == 2)
+
+
+def drive(robot: Robot, folder: Path, contract: Contract, args: argparse.Namespace, fixed: Sequence[float] | None, kind: str) -> None:
+    """Drive ``robot`` until Ctrl-C or for ``args.time``.
+
+    ``fixed`` (C,) is followed while nobody drives; None: the defaults. ``kind`` of robot, for the log.
+    """
+    with ExitStack() as stack:
+        stack.callback(robot.close)
+        safety = Safety(contract, Limits.of(folder, contract, robot.limits, parse_limits(args.limit)))
+        path = None if args.log == "off" else Path(args.log) if args.log else log_path(contract)
+        log = Log(path, contract, folder, kind) if path else None
+        console = stack.enter_context(Console(contract))
+        controller, command = Controller(folder, contract), _commands(contract, args, fixed)
+        states = States(controller, _sources(contract, args), command, console.say)
+        stack.callback(states.close)
+        console.say(f"{KEYS}\n{states.state}: {states.note}")
+        stack.enter_context(_ended_by_signals())
+        show, seconds = console.watch(states), args.time or math.inf
+        done = run(robot, controller, command, seconds, watch=show, safety=safety, states=states, log=log)
+        console.say(f"{done.timing}\nthe joints are damped{f'; logged to {shown(path)}' if path else ''}")
+
+
+def _sources(contract: Contract, args: argparse.Namespace) -> list[Source]:
+    """Who may drive; the first one that does goes before the others."""
+    sources: list[Source] = [RobotRemote(contract.commands)]
+    if args.stop_fd is not None:
+        sources.append(StopFile(args.stop_fd))
+    if args.gamepad:
+        sources.append(Gamepad(args.gamepad, contract.commands))
+    if sys.stdin.isatty():
+        sources.append(Keys(contract.commands))
+    return sources
+
+
+def _commands(contract: Contract, args: argparse.Namespace, fixed: Sequence[float] | None) -> Callable[[float], Floats]:
+    """The command (C,) at a time since the policy began: of the script, the fixed one, or the defaults."""
+    rest = np.array([each.default for each in contract.commands]) if fixed is None else np.array(fixed)
+    if not args.commands:
+        return lambda _: rest
+    entries = [(entry.time, np.array(entry.command)) for entry in load_script(args.commands, contract.commands).entries if entry.command]
+    return lambda time: next((command for start, command in reversed(entries) if start <= time + 1e-9), rest)
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """A request to end, or a closed terminal, damps the robot as Ctrl-C does."""
+    asked = (signal.SIGTERM, signal.SIGHUP)
+    before = [signal.signal(each, signal.default_int_handler) for each in asked]
+    try:
+        yield
+    finally:
+        for each, handler in zip(asked, before, strict=True):
+            signal.signal(each, handler)
+
+
+class Console:
+    """Prints lines and, in a terminal, a status below them, on a thread: a terminal that hangs delays no step."""
+
+    def __init__(self, contract: Contract) -> None:
+        self._units = with_units(contract.commands)
+        self._lines: queue.SimpleQueue[tuple[str, bool] | None] = queue.SimpleQueue()
+        self._terminal, self._next = sys.stdout.isatty(), 0.0
+        self._thread = threading.Thread(target=self._print, name="console", daemon=True)
+
+    def __enter__(self) -> Console:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._lines.put(None)
+        self._thread.join(timeout=1.0)
+
+    def say(self, line: str) -> None:
+        """A line that stays."""
+        self._lines.put((line, False))
+
+    def watch(self, states: States) -> Callable[[float, Measurement], None]:
+        """A status of the state, its command and the measured turn, that is overwritten."""
+
+        def show(now: float, measured: Measurement) -> None:
+            if self._terminal and now >= self._next and self._lines.qsize() < 10:
+                self._next = now + STATUS
+                command = " ".join(f"{value:+.2f}" for value in states.command)
+                self._lines.put((f"{now:7.1f} s  {states.state:<11}  command {command} ({self._units})", True))
+
+        return show
+
+    def _print(self) -> None:
+        with suppress(OSError, ValueError):  # nobody reads any more: the run goes on, and ends by its own rules
+            while (entry := self._lines.get()) is not None:
+                line, fleeting = entry
+                clear = "\r\x1b[K" if self._terminal else ""
+                print(f"{clear}{line}", end="" if fleeting else "\n", flush=True)

@@ -1,0 +1,183 @@
+"""The log of a run on one robot: what was measured, seen, done and asked, when, and each trip, in one compressed file.
+
+The file is a row of blocks, each a length (8 bytes, little-endian) and an .npz of so many bytes: a header, then the columns of
+CHUNK steps at a time. A process that dies loses the last chunk alone. Nothing in it is code: it is read without pickle.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import queue
+import struct
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.loop import Loop
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.robot import Floats, Health, Measurement, layout
+from legged_mw.deploy.states import POLICY, STATES, Order
+from legged_mw.utils.errors import UserError
+
+FORMAT = 1
+CHUNK = 100  # steps a block
+BACKLOG = 60  # blocks that wait to be written: a slow disk must not fill the memory
+SUFFIX = ".lmwlog"
+_LENGTH = struct.Struct("<Q")
+
+
+class LogError(UserError, ValueError):
+    """A file that is no log, or cannot be written."""
+
+
+def log_path(contract: Contract, folder: Path = Path("logs/deploy")) -> Path:
+    """Where a run is logged that was not told where."""
+    return folder / f"{contract.task}_{time.strftime('%Y-%m-%d_%H-%M-%S')}{SUFFIX}"
+
+
+def _columns(contract: Contract) -> dict[str, int]:
+    """Values a step: times [s], the state's place in STATES, the controller's rows, then the measurement's parts."""
+    joints = len(contract.joints)
+    return {
+        **dict.fromkeys(("time", "behind", "work", "age", "state", "voltage"), 1),
+        **{"command": len(contract.commands), "observation": contract.size},
+        **dict.fromkeys(("action", "target", "stiffness", "damping", "temperature"), joints),
+        **layout(contract),
+    }
+
+
+class Log:
+    """Writes a run's log; a thread of its own compresses and writes, so a step only copies numbers."""
+
+    def __init__(self, path: Path, contract: Contract, folder: Path, robot: str) -> None:
+        """Begin the file. Raises LogError if it cannot be written."""
+        self.path, self.contract = path, contract
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("xb")
+        except OSError as error:
+            raise LogError(f"cannot write the log {path}: {error.strerror}; say --log FILE, or --log off") from None
+        said = {"format": FORMAT, "task": contract.task, "network": contract.digest, "robot": robot, "export": str(folder.resolve())}
+        self._blocks: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
+        self._blocks.put({"header": json.dumps({**said, "began": time.strftime("%Y-%m-%d %H:%M:%S"), "contract": contract.to_dict()})})
+        self._events: list[tuple[float, str]] = []
+        self._lost = 0  # steps
+        self._begin()
+        self._thread = threading.Thread(target=self._write, name="log", daemon=True)
+        self._thread.start()
+
+    def add(self, loop: Loop, controller: Controller, measured: Measurement, health: Health, order: Order, command: Floats) -> None:
+        """One step. What there was none of is NaN."""
+        nothing, contract = np.nan, self.contract
+        targets, acts = order.targets is not None, order.state == POLICY
+        stiffness = contract.stiffness if order.stiffness is None else order.stiffness
+        damping = contract.damping if order.damping is None else order.damping
+        values = {
+            **{"time": loop.now, "behind": loop.behind, "work": loop.work, "state": STATES.index(order.state)},
+            **{"age": _or_nan(health.age_s), "voltage": _or_nan(health.voltage), "temperature": _or_nan(health.temperatures)},
+            **{"command": command, "observation": controller.last_observation[0] if acts else nothing},
+            **{"action": controller.last_actions[0] if acts else nothing, "target": order.targets if targets else nothing},
+            **{"stiffness": stiffness if targets else nothing, "damping": damping if targets else nothing},
+        }
+        for name, column in self._rows.items():
+            value = values.get(name)
+            column[self._count] = (
+                (measured.others[name] if name in measured.others else getattr(measured, name)) if value is None else value
+            )
+        self._count += 1
+        if self._count == CHUNK:
+            self._hand_over()
+
+    def event(self, now: float, text: str) -> None:
+        """A trip, or something else to say of a moment."""
+        self._events.append((now, text))
+
+    def close(self) -> None:
+        """Write the rest; again is allowed."""
+        if self._thread.is_alive():
+            self._hand_over(last=True)
+            self._blocks.put(None)
+            self._thread.join()
+
+    def _begin(self) -> None:
+        self._count, self._events = 0, []
+        self._rows = {name: np.empty((CHUNK, size), np.float64 if name == "time" else np.float32) for name, size in self._sizes().items()}
+
+    def _sizes(self) -> dict[str, int]:
+        return _columns(self.contract)
+
+    def backlog(self) -> int:
+        """Blocks that wait to be written."""
+        return self._blocks.qsize()
+
+    def _hand_over(self, last: bool = False) -> None:
+        if not last and self.backlog() >= BACKLOG:
+            self._lost, self._count = self._lost + self._count, 0
+            return
+        if self._lost:
+            self.event(float(self._rows["time"][0, 0]), f"{self._lost} steps were not logged: the disk is too slow")
+            self._lost = 0
+        if self._count or self._events:
+            rows = {name: column[: self._count] for name, column in self._rows.items()}
+            self._blocks.put({**rows, "events": json.dumps(self._events)})
+            self._begin()
+
+    def _write(self) -> None:
+        with self._file:
+            while (block := self._blocks.get()) is not None:
+                buffer = io.BytesIO()
+                np.savez_compressed(buffer, **block)
+                self._file.write(_LENGTH.pack(buffer.tell()) + buffer.getvalue())
+                self._file.flush()
+
+
+def _or_nan(value: Any) -> Any:
+    return np.nan if value is None else value
+
+
+@dataclass(frozen=True)
+class Recording:
+    """A log that was read."""
+
+    header: dict[str, Any]
+    rows: dict[str, Floats]  # name -> (T, values)
+    events: list[tuple[float, str]]
+
+
+def read_log(path: Path) -> Recording:
+    """The whole log; a last block that was cut off is left out. Raises LogError."""
+    try:
+        first, *blocks = _blocks(path)
+        header = json.loads(str(first["header"]))
+        rows = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0] if name != "events"} if blocks else {}
+        events = [(float(now), str(text)) for block in blocks for now, text in json.loads(str(block["events"]))]
+        fits = header["format"] == FORMAT
+    except OSError as error:
+        raise LogError(f"cannot read {path}: {error.strerror}") from None
+    except (ValueError, KeyError, TypeError):
+        raise LogError(f"{path} is no log of legged_mw.deploy") from None
+    if not fits:
+        raise LogError(f"{path} is a log of format {header['format']}; this version reads {FORMAT}")
+    if not rows:
+        raise LogError(f"{path} holds no step: its run ended within the first {CHUNK}, or was cut off")
+    return Recording(header, rows, events)
+
+
+def _blocks(path: Path) -> Iterator[dict[str, Any]]:
+    with path.open("rb") as file:
+        while len(start := file.read(_LENGTH.size)) == _LENGTH.size:
+            (length,) = _LENGTH.unpack(start)
+            if length > 1 << 28:
+                raise ValueError("not a block")
+            data = file.read(length)
+            if len(data) < length:
+                return
+            with np.load(io.BytesIO(data), allow_pickle=False) as block:
+                yield {name: block[name] for name in block.files}

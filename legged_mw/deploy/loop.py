@@ -1,0 +1,151 @@
+"""Keeps the time of a control loop: absolute deadlines, what they were missed by, and no garbage collection within a step.
+
+Deadline k is start + k * period, whatever a step took, so the loop does not drift. It knows neither robot nor policy.
+"""
+
+from __future__ import annotations
+
+import gc
+import math
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from typing import Any, NamedTuple
+
+import numpy as np
+
+LATE = 0.5  # [periods] by which a step may begin late before it is counted
+KEPT = 1 << 16  # samples for median and p99: 22 minutes at 50 Hz; the worst is of the whole run
+_PRIORITY = 20  # ours, of 1 to 99: above all that is not real time, below a kernel's own threads
+_YIELD = 5e-4  # [s] for which another thread may keep the interpreter; Python's own 5 ms would be a late step
+_SPARE = 0.003  # [s] of waiting that must be left for a collection: it takes 0.1 ms, as frozen objects are not looked at
+
+
+class Spread(NamedTuple):
+    """Median, 99th percentile and worst of a time [s]."""
+
+    median: float
+    p99: float
+    worst: float
+
+    def __str__(self) -> str:
+        return f"median {1e3 * self.median:.2f}, p99 {1e3 * self.p99:.2f}, worst {1e3 * self.worst:.2f} ms"
+
+
+class Timing(NamedTuple):
+    """How a loop kept its time."""
+
+    jitter: Spread  # how late steps began
+    work: Spread  # what a step took
+    steps: int
+    late: int  # steps that began more than LATE periods late
+    lost: int  # periods that were left out, since the step before took longer
+
+    def __str__(self) -> str:
+        lost = f", {self.lost} periods left out" if self.lost else ""
+        return f"{self.steps} steps, {self.late} late{lost}; begin late by {self.jitter}; work of a step {self.work}"
+
+
+class _Samples:
+    """The last KEPT values, their worst ever; memory is fixed."""
+
+    def __init__(self) -> None:
+        self.values, self.count, self.worst = np.zeros(KEPT, dtype=np.float32), 0, 0.0
+
+    def add(self, value: float) -> None:
+        self.values[self.count % KEPT] = value
+        self.count += 1
+        self.worst = max(self.worst, value)
+
+    def spread(self) -> Spread:
+        if not self.count:
+            return Spread(0.0, 0.0, 0.0)
+        median, p99 = np.percentile(self.values[: self.count], (50, 99))
+        return Spread(float(median), float(p99), self.worst)
+
+
+class Loop:
+    """Gives the time of each step, in ``ticks``. ``live``: in real time; else it never waits, and leaves the garbage collector alone.
+
+    As a context it keeps the collector from running within a step; it collects while it waits. It asks the system for real-time
+    priority, and goes on without where that is not allowed.
+    """
+
+    def __init__(self, period: float, live: bool = True) -> None:
+        self.period, self.live = period, live
+        self.now = 0.0  # [s] of the step since the first one, a multiple of the period
+        self.behind = 0.0  # [s] by which this step began late
+        self.work = 0.0  # [s] that the step before took
+        self.steps = self.late = self.lost = 0
+        self._tick, self._start, self._began = -1, 0.0, 0.0
+        self._jitter, self._work = _Samples(), _Samples()
+        self._before = False, 0.0  # whether the collector ran, and how long threads kept the interpreter [s]
+        self._scheduled: tuple[int, Any] | None = None  # as the system ran this thread
+
+    def __enter__(self) -> Loop:
+        if self.live:
+            self._before = gc.isenabled(), sys.getswitchinterval()
+            gc.collect()
+            gc.freeze()
+            gc.disable()
+            sys.setswitchinterval(_YIELD)
+            with suppress(OSError, AttributeError):  # not allowed, or not Linux
+                now = os.sched_getscheduler(0), os.sched_getparam(0)
+                os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
+                self._scheduled = now
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.live:
+            gc.unfreeze()
+            sys.setswitchinterval(self._before[1])
+            if self._before[0]:
+                gc.enable()
+            if self._scheduled:
+                os.sched_setscheduler(0, *self._scheduled)
+
+    def ticks(self, seconds: float = math.inf) -> Iterator[float]:
+        """The time [s] of each step for ``seconds``, when it is due, or at once if it is late.
+
+        A deadline that is missed by a whole period is left out.
+        """
+        while self._wait() < seconds - 1e-9:
+            self.steps += 1
+            yield self.now
+
+    def timing(self) -> Timing:
+        """So far."""
+        return Timing(self._jitter.spread(), self._work.spread(), self.steps, self.late, self.lost)
+
+    def _wait(self) -> float:
+        """Time of the next step, when it begins."""
+        self._tick += 1
+        self.now = self._tick * self.period
+        if not self.live:
+            return self.now
+        if self._tick:
+            self._end_step()
+        else:
+            self._start = time.perf_counter()
+        self._began = time.perf_counter()
+        self.behind = max(0.0, self._began - self._start - self.now)
+        if self._tick:
+            self._jitter.add(self.behind)
+        self.late += self.behind > LATE * self.period + 1e-9
+        return self.now
+
+    def _end_step(self) -> None:
+        """Wait for the next deadline that is less than a period ago."""
+        ended = time.perf_counter()
+        self.work = ended - self._began
+        self._work.add(self.work)
+        missed = max(0, int((ended - self._start - self._tick * self.period) / self.period))
+        self._tick += missed
+        self.lost += missed
+        self.now = self._tick * self.period
+        due = self._start + self.now
+        if due - ended > _SPARE:
+            gc.collect()
+        time.sleep(max(0.0, due - time.perf_counter()))

@@ -1,0 +1,219 @@
+"""A log beside the simulation of the same commands: torque, joint errors, velocity and latency, as a table and a picture.
+
+The simulation starts where the policy began on the robot: its joints, its tilt, at the same speed, on level ground.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+
+from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.log import LogError, Recording, read_log
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.robot import QUANTITIES, Floats
+from legged_mw.deploy.simulated import MujocoRobot
+from legged_mw.deploy.states import POLICY, STATES
+from legged_mw.utils.commands import VELOCITY
+from legged_mw.utils.errors import UserError, shown
+
+LAGS = 12  # [periods] in which a joint's answer to its target is looked for
+MOVES = 0.02  # [rad] a target whose deviation is less tells no latency
+SHORTEST = 50  # steps of the policy that can be compared
+Rows = dict[str, Floats]  # name -> (T, values)
+
+
+class Replay(NamedTuple):
+    """The longest walk of a log, and the simulation of it; both have T rows, or the simulation fewer if it fell."""
+
+    contract: Contract
+    recording: Recording
+    robot: Rows
+    simulated: Rows
+
+
+def replay(path: Path, folder: Path | None = None) -> Replay:
+    """Simulate the longest walk in a log with the export in ``folder`` (None: the one that it names). Raises LogError, ContractError."""
+    recording = read_log(path)
+    folder = folder or Path(recording.header["export"])
+    contract = read_contract(folder)
+    if contract.digest != recording.header["network"]:
+        raise LogError(f"{shown(path)} is of another network than the one in {shown(folder)} ({recording.header['task']}); name its export")
+    walked = _longest(recording.rows["state"][:, 0] == STATES.index(POLICY))
+    if walked.stop - walked.start < SHORTEST:
+        raise LogError(f"{shown(path)} holds no walk of {SHORTEST} steps: the policy was not on for so long")
+    rows = {name: values[walked].astype(float) for name, values in recording.rows.items()}
+    return Replay(contract, recording, rows, _simulate(folder, contract, rows))
+
+
+def _longest(on: Any) -> slice:
+    """The longest run of true values."""
+    edges = np.flatnonzero(np.diff(np.r_[False, on, False].astype(int))).reshape(-1, 2)
+    start, stop = max(edges, key=lambda edge: edge[1] - edge[0], default=(0, 0))
+    return slice(int(start), int(stop))
+
+
+def _simulate(folder: Path, contract: Contract, rows: Rows) -> Rows:
+    """The same steps on the simulated robot, until it falls."""
+    robot, controller = MujocoRobot(folder, contract), Controller(folder, contract)
+    _pose(robot, {name: rows[name][0] for name in ("joint_pos", "joint_vel", "gravity", "lin_vel", "ang_vel")})
+    found: dict[str, list[Floats]] = {name: [] for name in (*QUANTITIES, "target")}
+    for command in rows["command"]:
+        measured = robot.read()
+        if robot.fell():
+            break
+        targets = controller.act(measured, contract.held(command))[0]
+        for name in QUANTITIES:
+            found[name].append(getattr(measured, name))
+        found["target"].append(targets)
+        robot.write(targets)
+    return {name: np.array(values) for name, values in found.items()}
+
+
+def _pose(robot: MujocoRobot, start: Rows) -> None:
+    """Put the simulated robot where the real one was, its lowest foot on the ground."""
+    fleet, contract = robot.fleet, robot.fleet.contract
+    data = mujoco.MjData(fleet.model)
+    data.qpos[:] = fleet.qpos[0]
+    joints = [fleet.model.joint(name) for name in contract.joints]
+    data.qpos[[joint.qposadr[0] for joint in joints]] = start["joint_pos"]
+    up = -start["gravity"] / np.linalg.norm(start["gravity"])  # z axis of the world, in the body
+    axis, turn = np.cross(up, [0.0, 0.0, 1.0]), math.acos(np.clip(up[2], -1.0, 1.0))
+    mujoco.mju_axisAngle2Quat(data.qpos[3:7], axis / max(float(np.linalg.norm(axis)), 1e-9), turn)
+    mujoco.mj_kinematics(fleet.model, data)
+    model = fleet.model
+    touching = np.flatnonzero((model.geom_conaffinity > 0) & (model.geom_bodyid > 0))
+    lowest = [data.geom_xpos[i, 2] - _reach(model.geom_size[i], data.geom_xmat[i], model.geom_type[i]) for i in touching]
+    data.qpos[2] -= min(lowest, default=0.0)
+    fleet.qpos[0], fleet.qvel[0, 3:6] = data.qpos, start["ang_vel"]
+    rotation = data.xmat[model.jnt_bodyid[0]].reshape(3, 3)
+    fleet.qvel[0, :3] = rotation @ np.nan_to_num(start["lin_vel"])
+    fleet.qvel[0, [joint.dofadr[0] for joint in joints]] = start["joint_vel"]
+    fleet.refresh()
+
+
+def _reach(size: Floats, turn: Floats, kind: int) -> float:
+    """How far a sphere or capsule reaches down from its centre [m]; another shape about its largest size."""
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return size[0] + abs(turn[8]) * size[1]
+    return size[0] if kind == mujoco.mjtGeom.mjGEOM_SPHERE else float(size.max())
+
+
+# ---- figures
+
+
+def latency(rows: Rows, period: float) -> Floats:
+    """(D,) [s] by which each joint follows its target: the lag of the best correlation; NaN of one that hardly moves."""
+    found = []
+    for target, angle in zip(rows["target"].T, rows["joint_pos"].T, strict=True):
+        if len(target) <= 2 * LAGS or target.std() < MOVES or angle.std() == 0.0:
+            found.append(math.nan)
+            continue
+        fits = [np.corrcoef(target[: len(target) - lag], angle[lag:])[0, 1] for lag in range(LAGS)]
+        best = int(np.argmax(fits))
+        between = 0.0
+        if 0 < best < LAGS - 1:  # top of the parabola through three lags
+            left, top, right = fits[best - 1 : best + 2]
+            between = 0.5 * (left - right) / (left - 2.0 * top + right)
+        found.append((best + between) * period)
+    return np.array(found)
+
+
+def _rms(values: Floats) -> Floats:
+    return np.sqrt((values**2).mean(axis=0))
+
+
+def figures(rows: Rows, contract: Contract) -> dict[str, Floats]:
+    """What is compared, each (D,) or (3,)."""
+    velocity = np.concatenate([rows["lin_vel"][:, :2], rows["ang_vel"][:, 2:]], axis=1)
+    return {
+        "torque": _rms(rows["joint_torque"]),
+        "error": _rms(rows["target"] - rows["joint_pos"]),
+        "latency": 1e3 * latency(rows, contract.period),
+        "velocity": velocity[len(velocity) // 4 :].mean(axis=0),
+    }
+
+
+def table(shown_: Replay) -> str:
+    """Robot beside simulation, a line a joint."""
+    contract, rows = shown_.contract, shown_.robot
+    robot, simulated = figures(rows, contract), figures(shown_.simulated, contract)
+    steps, made = len(rows["command"]), len(shown_.simulated["target"])
+    fell = "" if made == steps else f"; the simulated robot fell after {made * contract.period:.1f} s"
+    lines = [
+        f"{shown_.recording.header['task']}, {shown_.recording.header['robot']}: {steps * contract.period:.1f} s of the policy{fell}",
+        f"{'robot / simulated':<28}{'torque [N m]':>18}{'error [rad]':>18}{'latency [ms]':>18}",
+    ]
+    for i, name in enumerate(contract.joints):
+        pairs = "".join(f"{robot[key][i]:>10.{n}f}{simulated[key][i]:>8.{n}f}" for key, n in (("torque", 2), ("error", 3), ("latency", 0)))
+        lines.append(f"{name:<28}{pairs}")
+    for i, axis in enumerate(("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")):
+        measured = f"{robot['velocity'][i]:.3f}" if i == 2 or rows["lin_vel"].any() else "-"
+        lines.append(f"{axis + ', mean':<28}{measured:>10}{simulated['velocity'][i]:>8.3f}")
+    age = rows["age"][np.isfinite(rows["age"])]
+    for name, values in (("age of a measurement", age), ("work of a step", rows["work"]), ("step began late by", rows["behind"])):
+        if len(values):
+            median, p99 = 1e3 * np.percentile(values, (50, 99))
+            lines.append(f"{name:<28}median {median:.2f}, p99 {p99:.2f}, worst {1e3 * values.max():.2f} ms")
+    return "\n".join([*lines, *(f"{now:8.2f} s  {text}" for now, text in shown_.recording.events)])
+
+
+# ---- the picture
+
+
+def draw(shown_: Replay, path: Path) -> None:
+    """Write the picture. Raises UserError where matplotlib is missing."""
+    try:
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise UserError("drawing a log needs matplotlib: pip install matplotlib") from None
+    contract, rows, simulated = shown_.contract, shown_.robot, shown_.simulated
+    figure = Figure((13, 11), layout="constrained")
+    grid = figure.add_gridspec(4, 3)
+    time, made = rows["time"][:, 0], len(simulated["target"])
+    _velocities([figure.add_subplot(grid[0, i]) for i in range(3)], contract, rows, simulated, time)
+    both, where = (figures(rows, contract), figures(simulated, contract)), np.arange(len(contract.joints))
+    for i, (key, title) in enumerate(
+        (("torque", "torque, rms [N m]"), ("error", "target - angle, rms [rad]"), ("latency", "latency [ms]"))
+    ):
+        axes = figure.add_subplot(grid[1, i], title=title)
+        for shift, values, label in zip((-0.2, 0.2), both, ("robot", "simulated"), strict=True):
+            axes.bar(where + shift, np.nan_to_num(values[key]), 0.4, label=label)
+        axes.set_xticks(where, contract.joints, rotation=90, fontsize=5)
+    joint = int(np.argmax(np.abs(both[0]["torque"] - both[1]["torque"])))
+    for i, (key, unit) in enumerate((("joint_pos", "rad"), ("joint_torque", "N m"))):
+        axes = figure.add_subplot(grid[2 + i, :2], title=f"{contract.joints[joint]} [{unit}]: the joint whose torque differs most")
+        if key == "joint_pos":
+            axes.plot(time, rows["target"][:, joint], color="0.6", linewidth=0.8, label="target")
+        axes.plot(time, rows[key][:, joint], label="robot")
+        axes.plot(time[:made], simulated[key][:, joint], label="simulated")
+        axes.legend(fontsize=6)
+    axes = figure.add_subplot(grid[2:, 2], title="timing [ms]", xlabel="[s]")
+    for name in ("behind", "work", "age"):
+        axes.plot(time, 1e3 * rows[name][:, 0], linewidth=0.8, label=name)
+    axes.legend(fontsize=6)
+    try:
+        figure.savefig(path, dpi=110)
+    except OSError as error:
+        raise LogError(f"cannot write {path}: {error.strerror}") from None
+
+
+def _velocities(many: list[Any], contract: Contract, rows: Rows, simulated: Rows, time: Floats) -> None:
+    """vx, vy, yaw rate: commanded, the robot's, the simulated one's."""
+    names, made = [each.name for each in contract.commands], len(simulated["target"])
+    for i, (axes, title) in enumerate(zip(many, ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]"), strict=True)):
+        axes.set_title(title)
+        if VELOCITY[i] in names:
+            axes.plot(time, rows["command"][:, names.index(VELOCITY[i])], color="0.6", label="command")
+        for each, label in ((rows, "robot"), (simulated, "simulated")):
+            values = each["ang_vel"][:, 2] if i == 2 else each["lin_vel"][:, i]
+            if not values.any():  # not measured
+                continue
+            axes.plot(time[:made] if each is simulated else time, values, linewidth=0.8, label=label)
+        axes.legend(fontsize=6)

@@ -1,0 +1,258 @@
+"""The limits between any policy and any robot: each step is checked, and what is beyond a limit is named in one line.
+
+A trip is a sentence; who calls `Safety` damps the robot. Nothing here moves a joint, reads a clock or knows a kind of robot.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, Contract
+from legged_mw.deploy.loop import LATE
+from legged_mw.deploy.robot import Floats, Health, Measurement, RobotError
+from legged_mw.utils.errors import UserError, unknown
+
+TORQUE = "torque"  # an action's origin: its targets are torques
+OFF = math.inf  # a limit that is never passed
+
+
+class LimitError(UserError, ValueError):
+    """A limit that does not exist, or a value that it cannot have."""
+
+
+class Trip(NamedTuple):
+    """What was beyond a limit."""
+
+    limit: str  # its name: a field of Limits, or "finite", "stop", "robot"
+    text: str  # what and how much, in one line
+
+
+class Tripped(RobotError):
+    """A run that a trip ended; its robot is damped."""
+
+    def __init__(self, trip: Trip) -> None:
+        self.trip = trip
+        super().__init__(f"{trip.text}; the joints are damped")
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of D joints in the contract's order. The first five are the machine's; the others can be set by their names.
+
+    Where no source is named the default is ours: what the shipped policies of Go1, Go2 and G1 need in the walking exam with its
+    pushes of 2 m/s (the figure in brackets), and a margin. Narrower ones for one robot or policy belong in its contract.
+    """
+
+    low: Floats  # (D,) [rad] the joints' range
+    high: Floats  # (D,) [rad]
+    motor: Floats  # (D,) [N m] what the motors can give
+    lowest: Floats  # (D,) [rad] the servos' range: targets are held within it, as in training; no drive does it
+    highest: Floats  # (D,) [rad]
+    position: float = 0.25  # [rad] of a measured angle beyond the range [0.15: simulated end stops give]
+    target: float = 0.9  # [rad] of a target beyond the range [0.62]
+    step: float = 2.5  # [rad] between two targets of a joint [1.85]
+    torque: float = 2.0  # [share of `motor`] that the servo would ask for [1.52]
+    speed: float = 60.0  # [rad/s] of a joint [48]
+    tilt: float = 60.0  # [deg] of the body, where the contract calls one up to 90 a fall; else what it calls a fall [30]
+    temperature: float = 85.0  # [deg C] of a motor: below the 90 at which drives switch themselves off
+    voltage: float = -OFF  # [V] of the battery, at least; a robot's class states its own
+    age: float = 2.0  # [periods] of the newest measurement
+    frozen: float = 4.0  # measurements in a row that are the same, bit for bit
+    late: float = 5.0  # steps in a second that began more than half a period late
+    remote: float = 3.0  # [s] without the remote that was there [unitree_rl_lab]
+
+    @staticmethod
+    def of(folder: Path, contract: Contract, *more: Mapping[str, Any]) -> Limits:
+        """Those of the export in ``folder``: the machine's from its scene, then the contract's section ``safety``, then ``more``."""
+        falls = OFF if contract.ends.max_tilt is None else contract.ends.max_tilt
+        limits = replace(_machine(folder, contract), tilt=falls if falls > 90.0 else min(Limits.tilt, falls))
+        limits = limits.but(contract.safety or {}, f"{CONTRACT_FILE}: safety")
+        for values in more:
+            limits = limits.but(values, "--limit")
+        return limits
+
+    def but(self, values: Mapping[str, Any], where: str) -> Limits:
+        """With other values by name; "off" switches a limit off. Raises LimitError."""
+        return replace(self, **{name: _value(name, value, where) for name, value in values.items()})
+
+
+NAMES = tuple(f.name for f in fields(Limits) if f.name not in ("low", "high", "motor", "lowest", "highest"))
+
+
+def parse_limits(texts: Sequence[str]) -> dict[str, str]:
+    """ "NAME=VALUE" each, as the command line has them. Raises LimitError."""
+    for text in texts:
+        if "=" not in text:
+            raise LimitError(f"--limit {text}: write NAME=VALUE or NAME=off; there are: {', '.join(NAMES)}")
+    return {name.strip(): value.strip() for name, _, value in (text.partition("=") for text in texts)}
+
+
+def _value(name: str, value: Any, where: str) -> float:
+    if name not in NAMES:
+        raise LimitError(f"{where}: {unknown('limit', name, NAMES, 'the safety layer')}")
+    if value in ("off", False):  # YAML reads off as False
+        return -OFF if name == "voltage" else OFF
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if isinstance(value, bool) or not number >= 0.0:
+        raise LimitError(f"{where}: {name} is {value!r}; it must be a number from 0, or off")
+    return number
+
+
+def _machine(folder: Path, contract: Contract) -> Limits:
+    """Ranges and torques of the export's scene; what it does not limit is without limit."""
+    import mujoco
+
+    model = mujoco.MjSpec.from_file(str(folder / SCENE_FILE)).compile()
+    joints = [model.joint(name).id for name in contract.joints]
+    servos = [model.actuator(name).id for name in contract.joints]
+    low, high = np.where(model.jnt_limited[joints, None] > 0, model.jnt_range[joints], [-OFF, OFF]).T
+    servo = np.where(model.actuator_forcelimited[servos] > 0, model.actuator_forcerange[servos, 1], OFF)
+    joint = np.where(model.jnt_actfrclimited[joints] > 0, model.jnt_actfrcrange[joints, 1], OFF)
+    lowest, highest = np.where(model.actuator_ctrllimited[servos, None] > 0, model.actuator_ctrlrange[servos], [-OFF, OFF]).T
+    return Limits(low, high, np.minimum(servo, joint), lowest, highest)
+
+
+class Safety:
+    """Checks one robot. Its memory is of the last steps only; ``reset`` forgets it when a person starts the robot again."""
+
+    def __init__(self, contract: Contract, limits: Limits) -> None:
+        self.contract, self.limits = contract, limits
+        self.reset()
+
+    def reset(self) -> None:
+        """As if nothing had been measured, asked or missed."""
+        self._last: Floats | None = None  # targets (D,) of the step before
+        self._seen, self._same = b"", 0
+        self._late: deque[float] = deque(maxlen=64)  # [s] of steps that began late
+        self._remote: float | None = None  # [s] when the remote was last there
+
+    def sensed(self, measured: Measurement, health: Health, now: float, behind: float = 0.0) -> Trip | None:
+        """The first limit that a measurement passes; ``now`` [s], ``behind`` [s] is how late the step began."""
+        return (
+            self._finite(measured)
+            or self._fresh(measured, health)
+            or self._on_time(now, behind)
+            or self._joints(measured)
+            or self._tilt(measured)
+            or self._machine(health)
+            or self._heard(health, now)
+        )
+
+    def held(self, targets: Floats) -> Floats:
+        """``targets`` (D,) within the servos' range; torques within that of the motors, if their actuators have one."""
+        return np.clip(targets, self.limits.lowest, self.limits.highest)
+
+    def asked(self, measured: Measurement, targets: Floats, stiffness: Floats | None = None, damping: Floats | None = None) -> Trip | None:
+        """The first limit that targets (D,) [rad], or torques [N m], pass, for servos with these gains (D,); None: the contract's."""
+        limits, contract = self.limits, self.contract
+        strong = "is asked for {value:.1f} N m, more than {most:.1f}"
+        if not (finite := np.isfinite(targets)).all():
+            return Trip("finite", f"the target of {self._name(finite)} is not finite: {targets[_first(~finite)]}")
+        if contract.action.origin == TORQUE and stiffness is None:
+            return self._most("torque", strong, np.abs(targets), limits.torque * limits.motor)
+        stiffness = contract.stiffness if stiffness is None else stiffness
+        damping = contract.damping if damping is None else damping
+        torque = np.abs(stiffness * (self.held(targets) - measured.joint_pos) - damping * measured.joint_vel)
+        stepped = np.zeros_like(targets) if self._last is None else np.abs(targets - self._last)
+        trip = (
+            self._range("target", "is told to go to", targets, limits.target)
+            or self._most(
+                "step", "is told to step by {value:.2f} rad from one target to the next, more than {most:.2f}", stepped, limits.step
+            )
+            or self._most("torque", strong, torque, limits.torque * limits.motor)
+        )
+        self._last = np.array(targets)
+        return trip
+
+    # ---- each limit. A comparison is such that NaN is beyond the limit.
+
+    def _finite(self, measured: Measurement) -> Trip | None:
+        for name in ("joint_pos", "joint_vel", "gravity", "ang_vel"):
+            if not np.isfinite(getattr(measured, name)).all():
+                return Trip("finite", f"what is measured is not finite: {name}")
+        return None
+
+    def _fresh(self, measured: Measurement, health: Health) -> Trip | None:
+        age, most = health.age_s, self.limits.age * self.contract.period
+        if age is not None and not age <= most:
+            return Trip("age", f"the newest measurement is {1e3 * age:.0f} ms old, more than {1e3 * most:.0f}")
+        seen = measured.joint_pos.tobytes() + measured.joint_vel.tobytes() + measured.ang_vel.tobytes()
+        self._same, self._seen = self._same + 1 if seen == self._seen else 1, seen
+        if self._same >= self.limits.frozen:
+            return Trip("frozen", f"{self._same} measurements in a row are the same")
+        return None
+
+    def _on_time(self, now: float, behind: float) -> Trip | None:
+        if behind > LATE * self.contract.period:
+            self._late.append(now)
+        if (count := sum(now - then < 1.0 for then in self._late)) >= self.limits.late:
+            what = f"the last by {1e3 * behind:.0f} ms" if behind else "by more than half a period"
+            return Trip("late", f"{count} steps within a second began late, {what}")
+        return None
+
+    def _joints(self, measured: Measurement) -> Trip | None:
+        fast = "turns at {value:.1f} rad/s, more than {most:.1f}"
+        return self._range("position", "is at", measured.joint_pos, self.limits.position) or self._most(
+            "speed", fast, np.abs(measured.joint_vel), self.limits.speed
+        )
+
+    def _tilt(self, measured: Measurement) -> Trip | None:
+        tilt = math.degrees(math.acos(np.clip(-measured.gravity[2], -1.0, 1.0)))
+        return (
+            None if tilt <= self.limits.tilt else Trip("tilt", f"the body is tilted by {tilt:.0f} degrees, more than {self.limits.tilt:g}")
+        )
+
+    def _machine(self, health: Health) -> Trip | None:
+        for joint, fault in health.motor_faults.items():
+            return Trip("motor", f"the motor of {joint} reports a fault: {fault}")
+        if health.voltage is not None and not health.voltage >= self.limits.voltage:
+            return Trip("voltage", f"the battery has {health.voltage:.1f} V, less than {self.limits.voltage:g}")
+        if health.temperatures is None:
+            return None
+        hot = "has a motor of {value:.0f} deg C, more than {most:.0f}"
+        return self._most("temperature", hot, health.temperatures, self.limits.temperature)
+
+    def _heard(self, health: Health, now: float) -> Trip | None:
+        if health.remote is not None:
+            self._remote = now
+        if self._remote is None or now - self._remote < self.limits.remote:
+            return None
+        return Trip("remote", f"the remote was not heard for {now - self._remote:.1f} s")
+
+    # ---- the same for all joints
+
+    def _name(self, fine: Any) -> str:
+        return self.contract.joints[_first(~fine)]
+
+    def _most(self, limit: str, words: str, values: Floats, most: float | Floats) -> Trip | None:
+        most = np.broadcast_to(most, values.shape)
+        if (fine := values <= most).all():
+            return None
+        worst = _first(~fine)
+        return Trip(limit, f"{self._name(fine)} {words.format(value=values[worst], most=most[worst])}")
+
+    def _range(self, limit: str, words: str, values: Floats, margin: float) -> Trip | None:
+        low, high = self.limits.low, self.limits.high
+        if (fine := (values >= low - margin) & (values <= high + margin)).all():
+            return None
+        joint = _first(~fine)
+        beyond, ends = max(low[joint] - values[joint], values[joint] - high[joint]), f"{low[joint]:.2f} to {high[joint]:.2f}"
+        return Trip(
+            limit, f"{self._name(fine)} {words} {values[joint]:.2f} rad, {beyond:.2f} beyond its range {ends}; {margin:.2f} is the most"
+        )
+
+
+def _first(wrong: Any) -> int:
+    return int(np.argmax(wrong))

@@ -1,0 +1,136 @@
+"""What a robot does: zero torque -> (start) -> stand -> (A) -> policy -> (select, a fall, a trip) -> damping -> (start) -> the first.
+
+A person moves it on, by a remote, a gamepad or keys; only damping comes by itself. Times are handed in: nothing waits here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from legged_mw.deploy.inputs import END, START, WALK, Source, Wish
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.robot import Floats, Health, Measurement
+from legged_mw.deploy.safety import Trip
+
+ZERO, STAND, POLICY, DAMPING = STATES = ("zero torque", "stand", "policy", "damping")
+ARMED = (STAND, POLICY)  # states in which limits are watched: in the others nothing pushes
+RISE = 2.0  # [s] from wherever the joints are to the default pose [unitree_rl_gym]
+SOFT = 0.1  # [share of the stiffness] that standing up begins with
+NEAR = 0.15  # [rad] ours: a joint that is farther from the pose after RISE carries weight, and gets stiffer
+STIFFEST = 3.0  # [share of the stiffness] at most; unitree_rl_lab stands a Go2 with 60 N m/rad, three times what go2_flat walks with
+STIFFEN = 1.0  # [share of the stiffness a second]
+STANDS = 0.3  # [rad] from the pose, at most, where a policy may begin; ours: the shipped policies walk off from there
+
+
+class Order(NamedTuple):
+    """What the servos do in the next period."""
+
+    state: str
+    targets: Floats | None = None  # (D,) [rad]; None: limp in ZERO, damped in DAMPING
+    stiffness: Floats | None = None  # (D,); None: the contract's
+    damping: Floats | None = None  # (D,); None: the contract's
+
+
+class States:
+    """The states of one robot, and who may change them.
+
+    ``command`` gives (C,) at a time [s] since the policy began, while nobody drives; ``say`` gets a line for each change.
+    """
+
+    def __init__(
+        self, controller: Controller, sources: Sequence[Source], command: Callable[[float], Floats], say: Callable[[str], None] = print
+    ) -> None:
+        self.controller, self.sources, self._own, self._say = controller, list(sources), command, say
+        self.state, self.since = ZERO, 0.0  # [s] since when
+        self.command = controller.contract.held(command(0.0))  # (C,) as followed now
+        self.note = f"{START}: stand"
+        self._from: Floats = controller.contract.default_pose  # (D,) [rad] where standing up began
+        self._stiffer = 1.0
+        self._wish = Wish()
+
+    @property
+    def armed(self) -> bool:
+        """Whether limits are watched."""
+        return self.state in ARMED
+
+    def listen(self, health: Health, now: float) -> Trip | None:
+        """Ask everyone who may drive; an emergency stop comes back."""
+        wishes = [source.poll(health) for source in self.sources]
+        driving = next((i for i, wish in enumerate(wishes) if wish.command is not None), None)
+        command = self._own(now - self.since if self.state == POLICY else 0.0) if driving is None else wishes[driving].command
+        for i, source in enumerate(self.sources):
+            if driving is not None and i > driving:
+                source.let_go()
+        self.command = self.controller.contract.held(np.asarray(command, dtype=float))
+        self._wish = Wish(frozenset().union(*(wish.pressed for wish in wishes)))
+        stop = next((wish.stop for wish in wishes if wish.stop), "")
+        return Trip("stop", stop) if stop and self.state != DAMPING else None
+
+    def step(self, measured: Measurement, now: float) -> Order:
+        """Move on as was wished, and say what the servos do."""
+        self._move_on(measured, now)
+        if self.state == STAND:
+            return self._stand(measured, now)
+        if self.state == POLICY:
+            return Order(POLICY, self.controller.act(measured, self.command)[0])
+        return Order(self.state)
+
+    def trip(self, trip: Trip, now: float) -> Order:
+        """A limit was passed: damping, until a person starts again."""
+        if self.state != DAMPING:
+            self._enter(DAMPING, now, trip.text)
+        return Order(DAMPING)
+
+    def close(self) -> None:
+        """Give back keys and files."""
+        for source in self.sources:
+            source.close()
+
+    # ---- the changes
+
+    def _move_on(self, measured: Measurement, now: float) -> None:
+        pressed = self._wish.pressed
+        if END in pressed:
+            if self.state != DAMPING:
+                self._enter(DAMPING, now, f"{END} was pressed")
+        elif START in pressed and self.state == DAMPING:
+            self._enter(ZERO, now, f"{START}: stand")
+        elif START in pressed and self.state == ZERO:
+            self._from, self._stiffer = measured.joint_pos.copy(), 1.0
+            self._enter(STAND, now, f"{RISE:g} s to the default pose; then {WALK}: policy")
+        elif WALK in pressed and self.state == STAND:
+            self._begin(measured, now)
+
+    def _begin(self, measured: Measurement, now: float) -> None:
+        """The policy, if the robot stands."""
+        contract = self.controller.contract
+        off = np.abs(measured.joint_pos - contract.default_pose)
+        if now - self.since < RISE or contract.ends.tilted(measured.gravity) or off.max() > STANDS:
+            joint = contract.joints[int(off.argmax())]
+            self._tell(
+                f"{WALK} has to wait until the robot stands: {joint} is {off.max():.2f} rad from its pose after {now - self.since:.1f} s"
+            )
+            return
+        self.controller.reset()
+        self._enter(POLICY, now, f"{END}: damping")
+
+    def _stand(self, measured: Measurement, now: float) -> Order:
+        """A straight line to the default pose with gains that rise; where that does not carry the robot, they rise further."""
+        contract = self.controller.contract
+        share = min(1.0, (now - self.since) / RISE)
+        targets = self._from + share * (contract.default_pose - self._from)
+        if share == 1.0 and np.abs(measured.joint_pos - targets).max() > NEAR:
+            self._stiffer = min(STIFFEST, self._stiffer + STIFFEN * contract.period)
+        gain = self._stiffer * (SOFT + (1.0 - SOFT) * share)
+        return Order(STAND, targets, gain * contract.stiffness, max(1.0, gain**0.5) * contract.damping)
+
+    def _enter(self, state: str, now: float, note: str) -> None:
+        self.state, self.since = state, now
+        self._tell(note)
+
+    def _tell(self, note: str) -> None:
+        self.note = note
+        self._say(f"{self.state}: {note}")

@@ -1,0 +1,235 @@
+"""A Unitree robot behind the seam ``Robot``: measurements out of its state messages, its command messages out of targets.
+
+Motors are found by the names of their joints. What the robot must be asked or told before its motors obey is in ``link``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from legged_mw.deploy.contract import COMPUTED, CONTRACT_FILE, Contract
+from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError, damped
+from legged_mw.deploy.simulated import read_scene
+from legged_mw.deploy.unitree import need_dds
+from legged_mw.deploy.unitree.codec import LAYOUTS, Message
+from legged_mw.deploy.unitree.remote import decode
+from legged_mw.deploy.unitree.robots import Machine, check_body, machine_of, order
+
+TOO_OLD = 0.1  # [s] ours: a measurement older than this is none
+TOUCH = 20  # foot_force from which a foot touches the ground, in the robot's own unit; ours
+LOST = 5  # messages that a motor may lose between two looks; ours
+_MEASURED = ("ang_vel", "gravity", "joint_pos", "joint_vel", "joint_torque", "acceleration")
+_PARTS = ("q", "dq", "tau", "kp", "kd")
+
+
+class Owner(Protocol):
+    """Who owns the wire: this process (``Direct``), or the guard's (``guard.Guarded``)."""
+
+    def receive(self) -> Any:
+        """The newest state with its stamp, or None if none came since the last call."""
+
+    def arm(self, damping: bytes) -> None:
+        """Say what damps this robot, for when nobody can say it any more."""
+
+    def send(self, body: bytes, stamp: float, safe: bool) -> None:
+        """Send a command made of the state of ``stamp``; ``safe``: it may hold for ever."""
+
+    def close(self, last: bytes) -> str:
+        """Send ``last`` for a while and let go; returns what there is to say."""
+        ...
+
+
+class Direct:
+    """A wire in this process, without a guard: for tests in one process."""
+
+    def __init__(self, wire: Any) -> None:
+        self.wire = wire
+
+    def receive(self) -> Any:
+        if self.wire.other_commander():
+            raise RobotError("another program sends commands to this robot, too")
+        return self.wire.receive()
+
+    def arm(self, damping: bytes) -> None: ...
+
+    def send(self, body: bytes, stamp: float, safe: bool) -> None:
+        self.wire.send(body)
+
+    def close(self, last: bytes) -> str:
+        for _ in range(5):
+            self.wire.send(last)
+        return ""
+
+
+class UnitreeRobot(Robot):
+    """A Go2, G1 or H1. Its motors hold the contract's stiffness and damping, at their own rate."""
+
+    can_change_gains = True
+
+    def __init__(
+        self,
+        contract: Contract,
+        owner: Owner,
+        first: Any,
+        *,
+        ranges: tuple[Floats, Floats],
+        echo: bool = False,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``first``: the state that the robot sent last. ``ranges``: lowest and highest target (D,) [rad] of each servo, as trained.
+
+        ``echo``: commands name the state that they answer, for a simulated robot.
+
+        Raises RobotError if this is not the contract's robot, or cannot measure what the policy observes.
+        """
+        self.contract, self._owner, self._clock, self._echo = contract, owner, clock, echo
+        self.machine = machine_of(contract.joints)
+        self.limits = self.machine.limits
+        check_rows(contract, self.machine)
+        self._slots = order(self.machine, contract.joints)
+        self._state, self._stamp, self._open = self._decoded(first.body), first.stamp, True
+        self.report = ""  # after `close`: what there is to say of the wire
+        check_body(self.machine, self._mode_machine)
+        self._default, self._ranges = (contract.stiffness, contract.damping), ranges
+        self._lost = self._state["motor_state.lost"].astype(int) if self.machine.package == "unitree_go" else None
+        self.bad_states = 0  # with a wrong checksum, which are left out
+        owner.arm(self._command(kd=damped(contract)))
+
+    @property
+    def _mode_machine(self) -> int:
+        return int(self._state["mode_machine"]) if self.machine.package == "unitree_hg" else 0
+
+    def _decoded(self, body: bytes) -> Message:
+        return Message(LAYOUTS[self.machine.package, "LowState_"], body)
+
+    def read(self) -> Measurement:
+        self._listen()
+        if (age := self._clock() - self._stamp) > TOO_OLD:
+            raise RobotError(f"the newest measurement is {1000 * age:.0f} ms old: the robot is silent, or the link is down")
+        state, slots = self._state, self._slots
+        w, x, y, z = (float(value) for value in state["imu_state.quaternion"])
+        feet = np.zeros(len(self.contract.feet))
+        if self.machine.feet:
+            force = dict(zip(self.machine.feet, state["foot_force"], strict=True))
+            feet = np.array([float(force.get(name, 0) > TOUCH) for name in self.contract.feet])
+        q, dq, torque = (state[f"motor_state.{part}"][slots].astype(float) for part in ("q", "dq", "tau_est"))
+        return Measurement(
+            lin_vel=np.zeros(3),
+            ang_vel=state["imu_state.gyroscope"].astype(float),
+            gravity=-np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+            joint_pos=q,
+            joint_vel=dq,
+            joint_torque=torque,
+            acceleration=state["imu_state.accelerometer"].astype(float),
+            foot_contact=feet,
+        )
+
+    def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
+        kp, kd = (own if given is None else given for own, given in zip(self._default, (stiffness, damping), strict=True))
+        self._send(q=np.clip(targets, *self._ranges), kp=kp, kd=kd)
+
+    def damp(self) -> None:
+        self._send(kd=damped(self.contract), safe=True)
+
+    def limp(self) -> None:
+        self._send(safe=True)
+
+    def close(self) -> None:
+        if self._open:
+            self._open = False
+            self.report = self._owner.close(self._command(kd=damped(self.contract)))
+
+    def health(self) -> Health:
+        self._listen()
+        state, slots = self._state, self._slots
+        if self.machine.package == "unitree_go":
+            temperatures, voltage = state["motor_state.temperature"][slots], float(state["power_v"])
+            before, self._lost = self._lost, state["motor_state.lost"].astype(int)
+            wrong = {i: f"it lost {n} messages in a period" for i, n in enumerate(self._lost - before) if n > LOST}
+        else:
+            temperatures = state["motor_state.temperature"].reshape(-1, 2)[slots].max(axis=1)
+            voltage = float(np.median(state["motor_state.vol"][slots]))
+            wrong = {i: f"error {state['motor_state.motorstate'][i]:#x}" for i in slots if state["motor_state.motorstate"][i]}
+        faults = {name: wrong[i] for name, i in zip(self.contract.joints, slots, strict=True) if i in wrong}
+        return Health(
+            age_s=self._clock() - self._stamp,
+            temperatures=temperatures.astype(float),
+            voltage=voltage or None,
+            remote=decode(state["wireless_remote"].tobytes()),
+            motor_faults=faults,
+        )
+
+    def _listen(self) -> None:
+        """Take the newest state, if it is whole. Simulators that set no checksum send 0."""
+        if not (received := self._owner.receive()):
+            return
+        state = self._decoded(received.body)
+        if state["crc"] != 0 and not state.intact():
+            self.bad_states += 1
+            return
+        self._state, self._stamp = state, received.stamp
+
+    def _command(self, **parts: Floats) -> bytes:
+        """A sealed command: ``parts`` (D,) of the joints, zero where not given."""
+        machine, command = self.machine, Message(LAYOUTS[self.machine.package, "LowCmd_"])
+        used = np.isin(np.arange(machine.slots), self._slots)
+        command["motor_cmd.mode"] = np.where(used, [machine.modes.get(i, 1) for i in range(machine.slots)], 0)
+        for name, values in parts.items():
+            column = np.zeros(machine.slots)
+            column[self._slots] = values
+            command[f"motor_cmd.{name}"] = column
+        if machine.package == "unitree_go":
+            command["head"], command["level_flag"] = (0xFE, 0xEF), 0xFF  # low level
+        else:
+            command["mode_pr"], command["mode_machine"] = 0, self._mode_machine  # ankles and waist by pitch and roll
+        if self._echo:
+            command["reserve"] = self._state["tick"]
+        return command.seal()
+
+    def _send(self, safe: bool = False, **parts: Floats) -> None:
+        if not all(np.isfinite(values).all() for values in parts.values()):
+            raise RobotError(f"targets that are not finite are not sent: {', '.join(parts)}")
+        self._owner.send(self._command(**parts), self._stamp, safe)
+
+
+def check_rows(contract: Contract, machine: Machine) -> None:
+    """Refuse a policy that observes what this robot does not measure, or does not command angles. Raises RobotError."""
+    if contract.action.origin == "torque":
+        raise RobotError(f"{CONTRACT_FILE}: the policy commands torques; a {machine.name} is driven by angles here")
+    measured = {*_MEASURED, *COMPUTED, *(["foot_contact"] if machine.feet else [])}
+    if wrong := [row for row in contract.rows if row.measured not in measured]:
+        raise RobotError(
+            f"{CONTRACT_FILE}: the policy observes {', '.join(row.name for row in wrong)}, which a {machine.name} does not measure; "
+            f"train one without: observations.leave_out = {{'state': [{', '.join(repr(row.name) for row in wrong)}]}}"
+        )
+
+
+def servo_ranges(folder: Path, contract: Contract) -> tuple[Floats, Floats]:
+    """Lowest and highest target (D,) [rad]: the scene's servos hold targets within these, and no drive does."""
+    scene = read_scene(folder, contract)
+    limited = scene.model.actuator_ctrllimited[scene.actuators, None] > 0
+    low, high = np.where(limited, scene.model.actuator_ctrlrange[scene.actuators], [-np.inf, np.inf]).T
+    return low, high
+
+
+def connect(folder: Path, contract: Contract, interface: str, domain: int | None = None) -> UnitreeRobot:
+    """The robot on a network interface, its wire owned by a guard process. Raises RobotError with what is wrong."""
+    need_dds()
+    from legged_mw.deploy.unitree.guard import Guarded
+    from legged_mw.deploy.unitree.link import LOOPBACK, default_domain
+
+    machine = machine_of(contract.joints)
+    check_rows(contract, machine)
+    ranges = servo_ranges(folder, contract)
+    domain = default_domain(interface) if domain is None else domain
+    owner = Guarded(machine.package, interface, domain, lies_down=machine.lies_down)
+    try:
+        return UnitreeRobot(contract, owner, owner.first, ranges=ranges, echo=interface in LOOPBACK)
+    except BaseException:
+        owner.close(b"")
+        raise

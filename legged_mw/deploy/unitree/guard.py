@@ -1,0 +1,271 @@
+"""The guard: a small process that owns the wire, so that a robot is damped when the policy's process dies, hangs or is late.
+
+The policy's process gives it finished commands and gets states back as they came. The guard repeats the newest command at the
+robot's own rate. Once it has damped, it refuses every command: nothing resumes without a person.
+
+A guard that is killed itself can damp nothing. Then the robot holds its last command, perhaps for ever.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import json
+import mmap
+import os
+import select
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from legged_mw.deploy.robot import RobotError
+from legged_mw.deploy.unitree.codec import LAYOUTS
+
+LATE = 0.06  # [s] ours: three periods at 50 Hz without a command. With what it takes to notice, joints are damped within 100 ms
+REPEAT = 0.002  # [s] between two messages to the robot [unitree_sdk2's examples]
+AFTER = 1.0  # [s] ours: how long damping is sent before the wire is let go
+START = 60.0  # [s] for a guard to find the robot
+PRIORITY = 30  # ours, of a real-time process: before the policy's, which it must outlive
+_TURN = 0.001  # [s] at most between two looks at the wire
+_BOARD = struct.Struct("<QdI512s")  # changes of the board (odd: one is going on), stamp of the state, bytes of the text, text
+_FRAME = struct.Struct("<Bd")  # kind, stamp of the state that a command answers
+# Kinds: it must be followed by another; it may hold for ever; it is the last; it is what damps the robot, and is not sent now.
+MOVE, SAFE, CLOSE, ARM = 1, 2, 3, 4
+
+
+class Board:
+    """Memory of two processes: the guard writes states and a text, the policy's process reads the newest."""
+
+    def __init__(self, file: int, size: int) -> None:
+        self._map, self._size, self._seen = mmap.mmap(file, _BOARD.size + size), size, 0
+        self._changes, self._stamp, self._text, self._body = 0, 0.0, b"", bytes(size)
+
+    def put(self, body: bytes | None = None, stamp: float = 0.0, text: str = "") -> None:
+        if body is not None:
+            self._body, self._stamp = body, stamp
+        self._text = text.encode()[:512] if text else self._text
+        struct.pack_into("<Q", self._map, 0, self._changes + 1)
+        self._map[_BOARD.size :] = self._body
+        struct.pack_into("<dI512s", self._map, 8, self._stamp, len(self._text), self._text)
+        self._changes += 2
+        struct.pack_into("<Q", self._map, 0, self._changes)
+
+    def get(self) -> tuple[bytes, float, str]:
+        """State, stamp, text. What is being written meanwhile is read again."""
+        while True:
+            before, stamp, length, text = _BOARD.unpack_from(self._map)
+            body = self._map[_BOARD.size :]
+            if before % 2 == 0 and struct.unpack_from("<Q", self._map)[0] == before:
+                return body, stamp, text[:length].decode(errors="replace")
+
+
+# ---- the policy's side ---------------------------------------------------------------------------------------------
+
+
+class Guarded:
+    """The wire as the policy's process sees it, through a guard (see ``client.Owner``)."""
+
+    def __init__(
+        self, package: str, interface: str, domain: int, *, lies_down: bool = False, late: float = LATE, find: float = 5.0
+    ) -> None:
+        """Start a guard, which takes the robot over (``lies_down`` as in ``link.Wire.prepare``).
+
+        ``find``: [s] for a robot to be heard. Raises RobotError with what the guard says.
+        """
+        size = LAYOUTS[package, "LowState_"].size
+        with tempfile.TemporaryFile() as file:
+            file.truncate(_BOARD.size + size)
+            self._board = Board(file.fileno(), size)
+            self._channel, theirs = socket.socketpair()
+            with theirs:
+                told = {"package": package, "interface": interface, "domain": domain, "late": late, "find": find}
+                told |= {"lies_down": lies_down}
+                told |= {"channel": theirs.fileno(), "board": file.fileno()}
+                program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
+                self.process = subprocess.Popen(
+                    [sys.executable, "-c", program, json.dumps(told)],
+                    pass_fds=(theirs.fileno(), file.fileno()),
+                    start_new_session=True,  # a Ctrl-C in the terminal is not for the guard
+                )
+        self._channel.settimeout(START)
+        said = self._answer()
+        if "error" in said or not said:
+            self._channel.close()
+            raise RobotError(said.get("error", f"the guard of the wire did not start within {START:g} s"))
+        self._channel.settimeout(0.5)
+        self._last = 0.0
+        self.first = self.receive()
+
+    def receive(self) -> Any:
+        from legged_mw.deploy.unitree.link import Received
+
+        body, stamp, text = self._board.get()
+        if text:
+            raise RobotError(text)
+        if stamp == self._last:
+            return None
+        self._last = stamp
+        return Received(body, stamp)
+
+    def arm(self, damping: bytes) -> None:
+        self._put(ARM, 0.0, damping)
+
+    def send(self, body: bytes, stamp: float, safe: bool) -> None:
+        self._put(SAFE if safe else MOVE, stamp, body)
+
+    def close(self, last: bytes) -> str:
+        """Returns the latency of measurements, as the guard saw it."""
+        said: dict[str, Any] = {}
+        if self._channel.fileno() >= 0:
+            with contextlib.suppress(RobotError):
+                if last:
+                    self._put(CLOSE, 0.0, last)
+                    self._channel.settimeout(AFTER + 2.0)
+                    said = self._answer()
+            self._channel.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(AFTER + 2.0)
+        return said.get("report", "")
+
+    def _put(self, kind: int, stamp: float, body: bytes) -> None:
+        try:
+            self._channel.sendall(_FRAME.pack(kind, stamp) + body)
+        except OSError:
+            if text := self._board.get()[2]:
+                raise RobotError(text) from None
+            raise RobotError("the guard of the wire is gone: the robot may hold its last command. Press its emergency stop") from None
+
+    def _answer(self) -> dict[str, Any]:
+        """A line of JSON from the guard; empty if none comes."""
+        data = b""
+        with contextlib.suppress(OSError):
+            while not data.endswith(b"\n") and (more := self._channel.recv(65536)):
+                data += more
+        return json.loads(data) if data.endswith(b"\n") else {}
+
+
+# ---- the guard's side ----------------------------------------------------------------------------------------------
+
+
+class Guard:
+    """The loop of the guard's process."""
+
+    def __init__(self, wire: Any, channel: socket.socket, board: Board, package: str, late: float) -> None:
+        self.wire, self.channel, self.board, self.late = wire, channel, board, late
+        self._size = _FRAME.size + LAYOUTS[package, "LowCmd_"].size
+        self._buffer, self._latencies = b"", deque[float](maxlen=1 << 16)
+        self._command, self._damping = b"", b""  # what is sent again and again; what is sent instead of it
+        self._moving, self._heard, self._until = False, 0.0, float("inf")
+        self.tripped, self._stop = "", ""
+        channel.setblocking(False)
+
+    def stop(self, *_: object) -> None:
+        """Damp, and end; a signal's handler."""
+        self._stop = "the guard was told to end"
+
+    def run(self) -> None:
+        """Until the other side closes, or AFTER a trip for which there is nobody to tell."""
+        due = time.monotonic()
+        while time.monotonic() < self._until:
+            select.select([self.channel] if self.channel.fileno() >= 0 else [], [], [], _TURN)
+            now = time.monotonic()
+            self._hear(now)
+            if state := self.wire.receive():
+                self.board.put(state.body, state.stamp)
+            if self._moving and now - self._heard > self.late:
+                self.trip(f"no targets for {1000 * (now - self._heard):.0f} ms: the policy's process hangs or is late")
+            if self._command and self.wire.other_commander():
+                self.trip("another program sends commands to this robot, too")
+            if self._stop:
+                self.trip(self._stop)
+                self._until = min(self._until, now + AFTER)
+            if self._command and now >= due:
+                self.wire.send(self._command)
+                due = now + REPEAT
+
+    def _hear(self, now: float) -> None:
+        """Take what the policy's process sent; the newest command counts."""
+        if self.channel.fileno() < 0:
+            return
+        try:
+            data = self.channel.recv(1 << 20)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self.channel.close()
+            if self._until == float("inf"):
+                self.trip("the policy's process ended")
+                self._until = now + AFTER
+            return
+        self._buffer += data
+        while len(self._buffer) >= self._size:
+            frame, self._buffer = self._buffer[: self._size], self._buffer[self._size :]
+            kind, stamp = _FRAME.unpack_from(frame)
+            self._obey(kind, stamp, frame[_FRAME.size :], now)
+
+    def _obey(self, kind: int, stamp: float, body: bytes, now: float) -> None:
+        if kind == ARM:
+            self._damping = body
+        elif kind == CLOSE:
+            self._command, self._moving, self._until = body, False, now + AFTER
+            self.tell({"report": self._report()})
+        elif not self.tripped:
+            self._command, self._moving, self._heard = body, kind == MOVE, now
+            self.wire.send(body)
+            if kind == MOVE:
+                self._latencies.append(time.monotonic() - stamp)
+
+    def trip(self, why: str) -> None:
+        """Damp from now on, and say why; the first reason counts."""
+        if self._command:
+            self._command = self._damping
+            self.wire.send(self._command)
+        if not self.tripped:
+            self.tripped, self._moving = why, False
+            done = f"{why}; the joints are damped" if self._command else why
+            self.board.put(text=done)
+            print(f"guard: {done}", file=sys.stderr, flush=True)
+
+    def _report(self) -> str:
+        if not self._latencies:
+            return ""
+        middle, most = (1000 * float(value) for value in np.percentile(self._latencies, (50, 99)))
+        return f"from a measurement to its target: median {middle:.1f} ms, p99 {most:.1f} ms ({len(self._latencies)} targets)"
+
+    def tell(self, what: dict[str, Any]) -> None:
+        with contextlib.suppress(OSError):
+            self.channel.sendall(json.dumps(what).encode() + b"\n")
+
+
+def main() -> None:
+    from legged_mw.deploy.unitree.link import Wire
+
+    told = json.loads(sys.argv[1])
+    channel = socket.socket(fileno=told["channel"])
+    with contextlib.suppress(OSError, AttributeError):  # not allowed, or not Linux
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))  # before DDS starts its threads, which then have it too
+    try:
+        wire = Wire(told["package"], told["interface"], told["domain"])
+        first = wire.prepare(told["find"], lies_down=told["lies_down"])
+    except RobotError as error:
+        channel.sendall(json.dumps({"error": str(error)}).encode() + b"\n")
+        return
+    board = Board(told["board"], len(first.body))
+    board.put(first.body, first.stamp)
+    guard = Guard(wire, channel, board, told["package"], told["late"])
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, guard.stop)
+    guard.tell({"ready": True})
+    gc.freeze()
+    gc.disable()
+    guard.run()

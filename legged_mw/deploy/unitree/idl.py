@@ -1,0 +1,94 @@
+"""The types that cyclonedds announces, made of the tables in ``codec``.
+
+Two things must be Unitree's to the bit: a type's name, and the hash that DDS makes of its fields. Unitree's robots run Cyclone
+0.10.2, which has no type of 8 bits but the octet. A field declared ``uint8`` under cyclonedds 11 gives another hash; 0.10.2 then asks
+for the type and crashes on the answer. So a byte is an octet here, and ``wrong_hash`` compares with what the robots announce.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from cyclonedds.idl import annotations, make_idl_struct, types
+
+from legged_mw.deploy.unitree.codec import HEADER, LAYOUTS, STRUCTS, fields
+
+# Complete XTypes hashes that Unitree's own C++ processes (Cyclone 0.10.2) announce.
+HASHES = {
+    ("unitree_go", "LowCmd_"): "52cc8eb0d427d692aa2b20a90540",
+    ("unitree_go", "LowState_"): "08f239c471d3a27e67e7c7723184",
+    ("unitree_hg", "LowCmd_"): "42b0283aa7e1bb592ec898a0dbed",
+    ("unitree_hg", "LowState_"): "2be9706c9587e8d8afd8bfc6de7b",
+    ("unitree_api", "Request_"): "c47a4429fcbf539486498753c48f",
+    ("unitree_api", "Response_"): "d1c32cc02214901a464a6c51325d",
+}
+_PLAIN = {"str": str, "bool": bool, "sequence": types.sequence[types.byte]}
+
+
+def _make(package: str, name: str, made: dict[str, Any]) -> Any:
+    """One struct; those inside of it are in ``made``."""
+    members = {}
+    for field in fields(package, name):
+        kind = made.get(field.type) or _PLAIN.get(field.type) or getattr(types, field.type)
+        members[field.name] = kind if field.count is None else types.array[kind, field.count]
+    made_type = make_idl_struct(name, f"{package}.msg.dds_.{name}", members)
+    return annotations.autoid("sequential")(annotations.final(made_type))
+
+
+def _types() -> dict[tuple[str, str], Any]:
+    found = {}
+    for package, structs in STRUCTS.items():
+        made: dict[str, Any] = {}
+        for name in structs:
+            made[name] = _make(package, name, made)
+        found |= {(package, name): made[name] for name in structs}
+    return found
+
+
+TYPES: dict[tuple[str, str], Any] = _types()
+
+
+def _raw(base: Any, size: int) -> Any:
+    """``base`` with samples that hold the message's bytes: cyclonedds' own codec takes a millisecond a message."""
+
+    def __init__(self: Any, body: bytes = bytes(size)) -> None:
+        self.body = body
+
+    def deserialize(cls: Any, data: bytes, has_header: bool = True, use_version_2: bool | None = None) -> Any:
+        body = bytes(data[4 if has_header else 0 :])
+        little = not has_header or data[:2] == HEADER[:2]
+        return cls(body[:size] if little else b"")  # another encoding shows as a message of the wrong size
+
+    def deserialize_key(cls: Any, *_: Any, **__: Any) -> Any:
+        return cls(b"")  # of a writer that has gone
+
+    methods: dict[str, Any] = {
+        "__init__": __init__,
+        "serialize": lambda self, *_, **__: HEADER + self.body,
+        "deserialize": classmethod(deserialize),
+        "deserialize_key": classmethod(deserialize_key),
+    }
+    for name, method in methods.items():
+        setattr(base, name, method)
+    return base
+
+
+_copies: dict[tuple[str, str], Any] = _types()
+RAW: dict[tuple[str, str], Any] = {key: _raw(_copies[key], layout.size) for key, layout in LAYOUTS.items()}
+
+
+def hashes() -> dict[tuple[str, str], str]:
+    """The complete XTypes hash of each type that crosses the wire."""
+    found = {}
+    for key in HASHES:
+        TYPES[key].__idl__.populate()
+        found[key] = bytes(TYPES[key].__idl__.get_type_id().get()[1]).hex()
+    return found
+
+
+def wrong_hash() -> str:
+    """The first type that would be announced otherwise than the robots announce it, in words; empty if all are right."""
+    for (package, name), found in hashes().items():
+        if found != (right := HASHES[package, name]):
+            return f"{package} {name} as {found}, not {right}"
+    return ""

@@ -1,0 +1,230 @@
+"""The wire: a DDS domain on one network interface, and the topics of a Unitree robot. Messages are bytes here."""
+
+from __future__ import annotations
+
+import json
+import socket
+import time
+from collections.abc import Callable
+from importlib.metadata import version
+from typing import Any, NamedTuple
+
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
+from cyclonedds.core import DDSException
+from cyclonedds.domain import Domain, DomainParticipant
+from cyclonedds.pub import DataWriter
+from cyclonedds.qos import Policy, Qos
+from cyclonedds.sub import DataReader
+from cyclonedds.topic import Topic
+
+from legged_mw.deploy.robot import RobotError
+from legged_mw.deploy.unitree.codec import LAYOUTS
+from legged_mw.deploy.unitree.idl import RAW, TYPES, wrong_hash
+from legged_mw.utils.errors import unknown
+
+COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
+MOTION = "rt/api/motion_switcher/request", "rt/api/motion_switcher/response"
+SPORT = "rt/api/sport/request"
+CHECK_MODE, RELEASE_MODE = 1001, 1003  # of the motion service
+STAND_DOWN = 1005  # of the sport service [unitree_sdk2]
+LOOPBACK = ("lo", "lo0")
+_INTERFACE = "<General><Interfaces><NetworkInterface name='{name}' {multicast}/></Interfaces>{more}</General>"
+# Loopback interfaces know no multicast, so the processes look for each other at 127.0.0.1, one port after the other.
+_LOCAL = "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>"
+_LOCAL += "<Peers><Peer Address='127.0.0.1'/></Peers></Discovery>"
+_joined: dict[int, tuple[str, Any]] = {}  # domain -> interface, and what keeps it; a process may configure a domain only once
+
+
+def default_domain(interface: str) -> int:
+    """0, a robot's own; on loopback 1, which unitree_mujoco takes."""
+    return 1 if interface in LOOPBACK else 0
+
+
+def join(interface: str, domain: int) -> Any:
+    """A participant of the domain. Raises RobotError if there is no such interface, or if joining could harm the robots on it."""
+    names = [name for _, name in socket.if_nameindex()]
+    if interface not in names:
+        raise RobotError(f"--interface: {unknown('network interface', interface, names, 'this machine')}")
+    if not 0 <= domain <= 232:
+        raise RobotError(f"--domain {domain}: a domain is a number from 0 to 232")
+    if interface not in LOOPBACK and (wrong := wrong_hash()):
+        raise RobotError(
+            f"cyclonedds {version('cyclonedds')} announces {wrong}, which crashes the robot's own programs: nothing was sent; "
+            "install the version that was tried: pip install 'cyclonedds>=11.0.1,<12'"
+        )
+    if domain not in _joined:
+        local = interface in LOOPBACK
+        text = _INTERFACE.format(
+            name=interface,
+            multicast="multicast='false'" if local else "priority='default' multicast='default'",
+            more="<AllowMulticast>false</AllowMulticast>" if local else "",
+        )
+        text = f"<CycloneDDS><Domain Id='any'>{text}{_LOCAL if local else ''}</Domain></CycloneDDS>"
+        _joined[domain] = interface, Domain(domain, text)
+    elif _joined[domain][0] != interface:
+        raise RobotError(f"this process has joined domain {domain} on {_joined[domain][0]}, not on {interface}")
+    try:
+        return DomainParticipant(domain)
+    except DDSException as error:
+        raise RobotError(f"cannot join DDS domain {domain} on {interface}: {str(error).splitlines()[0]}") from None
+
+
+def _reader(participant: Any, topic: str, kind: Any, depth: int = 1, foreign: bool = False) -> Any:
+    """The newest ``depth`` samples; ``foreign``: not those that this participant wrote."""
+    policies = [Policy.Reliability.BestEffort, Policy.History.KeepLast(depth)]
+    policies += [Policy.IgnoreLocal.Participant] if foreign else []
+    return DataReader(participant, Topic(participant, topic, kind), Qos(*policies))
+
+
+def _writer(participant: Any, topic: str, kind: Any) -> Any:
+    return DataWriter(participant, Topic(participant, topic, kind))
+
+
+def _taken(reader: Any, count: int = 1) -> list[Any]:
+    """Samples with data: a writer that goes leaves one without."""
+    return [sample for sample in reader.take(count) if sample.sample_info.valid_data]
+
+
+def _request(call: int) -> Any:
+    """A call of one of the robot's services."""
+    kinds = {name: TYPES["unitree_api", f"Request{name}_"] for name in ("", "Header", "Identity", "Lease", "Policy")}
+    identity = kinds["Identity"](id=time.monotonic_ns(), api_id=call)
+    header = kinds["Header"](identity=identity, lease=kinds["Lease"](id=0), policy=kinds["Policy"](priority=0, noreply=False))
+    return kinds[""](header=header, parameter="{}", binary=[])
+
+
+class Received(NamedTuple):
+    """One message, and when it came."""
+
+    body: bytes
+    stamp: float  # [s] of time.monotonic, which all processes of a machine share
+
+
+class Wire:
+    """The program's end: states come in, commands go out. Nothing is sent before ``send``."""
+
+    def __init__(
+        self,
+        package: str,
+        interface: str,
+        domain: int,
+        wait: Callable[[], None] = lambda: time.sleep(0.001),
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """``wait`` passes a moment while nothing comes. In one process with a simulated robot, that moves on there, by its own clock."""
+        self.package, self._wait, self.clock = package, wait, clock
+        self._where = f"domain {domain} on {interface}"
+        self._participant = join(interface, domain)
+        self._size = LAYOUTS[package, "LowState_"].size
+        command = RAW[package, "LowCmd_"]
+        self._sample = command
+        self._out = _writer(self._participant, COMMANDS, command)
+        self._others = _reader(self._participant, COMMANDS, command, foreign=True)
+        self._states = _reader(self._participant, STATES, RAW[package, "LowState_"])
+        self._requests = _writer(self._participant, MOTION[0], TYPES["unitree_api", "Request_"])
+        self._answers = _reader(self._participant, MOTION[1], TYPES["unitree_api", "Response_"], depth=10)
+        self._sport = _writer(self._participant, SPORT, TYPES["unitree_api", "Request_"])
+
+    def receive(self) -> Received | None:
+        """The newest state since the last call, with the moment of this call: ask often."""
+        for sample in _taken(self._states):
+            if len(sample.body) == self._size:
+                return Received(sample.body, self.clock())
+        return None
+
+    def send(self, body: bytes) -> None:
+        self._out.write(self._sample(body))
+
+    def other_commander(self) -> bool:
+        """Whether somebody else sent a command since the last call."""
+        return bool(_taken(self._others))
+
+    def prepare(self, seconds: float = 5.0, listen: float = 0.5, lies_down: bool = False) -> Received:
+        """Wait for the robot, take it from its own motion service, and listen for other commanders; returns its state.
+
+        ``lies_down``: it can be asked to, so that it does not fall when its own program lets go. Raises RobotError with what is
+        wrong; no command was sent then.
+        """
+        if not (state := self._until(self.receive, seconds)):
+            raise RobotError(self._nobody(seconds))
+        self._release(lies_down)
+        if self._until(self.other_commander, listen):
+            raise RobotError(f"another program sends {COMMANDS} in {self._where}: end it first; nothing was sent")
+        return self._until(self.receive, 0.1) or state
+
+    def _until(self, found: Callable[[], Any], seconds: float) -> Any:
+        end = self.clock() + seconds
+        while not (result := found()) and self.clock() < end:
+            self._wait()
+        return result
+
+    def _nobody(self, seconds: float) -> str:
+        """Why no state came."""
+        text = f"no robot: no {STATES} of {self.package} in {self._where} within {seconds:g} s"
+        seen = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
+        kinds = sorted({s.type_name for s in seen.take(100) if s and s.topic_name == STATES and not s.type_name.startswith(self.package)})
+        if kinds:
+            return f"{text}; the robot there speaks {', '.join(kinds)}: it is not the contract's"
+        return f"{text}; is it on, is this the right network interface, and can it be pinged (192.168.123.161)?"
+
+    def _release(self, lies_down: bool, tries: int = 8) -> None:
+        """Switch the robot's own motion programs off; without such a service there is nothing to switch off."""
+        if not self._until(self._requests.get_matched_subscriptions, 0.5):
+            return
+        name, moment = "", 0.2 if self._where.endswith(LOOPBACK) else 3.0  # [s; unitree_sdk2's examples wait 1 to 5 s]
+        for attempt in range(tries):
+            if not (name := json.loads(self._ask(CHECK_MODE) or "{}").get("name", "")):
+                return
+            if lies_down and attempt == 0 and self._sport.get_matched_subscriptions():
+                self._sport.write(_request(STAND_DOWN))
+                self._until(lambda: False, moment)
+            self._ask(RELEASE_MODE)
+            self._until(lambda: False, moment)
+        raise RobotError(f"the robot's own program '{name}' does not let go of the motors: end it with the remote (L2+A, then L2+R2)")
+
+    def _ask(self, call: int) -> str:
+        """One call of the motion service; returns its data."""
+        request = _request(call)
+        self._requests.write(request)
+        mine = request.header.identity.id
+        found = self._until(lambda: [a for a in _taken(self._answers, 10) if a.header.identity.id == mine], 2.0)
+        if not found:
+            raise RobotError("the robot's motion service does not answer: nothing was sent; restart the robot")
+        return found[0].data
+
+
+class RobotEnd:
+    """The robot's end of the wire, for a simulated one: states go out, commands and calls of the motion service come in."""
+
+    def __init__(self, package: str, interface: str, domain: int) -> None:
+        self._participant = join(interface, domain)
+        self._sample = RAW[package, "LowState_"]
+        self._out = _writer(self._participant, STATES, self._sample)
+        self._commands = _reader(self._participant, COMMANDS, RAW[package, "LowCmd_"])
+        self._requests = _reader(self._participant, MOTION[0], TYPES["unitree_api", "Request_"], depth=10)
+        self._answers = _writer(self._participant, MOTION[1], TYPES["unitree_api", "Response_"])
+        self._sport = _reader(self._participant, SPORT, TYPES["unitree_api", "Request_"], depth=10)
+        self.program = "normal"  # the motion program that holds the motors; "" once released
+        self.calls: list[int] = []  # of its services, in their order
+
+    def send(self, body: bytes) -> None:
+        self._out.write(self._sample(body))
+
+    def receive(self) -> bytes | None:
+        """The newest command since the last call."""
+        taken = _taken(self._commands)
+        return taken[-1].body if taken else None
+
+    def answer(self) -> None:
+        """Answer the calls of the motion service; a call of the sport service needs no answer."""
+        self.calls += [request.header.identity.api_id for request in _taken(self._sport, 10)]
+        header, status = TYPES["unitree_api", "ResponseHeader_"], TYPES["unitree_api", "ResponseStatus_"]
+        for request in _taken(self._requests, 10):
+            call, data = request.header.identity.api_id, ""
+            self.calls.append(call)
+            if call == CHECK_MODE:
+                data = json.dumps({"form": "0", "name": self.program})
+            elif call == RELEASE_MODE:
+                self.program = ""
+            head = header(identity=request.header.identity, status=status(code=0))
+            self._answers.write(TYPES["unitree_api", "Response_"](header=head, data=data, binary=[]))

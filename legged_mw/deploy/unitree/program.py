@@ -1,0 +1,132 @@
+"""What `--serve unitree` does: a simulated robot on the wire, in real time, until its time is over or somebody ends it."""
+
+from __future__ import annotations
+
+import contextlib
+import gc
+import math
+import os
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.unitree import need_dds
+from legged_mw.deploy.unitree.handset import Handset
+from legged_mw.deploy.unitree.robots import machine_of
+from legged_mw.deploy.unitree.serve import STEP, Faults, SimulatedUnitree
+
+BEHIND = 0.1  # [s] by which the simulation may be late before it gives the time up
+PRIORITY = 10  # ours, of a real-time process: below those of a policy
+UPRIGHT = 0.5  # cosine of the tilt from which it lies
+
+
+@dataclass
+class Served:
+    """What a simulated robot saw while it was served."""
+
+    seconds: float = 0.0  # simulated
+    wall: float = 0.0  # [s]
+    upright: float = 1.0  # cosine of its largest tilt while its servos were on
+    latencies: list[float] = field(default_factory=list)  # [s] from a state that it sent to the first command that answers it
+    commands: int = 0
+    refused: int = 0
+    watchdog: int = 0
+    height: float = 0.0  # [m] of the root at the end
+    place: tuple[float, float] = (0.0, 0.0)  # [m] of the root at the end
+
+    def text(self) -> str:
+        lines = [f"{self.seconds:.1f} s simulated in {self.wall:.1f} s; {self.commands} commands taken, {self.refused} refused"]
+        if self.latencies:
+            middle, most = (1000 * float(value) for value in np.percentile(self.latencies, (50, 99)))
+            lines.append(f"from a state to the first command that answers it: median {middle:.1f} ms, p99 {most:.1f} ms")
+        if self.watchdog:
+            lines.append(f"the watchdog damped it {self.watchdog} times")
+        tilt = math.degrees(math.acos(min(1.0, self.upright)))
+        fell = (
+            "it fell while its servos were on" if self.upright < UPRIGHT else f"with its servos on at most {tilt:.0f} degrees from upright"
+        )
+        lines.append(f"{fell}; at the end at {self.place[0]:.1f}, {self.place[1]:.1f} m, {self.height:.2f} m high")
+        return "\n".join(lines)
+
+
+class Latency:
+    """Times between states that were sent and the first commands that answer them, which name their state in ``reserve``."""
+
+    def __init__(self) -> None:
+        self.seconds: list[float] = []
+        self._sent: dict[int, float] = {}  # tick -> when
+        self._answered = 0
+
+    def watch(self, sim: SimulatedUnitree) -> None:
+        """After each step."""
+        now = time.monotonic()
+        self._sent[sim.tick] = now
+        if sim.command is not None and (tick := int(np.ravel(sim.command["reserve"])[0])) > self._answered:
+            self._answered = tick
+            if tick in self._sent:
+                self.seconds.append(now - self._sent[tick])
+            self._sent = {sent: when for sent, when in self._sent.items() if sent > tick}
+
+
+def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf) -> Served:
+    """Step the robot in real time, its remote held by ``handset``. Ctrl-C ends it."""
+    latency, served = Latency(), Served()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    began = start = time.monotonic()
+    steps = 0
+    try:
+        while sim.time < seconds - 1e-9:
+            sim.remote = handset.state(sim.time)
+            sim.hoist = sim.hoist if handset.hoist is None else handset.hoist
+            sim.step()
+            latency.watch(sim)
+            if sim.acted["kp"].any():
+                served.upright = min(served.upright, sim.upright)
+            steps += 1
+            ahead = start + steps * STEP - time.monotonic()
+            if ahead > 0:
+                time.sleep(ahead)
+            elif ahead < -BEHIND:
+                start -= ahead
+    except KeyboardInterrupt:
+        print("\nstopped", flush=True)
+    finally:
+        gc.unfreeze()
+        gc.enable()
+        handset.close()
+    counts, place = sim.counts, sim.data.qpos
+    served.seconds, served.wall, served.latencies = sim.time, time.monotonic() - began, latency.seconds
+    served.commands, served.refused, served.watchdog = counts.commands, counts.refused, counts.watchdog
+    served.height, served.place = float(place[2]), (float(place[0]), float(place[1]))
+    return served
+
+
+def serve(
+    folder: Path,
+    contract: Contract,
+    interface: str,
+    domain: int | None,
+    *,
+    seconds: float = math.inf,
+    handset: Handset | None = None,
+    faults: Faults | None = None,
+    watchdog: float = math.inf,
+) -> Served:
+    """A simulated robot of the export on a network interface."""
+    need_dds()
+    from legged_mw.deploy.unitree.link import RobotEnd, default_domain
+
+    with contextlib.suppress(OSError, AttributeError):  # not allowed, or not Linux
+        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))  # a robot's own computer does nothing else either
+    domain = default_domain(interface) if domain is None else domain
+    machine = machine_of(contract.joints)
+    end = RobotEnd(machine.package, interface, domain)
+    sim = SimulatedUnitree(folder, contract, end, faults=faults, watchdog=watchdog)
+    how = "on a hoist" if sim.hoist else "on the ground"
+    print(f"a simulated {machine.name}, limp, {how}, in domain {domain} on {interface}; Ctrl-C ends it", flush=True)
+    return run(sim, handset or Handset(), seconds)

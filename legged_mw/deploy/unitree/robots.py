@@ -1,0 +1,100 @@
+"""Unitree's robots as their messages see them: which motor is which joint, and what their commands must say."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from legged_mw.deploy.contract import CONTRACT_FILE
+from legged_mw.deploy.robot import RobotError
+
+
+def _legs(names: Sequence[str], parts: Sequence[str]) -> list[str]:
+    return [f"{name}_{part}_joint" for name in names for part in parts]
+
+
+def _named(joints: Sequence[str], first: int = 0) -> dict[str, int]:
+    return {joint: first + i for i, joint in enumerate(joints)}
+
+
+_G1_LEG = ("hip_pitch", "hip_roll", "hip_yaw", "knee", "ankle_pitch", "ankle_roll")
+_G1_ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow", "wrist_roll", "wrist_pitch", "wrist_yaw")
+_H1_ARM = ("shoulder_pitch", "shoulder_roll", "shoulder_yaw", "elbow")
+_H1_BODY = (  # slot 9 has no motor
+    *("right_hip_roll", "right_hip_pitch", "right_knee", "left_hip_roll", "left_hip_pitch", "left_knee"),
+    *("torso", "left_hip_yaw", "right_hip_yaw", "", "left_ankle", "right_ankle"),
+)
+
+
+@dataclass(frozen=True)
+class Machine:
+    """One kind of robot."""
+
+    name: str
+    package: str  # of its messages
+    motors: dict[str, int]  # joint -> slot in LowCmd_ and LowState_ [unitree_sdk2's headers and examples]
+    modes: dict[int, int] = field(default_factory=dict)  # slot -> motor mode where it is not 1
+    feet: tuple[str, ...] = ()  # order of foot_force
+    lies_down: bool = False  # whether its own program can be asked to lay it down
+    cells: int = 0  # of the battery, in a row [Unitree's data sheets]; 0: not known
+    machines: tuple[int, ...] = ()  # LowState_.mode_machine of this body; 0: a simulation that sets none
+
+    @property
+    def limits(self) -> dict[str, float]:
+        """Limits of the safety layer that are this machine's: 3 V a cell, where lithium batteries are called empty."""
+        return {"voltage": 3.0 * self.cells} if self.cells else {}
+
+    @property
+    def slots(self) -> int:
+        return {"unitree_go": 20, "unitree_hg": 35}[self.package]
+
+
+GO2 = Machine(
+    "go2", "unitree_go", _named(_legs(("FR", "FL", "RR", "RL"), ("hip", "thigh", "calf"))), feet=("FR", "FL", "RR", "RL"), cells=8
+)
+G1 = Machine(
+    "g1",
+    "unitree_hg",
+    _named([*_legs(("left", "right"), _G1_LEG), *_legs(("waist",), ("yaw", "roll", "pitch")), *_legs(("left", "right"), _G1_ARM)]),
+    cells=13,
+    machines=(0, 2, 3, 5, 6),  # of 29 joints [unitree_rl_lab]; 1 and 4 have 23
+)
+H1 = Machine(
+    "h1",
+    "unitree_go",
+    {f"{name}_joint": i for i, name in enumerate(_H1_BODY) if name} | _named(_legs(("right", "left"), _H1_ARM), 12),
+    modes={i: 0x0A if i < 10 else 0x01 for i in range(20)},  # strong motors, then weak ones
+)
+MACHINES = {machine.name: machine for machine in (GO2, G1, H1)}
+BODIES = {1: 23, 4: 23, 2: 29, 3: 29, 5: 29, 6: 29, 9: 14}  # joints by mode_machine [unitree_rl_lab]
+
+
+def machine_of(joints: Sequence[str]) -> Machine:
+    """The robot that has these joints, in whatever order. Raises RobotError with both lists."""
+    for machine in MACHINES.values():
+        if set(joints) == set(machine.motors):
+            return machine
+    nearest = max(MACHINES.values(), key=lambda m: (len(set(joints) & set(m.motors)), m.name))
+    only = [name for name in joints if name not in nearest.motors], [name for name in nearest.motors if name not in joints]
+    raise RobotError(
+        f"{CONTRACT_FILE} is of no robot that is known here ({', '.join(MACHINES)}); the nearest is {nearest.name}. "
+        f"Only in the contract: {', '.join(only[0]) or 'none'}; only on {nearest.name}: {', '.join(only[1]) or 'none'}. "
+        f"The contract has: {', '.join(joints)}; {nearest.name} has: {', '.join(nearest.motors)}"
+    )
+
+
+def order(machine: Machine, joints: Sequence[str]) -> np.ndarray:
+    """The slot of each joint (D,)."""
+    return np.array([machine.motors[name] for name in joints])
+
+
+def check_body(machine: Machine, mode_machine: int) -> None:
+    """Refuse a body with other motors than the contract's. Raises RobotError."""
+    if machine.machines and mode_machine not in machine.machines:
+        has = f"{BODIES[mode_machine]} joints" if mode_machine in BODIES else "an unknown body"
+        raise RobotError(
+            f"this {machine.name} has {has} (mode_machine {mode_machine}), the contract {len(machine.motors)}: "
+            f"{', '.join(machine.motors)}; use a policy of its own"
+        )

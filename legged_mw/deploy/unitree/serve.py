@@ -1,0 +1,280 @@
+"""A simulated robot at the other end of the wire: MuJoCo at the rate of the motors, behind Unitree's messages.
+
+Each step of 2 ms sends a state, takes the newest command and moves on by the motors' law tau + kp (q - q_now) + kd (dq - dq_now).
+Without a watchdog, as on a robot, the last command holds for ever.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import heapq
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.robot import Floats, damped
+from legged_mw.deploy.simulated import read_scene
+from legged_mw.deploy.unitree.codec import LAYOUTS, Message
+from legged_mw.deploy.unitree.remote import encode
+from legged_mw.deploy.unitree.robots import Machine, machine_of, order
+
+STEP = 0.002  # [s]; robots send their state at 500 Hz
+POSITION_STOP, VELOCITY_STOP = 2.146e9, 16000.0  # in q and dq: no control of the position, of the velocity [unitree_sdk2]
+LOW_LEVEL = (0xFE, 0xEF, 0xFF)  # head and level_flag of unitree_go
+_MACHINE = {"g1": 5}  # mode_machine that a simulated one says
+_TOUCH = 60  # foot_force of a foot that touches the ground, in the robot's own unit; ours
+_FULL = 4.1  # [V] of a full battery's cell
+_FAULT = 0x1  # motorstate of a motor with a fault
+_HOIST, _HOIST_DAMPING, _LOWERING = 12.0, 1.2, 1.0  # [weights/m], [weights s/m], [s] ours: a soft rope and how long it gives way
+
+
+@dataclass
+class Faults:
+    """What is wrong with the wire and the robot; may change at any time."""
+
+    delay_ms: float = 0.0  # of every message, each way
+    jitter_ms: float = 0.0  # standard deviation of the delay
+    loss: float = 0.0  # share of messages that are lost
+    joint_bias: Floats | float = 0.0  # (D,) [rad] added to measured angles
+    gyro_bias: Floats | float = 0.0  # (3,) [rad/s]
+    dead_motors: set[str] = field(default_factory=set)  # joints whose motors give no torque and say so
+    temperature: float = 35.0  # [deg C] of every motor
+    voltage: float | None = None  # [V]; None: of a full battery
+    frozen: bool = False  # the same state again and again
+    silent: bool = False  # no states
+    corrupt: bool = False  # states with a wrong checksum
+    no_remote: bool = False  # the remote is off: 40 zeros
+
+
+class _Line:
+    """One direction of the wire: messages come out when their time has come, late, in another order, or never."""
+
+    def __init__(self, faults: Faults, rng: np.random.Generator) -> None:
+        self._faults, self._rng, self._queue, self._count = faults, rng, list[tuple[float, int, bytes]](), 0
+
+    def put(self, now: float, body: bytes) -> None:
+        faults = self._faults
+        if faults.loss and self._rng.random() < faults.loss:
+            return
+        delay = max(0.0, faults.delay_ms + (faults.jitter_ms * self._rng.standard_normal() if faults.jitter_ms else 0.0))
+        self._count += 1
+        heapq.heappush(self._queue, (now + delay / 1000, self._count, body))
+
+    def due(self, now: float) -> list[bytes]:
+        out = []
+        while self._queue and self._queue[0][0] <= now + 1e-9:
+            out.append(heapq.heappop(self._queue)[2])
+        return out
+
+
+@dataclass
+class Counts:
+    """What a simulated robot saw."""
+
+    commands: int = 0
+    refused: int = 0  # commands with a wrong checksum, head or mode_machine
+    watchdog: int = 0  # times that it damped by itself
+
+
+class SimulatedUnitree:
+    """One robot in MuJoCo with a Unitree's motors, sensors and messages; ``end`` is its end of the wire."""
+
+    def __init__(
+        self,
+        folder: Path,
+        contract: Contract,
+        end: Any,
+        *,
+        faults: Faults | None = None,
+        watchdog: float = math.inf,
+        hoist: bool | None = None,
+        seed: int = 0,
+    ) -> None:
+        """The robot of the export in ``folder``, limp: on the ground, or on a hoist (``hoist``; None: if it has two feet).
+
+        ``watchdog``: seconds without a command until it damps by itself.
+        """
+        self.machine: Machine = machine_of(contract.joints)
+        self.contract, self.end, self.faults, self.counts, self._watchdog = contract, end, faults or Faults(), Counts(), watchdog
+        self._scene = read_scene(folder, contract)
+        self.model, self._rng = _whole(self._scene.spec), np.random.default_rng(seed)
+        self._make_motors()
+        self.data = mujoco.MjData(self.model)
+        mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
+        mujoco.mj_step1(self.model, self.data)
+        self._height, self._weight = float(self.data.qpos[2]), 9.81 * float(self.model.body_subtreemass[1])
+        self.hoist = len(contract.feet) < 4 if hoist is None else hoist
+        self._rope = 1.0 if self.hoist else 0.0  # share of the rope's force that is left
+        self._slots = order(self.machine, contract.joints)
+        self._in, self._out = _Line(self.faults, self._rng), _Line(self.faults, self._rng)
+        self._state = Message(LAYOUTS[self.machine.package, "LowState_"])
+        self.remote = encode()
+        self.command: Message | None = None  # the last one that was taken
+        self.acted = dict.fromkeys(("q", "dq", "tau", "kp", "kd"), np.zeros(len(contract.joints)))  # (D,) what the motors obey
+        self._last = -math.inf
+        self._fill()
+
+    def _make_motors(self) -> None:
+        """Torque motors in place of the scene's servos, whose damping is the motors' now."""
+        model, joints = self.model, [self.model.joint(name).id for name in self.contract.joints]
+        self._dofs, self._angles = model.jnt_dofadr[joints], model.jnt_qposadr[joints]
+        self._actuators = self._scene.actuators
+        model.opt.timestep, model.opt.integrator = STEP, mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        model.dof_damping[self._dofs] = 0.0
+        model.actuator_ctrllimited[:] = 0
+        model.actuator_biastype[:] = mujoco.mjtBias.mjBIAS_AFFINE
+        model.actuator_gainprm[:], model.actuator_biasprm[:] = 0.0, 0.0
+
+    @property
+    def time(self) -> float:
+        return float(self.data.time)
+
+    @property
+    def tick(self) -> int:
+        """Of the state that was sent last [ms]."""
+        return int(self._state["tick"])
+
+    @property
+    def joint_pos(self) -> Floats:
+        """(D,) [rad], the truth."""
+        return self.data.qpos[self._angles].copy()
+
+    @property
+    def joint_vel(self) -> Floats:
+        """(D,) [rad/s], the truth."""
+        return self.data.qvel[self._dofs].copy()
+
+    @property
+    def torque(self) -> Floats:
+        """(D,) [N m] of the last step."""
+        return self.data.actuator_force[self._actuators].copy()
+
+    @property
+    def upright(self) -> float:
+        """Cosine of the root's tilt."""
+        return float(self.data.xmat[1, 8])
+
+    def step(self) -> None:
+        """Send the state, take the newest command, move on by STEP."""
+        if not self.faults.frozen:
+            self._fill()
+        if not self.faults.silent:
+            self._out.put(self.time, self._state.body)
+        for body in self._out.due(self.time):
+            self.end.send(body)
+        self.end.answer()
+        if body := self.end.receive():
+            self._in.put(self.time, body)
+        for body in self._in.due(self.time):
+            self._take(Message(LAYOUTS[self.machine.package, "LowCmd_"], body))
+        self._move()
+        self._pull()
+        mujoco.mj_step2(self.model, self.data)
+        mujoco.mj_step1(self.model, self.data)
+
+    def _take(self, command: Message) -> None:
+        """Obey a command from now on, if it is one."""
+        if self.machine.package == "unitree_go":
+            fits = (*command["head"], command["level_flag"]) == LOW_LEVEL
+        else:
+            fits = command["mode_machine"] == self._state["mode_machine"]
+        if not fits or not command.intact():
+            self.counts.refused += 1
+            return
+        on = command["motor_cmd.mode"][self._slots] != 0
+        self.acted = {name: np.where(on, command[f"motor_cmd.{name}"][self._slots], 0.0) for name in ("q", "dq", "tau", "kp", "kd")}
+        self.acted["kp"][np.abs(self.acted["q"]) >= POSITION_STOP / 2] = 0.0
+        self.acted["kd"][np.abs(self.acted["dq"]) >= VELOCITY_STOP / 2] = 0.0
+        self.command, self._last = command, self.time
+        self.counts.commands += 1
+
+    def _move(self) -> None:
+        """The motors' law, as MuJoCo's affine actuators know it: tau + kp q + kd dq - kp q_now - kd dq_now."""
+        acted = self.acted
+        if self.command and self.time - self._last > self._watchdog and acted["kp"].any():
+            zero = np.zeros(len(acted["q"]))
+            self.acted = acted = {**dict.fromkeys(("q", "dq", "tau", "kp"), zero), "kd": damped(self.contract)}
+            self.counts.watchdog += 1
+        law = np.stack([acted["tau"] + acted["kp"] * acted["q"] + acted["kd"] * acted["dq"], -acted["kp"], -acted["kd"]], axis=1)
+        law[[name in self.faults.dead_motors for name in self.contract.joints]] = 0.0
+        self.model.actuator_biasprm[self._actuators, :3] = law
+
+    def _pull(self) -> None:
+        """The rope of the hoist: it holds the root upright at its height, softly, and gives way slowly."""
+        if not self.hoist:
+            self._rope = max(0.0, self._rope - STEP / _LOWERING)
+        data, rope = self.data, self._rope * self._weight
+        lift = rope * (1.0 + _HOIST * (self._height - data.qpos[2]) - _HOIST_DAMPING * data.qvel[2])
+        side = rope * (-_HOIST * data.qpos[:2] - _HOIST_DAMPING * data.qvel[:2])
+        tilt = np.cross(data.xmat[1].reshape(3, 3)[:, 2], [0.0, 0.0, 1.0])
+        turn = data.xmat[1].reshape(3, 3) @ data.qvel[3:6]
+        data.xfrc_applied[1, :3] = [*side, max(0.0, lift)]
+        data.xfrc_applied[1, 3:] = rope * (2.0 * tilt - 0.2 * turn)
+
+    def _fill(self) -> None:
+        """The state message of this moment."""
+        state, data, faults = self._state, self.data, self.faults
+        orientation = np.zeros(4)
+        mujoco.mju_mat2Quat(orientation, data.site(self.contract.imu).xmat)
+        state["imu_state.quaternion"] = orientation
+        state["imu_state.gyroscope"] = self._sensor("ang_vel") + faults.gyro_bias
+        state["imu_state.accelerometer"] = self._sensor("acceleration")
+        state["imu_state.rpy"] = _roll_pitch_yaw(orientation)
+        state["motor_state.mode"] = self._in_slots(1.0)
+        state["motor_state.q"] = self._in_slots(self.joint_pos + faults.joint_bias)
+        state["motor_state.dq"] = self._in_slots(self.joint_vel)
+        state["motor_state.tau_est"] = self._in_slots(self.torque)
+        state["motor_state.temperature"] = int(faults.temperature)
+        state["wireless_remote"] = 0 if faults.no_remote else list(self.remote)
+        state["tick"] = round(data.time * 1000)
+        voltage = _FULL * self.machine.cells if faults.voltage is None else faults.voltage
+        dead = self._in_slots([name in faults.dead_motors for name in self.contract.joints]).astype(int)
+        if self.machine.package == "unitree_go":
+            state["head"], state["level_flag"], state["power_v"] = LOW_LEVEL[:2], LOW_LEVEL[2], voltage
+            state["motor_state.lost"] = state["motor_state.lost"] + dead  # no message reaches them any more
+            feet = zip(self.contract.feet, self._scene.contacts, strict=True)
+            touch = {foot: (data.sensordata[where] > 0.0).any() for foot, where in feet}
+            state["foot_force"] = [_TOUCH * touch.get(foot, False) for foot in self.machine.feet] or 0
+        else:
+            state["mode_machine"] = _MACHINE.get(self.machine.name, 0)
+            state["motor_state.vol"], state["motor_state.motorstate"] = voltage, dead * _FAULT
+        state.seal()
+        if faults.corrupt:
+            state["crc"] = int(state["crc"]) ^ 1
+
+    def _in_slots(self, values: Any) -> Floats:
+        """Values (D,) of the joints, each at its motor's place; zero elsewhere."""
+        slots = np.zeros(self.machine.slots)
+        slots[self._slots] = values
+        return slots
+
+    def _sensor(self, quantity: str) -> Floats:
+        return self.data.sensordata[self._scene.sensordata[quantity]]
+
+
+def _whole(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """The scene with every body on the ground that has shapes of collision (group 3), and a solver for a robot that lies there.
+
+    Training leaves most bodies out, and stops after the first iterations. Bodies that were on the ground stay as they were: feet.
+    """
+    for body in spec.bodies:
+        shapes = [geom for geom in body.geoms if geom.group == 3]
+        for geom in shapes if not any(geom.conaffinity for geom in shapes) else ():
+            geom.conaffinity = 1
+    model = spec.compile()
+    model.opt.iterations, model.opt.ls_iterations = 100, 50  # MuJoCo's own
+    return model
+
+
+def _roll_pitch_yaw(quaternion: Sequence[float] | Floats) -> list[float]:
+    w, x, y, z = quaternion
+    pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    return [math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))]

@@ -1,0 +1,191 @@
+"""The log of a run, and its replay beside the simulation of the same commands."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import threading
+import time
+import tracemalloc
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drivers import Script, Watched
+
+from legged_mw import ROOT
+from legged_mw.deploy import __main__ as program
+from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.log import CHUNK, Log, LogError, log_path, read_log
+from legged_mw.deploy.loop import Loop
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.replay import draw, figures, latency, replay, table
+from legged_mw.deploy.robot import Health
+from legged_mw.deploy.runner import run
+from legged_mw.deploy.safety import Limits
+from legged_mw.deploy.states import States
+from legged_mw.utils.cli import one_line_errors
+
+GO2 = ROOT / "resources/policies/go2_flat"
+
+
+@pytest.fixture(scope="module")
+def contract() -> Contract:
+    return read_contract(GO2)
+
+
+def walk(path: Path, contract: Contract, seconds: float = 5.0) -> Watched:
+    """Hang, stand, walk ahead from 2.2 s on, and trip at 4.8 s."""
+    robot, controller = Watched(GO2, contract, hoisted=True), Controller(GO2, contract)
+    robot.told = lambda step: Health(age_s=0.004, temperatures=np.full(12, 90.0 if step == 240 else 30.0))
+    states = States(controller, [Script({5: "start", 110: "A"}, [0.8, 0.0, 0.0])], lambda _: np.zeros(3), lambda _: None)
+    log = Log(path, contract, GO2, "the test's")
+    run(robot, controller, lambda _: np.zeros(0), seconds, live=False, states=states, log=log)
+    return robot
+
+
+@pytest.fixture(scope="module")
+def logged(contract: Contract, tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Watched]]:
+    path = tmp_path_factory.mktemp("log") / "walk.lmwlog"
+    yield path, walk(path, contract)
+
+
+def test_a_log_holds_the_run(logged: tuple[Path, Watched], contract: Contract) -> None:
+    path, robot = logged
+    log = read_log(path)
+    rows, states = log.rows, log.rows["state"][:, 0]
+    assert len(states) == 250 and list(dict.fromkeys(states)) == [0, 1, 2, 3] and log.header["robot"] == "the test's"
+    assert log.header["task"] == "go2_flat" and log.header["contract"]["joints"] == list(contract.joints)
+    np.testing.assert_allclose(rows["time"][:, 0], 0.02 * np.arange(250), atol=1e-9)
+    np.testing.assert_allclose(rows["joint_pos"][1:], np.array(robot.joints)[:-1], atol=1e-6)
+    assert rows["observation"].shape == (250, 45) and np.isfinite(rows["observation"][states == 2]).all()
+    limits = Limits.of(GO2, contract)
+    wanted = np.clip(contract.default_pose + 0.25 * rows["action"][states == 2], limits.low, limits.high)
+    np.testing.assert_allclose(rows["target"][states == 2], wanted, atol=1e-6)
+    assert np.isnan(rows["target"][(states == 0) | (states == 3)]).all() and np.isnan(rows["action"][states == 1]).all()
+    assert (rows["stiffness"][states == 2] == 20.0).all() and rows["stiffness"][6, 0] < 3.0
+    assert np.isnan(rows["voltage"]).all() and rows["age"][0, 0] == np.float32(0.004) and rows["temperature"][240, 3] == 90.0
+    assert log.events == [(4.8, "temperature: FL_hip_joint has a motor of 90 deg C, more than 85")]
+
+
+def test_a_log_is_small(logged: tuple[Path, Watched]) -> None:
+    """Compressed: a minute of a walking Go2 has at most 1.5 MB."""
+    assert logged[0].stat().st_size / 250 * 3000 < 1.5e6
+
+
+def test_a_log_that_was_cut_off(logged: tuple[Path, Watched], tmp_path: Path) -> None:
+    """Whole blocks are read, whatever comes after them."""
+    whole, cut = logged[0].read_bytes(), tmp_path / "cut.lmwlog"
+    cut.write_bytes(whole[:-10])
+    assert len(read_log(cut).rows["time"]) == 2 * CHUNK
+    cut.write_bytes(whole[: 8 + int.from_bytes(whole[:8], "little") + 100])
+    with pytest.raises(LogError, match="holds no step: its run ended within the first 100, or was cut off"):
+        read_log(cut)
+
+
+def test_what_is_no_log(tmp_path: Path, contract: Contract, logged: tuple[Path, Watched]) -> None:
+    wrong = tmp_path / "wrong.lmwlog"
+    with pytest.raises(LogError, match="cannot read .*wrong.lmwlog: No such file"):
+        read_log(wrong)
+    for content in (b"", b"no log", b"x" * 100, b"\x05" + b"\0" * 7 + b"hello"):
+        wrong.write_bytes(content)
+        with pytest.raises(LogError, match=r"wrong.lmwlog is no log of legged_mw.deploy"):
+            read_log(wrong)
+    with pytest.raises(LogError, match=r"cannot write the log .*walk.lmwlog: File exists; say --log FILE, or --log off"):
+        Log(logged[0], contract, GO2, "")
+    assert log_path(contract).parent == Path("logs/deploy") and log_path(contract).name.startswith("go2_flat_")
+
+
+def test_memory_is_flat_while_it_logs(contract: Contract, tmp_path: Path) -> None:
+    robot, controller, sizes = Watched(GO2, contract, hoisted=True), Controller(GO2, contract), []
+    robot._keep = lambda _: None  # type: ignore[method-assign]
+    log = Log(tmp_path / "long.lmwlog", contract, GO2, "")
+    measured, health = robot.read(), Health()
+    states = States(controller, [], lambda _: np.zeros(3), lambda _: None)
+    loop = Loop(0.02, live=False)
+    tracemalloc.start()
+    try:
+        for step, _ in enumerate(loop.ticks(60.0)):
+            log.add(loop, controller, measured, health, states.step(measured, loop.now), states.command)
+            if step in (1050, 2950):
+                while log.backlog():
+                    time.sleep(0.01)
+                sizes.append(tracemalloc.get_traced_memory()[0])
+    finally:
+        tracemalloc.stop()
+        log.close()
+        log.close()
+    assert sizes[1] - sizes[0] < 500_000 and len(read_log(log.path).rows["time"]) == 3000
+
+
+def test_a_disk_that_hangs_costs_steps_of_the_log_alone(contract: Contract, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("legged_mw.deploy.log.BACKLOG", 2)
+    hangs = threading.Event()
+    monkeypatch.setattr(np, "savez_compressed", lambda file, **block: (hangs.wait(), np.savez(file, **block)))
+    robot, controller = Watched(GO2, contract), Controller(GO2, contract)
+    log = Log(tmp_path / "hangs.lmwlog", contract, GO2, "")
+    states = States(controller, [], lambda _: np.zeros(3), lambda _: None)
+    loop, measured = Loop(0.02, live=False), robot.read()
+    for _ in loop.ticks(20.0):
+        log.add(loop, controller, measured, Health(), states.step(measured, loop.now), states.command)
+    hangs.set()
+    log.close()
+    found = read_log(log.path)
+    assert len(found.rows["time"]) in (200, 300) and found.events[-1][1].endswith(" steps were not logged: the disk is too slow")
+
+
+# ---- replay
+
+
+def test_the_simulation_of_a_simulated_walk_is_like_it(logged: tuple[Path, Watched], contract: Contract, tmp_path: Path) -> None:
+    found = replay(logged[0])
+    assert len(found.robot["time"]) == 130 == len(found.simulated["target"])
+    robot, simulated = figures(found.robot, contract), figures(found.simulated, contract)
+    np.testing.assert_allclose(robot["torque"].sum(), simulated["torque"].sum(), rtol=0.25)  # it began 2 cm above the ground
+    np.testing.assert_allclose(robot["velocity"], simulated["velocity"], atol=0.08)
+    text = table(found)
+    assert "go2_flat, the test's: 2.6 s of the policy\n" in text and "age of a measurement" in text
+    assert "    4.80 s  temperature: FL_hip_joint has a motor of 90 deg C, more than 85" in text
+    draw(found, tmp_path / "walk.png")
+    assert (tmp_path / "walk.png").read_bytes()[:4] == b"\x89PNG"
+    with pytest.raises(LogError, match=r"cannot write .*/no/walk.png: No such file"):
+        draw(found, tmp_path / "no/walk.png")
+
+
+def test_latency_is_the_delay_of_a_joint() -> None:
+    """Of joints that follow a target 1, 2.5 and 4 periods later; one that rests has none."""
+    time = np.arange(300) * 0.02
+    target = np.stack([np.sin(9.0 * time)] * 3 + [np.zeros(300)], axis=1)
+    angle = np.stack([0.4 * np.sin(9.0 * (time - lag * 0.02)) for lag in (1.0, 2.5, 4.0)] + [np.zeros(300)], axis=1)
+    np.testing.assert_allclose(1e3 * latency({"target": target, "joint_pos": angle}, 0.02), [20.0, 50.0, 80.0, np.nan], atol=1.0)
+
+
+def test_replay_of_another_network(logged: tuple[Path, Watched], tmp_path: Path, contract: Contract) -> None:
+    with pytest.raises(LogError, match=r"is of another network than the one in resources/policies/go1_flat \(go2_flat\); name its export"):
+        replay(logged[0], ROOT / "resources/policies/go1_flat")
+    walk(tmp_path / "short.lmwlog", contract, 2.5)
+    with pytest.raises(LogError, match="short.lmwlog holds no walk of 50 steps: the policy was not on for so long"):
+        replay(tmp_path / "short.lmwlog")
+
+
+def test_the_program_draws_a_log(
+    logged: tuple[Path, Watched], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copy(logged[0], tmp_path / "run.lmwlog")
+    monkeypatch.setattr(sys, "argv", ["deploy", "--replay", str(tmp_path / "run.lmwlog")])
+    program.main()
+    assert (tmp_path / "run.png").is_file() and f"written to {tmp_path / 'run.png'}" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", ["deploy"])
+    with pytest.raises(SystemExit, match="2"), one_line_errors("legged_mw.deploy"):
+        program.main()
+    assert "the following arguments are required: DIR" in capsys.readouterr().err
+
+
+def test_a_log_names_rows_of_its_own(contract: Contract) -> None:
+    """What a measurement holds beside the usual is logged under its name."""
+    from legged_mw.deploy.log import _columns
+
+    row = replace(contract.rows[0], name="belly", measured="sensors", sensors=("touch/belly",), size=1, scale=(1.0,))
+    assert _columns(replace(contract, rows=(*contract.rows, row)))["belly"] == 1

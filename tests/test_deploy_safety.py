@@ -1,0 +1,378 @@
+"""The safety layer: each limit at the limit and just beyond it, faults on the simulated robot, and none of it on a good walk."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from drivers import Script, Watched, beyond, driven
+from recorder import Recorder
+
+from legged_mw import ROOT
+from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.exam import contract_rules
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.robot import QUANTITIES, Health, Measurement, Remote, Robot, RobotError
+from legged_mw.deploy.runner import run
+from legged_mw.deploy.safety import NAMES, LimitError, Limits, Safety, Trip, Tripped, parse_limits
+from legged_mw.deploy.simulated import MujocoRobot
+from legged_mw.deploy.stage import DeployStage
+from legged_mw.eval import rules
+from legged_mw.utils.commands import VELOCITY
+
+POLICIES = ROOT / "resources/policies"
+GO2 = POLICIES / "go2_flat"
+ASKED = {"position": 0.1, "target": 0.3, "step": 0.5, "torque": 1.0, "speed": 20.0, "tilt": 30.0, "temperature": 80.0, "voltage": 24.0}
+
+
+@pytest.fixture(scope="module")
+def contract() -> Contract:
+    return read_contract(GO2)
+
+
+@pytest.fixture(scope="module")
+def limits(contract: Contract) -> Limits:
+    return Limits.of(GO2, contract, ASKED)
+
+
+def at_rest(contract: Contract, **changed: Any) -> Measurement:
+    zeros = {name: np.zeros(3) for name in ("lin_vel", "ang_vel", "acceleration")}
+    joints = {"joint_pos": contract.default_pose, "joint_vel": np.zeros(12), "joint_torque": np.zeros(12)}
+    return Measurement(**{**zeros, **joints, "gravity": np.array([0.0, 0.0, -1.0]), "foot_contact": np.zeros(4), **changed})
+
+
+def put(values: Any, joint: int, value: float) -> Any:
+    changed = np.array(values, dtype=float)
+    changed[joint] = value
+    return changed
+
+
+def tilted(degrees: float) -> Any:
+    return np.array([math.sin(math.radians(degrees)), 0.0, -math.cos(math.radians(degrees))])
+
+
+# ---- each limit, at it and beyond it. Of joint 5, FR_calf_joint: -2.7227 to -0.83776 rad, 45.43 N m
+
+SENSED = {
+    "position": (lambda x: {"joint_pos": x}, -0.8378 + 0.1, "FR_calf_joint is at -0.69 rad, 0.15 beyond its range -2.72 to -0.84; 0.10 is"),
+    "speed": (lambda x: {"joint_vel": x}, 20.0, "FR_calf_joint turns at 20.1 rad/s, more than 20.0"),
+    "tilt": (lambda x: {"gravity": tilted(x)}, 30.0, "the body is tilted by 30 degrees, more than 30"),
+}
+
+
+@pytest.mark.parametrize("name", SENSED)
+def test_what_is_measured(name: str, contract: Contract, limits: Limits) -> None:
+    make, limit, text = SENSED[name]
+
+    def check(value: float) -> Trip | None:
+        base = {"position": contract.default_pose, "speed": np.zeros(12)}.get(name)
+        changed = make(value if base is None else put(base, 5, value))
+        return Safety(contract, limits).sensed(at_rest(contract, **changed), Health(), 0.0)
+
+    assert check(limit - 1e-3) is None
+    assert (trip := check(limit + 0.05)) and trip.limit == name and trip.text.startswith(text)
+    assert (trip := check(math.nan)) and trip.limit == "finite" and "what is measured is not finite: " in trip.text
+
+
+HEALTH: dict[str, tuple[Health, Health, str]] = {
+    "temperature": (
+        Health(temperatures=np.full(12, 80.0)),
+        Health(temperatures=put(np.full(12, 30.0), 2, 81.0)),
+        "FL_calf_joint has a motor of 81 deg C, more than 80",
+    ),
+    "voltage": (Health(voltage=24.0), Health(voltage=23.9), "the battery has 23.9 V, less than 24"),
+    "age": (Health(age_s=0.04), Health(age_s=0.041), "the newest measurement is 41 ms old, more than 40"),
+    "motor": (Health(), Health(motor_faults={"FL_hip_joint": "error 0x4"}), "the motor of FL_hip_joint reports a fault: error 0x4"),
+}
+
+
+@pytest.mark.parametrize("name", HEALTH)
+def test_what_the_robot_tells(name: str, contract: Contract, limits: Limits) -> None:
+    fine, wrong, text = HEALTH[name]
+    assert Safety(contract, limits).sensed(at_rest(contract), fine, 0.0) is None
+    assert Safety(contract, limits).sensed(at_rest(contract), wrong, 0.0) == Trip(name, text)
+    if name != "motor":
+        bad = replace(wrong, **{key: math.nan for key in ("voltage", "age_s") if getattr(wrong, key) is not None})
+        assert Safety(contract, limits).sensed(at_rest(contract), bad, 0.0)
+
+
+def test_targets(contract: Contract, limits: Limits) -> None:
+    """Beyond the range, too far at once, too strong for the motor, not finite."""
+    pose, rest = contract.default_pose, at_rest(contract)
+
+    def check(*targets: Any, measured: Measurement = rest) -> Trip | None:
+        safety = Safety(contract, limits)
+        found = [safety.asked(measured, each) for each in targets]
+        assert not any(found[:-1])
+        return found[-1]
+
+    assert check(put(pose, 5, -0.8378 + 0.299)) is None
+    assert check(put(pose, 5, -0.5)) == Trip(
+        "target", "FR_calf_joint is told to go to -0.50 rad, 0.34 beyond its range -2.72 to -0.84; 0.30 is the most"
+    )
+    assert check(pose, put(pose, 1, 1.299)) is None
+    assert check(pose, put(pose, 1, 1.301)) == Trip(
+        "step", "FL_thigh_joint is told to step by 0.50 rad from one target to the next, more than 0.50"
+    )
+    fast = at_rest(contract, joint_vel=put(np.zeros(12), 0, -10.0))  # damping asks for 5 N m more
+    assert check(put(pose, 0, 0.1 + 0.93), measured=fast) is None  # 20 * 0.93 + 5 = 23.6 of 23.7 N m
+    assert check(put(pose, 0, 0.1 + 0.94), measured=fast) == Trip("torque", "FL_hip_joint is asked for 23.8 N m, more than 23.7")
+    for value in (math.nan, math.inf):
+        assert check(put(pose, 7, value)) == Trip("finite", f"the target of RL_thigh_joint is not finite: {value}")
+
+
+def test_targets_are_held_within_the_servos_range(contract: Contract) -> None:
+    """As MuJoCo's servos hold them in training: a robot's drives do not."""
+    robot, controller = Recorder(MujocoRobot(GO2, contract)), Controller(GO2, contract)
+    beyond_it = put(contract.default_pose, 5, -0.5)
+    controller.act = lambda *_: beyond_it[None]  # type: ignore[method-assign]
+    run(robot, controller, lambda _: np.zeros(3), 0.04, live=False)
+    np.testing.assert_array_equal(robot.targets, [put(beyond_it, 5, Limits.of(GO2, contract).high[5])] * 2)
+
+
+def test_gains_count_in_the_torque(contract: Contract, limits: Limits) -> None:
+    target = put(contract.default_pose, 0, 0.5)
+    safety, zeros = Safety(contract, limits), np.zeros(12)
+    assert safety.asked(at_rest(contract), target, 2.9 * contract.stiffness, zeros) is None
+    assert safety.asked(at_rest(contract), target, 3.1 * contract.stiffness, zeros) == Trip(
+        "torque", "FL_hip_joint is asked for 24.8 N m, more than 23.7"
+    )
+
+
+def test_a_policy_of_torques(contract: Contract, limits: Limits) -> None:
+    """Its targets are torques: the motor's limit is theirs, and no servo stands such a robot up."""
+    torques = replace(contract, action=contract.action._replace(origin="torque"))
+    safety = Safety(torques, limits)
+    assert safety.asked(at_rest(contract), put(np.zeros(12), 2, -45.4)) is None
+    assert safety.asked(at_rest(contract), put(np.zeros(12), 2, -45.5)) == Trip(
+        "torque", "FL_calf_joint is asked for 45.5 N m, more than 45.4"
+    )
+    controller = Controller(GO2, torques)
+    with pytest.raises(RobotError, match="a policy of torques cannot stand a robot up: its states need servos; run it without them"):
+        driven(Watched(GO2, contract), controller, Script({}), 0.1)
+
+
+def test_steps_that_are_late(contract: Contract, limits: Limits) -> None:
+    """Five within a second, each by more than half a period; four, or half a period, are fine."""
+    off = limits.but({"frozen": "off"}, "test")
+    for count, apart, behind, trips in ((5, 0.2, 0.0101, True), (5, 0.26, 0.0101, False), (4, 0.02, 0.02, False), (9, 0.02, 0.01, False)):
+        safety = Safety(contract, off)
+        found = [safety.sensed(at_rest(contract), Health(), i * apart, behind) for i in range(count)]
+        assert not any(found[:-1]) and bool(found[-1]) == trips
+    assert Safety(contract, off).sensed(at_rest(contract), Health(), 0.0, 5.0) is None
+    safety = Safety(contract, off)
+    found = [safety.sensed(at_rest(contract), Health(), i * 0.02, 0.015) for i in range(5)]
+    assert found[-1] == Trip("late", "5 steps within a second began late, the last by 15 ms")
+
+
+def test_measurements_that_are_frozen(contract: Contract, limits: Limits) -> None:
+    safety, health = Safety(contract, limits), Health()
+    for bit in (0.0, 0.0, 0.0, 1e-15, 1e-15, 1e-15):
+        assert safety.sensed(at_rest(contract, joint_vel=put(np.zeros(12), 0, bit)), health, 0.0) is None
+    trip = safety.sensed(at_rest(contract, joint_vel=put(np.zeros(12), 0, 1e-15)), health, 0.0)
+    assert trip == Trip("frozen", "4 measurements in a row are the same")
+    safety.reset()
+    assert safety.sensed(at_rest(contract), health, 0.0) is None
+
+
+def test_a_remote_that_is_lost(contract: Contract, limits: Limits) -> None:
+    safety = Safety(contract, limits.but({"frozen": "off"}, "test"))
+    assert safety.sensed(at_rest(contract), Health(), 100.0) is None  # one that was never there is not missed
+    assert safety.sensed(at_rest(contract), Health(remote=Remote()), 100.0) is None
+    assert safety.sensed(at_rest(contract), Health(), 102.98) is None
+    assert safety.sensed(at_rest(contract), Health(), 103.0) == Trip("remote", "the remote was not heard for 3.0 s")
+
+
+# ---- where limits come from
+
+
+def test_limits_of_an_export(contract: Contract) -> None:
+    """The scene's machine, the contract's section, then what the machine's class and the command line say."""
+    limits = Limits.of(GO2, contract)
+    np.testing.assert_allclose((limits.low[5], limits.high[5], limits.motor[5]), (-2.7227, -0.83776, 45.43), atol=1e-4)
+    assert limits.tilt == 60.0 and limits.voltage == -math.inf
+    narrow = replace(contract, safety={"speed": 25, "tilt": False})
+    limits = Limits.of(GO2, narrow, {"voltage": 24.0}, parse_limits(["speed=30", "late = off"]))
+    assert (limits.speed, limits.tilt, limits.voltage, limits.late) == (30.0, math.inf, 24.0, math.inf)
+    for falls, tilt in ((None, math.inf), (45.0, 45.0), (170.0, 170.0)):
+        assert Limits.of(GO2, replace(contract, ends=contract.ends._replace(max_tilt=falls))).tilt == tilt
+    assert narrow.to_dict()["safety"] == {"speed": 25, "tilt": False} and "safety" not in contract.to_dict()
+    assert set(NAMES) == {*ASKED, "age", "frozen", "late", "remote"}
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("tilt", "--limit tilt: write NAME=VALUE or NAME=off; there are: position, target, step,"),
+        ("tlit=3", "--limit: no limit 'tlit' in the safety layer; did you mean 'tilt'?"),
+        ("tilt=steep", "--limit: tilt is 'steep'; it must be a number from 0, or off"),
+        ("tilt=-1", "--limit: tilt is '-1'; it must be a number from 0, or off"),
+        ("tilt=nan", "--limit: tilt is 'nan'; it must be a number from 0, or off"),
+    ],
+)
+def test_a_wrong_limit(text: str, said: str, contract: Contract) -> None:
+    with pytest.raises(LimitError) as error:
+        Limits.of(GO2, contract, parse_limits([text]))
+    assert said in str(error.value)
+    with pytest.raises(LimitError, match="policy.yaml: safety: no limit 'tlit'"):
+        Limits.of(GO2, replace(contract, safety={"tlit": 3}))
+
+
+# ---- a good walk passes none of them
+
+
+@pytest.mark.parametrize("name", ["go1_flat", "go2_flat", "g1_flat"])
+def test_shipped_policies_trip_nothing(name: str) -> None:
+    """All commands of the walking exam, and its pushes of up to 2 m/s after 1.5 s: as shipped, limits at their defaults."""
+    folder = POLICIES / name
+    contract = read_contract(folder)
+    exam, names = contract_rules(contract), [command.name for command in contract.commands]
+    directions = np.arange(rules.PUSH_DIRECTIONS) * 2 * math.pi / rules.PUSH_DIRECTIONS
+    kicks = [speed * np.array([math.cos(a), math.sin(a)]) for speed in exam.push_speeds if speed <= 2.0 for a in directions]
+    held = exam.held()
+    wanted = np.tile([command.default for command in contract.commands], (len(held) + len(kicks), 1))
+    wanted[:, [names.index(each) for each in VELOCITY]] = [*held, *[(exam.push_vx, 0.0, 0.0)] * len(kicks)]
+    stage, limits = DeployStage(folder, len(wanted)), Limits.of(folder, contract)
+    layers = [Safety(contract, limits) for _ in wanted]
+    for step in range(125):
+        measured = stage.measured
+        if step == 75:
+            for i, kick in enumerate(kicks):
+                stage.push(len(held) + i, kick)
+        stage.step(wanted)
+        for i, layer in enumerate(layers):
+            one = Measurement(**{quantity: getattr(measured, quantity)[i] for quantity in QUANTITIES})
+            trip = layer.sensed(one, Health(), step * stage.dt) or layer.asked(one, stage.controller.last_targets[i])
+            assert trip is None, f"robot {i} at step {step}: {trip}"
+
+
+# ---- faults of a walking robot: damped at once, said in one line, no joint beyond its limits
+
+AT = 170  # the step of a fault: the policy walks since step 110
+Fault = Callable[[Watched, Controller, Script], None]
+
+
+def policy_of(change: Callable[[Any], Any]) -> Fault:
+    """A network that goes wrong."""
+
+    def fault(robot: Watched, controller: Controller, _: Script) -> None:
+        right = controller._network
+        controller._network = lambda obs: change(right(obs)) if robot.step >= AT else right(obs)
+
+    return fault
+
+
+def measured_as(change: Callable[[Watched, Measurement], Measurement]) -> Fault:
+    def fault(robot: Watched, _: Controller, __: Script) -> None:
+        robot.changed = lambda step, measured: change(robot, measured) if step >= AT else measured
+
+    return fault
+
+
+def told(health: Health) -> Fault:
+    def fault(robot: Watched, _: Controller, __: Script) -> None:
+        robot.told = lambda step: health if step >= AT else Health(age_s=0.0, remote=Remote())
+
+    return fault
+
+
+def frozen(robot: Watched, measured: Measurement) -> Measurement:
+    if not hasattr(robot, "still"):
+        robot.still = measured  # type: ignore[attr-defined]
+    return robot.still  # type: ignore[attr-defined]
+
+
+def silent(robot: Watched, measured: Measurement) -> Measurement:
+    raise RobotError("the newest measurement is 100 ms old: the link is down")
+
+
+def stopped(robot: Watched, controller: Controller, script: Script) -> None:
+    script.stop = AT
+
+
+def ended(robot: Watched, controller: Controller, script: Script) -> None:
+    script.presses[AT] = "select"
+
+
+def thrown(robot: Watched, controller: Controller, script: Script) -> None:
+    """On its back within a step."""
+
+    def change(step: int, measured: Measurement) -> Measurement:
+        return replace(measured, gravity=np.array([0.0, 0.0, 1.0])) if step >= AT else measured
+
+    robot.changed = change
+
+
+FAULTS: dict[str, tuple[Fault, int, str]] = {  # fault, periods until it can be known, what is said
+    "NaN from the policy": (policy_of(lambda actions: np.nan * actions), 0, "the target of FL_hip_joint is not finite: nan"),
+    "inf from the policy": (policy_of(lambda actions: np.inf * actions), 0, "the target of FL_hip_joint is not finite: nan"),
+    "actions ten times too large": (policy_of(lambda actions: 10 * actions), 4, "damping: "),
+    "NaN from a sensor": (
+        measured_as(lambda _, m: replace(m, joint_vel=np.nan * m.joint_vel)),
+        0,
+        "what is measured is not finite: joint_vel",
+    ),
+    "an angle that jumps": (
+        measured_as(lambda _, m: replace(m, joint_pos=m.joint_pos + 2.0)),
+        0,
+        "FL_hip_joint is at 2.",
+    ),
+    "a speed that jumps": (measured_as(lambda _, m: replace(m, joint_vel=m.joint_vel + 100.0)), 0, "FL_hip_joint turns at "),
+    "joints in another order": (
+        measured_as(lambda _, m: replace(m, joint_pos=np.roll(m.joint_pos, 1))),
+        0,
+        "FL_hip_joint is at -1.",
+    ),
+    "a frozen state": (measured_as(frozen), 3, "4 measurements in a row are the same"),
+    "a silent robot": (measured_as(silent), 0, "the newest measurement is 100 ms old: the link is down"),
+    "a stale measurement": (told(Health(age_s=0.05)), 0, "the newest measurement is 50 ms old, more than 40"),
+    "a hot motor": (told(Health(temperatures=np.full(12, 90.0))), 0, "FL_hip_joint has a motor of 90 deg C, more than 85"),
+    "an empty battery": (told(Health(voltage=20.0)), 0, "the battery has 20.0 V, less than 24"),
+    "a motor's fault": (told(Health(motor_faults={"FR_calf_joint": "error 0x1"})), 0, "the motor of FR_calf_joint reports a fault"),
+    "the remote lost": (told(Health()), 149, "the remote was not heard for 3.0 s"),
+    "an emergency stop": (stopped, 0, "the test"),
+    "select": (ended, 0, "select was pressed"),
+    "a fall": (thrown, 0, "the robot fell"),
+}
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_a_fault_damps(name: str, contract: Contract) -> None:
+    """In the period in which it can be known; and nothing moves again by itself."""
+    fault, periods, text = FAULTS[name]
+    robot, controller, said = Watched(GO2, contract, whole=True, hoisted=True), Controller(GO2, contract), []
+    source = Script({5: "start", 110: "A"}, command=[0.8, 0.0, 0.0])
+    fault(robot, controller, source)
+    done, passed = driven(robot, controller, source, (AT + periods + 30) * contract.period, said, voltage=24.0)
+    assert passed == ["zero torque", "stand", "policy", "damping"]
+    assert robot.done.index("damp") in range(AT, AT + periods + 1)
+    first = robot.done.index("damp")
+    assert set(robot.done[first:]) == {"damp"}  # nothing resumes by itself
+    assert text in said[-1] and said[-1].startswith("damping: ") and "\n" not in said[-1]
+    assert len(done.trips) == (0 if name == "select" else 1)
+    limits = Limits.of(GO2, contract)
+    assert beyond(robot, limits) < limits.position
+
+
+def test_a_plain_run_raises_what_tripped(contract: Contract) -> None:
+    robot = Watched(GO2, contract)
+    robot.changed = lambda step, measured: replace(measured, joint_vel=measured.joint_vel + (99.0 if step == 20 else 0.0))
+    with pytest.raises(Tripped, match=r"FL_hip_joint turns at .* rad/s, more than 60.0; the joints are damped") as error:
+        run(robot, Controller(GO2, contract), lambda _: np.zeros(3), 1.0, live=False)
+    assert error.value.trip.limit == "speed" and len(robot.done) == 20
+    before = robot.fleet.qpos[0, 2]
+    for _ in range(50):
+        robot.write(contract.default_pose)  # closed: it sinks, whatever is written
+    assert robot.fleet.qpos[0, 2] < before - 0.05
+
+
+def test_a_robot_without_damp_has_no_states(contract: Contract) -> None:
+    class Plain(MujocoRobot):
+        limp = Robot.limp
+
+    with pytest.raises(RobotError, match=r"Plain has no damp\(\) and limp\(\) of its own, which the states need"):
+        driven(Plain(GO2, contract), Controller(GO2, contract), Script({}), 0.1)  # type: ignore[arg-type]

@@ -1,0 +1,255 @@
+"""The guard of the wire: what it sends when the policy's process dies, hangs, is late or is not alone; then real processes."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.robot import RobotError
+from legged_mw.deploy.unitree import client, guard
+from legged_mw.deploy.unitree.codec import LAYOUTS
+from legged_mw.deploy.unitree.guard import Board, Guard, Guarded
+from legged_mw.deploy.unitree.link import Received, RobotEnd
+from legged_mw.deploy.unitree.serve import STEP, SimulatedUnitree
+from tests.wires import POLICIES
+from tests.wires import domain as domain
+
+SIZE = LAYOUTS["unitree_go", "LowCmd_"].size
+MOVING, DAMPING = b"m" * SIZE, b"d" * SIZE
+
+
+class FakeWire:
+    """Keeps what is sent."""
+
+    def __init__(self) -> None:
+        self.sent, self.state, self.other = list[bytes](), None, False
+
+    def receive(self) -> Received | None:
+        state, self.state = self.state, None
+        return state
+
+    def send(self, body: bytes) -> None:
+        self.sent.append(body)
+
+    def other_commander(self) -> bool:
+        return self.other
+
+
+class Bench:
+    """A guard in a thread, with the policy's end of its channel and board."""
+
+    def __init__(self, late: float) -> None:
+        self.wire = FakeWire()
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115
+        self._file.truncate(4096)
+        self.here, there = socket.socketpair()
+        self.board, size = Board(self._file.fileno(), 64), 64
+        self.guard = Guard(self.wire, there, Board(self._file.fileno(), size), "unitree_go", late)
+        self._thread = threading.Thread(target=self.guard.run, daemon=True)
+        self._thread.start()
+
+    def send(self, kind: int, body: bytes, stamp: float = 0.0) -> None:
+        self.here.sendall(guard._FRAME.pack(kind, stamp) + body)
+
+    def ended(self, seconds: float = 5.0) -> bool:
+        self._thread.join(seconds)
+        return not self._thread.is_alive()
+
+    def close(self) -> None:
+        self.guard._until = 0.0
+        self.ended()
+        self.here.close()
+        self._file.close()
+
+
+def until(true: Any, seconds: float = 5.0) -> bool:
+    end = time.monotonic() + seconds
+    while not true() and time.monotonic() < end:
+        time.sleep(0.001)
+    return bool(true())
+
+
+@pytest.fixture
+def bench(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Bench]:
+    monkeypatch.setattr(guard, "AFTER", 0.1)
+    made = Bench(getattr(request, "param", 60.0))
+    made.send(guard.ARM, DAMPING)
+    yield made
+    made.close()
+
+
+def test_it_repeats_the_newest_command(bench: Bench) -> None:
+    bench.send(guard.MOVE, MOVING)
+    assert until(lambda: len(bench.wire.sent) > 20) and set(bench.wire.sent) == {MOVING}
+    newer = b"n" * SIZE
+    bench.send(guard.MOVE, newer)
+    assert until(lambda: bench.wire.sent[-1] == newer)
+
+
+def test_nothing_is_sent_before_the_first_command(bench: Bench) -> None:
+    bench.wire.state = Received(b"s" * 64, 7.0)
+    assert until(lambda: bench.board.get()[1] == 7.0) and bench.board.get() == (b"s" * 64, 7.0, "")
+    assert not bench.wire.sent
+
+
+@pytest.mark.parametrize("bench", [0.1], indirect=True)
+def test_a_late_policy_is_damped_and_does_not_resume(bench: Bench, capfd: pytest.CaptureFixture[str]) -> None:
+    bench.send(guard.MOVE, MOVING)
+    assert until(lambda: bench.guard.tripped) and until(lambda: bench.wire.sent[-1] == DAMPING)
+    bench.send(guard.MOVE, MOVING)
+    count = len(bench.wire.sent)
+    assert until(lambda: len(bench.wire.sent) > count + 20) and set(bench.wire.sent[count:]) == {DAMPING}
+    text = bench.board.get()[2]
+    assert text.startswith("no targets for ") and text.endswith(" ms: the policy's process hangs or is late; the joints are damped")
+    assert "guard: no targets for" in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("bench", [0.05], indirect=True)
+def test_what_is_safe_may_hold_for_ever(bench: Bench) -> None:
+    """Limp and damped joints need nobody: a person may take a while before the robot stands."""
+    bench.send(guard.SAFE, b"l" * SIZE)
+    assert until(lambda: len(bench.wire.sent) > 10)
+    time.sleep(0.15)
+    assert not bench.guard.tripped and bench.wire.sent[-1] == b"l" * SIZE
+
+
+def test_a_policy_that_dies_is_damped(bench: Bench) -> None:
+    bench.send(guard.MOVE, MOVING)
+    assert until(lambda: bench.wire.sent)
+    bench.here.close()
+    assert bench.ended() and bench.wire.sent[-1] == DAMPING
+    assert bench.board.get()[2] == "the policy's process ended; the joints are damped"
+
+
+def test_a_second_commander(bench: Bench) -> None:
+    bench.send(guard.MOVE, MOVING)
+    assert until(lambda: bench.wire.sent)
+    bench.wire.other = True
+    assert until(lambda: bench.wire.sent[-1] == DAMPING)
+    assert bench.board.get()[2] == "another program sends commands to this robot, too; the joints are damped"
+
+
+def test_a_guard_that_is_told_to_end_damps_first(bench: Bench) -> None:
+    bench.send(guard.MOVE, MOVING)
+    assert until(lambda: bench.wire.sent)
+    bench.guard.stop()
+    assert bench.ended() and bench.wire.sent[-1] == DAMPING
+
+
+def test_the_end(bench: Bench) -> None:
+    """The last command is sent for a while, and the latency of the others is told."""
+    bench.send(guard.MOVE, MOVING, stamp=time.monotonic())
+    bench.send(guard.CLOSE, DAMPING)
+    assert b"from a measurement to its target: median " in bench.here.recv(4096)
+    assert bench.ended() and bench.wire.sent[-1] == DAMPING and bench.guard.tripped == ""
+
+
+# ---- processes
+
+POLICY = """
+import sys, time
+import numpy as np
+from pathlib import Path
+from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.unitree.client import connect
+contract = read_contract(Path(sys.argv[1]))
+robot = connect(Path(sys.argv[1]), contract, "lo", int(sys.argv[2]))
+print("pid", robot._owner.process.pid, flush=True)
+while True:
+    robot.read()
+    robot.write(contract.default_pose)
+    time.sleep(0.01)
+"""
+
+
+def served(domain: int) -> SimulatedUnitree:
+    folder = POLICIES / "go2_flat"
+    return SimulatedUnitree(folder, read_contract(folder), RobotEnd("unitree_go", "lo", domain))
+
+
+def live(sim: SimulatedUnitree, until: Any, seconds: float = 30.0) -> float:
+    """Step in real time until something is true; returns how long it took [s]."""
+    start = due = time.monotonic()
+    while not until():
+        sim.step()
+        due = max(due + STEP, time.monotonic() - 0.05)
+        time.sleep(max(0.0, due - time.monotonic()))
+        assert time.monotonic() - start < seconds, "it did not happen"
+    return time.monotonic() - start
+
+
+@contextlib.contextmanager
+def policy(domain: int) -> Iterator[subprocess.Popen[str]]:
+    told = [sys.executable, "-c", POLICY, str(POLICIES / "go2_flat"), str(domain)]
+    process = subprocess.Popen(told, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=POLICIES.parents[1])
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.communicate()
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["dies", "hangs"])
+def test_processes_of_a_policy_that_dies_or_hangs(number: signal.Signals, domain: int) -> None:
+    """The guard is another process: it damps on the simulated robot's own record, where there is no watchdog."""
+    sim = served(domain)
+    with policy(domain) as process:
+        live(sim, lambda: sim.acted["kp"].any())
+        os.kill(process.pid, number)
+        live(sim, lambda: not sim.acted["kp"].any())
+        assert sim.acted["kd"].all() and np.isfinite(sim.data.qpos).all()
+
+
+def test_a_guard_that_is_killed_leaves_the_last_command(domain: int) -> None:
+    """As a robot without a watchdog does; the policy's process says so."""
+    sim = served(domain)
+    with policy(domain) as process:
+        live(sim, lambda: sim.acted["kp"].any())
+        assert process.stdout
+        os.kill(int(process.stdout.readline().split()[1]), signal.SIGKILL)
+        live(sim, lambda: process.poll() is not None)
+        assert sim.acted["kp"].any()
+        assert "the guard of the wire is gone: the robot may hold its last command" in process.communicate()[1]
+
+
+def test_a_guard_says_what_is_wrong(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    with pytest.raises(RobotError, match="no robot: no rt/lowstate of unitree_go in domain"):
+        Guarded("unitree_go", "lo", domain, find=0.2)
+    contract = read_contract(POLICIES / "go1_flat")
+    with pytest.raises(RobotError, match="which a go2 does not measure"):
+        client.connect(POLICIES / "go1_flat", contract, "lo", domain)
+
+
+def test_the_programs(domain: int, tmp_path: Path) -> None:
+    """Two programs over loopback: the remote of the robot's side stands the robot up, starts the policy, walks and ends it."""
+    press = [f"{{time: {0.5 * k}, press: [{button}]}}" for k, button in enumerate(["start", "A"] * 20, start=4)]
+    (tmp_path / "remote.yaml").write_text(f"remote: [{{time: 0, ly: 0.4}}, {', '.join(press)}]")
+    command = [sys.executable, "-m", "legged_mw.deploy", "go2_flat", "--interface", "lo", "--domain", str(domain)]
+    where: dict[str, Any] = {"cwd": POLICIES.parents[1], "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with contextlib.ExitStack() as stack:
+        robot = subprocess.Popen([*command, "--serve", "unitree", "--remote", str(tmp_path / "remote.yaml")], **where)
+        stack.callback(robot.kill)
+        policy = subprocess.Popen([*command, "--robot", "unitree", "--time", "6s", "--log", "off"], **where)
+        stack.callback(policy.kill)
+        said, errors = policy.communicate(timeout=60)
+        assert policy.returncode == 0, errors
+        assert "go2 at lo: 12 joints, 32.8 V" in said and "from a measurement to its target: median " in said
+        assert "zero torque: " in said and "stand: " in said and "policy: select: damping" in said
+        robot.send_signal(signal.SIGINT)
+        said, errors = robot.communicate(timeout=60)
+        assert "from a state to the first command that answers it: median " in said and "0 refused" in said, errors
+        assert "degrees from upright" in said

@@ -1,0 +1,313 @@
+"""A Unitree robot behind the seam ``Robot``, against a simulated one at the other end of the wire: one process, no waiting."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+from legged_mw.deploy.contract import ContractRow, read_contract
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.robot import RobotError, damped
+from legged_mw.deploy.unitree.client import UnitreeRobot, check_rows, servo_ranges
+from legged_mw.deploy.unitree.codec import LAYOUTS, Message
+from legged_mw.deploy.unitree.link import CHECK_MODE, RELEASE_MODE, STAND_DOWN, Received, RobotEnd, Wire
+from legged_mw.deploy.unitree.robots import G1, GO2, H1
+from legged_mw.deploy.unitree.serve import Faults, SimulatedUnitree
+from tests.wires import POLICIES, pair
+from tests.wires import domain as domain
+
+
+def test_go2_stands_walks_and_is_damped(domain: int) -> None:
+    """With a wire that is late and loses messages; then its joints are only damped, and it sinks to the ground."""
+    both = pair("go2_flat", domain, faults=Faults(delay_ms=10.0, jitter_ms=2.0, loss=0.05))
+    sim, robot = both.sim, both.robot
+    assert sim.end.program == "" and sim.data.qpos[2] < 0.12 and not np.any(sim.acted["kp"])
+    both.rise()
+    assert sim.data.qpos[2] > 0.25 and sim.upright > 0.97
+    far = both.walk(Controller(POLICIES / "go2_flat", both.contract), np.array([0.8, 0.0, 0.0]), 3.0)
+    assert 1.6 < far[0] < 2.7 and abs(far[1]) < 0.4 and sim.upright > 0.97
+    robot.close()
+    both.steps(1.5)
+    assert sim.data.qpos[2] < 0.12 and not sim.acted["kp"].any() and np.abs(sim.joint_vel).max() < 1.0
+    assert np.allclose(sim.acted["kd"], damped(both.contract)) and sim.counts.refused == 0
+
+
+def test_g1_walks_off_its_hoist(domain: int) -> None:
+    both = pair("g1_flat", domain)
+    sim = both.sim
+    assert sim.hoist and 0.7 < sim.data.qpos[2] < 0.85
+    both.rise()
+    assert np.abs(sim.joint_pos - both.contract.default_pose).max() < 0.1
+    controller = Controller(POLICIES / "g1_flat", both.contract)
+    both.walk(controller, np.zeros(3), 0.5)
+    sim.hoist = False
+    both.walk(controller, np.zeros(3), 1.0)
+    far = both.walk(controller, np.array([0.6, 0.0, 0.0]), 2.0)
+    assert far[0] > 0.7 and sim.upright > 0.95 and not sim.data.xfrc_applied.any()
+    assert sim.command is not None and sim.command["mode_machine"] == 5 and sim.command["mode_pr"] == 0
+
+
+# ---- what is measured
+
+
+def test_measurements_are_the_truth_by_name(domain: int) -> None:
+    both = pair("go2_flat", domain)
+    sim, robot = both.sim, both.robot
+    sim.data.qpos[3:7] = [math.cos(0.2), math.sin(0.2), 0.0, 0.0]  # rolled to the right by 0.4 rad
+    for i, name in enumerate(both.contract.joints):
+        sim.data.joint(name).qpos[0] = 0.01 * i
+    sim.data.qvel[:] = 0.0
+    sim.data.qvel[6:] = np.arange(12)
+    mujoco.mj_step1(sim.model, sim.data)
+    sim._fill()
+    robot._owner = Once(sim._state.body, sim.time)
+    measured = robot.read()
+    assert np.allclose(measured.joint_pos, 0.01 * np.arange(12), atol=1e-6)
+    assert np.allclose(measured.joint_vel, sim.joint_vel, atol=1e-6)
+    assert measured.gravity[1] == pytest.approx(-math.sin(0.4), abs=1e-5)
+    assert measured.gravity[2] == pytest.approx(-math.cos(0.4), abs=1e-5)
+    message = Message(LAYOUTS["unitree_go", "LowState_"], sim._state.body)
+    assert message["motor_state.q"][GO2.motors["FL_calf_joint"]] == pytest.approx(0.02)
+    assert message["motor_state.q"][12:].tolist() == [0.0] * 8
+
+
+class Once:
+    """An owner of the wire that has one state to give, and keeps what is sent."""
+
+    def __init__(self, body: bytes, stamp: float = 0.0) -> None:
+        self.state, self.sent = Received(body, stamp), list[bytes]()
+
+    def receive(self) -> Any:
+        state, self.state = self.state, None
+        return state
+
+    def arm(self, damping: bytes) -> None:
+        self.sent.append(damping)
+
+    def send(self, body: bytes, stamp: float, safe: bool) -> None:
+        self.sent.append(body)
+
+    def close(self, last: bytes) -> str:
+        self.sent.append(last)
+        return ""
+
+
+def test_health_and_faults(domain: int) -> None:
+    both = pair("go2_flat", domain)
+    sim, robot = both.sim, both.robot
+    both.steps(0.02)
+    health = robot.health()
+    assert health.age_s == 0.0 and health.voltage == pytest.approx(32.8) and not health.motor_faults
+    assert health.remote and not health.remote.buttons and health.temperatures is not None and (health.temperatures == 35).all()
+    sim.faults.temperature, sim.faults.voltage, sim.faults.no_remote, sim.faults.dead_motors = 91.0, 21.5, True, {"RL_calf_joint"}
+    both.steps(0.02)
+    health = robot.health()
+    assert health.temperatures is not None and (health.temperatures == 91).all() and health.voltage == pytest.approx(21.5)
+    assert health.remote is None and health.motor_faults == {"RL_calf_joint": "it lost 10 messages in a period"}
+    assert robot.limits == {"voltage": 24.0}
+
+
+def test_a_g1_names_its_motors_error(domain: int) -> None:
+    both = pair("g1_flat", domain, faults=Faults(dead_motors={"left_knee_joint"}))
+    both.robot.write(both.contract.default_pose)
+    both.steps(0.1)
+    assert both.robot.health().motor_faults == {"left_knee_joint": "error 0x1"}
+    assert both.sim.torque[both.contract.joints.index("left_knee_joint")] == 0.0 and np.abs(both.sim.torque).max() > 0.0
+
+
+def test_a_bias_is_measured_and_not_there(domain: int) -> None:
+    both = pair("go2_flat", domain, faults=Faults(joint_bias=0.03, gyro_bias=0.5))
+    both.steps(0.5)
+    measured = both.robot.read()
+    assert np.allclose(measured.joint_pos - both.sim.joint_pos, 0.03, atol=1e-3)
+    assert np.allclose(measured.ang_vel - both.sim.data.qvel[3:6], 0.5, atol=0.05)
+
+
+@pytest.mark.parametrize("fault", ["silent", "corrupt"])
+def test_a_robot_without_good_states_is_none(fault: str, domain: int) -> None:
+    both = pair("go2_flat", domain)
+    both.steps(0.05)
+    both.robot.read()
+    setattr(both.sim.faults, fault, True)
+    both.steps(0.08)
+    both.robot.read()
+    both.steps(0.04)
+    with pytest.raises(RobotError, match="the newest measurement is 1[0-9]{2} ms old: the robot is silent, or the link is down"):
+        both.robot.read()
+    assert both.robot.bad_states == (2 if fault == "corrupt" else 0)
+
+
+def test_states_without_a_checksum_are_taken(domain: int) -> None:
+    """unitree_mujoco's simulator in Python sends none."""
+    both = pair("go2_flat", domain)
+    both.steps(0.1)
+    message = Message(LAYOUTS["unitree_go", "LowState_"], both.sim._state.body)
+    message["crc"], message["motor_state.q"] = 0, 0.7
+    both.robot._owner = Once(message.body, both.sim.time)
+    assert np.allclose(both.robot.read().joint_pos, 0.7)
+
+
+# ---- what is commanded
+
+
+def test_commands(domain: int) -> None:
+    both = pair("go2_flat", domain)
+    robot, owner = both.robot, Once(b"")
+    robot._owner, targets = owner, both.contract.default_pose + np.linspace(-0.5, 0.5, 12)
+    robot.write(targets)
+    robot.write(targets, stiffness=np.full(12, 7.0), damping=np.full(12, 0.7))
+    robot.damp()
+    robot.limp()
+    slots = [GO2.motors[name] for name in both.contract.joints]
+    sent = [Message(LAYOUTS["unitree_go", "LowCmd_"], body) for body in owner.sent]
+    for message in sent:
+        assert message.intact() and message["head"].tolist() == [0xFE, 0xEF] and message["level_flag"] == 0xFF
+        assert message["motor_cmd.mode"].tolist() == [1] * 12 + [0] * 8 and not message["motor_cmd.dq"].any()
+    assert np.allclose(sent[0]["motor_cmd.q"][slots], targets) and np.allclose(sent[0]["motor_cmd.kp"][slots], both.contract.stiffness)
+    assert np.allclose(sent[1]["motor_cmd.kp"][:12], 7.0) and np.allclose(sent[1]["motor_cmd.kd"][:12], 0.7)
+    assert not sent[2]["motor_cmd.kp"].any() and np.allclose(sent[2]["motor_cmd.kd"][slots], damped(both.contract))
+    assert not any(sent[3][f"motor_cmd.{part}"].any() for part in ("q", "kp", "kd", "tau"))
+    with pytest.raises(RobotError, match="targets that are not finite are not sent: q"):
+        robot.write(np.full(12, math.nan))
+    assert len(owner.sent) == 4
+
+
+def test_targets_are_held_within_what_was_trained(domain: int) -> None:
+    """The scene's servos hold targets within the joints' ranges, so the policy may ask for more than a joint can do; drives would obey."""
+    both = pair("g1_flat", domain)
+    low, high = servo_ranges(POLICIES / "g1_flat", both.contract)
+    knee = both.contract.joints.index("left_knee_joint")
+    assert (low[knee], high[knee]) == (pytest.approx(-0.087267), pytest.approx(2.8798))
+    owner = both.robot._owner = Once(b"")
+    both.robot.write(np.full(29, -9.0))
+    sent = Message(LAYOUTS["unitree_hg", "LowCmd_"], owner.sent[0])
+    assert np.allclose(sent["motor_cmd.q"][[G1.motors[name] for name in both.contract.joints]], low)
+
+
+def test_h1_on_the_wire() -> None:
+    """Its table alone: there is no policy for it here."""
+    contract = replace(
+        read_contract(POLICIES / "g1_flat"),
+        joints=tuple(H1.motors),
+        **{name: np.arange(19.0) for name in ("default_pose", "stiffness", "damping")},
+    )
+    owner = Once(Message(LAYOUTS["unitree_go", "LowState_"]).seal())
+    robot = UnitreeRobot(contract, owner, owner.receive(), ranges=(np.full(19, -20.0), np.full(19, 20.0)), clock=lambda: 0.0)
+    robot.write(np.arange(19.0))
+    message = Message(LAYOUTS["unitree_go", "LowCmd_"], owner.sent[-1])
+    assert message["motor_cmd.mode"].tolist() == [10] * 9 + [0] + [1] * 10
+    assert message["motor_cmd.q"][[9, 6, 19]].tolist() == [0.0, 6.0, contract.joints.index("left_elbow_joint")]
+
+
+def test_the_simulated_robot_obeys_as_a_motor_does(domain: int) -> None:
+    """Wrong messages move nothing; a motor's mode 0 and Unitree's stop values give no torque; the last command holds for ever."""
+    both = pair("go2_flat", domain)
+    sim, robot = both.sim, both.robot
+    command = Message(LAYOUTS["unitree_go", "LowCmd_"], robot._command(q=both.contract.default_pose, kp=both.contract.stiffness))
+    wrong = Message(command.layout, command.body)
+    wrong["motor_cmd.kp"] = 99.0
+    low = Message(command.layout, command.body)
+    low["level_flag"] = 0xEE
+    for bad in (wrong.body, low.seal()):
+        sim._take(Message(command.layout, bad))
+    assert sim.counts.refused == 2 and not sim.acted["kp"].any()
+    sim._take(command)
+    both.steps(1.0)
+    assert np.allclose(sim.acted["kp"], both.contract.stiffness)
+    command["motor_cmd.mode"] = 0
+    command.seal()
+    sim._take(command)
+    sim.step()
+    assert not sim.torque.any()
+    command["motor_cmd.mode"], command["motor_cmd.q"], command["motor_cmd.dq"], command["motor_cmd.kd"] = 1, 2.146e9, 16000.0, 5.0
+    command.seal()
+    sim._take(command)
+    sim.step()
+    assert sim.counts.refused == 2 and not sim.torque.any()
+
+
+def test_a_watchdog_if_asked_for(domain: int) -> None:
+    both = pair("go2_flat", domain, watchdog=0.1)
+    both.robot.write(both.contract.default_pose)
+    both.steps(0.09)
+    assert both.sim.acted["kp"].any()
+    both.steps(0.03)
+    assert not both.sim.acted["kp"].any() and np.allclose(both.sim.acted["kd"], damped(both.contract)) and both.sim.counts.watchdog == 1
+
+
+# ---- before the first command
+
+
+def test_no_robot(domain: int) -> None:
+    wire = Wire("unitree_go", "lo", domain)
+    with pytest.raises(RobotError, match="no robot: no rt/lowstate of unitree_go in domain .* on lo within 0.1 s; is it on, is this"):
+        wire.prepare(seconds=0.1)
+
+
+def test_the_wrong_robot(domain: int) -> None:
+    """A Go2's policy where a G1 is."""
+    folder = POLICIES / "g1_flat"
+    sim = SimulatedUnitree(folder, read_contract(folder), RobotEnd("unitree_hg", "lo", domain))
+    wire = Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time)
+    with pytest.raises(RobotError, match="the robot there speaks unitree_hg::msg::dds_::LowState_: it is not the contract's"):
+        wire.prepare(seconds=0.5)
+    assert sim.counts.commands == 0
+
+
+def test_another_commander(domain: int) -> None:
+    both = pair("go2_flat", domain)
+
+    def wait() -> None:
+        both.robot.limp()
+        both.sim.step()
+
+    second = Wire("unitree_go", "lo", domain, wait=wait, clock=lambda: both.sim.time)
+    with pytest.raises(RobotError, match="another program sends rt/lowcmd in domain .* end it first; nothing was sent"):
+        second.prepare(listen=0.2)
+    second.send(both.robot._command())
+    with pytest.raises(RobotError, match="another program sends commands to this robot, too"):
+        both.robot.read()
+
+
+def test_it_is_laid_down_before_its_own_program_lets_go(domain: int) -> None:
+    folder = POLICIES / "go2_flat"
+    sim = SimulatedUnitree(folder, read_contract(folder), RobotEnd("unitree_go", "lo", domain))
+    Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time).prepare(lies_down=True)
+    assert sim.end.calls == [CHECK_MODE, STAND_DOWN, RELEASE_MODE, CHECK_MODE] and sim.end.program == ""
+
+
+def test_a_motion_program_that_does_not_let_go(domain: int) -> None:
+    folder = POLICIES / "go2_flat"
+
+    class Stubborn(RobotEnd):
+        program = property(lambda self: "ai", lambda self, name: None)  # type: ignore[assignment]
+
+    sim = SimulatedUnitree(folder, read_contract(folder), Stubborn("unitree_go", "lo", domain))
+    wire = Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time)
+    with pytest.raises(RobotError, match="the robot's own program 'ai' does not let go of the motors"):
+        wire.prepare()
+    assert sim.counts.commands == 0
+
+
+def test_rows_that_a_robot_does_not_measure() -> None:
+    contract = read_contract(POLICIES / "go2_flat")
+    rows = [
+        ContractRow(name, size, "", "", 0.0, measured)
+        for name, size, measured in (("base_lin_vel", 3, "lin_vel"), ("touch", 4, "foot_contact"))
+    ]
+    check_rows(replace(contract, rows=(*contract.rows, rows[1])), GO2)
+    with pytest.raises(RobotError) as error:
+        check_rows(replace(contract, rows=(*contract.rows, *rows)), G1)
+    assert "the policy observes base_lin_vel, touch, which a g1 does not measure; train one without: " in str(error.value)
+    assert "observations.leave_out = {'state': ['base_lin_vel', 'touch']}" in str(error.value)
+
+
+def test_a_policy_of_torques() -> None:
+    contract = read_contract(POLICIES / "go2_flat")
+    with pytest.raises(RobotError, match="the policy commands torques; a go2 is driven by angles here"):
+        check_rows(replace(contract, action=contract.action._replace(origin="torque")), GO2)

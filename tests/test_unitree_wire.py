@@ -1,0 +1,275 @@
+"""Unitree's messages: bytes, checksum, what cyclonedds announces, tables of motors, the remote, and what is refused in words."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from legged_mw import ROOT
+from legged_mw.deploy import __main__ as deploy
+from legged_mw.deploy import unitree
+from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.options import wire_faults
+from legged_mw.deploy.robot import BUTTONS, RobotError
+from legged_mw.deploy.unitree import handset, idl, link
+from legged_mw.deploy.unitree.codec import LAYOUTS, STRUCTS, Message, crc32, fields
+from legged_mw.deploy.unitree.remote import decode, encode
+from legged_mw.deploy.unitree.robots import G1, GO2, H1, check_body, machine_of, order
+from legged_mw.utils.cli import one_line_errors
+from legged_mw.utils.errors import UserError
+
+POLICIES = ROOT / "resources" / "policies"
+
+
+def test_types_are_announced_as_the_robots_announce_them() -> None:
+    """Another hash makes Unitree's own programs, on the robot too, ask for the type and crash on the answer."""
+    assert idl.hashes() == idl.HASHES
+    assert idl.wrong_hash() == ""
+
+
+def test_a_wrong_type_is_announced_on_this_machine_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link, "wrong_hash", lambda: "unitree_go LowCmd_ as 00, not 52")
+    monkeypatch.setattr(link.socket, "if_nameindex", lambda: [(1, "lo"), (2, "eth0")])
+    with pytest.raises(RobotError, match="LowCmd_ as 00, not 52, which crashes the robot's own programs: nothing was sent; install"):
+        link.join("eth0", 0)
+
+
+def test_a_wrong_interface_or_domain(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link.socket, "if_nameindex", lambda: [(1, "lo"), (2, "eth0")])
+    with pytest.raises(RobotError, match="--interface: no network interface 'eth1' in this machine; did you mean 'eth0'"):
+        link.join("eth1", 0)
+    with pytest.raises(RobotError, match="--domain 233: a domain is a number from 0 to 232"):
+        link.join("lo", 233)
+    assert (link.default_domain("lo"), link.default_domain("eth0")) == (1, 0)
+
+
+# ---- bytes
+
+
+def filled(key: tuple[str, str], rng: np.random.Generator) -> Any:
+    """A sample of cyclonedds' own, with a number in every field."""
+    package, made = key[0], {}
+    for name, kind, count in fields(*key):
+        values = [filled((package, kind), rng) if kind in STRUCTS[package] else _number(kind, rng) for _ in range(count or 1)]
+        made[name] = values[0] if count is None else values
+    return idl.TYPES[key](**made)
+
+
+def _number(kind: str, rng: np.random.Generator) -> float:
+    if kind == "float32":
+        return float(np.float32(rng.normal()))
+    return int(rng.integers(0, {"byte": 256, "int16": 2**15}.get(kind, 2**16)))
+
+
+def flat(sample: Any) -> list[float]:
+    """Its numbers in the order of the fields."""
+    if dataclasses.is_dataclass(sample):
+        return [x for field in dataclasses.fields(sample) for x in flat(getattr(sample, field.name))]
+    return [x for each in sample for x in flat(each)] if isinstance(sample, list) else [sample]
+
+
+@pytest.mark.parametrize(("key", "size"), [(("unitree_go", "LowCmd_"), 812), (("unitree_hg", "LowState_"), 2092)], ids=str)
+def test_bytes_are_those_of_the_generic_codec(key: tuple[str, str], size: int) -> None:
+    """Field by field: what cyclonedds' own codec writes is read by name, and the other way round."""
+    sample, layout = filled(key, np.random.default_rng(1)), LAYOUTS[key]
+    data = bytes(sample.serialize())
+    assert len(data) == layout.size + 4 == size
+    message, copy = Message(layout, data[4:]), Message(layout)
+    for name in layout.index:
+        copy[name] = message[name]
+    assert copy.body == data[4:] == idl.RAW[key](copy.body).serialize()[4:]
+    motor = "motor_cmd" if "LowCmd_" in key else "motor_state"
+    assert np.array_equal(message[f"{motor}.q"], [each.q for each in getattr(sample, motor)])
+    assert np.array_equal(message[f"{motor}.mode"], [each.mode for each in getattr(sample, motor)])
+    assert idl.RAW[key].deserialize(data).body == data[4:]
+
+
+@pytest.mark.parametrize("key", LAYOUTS, ids=str)
+def test_every_layout_is_the_generic_codecs(key: tuple[str, str]) -> None:
+    sample, layout = filled(key, np.random.default_rng(2)), LAYOUTS[key]
+    message = Message(layout, bytes(sample.serialize())[4:])
+    values = np.concatenate([np.ravel(message[name]) for name in layout.index])
+    assert sorted(values.tolist()) == sorted(flat(sample))
+
+
+def bitwise(image: np.ndarray) -> int:
+    """The checksum as Unitree's sources describe it."""
+    crc = 0xFFFFFFFF
+    for word in image.view("<u4").tolist():
+        for bit in range(31, -1, -1):
+            top = crc >> 31
+            crc = (crc << 1) & 0xFFFFFFFF
+            if top:
+                crc ^= 0x04C11DB7
+            if word >> bit & 1:
+                crc ^= 0x04C11DB7
+    return crc
+
+
+def test_the_checksum() -> None:
+    image = np.random.default_rng(3).integers(0, 256, 64, dtype=np.uint8)
+    assert crc32(image) == bitwise(image)
+
+
+@pytest.mark.parametrize(("key", "size"), [(k, s) for k, s in zip(LAYOUTS, (812, 1180, 1004, 2092), strict=True)], ids=str)
+def test_it_is_taken_of_the_struct_not_of_the_wire(key: tuple[str, str], size: int) -> None:
+    """The compiler pads where the wire does not: a field that is set must lie where C++ has it."""
+    layout = LAYOUTS[key]
+    message = Message(layout)
+    assert layout.image_size == size and not message.intact()
+    message.seal()
+    assert message.intact()
+    name = "motor_cmd.kd" if key[1] == "LowCmd_" else "motor_state.tau_est"
+    message[name] = np.arange(len(message[name]))
+    assert not message.intact()
+
+
+def test_a_known_checksum() -> None:
+    """A command of G1, all motors on, kp 60, computed bit by bit over the struct as gcc lays it out."""
+    message = Message(LAYOUTS["unitree_hg", "LowCmd_"])
+    message["mode_machine"], message["motor_cmd.mode"], message["motor_cmd.kp"] = 5, 1, 60.0
+    motor = np.zeros((35, 28), dtype=np.uint8)
+    motor[:, 0] = 1
+    motor[:, 16:20] = np.frombuffer(np.float32(60.0).tobytes(), dtype=np.uint8)
+    image = np.concatenate([np.array([0, 5, 0, 0], dtype=np.uint8), motor.ravel(), np.zeros(16, dtype=np.uint8)])
+    assert message.checksum() == bitwise(image)
+
+
+def test_a_message_of_another_size() -> None:
+    with pytest.raises(ValueError, match="a message of 3 bytes, not 808"):
+        Message(LAYOUTS["unitree_go", "LowCmd_"], b"abc")
+
+
+# ---- motors and the remote
+
+
+def test_motors_by_name() -> None:
+    assert list(GO2.motors)[:4] == ["FR_hip_joint", "FR_thigh_joint", "FR_calf_joint", "FL_hip_joint"] and len(GO2.motors) == 12
+    assert [G1.motors[f"{name}_joint"] for name in ("left_knee", "right_hip_pitch", "waist_pitch", "left_elbow", "right_wrist_yaw")] == [
+        *(3, 6, 14, 18, 28)
+    ]
+    assert [H1.motors[f"{name}_joint"] for name in ("right_knee", "torso", "left_ankle", "right_shoulder_pitch", "left_elbow")] == [
+        *(2, 6, 10, 12, 19)
+    ]
+    assert (9 not in H1.motors.values(), len(H1.motors), len(G1.motors)) == (True, 19, 29)
+    for name, machine in (("go2_flat", GO2), ("g1_flat", G1)):
+        joints = read_contract(POLICIES / name).joints
+        assert machine_of(joints[::-1]) is machine
+        assert order(machine, joints[::-1]).tolist() == order(machine, joints).tolist()[::-1]
+    assert order(GO2, ["FL_hip_joint", "FR_hip_joint"]).tolist() == [3, 0]
+
+
+def test_another_robot_is_refused_with_both_lists() -> None:
+    joints = [*list(GO2.motors)[:11], "RL_foot_joint"]
+    with pytest.raises(RobotError) as error:
+        machine_of(joints)
+    text = str(error.value)
+    assert "of no robot that is known here (go2, g1, h1); the nearest is go2" in text
+    assert "Only in the contract: RL_foot_joint; only on go2: RL_calf_joint." in text
+    assert f"The contract has: {', '.join(joints)}; go2 has: {', '.join(GO2.motors)}" in text
+
+
+@pytest.mark.parametrize(("number", "said"), [(4, "has 23 joints (mode_machine 4), the contract 29"), (77, "has an unknown body")])
+def test_another_body_is_refused(number: int, said: str) -> None:
+    check_body(G1, 5)
+    check_body(GO2, 77)
+    with pytest.raises(RobotError) as error:
+        check_body(G1, number)
+    assert said in str(error.value) and "left_hip_pitch_joint" in str(error.value)
+
+
+def test_the_remote() -> None:
+    data = encode(["A", "L2"], lx=0.25, ly=0.5, rx=-1.0, ry=0.125)
+    assert len(data) == 40 and data[2:4] == (1 << 8 | 1 << 5).to_bytes(2, "little")
+    assert np.frombuffer(data, "<f4", offset=4)[[0, 1, 2, 4]].tolist() == [0.25, -1.0, 0.125, 0.5]
+    remote = decode(data)
+    assert remote and remote.buttons == {"A", "L2"} and (remote.lx, remote.ly, remote.rx, remote.ry) == (0.25, 0.5, -1.0, 0.125)
+    assert decode(bytes(40)) is None
+    for i, name in enumerate(BUTTONS):
+        assert encode([name])[2:4] == (1 << i).to_bytes(2, "little")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("remote: []", "write one list 'remote' with at least one entry"),
+        ("remote: [{press: [A]}]", "remote[0]: an entry is a mapping with a time"),
+        ("remote: [{time: 1, press: [C]}]", "remote[0]: no button 'C' in the remote"),
+        ("remote: [{time: 1, lz: 1}]", "no field 'lz' in an entry; there are: time, press, hoist, lx"),
+        ("remote: [{time: 1, ly: 2}]", "ly is 2; a stick is a number from -1 to 1"),
+        ("remote: [{time: 1, hoist: 3}]", "hoist is 3; it is true or false"),
+    ],
+)
+def test_a_wrong_script_of_the_remote(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "remote.yaml").write_text(text)
+    with pytest.raises(UserError) as error:
+        handset.load_remote(tmp_path / "remote.yaml")
+    assert said in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_script_of_the_remote(tmp_path: Path) -> None:
+    (tmp_path / "remote.yaml").write_text("remote: [{time: 2, ly: 0.5}, {time: 1, press: start}, {time: 3, lx: -1, hoist: false}]")
+    hand = handset.Handset(handset.load_remote(tmp_path / "remote.yaml"))
+    states = [decode(hand.state(time)) for time in (0.0, 1.0, 1.09, 1.2, 2.5, 3.0)]
+    assert [(set(s.buttons), s.ly, s.lx) for s in states if s] == [
+        *((set(), 0, 0), ({"start"}, 0, 0), ({"start"}, 0, 0), (set(), 0, 0), (set(), 0.5, 0), (set(), 0.5, -1))
+    ]
+    assert hand.hoist is False
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("dealy=3", "--wire dealy=3: no fault 'dealy' in what a wire can have; did you mean 'delay'"),
+        ("loss=200", "--wire loss=200: loss=200 must be a number from 0 to 100"),
+        ("delay=x", "--wire delay=x: delay=x must be a number from 0 to 1000"),
+    ],
+)
+def test_wrong_faults_of_the_wire(text: str, said: str) -> None:
+    with pytest.raises(UserError) as error:
+        wire_faults(text)
+    assert said in str(error.value)
+
+
+def test_faults_of_the_wire() -> None:
+    assert wire_faults("delay=10,jitter=2,loss=5") == {"delay_ms": 10.0, "jitter_ms": 2.0, "loss": 0.05}
+
+
+def test_without_the_extra_one_command_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(unitree, "find_spec", lambda name: None)
+    with pytest.raises(UserError, match=r"needs cyclonedds: pip install 'legged_mw\[unitree\]'"):
+        unitree.need_dds()
+    assert importlib.util.find_spec("cyclonedds")
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (("--interface", "lo"), "--interface is of a robot on a network: add --robot unitree or --serve unitree"),
+        (
+            ("--robot", "unitree"),
+            "say on which network the robot is: --interface eth0, or --interface lo for one that --serve simulates here",
+        ),
+        (("--robot", "unitree", "--interface", "lo", "--wire", "loss=5"), "--wire is of a robot that is simulated for others: add --serve"),
+        (
+            ("--serve", "unitree", "--robot", "unitree", "--interface", "lo"),
+            "--serve is the robot and --robot drives one: start them as two",
+        ),
+        (("--serve", "unitree", "--interface", "lo", "--num_envs", "3"), "--num_envs is of simulated robots in this program: leave it out"),
+        (("--serve", "unitree", "--interface", "nowhere"), "no network interface 'nowhere' in this machine"),
+    ],
+)
+def test_flags_that_do_not_go_together(
+    flags: tuple[str, ...], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["legged_mw.deploy", "go2_flat", *flags])
+    with pytest.raises(SystemExit) as ended, one_line_errors("legged_mw.deploy"):
+        deploy.main()
+    error = capsys.readouterr().err
+    assert ended.value.code == 2 and said in error and error.count("\n") == 1

@@ -1,0 +1,84 @@
+"""For tests of the wire: a DDS domain that no other test on this machine uses, and both of its ends in one process, in lockstep."""
+
+from __future__ import annotations
+
+import fcntl
+import gc
+import itertools
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import pytest
+
+from legged_mw import ROOT
+from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.robot import Floats
+from legged_mw.deploy.unitree.client import Direct, UnitreeRobot, servo_ranges
+from legged_mw.deploy.unitree.link import RobotEnd, Wire
+from legged_mw.deploy.unitree.robots import machine_of
+from legged_mw.deploy.unitree.serve import STEP, SimulatedUnitree
+
+POLICIES = ROOT / "resources" / "policies"
+
+
+_next = itertools.count(os.getpid())
+
+
+@pytest.fixture
+def domain() -> Iterator[int]:
+    """Locked while the test runs, and another one for each test: a guard goes on for a second after it has damped."""
+    for number in (100 + each % 130 for each in itertools.islice(_next, 130)):
+        with (Path(tempfile.gettempdir()) / f"legged_mw-dds-{number}").open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                continue
+            yield number
+            gc.collect()  # participants leave with their last reference
+            return
+    raise RuntimeError("no DDS domain is free")
+
+
+class Pair(NamedTuple):
+    """A simulated robot and its client; no time passes but by ``steps`` and ``play``."""
+
+    sim: SimulatedUnitree
+    robot: UnitreeRobot
+    contract: Contract
+
+    def steps(self, seconds: float) -> None:
+        for _ in range(round(seconds / STEP)):
+            self.sim.step()
+
+    def period(self) -> None:
+        self.steps(self.contract.period)
+
+    def rise(self, seconds: float = 1.5) -> None:
+        """Stand, at three times the contract's stiffness."""
+        begin, count = self.robot.read().joint_pos, round(seconds / self.contract.period)
+        for k in range(1, count + 1):
+            share = k / count
+            self.robot.write(begin + share * (self.contract.default_pose - begin), stiffness=3 * share * self.contract.stiffness)
+            self.period()
+
+    def walk(self, controller: Any, command: Floats, seconds: float) -> Floats:
+        """Follow a policy; returns how far (x, y) [m] the root came."""
+        begin = self.sim.data.qpos[:2].copy()
+        for _ in range(round(seconds / self.contract.period)):
+            self.robot.write(controller.act(self.robot.read(), command)[0])
+            self.period()
+        return self.sim.data.qpos[:2] - begin
+
+
+def pair(task: str, domain: int, **settings: Any) -> Pair:
+    """Both ends of a shipped policy's robot, after what must be asked before the first command."""
+    folder = POLICIES / task
+    contract = read_contract(folder)
+    package = machine_of(contract.joints).package
+    sim = SimulatedUnitree(folder, contract, RobotEnd(package, "lo", domain), **settings)
+    wire = Wire(package, "lo", domain, wait=sim.step, clock=lambda: sim.time)
+    first = wire.prepare(listen=0.1)
+    return Pair(sim, UnitreeRobot(contract, Direct(wire), first, ranges=servo_ranges(folder, contract), clock=lambda: sim.time), contract)
