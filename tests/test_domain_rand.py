@@ -332,6 +332,19 @@ def test_mistakes_are_named(path: str, value: object, message: str) -> None:
     assert "\n" not in message
 
 
+def test_one_field_has_one_writer_under_a_law_in_code_too() -> None:
+    """The law has a torque-speed curve, though control.actuator is "servo"."""
+
+    class Springs(LeggedRobot):
+        def _compute_torques(self, actions: torch.Tensor) -> torch.Tensor:
+            return super()._compute_torques(actions)
+
+    curve = {"control.stall_torque": {"": 20.0}, "control.no_load_speed": {"": 25.0}, "domain_rand.stall_torque": [0.9, 1.1]}
+    factor = {"domain_rand.enable": True, "domain_rand.model_factors": {"actuator_gainprm": [0.9, 1.1]}}
+    with pytest.raises(ConfigError, match=r"model_factors.actuator_gainprm: domain_rand.stall_torque writes that field"):
+        make_env(2, {**curve, **factor}, env_class=Springs)
+
+
 def test_the_table_and_the_config_name_the_same() -> None:
     section = load_task("go1_flat").cfg.domain_rand
     fields = {name for name in vars(type(section)) if not name.startswith("_")} - {"enable", "observe", "model_factors"}

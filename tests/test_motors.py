@@ -505,6 +505,8 @@ def test_mistakes_are_named(fields: dict[str, Any], message: str) -> None:
 def test_two_laws_at_once_are_refused() -> None:
     with pytest.raises(ConfigError, match="control.actuator is 'dc_motor', but Springs._compute_torques is a motor law of its own"):
         make_env(2, DC, env_class=Springs)
+    with pytest.raises(ConfigError, match="control.action_origin is 'joints', but Springs._compute_torques is a motor law of its own"):
+        make_env(2, {"control.action_origin": "joints"}, env_class=Springs)
 
 
 def changed_arrays(**changes: Any) -> dict[str, Any]:
@@ -526,6 +528,10 @@ def changed_arrays(**changes: Any) -> dict[str, Any]:
             changed_arrays(weight_ih_l0=np.zeros((32, 2)), weight_hh_l0=np.zeros((32, 8))),
             r"array 'weight_ih_l0' has shape \(32, 2\), it must be \(32, 6\)",
         ),
+        (changed_arrays(frames=np.array([])), r"net.npz: frames is \[\]; they must be ages in simulation steps"),
+        (changed_arrays(weight0=np.float32(1)), r"array 'weight0' has shape \(\), it must be \(-1, 6\)"),
+        (changed_arrays(torque_scale=np.ones(2)), r"array 'torque_scale' has shape \(2,\), it must be \(\)"),
+        (changed_arrays(bias1=np.full(32, np.nan)), "net.npz: array 'bias1' has values that are not finite"),
         ({"weight0": np.array([object()])}, "net.npz: Object arrays cannot be loaded|net.npz is no .npz of plain arrays"),
     ],
 )
@@ -536,7 +542,11 @@ def test_files_that_are_no_network_are_refused(arrays: dict[str, Any], message: 
     assert "\n" not in str(error.value)
 
 
-def test_a_file_of_another_kind_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "net.pt").write_bytes(b"PK no")
+@pytest.mark.parametrize("what", ["text", "empty", "one array"])
+def test_a_file_of_another_kind_is_refused(what: str, tmp_path: Path) -> None:
+    (tmp_path / "net.pt").write_bytes(b"PK no" if what == "text" else b"")
+    if what == "one array":
+        with (tmp_path / "net.pt").open("wb") as out:
+            np.save(out, np.zeros(3))
     with pytest.raises(UserError, match="net.pt is no .npz of plain arrays; a torchscript file becomes one by: python -m legged_mw"):
         read_network(tmp_path / "net.pt")

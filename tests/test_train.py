@@ -505,9 +505,8 @@ def test_drawn_seed_is_saved(seeded: dict[str, Path]) -> None:
 
 
 def test_numbers_go_to_their_end_in_a_straight_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Over the iterations of `learn`, from the rollout on, so that a resumed run's first one is no other; one whose end is 0 stays."""
+    """Over the iterations of `learn`; one whose end is 0 stays."""
     task, seen = small_task(), []
-    rolled: list[float] = []
     task.set("algorithm.desired_kl", 0.01)
     task.set("algorithm.entropy_coef", 0.005)
     task.set("anneal.desired_kl", 0.002)
@@ -517,14 +516,18 @@ def test_numbers_go_to_their_end_in_a_straight_line(monkeypatch: pytest.MonkeyPa
     env = LeggedRobot(task.cfg, "cpu")
     runner = make_runner(env, task.train, None, "cpu")
     alg, update = runner.alg, runner.alg.update
-    monkeypatch.setattr(alg, "update", lambda: (seen.append((alg.desired_kl, alg.entropy_coef, env.tracking_sigma.item())), update())[1])
-    rollout = runner._rollout
-    monkeypatch.setattr(runner, "_rollout", lambda obs: (rolled.append(env.tracking_sigma.item()), rollout(obs))[1])
+    monkeypatch.setattr(alg, "update", lambda: (seen.append((alg.desired_kl, alg.entropy_coef, float(env.tracking_sigma))), update())[1])
+    rolled, step = [], env.step
+    monkeypatch.setattr(env, "step", lambda actions: (rolled.append(float(env.tracking_sigma)), step(actions))[1])
     runner.learn(5)
     kl, entropy, sigma = zip(*seen, strict=True)
     assert kl == pytest.approx([0.01, 0.008, 0.006, 0.004, 0.002])
     assert entropy == (0.005,) * 5
-    assert list(sigma) == rolled == pytest.approx([0.25, 0.2, 0.15, 0.1, 0.05])
+    assert sigma == pytest.approx([0.25, 0.2, 0.15, 0.1, 0.05]) == list(dict.fromkeys(rolled))
+    env.anneal(0.0)  # as a new environment has it
+    runner.current_learning_iteration, first = 3, len(rolled)
+    runner.learn(2, False)
+    assert rolled[first] == pytest.approx(0.1), "a resumed training goes on where it was, from its first step"
 
 
 def test_before_an_episode_has_ended_its_means_are_dashes() -> None:

@@ -44,14 +44,15 @@ class TorqueLaw:
     @property
     def motor_law(self) -> str:
         """``control.actuator``, or OWN."""
-        law, task = self.cfg.control.actuator, type(self)
+        control, task = self.cfg.control, type(self)
         if task._compute_torques is TorqueLaw._compute_torques:
-            return law
-        if law != "servo":
-            raise ConfigError(
-                f"control.actuator is {law!r}, but {task.__name__}._compute_torques is a motor law of its own: "
-                "leave control.actuator out, or remove the method"
-            )
+            return control.actuator
+        for field, default in (("actuator", "servo"), ("action_origin", "default")):
+            if (value := getattr(control, field)) != default:
+                raise ConfigError(
+                    f"control.{field} is {value!r}, but {task.__name__}._compute_torques is a motor law of its own: "
+                    f"leave control.{field} out, or remove the method"
+                )
         return OWN
 
     @property

@@ -106,10 +106,10 @@ LEARNER: dict[str, Rule] = {
 }
 
 
-def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None) -> None:
-    """Raise ConfigError at the first value that cannot work."""
+def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None, law: str = "") -> None:
+    """Raise ConfigError at the first value that cannot work; ``law`` of the motors is ``control.actuator``, unless said otherwise."""
     _check(cfg, ENVIRONMENT)
-    _check_redraws(cfg)
+    _check_redraws(cfg, law)
     _check_motors(cfg)
     if isinstance(cfg, LeggedRobotCfg):
         _check_walking(cfg)
@@ -169,7 +169,7 @@ def _check_motors(cfg: RobotTaskCfg) -> None:
             raise ConfigError(f"domain_rand.{name} is a factor on control.{name}, which is empty: fill it, or leave the range out ([])")
 
 
-def _check_redraws(cfg: RobotTaskCfg) -> None:
+def _check_redraws(cfg: RobotTaskCfg, law: str) -> None:
     for name in cfg.domain_rand.redraw_at_reset:
         if name in ONLY_AT_START:
             raise ConfigError(
@@ -182,7 +182,7 @@ def _check_redraws(cfg: RobotTaskCfg) -> None:
         wanted, holds = or_empty(SPAN)
         if not holds(span):
             raise ConfigError(f"domain_rand.model_factors.{name} is {span!r}; it must be {wanted}")
-        writers = [kind for kind, (what, *_) in active(cfg).items() if kind != name and name in what.fields]
+        writers = [kind for kind, (what, *_) in active(cfg, law).items() if kind != name and name in what.fields]
         if writers:
             raise ConfigError(f"domain_rand.model_factors.{name}: domain_rand.{writers[0]} writes that field; leave one of them out ([])")
 

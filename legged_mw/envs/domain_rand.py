@@ -51,9 +51,8 @@ KINDS: dict[str, Kind] = {
     "delay_ms": Kind("world", 0.0, "scalar"),
     "observation_delay": Kind("world", 0.0, "scalar", whole=True),
 }
+_RESISTANCE, _CONSTANT, _STIFFNESS, _DAMPING = 0, 1, 4, 6  # places in actuator_gainprm of MuJoCo's DC motor
 # Constants of the model depend on them: derived once they are drawn, never within a recorded step.
-# Places in actuator_gainprm of MuJoCo's DC motor.
-_RESISTANCE, _CONSTANT, _STIFFNESS, _DAMPING = 0, 1, 4, 6
 ONLY_AT_START = tuple(name for name, kind in KINDS.items() if {*kind.fields} & {*CONSTANTS_READ})
 
 
@@ -107,17 +106,17 @@ class DomainRand:
         writers = {name: self._writer(name, field) for name in order for field in kinds[name][0].fields[:1]}
         self._writers = list(dict.fromkeys(writers.values()))
         self._writers_again = list(dict.fromkeys(writers[name] for name in again if name in writers))
-        self._longest = {name: int(kinds[name][2]) for name in self._whole}
+        self._highest = {name: kinds[name][2] for name in order}
 
     def delay(self, name: str, width: int, start: float | None = None) -> Delay | None:
         """The delay line of ``action_delay`` or ``observation_delay``, or None if the config has none."""
-        return Delay(self.values[name], self._longest[name], width, start) if name in self.values else None
+        return Delay(self.values[name], int(self._highest[name]), width, start) if name in self.values else None
 
     def substep_delay(self, substeps: int, width: int) -> SubstepDelay | None:
         """The delay line of ``delay_ms``, for control steps of ``substeps``."""
         if "delay_ms" not in self.values:
             return None
-        longest = self.rounded_delay(float(self._high[self.values["delay_ms"].storage_offset()]))
+        longest = self.rounded_delay(self._highest["delay_ms"])
         return SubstepDelay(self.values["delay_ms"], self._substep_ms, longest, substeps, width)
 
     def rounded_delay(self, delay: Any) -> Any:

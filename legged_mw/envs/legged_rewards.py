@@ -57,16 +57,18 @@ class LeggedRewards(RobotRewards):
     foot_names: tuple[str, ...]
     _partners: Callable[[], Partners]
 
-    tracking_sigma: Tensor  # () [m^2/s^2, rad^2/s^2]
+    tracking_sigma: Tensor | float  # () [m^2/s^2, rad^2/s^2]; a number where it stays, which takes an operation less
 
     def anneal(self, done: float) -> None:
         """A training is ``done`` so far, from 0 to 1: ``tracking_sigma`` on its way to ``rewards.tracking_sigma_end``."""
         begin, end = self.cfg.rewards.tracking_sigma, self.cfg.rewards.tracking_sigma_end
-        self.tracking_sigma.fill_(begin + (end - begin) * done if end else begin)
+        if isinstance(self.tracking_sigma, Tensor):
+            self.tracking_sigma.fill_(begin + (end - begin) * done)
 
     def _init_foot_rewards(self) -> None:
         """What terms need beside the state, where they are on."""
-        self.tracking_sigma = torch.tensor(self.cfg.rewards.tracking_sigma, device=self.device)
+        sigma, changes = self.cfg.rewards.tracking_sigma, self.cfg.rewards.tracking_sigma_end > 0.0
+        self.tracking_sigma = torch.tensor(sigma, device=self.device) if changes else sigma
         on = self._active_scales()
         if not {"feet_orientation", "feet_distance"} & on.keys():
             return

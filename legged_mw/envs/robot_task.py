@@ -51,8 +51,8 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
 
     @in_config_words()
     def __init__(self, cfg: RobotTaskCfg, device: str, eager: bool = False) -> None:
-        check_values(cfg)
         self.cfg = cfg
+        check_values(cfg, law=self.motor_law)
         self.terrain = self._make_terrain()
         self.robot = self._load_robot(pick_engine(cfg.sim.engine, device))
         super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)

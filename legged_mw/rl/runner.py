@@ -91,7 +91,7 @@ class Runner(OnPolicyRunner):
         self._all_stop = False
         start = clock.mark()
         while self.current_learning_iteration < self._last and not self._must_stop():
-            self._anneal()
+            self._anneal()  # first, so that a resumed rollout is what it would have been
             obs = self._rollout(obs)
             if self._must_stop():
                 self.alg.storage.clear()  # an unfinished rollout is dropped

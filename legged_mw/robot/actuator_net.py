@@ -42,7 +42,7 @@ def convert(file: Path, frames: Sequence[int] = (), **layout: Any) -> tuple[Moto
     if width != 2 * len(frames):
         raise UserError(f"{file.name} takes {width} values a joint, and --frames means {2 * len(frames)}: an error and a speed of each")
     fed = replace(found, frames=frames, **layout)
-    states = _states(fed)
+    states = _states()
     wanted = _theirs(module, fed, states)
     activations = [*ACTIVATIONS] if len(fed.linear) > 1 else [fed.activation]
     fits = [_fit(replace(fed, activation=name), states, wanted) for name in activations]
@@ -70,7 +70,7 @@ def _layers(state: dict[str, Any], file: Path) -> MotorNetwork:
     return MotorNetwork(recurrent, linear, "elu", (0,))
 
 
-def _states(fed: MotorNetwork) -> Any:
+def _states() -> Any:
     """Errors [rad] and speeds [rad/s] (T, 2, J) of joints, as a walking robot has them."""
     spread = np.array([[0.3], [3.0]])
     return (spread * np.random.default_rng(0).standard_normal((_STEPS, 2, _JOINTS))).astype(np.float32)
@@ -131,11 +131,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("out", type=Path, help="the .npz to write")
     parser.add_argument("--frames", type=int, nargs="+", default=None, help="ages in simulation steps, 0 is now (default: 0 1 2 ...)")
     parser.add_argument("--in_turns", action="store_true", help="error, speed, error, speed ...; else errors first")
-    for name, what in (
-        ("error", "of target - angle [rad]"),
-        ("speed", "of the speed [rad/s]"),
-        ("torque", "of what comes out"),
-    ):
+    for name, what in (("error", "of target - angle [rad]"), ("speed", "of the speed [rad/s]"), ("torque", "of what comes out")):
         parser.add_argument(f"--{name}_scale", type=float, default=1.0, help=f"factor {what}")
     args = parser.parse_args(argv)
     layout = {name: getattr(args, name) for name in ("in_turns", "error_scale", "speed_scale", "torque_scale")}

@@ -63,7 +63,7 @@ def read_network(file: Path) -> MotorNetwork:
     try:
         with np.load(file, allow_pickle=False) as archive:
             arrays = dict(archive)
-    except (ValueError, OSError, zipfile.BadZipFile):
+    except (ValueError, OSError, EOFError, TypeError, zipfile.BadZipFile):  # TypeError: an .npy, which is one array
         raise UserError(
             f"{file.name} is no .npz of plain arrays; a torchscript file becomes one by: python -m legged_mw.robot.actuator_net {file.name}"
         ) from None
@@ -74,36 +74,40 @@ def read_network(file: Path) -> MotorNetwork:
 
 
 def _read(arrays: Mapping[str, Any]) -> MotorNetwork:
-    frames = tuple(int(age) for age in np.atleast_1d(arrays.get("frames", 0)))
-    if list(frames) != sorted({*frames}) or frames[0] < 0:
+    frames = tuple(int(age) for age in np.ravel(arrays.get("frames", 0)))
+    if not frames or list(frames) != sorted({*frames}) or frames[0] < 0:
         raise ValueError(f"frames is {list(frames)}; they must be ages in simulation steps, the newest first")
     activation = str(arrays.get("activation", "elu"))
     if activation not in ACTIVATIONS:
         raise ValueError(unknown("activation", activation, ACTIVATIONS, "motor networks"))
     width, recurrent, linear = 2 * len(frames), [], []
     while f"weight_ih_l{len(recurrent)}" in arrays:
-        names = [f"{name}_l{len(recurrent)}" for name in _RECURRENT]
-        units = _take(arrays, names[1]).shape[-1]
+        units = _take(arrays, f"weight_hh_l{len(recurrent)}", -1, -1).shape[1]
         shapes = ((4 * units, width), (4 * units, units), (4 * units,), (4 * units,))
-        recurrent.append(tuple(_take(arrays, name, shape) for name, shape in zip(names, shapes, strict=True)))
+        recurrent.append(tuple(_take(arrays, f"{name}_l{len(recurrent)}", *shape) for name, shape in zip(_RECURRENT, shapes, strict=True)))
         width = units
     while f"weight{len(linear)}" in arrays:
-        weight = _take(arrays, f"weight{len(linear)}")
-        linear.append((_take(arrays, f"weight{len(linear)}", (len(weight), width)), _take(arrays, f"bias{len(linear)}", (len(weight),))))
+        weight = _take(arrays, f"weight{len(linear)}", -1, width)
+        linear.append((weight, _take(arrays, f"bias{len(linear)}", len(weight))))
         width = len(weight)
     if not linear or width != 1:
         found = width if linear else "none: there is no weight0"
         raise ValueError(f"the last layer must give one value, a joint's torque; it gives {found}")
-    scales = {name: float(arrays.get(name, 1.0)) for name in _SCALES}
+    scales = {name: float(_take({name: 1.0, **arrays}, name)) for name in _SCALES}
     return MotorNetwork(recurrent, linear, activation, frames, bool(arrays.get("in_turns", False)), **scales)
 
 
-def _take(arrays: Mapping[str, Any], name: str, shape: tuple[int, ...] | None = None) -> Floats:
+def _take(arrays: Mapping[str, Any], name: str, *shape: int) -> Floats:
+    """The array ``name`` of ``shape``, in which -1 is any size."""
     if name not in arrays:
         raise ValueError(f"array '{name}' is missing")
     value = np.asarray(arrays[name], dtype=np.float32)
-    if shape is not None and value.shape != shape:
-        raise ValueError(f"array '{name}' has shape {value.shape}, it must be {shape}: (out, in), in from the layer before or the frames")
+    same = value.ndim == len(shape)
+    wanted = tuple(own if size < 0 else size for own, size in zip(value.shape, shape, strict=True)) if same else shape
+    if value.shape != wanted:
+        raise ValueError(f"array '{name}' has shape {value.shape}, it must be {wanted}: (out, in), in from the layer before or the frames")
+    if not np.isfinite(value).all():
+        raise ValueError(f"array '{name}' has values that are not finite")
     return value
 
 
