@@ -16,7 +16,7 @@ from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from test_deploy import main, put, rewrite, without
 from test_ppo import SYMMETRY, update
-from test_train import assert_equal, copy_world, load, small_task
+from test_train import assert_equal, assert_resumes_exactly, load, small_task
 from torch import Tensor, nn
 from worlds import QUIET, layout, make_env
 
@@ -155,16 +155,7 @@ def test_the_update_asks_the_host_nothing(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_checkpoint_goes_on_bit_for_bit(tmp_path: Path) -> None:
     """Adam's memory of the estimator, its own rate and the normaliser of targets too, from a file that holds no code."""
     task = task_with(cpu__update_threads=1)  # else how long an update takes decides how it is rounded
-    torch.manual_seed(0)
-    one, two = (LeggedRobot(task.cfg, "cpu") for _ in range(2))
-    uninterrupted, resumed = (make_runner(env, task.train, None, "cpu") for env in (one, two))
-    uninterrupted.learn(2)
-    uninterrupted.save(str(tmp_path / "model_2.pt"))
-    copy_world(one, two)
-    uninterrupted.learn(2, False)
-    resumed.load(str(tmp_path / "model_2.pt"))
-    resumed.learn(2, False)
-    assert_equal(resumed.alg.save(), uninterrupted.alg.save())
+    assert_resumes_exactly(task, tmp_path / "model_2.pt")
     saved = load(tmp_path / "model_2.pt")
     groups = saved["optimizer_state_dict"]["param_groups"]
     assert [len(group["params"]) for group in groups] == [7 + 6, 4] and groups[1]["lr"] == pytest.approx(1e-3)

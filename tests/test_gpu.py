@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -244,14 +245,20 @@ def test_recorded_update_is_rsl_rls_own(settings: dict) -> None:
     """Each of six updates of 20 minibatches, the last three replayed, from equal states and the stock learner's experience."""
     stock, ours = make(PPO, DEVICE, **settings), make(GraphedPPO, DEVICE, **settings)
     assert ours.graphed and difference(parameters(stock), parameters(ours)) == 0.0
-    for seed in range(6):
-        collect(stock, DEVICE, seed=seed)
-        share_experience(stock, ours)
-        take_over(ours, stock)
-        expected, got = update(stock), update(ours)
-        assert difference(parameters(stock), parameters(ours)) < 1e-4
-        assert got == pytest.approx(expected, rel=1e-3, abs=1e-5)
+    for _ in six_equal_updates(stock, ours):
         assert ours.learning_rate == pytest.approx(stock.learning_rate, rel=1e-12)
+
+
+def six_equal_updates(other: PPO, ours: GraphedPPO) -> Iterator[dict[str, float]]:
+    """Six updates of both from equal states and the other's experience; yields our losses after each. The last three are replayed."""
+    for seed in range(6):
+        collect(other, DEVICE, seed=seed)
+        share_experience(other, ours)
+        take_over(ours, other)
+        expected, got = update(other), update(ours)
+        assert difference(parameters(other), parameters(ours)) < 1e-4
+        assert got == pytest.approx(expected, rel=1e-3, abs=1e-5)
+        yield got
     assert ours._update_graph.recorded
 
 
@@ -260,14 +267,9 @@ def test_recorded_estimator_learns_as_step_by_step(settings: dict) -> None:
     """Six updates, the last three replayed, beside a learner that records none, from equal states and experience."""
     eager, ours = (make(GraphedPPO, DEVICE, estimator={}, **settings) for _ in range(2))
     eager._update_graph = StepGraph(eager._update, DEVICE, eager=True)
-    for seed in range(6):
-        collect(eager, DEVICE, seed=seed)
-        share_experience(eager, ours)
-        take_over(ours, eager)
-        expected, got = update(eager), update(ours)
-        assert difference(parameters(eager), parameters(ours)) < 1e-4
-        assert got == pytest.approx(expected, rel=1e-3, abs=1e-5) and got["estimate"] > 0.0
-    assert ours._update_graph.recorded and not eager._update_graph.recorded
+    for got in six_equal_updates(eager, ours):
+        assert got["estimate"] > 0.0
+    assert not eager._update_graph.recorded
 
 
 @pytest.mark.parametrize("memory", NETWORKS.values(), ids=NETWORKS.keys())

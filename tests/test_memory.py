@@ -183,25 +183,25 @@ def test_the_worlds_that_act_alone_do_not_depend_on_the_others(actor: RNNModel) 
     assert not np.array_equal(few["action"][4], few["action"][11])
 
 
-class Told:
-    """Stands still, and notes what it is told to forget."""
+class Forgetful:
+    """Stands still, and notes where it must forget."""
 
     is_recurrent = True
 
     def __init__(self) -> None:
-        self.told: list[Any] = []
+        self.forgotten: list[Any] = []
 
     def reset(self, ended: torch.Tensor | None = None) -> None:
-        self.told.append(None if ended is None else ended.nonzero().flatten().tolist())
+        self.forgotten.append(None if ended is None else ended.nonzero().flatten().tolist())
 
     def __call__(self, obs: Any) -> torch.Tensor:
         return torch.zeros(len(obs), 12)
 
 
 def test_a_roll_out_and_a_crossing_say_where_an_episode_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    one, other = Told(), Told()
+    one, other = Forgetful(), Forgetful()
     roll_out(make_env(3, {**OVERRIDES, "env.episode_length_s": 0.06}), one, [holding((0.0, 0.0, 0.0))] * 3, 4, {})
-    assert one.told == [None, [], [], [0, 1, 2], []]
+    assert one.forgotten == [None, [], [], [0, 1, 2], []]
     monkeypatch.setattr(crossing, "SECONDS", 0.06)
     task = load_task("go1_rough")
     task.set("terrain.terrain_proportions", {"flat": 1.0})
@@ -210,7 +210,7 @@ def test_a_roll_out_and_a_crossing_say_where_an_episode_ended(monkeypatch: pytes
     env.max_episode_length = 2
     crossing.run_crossing(env, other)
     everyone = list(range(env.num_envs))
-    assert other.told == [None, [], everyone, []]
+    assert other.forgotten == [None, [], everyone, []]
 
 
 def test_the_viewer_forgets_a_robot_that_starts_again(actor: RNNModel) -> None:

@@ -110,19 +110,19 @@ def test_what_a_law_does_not_have_is_not_drawn() -> None:
 
 
 def test_a_delay_of_7_ms_by_hand() -> None:
-    """In steps of 4 ms the nearest is 8 ms: the first two of five steps still hear what was told before."""
+    """In steps of 4 ms the nearest is 8 ms: the first two of five steps still use what was sent before."""
     delay = SubstepDelay(torch.tensor([[0.0], [8.0], [32.0]]), 4.0, 32.0, 5, 1)
     delay.restart(torch.ones(3, dtype=torch.bool), torch.full((3, 1), -1.0))
-    heard = []
-    for told in (0.0, 1.0, 2.0):
-        delay(torch.full((3, 1), told))
-        heard.append(delay.heard[:, :, 0].T.tolist())
-    assert heard[0] == [[0] * 5, [-1, -1, 0, 0, 0], [-1] * 5]
-    assert heard[1] == [[1] * 5, [0, 0, 1, 1, 1], [-1, -1, -1, 0, 0]]
-    assert heard[2] == [[2] * 5, [1, 1, 2, 2, 2], [0, 0, 0, 1, 1]]
+    arriving = []
+    for sent in (0.0, 1.0, 2.0):
+        delay(torch.full((3, 1), sent))
+        arriving.append(delay.arriving[:, :, 0].T.tolist())
+    assert arriving[0] == [[0] * 5, [-1, -1, 0, 0, 0], [-1] * 5]
+    assert arriving[1] == [[1] * 5, [0, 0, 1, 1, 1], [-1, -1, -1, 0, 0]]
+    assert arriving[2] == [[2] * 5, [1, 1, 2, 2, 2], [0, 0, 0, 1, 1]]
     delay.restart(torch.tensor([False, True, False]), torch.full((3, 1), 9.0))
     delay(torch.full((3, 1), 3.0))
-    assert delay.heard[:, :, 0].T.tolist() == [[3] * 5, [9, 9, 3, 3, 3], [1, 1, 1, 2, 2]]
+    assert delay.arriving[:, :, 0].T.tolist() == [[3] * 5, [9, 9, 3, 3, 3], [1, 1, 1, 2, 2]]
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -134,13 +134,13 @@ def test_physics_hears_a_delay_of_7_ms(engine: str, law: str) -> None:
     twin = make_env(2, {**late, "domain_rand.encoder_offset": [], "domain_rand.enable": False})
     assert env.domain_rand.values["delay_ms"].tolist() == [[8.0], [8.0]]
     twin.sim.qpos.copy_(env.sim.qpos)
-    offset, told = env.domain_rand.values["encoder_offset"], env.default_dof_pos
+    offset, target = env.domain_rand.values["encoder_offset"], env.default_dof_pos
     for _ in range(3):
         action = 0.2 * torch.randn(2, 12)
-        twin.sim.ctrl.copy_(told - offset)
+        twin.sim.ctrl.copy_(target - offset)
         twin.sim.step(2)
-        told = env.default_dof_pos + 0.5 * action
-        twin.sim.ctrl.copy_(told - offset)
+        target = env.default_dof_pos + 0.5 * action
+        twin.sim.ctrl.copy_(target - offset)
         twin.sim.step(3)
         env.step(action)
         torch.testing.assert_close(env.sim.qpos, twin.sim.qpos, atol=2e-5, rtol=0)
@@ -196,10 +196,10 @@ def test_a_law_in_code_has_gains_delays_and_a_curve() -> None:
     env = make_env(2, {**DC, **nothing, **drawn, "control.actuator": "servo"}, env_class=Springs)
     assert torch.equal(env.p_gains, 35.0 * env.domain_rand.values["stiffness"]) and env.d_gains.tolist() == [0.5] * 12
     assert (env.robot.tables["`stall_torque`"], env.robot.tables["`no_load_speed`"]) == ([20.0] * 12, [25.0] * 12)
-    heard: list[Tensor] = []
-    env.actuators._compute = lambda actions: heard.append(actions.clone()) or torch.zeros_like(actions)
+    arrived: list[Tensor] = []
+    env.actuators._compute = lambda actions: arrived.append(actions.clone()) or torch.zeros_like(actions)
     env.step(torch.full((2, 12), 0.5))
-    assert [x[0, 0].item() for x in heard] == [0.0, 0.0, 0.5, 0.5, 0.5]
+    assert [x[0, 0].item() for x in arrived] == [0.0, 0.0, 0.5, 0.5, 0.5]
 
 
 class Asks(LeggedRobot):
@@ -407,7 +407,7 @@ def test_deploys_robot_has_the_same_motors(law: str, exported: Callable[[dict[st
     for _ in range(4):
         actions = torch.randn(2, 12).clamp(-2.0, 2.0)
         env.step(actions)
-        fleet.write(env.actuators.told().double().numpy())
+        fleet.write(env.actuators.sent().double().numpy())
         np.testing.assert_allclose(fleet.qpos, env.sim.qpos, atol=3e-4)
     np.testing.assert_allclose(fleet.read().joint_torque, env.torques, atol=0.1)
     fleet.set_gains(np.zeros(12), np.full(12, 3.0))  # off, damped

@@ -266,20 +266,24 @@ def copy_world(source: LeggedRobot, target: LeggedRobot) -> None:
     target.sim._batch.state[:] = source.sim._batch.state  # type: ignore[attr-defined]
 
 
-def test_checkpoint_is_all_that_learning_needs(tmp_path: Path) -> None:
-    """With the worlds' state copied too, which no checkpoint holds, a resumed run is the uninterrupted one, bit for bit."""
-    task = small_task()
+def assert_resumes_exactly(task: LoadedTask, checkpoint: Path) -> tuple[Runner, Runner]:
+    """With the worlds' state copied too, which no checkpoint holds, a resumed run is the uninterrupted one, bit for bit: both."""
     torch.manual_seed(0)
     one, two = (LeggedRobot(task.cfg, "cpu") for _ in range(2))
     uninterrupted, resumed = (make_runner(env, task.train, None, "cpu") for env in (one, two))
     uninterrupted.learn(2)
-    uninterrupted.save(str(tmp_path / "model_2.pt"))
+    uninterrupted.save(str(checkpoint))
     copy_world(one, two)
     assert not torch.equal(uninterrupted.alg.get_policy().mlp[0].weight, resumed.alg.get_policy().mlp[0].weight)
     uninterrupted.learn(2, False)
-    resumed.load(str(tmp_path / "model_2.pt"))
+    resumed.load(str(checkpoint))
     resumed.learn(2, False)
     assert_equal(resumed.alg.save(), uninterrupted.alg.save())
+    return resumed, uninterrupted
+
+
+def test_checkpoint_is_all_that_learning_needs(tmp_path: Path) -> None:
+    resumed, uninterrupted = assert_resumes_exactly(small_task(), tmp_path / "model_2.pt")
     assert (resumed.total_steps, resumed.current_learning_iteration) == (uninterrupted.total_steps, 4) == (4 * STEPS, 4)
 
 

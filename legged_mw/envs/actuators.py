@@ -1,7 +1,7 @@
-"""From actions to what motors are told, with what stands between a policy and its motors: scale, delays, encoders that are off.
+"""From actions to motor commands, with what stands between a policy and its motors: scale, delays, encoders that are off.
 
 The laws of the motors: ``control.actuator``, or a task's own ``_compute_torques``. Servos, DC motors and plain torques are MuJoCo's
-actuators. What is computed anew in every simulation step goes through ``Actuators.before``.
+actuators. What changes within a control step goes through ``Actuators.before``.
 """
 
 from __future__ import annotations
@@ -89,7 +89,7 @@ class Actuators:
         self._delay = rand.delay("action_delay", len(robot.joint_names), start=0.0)
         self._late = rand.substep_delay(cfg.control.decimation, len(robot.joint_names))
         self._network, self._compute = None, task._compute_torques if self.law == OWN else None
-        # (N, D) what motors are told: targets less what their encoders are off, torques, or under OWN actions
+        # (N, D) what is sent to the motors: targets less what their encoders are off, torques, or under OWN actions
         self._sent = sim.ctrl
         if self._late or self.law in ("network", OWN):
             self._sent, self.before = torch.zeros_like(sim.ctrl), self._before_substep
@@ -97,8 +97,8 @@ class Actuators:
             self._network = make_motor_network(read_network(find_file(cfg, "control.network")), sim)
         self.targets = self._sent if self._offset is None else torch.zeros_like(sim.ctrl)  # (N, D) as the policy means them
 
-    def told(self) -> Tensor:
-        """(N, D) what the motors were told last, as the policy means it."""
+    def sent(self) -> Tensor:
+        """(N, D) what was sent to the motors last, as the policy means it."""
         return self._sent if self._offset is None else self._sent + self._offset
 
     def gain(self, name: str) -> Tensor:
@@ -106,7 +106,7 @@ class Actuators:
         return self._gains[name] * self._rand.values[name] if name in self._rand.values else self._gains[name]
 
     def apply(self, actions: Tensor) -> None:
-        """Tell the motors what ``actions`` (N, D) mean."""
+        """Send the motors what ``actions`` (N, D) mean."""
         late = self._delay(actions) if self._delay else actions
         if self.law == OWN:
             self._sent.copy_(late)
@@ -133,14 +133,16 @@ class Actuators:
 
     def _before_substep(self, k: int) -> None:
         """Write ``ctrl`` for substep ``k``."""
-        heard = self._late.heard[k] if self._late else self._sent
+        sent = self._late.arriving[k] if self._late else self._sent
         if self._network:
-            self._network(heard)
+            self._network(sent)
             return
-        told = self._compute(heard) if self._compute else heard
-        if told.shape != heard.shape:
-            raise ConfigError(f"_compute_torques must return a tensor {tuple(heard.shape)}, a torque a joint; it returned {(*told.shape,)}")
-        self._sim.ctrl.copy_(told)
+        torques = self._compute(sent) if self._compute else sent
+        if torques.shape != sent.shape:
+            raise ConfigError(
+                f"_compute_torques must return a tensor {tuple(sent.shape)}, a torque a joint; it returned {(*torques.shape,)}"
+            )
+        self._sim.ctrl.copy_(torques)
 
     def reset(self, mask: Tensor) -> None:
         """Targets at the default pose, or torques zero, where ``mask`` (N,) is true; of delays and networks nothing is left."""

@@ -37,10 +37,10 @@ class Delay:
 
 
 class SubstepDelay:
-    """What motors hear of what they are told once a control step, late by whole simulation steps; each world has its own delay.
+    """Motor commands, sent once a control step, arrive late by whole simulation steps; each world has its own delay.
 
-    A delay of d steps changes what is heard before substep d of those that follow. 7 ms in steps of 4 ms, the nearest being
-    d = 2: physics from t + 8 ms on hears what is told at t.
+    A command with a delay of d steps arrives before substep d of those that follow. 7 ms in steps of 4 ms, the nearest being
+    d = 2: physics from t + 8 ms on uses what is sent at t.
     """
 
     def __init__(self, delay: Tensor, step_ms: float, longest: float, substeps: int, width: int) -> None:
@@ -48,16 +48,16 @@ class SubstepDelay:
         self._delay, self._step_ms = delay, step_ms
         self._past = torch.zeros(math.ceil(round(longest / step_ms) / substeps) + 1, len(delay), width, device=delay.device)  # newest first
         self._substep = torch.arange(substeps, device=delay.device)[:, None, None]
-        self.heard = torch.zeros(substeps, len(delay), width, device=delay.device)  # in each substep
+        self.arriving = torch.zeros(substeps, len(delay), width, device=delay.device)  # in each substep
 
-    def restart(self, mask: Tensor, told: Tensor) -> None:
-        """Where ``mask`` (N,) is true ``told`` (N, width) is all that was ever told."""
-        self._past.copy_(torch.where(mask[:, None], told, self._past))
+    def restart(self, mask: Tensor, sent: Tensor) -> None:
+        """Where ``mask`` (N,) is true ``sent`` (N, width) is all that was ever sent."""
+        self._past.copy_(torch.where(mask[:, None], sent, self._past))
 
-    def __call__(self, told: Tensor) -> None:
-        """Fill ``heard`` for the control step that begins, in which motors are told ``told`` (N, width)."""
+    def __call__(self, sent: Tensor) -> None:
+        """Fill ``arriving`` for the control step that begins with ``sent`` (N, width)."""
         self._past[1:] = self._past[:-1].clone()
-        self._past[0] = told
+        self._past[0] = sent
         steps, count = torch.round(self._delay / self._step_ms).long(), len(self._substep)
-        age = (steps - self._substep + count - 1).clamp_(min=0) // count  # control steps since it was told, (substeps, N, 1)
-        torch.gather(self._past, 0, age.expand_as(self.heard), out=self.heard)
+        age = (steps - self._substep + count - 1).clamp_(min=0) // count  # control steps since it was sent, (substeps, N, 1)
+        torch.gather(self._past, 0, age.expand_as(self.arriving), out=self.arriving)

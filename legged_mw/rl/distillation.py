@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 from legged_mw.rl.adam import make_recordable, plain_state
 from legged_mw.rl.estimator import EstimatingModel
-from legged_mw.rl.layers import run_mlp, update_normalizer
-from legged_mw.rl.recurrent import HiddenState, step
+from legged_mw.rl.layers import run_mlp, sample, update_normalizer
+from legged_mw.rl.recurrent import HiddenStates, step
 from legged_mw.sim.graph import StepGraph
 
 
@@ -61,10 +61,7 @@ class GraphedDistillation(Distillation):
 
     def _begin(self) -> None:
         """Empty memories, and graphs that are not recorded yet."""
-        recurrent = [model for model in (self.student, self.teacher) if isinstance(model, RNNModel)]
-        self._memories: dict[MLPModel, HiddenState] = {
-            model: HiddenState(model, self.storage.num_envs, 1, str(self.device)) for model in recurrent
-        }
+        self._memories = HiddenStates((self.student, self.teacher), self.storage.num_envs, 1, str(self.device))
         self._act_graph, self._update_graph = (StepGraph(fn, str(self.device)) for fn in (self._act, self._update))
 
     def release(self) -> None:
@@ -79,8 +76,7 @@ class GraphedDistillation(Distillation):
         if not self.graphed:
             return super().act(obs)
         if self.storage.step == 0:
-            for memory in self._memories.values():
-                memory.start.copy_(memory.now)
+            self._memories.begin_rollout()
         self._obs.copy_(obs.select(*self._obs.keys()))
         self._act_graph()
         self.transition.observations = self._obs.select(*self.student.obs_groups)
@@ -88,12 +84,8 @@ class GraphedDistillation(Distillation):
         return self._acted[0].clone()
 
     def _act(self) -> None:
-        student = self.student
-        assert student.distribution is not None
-        student.distribution.update(student.mlp(self._latent(student)))  # the forward pass without its sample
-        mean, std = student.output_mean, student.output_std
-        # torch.normal would check std on the host
-        self._acted = (mean + std * torch.randn_like(mean)).detach(), self._mean(self.teacher, self._latent(self.teacher)).detach()
+        actions, wanted = sample(self.student, self._latent(self.student)), self._mean(self.teacher, self._latent(self.teacher))
+        self._acted = actions.detach(), wanted.detach()
 
     def _latent(self, model: MLPModel) -> Tensor:
         """What a network's MLP reads; a memory takes in the observations."""
@@ -106,8 +98,8 @@ class GraphedDistillation(Distillation):
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
         """Store the transition; worlds whose episode ended are forgotten."""
         super().process_env_step(obs, rewards, dones, extras)
-        for memory in self._memories.values() if self.graphed else ():
-            memory.forget(dones)
+        if self.graphed:
+            self._memories.forget(dones)
 
     # ---- the update -----------------------------------------------------------------------------------------------
 

@@ -64,7 +64,7 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
         taken[-2:] += contract.action.clip * torch.randn_like(taken[-2:])
         seen, _, dones, _ = env.step(taken)
         forget(policy, dones)
-        arrays = (tensor.numpy().copy() for tensor in (actions, taken, env.actuators.told(), dones.bool()))
+        arrays = (tensor.numpy().copy() for tensor in (actions, taken, env.actuators.sent(), dones.bool()))
         steps.append(Step(observation, measured, commands, *arrays, clock=clock, memory=memory))
     return steps
 

@@ -6,6 +6,7 @@ import math
 from typing import Any
 
 import torch
+from rsl_rl.models import MLPModel
 from rsl_rl.modules import EmpiricalNormalization
 from torch import Tensor, nn
 
@@ -44,6 +45,14 @@ def run_mlp(layers: nn.Module, x: Tensor) -> Tensor:
     for layer in layers:  # type: ignore[attr-defined]
         x = Linear.apply(x, layer.weight, layer.bias) if type(layer) is nn.Linear else layer(x)  # type: ignore[misc]
     return x
+
+
+def sample(model: MLPModel, latent: Tensor) -> Tensor:
+    """Actions (N, A) drawn from a policy with a Gaussian, for what its MLP reads; torch.normal would check the std on the host."""
+    assert model.distribution is not None
+    model.distribution.update(model.mlp(latent))  # the forward pass without its own sample
+    mean = model.output_mean
+    return mean + model.output_std * torch.randn_like(mean)
 
 
 def update_normalizer(normalizer: EmpiricalNormalization, x: Tensor, world_size: int) -> None:

@@ -26,8 +26,8 @@ from torch import Tensor, nn
 
 from legged_mw.rl.adam import make_recordable, plain_state
 from legged_mw.rl.estimator import EstimatingModel, trained_parts
-from legged_mw.rl.layers import run_mlp, update_normalizer
-from legged_mw.rl.recurrent import HiddenState, SequenceInput, check_recurrent, unroll
+from legged_mw.rl.layers import run_mlp, sample, update_normalizer
+from legged_mw.rl.recurrent import HiddenStates, SequenceInput, check_recurrent, unroll
 from legged_mw.sim.graph import StepGraph
 
 _MIN_RATE, _MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
@@ -101,11 +101,7 @@ class GraphedPPO(PPO):
         self._size = self._share * (st.num_transitions_per_env if self._recurrent else 1)  # in samples
         self._obs = TensorDict({name: value[0].clone() for name, value in st.observations.items()}, [st.num_envs], device=device)
         self._order = torch.zeros(self._share * self.num_mini_batches, dtype=torch.long, device=device)
-        self._memories: dict[nn.Module, HiddenState] = {
-            model: HiddenState(model, st.num_envs, 2 if self.symmetry else 1, device)
-            for model in (self.actor, self.critic)
-            if isinstance(model, RNNModel)
-        }
+        self._memories = HiddenStates((self.actor, self.critic), st.num_envs, 2 if self.symmetry else 1, device)
         self._advantages = torch.zeros_like(st.returns)
         more = {"symmetry": self.symmetry, "estimate": len(self._parts) > 2}
         self._loss_names = ("value", "surrogate", "entropy", *(name for name, there in more.items() if there))
@@ -152,8 +148,7 @@ class GraphedPPO(PPO):
         if not self.graphed:
             return super().act(obs)
         if self.storage.step == 0:
-            for memory in self._memories.values():
-                memory.start.copy_(memory.now)
+            self._memories.begin_rollout()
         self._obs.copy_(obs)
         self._act_graph()
         self.transition.observations = self._obs
@@ -167,10 +162,7 @@ class GraphedPPO(PPO):
             seen, _ = self.symmetry.data_augmentation_func(env=self.symmetry.env, obs=seen, actions=None)
         with self._beside():
             values = self.critic.mlp(self._latent(self.critic, seen))
-        assert actor.distribution is not None
-        actor.distribution.update(actor.mlp(self._latent(actor, seen)))  # the forward pass without its sample
-        mean, std = actor.output_mean, actor.output_std
-        actions = mean + std * torch.randn_like(mean)  # torch.normal would check std on the host
+        actions = sample(actor, self._latent(actor, seen))
         self._acted = (actions, values, actor.get_output_log_prob(actions))
         self._acted_params = tuple(actor.output_distribution_params)
         self._meet()
@@ -182,8 +174,8 @@ class GraphedPPO(PPO):
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
         """Store the transition; worlds whose episode ended are forgotten."""
         super().process_env_step(obs, rewards, dones, extras)
-        for memory in self._memories.values() if self.graphed else ():
-            memory.forget(dones)
+        if self.graphed:
+            self._memories.forget(dones)
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Returns and advantages of the stored transitions, into the storage."""

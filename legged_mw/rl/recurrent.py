@@ -8,7 +8,7 @@ the same values and gradients. cuDNN cannot change a state on the way, so each s
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import torch
@@ -63,6 +63,23 @@ class HiddenState:
         ended = dones.index_select(1, worlds).to(inputs.dtype)
         keep = torch.cat([torch.ones_like(ended[:1]), 1.0 - ended[:-1]])
         return SequenceInput(inputs.view(-1, len(keep), len(worlds), inputs.shape[1]), self.start.index_select(2, worlds), keep)
+
+
+class HiddenStates(dict[nn.Module, HiddenState]):
+    """Those of the recurrent networks among a learner's ``models``."""
+
+    def __init__(self, models: Iterable[nn.Module], worlds: int, images: int, device: str) -> None:
+        super().__init__({model: HiddenState(model, worlds, images, device) for model in models if isinstance(model, RNNModel)})
+
+    def begin_rollout(self) -> None:
+        """Keep the present states as those that the rollout begins with."""
+        for state in self.values():
+            state.start.copy_(state.now)
+
+    def forget(self, ended: Tensor) -> None:
+        """All states become 0 where ``ended`` (N,)."""
+        for state in self.values():
+            state.forget(ended)
 
 
 def check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | None, recorded: bool) -> None:
