@@ -97,7 +97,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         self.compute_observations()
 
     def _apply_actions(self) -> None:
-        """What the motors are told, from the actions."""
+        """Motor commands from the actions."""
         self.actuators.apply(self.actions)
 
     def _update_state(self) -> None:
