@@ -277,7 +277,7 @@ def test_another_commander(domain: int) -> None:
 def test_it_is_laid_down_before_its_own_program_lets_go(domain: int) -> None:
     folder = POLICIES / "go2_flat"
     sim = SimulatedUnitree(folder, read_contract(folder), RobotEnd("unitree_go", "lo", domain))
-    Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time).prepare(lies_down=True)
+    Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time).prepare(lies_down=GO2.lies_down)
     assert sim.end.calls == [CHECK_MODE, STAND_DOWN, RELEASE_MODE, CHECK_MODE] and sim.end.program == ""
 
 

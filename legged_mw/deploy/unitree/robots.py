@@ -52,7 +52,12 @@ class Machine:
 
 
 GO2 = Machine(
-    "go2", "unitree_go", _named(_legs(("FR", "FL", "RR", "RL"), ("hip", "thigh", "calf"))), feet=("FR", "FL", "RR", "RL"), cells=8
+    "go2",
+    "unitree_go",
+    _named(_legs(("FR", "FL", "RR", "RL"), ("hip", "thigh", "calf"))),
+    feet=("FR", "FL", "RR", "RL"),
+    lies_down=True,
+    cells=8,
 )
 G1 = Machine(
     "g1",
