@@ -1,6 +1,6 @@
 """A Unitree robot behind the seam ``Robot``: measurements out of its state messages, its command messages out of targets.
 
-Motors are found by the names of their joints. What the robot must be asked or told before its motors obey is in ``link``.
+Motors are found by the names of their joints. Services that must be called before its motors obey are in ``link``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ TOO_OLD = 0.1  # [s] ours: a measurement older than this is none
 TOUCH = 20  # foot_force from which a foot touches the ground, in the robot's own unit; ours
 LOST = 5  # messages that a motor may lose between two looks; ours
 _MEASURED = ("ang_vel", "gravity", "joint_pos", "joint_vel", "joint_torque", "acceleration")
-_PARTS = ("q", "dq", "tau", "kp", "kd")
 
 
 class Owner(Protocol):
@@ -34,13 +33,13 @@ class Owner(Protocol):
         """The newest state with its stamp, or None if none came since the last call."""
 
     def arm(self, damping: bytes) -> None:
-        """Say what damps this robot, for when nobody can say it any more."""
+        """Store the command that damps this robot, for when this process can send none."""
 
     def send(self, body: bytes, stamp: float, safe: bool) -> None:
-        """Send a command made of the state of ``stamp``; ``safe``: it may hold for ever."""
+        """Send a command computed from the state of ``stamp``; ``safe``: it may be repeated for ever."""
 
     def close(self, last: bytes) -> str:
-        """Send ``last`` for a while and let go; returns what there is to say."""
+        """Send ``last`` for a while and close; returns a report of latencies, or nothing."""
         ...
 
 
@@ -93,7 +92,7 @@ class UnitreeRobot(Robot):
         check_rows(contract, self.machine)
         self._slots = order(self.machine, contract.joints)
         self._state, self._stamp, self._open = self._decoded(first.body), first.stamp, True
-        self.report = ""  # after `close`: what there is to say of the wire
+        self.report = ""  # after `close`: latencies of the wire
         check_body(self.machine, self._mode_machine)
         self._default, self._ranges = (contract.stiffness, contract.damping), ranges
         self._lost = self._state["motor_state.lost"].astype(int) if self.machine.package == "unitree_go" else None
