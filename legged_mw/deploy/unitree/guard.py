@@ -24,8 +24,7 @@ import time
 from collections import deque
 from typing import Any
 
-import numpy as np
-
+from legged_mw.deploy.loop import Spread
 from legged_mw.deploy.robot import RobotError
 from legged_mw.deploy.unitree.codec import LAYOUTS
 
@@ -238,8 +237,7 @@ class Guard:
     def _report(self) -> str:
         if not self._latencies:
             return ""
-        middle, most = (1000 * float(value) for value in np.percentile(self._latencies, (50, 99)))
-        return f"from a measurement to its target: median {middle:.1f} ms, p99 {most:.1f} ms ({len(self._latencies)} targets)"
+        return f"from a measurement to its target: {Spread.of(self._latencies)} ({len(self._latencies)} targets)"
 
     def tell(self, what: dict[str, Any]) -> None:
         with contextlib.suppress(OSError):
