@@ -66,7 +66,10 @@ class Direct:
 
 
 class UnitreeRobot(Robot):
-    """A Go2, G1 or H1. Its motors hold the contract's stiffness and damping, at their own rate."""
+    """A Go2, G1 or H1. Its motors hold the contract's stiffness and damping, at their own rate.
+
+    Targets are sent as they are: ``Safety.held`` holds them within the servos' ranges, for every robot.
+    """
 
     can_change_gains = True
 
@@ -76,13 +79,10 @@ class UnitreeRobot(Robot):
         owner: Owner,
         first: Any,
         *,
-        ranges: tuple[Floats, Floats],
         echo: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``first``: the state that the robot sent last. ``ranges``: lowest and highest target (D,) [rad] of each servo, as trained.
-
-        ``echo``: commands name the state that they answer, for a simulated robot.
+        """``first``: the state that the robot sent last. ``echo``: commands name the state that they answer, for a simulated robot.
 
         Raises RobotError if this is not the contract's robot, or cannot measure what the policy observes.
         """
@@ -94,7 +94,7 @@ class UnitreeRobot(Robot):
         self._state, self._stamp, self._open = self._decoded(first.body), first.stamp, True
         self.report = ""  # after `close`: latencies of the wire
         check_body(self.machine, self._mode_machine)
-        self._default, self._ranges = (contract.stiffness, contract.damping), ranges
+        self._default = contract.stiffness, contract.damping
         self._lost = self._state["motor_state.lost"].astype(int) if self.machine.package == "unitree_go" else None
         self.bad_states = 0  # with a wrong checksum, which are left out
         owner.arm(self._command(kd=damped(contract)))
@@ -130,7 +130,7 @@ class UnitreeRobot(Robot):
 
     def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
         kp, kd = (own if given is None else given for own, given in zip(self._default, (stiffness, damping), strict=True))
-        self._send(q=np.clip(targets, *self._ranges), kp=kp, kd=kd)
+        self._send(q=targets, kp=kp, kd=kd)
 
     def damp(self) -> None:
         self._send(kd=damped(self.contract), safe=True)
@@ -208,14 +208,6 @@ def check_rows(contract: Contract, machine: Machine) -> None:
         )
 
 
-def servo_ranges(folder: Path, contract: Contract) -> tuple[Floats, Floats]:
-    """Lowest and highest target (D,) [rad]: the scene's servos hold targets within these, and no drive does."""
-    scene = read_scene(folder, contract)
-    limited = scene.model.actuator_ctrllimited[scene.actuators, None] > 0
-    low, high = np.where(limited, scene.model.actuator_ctrlrange[scene.actuators], [-np.inf, np.inf]).T
-    return low, high
-
-
 def connect(folder: Path, contract: Contract, interface: str, domain: int | None = None) -> UnitreeRobot:
     """The robot on a network interface, its wire owned by a guard process. Raises RobotError with what is wrong."""
     need_dds()
@@ -224,11 +216,11 @@ def connect(folder: Path, contract: Contract, interface: str, domain: int | None
 
     machine = machine_of(contract.joints)
     check_rows(contract, machine)
-    ranges = servo_ranges(folder, contract)
+    read_scene(folder, contract)  # a scene that is not the contract's is refused before anything is sent
     domain = default_domain(interface) if domain is None else domain
     owner = Guarded(machine.package, interface, domain, lies_down=machine.lies_down)
     try:
-        return UnitreeRobot(contract, owner, owner.first, ranges=ranges, echo=interface in LOOPBACK)
+        return UnitreeRobot(contract, owner, owner.first, echo=interface in LOOPBACK)
     except BaseException:
         owner.close(b"")
         raise
