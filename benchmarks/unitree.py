@@ -15,7 +15,6 @@ from collections import defaultdict
 from dataclasses import replace
 from pathlib import Path
 
-import mujoco
 import numpy as np
 
 from legged_mw import ROOT
@@ -23,7 +22,8 @@ from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.options import wire_faults
 from legged_mw.deploy.policy import Controller
-from legged_mw.deploy.unitree.client import Direct, UnitreeRobot, servo_ranges
+from legged_mw.deploy.safety import Limits, Safety
+from legged_mw.deploy.unitree.client import Direct, UnitreeRobot
 from legged_mw.deploy.unitree.link import RobotEnd, Wire
 from legged_mw.deploy.unitree.robots import machine_of
 from legged_mw.deploy.unitree.serve import STEP, Faults, SimulatedUnitree
@@ -33,9 +33,7 @@ from legged_mw.eval.rules import ExamRules
 
 def begin(sim: SimulatedUnitree, robot: UnitreeRobot) -> None:
     """Put the robot into its first keyframe, its servos on."""
-    mujoco.mj_resetDataKeyframe(sim.model, sim.data, 0)  # pyright: ignore[reportAttributeAccessIssue]
-    sim.data.time = robot._stamp + 1.0
-    mujoco.mj_step1(sim.model, sim.data)  # pyright: ignore[reportAttributeAccessIssue]
+    sim.reset(after=1.0)
     sim.step()
     robot.write(robot.contract.default_pose)
     sim.step()
@@ -46,7 +44,8 @@ def examine(folder: Path, contract: Contract, exam: ExamRules, domain: int, faul
     package = machine_of(contract.joints).package
     sim = SimulatedUnitree(folder, contract, RobotEnd(package, "lo", domain), faults=faults, hoist=False)
     wire = Wire(package, "lo", domain, wait=sim.step, clock=lambda: sim.time)
-    robot = UnitreeRobot(contract, Direct(wire), wire.prepare(), ranges=servo_ranges(folder, contract), clock=lambda: sim.time)
+    robot = UnitreeRobot(contract, Direct(wire), wire.prepare(), clock=lambda: sim.time)
+    safety = Safety(contract, Limits.of(folder, contract))
     controller, names = Controller(folder, contract), [command.name for command in contract.commands]
     signals, fell_at, last = defaultdict(list), [], []
     pushed = [(exam.push_vx, 0.0, 0.0)] * rules.PUSH_DIRECTIONS
@@ -65,7 +64,7 @@ def examine(folder: Path, contract: Contract, exam: ExamRules, domain: int, faul
             if direction >= 0 and step == round(rules.PUSH_AT / contract.period) + direction:
                 angle = 2 * math.pi * direction / rules.PUSH_DIRECTIONS
                 sim.data.qvel[:2] += exam.push_mark * np.array([math.cos(angle), math.sin(angle)])
-            robot.write(controller.act(robot.read(), command)[0])
+            robot.write(safety.held(controller.act(robot.read(), command)[0]))
             for _ in range(round(contract.period / STEP)):
                 sim.step()
             if sim.upright < 0.0:

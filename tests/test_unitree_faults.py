@@ -6,7 +6,6 @@ import re
 from collections.abc import Callable
 from typing import Any
 
-import mujoco
 import numpy as np
 import pytest
 
@@ -15,7 +14,6 @@ from legged_mw.deploy.inputs import RobotRemote
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.runner import run
-from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.states import POLICY, States
 from legged_mw.deploy.unitree.client import Direct
 from legged_mw.deploy.unitree.link import Wire
@@ -39,9 +37,7 @@ class Scene:
 
     def __init__(self, both: Pair) -> None:
         self.both, self.sim = both, both.sim
-        mujoco.mj_resetDataKeyframe(self.sim.model, self.sim.data, 0)
-        self.sim.data.time = both.robot._stamp + 0.01
-        mujoco.mj_step1(self.sim.model, self.sim.data)
+        self.sim.reset(after=0.01)
         self.begin, self.damped, self.seen = both.sim.time, None, list[str]()
         self.fault: Callable[[SimulatedUnitree], None] = lambda sim: None
         self.hold: Callable[[float], bytes] | None = None  # the remote from AT on
@@ -51,7 +47,6 @@ class Scene:
         contract = both.contract
         self.controller = Controller(POLICIES / "go2_flat", contract)
         self.states = States(self.controller, [RobotRemote(contract.commands)], lambda _: np.zeros(3), self.seen.append)
-        self.safety = Safety(contract, Limits.of(POLICIES / "go2_flat", contract, robot.limits))
 
     @property
     def time(self) -> float:
@@ -79,7 +74,7 @@ class Scene:
 
     def run(self, seconds: float = 4.2) -> Any:
         robot = self.both.robot
-        return run(robot, self.controller, lambda _: np.zeros(3), seconds, live=False, safety=self.safety, states=self.states)
+        return run(robot, self.controller, lambda _: np.zeros(3), seconds, live=False, safety=self.both.safety, states=self.states)
 
 
 def fault(name: str, value: Any) -> Callable[[Scene], None]:

@@ -13,7 +13,7 @@ import pytest
 from legged_mw.deploy.contract import ContractRow, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import RobotError, damped
-from legged_mw.deploy.unitree.client import UnitreeRobot, check_rows, servo_ranges
+from legged_mw.deploy.unitree.client import UnitreeRobot, check_rows
 from legged_mw.deploy.unitree.codec import LAYOUTS, Message
 from legged_mw.deploy.unitree.link import CHECK_MODE, RELEASE_MODE, STAND_DOWN, Received, RobotEnd, Wire
 from legged_mw.deploy.unitree.robots import G1, GO2, H1
@@ -180,11 +180,11 @@ def test_commands(domain: int) -> None:
 def test_targets_are_held_within_what_was_trained(domain: int) -> None:
     """The scene's servos hold targets within the joints' ranges, so the policy may ask for more than a joint can do; drives would obey."""
     both = pair("g1_flat", domain)
-    low, high = servo_ranges(POLICIES / "g1_flat", both.contract)
+    low, high = both.safety.limits.lowest, both.safety.limits.highest
     knee = both.contract.joints.index("left_knee_joint")
     assert (low[knee], high[knee]) == (pytest.approx(-0.087267), pytest.approx(2.8798))
     owner = both.robot._owner = Once(b"")
-    both.robot.write(np.full(29, -9.0))
+    both.robot.write(both.safety.held(np.full(29, -9.0)))
     sent = Message(LAYOUTS["unitree_hg", "LowCmd_"], owner.sent[0])
     assert np.allclose(sent["motor_cmd.q"][[G1.motors[name] for name in both.contract.joints]], low)
 
@@ -197,7 +197,7 @@ def test_h1_on_the_wire() -> None:
         **{name: np.arange(19.0) for name in ("default_pose", "stiffness", "damping")},
     )
     owner = Once(Message(LAYOUTS["unitree_go", "LowState_"]).seal())
-    robot = UnitreeRobot(contract, owner, owner.receive(), ranges=(np.full(19, -20.0), np.full(19, 20.0)), clock=lambda: 0.0)
+    robot = UnitreeRobot(contract, owner, owner.receive(), clock=lambda: 0.0)
     robot.write(np.arange(19.0))
     message = Message(LAYOUTS["unitree_go", "LowCmd_"], owner.sent[-1])
     assert message["motor_cmd.mode"].tolist() == [10] * 9 + [0] + [1] * 10
@@ -277,7 +277,7 @@ def test_another_commander(domain: int) -> None:
 def test_it_is_laid_down_before_its_own_program_lets_go(domain: int) -> None:
     folder = POLICIES / "go2_flat"
     sim = SimulatedUnitree(folder, read_contract(folder), RobotEnd("unitree_go", "lo", domain))
-    Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time).prepare(lies_down=True)
+    Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time).prepare(lies_down=GO2.lies_down)
     assert sim.end.calls == [CHECK_MODE, STAND_DOWN, RELEASE_MODE, CHECK_MODE] and sim.end.program == ""
 
 

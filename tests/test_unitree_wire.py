@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from legged_mw import ROOT
 from legged_mw.deploy import __main__ as deploy
 from legged_mw.deploy import unitree
 from legged_mw.deploy.contract import read_contract
@@ -23,8 +22,7 @@ from legged_mw.deploy.unitree.remote import decode, encode
 from legged_mw.deploy.unitree.robots import G1, GO2, H1, check_body, machine_of, order
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.errors import UserError
-
-POLICIES = ROOT / "resources" / "policies"
+from tests.wires import POLICIES
 
 
 def test_types_are_announced_as_the_robots_announce_them() -> None:

@@ -16,7 +16,8 @@ import pytest
 from legged_mw import ROOT
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.robot import Floats
-from legged_mw.deploy.unitree.client import Direct, UnitreeRobot, servo_ranges
+from legged_mw.deploy.safety import Limits, Safety
+from legged_mw.deploy.unitree.client import Direct, UnitreeRobot
 from legged_mw.deploy.unitree.link import RobotEnd, Wire
 from legged_mw.deploy.unitree.robots import machine_of
 from legged_mw.deploy.unitree.serve import STEP, SimulatedUnitree
@@ -43,11 +44,12 @@ def domain() -> Iterator[int]:
 
 
 class Pair(NamedTuple):
-    """A simulated robot and its client; no time passes but by ``steps`` and ``play``."""
+    """A simulated robot and its client; time passes only in ``steps`` and what calls it."""
 
     sim: SimulatedUnitree
     robot: UnitreeRobot
     contract: Contract
+    safety: Safety
 
     def steps(self, seconds: float) -> None:
         for _ in range(round(seconds / STEP)):
@@ -68,7 +70,7 @@ class Pair(NamedTuple):
         """Follow a policy; returns how far (x, y) [m] the root came."""
         begin = self.sim.data.qpos[:2].copy()
         for _ in range(round(seconds / self.contract.period)):
-            self.robot.write(controller.act(self.robot.read(), command)[0])
+            self.robot.write(self.safety.held(controller.act(self.robot.read(), command)[0]))
             self.period()
         return self.sim.data.qpos[:2] - begin
 
@@ -80,5 +82,5 @@ def pair(task: str, domain: int, **settings: Any) -> Pair:
     package = machine_of(contract.joints).package
     sim = SimulatedUnitree(folder, contract, RobotEnd(package, "lo", domain), **settings)
     wire = Wire(package, "lo", domain, wait=sim.step, clock=lambda: sim.time)
-    first = wire.prepare(listen=0.1)
-    return Pair(sim, UnitreeRobot(contract, Direct(wire), first, ranges=servo_ranges(folder, contract), clock=lambda: sim.time), contract)
+    robot = UnitreeRobot(contract, Direct(wire), wire.prepare(listen=0.1), clock=lambda: sim.time)
+    return Pair(sim, robot, contract, Safety(contract, Limits.of(folder, contract, robot.limits)))

@@ -10,11 +10,12 @@ import math
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 LATE = 0.5  # [periods] by which a step may begin late before it is counted
 KEPT = 1 << 16  # samples for median and p99: 22 minutes at 50 Hz; the worst is of the whole run
@@ -29,6 +30,11 @@ class Spread(NamedTuple):
     median: float
     p99: float
     worst: float
+
+    @classmethod
+    def of(cls, values: NDArray[Any] | Sequence[float]) -> Spread:
+        """Of at least one value [s]."""
+        return cls(*(float(value) for value in np.percentile(values, (50, 99, 100))))
 
     def __str__(self) -> str:
         return f"median {1e3 * self.median:.2f}, p99 {1e3 * self.p99:.2f}, worst {1e3 * self.worst:.2f} ms"
@@ -62,8 +68,7 @@ class _Samples:
     def spread(self) -> Spread:
         if not self.count:
             return Spread(0.0, 0.0, 0.0)
-        median, p99 = np.percentile(self.values[: self.count], (50, 99))
-        return Spread(float(median), float(p99), self.worst)
+        return Spread.of(self.values[: self.count])._replace(worst=self.worst)
 
 
 class Loop:

@@ -16,6 +16,7 @@ import numpy as np
 
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.log import LogError, Recording, read_log
+from legged_mw.deploy.loop import Spread
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import QUANTITIES, Floats
 from legged_mw.deploy.simulated import MujocoRobot
@@ -159,8 +160,7 @@ def table(shown_: Replay) -> str:
     age = rows["age"][np.isfinite(rows["age"])]
     for name, values in (("age of a measurement", age), ("work of a step", rows["work"]), ("step began late by", rows["behind"])):
         if len(values):
-            median, p99 = 1e3 * np.percentile(values, (50, 99))
-            lines.append(f"{name:<28}median {median:.2f}, p99 {p99:.2f}, worst {1e3 * values.max():.2f} ms")
+            lines.append(f"{name:<28}{Spread.of(values)}")
     return "\n".join([*lines, *(f"{now:8.2f} s  {text}" for now, text in shown_.recording.events)])
 
 

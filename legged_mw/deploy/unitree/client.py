@@ -1,6 +1,6 @@
 """A Unitree robot behind the seam ``Robot``: measurements out of its state messages, its command messages out of targets.
 
-Motors are found by the names of their joints. What the robot must be asked or told before its motors obey is in ``link``.
+Motors are found by the names of their joints. Services that must be called before its motors obey are in ``link``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ TOO_OLD = 0.1  # [s] ours: a measurement older than this is none
 TOUCH = 20  # foot_force from which a foot touches the ground, in the robot's own unit; ours
 LOST = 5  # messages that a motor may lose between two looks; ours
 _MEASURED = ("ang_vel", "gravity", "joint_pos", "joint_vel", "joint_torque", "acceleration")
-_PARTS = ("q", "dq", "tau", "kp", "kd")
 
 
 class Owner(Protocol):
@@ -34,13 +33,13 @@ class Owner(Protocol):
         """The newest state with its stamp, or None if none came since the last call."""
 
     def arm(self, damping: bytes) -> None:
-        """Say what damps this robot, for when nobody can say it any more."""
+        """Store the command that damps this robot, for when this process can send none."""
 
     def send(self, body: bytes, stamp: float, safe: bool) -> None:
-        """Send a command made of the state of ``stamp``; ``safe``: it may hold for ever."""
+        """Send a command computed from the state of ``stamp``; ``safe``: it may be repeated for ever."""
 
     def close(self, last: bytes) -> str:
-        """Send ``last`` for a while and let go; returns what there is to say."""
+        """Send ``last`` for a while and close; returns a report of latencies, or nothing."""
         ...
 
 
@@ -67,7 +66,10 @@ class Direct:
 
 
 class UnitreeRobot(Robot):
-    """A Go2, G1 or H1. Its motors hold the contract's stiffness and damping, at their own rate."""
+    """A Go2, G1 or H1. Its motors hold the contract's stiffness and damping, at their own rate.
+
+    Targets are sent as they are: ``Safety.held`` holds them within the servos' ranges, for every robot.
+    """
 
     can_change_gains = True
 
@@ -77,13 +79,10 @@ class UnitreeRobot(Robot):
         owner: Owner,
         first: Any,
         *,
-        ranges: tuple[Floats, Floats],
         echo: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """``first``: the state that the robot sent last. ``ranges``: lowest and highest target (D,) [rad] of each servo, as trained.
-
-        ``echo``: commands name the state that they answer, for a simulated robot.
+        """``first``: the state that the robot sent last. ``echo``: commands name the state that they answer, for a simulated robot.
 
         Raises RobotError if this is not the contract's robot, or cannot measure what the policy observes.
         """
@@ -93,9 +92,9 @@ class UnitreeRobot(Robot):
         check_rows(contract, self.machine)
         self._slots = order(self.machine, contract.joints)
         self._state, self._stamp, self._open = self._decoded(first.body), first.stamp, True
-        self.report = ""  # after `close`: what there is to say of the wire
+        self.report = ""  # after `close`: latencies of the wire
         check_body(self.machine, self._mode_machine)
-        self._default, self._ranges = (contract.stiffness, contract.damping), ranges
+        self._default = contract.stiffness, contract.damping
         self._lost = self._state["motor_state.lost"].astype(int) if self.machine.package == "unitree_go" else None
         self.bad_states = 0  # with a wrong checksum, which are left out
         owner.arm(self._command(kd=damped(contract)))
@@ -131,7 +130,7 @@ class UnitreeRobot(Robot):
 
     def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
         kp, kd = (own if given is None else given for own, given in zip(self._default, (stiffness, damping), strict=True))
-        self._send(q=np.clip(targets, *self._ranges), kp=kp, kd=kd)
+        self._send(q=targets, kp=kp, kd=kd)
 
     def damp(self) -> None:
         self._send(kd=damped(self.contract), safe=True)
@@ -209,14 +208,6 @@ def check_rows(contract: Contract, machine: Machine) -> None:
         )
 
 
-def servo_ranges(folder: Path, contract: Contract) -> tuple[Floats, Floats]:
-    """Lowest and highest target (D,) [rad]: the scene's servos hold targets within these, and no drive does."""
-    scene = read_scene(folder, contract)
-    limited = scene.model.actuator_ctrllimited[scene.actuators, None] > 0
-    low, high = np.where(limited, scene.model.actuator_ctrlrange[scene.actuators], [-np.inf, np.inf]).T
-    return low, high
-
-
 def connect(folder: Path, contract: Contract, interface: str, domain: int | None = None) -> UnitreeRobot:
     """The robot on a network interface, its wire owned by a guard process. Raises RobotError with what is wrong."""
     need_dds()
@@ -225,11 +216,11 @@ def connect(folder: Path, contract: Contract, interface: str, domain: int | None
 
     machine = machine_of(contract.joints)
     check_rows(contract, machine)
-    ranges = servo_ranges(folder, contract)
+    read_scene(folder, contract)  # a scene that is not the contract's is refused before anything is sent
     domain = default_domain(interface) if domain is None else domain
     owner = Guarded(machine.package, interface, domain, lies_down=machine.lies_down)
     try:
-        return UnitreeRobot(contract, owner, owner.first, ranges=ranges, echo=interface in LOOPBACK)
+        return UnitreeRobot(contract, owner, owner.first, echo=interface in LOOPBACK)
     except BaseException:
         owner.close(b"")
         raise

@@ -24,8 +24,7 @@ import time
 from collections import deque
 from typing import Any
 
-import numpy as np
-
+from legged_mw.deploy.loop import Spread
 from legged_mw.deploy.robot import RobotError
 from legged_mw.deploy.unitree.codec import LAYOUTS
 
@@ -37,7 +36,7 @@ PRIORITY = 30  # ours, of a real-time process: before the policy's, which it mus
 _TURN = 0.001  # [s] at most between two looks at the wire
 _BOARD = struct.Struct("<QdI512s")  # changes of the board (odd: one is going on), stamp of the state, bytes of the text, text
 _FRAME = struct.Struct("<Bd")  # kind, stamp of the state that a command answers
-# Kinds: it must be followed by another; it may hold for ever; it is the last; it is what damps the robot, and is not sent now.
+# Kinds of command: another must follow in time; may be repeated for ever; the last one; stored for a trip, not sent now.
 MOVE, SAFE, CLOSE, ARM = 1, 2, 3, 4
 
 
@@ -78,7 +77,7 @@ class Guarded:
     ) -> None:
         """Start a guard, which takes the robot over (``lies_down`` as in ``link.Wire.prepare``).
 
-        ``find``: [s] for a robot to be heard. Raises RobotError with what the guard says.
+        ``find``: [s] to wait for the robot's first state. Raises RobotError with the guard's error.
         """
         size = LAYOUTS[package, "LowState_"].size
         with tempfile.TemporaryFile() as file:
@@ -86,12 +85,11 @@ class Guarded:
             self._board = Board(file.fileno(), size)
             self._channel, theirs = socket.socketpair()
             with theirs:
-                told = {"package": package, "interface": interface, "domain": domain, "late": late, "find": find}
-                told |= {"lies_down": lies_down}
-                told |= {"channel": theirs.fileno(), "board": file.fileno()}
+                settings = {"package": package, "interface": interface, "domain": domain, "late": late, "find": find}
+                settings |= {"lies_down": lies_down, "channel": theirs.fileno(), "board": file.fileno()}
                 program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
                 self.process = subprocess.Popen(
-                    [sys.executable, "-c", program, json.dumps(told)],
+                    [sys.executable, "-c", program, json.dumps(settings)],
                     pass_fds=(theirs.fileno(), file.fileno()),
                     start_new_session=True,  # a Ctrl-C in the terminal is not for the guard
                 )
@@ -162,17 +160,17 @@ class Guard:
         self.wire, self.channel, self.board, self.late = wire, channel, board, late
         self._size = _FRAME.size + LAYOUTS[package, "LowCmd_"].size
         self._buffer, self._latencies = b"", deque[float](maxlen=1 << 16)
-        self._command, self._damping = b"", b""  # what is sent again and again; what is sent instead of it
+        self._command, self._damping = b"", b""  # the command that is repeated; the one that replaces it after a trip
         self._moving, self._heard, self._until = False, 0.0, float("inf")
-        self.tripped, self._stop = "", ""
+        self.tripped, self._stopped = "", False
         channel.setblocking(False)
 
     def stop(self, *_: object) -> None:
         """Damp, and end; a signal's handler."""
-        self._stop = "the guard was told to end"
+        self._stopped = True
 
     def run(self) -> None:
-        """Until the other side closes, or AFTER a trip for which there is nobody to tell."""
+        """Run until AFTER [s] from the last command, from the end of the policy's process, or from `stop`."""
         due = time.monotonic()
         while time.monotonic() < self._until:
             select.select([self.channel] if self.channel.fileno() >= 0 else [], [], [], _TURN)
@@ -184,8 +182,8 @@ class Guard:
                 self.trip(f"no targets for {1000 * (now - self._heard):.0f} ms: the policy's process hangs or is late")
             if self._command and self.wire.other_commander():
                 self.trip("another program sends commands to this robot, too")
-            if self._stop:
-                self.trip(self._stop)
+            if self._stopped:
+                self.trip("the guard was stopped (SIGTERM)")
                 self._until = min(self._until, now + AFTER)
             if self._command and now >= due:
                 self.wire.send(self._command)
@@ -239,8 +237,7 @@ class Guard:
     def _report(self) -> str:
         if not self._latencies:
             return ""
-        middle, most = (1000 * float(value) for value in np.percentile(self._latencies, (50, 99)))
-        return f"from a measurement to its target: median {middle:.1f} ms, p99 {most:.1f} ms ({len(self._latencies)} targets)"
+        return f"from a measurement to its target: {Spread.of(self._latencies)} ({len(self._latencies)} targets)"
 
     def tell(self, what: dict[str, Any]) -> None:
         with contextlib.suppress(OSError):
@@ -250,19 +247,19 @@ class Guard:
 def main() -> None:
     from legged_mw.deploy.unitree.link import Wire
 
-    told = json.loads(sys.argv[1])
-    channel = socket.socket(fileno=told["channel"])
+    settings = json.loads(sys.argv[1])
+    channel = socket.socket(fileno=settings["channel"])
     with contextlib.suppress(OSError, AttributeError):  # not allowed, or not Linux
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))  # before DDS starts its threads, which then have it too
     try:
-        wire = Wire(told["package"], told["interface"], told["domain"])
-        first = wire.prepare(told["find"], lies_down=told["lies_down"])
+        wire = Wire(settings["package"], settings["interface"], settings["domain"])
+        first = wire.prepare(settings["find"], lies_down=settings["lies_down"])
     except RobotError as error:
         channel.sendall(json.dumps({"error": str(error)}).encode() + b"\n")
         return
-    board = Board(told["board"], len(first.body))
+    board = Board(settings["board"], len(first.body))
     board.put(first.body, first.stamp)
-    guard = Guard(wire, channel, board, told["package"], told["late"])
+    guard = Guard(wire, channel, board, settings["package"], settings["late"])
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, guard.stop)
     guard.tell({"ready": True})

@@ -7,16 +7,17 @@ import gc
 import math
 import os
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.loop import Spread
 from legged_mw.deploy.unitree import need_dds
 from legged_mw.deploy.unitree.handset import Handset
 from legged_mw.deploy.unitree.robots import machine_of
-from legged_mw.deploy.unitree.serve import STEP, Faults, SimulatedUnitree
+from legged_mw.deploy.unitree.serve import STEP, Counts, Faults, SimulatedUnitree
 
 BEHIND = 0.1  # [s] by which the simulation may be late before it gives the time up
 PRIORITY = 10  # ours, of a real-time process: below those of a policy
@@ -27,28 +28,24 @@ UPRIGHT = 0.5  # cosine of the tilt from which it lies
 class Served:
     """What a simulated robot saw while it was served."""
 
-    seconds: float = 0.0  # simulated
-    wall: float = 0.0  # [s]
-    upright: float = 1.0  # cosine of its largest tilt while its servos were on
-    latencies: list[float] = field(default_factory=list)  # [s] from a state that it sent to the first command that answers it
-    commands: int = 0
-    refused: int = 0
-    watchdog: int = 0
-    height: float = 0.0  # [m] of the root at the end
-    place: tuple[float, float] = (0.0, 0.0)  # [m] of the root at the end
+    seconds: float  # simulated
+    wall: float  # [s]
+    upright: float  # cosine of its largest tilt while its servos were on
+    latencies: list[float]  # [s] from a state that it sent to the first command that answers it
+    counts: Counts
+    place: tuple[float, float, float]  # [m] of the root at the end
 
     def text(self) -> str:
-        lines = [f"{self.seconds:.1f} s simulated in {self.wall:.1f} s; {self.commands} commands taken, {self.refused} refused"]
+        counts = self.counts
+        lines = [f"{self.seconds:.1f} s simulated in {self.wall:.1f} s; {counts.commands} commands taken, {counts.refused} refused"]
         if self.latencies:
-            middle, most = (1000 * float(value) for value in np.percentile(self.latencies, (50, 99)))
-            lines.append(f"from a state to the first command that answers it: median {middle:.1f} ms, p99 {most:.1f} ms")
-        if self.watchdog:
-            lines.append(f"the watchdog damped it {self.watchdog} times")
+            lines.append(f"from a state to the first command that answers it: {Spread.of(self.latencies)}")
+        if counts.watchdog:
+            lines.append(f"the watchdog damped it {counts.watchdog} times")
         tilt = math.degrees(math.acos(min(1.0, self.upright)))
-        fell = (
-            "it fell while its servos were on" if self.upright < UPRIGHT else f"with its servos on at most {tilt:.0f} degrees from upright"
-        )
-        lines.append(f"{fell}; at the end at {self.place[0]:.1f}, {self.place[1]:.1f} m, {self.height:.2f} m high")
+        fell, (x, y, z) = self.upright < UPRIGHT, self.place
+        how = "it fell while its servos were on" if fell else f"with its servos on at most {tilt:.0f} degrees from upright"
+        lines.append(f"{how}; at the end at {x:.1f}, {y:.1f} m, {z:.2f} m high")
         return "\n".join(lines)
 
 
@@ -73,7 +70,7 @@ class Latency:
 
 def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf) -> Served:
     """Step the robot in real time, its remote held by ``handset``. Ctrl-C ends it."""
-    latency, served = Latency(), Served()
+    latency, upright = Latency(), 1.0
     gc.collect()
     gc.freeze()
     gc.disable()
@@ -86,7 +83,7 @@ def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf) -> S
             sim.step()
             latency.watch(sim)
             if sim.acted["kp"].any():
-                served.upright = min(served.upright, sim.upright)
+                upright = min(upright, sim.upright)
             steps += 1
             ahead = start + steps * STEP - time.monotonic()
             if ahead > 0:
@@ -99,11 +96,8 @@ def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf) -> S
         gc.unfreeze()
         gc.enable()
         handset.close()
-    counts, place = sim.counts, sim.data.qpos
-    served.seconds, served.wall, served.latencies = sim.time, time.monotonic() - began, latency.seconds
-    served.commands, served.refused, served.watchdog = counts.commands, counts.refused, counts.watchdog
-    served.height, served.place = float(place[2]), (float(place[0]), float(place[1]))
-    return served
+    x, y, z = (float(value) for value in sim.data.qpos[:3])
+    return Served(sim.time, time.monotonic() - began, upright, latency.seconds, sim.counts, (x, y, z))
 
 
 def serve(

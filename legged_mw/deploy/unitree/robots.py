@@ -39,7 +39,6 @@ class Machine:
     feet: tuple[str, ...] = ()  # order of foot_force
     lies_down: bool = False  # whether its own program can be asked to lay it down
     cells: int = 0  # of the battery, in a row [Unitree's data sheets]; 0: not known
-    machines: tuple[int, ...] = ()  # LowState_.mode_machine of this body; 0: a simulation that sets none
 
     @property
     def limits(self) -> dict[str, float]:
@@ -52,14 +51,18 @@ class Machine:
 
 
 GO2 = Machine(
-    "go2", "unitree_go", _named(_legs(("FR", "FL", "RR", "RL"), ("hip", "thigh", "calf"))), feet=("FR", "FL", "RR", "RL"), cells=8
+    "go2",
+    "unitree_go",
+    _named(_legs(("FR", "FL", "RR", "RL"), ("hip", "thigh", "calf"))),
+    feet=("FR", "FL", "RR", "RL"),
+    lies_down=True,
+    cells=8,
 )
 G1 = Machine(
     "g1",
     "unitree_hg",
     _named([*_legs(("left", "right"), _G1_LEG), *_legs(("waist",), ("yaw", "roll", "pitch")), *_legs(("left", "right"), _G1_ARM)]),
     cells=13,
-    machines=(0, 2, 3, 5, 6),  # of 29 joints [unitree_rl_lab]; 1 and 4 have 23
 )
 H1 = Machine(
     "h1",
@@ -68,7 +71,7 @@ H1 = Machine(
     modes={i: 0x0A if i < 10 else 0x01 for i in range(20)},  # strong motors, then weak ones
 )
 MACHINES = {machine.name: machine for machine in (GO2, G1, H1)}
-BODIES = {1: 23, 4: 23, 2: 29, 3: 29, 5: 29, 6: 29, 9: 14}  # joints by mode_machine [unitree_rl_lab]
+BODIES = {1: 23, 4: 23, 2: 29, 3: 29, 5: 29, 6: 29, 9: 14}  # joints of a G1 by mode_machine [unitree_rl_lab]
 
 
 def machine_of(joints: Sequence[str]) -> Machine:
@@ -91,8 +94,8 @@ def order(machine: Machine, joints: Sequence[str]) -> np.ndarray:
 
 
 def check_body(machine: Machine, mode_machine: int) -> None:
-    """Refuse a body with other motors than the contract's. Raises RobotError."""
-    if machine.machines and mode_machine not in machine.machines:
+    """Refuse a G1 with other motors than the contract's; a simulation that sets no mode_machine sends 0. Raises RobotError."""
+    if machine is G1 and mode_machine and BODIES.get(mode_machine) != len(machine.motors):
         has = f"{BODIES[mode_machine]} joints" if mode_machine in BODIES else "an unknown body"
         raise RobotError(
             f"this {machine.name} has {has} (mode_machine {mode_machine}), the contract {len(machine.motors)}: "

@@ -31,6 +31,7 @@ LOW_LEVEL = (0xFE, 0xEF, 0xFF)  # head and level_flag of unitree_go
 _MACHINE = {"g1": 5}  # mode_machine that a simulated one says
 _TOUCH = 60  # foot_force of a foot that touches the ground, in the robot's own unit; ours
 _FULL = 4.1  # [V] of a full battery's cell
+_PARTS = ("q", "dq", "tau", "kp", "kd")  # of a motor's command
 _FAULT = 0x1  # motorstate of a motor with a fault
 _HOIST, _HOIST_DAMPING, _LOWERING = 12.0, 1.2, 1.0  # [weights/m], [weights s/m], [s] ours: a soft rope and how long it gives way
 
@@ -107,8 +108,7 @@ class SimulatedUnitree:
         self.model, self._rng = _whole(self._scene.spec), np.random.default_rng(seed)
         self._make_motors()
         self.data = mujoco.MjData(self.model)
-        mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
-        mujoco.mj_step1(self.model, self.data)
+        self.reset()
         self._height, self._weight = float(self.data.qpos[2]), 9.81 * float(self.model.body_subtreemass[1])
         self.hoist = len(contract.feet) < 4 if hoist is None else hoist
         self._rope = 1.0 if self.hoist else 0.0  # share of the rope's force that is left
@@ -117,9 +117,16 @@ class SimulatedUnitree:
         self._state = Message(LAYOUTS[self.machine.package, "LowState_"])
         self.remote = encode()
         self.command: Message | None = None  # the last one that was taken
-        self.acted = dict.fromkeys(("q", "dq", "tau", "kp", "kd"), np.zeros(len(contract.joints)))  # (D,) what the motors obey
+        self.acted = dict.fromkeys(_PARTS, np.zeros(len(contract.joints)))  # (D,) what the motors obey
         self._last = -math.inf
         self._fill()
+
+    def reset(self, after: float = 0.0) -> None:
+        """Put it into its first keyframe, ``after`` seconds from now: its clock goes on."""
+        time = self.time + after
+        mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
+        self.data.time = time
+        mujoco.mj_step1(self.model, self.data)
 
     def _make_motors(self) -> None:
         """Torque motors in place of the scene's servos, whose damping is the motors' now."""
@@ -190,7 +197,7 @@ class SimulatedUnitree:
             self.counts.refused += 1
             return
         on = command["motor_cmd.mode"][self._slots] != 0
-        self.acted = {name: np.where(on, command[f"motor_cmd.{name}"][self._slots], 0.0) for name in ("q", "dq", "tau", "kp", "kd")}
+        self.acted = {name: np.where(on, command[f"motor_cmd.{name}"][self._slots], 0.0) for name in _PARTS}
         self.acted["kp"][np.abs(self.acted["q"]) >= POSITION_STOP / 2] = 0.0
         self.acted["kd"][np.abs(self.acted["dq"]) >= VELOCITY_STOP / 2] = 0.0
         self.command, self._last = command, self.time
@@ -201,7 +208,7 @@ class SimulatedUnitree:
         acted = self.acted
         if self.command and self.time - self._last > self._watchdog and acted["kp"].any():
             zero = np.zeros(len(acted["q"]))
-            self.acted = acted = {**dict.fromkeys(("q", "dq", "tau", "kp"), zero), "kd": damped(self.contract)}
+            self.acted = acted = {**dict.fromkeys(_PARTS, zero), "kd": damped(self.contract)}
             self.counts.watchdog += 1
         law = np.stack([acted["tau"] + acted["kp"] * acted["q"] + acted["kd"] * acted["dq"], -acted["kp"], -acted["kd"]], axis=1)
         law[[name in self.faults.dead_motors for name in self.contract.joints]] = 0.0
