@@ -17,7 +17,7 @@ from legged_mw import ROOT
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.exam import contract_rules
 from legged_mw.deploy.policy import Controller
-from legged_mw.deploy.robot import QUANTITIES, Health, Measurement, Remote, Robot, RobotError
+from legged_mw.deploy.robot import Health, Measurement, Remote, Robot, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import NAMES, LimitError, Limits, Safety, Trip, Tripped, parse_limits
 from legged_mw.deploy.simulated import MujocoRobot
@@ -166,6 +166,8 @@ def test_steps_that_are_late(contract: Contract, limits: Limits) -> None:
         found = [safety.sensed(at_rest(contract), Health(), i * apart, behind) for i in range(count)]
         assert not any(found[:-1]) and bool(found[-1]) == trips
     assert Safety(contract, off).sensed(at_rest(contract), Health(), 0.0, 5.0) is None
+    many = Safety(contract, off.but({"late": 100}, "test"))
+    assert [bool(many.sensed(at_rest(contract), Health(), i * 0.002, 0.02)) for i in range(100)] == [False] * 99 + [True]
     safety = Safety(contract, off)
     found = [safety.sensed(at_rest(contract), Health(), i * 0.02, 0.015) for i in range(5)]
     assert found[-1] == Trip("late", "5 steps within a second began late, the last by 15 ms")
@@ -249,7 +251,7 @@ def test_shipped_policies_trip_nothing(name: str) -> None:
                 stage.push(len(held) + i, kick)
         stage.step(wanted)
         for i, layer in enumerate(layers):
-            one = Measurement(**{quantity: getattr(measured, quantity)[i] for quantity in QUANTITIES})
+            one = measured.of(i)
             trip = layer.sensed(one, Health(), step * stage.dt) or layer.asked(one, stage.controller.last_targets[i])
             assert trip is None, f"robot {i} at step {step}: {trip}"
 

@@ -1,6 +1,6 @@
 """The limits between any policy and any robot: each step is checked, and what is beyond a limit is named in one line.
 
-A trip is a sentence; who calls `Safety` damps the robot. Nothing here moves a joint, reads a clock or knows a kind of robot.
+A trip is a sentence; the caller of `Safety` damps the robot. Nothing here moves a joint, reads a clock or knows a kind of robot.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -135,7 +135,7 @@ class Safety:
         """As if nothing had been measured, asked or missed."""
         self._last: Floats | None = None  # targets (D,) of the step before
         self._seen, self._same = b"", 0
-        self._late: deque[float] = deque(maxlen=64)  # [s] of steps that began late
+        self._late: deque[float] = deque()  # [s] of steps that began late, within the last second
         self._remote: float | None = None  # [s] when the remote was last there
 
     def sensed(self, measured: Measurement, health: Health, now: float, behind: float = 0.0) -> Trip | None:
@@ -198,7 +198,9 @@ class Safety:
     def _on_time(self, now: float, behind: float) -> Trip | None:
         if behind > LATE * self.contract.period:
             self._late.append(now)
-        if (count := sum(now - then < 1.0 for then in self._late)) >= self.limits.late:
+        while self._late and now - self._late[0] >= 1.0:
+            self._late.popleft()
+        if (count := len(self._late)) >= self.limits.late:
             what = f"the last by {1e3 * behind:.0f} ms" if behind else "by more than half a period"
             return Trip("late", f"{count} steps within a second began late, {what}")
         return None

@@ -166,8 +166,7 @@ class MujocoRobot(Robot):
         self._start, self.can_change_gains = self.fleet.qpos[0, :7].copy(), contract.motors.law == "servo"
 
     def read(self) -> Measurement:
-        many = self.fleet.read()
-        return Measurement(**{n: getattr(many, n)[0] for n in QUANTITIES}, others={n: v[0] for n, v in many.others.items()})
+        return self.fleet.read().of(0)
 
     def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
         contract, self.hoisted = self.fleet.contract, self.hoisted and stiffness is not None
