@@ -18,7 +18,7 @@ from drivers import Script, Watched
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import Contract, read_contract
-from legged_mw.deploy.log import CHUNK, Log, LogError, log_path, read_log
+from legged_mw.deploy.log import CHUNK, Log, LogError, _columns, log_path, read_log
 from legged_mw.deploy.loop import Loop
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.replay import draw, figures, latency, replay, table
@@ -100,7 +100,6 @@ def test_what_is_no_log(tmp_path: Path, contract: Contract, logged: tuple[Path, 
 
 def test_memory_is_flat_while_it_logs(contract: Contract, tmp_path: Path) -> None:
     robot, controller, sizes = Watched(GO2, contract, hoisted=True), Controller(GO2, contract), []
-    robot._keep = lambda _: None  # type: ignore[method-assign]
     log = Log(tmp_path / "long.lmwlog", contract, GO2, "")
     measured, health = robot.read(), Health()
     states = States(controller, [], lambda _: np.zeros(3), lambda _: None)
@@ -185,7 +184,5 @@ def test_the_program_draws_a_log(
 
 def test_a_log_names_rows_of_its_own(contract: Contract) -> None:
     """What a measurement holds beside the usual is logged under its name."""
-    from legged_mw.deploy.log import _columns
-
     row = replace(contract.rows[0], name="belly", measured="sensors", sensors=("touch/belly",), size=1, scale=(1.0,))
     assert _columns(replace(contract, rows=(*contract.rows, row)))["belly"] == 1

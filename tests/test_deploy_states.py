@@ -10,6 +10,7 @@ import struct
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,8 +62,7 @@ def test_standing_begins_where_the_joints_are(contract: Contract) -> None:
     states = States(controller, [source], lambda _: np.zeros(3), lambda _: None)
     robot = Watched(GO1, contract)
     lying = contract.default_pose + np.linspace(-1.0, 1.0, 12)
-    measured = robot.read()
-    object.__setattr__(measured, "joint_pos", lying)
+    measured = replace(robot.read(), joint_pos=lying)
     orders = []
     for step in range(101):
         assert states.listen(Health(), 0.02 * step) is None

@@ -139,7 +139,7 @@ class Console:
         self._lines.put((line, False))
 
     def watch(self, states: States) -> Callable[[float, Measurement], None]:
-        """A status of the state, its command and the measured turn, that is overwritten."""
+        """Overwrite one line with the state and its command."""
 
         def show(now: float, measured: Measurement) -> None:
             if self._terminal and now >= self._next and self._lines.qsize() < 10:

@@ -20,7 +20,7 @@ import numpy as np
 
 from legged_mw.deploy.robot import Floats, Health, Remote, RobotError
 from legged_mw.utils.commands import VELOCITY, Command
-from legged_mw.view.drive import BINDINGS, Pilot
+from legged_mw.view.drive import ACTIONS, BINDINGS, Pilot
 
 START, WALK, END = "start", "A", "select"  # buttons of the states, as in unitree_rl_gym
 STOP = frozenset({"L2", "B"})  # held together: the emergency stop [unitree_rl_lab]
@@ -153,7 +153,7 @@ class Keys:
 
     STATES = {"s": START, "a": WALK, "x": END}
     _ARROWS = {"\x1b[A": "up", "\x1b[B": "down", "\x1b[D": "left", "\x1b[C": "right"}
-    _DRIVE = {key: b.action for b in BINDINGS[:10] for key in b.keys}  # up to "own": the others are of a simulation
+    _DRIVE = {key for b in BINDINGS[: ACTIONS.index("own") + 1] for key in b.keys}  # the others are of a simulation
 
     def __init__(self, table: Sequence[Command], file: int | None = None) -> None:
         """``file``: its descriptor (None: standard input); a terminal gives its keys at once until ``close``."""

@@ -108,10 +108,8 @@ class Log:
 
     def _begin(self) -> None:
         self._count, self._events = 0, []
-        self._rows = {name: np.empty((CHUNK, size), np.float64 if name == "time" else np.float32) for name, size in self._sizes().items()}
-
-    def _sizes(self) -> dict[str, int]:
-        return _columns(self.contract)
+        sizes = _columns(self.contract).items()
+        self._rows = {name: np.empty((CHUNK, size), np.float64 if name == "time" else np.float32) for name, size in sizes}
 
     def backlog(self) -> int:
         """Blocks that wait to be written."""

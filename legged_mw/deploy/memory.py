@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from legged_mw.deploy.reader import Reader
+
 MEMORY = "memory"  # the contract's section, inside of `network`
 
 
@@ -25,7 +27,7 @@ class Memory(NamedTuple):
         return {**self._asdict(), "shape": list(self.shape)}
 
 
-def read_memory(section: Any) -> Memory:
+def read_memory(section: Reader) -> Memory:
     """From the contract's reader of the section."""
     wanted = "two whole numbers from 1: states and the size of each"
     shape = section.take("shape", wanted, lambda v: isinstance(v, list) and len(v) == 2 and all(type(n) is int and n >= 1 for n in v))

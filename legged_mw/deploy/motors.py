@@ -47,11 +47,8 @@ class Motors(NamedTuple):
         return found
 
     def limp(self, batch: Any) -> None:
-        """Switch the motors of ``batch`` off: what is left is damping, if there is any."""
-        if self.law == "servo":
-            for name in ("actuator_gainprm", "actuator_biasprm"):
-                batch.expand(name)[:] = 0.0
-        elif self.law == "dc_motor":
+        """Switch the motors of ``batch``, which are no servos, off: what is left is damping, if there is any."""
+        if self.law == "dc_motor":
             batch.expand("actuator_gainprm")[:, :, _STIFFNESS] = 0.0
         else:
             batch.expand("actuator_gear")[:] = 0.0

@@ -27,6 +27,7 @@ from legged_mw.utils.errors import UserError, shown
 LAGS = 12  # [periods] in which a joint's answer to its target is looked for
 MOVES = 0.02  # [rad] a target whose deviation is less tells no latency
 SHORTEST = 50  # steps of the policy that can be compared
+AXES = ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")
 Rows = dict[str, Floats]  # name -> (T, values)
 
 
@@ -141,39 +142,39 @@ def figures(rows: Rows, contract: Contract) -> dict[str, Floats]:
     }
 
 
-def table(shown_: Replay) -> str:
+def table(replayed: Replay) -> str:
     """Robot beside simulation, a line a joint."""
-    contract, rows = shown_.contract, shown_.robot
-    robot, simulated = figures(rows, contract), figures(shown_.simulated, contract)
-    steps, made = len(rows["command"]), len(shown_.simulated["target"])
+    contract, rows = replayed.contract, replayed.robot
+    robot, simulated = figures(rows, contract), figures(replayed.simulated, contract)
+    steps, made = len(rows["command"]), len(replayed.simulated["target"])
     fell = "" if made == steps else f"; the simulated robot fell after {made * contract.period:.1f} s"
     lines = [
-        f"{shown_.recording.header['task']}, {shown_.recording.header['robot']}: {steps * contract.period:.1f} s of the policy{fell}",
+        f"{replayed.recording.header['task']}, {replayed.recording.header['robot']}: {steps * contract.period:.1f} s of the policy{fell}",
         f"{'robot / simulated':<28}{'torque [N m]':>18}{'error [rad]':>18}{'latency [ms]':>18}",
     ]
     for i, name in enumerate(contract.joints):
         pairs = "".join(f"{robot[key][i]:>10.{n}f}{simulated[key][i]:>8.{n}f}" for key, n in (("torque", 2), ("error", 3), ("latency", 0)))
         lines.append(f"{name:<28}{pairs}")
-    for i, axis in enumerate(("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")):
+    for i, axis in enumerate(AXES):
         measured = f"{robot['velocity'][i]:.3f}" if i == 2 or rows["lin_vel"].any() else "-"
         lines.append(f"{axis + ', mean':<28}{measured:>10}{simulated['velocity'][i]:>8.3f}")
     age = rows["age"][np.isfinite(rows["age"])]
     for name, values in (("age of a measurement", age), ("work of a step", rows["work"]), ("step began late by", rows["behind"])):
         if len(values):
             lines.append(f"{name:<28}{Spread.of(values)}")
-    return "\n".join([*lines, *(f"{now:8.2f} s  {text}" for now, text in shown_.recording.events)])
+    return "\n".join([*lines, *(f"{now:8.2f} s  {text}" for now, text in replayed.recording.events)])
 
 
 # ---- the picture
 
 
-def draw(shown_: Replay, path: Path) -> None:
+def draw(replayed: Replay, path: Path) -> None:
     """Write the picture. Raises UserError where matplotlib is missing."""
     try:
         from matplotlib.figure import Figure
     except ImportError:
         raise UserError("drawing a log needs matplotlib: pip install matplotlib") from None
-    contract, rows, simulated = shown_.contract, shown_.robot, shown_.simulated
+    contract, rows, simulated = replayed.contract, replayed.robot, replayed.simulated
     figure = Figure((13, 11), layout="constrained")
     grid = figure.add_gridspec(4, 3)
     time, made = rows["time"][:, 0], len(simulated["target"])
@@ -207,7 +208,7 @@ def draw(shown_: Replay, path: Path) -> None:
 def _velocities(many: list[Any], contract: Contract, rows: Rows, simulated: Rows, time: Floats) -> None:
     """vx, vy, yaw rate: commanded, the robot's, the simulated one's."""
     names, made = [each.name for each in contract.commands], len(simulated["target"])
-    for i, (axes, title) in enumerate(zip(many, ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]"), strict=True)):
+    for i, (axes, title) in enumerate(zip(many, AXES, strict=True)):
         axes.set_title(title)
         if VELOCITY[i] in names:
             axes.plot(time, rows["command"][:, names.index(VELOCITY[i])], color="0.6", label="command")

@@ -40,6 +40,11 @@ class Measurement:
     foot_contact: Floats  # (F,) 1 where a foot touches the ground, else 0
     others: Mapping[str, Floats] = field(default_factory=dict)  # rows with sensors of their own, a height scan: row -> (size,)
 
+    def of(self, robot: int) -> Measurement:
+        """That of one robot of many."""
+        own = {name: getattr(self, name)[robot] for name in QUANTITIES}
+        return Measurement(**own, others={name: values[robot] for name, values in self.others.items()})
+
 
 @dataclass(frozen=True)
 class Remote:

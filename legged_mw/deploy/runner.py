@@ -104,7 +104,6 @@ class _Step:
         self.summary = Summary()
         if states and (type(robot).damp is Robot.damp or type(robot).limp is Robot.limp):
             raise RobotError(f"{type(robot).__name__} has no damp() and limp() of its own, which the states need")
-
         if states and controller.contract.action.origin == TORQUE:
             raise RobotError("a policy of torques cannot stand a robot up: its states need servos; run it without them")
 
@@ -114,9 +113,10 @@ class _Step:
         if self.summary.fell is not None:
             return measured
         self.summary.steps += 1
-        if trip or measured is None:
+        if trip:
             order = self._trip(trip, loop.now)
         else:
+            assert measured  # else there is a trip
             order = self._decide(measured, loop.now)
             if order.targets is not None:
                 trip = self.safety.asked(measured, order.targets, order.stiffness, order.damping)
@@ -156,17 +156,15 @@ class _Step:
             self.safety.reset()
         return order
 
-    def _trip(self, trip: Trip | None, now: float) -> Order:
+    def _trip(self, trip: Trip, now: float) -> Order:
         """Damping, or the end of the run."""
         if self.states is None:
-            assert trip
             raise Tripped(trip)
-        if trip and self.states.state != DAMPING:
+        if self.states.state != DAMPING:
             self.summary.trips.append(trip)
             if self.log:
                 self.log.event(now, f"{trip.limit}: {trip.text}")
-            return self.states.trip(trip, now)
-        return Order(self.states.state)
+        return self.states.trip(trip, now)
 
     def _do(self, order: Order) -> None:
         if order.targets is None:

@@ -1,6 +1,6 @@
 """The limits between any policy and any robot: each step is checked, and what is beyond a limit is named in one line.
 
-A trip is a sentence; who calls `Safety` damps the robot. Nothing here moves a joint, reads a clock or knows a kind of robot.
+A trip is a sentence; the caller of `Safety` damps the robot. Nothing here moves a joint, reads a clock or knows a kind of robot.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -74,7 +74,7 @@ class Limits:
     def of(folder: Path, contract: Contract, *more: Mapping[str, Any]) -> Limits:
         """Those of the export in ``folder``: the machine's from its scene, then the contract's section ``safety``, then ``more``."""
         falls = OFF if contract.ends.max_tilt is None else contract.ends.max_tilt
-        limits = replace(_machine(folder, contract), tilt=falls if falls > 90.0 else min(Limits.tilt, falls))
+        limits = replace(_of_scene(folder, contract), tilt=falls if falls > 90.0 else min(Limits.tilt, falls))
         limits = limits.but(contract.safety or {}, f"{CONTRACT_FILE}: safety")
         for values in more:
             limits = limits.but(values, "--limit")
@@ -85,7 +85,7 @@ class Limits:
         return replace(self, **{name: _value(name, value, where) for name, value in values.items()})
 
 
-NAMES = tuple(f.name for f in fields(Limits) if f.name not in ("low", "high", "motor", "lowest", "highest"))
+NAMES = tuple(f.name for f in fields(Limits) if f.default is not MISSING)
 
 
 def parse_limits(texts: Sequence[str]) -> dict[str, str]:
@@ -110,7 +110,7 @@ def _value(name: str, value: Any, where: str) -> float:
     return number
 
 
-def _machine(folder: Path, contract: Contract) -> Limits:
+def _of_scene(folder: Path, contract: Contract) -> Limits:
     """Ranges and torques of the export's scene; what it does not limit is without limit."""
     import mujoco
 
@@ -135,7 +135,7 @@ class Safety:
         """As if nothing had been measured, asked or missed."""
         self._last: Floats | None = None  # targets (D,) of the step before
         self._seen, self._same = b"", 0
-        self._late: deque[float] = deque(maxlen=64)  # [s] of steps that began late
+        self._late: deque[float] = deque()  # [s] of steps that began late, within the last second
         self._remote: float | None = None  # [s] when the remote was last there
 
     def sensed(self, measured: Measurement, health: Health, now: float, behind: float = 0.0) -> Trip | None:
@@ -159,7 +159,8 @@ class Safety:
         limits, contract = self.limits, self.contract
         strong = "is asked for {value:.1f} N m, more than {most:.1f}"
         if not (finite := np.isfinite(targets)).all():
-            return Trip("finite", f"the target of {self._name(finite)} is not finite: {targets[_first(~finite)]}")
+            joint = _first(~finite)
+            return Trip("finite", f"the target of {contract.joints[joint]} is not finite: {targets[joint]}")
         if contract.action.origin == TORQUE and stiffness is None:
             return self._most("torque", strong, np.abs(targets), limits.torque * limits.motor)
         stiffness = contract.stiffness if stiffness is None else stiffness
@@ -197,7 +198,9 @@ class Safety:
     def _on_time(self, now: float, behind: float) -> Trip | None:
         if behind > LATE * self.contract.period:
             self._late.append(now)
-        if (count := sum(now - then < 1.0 for then in self._late)) >= self.limits.late:
+        while self._late and now - self._late[0] >= 1.0:
+            self._late.popleft()
+        if (count := len(self._late)) >= self.limits.late:
             what = f"the last by {1e3 * behind:.0f} ms" if behind else "by more than half a period"
             return Trip("late", f"{count} steps within a second began late, {what}")
         return None
@@ -233,26 +236,23 @@ class Safety:
 
     # ---- the same for all joints
 
-    def _name(self, fine: Any) -> str:
-        return self.contract.joints[_first(~fine)]
-
     def _most(self, limit: str, words: str, values: Floats, most: float | Floats) -> Trip | None:
         most = np.broadcast_to(most, values.shape)
         if (fine := values <= most).all():
             return None
-        worst = _first(~fine)
-        return Trip(limit, f"{self._name(fine)} {words.format(value=values[worst], most=most[worst])}")
+        joint = _first(~fine)
+        return Trip(limit, f"{self.contract.joints[joint]} {words.format(value=values[joint], most=most[joint])}")
 
     def _range(self, limit: str, words: str, values: Floats, margin: float) -> Trip | None:
         low, high = self.limits.low, self.limits.high
         if (fine := (values >= low - margin) & (values <= high + margin)).all():
             return None
         joint = _first(~fine)
-        beyond, ends = max(low[joint] - values[joint], values[joint] - high[joint]), f"{low[joint]:.2f} to {high[joint]:.2f}"
-        return Trip(
-            limit, f"{self._name(fine)} {words} {values[joint]:.2f} rad, {beyond:.2f} beyond its range {ends}; {margin:.2f} is the most"
-        )
+        name, ends = self.contract.joints[joint], f"{low[joint]:.2f} to {high[joint]:.2f}"
+        beyond = max(low[joint] - values[joint], values[joint] - high[joint])
+        return Trip(limit, f"{name} {words} {values[joint]:.2f} rad, {beyond:.2f} beyond its range {ends}; {margin:.2f} is the most")
 
 
 def _first(wrong: Any) -> int:
+    """The first joint that is wrong."""
     return int(np.argmax(wrong))

@@ -54,7 +54,7 @@ class Fleet:
         self._where, self._contacts = scene.sensordata, scene.contacts
         self.broken: NDArray[np.bool_] = np.zeros(count, dtype=bool)  # robots that MuJoCo could not step since their reset
         self._network = make_network(folder, contract.motors, count, len(contract.joints))
-        self._joints = [(int(joint.qposadr[0]), int(joint.dofadr[0])) for joint in map(self.model.joint, contract.joints)]
+        self._angles = [int(self.model.joint(name).qposadr[0]) for name in contract.joints]  # of each joint in qpos
         self.reset()
 
     def read(self) -> Measurement:
@@ -68,9 +68,8 @@ class Fleet:
         if not self._network:
             self._step(self.contract.decimation, _NOW)
             return
-        angles, speeds = zip(*self._joints, strict=True)
         for left in reversed(range(self.contract.decimation)):
-            self._ctrl[:, self._actuators] = self._network.torque(targets - self.qpos[:, angles], self.qvel[:, speeds])
+            self._ctrl[:, self._actuators] = self._network.torque(targets - self.qpos[:, self._angles], self.qvel[:, self._dofs])
             self._step(1, 0 if left else _NOW)
 
     def _step(self, count: int, stage: int) -> None:
@@ -167,8 +166,7 @@ class MujocoRobot(Robot):
         self._start, self.can_change_gains = self.fleet.qpos[0, :7].copy(), contract.motors.law == "servo"
 
     def read(self) -> Measurement:
-        many = self.fleet.read()
-        return Measurement(**{n: getattr(many, n)[0] for n in QUANTITIES}, others={n: v[0] for n, v in many.others.items()})
+        return self.fleet.read().of(0)
 
     def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
         contract, self.hoisted = self.fleet.contract, self.hoisted and stiffness is not None

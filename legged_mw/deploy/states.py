@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from legged_mw.deploy.inputs import END, START, WALK, Source, Wish
+from legged_mw.deploy.inputs import END, START, WALK, Source
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement
 from legged_mw.deploy.safety import Trip
@@ -49,7 +49,7 @@ class States:
         self.note = f"{START}: stand"
         self._from: Floats = controller.contract.default_pose  # (D,) [rad] where standing up began
         self._stiffer = 1.0
-        self._wish = Wish()
+        self._pressed = frozenset[str]()
 
     @property
     def armed(self) -> bool:
@@ -60,12 +60,14 @@ class States:
         """Ask everyone who may drive; an emergency stop comes back."""
         wishes = [source.poll(health) for source in self.sources]
         driving = next((i for i, wish in enumerate(wishes) if wish.command is not None), None)
-        command = self._own(now - self.since if self.state == POLICY else 0.0) if driving is None else wishes[driving].command
-        for i, source in enumerate(self.sources):
-            if driving is not None and i > driving:
+        if driving is None:
+            command = self._own(now - self.since if self.state == POLICY else 0.0)
+        else:
+            command = wishes[driving].command
+            for source in self.sources[driving + 1 :]:
                 source.let_go()
         self.command = self.controller.contract.held(np.asarray(command, dtype=float))
-        self._wish = Wish(frozenset().union(*(wish.pressed for wish in wishes)))
+        self._pressed = frozenset().union(*(wish.pressed for wish in wishes))
         stop = next((wish.stop for wish in wishes if wish.stop), "")
         return Trip("stop", stop) if stop and self.state != DAMPING else None
 
@@ -92,7 +94,7 @@ class States:
     # ---- the changes
 
     def _move_on(self, measured: Measurement, now: float) -> None:
-        pressed = self._wish.pressed
+        pressed = self._pressed
         if END in pressed:
             if self.state != DAMPING:
                 self._enter(DAMPING, now, f"{END} was pressed")
