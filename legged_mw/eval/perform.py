@@ -18,7 +18,7 @@ from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.eval import exam, skill_page
 from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
-from legged_mw.eval.skill import Ground, Recording, Robot, Skill
+from legged_mw.eval.skill import Ground, Recording, Robot, Skill, Starts
 from legged_mw.eval.skills import make_skill
 from legged_mw.rl.recurrent import forget
 from legged_mw.utils.task import LoadedTask, load_task
@@ -82,10 +82,10 @@ def machine(env: RobotTask) -> Robot:
     return Robot(env.robot.physics, np.array([*env.start_place, 1.0, 0.0, 0.0, 0.0, *env.robot.pose]), env.dt)
 
 
-def perform(env: RobotTask, policy: Policy, skill: Skill) -> Recording:
-    """Put the robots of all worlds into their starts and let ``policy`` act."""
+def perform(env: RobotTask, policy: Policy, skill: Skill, starts: Starts | None = None) -> Recording:
+    """Put the robots of all worlds into their starts, or into ``starts`` where they are known, and let ``policy`` act."""
     env.reset()
-    if starts := skill.starts(machine(env), env.num_envs):
+    if starts := starts or skill.starts(machine(env), env.num_envs):
         for state, values in zip((env.sim.qpos, env.sim.qvel), starts, strict=True):
             state.copy_(torch.as_tensor(values, dtype=torch.float))
         env._refresh_base()
@@ -123,16 +123,17 @@ class InTraining:
         self.skill, self._generators = skill_of(copied.cfg, copied.exam), [device] if device.startswith("cuda") else []
         with torch.random.fork_rng(self._generators):
             self.env = copied.env_class(copied.cfg, device, eager=eager)
+        self._starts = self.skill.starts(machine(self.env), self.env.num_envs)
 
     def __call__(self, policy: Policy) -> dict[str, float]:
         """The figures of ``first_part``."""
         with torch.random.fork_rng(self._generators):
-            return first_part(self.env, policy, self.skill)
+            return first_part(self.env, policy, self.skill, self._starts)
 
 
-def first_part(env: RobotTask, policy: Policy, skill: Skill) -> dict[str, float]:
+def first_part(env: RobotTask, policy: Policy, skill: Skill, starts: Starts | None = None) -> dict[str, float]:
     """The figures of the part that a prepared task is, by name; those that there is nothing to measure of are left out."""
-    found = skill.judge(machine(env), perform(env, policy, skill))
+    found = skill.judge(machine(env), perform(env, policy, skill, starts))
     return {measure.key: float(value) for measure in skill.measures if (value := found[measure.key]) is not None}
 
 

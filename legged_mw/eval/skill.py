@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from legged_mw.eval.rules import Figure
 
 Floats = NDArray[np.float64]
+Starts = tuple[Floats, Floats]  # qpos (N, nq), qvel (N, nv)
 
 
 class Ground(NamedTuple):
@@ -74,7 +75,7 @@ class Skill(ABC):
         """How long robots are watched [s]."""
 
     @abstractmethod
-    def starts(self, robot: Robot, count: int) -> tuple[Floats, Floats] | None:
+    def starts(self, robot: Robot, count: int) -> Starts | None:
         """qpos (count, nq) and qvel (count, nv) to begin with, the same at every call; None: where the task's episodes begin."""
 
     @abstractmethod
