@@ -18,6 +18,7 @@ class G1GetupCfg(GetupCfg):
 
     class falls(GetupCfg.falls):
         seconds = 1.5  # [s] [ours: it falls from higher]
+        pull = 0.6  # of its weight [H]
 
     class init_state(GetupCfg.init_state):
         default_joint_angles = G1FlatCfg.init_state.default_joint_angles

@@ -1,6 +1,6 @@
 """Get up: from any fall to standing in the default pose, and staying there. The class, its config and its learner's.
 
-Sources: [P] MuJoCo Playground's Go1 getup (commit d5e6b47); [H] HoST (OpenRobotLab); [ours] with the reason.
+Sources: [P] MuJoCo Playground's Go1 getup (commit d5e6b47); [H] HoST (OpenRobotLab), a G1; [ours] with the reason.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from legged_mw.envs.observations import Row
+from legged_mw.envs.pull import Pull
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
 from legged_mw.sim.settle import fallen
@@ -17,8 +18,7 @@ from legged_mw.utils.math import assign
 
 class GetupCfg(RobotTaskCfg):
     class env(RobotTaskCfg.env):
-        num_envs = 8192
-        episode_length_s = 6.0  # [s] [P]
+        num_envs, episode_length_s = 8192, 6.0  # [-], [s] [P]
 
     class asset(RobotTaskCfg.asset):
         self_collisions = True  # and all colliders touch the ground [P]
@@ -28,6 +28,8 @@ class GetupCfg(RobotTaskCfg):
         states: int = 2048  # settled falls to begin from; at most eight a world are made [ours]
         seconds: float = 1.0  # from the drop to the state [P 0.5; ours: a roll takes longer]
         seed: int = 1  # the same seed makes the same falls; the exam has its own
+        pull: float = 0.0  # share of the weight that lifts the root of a robot that is not up; it fades as they learn [H 0.6]
+        pull_fades: float = 0.2  # of it, when every world has ended an episode up [ours]
 
     class control(RobotTaskCfg.control):
         action_origin = "joints"  # [P, H]
@@ -38,10 +40,9 @@ class GetupCfg(RobotTaskCfg):
     class termination(RobotTaskCfg.termination):
         max_tilt = 180.0  # [deg]: no attitude ends an episode [P, H]
 
-    class domain_rand(RobotTaskCfg.domain_rand):  # as SimToRealCfg, but for a wider friction and load
+    class domain_rand(RobotTaskCfg.domain_rand):
         enable, observe = True, True
-        base_mass, base_com = [-1.0, 3.0], [-0.03, 0.03]  # [kg], [m] [H mass -2 to 5]
-        friction = [0.3, 1.2]  # [H 0.1 to 1]
+        base_mass, base_com, friction = [-1.0, 3.0], [-0.03, 0.03], [0.3, 1.2]  # [kg] [H -2 to 5], [m], [-] [H 0.1 to 1]
         stiffness, damping, strength = [0.9, 1.1], [0.9, 1.1], [0.9, 1.1]  # [H 0.85 to 1.15]
         encoder_offset = [-0.015, 0.015]  # [rad]
 
@@ -56,29 +57,22 @@ class GetupCfg(RobotTaskCfg):
 
         class scales(RobotTaskCfg.rewards.scales):  # [P], with our terms of the same meaning
             upright, height, posture, stand_still = 1.0, 1.0, 1.0, 1.0
-            action_rate, action_smoothness, torques, dof_acc = -0.001, -0.001, -1e-5, -2.5e-7
-            dof_pos_limits = -0.1
+            action_rate, action_smoothness, torques, dof_acc, dof_pos_limits = -0.001, -0.001, -1e-5, -2.5e-7, -0.1
             fast_joints = -0.005  # [ours, P -0.1: actions of the first iterations would cost 20 times what standing gives]
 
 
 class GetupCfgPPO(RobotTaskCfgPPO):
     class runner(RobotTaskCfgPPO.runner):
-        num_steps_per_env = 20  # [P]
-        max_iterations = 1000
-
-    class actor(RobotTaskCfgPPO.actor):
-        class distribution_cfg(RobotTaskCfgPPO.actor.distribution_cfg):
-            init_std = 0.6
+        num_steps_per_env, max_iterations = 20, 1000  # [P], [ours]
 
     class algorithm(RobotTaskCfgPPO.algorithm):
-        gamma = 0.97  # [P]
-        num_mini_batches = 8
+        gamma, num_mini_batches = 0.97, 8  # [P], [ours]
 
     class anneal(RobotTaskCfgPPO.anneal):
-        entropy_coef, desired_kl = 0.001, 0.003
+        entropy_coef, desired_kl = 0.001, 0.003  # [ours]
 
     class symmetry(RobotTaskCfgPPO.symmetry):
-        use_data_augmentation = True
+        use_data_augmentation = True  # [ours]
 
 
 class Getup(RobotTask):
@@ -88,9 +82,26 @@ class Getup(RobotTask):
     def _init_buffers(self) -> None:
         super()._init_buffers()
         falls = self.cfg.falls
-        made = fallen(self.robot.physics, min(falls.states, 8 * self.num_envs), falls.seed, falls.seconds)
-        self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in made)  # (P, nq), (P, nv)
-        self.standing_height = 0.99 * self.start_place[2]  # [m] of the root that counts as up [P: 0.275 of 0.278]
+        states = fallen(self.robot.physics, min(falls.states, 8 * self.num_envs), falls.seed, falls.seconds)
+        self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in states)  # (P, nq), (P, nv)
+        self.up_height = 0.99 * self.start_place[2]  # [m] of the root, standing [P: 0.275 of 0.278]
+        self.pull = Pull(self.sim, self.root_body, falls.pull * 9.81 * self.total_mass, falls.pull_fades)
+
+    def _apply_actions(self) -> None:
+        super()._apply_actions()
+        if self.cfg.falls.pull:
+            self.pull.apply(self._is_up())
+
+    def _update_curricula(self, mask: Tensor) -> None:
+        super()._update_curricula(mask)
+        self.pull.update(mask & (self.episode_steps[:, 0] > 0.0), self._is_up())
+
+    def training_state(self) -> dict[str, Tensor]:
+        return {**super().training_state(), "pull_level": self.pull.level.clone()}
+
+    def load_training_state(self, state: dict[str, Tensor]) -> None:
+        super().load_training_state(state)
+        self.pull.level.copy_(state.get("pull_level", self.pull.level))
 
     def _reset_robots(self, mask: Tensor) -> None:
         """Standing as any task begins, or, by chance, in one of the settled falls."""
@@ -104,27 +115,23 @@ class Getup(RobotTask):
     def _body_rows(self) -> list[Row]:
         return [*super()._body_rows(), Row("base_height", self.base_height[:, None], mirror="scalar")]  # [m] [P]
 
-    # ---- rewards
-
-    def _off_upright(self) -> Tensor:
-        """Squared distance of gravity's direction from straight down in the body, 0 to 4 [P]."""
-        return self.projected_gravity[:, :2].square().sum(dim=1) + (self.projected_gravity[:, 2] + 1.0).square()
+    def _is_upright(self) -> Tensor:
+        return self._reward_upright() > 0.98  # exp(-2 x 0.01), 5.7 degrees [P]
 
     def _is_up(self) -> Tensor:
-        """Upright and high. [P]"""
-        return (self._off_upright() < 0.01) & (self.base_height > 0.98 * self.standing_height)
+        return self._is_upright() & (self.base_height > 0.98 * self.up_height)  # [P]
 
     def _reward_upright(self) -> Tensor:
-        return torch.exp(-2.0 * self._off_upright())
+        """Gravity's direction is straight down in the body. [P]"""
+        return torch.exp(-2.0 * (2.0 + 2.0 * self.projected_gravity[:, 2]))  # |g + z|^2 of unit vectors
 
     def _reward_height(self) -> Tensor:
         """Height of the root up to standing [m], exponential. [P]"""
-        return torch.exp(self.base_height.clamp(max=self.standing_height)) - 1.0
+        return torch.exp(self.base_height.clamp(max=self.up_height)) - 1.0
 
     def _reward_posture(self) -> Tensor:
         """The default pose, once it is upright. [P]"""
-        near = torch.exp(-0.5 * (self.dof_offset.square() * self.pose_weights).sum(dim=1))
-        return torch.where(self._off_upright() < 0.01, near, 0.0)
+        return torch.where(self._is_upright(), self._reward_pose().sqrt(), 0.0)  # exp(-0.5 x ...)
 
     def _reward_stand_still(self) -> Tensor:
         """Joints at rest, once it is up. [P: small actions; ours: an action is a torque here, and standing takes some]"""
