@@ -55,7 +55,7 @@ class Handstand(Skill):
         up = upright & (recording.qpos[..., 2] > HIGH * self.height) & ~touching & alive  # (T, N)
         hold = round(HOLD / robot.dt)
         held = np.lib.stride_tricks.sliding_window_view(up, hold, axis=0).all(axis=2)  # (T - hold + 1, N)
-        holds, begin, each = held.any(axis=0), held.argmax(axis=0), np.arange(held.shape[1])
+        holds, begin, each = held.any(axis=0), held.argmax(axis=0), np.arange(len(holds))
         drift = np.linalg.norm(hands[begin + hold - 1, each] - hands[begin, each], axis=1)
         power = np.abs(recording.torque * recording.qvel[..., 6:]).sum(axis=2)  # (T, N)
         return {
