@@ -1,7 +1,7 @@
 """What tasks for real robots share: no measured velocity, randomized worlds, kicks and pushes, and a learner that suits.
 
 Config classes only: a robot's own names and numbers are in configs/. Sources: [I] Isaac Lab's G1 task, [M] mjlab's velocity
-task, [G] MuJoCo Playground's G1 joystick task, [U] unitree_rl_gym's G1; [ours] is measured: docs/lab.md.
+task, [G] MuJoCo Playground's G1 joystick task, [P] its Go1 tasks, [U] unitree_rl_gym's G1; [ours] is measured: docs/lab.md.
 """
 
 from __future__ import annotations
@@ -71,6 +71,42 @@ class SimToRealCfgPPO(LeggedRobotCfgPPO):
         use_data_augmentation = True  # [ours]
 
 
+class SimToRealRoughCfg(SimToRealCfg):
+    """Such a robot, of a Go2's size, on rough ground that it does not see: the first parent of a task whose second is the flat one.
+
+    [L] legged_gym; [ours] docs/terrain.md.
+    """
+
+    class commands(SimToRealCfg.commands):
+        curriculum = False  # [ours: the ground's is enough]
+
+    class terrain(SimToRealCfg.terrain):
+        mesh_type = "heightfield"
+        height_scan = ["privileged_state"]  # the critic sees the ground, the robot does not
+        terrain_proportions = {  # [ours: stairs up are learned last]
+            "flat": 0.05,
+            "smooth_slope": 0.1,
+            "rough_slope": 0.1,
+            "stairs_up": 0.35,
+            "stairs_down": 0.15,
+            "obstacles": 0.15,
+            "waves": 0.05,
+            "low_random": 0.05,
+        }
+
+    class termination(SimToRealCfg.termination):
+        min_base_height = 0.12  # [m] [ours: the feet alone touch the ground, so that a trunk would sink into a step unpunished]
+
+    class rewards(SimToRealCfg.rewards):
+        tracking_sigma = 0.25  # [P]
+        swing_height = 0.15  # [m] [ours: over a step of 12 cm; P 0.1]
+
+        class scales(SimToRealCfg.rewards.scales):
+            orientation = -1.0  # [P -5] [ours: on a slope the trunk tilts with the ground]
+            lin_vel_z = -0.2  # [P -0.5] [ours: stairs go up]
+            feet_clearance = -1.0  # [P -2.0] [ours]
+
+
 class SimToRealRoughCfgPPO(SimToRealCfgPPO):
     """Its learner on rough ground: longer pieces of walks, and a longer sight."""
 
@@ -124,6 +160,18 @@ class BipedCfgPPO(SimToRealCfgPPO):
 
     class algorithm(SimToRealCfgPPO.algorithm):
         desired_kl = 0.02  # [ours: of 29 joints together; at 0.01 the rate falls to 1e-5]
+
+
+class BipedRoughCfg(BipedCfg):
+    """Such a robot, of a G1's size, on rough ground that it does not see."""
+
+    class terrain(BipedCfg.terrain):
+        mesh_type = "heightfield"
+        height_scan = ["privileged_state"]  # the critic sees the ground, the robot does not
+        difficulty = [0.0, 0.6]  # [ours: stairs up to 14 cm]
+
+    class rewards(BipedCfg.rewards):
+        swing_height = 0.12  # [m]
 
 
 class BipedRoughCfgPPO(BipedCfgPPO):
