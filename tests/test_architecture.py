@@ -291,6 +291,12 @@ def test_files_and_functions_stay_readable(path: str) -> None:
     assert ast.get_docstring(ast.parse(source)), "a module docstring says what lives here"
 
 
+@pytest.mark.parametrize("task", ["go2_flat", "g1_flat", "g1_12dof_flat", "go2_rough", "go2_rough_scan", "g1_rough"])
+def test_a_robot_is_a_short_config(task: str) -> None:
+    """40 lines for its first task, 20 for a further one; go1_flat and go1_rough spell out each number."""
+    assert len((ROOT / f"configs/{task}.py").read_text().splitlines()) <= (40 if task in ("go2_flat", "g1_flat") else 20)
+
+
 def test_what_is_too_long_is_found() -> None:
     body = "".join(f"    x = {i}\n" for i in range(MAX_FUNCTION - 1))
     assert too_long("\n" * MAX_LINES) == [] and too_long("\n" * (MAX_LINES + 1)) == ["401 lines"]
