@@ -36,7 +36,6 @@ class Handstand(Skill):
         Measure("drift", "drift of the hands in 5 s, mean [m]", 3),
         Measure("power", "power while up, mean [W]", 0),
     )
-    overrides: ClassVar = {"termination.max_tilt": 180.0}  # what is a fall is judged here
 
     @property
     def seconds(self) -> float:
@@ -54,8 +53,9 @@ class Handstand(Skill):
         alive = np.arange(len(touching))[:, None] <= recording.ended_at
         up = upright & (recording.qpos[..., 2] > HIGH * self.height) & ~touching & alive  # (T, N)
         hold = round(HOLD / robot.dt)
-        held = np.lib.stride_tricks.sliding_window_view(up, hold, axis=0).all(axis=2)  # (T - hold + 1, N)
-        holds, begin, each = held.any(axis=0), held.argmax(axis=0), np.arange(len(holds))
+        held = np.asarray(np.lib.stride_tricks.sliding_window_view(up, hold, axis=0).all(axis=2))  # (T - hold + 1, N)
+        holds, begin = held.any(axis=0), held.argmax(axis=0)
+        each = np.arange(len(recording.ended_at))
         drift = np.linalg.norm(hands[begin + hold - 1, each] - hands[begin, each], axis=1)
         power = np.abs(recording.torque * recording.qvel[..., 6:]).sum(axis=2)  # (T, N)
         return {
