@@ -11,6 +11,8 @@ from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
 
 
 class HandstandCfg(RobotTaskCfg):
@@ -67,6 +69,12 @@ class HandstandCfgPPO(RobotTaskCfgPPO):
 class Handstand(RobotTask):
     cfg: HandstandCfg
     exam = "handstand"
+
+    def _init_buffers(self) -> None:
+        super()._init_buffers()
+        geoms = [self.robot.physics.geom(i).name for i in range(self.robot.physics.ngeom)]
+        if wrong := [name for name in self.cfg.exam.hands if name not in geoms]:
+            raise ConfigError(f"exam.hands: {unknown('geom', wrong[0], geoms, self.cfg.asset.file)}")
 
     def _reward_stand_height(self) -> Tensor:
         """Height of the root up to ``exam.height`` [m], exponential. [P]"""

@@ -34,7 +34,7 @@ class Getup(Skill):
         Measure("energy", "energy until it stands, mean [J]", 0),
         Measure("at_limit", "share of torques at the limit", 3),
     )
-    overrides = {"termination.max_tilt": 180.0}
+    overrides: ClassVar = {"falls.pull": 0.0}
 
     @property
     def seconds(self) -> float:
