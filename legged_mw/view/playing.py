@@ -26,6 +26,7 @@ NOMINAL = {  # what playing changes in the trained config
     "domain_rand.enable": False,
     "commands.curriculum": False,
     "falls.pull": 0.0,
+    "falls.share": 1.0,  # of a task that gets up: a reset is another fall
 }
 ROWS, BORDER = 3, 2.0  # of the ground to watch: levels, from the easiest to the hardest, and [m]
 
