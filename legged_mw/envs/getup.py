@@ -25,7 +25,7 @@ class GetupCfg(RobotTaskCfg):
 
     class falls:
         share: float = 0.6  # of episodes that begin in a fall; the others stand [P]
-        states: int = 2048  # settled falls to begin from; at most eight a world are made [ours]
+        states: int = 2048  # settled falls to begin from; at most four a world are made [ours]
         seconds: float = 1.0  # from the drop to the state [P 0.5; ours: a roll takes longer]
         seed: int = 1  # the same seed makes the same falls; the exam has its own
         pull: float = 0.0  # share of the weight that lifts the root of a robot that is not up; it fades as they learn [H 0.6]
@@ -82,7 +82,7 @@ class Getup(RobotTask):
     def _init_buffers(self) -> None:
         super()._init_buffers()
         falls = self.cfg.falls
-        states = fallen(self.robot.physics, min(falls.states, 8 * self.num_envs), falls.seed, falls.seconds)
+        states = fallen(self.robot.physics, min(falls.states, 4 * self.num_envs), falls.seed, falls.seconds)
         self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in states)  # (P, nq), (P, nv)
         self.up_height = 0.99 * self.start_place[2]  # [m] of the root, standing [P: 0.275 of 0.278]
         self.pull = Pull(self.sim, self.root_body, falls.pull * 9.81 * self.total_mass, falls.pull_fades)
