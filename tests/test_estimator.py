@@ -435,7 +435,7 @@ def test_the_report_draws_it_and_compares_it_with_a_policy_that_has_none() -> No
     columns = [Column("one", {}, graded((0.03, 0.04))), Column("other", {}, graded(None))]
     results = [column.exam for column in columns]
     asked = ExamRules.from_mapping(results[0]["rules"])
-    table = page._exam_table(columns, [asked.figures(result, others=results) for result in results], "")
+    table = page.exam_table(columns, [asked.figures(result, others=results) for result in results], "")
     assert "estimate of vx, rms [m/s]</th>" in table and ">0.030</span>" in table and ">none</span>" in table
 
 

@@ -64,6 +64,7 @@ ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys(("asset.effort", "asset.joint_speed_limits"), LIMITS),
     "viewer.camera": or_empty(("three numbers, not straight above or below", lambda v: len(v) == 3 and (v[0] != 0 or v[1] != 0))),
     "termination.max_tilt": ("above 0 and at most 180 degrees", lambda v: 0 < v <= 180),
+    "terrain.slope": ("from -60 to 60 degrees", lambda v: -60 <= v <= 60),
     "terrain.condim": ("1, 3, 4 or 6", lambda v: v in (1, 3, 4, 6)),
 }
 WALKING: dict[str, Rule] = {

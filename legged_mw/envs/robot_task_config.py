@@ -153,6 +153,7 @@ class RobotTaskCfg(Config):
     class terrain:
         friction: float = 0.6  # sliding friction of the ground, which overrules the robot's [-] [P]
         condim: int = 3  # contact dimensions: 3 is sliding without torsion [P]
+        slope: float = 0.0  # [deg] of the plane, downhill along x: gravity leans, the plane and heights above it stay as they are
 
     class sim:
         engine: Literal["auto", "mujoco_warp", "mujoco"] = "auto"  # auto: mujoco_warp on a GPU, MuJoCo's own on a CPU
