@@ -265,5 +265,6 @@ def test_it_can_teach_a_student_that_is_distilled(run_folder: Path, tmp_path: Pa
     distil = ["--teacher", str(run_folder), "--max_iterations", "1"]
     result = run("train", tmp_path, *SMALL, *FLAGS[:4], *distil)
     assert result.code == 0, result.err
+    assert "symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it" in result.out
     line = refused(tmp_path, "train", *SMALL, *FLAGS, *distil)
     assert "actor.concurrent.groups: only the recorded update of GraphedPPO trains that" in line

@@ -137,6 +137,8 @@ def _note_others(task: LoadedTask, start: Start) -> None:
             file = shown(trained.source.checkpoint)
             task.update({section: {field: trained.task.name if trained.source.shipped else file}}, where="train")
             print(f"{'teacher' if trained is start.teacher else 'begins with the actor of'}: {file}")
+    if start.teacher and (task.train.symmetry.use_data_augmentation or task.train.symmetry.use_mirror_loss):
+        print("symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it again")
 
 
 def _announce(task: LoadedTask, device: str, rank: Rank) -> None:
