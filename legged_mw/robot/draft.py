@@ -168,7 +168,6 @@ def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
             "pose_weights": table(pose_weights(robot, found.pose, found.feet), robot.joint_names),
             "scales": {"contact_phase": 1.0, "no_fly": 0.5},
         },
-        "sim": {"iterations": 3},
     }
 
 
