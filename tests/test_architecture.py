@@ -59,6 +59,7 @@ NEVER_IN = {
     "legged_mw/sim/*": ["legged_mw.utils.config", "legged_mw.utils.task"],
     "legged_mw/eval/rules.py": ["torch", "mujoco"],  # numbers in, numbers out: of use to whoever drives the robot otherwise
     "legged_mw/eval/figures.py": ["torch", "mujoco"],
+    "legged_mw/eval/skill*.py": ["torch", "legged_mw.envs", "legged_mw.rl", "legged_mw.eval.perform"],
     "legged_mw/view/*": [
         "torch",
         "rsl_rl",
@@ -85,6 +86,8 @@ DEPLOY_MAY = [
         "legged_mw.deploy",
         "legged_mw.view",
         "legged_mw.eval.rules",
+        "legged_mw.eval.skill",
+        "legged_mw.eval.skills",
     ),
     *("legged_mw.utils.cli", "legged_mw.utils.config", "legged_mw.utils.errors", "legged_mw.utils.machine", "legged_mw.utils.commands"),
     "legged_mw.utils.motor_network",
