@@ -106,12 +106,15 @@ def duration(text: str) -> float:
 
 @contextmanager
 def one_line_errors(program: str = "") -> Iterator[None]:
-    """Turn mistakes of the user into one line and exit code 2; memory that runs out into advice."""
+    """Turn mistakes of the user into one line and exit code 2, memory that runs out into advice, Ctrl-C into a word and code 130."""
     program = program or Path(sys.argv[0]).name
     try:
         yield
     except UserError as error:
         fail(program, str(error))
+    except KeyboardInterrupt:
+        print(f"\n{program}: stopped", file=sys.stderr)
+        raise SystemExit(130) from None
     except RuntimeError as error:
         first: BaseException = error
         while first.__context__ is not None:
