@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from ctypes import ArgumentError
 from pathlib import Path
 
 import pytest
@@ -541,6 +542,9 @@ def test_memory_that_runs_out_gives_advice(text: str, capsys: pytest.CaptureFixt
 
 
 def test_ctrl_c_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit, match="130"), one_line_errors("play.py"):
-        raise KeyboardInterrupt
-    assert capsys.readouterr().err == "\nplay.py: stopped\n"
+    for error in (KeyboardInterrupt(), ArgumentError("argument 1: KeyboardInterrupt: ")):
+        with pytest.raises(SystemExit, match="130"), one_line_errors("play.py"):
+            raise error
+        assert capsys.readouterr().err == "\nplay.py: stopped\n"
+    with pytest.raises(ArgumentError), one_line_errors("play.py"):
+        raise ArgumentError("argument 1: TypeError: ")

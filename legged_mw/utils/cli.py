@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from ctypes import ArgumentError
 from pathlib import Path
 from typing import NoReturn
 
@@ -112,7 +113,9 @@ def one_line_errors(program: str = "") -> Iterator[None]:
         yield
     except UserError as error:
         fail(program, str(error))
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, ArgumentError) as error:  # ctypes wraps one that comes while it converts an argument
+        if "KeyboardInterrupt" not in repr(error):
+            raise
         print(f"\n{program}: stopped", file=sys.stderr)
         raise SystemExit(130) from None
     except RuntimeError as error:
