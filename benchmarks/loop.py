@@ -85,7 +85,7 @@ class TimedRobot(MujocoRobot):
 
     def __init__(self, folder: Path, contract: Contract, seconds: float) -> None:
         super().__init__(folder, contract, whole=True, hoisted=len(contract.feet) == 2)
-        self.took, self._step = np.zeros(round(seconds / contract.period) + 1), -1  # [s] of each step
+        self.took, self._step = np.full(round(seconds / contract.period) + 1, 0.0), -1  # [s] of each step
 
     def read(self) -> Measurement:
         began = time.perf_counter()
@@ -121,6 +121,11 @@ def resident() -> int:
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() // 1024
 
 
+def stolen() -> float:
+    """[s] that the machine under this one took of its cores since it started."""
+    return int(Path("/proc/stat").read_text().split()[8]) / os.sysconf("SC_CLK_TCK")
+
+
 def threads() -> int:
     """Of this process, as the system counts them."""
     return len(os.listdir("/proc/self/task"))
@@ -140,6 +145,7 @@ def measure(folder: Path, seconds: float, path: Path) -> str:
         if now % 1.0 < contract.period:
             memory[now >= MINUTE] = resident()
 
+    taken = stolen()
     gc.callbacks.append(count)
     try:
         done = run(robot, controller, lambda _: np.zeros(0), seconds, watch=watch, safety=safety, states=states, log=log)
@@ -148,14 +154,15 @@ def measure(folder: Path, seconds: float, path: Path) -> str:
     rows = read_log(path).rows
     own = rows["work"][1:, 0] - robot.took[: len(rows["work"]) - 1]  # a row has the work of the step before
     walked = float((rows["state"] == STATES.index(POLICY)).mean())
-    rate, load = 1.0 / contract.period, os.getloadavg()[0]
+    rate, load, taken = 1.0 / contract.period, os.getloadavg()[0], stolen() - taken
     return "\n".join(
         (
-            f"{contract.task} at {rate:g} Hz for {seconds:g} s, the policy {walked:.0%} of it; load {load:.1f}",
+            f"{contract.task} at {rate:g} Hz for {seconds:g} s, the policy {walked:.0%} of it",
             f"{done.timing}",
             f"work of a step without the simulation: {Spread.of(own)}",
             f"garbage was collected {count.between} times while the loop waited, {count.within} times within a step",
             f"memory: {memory[0]} kB after {min(seconds, MINUTE):g} s, {memory[1] or memory[0]} kB at the end",
+            f"load {load:.1f} on {os.cpu_count()} cores, of which the machine under this one took {taken:.2f} s",
             f"threads that the network started (onnxruntime {onnxruntime.__version__}): {started}; states: {'; '.join(said)}",
         )
     )

@@ -57,7 +57,8 @@ class _Samples:
     """The last KEPT values, their worst ever; memory is fixed."""
 
     def __init__(self) -> None:
-        self.values, self.count, self.worst = np.zeros(KEPT, dtype=np.float32), 0, 0.0
+        self.values = np.full(KEPT, 0.0, dtype=np.float32)  # in memory now: zeros() would be taken page by page
+        self.count, self.worst = 0, 0.0
 
     def add(self, value: float) -> None:
         self.values[self.count % KEPT] = value

@@ -225,6 +225,7 @@ def draw(replayed: Replay, path: Path) -> None:
         for shift, values, label in zip((-0.2, 0.2), both, ("robot", "simulated"), strict=True):
             axes.bar(where + shift, np.nan_to_num(values[key]), 0.4, label=label)
         axes.set_xticks(where, contract.joints, rotation=90, fontsize=5)
+        axes.legend(fontsize=6)
     joint = int(np.argmax(np.abs(both[0]["torque"] - both[1]["torque"])))
     for i, (key, unit) in enumerate((("joint_pos", "rad"), ("joint_torque", "N m"))):
         axes = figure.add_subplot(grid[2 + i, :2], title=f"{contract.joints[joint]} [{unit}]: the joint whose torque differs most")
