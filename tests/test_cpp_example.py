@@ -23,6 +23,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from legged_mw import ROOT
+from legged_mw.deploy.contract import FORMATS
 from legged_mw.utils.config import load_yaml, save_yaml
 
 FOLDER, POLICIES = ROOT / "examples/cpp", ROOT / "resources/policies"
@@ -115,7 +116,7 @@ def test_it_runs_the_network_itself(check: Check, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "error"),
     [
-        ("format: 2", "format: 4", "policy.yaml, line 1: format 4 is not one that this program reads (2 and 3)"),
+        ("format: 2", "format: 4", "policy.yaml, line 1: format 4 is not one that this program reads ({} and {})".format(*FORMATS)),
         ("period: 0.02\n", "", "'period' is missing"),
         ("period: 0.02", "period: fast", "policy.yaml, line 8: 'fast' is no number"),
         ("origin: default", "origin: pose", "no origin 'pose'; there are: default, joints, targets, torque"),
