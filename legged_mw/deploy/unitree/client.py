@@ -198,8 +198,8 @@ class UnitreeRobot(Robot):
 
 def check_rows(contract: Contract, machine: Machine) -> None:
     """Refuse a policy that observes what this robot does not measure, or does not command angles. Raises RobotError."""
-    if contract.action.origin == "torque":
-        raise RobotError(f"{CONTRACT_FILE}: the policy commands torques; a {machine.name} is driven by angles here")
+    if contract.action.origin in ("torque", "speed"):
+        raise RobotError(f"{CONTRACT_FILE}: the policy commands {contract.action.origin}s; a {machine.name} is driven by angles here")
     measured = {*_MEASURED, *COMPUTED, *(["foot_contact"] if machine.feet else [])}
     if wrong := [row for row in contract.rows if row.measured not in measured]:
         raise RobotError(
