@@ -110,8 +110,10 @@ def _infer_inertias(spec: mujoco.MjSpec) -> None:
     kinds = mujoco.mjtInertiaFromGeom
     if spec.compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_TRUE:
         spec.compiler.inertiafromgeom = kinds.mjINERTIAFROMGEOM_AUTO
-        for body in spec.bodies:
-            body.explicitinertial = False
+        fresh = mujoco.MjSpec().worldbody.add_body()
+        for body in spec.bodies[1:]:
+            for name in ("explicitinertial", "mass", "ipos", "iquat", "inertia", "fullinertia"):
+                setattr(body, name, getattr(fresh, name))
 
 
 def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
