@@ -17,6 +17,7 @@ import numpy as np
 from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.inputs import Gamepad, Keys, RobotRemote, Source, StopFile
 from legged_mw.deploy.log import Log, log_path
+from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement, Robot
 from legged_mw.deploy.runner import run
@@ -63,10 +64,18 @@ def hoisted(args: argparse.Namespace, contract: Contract) -> bool:
     return args.hoist == "yes" or (args.hoist is None and len(contract.feet) == 2)
 
 
-def drive(robot: Robot, folder: Path, contract: Contract, args: argparse.Namespace, fixed: Sequence[float] | None, kind: str) -> None:
+def drive(
+    robot: Robot,
+    folder: Path,
+    contract: Contract,
+    args: argparse.Namespace,
+    fixed: Sequence[float] | None,
+    kind: str,
+    contact: str | None = None,
+) -> None:
     """Drive ``robot`` until Ctrl-C or for ``args.time``.
 
-    ``fixed`` (C,) is followed while nobody drives; None: the defaults. ``kind`` of robot, for the log.
+    ``fixed`` (C,) is followed while nobody drives; None: the defaults. ``kind`` of robot, for the log. ``contact``: of Odometry, if any.
     """
     with ExitStack() as stack:
         stack.callback(robot.close)
@@ -80,7 +89,8 @@ def drive(robot: Robot, folder: Path, contract: Contract, args: argparse.Namespa
         console.say(f"{KEYS}\n{states.state}: {states.note}")
         stack.enter_context(_ended_by_signals())
         show, seconds = console.watch(states), args.time or math.inf
-        done = run(robot, controller, command, seconds, watch=show, safety=safety, states=states, log=log)
+        odometry = Odometry(folder, contract, 1, contact) if contact else None
+        done = run(robot, controller, command, seconds, watch=show, safety=safety, states=states, log=log, odometry=odometry)
         console.say(f"{done.timing}\nthe joints are damped{f'; logged to {shown(path)}' if path else ''}")
 
 
