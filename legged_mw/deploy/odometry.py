@@ -23,11 +23,11 @@ from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.simulated import read_scene
 
 ROW = "lin_vel"  # ContractRow.measured of the velocity
-# Ours, as those below: tried in the walking exam of go1_flat, go2_flat and g1_flat. Less DRIFT and DOUBT is more exact in a calm walk
-# (0.038 instead of 0.046 m/s), and slower to notice what no accelerometer feels: a shock between two measurements.
+# Ours, as those below: tried in the walking exam of go1_flat, with the noise of sensors and without. Less DRIFT and DOUBT is calmer, and
+# slower to notice what no accelerometer feels: a shock between two measurements.
 DRIFT = 4.0  # [m/s^2] noise of the accelerometer over a period
-STANDING = 0.1  # [m/s] noise of the velocity of a foot that stands
-DOUBT = {"measured": 0.5, "torque": 0.2, "height": 0.2}  # [m/s] from which a foot that moves counts half, by how sure its contact is
+STANDING = 0.2  # [m/s] noise of the velocity of a foot that stands
+DOUBT = {"measured": 0.5, "torque": 0.3, "height": 0.3}  # [m/s] from which a foot that moves counts half, by how sure its contact is
 CONTACTS = tuple(DOUBT)  # how a foot on the ground is found
 LOADED = 0.1  # [weights] of a foot's force from which it stands, by its joints' torques
 LEVEL = 0.01  # [m] above the lowest foot, within which others stand too, by their height

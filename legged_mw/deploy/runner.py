@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -40,7 +41,7 @@ def run(
     seconds: float = math.inf,
     *,
     live: bool = True,
-    watch: Callable[[float, Measurement], None] | None = None,
+    watch: Callable[[float, Any], None] | None = None,
     safety: Safety | None = None,
     states: States | None = None,
     log: Log | None = None,
@@ -49,7 +50,7 @@ def run(
     """Run for ``seconds``, or until the robot falls: read, decide, write, once a period; then close the robot, also after an error.
 
     ``command`` gives (C,), in the contract's order, at a time [s] since the start; it is held within the trained ranges.
-    ``live``: in real time, as a robot needs it; else as fast as the robot answers. ``watch`` gets each measurement.
+    ``live``: in real time, as a robot needs it; else as fast as the robot answers. ``watch`` gets each measurement, or None.
     ``safety``: other limits than the export's. A limit that is passed damps the robot and raises Tripped. ``odometry`` gives the velocity.
     ``states``: begin at zero torque and do what they say, with their own commands; a trip or a fall damps and the run goes on.
     """
@@ -68,8 +69,8 @@ def run(
                     break
                 if measured:
                     velocities.add(measured)
-                    if watch:
-                        watch(now, measured)
+                if watch and (measured or states):
+                    watch(now, measured)
         if log and live:
             log.event(loop.now, str(loop.timing()))
     return replace(one.summary, velocity=velocities.mean(one.summary.steps), late=loop.late, timing=loop.timing() if live else None)
