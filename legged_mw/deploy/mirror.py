@@ -36,7 +36,7 @@ from legged_mw.view.stage import ViewError
 
 RATE = 25.0  # [Hz] of pictures
 START = 30.0  # [s] for a viewer to open
-ACTIONS = {"reset": "Damp", "camera": "camera: follow, behind, all around"}  # all that can be done, in words
+ACTIONS = {"reset": "Damp", "camera": "", "help": ""}  # all that can be done, where another word than in BINDINGS fits
 DAMP = b"damp"
 _PARTS = ("joint_pos", "gravity", "ang_vel", "lin_vel", "foot_contact")  # of a measurement
 FLAGS = ("viewer", "camera", "host", "port")
@@ -48,11 +48,10 @@ class Mirror:
 
     def __init__(self, folder: Path, contract: Contract, args: argparse.Namespace) -> None:
         """Open the viewer that ``args`` name (see ``launch.add_flags``). Raises ViewError."""
-        self._period, self._due, self._health = contract.period, 0.0, Health()
-        self._x = self._y = self._heading = 0.0  # [m], [rad] since the start
         settings = {"folder": str(folder.resolve()), **{name: getattr(args, name) for name in FLAGS}}
         program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
-        self._channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.begin(contract, channel)
         with theirs:
             settings["channel"] = theirs.fileno()
             command = [sys.executable, "-c", program, json.dumps(settings)]
@@ -66,6 +65,11 @@ class Mirror:
         if said:
             self.close()
             raise ViewError(said)
+
+    def begin(self, contract: Contract, channel: socket.socket) -> None:
+        """Tell of the robot through ``channel`` from now on."""
+        self._period, self._channel, self._due, self._health = contract.period, channel, 0.0, Health()
+        self._x = self._y = self._heading = 0.0  # [m], [rad] since the start
 
     def show(self, now: float, measured: Measurement | None, states: States) -> None:
         """One step; of some a picture is made."""
@@ -178,8 +182,8 @@ class MirrorSession(Session):
 
     def _lines(self, command: Floats, velocity: Floats) -> tuple[tuple[str, str], ...]:
         told = self.stage.told
-        lines = [("state", told["state"]), ("", told["note"]), *([("command", signed(command))] if told["command"] else [])]
-        lines.append(("measured", signed(velocity)))
+        followed = signed(command) if told["command"] else "-"
+        lines = [("state", told["state"]), ("", told["note"]), ("command", followed), ("measured", signed(velocity))]
         for name, key, form in (("battery", "voltage", "{:.1f} V"), ("hottest", "hottest", "{:.0f} deg C"), ("time", "time", "{:.1f} s")):
             lines += [(name, form.format(told[key]))] if told.get(key) is not None else []
         return tuple(lines)

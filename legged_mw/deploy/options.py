@@ -58,7 +58,9 @@ def check_flags(args: argparse.Namespace) -> None:
         raise UserError("--serve is the robot and --robot drives one: start them as two programs")
     if args.interface is None:
         raise UserError("say on which network the robot is: --interface eth0, or --interface lo for one that --serve simulates here")
-    others = [name for name in ("eval", "terrain", "video", "sheet") if getattr(args, name)] + ["num_envs"] * (args.num_envs != 1)
+    given = {name: getattr(args, name) for name in ("eval", "terrain", "video", "sheet")}
+    given |= {"num_envs": args.num_envs != 1, "viewer": args.serve and args.viewer != "auto"}
+    others = [name for name, value in given.items() if value]
     if others:
         raise UserError(f"--{others[0]} is of simulated robots in this program: leave it out")
 

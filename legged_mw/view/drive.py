@@ -75,7 +75,7 @@ class Pilot:
     """What the user wants now. `ask`, `press`, `steer` and `push` may be called from any thread; the rest belongs to the session's."""
 
     def __init__(self, table: Sequence[Command], num_worlds: int = 1, camera: str = "follow", only: Mapping[str, str] = {}) -> None:
-        """``only``: the actions that there are, in words; empty: all. Without "own" nothing is driven."""
+        """``only``: the actions that there are, with other words for them or ""; empty: all. Without "own" nothing is driven."""
         self.table, self.num_worlds = tuple(table), num_worlds
         self.low, self.high, self.default = (
             np.array([getattr(command, end) for command in table], dtype=np.float64) for end in ("low", "high", "default")
@@ -88,7 +88,7 @@ class Pilot:
         self.speed = SPEEDS[0]
         self.push_speed = PUSH_SPEED
         self.message = ""  # why the last action did nothing
-        self.bindings = tuple(b._replace(text=only.get(b.action, b.text)) for b in BINDINGS if not only or b.action in only)
+        self.bindings = tuple(b._replace(text=only.get(b.action) or b.text) for b in BINDINGS if not only or b.action in only)
         self.words, self.can = only, frozenset(binding.action for binding in self.bindings)
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._pushes: list[tuple[int, FloatArray]] = []
