@@ -8,12 +8,12 @@ from pathlib import Path
 from legged_mw import ROOT
 from legged_mw.deploy import drive, options, replay
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, read_contract
-from legged_mw.deploy.exam import run_exam
+from legged_mw.deploy.exam import contract_skill, run_exam, run_skill
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rules
 from legged_mw.utils.cli import Parser, duration, one_line_errors, positive
-from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.errors import UserError, shown, unknown
 from legged_mw.view import launch
 
 RESULT_FILE = "exam.json"
@@ -76,9 +76,14 @@ def main() -> None:
 
 
 def find(name: str) -> Path:
-    """The folder of an export, or of the shipped policy of this name."""
-    shipped = ROOT / "resources" / "policies" / name
-    return shipped if shipped.is_dir() and not Path(name).exists() else Path(name)
+    """The folder of an export, or of the shipped policy of this name. Raises UserError if it is neither."""
+    shipped = ROOT / "resources" / "policies"
+    if Path(name).exists():
+        return Path(name)
+    if not (shipped / name).is_dir():
+        there = sorted(path.parent.name for path in shipped.glob(f"*/{CONTRACT_FILE}"))
+        raise UserError(f"no folder {name}, and {unknown('policy', name, there, 'resources/policies')}")
+    return shipped / name
 
 
 def show_log(path: Path, folder: Path | None) -> None:
@@ -91,8 +96,18 @@ def show_log(path: Path, folder: Path | None) -> None:
 
 def examine(folder: Path, path: Path, common: bool = False, contact: str | None = None) -> None:
     """The exam: its table, and a JSON file at ``path``. ``contact``: see DeployStage."""
-    result = run_exam(folder, common=common, contact=contact)
-    print(rules.table(result))
+    contract = read_contract(folder)
+    if contract.exam and "kind" in contract.exam:
+        if common:
+            raise UserError("--ranges says what the walking exam asks: leave it out")
+        if contact:
+            raise UserError("--velocity odometry is of robots that walk, and this exam is another: leave it out")
+        skill = contract_skill(contract)
+        result = run_skill(folder, skill)
+        print(skill.table(result))
+    else:
+        result = run_exam(folder, common=common, contact=contact)
+        print(rules.table(result))
     said = {"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)"}
     said |= {"velocity": f"odometry, contact by {contact}"} if contact else {}
     try:

@@ -14,7 +14,7 @@ from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
 from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats
-from legged_mw.deploy.simulated import Fleet
+from legged_mw.deploy.simulated import Change, Fleet
 
 STROLL = {"lin_vel_x": 0.5}  # [m/s] where no command is given: a robot that walks shows more than one that stands
 
@@ -36,15 +36,17 @@ class DeployStage:
         scene_file: str = SCENE_FILE,
         ends: Ends | None = None,
         contact: str | None = None,
+        change: Change | None = None,
     ) -> None:
         """Load the export in ``folder``.
 
-        ``command`` (C,) is what robots follow where ``step`` gets none; ``ends`` are other rules for a fall than the contract's.
+        ``command`` (C,) is what robots follow where ``step`` gets none; ``ends`` are other rules for a fall than the contract's;
+        ``change`` is made to the model first.
         ``contact``: the policy sees the velocity of leg odometry, which finds feet on the ground so; None: the true one.
         """
         contract = read_contract(folder)
         self.contract = replace(contract, ends=ends or contract.ends)
-        self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file)
+        self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file, change=change)
         self.controller = Controller(folder, self.contract, num_worlds)
         self.odometry = Odometry(folder, self.contract, num_worlds, contact) if contact else None
         self.spec, self.num_worlds, self.dt = self.fleet.spec, num_worlds, self.contract.period
@@ -98,6 +100,13 @@ class DeployStage:
     def push(self, world: int, velocity: Any) -> None:
         """Add ``velocity`` (2,) [m/s, world frame] to the robot's horizontal velocity; the policy sees it a step later."""
         self.fleet.qvel[world, :2] += velocity
+
+    def put(self, qpos: Floats, qvel: Floats) -> None:
+        """All robots begin anew in these states, (N, nq) and (N, nv)."""
+        self.fleet.qpos[:], self.fleet.qvel[:] = qpos, qvel
+        self.fleet.refresh()
+        self._forget(slice(None))
+        self.measured = self.fleet.read()
 
     def reset(self, world: int) -> None:
         """Back to the start, at rest."""

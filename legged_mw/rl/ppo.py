@@ -17,16 +17,17 @@ from typing import Any, NamedTuple
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.extensions import Symmetry
-from rsl_rl.models import MLPModel, RNNModel
+from rsl_rl.models import MLPModel
 from rsl_rl.modules import EmpiricalNormalization
-from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from legged_mw.rl.adam import make_recordable, plain_state
-from legged_mw.rl.estimator import EstimatingModel, trained_parts
+from legged_mw.rl.adam import make_recordable
+from legged_mw.rl.concurrent import ConcurrentModel
+from legged_mw.rl.estimator import EstimatingModel, RegressingModel, trained_parts
 from legged_mw.rl.layers import run_mlp, sample, update_normalizer
+from legged_mw.rl.recorded import Recorded, why_stock
 from legged_mw.rl.recurrent import HiddenStates, SequenceInput, check_recurrent, unroll
 from legged_mw.sim.graph import StepGraph
 
@@ -39,10 +40,10 @@ class Minibatch(NamedTuple):
     batch: RolloutStorage.Batch
     actor_input: Tensor | SequenceInput  # (B, size), normalised; a sequence for a network with a memory
     critic_input: Tensor | SequenceInput
-    targets: Tensor | None = None  # (B, E) of the actor's estimator, normalised
+    lesson: tuple[Tensor, ...] = ()  # what the actor's estimator learns from
 
 
-class GraphedPPO(PPO):
+class GraphedPPO(Recorded, PPO):
     """PPO whose update and acting are replayed CUDA graphs.
 
     A network with a memory (RNNModel) learns from whole worlds, in the order that is drawn; else from samples.
@@ -80,18 +81,11 @@ class GraphedPPO(PPO):
 
     def _why_stock(self) -> str | None:
         """What keeps this configuration from being recorded, or None."""
-        for model in (self.actor, self.critic):
-            if type(model) not in (MLPModel, RNNModel, EstimatingModel):
-                return f"a network is a {type(model).__name__}"
-        if self.rnd or self.use_mixed_precision:
-            return f"{'rnd_cfg' if self.rnd else 'use_mixed_precision'} is set"
-        if getattr(type(self.actor.distribution), "sample", None) is not GaussianDistribution.sample:
-            return f"actions are drawn from a {type(self.actor.distribution).__name__}"
+        if self.rnd:
+            return "rnd_cfg is set"
         if not {*map(id, self.actor.parameters())}.isdisjoint(map(id, self.critic.parameters())):
             return "the networks share parameters"
-        if type(self.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
-            return f"the optimizer is {type(self.optimizer).__name__}"
-        return None
+        return why_stock(self, self.actor, {self.actor: (EstimatingModel, ConcurrentModel), self.critic: ()})
 
     def _begin(self) -> None:
         """Fixed tensors, and graphs that are not recorded yet."""
@@ -100,22 +94,19 @@ class GraphedPPO(PPO):
         self._share = drawn // self.num_mini_batches  # of a minibatch, in samples or in whole worlds
         self._size = self._share * (st.num_transitions_per_env if self._recurrent else 1)  # in samples
         self._obs = TensorDict({name: value[0].clone() for name, value in st.observations.items()}, [st.num_envs], device=device)
+        self._worlds = torch.arange(st.num_envs, device=device).expand(st.num_transitions_per_env, -1)  # of each transition
         self._order = torch.zeros(self._share * self.num_mini_batches, dtype=torch.long, device=device)
         self._memories = HiddenStates((self.actor, self.critic), st.num_envs, 2 if self.symmetry else 1, device)
         self._advantages = torch.zeros_like(st.returns)
-        more = {"symmetry": self.symmetry, "estimate": len(self._parts) > 2}
-        self._loss_names = ("value", "surrogate", "entropy", *(name for name, there in more.items() if there))
+        more = ["symmetry"] if self.symmetry else []
+        more += [self.actor.regression] if isinstance(self.actor, RegressingModel) else []
+        self._loss_names = ("value", "surrogate", "entropy", *more)
         self._losses = torch.zeros(len(self._loss_names), device=device)
         self._entropy_coef, self._desired_kl = torch.zeros((), device=device), torch.zeros((), dtype=torch.float64, device=device)
         self._side = torch.cuda.Stream(device) if str(device).startswith("cuda") else None
         self._act_graph, self._returns_graph, self._update_graph = (
             StepGraph(fn, str(device)) for fn in (self._act, self._compute_returns, self._update)
         )
-
-    def release(self) -> None:
-        """Drop what is recorded: NCCL does not close a connection that a CUDA graph still names. The next calls record again."""
-        if self.graphed:
-            self._begin()
 
     def learn_critic_only(self, on: bool) -> None:
         """From the next update on the critic learns and the actor stays as it is, or both learn again.
@@ -169,13 +160,9 @@ class GraphedPPO(PPO):
 
     def _latent(self, model: MLPModel, seen: TensorDict) -> Tensor:
         """What a network's MLP reads; a memory takes in what is ``seen``, with mirror images where it is to learn from those."""
-        return self._memories[model].advance(seen) if model in self._memories else model.get_latent(self._obs)
-
-    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
-        """Store the transition; worlds whose episode ended are forgotten."""
-        super().process_env_step(obs, rewards, dones, extras)
-        if self.graphed:
-            self._memories.forget(dones)
+        if model in self._memories:
+            return self._memories[model].advance(seen)
+        return model.rollout_latent(self._obs) if isinstance(model, RegressingModel) else model.get_latent(self._obs)
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Returns and advantages of the stored transitions, into the storage."""
@@ -237,9 +224,10 @@ class GraphedPPO(PPO):
             batch.advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)  # type: ignore[operator]
         if self.symmetry:
             self.symmetry.augment_batch(batch, self._size)
-        targets = self.actor.targets(batch.observations) if isinstance(self.actor, EstimatingModel) else None
         actor_input, critic_input = (self._input(model, batch.observations, indices) for model in (self.actor, self.critic))
-        return Minibatch(batch, actor_input, critic_input, targets)
+        if not isinstance(self.actor, RegressingModel):
+            return Minibatch(batch, actor_input, critic_input)
+        return Minibatch(batch, actor_input, critic_input, self.actor.lesson(batch.observations, take(self._worlds)))
 
     @torch.no_grad()
     def _input(self, model: MLPModel, obs: Any, indices: Tensor) -> Tensor | SequenceInput:
@@ -251,16 +239,18 @@ class GraphedPPO(PPO):
 
     def _minibatch(self, minibatch: Minibatch) -> None:
         """One gradient step."""
-        batch, actor_input, critic_input, targets = minibatch
+        batch, actor_input, critic_input, lesson = minibatch
         self.optimizer.zero_grad()
         with self._beside():
             value_loss = self._value_loss(batch, _forward(self.critic, critic_input))
             (self.value_loss_coef * value_loss).backward()
         with torch.set_grad_enabled(not self.critic_only):  # an actor that stands keeps nothing for a gradient
-            loss, parts, kl = self._policy_loss(batch, _forward(self.actor, actor_input))
-            if targets is not None and isinstance(self.actor, EstimatingModel) and isinstance(actor_input, Tensor):
-                parts.append(nn.functional.mse_loss(run_mlp(self.actor.estimator, actor_input), targets))
-                loss = loss + parts[-1]  # of other parameters
+            if isinstance(self.actor, RegressingModel) and isinstance(actor_input, Tensor):
+                output, *regression = self.actor.learn(actor_input, lesson)
+            else:
+                output, regression = _forward(self.actor, actor_input), []
+            loss, parts, kl = self._policy_loss(batch, output)
+            loss = sum(regression, loss)  # of other parameters
         if self.critic_only:
             kl = None  # of an actor that stands still it is rounding noise
         else:
@@ -273,7 +263,7 @@ class GraphedPPO(PPO):
         for part in self._parts:
             nn.utils.clip_grad_norm_(part, self.max_grad_norm)
         self.optimizer.step()
-        self._losses.add_(torch.stack([value.detach() for value in (value_loss, *parts)]))
+        self._losses.add_(torch.stack([value.detach() for value in (value_loss, *parts, *regression)]))
 
     def _value_loss(self, batch: Any, values: Tensor) -> Tensor:
         error = (values - batch.returns).square()
@@ -331,8 +321,8 @@ class GraphedPPO(PPO):
             if isinstance(model.obs_normalizer, EmpiricalNormalization):
                 inputs = torch.cat([obs[group] for group in model.obs_groups], dim=-1)
                 update_normalizer(model.obs_normalizer, inputs, self.gpu_world_size)
-        if isinstance(self.actor, EstimatingModel) and not self.critic_only:
-            update_normalizer(self.actor.target_normalizer, self.actor.truth(obs), self.gpu_world_size)
+        if isinstance(self.actor, RegressingModel) and not self.critic_only:
+            self.actor.learn_spread(obs, self.gpu_world_size)
 
     def _symmetry_loss(self, batch: Any) -> Tensor:
         """How far the policy is from its own mirror image; of an augmented batch, the forward pass is already made."""
@@ -344,7 +334,7 @@ class GraphedPPO(PPO):
         _, mirrored = symmetry.data_augmentation_func(env=symmetry.env, obs=None, actions=means[:size].detach())
         return nn.functional.mse_loss(means[size:], mirrored[size:])
 
-    # ---- learning rate and checkpoints: rsl-rl's own PPO reads and writes the same -----------------------------------------
+    # ---- the learning rate --------------------------------------------------------------------------------------------
 
     @property
     def rate(self) -> Tensor:
@@ -363,22 +353,6 @@ class GraphedPPO(PPO):
         else:
             self._rate.fill_(float(rate))
             self._adam_rate.fill_(float(rate))
-
-    def save(self) -> dict[str, Any]:
-        """The networks' and the optimizer's state, in the form that rsl-rl's own PPO writes."""
-        content = super().save()
-        if self.graphed:
-            rates = [self.learning_rate, *map(float, self._rates[1:])]
-            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], rates)
-        return content
-
-    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Take over a checkpoint of this class or of rsl-rl's own PPO."""
-        iteration = super().load(loaded_dict, load_cfg, strict)
-        if self.graphed:
-            make_recordable(self.optimizer, self._rates, str(self.device))
-            self._begin()  # Adam's memory has moved
-        return iteration
 
 
 def _forward(model: MLPModel, inputs: Tensor | SequenceInput) -> Tensor:
