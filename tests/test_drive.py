@@ -630,9 +630,7 @@ def test_a_panel_offers_what_its_pilot_can_and_no_more() -> None:
     assert [text for text in ui.seen if "###" in text] == ["Damp###reset", "View: follow###camera"] and not ui.ranges
     assert pilot.take_resets() == [0] and not (pilot.driving or pilot.paused or pilot.take_pushes())
     assert "Damp" in ui.seen and "slow motion" not in ui.seen and ui.depth == 0
-    assert (
-        [row[2] for row in window_texts(page.moment._replace(help=True), pilot.bindings)][1] == "r backspace\nc" if page.moment else False
-    )
+    assert page.moment and window_texts(page.moment._replace(help=True), pilot.bindings)[1][2] == "r backspace\nc"
 
 
 def test_one_robot_has_no_next_one_and_speed_goes_round() -> None:

@@ -26,6 +26,7 @@ from legged_mw.deploy.stage import DeployStage
 from legged_mw.deploy.unitree.client import check_rows
 from legged_mw.deploy.unitree.robots import G1, GO2
 from legged_mw.utils.cli import one_line_errors
+from legged_mw.utils.errors import UserError
 
 POLICIES = ROOT / "resources/policies"
 GO1 = POLICIES / "go1_flat"
@@ -123,6 +124,12 @@ def test_the_exam_says_how_far_the_estimate_is(tmp_path: Path, monkeypatch: pyte
     program.main()
     assert "estimate of vx, rms [m/s]            0.0" in capsys.readouterr().out
     assert '"velocity": "odometry, contact by measured"' in (tmp_path / "exam.json").read_text()
+
+
+def test_other_exams_have_no_odometry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(program, "read_contract", lambda folder: replace(read_contract(folder), exam={"kind": "getup"}))
+    with pytest.raises(UserError, match="--velocity odometry is of robots that walk, and this exam is another: leave it out"):
+        program.examine(GO1, tmp_path / "exam.json", contact="torque")
 
 
 LO = ["--interface", "lo"]

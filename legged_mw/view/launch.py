@@ -165,7 +165,7 @@ def web_page(stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, tit
     if args.host == web.LOCAL and not has_display():
         print(f"  on another machine paste this into a terminal there, then open the page: {web.tunnel_line(page.port)}")
     elif args.host != web.LOCAL:
-        print("  it has no password: whoever reaches this port can drive")
+        print(f"  it has no password: whoever reaches this port can {'drive' if 'own' in pilot.can else 'damp the robot'}")
     sys.stdout.flush()
     return page
 
