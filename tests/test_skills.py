@@ -13,9 +13,12 @@ import pytest
 import torch
 from program import refused, run
 
+from legged_mw import ROOT as REPOSITORY
+from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import ContractError, read_contract
 from legged_mw.deploy.exam import contract_skill, put_on, run_skill
 from legged_mw.deploy.simulated import Fleet
+from legged_mw.deploy.switch import SwitchStage
 from legged_mw.envs.getup import Getup
 from legged_mw.envs.handstand import Handstand
 from legged_mw.eval import getup, handstand, strip
@@ -23,10 +26,11 @@ from legged_mw.eval.perform import machine, on_ground
 from legged_mw.eval.skill import Ground, Recording, Robot
 from legged_mw.sim.settle import fallen
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import load_task
 
-ROOT = math.sqrt(0.5)
-UPSIDE_DOWN, NOSE_DOWN, NOSE_UP = [0.0, 1.0, 0.0, 0.0], [ROOT, 0.0, ROOT, 0.0], [ROOT, 0.0, -ROOT, 0.0]
+POLICIES, HALF = REPOSITORY / "resources/policies", math.sqrt(0.5)
+UPSIDE_DOWN, NOSE_DOWN, NOSE_UP = [0.0, 1.0, 0.0, 0.0], [HALF, 0.0, HALF, 0.0], [HALF, 0.0, -HALF, 0.0]
 
 
 def make(name: str, **changes: Any) -> Any:
@@ -219,12 +223,54 @@ def test_getup_from_training_to_deploy(tmp_path: Path, small: None) -> None:
     assert "--eval sets falls.pull itself" in line
     leaning = Fleet(folder / "export", contract, 1, threads=1, change=lambda model: put_on(model, Ground(slope=10.0)))
     np.testing.assert_allclose(leaning.read().gravity[0], [math.sin(math.radians(10.0)), 0.0, -math.cos(math.radians(10.0))], atol=1e-9)
+    check_switch(folder / "export")
     for section, words in (
         ({"kind": "getpu"}, "policy.yaml: no exam 'getpu' in legged_mw/eval/skills.py; did you mean 'getup'?"),
         ({"kind": "getup", "wihtin": 3}, "policy.yaml: exam: no field 'wihtin' in the exam getup; did you mean 'within'?"),
     ):
         with pytest.raises(ContractError, match=re.escape(words)):
             contract_skill(contract.__class__(**{**vars(contract), "exam": section}))
+
+
+def check_switch(rescuer: Path) -> None:
+    """A walker that falls is handed over, and back when it stands; nobody is put back."""
+    stage = SwitchStage(POLICIES / "go1_flat", rescuer, 2, command=(0.5, 0.0, 0.0))
+    stage.step()
+    assert not stage.rescued.any() and not stage.fell().any()
+    stage.fleet.qpos[1, 2:7] = [0.1, *UPSIDE_DOWN]
+    stage.fleet.refresh()
+    stage.measured = stage.fleet.read()
+    stage.step()
+    assert stage.fell().tolist() == stage.rescued.tolist() == [False, True]
+    stage.step()
+    assert stage.rescued[1] and not stage.fell().any() and stage.qpos()[1, 2] < 0.2
+    assert stage.rescuer.last_actions[1].any() and not stage.controller.last_actions[1].any()
+    stage.put(np.tile(stage.fleet.model.key_qpos[0], (2, 1)), np.zeros_like(stage.fleet.qvel))  # as if it got up
+    stood = [bool(stage._stood(stage.measured)[1]) for _ in range(25)]
+    assert stood == [False] * 24 + [True]  # half a second
+    stage._stood = lambda measured: np.array([False, True])  # type: ignore[method-assign]
+    stage.step()
+    assert not stage.rescued[1]
+    with pytest.raises(UserError, match="--switch: joints of go1_flat and g1_flat differ, so they cannot drive one robot"):
+        SwitchStage(POLICIES / "go1_flat", POLICIES / "g1_flat")
+
+
+@pytest.mark.parametrize(
+    ("args", "line"),
+    [
+        (["go1_flat", "go2_flat"], "--switch fall is of two policies: python -m legged_mw.deploy DIR DIR2 --switch fall"),
+        (["go1_flat", "--switch", "fall"], "--switch fall is of two policies"),
+        (
+            ["go1_flat", "go2_flat", "--switch", "fall", "--eval"],
+            "--switch is watched in simulation, on flat ground: leave the other flags out",
+        ),
+    ],
+)
+def test_switch_flags(args: list[str], line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("sys.argv", ["deploy", *args])
+    with pytest.raises(SystemExit):
+        program.parse()
+    assert line in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["go2_getup", "go1_footstand", "go2_handstand", "go2_footstand"])
