@@ -73,8 +73,11 @@ class Limits:
     @staticmethod
     def of(folder: Path, contract: Contract, *more: Mapping[str, Any]) -> Limits:
         """Those of the export in ``folder``: the machine's from its scene, then the contract's section ``safety``, then ``more``."""
+        import mujoco
+
         falls = OFF if contract.ends.max_tilt is None else contract.ends.max_tilt
-        limits = replace(_of_scene(folder, contract), tilt=falls if falls > 90.0 else min(Limits.tilt, falls))
+        scene = mujoco.MjSpec.from_file(str(folder / SCENE_FILE)).compile()
+        limits = replace(limits_of(scene, contract), tilt=falls if falls > 90.0 else min(Limits.tilt, falls))
         limits = limits.but(contract.safety or {}, f"{CONTRACT_FILE}: safety")
         for values in more:
             limits = limits.but(values, "--limit")
@@ -110,11 +113,8 @@ def _value(name: str, value: Any, where: str) -> float:
     return number
 
 
-def _of_scene(folder: Path, contract: Contract) -> Limits:
-    """Ranges and torques of the export's scene; what it does not limit is without limit."""
-    import mujoco
-
-    model = mujoco.MjSpec.from_file(str(folder / SCENE_FILE)).compile()
+def limits_of(model: Any, contract: Contract) -> Limits:
+    """Ranges and torques of the export's scene, compiled; what it does not limit is without limit."""
     joints = [model.joint(name).id for name in contract.joints]
     servos = [model.actuator(name).id for name in contract.joints]
     low, high = np.where(model.jnt_limited[joints, None] > 0, model.jnt_range[joints], [-OFF, OFF]).T
@@ -187,6 +187,8 @@ class Safety:
 
     def _fresh(self, measured: Measurement, health: Health) -> Trip | None:
         age, most = health.age_s, self.limits.age * self.contract.period
+        if age is not None and age < -most:
+            return Trip("age", f"the newest measurement comes from {-1e3 * age:.0f} ms ahead: a clock went back")
         if age is not None and not age <= most:
             return Trip("age", f"the newest measurement is {1e3 * age:.0f} ms old, more than {1e3 * most:.0f}")
         seen = measured.joint_pos.tobytes() + measured.joint_vel.tobytes() + measured.ang_vel.tobytes()

@@ -93,6 +93,20 @@ def order(machine: Machine, joints: Sequence[str]) -> np.ndarray:
     return np.array([machine.motors[name] for name in joints])
 
 
+def known_motors(package: str) -> str:
+    """The robots that speak ``package``, and the joints of each."""
+    return "; ".join(f"{m.name} has {', '.join(m.motors)}" for m in MACHINES.values() if m.package == package) or f"{package} is not known"
+
+
+def check_slots(machine: Machine, angles: np.ndarray) -> None:
+    """Refuse a robot that measures angles (slots,) where this one has no motors: a Go2 by an H1's contract is not noticed so. Raises RobotError."""
+    if machine.package == "unitree_go" and (more := sorted({*np.flatnonzero(angles).tolist()} - {*machine.motors.values()})):
+        raise RobotError(
+            f"motors answer at {', '.join(map(str, more))}, where a {machine.name} has none: it is not the contract's robot. "
+            f"Known are: {known_motors(machine.package)}"
+        )
+
+
 def check_body(machine: Machine, mode_machine: int) -> None:
     """Refuse a G1 with other motors than the contract's; a simulation that sets no mode_machine sends 0. Raises RobotError."""
     if machine is G1 and mode_machine and BODIES.get(mode_machine) != len(machine.motors):
