@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import re
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -10,11 +9,10 @@ from typing import NamedTuple
 import pytest
 
 from legged_mw.deploy.contract import read_contract
-from legged_mw.deploy.safety import Limits
 from legged_mw.deploy.unitree.link import RobotEnd, Wire
 from legged_mw.deploy.unitree.robots import machine_of
 from legged_mw.deploy.unitree.serve import SimulatedUnitree
-from tests.faults import CASES, SOON, lockstep
+from tests.faults import CASES, SOON, limits_of, lockstep
 from tests.wires import POLICIES, locked_domain
 
 
@@ -31,7 +29,7 @@ class Ends(NamedTuple):
 def ends() -> Iterator[dict[str, Ends]]:
     with locked_domain() as domain:
         made = {}
-        for i, task in enumerate(("go2_flat", "g1_flat")):
+        for task in ("go2_flat", "g1_flat"):
             contract = read_contract(POLICIES / task)
             package = machine_of(contract.joints).package
             sim = SimulatedUnitree(POLICIES / task, contract, RobotEnd(package, "lo", domain))
@@ -40,7 +38,6 @@ def ends() -> Iterator[dict[str, Ends]]:
             made[task] = Ends(sim, *wires, RobotEnd(package, "lo", domain))
         yield made
         made.clear()
-        gc.collect()
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -58,7 +55,7 @@ def test_a_fault_damps(name: str, ends: dict[str, Ends], monkeypatch: pytest.Mon
     assert after is not None and after <= SOON, (after, known, sim.record.changes, lines)
     said = [line for line in lines if re.search(case.said, line)]
     assert said and "\n" not in said[0], lines
-    limits = Limits.of(POLICIES / case.task, sim.contract)
+    limits = limits_of(POLICIES / case.task)
     assert sim.record.beyond < limits.position and sim.record.fastest < limits.speed
     if not case.misplaced:
         assert sim.record.asked < limits.torque and sim.record.outside < 1e-6

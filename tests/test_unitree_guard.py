@@ -228,7 +228,7 @@ def test_a_guard_that_is_killed_leaves_the_last_command(domain: int) -> None:
 
 def test_a_guard_says_what_is_wrong(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RobotError, match="no robot: no rt/lowstate of unitree_go in domain"):
-        Guarded("unitree_go", "lo", domain, find=0.2)
+        Guarded.start("unitree_go", "lo", domain, find=0.2)
     contract = read_contract(POLICIES / "go1_flat")
     with pytest.raises(RobotError, match="which a go2 does not measure"):
         client.connect(POLICIES / "go1_flat", contract, "lo", domain)

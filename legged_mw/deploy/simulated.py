@@ -291,8 +291,8 @@ def _check_order(model: mujoco.MjModel, contract: Contract) -> None:
         for joint, sensor in zip(contract.joints, sensors, strict=True):
             if (found := model.joint(int(model.sensor(sensor).objid[0])).name) != joint:
                 raise ContractError(
-                    f"{CONTRACT_FILE}: joints are not in the order of sensors: {name}: {sensor} measures {found}, and {joint} stands there; "
-                    "export the policy again"
+                    f"{CONTRACT_FILE}: joints are in another order than sensors: {name}, where {sensor} measures {found} "
+                    f"in the place of {joint}; export the policy again"
                 )
 
 

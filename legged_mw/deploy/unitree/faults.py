@@ -115,8 +115,8 @@ def _value(name: str, kind: Kind, value: str | None, joints: Sequence[str], wher
     if kind.value is True:
         raise UserError(f"{where}: {name} has no value but {OFF}")
     if not kind.low <= (number := _number(value)) <= kind.high or math.isinf(number):
-        wanted = f" from {kind.low:g} to {kind.high:g}" if math.isfinite(kind.high) else f" from {kind.low:g}" if math.isfinite(kind.low) else ""
-        raise UserError(f"{where}: {name} is a number{wanted}{f' [{kind.unit}]' if kind.unit else ''}, or {OFF}")
+        ends = "" if math.isinf(kind.low) else f" from {kind.low:g}" + ("" if math.isinf(kind.high) else f" to {kind.high:g}")
+        raise UserError(f"{where}: {name} is a number{ends}{f' [{kind.unit}]' if kind.unit else ''}, or {OFF}")
     return number / 100 if name == "loss" else int(number) if isinstance(kind.value, int) else number
 
 

@@ -30,6 +30,7 @@ from legged_mw.deploy.unitree import clock
 from legged_mw.deploy.unitree.codec import LAYOUTS
 
 LATE = 0.06  # [s] ours: three periods at 50 Hz without a command; docs/faults.md has what the joints then take to be damped
+STILL = 0.1  # [s] ours, between two looks at the wire: this computer slept, or the guard was stopped
 REPEAT = 0.002  # [s] between two messages to the robot [unitree_sdk2's examples]
 AFTER = 1.0  # [s] ours: how long damping is sent before the wire is let go
 START = 60.0  # [s] for a guard to find the robot
@@ -168,7 +169,7 @@ class Guard:
         self._size = _FRAME.size + LAYOUTS[package, "LowCmd_"].size
         self._buffer, self._latencies = b"", deque[float](maxlen=1 << 16)
         self._command, self._damping = b"", b""  # the command that is repeated; the one that replaces it after a trip
-        self._moving, self._heard, self._until, self._due = False, 0.0, float("inf"), 0.0
+        self._moving, self._heard, self._until, self._due, self._looked = False, 0.0, float("inf"), 0.0, float("inf")
         self.tripped, self._stopped = "", False
         channel.setblocking(False)
 
@@ -185,6 +186,9 @@ class Guard:
     def turn(self) -> None:
         """One look at both sides."""
         now = self.clock()
+        still, self._looked = now - self._looked, now
+        if self._moving and still > STILL:
+            self.trip(f"nothing was sent for {1000 * still:.0f} ms: the guard stood still, or this computer slept")
         self._hear(now)
         if state := self.wire.receive():
             self.board.put(state.body, state.stamp)

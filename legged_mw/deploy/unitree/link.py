@@ -166,8 +166,8 @@ class Wire:
         seen = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
         kinds = sorted({s.type_name.partition("::")[0] for s in seen.take(100) if s and s.topic_name == STATES} - {self.package})
         if kinds:
-            there = "; ".join(known_motors(kind) for kind in kinds)
-            return f"{text}; the robot there speaks {', '.join(kinds)}: it is not the contract's. There: {there}. Here: {known_motors(self.package)}"
+            there, here = "; ".join(known_motors(kind) for kind in kinds), known_motors(self.package)
+            return f"{text}; the robot there speaks {', '.join(kinds)}: it is not the contract's. There: {there}. Here: {here}"
         return f"{text}; is it on, is this the right network interface, and can it be pinged (192.168.123.161)?"
 
     def _release(self, lies_down: bool, tries: int = 8) -> None:

@@ -99,7 +99,10 @@ def known_motors(package: str) -> str:
 
 
 def check_slots(machine: Machine, angles: np.ndarray) -> None:
-    """Refuse a robot that measures angles (slots,) where this one has no motors: a Go2 by an H1's contract is not noticed so. Raises RobotError."""
+    """Refuse a robot with angles (slots,) where this one has no motors, such as an H1 by a Go2's contract. Raises RobotError.
+
+    Fewer motors are not noticed: an angle may be 0.
+    """
     if machine.package == "unitree_go" and (more := sorted({*np.flatnonzero(angles).tolist()} - {*machine.motors.values()})):
         raise RobotError(
             f"motors answer at {', '.join(map(str, more))}, where a {machine.name} has none: it is not the contract's robot. "

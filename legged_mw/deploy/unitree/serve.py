@@ -63,9 +63,9 @@ class Record:
 
     def damped_after(self, time: float) -> float | None:
         """[s] from ``time`` until the motors damped and did nothing else from then on; None: they do not, or did not drive then."""
-        before = next((what for since, what in reversed(self.changes) if since <= time), LIMP)
+        before = next((what for since, what in reversed(self.changes) if since < time), LIMP)
         since, what = self.changes[-1]
-        return since - time if before == DRIVEN and what == DAMPED and since > time else None
+        return since - time if before == DRIVEN and what == DAMPED and since >= time else None
 
 
 class SimulatedUnitree:
@@ -198,10 +198,12 @@ class SimulatedUnitree:
             record.outside = max(record.outside, _outside(acted["q"][stiff], limits.lowest[stiff], limits.highest[stiff]))
         record.drive(self.time, acted)
 
-    def _plugs(self) -> tuple[Floats, Floats]:
-        """The slot that each joint's motor is plugged into (D,), and the way that it turns (D,): 1 or -1."""
-        turned = [name in self.faults.turned_joints for name in self.contract.joints]
-        return np.roll(self._slots, self.faults.joint_order), np.where(turned, -1.0, 1.0)
+    def _plugs(self) -> tuple[Any, Any]:
+        """The slot that each joint's motor is plugged into (D,), and the way that it turns: 1 or -1, of each or of all."""
+        faults = self.faults
+        slots = np.roll(self._slots, faults.joint_order) if faults.joint_order else self._slots
+        turned = faults.turned_joints
+        return slots, np.where([name in turned for name in self.contract.joints], -1.0, 1.0) if turned else 1.0
 
     def _move(self) -> None:
         """The motors' law, as MuJoCo's affine actuators know it: tau + kp q + kd dq - kp q_now - kd dq_now."""
