@@ -25,7 +25,7 @@ from legged_mw.deploy.unitree.faults import Faults, parse_faults
 from legged_mw.deploy.unitree.guard import Board, Guard, Guarded
 from legged_mw.deploy.unitree.link import RobotEnd, Wire
 from legged_mw.deploy.unitree.remote import encode
-from legged_mw.deploy.unitree.serve import DRIVEN, STEP, Record, SimulatedUnitree
+from legged_mw.deploy.unitree.serve import STEP, Record, SimulatedUnitree
 
 SOON = 0.1  # [s] within which joints must be damped
 RISE, WALK = 0.1, 0.2  # [s] in lockstep: to stand up, as it stands at first, and to walk before the fault
@@ -48,9 +48,10 @@ class Killed(BaseException):
 class Side:
     """The robot's side: its remote stands it up and starts the policy; then comes the fault."""
 
-    def __init__(self, sim: SimulatedUnitree, case: Case, rise: float, other: Wire | None = None, end: RobotEnd | None = None) -> None:
-        """``rise``: [s] to stand up. ``other``, ``end``: another commander's and another robot's ends of the wire."""
-        self.sim, self.case, self.rise, self.other, self.end = sim, case, rise, other, end
+    def __init__(self, sim: SimulatedUnitree, case: Case, other: Wire | None = None, end: RobotEnd | None = None) -> None:
+        """``other``, ``end``: another commander's and another robot's ends of the wire."""
+        self.sim, self.case, self.other, self.end = sim, case, other, end
+        self.walking: float | None = None  # [s] when the policy began
         self.held: tuple[str, ...] | None = None  # buttons, from the fault on
         self.injected: float | None = None  # [s] when the fault began
         self.tilted: float | None = None  # [s] when it was tilted by more than 60 degrees
@@ -65,8 +66,7 @@ class Side:
         since = now - self._begun if self._begun is not None else -1.0
         button = "start" if 0.0 < since < 0.05 else "A" if since > 0.1 and since % 0.08 < 0.04 else ""
         sim.remote = encode(([button] if button else []) if self.held is None else self.held)
-        driven = next((time for time, what in sim.record.changes if what == DRIVEN), None)
-        if self.case.robot and self.injected is None and driven is not None and now > driven + self.rise + 0.1 + WALK:
+        if self.case.robot and self.injected is None and self.walking is not None and now > self.walking + WALK:
             self.injected = now
             if isinstance(self.case.robot, str):
                 for fault in parse_faults([self.case.robot], sim.contract.joints):
@@ -107,6 +107,8 @@ class Rig:
         """Drive the robot, with the fault once it has walked."""
 
         def act(measured: Measurement, commands: Floats) -> Floats:
+            if not self._steps:
+                self.walks()
             self._steps += 1
             if case.policy and self.injected is None and self._steps > WALK / self.contract.period:
                 self.begin()
@@ -129,6 +131,9 @@ class Rig:
             for file in (*self._files, self.keys, self.stop, self.pad):
                 if file >= 0:
                     os.close(file)
+
+    def walks(self) -> None:
+        """The policy begins."""
 
     def begin(self) -> None:
         """The fault begins now."""
@@ -191,6 +196,9 @@ class Lockstep(Rig):
         owner.guard = self.guard
         super().__init__(UnitreeRobot(contract, owner, owner.first, clock=self.late_clock), folder, self.read_clock, self.pass_, 0.001)
 
+    def walks(self) -> None:
+        self.side.walking = self.now
+
     def read_clock(self) -> float:
         return self.now
 
@@ -228,7 +236,7 @@ def lockstep(case: Case, sim: SimulatedUnitree, wire: Wire, folder: Path, patch:
     sim.reset(after=1.0)
     while wire.receive() or wire.other_commander() or sim.end.receive():  # of the fault before
         pass
-    rig = Lockstep(Side(sim, case, RISE, **others), wire, folder)
+    rig = Lockstep(Side(sim, case, **others), wire, folder)
     patch.setattr("time.perf_counter", rig.read_clock)
     patch.setattr("time.sleep", rig.pass_)
     patch.setattr("gc.collect", lambda: None)  # for speed
@@ -255,6 +263,7 @@ class Case(NamedTuple):
     limits: Mapping[str, float] = {}  # of the safety layer, other than the defaults
     task: str = "go2_flat"
     misplaced: bool = False  # the fault itself brings right commands to wrong joints
+    in_lockstep: bool = False  # nothing that a real process could do here
 
 
 def puts(joint: int, value: float) -> Callable[[Rig], None]:
@@ -369,5 +378,6 @@ CASES: dict[str, Case] = {
     "computer that slept": Case(
         "nothing was sent for 600[0-9][0-9] ms: the guard stood still, or this computer slept",
         policy=lambda rig: rig.computer_sleeps(60.0),
+        in_lockstep=True,
     ),
 }

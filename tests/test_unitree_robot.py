@@ -189,8 +189,8 @@ def test_a_contract_in_another_order_sends_the_same(domain: int) -> None:
     both = pair("go2_flat", domain)
     named = ("joints", "default_pose", "stiffness", "damping")
     backwards = replace(both.contract, **{name: getattr(both.contract, name)[::-1] for name in named})
-    owners = [Once(both.sim._state.body, 0.0) for _ in range(2)]
-    robots = [UnitreeRobot(each, owner, owner.receive(), clock=lambda: 0.0) for each, owner in zip((both.contract, backwards), owners, strict=True)]
+    owners, first = [Once(both.sim._state.body) for _ in range(2)], Received(both.sim._state.body, 0.0)
+    robots = [UnitreeRobot(*each, first, clock=lambda: 0.0) for each in zip((both.contract, backwards), owners, strict=True)]
     robots[0].write(both.contract.default_pose + 0.01 * np.arange(12))
     robots[1].write((both.contract.default_pose + 0.01 * np.arange(12))[::-1])
     assert owners[0].sent == owners[1].sent and np.array_equal(robots[0].read().joint_pos, robots[1].read().joint_pos[::-1])
