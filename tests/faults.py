@@ -61,6 +61,8 @@ class Side:
     def before(self) -> None:
         """Before each step of the robot."""
         sim, now = self.sim, self.sim.time
+        if self.end:
+            self.end.answer()
         if self._begun is None and sim.record.commands:
             self._begun = now
         since = now - self._begun if self._begun is not None else -1.0

@@ -305,7 +305,7 @@ def test_the_program_with_motors_in_another_order(domain: int) -> None:
         live(sim, lambda: policy.poll() is not None)
         said, errors = policy.communicate()
     assert policy.returncode == 0, errors
-    assert re.search("\ndamping: F[LR]_.*_joint is (at|told to go to) .* rad, .* beyond its range .*; 0.25 is the most\n", said), said
+    assert re.search("\ndamping: F[LR]_.*_joint is (at|told to go to) .* rad, .* beyond its range .*; 0.[0-9]+ is the most\n", said), said
     assert sim.record.changes[-1][1] == DAMPED and sim.record.beyond < 0.25
 
 

@@ -73,11 +73,8 @@ class Limits:
     @staticmethod
     def of(folder: Path, contract: Contract, *more: Mapping[str, Any]) -> Limits:
         """Those of the export in ``folder``: the machine's from its scene, then the contract's section ``safety``, then ``more``."""
-        import mujoco
-
         falls = OFF if contract.ends.max_tilt is None else contract.ends.max_tilt
-        scene = mujoco.MjSpec.from_file(str(folder / SCENE_FILE)).compile()
-        limits = replace(limits_of(scene, contract), tilt=falls if falls > 90.0 else min(Limits.tilt, falls))
+        limits = replace(_of_scene(folder, contract), tilt=falls if falls > 90.0 else min(Limits.tilt, falls))
         limits = limits.but(contract.safety or {}, f"{CONTRACT_FILE}: safety")
         for values in more:
             limits = limits.but(values, "--limit")
@@ -111,6 +108,12 @@ def _value(name: str, value: Any, where: str) -> float:
     if isinstance(value, bool) or not number >= 0.0:
         raise LimitError(f"{where}: {name} is {value!r}; it must be a number from 0, or off")
     return number
+
+
+def _of_scene(folder: Path, contract: Contract) -> Limits:
+    import mujoco
+
+    return limits_of(mujoco.MjSpec.from_file(str(folder / SCENE_FILE)).compile(), contract)
 
 
 def limits_of(model: Any, contract: Contract) -> Limits:
