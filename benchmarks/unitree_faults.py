@@ -19,7 +19,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -138,6 +138,8 @@ def live(name: str, domain: int) -> tuple[float, str]:
     side.tilted = None if side.tilted is None else moment(side.tilted)
     known = case.known(Seen(injected, told.get("read_at", 0.0), side)) if case.known else injected  # type: ignore[arg-type]
     lines = [*told["said"], *told["errors"].splitlines()]
+    if not any(re.search(case.said, line) for line in lines):
+        raise RuntimeError(f"{name}: something else was said: {lines[-3:]}")
     return 1000 * (moment(damped) - known), line_of(case, lines)
 
 
@@ -172,18 +174,31 @@ def main() -> None:
         os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(10))
     print("| fault | `--fault` | the line | in lockstep | live |\n| --- | --- | --- | --- | --- |")
     for name in args.faults or CASES:
-        case = CASES[name]
+        print(row(name), flush=True)
+
+
+def row(name: str) -> str:
+    """One row of the table."""
+    case, took, said = CASES[name], "", ""
+    exact = once_more(in_lockstep, name)
+    if not case.in_lockstep:
+        milliseconds, said = once_more(live, name)
+        took = f"{milliseconds:.0f}"
+    flag = f"`{case.robot}`" if isinstance(case.robot, str) and case.robot else ""
+    return f"| {name} | {flag} | {said and f'`{said}`'} | {exact:.0f} | {took} |"
+
+
+def once_more(measure: Callable[[str, int], Any], name: str) -> Any:
+    """Again, if it failed: in another domain, where no other program's guard is about to end."""
+    for attempt in range(3):
         with locked_domain() as domain:
-            exact = in_lockstep(name, domain)
-        flag = f"`{case.robot}`" if isinstance(case.robot, str) and case.robot else ""
-        took, said = ("", "") if case.in_lockstep else _live(name)
-        print(f"| {name} | {flag} | {said and f'`{said}`'} | {exact:.0f} | {took} |", flush=True)
-
-
-def _live(name: str) -> tuple[str, str]:
-    with locked_domain() as domain:
-        took, said = live(name, domain)
-    return f"{took:.0f}", said
+            try:
+                return measure(name, domain)
+            except RuntimeError as error:
+                print(f"{name}: {error}", file=sys.stderr, flush=True)
+                if attempt == 2:
+                    raise
+    raise AssertionError("not reached")
 
 
 if __name__ == "__main__":

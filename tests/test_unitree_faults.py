@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import pytest
 
+from legged_mw import ROOT
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.unitree.link import RobotEnd, Wire
 from legged_mw.deploy.unitree.robots import machine_of
@@ -59,3 +60,9 @@ def test_a_fault_damps(name: str, ends: dict[str, Ends], monkeypatch: pytest.Mon
     assert sim.record.beyond < limits.position and sim.record.fastest < limits.speed
     if not case.misplaced:
         assert sim.record.asked < limits.torque and sim.record.outside < 1e-6
+
+
+def test_the_page_has_them_all() -> None:
+    page = (ROOT / "docs/faults.md").read_text()
+    assert [name for name in CASES if f"| {name} |" not in page] == []
+    assert f"[{len(CASES)} faults](docs/faults.md)" in (ROOT / "README.md").read_text()
