@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import os
 import re
 import signal
 import subprocess
@@ -31,9 +30,11 @@ from pytest import MonkeyPatch
 
 from legged_mw.deploy import states
 from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.loop import real_time
 from legged_mw.deploy.unitree import clock
 from legged_mw.deploy.unitree.client import connect
 from legged_mw.deploy.unitree.link import RobotEnd, Wire
+from legged_mw.deploy.unitree.program import PRIORITY
 from legged_mw.deploy.unitree.robots import machine_of
 from legged_mw.deploy.unitree.serve import DAMPED, STEP, SimulatedUnitree
 from tests.faults import CASES, Case, Rig, Side, answers_too, lockstep
@@ -170,8 +171,7 @@ def main() -> None:
     if args.policy:
         policy(args.policy, args.domain)
         return
-    with contextlib.suppress(OSError, AttributeError):  # not allowed, or not Linux
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(10))
+    real_time(PRIORITY, heirs=True)
     print("| fault | `--fault` | the line | in lockstep | live |\n| --- | --- | --- | --- | --- |")
     for name in args.faults or CASES:
         print(row(name), flush=True)

@@ -175,7 +175,16 @@ def test_another_robot_is_refused_with_both_lists() -> None:
     assert f"The contract has: {', '.join(joints)}; go2 has: {', '.join(GO2.motors)}" in text
 
 
-@pytest.mark.parametrize(("number", "said"), [(4, "has 23 joints (mode_machine 4), the contract 29"), (77, "has an unknown body")])
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (
+            4,
+            "has 23 joints (mode_machine 4: no waist_roll_joint, waist_pitch_joint, left_wrist_pitch_joint, left_wrist_yaw_joint, right_wrist_",
+        ),
+        (77, "has an unknown body (mode_machine 77), the contract 29: left_hip_pitch_joint, "),
+    ],
+)
 def test_another_body_is_refused(number: int, said: str) -> None:
     check_body(G1, 5)
     check_body(GO2, 77)
