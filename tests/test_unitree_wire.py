@@ -180,7 +180,7 @@ def test_another_robot_is_refused_with_both_lists() -> None:
     [
         (
             4,
-            "has 23 joints (mode_machine 4: no waist_roll_joint, waist_pitch_joint, left_wrist_pitch_joint, left_wrist_yaw_joint, right_wrist_",
+            "has 23 joints (mode_machine 4: no waist_roll_joint, waist_pitch_joint, left_wrist_pitch_joint, left_wrist_yaw_joint, ",
         ),
         (77, "has an unknown body (mode_machine 77), the contract 29: left_hip_pitch_joint, "),
     ],
