@@ -287,7 +287,7 @@ def test_more_motors_than_the_contracts_robot_has(domain: int) -> None:
     """The same messages, another robot: a Go2 with wheels at 12 to 15, or an H1."""
     both = pair("go2_flat", domain)
     state = Message(LAYOUTS["unitree_go", "LowState_"], both.sim._state.body)
-    state["motor_state.q"] = np.arange(20) < 16
+    state["motor_state.q"] = state["motor_state.mode"] = np.arange(20) < 16
     with pytest.raises(
         RobotError, match="motors answer at 12, 13, 14, 15, where a go2 has none: it is not the contract's robot. Known are: go2"
     ):

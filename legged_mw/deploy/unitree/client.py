@@ -21,6 +21,7 @@ from legged_mw.deploy.unitree.robots import Machine, check_body, check_slots, ma
 
 TOO_OLD = 0.1  # [s] ours: a measurement older than this is none
 TOUCH = 20  # foot_force from which a foot touches the ground, in the robot's own unit; ours
+_WRAP = 2**32 / 1000  # [s] after which a robot's tick begins at 0 again
 LOST = 5  # messages that a motor may lose between two looks; ours
 _MEASURED = ("ang_vel", "gravity", "joint_pos", "joint_vel", "joint_torque", "acceleration")
 
@@ -94,7 +95,7 @@ class UnitreeRobot(Robot):
         self.report = ""  # after `close`: latencies of the wire
         check_body(self.machine, self._mode_machine)
         self._body = self._mode_machine
-        check_slots(self.machine, self._state["motor_state.q"])
+        check_slots(self.machine, (self._state["motor_state.q"] != 0.0) & (self._state["motor_state.mode"] != 0))
         self._default = contract.stiffness, contract.damping
         self._lost = self._state["motor_state.lost"].astype(int) if self.machine.package == "unitree_go" else None
         self._left_out = 0  # states since the last good one
@@ -176,7 +177,7 @@ class UnitreeRobot(Robot):
             self._left_out += 1
             return
         back = (int(self._state["tick"]) - int(state["tick"])) / 1000
-        if back > TOO_OLD:
+        if TOO_OLD < back < _WRAP / 2:
             raise RobotError(f"the robot's clock went back by {back:.1f} s: it was started again, or two robots answer")
         self._state, self._stamp, self._left_out = state, received.stamp, 0
         if (body := self._mode_machine) != self._body:
@@ -220,14 +221,15 @@ def check_rows(contract: Contract, machine: Machine) -> None:
 def connect(folder: Path, contract: Contract, interface: str, domain: int | None = None) -> UnitreeRobot:
     """The robot on a network interface, its wire owned by a guard process. Raises RobotError with what is wrong."""
     need_dds()
-    from legged_mw.deploy.unitree.guard import Guarded
+    from legged_mw.deploy.unitree.guard import LATE, Guarded
     from legged_mw.deploy.unitree.link import LOOPBACK, default_domain
 
     machine = machine_of(contract.joints)
     check_rows(contract, machine)
     read_scene(folder, contract)  # a scene that is not the contract's is refused before anything is sent
     domain = default_domain(interface) if domain is None else domain
-    owner = Guarded.start(machine.package, interface, domain, lies_down=machine.lies_down)
+    late = max(LATE, 1.5 * contract.period)  # a policy may be slow
+    owner = Guarded.start(machine.package, interface, domain, lies_down=machine.lies_down, late=late)
     try:
         return UnitreeRobot(contract, owner, owner.first, echo=interface in LOOPBACK)
     except BaseException:

@@ -99,12 +99,12 @@ def known_motors(package: str) -> str:
     return "; ".join(f"{m.name} has {', '.join(m.motors)}" for m in MACHINES.values() if m.package == package) or f"{package} is not known"
 
 
-def check_slots(machine: Machine, angles: np.ndarray) -> None:
-    """Refuse a robot with angles (slots,) where this one has no motors, such as an H1 by a Go2's contract. Raises RobotError.
+def check_slots(machine: Machine, answers: np.ndarray) -> None:
+    """Refuse a robot with motors that answer (slots,) where this one has none: an H1 by a Go2's contract. Raises RobotError.
 
-    Fewer motors are not noticed: an angle may be 0.
+    Fewer motors are not noticed: not all simulators set all that a motor answers.
     """
-    if machine.package == "unitree_go" and (more := sorted({*np.flatnonzero(angles).tolist()} - {*machine.motors.values()})):
+    if machine.package == "unitree_go" and (more := sorted({*np.flatnonzero(answers).tolist()} - {*machine.motors.values()})):
         raise RobotError(
             f"motors answer at {', '.join(map(str, more))}, where a {machine.name} has none: it is not the contract's robot. "
             f"Known are: {known_motors(machine.package)}"
