@@ -280,12 +280,6 @@ def policy_of(change: Callable[[Any], Any]) -> Fault:
     return fault
 
 
-def scaled(robot: Watched, controller: Controller, _: Script) -> None:
-    """A contract of another policy: each target is ten times as far from the default pose."""
-    right, pose = controller.act, controller.contract.default_pose
-    controller.act = lambda *seen: right(*seen) if robot.step < AT else pose + 10 * (right(*seen) - pose)  # type: ignore[method-assign]
-
-
 def measured_as(change: Callable[[Watched, Measurement], Measurement]) -> Fault:
     def fault(robot: Watched, _: Controller, __: Script) -> None:
         robot.changed = lambda step, measured: change(robot, measured) if step >= AT else measured
@@ -326,7 +320,7 @@ def ended(robot: Watched, controller: Controller, script: Script) -> None:
 FAULTS: dict[str, tuple[Fault, int, str]] = {  # fault, periods until it can be known, what is said
     "NaN from the policy": (policy_of(lambda actions: np.nan * actions), 0, "the target of FL_hip_joint is not finite: nan"),
     "inf from the policy": (policy_of(lambda actions: np.inf * actions), 0, "the target of FL_hip_joint is not finite: nan"),
-    "a scale ten times too large": (scaled, 5, "_joint is "),
+    "actions a hundred times too large": (policy_of(lambda actions: 100 * actions), 5, "damping: "),
     "NaN from a sensor": (
         measured_as(lambda _, m: replace(m, joint_vel=np.nan * m.joint_vel)),
         0,
