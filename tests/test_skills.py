@@ -93,7 +93,7 @@ def test_rewards_of_getup(go1: Getup) -> None:
     expected = {
         "upright": [1.0, math.exp(-8.0), 1.0, 1.0],
         "height": [1.0, 1.0, 0.1 / (0.99 * 0.278), 1.0],
-        "posture": [1.0, 0.0, 1.0, math.exp(-0.5 * 0.04)],
+        "posture": [1.0, 0.0, 1.0, math.exp(-2.0 * 0.04 / 12)],
         "stand_still": [1.0, 0.0, 0.0, still],
         "fast_joints": [0.0, 0.0, 0.0, (4.0 * math.pi) ** 2],
     }

@@ -130,8 +130,8 @@ class Getup(RobotTask):
         return (self.base_height / self.up_height).clamp(max=1.0)
 
     def _reward_posture(self) -> Tensor:
-        """The default pose, once it is upright. [P]"""
-        return torch.where(self._is_upright(), self._reward_pose().sqrt(), 0.0)  # exp(-0.5 x ...)
+        """The default pose, once it is upright. [P: exp(-0.5 x sum), which is flat where the legs are folded; ours: by the mean]"""
+        return torch.where(self._is_upright(), torch.exp(-2.0 * (self.dof_offset.square() * self.pose_weights).mean(dim=1)), 0.0)
 
     def _reward_stand_still(self) -> Tensor:
         """Joints at rest, once it is up. [P: small actions; ours: an action is a torque here, and standing takes some]"""
