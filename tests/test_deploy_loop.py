@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import gc
+import os
 import tracemalloc
+from typing import Any
 
 import numpy as np
 import pytest
@@ -47,6 +49,21 @@ def test_a_late_step_moves_no_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
     timing = loop.timing()
     assert (timing.late, timing.lost) == (2, 1) and timing.jitter.worst == pytest.approx(0.015)
     assert str(timing).startswith("9 steps, 2 late, 1 periods left out; begin late by median 0.00, p99 ")
+
+
+def test_real_time_priority_is_given_back_as_a_user_may(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Linux lets only root take back the flag that threads do not inherit the priority."""
+    asked: list[int] = []
+
+    def schedule(_: int, policy: int, parameters: Any) -> None:
+        if asked and not policy & os.SCHED_RESET_ON_FORK:
+            raise PermissionError(1, "Operation not permitted")
+        asked.append(policy)
+
+    monkeypatch.setattr("os.sched_setscheduler", schedule)
+    with Loop(0.02):
+        assert asked == [os.SCHED_RR | os.SCHED_RESET_ON_FORK]
+    assert asked[1:] == [os.sched_getscheduler(0) | os.SCHED_RESET_ON_FORK]
 
 
 def test_a_loop_that_is_not_live_never_waits(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -119,7 +119,8 @@ class Loop:
             if self._before[0]:
                 gc.enable()
             if self._scheduled:
-                os.sched_setscheduler(0, *self._scheduled)
+                policy, parameters = self._scheduled
+                os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, parameters)  # only root may take that flag back
 
     def ticks(self, seconds: float = math.inf) -> Iterator[float]:
         """The time [s] of each step for ``seconds``, when it is due, or at once if it is late.
