@@ -154,6 +154,13 @@ def test_a_guard_that_is_told_to_end_damps_first(bench: Bench) -> None:
     assert bench.ended() and bench.wire.sent[-1] == DAMPING
 
 
+def test_a_guard_that_is_killed_while_it_writes(bench: Bench) -> None:
+    """The policy's process does not read for ever what will never be whole."""
+    bench.board._map[0] = 1
+    with pytest.raises(RobotError, match="the guard of the wire is gone: the robot may hold its last command. Press its emergency stop"):
+        bench.board.get()
+
+
 def test_the_end(bench: Bench) -> None:
     """The last command is sent for a while, and the latency of the others is told."""
     bench.send(guard.MOVE, MOVING, stamp=clock())

@@ -34,6 +34,7 @@ REPEAT = 0.002  # [s] between two messages to the robot [unitree_sdk2's examples
 AFTER = 1.0  # [s] ours: how long damping is sent before the wire is let go
 START = 60.0  # [s] for a guard to find the robot
 PRIORITY = 30  # ours, of a real-time process: before the policy's, which it must outlive
+GONE = "the guard of the wire is gone: the robot may hold its last command. Press its emergency stop"
 _TURN = 0.001  # [s] at most between two looks at the wire
 _BOARD = struct.Struct("<QdI512s")  # changes of the board (odd: one is going on), stamp of the state, bytes of the text, text
 _FRAME = struct.Struct("<Bd")  # kind, stamp of the state that a command answers
@@ -59,12 +60,14 @@ class Board:
         struct.pack_into("<Q", self._map, 0, self._changes)
 
     def get(self) -> tuple[bytes, float, str]:
-        """State, stamp, text. What is being written meanwhile is read again."""
-        while True:
+        """State, stamp, text. What is being written meanwhile is read again. Raises RobotError if that does not end."""
+        end = clock() + STILL
+        while clock() < end:
             before, stamp, length, text = _BOARD.unpack_from(self._map)
             body = self._map[_BOARD.size :]
             if before % 2 == 0 and struct.unpack_from("<Q", self._map)[0] == before:
                 return body, stamp, text[:length].decode(errors="replace")
+        raise RobotError(GONE)
 
 
 # ---- the policy's side ---------------------------------------------------------------------------------------------
@@ -144,7 +147,7 @@ class Guarded:
         except OSError:
             if text := self._board.get()[2]:
                 raise RobotError(text) from None
-            raise RobotError("the guard of the wire is gone: the robot may hold its last command. Press its emergency stop") from None
+            raise RobotError(GONE) from None
 
     def _answer(self) -> dict[str, Any]:
         """A line of JSON from the guard; empty if none comes."""
