@@ -56,6 +56,15 @@ def test_from_lying_to_walking(name: str, lies: float, stands: float) -> None:
     assert robot.fleet.qpos[0, 0] > 1.0  # it walked
 
 
+def test_limits_judge_the_gains_that_a_robot_has(contract: Contract, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that cannot change them stands up with the contract's, so the torque limit counts with those."""
+    robot, judged = Watched(GO1, contract, whole=True), []
+    robot.can_change_gains = False
+    monkeypatch.setattr("legged_mw.deploy.safety.Safety.asked", lambda _, measured, targets, *gains: judged.append(gains))
+    driven(robot, Controller(GO1, contract), Script({2: "start"}), 0.2, [])
+    assert len(judged) == 8 and set(judged) == {(None, None)}
+
+
 def test_standing_begins_where_the_joints_are(contract: Contract) -> None:
     """The first target is the measured pose, with a tenth of the stiffness; both reach their ends after 2 s."""
     controller, source = Controller(GO1, contract), Script({0: "start"})

@@ -121,6 +121,8 @@ class _Step:
         else:
             assert measured  # else there is a trip
             order = self._decide(measured, loop.now)
+            if not self.robot.can_change_gains:
+                order = order._replace(stiffness=None, damping=None)
             if order.targets is not None:
                 trip = self.safety.asked(measured, order.targets, order.stiffness, order.damping)
                 held = self.safety.held(order.targets)
@@ -175,7 +177,7 @@ class _Step:
     def _do(self, order: Order) -> None:
         if order.targets is None:
             self.robot.limp() if order.state == ZERO else self.robot.damp()
-        elif order.stiffness is None or not self.robot.can_change_gains:
+        elif order.stiffness is None:
             self.robot.write(order.targets)
         else:
             self.robot.write(order.targets, stiffness=order.stiffness, damping=order.damping)
