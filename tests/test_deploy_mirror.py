@@ -101,6 +101,17 @@ def test_measured_joints_tilt_state_and_why_are_shown(ends: Ends, contract: Cont
     assert min(soles) == pytest.approx(0.0, abs=1e-6)
 
 
+@pytest.mark.parametrize(("gravity", "height"), [((0.0, 0.0, 1.0), 0.057), ((0.0, 1.0, 0.0), 0.195)])
+def test_a_robot_that_lies_is_shown_on_the_ground(ends: Ends, contract: Contract, gravity: Any, height: float) -> None:
+    """On its back, on its side: the trunk's shapes and the legs' count, not the feet alone."""
+    ends.mirror.show(0.0, measurement(contract, gravity=np.array(gravity), joint_pos=contract.default_pose), state("damping", ""))
+    ends.turn()
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, ends.shown[-1].qpos[0, 3:7])
+    assert np.allclose(turn.reshape(3, 3) @ gravity, [0, 0, -1], atol=1e-6)
+    assert ends.shown[-1].qpos[0, 2] == pytest.approx(height, abs=0.002)
+
+
 def test_it_walks_by_its_velocity_and_a_silent_robot_stays(ends: Ends, contract: Contract) -> None:
     moving = measurement(contract, lin_vel=np.array([1.0, 0.0, 0.0]), ang_vel=np.array([0.0, 0.0, 0.5]))
     for step in range(50):

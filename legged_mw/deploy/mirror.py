@@ -121,7 +121,7 @@ class MirroredStage:
 
     def __init__(self, folder: Path, channel: socket.socket) -> None:
         self.contract = read_contract(folder)
-        scene = read_scene(folder, self.contract)
+        scene = read_scene(folder, self.contract, whole=True)  # it may lie
         self.spec, self._model, self._data, self._channel = scene.spec, scene.model, mujoco.MjData(scene.model), channel
         mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
         self.command_table, self._parent = self.contract.commands, os.getppid()

@@ -19,17 +19,22 @@ def place(model: Any, data: Any, joints: Sequence[str], angles: Floats, gravity:
     data.qpos[[model.joint(name).qposadr[0] for name in joints]] = angles
     up, tilt, turn = -gravity / np.linalg.norm(gravity), np.zeros(4), np.zeros(4)  # z axis of the world, in the body
     axis = np.cross(up, [0.0, 0.0, 1.0])
-    mujoco.mju_axisAngle2Quat(tilt, axis / max(float(np.linalg.norm(axis)), 1e-9), math.acos(np.clip(up[2], -1.0, 1.0)))
+    sine = float(np.linalg.norm(axis))
+    axis = axis / sine if sine > 1e-9 else np.array([1.0, 0.0, 0.0])  # level, or upside down
+    mujoco.mju_axisAngle2Quat(tilt, axis, math.acos(np.clip(up[2], -1.0, 1.0)))
     mujoco.mju_axisAngle2Quat(turn, np.array([0.0, 0.0, 1.0]), heading)
     mujoco.mju_mulQuat(data.qpos[3:7], turn, tilt)
     mujoco.mj_kinematics(model, data)
-    touching = np.flatnonzero((model.geom_conaffinity > 0) & (model.geom_bodyid > 0))
-    lowest = [data.geom_xpos[i, 2] - _reach(model.geom_size[i], data.geom_xmat[i], model.geom_type[i]) for i in touching]
+    touching = np.flatnonzero((model.geom_conaffinity > 0) & (model.geom_bodyid > 0)).tolist()
+    lowest = [data.geom_xpos[i, 2] - _reach(model, i, data.geom_xmat[i]) for i in touching]
     data.qpos[2] -= min(lowest, default=0.0)
 
 
-def _reach(size: Floats, turn: Floats, kind: int) -> float:
-    """How far a sphere or capsule reaches down from its centre [m]; another shape about its largest size."""
+def _reach(model: Any, geom: int, turn: Floats) -> float:
+    """How far a sphere or capsule reaches down from its centre [m]; of another shape the box around it."""
+    kind, size = model.geom_type[geom], model.geom_size[geom]
     if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
         return size[0] + abs(turn[8]) * size[1]
-    return size[0] if kind == mujoco.mjtGeom.mjGEOM_SPHERE else float(size.max())
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return size[0]
+    return float(np.abs(turn[6:]) @ model.geom_aabb[geom, 3:] - turn[6:] @ model.geom_aabb[geom, :3])
