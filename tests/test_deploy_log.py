@@ -92,7 +92,7 @@ def test_what_is_no_log(tmp_path: Path, contract: Contract, logged: tuple[Path, 
     wrong = tmp_path / "wrong.lmwlog"
     with pytest.raises(LogError, match="cannot read .*wrong.lmwlog: No such file"):
         read_log(wrong)
-    for content in (b"", b"no log", b"x" * 100, b"\x05" + b"\0" * 7 + b"hello"):
+    for content in (b"", b"no log", b"x" * 100, b"\x05" + b"\0" * 7 + b"hello", b"\0" * 8, b"\x05" + b"\0" * 7 + b"PK\x03\x04-"):
         wrong.write_bytes(content)
         with pytest.raises(LogError, match=r"wrong.lmwlog is no log of legged_mw.deploy"):
             read_log(wrong)

@@ -13,6 +13,8 @@ import queue
 import struct
 import threading
 import time
+import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -176,7 +178,7 @@ def read_log(path: Path) -> Recording:
         fits = header["format"] == FORMAT
     except OSError as error:
         raise LogError(f"cannot read {path}: {error.strerror}") from None
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, EOFError, zipfile.BadZipFile, zlib.error):
         raise LogError(f"{path} is no log of legged_mw.deploy") from None
     if not fits:
         raise LogError(f"{path} is a log of format {header['format']}; this version reads {FORMAT}")
