@@ -253,6 +253,9 @@ def check_switch(rescuer: Path) -> None:
     assert not stage.rescued[1]
     with pytest.raises(UserError, match="--switch: joints of go1_flat and g1_flat differ, so they cannot drive one robot"):
         SwitchStage(POLICIES / "go1_flat", POLICIES / "g1_flat")
+    line = "--switch: rows with sensors of their own of go1_flat and go1_rough_scan differ, .* one robot: \\[\\] and \\['height_scan'\\]"
+    with pytest.raises(UserError, match=line):
+        SwitchStage(POLICIES / "go1_flat", POLICIES / "go1_rough_scan")
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from legged_mw.deploy.contract import Contract, Ends, read_contract
+from legged_mw.deploy.contract import OWN, Contract, Ends, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.simulated import Fleet
@@ -17,12 +17,9 @@ from legged_mw.deploy.stage import DeployStage
 from legged_mw.utils.errors import UserError
 
 FELL = 60.0  # [deg] between the robot's z axis and the vertical: the second policy takes over [ours: a walker does not come back]
-UP, NEAR, SLOW, HOLD = (
-    10.0,
-    0.35,
-    1.0,
-    0.5,
-)  # [deg], [rad] of every joint from the first's default pose, [rad/s] mean, [s]: the first [ours]
+# It stands again, so that the first takes over, while it is [ours]:
+UP, NEAR, SLOW = 10.0, 0.35, 1.0  # [deg] tilted; [rad] from the first's default pose, each joint; [rad/s] of joints, the mean
+HOLD = 0.5  # [s] for so long
 
 
 class SwitchStage(DeployStage):
@@ -71,14 +68,16 @@ class SwitchStage(DeployStage):
 
 def check_same(first: Contract, second: Contract) -> None:
     """Raises UserError where two policies cannot drive one robot in turns."""
-    own = {row.name for row in second.rows if row.sensors} - {row.name for row in first.rows}
+    own = sorted({row.name for row in second.rows if row.measured in OWN} - {row.name for row in first.rows})
     for what, here, there in (
         ("joints", first.joints, second.joints),
         ("period", first.period, second.period),
         ("stiffness", first.stiffness.tolist(), second.stiffness.tolist()),
         ("damping", first.damping.tolist(), second.damping.tolist()),
         ("motors", first.motors, second.motors),
-        ("rows with sensors of their own", set(), own),
+        ("rows with sensors of their own", [], own),
     ):
         if here != there:
-            raise UserError(f"--switch: {what} of {first.task} and {second.task} differ, so they cannot drive one robot")
+            raise UserError(
+                f"--switch: {what} of {first.task} and {second.task} differ, so they cannot drive one robot: {here} and {there}"
+            )
