@@ -277,6 +277,12 @@ def test_faults_on_demand() -> None:
     assert faults == Faults(loss=0.05, joint_order=1, temperature=90.0, dead_motors={"FL_calf_joint"}, silent=True)
     found[-1].begin(faults)
     assert not faults.silent
+    for fault in parse_faults(["motor_fault=FL_hip_joint"], JOINTS):
+        fault.begin(faults)
+    assert faults.dead_motors == {"FL_calf_joint", "FL_hip_joint"}
+    for fault in parse_faults(["motor_fault=off"], JOINTS):
+        fault.begin(faults)
+    assert not faults.dead_motors
     page = (ROOT / "docs/faults.md").read_text()
     assert [name for name in KINDS if f"`{name}" not in page] == []
 

@@ -82,7 +82,10 @@ class Fault(NamedTuple):
     time: float  # [s]
 
     def begin(self, faults: Faults) -> None:
-        setattr(faults, self.field, self.value)
+        value = self.value
+        if isinstance(value, set) and value:
+            value = value | getattr(faults, self.field)  # one more joint
+        setattr(faults, self.field, value)
 
 
 def parse_faults(texts: Sequence[str], joints: Sequence[str]) -> list[Fault]:
