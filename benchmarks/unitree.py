@@ -37,6 +37,8 @@ def begin(sim: SimulatedUnitree, robot: UnitreeRobot) -> None:
     sim.step()
     robot.write(robot.contract.default_pose)
     sim.step()
+    while (robot.health().age_s or 0.0) > 0.01 + sim.faults.delay_ms / 1000:  # its first state is under way
+        sim.step()
 
 
 def examine(folder: Path, contract: Contract, exam: ExamRules, domain: int, faults: Faults) -> dict[str, object]:
