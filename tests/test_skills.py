@@ -265,7 +265,7 @@ def check_switch(rescuer: Path) -> None:
         (["go1_flat", "--switch", "fall"], "--switch fall is of two policies"),
         (
             ["go1_flat", "go2_flat", "--switch", "fall", "--eval"],
-            "--switch is watched in simulation, on flat ground: leave the other flags out",
+            "--switch is watched in simulation, on flat ground: leave --eval out",
         ),
     ],
 )

@@ -241,7 +241,8 @@ JOINTS = ["FL_hip_joint", "FL_calf_joint"]
         ("dealy=3", "no fault 'dealy' in what a served robot can have; did you mean 'delay'? there are: delay, jitter, loss,"),
         ("loss=200", "loss is a number from 0 to 100 [%], or off"),
         ("delay=x", "delay is a number from 0 to 1000 [ms], or off"),
-        ("clock_jump=inf", "clock_jump is a number [s], or off"),
+        ("clock_jump=1e9", "clock_jump is a number from -1000 to 1000 [s], or off"),
+        ("joint_bias=inf", "joint_bias is a number [rad], or off"),
         ("low_battery=-1", "low_battery is a number from 0 [V], or off"),
         ("frozen=3", "frozen has no value but off"),
         ("frozen@soon", "after @ stands when it begins, a number of seconds from 0"),
@@ -322,6 +323,14 @@ def test_nothing_of_dds_is_imported_by_the_program() -> None:
         ),
         (("--serve", "unitree", "--interface", "lo", "--num_envs", "3"), "--num_envs is of simulated robots in this program: leave it out"),
         (("--serve", "unitree", "--interface", "lo", "--fault", "hot"), "--fault hot: no fault 'hot' in what a served robot can have"),
+        (
+            ("--serve", "unitree", "--interface", "lo", "--watchdog", "0"),
+            "--watchdog 0: a time of more than 0 s; without the flag it never damps by itself",
+        ),
+        (
+            ("--robot", "unitree", "--interface", "lo", "--viewer", "video"),
+            "--robot unitree is one robot in real time: leave --viewer out",
+        ),
         (("--serve", "unitree", "--interface", "nowhere"), "no network interface 'nowhere' in this machine"),
     ],
 )

@@ -44,8 +44,9 @@ def parse() -> argparse.Namespace:
         parser.error(f"--eval brings its own commands, is on flat ground and shows nothing: leave {asked[0]} out")
     if (args.second is None) != (args.switch is None):
         parser.error("--switch fall is of two policies: python -m legged_mw.deploy DIR DIR2 --switch fall")
-    if args.switch and (args.eval or args.drive or args.serve or args.terrain or args.robot != "simulated" or args.velocity):
-        parser.error("--switch is watched in simulation, on flat ground: leave the other flags out")
+    others = [f"--{name}" for name in ("eval", "drive", "serve", "terrain", "velocity") if getattr(args, name)]
+    if args.switch and (others := others + ["--robot"] * (args.robot != "simulated")):
+        parser.error(f"--switch is watched in simulation, on flat ground: leave {others[0]} out")
     if args.ranges and not args.eval:
         parser.error("--ranges says what the exam asks: add --eval")
     if args.command is not None and args.commands:

@@ -54,10 +54,11 @@ def check_flags(args: argparse.Namespace) -> None:
     several = {"eval": args.eval, "num_envs": args.num_envs != 1, "replay": args.replay}
     shown = ("--commands", *([f"--{name}" for name in FLAGS] if args.viewer in LIVE else []))
     watched = [flag.removeprefix("--") for flag in launch.asked(args) if flag not in shown]
-    if args.drive and (given := [name for name, value in several.items() if value] + watched):
-        raise FlagError(f"--drive is one robot in real time: leave --{given[0]} out")
+    driven = "--drive" if args.drive else f"--robot {args.robot}" if args.robot != "simulated" else ""
+    if driven and (given := [name for name, value in several.items() if value] + watched):
+        raise FlagError(f"{driven} is one robot in real time: leave --{given[0]} out")
     alone = {"hoist": args.hoist, "limit": args.limit, "gamepad": args.gamepad, "stop_fd": args.stop_fd is not None, "log": args.log}
-    if not args.drive and args.robot == "simulated" and (given := [name for name, value in alone.items() if value]):
+    if not driven and (given := [name for name, value in alone.items() if value]):
         raise FlagError(f"--{given[0]} is of a robot that is driven: add --drive")
     parse_limits(args.limit)
 

@@ -47,6 +47,8 @@ def check_flags(args: argparse.Namespace) -> None:
     for name in _OF_SERVING:
         if not args.serve and getattr(args, name) is not None:
             raise UserError(f"--{name} is of a robot that is simulated for others: add --serve unitree")
+    if args.watchdog is not None and not args.watchdog > 0.0:
+        raise UserError(f"--watchdog {args.watchdog:g}: a time of more than 0 s; without the flag it never damps by itself")
     if args.contact and args.velocity != ODOMETRY:
         raise UserError(f"--contact is of leg odometry: add --velocity {ODOMETRY}")
     if args.velocity and (args.serve or (args.velocity == TRUTH and wire)):

@@ -58,7 +58,7 @@ KINDS = {
     "jitter": Kind("jitter_ms", 20.0, 0, 1000, "ms"),
     "loss": Kind("loss", 100.0, 0, 100, "%"),
     **{name: Kind(name, True) for name in ("bad_crc", "frozen", "silent", "no_remote")},
-    "clock_jump": Kind("clock_jump", -1.0, unit="s"),
+    "clock_jump": Kind("clock_jump", -1.0, -1000, 1000, "s"),
     "mode_machine": Kind("mode_machine", 4, 0, 255),
     "joint_order": Kind("joint_order", 1, -40, 40, "places"),
     "joint_sign": Kind("turned_joints", None),
