@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -269,6 +270,12 @@ def test_a_guard_that_is_killed_leaves_the_last_command(domain: int) -> None:
         live(sim, lambda: process.poll() is not None)
         assert sim.acted["kp"].any()
         assert "the guard of the wire is gone: the robot may hold its last command" in process.communicate()[1]
+
+
+def test_a_guard_that_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.executable", shutil.which("false"))
+    with pytest.raises(RobotError, match="the guard of the wire did not start: it ended, or took longer than 60 s; no command was sent"):
+        Guarded.start("unitree_go", "lo", 0)
 
 
 def test_a_guard_says_what_is_wrong(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:

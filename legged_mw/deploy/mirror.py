@@ -15,6 +15,7 @@ import os
 import socket
 import subprocess
 import sys
+import time
 from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
@@ -56,15 +57,21 @@ class Mirror:
             settings["channel"] = theirs.fileno()
             command = [sys.executable, "-c", program, json.dumps(settings)]
             self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), start_new_session=True)  # Ctrl-C is not for it
-        self._channel.settimeout(START)
-        try:
-            said = self._channel.recv(4096).decode()
-        except OSError:
-            said = "it did not start"
+        said = self._first_word()
         self._channel.setblocking(False)
         if said:
             self.close()
             raise ViewError(said)
+
+    def _first_word(self) -> str:
+        """What is wrong with the viewer; nothing once it is open."""
+        end, alive = time.monotonic() + START, True
+        self._channel.settimeout(0.1)
+        while alive:
+            alive = self._process.poll() is None and time.monotonic() < end
+            with suppress(OSError):
+                return self._channel.recv(4096).decode()
+        return f"the viewer did not start: it ended, or took longer than {START:g} s; leave --viewer out"
 
     def begin(self, contract: Contract, channel: socket.socket) -> None:
         """Tell of the robot through ``channel`` from now on."""

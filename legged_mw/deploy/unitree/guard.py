@@ -83,7 +83,8 @@ class Guarded:
         said = self._answer()
         if "error" in said or not said:
             self._channel.close()
-            raise RobotError(said.get("error", f"the guard of the wire did not start within {START:g} s"))
+            why = f"the guard of the wire did not start: it ended, or took longer than {START:g} s; no command was sent"
+            raise RobotError(said.get("error", why))
         self._channel.settimeout(0.5)
         self._last = 0.0
         self.first = self.receive()
