@@ -146,7 +146,7 @@ def swayed(push: Floats, height: float) -> Floats:
     count, stiff = len(push), height / GRAVITY * RATE**2
     matrix = np.diag(np.full(count, 1.0 + 2.0 * stiff)) + np.diag(np.full(count - 1, -stiff), 1) + np.diag(np.full(count - 1, -stiff), -1)
     matrix[0, 0] = matrix[-1, -1] = 1.0 + stiff
-    return np.linalg.solve(matrix, push)
+    return np.asarray(np.linalg.solve(matrix, push), dtype=np.float64)
 
 
 def stand(body: Body, seconds: float) -> Plan:

@@ -24,7 +24,15 @@ LONG = {
 
 # Imports run one way: train, play -> rl -> envs -> sim -> utils; configs -> envs, utils.
 LAYERS = ("utils", "sim", "envs", "rl")
-TOOLS = ("legged_mw.check", "legged_mw.view", "legged_mw.eval", "legged_mw.deploy", "legged_mw.robot", "legged_mw.drawing", "legged_mw.motion")
+TOOLS = (
+    "legged_mw.check",
+    "legged_mw.view",
+    "legged_mw.eval",
+    "legged_mw.deploy",
+    "legged_mw.robot",
+    "legged_mw.drawing",
+    "legged_mw.motion",
+)
 ONLY_IN = {
     "warp": ["legged_mw/sim/*"],
     "mujoco_warp": ["legged_mw/sim/*"],
