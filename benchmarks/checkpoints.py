@@ -1,4 +1,4 @@
-"""The walking exam of many checkpoints of a run, in one environment: when it first walks, and how it goes on.
+"""The exam of many checkpoints of a run, in one environment: when it first walks, or stands, and how it goes on.
 
     python benchmarks/checkpoints.py logs/go2_flat/<time> --every 25 --until 500
     python benchmarks/checkpoints.py logs/go2_flat/<time> --ranges common --crossing
@@ -11,10 +11,12 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from legged_mw.eval import crossing, exam
+from legged_mw.eval import crossing, exam, perform
+from legged_mw.eval.exams import require_exam
 from legged_mw.eval.rules import in_common
 from legged_mw.rl.policies import load_policy
 from legged_mw.rl.runs import CONFIG_FILE, checkpoints, task_of
@@ -43,6 +45,8 @@ def line(result: dict[str, Any]) -> str:
     start = f"{result['iteration']:>6} {result['seconds']:>7.1f} s"
     if "kinds" in result:
         return f"{start}\n{crossing.table(result)}"
+    if "walks" not in result:
+        return f"{start}  " + "  ".join(f"{name} {value:.3f}" for name, value in result.items() if name not in ("iteration", "seconds"))
     figures = [f"{name} {', '.join(f'{value:.3f}' for value in result[name])}" for name in ("error", "offset", "worst")]
     drift, cost = (f"{result[name]:.3f}" if result[name] is not None else "-" for name in ("drift", "cost_of_transport"))
     pushes = ", ".join(f"{share:g}" for share in result["pushes"].values())
@@ -64,10 +68,16 @@ def main() -> None:
     task.update_from_run(load_yaml(args.run / CONFIG_FILE), where=str(args.run))
     if args.ranges == "common":
         task.update({"exam": in_common(load_task(task_of(args.run)).cfg.exam.peer)}, where="--ranges common")
-    (crossing if args.crossing else exam).prepare(task)
+    require_exam(task)
+    if task.exam != "walking":
+        perform.prepare(task)
+        grade: Callable[[Any, Any], dict[str, Any]] = partial(perform.first_part, skill=perform.skill_of(task.cfg, task.exam))
+    else:
+        (crossing if args.crossing else exam).prepare(task)
+        grade = crossing.run_crossing if args.crossing else exam.run_exam
     found = [iteration for iteration in checkpoints(args.run) if iteration <= args.until]
     wanted = [iteration for iteration in found if iteration % args.every == 0 or iteration == found[-1]]
-    results = graded(args.run, wanted, device, crossing.run_crossing if args.crossing else exam.run_exam, task)
+    results = graded(args.run, wanted, device, grade, task)
     if args.out:
         args.out.write_text(json.dumps(results, indent=1) + "\n", encoding="utf-8")
 

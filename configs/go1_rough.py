@@ -5,26 +5,12 @@ Sources: [P] MuJoCo Playground's rough task for this robot; [L] legged_gym's ter
 
 from configs.go1_flat_dr import Go1FlatDrCfg, Go1FlatDrCfgPPO
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.sim_to_real_config import SimToRealRoughCfg
 from legged_mw.utils.task import Task
 
 
 class Go1RoughCfg(Go1FlatDrCfg):
-    class terrain(Go1FlatDrCfg.terrain):
-        mesh_type = "heightfield"
-        height_scan = ["privileged_state"]  # the critic sees the ground, the robot does not
-        terrain_proportions = {  # [ours: stairs up are learned last]
-            "flat": 0.05,
-            "smooth_slope": 0.1,
-            "rough_slope": 0.1,
-            "stairs_up": 0.35,
-            "stairs_down": 0.15,
-            "obstacles": 0.15,
-            "waves": 0.05,
-            "low_random": 0.05,
-        }
-
-    class termination(Go1FlatDrCfg.termination):
-        min_base_height = 0.12  # [m] [ours: the feet alone touch the ground, so that a trunk would sink into a step unpunished]
+    terrain, termination = SimToRealRoughCfg.terrain, SimToRealRoughCfg.termination
 
     class sim(Go1FlatDrCfg.sim):
         njmax = 56  # 12 friction, 12 limits, 4 a contact, two contacts a foot

@@ -1,14 +1,11 @@
-"""Unitree Go2 follows a joystick on flat ground without knowing its velocity; randomized worlds, kicks and pushes.
-
-Sources: [U] Unitree's own training configs for this robot; [ours] docs/lab.md. The machine's figures are in go2.xml.
-"""
+"""Unitree Go2 follows a joystick on flat ground without knowing its velocity; randomized worlds, kicks and pushes."""
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.sim_to_real_config import SimToRealCfg, SimToRealCfgPPO
 from legged_mw.utils.task import Task
 
 
-class Go2FlatCfg(SimToRealCfg):
+class Go2FlatCfg(SimToRealCfg):  # [U] Unitree's own training configs for this robot; [ours] docs/lab.md
     class asset(SimToRealCfg.asset):
         file = "resources/robots/go2/go2.xml"
         foot_names = ["FR", "FL", "RR", "RL"]

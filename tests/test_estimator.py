@@ -184,9 +184,9 @@ def task_with(**changes: Any) -> LoadedTask:
         ({"observations__foot_height": False}, r"no observation row 'foot_height' in .* \(observations.foot_height = True adds it\)"),
         ({"actor__estimator__targets": ["base_lin_vel"] * 2}, "names 'base_lin_vel' twice"),
         ({"obs_groups__actor": ["privileged_state"]}, "no observation row 'foot_height' in 'state'"),
-        ({"algorithm__class_name": "PPO"}, "only the recorded update of GraphedPPO trains an estimator, and rsl-rl's own is used here"),
-        ({"algorithm__optimizer": "sgd"}, "only the recorded update of GraphedPPO trains an estimator, and rsl-rl's own is used here"),
-        ({"actor__class_name": "CNNModel"}, "an estimator goes with actor.class_name 'MLPModel', not 'CNNModel'"),
+        ({"algorithm__class_name": "PPO"}, "only the recorded update of GraphedPPO trains that, and rsl-rl's own is used here"),
+        ({"algorithm__optimizer": "sgd"}, "only the recorded update of GraphedPPO trains that, and rsl-rl's own is used here"),
+        ({"actor__class_name": "CNNModel"}, "that goes with actor.class_name 'MLPModel', not 'CNNModel'"),
     ],
     ids=lambda value: "" if isinstance(value, str) else "".join(value),
 )
@@ -435,7 +435,7 @@ def test_the_report_draws_it_and_compares_it_with_a_policy_that_has_none() -> No
     columns = [Column("one", {}, graded((0.03, 0.04))), Column("other", {}, graded(None))]
     results = [column.exam for column in columns]
     asked = ExamRules.from_mapping(results[0]["rules"])
-    table = page._exam_table(columns, [asked.figures(result, others=results) for result in results], "")
+    table = page.exam_table(columns, [asked.figures(result, others=results) for result in results], "")
     assert "estimate of vx, rms [m/s]</th>" in table and ">0.030</span>" in table and ">none</span>" in table
 
 

@@ -26,8 +26,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl import export as exporting
-from legged_mw.rl.classes import network_section
-from legged_mw.rl.estimator import actor_settings
+from legged_mw.rl.classes import actor_settings, network_section
 from legged_mw.rl.export import FILES, Exported, ExportError, contract_rows, export
 from legged_mw.rl.export_replay import overridden, own_ends
 from legged_mw.rl.export_scene import differences, standalone

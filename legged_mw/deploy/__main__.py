@@ -8,7 +8,7 @@ from pathlib import Path
 from legged_mw import ROOT
 from legged_mw.deploy import drive, options, replay
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, read_contract
-from legged_mw.deploy.exam import run_exam
+from legged_mw.deploy.exam import contract_skill, run_exam, run_skill
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rules
@@ -90,8 +90,16 @@ def show_log(path: Path, folder: Path | None) -> None:
 
 def examine(folder: Path, path: Path, common: bool = False) -> None:
     """The exam: its table, and a JSON file at ``path``."""
-    result = run_exam(folder, common=common)
-    print(rules.table(result))
+    contract = read_contract(folder)
+    if contract.exam and "kind" in contract.exam:
+        if common:
+            raise UserError("--ranges says what the walking exam asks: leave it out")
+        skill = contract_skill(contract)
+        result = run_skill(folder, skill)
+        print(skill.table(result))
+    else:
+        result = run_exam(folder, common=common)
+        print(rules.table(result))
     try:
         rules.save({"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)", **result}, path)
     except OSError as error:

@@ -1,21 +1,27 @@
-"""The walking exam on an export, in MuJoCo's C engine. Commands, pushes and marks are in ``legged_mw.eval.rules``.
+"""The exams on an export, in MuJoCo's C engine. What the walking exam asks is in ``legged_mw.eval.rules``, of others in ``skill``.
 
-The order of a step is that of ``legged_mw.eval.exam``, so that both give one result: sample, decide, push, move, look for falls.
+The order of a step is that of the environment's exams, so that both give one result: sample, decide, push, move, look for falls.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import math
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 
 from legged_mw.deploy.contract import CONTRACT_FILE, Contract, ContractError, Ends, read_contract
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rules
 from legged_mw.eval.rules import ExamRules, in_common
+from legged_mw.eval.skill import Ground, Recording, Robot, Skill
+from legged_mw.eval.skills import make_skill
 from legged_mw.utils.commands import VELOCITY
+from legged_mw.utils.config import ConfigError
 
 
 def run_exam(folder: Path, exam: ExamRules | None = None, threads: int = 0, common: bool = False) -> dict[str, Any]:
@@ -44,6 +50,51 @@ def run_exam(folder: Path, exam: ExamRules | None = None, threads: int = 0, comm
         fell_at[stage.fell() & np.isinf(fell_at)] = step
     signals = {name: np.stack(values) for name, values in sampled.items() if values}
     return exam.grade(signals, last_position=stage.qpos()[:, :2], fell_at=fell_at, mass=stage.contract.mass, dt=stage.dt)
+
+
+def run_skill(folder: Path, skill: Skill | None = None, threads: int = 0) -> dict[str, Any]:
+    """Grade the export in ``folder`` by ``skill``, else by what its contract names."""
+    skill = skill or contract_skill(read_contract(folder))
+    return skill.result({name: skill.judge(*perform(folder, skill, ground, threads)) for name, ground in skill.grounds.items()})
+
+
+def contract_skill(contract: Contract) -> Skill:
+    """The exam that the section ``exam`` of a contract names by its key ``kind``."""
+    section = dict(contract.exam or {})
+    try:
+        return make_skill(str(section.pop("kind", "")), section)
+    except ConfigError as error:
+        raise ContractError(f"{CONTRACT_FILE}: {error}") from error
+
+
+def perform(folder: Path, skill: Skill, ground: Ground, threads: int = 0) -> tuple[Robot, Recording]:
+    """Put robots into their starts on ``ground`` and let the policy act."""
+    stage = DeployStage(folder, skill.robots, threads=threads, change=lambda model: put_on(model, ground))
+    robot = Robot(stage.fleet.model, stage.qpos()[0], stage.dt)
+    if starts := skill.starts(robot, skill.robots):
+        stage.put(*starts)
+    steps = []
+    ended_at = np.full(skill.robots, math.inf)
+    for step in range(round(skill.seconds / stage.dt)):
+        steps.append((stage.qpos(), stage.fleet.qvel.copy(), stage.measured.joint_torque))
+        stage.step()
+        ended_at[stage.fell() & np.isinf(ended_at)] = step
+    qpos, qvel, torque = (np.stack(values) for values in zip(*steps, strict=True))
+    return robot, Recording(qpos, qvel, torque, ended_at)
+
+
+def put_on(model: mujoco.MjModel, ground: Ground) -> None:
+    """Change a scene: the lean of gravity, the friction of the ground, the mass of the root and its inertia in proportion."""
+    if ground.slope:
+        size, angle = np.linalg.norm(model.opt.gravity), math.radians(ground.slope)
+        model.opt.gravity[:] = size * math.sin(angle), 0.0, -size * math.cos(angle)
+    if ground.friction is not None:
+        model.geom_friction[model.geom_bodyid == 0, 0] = ground.friction
+    if ground.load:
+        root = int(model.jnt_bodyid[0])
+        model.body_inertia[root] *= 1.0 + ground.load / model.body_mass[root]
+        model.body_mass[root] += ground.load
+        mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
 def contract_rules(contract: Contract, common: bool = False) -> ExamRules:

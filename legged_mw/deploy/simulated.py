@@ -9,7 +9,7 @@ acceleration) is one physics step old, as it was in training. Contact was one st
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, dampe
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import usable_cores
 
+Change = Callable[[mujoco.MjModel], None]
 _NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # sensors of position and velocity describe the new state
 
 _GROUND_GROUP = [1, 0, 0, 0, 0, 0]  # geom groups that a height scan sees: a robot's own are others
@@ -36,14 +37,23 @@ class Fleet:
     """``count`` robots, each in a world of its own, stepped together on ``threads`` threads (0: one a core)."""
 
     def __init__(
-        self, folder: Path, contract: Contract, count: int = 1, threads: int = 0, scene_file: str = SCENE_FILE, whole: bool = False
+        self,
+        folder: Path,
+        contract: Contract,
+        count: int = 1,
+        threads: int = 0,
+        scene_file: str = SCENE_FILE,
+        whole: bool = False,
+        change: Change | None = None,
     ) -> None:
         """Load the scene and put every robot into its first keyframe. ``whole``: its body touches the ground too, not only its feet.
 
-        Raises ContractError.
+        ``change`` is made to the model before it is stepped. Raises ContractError.
         """
         scene = read_scene(folder, contract, scene_file, whole)
         self.contract, self.count, self.spec, self.model = contract, count, scene.spec, scene.model
+        if change:
+            change(self.model)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world counts as fallen; nothing is printed
         _keep_quiet()
         self._batch = Batch(self.model, count, threads or min(usable_cores(), count))
@@ -124,13 +134,21 @@ class Fleet:
 
     def _value(self, name: str) -> Floats:
         if name == "gravity":
-            return -self._sensors[:, self._where["up"]]
+            return self._gravity()
         if any(row.name == name and row.measured == SCAN for row in self.contract.rows):
             return self._scan()
         if name == "foot_contact":
             feet = [(self._sensors[:, where] > 0.0).any(axis=1) for where in self._contacts]
             return np.stack(feet, axis=1).astype(float) if feet else np.zeros((self.count, 0))
         return self._sensors[:, self._where[name]]
+
+    def _gravity(self) -> Floats:
+        """Direction of gravity (N, 3), body frame; it may lean towards the world's x axis."""
+        up, (x, _, z) = self._sensors[:, self._where["up"]], self.model.opt.gravity / np.linalg.norm(self.model.opt.gravity)
+        if not x:
+            return -up
+        w, i, j, k = self.qpos[:, 3:7].T
+        return z * up + x * np.stack([1.0 - 2.0 * (j * j + k * k), 2.0 * (i * j - w * k), 2.0 * (i * k + w * j)], axis=1)
 
     def _scan(self) -> Floats:
         """The height scan (N, points) [m] of the contract."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats
-from legged_mw.deploy.simulated import Fleet
+from legged_mw.deploy.simulated import Change, Fleet
 
 STROLL = {"lin_vel_x": 0.5}  # [m/s] where no command is given: a robot that walks shows more than one that stands
 
@@ -34,14 +34,16 @@ class DeployStage:
         threads: int = 0,
         scene_file: str = SCENE_FILE,
         ends: Ends | None = None,
+        change: Change | None = None,
     ) -> None:
         """Load the export in ``folder``.
 
-        ``command`` (C,) is what robots follow where ``step`` gets none; ``ends`` are other rules for a fall than the contract's.
+        ``command`` (C,) is what robots follow where ``step`` gets none; ``ends`` are other rules for a fall than the contract's;
+        ``change`` is made to the model first.
         """
         contract = read_contract(folder)
         self.contract = replace(contract, ends=ends or contract.ends)
-        self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file)
+        self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file, change=change)
         self.controller = Controller(folder, self.contract, num_worlds)
         self.spec, self.num_worlds, self.dt = self.fleet.spec, num_worlds, self.contract.period
         self.command_table = self.contract.commands
@@ -93,6 +95,13 @@ class DeployStage:
     def push(self, world: int, velocity: Any) -> None:
         """Add ``velocity`` (2,) [m/s, world frame] to the robot's horizontal velocity; the policy sees it a step later."""
         self.fleet.qvel[world, :2] += velocity
+
+    def put(self, qpos: Floats, qvel: Floats) -> None:
+        """All robots begin anew in these states, (N, nq) and (N, nv)."""
+        self.fleet.qpos[:], self.fleet.qvel[:] = qpos, qvel
+        self.fleet.refresh()
+        self.controller.reset()
+        self.measured = self.fleet.read()
 
     def reset(self, world: int) -> None:
         """Back to the start, at rest."""

@@ -24,7 +24,7 @@ class BaseTask(VecEnv):
     max_episode_length: int  # [control steps]
 
     def __init__(self, num_envs: int, num_actions: int, device: str, eager: bool = False) -> None:
-        self.num_envs, self.num_actions, self.device = num_envs, num_actions, device
+        self.num_envs, self.num_actions, self.device, self.eager = num_envs, num_actions, device, eager
         self.actions = torch.zeros(num_envs, num_actions, device=device)
         self.rew_buf = torch.zeros(num_envs, device=device)
         self.reset_buf = torch.zeros(num_envs, dtype=torch.bool, device=device)  # the episode ended in this step

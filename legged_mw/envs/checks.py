@@ -64,6 +64,7 @@ ENVIRONMENT: dict[str, Rule] = {
     **dict.fromkeys(("asset.effort", "asset.joint_speed_limits"), LIMITS),
     "viewer.camera": or_empty(("three numbers, not straight above or below", lambda v: len(v) == 3 and (v[0] != 0 or v[1] != 0))),
     "termination.max_tilt": ("above 0 and at most 180 degrees", lambda v: 0 < v <= 180),
+    "terrain.slope": ("from -60 to 60 degrees", lambda v: -60 <= v <= 60),
     "terrain.condim": ("1, 3, 4 or 6", lambda v: v in (1, 3, 4, 6)),
 }
 WALKING: dict[str, Rule] = {
@@ -97,8 +98,12 @@ LEARNER: dict[str, Rule] = {
     **dict.fromkeys(("cpu.envs_per_core", "cpu.num_steps_per_env", "cpu.max_iterations", "cpu.rnn_hidden_dim"), POSITIVE),
     **dict.fromkeys(("cpu.num_learning_epochs", "cpu.num_mini_batches", "cpu.desired_kl"), POSITIVE),
     **dict.fromkeys(("symmetry.mirror_loss_coeff", "anneal.entropy_coef", "anneal.desired_kl", "cpu.update_threads"), NOT_NEGATIVE),
-    "actor.estimator.learning_rate": POSITIVE,
-    "actor.estimator.hidden_dims": ("whole numbers from 1, at least one", lambda v: len(v) > 0 and min(v) >= 1),
+    **dict.fromkeys(("actor.estimator.learning_rate", "actor.concurrent.learning_rate", "actor.concurrent.latent_dim"), POSITIVE),
+    **dict.fromkeys(
+        ("actor.estimator.hidden_dims", "actor.concurrent.hidden_dims"),
+        ("whole numbers from 1, at least one", lambda v: len(v) > 0 and min(v) >= 1),
+    ),
+    "actor.concurrent.teacher_share": ("above 0 and at most 1", lambda v: 0 < v <= 1),
     **dict.fromkeys(("distillation.learning_rate", "distillation.num_learning_epochs", "distillation.gradient_length"), POSITIVE),
     **dict.fromkeys(("distillation.init_std", "warm_start.init_std"), POSITIVE),
     **dict.fromkeys(("runner.exam_interval", "distillation.max_grad_norm", "warm_start.critic_warmup"), NOT_NEGATIVE),

@@ -419,8 +419,8 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         self._episode, views = columns(n, device, **self._episode_columns())  # one matrix, so that a reset clears it in one go
         for name, view in views.items():
             setattr(self, name, view)
-        self.gravity_dir = torch.tensor([0.0, 0.0, -1.0], device=device).expand(n, 3)
         model = self.robot.physics
+        self.gravity_dir = self._tensor(model.opt.gravity / (math.hypot(*model.opt.gravity) or 1.0)).expand(n, 3)
         self.total_mass = float(model.body_subtreemass[0])  # [kg]
         self.root_body = self.robot.id("body", self.robot.root)
         self.imu_pos = self._tensor(model.site_pos[self.robot.id("site", self.robot.imu)]).expand(n, 3)  # body frame [m]

@@ -153,6 +153,7 @@ class RobotTaskCfg(Config):
     class terrain:
         friction: float = 0.6  # sliding friction of the ground, which overrules the robot's [-] [P]
         condim: int = 3  # contact dimensions: 3 is sliding without torsion [P]
+        slope: float = 0.0  # [deg] of the plane, downhill along x: gravity leans, the plane and heights above it stay as they are
 
     class sim:
         engine: Literal["auto", "mujoco_warp", "mujoco"] = "auto"  # auto: mujoco_warp on a GPU, MuJoCo's own on a CPU
@@ -219,6 +220,16 @@ class RobotTaskCfgPPO(Config):
             hidden_dims: list[int] = [256, 128]  # [genesis_lr's explicit estimator of a Go2]
             activation: str = "elu"
             learning_rate: float = 1e-3  # fixed [HIMLoco]
+
+        class concurrent:
+            """The actor reads its newest frame and a latent: a teacher's of ``groups``, or a student's of all frames (rl/concurrent.py)."""
+
+            groups: list[str] = []  # that the teacher's encoder reads: ["privileged_state"]; empty: no teacher [CTS, arXiv 2405.10830]
+            teacher_share: float = 0.75  # of the worlds, that act by the teacher's latent [CTS]
+            latent_dim: int = 32  # values of a latent, whose length is 1 [go2_rl_gym]
+            hidden_dims: list[int] = [512, 256]  # of both encoders [go2_rl_gym]
+            activation: str = "elu"
+            learning_rate: float = 1e-3  # of the student's encoder, fixed [go2_rl_gym]
 
     class critic:
         class_name: str = "MLPModel"

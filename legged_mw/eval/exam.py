@@ -7,10 +7,12 @@ overrides and a roll-out, not a second environment: all tests run side by side a
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import torch
 
+from legged_mw.deploy import exam as on_export
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval.rollout import Case, Policy, Push, Record, Signal, holding, roll_out
 from legged_mw.eval.rules import PUSH_AT, PUSH_DIRECTIONS, SECONDS, ExamRules, Velocity
@@ -69,6 +71,11 @@ def run_exam(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
     """Grade ``policy`` in an environment made from a prepared task."""
     rules = ExamRules.from_config(env.cfg)
     return grade(rules, roll_out(env, policy, cases(rules, env.dt), round(SECONDS / env.dt), SIGNALS))
+
+
+def deployed(folder: Path, task: LoadedTask) -> dict[str, Any]:
+    """Grade the export in ``folder`` of a prepared task, as ``legged_mw.deploy`` does."""
+    return on_export.run_exam(folder, ExamRules.from_config(task.cfg))
 
 
 def grade(rules: ExamRules, record: Record) -> dict[str, Any]:

@@ -3,43 +3,72 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
-from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.eval import crossing, exam, report, rules
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.eval import crossing, exam, perform, report, rules
+from legged_mw.eval.rollout import Policy
+from legged_mw.eval.skills import SKILLS
 from legged_mw.eval.training import TrainingExam
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.task import LoadedTask
 
 
+class Examiner(Protocol):
+    """The exam during training: called with a policy it gives figures by name."""
+
+    env: RobotTask
+
+    def __call__(self, policy: Policy) -> dict[str, float]: ...
+
+
 class Exam(NamedTuple):
     """One kind of exam. A result and figures are dicts that JSON can hold."""
 
-    sets: set[str]  # config fields that it decides itself, so that nobody may override them
+    sets: Callable[[LoadedTask], set[str]]  # config fields that it decides itself, so that nobody may override them
     prepare: Callable[[LoadedTask], None]  # turn a task into the exam
     make_room: Callable[[LoadedTask], None]  # set the number of worlds once more, after the user's overrides
     ask_alike: Callable[[Sequence[LoadedTask]], None]  # grade prepared tasks by the rules of the first
     examine: Callable[..., tuple[dict[str, Any], dict[str, Any]]]  # (env, policy, env of the rough part or None) -> result, figures
+    deployed: Callable[[Path, LoadedTask], dict[str, Any]]  # the result of an export in that folder, in MuJoCo's C engine
     table: Callable[[dict[str, Any]], str]  # the result as text
     write: Callable[..., None]  # the report: see report.write
-    in_training: type[TrainingExam]  # (task, device, eager); called with a policy it gives figures by name
+    in_training: Callable[[LoadedTask, str, bool], Examiner]  # task, device, eager
     rough: ModuleType | None = None  # a second part for tasks on rough ground, with prepare, SETS, make_room and table
+
+
+def _skill(kind: str) -> Exam:
+    return Exam(
+        lambda task: {*perform.overrides(task), "env.num_envs"} - {"domain_rand.enable"},
+        perform.prepare,
+        perform.make_room,
+        perform.ask_alike,
+        partial(perform.examine, kind),
+        perform.deployed,
+        perform.table,
+        perform.write,
+        perform.InTraining,
+    )
 
 
 EXAMS = {
     "walking": Exam(
-        exam.SETS,
+        lambda task: exam.SETS,
         report.prepare,
         report.make_room,
         report.ask_alike,
         report.examine,
+        exam.deployed,
         rules.table,
         report.write,
         TrainingExam,
         rough=crossing,
     ),
+    **{kind: _skill(kind) for kind in SKILLS},
 }
 
 
@@ -58,7 +87,7 @@ def require_exam(task: LoadedTask) -> Exam:
     return found
 
 
-def make_exam(task: LoadedTask, env: LeggedRobot, eager: bool = False) -> TrainingExam | None:
+def make_exam(task: LoadedTask, env: RobotTask, eager: bool = False) -> Examiner | None:
     """The exam for a policy that trains in ``env``; None if the task has none.
 
     None, too, and a line that says why, if the policy could not read the exam's nominal world.

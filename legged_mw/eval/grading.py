@@ -9,11 +9,11 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from legged_mw.envs.domain_rand import active
-from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.eval.exams import Exam, require_exam
 from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
-from legged_mw.eval.rules import ExamRules, in_common
+from legged_mw.eval.rules import in_common
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.policies import Source, introduce, load_policy
 from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything
@@ -53,7 +53,7 @@ def prepare(source: Source, trained: LoadedTask, args: argparse.Namespace, commo
     """
     task, exam = copy.deepcopy(trained), require_exam(trained)
     exam.prepare(task)
-    override(task, args, exam.sets)
+    override(task, args, exam.sets(task))
     if common:
         task.update({"exam": in_common(getattr(getattr(task.cfg, "exam", None), "peer", ""))}, where="--ranges common")
     exam.make_room(task)  # the ranges are known by now
@@ -81,7 +81,7 @@ def override(task: LoadedTask, args: argparse.Namespace, sets: set[str]) -> None
         raise ConfigError(f"--eval sets {', '.join(sorted(touched))} itself; an exam with other values would be another exam")
 
 
-def build(graded: Graded, args: argparse.Namespace, device: str) -> tuple[Policy, LeggedRobot, LeggedRobot | None]:
+def build(graded: Graded, args: argparse.Namespace, device: str) -> tuple[Policy, RobotTask, RobotTask | None]:
     """The policy, the environment of the exam, and the one of its rough part."""
     task, rough = graded.task, graded.crossing
     seed_everything(task.train.seed)
@@ -90,7 +90,7 @@ def build(graded: Graded, args: argparse.Namespace, device: str) -> tuple[Policy
     return load_policy(graded.source.checkpoint, env, task.train, device), env, ground
 
 
-def make_column(graded: Graded, policy: Policy, env: LeggedRobot, rough: LeggedRobot | None) -> Column:
+def make_column(graded: Graded, policy: Policy, env: RobotTask, rough: RobotTask | None) -> Column:
     """The exam and all else of a report, from one roll-out and, if there is a rough part, another; prints their tables."""
     source, exam = graded.source, graded.exam
     result, figures = exam.examine(env, policy, rough)
@@ -105,7 +105,6 @@ def make_column(graded: Graded, policy: Policy, env: LeggedRobot, rough: LeggedR
 
 def elsewhere(graded: Graded) -> list[tuple[str, dict[str, Any]]]:
     """The exam of the same policy on another physics: MuJoCo's C engine, through an export, as ``legged_mw.deploy`` runs it."""
-    from legged_mw.deploy.exam import run_exam
     from legged_mw.rl.export import export  # onnx takes a while to import
 
     if active(graded.task.cfg):
@@ -114,7 +113,7 @@ def elsewhere(graded: Graded) -> list[tuple[str, dict[str, Any]]]:
     with TemporaryDirectory() as folder:
         try:
             export(graded.task, graded.source.checkpoint, Path(folder) / "export")
-            return [("the same, deployed in MuJoCo", run_exam(Path(folder) / "export", ExamRules.from_config(graded.task.cfg)))]
+            return [("the same, deployed in MuJoCo", graded.exam.deployed(Path(folder) / "export", graded.task))]
         except UserError as error:  # a row that nobody can measure, no onnxruntime
             print(f"not graded through an export: {error}")
             return []

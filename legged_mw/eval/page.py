@@ -70,9 +70,9 @@ def html(task: str, rules: ExamRules, columns: Sequence[Column], drawn: Sequence
 <meta name="color-scheme" content="light dark"><title>{escape(task)}: walking exam</title><style>{CSS}</style></head>
 <body><main>
 <header><p class="above">Walking exam</p><h1>{escape(task)}</h1>{_names(columns, rules)}{_cards(figures[0])}</header>
-<section><h2>Exam</h2><p class="lead">{note}</p>{_exam_table(columns, figures, rules.peer_label)}</section>
+<section><h2>Exam</h2><p class="lead">{note}</p>{exam_table(columns, figures, rules.peer_label)}</section>
 {"".join(chapters)}{_published(rules, columns) if len(rules.peers) > 1 else ""}
-<footer>{_about(columns)}</footer>
+<footer>{about(columns)}</footer>
 </main></body></html>
 """
 
@@ -83,7 +83,7 @@ def _names(columns: Sequence[Column], rules: ExamRules) -> str:
     for column in columns:
         swatch = f'<i class="swatch c{drawn.index(column.name)}"></i>' if column.figures and len(drawn) > 1 else ""
         engine = escape(str(column.about.get("engine", "")))
-        pills = [_pill(*_said(words), yes) for words, yes in verdicts(rules, column.exam)]
+        pills = [pill(*_said(words), yes) for words, yes in verdicts(rules, column.exam)]
         items.append(f"<li>{swatch}<b>{escape(column.name)}</b> <span class='muted'>{engine}</span> {' '.join(pills)}</li>")
     return f'<ul class="names">{"".join(items)}</ul>'
 
@@ -94,7 +94,7 @@ def _said(words: str) -> tuple[str, str]:
     return words, f"does not {verb.removesuffix('s')} {rest}".strip()
 
 
-def _pill(good: str, bad: str, yes: bool) -> str:
+def pill(good: str, bad: str, yes: bool) -> str:
     return f'<span class="pill {"yes" if yes else "no"}">{"&#10003;" if yes else "&#10007;"} {good if yes else bad}</span>'
 
 
@@ -113,7 +113,7 @@ def _mood(figure: Figure) -> str:
     return {True: " pass", False: " fail", None: ""}[figure.passes()]
 
 
-def _exam_table(columns: Sequence[Column], figures: Sequence[Sequence[Figure]], peer: str) -> str:
+def exam_table(columns: Sequence[Column], figures: Sequence[Sequence[Figure]], peer: str, asks: str = "walks at") -> str:
     """A row a figure; from the second column on with the gap to the first."""
     lines = []
     for first, *others in zip(*figures, strict=True):
@@ -127,7 +127,7 @@ def _exam_table(columns: Sequence[Column], figures: Sequence[Sequence[Figure]], 
             cells.append(f"<td>{first.peer_text()}</td>")
         sub = ' class="sub"' if first.name.startswith(" ") else ""
         lines.append(f"<tr{sub}><th>{escape(first.name.strip())}</th>{''.join(cells)}</tr>")
-    heads = "".join(f"<th>{escape(name)}</th>" for name in [*(column.name for column in columns), "walks at", *([peer] if peer else [])])
+    heads = "".join(f"<th>{escape(name)}</th>" for name in [*(column.name for column in columns), asks, *([peer] if peer else [])])
     head = f"<thead><tr><th></th>{heads}</tr></thead>"
     return f'<div class="scroll"><table class="exam">{head}<tbody>{"".join(lines)}</tbody></table></div>'
 
@@ -230,7 +230,7 @@ def _table(heads: list[str], rows: list[list[str]], folded: str = "") -> str:
     return f"<details><summary>{folded}</summary>{table}</details>" if folded else table
 
 
-def _about(columns: Sequence[Column]) -> str:
+def about(columns: Sequence[Column]) -> str:
     """What was graded on what, and what was changed for it."""
     parts = []
     for column in columns:

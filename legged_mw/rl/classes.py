@@ -14,6 +14,8 @@ from rsl_rl.models import CNNModel, MLPModel, RNNModel
 from rsl_rl.modules import BetaDistribution, GaussianDistribution, HeteroscedasticGaussianDistribution
 from rsl_rl.utils import resolve_class
 
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl import concurrent, estimator
 from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.utils.config import Config, ConfigError
@@ -48,10 +50,32 @@ def check_classes(cfg: Config) -> None:
             )
 
 
+def actor_settings(sections: dict[str, Any], env: RobotTask | None, learns: bool = True) -> dict[str, Any]:
+    """Section ``actor`` of the learner's ``sections`` as rsl-rl takes it, with the class that its parts ask for. Raises ConfigError.
+
+    ``learns``: False for an actor that only acts, in worlds that may be without what the learner knew.
+    """
+    actor = {name: value for name, value in sections["actor"].items() if name not in ("estimator", "concurrent")}
+    estimates, taught = sections["actor"]["estimator"]["targets"], sections["actor"]["concurrent"]["groups"]
+    if not (estimates or taught):
+        return actor
+    field = estimator.FIELD if estimates else concurrent.FIELD
+    if estimates and taught:
+        raise ConfigError(f"{estimator.FIELD} and {concurrent.FIELD} are both set: the actor reads an estimate or a latent; empty one")
+    if actor["class_name"] != "MLPModel":
+        raise ConfigError(f"{field}: that goes with actor.class_name 'MLPModel', not '{actor['class_name']}'")
+    assert env is not None
+    if estimates:
+        kind, part = estimator.EstimatingModel, {"estimator": estimator.estimator_settings(sections, env, learns)}
+    else:
+        kind, part = concurrent.ConcurrentModel, {"concurrent": concurrent.concurrent_settings(sections, env, learns)}
+    return {**actor, **part, "class_name": f"{kind.__module__}:{kind.__name__}"}
+
+
 def network_section(section: dict[str, Any]) -> dict[str, Any]:
-    """The section of a network without the fields of a memory or an estimator, if its class has none. Imports the class: check it first."""
+    """The section of a network without the fields of a memory, if its class has none. Imports the class: check it first."""
     taken = inspect.signature(resolve_class(section)[0]).parameters
-    return {name: value for name, value in section.items() if name in taken or not name.startswith(("rnn_", "estimator"))}
+    return {name: value for name, value in section.items() if name in taken or not name.startswith("rnn_")}
 
 
 def _check_distribution(section: dict[str, Any] | None, path: str) -> None:

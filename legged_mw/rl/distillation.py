@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from legged_mw.rl.adam import make_recordable, plain_state
+from legged_mw.rl.concurrent import ConcurrentModel
 from legged_mw.rl.estimator import EstimatingModel
 from legged_mw.rl.layers import run_mlp, sample, update_normalizer
 from legged_mw.rl.recurrent import HiddenStates, step
@@ -46,7 +47,7 @@ class GraphedDistillation(Distillation):
 
     def _why_stock(self) -> str | None:
         """What keeps this configuration from being recorded, or None."""
-        for model, more in ((self.student, ()), (self.teacher, (EstimatingModel,))):  # an estimate of a teacher's is not learned
+        for model, more in ((self.student, ()), (self.teacher, (EstimatingModel, ConcurrentModel))):  # a teacher's estimator learns nothing
             if type(model) not in (MLPModel, RNNModel, *more):
                 return f"a network is a {type(model).__name__}"
         if self.use_mixed_precision:

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.layers import run_mlp, update_normalizer
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
@@ -44,8 +45,38 @@ class TargetNormalizer(EmpiricalNormalization):
         return y * self._std.clamp(min=SMALLEST) + self._mean
 
 
-class EstimatingModel(MLPModel):
-    """rsl-rl's MLPModel whose network reads normalised observations and, beside them, the normalised estimate of E values."""
+class RegressingModel(MLPModel):
+    """rsl-rl's MLPModel whose network also reads what its ``estimator`` makes of the observations, which learns by regression."""
+
+    field: str  # of the config, that asks for it
+    regression: str  # the name of the regression's loss
+    estimator: nn.Module
+    learning_rate: float  # of the estimator
+
+    def rollout_latent(self, obs: TensorDict) -> Tensor:
+        """What the network reads in a training's rollout, of all its worlds in order."""
+        return self.get_latent(obs)
+
+    def lesson(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
+        """What ``learn`` needs of observations (B,), beside ``get_latent``, that stays over an update. They are of ``worlds`` (B,).
+
+        Of mirror images, which come after what they are of, ``obs`` is longer.
+        """
+        raise NotImplementedError
+
+    def learn(self, latent: Tensor, lesson: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """The network's output, and the loss () of the regression: of other parameters. ``latent`` may have more columns, of zeros."""
+        raise NotImplementedError
+
+    def learn_spread(self, obs: TensorDict, ranks: int) -> None:
+        """Update the normaliser of what the estimator learns from."""
+        raise NotImplementedError
+
+
+class EstimatingModel(RegressingModel):
+    """Its network reads normalised observations and, beside them, the normalised estimate of E values."""
+
+    field, regression = FIELD, "estimate"
 
     def __init__(
         self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str, output_dim: int, *, estimator: dict[str, Any], **more: Any
@@ -72,9 +103,16 @@ class EstimatingModel(MLPModel):
         return torch.cat([seen, estimate], dim=-1)
 
     @torch.no_grad()
-    def targets(self, obs: TensorDict) -> Tensor:
+    def lesson(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
         """The targets (B, E), normalised: what the estimator is to say."""
-        return self.target_normalizer(self.truth(obs))
+        return (self.target_normalizer(self.truth(obs)),)
+
+    def learn(self, latent: Tensor, lesson: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """The estimator reads the first columns of the latent, the observations."""
+        return run_mlp(self.mlp, latent), nn.functional.mse_loss(run_mlp(self.estimator, latent), lesson[0])
+
+    def learn_spread(self, obs: TensorDict, ranks: int) -> None:
+        update_normalizer(self.target_normalizer, self.truth(obs), ranks)
 
     def truth(self, obs: TensorDict) -> Tensor:
         """The targets (B, E) in their units, as the groups of ``obs`` hold them."""
@@ -124,7 +162,7 @@ class _OnnxEstimatingModel(nn.Module):
 
 def trained_parts(actor: MLPModel, critic: MLPModel) -> tuple[list[list[nn.Parameter]], list[Tensor]]:
     """Parameters whose gradients are clipped together: the policy's, the critic's, the estimator's if there is one; and its rate ()."""
-    if not isinstance(actor, EstimatingModel):
+    if not isinstance(actor, RegressingModel):
         return [[*actor.parameters()], [*critic.parameters()]], []
     policy = [parameter for name, parameter in actor.named_parameters() if not name.startswith("estimator.")]
     rate = torch.tensor(actor.learning_rate, dtype=torch.float32, device=policy[0].device)
@@ -134,20 +172,12 @@ def trained_parts(actor: MLPModel, critic: MLPModel) -> tuple[list[list[nn.Param
 # ---- what the config means ------------------------------------------------------------------------------------------
 
 
-def actor_settings(sections: dict[str, Any], env: RobotTask | None, learns: bool = True) -> dict[str, Any]:
-    """Section ``actor`` of the learner's ``sections`` as rsl-rl takes it; with targets it is an EstimatingModel's. Raises ConfigError.
+def estimator_settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
+    """Section ``actor.estimator`` of the learner's ``sections`` as EstimatingModel takes it. Raises ConfigError.
 
     ``learns``: False for an actor that only acts, in worlds that may be without what ``domain_rand`` showed the critic.
     """
-    actor = copy.deepcopy(sections["actor"])
-    estimator = actor.pop("estimator", {"targets": []})
-    if not estimator["targets"]:
-        return actor
-    if actor["class_name"] != "MLPModel":
-        raise ConfigError(f"{FIELD}: an estimator goes with actor.class_name 'MLPModel', not '{actor['class_name']}'")
-    assert env is not None
-    estimator["targets"] = [tuple(target) for target, _ in find_targets(sections, env, learns)]
-    return {**actor, "class_name": f"{__name__}:EstimatingModel", "estimator": estimator}
+    return {**sections["actor"]["estimator"], "targets": [tuple(target) for target, _ in find_targets(sections, env, learns)]}
 
 
 def find_targets(sections: dict[str, Any], env: RobotTask, learns: bool = True) -> list[tuple[Target, Row]]:

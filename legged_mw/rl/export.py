@@ -12,7 +12,7 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -253,10 +253,16 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         input=INPUT,
         output=OUTPUT,
         digest=digest(folder / NETWORK_FILE),
-        exam=cfg.to_dict().get("exam") if task.exam == "walking" else None,
+        exam=_exam(task),
         motors=_motors(env, folder),
         estimate=_estimated(env, task),
     )
+
+
+def _exam(task: LoadedTask) -> dict[str, Any] | None:
+    """What grades an export: the section ``exam``, and its kind where that is not the walking exam."""
+    section = task.cfg.to_dict().get("exam", {})
+    return section if task.exam == "walking" else {"kind": task.exam, **section} if task.exam else None
 
 
 def _estimated(env: RobotTask, task: LoadedTask) -> tuple[Estimated, ...]:

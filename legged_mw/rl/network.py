@@ -22,8 +22,9 @@ from legged_mw.utils.config import ConfigError
 INPUT, OUTPUT, MEMORY_INPUT, MEMORY_OUTPUT, ESTIMATE = "obs", "actions", "state_in", "state_out", "estimate"
 PREFIX = "policy."  # of the weights' names in the file: the attribute of ExportedPolicy
 MEAN, STD = "obs_normalizer._mean", "obs_normalizer._std"
+LEARNING_ONLY = "teacher."  # parameters that nothing needs to act
 # neither a mean action nor an estimate needs them
-UNWRITTEN = ("distribution.", *(f"{of}_normalizer.{name}" for of in ("obs", "target") for name in ("_var", "count")))
+UNWRITTEN = ("distribution.", LEARNING_ONLY, *(f"{of}_normalizer.{name}" for of in ("obs", "target") for name in ("_var", "count")))
 
 
 class ExportedPolicy(nn.Module):

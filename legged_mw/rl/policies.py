@@ -14,9 +14,8 @@ from torch import Tensor
 
 from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.classes import check_classes, network_section
-from legged_mw.rl.estimator import actor_settings
-from legged_mw.rl.network import read_parameters
+from legged_mw.rl.classes import actor_settings, check_classes, network_section
+from legged_mw.rl.network import LEARNING_ONLY, read_parameters
 from legged_mw.rl.runs import CONFIG_FILE, check_fit, experiment_folder, find_checkpoint, find_run, load_tensors, runs, task_of
 from legged_mw.utils.config import Config, ConfigError, load_yaml
 from legged_mw.utils.errors import shown
@@ -133,12 +132,14 @@ def acting(cfg: Config, env: RobotTask) -> dict[str, Any]:
 
 def read_actor(path: Path, model: MLPModel, what: str = "actor") -> dict[str, Tensor]:
     """The parameters for ``model`` in a checkpoint, of PPO or of a student, or in a ``policy.onnx``. Raises ConfigError for others."""
+    own = model.state_dict()
     if path.suffix == ".onnx":
         saved = read_parameters(path, model)
     else:
         content = load_tensors(path, str(next(model.parameters()).device))
         saved = content["student_state_dict" if "student_state_dict" in content else "actor_state_dict"]
-    check_fit(saved, model.state_dict(), path, what)
+        saved = {name: value for name, value in saved.items() if name in own or not name.startswith(LEARNING_ONLY)}
+    check_fit(saved, own, path, what)
     return saved
 
 

@@ -25,7 +25,8 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from legged_mw.rl.adam import make_recordable, plain_state
-from legged_mw.rl.estimator import EstimatingModel, trained_parts
+from legged_mw.rl.concurrent import ConcurrentModel
+from legged_mw.rl.estimator import EstimatingModel, RegressingModel, trained_parts
 from legged_mw.rl.layers import run_mlp, sample, update_normalizer
 from legged_mw.rl.recurrent import HiddenStates, SequenceInput, check_recurrent, unroll
 from legged_mw.sim.graph import StepGraph
@@ -39,7 +40,7 @@ class Minibatch(NamedTuple):
     batch: RolloutStorage.Batch
     actor_input: Tensor | SequenceInput  # (B, size), normalised; a sequence for a network with a memory
     critic_input: Tensor | SequenceInput
-    targets: Tensor | None = None  # (B, E) of the actor's estimator, normalised
+    lesson: tuple[Tensor, ...] = ()  # what the actor's estimator learns from
 
 
 class GraphedPPO(PPO):
@@ -81,7 +82,7 @@ class GraphedPPO(PPO):
     def _why_stock(self) -> str | None:
         """What keeps this configuration from being recorded, or None."""
         for model in (self.actor, self.critic):
-            if type(model) not in (MLPModel, RNNModel, EstimatingModel):
+            if type(model) not in (MLPModel, RNNModel, EstimatingModel, ConcurrentModel):
                 return f"a network is a {type(model).__name__}"
         if self.rnd or self.use_mixed_precision:
             return f"{'rnd_cfg' if self.rnd else 'use_mixed_precision'} is set"
@@ -100,11 +101,13 @@ class GraphedPPO(PPO):
         self._share = drawn // self.num_mini_batches  # of a minibatch, in samples or in whole worlds
         self._size = self._share * (st.num_transitions_per_env if self._recurrent else 1)  # in samples
         self._obs = TensorDict({name: value[0].clone() for name, value in st.observations.items()}, [st.num_envs], device=device)
+        self._worlds = torch.arange(st.num_envs, device=device).expand(st.num_transitions_per_env, -1)  # of each transition
         self._order = torch.zeros(self._share * self.num_mini_batches, dtype=torch.long, device=device)
         self._memories = HiddenStates((self.actor, self.critic), st.num_envs, 2 if self.symmetry else 1, device)
         self._advantages = torch.zeros_like(st.returns)
-        more = {"symmetry": self.symmetry, "estimate": len(self._parts) > 2}
-        self._loss_names = ("value", "surrogate", "entropy", *(name for name, there in more.items() if there))
+        more = ["symmetry"] if self.symmetry else []
+        more += [self.actor.regression] if isinstance(self.actor, RegressingModel) else []
+        self._loss_names = ("value", "surrogate", "entropy", *more)
         self._losses = torch.zeros(len(self._loss_names), device=device)
         self._entropy_coef, self._desired_kl = torch.zeros((), device=device), torch.zeros((), dtype=torch.float64, device=device)
         self._side = torch.cuda.Stream(device) if str(device).startswith("cuda") else None
@@ -169,7 +172,9 @@ class GraphedPPO(PPO):
 
     def _latent(self, model: MLPModel, seen: TensorDict) -> Tensor:
         """What a network's MLP reads; a memory takes in what is ``seen``, with mirror images where it is to learn from those."""
-        return self._memories[model].advance(seen) if model in self._memories else model.get_latent(self._obs)
+        if model in self._memories:
+            return self._memories[model].advance(seen)
+        return model.rollout_latent(self._obs) if isinstance(model, RegressingModel) else model.get_latent(self._obs)
 
     def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
         """Store the transition; worlds whose episode ended are forgotten."""
@@ -237,9 +242,10 @@ class GraphedPPO(PPO):
             batch.advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)  # type: ignore[operator]
         if self.symmetry:
             self.symmetry.augment_batch(batch, self._size)
-        targets = self.actor.targets(batch.observations) if isinstance(self.actor, EstimatingModel) else None
         actor_input, critic_input = (self._input(model, batch.observations, indices) for model in (self.actor, self.critic))
-        return Minibatch(batch, actor_input, critic_input, targets)
+        if not isinstance(self.actor, RegressingModel):
+            return Minibatch(batch, actor_input, critic_input)
+        return Minibatch(batch, actor_input, critic_input, self.actor.lesson(batch.observations, take(self._worlds)))
 
     @torch.no_grad()
     def _input(self, model: MLPModel, obs: Any, indices: Tensor) -> Tensor | SequenceInput:
@@ -251,16 +257,18 @@ class GraphedPPO(PPO):
 
     def _minibatch(self, minibatch: Minibatch) -> None:
         """One gradient step."""
-        batch, actor_input, critic_input, targets = minibatch
+        batch, actor_input, critic_input, lesson = minibatch
         self.optimizer.zero_grad()
         with self._beside():
             value_loss = self._value_loss(batch, _forward(self.critic, critic_input))
             (self.value_loss_coef * value_loss).backward()
         with torch.set_grad_enabled(not self.critic_only):  # an actor that stands keeps nothing for a gradient
-            loss, parts, kl = self._policy_loss(batch, _forward(self.actor, actor_input))
-            if targets is not None and isinstance(self.actor, EstimatingModel) and isinstance(actor_input, Tensor):
-                parts.append(nn.functional.mse_loss(run_mlp(self.actor.estimator, actor_input), targets))
-                loss = loss + parts[-1]  # of other parameters
+            if isinstance(self.actor, RegressingModel) and isinstance(actor_input, Tensor):
+                output, *regression = self.actor.learn(actor_input, lesson)
+            else:
+                output, regression = _forward(self.actor, actor_input), []
+            loss, parts, kl = self._policy_loss(batch, output)
+            loss = sum(regression, loss)  # of other parameters
         if self.critic_only:
             kl = None  # of an actor that stands still it is rounding noise
         else:
@@ -273,7 +281,7 @@ class GraphedPPO(PPO):
         for part in self._parts:
             nn.utils.clip_grad_norm_(part, self.max_grad_norm)
         self.optimizer.step()
-        self._losses.add_(torch.stack([value.detach() for value in (value_loss, *parts)]))
+        self._losses.add_(torch.stack([value.detach() for value in (value_loss, *parts, *regression)]))
 
     def _value_loss(self, batch: Any, values: Tensor) -> Tensor:
         error = (values - batch.returns).square()
@@ -331,8 +339,8 @@ class GraphedPPO(PPO):
             if isinstance(model.obs_normalizer, EmpiricalNormalization):
                 inputs = torch.cat([obs[group] for group in model.obs_groups], dim=-1)
                 update_normalizer(model.obs_normalizer, inputs, self.gpu_world_size)
-        if isinstance(self.actor, EstimatingModel) and not self.critic_only:
-            update_normalizer(self.actor.target_normalizer, self.actor.truth(obs), self.gpu_world_size)
+        if isinstance(self.actor, RegressingModel) and not self.critic_only:
+            self.actor.learn_spread(obs, self.gpu_world_size)
 
     def _symmetry_loss(self, batch: Any) -> Tensor:
         """How far the policy is from its own mirror image; of an augmented batch, the forward pass is already made."""

@@ -23,8 +23,8 @@ from legged_mw.envs.divergence import Watch
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.envs.wording import config_words
-from legged_mw.rl.classes import check_classes, network_section
-from legged_mw.rl.estimator import FIELD, EstimatingModel, actor_settings
+from legged_mw.rl.classes import actor_settings, check_classes, network_section
+from legged_mw.rl.estimator import RegressingModel
 from legged_mw.rl.policies import acting
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import this_rank
@@ -315,8 +315,8 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
     graphed = isinstance(runner.alg, GraphedPPO) and runner.alg.graphed
     if settings["critic_warmup"] and not graphed:
         raise ConfigError(f"warm_start.critic_warmup is {settings['critic_warmup']}, but only the recorded PPO knows it; set it to 0")
-    if isinstance(runner.alg.get_policy(), EstimatingModel) and not graphed:
-        raise ConfigError(f"{FIELD}: only the recorded update of GraphedPPO trains an estimator, and rsl-rl's own is used here")
+    if isinstance(policy := runner.alg.get_policy(), RegressingModel) and not graphed:
+        raise ConfigError(f"{policy.field}: only the recorded update of GraphedPPO trains that, and rsl-rl's own is used here")
     return runner
 
 

@@ -4,6 +4,8 @@
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -26,6 +28,7 @@ class Ground:
     condim: int = 3  # 1 frictionless, 3 sliding, 4 and torsional, 6 and rolling
     terrain: Terrain | None = None  # None: the plane
     boxes: bool = False  # level pieces of the terrain as boxes, in what is stepped: for MuJoCo's own engine
+    slope: float = 0.0  # [deg] by which gravity leans from -z to x: the plane slopes down along x, and stays z = 0
 
 
 def add_ground(spec: mujoco.MjSpec, ground: Ground, where: str, notes: list[str]) -> None:
@@ -43,6 +46,15 @@ def add_ground(spec: mujoco.MjSpec, ground: Ground, where: str, notes: list[str]
     else:
         floor.type, floor.size, shape = mujoco.mjtGeom.mjGEOM_PLANE, [0, 0, 0.05], "plane"
     notes.append(f"ground: {shape}, friction {ground.friction:g}, condim {ground.condim}, priority 1")
+    if ground.slope:
+        spec.option.gravity = leaning(spec.option.gravity, ground.slope)
+        notes.append(f"gravity leans by {ground.slope:g} degrees, as on a slope down along x")
+
+
+def leaning(gravity: Sequence[float], slope: float) -> list[float]:
+    """``gravity`` (3,) in the axes of a plane that slopes down along x by ``slope`` [deg]."""
+    size, angle = float(np.linalg.norm(gravity)), math.radians(slope)
+    return [size * math.sin(angle), 0.0, -size * math.cos(angle)]
 
 
 def _fill_height_field(spec: mujoco.MjSpec, terrain: Terrain, heights: Heights) -> None:

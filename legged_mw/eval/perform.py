@@ -1,0 +1,155 @@
+"""Exams of the kind ``skill`` in the training environment: for ``--eval``, for the report, and during training."""
+
+from __future__ import annotations
+
+import copy
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from legged_mw.deploy import exam as on_export
+from legged_mw.envs.domain_rand import KINDS
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.eval import exam, skill_page
+from legged_mw.eval.page import Column
+from legged_mw.eval.rollout import Policy
+from legged_mw.eval.skill import Ground, Recording, Robot, Skill
+from legged_mw.eval.skills import make_skill
+from legged_mw.rl.recurrent import forget
+from legged_mw.utils.task import LoadedTask, load_task
+
+NOMINAL: dict[str, Any] = {**{f"domain_rand.{name}": [] for name in KINDS}, "domain_rand.delay_ms": [], "domain_rand.model_factors": {}}
+
+
+def skill_of(cfg: RobotTaskCfg, kind: str) -> Skill:
+    """The exam of a task: its kind, with what the config section ``exam`` says."""
+    return make_skill(kind, cfg.to_dict().get("exam", {}))
+
+
+def overrides(task: LoadedTask) -> dict[str, Any]:
+    """What the exam changes in the task; fields that it does not have are left out."""
+    wanted, config = {**exam.OVERRIDES, **skill_of(task.cfg, task.exam).overrides}, task.to_dict()
+    return {path: value for path, value in wanted.items() if path.split(".")[1] in config.get(path.split(".")[0], {})}
+
+
+def prepare(task: LoadedTask) -> None:
+    """Turn ``task`` into the first part of its exam."""
+    for path, value in overrides(task).items():
+        task.set(path, value, where="exam")
+    make_room(task)
+
+
+def make_room(task: LoadedTask) -> None:
+    """A world a robot."""
+    task.cfg.env.num_envs = skill_of(task.cfg, task.exam).robots
+
+
+def ask_alike(tasks: Sequence[LoadedTask]) -> None:
+    """Grade prepared tasks by what the first one's config asks."""
+    for task in tasks[1:]:
+        task.update({"exam": tasks[0].to_dict()["exam"]} if "exam" in tasks[0].to_dict() else {}, where="--compare")
+
+
+def examine(kind: str, env: RobotTask, policy: Policy, rough: None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The result, and what is drawn of it; ``env`` is made from a prepared task, each further ground needs one more."""
+    skill = skill_of(env.cfg, kind)
+    parts = {}
+    for number, (name, ground) in enumerate(skill.grounds.items()):
+        here = env if number == 0 else on_ground(env, ground)
+        recording = perform(here, policy, skill)
+        parts[name] = skill.judge(machine(here), recording)
+    return skill.result(parts), {}
+
+
+def on_ground(env: RobotTask, ground: Ground) -> RobotTask:
+    """Another environment of the same task, on ``ground``."""
+    changes = {"terrain.slope": ground.slope} if ground.slope else {}
+    changes |= {"terrain.friction": ground.friction} if ground.friction is not None else {}
+    changes |= {**NOMINAL, "domain_rand.enable": True, "domain_rand.base_mass": [ground.load, ground.load]} if ground.load else {}
+    cfg = copy.deepcopy(env.cfg)
+    for path, value in changes.items():
+        cfg.set(path, value, where="exam")
+    return type(env)(cfg, env.device, eager=env.eager)
+
+
+def machine(env: RobotTask) -> Robot:
+    """What the exam knows of the robot."""
+    return Robot(env.robot.physics, np.array([*env.start_place, 1.0, 0.0, 0.0, 0.0, *env.robot.pose]), env.dt)
+
+
+def perform(env: RobotTask, policy: Policy, skill: Skill) -> Recording:
+    """Put the robots of all worlds into their starts and let ``policy`` act."""
+    env.reset()
+    if starts := skill.starts(machine(env), env.num_envs):
+        for state, values in zip((env.sim.qpos, env.sim.qvel), starts, strict=True):
+            state.copy_(torch.as_tensor(values, dtype=torch.float))
+        env._refresh_base()
+    obs = env.first_observations()
+    forget(policy)
+    steps, n = round(skill.seconds / env.dt), env.num_envs
+    states = {"qpos": env.sim.qpos, "qvel": env.sim.qvel, "torque": env.torques}
+    kept = {name: torch.empty(steps, *state.shape, device=env.device) for name, state in states.items()}
+    ended_at = torch.full((n,), float("inf"), device=env.device)
+    for step in range(steps):
+        for name, state in states.items():
+            kept[name][step] = state
+        with torch.inference_mode():
+            actions = policy(obs)
+        obs, _, dones, _ = env.step(actions)
+        forget(policy, dones)
+        ended_at = torch.where(dones & ended_at.isinf(), torch.full_like(ended_at, step), ended_at)
+    arrays = {name: values.cpu().numpy().astype(float) for name, values in kept.items()}
+    return Recording(**arrays, ended_at=ended_at.cpu().numpy())
+
+
+def deployed(folder: Path, task: LoadedTask) -> dict[str, Any]:
+    """Grade the export in ``folder`` of a prepared task, as ``legged_mw.deploy`` does."""
+    return on_export.run_skill(folder, skill_of(task.cfg, task.exam))
+
+
+class InTraining:
+    """The first part of the exam for a policy that trains; see ``training.TrainingExam``, which is the walking exam's."""
+
+    def __init__(self, task: LoadedTask, device: str, eager: bool = False) -> None:
+        copied = load_task(str(task.path))
+        copied.update(task.to_dict(), where="training")
+        copied.exam = task.exam
+        prepare(copied)
+        self.skill, self._generators = skill_of(copied.cfg, copied.exam), [device] if device.startswith("cuda") else []
+        with torch.random.fork_rng(self._generators):
+            self.env = copied.env_class(copied.cfg, device, eager=eager)
+
+    def __call__(self, policy: Policy) -> dict[str, float]:
+        """The figures of ``first_part``."""
+        with torch.random.fork_rng(self._generators):
+            return first_part(self.env, policy, self.skill)
+
+
+def first_part(env: RobotTask, policy: Policy, skill: Skill) -> dict[str, float]:
+    """The figures of the part that a prepared task is, by name; those that there is nothing to measure of are left out."""
+    found = skill.judge(machine(env), perform(env, policy, skill))
+    return {measure.key: float(value) for measure in skill.measures if (value := found[measure.key]) is not None}
+
+
+def table(result: Mapping[str, Any]) -> str:
+    """The result as text."""
+    return of_result(result).table(result)
+
+
+def of_result(result: Mapping[str, Any]) -> Skill:
+    """The exam that gave a result."""
+    return make_skill(result["asked"]["kind"], {name: value for name, value in result["asked"].items() if name != "kind"})
+
+
+def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()) -> None:
+    """Write ``report.json`` and ``report.html``; see ``report.write``."""
+    columns = [columns[0], *(Column(name, {}, result) for name, result in extras), *columns[1:]]
+    folder.mkdir(parents=True, exist_ok=True)
+    content = {"task": task, "columns": [{**column._asdict(), "figures": None} for column in columns]}
+    (folder / "report.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    (folder / "report.html").write_text(skill_page.html(task, of_result(columns[0].exam), columns), encoding="utf-8")

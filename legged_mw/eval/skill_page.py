@@ -1,0 +1,28 @@
+"""The report on an exam of the kind ``skill`` as one page: tables and strips of pictures in, HTML out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+
+from legged_mw.eval.page import CSS, Column, about, exam_table, pill
+from legged_mw.eval.skill import Skill
+
+
+def html(task: str, skill: Skill, columns: Sequence[Column], strips: Mapping[str, str] | None = None) -> str:
+    """The whole page; ``strips`` are pictures as data URLs below the name of the part that they show."""
+    passed = [f"<li><b>{escape(c.name)}</b> {pill('passes', 'does not pass', c.exam['passed'])}</li>" for c in columns]
+    sections = []
+    for part in skill.grounds:
+        figures = [skill.figures(column.exam["parts"], part) for column in columns]
+        strip = f'<p><img src="{strips[part]}" alt="{escape(part)}" style="max-width:100%"></p>' if strips and part in strips else ""
+        sections.append(f"<section><h2>{escape(part)}</h2>{exam_table(columns, figures, '', 'asks')}{strip}</section>")
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark"><title>{escape(task)}: {escape(skill.kind)}</title><style>{CSS}</style></head>
+<body><main>
+<header><p class="above">Exam: {escape(skill.kind)}</p><h1>{escape(task)}</h1><ul class="names">{"".join(passed)}</ul></header>
+<p class="lead">{escape(skill.asks)}</p>{"".join(sections)}
+<footer>{about(columns)}</footer>
+</main></body></html>
+"""

@@ -1,0 +1,145 @@
+"""Concurrent teacher and student: one policy that reads a latent, which a teacher's encoder makes of what only the simulator knows, and a
+student's of what a robot has felt.
+
+Part of the worlds act by the teacher's latent, the rest by the student's. PPO learns from all of them: the policy, and in the teacher's
+worlds the teacher's encoder with it. The student's encoder learns by regression to the teacher's latent alone. During an update the
+policy reads the student's latent that it acted with. What plays and is exported is the student's path.
+
+Wang et al., "CTS: Concurrent Teacher-Student Reinforcement Learning for Legged Locomotion", RA-L 2024.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import torch
+from rsl_rl.models import MLPModel
+from rsl_rl.modules import MLP, EmpiricalNormalization
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.rl.estimator import RegressingModel
+from legged_mw.rl.layers import run_mlp, update_normalizer
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
+
+FIELD = "actor.concurrent.groups"
+_GOLDEN = 0.6180339887498949  # its multiples' fractions fill [0, 1) evenly, out of step with terrain columns and any other period
+
+
+class ConcurrentModel(RegressingModel):
+    """Its network reads the newest frames of the observations and a latent of unit length; ``estimator`` is the student's encoder."""
+
+    field, regression = FIELD, "student"
+
+    def __init__(
+        self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str, output_dim: int, *, concurrent: dict[str, Any], **more: Any
+    ) -> None:
+        """``concurrent``: the config section, and ``newest``, (start, stop) of columns of the observations; the rest is MLPModel's.
+
+        Without ``groups`` it is a student that only acts. ``obs`` must be of all N worlds otherwise.
+        """
+        self._newest, self._size, self._groups = concurrent["newest"], concurrent["latent_dim"], concurrent["groups"]
+        self.learning_rate = concurrent["learning_rate"]
+        super().__init__(obs, obs_groups, obs_set, output_dim, **more)
+        encoder = self._size, concurrent["hidden_dims"], concurrent["activation"]
+        self.estimator = MLP(self.obs_dim, *encoder)
+        if self._groups:
+            known = sum(obs[group].shape[1] for group in self._groups)
+            self.teacher = nn.Sequential(EmpiricalNormalization(known) if self.obs_normalization else nn.Identity(), MLP(known, *encoder))
+            self.register_buffer("taught", taught_worlds(obs.batch_size[0], concurrent["teacher_share"]), persistent=False)
+
+    taught: Tensor  # (N, 1): the worlds that act by the teacher's latent
+
+    def _get_latent_dim(self) -> int:
+        return sum(stop - start for start, stop in self._newest) + self._size
+
+    def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
+        """What the network reads (B, newest + E) of a student: the latent comes without its gradient."""
+        seen = super().get_latent(obs, masks, hidden_state)
+        with torch.no_grad():
+            return join(seen, self._newest, self.estimator(seen))
+
+    def rollout_latent(self, obs: TensorDict) -> Tensor:
+        own, (teacher, mlp) = self.get_latent(obs), self.teacher
+        return self._take_over(own, mlp(teacher(self._known(obs))), self.taught)
+
+    @torch.no_grad()
+    def lesson(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
+        """What the two encoders read (B, ...), with columns of zeros up to a multiple of four, and who is taught (B, 1)."""
+        seen, known = MLPModel.get_latent(self, obs), self.teacher[0](self._known(obs))
+        taught = self.taught.index_select(0, worlds).repeat(len(seen) // len(worlds), 1)
+        return *(nn.functional.pad(each, (0, -each.shape[1] % 4)) for each in (seen, known)), taught
+
+    def learn(self, latent: Tensor, lesson: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        seen, known, taught = lesson
+        wanted = run_mlp(self.teacher[1], known)
+        output = run_mlp(self.mlp, self._take_over(latent, wanted, taught))
+        return output, nn.functional.mse_loss(unit(run_mlp(self.estimator, seen)), unit(wanted).detach())
+
+    def learn_spread(self, obs: TensorDict, ranks: int) -> None:
+        if isinstance(normalizer := self.teacher[0], EmpiricalNormalization):
+            update_normalizer(normalizer, self._known(obs), ranks)
+
+    def _known(self, obs: TensorDict) -> Tensor:
+        return torch.cat([obs[group] for group in self._groups], dim=-1)
+
+    def _take_over(self, own: Tensor, encoded: Tensor, taught: Tensor) -> Tensor:
+        """What the network reads (B, ...), with the teacher's latent where ``taught`` (B, 1)."""
+        stop = self._get_latent_dim()
+        start = stop - self._size
+        return torch.cat([own[:, :start], torch.where(taught, unit(encoded), own[:, start:stop]), own[:, stop:]], dim=1)
+
+    def as_onnx(self, verbose: bool) -> nn.Module:
+        return _OnnxStudent(self)
+
+
+class _OnnxStudent(nn.Module):
+    """Observations (B, size) in their units -> mean actions (B, A), by the student's latent."""
+
+    def __init__(self, model: ConcurrentModel) -> None:
+        super().__init__()
+        self._newest = model._newest
+        self.obs_normalizer, self.mlp, self.estimator = copy.deepcopy((model.obs_normalizer, model.mlp, model.estimator))
+        assert model.distribution is not None
+        self.deterministic_output = model.distribution.as_deterministic_output_module()
+
+    def forward(self, obs: Tensor) -> Tensor:
+        seen = self.obs_normalizer(obs)
+        return self.deterministic_output(self.mlp(join(seen, self._newest, self.estimator(seen))))
+
+
+def join(seen: Tensor, newest: list[tuple[int, int]], encoded: Tensor) -> Tensor:
+    """The ``newest`` columns of what is seen, and the latent beside them."""
+    return torch.cat([*(seen[:, start:stop] for start, stop in newest), unit(encoded)], dim=-1)
+
+
+def unit(x: Tensor) -> Tensor:
+    """Vectors (B, E) of length 1."""
+    return nn.functional.normalize(x, dim=-1)
+
+
+def taught_worlds(worlds: int, share: float) -> Tensor:
+    """Which of N worlds act by the teacher's latent, (N, 1): always the same, and among neighbours some of both."""
+    return ((torch.arange(worlds, dtype=torch.float64) * _GOLDEN) % 1.0 < share)[:, None]
+
+
+def concurrent_settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
+    """Section ``actor.concurrent`` of the learner's ``sections`` as ConcurrentModel takes it. Raises ConfigError.
+
+    ``learns``: False for a student that only acts, and needs no teacher.
+    """
+    concurrent, read, groups = sections["actor"]["concurrent"], sections["obs_groups"]["actor"], env.observations.groups
+    for group in concurrent["groups"]:
+        if group not in groups:
+            raise ConfigError(f"{FIELD}: {unknown('observation group', group, groups, 'the observation table')}")
+        if group in read:
+            raise ConfigError(f"{FIELD}: the actor reads '{group}' itself; the teacher's encoder is for what a robot does not measure")
+    newest, start = [], 0
+    for group in read:
+        spans = [env.observations.newest(group, row.name) for row in groups[group]]
+        newest += [(start + span.start, start + span.stop) for span in spans]
+        start += env.observations.buffers[group].shape[1]
+    return {**concurrent, "newest": newest, "groups": concurrent["groups"] if learns else []}
