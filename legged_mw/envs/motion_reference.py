@@ -22,7 +22,7 @@ class Reference:
         def places(values: Sequence[int]) -> Tensor:
             return torch.tensor(list(values), dtype=torch.long, device=device)
 
-        tables, last, bins, bin_of, self.first = [], [], [], [], []
+        tables, last, bins, bin_of = [], [], [], []
         for clip in clips:
             start, count = len(last), len(clip.root_pos)
             qpos, qvel = (torch.tensor(values, dtype=torch.float, device=device) for values in (clip.qpos(), clip.qvel()))
@@ -35,11 +35,8 @@ class Reference:
             bin_of += [len(bins) + min(i * parts // (count - 1), parts - 1) for i in range(count)] + [len(bins) + parts - 1] * held
             bins += [(low, high - low) for low, high in zip(edges, edges[1:], strict=False)]
             last += [start + count - 1 + held] * (count + held)
-            self.first.append(start)
-        self.lengths = [len(clip.root_pos) for clip in clips]  # frames of each clip, without those that are held
         self._table = torch.cat(tables)  # (M, W)
         self._last, self._bin_of, self._bins = places(last), places(bin_of), torch.tensor(bins, device=device)
-        self._clip_of_world = places([self.first[world % len(clips)] for world in range(num_envs)])
         self.frame = torch.zeros(num_envs, dtype=torch.long, device=device)  # (N,)
         self.failures = torch.zeros(len(bins), device=device)  # a step, of WORLDS worlds, as remembered
         self._row = torch.zeros(num_envs, self._table.shape[1], device=device)
@@ -87,11 +84,11 @@ class Reference:
         return first + torch.minimum((chance[1] * count).long(), count - 1)
 
     def begin(self, mask: Tensor, start: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Where ``mask`` (N,) is true the frame after ``start`` (N,) is next, of None that after a clip's first.
+        """Where ``mask`` (N,) is true the frame after ``start`` (N,) is next; None: the first clip's first.
 
         Returns the states at ``start``: qpos (N, nq), qvel (N, nv).
         """
-        start = self._clip_of_world if start is None else start
+        start = torch.zeros_like(self.frame) if start is None else start
         rows = self._table.index_select(0, start)
         self.frame.copy_(torch.where(mask, start + 1, self.frame))
         widths = [self.qpos.shape[1], self.qvel.shape[1]]

@@ -176,9 +176,9 @@ class MotionTracking(RobotTask):
         self.ends = torch.tensor([motion.bodies.index(name) for name in motion.end_bodies], dtype=torch.long, device=self.device)
         self.kinematics = Kinematics(self.robot.physics, [self.robot.id("body", name) for name in motion.bodies], self.device)
         files = [find_file(self.cfg, "motion.clips", name) for name in motion.clips]
-        clips = [read_clip(file).at(1.0 / self.dt).of(self.robot.joint_names, file.name) for file in files]
+        self.clips = [read_clip(file).at(1.0 / self.dt).of(self.robot.joint_names, file.name) for file in files]
         held, bin_frames = round(motion.hold_s / self.dt), round(motion.bin_s / self.dt)
-        self.reference = Reference(clips, self.kinematics, self.num_envs, self.device, held=held, bin_frames=bin_frames)
+        self.reference = Reference(self.clips, self.kinematics, self.num_envs, self.device, held=held, bin_frames=bin_frames)
         self.start_range = self._tensor([*motion.start_pos, *motion.start_turn, *motion.start_lin_vel, *motion.start_ang_vel])
         self.body = Bodies(*(torch.zeros_like(part) for part in self.reference.bodies))
         self.anchor_pos, self.anchor_ori = self._zeros(3), self._zeros(6)

@@ -7,10 +7,11 @@ from dataclasses import fields
 from typing import Any
 
 from legged_mw.eval.skill import Skill
+from legged_mw.eval.tracking import Tracking
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
-SKILLS: dict[str, type[Skill]] = {}
+SKILLS: dict[str, type[Skill]] = {kind.kind: kind for kind in (Tracking,)}
 
 
 def make_skill(kind: str, section: Mapping[str, Any]) -> Skill:
