@@ -76,13 +76,22 @@ class MotionTracking(RobotTask):
 
     def compute_observations(self) -> None:
         self.reference.read()
-        ours, theirs = self.body.rot[:, self.anchor].transpose(1, 2), self.reference.bodies.rot[:, self.anchor]
-        away = self.reference.bodies.pos[:, self.anchor] - self.body.pos[:, self.anchor]
-        self.anchor_pos.copy_(rotate(ours, away))
-        self.anchor_ori.copy_(product(ours, theirs)[..., :2].flatten(1))
+        place, turn = self._anchor_seen()
+        theirs, seen = self.reference.bodies, turn.transpose(1, 2)
+        self.anchor_pos.copy_(rotate(seen, theirs.pos[:, self.anchor] - place))
+        self.anchor_ori.copy_(product(seen, theirs.rot[:, self.anchor])[..., :2].flatten(1))
+        ours = self.body.rot[:, self.anchor].transpose(1, 2)
         self.body_pos.copy_(rotate(ours[:, None], self.body.pos - self.body.pos[:, self.anchor, None]).flatten(1))
         self.body_ori.copy_(product(ours[:, None], self.body.rot)[..., :2].flatten(1))
         super().compute_observations()
+
+    def _anchor_seen(self) -> tuple[Tensor, Tensor]:
+        """Place (N, 3) [m] and attitude (N, 3, 3) of the anchor as a robot finds them: by encoders that may be off."""
+        if self.actuators.encoder_offset is None:
+            return self.body.pos[:, self.anchor], self.body.rot[:, self.anchor]
+        joints = self.dof_pos + self.actuators.encoder_offset
+        seen = self.anchor_kinematics(torch.cat([self.sim.qpos[:, :7], joints], dim=1), self.sim.qvel)
+        return seen.pos[:, 0], seen.rot[:, 0]
 
     def observation_rows(self) -> dict[str, list[Row | str]]:
         noise = self.cfg.noise.scales
@@ -174,7 +183,9 @@ class MotionTracking(RobotTask):
             raise ConfigError("motion.clips is empty; name a clip, as python -m legged_mw.motion FILE --out CLIP.npz writes it")
         self.anchor = motion.bodies.index(motion.anchor)
         self.ends = torch.tensor([motion.bodies.index(name) for name in motion.end_bodies], dtype=torch.long, device=self.device)
-        self.kinematics = Kinematics(self.robot.physics, [self.robot.id("body", name) for name in motion.bodies], self.device)
+        bodies = [self.robot.id("body", name) for name in motion.bodies]
+        self.kinematics = Kinematics(self.robot.physics, bodies, self.device)
+        self.anchor_kinematics = Kinematics(self.robot.physics, [bodies[self.anchor]], self.device)
         files = [find_file(self.cfg, "motion.clips", name) for name in motion.clips]
         self.clips = [read_clip(file).at(1.0 / self.dt).of(self.robot.joint_names, file.name) for file in files]
         held, bin_frames = round(motion.hold_s / self.dt), round(motion.bin_s / self.dt)

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from legged_mw.deploy.contract import COMPUTED, CONTRACT_FILE, Contract
+from legged_mw.deploy.motion import ATTITUDE, PLACE
 from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError, damped
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.unitree import need_dds
@@ -126,6 +127,7 @@ class UnitreeRobot(Robot):
             joint_torque=torque,
             acceleration=state["imu_state.accelerometer"].astype(float),
             foot_contact=feet,
+            others={ATTITUDE: np.array([w, x, y, z])} if self.contract.motion else {},
         )
 
     def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
@@ -200,7 +202,7 @@ def check_rows(contract: Contract, machine: Machine) -> None:
     """Refuse a policy that observes what this robot does not measure, or does not command angles. Raises RobotError."""
     if contract.action.origin == "torque":
         raise RobotError(f"{CONTRACT_FILE}: the policy commands torques; a {machine.name} is driven by angles here")
-    measured = {*_MEASURED, *COMPUTED, *(["foot_contact"] if machine.feet else [])}
+    measured = {*_MEASURED, *COMPUTED, *(["foot_contact"] if machine.feet else [])} - {PLACE}
     if wrong := [row for row in contract.rows if row.measured not in measured]:
         raise RobotError(
             f"{CONTRACT_FILE}: the policy observes {', '.join(row.name for row in wrong)}, which a {machine.name} does not measure; "
