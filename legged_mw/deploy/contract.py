@@ -235,7 +235,7 @@ def read_contract(folder: Path) -> Contract:
 
 
 def _read(top: Reader) -> Contract:
-    top.take("format", f"{' or '.join(map(str, FORMATS))}, which this version reads; export the policy again", lambda v: v in FORMATS)
+    top.take("format", f"one of {', '.join(map(str, FORMATS))}, which this version reads; export the policy again", lambda v: v in FORMATS)
     network, action, robot, physics, measured = (top.section(name) for name in ("network", "action", "robot", "physics", "sensors"))
     joints, feet = top.texts("joints"), robot.section("feet")
     top.take("joints", "names, each once", lambda names: len(set(names)) == len(names))
