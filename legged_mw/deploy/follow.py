@@ -61,6 +61,14 @@ class Follower:
         """The robots ``which`` are at the first frame."""
         self.frame[which] = 1
 
+    def ghost(self) -> Floats:
+        """The frames that come next, where the motion was moved to: (N, nq) of the scene."""
+        frame = np.minimum(self._now(), len(self.clip.root_pos) - 1)
+        states = np.zeros((len(frame), self._model.nq))
+        states[:, :3] = _rotate(self._heading, self.clip.root_pos[frame]) + self._shift
+        states[:, 3:7], states[:, self._angles] = multiply(self._heading, self.clip.root_quat[frame]), self.clip.joint_pos[frame]
+        return states
+
     def _now(self) -> NDArray[np.int64]:
         return np.minimum(self.frame if self.start is None else self.start, len(self._place) - 1)
 

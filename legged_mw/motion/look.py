@@ -94,6 +94,9 @@ class ClipStage:
     def qpos(self) -> FloatArray:
         return self._qpos[self._frame][None]
 
+    def ghost(self) -> FloatArray | None:
+        return None
+
     def contacts(self) -> BoolArray:
         return np.zeros((1, 0), dtype=bool)
 
