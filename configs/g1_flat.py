@@ -33,7 +33,7 @@ class G1FlatCfg(BipedCfg):  # sources: as BipedCfg's; [M]'s gains are from each 
         peer = "g1"
 
     class sim(BipedCfg.sim):
-        dt, iterations, ls_iterations = 0.005, 3, 10  # [s] [M: 5 ms]
+        dt, ls_iterations = 0.005, 10  # [s] [M: 5 ms]
 
 
 TASK = Task(LeggedRobot, G1FlatCfg, BipedCfgPPO)

@@ -10,6 +10,7 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
+from legged_mw.rl.concurrent import ConcurrentModel
 from legged_mw.rl.estimator import EstimatingModel
 
 WORLDS, STEPS, ACTIONS = 32, 6, 4
@@ -17,6 +18,10 @@ MODEL: type[MLPModel] = MLPModel
 SIZES = {"state": 7, "privileged_state": 11}
 TARGETS = [("speed", "privileged_state", 2, [1.0, 1.0]), ("height", "privileged_state", 6, [2.0])]
 ESTIMATOR: dict[str, Any] = {"targets": TARGETS, "hidden_dims": [24, 12], "activation": "elu", "learning_rate": 3e-3}
+CONCURRENT: dict[str, Any] = {
+    **{"groups": ["privileged_state"], "teacher_share": 0.75, "newest": [(2, 4), (5, 7)]},
+    **{"latent_dim": 5, "hidden_dims": [24, 12], "activation": "elu", "learning_rate": 3e-3},
+}
 
 
 class Env:
@@ -40,11 +45,13 @@ def make(
     distribution: dict[str, Any] | None = None,
     estimator: dict[str, Any] | None = None,
     memory: dict[str, dict[str, Any]] | None = None,
+    concurrent: dict[str, Any] | None = None,
     **settings: Any,
 ) -> Any:
     """A learner whose networks come from a fixed seed.
 
-    ``estimator``: what an actor that has one differs in from ESTIMATOR; ``memory``: what makes "actor" or "critic" recurrent.
+    ``estimator``, ``concurrent``: what an actor that has one differs in from ESTIMATOR or CONCURRENT; ``memory``: what makes "actor" or
+    "critic" recurrent.
     """
     torch.manual_seed(1)
     distribution = {"class_name": "GaussianDistribution", "init_std": 0.7} | (distribution or {})
@@ -52,6 +59,7 @@ def make(
         del distribution["init_std"]
     network = {"class_name": MODEL, "hidden_dims": [32, 16], "activation": "elu", "obs_normalization": True}
     more = {} if estimator is None else {"class_name": EstimatingModel, "estimator": {**ESTIMATOR, **estimator}}
+    more |= {} if concurrent is None else {"class_name": ConcurrentModel, "concurrent": {**CONCURRENT, **concurrent}}
     cfg = {
         "obs_groups": {"actor": ["state"], "critic": ["state", "privileged_state"]},
         "actor": {**network, "distribution_cfg": distribution, **more, **(memory or {}).get("actor", {})},

@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from ctypes import ArgumentError
 from pathlib import Path
 
 import pytest
@@ -196,7 +197,8 @@ def test_load_run_without_resume(root: Path, first: Path) -> None:
 
 
 def test_nothing_to_play(tmp_path: Path) -> None:
-    assert "nothing to play: no run in " in refused(tmp_path, "play", *TASK)
+    line = refused(tmp_path, "play", *TASK)
+    assert "nothing to play: no run in " in line and "so train first; no policy ships with go1_flat; those that ship: none" in line
 
 
 def test_run_without_its_config(root: Path, first: Path, tmp_path: Path) -> None:
@@ -537,3 +539,12 @@ def test_memory_that_runs_out_gives_advice(text: str, capsys: pytest.CaptureFixt
     assert capsys.readouterr().err == f"train.py: out of memory ({text}); fewer worlds need less: try half with --num_envs\n"
     with pytest.raises(RuntimeError, match="something else"), one_line_errors("train.py"):
         raise RuntimeError("something else")
+
+
+def test_ctrl_c_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    for error in (KeyboardInterrupt(), ArgumentError("argument 1: KeyboardInterrupt: ")):
+        with pytest.raises(SystemExit, match="130"), one_line_errors("play.py"):
+            raise error
+        assert capsys.readouterr().err == "\nplay.py: stopped\n"
+    with pytest.raises(ArgumentError), one_line_errors("play.py"):
+        raise ArgumentError("argument 1: TypeError: ")

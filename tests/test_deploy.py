@@ -193,6 +193,8 @@ def test_a_damaged_network(damage: str, export: Path, capsys: pytest.CaptureFixt
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_missing_file(name: str, export: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code, _, err = main(capsys, "go1_flta")
+    assert code == 2 and "no folder go1_flta, and no policy 'go1_flta' in resources/policies; did you mean 'go1_flat'? there are: " in err
     (export / name).unlink()
     code, _, err = main(capsys, export)
     assert code == 2 and f"no {name} in {export}; make an export with: python play.py --task <task> --export {export}" in err

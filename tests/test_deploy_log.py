@@ -17,7 +17,8 @@ from drivers import Script, Watched
 
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
-from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.contract import Contract, ContractError, read_contract
+from legged_mw.deploy.estimate import Estimated
 from legged_mw.deploy.log import CHUNK, Log, LogError, _columns, log_path, read_log
 from legged_mw.deploy.loop import Loop
 from legged_mw.deploy.policy import Controller
@@ -71,8 +72,10 @@ def test_a_log_holds_the_run(logged: tuple[Path, Watched], contract: Contract) -
 
 
 def test_a_log_is_small(logged: tuple[Path, Watched]) -> None:
-    """Compressed: a minute of a walking Go2 has at most 1.5 MB."""
-    assert logged[0].stat().st_size / 250 * 3000 < 1.5e6
+    """Compressed: a minute of a walking Go2 has at most 1.5 MB, beside the export at its start."""
+    whole = logged[0].read_bytes()
+    first = int.from_bytes(whole[:8], "little")
+    assert (len(whole) - first) / 250 * 3000 < 1.5e6 and first < 0.5e6
 
 
 def test_a_log_that_was_cut_off(logged: tuple[Path, Watched], tmp_path: Path) -> None:
@@ -144,8 +147,12 @@ def test_the_simulation_of_a_simulated_walk_is_like_it(logged: tuple[Path, Watch
     robot, simulated = figures(found.robot, contract), figures(found.simulated, contract)
     np.testing.assert_allclose(robot["torque"].sum(), simulated["torque"].sum(), rtol=0.25)  # it began 2 cm above the ground
     np.testing.assert_allclose(robot["velocity"], simulated["velocity"], atol=0.08)
+    limits = Limits.of(GO2, contract)
+    assert (found.simulated["target"] <= limits.highest).all() and (found.simulated["target"] >= limits.lowest).all()
+    np.testing.assert_allclose([robot["latency"], simulated["latency"]], 20.0, atol=1.0)  # a period, at whose end is measured
     text = table(found)
-    assert "go2_flat, the test's: 2.6 s of the policy\n" in text and "age of a measurement" in text
+    assert text.startswith(f"go2_flat, the test's, {found.recording.header['began']}: 2.6 s of the policy\n")
+    assert "age of a measurement" in text and "vx [m/s], mean" in text
     assert "    4.80 s  temperature: FL_hip_joint has a motor of 90 deg C, more than 85" in text
     draw(found, tmp_path / "walk.png")
     assert (tmp_path / "walk.png").read_bytes()[:4] == b"\x89PNG"
@@ -153,12 +160,31 @@ def test_the_simulation_of_a_simulated_walk_is_like_it(logged: tuple[Path, Watch
         draw(found, tmp_path / "no/walk.png")
 
 
-def test_latency_is_the_delay_of_a_joint() -> None:
-    """Of joints that follow a target 1, 2.5 and 4 periods later; one that rests has none."""
-    time = np.arange(300) * 0.02
-    target = np.stack([np.sin(9.0 * time)] * 3 + [np.zeros(300)], axis=1)
-    angle = np.stack([0.4 * np.sin(9.0 * (time - lag * 0.02)) for lag in (1.0, 2.5, 4.0)] + [np.zeros(300)], axis=1)
-    np.testing.assert_allclose(1e3 * latency({"target": target, "joint_pos": angle}, 0.02), [20.0, 50.0, 80.0, np.nan], atol=1.0)
+def test_latency_is_from_a_target_to_its_torque(contract: Contract) -> None:
+    """Of servos that obey a target 1, 2 and 4 periods later, in half of the steps 3 or 4; damped or not. Others have none."""
+    rng = np.random.default_rng(0)
+    steps = np.cumsum(rng.normal(0.0, 0.05, (12, 400)), axis=1)
+    angle, speed = 0.5 * rng.normal(0.0, 0.1, (12, 400)), rng.normal(0.0, 2.0, (12, 400))
+    lags = [np.full(400, lag) for lag in (1, 2, 4)] + [3 + rng.integers(0, 2, 400)] * 2
+    wanted = np.stack([steps[i, np.maximum(np.arange(400) - lag, 0)] for i, lag in enumerate(lags)] + [steps[i] for i in range(5, 12)])
+    torque = 20.0 * (wanted - angle) - np.array([0.5, 0.0] * 6)[:, None] * speed
+    steps[5] = 0.3  # it rests
+    torque[6], torque[7:] = 0.0, rng.normal(0.0, 10.0, (5, 400))  # none is measured; it has another reason
+    rows = {"target": steps, "joint_pos": angle, "joint_vel": speed, "joint_torque": torque}
+    found = 1e3 * latency({name: values.T for name, values in rows.items()}, contract)
+    np.testing.assert_allclose(found, [20.0, 40.0, 80.0, 70.0, 70.0, *[np.nan] * 7], atol=3.0)
+
+
+def test_a_log_needs_nothing_beside_it(logged: tuple[Path, Watched], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It holds the export. A log from before that names where it was."""
+    recording = read_log(logged[0])
+    assert recording.files["scene.xml"] == (GO2 / "scene.xml").read_bytes() and len(recording.files) == 3
+    elsewhere = replace(recording, header=recording.header | {"export": str(tmp_path)})
+    monkeypatch.setattr("legged_mw.deploy.replay.read_log", lambda _: elsewhere)
+    assert len(replay(logged[0]).simulated["target"]) == 130
+    elsewhere = replace(elsewhere, files={})
+    with pytest.raises(ContractError, match=f"no policy.yaml in {tmp_path}"):
+        replay(logged[0])
 
 
 def test_replay_of_another_network(logged: tuple[Path, Watched], tmp_path: Path, contract: Contract) -> None:
@@ -180,6 +206,31 @@ def test_the_program_draws_a_log(
     with pytest.raises(SystemExit, match="2"), one_line_errors("legged_mw.deploy"):
         program.main()
     assert "the following arguments are required: DIR" in capsys.readouterr().err
+
+
+class Believes:
+    """A network that stands still and has an estimate."""
+
+    estimate = np.array([[0.1, 0.2, 0.3]], dtype=np.float32)
+
+    def __call__(self, _: np.ndarray) -> np.ndarray:
+        return np.zeros((1, 12), dtype=np.float32)
+
+
+def test_an_estimate_is_logged_and_drawn_where_velocity_is_not_measured(contract: Contract, tmp_path: Path) -> None:
+    blind = replace(contract, estimate=(Estimated("base_lin_vel", 3, "m/s", "body"),))
+    robot, controller = Watched(GO2, contract, hoisted=True), Controller(GO2, blind, network=Believes())
+    robot.changed = lambda _, measured: replace(measured, lin_vel=np.zeros(3))
+    states = States(controller, [Script({5: "start", 110: "A"})], lambda _: np.zeros(3), lambda _: None)
+    log = Log(tmp_path / "blind.lmwlog", blind, GO2, "")
+    run(robot, controller, lambda _: np.zeros(0), 2.5, live=False, states=states, log=log)
+    rows = read_log(log.path).rows
+    acts = rows["state"][:, 0] == 2
+    assert acts.sum() == 15 and np.isnan(rows["estimate"][~acts]).all()
+    np.testing.assert_allclose(rows["estimate"][acts], np.tile(Believes.estimate, (15, 1)))
+    walked = {name: values[acts] for name, values in rows.items()}
+    np.testing.assert_allclose(figures(walked, blind)["velocity"][:2], [0.1, 0.2], atol=1e-6)
+    assert np.isnan(figures(walked, contract)["velocity"][:2]).all()
 
 
 def test_a_log_names_rows_of_its_own(contract: Contract) -> None:

@@ -246,11 +246,14 @@ def in_terminal(args: list[str], presses: list[tuple[str, bytes]]) -> tuple[int,
 
 
 def test_it_is_driven_from_a_terminal(tmp_path: Path) -> None:
-    log = tmp_path / "run.lmwlog"
+    log, script = tmp_path / "run.lmwlog", tmp_path / "script.yaml"
+    script.write_text("commands: [{time: 0, command: [0.1, 0, 0]}, {time: 1, push: [0, 1]}, {time: 2, reset: true}]")
     presses = [("zero torque: start", b"s"), ("stand: 2 s", b"a"), ("has to wait", b"\x1b[A"), ("+0.30 +0.00 +0.00", b"\x1b")]
     presses += [("emergency stop", b"\x03")]
-    code, shown = in_terminal([str(GO1), "--drive", "--hoist", "yes", "--log", str(log), "--limit", "late=off"], presses)
+    how = ["--hoist", "yes", "--log", str(log), "--limit", "late=off", "--commands", str(script)]
+    code, shown = in_terminal([str(GO1), "--drive", *how], presses)
     assert code == 0 and not presses, shown
+    assert "script.yaml: 2 of its pushes and resets are left out; a robot that is driven has commands alone" in shown
     assert "damping: the emergency stop (key Esc)" in shown and "late" in shown and "begin late by median" in shown
     assert f"the joints are damped; logged to {log}" in shown
     recording = read_log(log)

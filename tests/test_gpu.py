@@ -262,13 +262,15 @@ def six_equal_updates(other: PPO, ours: GraphedPPO) -> Iterator[dict[str, float]
     assert ours._update_graph.recorded
 
 
+@pytest.mark.parametrize("loss", ["estimate", "student"])
 @pytest.mark.parametrize("settings", [{}, VARIANTS["symmetric samples"]], ids=["plain", "mirrored"])
-def test_recorded_estimator_learns_as_step_by_step(settings: dict) -> None:
+def test_recorded_estimator_learns_as_step_by_step(settings: dict, loss: str) -> None:
     """Six updates, the last three replayed, beside a learner that records none, from equal states and experience."""
-    eager, ours = (make(GraphedPPO, DEVICE, estimator={}, **settings) for _ in range(2))
+    network: dict = {"estimator": {}} if loss == "estimate" else {"concurrent": {}}
+    eager, ours = (make(GraphedPPO, DEVICE, **network, **settings) for _ in range(2))
     eager._update_graph = StepGraph(eager._update, DEVICE, eager=True)
     for got in six_equal_updates(eager, ours):
-        assert got["estimate"] > 0.0
+        assert got[loss] > 0.0
     assert not eager._update_graph.recorded
 
 
@@ -335,12 +337,14 @@ def test_checkpoints_go_both_ways_on_a_gpu(tmp_path: Path) -> None:
     assert difference(parameters(stock), parameters(replaying)) < 1e-4
 
 
-@pytest.mark.parametrize("network", ["MLPModel", "RNNModel", "with an estimator"])
+@pytest.mark.parametrize("network", ["MLPModel", "RNNModel", "with an estimator", "concurrent"])
 def test_iteration_never_waits_for_the_host(network: str) -> None:
     """Rollout, returns, update and the report, once everything is recorded."""
     train = small_learner()
     if network == "with an estimator":
         train.actor.estimator.targets = ["base_lin_vel", "foot_contact"]
+    elif network == "concurrent":
+        train.actor.concurrent.groups = ["privileged_state"]
     else:
         train.actor.class_name = train.critic.class_name = network
     runner = make_runner(make_env(eager=False), train, None, DEVICE)
@@ -417,7 +421,11 @@ def test_recorded_student_acts_with_noise_beside_its_teacher() -> None:
         torch.testing.assert_close(alg.transition.privileged_actions, alg.teacher(obs), rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("networks", [{}, {"estimator": {}}, {"memory": NETWORKS["gru"]}], ids=["plain", "estimator", "memory"])
+@pytest.mark.parametrize(
+    "networks",
+    [{}, {"estimator": {}}, {"concurrent": {}}, {"memory": NETWORKS["gru"]}],
+    ids=["plain", "estimator", "concurrent", "memory"],
+)
 def test_a_recorded_warm_up_ends(networks: dict) -> None:
     """The actor stands to the bit while the critic learns, replayed too; then both learn, recorded anew."""
     alg = make(GraphedPPO, DEVICE, **networks)

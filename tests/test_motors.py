@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from program import run, trained
 from torch import Tensor, nn
 from worlds import QUIET, make_env
 
 from legged_mw.check.describe import describe
 from legged_mw.check.guard import check_recordable
 from legged_mw.check.recordable import recordable
-from legged_mw.deploy.contract import ContractError, digest, read_contract
+from legged_mw.deploy.contract import ContractError, read_contract
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.envs.delay import SubstepDelay
 from legged_mw.envs.legged_robot import LeggedRobot
@@ -28,6 +29,7 @@ from legged_mw.robot import actuator_net
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError
+from legged_mw.utils.files import digest
 from legged_mw.utils.motor_network import ACTIVATIONS, MotorNetwork, read_network
 from legged_mw.utils.task import LoadedTask, load_task
 
@@ -500,6 +502,24 @@ def test_mistakes_are_named(fields: dict[str, Any], message: str) -> None:
     with pytest.raises((ConfigError, ModelError, UserError), match=message) as error:
         make_env(2, {**DC, **fields})
     assert "\n" not in str(error.value)
+
+
+def test_a_network_that_changed_after_training_is_refused(tmp_path: Path) -> None:
+    """Under its name, by --resume, play.py and its export; the config can take it, and another name is another choice."""
+    file = save(mlp()[1], tmp_path)
+    folder = trained(tmp_path, "--set", "control.actuator=network", "--set", f"control.network={file}", "--max_iterations", "1")
+    known = {file: digest(Path(file))}
+    assert load_yaml(folder / "config.yaml")["control"]["network_digest"] == known
+    np.savez(file, **mlp("elu")[1].to_arrays())
+    for program, flags in (("train", ["--resume"]), ("play", ["--eval"]), ("play", ["--export", str(tmp_path / "out")])):
+        result = run(program, tmp_path, "--task", "go1_flat", "--device", "cpu", *flags)
+        assert result.code == 2 and f"control.network: {file} is not the file of that name that this run was trained " in result.err
+        assert result.err.endswith("take this one with --set control.network_digest={}\n") and result.err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+    resumed = ["--resume", "--set", "control.network_digest={}", "--max_iterations", "2"]
+    result = run("train", tmp_path, "--task", "go1_flat", "--device", "cpu", *resumed)
+    assert result.code == 0, result.err
+    assert load_yaml(folder / "config.yaml")["control"]["network_digest"] == {file: digest(Path(file))} != known
 
 
 def test_two_laws_at_once_are_refused() -> None:

@@ -317,6 +317,16 @@ def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
     assert 'effort = {"": 30.0}  # [N m] LOOK: the file has no force limit for all joints' in config_text(draft(free), free, "free")
 
 
+def test_a_robot_that_would_sink_gets_firmer_servos(tmp_path: Path) -> None:
+    """Four feet under 13 kg; not under 8, and not a biped, which falls on any."""
+    heavy = tmp_path / "heavy.xml"
+    heavy.write_text((ROOT / "tests/data/go2_style.xml").read_text().replace('mass="7"', 'mass="12"'))
+    found, light = draft(heavy), draft(ROOT / "tests/data/go2_style.xml")
+    assert found.guessed[2] == "gains: 1.5 times what is suggested below, to stand on its servos"
+    assert [gain.kp for gain in found.gains[:3]] == [36.0, 36.0, 68.0] and [gain.kp for gain in light.gains[:3]] == [24.0, 24.0, 45.0]
+    assert health_of(found, heavy).stand.end == "stands" and light.guessed[2] == "gains: as suggested below"
+
+
 FEET = {
     "a1_style": ["FR_foot", "FL_foot", "RR_foot", "RL_foot"],
     "anymal_c_style": ["LF_FOOT", "RF_FOOT", "LH_FOOT", "RH_FOOT"],

@@ -11,13 +11,14 @@ import torch
 from program import run
 
 from legged_mw import ROOT
-from legged_mw.deploy.contract import digest, read_contract
+from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.eval import exam, rules
 from legged_mw.rl.export import FILES
 from legged_mw.rl.network import ExportedPolicy
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.utils.config import load_yaml
+from legged_mw.utils.files import digest
 from legged_mw.utils.task import load_task
 
 POLICIES = sorted(path.parent for path in (ROOT / "resources/policies").glob("*/policy.onnx"))

@@ -772,6 +772,21 @@ def test_all_fits(robot: RobotModel) -> None:
 
 
 @pytest.mark.parametrize(
+    ("bit", "advice"),
+    [
+        (OverflowType.CONTACT_MATCH, 'raise <numeric name="contact_sensor_maxmatch" data="128"/> in the MJCF (now 64)'),
+        (OverflowType.NJMAX_NNZ, "raise `njmax` (now "),
+        (OverflowType.CCD, "simpler geoms or fewer contacts may help"),
+    ],
+)
+def test_what_overflows_for_other_reasons_is_told_what_helps(robot: RobotModel, bit: OverflowType, advice: str) -> None:
+    sim = simulate(robot, "mujoco_warp")
+    sim.overflow[0] |= int(bit)
+    sim.step(1)
+    assert sim.overflow_report().startswith(f"simulator overflow ({bit.name}) in 1 of {sim.num_envs} worlds; {advice}")
+
+
+@pytest.mark.parametrize(
     ("room", "advice"),
     [
         ({"nconmax": 1, "njmax": 4}, "raise `njmax` (now 4) and `nconmax` (now 1)"),

@@ -20,6 +20,9 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
             lines.append(line + (f"   {row.history} frames" if row.history > 1 else ""))
     if targets := find_targets(task.train.to_dict(), env):
         lines.append(f"the actor estimates {', '.join(f'{target.name} ({len(target.scale)})' for target, _ in targets)}")
+    if (taught := task.train.actor.concurrent).groups:
+        latent = f"a teacher's latent ({taught.latent_dim}) of {', '.join(taught.groups)}"
+        lines.append(f"{taught.teacher_share:.0%} of the worlds act by {latent}")
     for command in env.command_table:
         lines.append(f"command {command.label:<14} [{command.low:g}, {command.high:g}] {command.unit}")
     lines.append(f"actions ({env.num_actions}), clipped at +-{task.cfg.normalization.clip_actions:g}, {1 / env.dt:g} Hz")

@@ -13,7 +13,7 @@ from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rules
 from legged_mw.utils.cli import Parser, duration, one_line_errors, positive
-from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.errors import UserError, shown, unknown
 from legged_mw.view import launch
 
 RESULT_FILE = "exam.json"
@@ -75,9 +75,14 @@ def main() -> None:
 
 
 def find(name: str) -> Path:
-    """The folder of an export, or of the shipped policy of this name."""
-    shipped = ROOT / "resources" / "policies" / name
-    return shipped if shipped.is_dir() and not Path(name).exists() else Path(name)
+    """The folder of an export, or of the shipped policy of this name. Raises UserError if it is neither."""
+    shipped = ROOT / "resources" / "policies"
+    if Path(name).exists():
+        return Path(name)
+    if not (shipped / name).is_dir():
+        there = sorted(path.parent.name for path in shipped.glob(f"*/{CONTRACT_FILE}"))
+        raise UserError(f"no folder {name}, and {unknown('policy', name, there, 'resources/policies')}")
+    return shipped / name
 
 
 def show_log(path: Path, folder: Path | None) -> None:

@@ -5,7 +5,6 @@ The export writes it from here and ``legged_mw.deploy`` reads it with this. Noth
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from legged_mw.deploy.reader import Reader, is_list, is_number
 from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import unknown
+from legged_mw.utils.files import digest
 
 FORMATS = (2, 3, 4)  # 3: a memory, an estimate, motors; 4: a motion. A file has the lowest that suffices: old readers read what they can
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"
@@ -205,11 +205,6 @@ def _row_to_dict(row: ContractRow) -> dict[str, Any]:
 def _short(values: Sequence[float]) -> float | list[float]:
     """One number where all are the same."""
     return values[0] if len(set(values)) == 1 else list(values)
-
-
-def digest(path: Path) -> str:
-    """SHA-256 of a file."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 # ---- reading -------------------------------------------------------------------------------------------------------

@@ -74,7 +74,7 @@ def drive(robot: Robot, folder: Path, contract: Contract, args: argparse.Namespa
         path = None if args.log == "off" else Path(args.log) if args.log else log_path(contract)
         log = Log(path, contract, folder, kind) if path else None
         console = stack.enter_context(Console(contract))
-        controller, command = Controller(folder, contract), _commands(contract, args, fixed)
+        controller, command = Controller(folder, contract), _commands(contract, args, fixed, console.say)
         states = States(controller, _sources(contract, args), command, console.say)
         stack.callback(states.close)
         console.say(f"{KEYS}\n{states.state}: {states.note}")
@@ -96,12 +96,17 @@ def _sources(contract: Contract, args: argparse.Namespace) -> list[Source]:
     return sources
 
 
-def _commands(contract: Contract, args: argparse.Namespace, fixed: Sequence[float] | None) -> Callable[[float], Floats]:
+def _commands(
+    contract: Contract, args: argparse.Namespace, fixed: Sequence[float] | None, say: Callable[[str], None]
+) -> Callable[[float], Floats]:
     """The command (C,) at a time since the policy began: of the script, the fixed one, or the defaults."""
     rest = np.array([each.default for each in contract.commands]) if fixed is None else np.array(fixed)
     if not args.commands:
         return lambda _: rest
-    entries = [(entry.time, np.array(entry.command)) for entry in load_script(args.commands, contract.commands).entries if entry.command]
+    script = load_script(args.commands, contract.commands).entries
+    if others := sum((entry.push is not None) + entry.reset for entry in script):
+        say(f"--commands {args.commands}: {others} of its pushes and resets are left out; a robot that is driven has commands alone")
+    entries = [(entry.time, np.array(entry.command)) for entry in script if entry.command]
     return lambda time: next((command for start, command in reversed(entries) if start <= time + 1e-9), rest)
 
 

@@ -1,7 +1,8 @@
 """The log of a run on one robot: what was measured, seen, done and asked, when, and each trip, in one compressed file.
 
-The file is a row of blocks, each a length (8 bytes, little-endian) and an .npz of so many bytes: a header, then the columns of
-CHUNK steps at a time. A process that dies loses the last chunk alone. Nothing in it is code: it is read without pickle.
+The file is a row of blocks, each a length (8 bytes, little-endian) and an .npz of so many bytes: a header with the export's own
+files, then the columns of CHUNK steps at a time. A process that dies loses the last chunk alone. Nothing in it is code: it is read
+without pickle.
 """
 
 from __future__ import annotations
@@ -19,8 +20,10 @@ from typing import Any
 
 import numpy as np
 
-from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.contract import CONTRACT_FILE, NETWORK_FILE, SCENE_FILE, Contract
+from legged_mw.deploy.estimate import ESTIMATE
 from legged_mw.deploy.loop import Loop
+from legged_mw.deploy.motors import MOTORS_FILE
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement, layout
 from legged_mw.deploy.states import POLICY, STATES, Order
@@ -30,6 +33,7 @@ FORMAT = 1
 CHUNK = 100  # steps a block
 BACKLOG = 60  # blocks that wait to be written: a slow disk must not fill the memory
 SUFFIX = ".lmwlog"
+EXPORT = (CONTRACT_FILE, NETWORK_FILE, SCENE_FILE, MOTORS_FILE)  # files of an export that a log holds, if they are there
 _LENGTH = struct.Struct("<Q")
 
 
@@ -49,6 +53,7 @@ def _columns(contract: Contract) -> dict[str, int]:
         **dict.fromkeys(("time", "behind", "work", "age", "state", "voltage"), 1),
         **{"command": len(contract.commands), "observation": contract.size},
         **dict.fromkeys(("action", "target", "stiffness", "damping", "temperature"), joints),
+        **({ESTIMATE: sum(row.size for row in contract.estimate)} if contract.estimate else {}),
         **layout(contract),
     }
 
@@ -66,7 +71,9 @@ class Log:
             raise LogError(f"cannot write the log {path}: {error.strerror}; say --log FILE, or --log off") from None
         said = {"format": FORMAT, "task": contract.task, "network": contract.digest, "robot": robot, "export": str(folder.resolve())}
         self._blocks: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
-        self._blocks.put({"header": json.dumps({**said, "began": time.strftime("%Y-%m-%d %H:%M:%S"), "contract": contract.to_dict()})})
+        header = json.dumps({**said, "began": time.strftime("%Y-%m-%d %H:%M:%S"), "contract": contract.to_dict()})
+        files = {name: np.fromfile(folder / name, np.uint8) for name in EXPORT if (folder / name).is_file()}
+        self._blocks.put({"header": header, **files})
         self._events: list[tuple[float, str]] = []
         self._lost = 0  # steps
         self._begin()
@@ -85,6 +92,7 @@ class Log:
             **{"command": command, "observation": controller.last_observation[0] if acts else nothing},
             **{"action": controller.last_actions[0] if acts else nothing, "target": order.targets if targets else nothing},
             **{"stiffness": stiffness if targets else nothing, "damping": damping if targets else nothing},
+            ESTIMATE: _believed(controller) if acts else nothing,
         }
         for name, column in self._rows.items():
             value = values.get(name)
@@ -136,6 +144,13 @@ class Log:
                 self._file.flush()
 
 
+def _believed(controller: Controller) -> Any:
+    """The rows of an estimate side by side, as of the last step."""
+    rows = [controller.estimate(row.name) for row in controller.contract.estimate]
+    known = [row[0] for row in rows if row is not None]
+    return np.concatenate(known) if known else np.nan
+
+
 def _or_nan(value: Any) -> Any:
     return np.nan if value is None else value
 
@@ -145,6 +160,7 @@ class Recording:
     """A log that was read."""
 
     header: dict[str, Any]
+    files: dict[str, bytes]  # of the export: name -> content
     rows: dict[str, Floats]  # name -> (T, values)
     events: list[tuple[float, str]]
 
@@ -154,6 +170,7 @@ def read_log(path: Path) -> Recording:
     try:
         first, *blocks = _blocks(path)
         header = json.loads(str(first["header"]))
+        files = {name: first[name].tobytes() for name in EXPORT if name in first}
         rows = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0] if name != "events"} if blocks else {}
         events = [(float(now), str(text)) for block in blocks for now, text in json.loads(str(block["events"]))]
         fits = header["format"] == FORMAT
@@ -165,7 +182,7 @@ def read_log(path: Path) -> Recording:
         raise LogError(f"{path} is a log of format {header['format']}; this version reads {FORMAT}")
     if not rows:
         raise LogError(f"{path} holds no step: its run ended within the first {CHUNK}, or was cut off")
-    return Recording(header, rows, events)
+    return Recording(header, files, rows, events)
 
 
 def _blocks(path: Path) -> Iterator[dict[str, Any]]:

@@ -11,7 +11,6 @@ import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,7 +57,8 @@ class _Samples:
     """The last KEPT values, their worst ever; memory is fixed."""
 
     def __init__(self) -> None:
-        self.values, self.count, self.worst = np.zeros(KEPT, dtype=np.float32), 0, 0.0
+        self.values = np.full(KEPT, 0.0, dtype=np.float32)  # in memory now: zeros() would be taken page by page
+        self.count, self.worst = 0, 0.0
 
     def add(self, value: float) -> None:
         self.values[self.count % KEPT] = value
@@ -69,6 +69,19 @@ class _Samples:
         if not self.count:
             return Spread(0.0, 0.0, 0.0)
         return Spread.of(self.values[: self.count])._replace(worst=self.worst)
+
+
+def real_time(priority: int, heirs: bool = False) -> tuple[int, Any] | None:
+    """Have the system run this thread before all that is not real time, round robin at ``priority`` of 1 to 99.
+
+    ``heirs``: also the threads that it starts from now on. Returns how it was run before; None where it may not ask, or on no Linux.
+    """
+    try:
+        before = os.sched_getscheduler(0), os.sched_getparam(0)
+        os.sched_setscheduler(0, os.SCHED_RR | (0 if heirs else os.SCHED_RESET_ON_FORK), os.sched_param(priority))
+    except (OSError, AttributeError):
+        return None
+    return before
 
 
 class Loop:
@@ -96,10 +109,7 @@ class Loop:
             gc.freeze()
             gc.disable()
             sys.setswitchinterval(_YIELD)
-            with suppress(OSError, AttributeError):  # not allowed, or not Linux
-                now = os.sched_getscheduler(0), os.sched_getparam(0)
-                os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(_PRIORITY))
-                self._scheduled = now
+            self._scheduled = real_time(_PRIORITY)
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -4,7 +4,6 @@
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-import hashlib
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,6 +11,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.deploy.reader import ContractError, Reader
+from legged_mw.utils.files import digest
 from legged_mw.utils.motor_network import NetworkMotors, read_network
 
 MOTORS, MOTORS_FILE = "motors", "motors.npz"
@@ -73,6 +73,6 @@ def make_network(folder: Path, motors: Motors, count: int, joints: int) -> Netwo
         return None
     if not (folder / MOTORS_FILE).is_file():
         raise ContractError(f"no {MOTORS_FILE} in {folder}, the network of its motors; export the policy again")
-    if hashlib.sha256((folder / MOTORS_FILE).read_bytes()).hexdigest() != motors.digest:
+    if digest(folder / MOTORS_FILE) != motors.digest:
         raise ContractError(f"{MOTORS_FILE} is not the file that policy.yaml was written for: its SHA-256 differs; export the policy again")
     return NetworkMotors(read_network(folder / MOTORS_FILE), count, joints)

@@ -1,6 +1,7 @@
 """A log beside the simulation of the same commands: torque, joint errors, velocity and latency, as a table and a picture.
 
-The simulation starts where the policy began on the robot: its joints, its tilt, at the same speed, on level ground.
+The simulation starts where the policy began on the robot: its joints, its tilt, at the same speed, on level ground. Its targets are
+held as the robot's were.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -8,6 +9,8 @@ The simulation starts where the policy began on the robot: its joints, its tilt,
 from __future__ import annotations
 
 import math
+import tempfile
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,17 +18,20 @@ import mujoco
 import numpy as np
 
 from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.estimate import ESTIMATE, columns_of
 from legged_mw.deploy.log import LogError, Recording, read_log
 from legged_mw.deploy.loop import Spread
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import QUANTITIES, Floats
+from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.states import POLICY, STATES
 from legged_mw.utils.commands import VELOCITY
 from legged_mw.utils.errors import UserError, shown
 
-LAGS = 12  # [periods] in which a joint's answer to its target is looked for
+LAGS = 12  # [periods] in which a target is looked for in the torque
 MOVES = 0.02  # [rad] a target whose deviation is less tells no latency
+EXPLAINED = 0.5  # [share] of a torque that its servo must explain to tell a latency
 SHORTEST = 50  # steps of the policy that can be compared
 AXES = ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")
 Rows = dict[str, Floats]  # name -> (T, values)
@@ -41,9 +47,15 @@ class Replay(NamedTuple):
 
 
 def replay(path: Path, folder: Path | None = None) -> Replay:
-    """Simulate the longest walk in a log with the export in ``folder`` (None: the one that it names). Raises LogError, ContractError."""
+    """Simulate the longest walk in a log with the export in ``folder`` (None: the one in the log). Raises LogError, ContractError."""
     recording = read_log(path)
-    folder = folder or Path(recording.header["export"])
+    with tempfile.TemporaryDirectory() as own:
+        for name, content in recording.files.items():
+            (Path(own) / name).write_bytes(content)
+        return _replay(path, recording, folder or (Path(own) if recording.files else Path(recording.header["export"])))
+
+
+def _replay(path: Path, recording: Recording, folder: Path) -> Replay:
     contract = read_contract(folder)
     if contract.digest != recording.header["network"]:
         raise LogError(f"{shown(path)} is of another network than the one in {shown(folder)} ({recording.header['task']}); name its export")
@@ -63,14 +75,14 @@ def _longest(on: Any) -> slice:
 
 def _simulate(folder: Path, contract: Contract, rows: Rows) -> Rows:
     """The same steps on the simulated robot, until it falls."""
-    robot, controller = MujocoRobot(folder, contract), Controller(folder, contract)
+    robot, controller, safety = MujocoRobot(folder, contract), Controller(folder, contract), Safety(contract, Limits.of(folder, contract))
     _pose(robot, {name: rows[name][0] for name in ("joint_pos", "joint_vel", "gravity", "lin_vel", "ang_vel")})
     found: dict[str, list[Floats]] = {name: [] for name in (*QUANTITIES, "target")}
     for command in rows["command"]:
         measured = robot.read()
         if robot.fell():
             break
-        targets = controller.act(measured, contract.held(command))[0]
+        targets = safety.held(controller.act(measured, contract.held(command))[0])
         for name in QUANTITIES:
             found[name].append(getattr(measured, name))
         found["target"].append(targets)
@@ -110,54 +122,79 @@ def _reach(size: Floats, turn: Floats, kind: int) -> float:
 # ---- figures
 
 
-def latency(rows: Rows, period: float) -> Floats:
-    """(D,) [s] by which each joint follows its target: the lag of the best correlation; NaN of one that hardly moves."""
-    found = []
-    for target, angle in zip(rows["target"].T, rows["joint_pos"].T, strict=True):
-        if len(target) <= 2 * LAGS or target.std() < MOVES or angle.std() == 0.0:
-            found.append(math.nan)
-            continue
-        fits = [np.corrcoef(target[: len(target) - lag], angle[lag:])[0, 1] for lag in range(LAGS)]
-        best = int(np.argmax(fits))
-        between = 0.0
-        if 0 < best < LAGS - 1:  # top of the parabola through three lags
-            left, top, right = fits[best - 1 : best + 2]
-            between = 0.5 * (left - right) / (left - 2.0 * top + right)
-        found.append((best + between) * period)
-    return np.array(found)
+def latency(rows: Rows, contract: Contract) -> Floats:
+    """(D,) [s] from a target to the measurement whose torque follows it: the lag at which the servo's law fits best.
+
+    torque = stiffness * (target - angle) - damping * speed, with the contract's stiffness; damping is fitted, as not every robot has it
+    in its torque. Where no lag explains the torque, or the target hardly moves, it is NaN.
+    """
+    columns = zip(*(rows[name].T for name in ("target", "joint_pos", "joint_vel", "joint_torque")), contract.stiffness, strict=True)
+    return contract.period * np.array([_lag(*each) for each in columns])
+
+
+def _lag(target: Floats, angle: Floats, speed: Floats, torque: Floats, stiffness: float) -> float:
+    """[periods] of one joint. Between two whole lags: the share of steps, about, in which the older target was still in force."""
+    if len(target) <= 2 * LAGS or target.std() < MOVES or not torque.any():
+        return math.nan
+    lagged = [target[LAGS - lag : len(target) - lag] for lag in range(LAGS + 1)]
+    angle, speed, torque = angle[LAGS:], speed[LAGS:], torque[LAGS:]
+    best, least = math.nan, (1.0 - EXPLAINED) * float(torque.var())
+    for lag, (newer, older) in enumerate(pairwise(lagged)):
+        wanted, causes = torque - stiffness * (newer - angle), np.stack([stiffness * (older - newer), -speed], axis=1)
+        share = float(np.clip(np.linalg.lstsq(causes, wanted, rcond=None)[0][0], 0.0, 1.0))
+        wanted = wanted - share * causes[:, 0]
+        rest = wanted - speed * (wanted @ speed) / max(float(speed @ speed), 1e-12)
+        if (error := float((rest**2).mean())) < least:
+            best, least = lag + share, error
+    return best
 
 
 def _rms(values: Floats) -> Floats:
     return np.sqrt((values**2).mean(axis=0))
 
 
+def _lin_vel(rows: Rows, contract: Contract) -> Floats:
+    """(T, 3) [m/s] as measured, else as the policy estimated it, else NaN."""
+    columns = columns_of(contract.estimate, "base_lin_vel")
+    if rows["lin_vel"].any():
+        return rows["lin_vel"]
+    return rows[ESTIMATE][:, columns] if columns and ESTIMATE in rows else np.full((len(rows["lin_vel"]), 3), np.nan)
+
+
 def figures(rows: Rows, contract: Contract) -> dict[str, Floats]:
     """What is compared, each (D,) or (3,)."""
-    velocity = np.concatenate([rows["lin_vel"][:, :2], rows["ang_vel"][:, 2:]], axis=1)
+    velocity = np.concatenate([_lin_vel(rows, contract)[:, :2], rows["ang_vel"][:, 2:]], axis=1)
     return {
         "torque": _rms(rows["joint_torque"]),
         "error": _rms(rows["target"] - rows["joint_pos"]),
-        "latency": 1e3 * latency(rows, contract.period),
+        "latency": 1e3 * latency(rows, contract),
         "velocity": velocity[len(velocity) // 4 :].mean(axis=0),
     }
+
+
+def _title(replayed: Replay) -> str:
+    said, period = replayed.recording.header, replayed.contract.period
+    steps, made = len(replayed.robot["command"]), len(replayed.simulated["target"])
+    fell = "" if made == steps else f"; the simulated robot fell after {made * period:.1f} s"
+    return f"{said['task']}, {said['robot']}, {said['began']}: {steps * period:.1f} s of the policy{fell}"
 
 
 def table(replayed: Replay) -> str:
     """Robot beside simulation, a line a joint."""
     contract, rows = replayed.contract, replayed.robot
     robot, simulated = figures(rows, contract), figures(replayed.simulated, contract)
-    steps, made = len(rows["command"]), len(replayed.simulated["target"])
-    fell = "" if made == steps else f"; the simulated robot fell after {made * contract.period:.1f} s"
+
+    def pair(key: str, i: int, digits: int) -> str:
+        texts = [f"{found[key][i]:.{digits}f}" if math.isfinite(found[key][i]) else "-" for found in (robot, simulated)]
+        return f"{texts[0]:>10}{texts[1]:>8}"
+
     lines = [
-        f"{replayed.recording.header['task']}, {replayed.recording.header['robot']}: {steps * contract.period:.1f} s of the policy{fell}",
+        _title(replayed),
         f"{'robot / simulated':<28}{'torque [N m]':>18}{'error [rad]':>18}{'latency [ms]':>18}",
     ]
     for i, name in enumerate(contract.joints):
-        pairs = "".join(f"{robot[key][i]:>10.{n}f}{simulated[key][i]:>8.{n}f}" for key, n in (("torque", 2), ("error", 3), ("latency", 0)))
-        lines.append(f"{name:<28}{pairs}")
-    for i, axis in enumerate(AXES):
-        measured = f"{robot['velocity'][i]:.3f}" if i == 2 or rows["lin_vel"].any() else "-"
-        lines.append(f"{axis + ', mean':<28}{measured:>10}{simulated['velocity'][i]:>8.3f}")
+        lines.append(f"{name:<28}" + "".join(pair(key, i, n) for key, n in (("torque", 2), ("error", 3), ("latency", 0))))
+    lines += [f"{axis + ', mean':<28}{pair('velocity', i, 3)}" for i, axis in enumerate(AXES)]
     age = rows["age"][np.isfinite(rows["age"])]
     for name, values in (("age of a measurement", age), ("work of a step", rows["work"]), ("step began late by", rows["behind"])):
         if len(values):
@@ -177,6 +214,7 @@ def draw(replayed: Replay, path: Path) -> None:
     contract, rows, simulated = replayed.contract, replayed.robot, replayed.simulated
     figure = Figure((13, 11), layout="constrained")
     grid = figure.add_gridspec(4, 3)
+    figure.suptitle("\n".join([_title(replayed), *(f"{now:.2f} s  {text}" for now, text in replayed.recording.events[:4])]), fontsize=9)
     time, made = rows["time"][:, 0], len(simulated["target"])
     _velocities([figure.add_subplot(grid[0, i]) for i in range(3)], contract, rows, simulated, time)
     both, where = (figures(rows, contract), figures(simulated, contract)), np.arange(len(contract.joints))
@@ -187,6 +225,7 @@ def draw(replayed: Replay, path: Path) -> None:
         for shift, values, label in zip((-0.2, 0.2), both, ("robot", "simulated"), strict=True):
             axes.bar(where + shift, np.nan_to_num(values[key]), 0.4, label=label)
         axes.set_xticks(where, contract.joints, rotation=90, fontsize=5)
+        axes.legend(fontsize=6)
     joint = int(np.argmax(np.abs(both[0]["torque"] - both[1]["torque"])))
     for i, (key, unit) in enumerate((("joint_pos", "rad"), ("joint_torque", "N m"))):
         axes = figure.add_subplot(grid[2 + i, :2], title=f"{contract.joints[joint]} [{unit}]: the joint whose torque differs most")
@@ -213,8 +252,6 @@ def _velocities(many: list[Any], contract: Contract, rows: Rows, simulated: Rows
         if VELOCITY[i] in names:
             axes.plot(time, rows["command"][:, names.index(VELOCITY[i])], color="0.6", label="command")
         for each, label in ((rows, "robot"), (simulated, "simulated")):
-            values = each["ang_vel"][:, 2] if i == 2 else each["lin_vel"][:, i]
-            if not values.any():  # not measured
-                continue
+            values = each["ang_vel"][:, 2] if i == 2 else _lin_vel(each, contract)[:, i]
             axes.plot(time[:made] if each is simulated else time, values, linewidth=0.8, label=label)
         axes.legend(fontsize=6)

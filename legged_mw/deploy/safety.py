@@ -71,13 +71,13 @@ class Limits:
     remote: float = 3.0  # [s] without the remote that was there [unitree_rl_lab]
 
     @staticmethod
-    def of(folder: Path, contract: Contract, *more: Mapping[str, Any]) -> Limits:
-        """Those of the export in ``folder``: the machine's from its scene, then the contract's section ``safety``, then ``more``."""
+    def of(folder: Path, contract: Contract, robot: Mapping[str, Any] | None = None, asked: Mapping[str, Any] | None = None) -> Limits:
+        """Those of the export in ``folder``: the machine's from its scene, then the contract's section ``safety``, then those that
+        the robot's class states, then what the command line asks."""
         falls = OFF if contract.ends.max_tilt is None else contract.ends.max_tilt
         limits = replace(_of_scene(folder, contract), tilt=falls if falls > 90.0 else min(Limits.tilt, falls))
-        limits = limits.but(contract.safety or {}, f"{CONTRACT_FILE}: safety")
-        for values in more:
-            limits = limits.but(values, "--limit")
+        for values, where in ((contract.safety, f"{CONTRACT_FILE}: safety"), (robot, "Robot.limits"), (asked, "--limit")):
+            limits = limits.but(values or {}, where)
         return limits
 
     def but(self, values: Mapping[str, Any], where: str) -> Limits:

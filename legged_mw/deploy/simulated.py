@@ -250,16 +250,20 @@ class Scene:
 def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: bool = False) -> Scene:
     """``scene.xml`` of an export, or another ``file`` in it, which must be the robot of the contract. Raises ContractError.
 
-    ``whole``: the robot's body touches the ground too, not only its feet.
+    ``whole``: every body with collision shapes (group 3) touches the ground, and the solver is one for a robot that lies there.
+    Training leaves most bodies out and stops after the first iterations. Bodies that were on the ground stay as they were: feet.
     """
     if not (folder / file).is_file():
         raise ContractError(f"no {file} in {folder}; an export has one if its task was trained on ground with steps or blocks")
     try:
         spec = mujoco.MjSpec.from_file(str(folder / file))
-        for geom in spec.geoms if whole else ():
-            if geom.group == _SHAPES and geom.parent.name != "world":
+        for body in spec.bodies[1:] if whole else ():
+            shapes = [geom for geom in body.geoms if geom.group == _SHAPES]
+            for geom in shapes if not any(geom.conaffinity for geom in shapes) else ():
                 geom.conaffinity = 1
         model = spec.compile()
+        if whole:
+            model.opt.iterations, model.opt.ls_iterations = 100, 50  # MuJoCo's own
     except ValueError as error:
         raise ContractError(f"{file} is not a valid MJCF: {' '.join(str(error).split())}") from None
     joints = [_index(model, file, "joint", name, "joint") for name in contract.joints]

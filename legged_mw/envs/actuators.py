@@ -7,6 +7,7 @@ actuators. What changes within a control step goes through ``Actuators.before``.
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import torch
 from torch import Tensor
@@ -17,7 +18,7 @@ from legged_mw.sim.model import RobotModel
 from legged_mw.sim.motor_network import make_motor_network
 from legged_mw.sim.simulation import Simulation
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.files import find_file
+from legged_mw.utils.files import digest, find_file
 from legged_mw.utils.math import assign
 from legged_mw.utils.motor_network import read_network
 
@@ -66,6 +67,25 @@ class TorqueLaw:
         return self.actuators.gain("damping")
 
 
+def note_network(cfg: RobotTaskCfg) -> None:
+    """Write into the config which file its motors' network is; what a run was trained with stays."""
+    control = cfg.control
+    if control.actuator == "network" and control.network and control.network not in control.network_digest:
+        control.network_digest = {control.network: digest(find_file(cfg, "control.network"))}
+
+
+def find_network(cfg: RobotTaskCfg) -> Path:
+    """The file ``control.network``. Raises ConfigError if it has changed since the training that the config is of."""
+    control, file = cfg.control, find_file(cfg, "control.network")
+    if control.network_digest.get(control.network) not in (None, found := digest(file)):
+        was = control.network_digest[control.network]
+        raise ConfigError(
+            f"control.network: {file} is not the file of that name that this run was trained with (SHA-256 {found[:8]}..., then "
+            f"{was[:8]}...); bring that one back, or take this one with --set control.network_digest={{}}"
+        )
+    return file
+
+
 class Actuators:
     """Motors of N robots with D joints. An action means a target, origin + scale * action, or under the law "torque" scale * action.
 
@@ -94,7 +114,7 @@ class Actuators:
         if self._late or self.law in ("network", OWN):
             self._sent, self.before = torch.zeros_like(sim.ctrl), self._before_substep
         if self.law == "network":
-            self._network = make_motor_network(read_network(find_file(cfg, "control.network")), sim)
+            self._network = make_motor_network(read_network(find_network(cfg)), sim)
         self.targets = self._sent if self._offset is None else torch.zeros_like(sim.ctrl)  # (N, D) as the policy means them
 
     def sent(self) -> Tensor:

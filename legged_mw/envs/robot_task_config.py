@@ -59,6 +59,7 @@ class RobotTaskCfg(Config):
         no_load_speed: dict[str, float] = {}  # [rad/s]
         gear: dict[str, float] = {"": 1.0}  # turns of the motor a turn of the joint; 1: the two tables are the joint's own
         network: str = ""  # of `network`: an .npz, as `python -m legged_mw.robot.actuator_net` writes it
+        network_digest: dict[str, str] = {}  # written by train.py: that name -> SHA-256 of the file; a changed file is refused
         action_scale: float | dict[str, float] = 0.5  # target = origin + scale * action [rad]; a number, or a table a joint [P]
         action_origin: Literal["default", "joints", "targets"] = "default"  # the default pose, the measured angles or the last targets [P]
         decimation: int = 5  # simulation steps a control step [P]

@@ -155,6 +155,9 @@ class BipedCfg(SimToRealCfg):
             feet_orientation = -0.5  # [ours]
             feet_phase = 1.0  # [G]
 
+    class sim(SimToRealCfg.sim):
+        iterations = 3  # [ours: soles slip and robots fall with 1; docs/lab.md]
+
 
 class BipedCfgPPO(SimToRealCfgPPO):
     """Its learner."""

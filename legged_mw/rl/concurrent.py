@@ -63,8 +63,7 @@ class ConcurrentModel(RegressingModel):
             return join(seen, self._newest, self.estimator(seen))
 
     def rollout_latent(self, obs: TensorDict) -> Tensor:
-        own, (teacher, mlp) = self.get_latent(obs), self.teacher
-        return self._take_over(own, mlp(teacher(self._known(obs))), self.taught)
+        return self._take_over(self.get_latent(obs), self.teacher(self._known(obs)), self.taught)
 
     @torch.no_grad()
     def lesson(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:

@@ -11,20 +11,20 @@ import torch
 from rsl_rl.algorithms import Distillation
 from rsl_rl.models import MLPModel, RNNModel
 from rsl_rl.modules import EmpiricalNormalization
-from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from legged_mw.rl.adam import make_recordable, plain_state
+from legged_mw.rl.adam import make_recordable
 from legged_mw.rl.concurrent import ConcurrentModel
 from legged_mw.rl.estimator import EstimatingModel
 from legged_mw.rl.layers import run_mlp, sample, update_normalizer
+from legged_mw.rl.recorded import Recorded, why_stock
 from legged_mw.rl.recurrent import HiddenStates, step
 from legged_mw.sim.graph import StepGraph
 
 
-class GraphedDistillation(Distillation):
+class GraphedDistillation(Recorded, Distillation):
     """Distillation whose acting and update are replayed CUDA graphs.
 
     What cannot be recorded (a network that is neither a plain MLPModel nor an RNNModel, mixed precision, an optimizer other than
@@ -38,7 +38,8 @@ class GraphedDistillation(Distillation):
         if reason:
             print(f"Distillation: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
             return
-        make_recordable(self.optimizer, [self.learning_rate], str(self.device))
+        self._rates = [self.learning_rate]
+        make_recordable(self.optimizer, self._rates, str(self.device))
         seen = storage.observations.select(*student.obs_groups, *teacher.obs_groups)
         self._obs = TensorDict({name: value[0].clone() for name, value in seen.items()}, [storage.num_envs], device=self.device)
         storage.observations = storage.observations.select(*student.obs_groups)  # what the teacher sees is not learned from
@@ -47,28 +48,15 @@ class GraphedDistillation(Distillation):
 
     def _why_stock(self) -> str | None:
         """What keeps this configuration from being recorded, or None."""
-        for model, more in ((self.student, ()), (self.teacher, (EstimatingModel, ConcurrentModel))):  # a teacher's estimator learns nothing
-            if type(model) not in (MLPModel, RNNModel, *more):
-                return f"a network is a {type(model).__name__}"
-        if self.use_mixed_precision:
-            return "use_mixed_precision is set"
-        if getattr(type(self.student.distribution), "sample", None) is not GaussianDistribution.sample:
-            return f"actions are drawn from a {type(self.student.distribution).__name__}"
-        if type(self.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
-            return f"the optimizer is {type(self.optimizer).__name__}"
         if self.storage.num_transitions_per_env % self.gradient_length:
             return f"gradient_length {self.gradient_length} does not divide a rollout of {self.storage.num_transitions_per_env} steps"
-        return None
+        # a teacher's estimator learns nothing
+        return why_stock(self, self.student, {self.student: (), self.teacher: (EstimatingModel, ConcurrentModel)})
 
     def _begin(self) -> None:
         """Empty memories, and graphs that are not recorded yet."""
         self._memories = HiddenStates((self.student, self.teacher), self.storage.num_envs, 1, str(self.device))
         self._act_graph, self._update_graph = (StepGraph(fn, str(self.device)) for fn in (self._act, self._update))
-
-    def release(self) -> None:
-        """Drop what is recorded: NCCL does not close a connection that a CUDA graph still names. The next calls record again."""
-        if self.graphed:
-            self._begin()
 
     # ---- the rollout ----------------------------------------------------------------------------------------------
 
@@ -95,12 +83,6 @@ class GraphedDistillation(Distillation):
     def _mean(self, model: MLPModel, latent: Tensor) -> Tensor:
         output = run_mlp(model.mlp, latent)
         return model.distribution.deterministic_output(output) if model.distribution else output
-
-    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
-        """Store the transition; worlds whose episode ended are forgotten."""
-        super().process_env_step(obs, rewards, dones, extras)
-        if self.graphed:
-            self._memories.forget(dones)
 
     # ---- the update -----------------------------------------------------------------------------------------------
 
@@ -158,20 +140,3 @@ class GraphedDistillation(Distillation):
             nn.utils.clip_grad_norm_(self.student.parameters(), self.max_grad_norm)
         self.optimizer.step()
         self._loss += loss.detach()
-
-    # ---- checkpoints: rsl-rl's own Distillation reads and writes the same -----------------------------------------------
-
-    def save(self) -> dict[str, Any]:
-        """The networks' and the optimizer's state, in the form that rsl-rl's own Distillation writes."""
-        content = super().save()
-        if self.graphed:
-            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], [self.learning_rate])
-        return content
-
-    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Take over a checkpoint of this class or of rsl-rl's own Distillation, or a teacher from one of PPO."""
-        iteration = super().load(loaded_dict, load_cfg, strict)
-        if self.graphed:
-            make_recordable(self.optimizer, [self.learning_rate], str(self.device))
-            self._begin()  # Adam's memory has moved
-        return iteration

@@ -34,7 +34,6 @@ from legged_mw.deploy.contract import (
     Ends,
     Gait,
     HeightScan,
-    digest,
 )
 from legged_mw.deploy.estimate import Estimated
 from legged_mw.deploy.memory import Memory
@@ -68,7 +67,7 @@ from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.utils.clip import save_clip
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import shown
-from legged_mw.utils.files import find_file
+from legged_mw.utils.files import digest, find_file
 from legged_mw.utils.task import LoadedTask
 
 FILES = (CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others

@@ -40,10 +40,10 @@ def find_policy(task: LoadedTask, run: str | None = None, checkpoint: int = -1, 
     """The run or export asked for, else the last run, else the policy that ships with the task."""
     folder = experiment_folder(task, experiment)
     if run == "shipped":
-        return shipped_policy(task, f"--load_run shipped: no policy ships with {task.name}")
+        return shipped_policy(task, "--load_run shipped: ")
     if run is not None or checkpoint != -1 or runs(folder):
         return _run_or_export(folder, run or "-1", checkpoint)
-    return shipped_policy(task, f"nothing to play: no run in {shown(folder)} and no policy shipped for {task.name}; train first")
+    return shipped_policy(task, f"nothing to play: no run in {shown(folder)}, so train first; ")
 
 
 class Trained(NamedTuple):
@@ -73,7 +73,7 @@ def find_trained(asked: str, experiment: Path, flag: str) -> Trained:
 def find_rival(task: LoadedTask, run: str, experiment: str | None = None) -> Source:
     """The policy that ``--compare`` names; it must be of the same task."""
     if run == "shipped":
-        return shipped_policy(task, f"--compare shipped: no policy ships with {task.name}")
+        return shipped_policy(task, "--compare shipped: ")
     rival = _run_or_export(experiment_folder(task, experiment), run)
     theirs = str(load_yaml(rival.folder / CONFIG_FILE).get("task", task.name))
     if Path(theirs).stem != task.name:
@@ -90,11 +90,12 @@ def _run_or_export(experiment: Path, name: str, checkpoint: int = -1) -> Source:
     return Source(found, find_checkpoint(found, checkpoint), shipped=False)
 
 
-def shipped_policy(task: LoadedTask, otherwise: str) -> Source:
-    """The policy that ships with the task; ``otherwise`` is the error where there is none."""
+def shipped_policy(task: LoadedTask, asked: str) -> Source:
+    """The policy that ships with the task. Raises ConfigError that begins with what was ``asked`` and lists those that ship."""
     folder = ROOT / "resources" / "policies" / task.name
     if not (folder / NETWORK_FILE).is_file():
-        raise ConfigError(otherwise)
+        there = ", ".join(sorted(path.parent.name for path in folder.parent.glob(f"*/{NETWORK_FILE}")))
+        raise ConfigError(f"{asked}no policy ships with {task.name}; those that ship: {there or 'none'}")
     return Source(folder, folder / NETWORK_FILE, shipped=True)
 
 

@@ -17,17 +17,17 @@ from typing import Any, NamedTuple
 import torch
 from rsl_rl.algorithms import PPO
 from rsl_rl.extensions import Symmetry
-from rsl_rl.models import MLPModel, RNNModel
+from rsl_rl.models import MLPModel
 from rsl_rl.modules import EmpiricalNormalization
-from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from legged_mw.rl.adam import make_recordable, plain_state
+from legged_mw.rl.adam import make_recordable
 from legged_mw.rl.concurrent import ConcurrentModel
 from legged_mw.rl.estimator import EstimatingModel, RegressingModel, trained_parts
 from legged_mw.rl.layers import run_mlp, sample, update_normalizer
+from legged_mw.rl.recorded import Recorded, why_stock
 from legged_mw.rl.recurrent import HiddenStates, SequenceInput, check_recurrent, unroll
 from legged_mw.sim.graph import StepGraph
 
@@ -43,7 +43,7 @@ class Minibatch(NamedTuple):
     lesson: tuple[Tensor, ...] = ()  # what the actor's estimator learns from
 
 
-class GraphedPPO(PPO):
+class GraphedPPO(Recorded, PPO):
     """PPO whose update and acting are replayed CUDA graphs.
 
     A network with a memory (RNNModel) learns from whole worlds, in the order that is drawn; else from samples.
@@ -81,18 +81,11 @@ class GraphedPPO(PPO):
 
     def _why_stock(self) -> str | None:
         """What keeps this configuration from being recorded, or None."""
-        for model in (self.actor, self.critic):
-            if type(model) not in (MLPModel, RNNModel, EstimatingModel, ConcurrentModel):
-                return f"a network is a {type(model).__name__}"
-        if self.rnd or self.use_mixed_precision:
-            return f"{'rnd_cfg' if self.rnd else 'use_mixed_precision'} is set"
-        if getattr(type(self.actor.distribution), "sample", None) is not GaussianDistribution.sample:
-            return f"actions are drawn from a {type(self.actor.distribution).__name__}"
+        if self.rnd:
+            return "rnd_cfg is set"
         if not {*map(id, self.actor.parameters())}.isdisjoint(map(id, self.critic.parameters())):
             return "the networks share parameters"
-        if type(self.optimizer) not in (torch.optim.Adam, torch.optim.AdamW):
-            return f"the optimizer is {type(self.optimizer).__name__}"
-        return None
+        return why_stock(self, self.actor, {self.actor: (EstimatingModel, ConcurrentModel), self.critic: ()})
 
     def _begin(self) -> None:
         """Fixed tensors, and graphs that are not recorded yet."""
@@ -114,11 +107,6 @@ class GraphedPPO(PPO):
         self._act_graph, self._returns_graph, self._update_graph = (
             StepGraph(fn, str(device)) for fn in (self._act, self._compute_returns, self._update)
         )
-
-    def release(self) -> None:
-        """Drop what is recorded: NCCL does not close a connection that a CUDA graph still names. The next calls record again."""
-        if self.graphed:
-            self._begin()
 
     def learn_critic_only(self, on: bool) -> None:
         """From the next update on the critic learns and the actor stays as it is, or both learn again.
@@ -175,12 +163,6 @@ class GraphedPPO(PPO):
         if model in self._memories:
             return self._memories[model].advance(seen)
         return model.rollout_latent(self._obs) if isinstance(model, RegressingModel) else model.get_latent(self._obs)
-
-    def process_env_step(self, obs: TensorDict, rewards: Tensor, dones: Tensor, extras: dict[str, Tensor]) -> None:
-        """Store the transition; worlds whose episode ended are forgotten."""
-        super().process_env_step(obs, rewards, dones, extras)
-        if self.graphed:
-            self._memories.forget(dones)
 
     def compute_returns(self, obs: TensorDict) -> None:
         """Returns and advantages of the stored transitions, into the storage."""
@@ -352,7 +334,7 @@ class GraphedPPO(PPO):
         _, mirrored = symmetry.data_augmentation_func(env=symmetry.env, obs=None, actions=means[:size].detach())
         return nn.functional.mse_loss(means[size:], mirrored[size:])
 
-    # ---- learning rate and checkpoints: rsl-rl's own PPO reads and writes the same -----------------------------------------
+    # ---- the learning rate --------------------------------------------------------------------------------------------
 
     @property
     def rate(self) -> Tensor:
@@ -371,22 +353,6 @@ class GraphedPPO(PPO):
         else:
             self._rate.fill_(float(rate))
             self._adam_rate.fill_(float(rate))
-
-    def save(self) -> dict[str, Any]:
-        """The networks' and the optimizer's state, in the form that rsl-rl's own PPO writes."""
-        content = super().save()
-        if self.graphed:
-            rates = [self.learning_rate, *map(float, self._rates[1:])]
-            content["optimizer_state_dict"] = plain_state(content["optimizer_state_dict"], rates)
-        return content
-
-    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
-        """Take over a checkpoint of this class or of rsl-rl's own PPO."""
-        iteration = super().load(loaded_dict, load_cfg, strict)
-        if self.graphed:
-            make_recordable(self.optimizer, self._rates, str(self.device))
-            self._begin()  # Adam's memory has moved
-        return iteration
 
 
 def _forward(model: MLPModel, inputs: Tensor | SequenceInput) -> Tensor:

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 import torch
 from rsl_rl.algorithms import Distillation
 
+from legged_mw.envs.actuators import note_network
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import check_classes
@@ -98,6 +99,7 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     if fitted or start.policy:
         apply_overrides(task, args)  # again: what the user says wins
     _note_others(task, start)
+    note_network(task.cfg)
     check_classes(task.train)
     check_values(task.cfg, task.train)
     if device != "cpu":
@@ -135,6 +137,8 @@ def _note_others(task: LoadedTask, start: Start) -> None:
             file = shown(trained.source.checkpoint)
             task.update({section: {field: trained.task.name if trained.source.shipped else file}}, where="train")
             print(f"{'teacher' if trained is start.teacher else 'begins with the actor of'}: {file}")
+    if start.teacher and (task.train.symmetry.use_data_augmentation or task.train.symmetry.use_mirror_loss):
+        print("symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it again")
 
 
 def _announce(task: LoadedTask, device: str, rank: Rank) -> None:

@@ -13,6 +13,7 @@ from legged_mw.envs.observations import Observations, Row
 from legged_mw.envs.other_task import class_in, differences, in_words, observe_as
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
+from legged_mw.rl.network import LEARNING_ONLY
 from legged_mw.rl.policies import NETWORK_FILE, Trained, read_actor
 from legged_mw.rl.runs import CONFIG_FILE, checkpoints
 from legged_mw.utils.config import ConfigError, save_yaml
@@ -66,6 +67,8 @@ def check_start(env: RobotTask, task: LoadedTask, policy: Trained) -> None:
 def begin_with(model: MLPModel, policy: Trained) -> None:
     """Give ``model`` the actor's parameters; its noise stays its own."""
     path, own = policy.source.checkpoint, model.state_dict()
+    if path.suffix == ".onnx" and any(name.startswith(LEARNING_ONLY) for name in own):
+        raise ConfigError(f"{shown(path)} holds the student alone, not the teacher's encoder that it would learn from; name a checkpoint")
     saved = read_actor(path, model)
     for name in [name for name in saved if name.endswith("_normalizer._std") and path.suffix == ".onnx"]:  # of observations, of targets
         of = name.removesuffix("_std")

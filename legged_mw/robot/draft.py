@@ -5,9 +5,11 @@ What is guessed or chosen is marked LOOK in the file.
 
 from __future__ import annotations
 
+import copy
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +22,7 @@ from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.sim_to_real_config import BipedCfg, BipedCfgPPO
 from legged_mw.robot.crouch import bent, pose_weights
 from legged_mw.robot.feet import Foot, guess_feet
-from legged_mw.robot.measure import Joint, mass_matrices, stand_as_statue, what_joints_bear
+from legged_mw.robot.measure import Joint, mass_matrices, stand_as_statue, stand_on_servos, what_joints_bear
 from legged_mw.robot.suggest import Gains, suggest
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import RobotModel
@@ -30,6 +32,7 @@ from legged_mw.sim.vendor import read_robot
 from legged_mw.utils.config import ConfigError
 
 LOW = 0.33  # [m] a root that stands lower than this cannot swing its feet as high as others
+FIRMNESS = (1.0, 1.25, 1.5, 2.0)  # times the suggested gains: beyond 2 it is another robot than vendors publish gains for [ours]
 CLEARANCE = 0.003  # [m] above the ground at reset, so that nothing begins inside of it
 
 
@@ -60,17 +63,34 @@ def draft(file: Path) -> Draft:
     if bends is not None:
         pose, rest = bends, stand_as_statue(robot, bends, place)
     joints = what_joints_bear(robot, mass_matrices(robot, pose), rest.torque)
-    gains = suggest(joints, float(robot.physics.opt.timestep))
     how = "all joints at 0, or at the nearest end of their range" if bends is None else "knees bent, feet under the hips"
     how = "the file's keyframe" if from_file else how
+    pose = (np.round(pose, 4) + 0.0).tolist()  # no -0.0
+    height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
+    place = [0.0, 0.0, round(height + CLEARANCE, 3)]
+    firmness, gains = _firm(robot, pose, place, joints, feet)
     guessed = [
         f"pose: {how}",
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest ends of limbs",
-        "gains: as suggested below",
+        "gains: as suggested below" if firmness == 1.0 else f"gains: {firmness:g} times what is suggested below, to stand on its servos",
     ]
-    pose = (np.round(pose, 4) + 0.0).tolist()  # no -0.0
-    height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
-    return Draft(robot, pose, [0.0, 0.0, round(height + CLEARANCE, 3)], joints, gains, feet, guessed, how, read.notes)
+    return Draft(robot, pose, place, joints, gains, feet, guessed, how, read.notes)
+
+
+def _firm(
+    robot: RobotModel, pose: list[float], place: list[float], joints: Sequence[Joint], feet: Sequence[Foot]
+) -> tuple[float, list[Gains]]:
+    """The first of FIRMNESS with whose gains the robot stands on its feet, and these; 1 if none does, and on two feet, which tip anyway."""
+    model, touching = copy.copy(robot.physics), {geom for foot in feet for geom in foot.geoms}
+    for geom in range(robot.ground_geoms().stop, model.ngeom):
+        model.geom_conaffinity[geom] *= model.geom(geom).name in touching
+    for firmness in FIRMNESS if len(feet) > 2 else ():
+        gains = suggest(joints, float(model.opt.timestep), firmness)
+        model.actuator_gainprm[:, 0], model.dof_damping[6:] = [gain.kp for gain in gains], [gain.kd for gain in gains]
+        model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
+        if stand_on_servos(replace(robot, physics=model), np.array(pose), place, RobotTaskCfg.control.decimation).end == "stands":
+            return firmness, gains
+    return 1.0, suggest(joints, float(model.opt.timestep))
 
 
 def _bare(file: Path, keyframe: bool) -> RobotTask:
@@ -148,7 +168,6 @@ def _of_a_biped(found: Draft, low: dict[str, Any]) -> dict[str, dict[str, Any]]:
             "pose_weights": table(pose_weights(robot, found.pose, found.feet), robot.joint_names),
             "scales": {"contact_phase": 1.0, "no_fly": 0.5},
         },
-        "sim": {"iterations": 3},
     }
 
 

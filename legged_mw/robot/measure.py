@@ -26,6 +26,8 @@ from legged_mw.sim.engines import make_simulation
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.pose import posed
 from legged_mw.sim.room import Room, count_room
+from legged_mw.sim.vendor import tilt
+from legged_mw.view.posed_robot import boxes
 
 FloatArray = NDArray[np.float64]
 
@@ -181,52 +183,27 @@ def _settle(robot: RobotModel, pose: FloatArray, place: FloatArray, upright: boo
     return data
 
 
-def tilt(quat: FloatArray) -> float:
-    """[deg] between the z axis of ``quat`` (w, x, y, z) and the vertical."""
-    _, x, y, _ = quat / np.linalg.norm(quat)
-    return math.degrees(math.acos(max(-1.0, min(1.0, 1.0 - 2.0 * float(x * x + y * y)))))
-
-
 def inside_by(points: FloatArray, place: FloatArray) -> float:
-    """How far ``place`` (2,) lies inside the convex hull of ``points`` (P, 2) [m]; negative: outside by so much."""
+    """How far ``place`` (2,) lies inside the convex hull of ``points`` (P, 2) [m]; negative: outside by so much.
+
+    It is how far the hull reaches beyond the place in the direction in which it reaches least: square to a line through two
+    of the points, or from a point to the place.
+    """
     if not len(points):
         return -math.inf
-    hull = _hull(points)
-    edges = list(zip(hull, [*hull[1:], hull[0]], strict=True))
-    away = min(_to_segment(place, start, end) for start, end in edges)
-    turns = [(end[0] - start[0]) * (place[1] - start[1]) - (end[1] - start[1]) * (place[0] - start[0]) for start, end in edges]
-    return away if len(hull) > 2 and min(turns) >= 0.0 else -away
-
-
-def _hull(points: FloatArray) -> list[FloatArray]:
-    """Corners of the convex hull, counter-clockwise (Andrew's monotone chain)."""
-    ordered = [np.array(p) for p in sorted({(round(float(x), 9), round(float(y), 9)) for x, y in points})]
-
-    def chain(these: list[FloatArray]) -> list[FloatArray]:
-        kept: list[FloatArray] = []
-        for p in these:
-            while len(kept) > 1 and np.linalg.det([kept[-1] - kept[-2], p - kept[-1]]) <= 1e-12:
-                kept.pop()
-            kept.append(p)
-        return kept[:-1]
-
-    return chain(ordered) + chain(ordered[::-1]) or ordered
-
-
-def _to_segment(place: FloatArray, start: FloatArray, end: FloatArray) -> float:
-    along = end - start
-    share = float(np.clip((place - start) @ along / max(float(along @ along), 1e-12), 0.0, 1.0))
-    return float(np.linalg.norm(place - start - share * along))
+    away = points - place
+    ways = np.concatenate([(away[:, None] - away[None]).reshape(-1, 2) @ [[0.0, 1.0], [-1.0, 0.0]], -away])
+    lengths = np.linalg.norm(ways, axis=1)
+    ways = ways[lengths > 1e-9] / lengths[lengths > 1e-9, None]
+    return float((ways @ away.T).max(axis=1).min()) if len(ways) else 0.0
 
 
 def _highest(robot: RobotModel, qpos: FloatArray) -> float:
     """[m] of the robot's geoms, looks included."""
     model = robot.spec.copy().compile()
     data = posed(model, qpos[7:], qpos[:7])
-    moving = np.flatnonzero(model.body_weldid[model.geom_bodyid])
-    rotation, box = data.geom_xmat[moving].reshape(-1, 3, 3), model.geom_aabb[moving]
-    tops = data.geom_xpos[moving, 2] + (rotation @ box[:, :3, None])[:, 2, 0] + (np.abs(rotation) @ box[:, 3:, None])[:, 2, 0]
-    return float(tops.max(initial=0.0))
+    centres, halves = boxes(model, data, np.flatnonzero(model.body_weldid[model.geom_bodyid]))
+    return float((centres + halves)[:, 2].max(initial=0.0))
 
 
 # ---- servos ----

@@ -48,7 +48,6 @@ _COMMENTS = {
     "min_feet_distance": "[m] between the feet, sideways: less is punished",
     "pose_weights": "how near the default pose each joint is to stay",
     "contact_phase": "one foot after the other; without it and no_fly a beginner hops [ours: docs/lab.md]",
-    "iterations": "a biped's soles want more than 1 [ours]",
 }
 
 

@@ -20,7 +20,8 @@ from legged_mw.drawing.scene import visual_spec
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.tables import family
 from legged_mw.view.feet import patch
-from legged_mw.view.posed_robot import GROUPS_SHOWN, PosedRobots
+from legged_mw.view.overlay import connect, draw_disc
+from legged_mw.view.posed_robot import GROUPS_SHOWN, PosedRobots, boxes
 from legged_mw.view.recorder import no_context
 from legged_mw.view.stage import FloatArray, ViewError
 from legged_mw.view.video import Frame, save_png
@@ -129,9 +130,7 @@ class _Picture:
         """Middle and diagonal [m] of the upright box around the robot."""
         model, data = self.posed.model, self.posed.data
         moving = np.flatnonzero((model.body_weldid[model.geom_bodyid] > 0) & (model.geom_rgba[:, 3] > 0))
-        rotation, box = data.geom_xmat[moving].reshape(-1, 3, 3), model.geom_aabb[moving]
-        centre = data.geom_xpos[moving] + (rotation @ box[:, :3, None])[..., 0]
-        half = (np.abs(rotation) @ box[:, 3:, None])[..., 0]
+        centre, half = boxes(model, data, moving)
         places = np.concatenate([centre - half, centre + half, data.xpos[self.posed.base][None]])
         low, high = places.min(axis=0), places.max(axis=0)
         self.middle, self.size = (low + high) / 2, float(max(high[2] - low[2], 0.95 * np.linalg.norm((high - low)[:2])))
@@ -143,7 +142,7 @@ class _Picture:
             joint = self.posed.model.joint(name).id
             place, axis = self.posed.data.xanchor[joint].copy(), self.posed.data.xaxis[joint].copy()
             rgb = FAMILY_RGB[families.index(family(name)) % len(FAMILY_RGB)]
-            self._arrow(place, axis, length, (*rgb, 1.0))
+            self._arrow(place, axis, length, rgb)
             labels.append(Label(name, place, rgb, ((place + length * axis, rgb),)))
         return labels
 
@@ -151,12 +150,10 @@ class _Picture:
         """A disc under each foot, as the viewer draws one that stands."""
         labels, model = [], self.posed.model
         for name, geoms in self.feet.items():
-            place, turn, half = patch(model, self.posed.data, [model.geom(geom).id for geom in geoms], self.posed.radius)
-            place[2] = 0.002
-            disc = self._geom(mujoco.mjtGeom.mjGEOM_CYLINDER, (half[0], 0.002, 0.0), place, FOOT_RGBA)
-            disc.size[1] = half[1]
-            disc.mat[:] = turn
-            labels.append(Label(f"foot {name}", place, FOOT_RGBA[:3]))
+            foot = patch(model, self.posed.data, [model.geom(geom).id for geom in geoms], self.posed.radius)
+            foot.place[2] = 0.002
+            draw_disc(self._renderer.scene, foot, 0.002, FOOT_RGBA)
+            labels.append(Label(f"foot {name}", foot.place, FOOT_RGBA[:3]))
         return labels
 
     def _draw_imu(self) -> list[Label]:
@@ -164,23 +161,13 @@ class _Picture:
         place, axes = self.posed.data.site_xpos[site].copy(), self.posed.data.site_xmat[site].reshape(3, 3)
         length = 0.2 * self.size
         for axis, rgb in zip(axes.T, AXES_RGB, strict=True):
-            self._arrow(place, axis, length, (*rgb, 1.0))
+            self._arrow(place, axis, length, rgb)
         ends = tuple((place + length * axis, rgb) for axis, rgb in zip(axes.T, AXES_RGB, strict=True))
         return [Label(self.robot.imu, place, (1.0, 1.0, 1.0), ends)]
 
-    def _arrow(self, place: FloatArray, axis: FloatArray, length: float, rgba: Sequence[float]) -> None:
-        geom = self._geom(mujoco.mjtGeom.mjGEOM_ARROW, (0.0, 0.0, 0.0), place, rgba)
-        mujoco.mjv_connector(
-            geom, mujoco.mjtGeom.mjGEOM_ARROW, 0.009 * self.size, place, place + 2.0 * length * axis
-        )  # it draws half of it
-
-    def _geom(self, kind: int, size: Sequence[float], place: FloatArray, rgba: Sequence[float]) -> mujoco.MjvGeom:
-        scene = self._renderer.scene
-        geom = scene.geoms[scene.ngeom]
-        mujoco.mjv_initGeom(geom, kind, np.array(size), place, np.eye(3).ravel(), np.asarray(rgba, dtype=np.float32))
-        geom.category, geom.emission = mujoco.mjtCatBit.mjCAT_DECOR, 0.6
-        scene.ngeom += 1
-        return geom
+    def _arrow(self, place: FloatArray, axis: FloatArray, length: float, rgb: Rgb) -> None:
+        end = place + 2.0 * length * axis  # half of it is drawn
+        connect(self._renderer.scene, mujoco.mjtGeom.mjGEOM_ARROW, 0.009 * self.size, place, end, (*rgb, 1.0))
 
     # ---- names ----
 

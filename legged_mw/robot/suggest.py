@@ -5,6 +5,7 @@ and knee 100 and 150 at 88 and 139 N m (unitree_rl_gym), Go2 20 and 40 at 23.5 a
 Playground). It is at least what holds twice the load at rest, as half of the feet do in a walk, within 0.4 rad. Where nobody states an
 effort, it is that, and at least what swings the limb at 2 Hz.
 kd: 25 ms of kp: ANYmal 2 of 80, Go2 0.5 of 20, G1 2 of 100, Booster T1 5 of 200.
+A robot on more than two feet that would not stand on these gets up to twice as much (draft.py).
 Both are cut where the step would not bear them: dt sqrt(kp / I) at most 0.5 and dt kd / I at most 0.5, with the joint's smallest inertia.
 """
 
@@ -32,9 +33,9 @@ class Gains(NamedTuple):
     cut: bool  # whether the step, and not the robot, limits one of them
 
 
-def suggest(joints: Sequence[Joint], dt: float) -> list[Gains]:
-    """Gains for each joint; joints that differ in their side alone get the same ones."""
-    wanted = [_wanted(joint) for joint in joints]
+def suggest(joints: Sequence[Joint], dt: float, firmness: float = 1.0) -> list[Gains]:
+    """Gains for each joint, ``firmness`` times the rule's; joints that differ in their side alone get the same ones."""
+    wanted = [firmness * _wanted(joint) for joint in joints]
     most = [joint.inertia / dt for joint in joints]  # [kg m^2/s]
     gains = []
     for joint in joints:

@@ -7,7 +7,7 @@ Whatever is dropped, added or renamed is a line of ``Loaded.notes``. Host only; 
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -114,11 +114,11 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
         angles = {joint.name: qpos[start] for joint, start in zip(spec.joints, starts[:-1], strict=True) if joint.type in _SCALAR_JOINTS}
         first = next(iter(spec.joints), None)
         free = bool(first and first.type == _FREE)
-        tilt = _tilt(qpos[3:7]) if free else 0.0
-        taken = Keyframe(chosen.name, qpos[2] if free and tilt < _UPRIGHT else None, angles)
+        lean = tilt(qpos[3:7]) if free else 0.0
+        taken = Keyframe(chosen.name, qpos[2] if free and lean < _UPRIGHT else None, angles)
         notes.append(f"keyframe '{chosen.name}' read: pose and height of the root, where nothing else states them")
-        if tilt > _UPRIGHT:
-            text = f"warning: keyframe '{chosen.name}' tilts the root by {tilt:.0f} degrees; that and its height are not read, the root "
+        if lean > _UPRIGHT:
+            text = f"warning: keyframe '{chosen.name}' tilts the root by {lean:.0f} degrees; that and its height are not read, the root "
             notes.append(f"{text}begins upright: state a pose for that by `pose`")
     for key in keys:
         if key is not chosen:
@@ -130,7 +130,7 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
     return taken
 
 
-def _tilt(quat: list[float]) -> float:
+def tilt(quat: Sequence[float] | np.ndarray) -> float:
     """Between the root's z axis and the vertical [degrees]; ``quat`` wxyz."""
     w, x, y, z = np.array(quat) / (np.linalg.norm(quat) or 1.0)
     return float(np.degrees(np.arccos(np.clip(w * w - x * x - y * y + z * z, -1.0, 1.0))))

@@ -103,14 +103,15 @@ class WarpSimulation(Simulation):
         seen = self._overflow_seen & ~int(_EXPECTED)
         bits = [bit for bit in OverflowType if bit != OverflowType.ALL and bool((seen & int(bit)).any())]
         raise_ = []
-        if OverflowType.NEFC in bits:
+        if {OverflowType.NEFC, OverflowType.NJMAX_NNZ} & set(bits):
             raise_.append(f"`njmax` (now {self.njmax})")
         if {OverflowType.NARROWPHASE, OverflowType.BROADPHASE} & set(bits):
             raise_.append(f"`nconmax` (now {self.nconmax})")
-        names = ", ".join(str(bit.name) for bit in bits)
-        return (
-            f"simulator overflow ({names}) in {worlds} of {self.num_envs} worlds; raise {' and '.join(raise_) or '`nconmax` and `njmax`'}"
-        )
+        if OverflowType.CONTACT_MATCH in bits:  # more contacts than one sensor takes in
+            most = self._model.opt.contact_sensor_maxmatch
+            raise_.append(f'<numeric name="contact_sensor_maxmatch" data="{2 * most}"/> in the MJCF (now {most})')
+        advice = f"raise {' and '.join(raise_)}" if raise_ else "simpler geoms or fewer contacts may help"
+        return f"simulator overflow ({', '.join(str(bit.name) for bit in bits)}) in {worlds} of {self.num_envs} worlds; {advice}"
 
     def actuator_velocity(self) -> Tensor:
         return wp.to_torch(self._data.actuator_velocity)

@@ -8,6 +8,7 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from ctypes import ArgumentError
 from pathlib import Path
 from typing import NoReturn
 
@@ -106,12 +107,17 @@ def duration(text: str) -> float:
 
 @contextmanager
 def one_line_errors(program: str = "") -> Iterator[None]:
-    """Turn mistakes of the user into one line and exit code 2; memory that runs out into advice."""
+    """Turn mistakes of the user into one line and exit code 2, memory that runs out into advice, Ctrl-C into a word and code 130."""
     program = program or Path(sys.argv[0]).name
     try:
         yield
     except UserError as error:
         fail(program, str(error))
+    except (KeyboardInterrupt, ArgumentError) as error:  # ctypes wraps one that comes while it converts an argument
+        if "KeyboardInterrupt" not in repr(error):
+            raise
+        print(f"\n{program}: stopped", file=sys.stderr)
+        raise SystemExit(130) from None
     except RuntimeError as error:
         first: BaseException = error
         while first.__context__ is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import sys
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,11 @@ def find_file(cfg: Any, path: str, one: str = "") -> Path:
     if written.is_absolute():
         raise UserError(f"{path}: no file at {written}; an absolute path is of one machine: name the file relative to the task's")
     raise UserError(f"{path}: no file '{written}' in {', '.join(map(str, places))}")
+
+
+def digest(file: Path) -> str:
+    """SHA-256 of a file."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def _folder(cls: type) -> Path | None:

@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike
 
+from legged_mw.view.feet import Patch
 from legged_mw.view.posed_robot import Placement, PosedRobots, show_groups
 from legged_mw.view.stage import FloatArray, Moment
 
@@ -77,7 +78,7 @@ def _draw_straight(
     cos, sin = math.cos(placement.heading), math.sin(placement.heading)
     along = np.array([cos * velocity[0] - sin * velocity[1], sin * velocity[0] + cos * velocity[1], 0.0])
     tip = origin + per_speed * placement.radius * along
-    _connect(scene, mujoco.mjtGeom.mjGEOM_ARROW, 0.03 * placement.radius, origin, tip, rgba)
+    connect(scene, mujoco.mjtGeom.mjGEOM_ARROW, 0.03 * placement.radius, origin, tip, rgba)
 
 
 def _draw_turn(scene: mujoco.MjvScene, placement: Placement, origin: FloatArray, rate: float, rgba: tuple[float, ...]) -> None:
@@ -89,19 +90,24 @@ def _draw_turn(scene: mujoco.MjvScene, placement: Placement, origin: FloatArray,
     ring = 0.5 * placement.radius * np.stack([np.cos(angles), np.sin(angles), np.zeros_like(angles)], axis=1) + origin
     width = 0.016 * placement.radius
     for start, end in zip(ring[:-1], ring[1:], strict=True):
-        _connect(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, width, start, end, rgba)
+        connect(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, width, start, end, rgba)
     tangent = math.copysign(1.0, rate) * np.array([-math.sin(angles[-1]), math.cos(angles[-1]), 0.0])
-    _connect(scene, mujoco.mjtGeom.mjGEOM_ARROW, 2.0 * width, ring[-1], ring[-1] + 0.13 * placement.radius * tangent, rgba)
+    connect(scene, mujoco.mjtGeom.mjGEOM_ARROW, 2.0 * width, ring[-1], ring[-1] + 0.13 * placement.radius * tangent, rgba)
 
 
 def _draw_contacts(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment) -> None:
     """A disc under each foot on the ground, as long and as wide as what touches it."""
     thick = DISC * robots.radius
     for place, turn, half in robots.patches(moment.contacts):
-        disc = _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (half[0], thick, 0.0), place + (0.0, 0.0, 1.3 * thick), CONTACT_RGBA)
-        if disc is not None:
-            disc.size[1] = half[1]
-            disc.mat[:] = turn
+        draw_disc(scene, Patch(place + (0.0, 0.0, 1.3 * thick), turn, half), thick, CONTACT_RGBA)
+
+
+def draw_disc(scene: mujoco.MjvScene, patch: Patch, thick: float, rgba: tuple[float, ...]) -> None:
+    """Append an upright disc of twice ``thick`` [m] with its middle at the patch's place."""
+    disc = _add(scene, mujoco.mjtGeom.mjGEOM_CYLINDER, (patch.half[0], thick, 0.0), patch.place, rgba)
+    if disc is not None:
+        disc.size[1] = patch.half[1]
+        disc.mat[:] = patch.turn
 
 
 def _draw_ghosts(scene: mujoco.MjvScene, robots: PosedRobots, qpos: FloatArray) -> None:
@@ -119,7 +125,8 @@ def _draw_fall(scene: mujoco.MjvScene, place: FloatArray, radius: float) -> None
     _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (0.35 * radius,) * 3, place, FALL_RGBA, "fell")
 
 
-def _connect(scene: mujoco.MjvScene, kind: int, width: float, start: FloatArray, end: FloatArray, rgba: tuple[float, ...]) -> None:
+def connect(scene: mujoco.MjvScene, kind: int, width: float, start: FloatArray, end: FloatArray, rgba: tuple[float, ...]) -> None:
+    """Append a capsule or an arrow from ``start`` to ``end``; of an arrow MuJoCo draws half."""
     geom = _add(scene, kind, (0.0, 0.0, 0.0), start, rgba)
     if geom is not None:
         mujoco.mjv_connector(geom, kind, width, start, end)

@@ -105,21 +105,23 @@ class PosedRobots:
         rotation = self.data.xmat[body]
         return Placement(np.array(self.data.xpos[body]), math.atan2(rotation[3], rotation[0]), self.radius, self.top, self.bottom)
 
-    def _box(self, geom: int) -> tuple[FloatArray, FloatArray]:
-        """Centre and half edges of the upright box around a geom, (3,) each [m]."""
-        rotation, box = self.data.geom_xmat[geom].reshape(3, 3), self.model.geom_aabb[geom]
-        return self.data.geom_xpos[geom] + rotation @ box[:3], np.abs(rotation) @ box[3:]
-
     def _measure(self) -> tuple[float, float, float]:
         """Of what is seen of a robot, and its feet: largest distance from its base, height above it and depth below it [m]."""
-        model, radius, top, bottom = self.model, 0.0, 0.0, 0.0
+        model = self.model
         robot = model.body_rootid[model.geom_bodyid] == model.body_rootid[self.base]
-        for geom in {*map(int, np.flatnonzero(robot & (model.geom_group < GROUPS_SHOWN))), *self._feet[0]}:
-            centre, half = self._box(geom)
-            centre = centre - self.data.xpos[self.base]
-            radius = max(radius, float(np.linalg.norm(np.abs(centre) + half)))
-            top, bottom = max(top, float(centre[2] + half[2])), max(bottom, float(half[2] - centre[2]))
+        seen = {*map(int, np.flatnonzero(robot & (model.geom_group < GROUPS_SHOWN))), *self._feet[0]}
+        centres, halves = boxes(model, self.data, sorted(seen))
+        centres = centres - self.data.xpos[self.base]
+        radius = float(np.linalg.norm(np.abs(centres) + halves, axis=1).max(initial=0.0))
+        top, bottom = (float(edges[:, 2].max(initial=0.0)) for edges in (centres + halves, halves - centres))
         return (radius or 0.5), top, bottom  # a robot without geometry still needs a camera distance
+
+
+def boxes(model: mujoco.MjModel, data: mujoco.MjData, geoms: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Centres and half edges (G, 3) [m] of the upright boxes around ``geoms``."""
+    rotation, box = data.geom_xmat[geoms].reshape(-1, 3, 3), model.geom_aabb[geoms]
+    centres = data.geom_xpos[geoms] + (rotation @ box[:, :3, None])[..., 0]
+    return centres, (np.abs(rotation) @ box[:, 3:, None])[..., 0]
 
 
 def many_robots(spec: mujoco.MjSpec, single: mujoco.MjModel, count: int) -> tuple[mujoco.MjModel, list[int], list[list[int]]]:

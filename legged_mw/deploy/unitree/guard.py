@@ -12,7 +12,6 @@ import contextlib
 import gc
 import json
 import mmap
-import os
 import select
 import signal
 import socket
@@ -24,7 +23,7 @@ import time
 from collections import deque
 from typing import Any
 
-from legged_mw.deploy.loop import Spread
+from legged_mw.deploy.loop import Spread, real_time
 from legged_mw.deploy.robot import RobotError
 from legged_mw.deploy.unitree.codec import LAYOUTS
 
@@ -249,8 +248,7 @@ def main() -> None:
 
     settings = json.loads(sys.argv[1])
     channel = socket.socket(fileno=settings["channel"])
-    with contextlib.suppress(OSError, AttributeError):  # not allowed, or not Linux
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))  # before DDS starts its threads, which then have it too
+    real_time(PRIORITY, heirs=True)  # before DDS starts its threads
     try:
         wire = Wire(settings["package"], settings["interface"], settings["domain"])
         first = wire.prepare(settings["find"], lies_down=settings["lies_down"])

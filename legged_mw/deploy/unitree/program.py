@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import gc
 import math
-import os
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from legged_mw.deploy.contract import Contract
-from legged_mw.deploy.loop import Spread
+from legged_mw.deploy.loop import Spread, real_time
 from legged_mw.deploy.unitree import need_dds
 from legged_mw.deploy.unitree.handset import Handset
 from legged_mw.deploy.unitree.robots import machine_of
@@ -115,8 +113,7 @@ def serve(
     need_dds()
     from legged_mw.deploy.unitree.link import RobotEnd, default_domain
 
-    with contextlib.suppress(OSError, AttributeError):  # not allowed, or not Linux
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(PRIORITY))  # a robot's own computer does nothing else either
+    real_time(PRIORITY, heirs=True)  # a robot's own computer does nothing else either
     domain = default_domain(interface) if domain is None else domain
     machine = machine_of(contract.joints)
     end = RobotEnd(machine.package, interface, domain)

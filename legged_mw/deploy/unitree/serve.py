@@ -104,8 +104,8 @@ class SimulatedUnitree:
         """
         self.machine: Machine = machine_of(contract.joints)
         self.contract, self.end, self.faults, self.counts, self._watchdog = contract, end, faults or Faults(), Counts(), watchdog
-        self._scene = read_scene(folder, contract)
-        self.model, self._rng = _whole(self._scene.spec), np.random.default_rng(seed)
+        self._scene = read_scene(folder, contract, whole=True)
+        self.model, self._rng = self._scene.model, np.random.default_rng(seed)
         self._make_motors()
         self.data = mujoco.MjData(self.model)
         self.reset()
@@ -265,20 +265,6 @@ class SimulatedUnitree:
 
     def _sensor(self, quantity: str) -> Floats:
         return self.data.sensordata[self._scene.sensordata[quantity]]
-
-
-def _whole(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """The scene with every body on the ground that has shapes of collision (group 3), and a solver for a robot that lies there.
-
-    Training leaves most bodies out, and stops after the first iterations. Bodies that were on the ground stay as they were: feet.
-    """
-    for body in spec.bodies:
-        shapes = [geom for geom in body.geoms if geom.group == 3]
-        for geom in shapes if not any(geom.conaffinity for geom in shapes) else ():
-            geom.conaffinity = 1
-    model = spec.compile()
-    model.opt.iterations, model.opt.ls_iterations = 100, 50  # MuJoCo's own
-    return model
 
 
 def _roll_pitch_yaw(quaternion: Sequence[float] | Floats) -> list[float]:
