@@ -25,6 +25,7 @@ NOMINAL = {  # what playing changes in the trained config
     "perturbation.push": False,
     "domain_rand.enable": False,
     "commands.curriculum": False,
+    "motion.random_start": False,  # from a clip's start to its end
 }
 ROWS, BORDER = 3, 2.0  # of the ground to watch: levels, from the easiest to the hardest, and [m]
 
