@@ -58,6 +58,9 @@ class G1TrackCfg(MotionTrackingCfg):
 
 
 class G1TrackCfgPPO(RobotTaskCfgPPO):
+    class algorithm(RobotTaskCfgPPO.algorithm):
+        desired_kl = 0.02  # [ours: of 29 joints together, as g1_flat's]
+
     class runner(RobotTaskCfgPPO.runner):
         max_iterations = 3000
 
