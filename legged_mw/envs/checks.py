@@ -132,7 +132,7 @@ def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None, law: s
     if isinstance(cfg, LeggedRobotCfg):
         _check_walking(cfg)
     if isinstance(cfg, MotionTrackingCfg):
-        _check(cfg, TRACKING)
+        _check_tracking(cfg)
     if train is not None:
         _check(train, LEARNER)
         samples = cfg.env.num_envs * train.runner.num_steps_per_env
@@ -168,6 +168,17 @@ def _check_walking(cfg: LeggedRobotCfg) -> None:
         raise ConfigError(
             "commands.curriculum goes by how well tracking_lin_vel is met: give rewards.scales.tracking_lin_vel a number above 0"
         )
+
+
+def _check_tracking(cfg: MotionTrackingCfg) -> None:
+    _check(cfg, TRACKING)
+    motion = cfg.motion
+    for field, names in (("anchor", [motion.anchor]), ("end_bodies", motion.end_bodies)):
+        for name in names:
+            if name not in motion.bodies:
+                raise ConfigError(f"motion.{field}: {unknown('body', name, motion.bodies, 'motion.bodies')}")
+    if not motion.clips:
+        raise ConfigError("motion.clips is empty; name a clip, as python -m legged_mw.motion FILE --out CLIP.npz writes it")
 
 
 def _check_motors(cfg: RobotTaskCfg) -> None:

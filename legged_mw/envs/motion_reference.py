@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
 from legged_mw.sim.kinematics import Bodies, Kinematics, product, rotate
-from legged_mw.utils.clip import Clip
+from legged_mw.utils.clip import Clip, read_clip
+from legged_mw.utils.files import find_file
 
 WORLDS = 4096  # [BeyondMimic] whose failures a step the bins' memory counts
 
@@ -94,6 +96,12 @@ class Reference:
         widths = [self.qpos.shape[1], self.qvel.shape[1]]
         qpos, qvel = rows[:, : sum(widths)].split(widths, dim=1)
         return qpos, qvel
+
+
+def load_clips(cfg: MotionTrackingCfg, joints: Sequence[str], rate: float) -> list[Clip]:
+    """The clips of ``motion.clips`` with these ``joints``, at ``rate`` frames a second."""
+    files = [find_file(cfg, "motion.clips", name) for name in cfg.motion.clips]
+    return [read_clip(file).at(rate).of(joints, file.name) for file in files]
 
 
 def angle_between(a: Tensor, b: Tensor) -> Tensor:

@@ -9,15 +9,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from legged_mw.envs.motion_reference import Reference, angle_between
+from legged_mw.envs.motion_reference import Reference, angle_between, load_clips
 from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.sim.kinematics import Bodies, Kinematics, product, rotate
-from legged_mw.utils.clip import read_clip
-from legged_mw.utils.config import ConfigError
-from legged_mw.utils.errors import unknown
-from legged_mw.utils.files import find_file
 from legged_mw.utils.math import assign, quat_multiply, rotation_quat
 
 
@@ -95,22 +91,16 @@ class MotionTracking(RobotTask):
 
     def observation_rows(self) -> dict[str, list[Row | str]]:
         noise = self.cfg.noise.scales
-        clip = [
-            Row("reference_joint_pos", self.reference.joint_pos),
-            Row("reference_joint_vel", self.reference.joint_vel),
-        ]  # [rad], [rad/s]
-        anchors = self.anchor_pos, self.anchor_ori  # of the reference's anchor in the robot's: place [m], two columns of its rotation
+        frame = self.reference
+        clip = [Row("reference_joint_pos", frame.joint_pos), Row("reference_joint_vel", frame.joint_vel)]  # [rad], [rad/s]
+        # the reference's anchor in the robot's: its place [m], two columns of its rotation
+        anchors = [Row("anchor_pos", self.anchor_pos), Row("anchor_ori", self.anchor_ori)]
+        seen = [row._replace(noise=level, measured=True) for row, level in zip(anchors, (noise.anchor_pos, noise.anchor_ori), strict=True)]
         return {
-            "state": [
-                *clip,
-                Row("anchor_pos", anchors[0], noise.anchor_pos, measured=True),
-                Row("anchor_ori", anchors[1], noise.anchor_ori, measured=True),
-                *(row for row in self._measured_rows() if row.name != "projected_gravity"),
-            ],
+            "state": [*clip, *seen, *(row for row in self._measured_rows() if row.name != "projected_gravity")],
             "privileged_state": [
                 *clip,
-                Row("anchor_pos", anchors[0]),
-                Row("anchor_ori", anchors[1]),
+                *anchors,
                 Row("body_pos", self.body_pos),  # of each body in the anchor's frame [m]
                 Row("body_ori", self.body_ori),
                 *self._body_rows(),
@@ -156,9 +146,8 @@ class MotionTracking(RobotTask):
     def _live_statistics(self) -> dict[str, Tensor]:
         """Mean distance of the bodies from the reference, at the anchor [mm]."""
         off = (self.body.pos - self.reference.wanted_pos).norm(dim=2).mean(dim=1) * 1000.0
-        known = ~self.broken & off.isfinite()
-        sums = torch.where(known, off, 0.0).sum(), known.sum()
-        return {**super()._live_statistics(), "body_error_mm": torch.stack([value.float() for value in sums])}
+        known = off.isfinite()
+        return super()._live_statistics() | {"body_error_mm": torch.stack([torch.where(known, off, 0.0).sum(), known.float().sum()])}
 
     # ---- checkpoint, buffers ------------------------------------------------------------------------------------------------
 
@@ -175,21 +164,14 @@ class MotionTracking(RobotTask):
     def _init_buffers(self) -> None:
         super()._init_buffers()
         motion = self.cfg.motion
-        for field, names in (("anchor", [motion.anchor]), ("end_bodies", motion.end_bodies)):
-            for name in names:
-                if name not in motion.bodies:
-                    raise ConfigError(f"motion.{field}: {unknown('body', name, motion.bodies, 'motion.bodies')}")
-        if not motion.clips:
-            raise ConfigError("motion.clips is empty; name a clip, as python -m legged_mw.motion FILE --out CLIP.npz writes it")
         self.anchor = motion.bodies.index(motion.anchor)
         self.ends = torch.tensor([motion.bodies.index(name) for name in motion.end_bodies], dtype=torch.long, device=self.device)
         bodies = [self.robot.id("body", name) for name in motion.bodies]
         self.kinematics = Kinematics(self.robot.physics, bodies, self.device)
         self.anchor_kinematics = Kinematics(self.robot.physics, [bodies[self.anchor]], self.device)
-        files = [find_file(self.cfg, "motion.clips", name) for name in motion.clips]
-        self.clips = [read_clip(file).at(1.0 / self.dt).of(self.robot.joint_names, file.name) for file in files]
-        held, bin_frames = round(motion.hold_s / self.dt), round(motion.bin_s / self.dt)
-        self.reference = Reference(self.clips, self.kinematics, self.num_envs, self.device, held=held, bin_frames=bin_frames)
+        self.clips = load_clips(self.cfg, self.robot.joint_names, 1.0 / self.dt)
+        frames = {"held": round(motion.hold_s / self.dt), "bin_frames": round(motion.bin_s / self.dt)}
+        self.reference = Reference(self.clips, self.kinematics, self.num_envs, self.device, **frames)
         self.start_range = self._tensor([*motion.start_pos, *motion.start_turn, *motion.start_lin_vel, *motion.start_ang_vel])
         self.body = Bodies(*(torch.zeros_like(part) for part in self.reference.bodies))
         self.anchor_pos, self.anchor_ori = self._zeros(3), self._zeros(6)
