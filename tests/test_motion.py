@@ -70,7 +70,8 @@ def test_unitrees_csv(g1: RobotModel, tmp_path: Path) -> None:
 @pytest.mark.parametrize("order", ["as in the robot's file", "breadth first"])
 def test_bodies_tell_the_order_of_joints(order: str, g1: RobotModel, tmp_path: Path) -> None:
     """BeyondMimic's files come from Isaac Lab, mjlab's from MuJoCo; neither has names."""
-    clip = read_clip(CLIPS[0]).of(g1.joint_names, "clip")
+    whole = read_clip(CLIPS[0]).of(g1.joint_names, "clip")
+    clip = Clip(whole.fps, whole.joint_names, *(values[::25] for values in whole[2:]))
     names = breadth_first(g1) if order == "breadth first" else list(g1.joint_names)
     assert breadth_first(g1)[:4] == ["left_hip_pitch_joint", "right_hip_pitch_joint", "waist_yaw_joint", "left_hip_roll_joint"]
     states = [posed(g1.physics, row[7:], row[:7]) for row in clip.qpos()]
@@ -107,7 +108,7 @@ def test_a_shipped_clip_is_what_the_robot_can_do(file: Path, g1: RobotModel) -> 
     """Within the joints' ranges, no foot in the ground, none that slides."""
     text = page(g1, read_clip(file).of(g1.joint_names, file.name), feet_of(g1))
     assert "warning" not in text, text
-    assert "lowest point: -0 mm" in text or "lowest point: 0 mm" in text
+    assert "lowest point: 0 mm" in text
 
 
 def test_what_a_robot_cannot_do_is_said(g1: RobotModel, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: Any) -> None:

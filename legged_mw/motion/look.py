@@ -11,8 +11,7 @@ import numpy as np
 
 from legged_mw.drawing.scene import visual_spec
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.pose import posed
-from legged_mw.sim.shapes import surfaces
+from legged_mw.sim.shapes import SPACING, spheres_on
 from legged_mw.utils.clip import Clip, Floats
 from legged_mw.utils.commands import Command
 from legged_mw.view.stage import BoolArray, FloatArray
@@ -30,7 +29,7 @@ def page(robot: RobotModel, clip: Clip, feet: Sequence[str]) -> str:
     lines.append(f"fastest joint: {clip.joint_names[fastest]}, {speed.max():.1f} rad/s after {_when(clip, speed[:, fastest])}")
     heights, slides = _feet(robot, clip, feet)
     lowest, now = heights.min(), heights.min(axis=1)
-    lines.append(f"lowest point: {1000 * lowest:.0f} mm above the ground after {_when(clip, -now)}")
+    lines.append(f"lowest point: {round(1000 * lowest)} mm above the ground after {_when(clip, -now)}")
     lines.append(f"fastest slide of a foot within {1000 * NEAR:.0f} mm of the ground: {slides.max():.2f} m/s after {_when(clip, slides)}")
     return "\n".join([*lines, *(f"warning: {text}" for text in wrong(robot, clip, float(lowest), float(slides.max())))])
 
@@ -55,13 +54,17 @@ def _when(clip: Clip, values: Floats) -> str:
 
 def _feet(robot: RobotModel, clip: Clip, feet: Sequence[str]) -> tuple[Floats, Floats]:
     """Heights (T, bodies) of the lowest point of each foot [m], and the fastest standing foot (T,) [m/s]."""
-    model, heights, places = robot.physics, [], []
-    bodies = sorted({int(model.geom_bodyid[robot.id("geom", name)]) for name in feet})
+    model, data, heights, places = robot.physics, mujoco.MjData(robot.physics), [], []
+    geoms = [robot.id("geom", name) for name in feet]
+    bodies, points = sorted({int(model.geom_bodyid[geom]) for geom in geoms}), {geom: spheres_on(model, geom, SPACING) for geom in geoms}
     for row in clip.qpos():
-        data = posed(model, row[7:], row[:7])
-        found = surfaces(model, data, feet)
-        by_body = {body: [found[n][:, 2].min() for n in feet if model.geom_bodyid[robot.id("geom", n)] == body] for body in bodies}
-        heights.append([min(values) for values in by_body.values()])
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        low = dict.fromkeys(bodies, np.inf)
+        for geom, (spheres, radius) in points.items():
+            body, down = int(model.geom_bodyid[geom]), data.geom_xmat[geom, 6:]
+            low[body] = min(low[body], float(data.geom_xpos[geom, 2] + (spheres @ down).min() - radius))
+        heights.append([*low.values()])
         places.append(data.xpos[bodies, :2].copy())
     height, speed = np.array(heights), np.linalg.norm(np.diff(places, axis=0), axis=2) * clip.fps
     standing = (height[1:] < NEAR) & (height[:-1] < NEAR)
