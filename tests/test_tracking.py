@@ -125,10 +125,12 @@ def test_starts_are_drawn_by_failures() -> None:
     assert (everywhere > 15).all()
     reference.frame.fill_(301 + 50 + 125)  # of the second clip; after the first one's held frames
     reference.remember_failures(torch.arange(512) < 32, rate=0.5)
-    assert reference.failures.nonzero().tolist() == [[8]] and reference.failures[8].item() == pytest.approx(0.5 * 32 * 4096 / 512)
-    reference.failures.mul_(1e6)
-    drawn = reference.draw(0.1)
+    assert reference.failures.nonzero().tolist() == [[8]] and reference.failures[8].item() == pytest.approx(0.5 * 32 / 512)
+    among = torch.bincount(reference._bin_of[reference.draw(0.1)], minlength=14)
+    assert 430 < among[8] < 500 and among.gt(0).sum() > 7  # nine tenths, and a fourteenth of the rest
+    drawn = reference.draw(1e-9)
     assert (reference._bin_of[drawn] == 8).all() and drawn.min() == 451 and drawn.max() == 500
+    env.cfg.motion.uniform = 1e-9
     env.load_training_state({"motion_failures": reference.failures.clone()})  # a resumed run draws by them
     assert (reference.frame - 1).ge(451).all() and (reference.frame - 1).le(500).all()
     torch.testing.assert_close(env.training_state()["motion_failures"], reference.failures)
@@ -146,7 +148,7 @@ def test_the_step_can_be_recorded(left_out: dict[str, list[str]]) -> None:
     [
         ({"motion.clips": []}, "motion.clips is empty; name a clip"),
         ({"motion.clips": ["g1_kik.npz"]}, "motion.clips: no file 'g1_kik.npz' in"),
-        ({"motion.uniform": 0.0}, "motion.uniform is 0.0; it must be positive"),
+        ({"motion.uniform": 0.0}, "motion.uniform is 0.0; it must be above 0 and at most 1"),
         ({"motion.start_pos": [0.1, 0.1]}, "it must be three numbers from 0"),
         ({"motion.anchor": "torso"}, "motion.anchor: no body 'torso' in motion.bodies; did you mean 'torso_link'?"),
         ({"motion.end_bodies": ["head"]}, "motion.end_bodies: no body 'head' in motion.bodies"),

@@ -93,9 +93,9 @@ WALKING: dict[str, Rule] = {
     **dict.fromkeys(("commands.curriculum_start", "commands.curriculum_step"), PART),
 }
 TRACKING: dict[str, Rule] = {
-    **dict.fromkeys((f"motion.{name}" for name in ("bin_s", "uniform")), POSITIVE),
+    **dict.fromkeys(("motion.bin_s",), POSITIVE),
     **dict.fromkeys((f"motion.{name}" for name in ("hold_s", "start_joints")), NOT_NEGATIVE),
-    "motion.failure_rate": PART,
+    **dict.fromkeys(("motion.failure_rate", "motion.uniform"), PART),
     **dict.fromkeys(
         (f"motion.start_{name}" for name in ("pos", "turn", "lin_vel", "ang_vel")),
         ("three numbers from 0", lambda v: len(v) == 3 and all(0 <= number < math.inf for number in v)),

@@ -12,8 +12,6 @@ from legged_mw.sim.kinematics import Bodies, Kinematics, product, rotate
 from legged_mw.utils.clip import Clip, read_clip
 from legged_mw.utils.files import find_file
 
-WORLDS = 4096  # [BeyondMimic] whose failures a step the bins' memory counts
-
 
 class Reference:
     """Clips one after another, each followed by its last frame, held. Every world has a frame that it is to reach in the step to come."""
@@ -40,7 +38,7 @@ class Reference:
         self._table = torch.cat(tables)  # (M, W)
         self._last, self._bin_of, self._bins = places(last), places(bin_of), torch.tensor(bins, device=device)
         self.frame = torch.zeros(num_envs, dtype=torch.long, device=device)  # (N,)
-        self.failures = torch.zeros(len(bins), device=device)  # a step, of WORLDS worlds, as remembered
+        self.failures = torch.zeros(len(bins), device=device)  # share of the worlds that fall there in a step, as remembered
         self._row = torch.zeros(num_envs, self._table.shape[1], device=device)
         widths = [qpos.shape[1], qvel.shape[1], *(part[0].numel() for part in bodies)]
         self.qpos, self.qvel, *parts = self._row.split(widths, dim=1)
@@ -73,14 +71,15 @@ class Reference:
         return self.frame >= self._last.index_select(0, self.frame)
 
     def remember_failures(self, fell: Tensor, rate: float) -> None:
-        """Worlds ``fell`` (N,) at their present frame: a moving average of how many in each bin. [BeyondMimic]"""
+        """Worlds ``fell`` (N,) at their present frame: a moving average of their share in each bin. [BeyondMimic]"""
         count = torch.zeros_like(self.failures).scatter_add_(0, self._bin_of.index_select(0, self.frame), fell.float())
-        self.failures.lerp_(count * (WORLDS / len(fell)), rate)
+        self.failures.lerp_(count / len(fell), rate)
 
     def draw(self, uniform: float) -> Tensor:
-        """(N,) Frames to begin at: a bin by its failures plus a share of ``uniform``, then anywhere in it. [BeyondMimic]"""
+        """(N,) Frames to begin at: a bin by its failures, or, of a share of ``uniform``, any; then anywhere in it. [BeyondMimic]"""
         chance = torch.rand(2, len(self.frame), device=self.frame.device)
-        weights = (self.failures + uniform / len(self.failures)).cumsum(0)
+        weights = self.failures / self.failures.sum().clamp(min=1e-9) * (1.0 - uniform) + uniform / len(self.failures)
+        weights = weights.cumsum(0)
         which = torch.searchsorted(weights, chance[0] * weights[-1], right=True).clamp(max=len(weights) - 1)
         first, count = self._bins.index_select(0, which).unbind(dim=1)
         return first + torch.minimum((chance[1] * count).long(), count - 1)

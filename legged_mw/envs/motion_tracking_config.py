@@ -23,7 +23,9 @@ class MotionTrackingCfg(RobotTaskCfg):
         hold_s: float = 1.0  # a clip's last frame is held for so long, then the episode times out [s] [ours: deploy holds it, too]
         bin_s: float = 1.0  # length of a bin [s]
         failure_rate: float = 0.001  # share of a step in the moving average of the failures in each bin
-        uniform: float = 0.1  # failures a step, of 4096 worlds, that are added to all bins together
+        uniform: float = (
+            0.1  # share of the episodes that begin in any bin [-] [ours: B's code adds it to the failures, where it is nothing]
+        )
         start_pos: list[float] = [0.05, 0.05, 0.01]  # off the reference as an episode begins, each U(-range, range): x, y, z [m]
         start_turn: list[float] = [0.1, 0.1, 0.2]  # about x, y, z [rad]
         start_lin_vel: list[float] = [0.5, 0.5, 0.2]  # [m/s]
