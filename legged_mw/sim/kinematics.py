@@ -54,6 +54,7 @@ class Kinematics:
             return torch.tensor(list(values), dtype=torch.long, device=device)
 
         self._constant, self._sine, self._cosine, self._above = map(tensor, (constant, sine, cosine, above[..., None]))
+        self._products, self._identity = tensor(_matrix_of_products()), tensor(np.eye(3).ravel())
         self._zero, self._axis, self._anchor = tensor(model.qpos0[7:]), tensor(model.jnt_axis[hinges]), tensor(model.jnt_pos[hinges])
         self._angle_of = places([model.jnt_qposadr[j] - 7 if j >= 0 else 0 for j in joints])  # a body without a joint: sine is 0
         self._speed_of = places([model.jnt_dofadr[j] for j in hinges])
@@ -67,7 +68,9 @@ class Kinematics:
         """The bodies in the states ``qpos`` (N, nq), ``qvel`` (N, nv)."""
         angle = (qpos[:, 7:] - self._zero).index_select(1, self._angle_of)[..., None, None]
         local = self._constant + torch.sin(angle) * self._sine + (1.0 - torch.cos(angle)) * self._cosine
-        frames = [torch.nn.functional.pad(quat_to_matrix(qpos[:, None, 3:7]), (0, 1))]  # (N, 1, 3, 4): turn, and place from the root
+        products = (qpos[:, 3:7, None] * qpos[:, None, 3:7]).flatten(1)
+        turn = rotate(self._products, products).add_(self._identity).view(-1, 1, 3, 3)
+        frames = [torch.nn.functional.pad(turn, (0, 1))]  # (N, 1, 3, 4): turn, and place from the root
         for parents, span in self._levels:
             frames.append(product(frames[-1].index_select(1, parents), local[:, span]))
         every = torch.cat(frames, dim=1)
@@ -83,7 +86,7 @@ class Kinematics:
 
 
 def rotate(turn: Tensor, vector: Tensor) -> Tensor:
-    """``turn`` (..., 3, 3) times ``vector`` (..., 3). Sums of products: a GPU may round matrix products to ten bits."""
+    """A matrix (..., n, k) times ``vector`` (..., k). Sums of products: a GPU may round matrix products to ten bits."""
     return (turn * vector.unsqueeze(-2)).sum(dim=-1)
 
 
@@ -92,13 +95,15 @@ def product(a: Tensor, b: Tensor) -> Tensor:
     return (a.unsqueeze(-1) * b.unsqueeze(-3)).sum(dim=-2)
 
 
-def quat_to_matrix(q: Tensor) -> Tensor:
-    """(..., 3, 3) of a unit quaternion (..., 4)."""
-    w, x, y, z = q.unbind(dim=-1)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
-    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
-    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-    return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
+def _matrix_of_products() -> np.ndarray:
+    """(9, 16): what turns the products of a unit quaternion's entries into its rotation matrix, less the identity."""
+    w, x, y, z = range(4)
+    terms = np.zeros((3, 3, 4, 4))
+    for i, j, k in ((x, y, z), (y, z, x), (z, x, y)):
+        terms[i - 1, i - 1, j, j] = terms[i - 1, i - 1, k, k] = -2.0
+        terms[i - 1, j - 1, i, j], terms[i - 1, j - 1, w, k] = 2.0, -2.0
+        terms[j - 1, i - 1, i, j], terms[j - 1, i - 1, w, k] = 2.0, 2.0
+    return terms.reshape(9, 16)
 
 
 def _levels(model: mujoco.MjModel, root: int, bodies: Sequence[int]) -> list[list[int]]:
