@@ -243,9 +243,11 @@ def turn(body: Body) -> Plan:
     plan = stand(body, 8.0)
     quarter = np.pi / 4
     step(plan, body, 0.6, [quarter * (number // 2 + 1) for number in range(8)], first=0)
-    swing = keyed(8.0, {0.6: 0.0, 1.4: 1.0, 6.6: 1.0, 7.4: 0.0, 8.0: 0.0}) * np.sin(np.pi / STEP * (np.arange(len(plan.push)) / RATE - 0.6))
+    going = keyed(8.0, {0.6: 0.0, 1.4: 1.0, 6.6: 1.0, 7.4: 0.0, 8.0: 0.0})
+    swing = going * np.sin(np.pi / STEP * (np.arange(len(plan.push)) / RATE - 0.6))
     for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
-        plan.joints[f"{side}_shoulder_pitch_joint"] = ARMS["shoulder_pitch"] + sign * 0.25 * swing
+        plan.joints[f"{side}_shoulder_pitch_joint"] = ARMS["shoulder_pitch"] + sign * 0.2 * swing
+        plan.joints[f"{side}_shoulder_roll_joint"] = sign * (ARMS["shoulder_roll"] + 0.15 * going)  # hands clear of the thighs
     return plan
 
 
