@@ -10,8 +10,4 @@ class Go1FlatBlindCfg(Go1FlatCfg):
         leave_out = {"state": ["base_lin_vel"]}  # no sensor measures it
 
 
-class Go1FlatBlindCfgPPO(Go1FlatCfgPPO):
-    pass
-
-
-TASK = Task(LeggedRobot, Go1FlatBlindCfg, Go1FlatBlindCfgPPO)
+TASK = Task(LeggedRobot, Go1FlatBlindCfg, Go1FlatCfgPPO)

@@ -10,8 +10,4 @@ class Go1RoughScanCfg(Go1RoughCfg):
         height_scan = ["state", "privileged_state"]
 
 
-class Go1RoughScanCfgPPO(Go1RoughCfgPPO):
-    pass
-
-
-TASK = Task(LeggedRobot, Go1RoughScanCfg, Go1RoughScanCfgPPO)
+TASK = Task(LeggedRobot, Go1RoughScanCfg, Go1RoughCfgPPO)

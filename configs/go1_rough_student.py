@@ -11,8 +11,4 @@ class Go1RoughStudentCfg(Go1RoughCfg):
         history = {"state": 10}  # frames [genesis_lr]: a step is felt, not seen
 
 
-class Go1RoughStudentCfgPPO(Go1RoughCfgPPO):
-    pass
-
-
-TASK = Task(LeggedRobot, Go1RoughStudentCfg, Go1RoughStudentCfgPPO)
+TASK = Task(LeggedRobot, Go1RoughStudentCfg, Go1RoughCfgPPO)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from learner import WORLDS, collect, difference, make, parameters, share_experience
+from learner import STEPS, WORLDS, collect, difference, make, parameters, share_experience
 from program import SMALL, refused, run
 from rsl_rl.algorithms import PPO
-from rsl_rl.models import MLPModel
+from rsl_rl.models import MLPModel, RNNModel
 from tensordict import TensorDict
 from test_ppo import SYMMETRY, update
 from test_train import assert_resumes_exactly, load, small_task
@@ -47,6 +47,9 @@ def task_with(**changes: Any) -> LoadedTask:
     for path, value in {**TAUGHT, **{path.replace("__", "."): value for path, value in changes.items()}}.items():
         task.set(path, value)
     return task
+
+
+GRU = {"class_name": RNNModel, "rnn_type": "gru", "rnn_hidden_dim": 8, "rnn_num_layers": 1}
 
 
 # ---- learning
@@ -135,6 +138,20 @@ def test_worlds_act_by_the_latent_that_is_theirs() -> None:
     obs["privileged_state"] += 1.0
     moved = actor.rollout_latent(obs)
     assert torch.equal(moved[~taught], latent[~taught]) and (moved[taught] != latent[taught]).any(dim=1).all()
+
+
+@pytest.mark.parametrize("settings", [{}, {"symmetry_cfg": SYMMETRY}, {"memory": {"critic": GRU}}], ids=["plain", "mirrored", "memory"])
+def test_samples_are_learned_from_as_they_were_acted(settings: dict[str, Any]) -> None:
+    """Of a sample's world, its mirror image's too, and where a critic with a memory learns from whole worlds."""
+    alg = make(GraphedPPO, concurrent={}, **settings)
+    collect(alg)
+    alg.storage.observations["state"][..., 0] = torch.arange(WORLDS)
+    alg._order[:] = torch.randperm(len(alg._order))
+    batch = alg._prepare(alg._order[: alg._share])
+    worlds = batch.batch.observations["state"][:, 0].abs().long()
+    assert len(worlds) == (2 if "symmetry_cfg" in settings else 1) * STEPS * WORLDS // 4
+    assert torch.equal(batch.lesson[2], alg.actor.taught[worlds])
+    assert update(alg)["student"] > 0.0
 
 
 def test_every_part_of_the_worlds_has_teachers_and_students() -> None:

@@ -309,7 +309,7 @@ def ended(robot: Watched, controller: Controller, script: Script) -> None:
 FAULTS: dict[str, tuple[Fault, int, str]] = {  # fault, periods until it can be known, what is said
     "NaN from the policy": (policy_of(lambda actions: np.nan * actions), 0, "the target of FL_hip_joint is not finite: nan"),
     "inf from the policy": (policy_of(lambda actions: np.inf * actions), 0, "the target of FL_hip_joint is not finite: nan"),
-    "actions ten times too large": (policy_of(lambda actions: 10 * actions), 5, "damping: "),
+    "actions a hundred times too large": (policy_of(lambda actions: 100 * actions), 5, "damping: "),
     "NaN from a sensor": (
         measured_as(lambda _, m: replace(m, joint_vel=np.nan * m.joint_vel)),
         0,

@@ -25,6 +25,7 @@ from legged_mw.utils.task import load_task
 from legged_mw.view import launch, web
 from legged_mw.view.drive import ACTIONS, BINDINGS, CAMERAS, KEY_ACTION, NO_COMMANDS, SPEEDS, STEPS, Pilot
 from legged_mw.view.env_stage import EnvStage
+from legged_mw.view.native import window_texts
 from legged_mw.view.panel import BUTTONS, CURVE_SECONDS, KEY_NAMES, Curves, Panel
 from legged_mw.view.script import AFTER, load_script
 from legged_mw.view.session import Session, signed
@@ -527,6 +528,8 @@ class FakeUi:
     def Text(self, text: str) -> None:
         self.seen.append(text)
 
+    TextWrapped = Text
+
     def __getattr__(self, name: str) -> Any:
         return lambda *_: None
 
@@ -618,6 +621,19 @@ def test_keys_of_the_page_are_those_of_the_window_unless_somebody_types() -> Non
     page.build()
     pilot.listen()
     assert pilot.driving and pilot.world == 1
+
+
+def test_a_panel_offers_what_its_pilot_can_and_no_more() -> None:
+    """As of a real robot: in other words, without sliders, and other keys do nothing."""
+    page, ui, _, _ = panel(1)
+    page.pilot = pilot = Pilot(THREE, 1, only={"reset": "Damp", "camera": ""})
+    ui.clicked, ui.pressed = {"reset"}, {"UpArrow", "P", "Enter"}
+    page.build()
+    pilot.listen()
+    assert [text for text in ui.seen if "###" in text] == ["Damp###reset", "View: follow###camera"] and not ui.ranges
+    assert pilot.take_resets() == [0] and not (pilot.driving or pilot.paused or pilot.take_pushes())
+    assert "Damp" in ui.seen and "slow motion" not in ui.seen and ui.depth == 0
+    assert page.moment and window_texts(page.moment._replace(help=True), pilot.bindings)[1][2] == "r backspace\nc"
 
 
 def test_one_robot_has_no_next_one_and_speed_goes_round() -> None:

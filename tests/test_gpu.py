@@ -129,14 +129,16 @@ def test_replay_equals_eager_over_100_steps(task: str, settings: dict[str, objec
         assert torch.equal(a, b), f"step {i // 5}, output {i % 5}: largest difference {(a.float() - b.float()).abs().max():g}"
 
 
-@pytest.mark.parametrize("law", ["servo", "dc_motor", "torque", "network", "own"])
+@pytest.mark.parametrize("law", ["servo", "dc_motor", "speed", "torque", "network", "own"])
 def test_motors_replay_as_they_run_eager(law: str, tmp_path: Path) -> None:
     """Bit for bit, delayed by 0 to 30 ms, with drawn gains and curves, and episodes that end."""
     net = save(mlp(torque_scale=20.0)[1], tmp_path)
     drawn = {f"domain_rand.{name}": [0.8, 1.2] for name in ("stiffness", "damping", "strength", "stall_torque", "no_load_speed")}
     fields: dict[str, object] = {**CURVE, **drawn, "domain_rand.enable": True, "domain_rand.delay_ms": [0.0, 30.0]}
     fields |= {"control.actuator": "servo" if law == "own" else law, "control.network": net, "env.episode_length_s": 0.5}
-    fields |= {"control.action_scale": 5.0} if law == "torque" else {}
+    fields |= {"control.action_scale": 5.0} if law in ("torque", "speed") else {}
+    if law == "speed":
+        law, fields = "dc_motor", fields | {"control.actuator": "dc_motor", "control.action_origin": "speed"}
     task = load_task("go1_flat")
     for path, value in {"env.num_envs": 64, **fields}.items():
         task.set(path, value)

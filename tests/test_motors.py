@@ -54,11 +54,15 @@ def walk(env: LeggedRobot, steps: int, guarded: bool = False) -> Tensor:
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize(("law", "kp", "kd"), [("dc_motor", 1000.0, 0.5), ("torque", 0.0, 0.0)], ids=["by an angle", "by a torque"])
-def test_the_torque_speed_curve(engine: str, law: str, kp: float, kd: float) -> None:
+@pytest.mark.parametrize(
+    ("more", "kp", "kd"),
+    [({}, 1000.0, 0.5), ({"control.action_origin": "speed"}, 0.0, 4.0), ({"control.actuator": "torque"}, 0.0, 0.0)],
+    ids=["by an angle", "by a speed", "by a torque"],
+)
+def test_the_torque_speed_curve(engine: str, more: dict[str, Any], kp: float, kd: float) -> None:
     """Figures by hand: 20 N m at rest, none at 25 rad/s, and never more than 15 N m."""
-    gains = {"control.stiffness": {"": kp}, "control.damping": {"": kd}, "asset.effort": {"": 15.0}}
-    env = make_env(1, {**DC, **STILL, **gains, "control.actuator": law, "sim.engine": engine})
+    gains = {"control.stiffness": {"": kp or 35.0}, "control.damping": {"": kd}, "asset.effort": {"": 15.0}}
+    env = make_env(1, {**DC, **STILL, **gains, **more, "sim.engine": engine})
     speeds = env.sim.actuator_velocity()
     for speed, asked, given in [
         (0.0, 12.0, 12.0),  # within the curve
@@ -71,7 +75,8 @@ def test_the_torque_speed_curve(engine: str, law: str, kp: float, kd: float) -> 
     ]:
         env.reset()
         env.dof_vel[0, 4] = speed
-        env.sim.ctrl[0, 4] = env.dof_pos[0, 4] + (asked + kd * speed) / kp if kp else asked
+        by_angle = env.dof_pos[0, 4] + (asked + kd * speed) / kp if kp else None
+        env.sim.ctrl[0, 4] = by_angle if by_angle is not None else asked / kd + speed if kd else asked
         env.sim.step()
         assert env.torques[0, 4].item() == pytest.approx(given, abs=2e-3), (speed, asked)
         assert speeds[0, 4].item() == pytest.approx(speed, abs=1e-5)
@@ -392,16 +397,20 @@ def exported(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cal
     return export_with
 
 
-@pytest.mark.parametrize("law", ["dc_motor", "torque", "network"])
+@pytest.mark.parametrize("law", ["dc_motor", "speed", "torque", "network"])
 def test_deploys_robot_has_the_same_motors(law: str, exported: Callable[[dict[str, Any]], Path], tmp_path: Path) -> None:
     """The same targets move an export's robot as they move the environment's, to float32 and six digits in an MJCF."""
     fields = {**DC, "asset.effort": {"": 15.0}, "control.actuator": law, "domain_rand.delay_ms": [5.0, 9.0], "domain_rand.enable": True}
-    if law != "dc_motor":
+    origin = "torque" if law == "torque" else "default"
+    if law == "speed":
+        law, origin = "dc_motor", "speed"
+        fields |= {"control.actuator": law, "control.action_origin": origin, "control.action_scale": 8.0, "control.damping": {"": 1.0}}
+    elif law != "dc_motor":
         fields |= {"control.action_scale": 4.0} if law == "torque" else {"control.network": save(mlp(torque_scale=20.0)[1], tmp_path)}
     task, folder = small_task(fields), exported(fields)
     contract = read_contract(folder)
     assert (contract.motors.law, contract.motors.stall_torque, contract.motors.no_load_speed) == (law, (20.0,) * 12, (25.0,) * 12)
-    assert load_yaml(folder / "policy.yaml")["format"] == 3 and contract.action.origin == ("torque" if law == "torque" else "default")
+    assert load_yaml(folder / "policy.yaml")["format"] == 3 and contract.action.origin == origin
     for path, value in {"domain_rand.enable": False, "sim.engine": "mujoco", **STILL, "perturbation.kick": False}.items():
         task.set(path, value)
     env, fleet = task.env_class(task.cfg, "cpu"), Fleet(folder, contract, 2)
@@ -412,6 +421,8 @@ def test_deploys_robot_has_the_same_motors(law: str, exported: Callable[[dict[st
         fleet.write(env.actuators.sent().double().numpy())
         np.testing.assert_allclose(fleet.qpos, env.sim.qpos, atol=3e-4)
     np.testing.assert_allclose(fleet.read().joint_torque, env.torques, atol=0.1)
+    if origin == "speed":
+        return  # it has no stiffness to be switched off by, and nothing that does so takes it
     fleet.set_gains(np.zeros(12), np.full(12, 3.0))  # off, damped
     fleet.write(np.ones((2, 12)))
     assert np.isfinite(fleet.qpos).all()
@@ -482,6 +493,10 @@ def test_a_law_in_code_is_not_exported(made: Path, tmp_path: Path) -> None:
         ),
         ({"control.no_load_speed": {"": 20.0, "knee": 1.0}}, "control.no_load_speed: no joint 'knee'"),
         ({"control.actuator": "torque", "control.action_origin": "joints"}, "control.action_origin is 'joints', an origin of angles, but "),
+        (
+            {"control.actuator": "servo", "control.action_origin": "speed"},
+            "control.action_origin is 'speed', but .* only a 'dc_motor' is driven",
+        ),
         ({"control.actuator": "network"}, "control.actuator is 'network', but control.network names no file of weights"),
         ({"control.actuator": "network", "control.network": "no.npz"}, "control.network: no file 'no.npz' in "),
         ({"control.actuator": "motor"}, "control.actuator"),

@@ -13,6 +13,7 @@ import pytest
 from legged_mw.deploy.contract import ContractRow, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import RobotError, damped
+from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.unitree.client import UnitreeRobot, check_rows
 from legged_mw.deploy.unitree.codec import LAYOUTS, Message
 from legged_mw.deploy.unitree.link import CHECK_MODE, RELEASE_MODE, STAND_DOWN, Received, RobotEnd, Wire
@@ -307,7 +308,11 @@ def test_rows_that_a_robot_does_not_measure() -> None:
     assert "observations.leave_out = {'state': ['base_lin_vel', 'touch']}" in str(error.value)
 
 
-def test_a_policy_of_torques() -> None:
-    contract = read_contract(POLICIES / "go2_flat")
-    with pytest.raises(RobotError, match="the policy commands torques; a go2 is driven by angles here"):
-        check_rows(replace(contract, action=contract.action._replace(origin="torque")), GO2)
+def test_a_policy_of_torques_or_speeds() -> None:
+    folder = POLICIES / "go2_flat"
+    contract = read_contract(folder)
+    for origin in ("torque", "speed"):
+        with pytest.raises(RobotError, match=f"the policy commands {origin}s; a go2 is driven by angles here"):
+            check_rows(replace(contract, action=contract.action._replace(origin=origin)), GO2)
+    with pytest.raises(RobotError, match="the policy commands speeds, which no limit here judges: grade and watch it in simulation"):
+        Safety(replace(contract, action=contract.action._replace(origin="speed")), Limits.of(folder, contract))

@@ -563,6 +563,21 @@ def test_a_mesh_that_gives_a_body_its_mass_is_needed(tmp_path: Path) -> None:
     assert any(line.startswith("looks left out (") and "hull.stl" in line for line in robot.overrides)
 
 
+def test_a_skin_that_is_missing_is_left_out(tmp_path: Path) -> None:
+    """It was called "not a valid MJCF", as missing meshes once were."""
+    file = toy(tmp_path, extra='<asset><skin name="fur" file="fur.skn"/></asset>')
+    assert "looks left out (no such file): fur.skn" in build_toy(file).overrides
+
+
+def test_inertias_that_all_come_from_geoms_do(tmp_path: Path) -> None:
+    """Also of looks, which are not stepped, and in the place of what is written; MuJoCo alone leaves no looks out of such a file."""
+    inside = '<geom size="0.05" pos="0.2 0 0" contype="0" conaffinity="0" mass="1"/><inertial pos="0 0 0" mass="9" diaginertia="1 1 1"/>'
+    file = toy(tmp_path, inside=inside, extra='<compiler inertiafromgeom="true"/>')
+    ours, theirs = build_toy(file).physics, mujoco.MjModel.from_xml_path(str(file))
+    assert ours.body_mass[1] == 3.0 and ours.body_ipos[1, 0] == pytest.approx(0.2 / 3)
+    np.testing.assert_allclose(ours.body_inertia, theirs.body_inertia, rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     "place", ["meshes/leg.stl", "../mini_description/meshes/leg.stl", "../../mini_description/meshes/leg.stl", "leg.stl"]
 )

@@ -59,19 +59,20 @@ def main() -> None:
     command = launch.check_drive(args, contract.commands, advice=f"the ranges are in {folder / CONTRACT_FILE}")
     if contract.ends.not_covered:
         print(f"not judged here: {', '.join(contract.ends.not_covered)}, which ended episodes in training")
+    contact = options.contact(args, contract)
     if args.serve:
         options.serve(folder, contract, args)
     elif args.robot != "simulated":
         robot = options.connect(folder, contract, args)
-        drive.drive(robot, folder, contract, args, command, args.robot)
+        drive.drive(robot, folder, contract, args, command, args.robot, contact)
         print(robot.report)
     elif args.drive:
         robot = MujocoRobot(folder, contract, scene_file, whole=True, hoisted=drive.hoisted(args, contract))
-        drive.drive(robot, folder, contract, args, command, args.robot)
+        drive.drive(robot, folder, contract, args, command, args.robot, contact)
     elif args.eval:
-        examine(folder, Path(args.out) if args.out else folder / RESULT_FILE, common=args.ranges == "common")
+        examine(folder, Path(args.out) if args.out else folder / RESULT_FILE, args.ranges == "common", contact)
     else:
-        launch.watch(DeployStage(folder, args.num_envs, command, scene_file=scene_file), args, folder, title=contract.task)
+        launch.watch(DeployStage(folder, args.num_envs, command, scene_file=scene_file, contact=contact), args, folder, title=contract.task)
 
 
 def find(name: str) -> Path:
@@ -93,20 +94,24 @@ def show_log(path: Path, folder: Path | None) -> None:
     print(f"written to {shown(path.with_suffix('.png'))}")
 
 
-def examine(folder: Path, path: Path, common: bool = False) -> None:
-    """The exam: its table, and a JSON file at ``path``."""
+def examine(folder: Path, path: Path, common: bool = False, contact: str | None = None) -> None:
+    """The exam: its table, and a JSON file at ``path``. ``contact``: see DeployStage."""
     contract = read_contract(folder)
     if contract.exam and "kind" in contract.exam:
         if common:
             raise UserError("--ranges says what the walking exam asks: leave it out")
+        if contact:
+            raise UserError("--velocity odometry is of robots that walk, and this exam is another: leave it out")
         skill = contract_skill(contract)
         result = run_skill(folder, skill)
         print(skill.table(result))
     else:
-        result = run_exam(folder, common=common)
+        result = run_exam(folder, common=common, contact=contact)
         print(rules.table(result))
+    said = {"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)"}
+    said |= {"velocity": f"odometry, contact by {contact}"} if contact else {}
     try:
-        rules.save({"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)", **result}, path)
+        rules.save({**said, **result}, path)
     except OSError as error:
         raise UserError(f"cannot write {path}: {error.strerror}; say --out FILE") from None
     print(f"written to {shown(path)}")

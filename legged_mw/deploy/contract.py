@@ -69,7 +69,7 @@ SENSORS = "sensors"  # ContractRow.measured of a row that names sensors of the s
 SCAN = "height_scan"  # ContractRow.measured of the height scan
 CLOCK = "gait_clock"  # ContractRow.measured of the gait clock
 OWN = (SENSORS, SCAN, "")  # rows that come whole, in Measurement.others, by their names
-ORIGINS = ("default", "joints", "targets", "torque")
+ORIGINS = ("default", "joints", "targets", "torque", "speed")
 
 
 @dataclass(frozen=True)
@@ -88,10 +88,10 @@ class ContractRow:
 
 
 class Action(NamedTuple):
-    """What an action means: joint target = origin + scale * action [rad], or torque = scale * action [N m]."""
+    """What an action means: joint target = origin + scale * action [rad], or torque [N m] or speed [rad/s] = scale * action."""
 
-    origin: str  # "default": the default pose; "joints": the measured angles; "targets": the last targets; "torque": none
-    scale: np.ndarray  # (D,) [rad], or [N m]
+    origin: str  # "default": the default pose; "joints": the measured angles; "targets": the last targets; "torque", "speed": none
+    scale: np.ndarray  # (D,) [rad], [N m] or [rad/s]
     clip: float  # |action| at most [-]
 
 

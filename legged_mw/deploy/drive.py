@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, closing, contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +17,10 @@ import numpy as np
 from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.inputs import Gamepad, Keys, RobotRemote, Source, StopFile
 from legged_mw.deploy.log import Log, log_path
+from legged_mw.deploy.mirror import FLAGS, LIVE, Mirror
+from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.policy import Controller
-from legged_mw.deploy.robot import Floats, Measurement, Robot
+from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits, Safety, parse_limits
 from legged_mw.deploy.states import States
@@ -29,6 +31,7 @@ from legged_mw.view.launch import FlagError
 from legged_mw.view.script import load_script
 
 KEYS = "keys: s start, a policy, x damping, Esc emergency stop, Ctrl-C end; arrows, q, e drive, space stops walking"
+GAMEPADS = Path("/dev/input")  # where Linux has them
 STATUS = 0.2  # [s] between two status lines
 
 
@@ -40,7 +43,7 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     )
     limits = "another limit of the safety layer, e.g. tilt=45 or frozen=off (docs/on_the_robot.md has them all)"
     parser.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE", help=limits)
-    parser.add_argument("--gamepad", type=Path, metavar="FILE", help="drive by a gamepad too, e.g. /dev/input/js0")
+    parser.add_argument("--gamepad", metavar="FILE", help="a gamepad that drives too (default: the first that is there), or off")
     parser.add_argument("--stop_fd", type=int, metavar="N", help="damp the robot when this file descriptor can be read or is closed")
     parser.add_argument("--log", metavar="FILE", help="where the run is logged (default: a new file in logs/deploy), or off")
     parser.add_argument("--replay", type=Path, metavar="LOG", help="draw a log beside the simulation of the same commands")
@@ -49,7 +52,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 def check_flags(args: argparse.Namespace) -> None:
     """Refuse flags that do not go together. Raises FlagError or LimitError."""
     several = {"eval": args.eval, "num_envs": args.num_envs != 1, "replay": args.replay}
-    watched = [flag.removeprefix("--") for flag in launch.asked(args) if flag != "--commands"]
+    shown = ("--commands", *([f"--{name}" for name in FLAGS] if args.viewer in LIVE else []))
+    watched = [flag.removeprefix("--") for flag in launch.asked(args) if flag not in shown]
     if args.drive and (given := [name for name, value in several.items() if value] + watched):
         raise FlagError(f"--drive is one robot in real time: leave --{given[0]} out")
     alone = {"hoist": args.hoist, "limit": args.limit, "gamepad": args.gamepad, "stop_fd": args.stop_fd is not None, "log": args.log}
@@ -63,37 +67,65 @@ def hoisted(args: argparse.Namespace, contract: Contract) -> bool:
     return args.hoist == "yes" or (args.hoist is None and len(contract.feet) == 2)
 
 
-def drive(robot: Robot, folder: Path, contract: Contract, args: argparse.Namespace, fixed: Sequence[float] | None, kind: str) -> None:
+def drive(
+    robot: Robot,
+    folder: Path,
+    contract: Contract,
+    args: argparse.Namespace,
+    fixed: Sequence[float] | None,
+    kind: str,
+    contact: str | None = None,
+) -> None:
     """Drive ``robot`` until Ctrl-C or for ``args.time``.
 
-    ``fixed`` (C,) is followed while nobody drives; None: the defaults. ``kind`` of robot, for the log.
+    ``fixed`` (C,) is followed while nobody drives; None: the defaults. ``kind`` of robot, for the log. ``contact``: of Odometry, if any.
     """
     with ExitStack() as stack:
         stack.callback(robot.close)
+        mirror = stack.enter_context(closing(Mirror(folder, contract, args))) if args.viewer in LIVE else None
         safety = Safety(contract, Limits.of(folder, contract, robot.limits, parse_limits(args.limit)))
         path = None if args.log == "off" else Path(args.log) if args.log else log_path(contract)
         log = Log(path, contract, folder, kind) if path else None
         console = stack.enter_context(Console(contract))
         controller, command = Controller(folder, contract), _commands(contract, args, fixed, console.say)
-        states = States(controller, _sources(contract, args), command, console.say)
+        sources = [*_sources(contract, args, console.say), *([mirror] if mirror else [])]
+        states = States(controller, sources, command, console.say)
         stack.callback(states.close)
         console.say(f"{KEYS}\n{states.state}: {states.note}")
         stack.enter_context(_ended_by_signals())
-        show, seconds = console.watch(states), args.time or math.inf
-        done = run(robot, controller, command, seconds, watch=show, safety=safety, states=states, log=log)
+        seconds = args.time or math.inf
+        odometry = Odometry(folder, contract, 1, contact) if contact else None
+
+        def show(now: float, measured: Measurement | None) -> None:
+            console.show(now, states)
+            if mirror:
+                mirror.show(now, measured, states)
+
+        done = run(robot, controller, command, seconds, watch=show, safety=safety, states=states, log=log, odometry=odometry)
         console.say(f"{done.timing}\nthe joints are damped{f'; logged to {shown(path)}' if path else ''}")
 
 
-def _sources(contract: Contract, args: argparse.Namespace) -> list[Source]:
+def _sources(contract: Contract, args: argparse.Namespace, say: Callable[[str], None]) -> list[Source]:
     """Who may drive; the first one that does goes before the others."""
     sources: list[Source] = [RobotRemote(contract.commands)]
     if args.stop_fd is not None:
         sources.append(StopFile(args.stop_fd))
-    if args.gamepad:
-        sources.append(Gamepad(args.gamepad, contract.commands))
+    if pad := _gamepad(contract, args.gamepad):
+        say(f"{pad.path} drives too; pulling its plug damps the robot")
+        sources.append(pad)
     if sys.stdin.isatty():
         sources.append(Keys(contract.commands))
     return sources
+
+
+def _gamepad(contract: Contract, asked: str | None) -> Gamepad | None:
+    """The one that is asked for, else the first that can be opened. Raises RobotError."""
+    if asked:
+        return None if asked == "off" else Gamepad(Path(asked), contract.commands)
+    for path in sorted(GAMEPADS.glob("js*")):
+        with suppress(RobotError):
+            return Gamepad(path, contract.commands)
+    return None
 
 
 def _commands(
@@ -143,16 +175,12 @@ class Console:
         """A line that stays."""
         self._lines.put((line, False))
 
-    def watch(self, states: States) -> Callable[[float, Measurement], None]:
+    def show(self, now: float, states: States) -> None:
         """Overwrite one line with the state and its command."""
-
-        def show(now: float, measured: Measurement) -> None:
-            if self._terminal and now >= self._next and self._lines.qsize() < 10:
-                self._next = now + STATUS
-                command = " ".join(f"{value:+.2f}" for value in states.command)
-                self._lines.put((f"{now:7.1f} s  {states.state:<11}  command {command} ({self._units})", True))
-
-        return show
+        if self._terminal and now >= self._next and self._lines.qsize() < 10:
+            self._next = now + STATUS
+            command = " ".join(f"{value:+.2f}" for value in states.command)
+            self._lines.put((f"{now:7.1f} s  {states.state:<11}  command {command} ({self._units})", True))
 
     def _print(self) -> None:
         with suppress(OSError, ValueError):  # nobody reads any more: the run goes on, and ends by its own rules

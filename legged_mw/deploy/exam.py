@@ -24,10 +24,12 @@ from legged_mw.utils.commands import VELOCITY
 from legged_mw.utils.config import ConfigError
 
 
-def run_exam(folder: Path, exam: ExamRules | None = None, threads: int = 0, common: bool = False) -> dict[str, Any]:
+def run_exam(
+    folder: Path, exam: ExamRules | None = None, threads: int = 0, common: bool = False, contact: str | None = None
+) -> dict[str, Any]:
     """Grade the export in ``folder`` by the rules ``exam``, else by those of its contract. Raises ContractError, ConfigError.
 
-    ``common``: the contract's, but in the one range that all published policies of the robot were asked.
+    ``common``: the contract's, but in the one range that all published policies of the robot were asked. ``contact``: see DeployStage.
     """
     contract = read_contract(folder)
     exam, names = exam or contract_rules(contract, common), [command.name for command in contract.commands]
@@ -35,7 +37,7 @@ def run_exam(folder: Path, exam: ExamRules | None = None, threads: int = 0, comm
     pushed = [(exam.push_vx, 0.0, 0.0)] * (exam.worlds() - len(exam.held()))
     wanted[:, [names.index(name) for name in VELOCITY]] = [*exam.held(), *pushed]
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # what counts as a fall in legged_mw.eval.exam
-    stage = DeployStage(folder, len(wanted), threads=threads, ends=ends)
+    stage = DeployStage(folder, len(wanted), threads=threads, ends=ends, contact=contact)
     fell_at = np.full(len(wanted), math.inf)
     sampled: dict[str, list[Any]] = {"velocity": [], "position": [], "power": [], "joint_speed": [], "estimate": []}
     for step in range(round(rules.SECONDS / stage.dt)):

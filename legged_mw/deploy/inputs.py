@@ -100,7 +100,7 @@ class Gamepad(RobotRemote):
             self._file = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
             raise RobotError(f"no gamepad at {path}: {error.strerror}") from None
-        self._sticks: dict[str, float] = {}
+        self.path, self._sticks = path, dict[str, float]()
         self._buttons, self._lost = set[str](), False
 
     def poll(self, health: Health) -> Wish:

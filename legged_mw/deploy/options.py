@@ -10,11 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.odometry import CONTACTS
 from legged_mw.deploy.unitree import client
 from legged_mw.deploy.unitree.client import UnitreeRobot
+from legged_mw.deploy.unitree.robots import machine_of
 from legged_mw.utils.errors import UserError, unknown
 
 ROBOTS = ("simulated", "unitree")
+TRUTH, ODOMETRY = "truth", "odometry"
+NO_TRUTH = f"no sensor of a real robot gives it; there is --velocity {ODOMETRY}"
 _WIRE = {"delay": ("delay_ms", 1.0), "jitter": ("jitter_ms", 1.0), "loss": ("loss", 0.01)}  # name -> field of Faults, unit
 _OF_A_ROBOT, _OF_SERVING = ("interface", "domain"), ("remote", "wire", "watchdog")
 
@@ -25,6 +29,10 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--serve", choices=ROBOTS[1:], help="simulate such a robot at --interface, for --robot to drive")
     parser.add_argument("--interface", metavar="IF", help="network interface of the robot: eth0, or lo for one that is served here")
     parser.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: 0, as robots have it; on lo 1)")
+    velocity = "where a policy's base_lin_vel is from: truth of a simulated robot (its default), or odometry of legs and IMU"
+    parser.add_argument("--velocity", choices=(TRUTH, ODOMETRY), help=velocity)
+    contact = "how odometry finds feet on the ground (default: measured where the robot does, else torque)"
+    parser.add_argument("--contact", choices=CONTACTS, help=contact)
     served = parser.add_argument_group("with --serve")
     served.add_argument("--remote", metavar="FILE", help="a YAML script of its remote (default: the keys of this terminal)")
     served.add_argument("--wire", metavar="FAULTS", help="delay=10,jitter=2,loss=5: [ms], [ms] and [%%] of each message, each way")
@@ -40,13 +48,19 @@ def check_flags(args: argparse.Namespace) -> None:
     for name in _OF_SERVING:
         if not args.serve and getattr(args, name) is not None:
             raise UserError(f"--{name} is of a robot that is simulated for others: add --serve unitree")
+    if args.contact and args.velocity != ODOMETRY:
+        raise UserError(f"--contact is of leg odometry: add --velocity {ODOMETRY}")
+    if args.velocity and (args.serve or (args.velocity == TRUTH and wire)):
+        raise UserError(f"--velocity {args.velocity}: " + ("it is of the program that drives" if args.serve else NO_TRUTH))
     if not wire:
         return
     if args.serve and args.robot != "simulated":
         raise UserError("--serve is the robot and --robot drives one: start them as two programs")
     if args.interface is None:
         raise UserError("say on which network the robot is: --interface eth0, or --interface lo for one that --serve simulates here")
-    others = [name for name in ("eval", "terrain", "video", "sheet") if getattr(args, name)] + ["num_envs"] * (args.num_envs != 1)
+    given = {name: getattr(args, name) for name in ("eval", "terrain", "video", "sheet")}
+    given |= {"num_envs": args.num_envs != 1, "viewer": args.serve and args.viewer != "auto"}
+    others = [name for name, value in given.items() if value]
     if others:
         raise UserError(f"--{others[0]} is of simulated robots in this program: leave it out")
 
@@ -87,8 +101,18 @@ def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
     print(served.text())
 
 
+def contact(args: argparse.Namespace, contract: Contract) -> str | None:
+    """How leg odometry finds feet on the ground; None without odometry. Raises RobotError."""
+    if args.velocity != ODOMETRY:
+        return None
+    feels = args.robot == "simulated" or bool(machine_of(contract.joints).feet)
+    if args.contact == CONTACTS[0] and not feels:
+        raise UserError(f"--contact {args.contact}: this robot does not measure it; there are: {', '.join(CONTACTS[1:])}")
+    return args.contact or CONTACTS[not feels]
+
+
 def connect(folder: Path, contract: Contract, args: argparse.Namespace) -> UnitreeRobot:
     """The robot on the wire."""
-    robot = client.connect(folder, contract, args.interface, args.domain)
+    robot = client.connect(folder, contract, args.interface, args.domain, odometry=args.velocity == ODOMETRY)
     print(f"{robot.machine.name} at {args.interface}: {len(contract.joints)} joints, {robot.health().voltage or 0:.1f} V", flush=True)
     return robot

@@ -22,6 +22,7 @@ from legged_mw.deploy.estimate import ESTIMATE, columns_of
 from legged_mw.deploy.log import LogError, Recording, read_log
 from legged_mw.deploy.loop import Spread
 from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.pose import place
 from legged_mw.deploy.robot import QUANTITIES, Floats
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.simulated import MujocoRobot
@@ -95,28 +96,12 @@ def _pose(robot: MujocoRobot, start: Rows) -> None:
     fleet, contract = robot.fleet, robot.fleet.contract
     data = mujoco.MjData(fleet.model)
     data.qpos[:] = fleet.qpos[0]
-    joints = [fleet.model.joint(name) for name in contract.joints]
-    data.qpos[[joint.qposadr[0] for joint in joints]] = start["joint_pos"]
-    up = -start["gravity"] / np.linalg.norm(start["gravity"])  # z axis of the world, in the body
-    axis, turn = np.cross(up, [0.0, 0.0, 1.0]), math.acos(np.clip(up[2], -1.0, 1.0))
-    mujoco.mju_axisAngle2Quat(data.qpos[3:7], axis / max(float(np.linalg.norm(axis)), 1e-9), turn)
-    mujoco.mj_kinematics(fleet.model, data)
-    model = fleet.model
-    touching = np.flatnonzero((model.geom_conaffinity > 0) & (model.geom_bodyid > 0))
-    lowest = [data.geom_xpos[i, 2] - _reach(model.geom_size[i], data.geom_xmat[i], model.geom_type[i]) for i in touching]
-    data.qpos[2] -= min(lowest, default=0.0)
+    place(fleet.model, data, contract.joints, start["joint_pos"], start["gravity"])
     fleet.qpos[0], fleet.qvel[0, 3:6] = data.qpos, start["ang_vel"]
-    rotation = data.xmat[model.jnt_bodyid[0]].reshape(3, 3)
+    rotation = data.xmat[fleet.model.jnt_bodyid[0]].reshape(3, 3)
     fleet.qvel[0, :3] = rotation @ np.nan_to_num(start["lin_vel"])
-    fleet.qvel[0, [joint.dofadr[0] for joint in joints]] = start["joint_vel"]
+    fleet.qvel[0, [fleet.model.joint(name).dofadr[0] for name in contract.joints]] = start["joint_vel"]
     fleet.refresh()
-
-
-def _reach(size: Floats, turn: Floats, kind: int) -> float:
-    """How far a sphere or capsule reaches down from its centre [m]; another shape about its largest size."""
-    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        return size[0] + abs(turn[8]) * size[1]
-    return size[0] if kind == mujoco.mjtGeom.mjGEOM_SPHERE else float(size.max())
 
 
 # ---- figures

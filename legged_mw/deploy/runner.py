@@ -7,11 +7,13 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from legged_mw.deploy.log import Log
 from legged_mw.deploy.loop import Loop, Timing
+from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError
 from legged_mw.deploy.safety import TORQUE, Limits, Safety, Trip, Tripped
@@ -39,25 +41,25 @@ def run(
     seconds: float = math.inf,
     *,
     live: bool = True,
-    watch: Callable[[float, Measurement], None] | None = None,
+    watch: Callable[[float, Any], None] | None = None,
     safety: Safety | None = None,
     states: States | None = None,
     log: Log | None = None,
+    odometry: Odometry | None = None,
 ) -> Summary:
     """Run for ``seconds``, or until the robot falls: read, decide, write, once a period; then close the robot, also after an error.
 
     ``command`` gives (C,), in the contract's order, at a time [s] since the start; it is held within the trained ranges.
-    ``live``: in real time, as a robot needs it; else as fast as the robot answers. ``watch`` gets each measurement.
-    ``safety``: other limits than the export's. A limit that is passed damps the robot and raises Tripped.
+    ``live``: in real time, as a robot needs it; else as fast as the robot answers. ``watch`` gets each measurement, or None.
+    ``safety``: other limits than the export's. A limit that is passed damps the robot and raises Tripped. ``odometry`` gives the velocity.
     ``states``: begin at zero torque and do what they say, with their own commands; a trip or a fall damps and the run goes on.
     """
-    contract = controller.contract
-    safety = safety or Safety(contract, Limits.of(controller.folder, contract, robot.limits))
-    one, velocities = _Step(robot, controller, command, safety, states, log), _Velocities(contract.period, seconds)
+    safety = safety or Safety(controller.contract, Limits.of(controller.folder, controller.contract, robot.limits))
+    one, velocities = _Step(robot, controller, command, safety, states, log, odometry), _Velocities(controller.contract.period, seconds)
     with ExitStack() as stack:
         for each in filter(None, (states, log)):
             stack.callback(each.close)
-        loop = stack.enter_context(Loop(contract.period, live))
+        loop = stack.enter_context(Loop(controller.contract.period, live))
         stack.enter_context(robot)
         controller.reset()
         with suppress(*([KeyboardInterrupt] if states else [])):  # a person ends a run with states so
@@ -67,8 +69,8 @@ def run(
                     break
                 if measured:
                     velocities.add(measured)
-                    if watch:
-                        watch(now, measured)
+                if watch and (measured or states):
+                    watch(now, measured)
         if log and live:
             log.event(loop.now, str(loop.timing()))
     return replace(one.summary, velocity=velocities.mean(one.summary.steps), late=loop.late, timing=loop.timing() if live else None)
@@ -99,9 +101,10 @@ class _Step:
         safety: Safety,
         states: States | None,
         log: Log | None,
+        odometry: Odometry | None,
     ) -> None:
         self.robot, self.controller, self.command, self.safety, self.states, self.log = robot, controller, command, safety, states, log
-        self.summary = Summary()
+        self.summary, self.odometry = Summary(), odometry
         if states and (type(robot).damp is Robot.damp or type(robot).limp is Robot.limp):
             raise RobotError(f"{type(robot).__name__} has no damp() and limp() of its own, which the states need")
         if states and controller.contract.action.origin == TORQUE:
@@ -132,6 +135,7 @@ class _Step:
         measured, health, trip = None, Health(), None
         try:
             measured, health = self.robot.read(), self.robot.health()
+            measured = self.odometry(measured) if self.odometry else measured
         except RobotError as error:
             if not self.states:
                 raise
@@ -152,6 +156,8 @@ class _Step:
         if self.states is None:
             return Order(POLICY, self.controller.act(measured, self._command(now))[0])
         before, order = self.states.armed, self.states.step(measured, now)
+        if self.odometry and not self.states.armed:
+            self.odometry.reset()  # it may lie, or hang
         if self.states.armed and not before:
             self.safety.reset()
         return order

@@ -128,6 +128,8 @@ class Safety:
     """Checks one robot. Its memory is of the last steps only; ``reset`` forgets it when a person starts the robot again."""
 
     def __init__(self, contract: Contract, limits: Limits) -> None:
+        if contract.action.origin == "speed":
+            raise RobotError(f"{CONTRACT_FILE}: the policy commands speeds, which no limit here judges: grade and watch it in simulation")
         self.contract, self.limits = contract, limits
         self.reset()
 

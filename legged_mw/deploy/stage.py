@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legged_mw.deploy.contract import SCENE_FILE, Contract, Ends, read_contract
+from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.simulated import Change, Fleet
@@ -34,33 +35,37 @@ class DeployStage:
         threads: int = 0,
         scene_file: str = SCENE_FILE,
         ends: Ends | None = None,
+        contact: str | None = None,
         change: Change | None = None,
     ) -> None:
         """Load the export in ``folder``.
 
         ``command`` (C,) is what robots follow where ``step`` gets none; ``ends`` are other rules for a fall than the contract's;
         ``change`` is made to the model first.
+        ``contact``: the policy sees the velocity of leg odometry, which finds feet on the ground so; None: the true one.
         """
         contract = read_contract(folder)
         self.contract = replace(contract, ends=ends or contract.ends)
         self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file, change=change)
         self.controller = Controller(folder, self.contract, num_worlds)
+        self.odometry = Odometry(folder, self.contract, num_worlds, contact) if contact else None
         self.spec, self.num_worlds, self.dt = self.fleet.spec, num_worlds, self.contract.period
         self.command_table = self.contract.commands
         own = idle_command(self.contract) if command is None else np.array(command, dtype=float)
         self._own = np.tile(own, (num_worlds, 1))
         self._commands = self._own.copy()
         self._fell = np.zeros(num_worlds, dtype=bool)
-        self.measured = self.fleet.read()  # at the end of the last step
+        self.measured = self._seen = self.fleet.read()  # at the end of the last step; as the policy saw it
 
     def step(self, commands: Floats | None = None) -> None:
         """One period with ``commands`` (N, C), or the stage's own. A robot that falls starts again."""
         self._commands = self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self._own.shape)
-        self.fleet.write(self.controller.act(self.measured, self._commands))
+        self._seen = self.odometry(self.measured) if self.odometry else self.measured
+        self.fleet.write(self.controller.act(self._seen, self._commands))
         self._fell = self.fleet.fell()
         if self._fell.any():
             self.fleet.reset(np.flatnonzero(self._fell))
-            self.controller.reset(self._fell)
+            self._forget(self._fell)
         self.measured = self.fleet.read()
 
     def commands(self) -> Floats:
@@ -72,8 +77,8 @@ class DeployStage:
         return np.concatenate([self.measured.lin_vel[:, :2], self.measured.ang_vel[:, 2:]], axis=1)
 
     def believed_velocity(self) -> Floats | None:
-        """(N, 2) vx, vy [m/s] that the policy believed when it acted last; None if it does not estimate them."""
-        estimate = self.controller.estimate("base_lin_vel")
+        """(N, 2) vx, vy [m/s] that the policy believed when it acted last, or leg odometry; None if nothing estimates them."""
+        estimate = self._seen.lin_vel if self.odometry else self.controller.estimate("base_lin_vel")
         return None if estimate is None else estimate[:, :2]
 
     def qpos(self) -> Floats:
@@ -104,11 +109,16 @@ class DeployStage:
         """All robots begin anew in these states, (N, nq) and (N, nv)."""
         self.fleet.qpos[:], self.fleet.qvel[:] = qpos, qvel
         self.fleet.refresh()
-        self.controller.reset()
+        self._forget(slice(None))
         self.measured = self.fleet.read()
 
     def reset(self, world: int) -> None:
         """Back to the start, at rest."""
         self.fleet.reset([world])
-        self.controller.reset([world])
+        self._forget([world])
         self.measured = self.fleet.read()
+
+    def _forget(self, which: Any) -> None:
+        self.controller.reset(which)
+        if self.odometry:
+            self.odometry.reset(which)

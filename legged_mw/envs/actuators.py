@@ -89,7 +89,8 @@ def find_network(cfg: RobotTaskCfg) -> Path:
 class Actuators:
     """Motors of N robots with D joints. An action means a target, origin + scale * action, or under the law "torque" scale * action.
 
-    ``control.action_origin`` is the origin: "default" the default pose, "joints" the measured joint angles, "targets" the last targets.
+    ``control.action_origin`` is the origin: "default" the default pose, "joints" the measured joint angles, "targets" the last targets;
+    with "speed" there is none, and targets are speeds [rad/s].
     """
 
     before: Callable[[int], None] | None = None  # what ``Simulation.step`` calls before each substep; None: nothing changes within a step
@@ -102,7 +103,7 @@ class Actuators:
         self.scale = torch.tensor(scale, device=sim.device)  # (D,) [rad], or [N m]
         self._gains = {name: torch.tensor(robot.tables[f"`{name}`"], device=sim.device) for name in ("stiffness", "damping")}
         self._same_scale = scale[0] if len(set(scale)) == 1 else None  # one number takes one operation less
-        by_angle = self.law not in ("torque", OWN)
+        by_angle = self.law not in ("torque", OWN) and self._origin != "speed"
         self.encoder_offset = rand.values.get("encoder_offset")  # (N, D) [rad], measured minus true angle
         self._offset = self.encoder_offset if by_angle else None
         self._start: Tensor | float = self._default if by_angle else 0.0  # targets of a new episode
@@ -130,7 +131,7 @@ class Actuators:
         late = self._delay(actions) if self._delay else actions
         if self.law == OWN:
             self._sent.copy_(late)
-        elif self.law == "torque":
+        elif self.law == "torque" or self._origin == "speed":
             torch.mul(late, self.scale, out=self.targets)
         else:
             self._aim(late)

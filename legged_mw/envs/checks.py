@@ -190,6 +190,10 @@ def _check_motors(cfg: RobotTaskCfg) -> None:
             f"control.action_origin is {control.action_origin!r}, an origin of angles, but under control.actuator 'torque' an action is a "
             "torque: leave action_origin out"
         )
+    if control.actuator != "dc_motor" and control.action_origin == "speed":
+        raise ConfigError(
+            f"control.action_origin is 'speed', but control.actuator is {control.actuator!r}: only a 'dc_motor' is driven by a speed"
+        )
     for name, unit in (("stall_torque", "N m"), ("no_load_speed", "rad/s")):
         if not getattr(control, name) and (control.actuator == "dc_motor" or (control.actuator != "servo" and curve)):
             raise ConfigError(

@@ -65,11 +65,12 @@ def active(cfg: RobotTaskCfg, law: str = "") -> dict[str, tuple[Kind, float, flo
     if not rand.enable:
         return {}
     lacks = {"stiffness", "damping"} if law in ("torque", "network") else set()
+    lacks |= {"stiffness"} if cfg.control.action_origin == "speed" else set()
     lacks |= set() if has_curve(cfg, law) else {"stall_torque", "no_load_speed"}
     given = {name: (kind, getattr(rand, name)) for name, kind in KINDS.items() if name not in lacks}
     if law not in ("servo", "torque", "network"):
         fields = ("actuator_gainprm",) if law == "dc_motor" else ()  # else a law in code reads them
-        given |= {name: (KINDS[name]._replace(fields=fields), given[name][1]) for name in ("stiffness", "damping")}
+        given |= {name: (KINDS[name]._replace(fields=fields), given[name][1]) for name in ("stiffness", "damping") if name in given}
     given |= {field: (Kind("world", 1.0, "scalar", (field,)), span) for field, span in rand.model_factors.items()}
     return {name: (kind, span[0], span[1]) for name, (kind, span) in given.items() if span and not span[0] == span[1] == kind.neutral}
 

@@ -12,6 +12,7 @@ from legged_mw.envs.wording import config_words
 from legged_mw.sim.joints import PARTIAL
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
 from legged_mw.sim.pose import standing_height
+from legged_mw.sim.servos import Drive
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.files import find_file
@@ -34,7 +35,7 @@ def load_robot(
     more_sensors: Collection[str] = (),
 ) -> RobotModel:
     """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors, and motors of ``law``."""
-    asset, scale, control = cfg.asset, cfg.control.action_scale, cfg.control
+    asset, scale, control, drive = cfg.asset, cfg.control.action_scale, cfg.control, motor_drive(cfg, law)
     none = {"": 0.0} if law in ("torque", "network") else {}
     if not asset.file:
         raise ConfigError("asset.file is empty; name the robot's MJCF or URDF, e.g. 'resources/robots/go1/go1.xml'")
@@ -42,7 +43,7 @@ def load_robot(
         find_file(cfg, "asset.file"),
         solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations, cfg.sim.integrator),
         ground=Ground(cfg.terrain.friction, cfg.terrain.condim, terrain, boxes=engine == "mujoco", slope=cfg.terrain.slope),
-        stiffness=control.stiffness or none,
+        stiffness={"": 0.0} if drive == "speed" else control.stiffness or none,
         damping=control.damping or none,
         colliders=asset.colliders,
         self_collisions=asset.self_collisions,
@@ -60,10 +61,17 @@ def load_robot(
         held_joints=asset.held_joints,
         partial={name: getattr(asset, name) for name in PARTIAL},
         more_sensors=more_sensors,
-        drive="angle" if law in ("servo", "dc_motor") else "torque",
+        drive=drive,
     )
     robot.overrides[:] = [config_words(line) for line in robot.overrides]
     return robot
+
+
+def motor_drive(cfg: RobotTaskCfg, law: str) -> Drive:
+    """What drives the simulated motors under ``law``."""
+    if law not in ("servo", "dc_motor"):
+        return "torque"
+    return "speed" if cfg.control.action_origin == "speed" else "angle"
 
 
 def start_place(cfg: RobotTaskCfg, robot: RobotModel, colliders: Sequence[str]) -> list[float]:

@@ -60,8 +60,9 @@ class RobotTaskCfg(Config):
         gear: dict[str, float] = {"": 1.0}  # turns of the motor a turn of the joint; 1: the two tables are the joint's own
         network: str = ""  # of `network`: an .npz, as `python -m legged_mw.robot.actuator_net` writes it
         network_digest: dict[str, str] = {}  # written by train.py: that name -> SHA-256 of the file; a changed file is refused
-        action_scale: float | dict[str, float] = 0.5  # target = origin + scale * action [rad]; a number, or a table a joint [P]
-        action_origin: Literal["default", "joints", "targets"] = "default"  # the default pose, the measured angles or the last targets [P]
+        action_scale: float | dict[str, float] = 0.5  # target = origin + scale * action [rad or rad/s]; a number, or a table a joint [P]
+        # the default pose, the measured angles or the last targets [P]; "speed": none, a dc_motor gives damping (scale action - speed)
+        action_origin: Literal["default", "joints", "targets", "speed"] = "default"
         decimation: int = 5  # simulation steps a control step [P]
 
     class observations:

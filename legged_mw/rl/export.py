@@ -41,6 +41,7 @@ from legged_mw.deploy.motion import MOTION_FILE, Motion
 from legged_mw.deploy.motors import MOTORS_FILE, Motors
 from legged_mw.envs.actuators import OWN as OWN_LAW
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.loading import motor_drive
 from legged_mw.envs.motion_tracking import MotionTracking
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.estimator import EstimatingModel, find_targets
@@ -290,7 +291,7 @@ def _write_scene(env: RobotTask, folder: Path) -> Scene:
     start = [*env.start_place, 1.0, 0.0, 0.0, 0.0, *robot.pose]
     if isinstance(env, MotionTracking):
         start = env.clips[0].qpos()[0].tolist()
-    held = start[7:] if law in ("servo", "dc_motor") else [0.0] * len(robot.pose)
+    held = start[7:] if motor_drive(cfg, law) == "angle" else [0.0] * len(robot.pose)
     source = find_file(cfg, "asset.file").read_text(encoding="utf-8", errors="replace")
     scene = standalone(robot, robot.imu, qpos=start, ctrl=held, camera=cfg.viewer.camera, source=source)
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")

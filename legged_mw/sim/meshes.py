@@ -32,7 +32,7 @@ def compile_readable(spec: mujoco.MjSpec, where: str, notes: list[str]) -> mujoc
         return _compile(spec)
     except ValueError:  # only then files are looked at: those of an attached model are not where the others are
         broken = {mesh.name: why_unreadable(path_of(spec, mesh)) or _read_error(spec, mesh) for mesh in spec.meshes if mesh.file}
-        if not any(broken.values()) and not _missing_pictures(spec):
+        if not any(broken.values()) and not _missing_pictures(spec) and not _missing_skins(spec):
             raise
     _drop(spec, broken, where, notes)
     _drop_pictures(spec, notes)
@@ -59,9 +59,9 @@ def _drop(spec: mujoco.MjSpec, reasons: Mapping[str, str], where: str, notes: li
         notes.append(f"looks left out ({reason}): {', '.join(dict.fromkeys(files))}")
 
 
-def path_of(spec: mujoco.MjSpec, item: mujoco.MjsMesh | mujoco.MjsTexture, file: str = "") -> Path:
-    """The file of a mesh or picture, or another ``file`` in its place."""
-    folder, name = spec.meshdir if isinstance(item, mujoco.MjsMesh) else spec.texturedir, Path(file or item.file)
+def path_of(spec: mujoco.MjSpec, item: mujoco.MjsMesh | mujoco.MjsTexture | mujoco.MjsSkin, file: str = "") -> Path:
+    """The file of a mesh, skin or picture, or another ``file`` in its place."""
+    folder, name = spec.texturedir if isinstance(item, mujoco.MjsTexture) else spec.meshdir, Path(file or item.file)
     return Path(spec.modelfiledir) / folder / (name.name if spec.strippath else name)
 
 
@@ -95,13 +95,20 @@ def _missing_pictures(spec: mujoco.MjSpec) -> dict[str, list[str]]:
     return {name: gone for name, gone in files.items() if gone}
 
 
+def _missing_skins(spec: mujoco.MjSpec) -> list[mujoco.MjsSkin]:
+    return [skin for skin in spec.skins if skin.file and not path_of(spec, skin).is_file()]
+
+
 def _drop_pictures(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Textures from files that are missing: the materials keep their colours."""
+    """Skins and textures from files that are missing: the materials keep their colours."""
     missing = _missing_pictures(spec)
+    gone = [file for files in missing.values() for file in files] + [skin.file for skin in _missing_skins(spec)]
+    for skin in _missing_skins(spec):
+        spec.delete(skin)
     for material in spec.materials:
         if any(name in missing for name in material.textures):
             material.textures = ["" if name in missing else name for name in material.textures]
     for texture in [texture for texture in spec.textures if texture.name in missing]:
         spec.delete(texture)
-    if missing:
-        notes.append(f"looks left out (no such file): {', '.join(dict.fromkeys(file for gone in missing.values() for file in gone))}")
+    if gone:
+        notes.append(f"looks left out (no such file): {', '.join(dict.fromkeys(gone))}")

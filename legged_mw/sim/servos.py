@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 
 Range = tuple[float, float]
-Drive = Literal["angle", "torque"]  # what ctrl is: an angle that the motor turns to [rad], or its torque [N m]
+Drive = Literal["angle", "speed", "torque"]  # what ctrl is: an angle that the motor turns to [rad], a speed [rad/s], or its torque [N m]
 _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
-_INPUTS = {"angle": 1, "torque": 4}  # of a DC motor: bits "pos" and "ff" of its input signature
+_INPUTS = {"angle": 1, "speed": 2, "torque": 4}  # of a DC motor: bits "pos", "vel" and "ff" of its input signature
 _NEVER, _ALWAYS = mujoco.mjtLimited.mjLIMITED_FALSE, mujoco.mjtLimited.mjLIMITED_TRUE
 
 
@@ -53,8 +53,8 @@ def _force(actuator: mujoco.MjsActuator) -> np.ndarray | None:
 class Motor(NamedTuple):
     """What drives one joint; both speed and torques are the joint's, behind the gear."""
 
-    stiffness: float  # [N m/rad] of a motor that is driven by an angle
-    damping: float  # [N m s/rad] of a servo: in the joint; of a motor with a curve that is driven by an angle: in its law, under its limits
+    stiffness: float  # [N m/rad] of a motor that is driven by an angle; 0 of one that is driven by a speed
+    damping: float  # [N m s/rad] of a servo: in the joint; of a motor with a curve: in its law, under its limits
     stall_torque: float = 0.0  # [N m] that it gives at rest
     no_load_speed: float = 0.0  # [rad/s] at which it gives none; 0: it has no torque-speed curve
 
@@ -62,7 +62,7 @@ class Motor(NamedTuple):
         """The actuator: MuJoCo's DC motor at a supply of 1 V where there is a curve, else its position servo or its plain motor."""
         motor = spec.add_actuator(name=joint.name, target=joint.name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
         if self.no_load_speed:
-            gains = (self.stiffness, self.damping) if drive == "angle" else (0.0, 0.0)
+            gains = (0.0, 0.0) if drive == "torque" else (self.stiffness, self.damping)
             motor.set_to_dcmotor(
                 motorconst=[0.0, 0.0],
                 resistance=0.0,
@@ -95,9 +95,10 @@ def add_motors(
             notes.append(f"{joint.name} damping: {old:g} -> {passive:g} N m s/rad")
         joint.damping = np.array([passive, *np.atleast_1d(joint.damping)[1:]]) if np.ndim(joint.damping) else passive
         servo = motor.add_to(spec, joint, drive)
-        law = f"kp {kp:g} N m/rad" + (f", kd {kd:g} N m s/rad" if passive != kd else "") if drive == "angle" else "a torque"
+        damped = f"kd {kd:g} N m s/rad"
+        laws = {"angle": f"kp {kp:g} N m/rad" + (f", {damped}" if passive != kd else ""), "speed": damped, "torque": "a torque"}
         curve = f", {stall:g} N m at rest, none at {speed:g} rad/s" if speed else ""
-        notes.append(f"{joint.name} {'motor' if speed or drive == 'torque' else 'servo'}: {law}{curve}")
+        notes.append(f"{joint.name} {'motor' if speed or drive == 'torque' else 'servo'}: {laws[drive]}{curve}")
         if drive == "angle" and math.isfinite(low) and math.isfinite(high):
             servo.ctrllimited, servo.ctrlrange = True, [low, high]
         if joint.name in limits:  # on the motor and not on the joint, so that actuator_force is the clamped force

@@ -76,6 +76,7 @@ def read_robot(file: Path) -> Loaded:
             spec, speeds = read_urdf(file, text, notes)
         else:
             spec = mujoco.MjSpec.from_file(str(file))
+        _infer_inertias(spec)
         limits = take_limits(spec, notes)
         keyframe = _take_keyframe(spec, notes)
         _drop_sensors(spec, notes)
@@ -102,6 +103,17 @@ def naming(file: Path) -> Iterator[None]:
 def _kind(file: Path) -> str:
     """What its name says that it is."""
     return "URDF" if file.suffix == ".urdf" else "MJCF"
+
+
+def _infer_inertias(spec: mujoco.MjSpec) -> None:
+    """Where all inertias are to come from geoms, whatever is written: the same in words that let looks be left out later."""
+    kinds = mujoco.mjtInertiaFromGeom
+    if spec.compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_TRUE:
+        spec.compiler.inertiafromgeom = kinds.mjINERTIAFROMGEOM_AUTO
+        fresh = mujoco.MjSpec().worldbody.add_body()
+        for body in spec.bodies[1:]:
+            for name in ("explicitinertial", "mass", "ipos", "iquat", "inertia", "fullinertia"):
+                setattr(body, name, getattr(fresh, name))
 
 
 def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import queue
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -74,7 +74,8 @@ _STEP = {  # command, sign
 class Pilot:
     """What the user wants now. `ask`, `press`, `steer` and `push` may be called from any thread; the rest belongs to the session's."""
 
-    def __init__(self, table: Sequence[Command], num_worlds: int = 1, camera: str = "follow") -> None:
+    def __init__(self, table: Sequence[Command], num_worlds: int = 1, camera: str = "follow", only: Mapping[str, str] = {}) -> None:
+        """``only``: the actions that there are, with other words for them or ""; empty: all. Without "own" nothing is driven."""
         self.table, self.num_worlds = tuple(table), num_worlds
         self.low, self.high, self.default = (
             np.array([getattr(command, end) for command in table], dtype=np.float64) for end in ("low", "high", "default")
@@ -87,6 +88,8 @@ class Pilot:
         self.speed = SPEEDS[0]
         self.push_speed = PUSH_SPEED
         self.message = ""  # why the last action did nothing
+        self.bindings = tuple(b._replace(text=only.get(b.action) or b.text) for b in BINDINGS if not only or b.action in only)
+        self.words, self.can = only, frozenset(binding.action for binding in self.bindings)
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._pushes: list[tuple[int, FloatArray]] = []
         self._resets: set[int] = set()
@@ -96,7 +99,8 @@ class Pilot:
         """Do one of ACTIONS at the session's next turn."""
         if action not in ACTIONS:
             raise ValueError(f"no action '{action}'; there are: {', '.join(ACTIONS)}")
-        self._asked.put(lambda: self._do(action))
+        if action in self.can:
+            self._asked.put(lambda: self._do(action))
 
     def press(self, key: str) -> None:
         """Do what a key of the table asks for; other keys do nothing."""

@@ -111,13 +111,13 @@ def watch(stage: Stage, args: argparse.Namespace, folder: Path, title: str = "le
     script = load_script(args.commands, stage.command_table) if args.commands else None
     kind, why = choose(args, sys.stdout.isatty(), has_display())
     pilot, viewer = _pilot(stage, args, kind), None
-    if kind == "native" and (viewer := _window(stage, pilot, why, fall_back=args.viewer == "auto")) is None:
+    if kind == "native" and (viewer := window(stage, pilot, why, fall_back=args.viewer == "auto")) is None:
         kind, why = choose(args, sys.stdout.isatty(), screen=False)
         pilot = _pilot(stage, args, kind)
     live = kind in ("native", "web")
     seconds = args.time or (script.seconds if script else None) or (None if live else SECONDS)
     if kind == "web":
-        viewer = _web_page(stage, pilot, why, args, title)
+        viewer = web_page(stage, pilot, why, args, title)
     elif kind == "video":
         viewer = _recorder(stage, pilot, why, args, folder, seconds or SECONDS, picture)
     elif kind == "none":
@@ -145,7 +145,7 @@ def _pilot(stage: Stage, args: argparse.Namespace, kind: str) -> Pilot:
     return pilot
 
 
-def _window(stage: Stage, pilot: Pilot, why: str, fall_back: bool) -> Viewer | None:
+def window(stage: Stage, pilot: Pilot, why: str, fall_back: bool) -> Viewer | None:
     """MuJoCo's window; None, with a printed reason, where it cannot be opened and another viewer may be taken."""
     try:
         viewer = NativeViewer(stage.spec, pilot, pilot.num_worlds)
@@ -158,13 +158,14 @@ def _window(stage: Stage, pilot: Pilot, why: str, fall_back: bool) -> Viewer | N
     return viewer
 
 
-def _web_page(stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, title: str) -> Viewer:
+def web_page(stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, title: str) -> Viewer:
+    """The page, and where to look."""
     page = web.WebViewer(stage.spec, pilot, pilot.num_worlds, host=args.host, port=args.port, title=title)
     print(f"viewer: a web page ({why}): {page.url}  Ctrl-C ends it")
     if args.host == web.LOCAL and not has_display():
         print(f"  on another machine paste this into a terminal there, then open the page: {web.tunnel_line(page.port)}")
     elif args.host != web.LOCAL:
-        print("  it has no password: whoever reaches this port can drive")
+        print(f"  it has no password: whoever reaches this port can {'drive' if 'own' in pilot.can else 'damp the robot'}")
     sys.stdout.flush()
     return page
 

@@ -7,13 +7,13 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mujoco
 
 from legged_mw.view.camera import RobotCamera
-from legged_mw.view.drive import BINDINGS, KEY_ACTION, Pilot
+from legged_mw.view.drive import BINDINGS, KEY_ACTION, Binding, Pilot
 from legged_mw.view.overlay import draw
 from legged_mw.view.posed_robot import PosedRobots, show_groups
 from legged_mw.view.stage import Moment, ViewError
@@ -42,7 +42,7 @@ class NativeViewer:
     """
 
     def __init__(self, spec: mujoco.MjSpec, pilot: Pilot | None = None, count: int = 1) -> None:
-        self.robots = PosedRobots(spec, count)
+        self.robots, self._bindings = PosedRobots(spec, count), pilot.bindings if pilot else BINDINGS
         before = set(threading.enumerate())
         self._handle: Any = _launch(self.robots.model, self.robots.data, on_key(pilot) if pilot else None)
         self._threads = set(threading.enumerate()) - before
@@ -68,7 +68,7 @@ class NativeViewer:
             self._camera.update(moment.camera, moment.world)
             for flag, value in self._own_flags.items():
                 handle.opt.flags[flag] = value
-        self._texts = window_texts(moment)
+        self._texts = window_texts(moment, self._bindings)
         handle.sync()
 
     def is_running(self) -> bool:
@@ -98,7 +98,7 @@ def on_key(pilot: Pilot) -> Callable[[int], None]:
     return lambda code: pilot.press(KEY_CODES.get(code, ""))
 
 
-def window_texts(moment: Moment) -> list[Text]:
+def window_texts(moment: Moment, bindings: Sequence[Binding] = BINDINGS) -> list[Text]:
     """The blocks of text for MuJoCo's window."""
     grid = mujoco.mjtGridPos
     blocks: list[Text] = []
@@ -106,8 +106,8 @@ def window_texts(moment: Moment) -> list[Text]:
         names, values = ("\n".join(column) for column in zip(*moment.lines, strict=True))
         blocks.append((None, int(grid.mjGRID_TOPLEFT), names, values))
     if moment.help:
-        keys = "\n".join(" ".join(binding.keys) for binding in BINDINGS)
-        blocks.append((None, int(grid.mjGRID_TOPRIGHT), keys, "\n".join(binding.text for binding in BINDINGS)))
+        keys = "\n".join(" ".join(binding.keys) for binding in bindings)
+        blocks.append((None, int(grid.mjGRID_TOPRIGHT), keys, "\n".join(binding.text for binding in bindings)))
     blocks.append((None, int(grid.mjGRID_BOTTOMLEFT), "orange\nblue\nh", "command\nmeasured\nkeys"))
     return blocks
 

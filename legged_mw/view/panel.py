@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from legged_mw.utils.commands import with_units
-from legged_mw.view.drive import BINDINGS, KEY_ACTION, NO_COMMANDS, PUSH_MAX, SPEEDS, Pilot
+from legged_mw.view.drive import KEY_ACTION, NO_COMMANDS, PUSH_MAX, SPEEDS, Pilot
 from legged_mw.view.overlay import COMMAND_RGBA, VELOCITY_RGBA
 from legged_mw.view.stage import FloatArray, Moment, velocity_columns
 
@@ -74,7 +74,8 @@ class Panel:
             self._folded = not kept  # the cross folds the panel, a click on the title unfolds it
             if opened:
                 self._numbers(moment)
-                self._sliders(moment)
+                if "own" in self.pilot.can:
+                    self._sliders(moment)
                 self._buttons()
                 self._curves()
                 self._help()
@@ -98,7 +99,7 @@ class Panel:
             else:
                 ui.Text(name)  # in the theme's colour
             ui.SameLine(COLUMN)
-            ui.Text(value)
+            ui.TextWrapped(value)
 
     def _sliders(self, moment: Moment) -> None:
         """A slider for each command; dragging one drives the robot."""
@@ -118,23 +119,27 @@ class Panel:
         ui, pilot = self.ui, self.pilot
         ui.SeparatorText("robot")
         for row in BUTTONS:
-            several = [(action, label) for action, label in row if action != "next" or pilot.num_worlds > 1]
+            several = [(action, label) for action, label in row if action in pilot.can and (action != "next" or pilot.num_worlds > 1)]
             for place, (action, label) in enumerate(several):
                 if place:
                     ui.SameLine()
                 if ui.Button(self._label(action, label), ui.Vec2(0.94 * WIDTH / 3 - 6 if len(row) == 3 else 0.47 * WIDTH - 6, 0)):
                     self._click(action)
         ui.SetNextItemWidth(0.62 * WIDTH)
-        changed, value = ui.SliderFloat("push [m/s]", pilot.push_speed, 0.0, PUSH_MAX, "%.1f")
-        if changed:
-            pilot.push_speed = value
+        if "push" in pilot.can:
+            pilot.push_speed = ui.SliderFloat("push [m/s]", pilot.push_speed, 0.0, PUSH_MAX, "%.1f")[1]
         if pilot.num_worlds > 1 and ui.Checkbox("drive all robots", pilot.everyone)[0]:
             pilot.ask("everyone")
 
     def _label(self, action: str, label: str) -> str:
         """What the button will do; ImGui knows it by the part after ###."""
         pilot = self.pilot
-        words = {"pause": "Go on" if pilot.paused else "Pause", "slower": f"Speed x {pilot.speed:g}", "camera": f"View: {pilot.camera}"}
+        words = {
+            **pilot.words,
+            "pause": "Go on" if pilot.paused else "Pause",
+            "slower": f"Speed x {pilot.speed:g}",
+            "camera": f"View: {pilot.camera}",
+        }
         return f"{words.get(action, label)}###{action}"
 
     def _click(self, action: str) -> None:
@@ -170,7 +175,7 @@ class Panel:
     def _help(self) -> None:
         ui = self.ui
         if ui.CollapsingHeader("keys") or self.pilot.help:
-            for binding in BINDINGS:
+            for binding in self.pilot.bindings:
                 ui.Text(" ".join(binding.keys))
                 ui.SameLine(COLUMN)
                 ui.Text(binding.text)

@@ -14,6 +14,7 @@ import numpy as np
 
 from legged_mw.deploy.contract import COMPUTED, CONTRACT_FILE, Contract
 from legged_mw.deploy.motion import ATTITUDE, PLACE
+from legged_mw.deploy.odometry import ROW
 from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError, damped
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.unitree import need_dds
@@ -81,16 +82,18 @@ class UnitreeRobot(Robot):
         first: Any,
         *,
         echo: bool = False,
+        odometry: bool = False,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """``first``: the state that the robot sent last. ``echo``: commands name the state that they answer, for a simulated robot.
+        ``odometry``: the velocity is estimated from what it measures.
 
         Raises RobotError if this is not the contract's robot, or cannot measure what the policy observes.
         """
         self.contract, self._owner, self._clock, self._echo = contract, owner, clock, echo
         self.machine = machine_of(contract.joints)
         self.limits = self.machine.limits
-        check_rows(contract, self.machine)
+        check_rows(contract, self.machine, odometry)
         self._slots = order(self.machine, contract.joints)
         self._state, self._stamp, self._open = self._decoded(first.body), first.stamp, True
         self.report = ""  # after `close`: latencies of the wire
@@ -198,31 +201,32 @@ class UnitreeRobot(Robot):
         self._owner.send(self._command(**parts), self._stamp, safe)
 
 
-def check_rows(contract: Contract, machine: Machine) -> None:
+def check_rows(contract: Contract, machine: Machine, odometry: bool = False) -> None:
     """Refuse a policy that observes what this robot does not measure, or does not command angles. Raises RobotError."""
-    if contract.action.origin == "torque":
-        raise RobotError(f"{CONTRACT_FILE}: the policy commands torques; a {machine.name} is driven by angles here")
-    measured = {*_MEASURED, *COMPUTED, *(["foot_contact"] if machine.feet else [])} - {PLACE}
+    if contract.action.origin in ("torque", "speed"):
+        raise RobotError(f"{CONTRACT_FILE}: the policy commands {contract.action.origin}s; a {machine.name} is driven by angles here")
+    measured = {*_MEASURED, *COMPUTED, *(["foot_contact"] if machine.feet else []), *([ROW] if odometry else [])} - {PLACE}
     if wrong := [row for row in contract.rows if row.measured not in measured]:
+        estimated = "add --velocity odometry, or " if [row.measured for row in wrong] == [ROW] else ""
         raise RobotError(
             f"{CONTRACT_FILE}: the policy observes {', '.join(row.name for row in wrong)}, which a {machine.name} does not measure; "
-            f"train one without: observations.leave_out = {{'state': [{', '.join(repr(row.name) for row in wrong)}]}}"
+            f"{estimated}train one without: observations.leave_out = {{'state': [{', '.join(repr(row.name) for row in wrong)}]}}"
         )
 
 
-def connect(folder: Path, contract: Contract, interface: str, domain: int | None = None) -> UnitreeRobot:
+def connect(folder: Path, contract: Contract, interface: str, domain: int | None = None, odometry: bool = False) -> UnitreeRobot:
     """The robot on a network interface, its wire owned by a guard process. Raises RobotError with what is wrong."""
     need_dds()
     from legged_mw.deploy.unitree.guard import Guarded
     from legged_mw.deploy.unitree.link import LOOPBACK, default_domain
 
     machine = machine_of(contract.joints)
-    check_rows(contract, machine)
+    check_rows(contract, machine, odometry)
     read_scene(folder, contract)  # a scene that is not the contract's is refused before anything is sent
     domain = default_domain(interface) if domain is None else domain
     owner = Guarded(machine.package, interface, domain, lies_down=machine.lies_down)
     try:
-        return UnitreeRobot(contract, owner, owner.first, echo=interface in LOOPBACK)
+        return UnitreeRobot(contract, owner, owner.first, echo=interface in LOOPBACK, odometry=odometry)
     except BaseException:
         owner.close(b"")
         raise

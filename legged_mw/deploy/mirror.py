@@ -1,0 +1,214 @@
+"""A robot that is driven, in a window or on a web page: its measured joints, its state and why, and one button, which damps it.
+
+The picture is made by a process of its own, so it delays no step, and a viewer that is closed or dies stops nothing. It does not
+drive: a browser may be gone without a word. Where the robot is in the picture follows from its velocity, if that is known.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import socket
+import subprocess
+import sys
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from legged_mw.deploy.contract import Contract, read_contract
+from legged_mw.deploy.inputs import Wish
+from legged_mw.deploy.pose import place
+from legged_mw.deploy.robot import Floats, Health, Measurement
+from legged_mw.deploy.simulated import read_scene
+from legged_mw.deploy.states import POLICY, States
+from legged_mw.utils.errors import UserError
+from legged_mw.view import launch
+from legged_mw.view.drive import Pilot
+from legged_mw.view.session import Session, signed
+from legged_mw.view.stage import ViewError
+
+RATE = 25.0  # [Hz] of pictures
+START = 30.0  # [s] for a viewer to open
+ACTIONS = {"reset": "Damp", "camera": "", "help": ""}  # all that can be done, where another word than in BINDINGS fits
+DAMP = b"damp"
+_PARTS = ("joint_pos", "gravity", "ang_vel", "lin_vel", "foot_contact")  # of a measurement
+FLAGS = ("viewer", "camera", "host", "port")
+LIVE = ("native", "web")  # of --viewer
+
+
+class Mirror:
+    """The side of the robot's program; also one who may drive (``inputs.Source``), whose only wish is to damp."""
+
+    def __init__(self, folder: Path, contract: Contract, args: argparse.Namespace) -> None:
+        """Open the viewer that ``args`` name (see ``launch.add_flags``). Raises ViewError."""
+        settings = {"folder": str(folder.resolve()), **{name: getattr(args, name) for name in FLAGS}}
+        program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
+        channel, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self.begin(contract, channel)
+        with theirs:
+            settings["channel"] = theirs.fileno()
+            command = [sys.executable, "-c", program, json.dumps(settings)]
+            self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), start_new_session=True)  # Ctrl-C is not for it
+        self._channel.settimeout(START)
+        try:
+            said = self._channel.recv(4096).decode()
+        except OSError:
+            said = "it did not start"
+        self._channel.setblocking(False)
+        if said:
+            self.close()
+            raise ViewError(said)
+
+    def begin(self, contract: Contract, channel: socket.socket) -> None:
+        """Tell of the robot through ``channel`` from now on."""
+        self._period, self._channel, self._due, self._health = contract.period, channel, 0.0, Health()
+        self._x = self._y = self._heading = 0.0  # [m], [rad] since the start
+
+    def show(self, now: float, measured: Measurement | None, states: States) -> None:
+        """One step; of some a picture is made."""
+        if measured is not None:
+            vx, vy, rate = (float(value) for value in (*measured.lin_vel[:2], -measured.gravity @ measured.ang_vel))
+            if math.isfinite(vx + vy + rate):
+                cos, sin = math.cos(self._heading), math.sin(self._heading)
+                self._x += self._period * (cos * vx - sin * vy)
+                self._y += self._period * (sin * vx + cos * vy)
+                self._heading += self._period * rate
+        if now < self._due:
+            return
+        self._due, health = now + 1.0 / RATE - 1e-9, self._health
+        told = {
+            "time": now,
+            "state": states.state,
+            "note": states.note,
+            "command": states.command.tolist() if states.state == POLICY else None,
+        }
+        told |= {"place": [self._x, self._y, self._heading], "voltage": health.voltage, "age": health.age_s}
+        told["hottest"] = None if health.temperatures is None else float(health.temperatures.max())
+        if measured is not None:
+            told |= {name: getattr(measured, name).tolist() for name in _PARTS}
+        with suppress(OSError):  # the viewer was closed, or is busy
+            self._channel.send(json.dumps(told).encode())
+
+    def poll(self, health: Health) -> Wish:
+        self._health = health
+        try:
+            return Wish(stop="the viewer's button" if self._channel.recv(64) == DAMP else "")
+        except OSError:
+            return Wish()
+
+    def let_go(self) -> None: ...
+
+    def close(self) -> None:
+        self._channel.close()
+        self._process.terminate()
+        self._process.wait()
+
+
+# ---- the viewer's process
+
+
+class MirroredStage:
+    """What is told of the robot, as a stage (the viewers' protocol ``Stage``). It steps nothing."""
+
+    num_worlds, dt = 1, 1.0 / RATE
+
+    def __init__(self, folder: Path, channel: socket.socket) -> None:
+        self.contract = read_contract(folder)
+        scene = read_scene(folder, self.contract)
+        self.spec, self._model, self._data, self._channel = scene.spec, scene.model, mujoco.MjData(scene.model), channel
+        mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
+        self.command_table, self._parent = self.contract.commands, os.getppid()
+        # which foot each geom of the feet is of, in the order of the sensors
+        self._foot = [foot for _, foot in sorted((at, foot) for foot, places in enumerate(scene.contacts) for at in set(places.tolist()))]
+        self.told: dict[str, Any] = {"command": None, "state": "", "note": "nothing was measured yet"}
+
+    def step(self, commands: Floats | None) -> None:
+        """Take the newest that was told. The process ends with the robot's program."""
+        newest = None
+        with suppress(BlockingIOError):
+            while data := self._channel.recv(1 << 16):
+                newest = json.loads(data)
+        if os.getppid() != self._parent:
+            raise SystemExit
+        if newest is None:
+            return
+        self.told |= newest
+        if "joint_pos" in newest and np.isfinite([*newest["joint_pos"], *newest["gravity"]]).all():
+            self._data.qpos[:2] = newest["place"][:2]
+            angles, gravity = np.array(newest["joint_pos"]), np.array(newest["gravity"])
+            place(self._model, self._data, self.contract.joints, angles, gravity, newest["place"][2])
+
+    def commands(self) -> Floats:
+        return np.array([self.told["command"] or [each.default for each in self.command_table]])
+
+    def velocity(self) -> Floats:
+        return np.nan_to_num(np.array([[*self.told.get("lin_vel", [0.0, 0.0])[:2], self.told.get("ang_vel", [0.0])[-1]]]))
+
+    def believed_velocity(self) -> None:
+        return None
+
+    def qpos(self) -> Floats:
+        return self._data.qpos[None].copy()
+
+    def ghost(self) -> None:
+        return None
+
+    def contacts(self) -> Any:
+        touches = self.told.get("foot_contact", [0.0] * len(self.contract.feet))
+        return np.array([[touches[foot] > 0.0 for foot in self._foot]])
+
+    def fell(self) -> Any:
+        return self.contract.ends.tilted(np.array([self.told.get("gravity", [0.0, 0.0, -1.0])]))
+
+    def ground(self, world: int) -> str:
+        return ""
+
+    def push(self, world: int, velocity: Floats) -> None: ...
+
+    def reset(self, world: int) -> None:
+        """The button was pressed."""
+        with suppress(OSError):
+            self._channel.send(DAMP)
+
+
+class MirrorSession(Session):
+    """Shows what the robot tells."""
+
+    stage: MirroredStage
+
+    def _lines(self, command: Floats, velocity: Floats) -> tuple[tuple[str, str], ...]:
+        told = self.stage.told
+        followed = signed(command) if told["command"] else "-"
+        lines = [("state", told["state"]), ("", told["note"]), ("command", followed), ("measured", signed(velocity))]
+        for name, key, form in (("battery", "voltage", "{:.1f} V"), ("hottest", "hottest", "{:.0f} deg C"), ("time", "time", "{:.1f} s")):
+            lines += [(name, form.format(told[key]))] if told.get(key) is not None else []
+        return tuple(lines)
+
+
+def main() -> None:
+    settings = json.loads(sys.argv[1])
+    channel = socket.socket(fileno=settings["channel"])
+    channel.setblocking(False)
+    os.nice(5)  # the robot goes first
+    args = argparse.Namespace(**{name: settings[name] for name in FLAGS})
+    try:
+        stage = MirroredStage(Path(settings["folder"]), channel)
+        pilot = Pilot(stage.command_table, 1, args.camera, only=ACTIONS)
+        if args.viewer == "native":
+            viewer = launch.window(stage, pilot, "as asked", fall_back=False)
+        else:
+            viewer = launch.web_page(stage, pilot, "as asked", args, stage.contract.task)
+    except UserError as error:
+        channel.send(str(error).encode())
+        return
+    channel.send(b"")
+    assert viewer
+    with closing(viewer):
+        MirrorSession(stage, viewer, pilot).run()

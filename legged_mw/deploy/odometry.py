@@ -1,0 +1,138 @@
+"""Leg odometry: the velocity of the IMU [m/s] from joints, gyro, accelerometer and the feet that stand. No robot, no policy.
+
+The velocity part of the filter of Bledt et al., "MIT Cheetah 3: Design and Control of a Robust, Dynamic Quadruped Robot", IROS 2018.
+Predicted by the accelerometer; corrected by each foot on the ground, which does not move there, so that the body moves by what
+the leg does. Places of the body and of the feet are left out: so the ground may have any height, and the noise of all three axes
+is one number. Ours: a foot that is at odds with the prediction counts less, as it slips or just touches down (Cauchy's weight).
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from legged_mw.deploy.contract import CONTRACT_FILE, Contract, ContractError
+from legged_mw.deploy.robot import Floats, Measurement
+from legged_mw.deploy.simulated import read_scene
+
+ROW = "lin_vel"  # ContractRow.measured of the velocity
+# Ours, as those below: tried in the walking exam of go1_flat, with the noise of sensors and without. Less DRIFT and DOUBT is calmer, and
+# slower to notice what no accelerometer feels: a shock between two measurements.
+DRIFT = 4.0  # [m/s^2] noise of the accelerometer over a period
+STANDING = 0.2  # [m/s] noise of the velocity of a foot that stands
+DOUBT = {"measured": 0.5, "torque": 0.3, "height": 0.3}  # [m/s] from which a foot that moves counts half, by how sure its contact is
+CONTACTS = tuple(DOUBT)  # how a foot on the ground is found
+LOADED = 0.1  # [weights] of a foot's force from which it stands, by its joints' torques
+LEVEL = 0.01  # [m] above the lowest foot, within which others stand too, by their height
+FLAT = 0.05  # [-] sine of a foot's tilt up to which it touches between its ends, not at one of them
+
+
+class Legs(NamedTuple):
+    """Of the feet of N robots, in the frame of the IMU."""
+
+    place: Floats  # (N, F, 3) [m] from the IMU to the foot's lowest point
+    velocity: Floats  # (N, F, 3) [m/s] of the IMU, if the foot does not move
+    force: Floats  # (N, F) [N] with which a leg presses down, by its joints' torques
+
+
+class Odometry:
+    """Estimates the velocity of ``count`` robots, one measurement a period."""
+
+    def __init__(self, folder: Path, contract: Contract, count: int = 1, contact: str = "measured") -> None:
+        """``contact``: of CONTACTS. Raises ContractError."""
+        if not contract.feet:
+            raise ContractError(f"{CONTRACT_FILE}: robot: feet is empty; leg odometry needs feet")
+        self.contract, self.contact, self._doubt, scene = contract, contact, DOUBT[contact], read_scene(folder, contract)
+        self.model, self._dofs = scene.model, scene.dofs
+        self._data = mujoco.MjData(self.model)
+        self._angles = [int(self.model.joint(name).qposadr[0]) for name in contract.joints]
+        self._imu = int(self.model.site(contract.imu).id)
+        self._feet = [_Foot(self.model, names) for names in contract.feet.values()]
+        self._gravity = float(np.linalg.norm(self.model.opt.gravity))
+        self.velocity: Floats = np.zeros((count, 3))  # [m/s] body frame
+        self._variance: Floats = np.zeros(count)  # [m^2/s^2] of it, the same along each axis
+        self._shock: Floats = np.full((count, 3), np.nan)  # [m/s^2] the accelerometer before
+        self.reset()
+
+    def reset(self, which: Any = slice(None)) -> None:
+        """The robots ``which`` (indices or a mask) are at rest."""
+        self.velocity[which], self._variance[which], self._shock[which] = 0.0, self._doubt**2, np.nan
+
+    def __call__(self, measured: Measurement) -> Measurement:
+        """``measured`` of N robots (or of one, without the leading axis) with the estimate in the place of its velocity."""
+        gyro, gravity, felt = (np.atleast_2d(each) for each in (measured.ang_vel, measured.gravity, measured.acceleration))
+        felt_before = np.where(np.isfinite(self._shock), self._shock, felt)
+        self._shock = felt.copy()
+        pull = 0.5 * (felt + felt_before) + self._gravity * gravity
+        velocity = self.velocity + self.contract.period * (pull - np.cross(gyro, self.velocity))
+        variance = self._variance + (self.contract.period * DRIFT) ** 2
+        legs = self.legs(measured)
+        missed = ((legs.velocity - velocity[:, None]) ** 2).sum(axis=2)
+        noise = STANDING**2 * (1.0 + missed / (self._doubt**2 + variance[:, None]))
+        trust = np.where(self.stands(measured, legs), 1.0 / noise, 0.0)  # (N, F)
+        self._variance = 1.0 / (1.0 / variance + trust.sum(axis=1))
+        pulled = velocity / variance[:, None] + (trust[..., None] * legs.velocity).sum(axis=1)
+        found = pulled * self._variance[:, None]
+        self.velocity = found.copy()
+        self.reset(~np.isfinite(found).all(axis=1))  # what is not finite is handed on, and forgotten
+        return replace(measured, lin_vel=found.reshape(np.shape(measured.lin_vel)))
+
+    def stands(self, measured: Measurement, legs: Legs) -> NDArray[np.bool_]:
+        """Feet (N, F) that are taken to stand."""
+        if self.contact == "measured":
+            return np.atleast_2d(measured.foot_contact) > 0.0
+        if self.contact == "torque":
+            return legs.force > LOADED * self.contract.mass * self._gravity
+        depth = (legs.place * np.atleast_2d(measured.gravity)[:, None]).sum(axis=2)
+        return depth > depth.max(axis=1, keepdims=True) - LEVEL
+
+    def legs(self, measured: Measurement) -> Legs:
+        """Where feet are, how the body moves if they do not, and how hard they press, by the scene's kinematics."""
+        parts = (measured.joint_pos, measured.joint_vel, measured.joint_torque, measured.ang_vel, measured.gravity)
+        return Legs(*map(np.array, zip(*map(self._legs, *map(np.atleast_2d, parts)), strict=True)))
+
+    def _legs(self, angles: Floats, speeds: Floats, torques: Floats, gyro: Floats, gravity: Floats) -> tuple[Floats, Floats, Floats]:
+        """Of one robot, without the leading axis. Its root stays where the model has it: only what is relative counts."""
+        model, data = self.model, self._data
+        data.qpos[self._angles] = angles
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        origin, turn = data.site_xpos[self._imu], data.site_xmat[self._imu].reshape(3, 3)
+        down, own, moved = turn @ gravity, np.zeros((3, model.nv)), np.zeros((len(self._feet), 3, model.nv))
+        mujoco.mj_jac(model, data, own, None, origin, model.site_bodyid[self._imu])
+        place = np.array([foot.lowest(data, down) for foot in self._feet])
+        for jacobian, foot, point in zip(moved, self._feet, place, strict=True):
+            mujoco.mj_jac(model, data, jacobian, None, point, foot.body)
+        slopes = turn.T @ (moved - own)[:, :, self._dofs]  # (F, 3, D) how far a foot moves, by each joint
+        place = (place - origin) @ turn
+        wrench = np.linalg.solve(slopes @ slopes.transpose(0, 2, 1) + 1e-4 * np.eye(3), (slopes @ torques)[..., None])[..., 0]
+        return place, -(np.cross(gyro, place) + slopes @ speeds), wrench @ gravity
+
+
+class _Foot:
+    """Shapes of one foot: a centre each, half edges along its own axes, and a radius around all that."""
+
+    def __init__(self, model: mujoco.MjModel, sensors: tuple[str, ...]) -> None:
+        """``sensors`` of contact name its shapes."""
+        self.geoms = [int(model.sensor(name).objid[0]) for name in sensors]
+        self.body = int(model.geom_bodyid[self.geoms[0]])
+        kinds, sizes, boxes = model.geom_type[self.geoms], model.geom_size[self.geoms], model.geom_aabb[self.geoms]
+        ball, rod = kinds == mujoco.mjtGeom.mjGEOM_SPHERE, kinds == mujoco.mjtGeom.mjGEOM_CAPSULE
+        self.radius: Floats = np.where(ball | rod, sizes[:, 0], 0.0)
+        self.centre: Floats = boxes[:, :3].copy()
+        self.half: Floats = np.where(ball[:, None], 0.0, boxes[:, 3:])
+        self.half[rod] = np.stack([0.0 * sizes[rod, 0], 0.0 * sizes[rod, 0], sizes[rod, 1]], axis=1)
+
+    def lowest(self, data: Any, down: Floats) -> Floats:
+        """(3,) the foot's point that is farthest along ``down``."""
+        turns = data.geom_xmat[self.geoms].reshape(-1, 3, 3)
+        ends = self.centre + self.half * np.clip(down @ turns / FLAT, -1.0, 1.0)
+        points = data.geom_xpos[self.geoms] + (turns @ ends[..., None])[..., 0] + self.radius[:, None] * down
+        return points[np.argmax(points @ down)]
