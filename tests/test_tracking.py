@@ -174,12 +174,12 @@ def test_the_exam_judges_places_at_the_anchor() -> None:
     qpos[200:, 3, 2] -= 0.3  # down
     nothing = np.zeros((frames, 4, 1))
     found = exam.judge(robot, Recording(qpos, nothing, nothing, ended_at=np.full(4, np.inf)))
-    assert found["finished"] == 0.75 and found["drift"] == pytest.approx(0.1)
+    assert found["worst"] == 3 and found["finished"] == 0.75 and found["drift"] == pytest.approx(0.1)
     steps = 3 * frames + 200
     assert found["joint_error"] == pytest.approx(0.01 * frames / steps)
     assert 0.0 < found["body_error"] < 10.0
     ended = exam.judge(robot, Recording(qpos[:, :2], nothing, nothing, ended_at=np.array([100.0, np.inf])))
-    assert ended["finished"] == 0.5 and ended["body_error"] == pytest.approx(0.0, abs=1e-6)
+    assert ended["worst"] == 0 and ended["finished"] == 0.5 and ended["body_error"] == pytest.approx(0.0, abs=1e-6)
     starts, speeds = exam.starts(robot, 32)
     assert (np.ptp(starts[:, 7:], axis=0) > 0.05).all() and np.abs(starts - robot.motion.qpos[0])[:, 7:].max() <= 0.05 and speeds.any()
 

@@ -71,10 +71,12 @@ class Tracking(Skill):
         lost = ~((away <= LOST_HEIGHT) & (np.abs(up[0] - up[1]) <= LOST_TILT))  # NaN too
         lost |= np.arange(steps)[:, None] > recording.ended_at
         follows = ~np.maximum.accumulate(lost, axis=0)
-        last = follows[-1]
+        last, kept = follows[-1], follows.sum(axis=0)
+        own = np.where(follows, error, 0.0).sum(axis=0) / np.maximum(kept, 1)
         drift = np.linalg.norm((found - wanted)[-1, last, anchor, :2], axis=1)
         return {
             "finished": float(last.mean()),
+            "worst": int(np.argmax(np.where(last, own, FAR - kept))),  # the robot that was lost first, else the least exact
             "body_error": float(1000.0 * error[follows].mean()) if follows.any() else None,
             "joint_error": float(joints[follows].mean()) if follows.any() else None,
             "drift": float(drift.mean()) if last.any() else None,
