@@ -1,7 +1,6 @@
 """Unitree G1 with 29 joints follows a motion, a side kick held in balance, without knowing its place or its velocity.
 
-Gains, action scales and default pose are g1_flat's. [B]: BeyondMimic; [M]: mjlab; [ours] docs/lab.md. With state estimation, as in
-[B]: --set "observations.leave_out={}". Another motion: --set "motion.clips=[resources/motions/g1_turn.npz]".
+[B]: BeyondMimic; [M]: mjlab; [ours]. With state estimation, as in [B]: --set "observations.leave_out={}" (docs/motions.md).
 """
 
 from configs.g1_flat import G1FlatCfg

@@ -52,6 +52,9 @@ NOMINAL = {  # the robot as its contract states it
     "perturbation.kick": False,
     "perturbation.push": False,
     "gait.random_start": False,
+    "motion.random_start": False,
+    "motion.start_turn": [0.0, 0.0, 0.0],  # a deployed robot has the heading of its motion as it begins
+    "motion.start_joints": 0.0,
 }
 
 

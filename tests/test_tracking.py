@@ -136,6 +136,31 @@ def test_starts_are_drawn_by_failures() -> None:
     torch.testing.assert_close(env.training_state()["motion_failures"], reference.failures)
 
 
+def test_a_mirrored_robot_follows_the_mirrored_motion() -> None:
+    """What the rows say is what a robot sees whose joints and attitude are the mirror images, and so is its reference's."""
+    env = make(worlds=2, **{"motion.start_turn": [0.3] * 3, "motion.start_joints": 0.1, "motion.random_start": False})
+    partners = env._partners()
+
+    def image(qpos: torch.Tensor) -> torch.Tensor:
+        place, attitude = qpos[:, :3] * torch.tensor([1.0, -1.0, 1.0]), qpos[:, 3:7] * torch.tensor([1.0, -1.0, 1.0, -1.0])
+        return torch.cat([place, attitude, qpos[:, 7:36][:, list(partners.joints)] * torch.tensor(partners.signs)], dim=1)
+
+    first = env.reference._table[:1, :36]
+    env.sim.qpos[1:] = image(env.sim.qpos[:1])
+    bodies = env.kinematics(torch.cat([first, image(first)]), torch.zeros(2, 35))
+    for kept, found in zip(env.reference.bodies, bodies, strict=True):
+        kept.copy_(found)
+    env.reference.read = lambda: None  # type: ignore[method-assign]
+    env._refresh_base()
+    env.compute_observations()
+    for name in ("anchor_pos", "anchor_ori", "body_pos", "body_ori"):
+        span = env.observations.span("privileged_state", name)
+        seen = env.mirror.observations["privileged_state"](env.obs_buf["privileged_state"])[0, span]
+        torch.testing.assert_close(seen, env.obs_buf["privileged_state"][1, span], atol=2e-3, rtol=0, msg=name)
+    with pytest.raises(ConfigError, match="body 'left_knee_link' is compared and its mirror image 'right_knee_link' is not"):
+        _ = make(worlds=1, **{"motion.bodies": ["torso_link", "left_knee_link"], "motion.end_bodies": []}).mirror
+
+
 @pytest.mark.parametrize("left_out", [{"state": ["anchor_pos", "base_lin_vel"]}, {}], ids=["154 rows", "160 rows"])
 def test_the_step_can_be_recorded(left_out: dict[str, list[str]]) -> None:
     task = load_task("g1_track")

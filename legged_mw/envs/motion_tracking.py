@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from legged_mw.envs.mirror import Block, body_blocks
 from legged_mw.envs.motion_reference import Reference, angle_between, load_clips
 from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
 from legged_mw.envs.observations import Row
@@ -45,8 +46,7 @@ class MotionTracking(RobotTask):
         down = super()._fallen()
         down |= (ours.pos[:, self.anchor, 2] - theirs.pos[:, self.anchor, 2]).abs() > end.max_anchor_height
         down |= (ours.rot[:, self.anchor, 2, 2] - theirs.rot[:, self.anchor, 2, 2]).abs() > end.max_anchor_tilt
-        high = (ours.pos - self.reference.wanted_pos).index_select(1, self.ends)[..., 2].abs()
-        down |= (high > end.max_end_height).any(dim=1)
+        down |= ((ours.pos - self.reference.wanted_pos).index_select(1, self.ends)[..., 2].abs() > end.max_end_height).any(dim=1)
         return down
 
     def _timed_out(self) -> Tensor:
@@ -57,11 +57,10 @@ class MotionTracking(RobotTask):
         """Robots near the reference, at a frame that the failures draw."""
         motion = self.cfg.motion
         qpos, qvel = self.reference.begin(mask, self.reference.draw(motion.uniform) if motion.random_start else None)
-        off = torch.rand(self.num_envs, 12, device=self.device).mul_(2.0).sub_(1.0).mul_(self.start_range)
-        place, turn, speed = off.split([3, 3, 6], dim=1)
-        joints = qpos[:, 7:] + torch.empty_like(self.dof_offset).uniform_(-motion.start_joints, motion.start_joints)
+        off = torch.rand(self.num_envs, len(self.start_range), device=self.device).mul_(2.0).sub_(1.0).mul_(self.start_range)
+        place, turn, speed, bend = off.split([3, 3, 6, self.num_actions], dim=1)
         attitude = quat_multiply(rotation_quat(turn), qpos[:, 3:7])
-        joints = joints.clamp(self.soft_lower, self.soft_upper)
+        joints = (qpos[:, 7:] + bend).clamp(self.soft_lower, self.soft_upper)
         assign(self.sim.qpos, mask, torch.cat([qpos[:, :3] + place, attitude, joints], dim=1))
         assign(self.sim.qvel, mask, torch.cat([qvel[:, :6] + speed, qvel[:, 6:]], dim=1))
         self._forget_for_rewards(mask)
@@ -91,23 +90,26 @@ class MotionTracking(RobotTask):
 
     def observation_rows(self) -> dict[str, list[Row | str]]:
         noise = self.cfg.noise.scales
-        frame = self.reference
-        clip = [Row("reference_joint_pos", frame.joint_pos), Row("reference_joint_vel", frame.joint_vel)]  # [rad], [rad/s]
+        angles = {"reference_joint_pos": self.reference.joint_pos, "reference_joint_vel": self.reference.joint_vel}  # [rad], [rad/s]
+        clip = [Row(name, value, mirror="joint") for name, value in angles.items()]
         # the reference's anchor in the robot's: its place [m], two columns of its rotation
-        anchors = [Row("anchor_pos", self.anchor_pos), Row("anchor_ori", self.anchor_ori)]
+        anchors = [Row("anchor_pos", self.anchor_pos, mirror="polar"), Row("anchor_ori", self.anchor_ori, mirror="turn")]
         seen = [row._replace(noise=level, measured=True) for row, level in zip(anchors, (noise.anchor_pos, noise.anchor_ori), strict=True)]
         return {
             "state": [*clip, *seen, *(row for row in self._measured_rows() if row.name != "projected_gravity")],
             "privileged_state": [
                 *clip,
                 *anchors,
-                Row("body_pos", self.body_pos),  # of each body in the anchor's frame [m]
-                Row("body_ori", self.body_ori),
+                Row("body_pos", self.body_pos, mirror="body_polar"),  # of each body in the anchor's frame [m]
+                Row("body_ori", self.body_ori, mirror="body_turn"),
                 *self._body_rows(),
-                Row("last_actions", self.last_actions),
+                Row("last_actions", self.last_actions, mirror="joint"),
                 *self._disturbance_rows(),
             ],
         }
+
+    def _mirror_blocks(self) -> dict[str, Block]:
+        return super()._mirror_blocks() | body_blocks(self.robot, self._partners(), self.cfg.motion.bodies)
 
     # ---- rewards ----------------------------------------------------------------------------------------------------------
 
@@ -145,9 +147,8 @@ class MotionTracking(RobotTask):
 
     def _live_statistics(self) -> dict[str, Tensor]:
         """Mean distance of the bodies from the reference, at the anchor [mm]."""
-        off = (self.body.pos - self.reference.wanted_pos).norm(dim=2).mean(dim=1) * 1000.0
-        known = off.isfinite()
-        return super()._live_statistics() | {"body_error_mm": torch.stack([torch.where(known, off, 0.0).sum(), known.float().sum()])}
+        off = ((self.body.pos - self.reference.wanted_pos).norm(dim=2).mean(dim=1) * 1000.0).nan_to_num(0.0, 0.0, 0.0)
+        return super()._live_statistics() | {"body_error_mm": torch.stack([off.sum(), torch.full_like(off[0], len(off))])}
 
     # ---- checkpoint, buffers ------------------------------------------------------------------------------------------------
 
@@ -172,7 +173,7 @@ class MotionTracking(RobotTask):
         self.clips = load_clips(self.cfg, self.robot.joint_names, 1.0 / self.dt)
         frames = {"held": round(motion.hold_s / self.dt), "bin_frames": round(motion.bin_s / self.dt)}
         self.reference = Reference(self.clips, self.kinematics, self.num_envs, self.device, **frames)
-        self.start_range = self._tensor([*motion.start_pos, *motion.start_turn, *motion.start_lin_vel, *motion.start_ang_vel])
+        ranges = [*motion.start_pos, *motion.start_turn, *motion.start_lin_vel, *motion.start_ang_vel]
+        self.start_range = self._tensor(ranges + [motion.start_joints] * self.num_actions)
         self.body = Bodies(*(torch.zeros_like(part) for part in self.reference.bodies))
-        self.anchor_pos, self.anchor_ori = self._zeros(3), self._zeros(6)
-        self.body_pos, self.body_ori = (self._zeros(size * len(motion.bodies)) for size in (3, 6))
+        self.anchor_pos, self.anchor_ori, self.body_pos, self.body_ori = map(self._zeros, (3, 6, 3 * len(bodies), 6 * len(bodies)))
