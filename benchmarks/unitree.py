@@ -1,7 +1,7 @@
 """The walking exam over the wire: a policy drives a simulated Unitree robot through its DDS messages, both in this process.
 
     python benchmarks/unitree.py go2_flat
-    python benchmarks/unitree.py g1_flat --wire delay=10,jitter=2,loss=5
+    python benchmarks/unitree.py g1_flat --fault delay=10,jitter=2,loss=5
 
 Beside it stands the exam of `python -m legged_mw.deploy go2_flat --eval`: another servo law's rate (2 ms), all shapes of the robot on
 the ground, MuJoCo's own number of solver iterations. Nothing waits for real time.
@@ -20,13 +20,13 @@ import numpy as np
 from legged_mw import ROOT
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.exam import contract_rules, run_exam
-from legged_mw.deploy.options import wire_faults
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.unitree.client import Direct, UnitreeRobot
+from legged_mw.deploy.unitree.faults import Faults, parse_faults
 from legged_mw.deploy.unitree.link import RobotEnd, Wire
 from legged_mw.deploy.unitree.robots import machine_of
-from legged_mw.deploy.unitree.serve import STEP, Faults, SimulatedUnitree
+from legged_mw.deploy.unitree.serve import STEP, SimulatedUnitree
 from legged_mw.eval import rules
 from legged_mw.eval.rules import ExamRules
 
@@ -80,14 +80,17 @@ def examine(folder: Path, contract: Contract, exam: ExamRules, domain: int, faul
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("policy", help="a shipped policy, or the folder of an export")
-    parser.add_argument("--wire", help="faults, as `--serve` has them")
+    parser.add_argument("--fault", action="append", default=[], help="as `--serve` has it, from the start")
     parser.add_argument("--domain", type=int, default=99)
     args = parser.parse_args()
     folder = Path(args.policy) if Path(args.policy).is_dir() else ROOT / "resources" / "policies" / args.policy
     contract = read_contract(folder)
+    faults = Faults()
+    for fault in parse_faults(args.fault, contract.joints):
+        fault.begin(faults)
     exam = replace(contract_rules(contract), push_speeds=(2.0,), push_mark=2.0)
     for where, result in (
-        ("over the wire", examine(folder, contract, exam, args.domain, Faults(**wire_faults(args.wire)))),
+        ("over the wire", examine(folder, contract, exam, args.domain, faults)),
         ("through --eval", run_exam(folder, exam)),
     ):
         print(f"{where}\n{rules.table(result)}", flush=True)

@@ -183,6 +183,12 @@ def test_measurements_that_are_frozen(contract: Contract, limits: Limits) -> Non
     assert safety.sensed(at_rest(contract), health, 0.0) is None
 
 
+def test_a_clock_that_went_back(contract: Contract, limits: Limits) -> None:
+    """Else a measurement would be fresh until that clock has caught up."""
+    trip = Safety(contract, limits).sensed(at_rest(contract), Health(age_s=-5.0), 0.0)
+    assert trip == Trip("age", "the newest measurement comes from 5000 ms ahead: a clock went back")
+
+
 def test_a_remote_that_is_lost(contract: Contract, limits: Limits) -> None:
     safety = Safety(contract, limits.but({"frozen": "off"}, "test"))
     assert safety.sensed(at_rest(contract), Health(), 100.0) is None  # one that was never there is not missed
@@ -302,6 +308,11 @@ def stopped(robot: Watched, controller: Controller, script: Script) -> None:
     script.stop = AT
 
 
+def fell(robot: Watched, controller: Controller, script: Script) -> None:
+    """By a rule that only the robot can judge."""
+    robot.fell = lambda: robot.step >= AT  # type: ignore[method-assign]
+
+
 def ended(robot: Watched, controller: Controller, script: Script) -> None:
     script.presses[AT] = "select"
 
@@ -335,7 +346,8 @@ FAULTS: dict[str, tuple[Fault, int, str]] = {  # fault, periods until it can be 
     "the remote lost": (told(Health()), 149, "the remote was not heard for 3.0 s"),
     "an emergency stop": (stopped, 0, "the test"),
     "select": (ended, 0, "select was pressed"),
-    "a fall": (measured_as(lambda _, m: replace(m, gravity=-m.gravity)), 0, "the robot fell"),  # on its back within a step
+    "on its back": (measured_as(lambda _, m: replace(m, gravity=-m.gravity)), 0, " degrees, more than 60"),
+    "a fall": (fell, 0, "the robot fell"),
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -20,11 +21,14 @@ import pytest
 
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.robot import RobotError
-from legged_mw.deploy.unitree import client, guard
+from legged_mw.deploy.unitree import client, clock, guard, program
 from legged_mw.deploy.unitree.codec import LAYOUTS
+from legged_mw.deploy.unitree.faults import Faults, parse_faults
 from legged_mw.deploy.unitree.guard import Board, Guard, Guarded
+from legged_mw.deploy.unitree.handset import Handset
 from legged_mw.deploy.unitree.link import Received, RobotEnd
-from legged_mw.deploy.unitree.serve import STEP, SimulatedUnitree
+from legged_mw.deploy.unitree.remote import encode
+from legged_mw.deploy.unitree.serve import DAMPED, STEP, SimulatedUnitree
 from tests.wires import POLICIES
 from tests.wires import domain as domain
 
@@ -152,7 +156,7 @@ def test_a_guard_that_is_told_to_end_damps_first(bench: Bench) -> None:
 
 def test_the_end(bench: Bench) -> None:
     """The last command is sent for a while, and the latency of the others is told."""
-    bench.send(guard.MOVE, MOVING, stamp=time.monotonic())
+    bench.send(guard.MOVE, MOVING, stamp=clock())
     bench.send(guard.CLOSE, DAMPING)
     assert b"from a measurement to its target: median " in bench.here.recv(4096)
     assert bench.ended() and bench.wire.sent[-1] == DAMPING and bench.guard.tripped == ""
@@ -161,18 +165,21 @@ def test_the_end(bench: Bench) -> None:
 # ---- processes
 
 POLICY = """
-import sys, time
-import numpy as np
+import itertools, sys, time
 from pathlib import Path
 from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.unitree import clock
 from legged_mw.deploy.unitree.client import connect
-contract = read_contract(Path(sys.argv[1]))
-robot = connect(Path(sys.argv[1]), contract, "lo", int(sys.argv[2]))
+folder, domain, fault = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
+contract = read_contract(folder)
+robot = connect(folder, contract, "lo", domain)
 print("pid", robot._owner.process.pid, flush=True)
-while True:
+for step in itertools.count():
+    if fault == "clock" and step == 30:
+        robot._clock = lambda: clock() + 10.0
     robot.read()
     robot.write(contract.default_pose)
-    time.sleep(0.01)
+    time.sleep(0.08 if fault == "late" and step > 30 else 0.01)
 """
 
 
@@ -193,8 +200,8 @@ def live(sim: SimulatedUnitree, until: Any, seconds: float = 30.0) -> float:
 
 
 @contextlib.contextmanager
-def policy(domain: int) -> Iterator[subprocess.Popen[str]]:
-    told = [sys.executable, "-c", POLICY, str(POLICIES / "go2_flat"), str(domain)]
+def policy(domain: int, fault: str = "") -> Iterator[subprocess.Popen[str]]:
+    told = [sys.executable, "-c", POLICY, str(POLICIES / "go2_flat"), str(domain), fault]
     process = subprocess.Popen(told, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=POLICIES.parents[1])
     try:
         yield process
@@ -203,15 +210,46 @@ def policy(domain: int) -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSTOP], ids=["dies", "hangs"])
-def test_processes_of_a_policy_that_dies_or_hangs(number: signal.Signals, domain: int) -> None:
+def second(domain: int, sim: SimulatedUnitree) -> str:
+    """What another program's guard says, which wants the same robot."""
+    said = list[str]()
+
+    def start() -> None:
+        try:
+            Guarded.start("unitree_go", "lo", domain).close(b"")
+        except RobotError as error:
+            said.append(str(error))
+
+    thread = threading.Thread(target=start)
+    thread.start()
+    live(sim, lambda: not thread.is_alive())
+    return said[0]
+
+
+LATE = "no targets for [0-9]+ ms: the policy's process hangs or is late; the joints are damped"
+PROCESSES: dict[str, tuple[signal.Signals | None, str]] = {  # a computer that is too busy is late, too
+    "dies": (signal.SIGKILL, f"the policy's process ended; the joints are damped|{LATE}"),
+    "hangs": (signal.SIGSTOP, LATE),
+    "late": (None, LATE),
+    "clock": (None, f"the newest measurement is 100[0-9]+ ms old|{LATE}"),
+}
+
+
+@pytest.mark.parametrize("fault", PROCESSES)
+def test_processes_of_a_policy_that_dies_hangs_or_is_late(fault: str, domain: int) -> None:
     """The guard is another process: it damps on the simulated robot's own record, where there is no watchdog."""
-    sim = served(domain)
-    with policy(domain) as process:
+    (number, said), sim = PROCESSES[fault], served(domain)
+    with policy(domain, fault) as process:
         live(sim, lambda: sim.acted["kp"].any())
-        os.kill(process.pid, number)
-        live(sim, lambda: not sim.acted["kp"].any())
-        assert sim.acted["kd"].all() and np.isfinite(sim.data.qpos).all()
+        if number == signal.SIGKILL:
+            assert re.match("another program sends rt/lowcmd in domain .*: end it first; nothing was sent", second(domain, sim))
+        if number:
+            os.kill(process.pid, number)
+        live(sim, lambda: sim.record.changes[-1][1] == DAMPED)
+        live(sim, lambda begun=sim.time: sim.time > begun + 0.2)
+        assert sim.record.changes[-1][1] == DAMPED and sim.record.beyond < 0.25
+        process.kill()
+        assert re.search(said, process.communicate()[1])
 
 
 def test_a_guard_that_is_killed_leaves_the_last_command(domain: int) -> None:
@@ -228,7 +266,7 @@ def test_a_guard_that_is_killed_leaves_the_last_command(domain: int) -> None:
 
 def test_a_guard_says_what_is_wrong(domain: int, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RobotError, match="no robot: no rt/lowstate of unitree_go in domain"):
-        Guarded("unitree_go", "lo", domain, find=0.2)
+        Guarded.start("unitree_go", "lo", domain, find=0.2)
     contract = read_contract(POLICIES / "go1_flat")
     with pytest.raises(RobotError, match="which a go2 does not measure"):
         client.connect(POLICIES / "go1_flat", contract, "lo", domain)
@@ -253,3 +291,29 @@ def test_the_programs(domain: int, tmp_path: Path) -> None:
         said, errors = robot.communicate(timeout=60)
         assert "from a state to the first command that answers it: median " in said and "0 refused" in said, errors
         assert "degrees from upright" in said
+
+
+def test_the_program_with_motors_in_another_order(domain: int) -> None:
+    """As soon as it would stand: the angles are not those of the joints."""
+    sim = served(domain)
+    sim.faults.joint_order = 1
+    command = [sys.executable, "-m", "legged_mw.deploy", "go2_flat", "--robot", "unitree", "--interface", "lo", "--domain", str(domain)]
+    where: dict[str, Any] = {"cwd": POLICIES.parents[1], "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen([*command, "--time", "1s", "--log", "off"], **where) as policy:
+        live(sim, lambda: sim.record.commands > 50)
+        sim.remote = encode(["start"])
+        live(sim, lambda: policy.poll() is not None)
+        said, errors = policy.communicate()
+    assert policy.returncode == 0, errors
+    assert re.search("\ndamping: F[LR]_.*_joint is (at|told to go to) .* rad, .* beyond its range .*; 0.[0-9]+ is the most\n", said), said
+    assert sim.record.changes[-1][1] == DAMPED and sim.record.beyond < 0.25
+
+
+def test_a_served_robot_tells_what_its_faults_led_to(domain: int, capsys: pytest.CaptureFixture[str]) -> None:
+    sim, faults = served(domain), parse_faults(["hot_motor@0.02,silent@0.02", "frozen@9"], [])
+    zeros, kp = np.zeros(12), np.full(12, 1.0)
+    sim._obey({"q": sim.joint_pos, "dq": zeros, "tau": zeros, "kp": kp, "kd": zeros})
+    sim.record.changes.append((0.065, DAMPED))
+    done = program.run(sim, Handset(), 0.04, faults)
+    assert sim.faults == Faults(temperature=95.0, silent=True) and len(done.faults) == 2
+    assert "hot_motor@0.02: its motors damped 45 ms later, and nothing drove them again\nsilent@0.02: its motors" in done.text()

@@ -10,10 +10,11 @@ import mujoco
 import numpy as np
 import pytest
 
-from legged_mw.deploy.contract import ContractRow, read_contract
+from legged_mw.deploy.contract import ContractError, ContractRow, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import RobotError, damped
 from legged_mw.deploy.safety import Limits, Safety
+from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.unitree.client import UnitreeRobot, check_rows
 from legged_mw.deploy.unitree.codec import LAYOUTS, Message
 from legged_mw.deploy.unitree.link import CHECK_MODE, RELEASE_MODE, STAND_DOWN, Received, RobotEnd, Wire
@@ -35,7 +36,7 @@ def test_go2_stands_walks_and_is_damped(domain: int) -> None:
     robot.close()
     both.steps(1.5)
     assert sim.data.qpos[2] < 0.12 and not sim.acted["kp"].any() and np.abs(sim.joint_vel).max() < 1.0
-    assert np.allclose(sim.acted["kd"], damped(both.contract)) and sim.counts.refused == 0
+    assert np.allclose(sim.acted["kd"], damped(both.contract)) and sim.record.refused == 0
 
 
 def test_g1_walks_off_its_hoist(domain: int) -> None:
@@ -129,18 +130,24 @@ def test_a_bias_is_measured_and_not_there(domain: int) -> None:
     assert np.allclose(measured.ang_vel - both.sim.data.qvel[3:6], 0.5, atol=0.05)
 
 
-@pytest.mark.parametrize("fault", ["silent", "corrupt"])
-def test_a_robot_without_good_states_is_none(fault: str, domain: int) -> None:
+@pytest.mark.parametrize(
+    ("fault", "said"),
+    [
+        ("silent", "the newest measurement is 1[0-9]{2} ms old: the robot is silent, or the link is down"),
+        ("bad_crc", "3 states in a row have a wrong checksum: the newest good one is 11[0-9] ms old"),
+    ],
+)
+def test_a_robot_without_good_states_is_none(fault: str, said: str, domain: int) -> None:
     both = pair("go2_flat", domain)
     both.steps(0.05)
     both.robot.read()
     setattr(both.sim.faults, fault, True)
-    both.steps(0.08)
-    both.robot.read()
-    both.steps(0.04)
-    with pytest.raises(RobotError, match="the newest measurement is 1[0-9]{2} ms old: the robot is silent, or the link is down"):
+    for seconds in (0.02, 0.018):
+        both.steps(seconds)
         both.robot.read()
-    assert both.robot.bad_states == (2 if fault == "corrupt" else 0)
+    both.steps(0.08)
+    with pytest.raises(RobotError, match=said):
+        both.robot.read()
 
 
 def test_states_without_a_checksum_are_taken(domain: int) -> None:
@@ -176,6 +183,21 @@ def test_commands(domain: int) -> None:
     with pytest.raises(RobotError, match="targets that are not finite are not sent: q"):
         robot.write(np.full(12, math.nan))
     assert len(owner.sent) == 4
+
+
+def test_a_contract_in_another_order_sends_the_same(domain: int) -> None:
+    """Motors are found by the names of their joints. Names that were only swapped are refused: the sensors of the scene tell."""
+    both = pair("go2_flat", domain)
+    named = ("joints", "default_pose", "stiffness", "damping")
+    backwards = replace(both.contract, **{name: getattr(both.contract, name)[::-1] for name in named})
+    owners, first = [Once(both.sim._state.body) for _ in range(2)], Received(both.sim._state.body, 0.0)
+    robots = [UnitreeRobot(*each, first, clock=lambda: 0.0) for each in zip((both.contract, backwards), owners, strict=True)]
+    robots[0].write(both.contract.default_pose + 0.01 * np.arange(12))
+    robots[1].write((both.contract.default_pose + 0.01 * np.arange(12))[::-1])
+    assert owners[0].sent == owners[1].sent and np.array_equal(robots[0].read().joint_pos, robots[1].read().joint_pos[::-1])
+    said = "joints are in another order than sensors: joint_pos, where jointpos/FL_hip_joint measures FL_hip_joint in the place of RR_calf"
+    with pytest.raises(ContractError, match=said):
+        read_scene(POLICIES / "go2_flat", backwards)
 
 
 def test_targets_are_held_within_what_was_trained(domain: int) -> None:
@@ -216,7 +238,7 @@ def test_the_simulated_robot_obeys_as_a_motor_does(domain: int) -> None:
     low["level_flag"] = 0xEE
     for bad in (wrong.body, low.seal()):
         sim._take(Message(command.layout, bad))
-    assert sim.counts.refused == 2 and not sim.acted["kp"].any()
+    assert sim.record.refused == 2 and not sim.acted["kp"].any()
     sim._take(command)
     both.steps(1.0)
     assert np.allclose(sim.acted["kp"], both.contract.stiffness)
@@ -229,7 +251,7 @@ def test_the_simulated_robot_obeys_as_a_motor_does(domain: int) -> None:
     command.seal()
     sim._take(command)
     sim.step()
-    assert sim.counts.refused == 2 and not sim.torque.any()
+    assert sim.record.refused == 2 and not sim.torque.any()
 
 
 def test_a_watchdog_if_asked_for(domain: int) -> None:
@@ -238,7 +260,7 @@ def test_a_watchdog_if_asked_for(domain: int) -> None:
     both.steps(0.09)
     assert both.sim.acted["kp"].any()
     both.steps(0.03)
-    assert not both.sim.acted["kp"].any() and np.allclose(both.sim.acted["kd"], damped(both.contract)) and both.sim.counts.watchdog == 1
+    assert not both.sim.acted["kp"].any() and np.allclose(both.sim.acted["kd"], damped(both.contract)) and both.sim.record.watchdog == 1
 
 
 # ---- before the first command
@@ -255,9 +277,22 @@ def test_the_wrong_robot(domain: int) -> None:
     folder = POLICIES / "g1_flat"
     sim = SimulatedUnitree(folder, read_contract(folder), RobotEnd("unitree_hg", "lo", domain))
     wire = Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time)
-    with pytest.raises(RobotError, match="the robot there speaks unitree_hg::msg::dds_::LowState_: it is not the contract's"):
+    with pytest.raises(RobotError) as error:
         wire.prepare(seconds=0.5)
-    assert sim.counts.commands == 0
+    assert "the robot there speaks unitree_hg: it is not the contract's. There: g1 has left_hip_pitch_joint, " in str(error.value)
+    assert ". Here: go2 has FR_hip_joint, FR_thigh_joint, " in str(error.value) and "; h1 has right_hip_roll_joint, " in str(error.value)
+    assert sim.record.commands == 0
+
+
+def test_more_motors_than_the_contracts_robot_has(domain: int) -> None:
+    """The same messages, another robot: a Go2 with wheels at 12 to 15, or an H1."""
+    both = pair("go2_flat", domain)
+    state = Message(LAYOUTS["unitree_go", "LowState_"], both.sim._state.body)
+    state["motor_state.q"] = state["motor_state.mode"] = np.arange(20) < 16
+    with pytest.raises(
+        RobotError, match="motors answer at 12, 13, 14, 15, where a go2 has none: it is not the contract's robot. Known are: go2"
+    ):
+        UnitreeRobot(both.contract, Once(b""), Received(state.seal(), 0.0))
 
 
 def test_another_commander(domain: int) -> None:
@@ -292,7 +327,7 @@ def test_a_motion_program_that_does_not_let_go(domain: int) -> None:
     wire = Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time)
     with pytest.raises(RobotError, match="the robot's own program 'ai' does not let go of the motors"):
         wire.prepare()
-    assert sim.counts.commands == 0
+    assert sim.record.commands == 0
 
 
 def test_rows_that_a_robot_does_not_measure() -> None:

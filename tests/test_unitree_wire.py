@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,13 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from legged_mw import ROOT
 from legged_mw.deploy import __main__ as deploy
 from legged_mw.deploy import unitree
 from legged_mw.deploy.contract import read_contract
-from legged_mw.deploy.options import wire_faults
 from legged_mw.deploy.robot import BUTTONS, RobotError
 from legged_mw.deploy.unitree import handset, idl, link
 from legged_mw.deploy.unitree.codec import LAYOUTS, STRUCTS, Message, crc32, fields
+from legged_mw.deploy.unitree.faults import KINDS, Faults, parse_faults
 from legged_mw.deploy.unitree.remote import decode, encode
 from legged_mw.deploy.unitree.robots import G1, GO2, H1, check_body, machine_of, order
 from legged_mw.utils.cli import one_line_errors
@@ -173,7 +175,16 @@ def test_another_robot_is_refused_with_both_lists() -> None:
     assert f"The contract has: {', '.join(joints)}; go2 has: {', '.join(GO2.motors)}" in text
 
 
-@pytest.mark.parametrize(("number", "said"), [(4, "has 23 joints (mode_machine 4), the contract 29"), (77, "has an unknown body")])
+@pytest.mark.parametrize(
+    ("number", "said"),
+    [
+        (
+            4,
+            "has 23 joints (mode_machine 4: no waist_roll_joint, waist_pitch_joint, left_wrist_pitch_joint, left_wrist_yaw_joint, ",
+        ),
+        (77, "has an unknown body (mode_machine 77), the contract 29: left_hip_pitch_joint, "),
+    ],
+)
 def test_another_body_is_refused(number: int, said: str) -> None:
     check_body(G1, 5)
     check_body(GO2, 77)
@@ -221,29 +232,70 @@ def test_a_script_of_the_remote(tmp_path: Path) -> None:
     assert hand.hoist is False
 
 
+JOINTS = ["FL_hip_joint", "FL_calf_joint"]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("dealy=3", "--wire dealy=3: no fault 'dealy' in what a wire can have; did you mean 'delay'"),
-        ("loss=200", "--wire loss=200: loss=200 must be a number from 0 to 100"),
-        ("delay=x", "--wire delay=x: delay=x must be a number from 0 to 1000"),
+        ("dealy=3", "no fault 'dealy' in what a served robot can have; did you mean 'delay'? there are: delay, jitter, loss,"),
+        ("loss=200", "loss is a number from 0 to 100 [%], or off"),
+        ("delay=x", "delay is a number from 0 to 1000 [ms], or off"),
+        ("clock_jump=inf", "clock_jump is a number [s], or off"),
+        ("low_battery=-1", "low_battery is a number from 0 [V], or off"),
+        ("frozen=3", "frozen has no value but off"),
+        ("frozen@soon", "after @ stands when it begins, a number of seconds from 0"),
+        ("motor_fault", "say of which joint, e.g. motor_fault=FL_hip_joint"),
+        ("motor_fault=FL_hip", "no value 'FL_hip' in motor_fault; did you mean 'FL_hip_joint'?"),
+        ("nan=z", "no value 'z' in nan; there are: q, dq, gyroscope, quaternion"),
     ],
 )
-def test_wrong_faults_of_the_wire(text: str, said: str) -> None:
+def test_a_wrong_fault(text: str, said: str) -> None:
     with pytest.raises(UserError) as error:
-        wire_faults(text)
-    assert said in str(error.value)
+        parse_faults([text], JOINTS)
+    assert str(error.value).startswith(f"--fault {text}: {said}") and "\n" not in str(error.value)
 
 
-def test_faults_of_the_wire() -> None:
-    assert wire_faults("delay=10,jitter=2,loss=5") == {"delay_ms": 10.0, "jitter_ms": 2.0, "loss": 0.05}
+def test_faults_on_demand() -> None:
+    """In the order of their times; "off" ends one."""
+    faults, found = (
+        Faults(),
+        parse_faults(["silent@2,silent=off@3", "loss=5,joint_order,motor_fault=FL_calf_joint@1.5", "hot_motor=90"], JOINTS),
+    )
+    assert [(fault.text, fault.time) for fault in found] == [
+        *(
+            ("loss=5", 0),
+            ("joint_order", 0),
+            ("hot_motor=90", 0),
+            ("motor_fault=FL_calf_joint@1.5", 1.5),
+            ("silent@2", 2),
+            ("silent=off@3", 3),
+        )
+    ]
+    for fault in found[:-1]:
+        fault.begin(faults)
+    assert faults == Faults(loss=0.05, joint_order=1, temperature=90.0, dead_motors={"FL_calf_joint"}, silent=True)
+    found[-1].begin(faults)
+    assert not faults.silent
+    page = (ROOT / "docs/faults.md").read_text()
+    assert [name for name in KINDS if f"`{name}" not in page] == []
 
 
-def test_without_the_extra_one_command_installs_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_one_command_installs_it(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(unitree, "find_spec", lambda name: None)
-    with pytest.raises(UserError, match=r"needs cyclonedds: pip install 'legged_mw\[unitree\]'"):
-        unitree.need_dds()
+    for flag in ("--robot", "--serve"):
+        monkeypatch.setattr(sys, "argv", ["legged_mw.deploy", "go2_flat", flag, "unitree", "--interface", "lo"])
+        with pytest.raises(SystemExit, match="2"), one_line_errors("legged_mw.deploy"):
+            deploy.main()
+        error = capsys.readouterr().err
+        assert "Unitree's robots speak DDS, which needs cyclonedds: pip install 'legged_mw[unitree]'\n" in error and error.count("\n") == 1
     assert importlib.util.find_spec("cyclonedds")
+
+
+def test_nothing_of_dds_is_imported_by_the_program() -> None:
+    """Only by who asks for such a robot."""
+    code = "import sys, legged_mw.deploy.__main__; print([name for name in sys.modules if name.partition('.')[0] == 'cyclonedds'])"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout == "[]\n"
 
 
 @pytest.mark.parametrize(
@@ -254,12 +306,16 @@ def test_without_the_extra_one_command_installs_it(monkeypatch: pytest.MonkeyPat
             ("--robot", "unitree"),
             "say on which network the robot is: --interface eth0, or --interface lo for one that --serve simulates here",
         ),
-        (("--robot", "unitree", "--interface", "lo", "--wire", "loss=5"), "--wire is of a robot that is simulated for others: add --serve"),
+        (
+            ("--robot", "unitree", "--interface", "lo", "--fault", "loss=5"),
+            "--fault is of a robot that is simulated for others: add --serve",
+        ),
         (
             ("--serve", "unitree", "--robot", "unitree", "--interface", "lo"),
             "--serve is the robot and --robot drives one: start them as two",
         ),
         (("--serve", "unitree", "--interface", "lo", "--num_envs", "3"), "--num_envs is of simulated robots in this program: leave it out"),
+        (("--serve", "unitree", "--interface", "lo", "--fault", "hot"), "--fault hot: no fault 'hot' in what a served robot can have"),
         (("--serve", "unitree", "--interface", "nowhere"), "no network interface 'nowhere' in this machine"),
     ],
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import gc
 import itertools
@@ -28,9 +29,9 @@ POLICIES = ROOT / "resources" / "policies"
 _next = itertools.count(os.getpid())
 
 
-@pytest.fixture
-def domain() -> Iterator[int]:
-    """Locked while the test runs, and another one for each test: a guard goes on for a second after it has damped."""
+@contextlib.contextmanager
+def locked_domain() -> Iterator[int]:
+    """A domain that is locked meanwhile, and another one each time: a guard goes on for a second after it has damped."""
     for number in (100 + each % 130 for each in itertools.islice(_next, 130)):
         with (Path(tempfile.gettempdir()) / f"legged_mw-dds-{number}").open("w") as file:
             try:
@@ -41,6 +42,13 @@ def domain() -> Iterator[int]:
             gc.collect()  # participants leave with their last reference
             return
     raise RuntimeError("no DDS domain is free")
+
+
+@pytest.fixture
+def domain() -> Iterator[int]:
+    """Of one test."""
+    with locked_domain() as number:
+        yield number
 
 
 class Pair(NamedTuple):

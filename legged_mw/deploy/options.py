@@ -7,20 +7,18 @@ import math
 import sys
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.odometry import CONTACTS
 from legged_mw.deploy.unitree import client
 from legged_mw.deploy.unitree.client import UnitreeRobot
 from legged_mw.deploy.unitree.robots import machine_of
-from legged_mw.utils.errors import UserError, unknown
+from legged_mw.utils.errors import UserError
 
 ROBOTS = ("simulated", "unitree")
 TRUTH, ODOMETRY = "truth", "odometry"
 NO_TRUTH = f"no sensor of a real robot gives it; there is --velocity {ODOMETRY}"
-_WIRE = {"delay": ("delay_ms", 1.0), "jitter": ("jitter_ms", 1.0), "loss": ("loss", 0.01)}  # name -> field of Faults, unit
-_OF_A_ROBOT, _OF_SERVING = ("interface", "domain"), ("remote", "wire", "watchdog")
+_OF_A_ROBOT, _OF_SERVING = ("interface", "domain"), ("remote", "fault", "watchdog")
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
@@ -35,7 +33,8 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--contact", choices=CONTACTS, help=contact)
     served = parser.add_argument_group("with --serve")
     served.add_argument("--remote", metavar="FILE", help="a YAML script of its remote (default: the keys of this terminal)")
-    served.add_argument("--wire", metavar="FAULTS", help="delay=10,jitter=2,loss=5: [ms], [ms] and [%%] of each message, each way")
+    fault = "what goes wrong, and when: delay=10,loss=5 or low_battery@8, again for more (docs/faults.md has them all)"
+    served.add_argument("--fault", action="append", metavar="NAME[=VALUE][@S]", help=fault)
     served.add_argument("--watchdog", type=float, metavar="S", help="it damps after S seconds without a command (default: never)")
 
 
@@ -65,28 +64,13 @@ def check_flags(args: argparse.Namespace) -> None:
         raise UserError(f"--{others[0]} is of simulated robots in this program: leave it out")
 
 
-def wire_faults(text: str | None) -> dict[str, Any]:
-    """The fields of ``Faults`` that --wire states. Raises UserError."""
-    found = {}
-    for part in text.split(",") if text else []:
-        name, _, value = part.partition("=")
-        if name not in _WIRE:
-            raise UserError(f"--wire {text}: {unknown('fault', name, _WIRE, 'what a wire can have')}")
-        field, unit = _WIRE[name]
-        try:
-            found[field] = float(value) * unit
-        except ValueError:
-            found[field] = math.nan
-        if not 0.0 <= found[field] <= (1.0 if name == "loss" else 1000.0):
-            raise UserError(f"--wire {text}: {name}={value} must be a number from 0 to {100 if name == 'loss' else 1000}")
-    return found
-
-
 def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
     """A simulated robot on the wire."""
-    from legged_mw.deploy.unitree import handset, need_dds, program, serve
+    from legged_mw.deploy.unitree import handset, need_dds, program
+    from legged_mw.deploy.unitree.faults import parse_faults
 
     need_dds()
+    faults = parse_faults(args.fault or [], contract.joints)
     script, keys = handset.load_remote(Path(args.remote)) if args.remote else [], args.remote is None and sys.stdin.isatty()
     if keys:
         print(handset.KEYS_HELP)
@@ -95,7 +79,7 @@ def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
             *(folder, contract, args.interface, args.domain),
             seconds=args.time or math.inf,
             handset=hand,
-            faults=serve.Faults(**wire_faults(args.wire)),
+            faults=faults,
             watchdog=args.watchdog or math.inf,
         )
     print(served.text())

@@ -143,13 +143,13 @@ class _Step:
         stop = self.states.listen(health, loop.now) if self.states else None
         if measured is None or stop:
             return measured, health, stop or trip
-        if self.controller.contract.ends.tilted(measured.gravity) or self.robot.fell():
-            if not self.states:
-                self.summary.fell = loop.now
-            elif self.states.state == POLICY:
-                return measured, health, Trip("fall", "the robot fell")
+        fell = self.controller.contract.ends.tilted(measured.gravity) or self.robot.fell()
+        if fell and not self.states:
+            self.summary.fell = loop.now
         if self.states is None or self.states.armed:
             trip = self.safety.sensed(measured, health, loop.now, loop.behind)
+        if fell and self.states and self.states.state == POLICY:
+            trip = trip or Trip("fall", "the robot fell")
         return measured, health, trip
 
     def _decide(self, measured: Measurement, now: float) -> Order:

@@ -111,10 +111,13 @@ def _value(name: str, value: Any, where: str) -> float:
 
 
 def _of_scene(folder: Path, contract: Contract) -> Limits:
-    """Ranges and torques of the export's scene; what it does not limit is without limit."""
     import mujoco
 
-    model = mujoco.MjSpec.from_file(str(folder / SCENE_FILE)).compile()
+    return limits_of(mujoco.MjSpec.from_file(str(folder / SCENE_FILE)).compile(), contract)
+
+
+def limits_of(model: Any, contract: Contract) -> Limits:
+    """Ranges and torques of the export's scene, compiled; what it does not limit is without limit."""
     joints = [model.joint(name).id for name in contract.joints]
     servos = [model.actuator(name).id for name in contract.joints]
     low, high = np.where(model.jnt_limited[joints, None] > 0, model.jnt_range[joints], [-OFF, OFF]).T
@@ -189,6 +192,8 @@ class Safety:
 
     def _fresh(self, measured: Measurement, health: Health) -> Trip | None:
         age, most = health.age_s, self.limits.age * self.contract.period
+        if age is not None and age < -most:
+            return Trip("age", f"the newest measurement comes from {-1e3 * age:.0f} ms ahead: a clock went back")
         if age is not None and not age <= most:
             return Trip("age", f"the newest measurement is {1e3 * age:.0f} ms old, more than {1e3 * most:.0f}")
         seen = measured.joint_pos.tobytes() + measured.joint_vel.tobytes() + measured.ang_vel.tobytes()

@@ -282,6 +282,7 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
         if len(places[name]) != size:
             raise ContractError(f"{file}: the sensors of '{name}' ({', '.join(sensors)}) have {len(places[name])} values, not {size}")
     feet = [_places(model, file, names, foot) for foot, names in contract.feet.items()]
+    _check_order(model, contract)
     return Scene(spec, model, np.array(actuators), model.jnt_dofadr[joints], places, feet)
 
 
@@ -307,6 +308,17 @@ def _places(model: mujoco.MjModel, file: str, sensors: Sequence[str], what: str)
             raise ContractError(f"{CONTRACT_FILE}: sensors of '{what}': {unknown('sensor', name, _names(model, 'sensor'), file)}")
         spans.append(np.arange(model.sensor_adr[index], model.sensor_adr[index] + model.sensor_dim[index]))
     return np.concatenate(spans)
+
+
+def _check_order(model: mujoco.MjModel, contract: Contract) -> None:
+    """The sensors of the joints measure them in the contract's order."""
+    for name, sensors in ((name, contract.sensors[name]) for name in ("joint_pos", "joint_vel")):
+        for joint, sensor in zip(contract.joints, sensors, strict=True):
+            if (found := model.joint(int(model.sensor(sensor).objid[0])).name) != joint:
+                raise ContractError(
+                    f"{CONTRACT_FILE}: joints are in another order than sensors: {name}, where {sensor} measures {found} "
+                    f"in the place of {joint}; export the policy again"
+                )
 
 
 def _check_machine(model: mujoco.MjModel, file: str, contract: Contract, joints: Sequence[int], actuators: Sequence[int]) -> None:

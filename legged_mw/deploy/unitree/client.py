@@ -5,7 +5,6 @@ Motors are found by the names of their joints. Services that must be called befo
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,13 +16,14 @@ from legged_mw.deploy.motion import ATTITUDE, PLACE
 from legged_mw.deploy.odometry import ROW
 from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError, damped
 from legged_mw.deploy.simulated import read_scene
-from legged_mw.deploy.unitree import need_dds
+from legged_mw.deploy.unitree import clock, need_dds
 from legged_mw.deploy.unitree.codec import LAYOUTS, Message
 from legged_mw.deploy.unitree.remote import decode
-from legged_mw.deploy.unitree.robots import Machine, check_body, machine_of, order
+from legged_mw.deploy.unitree.robots import Machine, check_body, check_slots, machine_of, order
 
 TOO_OLD = 0.1  # [s] ours: a measurement older than this is none
 TOUCH = 20  # foot_force from which a foot touches the ground, in the robot's own unit; ours
+_WRAP = 2**32 / 1000  # [s] after which a robot's tick begins at 0 again
 LOST = 5  # messages that a motor may lose between two looks; ours
 _MEASURED = ("ang_vel", "gravity", "joint_pos", "joint_vel", "joint_torque", "acceleration")
 
@@ -83,7 +83,7 @@ class UnitreeRobot(Robot):
         *,
         echo: bool = False,
         odometry: bool = False,
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = clock,
     ) -> None:
         """``first``: the state that the robot sent last. ``echo``: commands name the state that they answer, for a simulated robot.
         ``odometry``: the velocity is estimated from what it measures.
@@ -98,9 +98,11 @@ class UnitreeRobot(Robot):
         self._state, self._stamp, self._open = self._decoded(first.body), first.stamp, True
         self.report = ""  # after `close`: latencies of the wire
         check_body(self.machine, self._mode_machine)
+        self._body = self._mode_machine
+        check_slots(self.machine, (self._state["motor_state.q"] != 0.0) & (self._state["motor_state.mode"] != 0))
         self._default = contract.stiffness, contract.damping
         self._lost = self._state["motor_state.lost"].astype(int) if self.machine.package == "unitree_go" else None
-        self.bad_states = 0  # with a wrong checksum, which are left out
+        self._left_out = 0  # states since the last good one
         owner.arm(self._command(kd=damped(contract)))
 
     @property
@@ -112,7 +114,10 @@ class UnitreeRobot(Robot):
 
     def read(self) -> Measurement:
         self._listen()
-        if (age := self._clock() - self._stamp) > TOO_OLD:
+        age = self._clock() - self._stamp
+        if self._left_out and age > 2 * self.contract.period:
+            raise RobotError(f"{self._left_out} states in a row have a wrong checksum: the newest good one is {1000 * age:.0f} ms old")
+        if age > TOO_OLD:
             raise RobotError(f"the newest measurement is {1000 * age:.0f} ms old: the robot is silent, or the link is down")
         state, slots = self._state, self._slots
         w, x, y, z = (float(value) for value in state["imu_state.quaternion"])
@@ -169,14 +174,19 @@ class UnitreeRobot(Robot):
         )
 
     def _listen(self) -> None:
-        """Take the newest state, if it is whole. Simulators that set no checksum send 0."""
+        """Take the newest state, if it is whole, and of the same robot. Simulators that set no checksum, or no tick, send 0 there."""
         if not (received := self._owner.receive()):
             return
         state = self._decoded(received.body)
         if state["crc"] != 0 and not state.intact():
-            self.bad_states += 1
+            self._left_out += 1
             return
-        self._state, self._stamp = state, received.stamp
+        back = (int(self._state["tick"]) - int(state["tick"])) / 1000
+        if TOO_OLD < back < _WRAP / 2:
+            raise RobotError(f"the robot's clock went back by {back:.1f} s: it was started again, or two robots answer")
+        self._state, self._stamp, self._left_out = state, received.stamp, 0
+        if (body := self._mode_machine) != self._body:
+            raise RobotError(f"mode_machine was {self._body} and is {body}: the robot has another body, or two robots answer")
 
     def _command(self, **parts: Floats) -> bytes:
         """A sealed command: ``parts`` (D,) of the joints, zero where not given."""
@@ -217,14 +227,15 @@ def check_rows(contract: Contract, machine: Machine, odometry: bool = False) -> 
 def connect(folder: Path, contract: Contract, interface: str, domain: int | None = None, odometry: bool = False) -> UnitreeRobot:
     """The robot on a network interface, its wire owned by a guard process. Raises RobotError with what is wrong."""
     need_dds()
-    from legged_mw.deploy.unitree.guard import Guarded
+    from legged_mw.deploy.unitree.guard import LATE, Guarded
     from legged_mw.deploy.unitree.link import LOOPBACK, default_domain
 
     machine = machine_of(contract.joints)
     check_rows(contract, machine, odometry)
     read_scene(folder, contract)  # a scene that is not the contract's is refused before anything is sent
     domain = default_domain(interface) if domain is None else domain
-    owner = Guarded(machine.package, interface, domain, lies_down=machine.lies_down)
+    late = max(LATE, 1.5 * contract.period)  # a policy may be slow
+    owner = Guarded.start(machine.package, interface, domain, lies_down=machine.lies_down, late=late)
     try:
         return UnitreeRobot(contract, owner, owner.first, echo=interface in LOOPBACK, odometry=odometry)
     except BaseException:

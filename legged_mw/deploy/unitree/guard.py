@@ -19,15 +19,17 @@ import struct
 import subprocess
 import sys
 import tempfile
-import time
 from collections import deque
+from collections.abc import Callable
 from typing import Any
 
 from legged_mw.deploy.loop import Spread, real_time
 from legged_mw.deploy.robot import RobotError
+from legged_mw.deploy.unitree import clock
 from legged_mw.deploy.unitree.codec import LAYOUTS
 
-LATE = 0.06  # [s] ours: three periods at 50 Hz without a command. With what it takes to notice, joints are damped within 100 ms
+LATE = 0.06  # [s] ours: three periods at 50 Hz without a command; docs/faults.md has what the joints then take to be damped
+STILL = 0.1  # [s] ours, between two looks at the wire: this computer slept, or the guard was stopped
 REPEAT = 0.002  # [s] between two messages to the robot [unitree_sdk2's examples]
 AFTER = 1.0  # [s] ours: how long damping is sent before the wire is let go
 START = 60.0  # [s] for a guard to find the robot
@@ -71,27 +73,9 @@ class Board:
 class Guarded:
     """The wire as the policy's process sees it, through a guard (see ``client.Owner``)."""
 
-    def __init__(
-        self, package: str, interface: str, domain: int, *, lies_down: bool = False, late: float = LATE, find: float = 5.0
-    ) -> None:
-        """Start a guard, which takes the robot over (``lies_down`` as in ``link.Wire.prepare``).
-
-        ``find``: [s] to wait for the robot's first state. Raises RobotError with the guard's error.
-        """
-        size = LAYOUTS[package, "LowState_"].size
-        with tempfile.TemporaryFile() as file:
-            file.truncate(_BOARD.size + size)
-            self._board = Board(file.fileno(), size)
-            self._channel, theirs = socket.socketpair()
-            with theirs:
-                settings = {"package": package, "interface": interface, "domain": domain, "late": late, "find": find}
-                settings |= {"lies_down": lies_down, "channel": theirs.fileno(), "board": file.fileno()}
-                program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
-                self.process = subprocess.Popen(
-                    [sys.executable, "-c", program, json.dumps(settings)],
-                    pass_fds=(theirs.fileno(), file.fileno()),
-                    start_new_session=True,  # a Ctrl-C in the terminal is not for the guard
-                )
+    def __init__(self, channel: socket.socket, board: Board, process: subprocess.Popen[bytes] | None = None) -> None:
+        """Of a guard at the other end of ``channel``; raises RobotError with its error if it does not take the robot over."""
+        self._channel, self._board, self.process = channel, board, process
         self._channel.settimeout(START)
         said = self._answer()
         if "error" in said or not said:
@@ -100,6 +84,27 @@ class Guarded:
         self._channel.settimeout(0.5)
         self._last = 0.0
         self.first = self.receive()
+
+    @classmethod
+    def start(cls, package: str, interface: str, domain: int, *, lies_down: bool = False, late: float = LATE, find: float = 5.0) -> Guarded:
+        """Start a guard, which takes the robot over (``lies_down`` as in ``link.Wire.prepare``).
+
+        ``find``: [s] to wait for the robot's first state. Raises RobotError with the guard's error.
+        """
+        size = LAYOUTS[package, "LowState_"].size
+        with tempfile.TemporaryFile() as file:
+            file.truncate(_BOARD.size + size)
+            board, (channel, theirs) = Board(file.fileno(), size), socket.socketpair()
+            with theirs:
+                settings = {"package": package, "interface": interface, "domain": domain, "late": late, "find": find}
+                settings |= {"lies_down": lies_down, "channel": theirs.fileno(), "board": file.fileno()}
+                program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
+                process = subprocess.Popen(
+                    [sys.executable, "-c", program, json.dumps(settings)],
+                    pass_fds=(theirs.fileno(), file.fileno()),
+                    start_new_session=True,  # a Ctrl-C in the terminal is not for the guard
+                )
+        return cls(channel, board, process)
 
     def receive(self) -> Any:
         from legged_mw.deploy.unitree.link import Received
@@ -128,8 +133,9 @@ class Guarded:
                     self._channel.settimeout(AFTER + 2.0)
                     said = self._answer()
             self._channel.close()
-        with contextlib.suppress(subprocess.TimeoutExpired):
-            self.process.wait(AFTER + 2.0)
+        if self.process:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                self.process.wait(AFTER + 2.0)
         return said.get("report", "")
 
     def _put(self, kind: int, stamp: float, body: bytes) -> None:
@@ -155,12 +161,14 @@ class Guarded:
 class Guard:
     """The loop of the guard's process."""
 
-    def __init__(self, wire: Any, channel: socket.socket, board: Board, package: str, late: float) -> None:
-        self.wire, self.channel, self.board, self.late = wire, channel, board, late
+    def __init__(
+        self, wire: Any, channel: socket.socket, board: Board, package: str, late: float = LATE, clock: Callable[[], float] = clock
+    ) -> None:
+        self.wire, self.channel, self.board, self.late, self.clock = wire, channel, board, late, clock
         self._size = _FRAME.size + LAYOUTS[package, "LowCmd_"].size
         self._buffer, self._latencies = b"", deque[float](maxlen=1 << 16)
         self._command, self._damping = b"", b""  # the command that is repeated; the one that replaces it after a trip
-        self._moving, self._heard, self._until = False, 0.0, float("inf")
+        self._moving, self._heard, self._until, self._due, self._looked = False, 0.0, float("inf"), 0.0, float("inf")
         self.tripped, self._stopped = "", False
         channel.setblocking(False)
 
@@ -170,23 +178,29 @@ class Guard:
 
     def run(self) -> None:
         """Run until AFTER [s] from the last command, from the end of the policy's process, or from `stop`."""
-        due = time.monotonic()
-        while time.monotonic() < self._until:
+        while self.clock() < self._until:
             select.select([self.channel] if self.channel.fileno() >= 0 else [], [], [], _TURN)
-            now = time.monotonic()
-            self._hear(now)
-            if state := self.wire.receive():
-                self.board.put(state.body, state.stamp)
-            if self._moving and now - self._heard > self.late:
-                self.trip(f"no targets for {1000 * (now - self._heard):.0f} ms: the policy's process hangs or is late")
-            if self._command and self.wire.other_commander():
-                self.trip("another program sends commands to this robot, too")
-            if self._stopped:
-                self.trip("the guard was stopped (SIGTERM)")
-                self._until = min(self._until, now + AFTER)
-            if self._command and now >= due:
-                self.wire.send(self._command)
-                due = now + REPEAT
+            self.turn()
+
+    def turn(self) -> None:
+        """One look at both sides."""
+        now = self.clock()
+        still, self._looked = now - self._looked, now
+        if self._moving and still > STILL:
+            self.trip(f"nothing was sent for {1000 * still:.0f} ms: the guard stood still, or this computer slept")
+        self._hear(now)
+        if state := self.wire.receive():
+            self.board.put(state.body, state.stamp)
+        if self._moving and now - self._heard > self.late:
+            self.trip(f"no targets for {1000 * (now - self._heard):.0f} ms: the policy's process hangs or is late")
+        if self._command and self.wire.other_commander():
+            self.trip("another program sends commands to this robot, too")
+        if self._stopped:
+            self.trip("the guard was stopped (SIGTERM)")
+            self._until = min(self._until, now + AFTER)
+        if self._command and now >= self._due:
+            self.wire.send(self._command)
+            self._due = now + REPEAT
 
     def _hear(self, now: float) -> None:
         """Take what the policy's process sent; the newest command counts."""
@@ -220,7 +234,7 @@ class Guard:
             self._command, self._moving, self._heard = body, kind == MOVE, now
             self.wire.send(body)
             if kind == MOVE:
-                self._latencies.append(time.monotonic() - stamp)
+                self._latencies.append(self.clock() - stamp)
 
     def trip(self, why: str) -> None:
         """Damp from now on, and say why; the first reason counts."""

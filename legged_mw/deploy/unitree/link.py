@@ -18,8 +18,10 @@ from cyclonedds.sub import DataReader
 from cyclonedds.topic import Topic
 
 from legged_mw.deploy.robot import RobotError
+from legged_mw.deploy.unitree import clock
 from legged_mw.deploy.unitree.codec import LAYOUTS
 from legged_mw.deploy.unitree.idl import RAW, TYPES, wrong_hash
+from legged_mw.deploy.unitree.robots import known_motors
 from legged_mw.utils.errors import unknown
 
 COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
@@ -97,7 +99,7 @@ class Received(NamedTuple):
     """One message, and when it came."""
 
     body: bytes
-    stamp: float  # [s] of time.monotonic, which all processes of a machine share
+    stamp: float  # [s] of `unitree.clock`
 
 
 class Wire:
@@ -109,7 +111,7 @@ class Wire:
         interface: str,
         domain: int,
         wait: Callable[[], None] = lambda: time.sleep(0.001),
-        clock: Callable[[], float] = time.monotonic,
+        clock: Callable[[], float] = clock,
     ) -> None:
         """``wait`` passes a moment while nothing comes. In one process with a simulated robot, that moves on there, by its own clock."""
         self.package, self._wait, self.clock = package, wait, clock
@@ -162,9 +164,10 @@ class Wire:
         """Why no state came."""
         text = f"no robot: no {STATES} of {self.package} in {self._where} within {seconds:g} s"
         seen = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
-        kinds = sorted({s.type_name for s in seen.take(100) if s and s.topic_name == STATES and not s.type_name.startswith(self.package)})
+        kinds = sorted({s.type_name.partition("::")[0] for s in seen.take(100) if s and s.topic_name == STATES} - {self.package})
         if kinds:
-            return f"{text}; the robot there speaks {', '.join(kinds)}: it is not the contract's"
+            there, here = "; ".join(known_motors(kind) for kind in kinds), known_motors(self.package)
+            return f"{text}; the robot there speaks {', '.join(kinds)}: it is not the contract's. There: {there}. Here: {here}"
         return f"{text}; is it on, is this the right network interface, and can it be pinged (192.168.123.161)?"
 
     def _release(self, lies_down: bool, tries: int = 8) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,9 +14,10 @@ import numpy as np
 from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.loop import Spread, real_time
 from legged_mw.deploy.unitree import need_dds
+from legged_mw.deploy.unitree.faults import Fault
 from legged_mw.deploy.unitree.handset import Handset
 from legged_mw.deploy.unitree.robots import machine_of
-from legged_mw.deploy.unitree.serve import STEP, Counts, Faults, SimulatedUnitree
+from legged_mw.deploy.unitree.serve import STEP, Record, SimulatedUnitree
 
 BEHIND = 0.1  # [s] by which the simulation may be late before it gives the time up
 PRIORITY = 10  # ours, of a real-time process: below those of a policy
@@ -30,19 +32,25 @@ class Served:
     wall: float  # [s]
     upright: float  # cosine of its largest tilt while its servos were on
     latencies: list[float]  # [s] from a state that it sent to the first command that answers it
-    counts: Counts
     place: tuple[float, float, float]  # [m] of the root at the end
+    record: Record
+    faults: Sequence[Fault]  # that have begun
 
     def text(self) -> str:
-        counts = self.counts
-        lines = [f"{self.seconds:.1f} s simulated in {self.wall:.1f} s; {counts.commands} commands taken, {counts.refused} refused"]
+        record = self.record
+        lines = [f"{self.seconds:.1f} s simulated in {self.wall:.1f} s; {record.commands} commands taken, {record.refused} refused"]
+        for fault in self.faults:
+            if (after := record.damped_after(fault.time)) is not None:
+                lines.append(f"{fault.text}: its motors damped {1000 * after:.0f} ms later, and nothing drove them again")
         if self.latencies:
             lines.append(f"from a state to the first command that answers it: {Spread.of(self.latencies)}")
-        if counts.watchdog:
-            lines.append(f"the watchdog damped it {counts.watchdog} times")
+        if record.watchdog:
+            lines.append(f"the watchdog damped it {record.watchdog} times")
         tilt = math.degrees(math.acos(min(1.0, self.upright)))
         fell, (x, y, z) = self.upright < UPRIGHT, self.place
         how = "it fell while its servos were on" if fell else f"with its servos on at most {tilt:.0f} degrees from upright"
+        if record.beyond:
+            lines.append(f"a joint was {record.beyond:.3f} rad beyond its range at most")
         lines.append(f"{how}; at the end at {x:.1f}, {y:.1f} m, {z:.2f} m high")
         return "\n".join(lines)
 
@@ -66,18 +74,21 @@ class Latency:
             self._sent = {sent: when for sent, when in self._sent.items() if sent > tick}
 
 
-def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf) -> Served:
-    """Step the robot in real time, its remote held by ``handset``. Ctrl-C ends it."""
+def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf, faults: Sequence[Fault] = ()) -> Served:
+    """Step the robot in real time, its remote held by ``handset``; ``faults`` in the order of their times. Ctrl-C ends it."""
     latency, upright = Latency(), 1.0
     gc.collect()
     gc.freeze()
     gc.disable()
     began = start = time.monotonic()
-    steps = 0
+    steps = begun = 0
     try:
         while sim.time < seconds - 1e-9:
             sim.remote = handset.state(sim.time)
             sim.hoist = sim.hoist if handset.hoist is None else handset.hoist
+            while begun < len(faults) and faults[begun].time <= sim.time + 1e-9:
+                faults[begun].begin(sim.faults)
+                begun += 1
             sim.step()
             latency.watch(sim)
             if sim.acted["kp"].any():
@@ -95,7 +106,7 @@ def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf) -> S
         gc.enable()
         handset.close()
     x, y, z = (float(value) for value in sim.data.qpos[:3])
-    return Served(sim.time, time.monotonic() - began, upright, latency.seconds, sim.counts, (x, y, z))
+    return Served(sim.time, time.monotonic() - began, upright, latency.seconds, (x, y, z), sim.record, faults[:begun])
 
 
 def serve(
@@ -106,7 +117,7 @@ def serve(
     *,
     seconds: float = math.inf,
     handset: Handset | None = None,
-    faults: Faults | None = None,
+    faults: Sequence[Fault] = (),
     watchdog: float = math.inf,
 ) -> Served:
     """A simulated robot of the export on a network interface."""
@@ -117,7 +128,7 @@ def serve(
     domain = default_domain(interface) if domain is None else domain
     machine = machine_of(contract.joints)
     end = RobotEnd(machine.package, interface, domain)
-    sim = SimulatedUnitree(folder, contract, end, faults=faults, watchdog=watchdog)
+    sim = SimulatedUnitree(folder, contract, end, watchdog=watchdog)
     how = "on a hoist" if sim.hoist else "on the ground"
     print(f"a simulated {machine.name}, limp, {how}, in domain {domain} on {interface}; Ctrl-C ends it", flush=True)
-    return run(sim, handset or Handset(), seconds)
+    return run(sim, handset or Handset(), seconds, faults)

@@ -71,6 +71,7 @@ H1 = Machine(
     modes={i: 0x0A if i < 10 else 0x01 for i in range(20)},  # strong motors, then weak ones
 )
 MACHINES = {machine.name: machine for machine in (GO2, G1, H1)}
+_LACKS = {23: (13, 14, 20, 21, 27, 28)}  # slots without a motor in a G1 of so many joints [unitree_sdk2's example]
 BODIES = {1: 23, 4: 23, 2: 29, 3: 29, 5: 29, 6: 29, 9: 14}  # joints of a G1 by mode_machine [unitree_rl_lab]
 
 
@@ -93,11 +94,30 @@ def order(machine: Machine, joints: Sequence[str]) -> np.ndarray:
     return np.array([machine.motors[name] for name in joints])
 
 
+def known_motors(package: str) -> str:
+    """The robots that speak ``package``, and the joints of each."""
+    return "; ".join(f"{m.name} has {', '.join(m.motors)}" for m in MACHINES.values() if m.package == package) or f"{package} is not known"
+
+
+def check_slots(machine: Machine, answers: np.ndarray) -> None:
+    """Refuse a robot with motors that answer (slots,) where this one has none: an H1 by a Go2's contract. Raises RobotError.
+
+    Fewer motors are not noticed: not all simulators set all that a motor answers.
+    """
+    if machine.package == "unitree_go" and (more := sorted({*np.flatnonzero(answers).tolist()} - {*machine.motors.values()})):
+        raise RobotError(
+            f"motors answer at {', '.join(map(str, more))}, where a {machine.name} has none: it is not the contract's robot. "
+            f"Known are: {known_motors(machine.package)}"
+        )
+
+
 def check_body(machine: Machine, mode_machine: int) -> None:
     """Refuse a G1 with other motors than the contract's; a simulation that sets no mode_machine sends 0. Raises RobotError."""
     if machine is G1 and mode_machine and BODIES.get(mode_machine) != len(machine.motors):
-        has = f"{BODIES[mode_machine]} joints" if mode_machine in BODIES else "an unknown body"
+        count = BODIES.get(mode_machine)
+        has = f"{count} joints" if count else "an unknown body"
+        lacks = ", ".join(name for name, slot in machine.motors.items() if slot in _LACKS.get(count or 0, ()))
         raise RobotError(
-            f"this {machine.name} has {has} (mode_machine {mode_machine}), the contract {len(machine.motors)}: "
-            f"{', '.join(machine.motors)}; use a policy of its own"
+            f"this {machine.name} has {has} (mode_machine {mode_machine}{f': no {lacks}' if lacks else ''}), "
+            f"the contract {len(machine.motors)}: {', '.join(machine.motors)}; use a policy of its own"
         )

@@ -8,8 +8,8 @@ Without a watchdog, as on a robot, the last command holds for ever.
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-import heapq
 import math
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,8 +20,10 @@ import numpy as np
 
 from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.robot import Floats, damped
+from legged_mw.deploy.safety import limits_of
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.unitree.codec import LAYOUTS, Message
+from legged_mw.deploy.unitree.faults import NAN, Faults, Line
 from legged_mw.deploy.unitree.remote import encode
 from legged_mw.deploy.unitree.robots import Machine, machine_of, order
 
@@ -36,52 +38,34 @@ _FAULT = 0x1  # motorstate of a motor with a fault
 _HOIST, _HOIST_DAMPING, _LOWERING = 12.0, 1.2, 1.0  # [weights/m], [weights s/m], [s] ours: a soft rope and how long it gives way
 
 
-@dataclass
-class Faults:
-    """What is wrong with the wire and the robot; may change at any time."""
-
-    delay_ms: float = 0.0  # of every message, each way
-    jitter_ms: float = 0.0  # standard deviation of the delay
-    loss: float = 0.0  # share of messages that are lost
-    joint_bias: Floats | float = 0.0  # (D,) [rad] added to measured angles
-    gyro_bias: Floats | float = 0.0  # (3,) [rad/s]
-    dead_motors: set[str] = field(default_factory=set)  # joints whose motors give no torque and say so
-    temperature: float = 35.0  # [deg C] of every motor
-    voltage: float | None = None  # [V]; None: of a full battery
-    frozen: bool = False  # the same state again and again
-    silent: bool = False  # no states
-    corrupt: bool = False  # states with a wrong checksum
-    no_remote: bool = False  # the remote is off: 40 zeros
-
-
-class _Line:
-    """One direction of the wire: messages come out when their time has come, late, in another order, or never."""
-
-    def __init__(self, faults: Faults, rng: np.random.Generator) -> None:
-        self._faults, self._rng, self._queue, self._count = faults, rng, list[tuple[float, int, bytes]](), 0
-
-    def put(self, now: float, body: bytes) -> None:
-        faults = self._faults
-        if faults.loss and self._rng.random() < faults.loss:
-            return
-        delay = max(0.0, faults.delay_ms + (faults.jitter_ms * self._rng.standard_normal() if faults.jitter_ms else 0.0))
-        self._count += 1
-        heapq.heappush(self._queue, (now + delay / 1000, self._count, body))
-
-    def due(self, now: float) -> list[bytes]:
-        out = []
-        while self._queue and self._queue[0][0] <= now + 1e-9:
-            out.append(heapq.heappop(self._queue)[2])
-        return out
+LIMP, DAMPED, DRIVEN = "limp", "damped", "driven"  # what motors do: nothing, damping alone, more
 
 
 @dataclass
-class Counts:
-    """What a simulated robot saw."""
+class Record:
+    """What a simulated robot was told and did, by its own clock."""
 
     commands: int = 0
     refused: int = 0  # commands with a wrong checksum, head or mode_machine
     watchdog: int = 0  # times that it damped by itself
+    changes: deque[tuple[float, str]] = field(default_factory=lambda: deque([(0.0, LIMP)], maxlen=1000))  # [s], from when on they do what
+    beyond: float = 0.0  # [rad] by which a joint was outside its range at most
+    fastest: float = 0.0  # [rad/s] of a joint at most
+    outside: float = 0.0  # [rad] by which a target was outside its servo's range at most
+    asked: float = 0.0  # [share of what its motor has] that a command asked for at most
+
+    def drive(self, time: float, acted: dict[str, Floats]) -> None:
+        """The motors obey ``acted`` (D,) each from ``time`` [s] on."""
+        driven = acted["kp"].any() or acted["tau"].any()
+        what = DRIVEN if driven else DAMPED if acted["kd"].all() else LIMP
+        if what != self.changes[-1][1]:
+            self.changes.append((time, what))
+
+    def damped_after(self, time: float) -> float | None:
+        """[s] from ``time`` until the motors damped and did nothing else from then on; None: they do not, or did not drive then."""
+        before = next((what for since, what in reversed(self.changes) if since < time), LIMP)
+        since, what = self.changes[-1]
+        return since - time if before == DRIVEN and what == DAMPED and since >= time else None
 
 
 class SimulatedUnitree:
@@ -103,27 +87,25 @@ class SimulatedUnitree:
         ``watchdog``: seconds without a command until it damps by itself.
         """
         self.machine: Machine = machine_of(contract.joints)
-        self.contract, self.end, self.faults, self.counts, self._watchdog = contract, end, faults or Faults(), Counts(), watchdog
+        self.contract, self.end, self.faults, self.record, self._watchdog = contract, end, faults or Faults(), Record(), watchdog
         self._scene = read_scene(folder, contract, whole=True)
         self.model, self._rng = self._scene.model, np.random.default_rng(seed)
+        self._limits = limits_of(self.model, contract)
         self._make_motors()
-        self.data = mujoco.MjData(self.model)
+        self.data, self.remote = mujoco.MjData(self.model), encode()
+        self._slots, self._state = order(self.machine, contract.joints), Message(LAYOUTS[self.machine.package, "LowState_"])
         self.reset()
         self._height, self._weight = float(self.data.qpos[2]), 9.81 * float(self.model.body_subtreemass[1])
         self.hoist = len(contract.feet) < 4 if hoist is None else hoist
         self._rope = 1.0 if self.hoist else 0.0  # share of the rope's force that is left
-        self._slots = order(self.machine, contract.joints)
-        self._in, self._out = _Line(self.faults, self._rng), _Line(self.faults, self._rng)
-        self._state = Message(LAYOUTS[self.machine.package, "LowState_"])
-        self.remote = encode()
-        self.command: Message | None = None  # the last one that was taken
-        self.acted = dict.fromkeys(_PARTS, np.zeros(len(contract.joints)))  # (D,) what the motors obey
-        self._last = -math.inf
         self._fill()
 
     def reset(self, after: float = 0.0) -> None:
-        """Put it into its first keyframe, ``after`` seconds from now: its clock goes on."""
+        """Put it into its first keyframe, limp, ``after`` seconds from now, nothing under way to it: its clock and its record go on."""
         time = self.time + after
+        self._in, self._out, self._last = Line(self._rng), Line(self._rng), -math.inf
+        self.command: Message | None = None  # the last one that was taken
+        self.acted = dict.fromkeys(_PARTS, np.zeros(len(self.contract.joints)))  # (D,) what the motors obey
         mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
         self.data.time = time
         mujoco.mj_step1(self.model, self.data)
@@ -174,18 +156,20 @@ class SimulatedUnitree:
         if not self.faults.frozen:
             self._fill()
         if not self.faults.silent:
-            self._out.put(self.time, self._state.body)
+            self._out.put(self.time, self._state.body, self.faults)
         for body in self._out.due(self.time):
             self.end.send(body)
         self.end.answer()
         if body := self.end.receive():
-            self._in.put(self.time, body)
+            self._in.put(self.time, body, self.faults)
         for body in self._in.due(self.time):
             self._take(Message(LAYOUTS[self.machine.package, "LowCmd_"], body))
         self._move()
         self._pull()
         mujoco.mj_step2(self.model, self.data)
         mujoco.mj_step1(self.model, self.data)
+        self.record.beyond = max(self.record.beyond, _outside(self.joint_pos, self._limits.low, self._limits.high))
+        self.record.fastest = max(self.record.fastest, float(np.abs(self.joint_vel).max()))
 
     def _take(self, command: Message) -> None:
         """Obey a command from now on, if it is one."""
@@ -194,22 +178,40 @@ class SimulatedUnitree:
         else:
             fits = command["mode_machine"] == self._state["mode_machine"]
         if not fits or not command.intact():
-            self.counts.refused += 1
+            self.record.refused += 1
             return
-        on = command["motor_cmd.mode"][self._slots] != 0
-        self.acted = {name: np.where(on, command[f"motor_cmd.{name}"][self._slots], 0.0) for name in _PARTS}
-        self.acted["kp"][np.abs(self.acted["q"]) >= POSITION_STOP / 2] = 0.0
-        self.acted["kd"][np.abs(self.acted["dq"]) >= VELOCITY_STOP / 2] = 0.0
+        slots, signs = self._plugs()
+        on, signs = command["motor_cmd.mode"][slots] != 0, {"q": signs, "dq": signs, "tau": signs}
+        acted = {name: np.where(on, command[f"motor_cmd.{name}"][slots] * signs.get(name, 1.0), 0.0) for name in _PARTS}
+        acted["kp"][np.abs(acted["q"]) >= POSITION_STOP / 2] = 0.0
+        acted["kd"][np.abs(acted["dq"]) >= VELOCITY_STOP / 2] = 0.0
         self.command, self._last = command, self.time
-        self.counts.commands += 1
+        self.record.commands += 1
+        self._obey(acted)
+
+    def _obey(self, acted: dict[str, Floats]) -> None:
+        """From now on."""
+        self.acted, record, limits = acted, self.record, self._limits
+        torque = acted["tau"] + acted["kp"] * (acted["q"] - self.joint_pos) + acted["kd"] * (acted["dq"] - self.joint_vel)
+        if (stiff := acted["kp"] > 0.0).any():
+            record.asked = max(record.asked, float((np.abs(torque) / limits.motor).max()))
+            record.outside = max(record.outside, _outside(acted["q"][stiff], limits.lowest[stiff], limits.highest[stiff]))
+        record.drive(self.time, acted)
+
+    def _plugs(self) -> tuple[Any, Any]:
+        """The slot that each joint's motor is plugged into (D,), and the way that it turns: 1 or -1, of each or of all."""
+        faults = self.faults
+        slots = np.roll(self._slots, faults.joint_order) if faults.joint_order else self._slots
+        turned = faults.turned_joints
+        return slots, np.where([name in turned for name in self.contract.joints], -1.0, 1.0) if turned else 1.0
 
     def _move(self) -> None:
         """The motors' law, as MuJoCo's affine actuators know it: tau + kp q + kd dq - kp q_now - kd dq_now."""
         acted = self.acted
         if self.command and self.time - self._last > self._watchdog and acted["kp"].any():
             zero = np.zeros(len(acted["q"]))
-            self.acted = acted = {**dict.fromkeys(_PARTS, zero), "kd": damped(self.contract)}
-            self.counts.watchdog += 1
+            self._obey(acted := {**dict.fromkeys(_PARTS, zero), "kd": damped(self.contract)})
+            self.record.watchdog += 1
         law = np.stack([acted["tau"] + acted["kp"] * acted["q"] + acted["kd"] * acted["dq"], -acted["kp"], -acted["kd"]], axis=1)
         law[[name in self.faults.dead_motors for name in self.contract.joints]] = 0.0
         self.model.actuator_biasprm[self._actuators, :3] = law
@@ -229,42 +231,57 @@ class SimulatedUnitree:
     def _fill(self) -> None:
         """The state message of this moment."""
         state, data, faults = self._state, self.data, self.faults
-        orientation = np.zeros(4)
+        orientation, roll = np.zeros(4), math.radians(faults.imu_tilt) / 2
         mujoco.mju_mat2Quat(orientation, data.site(self.contract.imu).xmat)
+        mujoco.mju_mulQuat(orientation, orientation.copy(), np.array([math.cos(roll), math.sin(roll), 0.0, 0.0]))
         state["imu_state.quaternion"] = orientation
         state["imu_state.gyroscope"] = self._sensor("ang_vel") + faults.gyro_bias
         state["imu_state.accelerometer"] = self._sensor("acceleration")
         state["imu_state.rpy"] = _roll_pitch_yaw(orientation)
+        _, signs = self._plugs()
         state["motor_state.mode"] = self._in_slots(1.0)
-        state["motor_state.q"] = self._in_slots(self.joint_pos + faults.joint_bias)
-        state["motor_state.dq"] = self._in_slots(self.joint_vel)
-        state["motor_state.tau_est"] = self._in_slots(self.torque)
+        state["motor_state.q"] = self._in_slots(signs * self.joint_pos + faults.joint_bias)
+        state["motor_state.dq"] = self._in_slots(signs * self.joint_vel + faults.joint_speed)
+        state["motor_state.tau_est"] = self._in_slots(signs * self.torque)
         state["motor_state.temperature"] = int(faults.temperature)
         state["wireless_remote"] = 0 if faults.no_remote else list(self.remote)
-        state["tick"] = round(data.time * 1000)
+        state["tick"] = max(1, round((data.time + faults.clock_jump) * 1000))
+        if faults.nan:
+            state[NAN[faults.nan]] = math.nan
+        self._fill_own()
+        state.seal()
+        if faults.bad_crc:
+            state["crc"] = int(state["crc"]) ^ 1
+
+    def _fill_own(self) -> None:
+        """What only this package's robots tell."""
+        state, faults = self._state, self.faults
         voltage = _FULL * self.machine.cells if faults.voltage is None else faults.voltage
         dead = self._in_slots([name in faults.dead_motors for name in self.contract.joints]).astype(int)
         if self.machine.package == "unitree_go":
             state["head"], state["level_flag"], state["power_v"] = LOW_LEVEL[:2], LOW_LEVEL[2], voltage
             state["motor_state.lost"] = state["motor_state.lost"] + dead  # no message reaches them any more
             feet = zip(self.contract.feet, self._scene.contacts, strict=True)
-            touch = {foot: (data.sensordata[where] > 0.0).any() for foot, where in feet}
+            touch = {foot: (self.data.sensordata[where] > 0.0).any() for foot, where in feet}
             state["foot_force"] = [_TOUCH * touch.get(foot, False) for foot in self.machine.feet] or 0
         else:
-            state["mode_machine"] = _MACHINE.get(self.machine.name, 0)
+            body = _MACHINE.get(self.machine.name, 0) if faults.mode_machine is None else faults.mode_machine
+            state["mode_machine"] = body
             state["motor_state.vol"], state["motor_state.motorstate"] = voltage, dead * _FAULT
-        state.seal()
-        if faults.corrupt:
-            state["crc"] = int(state["crc"]) ^ 1
 
     def _in_slots(self, values: Any) -> Floats:
         """Values (D,) of the joints, each at its motor's place; zero elsewhere."""
         slots = np.zeros(self.machine.slots)
-        slots[self._slots] = values
+        slots[self._plugs()[0]] = values
         return slots
 
     def _sensor(self, quantity: str) -> Floats:
         return self.data.sensordata[self._scene.sensordata[quantity]]
+
+
+def _outside(values: Floats, low: Floats, high: Floats) -> float:
+    """[rad] by which the one that is farthest out is outside its range; 0: none is."""
+    return max(0.0, float(np.maximum(low - values, values - high).max()))
 
 
 def _roll_pitch_yaw(quaternion: Sequence[float] | Floats) -> list[float]:

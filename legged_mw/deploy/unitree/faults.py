@@ -1,0 +1,147 @@
+"""What is wrong with a simulated robot and its wire, on demand: ``--serve unitree --fault NAME[=VALUE][@SECONDS]``."""
+
+from __future__ import annotations
+
+import heapq
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from legged_mw.deploy.robot import Floats
+from legged_mw.utils.errors import UserError, unknown
+
+OFF = "off"  # a fault that ends
+
+
+@dataclass
+class Faults:
+    """What is wrong now; may change at any time."""
+
+    delay_ms: float = 0.0  # of every message, each way
+    jitter_ms: float = 0.0  # standard deviation of the delay
+    loss: float = 0.0  # share of messages that are lost
+    bad_crc: bool = False  # states with a wrong checksum
+    frozen: bool = False  # the same state again and again
+    silent: bool = False  # no states
+    no_remote: bool = False  # the remote is off: 40 zeros
+    clock_jump: float = 0.0  # [s] by which the robot's clock is ahead
+    mode_machine: int | None = None  # of another body; None: its own
+    joint_order: int = 0  # places by which the motors are plugged in otherwise
+    turned_joints: set[str] = field(default_factory=set)  # joints whose motors turn the other way
+    dead_motors: set[str] = field(default_factory=set)  # joints whose motors give no torque and say so
+    joint_bias: Floats | float = 0.0  # (D,) [rad] added to measured angles
+    joint_speed: Floats | float = 0.0  # (D,) [rad/s] added to measured speeds
+    gyro_bias: Floats | float = 0.0  # (3,) [rad/s]
+    imu_tilt: float = 0.0  # [deg] by which the measured orientation is rolled
+    nan: str = ""  # part of the state that is not a number
+    temperature: float = 35.0  # [deg C] of every motor
+    voltage: float | None = None  # [V]; None: of a full battery
+
+
+class Kind(NamedTuple):
+    """A fault by its name on the command line."""
+
+    field: str  # of Faults
+    value: Any  # without "=VALUE"; None: it must be stated
+    low: float = -math.inf
+    high: float = math.inf
+    unit: str = ""
+
+
+NAN = {"q": "motor_state.q", "dq": "motor_state.dq", "gyroscope": "imu_state.gyroscope", "quaternion": "imu_state.quaternion"}
+KINDS = {
+    "delay": Kind("delay_ms", 200.0, 0, 1000, "ms"),
+    "jitter": Kind("jitter_ms", 20.0, 0, 1000, "ms"),
+    "loss": Kind("loss", 100.0, 0, 100, "%"),
+    **{name: Kind(name, True) for name in ("bad_crc", "frozen", "silent", "no_remote")},
+    "clock_jump": Kind("clock_jump", -1.0, unit="s"),
+    "mode_machine": Kind("mode_machine", 4, 0, 255),
+    "joint_order": Kind("joint_order", 1, -40, 40, "places"),
+    "joint_sign": Kind("turned_joints", None),
+    "motor_fault": Kind("dead_motors", None),
+    "joint_bias": Kind("joint_bias", 2.0, unit="rad"),
+    "joint_speed": Kind("joint_speed", 100.0, unit="rad/s"),
+    "gyro_bias": Kind("gyro_bias", 0.5, unit="rad/s"),
+    "imu_tilt": Kind("imu_tilt", 180.0, unit="deg"),
+    "nan": Kind("nan", "q"),
+    "hot_motor": Kind("temperature", 95.0, 0, 127, "deg C"),
+    "low_battery": Kind("voltage", 20.0, 0, unit="V"),
+}
+
+
+class Fault(NamedTuple):
+    """One fault, and when it begins."""
+
+    text: str  # as it was asked for
+    field: str  # of Faults
+    value: Any
+    time: float  # [s]
+
+    def begin(self, faults: Faults) -> None:
+        setattr(faults, self.field, self.value)
+
+
+def parse_faults(texts: Sequence[str], joints: Sequence[str]) -> list[Fault]:
+    """Each text is one or more of NAME[=VALUE][@SECONDS], with commas between them; in the order of their times. Raises UserError."""
+    found = [_parse(part, joints) for text in texts for part in text.split(",")]
+    return sorted(found, key=lambda fault: fault.time)
+
+
+def _parse(text: str, joints: Sequence[str]) -> Fault:
+    name, value, time = re.fullmatch(r"([^=@]*)(?:=([^@]*))?(?:@(.*))?", text).groups()  # type: ignore[union-attr]
+    where = f"--fault {text}"
+    if name not in KINDS:
+        raise UserError(f"{where}: {unknown('fault', name, KINDS, 'what a served robot can have')}")
+    if not 0.0 <= (seconds := _number(time or "0")) < math.inf:
+        raise UserError(f"{where}: after @ stands when it begins, a number of seconds from 0")
+    kind = KINDS[name]
+    return Fault(text, kind.field, getattr(Faults(), kind.field) if value == OFF else _value(name, kind, value, joints, where), seconds)
+
+
+def _value(name: str, kind: Kind, value: str | None, joints: Sequence[str], where: str) -> Any:
+    known = NAN if name == "nan" else joints if kind.value is None else None
+    if known is not None and value is not None:
+        if value not in known:
+            raise UserError(f"{where}: {unknown('value', value, known, name)}")
+        return value if name == "nan" else {value}
+    if value is None:
+        if kind.value is None:
+            raise UserError(f"{where}: say of which joint, e.g. {name}={joints[0]}")
+        return kind.value / 100 if name == "loss" else kind.value
+    if kind.value is True:
+        raise UserError(f"{where}: {name} has no value but {OFF}")
+    if not kind.low <= (number := _number(value)) <= kind.high or math.isinf(number):
+        ends = "" if math.isinf(kind.low) else f" from {kind.low:g}" + ("" if math.isinf(kind.high) else f" to {kind.high:g}")
+        raise UserError(f"{where}: {name} is a number{ends}{f' [{kind.unit}]' if kind.unit else ''}, or {OFF}")
+    return number / 100 if name == "loss" else int(number) if isinstance(kind.value, int) else number
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+class Line:
+    """One direction of the wire: messages come out when their time has come, late, in another order, or never."""
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self._rng, self._queue, self._count = rng, list[tuple[float, int, bytes]](), 0
+
+    def put(self, now: float, body: bytes, faults: Faults) -> None:
+        if faults.loss and self._rng.random() < faults.loss:
+            return
+        delay = max(0.0, faults.delay_ms + (faults.jitter_ms * self._rng.standard_normal() if faults.jitter_ms else 0.0))
+        self._count += 1
+        heapq.heappush(self._queue, (now + delay / 1000, self._count, body))
+
+    def due(self, now: float) -> list[bytes]:
+        out = []
+        while self._queue and self._queue[0][0] <= now + 1e-9:
+            out.append(heapq.heappop(self._queue)[2])
+        return out
