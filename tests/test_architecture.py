@@ -39,7 +39,10 @@ ONLY_IN = {
     "rsl_rl": ["legged_mw/rl/*"],
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
     "matplotlib": ["legged_mw/eval/plots.py", "legged_mw/deploy/replay.py"],  # a second to import, and only for a report
-    "legged_mw.view": ["legged_mw/view/*", "legged_mw/deploy/*", "legged_mw/robot/*", "legged_mw/motion/*", "legged_mw/programs.py"],
+    "legged_mw.view": [
+        *("legged_mw/view/*", "legged_mw/deploy/*", "legged_mw/robot/*", "legged_mw/motion/*", "legged_mw/eval/strip.py"),
+        "legged_mw/programs.py",
+    ],
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/studio.py"],  # young, and not on every platform
     "legged_mw.check": ["legged_mw/check/*", "legged_mw/programs.py"],
     "legged_mw.robot": ["legged_mw/robot/*", "legged_mw/programs.py"],
@@ -47,6 +50,7 @@ ONLY_IN = {
         "legged_mw/drawing/*",
         "legged_mw/view/env_stage.py",
         "legged_mw/rl/export_scene.py",
+        "legged_mw/eval/strip.py",
         "legged_mw/robot/picture.py",
         "legged_mw/motion/look.py",
     ],

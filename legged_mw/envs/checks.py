@@ -68,6 +68,14 @@ ENVIRONMENT: dict[str, Rule] = {
     "terrain.slope": ("from -60 to 60 degrees", lambda v: -60 <= v <= 60),
     "terrain.condim": ("1, 3, 4 or 6", lambda v: v in (1, 3, 4, 6)),
 }
+SOMETIMES: dict[str, Rule] = {  # of sections that only some tasks have
+    "falls.share": ("from 0 to 1", lambda v: 0 <= v <= 1),
+    **dict.fromkeys(("falls.states", "falls.seconds", "exam.within", "exam.height"), POSITIVE),
+    "falls.pull": ("from 0 to 1, a share of the weight", lambda v: 0 <= v <= 1),
+    "falls.pull_fades": PART,
+    "exam.nose": ("-1, down, or 1, up", lambda v: v in (-1, 1)),
+    "exam.hands": NAMES,
+}
 WALKING: dict[str, Rule] = {
     "asset.foot_names": (
         "a list with at least one name, one for each foot (patterns are for foot_geoms)",
@@ -127,6 +135,8 @@ LEARNER: dict[str, Rule] = {
 def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None, law: str = "") -> None:
     """Raise ConfigError at the first value that cannot work; ``law`` of the motors is ``control.actuator``, unless said otherwise."""
     _check(cfg, ENVIRONMENT)
+    sections = cfg.to_dict()
+    _check(cfg, {path: rule for path, rule in SOMETIMES.items() if path.split(".")[1] in sections.get(path.split(".")[0], {})})
     _check_redraws(cfg, law)
     _check_motors(cfg)
     if isinstance(cfg, LeggedRobotCfg):

@@ -22,6 +22,7 @@ from legged_mw.eval.rules import Figure
 
 Floats = NDArray[np.float64]
 PUSH_EVERY, GOLDEN = 2.0, math.pi * (3.0 - 5.0**0.5)  # [s]; [rad] directions that never repeat
+Starts = tuple[Floats, Floats]  # qpos (N, nq), qvel (N, nv)
 
 
 class Ground(NamedTuple):
@@ -99,7 +100,7 @@ class Skill(ABC):
         return round(self.seconds / robot.dt)
 
     @abstractmethod
-    def starts(self, robot: Robot, count: int) -> tuple[Floats, Floats] | None:
+    def starts(self, robot: Robot, count: int) -> Starts | None:
         """qpos (count, nq) and qvel (count, nv) to begin with, the same at every call; None: where the task's episodes begin."""
 
     @abstractmethod
