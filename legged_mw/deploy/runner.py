@@ -71,6 +71,8 @@ def run(
                     velocities.add(measured)
                 if watch and (measured or states):
                     watch(now, measured)
+                if states and states.over:
+                    break
         if log and live:
             log.event(loop.now, str(loop.timing()))
     return replace(one.summary, velocity=velocities.mean(one.summary.steps), late=loop.late, timing=loop.timing() if live else None)

@@ -15,8 +15,8 @@ from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement
 from legged_mw.deploy.safety import Trip
 
-ZERO, STAND, POLICY, DAMPING = STATES = ("zero torque", "stand", "policy", "damping")
-ARMED = (STAND, POLICY)  # states in which limits are watched: in the others nothing pushes
+ZERO, STAND, POLICY, DAMPING, CHECK = STATES = ("zero torque", "stand", "policy", "damping", "joint check")
+ARMED = (STAND, POLICY, CHECK)  # states in which limits are watched: in the others nothing pushes
 RISE = 2.0  # [s] from wherever the joints are to the default pose [unitree_rl_gym]
 SOFT = 0.1  # [share of the stiffness] that standing up begins with
 NEAR = 0.15  # [rad] ours: a joint that is farther from the pose after RISE carries weight, and gets stiffer
@@ -39,6 +39,8 @@ class States:
 
     ``command`` gives (C,) at a time [s] since the policy began, while nobody drives; ``say`` gets a line for each change.
     """
+
+    over = False  # whether the run ends with this step
 
     def __init__(
         self, controller: Controller, sources: Sequence[Source], command: Callable[[float], Floats], say: Callable[[str], None] = print
