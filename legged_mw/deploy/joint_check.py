@@ -163,12 +163,11 @@ class JointCheck(States):
             centres.append(data.subtree_com[1].copy())
         shift = centres[1] - centres[0]
         shift -= (shift @ before.gravity) * before.gravity
-        light = model.body_subtreemass[model.joint(self.joints[joint]).bodyid[0]] < HEAVY * model.body_subtreemass[1]
+        mass, body = model.body_subtreemass, model.joint(self.joints[joint]).bodyid[0]
         tilts = [there.gravity - then.gravity for then in (before, back)]
         sizes = [float(np.linalg.norm(tilt)) for tilt in tilts]
-        return not (
-            light and min(sizes) > LEAN and all(t @ shift < ALONG * n * np.linalg.norm(shift) for t, n in zip(tilts, sizes, strict=True))
-        )
+        tells = mass[body] < HEAVY * mass[1] and min(sizes) > LEAN
+        return not tells or any(t @ shift > ALONG * n * np.linalg.norm(shift) for t, n in zip(tilts, sizes, strict=True))
 
     def _motor(self, joint: int, form: str = "{}") -> str:
         return form.format(self._motors[self.joints[joint]]) if self._motors else ""
@@ -186,8 +185,9 @@ class JointCheck(States):
                 form.format(self.joints[joint], self._motor(joint) or "-", f"{asked:+.2f}", own, f"{stiffness:.0%}", most, verdict)
             )
         wrong = [self.joints[row.joint] for row in self.rows if row.verdict != "right"]
-        said = f"{len(self.rows)} of {len(self.joints)} joints checked; " + (f"wrong: {', '.join(wrong)}" if wrong else "none is wrong")
-        return "\n".join([*lines, said if len(self.rows) == len(self.joints) else f"{said}; ended early: {self.note}"])
+        said = f"{len(self.rows)} of {len(self.joints)} joints checked" + (f"; wrong: {', '.join(wrong)}" if wrong else "")
+        early = "" if len(self.rows) == len(self.joints) else f"; ended early: {self.note}"
+        return "\n".join([*lines, said + (early or ("" if wrong else "; none is wrong"))])
 
 
 def joint_check(robot: Robot, controller: Controller, sources: Sequence[Source], say: Callable[[str], None], limits: Limits) -> JointCheck:

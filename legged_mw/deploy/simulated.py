@@ -185,7 +185,10 @@ class MujocoRobot(Robot):
         hoisted: bool = False,
         lift: float = 0.0,
     ) -> None:
-        """``whole``: its body touches the ground too. ``hoisted``: its base hangs until targets come at its own gains, ``lift`` [m] above its start."""
+        """``whole``: its body touches the ground too. ``hoisted``: its base hangs until targets come at its own gains.
+
+        It hangs ``lift`` [m] above its start.
+        """
         self.fleet, self.hoisted = Fleet(folder, contract, 1, threads=1, scene_file=scene_file, whole=whole), hoisted
         self._targets, self._gains, self._closed = contract.default_pose, (contract.stiffness, contract.damping), False
         self._start, self.can_change_gains = self.fleet.qpos[0, :7].copy(), contract.motors.law == "servo"

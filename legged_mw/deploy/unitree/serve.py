@@ -84,7 +84,9 @@ class SimulatedUnitree:
         lift: float = 0.0,
         seed: int = 0,
     ) -> None:
-        """The robot of the export in ``folder``, limp: on the ground, or on a hoist (``hoist``; None: if it has two feet), ``lift`` [m] above its start.
+        """The robot of the export in ``folder``, limp: on the ground, or on a hoist (``hoist``; None: if it has two feet).
+
+        ``lift``: [m] above its start, where it hangs freely.
 
         ``watchdog``: seconds without a command until it damps by itself.
         """
