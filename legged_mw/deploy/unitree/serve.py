@@ -87,7 +87,6 @@ class SimulatedUnitree:
         """The robot of the export in ``folder``, limp: on the ground, or on a hoist (``hoist``; None: if it has two feet).
 
         ``lift``: [m] above its start, where it hangs freely.
-
         ``watchdog``: seconds without a command until it damps by itself.
         """
         self.machine: Machine = machine_of(contract.joints)
