@@ -60,7 +60,7 @@ def test_a_right_robot_is_right() -> None:
     robot = Wired()
     check, done = checked(robot)
     assert check.right and check.over and not done.trips and [row.joint for row in check.rows] == list(range(12))
-    assert check.table().endswith("12 of 12 joints checked; none is wrong")
+    assert check.report.endswith("12 of 12 joints checked; none is wrong")
     assert all(0.07 < row.moved[row.joint] < 0.13 and row.asked == STEP for row in check.rows)
     targets, gains = (np.array(each) for each in zip(*robot.written, strict=True))
     assert np.abs(targets - targets[0]).max() < STEP + 1e-9 and np.abs(np.diff(targets, axis=0)).max() < 0.01
@@ -88,7 +88,7 @@ def test_wrong_joints_are_named() -> None:
         "RL_thigh_joint": "WRONG SIGN: it turned the other way",
         "RR_calf_joint": "STUCK: it did not move",
     }
-    lines = check.table().splitlines()
+    lines = check.report.strip().splitlines()
     assert lines[4].startswith("FR_hip_joint       -  +0.10 ") and lines[4].endswith("  WRONG JOINT: FL_hip_joint moved in its place")
     assert lines[-1].endswith("wrong: FL_hip_joint, FR_hip_joint, FR_thigh_joint, RL_thigh_joint, RR_calf_joint") and not check.right
 
@@ -107,7 +107,7 @@ def test_a_person_ends_it(source: Script, why: str) -> None:
     robot = Wired()
     check, _ = checked(robot, source)
     assert check.over and robot.done[-1] == "damp" and "write" not in robot.done[280:]
-    assert check.table().endswith(f"0 of 12 joints checked; ended early: {why}, while FL_hip_joint goes +0.10 rad")
+    assert check.report.endswith(f"0 of 12 joints checked; ended early: {why}, while FL_hip_joint goes +0.10 rad")
 
 
 @pytest.mark.parametrize(
@@ -133,9 +133,9 @@ def test_over_the_wire(fault: str, found: dict[str, str], domain: int) -> None:
     assert verdicts(check) == found and not check.right and not sim.acted["kp"].any() and sim.acted["kd"].all()
     if found:
         assert len(check.rows) == 3 and sim.record.beyond < 0.1
-        assert check.table().splitlines()[3].split()[:3] == ["FL_calf_joint", "5", "-0.10"]  # it hangs at its end: the other way
+        assert check.report.strip().splitlines()[3].split()[:3] == ["FL_calf_joint", "5", "-0.10"]  # it hangs at its end: the other way
     else:
-        assert done.trips[0].limit == "position" and "beyond its range" in check.table().splitlines()[-1]
+        assert done.trips[0].limit == "position" and "beyond its range" in check.report.strip().splitlines()[-1]
 
 
 def test_the_program_ends_with_code_1(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:

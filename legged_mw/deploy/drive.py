@@ -107,10 +107,10 @@ def drive(
         console = stack.enter_context(Console(contract))
         controller, command = Controller(folder, contract), _commands(contract, args, fixed, console.say)
         sources = [*_sources(contract, args, console.say), *([mirror] if mirror else [])]
-        check = joint_check(robot, controller, sources, console.say, safety.limits) if args.check_joints else None
-        states = check or States(controller, sources, command, console.say)
+        checked = joint_check(robot, controller, sources, console.say, safety.limits) if args.check_joints else None
+        states = checked or States(controller, sources, command, console.say)
         stack.callback(states.close)
-        console.say(f"{CHECK_KEYS if check else KEYS}\n{states.state}: {states.note}")
+        console.say(f"{CHECK_KEYS if args.check_joints else KEYS}\n{states.state}: {states.note}")
         stack.enter_context(_ended_by_signals())
         seconds = args.time or math.inf
         odometry = Odometry(folder, contract, 1, contact) if contact else None
@@ -121,10 +121,8 @@ def drive(
                 mirror.show(now, measured, states)
 
         done = run(robot, controller, command, seconds, watch=show, safety=safety, states=states, log=log, odometry=odometry)
-        console.say(f"{done.timing}\nthe joints are damped{f'; logged to {shown(path)}' if path else ''}")
-        if check:
-            console.say(check.table())
-    if check and not check.right:
+        console.say(f"{done.timing}\nthe joints are damped{f'; logged to {shown(path)}' if path else ''}{states.report}")
+    if not states.right:
         raise SystemExit(1)
 
 

@@ -44,7 +44,7 @@ class Row(NamedTuple):
 
 
 class JointCheck(States):
-    """The check of one robot; ``rows`` and ``table`` tell what came of it. ``model`` is the scene; ``motors``: joint -> its motor."""
+    """The check of one robot; ``rows`` and ``report`` tell what came of it. ``model`` is the scene; ``motors``: joint -> its motor."""
 
     def __init__(
         self,
@@ -172,8 +172,9 @@ class JointCheck(States):
     def _motor(self, joint: int, form: str = "{}") -> str:
         return form.format(self._motors[self.joints[joint]]) if self._motors else ""
 
-    def table(self) -> str:
-        """A line a joint, and one of the whole."""
+    @property
+    def report(self) -> str:
+        """A line a joint, and one of the whole; begins with a new line."""
         width = max(map(len, self.joints))
         form = f"{{:<{width}}} {{:>5}} {{:>6}} {{:>6}} {{:>9}}  {{:<{width + 7}}} {{}}"
         lines = [form.format("joint", "motor", "asked", "moved", "stiffness", "most of the others", "verdict")]
@@ -187,7 +188,7 @@ class JointCheck(States):
         wrong = [self.joints[row.joint] for row in self.rows if row.verdict != "right"]
         said = f"{len(self.rows)} of {len(self.joints)} joints checked" + (f"; wrong: {', '.join(wrong)}" if wrong else "")
         early = "" if len(self.rows) == len(self.joints) else f"; ended early: {self.note}"
-        return "\n".join([*lines, said + (early or ("" if wrong else "; none is wrong"))])
+        return "\n".join(["", *lines, said + (early or ("" if wrong else "; none is wrong"))])
 
 
 def joint_check(robot: Robot, controller: Controller, sources: Sequence[Source], say: Callable[[str], None], limits: Limits) -> JointCheck:

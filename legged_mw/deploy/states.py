@@ -40,7 +40,7 @@ class States:
     ``command`` gives (C,) at a time [s] since the policy began, while nobody drives; ``say`` gets a line for each change.
     """
 
-    over = False  # whether the run ends with this step
+    over, report, right = False, "", True  # whether the run ends now; what is said at its end, and whether that is good
 
     def __init__(
         self, controller: Controller, sources: Sequence[Source], command: Callable[[float], Floats], say: Callable[[str], None] = print
