@@ -101,9 +101,14 @@ def test_joints_in_another_order_end_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "why"), [(Script({100: "start", 280: "select"}), "select was pressed"), (Script({100: "start"}, stop=280), "the test")]
+    ("source", "why"),
+    [
+        (Script({50: "select", 60: "start", 100: "start", 280: "select"}), "select was pressed"),
+        (Script({100: "start"}, stop=280), "the test"),
+    ],
 )
 def test_a_person_ends_it(source: Script, why: str) -> None:
+    """Before it has begun, select only damps."""
     robot = Wired()
     check, _ = checked(robot, source)
     assert check.over and robot.done[-1] == "damp" and "write" not in robot.done[280:]

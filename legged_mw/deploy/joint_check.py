@@ -57,12 +57,14 @@ class JointCheck(States):
     ) -> None:
         rest = np.array([each.default for each in controller.contract.commands])
         super().__init__(controller, sources, lambda _: rest, say)
-        self.note, self.rows, self.joints = f"{START}: joint check", list[Row](), controller.contract.joints
+        self.rows, self.joints = list[Row](), controller.contract.joints
         self._limits, self._model, self._motors, self._moves = limits, model, motors, None
+
+    first = CHECK
 
     @property
     def over(self) -> bool:
-        return self.state == DAMPING
+        return self.state == DAMPING and self._moves is not None
 
     @property
     def right(self) -> bool:
@@ -70,19 +72,20 @@ class JointCheck(States):
         return len(self.rows) == len(self.joints) and all(row.verdict == "right" for row in self.rows)
 
     def step(self, measured: Measurement, now: float) -> Order:
-        order = Order(self.state)
+        if self._moves is None:
+            if self.state != ZERO or START not in self._pressed or END in self._pressed:
+                return super().step(measured, now)
+            self._enter(CHECK, now, f"each joint goes {STEP} rad and back; {END} if another one moves than the one that is named")
+            self.note, self._moves = "all joints are held", self._check(measured)
+            return next(self._moves)
         if END in self._pressed:
             self._enter(DAMPING, now, f"{END} was pressed")
-        elif self._moves:
-            try:
-                return self._moves.send(measured)
-            except StopIteration:
-                self._enter(DAMPING, now, "the joint check is over")
-        elif START in self._pressed and self.state == ZERO:
-            self._enter(CHECK, now, f"each joint goes {STEP} rad and back; {END} if another one moves than the one that is named")
-            self._moves = self._check(measured)
-            order = next(self._moves)
-        return order._replace(state=self.state)
+            return Order(DAMPING)
+        try:
+            return self._moves.send(measured)
+        except StopIteration:
+            self._enter(DAMPING, now, "the joint check is over")
+            return Order(DAMPING)
 
     def _enter(self, state: str, now: float, note: str) -> None:
         early = self.state == CHECK and len(self.rows) < len(self.joints)

@@ -40,6 +40,7 @@ class States:
     ``command`` gives (C,) at a time [s] since the policy began, while nobody drives; ``say`` gets a line for each change.
     """
 
+    first = STAND  # what start begins
     over, report, right = False, "", True  # whether the run ends now; what is said at its end, and whether that is good
 
     def __init__(
@@ -48,7 +49,7 @@ class States:
         self.controller, self.sources, self._own, self._say = controller, list(sources), command, say
         self.state, self.since = ZERO, 0.0  # [s] since when
         self.command = controller.contract.held(command(0.0))  # (C,) as followed now
-        self.note = f"{START}: stand"
+        self.note = f"{START}: {self.first}"
         self._from: Floats = controller.contract.default_pose  # (D,) [rad] where standing up began
         self._stiffer = 1.0
         self._pressed = frozenset[str]()
@@ -101,7 +102,7 @@ class States:
             if self.state != DAMPING:
                 self._enter(DAMPING, now, f"{END} was pressed")
         elif START in pressed and self.state == DAMPING:
-            self._enter(ZERO, now, f"{START}: stand")
+            self._enter(ZERO, now, f"{START}: {self.first}")
         elif START in pressed and self.state == ZERO:
             self._from, self._stiffer = measured.joint_pos.copy(), 1.0
             self._enter(STAND, now, f"{RISE:g} s to the default pose; then {WALK}: policy")
