@@ -93,6 +93,20 @@ def test_for_a_real_robot(file: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
     cfg = load_task(str(config)).cfg
     assert cfg.domain_rand.enable and cfg.observations.leave_out == {"state": ["base_lin_vel"]}
     assert cfg.perturbation.push and bool(cfg.gait.period) == file.startswith("g1")
+    if file.startswith("a1"):
+        check_rough(tmp_path)
+
+
+def check_rough(folder: Path) -> None:
+    """The class on the page for rough ground, beside the flat task: what rough ground changes, and what the robot states."""
+    heads = "from legged_mw.envs.sim_to_real_config import SimToRealRoughCfg, SimToRealRoughCfgPPO\nfrom mine_flat import MineFlatCfg\n"
+    heads += "from legged_mw.envs.legged_robot import LeggedRobot\nfrom legged_mw.utils.task import Task\n\n"
+    [body] = re.findall(r"```text\n(class MineRoughCfg.*?)```", PAGE.read_text(), re.DOTALL)
+    (folder / "mine_rough.py").write_text(f"{heads}{body}\nTASK = Task(LeggedRobot, MineRoughCfg, SimToRealRoughCfgPPO)\n")
+    cfg, flat = load_task(str(folder / "mine_rough.py")).cfg, load_task(str(folder / "mine_flat.py")).cfg
+    assert (cfg.terrain.mesh_type, cfg.termination.min_base_height, cfg.rewards.swing_height) == ("heightfield", 0.15, 0.15)
+    assert (cfg.asset.foot_names, cfg.commands.ranges.lin_vel_x) == (flat.asset.foot_names, flat.commands.ranges.lin_vel_x)
+    assert not cfg.commands.curriculum and flat.commands.curriculum
 
 
 def test_the_page_names_fields_that_exist() -> None:
