@@ -12,7 +12,7 @@ from drivers import Script, Watched, beyond
 from legged_mw.deploy import __main__ as program
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.drive import LIFT
-from legged_mw.deploy.joint_check import STEP, JointCheck, joint_check
+from legged_mw.deploy.joint_check import STEP, JointCheck
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Robot, RobotError
 from legged_mw.deploy.runner import Summary, run
@@ -46,7 +46,7 @@ class Wired(Watched):
 def checked(robot: Robot, source: Script | None = None, safety: Safety | None = None) -> tuple[JointCheck, Summary]:
     """The check of a robot that has hung for 2 s, as fast as it goes."""
     controller, safety = Controller(GO2, CONTRACT), safety or Safety(CONTRACT, LIMITS)
-    check = joint_check(robot, controller, [source or Script({100: "start"})], lambda _: None, safety.limits)
+    check = JointCheck(controller, [source or Script({100: "start"})], lambda _: None, robot, safety.limits)
     return check, run(robot, controller, lambda _: np.zeros(0), 120.0, live=False, safety=safety, states=check)
 
 

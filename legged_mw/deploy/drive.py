@@ -16,7 +16,7 @@ import numpy as np
 
 from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.inputs import Gamepad, Keys, RobotRemote, Source, StopFile
-from legged_mw.deploy.joint_check import joint_check
+from legged_mw.deploy.joint_check import JointCheck
 from legged_mw.deploy.log import Log, log_path
 from legged_mw.deploy.mirror import FLAGS, LIVE, Mirror
 from legged_mw.deploy.odometry import Odometry
@@ -107,7 +107,7 @@ def drive(
         console = stack.enter_context(Console(contract))
         controller, command = Controller(folder, contract), _commands(contract, args, fixed, console.say)
         sources = [*_sources(contract, args, console.say), *([mirror] if mirror else [])]
-        checked = joint_check(robot, controller, sources, console.say, safety.limits) if args.check_joints else None
+        checked = JointCheck(controller, sources, console.say, robot, safety.limits) if args.check_joints else None
         states = checked or States(controller, sources, command, console.say)
         stack.callback(states.close)
         console.say(f"{CHECK_KEYS if args.check_joints else KEYS}\n{states.state}: {states.note}")

@@ -9,8 +9,8 @@ tilt of a body that hangs freely tells, for legs, which way they moved; else onl
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Generator, Sequence
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -44,23 +44,18 @@ class Row(NamedTuple):
 
 
 class JointCheck(States):
-    """The check of one robot; ``rows`` and ``report`` tell what came of it. ``model`` is the scene; ``motors``: joint -> its motor."""
-
-    def __init__(
-        self,
-        controller: Controller,
-        sources: Sequence[Source],
-        say: Callable[[str], None],
-        limits: Limits,
-        model: Any,
-        motors: Mapping[str, int],
-    ) -> None:
-        rest = np.array([each.default for each in controller.contract.commands])
-        super().__init__(controller, sources, lambda _: rest, say)
-        self.rows, self.joints = list[Row](), controller.contract.joints
-        self._limits, self._model, self._motors, self._moves = limits, model, motors, None
+    """The check of one robot; ``rows`` and ``report`` tell what came of it."""
 
     first = CHECK
+
+    def __init__(self, controller: Controller, sources: Sequence[Source], say: Callable[[str], None], robot: Robot, limits: Limits) -> None:
+        """Raises RobotError if this robot cannot be moved softly."""
+        if not robot.can_change_gains:
+            raise RobotError(f"--check_joints is soft, and {type(robot).__name__} cannot change its gains: no joint was moved")
+        rest, self.rows = np.array([each.default for each in controller.contract.commands]), list[Row]()
+        super().__init__(controller, sources, lambda _: rest, say)
+        self.joints, self._limits, self._motors, self._moves = controller.contract.joints, limits, robot.motors, None
+        self._model = read_scene(controller.folder, controller.contract).model
 
     @property
     def over(self) -> bool:
@@ -192,10 +187,3 @@ class JointCheck(States):
         said = f"{len(self.rows)} of {len(self.joints)} joints checked" + (f"; wrong: {', '.join(wrong)}" if wrong else "")
         early = "" if len(self.rows) == len(self.joints) else f"; ended early: {self.note}"
         return "\n".join(["", *lines, said + (early or ("" if wrong else "; none is wrong"))])
-
-
-def joint_check(robot: Robot, controller: Controller, sources: Sequence[Source], say: Callable[[str], None], limits: Limits) -> JointCheck:
-    """The check of this robot. Raises RobotError if it cannot be soft."""
-    if not robot.can_change_gains:
-        raise RobotError(f"--check_joints is soft, and {type(robot).__name__} cannot change its gains: no joint was moved")
-    return JointCheck(controller, sources, say, limits, read_scene(controller.folder, controller.contract).model, robot.motors)
