@@ -116,10 +116,11 @@ FORCES: dict[str, object] = {
         ("go1_getup", {}),
         ("g1_getup", {}),
         ("go1_handstand", {}),
+        ("g1_track", {"motion__hold_s": 0.1}),
     ],
     ids=[
         *("nominal", "randomized", "rough", "forces", "go2", "biped", "held joints", "biped on rough ground"),
-        *("falls", "falls of a biped, lifted", "handstand"),
+        *("falls", "falls of a biped, lifted", "handstand", "a motion"),
     ],
 )
 def test_replay_equals_eager_over_100_steps(task: str, settings: dict[str, object]) -> None:

@@ -55,6 +55,9 @@ NOMINAL = {  # the robot as its contract states it
     "perturbation.push": False,
     "gait.random_start": False,
     "falls.share": 0.0,  # the many contacts of a robot that lies make much of rounding
+    "motion.random_start": False,
+    "motion.start_turn": [0.0, 0.0, 0.0],  # a deployed robot has the heading of its motion as it begins
+    "motion.start_joints": 0.0,
 }
 
 

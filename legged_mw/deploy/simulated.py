@@ -20,6 +20,7 @@ from mujoco.batch import Batch, SimulationError
 from numpy.typing import ArrayLike, NDArray
 
 from legged_mw.deploy.contract import CONTRACT_FILE, FALL, SCAN, SCENE_FILE, SENSED, Contract, ContractError, quantity_size
+from legged_mw.deploy.motion import ATTITUDE, POSITION
 from legged_mw.deploy.motors import make_network
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, damped, layout
 from legged_mw.utils.errors import unknown
@@ -135,6 +136,8 @@ class Fleet:
     def _value(self, name: str) -> Floats:
         if name == "gravity":
             return self._gravity()
+        if name in (ATTITUDE, POSITION):
+            return self.qpos[:, 3:7].copy() if name == ATTITUDE else self.qpos[:, :3].copy()
         if any(row.name == name and row.measured == SCAN for row in self.contract.rows):
             return self._scan()
         if name == "foot_contact":
@@ -176,12 +179,23 @@ class MujocoRobot(Robot):
     """One simulated robot behind the seam. Simulated time moves on in ``write``, ``damp`` and ``limp``, by one period."""
 
     def __init__(
-        self, folder: Path, contract: Contract, scene_file: str = SCENE_FILE, *, whole: bool = False, hoisted: bool = False
+        self,
+        folder: Path,
+        contract: Contract,
+        scene_file: str = SCENE_FILE,
+        *,
+        whole: bool = False,
+        hoisted: bool = False,
+        lift: float = 0.0,
     ) -> None:
-        """``whole``: its body touches the ground too. ``hoisted``: its base hangs at its start until targets come at its own gains."""
+        """``whole``: its body touches the ground too. ``hoisted``: its base hangs until targets come at its own gains.
+
+        It hangs ``lift`` [m] above its start.
+        """
         self.fleet, self.hoisted = Fleet(folder, contract, 1, threads=1, scene_file=scene_file, whole=whole), hoisted
         self._targets, self._gains, self._closed = contract.default_pose, (contract.stiffness, contract.damping), False
         self._start, self.can_change_gains = self.fleet.qpos[0, :7].copy(), contract.motors.law == "servo"
+        self._start[2] += lift
 
     def read(self) -> Measurement:
         return self.fleet.read().of(0)

@@ -13,12 +13,13 @@ import torch
 
 from legged_mw.deploy import exam as on_export
 from legged_mw.envs.domain_rand import KINDS
+from legged_mw.envs.motion_tracking import MotionTracking
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.eval import exam, skill_page
 from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
-from legged_mw.eval.skill import Ground, Recording, Robot, Skill, Starts
+from legged_mw.eval.skill import Ground, Motion, Recording, Robot, Skill, Starts
 from legged_mw.eval.skills import make_skill
 from legged_mw.rl.recurrent import forget
 from legged_mw.utils.errors import UserError
@@ -62,7 +63,7 @@ def examine(kind: str, env: RobotTask, policy: Policy, rough: None = None) -> tu
     skill, parts, strips = skill_of(env.cfg, kind), {}, {}
     for number, (name, ground) in enumerate(skill.grounds.items()):
         here = env if number == 0 else on_ground(env, ground)
-        recording = perform(here, policy, skill)
+        recording = perform(here, policy, skill, ground)
         parts[name] = skill.judge(machine(here), recording)
         if "worst" in parts[name]:
             strips[name] = recording.qpos[:, parts[name]["worst"]]
@@ -93,10 +94,16 @@ def on_ground(env: RobotTask, ground: Ground) -> RobotTask:
 
 def machine(env: RobotTask) -> Robot:
     """What the exam knows of the robot."""
-    return Robot(env.robot.physics, np.array([*env.start_place, 1.0, 0.0, 0.0, 0.0, *env.robot.pose]), env.dt)
+    home = np.array([*env.start_place, 1.0, 0.0, 0.0, 0.0, *env.robot.pose])
+    return Robot(env.robot.physics, home, env.dt, motion_of(env) if isinstance(env, MotionTracking) else None)
 
 
-def perform(env: RobotTask, policy: Policy, skill: Skill, starts: Starts | None = None) -> Recording:
+def motion_of(env: MotionTracking) -> Motion:
+    """The first clip."""
+    return Motion(env.clips[0].qpos(), tuple(env.cfg.motion.bodies), env.cfg.motion.anchor)
+
+
+def perform(env: RobotTask, policy: Policy, skill: Skill, ground: Ground = Ground(), starts: Starts | None = None) -> Recording:  # noqa: B008
     """Put the robots of all worlds into their starts, or into ``starts`` where they are known, and let ``policy`` act."""
     env.reset()
     if starts := starts or skill.starts(machine(env), env.num_envs):
@@ -105,7 +112,7 @@ def perform(env: RobotTask, policy: Policy, skill: Skill, starts: Starts | None 
         env._refresh_base()
     obs = env.first_observations()
     forget(policy)
-    steps, n = round(skill.seconds / env.dt), env.num_envs
+    steps, n = skill.steps(machine(env)), env.num_envs
     states = {"qpos": env.sim.qpos, "qvel": env.sim.qvel, "torque": env.torques}
     kept = {name: torch.empty(steps, *state.shape, device=env.device) for name, state in states.items()}
     ended_at = torch.full((n,), float("inf"), device=env.device)
@@ -114,6 +121,8 @@ def perform(env: RobotTask, policy: Policy, skill: Skill, starts: Starts | None 
             kept[name][step] = state
         with torch.inference_mode():
             actions = policy(obs)
+        if (jumps := ground.pushes(step, n, env.dt)) is not None:
+            env.root_lin_vel[:, :2] += torch.as_tensor(jumps, dtype=torch.float, device=env.device)
         obs, _, dones, _ = env.step(actions)
         forget(policy, dones)
         ended_at = torch.where(dones & ended_at.isinf(), torch.full_like(ended_at, step), ended_at)
@@ -147,7 +156,7 @@ class InTraining:
 
 def first_part(env: RobotTask, policy: Policy, skill: Skill, starts: Starts | None = None) -> dict[str, float]:
     """The figures of the part that a prepared task is, by name; those that there is nothing to measure of are left out."""
-    found = skill.judge(machine(env), perform(env, policy, skill, starts))
+    found = skill.judge(machine(env), perform(env, policy, skill, starts=starts))
     return {measure.key: float(value) for measure in skill.measures if (value := found[measure.key]) is not None}
 
 
