@@ -23,12 +23,12 @@ from legged_mw.check.recordable import recordable
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl.concurrent import ConcurrentModel, taught_worlds
+from legged_mw.rl.concurrent import ConcurrentModel, concurrent_settings, taught_worlds
 from legged_mw.rl.network import run_onnx
 from legged_mw.rl.policies import act, find_trained, load_policy
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.transfer import begin_with
+from legged_mw.rl.transfer import begin_with, load_teacher, seat_teacher
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask
 
@@ -276,6 +276,29 @@ def test_training_begins_with_a_checkpoint_and_not_with_an_export(run_folder: Pa
     assert torch.equal(model.teacher[1][0].weight, saved["teacher.1.0.weight"])
     with pytest.raises(ConfigError, match="policy.onnx holds the student alone, not the teacher's encoder .*; name a checkpoint"):
         begin_with(model, find_trained(str(run_folder / "export"), run_folder.parent, "--init"))
+
+
+@pytest.mark.parametrize("frames", [1, 5])
+def test_it_teaches_a_student_that_reads_other_frames(frames: int, policy: ConcurrentModel, run_folder: Path) -> None:
+    """Its newest frames are looked for among its own rows, not among those that the student's group of the same name has."""
+    task = task_with(**{"observations.history": {"state": frames}, "observations.leave_out": {}, "actor.concurrent.groups": []})
+    env, teacher = LeggedRobot(task.cfg, "cpu"), find_trained(str(run_folder), run_folder.parent, "--teacher")
+    seat_teacher(env, teacher)
+    runner: Any = make_runner(env, task.train, None, "cpu", teacher.task.train)
+    load_teacher(runner.alg.teacher, teacher, env)
+    obs = env.get_observations()
+    assert torch.equal(act(runner.alg.teacher, obs), act(policy, TensorDict({"state": obs["teacher"]}, obs.batch_size)))
+    assert runner.alg.teacher.obs_groups == ["teacher"] and obs["state"].shape[1] == 48 * frames
+
+
+def test_the_newest_frames_of_rows_within_a_group_of_groups() -> None:
+    """The critic's group begins with the actor's, three frames of each row, and shows one of its own rows."""
+    task = task_with(**{"obs_groups.actor": ["privileged_state"], "actor.concurrent.groups": ["privileged_state"]})
+    env = LeggedRobot(task.cfg, "cpu")
+    newest = concurrent_settings(task.train.to_dict(), env, learns=False)["newest"]
+    assert newest[:6] == [(6, 9), (15, 18), (42, 54), (78, 90), (114, 126), (132, 135)]
+    assert newest[-1][1] == env.observations.buffers["privileged_state"].shape[1]
+    assert sum(stop - start for start, stop in newest) == newest[-1][1] - 2 * 45
 
 
 def test_it_can_teach_a_student_that_is_distilled(run_folder: Path, tmp_path: Path) -> None:

@@ -130,15 +130,15 @@ def concurrent_settings(sections: dict[str, Any], env: RobotTask, learns: bool) 
 
     ``learns``: False for a student that only acts, and needs no teacher.
     """
-    concurrent, read, groups = sections["actor"]["concurrent"], sections["obs_groups"]["actor"], env.observations.groups
-    for group in concurrent["groups"]:
-        if group not in groups:
-            raise ConfigError(f"{FIELD}: {unknown('observation group', group, groups, 'the observation table')}")
+    concurrent, read = sections["actor"]["concurrent"], sections["obs_groups"]["actor"]
+    groups = concurrent["groups"] if learns else []
+    for group in groups:
+        if group not in env.observations.groups:
+            raise ConfigError(f"{FIELD}: {unknown('observation group', group, env.observations.groups, 'the observation table')}")
         if group in read:
             raise ConfigError(f"{FIELD}: the actor reads '{group}' itself; the teacher's encoder is for what a robot does not measure")
-    newest, start = [], 0
-    for group in read:
-        spans = [env.observations.newest(group, row.name) for row in groups[group]]
-        newest += [(start + span.start, start + span.stop) for span in spans]
-        start += env.observations.buffers[group].shape[1]
-    return {**concurrent, "newest": newest, "groups": concurrent["groups"] if learns else []}
+    newest, stop = [], 0
+    for row in (row for group in read for row in env.observations.rows(group)):
+        stop += row.size
+        newest.append((stop - row.value.shape[1], stop))
+    return {**concurrent, "newest": newest, "groups": groups}

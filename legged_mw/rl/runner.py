@@ -31,7 +31,7 @@ from legged_mw.rl.ranks import this_rank
 from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
 from legged_mw.rl.threads import UpdateThreads
-from legged_mw.rl.transfer import adapt
+from legged_mw.rl.transfer import TEACHER, adapt
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
 
@@ -308,7 +308,7 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
     torch.set_float32_matmul_precision(cfg.runner.matmul_precision)
     check_mirror(env, cfg)
     try:
-        settings = adapt(rsl_rl_config(cfg, env), cfg, acting(teacher, env) if teacher else None)
+        settings = adapt(rsl_rl_config(cfg, env), cfg, acting(teacher, env, [TEACHER]) if teacher else None)
         runner = Runner(env, settings, str(log_dir) if log_dir else None, device)
     except ValueError as error:  # a class, activation, optimizer or observation group that does not exist
         raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None
