@@ -197,7 +197,10 @@ def test_a_checkpoint_goes_on_bit_for_bit(tmp_path: Path) -> None:
         ({"latent_dim": 0}, "latent_dim is 0; it must be"),
         ({"hidden_dims": []}, r"hidden_dims is \[\]; it must be whole numbers from 1, at least one"),
         ({"actor.class_name": "RNNModel"}, "groups: that goes with actor.class_name 'MLPModel', not 'RNNModel'"),
-        ({"algorithm.class_name": "PPO"}, "groups: only the recorded update of GraphedPPO trains that, and rsl-rl's own is used here"),
+        (
+            {"algorithm.class_name": "PPO"},
+            "groups: only GraphedPPO's recorded update trains that, and rsl-rl's own is used here: set it to",
+        ),
         ({"actor.estimator.targets": ["base_lin_vel"]}, "groups are both set: the actor reads an estimate or a latent; empty one"),
     ],
     ids=lambda value: "" if isinstance(value, str) else "".join(value),
@@ -307,4 +310,4 @@ def test_it_can_teach_a_student_that_is_distilled(run_folder: Path, tmp_path: Pa
     assert result.code == 0, result.err
     assert "symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it" in result.out
     line = refused(tmp_path, "train", *SMALL, *FLAGS, *distil)
-    assert "actor.concurrent.groups: only the recorded update of GraphedPPO trains that" in line
+    assert "actor.concurrent.groups: only GraphedPPO's recorded update trains that" in line

@@ -78,7 +78,7 @@ class ConcurrentModel(RegressingModel):
         output = run_mlp(self.mlp, self._take_over(latent, wanted, taught))
         return output, nn.functional.mse_loss(unit(run_mlp(self.estimator, seen)), unit(wanted).detach())
 
-    def learn_spread(self, obs: TensorDict, ranks: int) -> None:
+    def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
         if isinstance(normalizer := self.teacher[0], EmpiricalNormalization):
             update_normalizer(normalizer, self._known(obs), ranks)
 

@@ -316,7 +316,7 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
     if settings["critic_warmup"] and not graphed:
         raise ConfigError(f"warm_start.critic_warmup is {settings['critic_warmup']}, but only the recorded PPO knows it; set it to 0")
     if isinstance(policy := runner.alg.get_policy(), RegressingModel) and not graphed:
-        raise ConfigError(f"{policy.field}: only the recorded update of GraphedPPO trains that, and rsl-rl's own is used here")
+        raise ConfigError(f"{policy.field}: only GraphedPPO's recorded update trains that, and rsl-rl's own is used here: set it to []")
     return runner
 
 
