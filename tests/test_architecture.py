@@ -24,14 +24,25 @@ LONG = {
 
 # Imports run one way: train, play -> rl -> envs -> sim -> utils; configs -> envs, utils.
 LAYERS = ("utils", "sim", "envs", "rl")
-TOOLS = ("legged_mw.check", "legged_mw.view", "legged_mw.eval", "legged_mw.deploy", "legged_mw.robot", "legged_mw.drawing")
+TOOLS = (
+    "legged_mw.check",
+    "legged_mw.view",
+    "legged_mw.eval",
+    "legged_mw.deploy",
+    "legged_mw.robot",
+    "legged_mw.drawing",
+    "legged_mw.motion",
+)
 ONLY_IN = {
     "warp": ["legged_mw/sim/*"],
     "mujoco_warp": ["legged_mw/sim/*"],
     "rsl_rl": ["legged_mw/rl/*"],
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
     "matplotlib": ["legged_mw/eval/plots.py", "legged_mw/deploy/replay.py"],  # a second to import, and only for a report
-    "legged_mw.view": ["legged_mw/view/*", "legged_mw/deploy/*", "legged_mw/robot/*", "legged_mw/programs.py"],
+    "legged_mw.view": [
+        *("legged_mw/view/*", "legged_mw/deploy/*", "legged_mw/robot/*", "legged_mw/motion/*", "legged_mw/eval/strip.py"),
+        "legged_mw/programs.py",
+    ],
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/studio.py"],  # young, and not on every platform
     "legged_mw.check": ["legged_mw/check/*", "legged_mw/programs.py"],
     "legged_mw.robot": ["legged_mw/robot/*", "legged_mw/programs.py"],
@@ -39,8 +50,11 @@ ONLY_IN = {
         "legged_mw/drawing/*",
         "legged_mw/view/env_stage.py",
         "legged_mw/rl/export_scene.py",
+        "legged_mw/eval/strip.py",
         "legged_mw/robot/picture.py",
+        "legged_mw/motion/look.py",
     ],
+    "legged_mw.motion": ["legged_mw/motion/*"],
     "legged_mw.eval": ["legged_mw/eval/*", "legged_mw/deploy/*", "legged_mw/programs.py"],
     "legged_mw.deploy": [
         *("legged_mw/deploy/*", "legged_mw/rl/export*.py", "legged_mw/eval/*", "legged_mw/programs.py"),
@@ -90,7 +104,7 @@ DEPLOY_MAY = [
         "legged_mw.eval.skills",
     ),
     *("legged_mw.utils.cli", "legged_mw.utils.config", "legged_mw.utils.errors", "legged_mw.utils.machine", "legged_mw.utils.commands"),
-    *("legged_mw.utils.motor_network", "legged_mw.utils.files"),
+    *("legged_mw.utils.motor_network", "legged_mw.utils.files", "legged_mw.utils.clip"),
     *sys.stdlib_module_names,
 ]
 

@@ -128,7 +128,7 @@ WRONG = [
     (put("default_pose.2", "bent"), "it must be 12 numbers, one a joint"),
     (put("stiffness.0", 20.0), "stiffness is [20., 35., 35.,"),
     (put("robot.mass", 20.0), "robot: mass is 20., but scene.xml has 12.743"),
-    (put("format", 1), "'format' is 1; it must be 2 or 3, which this version reads; export the policy again"),
+    (put("format", 1), "'format' is 1; it must be one of 2, 3, 4, which this version reads; export the policy again"),
     (
         put("network.memory", {"input": "state_in", "output": "state_out", "shape": [1, 0]}),
         "policy.yaml: network: memory: 'shape' is [1, 0]; it must be two whole numbers from 1: states and the size of each",
@@ -137,7 +137,7 @@ WRONG = [
         put("network.memory", {"input": "state_in", "output": "state_out", "shape": [1, 8]}),
         "its input is 'obs' ['batch', 48], the contract's is 'obs' [1, 48], 'state_in' [1, 1, 8] (the rows",
     ),
-    (without("format"), "policy.yaml: 'format' is missing; it must be 2 or 3, which"),
+    (without("format"), "policy.yaml: 'format' is missing; it must be one of 2, 3, 4, which"),
     (without("action.scale"), "policy.yaml: action: 'scale' is missing; it must be a number, or 12 numbers, one a joint"),
     (put("action.scale", [0.5] * 11), "it must be a number, or 12 numbers, one a joint"),
     (put("action.origin", "pose"), "policy.yaml: action: 'origin' is 'pose'; it must be one of default, joints, targets, torque"),

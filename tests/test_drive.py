@@ -241,6 +241,9 @@ class FakeStage:
     def velocity(self) -> Any:
         return np.resize(self.now, (self.num_worlds, 3)) + 0.01 if len(self.command_table) == 3 else np.full((self.num_worlds, 3), 0.11)
 
+    def ghost(self) -> None:
+        return None
+
     def believed_velocity(self) -> Any:
         return self.believed
 

@@ -244,8 +244,8 @@ def test_a_task_without_an_exam() -> None:
     task.env_class = Pose
     task.exam = Pose.exam  # as the loader does
     assert find_exam(task) is None and make_exam(task, None) is None
-    line = "--eval: no exam grades task 'go1_flat'; there are: walking. A task that walks by command has the walking exam, another one "
-    with pytest.raises(ConfigError, match=re.escape(line + "names its own: TASK = Task(Env, Cfg, CfgPPO, exam=...)")):
+    line = f"--eval: no exam grades task 'go1_flat'; there are: {', '.join(EXAMS)}. A task that walks by command has the walking exam, "
+    with pytest.raises(ConfigError, match=re.escape(line + "another one names its own: TASK = Task(Env, Cfg, CfgPPO, exam=...)")):
         require_exam(task)
     task.exam = "walkin"
     with pytest.raises(ConfigError, match=r"go1_flat.py: no exam 'walkin' in legged_mw/eval/exams.py; did you mean 'walking'\?"):

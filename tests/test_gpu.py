@@ -113,8 +113,15 @@ FORCES: dict[str, object] = {
         ("g1_flat", BIPED),
         ("g1_12dof_flat", {}),
         ("g1_rough", {}),
+        ("go1_getup", {}),
+        ("g1_getup", {}),
+        ("go1_handstand", {}),
+        ("g1_track", {"motion__hold_s": 0.1}),
     ],
-    ids=["nominal", "randomized", "rough", "forces", "go2", "biped", "held joints", "biped on rough ground"],
+    ids=[
+        *("nominal", "randomized", "rough", "forces", "go2", "biped", "held joints", "biped on rough ground"),
+        *("falls", "falls of a biped, lifted", "handstand", "a motion"),
+    ],
 )
 def test_replay_equals_eager_over_100_steps(task: str, settings: dict[str, object]) -> None:
     """Bit for bit, with noise, kicks, falls, time outs and resets: the same random numbers are drawn in both."""

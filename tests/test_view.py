@@ -27,7 +27,7 @@ from legged_mw.view import native
 from legged_mw.view.camera import DISTANCE, RobotCamera
 from legged_mw.view.drive import BINDINGS, Pilot
 from legged_mw.view.native import NativeViewer, has_display
-from legged_mw.view.overlay import ARC_SEGMENTS, draw_velocities
+from legged_mw.view.overlay import ARC_SEGMENTS, draw, draw_velocities
 from legged_mw.view.posed_robot import Placement, PosedRobots, show_groups
 from legged_mw.view.recorder import Recorder, RobotRenderer, shrunk
 from legged_mw.view.session import Pace
@@ -263,6 +263,16 @@ def test_feet_that_stand_and_places_of_falls_are_marked(model: mujoco.MjModel, r
     assert 5 < colour_count(one, green) < colour_count(two, green)
     fallen = renderer.frame(moment(model, falls=(Fall(0, np.array([0.0, 0.4, 0.3])),)))
     assert colour_count(fallen, pink) > 50
+
+
+def test_what_is_followed_is_a_pale_robot_beside(model: mujoco.MjModel) -> None:
+    robots, scenes = PosedRobots(mujoco.MjSpec.from_string(ROBOT)), [mujoco.MjvScene(model, 200) for _ in range(2)]
+    beside = model.qpos0[None] + np.eye(model.nq)[1] * 5.0
+    for scene, ghost in zip(scenes, (None, beside), strict=True):
+        draw(scene, robots, moment(model, ghost=ghost))
+    ghosts = scenes[1].geoms[scenes[0].ngeom : scenes[1].ngeom]
+    assert len(ghosts) and all(geom.rgba[3] < 0.5 and geom.pos[1] > 4.0 for geom in ghosts)
+    assert (robots.data.qpos == model.qpos0).all()  # the robot itself stays
 
 
 def test_words_are_written_over_the_picture(model: mujoco.MjModel, renderer: RobotRenderer) -> None:

@@ -57,7 +57,7 @@ def test_every_package_is_in_the_list() -> None:
 def test_configs_robots_and_policies_are_inside(installed: Path) -> None:
     package = installed / "legged_mw"
     assert {path.name for path in (package / "configs").iterdir()} == CONFIGS
-    for folder in ("robots", "policies"):
+    for folder in ("robots", "motions", "policies"):
         inside, here = package / "resources" / folder, ROOT / "resources" / folder
         ours = {path.relative_to(here) for path in here.rglob("*") if path.is_file() and path.name != "exam.json"}
         assert ours and ours == {path.relative_to(inside) for path in inside.rglob("*") if path.is_file()}

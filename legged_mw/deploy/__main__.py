@@ -11,6 +11,7 @@ from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, r
 from legged_mw.deploy.exam import contract_skill, run_exam, run_skill
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
+from legged_mw.deploy.switch import SwitchStage
 from legged_mw.eval import rules
 from legged_mw.utils.cli import Parser, duration, one_line_errors, positive
 from legged_mw.utils.errors import UserError, shown, unknown
@@ -23,7 +24,9 @@ def parse() -> argparse.Namespace:
     parser = Parser(prog="python -m legged_mw.deploy", description=__doc__, allow_abbrev=False)
     made = "play.py --export DIR makes one, a finished training too, in its run folder; or the name of a shipped policy"
     parser.add_argument("folder", metavar="DIR", nargs="?", help=f"an export: {made}")
-    parser.add_argument("--eval", action="store_true", help=f"the walking exam; prints its table and writes DIR/{RESULT_FILE}")
+    parser.add_argument("second", metavar="DIR2", nargs="?", help="with --switch: the policy that takes over, of the same robot")
+    parser.add_argument("--switch", choices=("fall",), help="fall: DIR until the robot falls, then DIR2 until it stands (simulated)")
+    parser.add_argument("--eval", action="store_true", help=f"the task's exam; prints its table and writes DIR/{RESULT_FILE}")
     parser.add_argument("--out", metavar="FILE", help=f"where --eval writes (default: DIR/{RESULT_FILE})")
     common = "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
@@ -39,6 +42,10 @@ def parse() -> argparse.Namespace:
         parser.error("the following arguments are required: DIR")
     if args.eval and (asked := [f"--{name}" for name in ("command", "terrain") if getattr(args, name)] + launch.asked(args)):
         parser.error(f"--eval brings its own commands, is on flat ground and shows nothing: leave {asked[0]} out")
+    if (args.second is None) != (args.switch is None):
+        parser.error("--switch fall is of two policies: python -m legged_mw.deploy DIR DIR2 --switch fall")
+    if args.switch and (args.eval or args.drive or args.serve or args.terrain or args.robot != "simulated" or args.velocity):
+        parser.error("--switch is watched in simulation, on flat ground: leave the other flags out")
     if args.ranges and not args.eval:
         parser.error("--ranges says what the exam asks: add --eval")
     if args.command is not None and args.commands:
@@ -60,7 +67,10 @@ def main() -> None:
     if contract.ends.not_covered:
         print(f"not judged here: {', '.join(contract.ends.not_covered)}, which ended episodes in training")
     contact = options.contact(args, contract)
-    if args.serve:
+    if args.switch:
+        stage = SwitchStage(folder, find(args.second), args.num_envs, command)
+        launch.watch(stage, args, folder, title=f"{contract.task}, {args.second}")
+    elif args.serve:
         options.serve(folder, contract, args)
     elif args.robot != "simulated":
         robot = options.connect(folder, contract, args)

@@ -15,6 +15,7 @@ import numpy as np
 
 from legged_mw.deploy.estimate import ESTIMATE, Estimated, read_estimated
 from legged_mw.deploy.memory import MEMORY, Memory, read_memory
+from legged_mw.deploy.motion import JOINT_POS, JOINT_VEL, MOTION, PLACE, REFERENCE, TURN, Motion, read_motion
 from legged_mw.deploy.motors import MOTORS, SERVOS, Motors, read_motors
 from legged_mw.deploy.reader import ContractError as ContractError
 from legged_mw.deploy.reader import Reader, is_list, is_number
@@ -23,7 +24,7 @@ from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.files import digest
 
-FORMATS = (2, 3)  # 3: a memory, an estimate, motors. A file has the lowest that suffices: old readers read what they can
+FORMATS = (2, 3, 4)  # 3: a memory, an estimate, motors; 4: a motion. A file has the lowest that suffices: old readers read what they can
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"
 TERRAIN_FILE = "terrain.xml"  # the same robot among steps and blocks; only of policies that were trained on such ground
 
@@ -49,6 +50,10 @@ ROWS: dict[str, Quantity] = {
     "last_actions": Quantity("last_action", "1", "joint; clipped, 0 before the first"),
     "gait_clock": Quantity("gait_clock", "1", "sine of each foot's phase, then cosine of each; 0 while told to stand"),
     "commands": Quantity("command", "", "in the order of `commands`"),
+    JOINT_POS: Quantity(JOINT_POS, "rad", "joint; of the motion, at the end of the step to come"),
+    JOINT_VEL: Quantity(JOINT_VEL, "rad/s", "joint; likewise"),
+    PLACE: Quantity(PLACE, "m", "the anchor's: from it to the motion's, at the end of the step to come"),
+    TURN: Quantity(TURN, "1", "the anchor's: the first two columns of the rotation to the motion's, row by row"),
     "height_scan": Quantity(
         "height_scan",
         "m",
@@ -56,7 +61,7 @@ ROWS: dict[str, Quantity] = {
         "the robot stands on level ground, within 1 m; x by x from behind, in each from right to left",
     ),
 }
-COMPUTED = ("joint_offset", "last_action", "command", "gait_clock")  # by the controller; a robot measures all others
+COMPUTED = ("joint_offset", "last_action", "command", "gait_clock", *REFERENCE)  # by the controller; a robot measures all others
 # What the sensors of a scene measure; "up" is the world's z axis in the IMU's frame, opposite to gravity.
 SENSED = ("lin_vel", "ang_vel", "up", "acceleration", "joint_pos", "joint_vel", "joint_torque")
 FALL = "fall_contact"  # contacts of `ends: falls_on` with the ground; only where there are such geoms
@@ -151,6 +156,7 @@ class Contract:
     memory: Memory | None = None  # of a recurrent network
     estimate: tuple[Estimated, ...] = ()  # the network's second output, row by row
     motors: Motors = SERVOS
+    motion: Motion | None = None  # that the policy follows
 
     @property
     def size(self) -> int:
@@ -166,7 +172,7 @@ class Contract:
         ends = {name: list(value) if isinstance(value, tuple) else value for name, value in self.ends._asdict().items() if value}
         network = {"file": NETWORK_FILE, "sha256": self.digest, "input": self.input, "output": self.output}
         return {
-            "format": FORMATS[1] if self.memory or self.estimate or self.motors != SERVOS else FORMATS[0],
+            "format": FORMATS[2 if self.motion else 1 if self.memory or self.estimate or self.motors != SERVOS else 0],
             "task": self.task,
             "network": network | ({MEMORY: self.memory.to_dict()} if self.memory else {}),
             "period": self.period,
@@ -186,6 +192,7 @@ class Contract:
             **{name: dict(said) for name, said in (("exam", self.exam), ("safety", self.safety)) if said is not None},
             **({ESTIMATE: [row._asdict() for row in self.estimate]} if self.estimate else {}),
             **self.motors.to_dict(),
+            **({MOTION: self.motion.to_dict()} if self.motion else {}),
         }
 
 
@@ -223,7 +230,7 @@ def read_contract(folder: Path) -> Contract:
 
 
 def _read(top: Reader) -> Contract:
-    top.take("format", f"{' or '.join(map(str, FORMATS))}, which this version reads; export the policy again", lambda v: v in FORMATS)
+    top.take("format", f"one of {', '.join(map(str, FORMATS))}, which this version reads; export the policy again", lambda v: v in FORMATS)
     network, action, robot, physics, measured = (top.section(name) for name in ("network", "action", "robot", "physics", "sensors"))
     joints, feet = top.texts("joints"), robot.section("feet")
     top.take("joints", "names, each once", lambda names: len(set(names)) == len(names))
@@ -256,6 +263,7 @@ def _read(top: Reader) -> Contract:
         memory=read_memory(network.section(MEMORY)) if MEMORY in network.values else None,
         estimate=read_estimated(top.sections(ESTIMATE)) if ESTIMATE in top.values else (),
         motors=read_motors(top.section(MOTORS), count) if MOTORS in top.values else SERVOS,
+        motion=read_motion(top.section(MOTION)) if MOTION in top.values else None,
     )
 
 
@@ -318,11 +326,11 @@ def _read_gait(top: Reader) -> Gait | None:
 
 def quantity_size(contract: Contract, name: str) -> int:
     """Values of a measured or computed quantity."""
-    per_joint = ("joint_pos", "joint_offset", "joint_vel", "joint_torque", "last_action")
+    per_joint = ("joint_pos", "joint_offset", "joint_vel", "joint_torque", "last_action", JOINT_POS, JOINT_VEL)
     scan = len(contract.scan.x) * len(contract.scan.y) if contract.scan else 0
     counts = {**dict.fromkeys(per_joint, len(contract.joints)), "foot_contact": len(contract.feet), "command": len(contract.commands)}
     clock = 2 * len(contract.gait.offsets) if contract.gait else 0
-    return {**counts, FALL: len(contract.ends.falls_on), SCAN: scan, CLOCK: clock}.get(name, 3)
+    return {**counts, FALL: len(contract.ends.falls_on), SCAN: scan, CLOCK: clock, TURN: 6}.get(name, 3)
 
 
 def _check_rows(contract: Contract) -> None:
@@ -337,6 +345,8 @@ def _check_rows(contract: Contract) -> None:
                 f"{where}: nothing says how it is measured, so it cannot be deployed; in the task write Row('{row.name}', ..., "
                 f"sensors=(...), unit=...) with sensors of the MJCF, or use one of the rows {', '.join(ROWS)}; then export again"
             )
+        if row.measured in REFERENCE and not contract.motion:
+            raise ContractError(f"{where} is of a motion, and the contract has no section `{MOTION}`; export the policy again")
         if row.measured not in measurable:
             raise ContractError(f"{where}: {unknown('quantity', row.measured, [*sorted(measurable), SENSORS], 'what a robot measures')}")
         if row.size != (right := quantity_size(contract, row.measured)):

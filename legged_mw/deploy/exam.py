@@ -18,7 +18,7 @@ from legged_mw.deploy.contract import CONTRACT_FILE, Contract, ContractError, En
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import rules
 from legged_mw.eval.rules import ExamRules, in_common
-from legged_mw.eval.skill import Ground, Recording, Robot, Skill
+from legged_mw.eval.skill import Ground, Motion, Recording, Robot, Skill
 from legged_mw.eval.skills import make_skill
 from legged_mw.utils.commands import VELOCITY
 from legged_mw.utils.config import ConfigError
@@ -72,13 +72,18 @@ def contract_skill(contract: Contract) -> Skill:
 def perform(folder: Path, skill: Skill, ground: Ground, threads: int = 0) -> tuple[Robot, Recording]:
     """Put robots into their starts on ``ground`` and let the policy act."""
     stage = DeployStage(folder, skill.robots, threads=threads, change=lambda model: put_on(model, ground))
-    robot = Robot(stage.fleet.model, stage.qpos()[0], stage.dt)
+    said, follower = stage.contract.motion, stage.controller.follower
+    motion = Motion(follower.clip.qpos(), said.bodies, said.anchor) if said and follower else None
+    robot = Robot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)
     if starts := skill.starts(robot, skill.robots):
         stage.put(*starts)
     steps = []
     ended_at = np.full(skill.robots, math.inf)
-    for step in range(round(skill.seconds / stage.dt)):
+    for step in range(skill.steps(robot)):
         steps.append((stage.qpos(), stage.fleet.qvel.copy(), stage.measured.joint_torque))
+        if (jumps := ground.pushes(step, skill.robots, stage.dt)) is not None:
+            for world, jump in enumerate(jumps):
+                stage.push(world, jump)
         stage.step()
         ended_at[stage.fell() & np.isinf(ended_at)] = step
     qpos, qvel, torque = (np.stack(values) for values in zip(*steps, strict=True))

@@ -157,6 +157,9 @@ class MirroredStage:
     def qpos(self) -> Floats:
         return self._data.qpos[None].copy()
 
+    def ghost(self) -> None:
+        return None
+
     def contacts(self) -> Any:
         touches = self.told.get("foot_contact", [0.0] * len(self.contract.feet))
         return np.array([[touches[foot] > 0.0 for foot in self._foot]])

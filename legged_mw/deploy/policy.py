@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from legged_mw.deploy.contract import CLOCK, CONTRACT_FILE, NETWORK_FILE, OWN, Contract, ContractError
 from legged_mw.deploy.estimate import ESTIMATE, columns_of
+from legged_mw.deploy.follow import Follower
 from legged_mw.deploy.gait import GaitClock
 from legged_mw.deploy.robot import Measurement
 from legged_mw.utils.errors import UserError
@@ -82,6 +83,7 @@ class Controller:
         self._frames = [np.zeros((count, row.history, row.size), dtype=np.float32) for row in contract.rows]  # as last observed
         self._fresh = np.ones(count, dtype=bool)  # robots that have observed nothing since their reset
         self.clock = GaitClock(contract, count) if contract.gait else None
+        self.follower = Follower(folder, contract, count) if contract.motion else None
         self.memory = contract.memory.start(count) if contract.memory else None  # (N, *shape)
 
     def observe(self, measurement: Measurement, commands: Floats) -> NDArray[np.float32]:
@@ -94,6 +96,8 @@ class Controller:
         self._frames = self._look(measurement, commands)
         if self.clock:
             self.clock.keep(commands, self._fresh)
+        if self.follower:
+            self.follower.keep(measurement, self._fresh)
         self._fresh[:] = False
         seen = self.last_observation = _side_by_side(self._frames)
         if self.memory is None:
@@ -116,6 +120,8 @@ class Controller:
         self.last_actions[which], self.last_targets[which], self._fresh[which] = 0.0, self.contract.default_pose, True
         if self.memory is not None:
             self.memory[which] = 0.0
+        if self.follower:
+            self.follower.reset(which)
 
     def _look(self, measurement: Measurement, commands: Floats) -> list[NDArray[np.float32]]:
         """Frames (N, history, size) of each row, the newest last."""
@@ -126,6 +132,8 @@ class Controller:
         }
         if self.clock:
             computed[CLOCK] = self.clock.row(commands, self._fresh)
+        if self.follower:
+            computed |= self.follower.rows(measurement, self._fresh)
         frames = []
         for row, before in zip(self.contract.rows, self._frames, strict=True):
             if row.measured in OWN and row.name not in measurement.others:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legged_mw.deploy.contract import OWN, Contract, quantity_size
+from legged_mw.deploy.motion import ATTITUDE, PLACE, POSITION
 from legged_mw.utils.errors import UserError
 
 Floats = NDArray[np.float64]
@@ -38,7 +39,8 @@ class Measurement:
     joint_torque: Floats  # (D,) [N m]
     acceleration: Floats  # (3,) of the IMU, body frame: standing level it is (0, 0, 9.81) [m/s^2]
     foot_contact: Floats  # (F,) 1 where a foot touches the ground, else 0
-    others: Mapping[str, Floats] = field(default_factory=dict)  # rows with sensors of their own, a height scan: row -> (size,)
+    # rows with sensors of their own, a height scan: row -> (size,); for a motion the root's attitude and, if a row asks for it, position
+    others: Mapping[str, Floats] = field(default_factory=dict)
 
     def of(self, robot: int) -> Measurement:
         """That of one robot of many."""
@@ -79,6 +81,7 @@ QUANTITIES = tuple(f.name for f in fields(Measurement) if f.name != "others")
 def layout(contract: Contract) -> dict[str, int]:
     """Values of each part of a measurement, the rows with sensors of their own last."""
     own = {row.name: row.size for row in contract.rows if row.measured in OWN and row.measured}
+    own |= ({ATTITUDE: 4} if contract.motion else {}) | ({POSITION: 3} if any(row.measured == PLACE for row in contract.rows) else {})
     return {**{name: quantity_size(contract, name) for name in QUANTITIES}, **own}
 
 

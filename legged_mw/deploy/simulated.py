@@ -20,6 +20,7 @@ from mujoco.batch import Batch, SimulationError
 from numpy.typing import ArrayLike, NDArray
 
 from legged_mw.deploy.contract import CONTRACT_FILE, FALL, SCAN, SCENE_FILE, SENSED, Contract, ContractError, quantity_size
+from legged_mw.deploy.motion import ATTITUDE, POSITION
 from legged_mw.deploy.motors import make_network
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, damped, layout
 from legged_mw.utils.errors import unknown
@@ -135,6 +136,8 @@ class Fleet:
     def _value(self, name: str) -> Floats:
         if name == "gravity":
             return self._gravity()
+        if name in (ATTITUDE, POSITION):
+            return self.qpos[:, 3:7].copy() if name == ATTITUDE else self.qpos[:, :3].copy()
         if any(row.name == name and row.measured == SCAN for row in self.contract.rows):
             return self._scan()
         if name == "foot_contact":

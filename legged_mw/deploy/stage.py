@@ -85,6 +85,10 @@ class DeployStage:
         """(N, nq)."""
         return self.fleet.qpos.copy()
 
+    def ghost(self) -> Floats | None:
+        """(N, nq) what each robot follows."""
+        return self.controller.follower.ghost() if self.controller.follower else None
+
     def contacts(self) -> NDArray[np.bool_]:
         """(N, G), the geoms of the feet."""
         return self.fleet.touching()

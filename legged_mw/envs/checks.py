@@ -8,6 +8,7 @@ from typing import Any
 
 from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, active
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
 from legged_mw.utils.commands import HEADING
 from legged_mw.utils.config import Config, ConfigError
@@ -67,6 +68,14 @@ ENVIRONMENT: dict[str, Rule] = {
     "terrain.slope": ("from -60 to 60 degrees", lambda v: -60 <= v <= 60),
     "terrain.condim": ("1, 3, 4 or 6", lambda v: v in (1, 3, 4, 6)),
 }
+SOMETIMES: dict[str, Rule] = {  # of sections that only some tasks have
+    "falls.share": ("from 0 to 1", lambda v: 0 <= v <= 1),
+    **dict.fromkeys(("falls.states", "falls.seconds", "exam.within", "exam.height"), POSITIVE),
+    "falls.pull": ("from 0 to 1, a share of the weight", lambda v: 0 <= v <= 1),
+    "falls.pull_fades": PART,
+    "exam.nose": ("-1, down, or 1, up", lambda v: v in (-1, 1)),
+    "exam.hands": NAMES,
+}
 WALKING: dict[str, Rule] = {
     "asset.foot_names": (
         "a list with at least one name, one for each foot (patterns are for foot_geoms)",
@@ -91,6 +100,18 @@ WALKING: dict[str, Rule] = {
     **dict.fromkeys(("terrain.measured_points_x", "terrain.measured_points_y"), POINTS),
     **dict.fromkeys(("commands.curriculum_start", "commands.curriculum_step"), PART),
 }
+TRACKING: dict[str, Rule] = {
+    **dict.fromkeys(("motion.bin_s",), POSITIVE),
+    **dict.fromkeys((f"motion.{name}" for name in ("hold_s", "start_joints")), NOT_NEGATIVE),
+    **dict.fromkeys(("motion.failure_rate", "motion.uniform"), PART),
+    **dict.fromkeys(
+        (f"motion.start_{name}" for name in ("pos", "turn", "lin_vel", "ang_vel")),
+        ("three numbers from 0", lambda v: len(v) == 3 and all(0 <= number < math.inf for number in v)),
+    ),
+    **dict.fromkeys((f"termination.max_{name}" for name in ("anchor_height", "anchor_tilt", "end_height")), POSITIVE),
+    **dict.fromkeys((f"rewards.{part}_sigma" for part in ("anchor_pos", "anchor_ori", "body_pos", "body_ori")), POSITIVE),
+    **dict.fromkeys(("rewards.body_lin_vel_sigma", "rewards.body_ang_vel_sigma"), POSITIVE),
+}
 LEARNER: dict[str, Rule] = {
     **dict.fromkeys(("runner.num_steps_per_env", "runner.max_iterations", "runner.save_interval"), POSITIVE),
     **dict.fromkeys(("algorithm.learning_rate", "algorithm.num_learning_epochs", "algorithm.num_mini_batches"), POSITIVE),
@@ -114,10 +135,14 @@ LEARNER: dict[str, Rule] = {
 def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None, law: str = "") -> None:
     """Raise ConfigError at the first value that cannot work; ``law`` of the motors is ``control.actuator``, unless said otherwise."""
     _check(cfg, ENVIRONMENT)
+    sections = cfg.to_dict()
+    _check(cfg, {path: rule for path, rule in SOMETIMES.items() if path.split(".")[1] in sections.get(path.split(".")[0], {})})
     _check_redraws(cfg, law)
     _check_motors(cfg)
     if isinstance(cfg, LeggedRobotCfg):
         _check_walking(cfg)
+    if isinstance(cfg, MotionTrackingCfg):
+        _check_tracking(cfg)
     if train is not None:
         _check(train, LEARNER)
         samples = cfg.env.num_envs * train.runner.num_steps_per_env
@@ -153,6 +178,17 @@ def _check_walking(cfg: LeggedRobotCfg) -> None:
         raise ConfigError(
             "commands.curriculum goes by how well tracking_lin_vel is met: give rewards.scales.tracking_lin_vel a number above 0"
         )
+
+
+def _check_tracking(cfg: MotionTrackingCfg) -> None:
+    _check(cfg, TRACKING)
+    motion = cfg.motion
+    for field, names in (("anchor", [motion.anchor]), ("end_bodies", motion.end_bodies)):
+        for name in names:
+            if name not in motion.bodies:
+                raise ConfigError(f"motion.{field}: {unknown('body', name, motion.bodies, 'motion.bodies')}")
+    if not motion.clips:
+        raise ConfigError("motion.clips is empty; name a clip, as python -m legged_mw.motion FILE --out CLIP.npz writes it")
 
 
 def _check_motors(cfg: RobotTaskCfg) -> None:

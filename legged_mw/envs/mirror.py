@@ -20,6 +20,7 @@ from torch import Tensor
 
 from legged_mw.envs.observations import Row
 from legged_mw.sim.mirror import Partners
+from legged_mw.sim.model import RobotModel
 from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
@@ -102,6 +103,26 @@ def foot_blocks(partners: Partners) -> dict[str, Block]:
     return {
         "foot": Block(feet, [1.0] * len(feet)),  # a number a foot
         "foot_polar": Block([3 * f + k for f in feet for k in range(3)], [1.0, -1.0, 1.0] * len(feet)),  # a polar vector a foot
+    }
+
+
+def body_blocks(robot: RobotModel, partners: Partners, names: Sequence[str]) -> dict[str, Block]:
+    """Kinds of mirror image of what each of the bodies ``names`` has. Raises ConfigError for one without its partner.
+
+    A turn is the first two columns of a rotation matrix, row by row.
+    """
+    carried = [int(robot.physics.joint(name).bodyid[0]) for name in robot.joint_names]  # the body that each joint moves
+    bodies = [robot.id("body", name) for name in names]
+    images = [carried[partners.joints[carried.index(body)]] if body in carried else body for body in bodies]
+    for name, image in zip(names, images, strict=True):
+        if image not in bodies:
+            other = robot.physics.body(image).name
+            raise ConfigError(f"body '{name}' is compared and its mirror image '{other}' is not: name both, or {NO_MIRROR}")
+    places, polar, turn = [bodies.index(image) for image in images], [1.0, -1.0, 1.0], [1.0, -1.0, -1.0, 1.0, 1.0, -1.0]
+    return {
+        "turn": Block([*range(6)], turn),
+        "body_polar": Block([3 * b + k for b in places for k in range(3)], polar * len(places)),
+        "body_turn": Block([6 * b + k for b in places for k in range(6)], turn * len(places)),
     }
 
 

@@ -85,14 +85,8 @@ class SimToRealRoughCfg(SimToRealCfg):
         mesh_type = "heightfield"
         height_scan = ["privileged_state"]  # the critic sees the ground, the robot does not
         terrain_proportions = {  # [ours: stairs up are learned last]
-            "flat": 0.05,
-            "smooth_slope": 0.1,
-            "rough_slope": 0.1,
-            "stairs_up": 0.35,
-            "stairs_down": 0.15,
-            "obstacles": 0.15,
-            "waves": 0.05,
-            "low_random": 0.05,
+            **{"flat": 0.05, "smooth_slope": 0.1, "rough_slope": 0.1, "stairs_up": 0.35, "stairs_down": 0.15},
+            **{"obstacles": 0.15, "waves": 0.05, "low_random": 0.05},
         }
 
     class termination(SimToRealCfg.termination):

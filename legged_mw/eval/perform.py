@@ -13,14 +13,16 @@ import torch
 
 from legged_mw.deploy import exam as on_export
 from legged_mw.envs.domain_rand import KINDS
+from legged_mw.envs.motion_tracking import MotionTracking
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.eval import exam, skill_page
 from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
-from legged_mw.eval.skill import Ground, Recording, Robot, Skill
+from legged_mw.eval.skill import Ground, Motion, Recording, Robot, Skill, Starts
 from legged_mw.eval.skills import make_skill
 from legged_mw.rl.recurrent import forget
+from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import LoadedTask, load_task
 
 NOMINAL: dict[str, Any] = {**{f"domain_rand.{name}": [] for name in KINDS}, "domain_rand.delay_ms": [], "domain_rand.model_factors": {}}
@@ -33,7 +35,8 @@ def skill_of(cfg: RobotTaskCfg, kind: str) -> Skill:
 
 def overrides(task: LoadedTask) -> dict[str, Any]:
     """What the exam changes in the task; fields that it does not have are left out."""
-    wanted, config = {**exam.OVERRIDES, **skill_of(task.cfg, task.exam).overrides}, task.to_dict()
+    common = {path: value for path, value in exam.OVERRIDES.items() if not path.startswith("termination.")}  # a task's own ends stay
+    wanted, config = {**common, **skill_of(task.cfg, task.exam).overrides}, task.to_dict()
     return {path: value for path, value in wanted.items() if path.split(".")[1] in config.get(path.split(".")[0], {})}
 
 
@@ -57,13 +60,25 @@ def ask_alike(tasks: Sequence[LoadedTask]) -> None:
 
 def examine(kind: str, env: RobotTask, policy: Policy, rough: None = None) -> tuple[dict[str, Any], dict[str, Any]]:
     """The result, and what is drawn of it; ``env`` is made from a prepared task, each further ground needs one more."""
-    skill = skill_of(env.cfg, kind)
-    parts = {}
+    skill, parts, strips = skill_of(env.cfg, kind), {}, {}
     for number, (name, ground) in enumerate(skill.grounds.items()):
         here = env if number == 0 else on_ground(env, ground)
-        recording = perform(here, policy, skill)
+        recording = perform(here, policy, skill, ground)
         parts[name] = skill.judge(machine(here), recording)
-    return skill.result(parts), {}
+        if "worst" in parts[name]:
+            strips[name] = recording.qpos[:, parts[name]["worst"]]
+    return skill.result(parts), {"strips": _draw(env, strips)}
+
+
+def _draw(env: RobotTask, strips: Mapping[str, np.ndarray]) -> dict[str, bytes]:
+    """A picture of each robot, or none where nothing can be drawn."""
+    from legged_mw.eval.strip import strip  # OpenGL
+
+    try:
+        return {name: strip(env, qpos) for name, qpos in strips.items()}
+    except UserError as error:
+        print(f"no strips of pictures: {error}")
+        return {}
 
 
 def on_ground(env: RobotTask, ground: Ground) -> RobotTask:
@@ -79,19 +94,25 @@ def on_ground(env: RobotTask, ground: Ground) -> RobotTask:
 
 def machine(env: RobotTask) -> Robot:
     """What the exam knows of the robot."""
-    return Robot(env.robot.physics, np.array([*env.start_place, 1.0, 0.0, 0.0, 0.0, *env.robot.pose]), env.dt)
+    home = np.array([*env.start_place, 1.0, 0.0, 0.0, 0.0, *env.robot.pose])
+    return Robot(env.robot.physics, home, env.dt, motion_of(env) if isinstance(env, MotionTracking) else None)
 
 
-def perform(env: RobotTask, policy: Policy, skill: Skill) -> Recording:
-    """Put the robots of all worlds into their starts and let ``policy`` act."""
+def motion_of(env: MotionTracking) -> Motion:
+    """The first clip."""
+    return Motion(env.clips[0].qpos(), tuple(env.cfg.motion.bodies), env.cfg.motion.anchor)
+
+
+def perform(env: RobotTask, policy: Policy, skill: Skill, ground: Ground = Ground(), starts: Starts | None = None) -> Recording:  # noqa: B008
+    """Put the robots of all worlds into their starts, or into ``starts`` where they are known, and let ``policy`` act."""
     env.reset()
-    if starts := skill.starts(machine(env), env.num_envs):
+    if starts := starts or skill.starts(machine(env), env.num_envs):
         for state, values in zip((env.sim.qpos, env.sim.qvel), starts, strict=True):
             state.copy_(torch.as_tensor(values, dtype=torch.float))
         env._refresh_base()
     obs = env.first_observations()
     forget(policy)
-    steps, n = round(skill.seconds / env.dt), env.num_envs
+    steps, n = skill.steps(machine(env)), env.num_envs
     states = {"qpos": env.sim.qpos, "qvel": env.sim.qvel, "torque": env.torques}
     kept = {name: torch.empty(steps, *state.shape, device=env.device) for name, state in states.items()}
     ended_at = torch.full((n,), float("inf"), device=env.device)
@@ -100,6 +121,8 @@ def perform(env: RobotTask, policy: Policy, skill: Skill) -> Recording:
             kept[name][step] = state
         with torch.inference_mode():
             actions = policy(obs)
+        if (jumps := ground.pushes(step, n, env.dt)) is not None:
+            env.root_lin_vel[:, :2] += torch.as_tensor(jumps, dtype=torch.float, device=env.device)
         obs, _, dones, _ = env.step(actions)
         forget(policy, dones)
         ended_at = torch.where(dones & ended_at.isinf(), torch.full_like(ended_at, step), ended_at)
@@ -123,16 +146,17 @@ class InTraining:
         self.skill, self._generators = skill_of(copied.cfg, copied.exam), [device] if device.startswith("cuda") else []
         with torch.random.fork_rng(self._generators):
             self.env = copied.env_class(copied.cfg, device, eager=eager)
+        self._starts = self.skill.starts(machine(self.env), self.env.num_envs)
 
     def __call__(self, policy: Policy) -> dict[str, float]:
         """The figures of ``first_part``."""
         with torch.random.fork_rng(self._generators):
-            return first_part(self.env, policy, self.skill)
+            return first_part(self.env, policy, self.skill, self._starts)
 
 
-def first_part(env: RobotTask, policy: Policy, skill: Skill) -> dict[str, float]:
+def first_part(env: RobotTask, policy: Policy, skill: Skill, starts: Starts | None = None) -> dict[str, float]:
     """The figures of the part that a prepared task is, by name; those that there is nothing to measure of are left out."""
-    found = skill.judge(machine(env), perform(env, policy, skill))
+    found = skill.judge(machine(env), perform(env, policy, skill, starts=starts))
     return {measure.key: float(value) for measure in skill.measures if (value := found[measure.key]) is not None}
 
 
@@ -152,4 +176,8 @@ def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[t
     folder.mkdir(parents=True, exist_ok=True)
     content = {"task": task, "columns": [{**column._asdict(), "figures": None} for column in columns]}
     (folder / "report.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    (folder / "report.html").write_text(skill_page.html(task, of_result(columns[0].exam), columns), encoding="utf-8")
+    strips = (columns[0].figures or {}).get("strips", {})
+    for name, picture in strips.items():
+        (folder / f"{name}.png").write_bytes(picture)
+    page = skill_page.html(task, of_result(columns[0].exam), columns, strips)
+    (folder / "report.html").write_text(page, encoding="utf-8")

@@ -8,6 +8,7 @@ numpy and MuJoCo, neither torch nor warp.
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -20,6 +21,8 @@ from numpy.typing import NDArray
 from legged_mw.eval.rules import Figure
 
 Floats = NDArray[np.float64]
+PUSH_EVERY, GOLDEN = 2.0, math.pi * (3.0 - 5.0**0.5)  # [s]; [rad] directions that never repeat
+Starts = tuple[Floats, Floats]  # qpos (N, nq), qvel (N, nv)
 
 
 class Ground(NamedTuple):
@@ -28,6 +31,24 @@ class Ground(NamedTuple):
     slope: float = 0.0  # [deg] of the plane; in simulation gravity leans and the plane stays
     friction: float | None = None  # [-] of the ground; None: the task's
     load: float = 0.0  # [kg] on the root
+    push: float = 0.0  # [m/s] by which each robot's horizontal velocity jumps, every PUSH_EVERY seconds
+
+    def pushes(self, step: int, count: int, dt: float) -> Floats | None:
+        """Jumps (count, 2) [m/s] at a control step of ``dt`` [s]; None: none. Robots are pushed one after another, in all directions."""
+        every, robots = round(PUSH_EVERY / dt), np.arange(count)
+        now = (step > 0) & ((step + robots * every // count) % every == 0)
+        if not self.push or not now.any():
+            return None
+        angle = GOLDEN * (robots + count * (step // every))
+        return self.push * now[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+class Motion(NamedTuple):
+    """What a robot is to follow."""
+
+    qpos: Floats  # (T, nq) a frame a control step
+    bodies: tuple[str, ...]  # that are compared
+    anchor: str  # one of them, at which they are
 
 
 class Robot(NamedTuple):
@@ -36,6 +57,7 @@ class Robot(NamedTuple):
     model: mujoco.MjModel  # as it is stepped, with the gravity of the exam's ground
     home: Floats  # (nq,) where an episode starts, joints in their default pose
     dt: float  # [s] a control step
+    motion: Motion | None = None
 
 
 class Recording(NamedTuple):
@@ -73,8 +95,12 @@ class Skill(ABC):
     def seconds(self) -> float:
         """How long robots are watched [s]."""
 
+    def steps(self, robot: Robot) -> int:
+        """How long [control steps]."""
+        return round(self.seconds / robot.dt)
+
     @abstractmethod
-    def starts(self, robot: Robot, count: int) -> tuple[Floats, Floats] | None:
+    def starts(self, robot: Robot, count: int) -> Starts | None:
         """qpos (count, nq) and qvel (count, nv) to begin with, the same at every call; None: where the task's episodes begin."""
 
     @abstractmethod

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Mapping, Sequence
 from html import escape
 
@@ -9,13 +10,13 @@ from legged_mw.eval.page import CSS, Column, about, exam_table, pill
 from legged_mw.eval.skill import Skill
 
 
-def html(task: str, skill: Skill, columns: Sequence[Column], strips: Mapping[str, str] | None = None) -> str:
-    """The whole page; ``strips`` are pictures as data URLs below the name of the part that they show."""
+def html(task: str, skill: Skill, columns: Sequence[Column], strips: Mapping[str, bytes]) -> str:
+    """The whole page; ``strips`` are PNGs by the part whose slowest robot, or one that failed, they show."""
     passed = [f"<li><b>{escape(c.name)}</b> {pill('passes', 'does not pass', c.exam['passed'])}</li>" for c in columns]
     sections = []
     for part in skill.grounds:
         figures = [skill.figures(column.exam["parts"], part) for column in columns]
-        strip = f'<p><img src="{strips[part]}" alt="{escape(part)}" style="max-width:100%"></p>' if strips and part in strips else ""
+        strip = picture(strips[part], part) if part in strips else ""
         sections.append(f"<section><h2>{escape(part)}</h2>{exam_table(columns, figures, '', 'asks')}{strip}</section>")
     return f"""<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
@@ -26,3 +27,8 @@ def html(task: str, skill: Skill, columns: Sequence[Column], strips: Mapping[str
 <footer>{about(columns)}</footer>
 </main></body></html>
 """
+
+
+def picture(png: bytes, name: str) -> str:
+    """The robot that failed, or was the slowest."""
+    return f'<p><img src="data:image/png;base64,{base64.b64encode(png).decode()}" alt="{escape(name)}" style="max-width:100%"></p>'

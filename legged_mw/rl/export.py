@@ -37,10 +37,12 @@ from legged_mw.deploy.contract import (
 )
 from legged_mw.deploy.estimate import Estimated
 from legged_mw.deploy.memory import Memory
+from legged_mw.deploy.motion import MOTION_FILE, Motion
 from legged_mw.deploy.motors import MOTORS_FILE, Motors
 from legged_mw.envs.actuators import OWN as OWN_LAW
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.loading import motor_drive
+from legged_mw.envs.motion_tracking import MotionTracking
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.estimator import EstimatingModel, find_targets
 from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
@@ -63,13 +65,14 @@ from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.sim.joints import CURVE
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import LEVEL, make_terrain
+from legged_mw.utils.clip import save_clip
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import shown
 from legged_mw.utils.files import digest, find_file
 from legged_mw.utils.task import LoadedTask
 
 FILES = (CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
-SOMETIMES = (TERRAIN_FILE, MOTORS_FILE)
+SOMETIMES = (TERRAIN_FILE, MOTORS_FILE, MOTION_FILE)
 WORLDS = 8  # of the roll-out that the export is tried on
 TOLERANCE = 1e-4  # between actions of the same observation, relative above 1: float32 sums in another order
 
@@ -152,6 +155,8 @@ def _small_env(task: LoadedTask) -> RobotTask:
     """The task as trained, kicks and pushes too, but small, on a CPU, and without what stands between a robot and its policy."""
     settings = {"env.num_envs": WORLDS, "sim.engine": "mujoco", "noise.level": 0.0}
     settings |= {f"domain_rand.{name}": [] for name in ("action_delay", "delay_ms", "observation_delay")}
+    if hasattr(task.cfg, "motion"):
+        settings["motion.clips"] = task.cfg.motion.clips[:1]  # that a deployed robot follows
     if hasattr(task.cfg.terrain, "mesh_type"):
         settings["terrain.mesh_type"] = "plane"  # the scene is the robot's alone
     for path, value in settings.items():
@@ -255,6 +260,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         digest=digest(folder / NETWORK_FILE),
         exam=_exam(task),
         motors=_motors(env, folder),
+        motion=_motion(env, folder),
         estimate=_estimated(env, task),
     )
 
@@ -283,7 +289,9 @@ def _write_scene(env: RobotTask, folder: Path) -> Scene:
             "exported with a law of control.actuator (docs/motors.md)"
         )
     start = [*env.start_place, 1.0, 0.0, 0.0, 0.0, *robot.pose]
-    held = robot.pose if motor_drive(cfg, law) == "angle" else [0.0] * len(robot.pose)
+    if isinstance(env, MotionTracking):
+        start = env.clips[0].qpos()[0].tolist()
+    held = start[7:] if motor_drive(cfg, law) == "angle" else [0.0] * len(robot.pose)
     source = find_file(cfg, "asset.file").read_text(encoding="utf-8", errors="replace")
     scene = standalone(robot, robot.imu, qpos=start, ctrl=held, camera=cfg.viewer.camera, source=source)
     (folder / SCENE_FILE).write_text(scene.xml, encoding="utf-8")
@@ -296,6 +304,14 @@ def _motors(env: RobotTask, folder: Path) -> Motors:
     if env.actuators.law == "network":
         shutil.copyfile(find_file(env.cfg, "control.network"), folder / MOTORS_FILE)
     return Motors(env.actuators.law, *curve, digest=digest(folder / MOTORS_FILE) if env.actuators.law == "network" else "")
+
+
+def _motion(env: RobotTask, folder: Path) -> Motion | None:
+    """What the policy follows, whose frames are written to ``folder``."""
+    if not isinstance(env, MotionTracking):
+        return None
+    save_clip(folder / MOTION_FILE, env.clips[0])
+    return Motion(env.cfg.motion.anchor, tuple(env.cfg.motion.bodies), digest(folder / MOTION_FILE))
 
 
 def _ends(env: RobotTask) -> Ends:

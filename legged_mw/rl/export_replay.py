@@ -16,6 +16,7 @@ from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.motion_tracking import MotionTracking
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.network import MEMORY_OUTPUT, run_onnx
 from legged_mw.rl.policies import act
@@ -41,6 +42,7 @@ class Step(NamedTuple):
     targets: np.ndarray  # (N, D) [rad] that the motors got, by encoders that may be off; or torques [N m]
     ended: np.ndarray  # (N,) the episode ended, so that nothing of the targets is left to see
     clock: np.ndarray  # (N,) phase of the gait clock, share of its period; 0 where there is none
+    frame: np.ndarray  # (N,) of the motion; 0 where there is none
     memory: np.ndarray  # (N, states, H) what the policy remembered before it acted; (N, 0, 0) without a memory
 
 
@@ -58,6 +60,7 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
         measured, commands = _measure(env, fleet), np.zeros((env.num_envs, 0))
         gait = getattr(env, "gait", None)
         clock = gait.phase.numpy().copy() if gait else np.zeros(env.num_envs)
+        frame = env.reference.frame.numpy().copy() if isinstance(env, MotionTracking) else np.zeros(env.num_envs, dtype=int)
         if contract.commands:
             commands = env.commands.numpy().copy()  # type: ignore[attr-defined]
         taken = actions.clone()
@@ -65,7 +68,7 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
         seen, _, dones, _ = env.step(taken)
         forget(policy, dones)
         arrays = (tensor.numpy().copy() for tensor in (actions, taken, env.actuators.sent(), dones.bool()))
-        steps.append(Step(observation, measured, commands, *arrays, clock=clock, memory=memory))
+        steps.append(Step(observation, measured, commands, *arrays, clock=clock, frame=frame, memory=memory))
     return steps
 
 
@@ -115,6 +118,8 @@ def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) 
     for number, step in enumerate(steps):
         if controller.clock:
             controller.clock.start[:] = step.clock  # an episode of training may begin anywhere in the period
+        if controller.follower:
+            controller.follower.start = step.frame  # anywhere in the motion
         observed, start = controller.observe(step.measured, step.commands), 0
         for row in contract.rows:
             columns = slice(start, start := start + row.size * row.history)

@@ -21,15 +21,15 @@ def note_file(cls: type) -> type:
     return cls
 
 
-def find_file(cfg: Any, path: str) -> Path:
-    """The file that the config field ``path`` ("asset.file") names. Raises UserError.
+def find_file(cfg: Any, path: str, one: str = "") -> Path:
+    """The file that the config field ``path`` ("asset.file") names, or ``one`` of those that it lists. Raises UserError.
 
     A relative name that a class body wrote is looked for beside that body's file. One that came later, by a flag or from a
     run, is looked for in the current folder, beside the task and beside the classes that it extends. Last comes the repository.
     """
     section, _, name = path.rpartition(".")
     owner = getattr(cfg, section)
-    written = Path(getattr(owner, name)).expanduser()
+    written = Path(one or getattr(owner, name)).expanduser()
     author = next(cls for cls in type(owner).__mro__ if name in vars(cls))
     folders = [_folder(author)]
     if getattr(owner, name) != getattr(author, name):

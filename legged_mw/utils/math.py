@@ -20,6 +20,18 @@ def quat_rotate_inverse(q: Tensor, v: Tensor) -> Tensor:
     return torch.addcmul(v, w, t, value=-2.0).add_(torch.linalg.cross(u, t), alpha=2.0)
 
 
+def quat_multiply(a: Tensor, b: Tensor) -> Tensor:
+    """The attitude (..., 4) that turns by ``b`` first, then by ``a``."""
+    w, u, s, v = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    return torch.cat([w * s - (u * v).sum(dim=-1, keepdim=True), w * v + s * u + torch.linalg.cross(u, v)], dim=-1)
+
+
+def rotation_quat(v: Tensor) -> Tensor:
+    """The attitude (..., 4) that turns about ``v`` (..., 3) by its length [rad]."""
+    half = v.norm(dim=-1, keepdim=True) / 2.0
+    return torch.cat([torch.cos(half), v * (0.5 * torch.sinc(half / torch.pi))], dim=-1)
+
+
 def yaw_of(q: Tensor) -> Tensor:
     """Heading of the body's x axis in the world's plane [rad] (...,) from the attitude ``q`` (..., 4)."""
     w, x, y, z = q.unbind(dim=-1)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from legged_mw.drawing.scene import visual_spec
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.motion_tracking import MotionTracking
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.estimator import believed_velocity
 from legged_mw.rl.recurrent import forget
@@ -68,6 +69,9 @@ class EnvStage:
 
     def qpos(self) -> FloatArray:
         return _array(self.env.sim.qpos)
+
+    def ghost(self) -> FloatArray | None:
+        return _array(self.env.reference.qpos) if isinstance(self.env, MotionTracking) else None
 
     def contacts(self) -> BoolArray:
         return (self._foot_contacts > 0.0).cpu().numpy()

@@ -1,4 +1,4 @@
-"""Geoms of a picture beside the robots: velocity arrows, feet on the ground, places of falls.
+"""Geoms of a picture beside the robots: velocity arrows, feet on the ground, places of falls, what is followed.
 
 Appends to a `mujoco.MjvScene`; opens no window, no file and no OpenGL context.
 """
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from legged_mw.view.feet import Patch
-from legged_mw.view.posed_robot import Placement, PosedRobots
+from legged_mw.view.posed_robot import Placement, PosedRobots, show_groups
 from legged_mw.view.stage import FloatArray, Moment
 
 # ours: vermillion, sky blue, bluish green and reddish purple of Okabe and Ito's palette, which the colour-blind tell apart
@@ -22,6 +22,7 @@ COMMAND_RGBA = (0.90, 0.38, 0.00, 1.0)
 VELOCITY_RGBA = (0.20, 0.62, 0.95, 1.0)
 CONTACT_RGBA = (0.00, 0.75, 0.52, 0.9)
 FALL_RGBA = (0.90, 0.20, 0.45, 0.45)
+GHOST_RGBA = (0.55, 0.75, 0.95, 0.3)  # ours: pale blue
 
 ARROW_PER_SPEED = 1.3  # [robot radius per m/s] arrow length; MuJoCo draws half of it: at 1 m/s a little more than from base to nose
 ARROW_MAX = 1.95  # [robot radius] of the fastest command: a longer arrow would leave the picture
@@ -40,6 +41,8 @@ def draw(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment) -> None:
         target, velocity, turn = moment.target_velocity[world], moment.velocity[world], world == moment.world
         draw_velocities(scene, robots.placements[world], target, velocity, turn, moment.top_speed)
     _draw_contacts(scene, robots, moment)
+    if moment.ghost is not None:
+        _draw_ghosts(scene, robots, moment.ghost)
     for fall in moment.falls:
         if fall.world < robots.count:
             _draw_fall(scene, fall.place + robots.offsets[fall.world], robots.radius)
@@ -105,6 +108,16 @@ def draw_disc(scene: mujoco.MjvScene, patch: Patch, thick: float, rgba: tuple[fl
     if disc is not None:
         disc.size[1] = patch.half[1]
         disc.mat[:] = patch.turn
+
+
+def _draw_ghosts(scene: mujoco.MjvScene, robots: PosedRobots, qpos: FloatArray) -> None:
+    """A transparent robot where each is to be."""
+    first, option = scene.ngeom, mujoco.MjvOption()
+    show_groups(option)
+    moving = mujoco.mjtCatBit.mjCAT_DYNAMIC.value
+    mujoco.mjv_addGeoms(robots.model, robots.ghost(qpos), option, mujoco.MjvPerturb(), moving, scene)
+    for geom in scene.geoms[first : scene.ngeom]:
+        geom.rgba[:], geom.matid, geom.category = GHOST_RGBA, -1, mujoco.mjtCatBit.mjCAT_DECOR
 
 
 def _draw_fall(scene: mujoco.MjvScene, place: FloatArray, radius: float) -> None:

@@ -25,6 +25,9 @@ NOMINAL = {  # what playing changes in the trained config
     "perturbation.push": False,
     "domain_rand.enable": False,
     "commands.curriculum": False,
+    "motion.random_start": False,  # from a clip's start to its end
+    "falls.pull": 0.0,
+    "falls.share": 1.0,  # of a task that gets up: a reset is another fall
 }
 ROWS, BORDER = 3, 2.0  # of the ground to watch: levels, from the easiest to the hardest, and [m]
 
@@ -39,7 +42,7 @@ def parse(description: str | None) -> argparse.Namespace:
         "--time", type=duration, default=None, metavar="T", help="how long to play (default: 10s of video, a window until closed)"
     )
     launch.add_flags(parser)
-    parser.add_argument("--eval", action="store_true", help="run the walking exam (on rough ground too), print its tables, write a report")
+    parser.add_argument("--eval", action="store_true", help="run the task's exam (on rough ground too), print its tables, write a report")
     parser.add_argument("--compare", metavar="RUN", help="with --eval: grade this run beside it; its name or path, or 'shipped'")
     common = "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)

@@ -73,6 +73,15 @@ class PosedRobots:
         self._forward()
         self.placements: list[Placement] = [self._placement(self._order.index(index)) for index in range(self.count)]
 
+    def ghost(self, qpos: ArrayLike) -> mujoco.MjData:
+        """The same robots at the rows of `qpos` (N, nq), in the order of the last `pose`."""
+        array = np.array(qpos, dtype=np.float64)[: self.count]
+        array[:, :3] += self.offsets
+        self._ghost = getattr(self, "_ghost", None) or mujoco.MjData(self.model)
+        self._ghost.qpos[:] = array[self._order].ravel()
+        mujoco.mj_kinematics(self.model, self._ghost)
+        return self._ghost
+
     def patches(self, contacts: ArrayLike) -> list[Patch]:
         """Where feet touch: one for each foot of which `contacts` (N, G) marks a geom, the first G with a contact sensor."""
         touching = np.asarray(contacts, dtype=bool)[: self.count]

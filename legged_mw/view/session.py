@@ -168,6 +168,7 @@ class Session:
         return Moment(
             time=self.time,
             qpos=stage.qpos(),
+            ghost=stage.ghost(),
             commands=commands,
             target_velocity=target_velocity(stage.command_table, commands),
             velocity=velocity,

@@ -53,6 +53,10 @@ class Stage(Protocol):
         """Pose of each robot (N, nq), world frame."""
         ...
 
+    def ghost(self) -> FloatArray | None:
+        """What each robot is to follow (N, nq); None where it follows no motion."""
+        ...
+
     def contacts(self) -> BoolArray:
         """Which geoms of the feet touch the ground (N, G), in the order of the model's first G contact sensors."""
         ...
@@ -93,6 +97,7 @@ class Moment(NamedTuple):
     camera: str = "follow"  # one of drive.CAMERAS
     lines: tuple[tuple[str, str], ...] = ()  # text to show: (name, value)
     help: bool = False  # show the keys
+    ghost: FloatArray | None = None  # (N, nq) what robots follow
     top_speed: float = 1.0  # [m/s] the fastest that robots can be commanded to go: arrows are drawn to fit it
 
 

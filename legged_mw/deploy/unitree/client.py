@@ -12,6 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from legged_mw.deploy.contract import COMPUTED, CONTRACT_FILE, Contract
+from legged_mw.deploy.motion import ATTITUDE, PLACE
 from legged_mw.deploy.odometry import ROW
 from legged_mw.deploy.robot import Floats, Health, Measurement, Robot, RobotError, damped
 from legged_mw.deploy.simulated import read_scene
@@ -134,6 +135,7 @@ class UnitreeRobot(Robot):
             joint_torque=torque,
             acceleration=state["imu_state.accelerometer"].astype(float),
             foot_contact=feet,
+            others={ATTITUDE: np.array([w, x, y, z])} if self.contract.motion else {},
         )
 
     def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
@@ -213,7 +215,7 @@ def check_rows(contract: Contract, machine: Machine, odometry: bool = False) -> 
     """Refuse a policy that observes what this robot does not measure, or does not command angles. Raises RobotError."""
     if contract.action.origin in ("torque", "speed"):
         raise RobotError(f"{CONTRACT_FILE}: the policy commands {contract.action.origin}s; a {machine.name} is driven by angles here")
-    measured = {*_MEASURED, *COMPUTED, *(["foot_contact"] if machine.feet else []), *([ROW] if odometry else [])}
+    measured = {*_MEASURED, *COMPUTED, *(["foot_contact"] if machine.feet else []), *([ROW] if odometry else [])} - {PLACE}
     if wrong := [row for row in contract.rows if row.measured not in measured]:
         estimated = "add --velocity odometry, or " if [row.measured for row in wrong] == [ROW] else ""
         raise RobotError(

@@ -1,0 +1,52 @@
+"""Unitree G1 with 29 joints gets up from any fall and stays standing; randomized worlds.
+
+Sources: [M] mjlab: gains and action scales; [H] HoST, a G1 with 23 joints.
+"""
+
+from configs.g1_flat import G1FlatCfg
+from legged_mw.envs.getup import Getup, GetupCfg, GetupCfgPPO
+from legged_mw.utils.task import Task
+
+
+class G1GetupCfg(GetupCfg):
+    class env(GetupCfg.env):
+        num_envs = 4096
+        episode_length_s = 10.0  # [s] [H]
+
+    class asset(GetupCfg.asset):
+        file, imu_site = G1FlatCfg.asset.file, G1FlatCfg.asset.imu_site
+
+    class falls(GetupCfg.falls):
+        seconds = 1.5  # [s] [ours: it falls from higher]
+        pull = 0.6  # of its weight [H]
+
+    class init_state(GetupCfg.init_state):
+        default_joint_angles = G1FlatCfg.init_state.default_joint_angles
+
+    class control(GetupCfg.control):
+        stiffness, damping = G1FlatCfg.control.stiffness, G1FlatCfg.control.damping
+        action_scale, decimation = G1FlatCfg.control.action_scale, G1FlatCfg.control.decimation  # of 4: the motors' whole torque [M]
+
+    class normalization(GetupCfg.normalization):
+        clip_actions = 4.0
+
+    class rewards(GetupCfg.rewards):
+        pose_weights = {"": 0.3, "hip": 1.0, "knee": 1.0, "waist": 1.0}  # [ours]
+
+    class sim(GetupCfg.sim):
+        dt = G1FlatCfg.sim.dt
+
+    class exam(GetupCfg.exam):
+        within = 6.0  # [s]
+
+
+class G1GetupCfgPPO(GetupCfgPPO):
+    class runner(GetupCfgPPO.runner):
+        max_iterations = 4000
+
+    class algorithm(GetupCfgPPO.algorithm):
+        gamma = 0.99  # [ours: it takes seconds]
+        desired_kl = 0.02  # [ours: of 29 joints together]
+
+
+TASK = Task(Getup, G1GetupCfg, G1GetupCfgPPO)

@@ -1,0 +1,24 @@
+"""Unitree Go2 gets up from any fall and stays standing; randomized worlds. The machine's figures are in go2.xml."""
+
+from configs.go2_flat import Go2FlatCfg
+from legged_mw.envs.getup import Getup, GetupCfg, GetupCfgPPO
+from legged_mw.utils.task import Task
+
+
+class Go2GetupCfg(GetupCfg):
+    class asset(GetupCfg.asset):
+        file = Go2FlatCfg.asset.file
+        joint_speed_limits = Go2FlatCfg.asset.joint_speed_limits
+
+    class init_state(GetupCfg.init_state):
+        pos, default_joint_angles = Go2FlatCfg.init_state.pos, Go2FlatCfg.init_state.default_joint_angles
+
+    class control(GetupCfg.control):
+        stiffness, damping = Go2FlatCfg.control.stiffness, Go2FlatCfg.control.damping
+        action_scale = 0.5  # [rad]
+
+    class normalization(GetupCfg.normalization):
+        clip_actions = 4.0  # [ours: with 20 N m/rad that is 40 N m, nearly what the knees have]
+
+
+TASK = Task(Getup, Go2GetupCfg, GetupCfgPPO)

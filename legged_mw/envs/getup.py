@@ -1,0 +1,142 @@
+"""Get up: from any fall to standing in the default pose, and staying there. The class, its config and its learner's.
+
+Sources: [P] MuJoCo Playground's Go1 getup (commit d5e6b47); [H] HoST (OpenRobotLab), a G1; [ours] with the reason.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from legged_mw.envs.observations import Row
+from legged_mw.envs.pull import Pull
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
+from legged_mw.sim.settle import fallen
+from legged_mw.utils.math import assign
+
+
+class GetupCfg(RobotTaskCfg):
+    class env(RobotTaskCfg.env):
+        num_envs, episode_length_s = 8192, 6.0  # [-], [s] [P]
+
+    class asset(RobotTaskCfg.asset):
+        self_collisions = True  # and all colliders touch the ground [P]
+
+    class falls:
+        share: float = 0.6  # of episodes that begin in a fall; the others stand [P]
+        states: int = 2048  # settled falls to begin from; at most four a world are made [ours]
+        seconds: float = 1.0  # from the drop to the state [P 0.5; ours: a roll takes longer]
+        seed: int = 1  # the same seed makes the same falls; the exam has its own
+        pull: float = 0.0  # share of the weight that lifts the root of a robot that is not up; it fades as they learn [H 0.6]
+        pull_fades: float = 0.2  # of it, when every world has ended an episode up [ours]
+
+    class control(RobotTaskCfg.control):
+        action_origin = "joints"  # [P, H]
+
+    class observations(RobotTaskCfg.observations):
+        leave_out = {"state": ["base_lin_vel"]}  # [P]
+
+    class termination(RobotTaskCfg.termination):
+        max_tilt = 180.0  # [deg]: no attitude ends an episode [P, H]
+
+    class domain_rand(RobotTaskCfg.domain_rand):
+        enable, observe = True, True
+        base_mass, base_com, friction = [-1.0, 3.0], [-0.03, 0.03], [0.3, 1.2]  # [kg] [H -2 to 5], [m], [-] [H 0.1 to 1]
+        stiffness, damping, strength = [0.9, 1.1], [0.9, 1.1], [0.9, 1.1]  # [H 0.85 to 1.15]
+        encoder_offset = [-0.015, 0.015]  # [rad]
+
+    class sim(RobotTaskCfg.sim):
+        iterations, ls_iterations = 3, 10  # [ours: a robot that lies has many contacts]
+
+    class exam:
+        within: float = 3.0  # [s] in which it must stand
+
+    class rewards(RobotTaskCfg.rewards):
+        only_positive_rewards = False  # [ours, P True: nothing ends an episode, and while it thrashes all would be clipped]
+
+        class scales(RobotTaskCfg.rewards.scales):  # [P], with our terms of the same meaning
+            upright, height, posture, stand_still = 1.0, 1.0, 1.0, 1.0
+            action_rate, action_smoothness, torques, dof_acc, dof_pos_limits = -0.001, -0.001, -1e-5, -2.5e-7, -0.1
+            fast_joints = -0.005  # [ours, P -0.1: actions of the first iterations would cost 20 times what standing gives]
+
+
+class GetupCfgPPO(RobotTaskCfgPPO):
+    class runner(RobotTaskCfgPPO.runner):
+        num_steps_per_env, max_iterations = 20, 1000  # [P], [ours]
+
+    class algorithm(RobotTaskCfgPPO.algorithm):
+        gamma, num_mini_batches, entropy_coef = 0.97, 8, 0.01  # [P], [ours], [P]
+
+    class anneal(RobotTaskCfgPPO.anneal):
+        entropy_coef, desired_kl = 0.001, 0.003  # [ours]
+
+    class symmetry(RobotTaskCfgPPO.symmetry):
+        use_data_augmentation = True  # [ours]
+
+
+class Getup(RobotTask):
+    cfg: GetupCfg
+    exam = "getup"
+
+    def _init_buffers(self) -> None:
+        super()._init_buffers()
+        falls = self.cfg.falls
+        states = fallen(self.robot.physics, min(falls.states, 4 * self.num_envs), falls.seed, falls.seconds)
+        self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in states)  # (P, nq), (P, nv)
+        self.up_height = 0.99 * self.start_place[2]  # [m] of the root, standing [P: 0.275 of 0.278]
+        self.pull = Pull(self.sim, self.root_body, falls.pull * 9.81 * self.total_mass, falls.pull_fades)
+
+    def _apply_actions(self) -> None:
+        super()._apply_actions()
+        if self.cfg.falls.pull:
+            self.pull.apply(self._is_up())
+
+    def _update_curricula(self, mask: Tensor) -> None:
+        super()._update_curricula(mask)
+        self.pull.update(mask & (self.episode_steps[:, 0] > 0.0), self._is_up())
+
+    def training_state(self) -> dict[str, Tensor]:
+        return {**super().training_state(), "pull_level": self.pull.level.clone()}
+
+    def load_training_state(self, state: dict[str, Tensor]) -> None:
+        super().load_training_state(state)
+        self.pull.level.copy_(state.get("pull_level", self.pull.level))
+
+    def _reset_robots(self, mask: Tensor) -> None:
+        """Standing as any task begins, or, by chance, in one of the settled falls."""
+        super()._reset_robots(mask)
+        fall = mask & (torch.rand_like(self.rew_buf) < self.cfg.falls.share)
+        pick = torch.randint(len(self.fallen_qpos), (self.num_envs,), device=self.device)
+        assign(self.sim.qpos, fall, self.fallen_qpos.index_select(0, pick))
+        assign(self.sim.qvel, fall, self.fallen_qvel.index_select(0, pick))
+        self._forget_for_rewards(mask)
+
+    def _body_rows(self) -> list[Row]:
+        return [*super()._body_rows(), Row("base_height", self.base_height[:, None], mirror="scalar")]  # [m] [P]
+
+    def _is_upright(self) -> Tensor:
+        return self._reward_upright() > 0.98  # exp(-2 x 0.01), 5.7 degrees [P]
+
+    def _is_up(self) -> Tensor:
+        return self._is_upright() & (self.base_height > 0.98 * self.up_height)  # [P]
+
+    def _reward_upright(self) -> Tensor:
+        """Gravity's direction is straight down in the body. [P]"""
+        return torch.exp(-2.0 * (2.0 + 2.0 * self.projected_gravity[:, 2]))  # |g + z|^2 of unit vectors
+
+    def _reward_height(self) -> Tensor:
+        """Height of the root, a share of standing. [P: exp(height) - 1, of which a Go1 gains a fifth of what a G1 does]"""
+        return (self.base_height / self.up_height).clamp(max=1.0)
+
+    def _reward_posture(self) -> Tensor:
+        """The default pose, once it is upright. [P: exp(-0.5 x sum), which is flat where the legs are folded; ours: by the mean]"""
+        return torch.where(self._is_upright(), torch.exp(-2.0 * (self.dof_offset.square() * self.pose_weights).mean(dim=1)), 0.0)
+
+    def _reward_stand_still(self) -> Tensor:
+        """Joints at rest, once it is up. [P: small actions; ours: an action is a torque here, and standing takes some]"""
+        return torch.where(self._is_up(), torch.exp(-2.0 * self.dof_vel.square().mean(dim=1)), 0.0)
+
+    def _reward_fast_joints(self) -> Tensor:
+        """What joints are faster than a turn a second, squared [rad^2/s^2]. [P]"""
+        return (self.dof_vel.abs() - 2.0 * torch.pi).clamp(min=0.0).square().sum(dim=1)

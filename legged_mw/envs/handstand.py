@@ -1,0 +1,85 @@
+"""Handstand and footstand: from standing on all legs to two of them, and staying there. The class, its config and its learner's.
+
+Source [P]: MuJoCo Playground's Go1 handstand and footstand (commit d5e6b47); [ours] with the reason. Which legs may touch the ground:
+the paper penalises those in the air, the code since a047305 any foot. As in the paper, here the legs that carry the robot are free to.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
+
+
+class HandstandCfg(RobotTaskCfg):
+    class env(RobotTaskCfg.env):
+        num_envs, episode_length_s = 8192, 10.0  # [-], [s] [P]
+
+    class exam:
+        """What is asked, of the reward and in the exam."""
+
+        nose: float = -1.0  # -1 down, a handstand; 1 up, a footstand
+        height: float = 0.55  # [m] of the root that is high enough [P]
+        hands: list[str] = []  # geoms that stand: nothing else may touch the ground
+
+    class control(RobotTaskCfg.control):
+        action_origin, action_scale = "targets", 0.3  # [rad] [P]
+
+    class observations(RobotTaskCfg.observations):
+        leave_out = {"state": ["base_lin_vel"]}  # [ours, P reads it: no sensor of the robot gives it]
+
+    class termination(RobotTaskCfg.termination):
+        max_tilt = 104.5  # [deg]: the trunk's z axis 0.25 below the horizon [P]
+
+    class domain_rand(RobotTaskCfg.domain_rand):
+        enable, observe = True, True  # [ours, P none]
+        base_mass, base_com, friction = [-0.5, 1.0], [-0.02, 0.02], [0.4, 1.2]  # [kg], [m], [-]
+        encoder_offset = [-0.015, 0.015]  # [rad]
+
+    class sim(RobotTaskCfg.sim):
+        iterations, ls_iterations = 3, 10  # [ours: as Getup]
+
+    class rewards(RobotTaskCfg.rewards):
+        soft_dof_pos_limit = 0.9  # [P]
+
+        class scales(RobotTaskCfg.rewards.scales):  # [P]; what it calls pose and contact is here joint_deviation, of angles, and collision
+            stand_height, stand_attitude = 1.0, 1.0
+            collision, dof_pos_limits, joint_deviation = -0.1, -0.5, -0.1
+            energy, dof_acc = -0.0003, -2.5e-7  # [P in its fine-tuning, energy -0.003]
+
+
+class HandstandCfgPPO(RobotTaskCfgPPO):
+    class runner(RobotTaskCfgPPO.runner):
+        num_steps_per_env, max_iterations = 20, 1000  # [P], [ours]
+
+    class algorithm(RobotTaskCfgPPO.algorithm):
+        num_mini_batches = 8  # [ours]
+
+    class anneal(RobotTaskCfgPPO.anneal):
+        entropy_coef, desired_kl = 0.001, 0.003  # [ours]
+
+    class symmetry(RobotTaskCfgPPO.symmetry):
+        use_data_augmentation = True  # [ours]
+
+
+class Handstand(RobotTask):
+    cfg: HandstandCfg
+    exam = "handstand"
+
+    def _init_buffers(self) -> None:
+        super()._init_buffers()
+        geoms = [self.robot.physics.geom(i).name for i in range(self.robot.physics.ngeom)]
+        if wrong := [name for name in self.cfg.exam.hands if name not in geoms]:
+            raise ConfigError(f"exam.hands: {unknown('geom', wrong[0], geoms, self.cfg.asset.file)}")
+
+    def _reward_stand_height(self) -> Tensor:
+        """Height of the root up to ``exam.height`` [m], exponential. [P]"""
+        return torch.exp(self.base_height.clamp(max=self.cfg.exam.height) - self.cfg.exam.height)
+
+    def _reward_stand_attitude(self) -> Tensor:
+        """The root's x axis points down, or up: 1; level: a quarter; the other way: 0. [P]"""
+        return (0.5 - 0.5 * self.cfg.exam.nose * self.projected_gravity[:, 0]).square()

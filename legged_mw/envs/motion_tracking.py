@@ -1,0 +1,179 @@
+"""A robot follows reference clips, read top to bottom. What every task shares is in ``robot_task``, and its rules hold here too.
+
+The recipe is BeyondMimic's [B] (arXiv 2508.08241), as its code and mjlab's [M] have it. Shapes: N worlds, D joints, B bodies.
+Everything is compared at the anchor: the reference is moved to where the robot's anchor is, and turned to its heading.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from legged_mw.envs.mirror import Block, body_blocks
+from legged_mw.envs.motion_reference import Reference, angle_between, load_clips
+from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
+from legged_mw.envs.observations import Row
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.sim.kinematics import Bodies, Kinematics, product, rotate
+from legged_mw.utils.math import assign, quat_multiply, rotation_quat
+
+
+class MotionTracking(RobotTask):
+    """N robots that each follow a clip from somewhere in it to its end."""
+
+    cfg: MotionTrackingCfg
+    exam = "tracking"
+
+    # ---- the step -------------------------------------------------------------------------------------------------
+
+    def _refresh_base(self) -> None:
+        super()._refresh_base()
+        for kept, found in zip(self.body, self.kinematics(self.sim.qpos, self.sim.qvel), strict=True):
+            kept.copy_(found)
+
+    def _update_state(self) -> None:
+        super()._update_state()
+        self.reference.align(self.body, self.anchor)
+
+    def _end_step(self) -> None:
+        super()._end_step()
+        self.reference.remember_failures(self.fell, self.cfg.motion.failure_rate)
+        self.reference.advance()
+
+    def _fallen(self) -> Tensor:
+        """(N,) The robot fell, or it is far from the reference in height or tilt."""
+        end, ours, theirs = self.cfg.termination, self.body, self.reference.bodies
+        down = super()._fallen()
+        down |= (ours.pos[:, self.anchor, 2] - theirs.pos[:, self.anchor, 2]).abs() > end.max_anchor_height
+        down |= (ours.rot[:, self.anchor, 2, 2] - theirs.rot[:, self.anchor, 2, 2]).abs() > end.max_anchor_tilt
+        down |= ((ours.pos - self.reference.wanted_pos).index_select(1, self.ends)[..., 2].abs() > end.max_end_height).any(dim=1)
+        return down
+
+    def _timed_out(self) -> Tensor:
+        """(N,) Out of time, or the clip is over."""
+        return super()._timed_out() | self.reference.over()
+
+    def _reset_robots(self, mask: Tensor) -> None:
+        """Robots near the reference, at a frame that the failures draw."""
+        motion = self.cfg.motion
+        qpos, qvel = self.reference.begin(mask, self.reference.draw(motion.uniform) if motion.random_start else None)
+        off = torch.rand(self.num_envs, len(self.start_range), device=self.device).mul_(2.0).sub_(1.0).mul_(self.start_range)
+        place, turn, speed, bend = off.split([3, 3, 6, self.num_actions], dim=1)
+        attitude = quat_multiply(rotation_quat(turn), qpos[:, 3:7])
+        joints = (qpos[:, 7:] + bend).clamp(self.soft_lower, self.soft_upper)
+        assign(self.sim.qpos, mask, torch.cat([qpos[:, :3] + place, attitude, joints], dim=1))
+        assign(self.sim.qvel, mask, torch.cat([qvel[:, :6] + speed, qvel[:, 6:]], dim=1))
+        self._forget_for_rewards(mask)
+        self.actuators.reset(mask)
+        self.observations.restart(mask)
+
+    # ---- observations ---------------------------------------------------------------------------------------------------
+
+    def compute_observations(self) -> None:
+        self.reference.read()
+        place, turn = self._anchor_seen()
+        theirs, seen = self.reference.bodies, turn.transpose(1, 2)
+        self.anchor_pos.copy_(rotate(seen, theirs.pos[:, self.anchor] - place))
+        self.anchor_ori.copy_(product(seen, theirs.rot[:, self.anchor])[..., :2].flatten(1))
+        ours = self.body.rot[:, self.anchor].transpose(1, 2)
+        self.body_pos.copy_(rotate(ours[:, None], self.body.pos - self.body.pos[:, self.anchor, None]).flatten(1))
+        self.body_ori.copy_(product(ours[:, None], self.body.rot)[..., :2].flatten(1))
+        super().compute_observations()
+
+    def _anchor_seen(self) -> tuple[Tensor, Tensor]:
+        """Place (N, 3) [m] and attitude (N, 3, 3) of the anchor as a robot finds them: by encoders that may be off."""
+        if self.actuators.encoder_offset is None:
+            return self.body.pos[:, self.anchor], self.body.rot[:, self.anchor]
+        joints = self.dof_pos + self.actuators.encoder_offset
+        seen = self.anchor_kinematics(torch.cat([self.sim.qpos[:, :7], joints], dim=1), self.sim.qvel)
+        return seen.pos[:, 0], seen.rot[:, 0]
+
+    def observation_rows(self) -> dict[str, list[Row | str]]:
+        noise = self.cfg.noise.scales
+        angles = {"reference_joint_pos": self.reference.joint_pos, "reference_joint_vel": self.reference.joint_vel}  # [rad], [rad/s]
+        clip = [Row(name, value, mirror="joint") for name, value in angles.items()]
+        # the reference's anchor in the robot's: its place [m], two columns of its rotation
+        anchors = [Row("anchor_pos", self.anchor_pos, mirror="polar"), Row("anchor_ori", self.anchor_ori, mirror="turn")]
+        seen = [row._replace(noise=level, measured=True) for row, level in zip(anchors, (noise.anchor_pos, noise.anchor_ori), strict=True)]
+        return {
+            "state": [*clip, *seen, *(row for row in self._measured_rows() if row.name != "projected_gravity")],
+            "privileged_state": [
+                *clip,
+                *anchors,
+                Row("body_pos", self.body_pos, mirror="body_polar"),  # of each body in the anchor's frame [m]
+                Row("body_ori", self.body_ori, mirror="body_turn"),
+                *self._body_rows(),
+                Row("last_actions", self.last_actions, mirror="joint"),
+                *self._disturbance_rows(),
+            ],
+        }
+
+    def _mirror_blocks(self) -> dict[str, Block]:
+        return super()._mirror_blocks() | body_blocks(self.robot, self._partners(), self.cfg.motion.bodies)
+
+    # ---- rewards ----------------------------------------------------------------------------------------------------------
+
+    def _near(self, squares: Tensor, sigma: float) -> Tensor:
+        """(N,) 1 where the mean of ``squares`` (N, bodies) is 0."""
+        return torch.exp(-squares.mean(dim=1) / sigma**2)
+
+    def _reward_tracking_anchor_pos(self) -> Tensor:
+        """The anchor's place in the world. [B]"""
+        off = self.body.pos - self.reference.bodies.pos
+        return self._near(off[:, self.anchor, None].square().sum(dim=2), self.cfg.rewards.anchor_pos_sigma)
+
+    def _reward_tracking_anchor_ori(self) -> Tensor:
+        """The anchor's attitude in the world. [B]"""
+        off = angle_between(self.body.rot[:, self.anchor, None], self.reference.bodies.rot[:, self.anchor, None])
+        return self._near(off.square(), self.cfg.rewards.anchor_ori_sigma)
+
+    def _reward_tracking_body_pos(self) -> Tensor:
+        """The bodies' places, at the anchor. [B]"""
+        return self._near((self.body.pos - self.reference.wanted_pos).square().sum(dim=2), self.cfg.rewards.body_pos_sigma)
+
+    def _reward_tracking_body_ori(self) -> Tensor:
+        """The bodies' attitudes, at the anchor. [B]"""
+        return self._near(angle_between(self.body.rot, self.reference.wanted_rot).square(), self.cfg.rewards.body_ori_sigma)
+
+    def _reward_tracking_body_lin_vel(self) -> Tensor:
+        """The bodies' velocities, world frame. [B]"""
+        off = self.body.lin_vel - self.reference.bodies.lin_vel
+        return self._near(off.square().sum(dim=2), self.cfg.rewards.body_lin_vel_sigma)
+
+    def _reward_tracking_body_ang_vel(self) -> Tensor:
+        """The bodies' angular velocities, world frame. [B]"""
+        off = self.body.ang_vel - self.reference.bodies.ang_vel
+        return self._near(off.square().sum(dim=2), self.cfg.rewards.body_ang_vel_sigma)
+
+    def _live_statistics(self) -> dict[str, Tensor]:
+        """Mean distance of the bodies from the reference, at the anchor [mm]."""
+        off = ((self.body.pos - self.reference.wanted_pos).norm(dim=2).mean(dim=1) * 1000.0).nan_to_num(0.0, 0.0, 0.0)
+        return super()._live_statistics() | {"body_error_mm": torch.stack([off.sum(), torch.full_like(off[0], len(off))])}
+
+    # ---- checkpoint, buffers ------------------------------------------------------------------------------------------------
+
+    def training_state(self) -> dict[str, Tensor]:
+        return {**super().training_state(), "motion_failures": self.reference.failures.clone()}
+
+    def load_training_state(self, state: dict[str, Tensor]) -> None:
+        """Go on from ``training_state``, with new episodes, unless the clips are others."""
+        super().load_training_state(state)
+        if "motion_failures" in state and state["motion_failures"].shape == self.reference.failures.shape:
+            self.reference.failures.copy_(state["motion_failures"])
+            self._reset_all()
+
+    def _init_buffers(self) -> None:
+        super()._init_buffers()
+        motion = self.cfg.motion
+        self.anchor = motion.bodies.index(motion.anchor)
+        self.ends = torch.tensor([motion.bodies.index(name) for name in motion.end_bodies], dtype=torch.long, device=self.device)
+        bodies = [self.robot.id("body", name) for name in motion.bodies]
+        self.kinematics = Kinematics(self.robot.physics, bodies, self.device)
+        self.anchor_kinematics = Kinematics(self.robot.physics, [bodies[self.anchor]], self.device)
+        self.clips = load_clips(self.cfg, self.robot.joint_names, 1.0 / self.dt)
+        frames = {"held": round(motion.hold_s / self.dt), "bin_frames": round(motion.bin_s / self.dt)}
+        self.reference = Reference(self.clips, self.kinematics, self.num_envs, self.device, **frames)
+        ranges = [*motion.start_pos, *motion.start_turn, *motion.start_lin_vel, *motion.start_ang_vel]
+        self.start_range = self._tensor(ranges + [motion.start_joints] * self.num_actions)
+        self.body = Bodies(*(torch.zeros_like(part) for part in self.reference.bodies))
+        self.anchor_pos, self.anchor_ori, self.body_pos, self.body_ori = map(self._zeros, (3, 6, 3 * len(bodies), 6 * len(bodies)))

@@ -1,0 +1,28 @@
+"""A force that lifts robots while they learn to stand, and fades as they do. [HoST: 200 N on a G1, until its head is up]"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from legged_mw.sim.simulation import Simulation
+
+GIVEN_BACK = 3.0  # times: an episode that ends down raises the level by this much more than one that ends up lowers it [ours]
+
+
+class Pull:
+    """An upward force on the root of each robot that is not up: ``level`` (), from 1 to 0, times ``force`` [N]."""
+
+    def __init__(self, sim: Simulation, root: int, force: float, fades: float) -> None:
+        """``fades``: by how much the level falls when every world has ended an episode up."""
+        self._force, self._fades = sim.xfrc_applied[:, root, 2], fades  # a view (N,)
+        self._highest, self.level = force, torch.ones((), device=sim.device)
+
+    def apply(self, up: Tensor) -> None:
+        """Before a step, in which ``up`` (N,) says who needs none."""
+        self._force.copy_(torch.where(up, 0.0, self._highest * self.level))
+
+    def update(self, ended: Tensor, up: Tensor) -> None:
+        """Episodes have ended, (N,) each."""
+        change = torch.where(up, -1.0, GIVEN_BACK).masked_fill(~ended, 0.0).mean()
+        self.level.add_(change, alpha=self._fades).clamp_(0.0, 1.0)

@@ -1,0 +1,85 @@
+"""The exam `handstand`, of handstands and footstands: from all fours to two legs, and five seconds there. Needs numpy and MuJoCo alone."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import mujoco
+import numpy as np
+
+from legged_mw.eval.skill import Floats, Ground, Measure, Recording, Robot, Skill
+
+SEED, OFFSET = 30_000, 0.05  # of the starts; each joint is off by U(-OFFSET, OFFSET) [rad] [ours]
+WITHIN, HOLD = 3.0, 5.0  # [s] in which it must be up, and stay [ours]
+TILT, HIGH = 30.0, 0.8  # [deg] between the root's x axis and the vertical, share of the height: up [ours]
+
+
+@dataclass(frozen=True)
+class Handstand(Skill):
+    """64 tries on each ground."""
+
+    nose: float = -1.0  # -1 down, 1 up
+    height: float = 0.55  # [m] of the root
+    hands: tuple[str, ...] | list[str] = ()  # geoms that may touch the ground
+
+    kind = "handstand"
+    asks = "64 tries from standing on each ground: within 3 s it is up for 5 s, and nothing but the hands touches the ground"
+    grounds: ClassVar = {"plane": Ground(), "slippery": Ground(friction=0.4), "loaded": Ground(load=1.0)}
+    robots = 64
+    measures = (
+        Measure("holds", "share that holds for 5 s", 3, (0.95, 0.9)),
+        Measure("up", "share that comes up", 3),
+        Measure("median", "time until up, median [s]", 2),
+        Measure("drift", "drift of the hands in 5 s, mean [m]", 3),
+        Measure("power", "power while up, mean [W]", 0),
+    )
+
+    @property
+    def seconds(self) -> float:
+        return WITHIN + HOLD
+
+    def starts(self, robot: Robot, count: int) -> tuple[Floats, Floats]:
+        qpos = np.tile(robot.home, (count, 1))
+        qpos[:, 7:] += np.random.default_rng(SEED).uniform(-OFFSET, OFFSET, (count, robot.model.nq - 7))
+        return qpos, np.zeros((count, robot.model.nv))
+
+    def judge(self, robot: Robot, recording: Recording) -> dict[str, float | None]:
+        touching, hands = self._ground_contact(robot, recording.qpos)
+        w, i, j, k = np.moveaxis(recording.qpos[..., 3:7], 2, 0)
+        upright = self.nose * 2.0 * (i * k - w * j) > np.cos(np.radians(TILT))  # of the root's x axis in the world, the z
+        alive = np.arange(len(touching))[:, None] <= recording.ended_at
+        up = upright & (recording.qpos[..., 2] > HIGH * self.height) & ~touching & alive  # (T, N)
+        hold = round(HOLD / robot.dt)
+        held = np.asarray(np.lib.stride_tricks.sliding_window_view(up, hold, axis=0).all(axis=2))  # (T - hold + 1, N)
+        holds, begin = held.any(axis=0), held.argmax(axis=0)
+        each = np.arange(len(recording.ended_at))
+        drift = np.linalg.norm(hands[begin + hold - 1, each] - hands[begin, each], axis=1)
+        power = np.abs(recording.torque * recording.qvel[..., 6:]).sum(axis=2)  # (T, N)
+        return {
+            "holds": float(holds.mean()),
+            "up": float(up.any(axis=0).mean()),
+            "median": float(np.median(begin[holds]) * robot.dt) if holds.any() else None,
+            "drift": float(drift[holds].mean()) if holds.any() else None,
+            "power": float(power[up].mean()) if up.any() else None,
+            "worst": int(np.argmax(np.where(holds, drift, np.inf))),  # a robot that did not, or the one that drifted most
+        }
+
+    def _ground_contact(self, robot: Robot, qpos: Floats) -> tuple[np.ndarray, np.ndarray]:
+        """(T, N) whether anything but the hands touches the ground, and (T, N, 2) the middle of the hands [m]."""
+        model, data = robot.model, mujoco.MjData(robot.model)
+        free = np.array([model.geom(name).id for name in self.hands])
+        steps, count = len(qpos), qpos.shape[1]
+        touching, middle = np.zeros((steps, count), dtype=bool), np.zeros((steps, count, 2))
+        for at in np.ndindex(steps, count):
+            data.qpos = qpos[at]
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            mujoco.mj_collision(model, data)
+            pairs = data.contact.geom
+            ground = (model.geom_bodyid[pairs] == 0).any(axis=1)
+            touching[at] = bool((ground & ~np.isin(pairs, free).any(axis=1)).any())
+            middle[at] = data.geom_xpos[free, :2].mean(axis=0)
+        return touching, middle

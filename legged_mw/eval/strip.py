@@ -1,0 +1,31 @@
+"""One robot of an exam as a strip of pictures: what it did, side by side in time."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from legged_mw.drawing.scene import visual_spec
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.eval.skill import Floats
+from legged_mw.view.recorder import RobotRenderer
+from legged_mw.view.stage import Moment
+from legged_mw.view.video import contact_sheet, save_png
+
+PICTURES, COLUMNS, WIDTH, HEIGHT = 12, 6, 320, 240  # pictures, of them in a row, [px] of each
+
+
+def strip(env: RobotTask, qpos: Floats) -> bytes:
+    """A PNG of the robot at PICTURES times, evenly spaced over ``qpos`` (T, nq). Raises ViewError where nothing can be drawn."""
+    renderer, none = RobotRenderer(visual_spec(env.robot, env.cfg.viewer.camera), WIDTH, HEIGHT), np.zeros((1, 3))
+    frames = []
+    for step in np.linspace(0, len(qpos) - 1, PICTURES).round().astype(int):
+        lines = ((f"{step * env.dt:.1f} s", ""),)
+        moment = Moment(step * env.dt, qpos[step][None], none[:, :0], np.nan * none, none, np.zeros((1, 0), dtype=bool), lines=lines)
+        frames.append(renderer.frame(moment))
+    renderer.close()
+    with TemporaryDirectory() as folder:
+        save_png(path := Path(folder) / "strip.png", contact_sheet(frames, COLUMNS))
+        return path.read_bytes()

@@ -1,0 +1,97 @@
+"""Motions as others write them: Unitree-style CSV, and the .npz of BeyondMimic and mjlab."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from legged_mw.sim.model import RobotModel
+from legged_mw.sim.pose import posed
+from legged_mw.utils.clip import KEYS, Clip, ClipError, checked, read_clip
+
+CSV_FPS = 30.0  # of LAFAN1 as retargeted by Unitree
+APART = 0.02  # [m] between the bodies of a file and ours, at most
+
+
+def read_motion(path: Path, robot: RobotModel, fps: float | None = None) -> Clip:
+    """The motion in ``path``, a .csv or .npz, for ``robot``. ``fps``: frames a second of a file that does not say. Raises ClipError."""
+    if path.suffix.lower() == ".csv":
+        return _read_csv(path, robot, fps or CSV_FPS)
+    if path.suffix.lower() != ".npz":
+        raise ClipError(f"{path} is neither .csv nor .npz: a motion is Unitree's CSV, or an .npz of BeyondMimic, mjlab or legged_mw")
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            held = {key: file[key] for key in file.files}
+    except (OSError, ValueError) as error:
+        raise ClipError(f"{path} cannot be read as a motion: {error}") from None
+    if {*KEYS} <= {*held}:
+        return read_clip(path).of(robot.joint_names, str(path))
+    return _read_bodies(path, robot, held, fps)
+
+
+def _read_csv(path: Path, robot: RobotModel, fps: float) -> Clip:
+    """A line a frame: root x, y, z [m], quaternion x, y, z, w, then the joints [rad] in the order of the robot's file."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+        skip = int(bool(lines) and not _is_number(lines[0].split(",")[0]))  # a line of names
+        table = np.loadtxt(lines, delimiter=",", skiprows=skip, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise ClipError(f"{path} cannot be read as a CSV of numbers: {error}") from None
+    count = 7 + len(robot.joint_names)
+    if table.shape[1:] != (count,):
+        got = table.shape[1] if table.ndim > 1 else 0
+        raise ClipError(f"{path} has {got} columns; of this robot it must have {count}: root x y z, quaternion x y z w, then the joints")
+    return checked(path, fps, robot.joint_names, table[:, :3], table[:, [6, 3, 4, 5]], table[:, 7:])
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _read_bodies(path: Path, robot: RobotModel, held: Mapping[str, Any], fps: float | None) -> Clip:
+    """Joints without names, and the places of all bodies: the order of joints is the one that puts the bodies there."""
+    for key in ("joint_pos", "body_pos_w", "body_quat_w"):
+        if key not in held:
+            raise ClipError(f"{path} has no '{key}'; a motion of BeyondMimic or mjlab has joint_pos, body_pos_w, body_quat_w and fps")
+    rate = float(np.ravel(held["fps"])[0]) if "fps" in held else fps
+    if not rate:
+        raise ClipError(f"{path} does not say how many frames a second it has; say --fps")
+    places, turns = held["body_pos_w"], held["body_quat_w"]
+    found = {}
+    for words, names in {"as in the robot's file": list(robot.joint_names), "breadth first": breadth_first(robot)}.items():
+        clip = checked(path, rate, names, places[:, 0], turns[:, 0], held["joint_pos"]).of(robot.joint_names, str(path))
+        found[words] = max(_apart(robot, clip, places, frame) for frame in np.linspace(0, len(places) - 1, 5).astype(int)), clip
+    apart, clip = min(found.values(), key=lambda each: each[0])
+    if apart > APART:
+        raise ClipError(
+            f"{path}: with its joints in either order ({', '.join(found)}) bodies are {apart:.2f} m from where it says; another robot?"
+        )
+    return clip
+
+
+def breadth_first(robot: RobotModel) -> list[str]:
+    """The joints as Isaac Lab has them: all that are one body away from the root, then all that are two, and so on."""
+    model, depth = robot.physics, {}
+    for name in robot.joint_names:
+        body, far = int(model.joint(name).bodyid[0]), 0
+        while body:
+            body, far = int(model.body_parentid[body]), far + 1
+        depth[name] = far
+    return sorted(robot.joint_names, key=depth.__getitem__)
+
+
+def _apart(robot: RobotModel, clip: Clip, places: np.ndarray, frame: int) -> float:
+    """How far the farthest body of the file is from the nearest one of ours [m]."""
+    model: mujoco.MjModel = robot.physics
+    ours = posed(model, clip.joint_pos[frame], clip.qpos()[frame, :7]).xpos[1:]
+    return float(np.linalg.norm(places[frame][:, None] - ours[None], axis=2).min(axis=1).max())

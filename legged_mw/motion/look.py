@@ -1,0 +1,115 @@
+"""A clip on a robot: what is wrong with it, and a stage that plays it in the viewers."""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from legged_mw.drawing.scene import visual_spec
+from legged_mw.sim.model import RobotModel
+from legged_mw.sim.shapes import SPACING, spheres_on
+from legged_mw.utils.clip import Clip, Floats
+from legged_mw.utils.commands import Command
+from legged_mw.view.stage import BoolArray, FloatArray
+
+DEEP, NEAR = 0.01, 0.005  # [m] below the ground that is too much; up to where a foot counts as standing
+SLIDING = 0.1  # [m/s] of a standing foot that is too much
+BEYOND = 1e-3  # [rad] beyond a joint's range that is too much
+
+
+def page(robot: RobotModel, clip: Clip, feet: Sequence[str]) -> str:
+    """What the clip is, and what of it a robot cannot do. ``feet``: geoms that touch the ground."""
+    speed = np.abs(clip.qvel()[:, 6:])
+    fastest = int(speed.max(axis=0).argmax())
+    lines = [f"{len(clip.root_pos)} frames, {clip.seconds:.2f} s at {clip.fps:g} frames a second, {len(clip.joint_names)} joints"]
+    lines.append(f"fastest joint: {clip.joint_names[fastest]}, {speed.max():.1f} rad/s after {_when(clip, speed[:, fastest])}")
+    heights, slides = _feet(robot, clip, feet)
+    lowest, now = heights.min(), heights.min(axis=1)
+    lines.append(f"lowest point: {round(1000 * lowest)} mm above the ground after {_when(clip, -now)}")
+    lines.append(f"fastest slide of a foot within {1000 * NEAR:.0f} mm of the ground: {slides.max():.2f} m/s after {_when(clip, slides)}")
+    return "\n".join([*lines, *(f"warning: {text}" for text in wrong(robot, clip, float(lowest), float(slides.max())))])
+
+
+def wrong(robot: RobotModel, clip: Clip, lowest: float, slide: float) -> list[str]:
+    """A line for each thing that a robot cannot do."""
+    found, (low, high) = [], robot.joint_range.T
+    beyond = np.maximum(low - clip.joint_pos, clip.joint_pos - high)
+    for joint in np.flatnonzero(beyond.max(axis=0) > BEYOND):
+        far, limits = beyond[:, joint].max(), f"{low[joint]:.2f} to {high[joint]:.2f}"
+        found.append(f"{clip.joint_names[joint]} is {far:.3f} rad beyond its range ({limits}) after {_when(clip, beyond[:, joint])}")
+    if lowest < -DEEP:
+        found.append(f"a foot is {-1000 * lowest:.0f} mm in the ground; --lift {-lowest:.3f} raises the clip")
+    if slide > SLIDING:
+        found.append(f"a foot slides on the ground at {slide:.2f} m/s")
+    return found
+
+
+def _when(clip: Clip, values: Floats) -> str:
+    return f"{int(np.argmax(values)) / clip.fps:.2f} s"
+
+
+def _feet(robot: RobotModel, clip: Clip, feet: Sequence[str]) -> tuple[Floats, Floats]:
+    """Heights (T, bodies) of the lowest point of each foot [m], and the fastest standing foot (T,) [m/s]."""
+    model, data, heights, places = robot.physics, mujoco.MjData(robot.physics), [], []
+    geoms = [robot.id("geom", name) for name in feet]
+    bodies, points = sorted({int(model.geom_bodyid[geom]) for geom in geoms}), {geom: spheres_on(model, geom, SPACING) for geom in geoms}
+    for row in clip.qpos():
+        data.qpos[:] = row
+        mujoco.mj_kinematics(model, data)
+        low = dict.fromkeys(bodies, np.inf)
+        for geom, (spheres, radius) in points.items():
+            body, down = int(model.geom_bodyid[geom]), data.geom_xmat[geom, 6:]
+            low[body] = min(low[body], float(data.geom_xpos[geom, 2] + (spheres @ down).min() - radius))
+        heights.append([*low.values()])
+        places.append(data.xpos[bodies, :2].copy())
+    height, speed = np.array(heights), np.linalg.norm(np.diff(places, axis=0), axis=2) * clip.fps
+    standing = (height[1:] < NEAR) & (height[:-1] < NEAR)
+    return height, np.r_[0.0, np.where(standing, speed, 0.0).max(axis=1)]
+
+
+class ClipStage:
+    """A clip as a stage: one robot that is placed, not stepped; see ``view.stage.Stage``. At its end the clip begins again."""
+
+    command_table: tuple[Command, ...] = ()
+    num_worlds = 1
+
+    def __init__(self, robot: RobotModel, clip: Clip) -> None:
+        self.spec: mujoco.MjSpec = visual_spec(robot)
+        self.dt, self._qpos, self._qvel, self._frame = 1.0 / clip.fps, clip.qpos(), clip.qvel(), 0
+
+    def step(self, commands: FloatArray | None) -> None:
+        self._frame = (self._frame + 1) % len(self._qpos)
+
+    def commands(self) -> FloatArray:
+        return np.zeros((1, 0))
+
+    def velocity(self) -> FloatArray:
+        vx, vy, *_, yaw_rate = self._qvel[self._frame, :6]
+        return np.array([[vx, vy, yaw_rate]])
+
+    def believed_velocity(self) -> FloatArray | None:
+        return None
+
+    def qpos(self) -> FloatArray:
+        return self._qpos[self._frame][None]
+
+    def ghost(self) -> FloatArray | None:
+        return None
+
+    def contacts(self) -> BoolArray:
+        return np.zeros((1, 0), dtype=bool)
+
+    def fell(self) -> BoolArray:
+        return np.zeros(1, dtype=bool)
+
+    def ground(self, world: int) -> str:
+        return ""
+
+    def push(self, world: int, velocity: FloatArray) -> None: ...
+
+    def reset(self, world: int) -> None:
+        self._frame = 0

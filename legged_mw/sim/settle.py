@@ -1,0 +1,63 @@
+"""States of a robot that was dropped with its motors off and came to lie, by MuJoCo's own engine. Host only.
+
+The same seed gives the same states on any machine and with any number of threads, whatever engine steps them later.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import copy
+
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from legged_mw.utils.machine import usable_cores
+
+DAMPING = (0.0, 5.0)  # [N m s/rad] at least, of joints of one half and of the other: limp, and as motors that only brake
+VELOCITY = 0.5  # [m/s, rad/s] of the root when it is dropped: each axis U(-0.5, 0.5) [MuJoCo Playground's getup]
+CLEAR = 0.02  # [m] between the lowest point and the ground when it is dropped
+_CHUNK = 256  # worlds that are stepped together: memory
+
+
+def fallen(model: mujoco.MjModel, count: int, seed: int, seconds: float) -> tuple[np.ndarray, np.ndarray]:
+    """qpos (count, nq) and qvel (count, nv), ``seconds`` after a drop in any attitude with any joint angles.
+
+    ``model`` has a free joint, then hinges, and its ground is z = 0. Fewer states are the first of more.
+    """
+    model = copy.copy(model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    model.opt.integrator, model.opt.iterations, model.opt.ls_iterations = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 50, 50
+    starts = _drops(model, count, np.random.default_rng(seed))
+    batch = Batch(model, min(_CHUNK, -(-count // 2)), usable_cores())
+    found = [np.empty((count, size)) for size in (model.nq, model.nv)]
+    for half, damping in enumerate(DAMPING):  # every other state
+        batch.expand("dof_damping")[:, 6:] = np.maximum(model.dof_damping[6:], damping)
+        for first in range(half, count, 2 * len(batch.state)):
+            which = np.arange(first, count, 2)[: len(batch.state)]
+            batch.reset(np.arange(len(batch.state)))
+            for name, start in zip(("qpos", "qvel"), starts, strict=True):
+                batch.bind(name)[: len(which)] = start[which]
+            batch.step(nstep=round(seconds / model.opt.timestep))
+            for name, states in zip(("qpos", "qvel"), found, strict=True):
+                states[which] = batch.bind(name)[: len(which)]
+    return found[0], found[1]
+
+
+def _drops(model: mujoco.MjModel, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """Any attitude, any joint angles within the ranges (of a joint without: +-pi), just above the ground."""
+    data, joints = mujoco.MjData(model), slice(1, model.njnt)
+    draw = rng.random((count, 9 + model.nq - 7))  # in one go, so that a state does not depend on how many there are
+    size, turn = np.sqrt([1.0 - draw[:, 6], draw[:, 6]]), 2.0 * np.pi * draw[:, 7:9].T  # [Shoemake 1992: uniform attitudes]
+    low, high = np.where(model.jnt_limited[joints, None] > 0, model.jnt_range[joints], [-np.pi, np.pi]).T
+    qpos, qvel = np.zeros((count, model.nq)), np.zeros((count, model.nv))
+    qpos[:, 3:7] = np.concatenate([size * np.sin(turn), size * np.cos(turn)]).T
+    qpos[:, 7:] = low + (high - low) * draw[:, 9:]
+    qvel[:, :6] = VELOCITY * (2.0 * draw[:, :6] - 1.0)
+    touching = (model.geom_bodyid > 0) & (model.geom_conaffinity > 0)
+    for state in qpos:
+        data.qpos = state
+        mujoco.mj_kinematics(model, data)
+        state[2] = CLEAR - (data.geom_xpos[touching, 2] - model.geom_rbound[touching]).min()
+    return qpos, qvel

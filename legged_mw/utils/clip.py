@@ -1,0 +1,129 @@
+"""A reference motion: root and joints over time, its file, and its velocities. Numbers only: no simulator, no torch.
+
+Quaternions are (w, x, y, z), unit, body to world.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from legged_mw.utils.errors import UserError, unknown
+
+Floats = NDArray[np.float64]
+KEYS = ("fps", "joint_names", "root_pos", "root_quat", "joint_pos")  # of a clip's .npz
+
+
+class ClipError(UserError, ValueError):
+    """A clip that cannot be used; the text states what is wrong and what to do."""
+
+
+class Clip(NamedTuple):
+    """T frames of a robot with D joints."""
+
+    fps: float  # frames a second
+    joint_names: tuple[str, ...]
+    root_pos: Floats  # (T, 3) [m, world]
+    root_quat: Floats  # (T, 4)
+    joint_pos: Floats  # (T, D) [rad]
+
+    @property
+    def seconds(self) -> float:
+        """From the first frame to the last [s]."""
+        return (len(self.root_pos) - 1) / self.fps
+
+    def qpos(self) -> Floats:
+        """(T, 7 + D), as MuJoCo has it."""
+        return np.concatenate([self.root_pos, self.root_quat, self.joint_pos], axis=1)
+
+    def qvel(self) -> Floats:
+        """(T, 6 + D) root [m/s, world], its turning [rad/s, body], joints [rad/s]; central differences, at the ends one-sided."""
+        turn = rotation_vector(multiply(conjugate(self.root_quat[:-1]), self.root_quat[1:])) * self.fps  # from frame to frame
+        turning = np.concatenate([turn[:1], (turn[:-1] + turn[1:]) / 2, turn[-1:]])
+        along = (np.gradient(values, 1.0 / self.fps, axis=0) for values in (self.root_pos, self.joint_pos))
+        root, joints = along
+        return np.concatenate([root, turning, joints], axis=1)
+
+    def at(self, rate: float) -> Clip:
+        """The same motion with ``rate`` frames a second, between frames along straight lines and great circles."""
+        if abs(rate - self.fps) < 1e-6:
+            return self
+        places = np.arange(int(self.seconds * rate + 1e-6) + 1) / rate * self.fps
+        first = np.minimum(places.astype(int), len(self.root_pos) - 2)
+        share = (places - first)[:, None]
+        here, there = self.root_quat[first], self.root_quat[first + 1]
+        turned = multiply(here, from_rotation_vector(share * rotation_vector(multiply(conjugate(here), there))))
+        root, joints = ((1 - share) * values[first] + share * values[first + 1] for values in (self.root_pos, self.joint_pos))
+        return Clip(rate, self.joint_names, root, turned, joints)
+
+    def of(self, joints: Sequence[str], where: str) -> Clip:
+        """The same with these ``joints``, in their order; others are left out. Raises ClipError for one that it does not have."""
+        for name in joints:
+            if name not in self.joint_names:
+                raise ClipError(f"{where}: {unknown('joint', name, self.joint_names, 'the clip')}")
+        return self._replace(joint_names=tuple(joints), joint_pos=self.joint_pos[:, [self.joint_names.index(name) for name in joints]])
+
+
+def read_clip(path: Path) -> Clip:
+    """The clip in an .npz as ``save_clip`` writes it. Raises ClipError."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            held = {key: file[key] for key in file.files}
+    except (OSError, ValueError) as error:
+        raise ClipError(f"{path} cannot be read as a clip: {error}") from None
+    if missing := [key for key in KEYS if key not in held]:
+        hint = f"convert it with: python -m legged_mw.motion {path.name} --task TASK --out CLIP.npz"
+        raise ClipError(f"{path} is no clip of legged_mw, for it has no '{missing[0]}'; {hint}")
+    names = tuple(map(str, held["joint_names"]))
+    return checked(path, float(held["fps"]), names, *(held[key] for key in KEYS[2:]))
+
+
+def checked(path: Path, fps: float, names: Sequence[str], root_pos: ArrayLike, root_quat: ArrayLike, joint_pos: ArrayLike) -> Clip:
+    """A clip of these arrays, its quaternions of unit length and without jumps of sign. Raises ClipError."""
+    pos, quat, joints = (np.array(values, dtype=np.float64) for values in (root_pos, root_quat, joint_pos))
+    if len(pos) < 2 or pos.shape != (len(pos), 3) or quat.shape != (len(pos), 4) or joints.shape != (len(pos), len(names)):
+        found = f"root_pos {pos.shape}, root_quat {quat.shape}, joint_pos {joints.shape}"
+        raise ClipError(f"{path}: {found} for {len(names)} joints; there must be two frames or more: (T, 3), (T, 4), (T, {len(names)})")
+    length = np.linalg.norm(quat, axis=1, keepdims=True)
+    finite = all(np.isfinite(values).all() for values in (pos, quat, joints))
+    if not finite or fps <= 0 or (np.abs(length - 1.0) > 0.01).any():
+        raise ClipError(f"{path}: the clip has a value that is not finite, a quaternion that is not of unit length, or no frame rate")
+    flips = np.sign((quat[1:] * quat[:-1]).sum(axis=1))
+    return Clip(fps, tuple(names), pos, quat / length * np.cumprod(np.r_[1.0, np.where(flips < 0, -1.0, 1.0)])[:, None], joints)
+
+
+def save_clip(path: Path, clip: Clip) -> None:
+    """Write ``path`` (.npz), float32."""
+    arrays = {key: np.asarray(getattr(clip, key), dtype=np.float32) for key in KEYS if key != "joint_names"}
+    np.savez_compressed(path, joint_names=np.array(clip.joint_names), **arrays)  # type: ignore[arg-type]
+
+
+# ---- rotations ---------------------------------------------------------------------------------------------------------
+
+
+def multiply(a: Floats, b: Floats) -> Floats:
+    """Quaternions (..., 4): first ``b``, then ``a``."""
+    w, u, s, v = a[..., :1], a[..., 1:], b[..., :1], b[..., 1:]
+    return np.concatenate([w * s - (u * v).sum(axis=-1, keepdims=True), w * v + s * u + np.cross(u, v)], axis=-1)
+
+
+def conjugate(q: Floats) -> Floats:
+    """The inverse rotation."""
+    return q * np.array([1.0, -1.0, -1.0, -1.0])
+
+
+def rotation_vector(q: Floats) -> Floats:
+    """Axis times angle (..., 3) [rad], the shorter way."""
+    q = np.where(q[..., :1] < 0, -q, q)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    return q[..., 1:] * np.where(sine > 1e-9, 2 * np.arctan2(sine, q[..., :1]) / np.maximum(sine, 1e-9), 2.0)
+
+
+def from_rotation_vector(v: Floats) -> Floats:
+    """The quaternion (..., 4) of axis times angle [rad]."""
+    half = np.linalg.norm(v, axis=-1, keepdims=True) / 2
+    return np.concatenate([np.cos(half), v / 2 * np.sinc(half / np.pi)], axis=-1)

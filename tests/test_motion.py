@@ -1,0 +1,161 @@
+"""Clips as files: read, resampled, checked; those of others; those that ship; and kinematics in torch beside MuJoCo's."""
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from legged_mw import ROOT
+from legged_mw.envs.loading import load_robot
+from legged_mw.motion.__main__ import feet_of, main
+from legged_mw.motion.foreign import breadth_first, read_motion
+from legged_mw.motion.look import page
+from legged_mw.sim.errors import ModelError
+from legged_mw.sim.kinematics import Kinematics
+from legged_mw.sim.model import RobotModel
+from legged_mw.sim.pose import posed
+from legged_mw.utils.clip import Clip, ClipError, checked, from_rotation_vector, read_clip, save_clip
+from legged_mw.utils.task import load_task
+
+CLIPS = sorted((ROOT / "resources/motions").glob("*.npz"))
+AXIS = np.array([0.6, 0.0, 0.8])
+
+
+@pytest.fixture(scope="module")
+def g1() -> RobotModel:
+    return load_robot(load_task("g1_track").cfg, "servo", "mujoco", None, [], {})
+
+
+def steady(fps: float = 30.0, frames: int = 31) -> Clip:
+    """A root that moves at 1 m/s and turns at 2 rad/s, and a joint at 3 rad/s."""
+    time = np.arange(frames) / fps
+    return checked(
+        Path("clip"), fps, ["knee"], np.outer(time, [1.0, 0.0, 0.0]), from_rotation_vector(np.outer(2 * time, AXIS)), 3 * time[:, None]
+    )
+
+
+def test_a_clip_at_another_rate_is_the_same_motion() -> None:
+    clip = steady().at(50.0)
+    assert len(clip.root_pos) == 51 and clip.seconds == pytest.approx(1.0)
+    for ours, right in zip(clip[2:], steady(50.0, 51)[2:], strict=True):
+        np.testing.assert_allclose(ours, right, atol=1e-9)
+    np.testing.assert_allclose(clip.qvel(), np.tile([1.0, 0, 0, *(2 * AXIS), 3.0], (51, 1)), atol=1e-9)  # turning is in the body's frame
+
+
+def test_signs_of_quaternions_do_not_jump(tmp_path: Path) -> None:
+    clip = steady()
+    flipped = clip._replace(root_quat=clip.root_quat * np.where(np.arange(31) % 2, -1.0, 1.0)[:, None])
+    save_clip(tmp_path / "clip.npz", flipped)
+    np.testing.assert_allclose(read_clip(tmp_path / "clip.npz").root_quat, clip.root_quat, atol=1e-6)
+
+
+def test_unitrees_csv(g1: RobotModel, tmp_path: Path) -> None:
+    clip = read_clip(CLIPS[0]).at(30.0)
+    table = np.concatenate([clip.root_pos, clip.root_quat[:, [1, 2, 3, 0]], clip.joint_pos], axis=1)
+    for name, header in (("plain.csv", ""), ("named.csv", ",".join(f"column{i}" for i in range(36)))):
+        np.savetxt(tmp_path / name, table, delimiter=",", header=header, comments="")
+        read = read_motion(tmp_path / name, g1)
+        assert read.fps == 30.0 and read.joint_names == g1.joint_names
+        np.testing.assert_allclose(read.qpos(), clip.qpos(), atol=1e-7)
+    np.savetxt(tmp_path / "legs.csv", table[:, :19], delimiter=",")
+    with pytest.raises(ClipError, match="legs.csv has 19 columns; of this robot it must have 36: root x y z, quaternion x y z w"):
+        read_motion(tmp_path / "legs.csv", g1)
+
+
+@pytest.mark.parametrize("order", ["as in the robot's file", "breadth first"])
+def test_bodies_tell_the_order_of_joints(order: str, g1: RobotModel, tmp_path: Path) -> None:
+    """BeyondMimic's files come from Isaac Lab, mjlab's from MuJoCo; neither has names."""
+    whole = read_clip(CLIPS[0]).of(g1.joint_names, "clip")
+    clip = Clip(whole.fps, whole.joint_names, *(values[::25] for values in whole[2:]))
+    names = breadth_first(g1) if order == "breadth first" else list(g1.joint_names)
+    assert breadth_first(g1)[:4] == ["left_hip_pitch_joint", "right_hip_pitch_joint", "waist_yaw_joint", "left_hip_roll_joint"]
+    states = [posed(g1.physics, row[7:], row[:7]) for row in clip.qpos()]
+    held: dict[str, Any] = {"fps": [50], "joint_pos": clip.of(names, "clip").joint_pos}
+    held |= {"body_pos_w": np.array([data.xpos[1:] for data in states]), "body_quat_w": np.array([data.xquat[1:] for data in states])}
+    np.savez(tmp_path / "theirs.npz", **held)
+    np.testing.assert_allclose(read_motion(tmp_path / "theirs.npz", g1).qpos(), clip.qpos(), atol=1e-6)
+    np.savez(tmp_path / "theirs.npz", **{**held, "joint_pos": held["joint_pos"][:, ::-1]})
+    with pytest.raises(ClipError, match="with its joints in either order .* another robot"):
+        read_motion(tmp_path / "theirs.npz", g1)
+
+
+WRONG: list[tuple[Callable[[Clip], Any], str]] = [
+    (lambda clip: clip._replace(joint_names=("ankle",)), "no joint 'knee' in the clip"),
+    (lambda clip: clip._replace(root_quat=2 * clip.root_quat), "a quaternion that is not of unit length"),
+    (lambda clip: clip._replace(root_pos=clip.root_pos[:5]), "there must be two frames or more"),
+]
+
+
+@pytest.mark.parametrize(("change", "said"), WRONG, ids=[said for _, said in WRONG])
+def test_a_wrong_clip(change: Callable[[Clip], Clip], said: str, tmp_path: Path) -> None:
+    save_clip(tmp_path / "clip.npz", change(steady()))
+    with pytest.raises(ClipError, match=said):
+        read_clip(tmp_path / "clip.npz").of(["knee"], "clip.npz")
+    np.savez(tmp_path / "other.npz", joint_pos=[1.0])
+    with pytest.raises(
+        ClipError, match="is no clip of legged_mw, for it has no 'fps'; convert it with: python -m legged_mw.motion other.npz"
+    ):
+        read_clip(tmp_path / "other.npz")
+
+
+@pytest.mark.parametrize("file", CLIPS, ids=lambda file: file.stem)
+def test_a_shipped_clip_is_what_the_robot_can_do(file: Path, g1: RobotModel) -> None:
+    """Within the joints' ranges, no foot in the ground, none that slides."""
+    text = page(g1, read_clip(file).of(g1.joint_names, file.name), feet_of(g1))
+    assert "warning" not in text, text
+    assert "lowest point: 0 mm" in text
+
+
+def test_what_a_robot_cannot_do_is_said(g1: RobotModel, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: Any) -> None:
+    clip = read_clip(CLIPS[0])
+    joints = clip.joint_pos.copy()
+    joints[10, clip.joint_names.index("left_knee_joint")] = 3.0
+    moved = clip.root_pos + np.outer(np.arange(len(joints)), [0.01, 0.0, 0.0]) - [0.0, 0.0, 0.05]
+    save_clip(tmp_path / "bad.npz", clip._replace(joint_pos=joints, root_pos=moved))
+    out = tmp_path / "mended.npz"
+    monkeypatch.setattr(
+        sys, "argv", ["motion", str(tmp_path / "bad.npz"), "--lift", "0.05", "--cut", "1", "2", "--rate", "25", "--out", str(out)]
+    )
+    robot = page(g1, read_clip(tmp_path / "bad.npz"), feet_of(g1))
+    assert "warning: left_knee_joint is 0.120 rad beyond its range (-0.09 to 2.88) after 0.20 s" in robot
+    assert "mm in the ground; --lift 0.0" in robot and "a foot slides on the ground at 0.5" in page(
+        g1, clip._replace(root_pos=moved + [0, 0, 0.05]), feet_of(g1)
+    )
+    main()
+    mended = read_clip(out)
+    assert (mended.fps, len(mended.root_pos)) == (25.0, 26) and "warning: left_knee" not in capsys.readouterr().out
+    np.testing.assert_allclose(mended.root_pos[0], moved[50] + [0.0, 0.0, 0.05], atol=1e-6)
+
+
+def test_the_shipped_clips_are_made_by_the_example(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    import make_motions
+
+    plan = make_motions.squat(body := make_motions.Body())
+    plan.push = plan.push[:60]
+    made, ships = body.pose(plan).qpos(), read_clip(ROOT / "resources/motions/g1_squat.npz").qpos()
+    np.testing.assert_allclose(made, ships[:60], atol=1e-5)
+
+
+def test_kinematics_are_mujocos(g1: RobotModel, double: None) -> None:
+    model, rng = g1.physics, np.random.default_rng(0)
+    names = ["pelvis", "right_wrist_yaw_link", "left_ankle_roll_link", "torso_link"]
+    bodies, data = [g1.id("body", name) for name in names], mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = rng.normal(size=model.nq), rng.normal(size=model.nv)
+    data.qpos[3:7] /= np.linalg.norm(data.qpos[3:7])
+    for compute in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_comVel):
+        compute(model, data)
+    found = Kinematics(model, bodies, "cpu")(torch.tensor(data.qpos)[None], torch.tensor(data.qvel)[None])
+    for i, body in enumerate(bodies):
+        speed = np.zeros(6)
+        mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_XBODY, body, speed, 0)
+        right = (data.xpos[body], data.xmat[body].reshape(3, 3), speed[3:], speed[:3])
+        for ours, theirs in zip(found, right, strict=True):
+            np.testing.assert_allclose(ours[0, i].numpy(), theirs, atol=1e-12)
+    with pytest.raises(ModelError, match="body 'world' is not carried by the robot's root 'pelvis'"):
+        Kinematics(model, [0], "cpu")

@@ -1,0 +1,300 @@
+"""Tasks without commands and their exams: falls, get up, handstand; the same exam in the environment and on an export."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from program import refused, run
+
+from legged_mw import ROOT as REPOSITORY
+from legged_mw.deploy import __main__ as program
+from legged_mw.deploy.contract import ContractError, read_contract
+from legged_mw.deploy.exam import contract_skill, put_on, run_skill
+from legged_mw.deploy.simulated import Fleet
+from legged_mw.deploy.switch import SwitchStage
+from legged_mw.envs.getup import Getup
+from legged_mw.envs.handstand import Handstand
+from legged_mw.eval import getup, handstand, strip
+from legged_mw.eval.perform import machine, on_ground
+from legged_mw.eval.skill import Ground, Recording, Robot
+from legged_mw.sim.settle import fallen
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import UserError
+from legged_mw.utils.task import load_task
+
+POLICIES, HALF = REPOSITORY / "resources/policies", math.sqrt(0.5)
+UPSIDE_DOWN, NOSE_DOWN, NOSE_UP = [0.0, 1.0, 0.0, 0.0], [HALF, 0.0, HALF, 0.0], [HALF, 0.0, -HALF, 0.0]
+
+
+def make(name: str, **changes: Any) -> Any:
+    task = load_task(name)
+    for path, value in {"env.num_envs": 4, "domain_rand.enable": False, **changes}.items():
+        task.set(path.replace("__", "."), value)
+    return task.env_class(task.cfg, "cpu")
+
+
+@pytest.fixture(scope="module")
+def go1() -> Getup:
+    return make("go1_getup", falls__states=6)
+
+
+@pytest.fixture(scope="module")
+def robot(go1: Getup) -> Robot:
+    return machine(go1)
+
+
+# ---- falls
+
+
+def test_falls_are_settled_and_made_again(robot: Robot) -> None:
+    """They lie: low, slow, nothing far below the ground; the same seed makes the same, and fewer are the first of more."""
+    qpos, qvel = fallen(robot.model, 12, seed=3, seconds=1.0)
+    again, _ = fallen(robot.model, 5, seed=3, seconds=1.0)
+    np.testing.assert_array_equal(again, qpos[:5])
+    assert np.abs(fallen(robot.model, 1, seed=4, seconds=0.1)[0] - qpos[:1]).max() > 0.1
+    assert (qpos[:, 2] < 0.24).all() and (qpos[:, 2] > 0.03).all() and np.median(np.abs(qvel)) < 0.1
+    np.testing.assert_allclose(np.linalg.norm(qpos[:, 3:7], axis=1), 1.0, atol=1e-9)
+    low, high = robot.model.jnt_range[1:].T
+    assert (qpos[:, 7:] > low - 0.1).all() and (qpos[:, 7:] < high + 0.1).all()
+
+
+def test_episodes_begin_in_falls(go1: Getup) -> None:
+    """Masked worlds only; with the share 0 all stand."""
+    before = go1.sim.qpos.clone()
+    mask = torch.tensor([True, False, True, True])
+    go1.cfg.falls.share = 1.0
+    go1.reset_envs(mask)
+    known = (go1.sim.qpos[:, None] - go1.fallen_qpos).abs().amax(dim=2).amin(dim=1) == 0.0
+    assert known[mask].all() and torch.equal(go1.sim.qpos[1], before[1])
+    assert torch.equal(go1.last_dof_vel[mask], go1.dof_vel[mask])  # type: ignore[index]
+    go1.cfg.falls.share = 0.0
+    go1.reset_envs(mask)
+    torch.testing.assert_close(go1.dof_pos[mask], go1.default_dof_pos.expand(3, -1))
+
+
+def test_rewards_of_getup(go1: Getup) -> None:
+    """Standing; upside down; level and low; one joint off by 0.2 rad; and a joint at 3 turns a second."""
+    home = torch.tensor([*go1.start_place, 1.0, 0.0, 0.0, 0.0, *go1.robot.pose])
+    go1.sim.qpos.copy_(home.expand(4, -1))
+    go1.sim.qvel.zero_()
+    go1.sim.qpos[1, 3:7] = torch.tensor(UPSIDE_DOWN)
+    go1.sim.qpos[2, 2] = 0.1
+    go1.sim.qpos[3, 7] += 0.2
+    go1.dof_vel[3, 0] = 6.0 * math.pi
+    go1._refresh_base()
+    still = math.exp(-2.0 * (6.0 * math.pi) ** 2 / 12)
+    expected = {
+        "upright": [1.0, math.exp(-8.0), 1.0, 1.0],
+        "height": [1.0, 1.0, 0.1 / (0.99 * 0.278), 1.0],
+        "posture": [1.0, 0.0, 1.0, math.exp(-2.0 * 0.04 / 12)],
+        "stand_still": [1.0, 0.0, 0.0, still],
+        "fast_joints": [0.0, 0.0, 0.0, (4.0 * math.pi) ** 2],
+    }
+    for name, values in expected.items():
+        torch.testing.assert_close(getattr(go1, f"_reward_{name}")(), torch.tensor(values), atol=1e-5, rtol=1e-5, msg=name)
+    assert not go1._fallen().any()
+
+
+def test_pull_lifts_who_is_down_and_fades() -> None:
+    """Half of the weight on those that are down; a quarter of episodes that end down undo three that end up; it is in a checkpoint."""
+    env = make("go1_getup", falls__states=4, falls__pull=0.5, falls__share=0.0)
+    env.sim.qpos[:2, 2] = 0.1
+    env._apply_actions()
+    half = 0.5 * 9.81 * env.total_mass
+    torch.testing.assert_close(env.sim.xfrc_applied[:, env.root_body, 2], torch.tensor([half, half, 0.0, 0.0]))
+    env.pull.level.fill_(0.5)
+    everyone, up = torch.ones(4, dtype=torch.bool), torch.tensor([True, True, True, False])
+    env.pull.update(everyone, up)
+    assert env.training_state()["pull_level"] == 0.5
+    env.pull.update(everyone, up | True)
+    env.pull.update(~everyone, up)
+    assert env.pull.level == pytest.approx(0.5 - env.cfg.falls.pull_fades)
+    other = make("go1_getup", falls__states=4, falls__pull=0.5)
+    other.load_training_state(env.training_state())
+    assert other.pull.level == env.pull.level
+
+
+# ---- what an exam makes of a recording
+
+
+def recording(robot: Robot, seconds: float, count: int) -> Recording:
+    """Robots that stand."""
+    steps, joints = round(seconds / robot.dt), robot.model.nv - 6
+    qpos = np.tile(robot.home, (steps, count, 1))
+    return Recording(qpos, np.zeros((steps, count, 6 + joints)), np.zeros((steps, count, joints)), np.full(count, np.inf))
+
+
+def test_what_getup_judges(robot: Robot) -> None:
+    """Up at once; up after 2 s; too late; down again after 3 s; never; up, but an episode ended."""
+    skill = getup.Getup(within=3.0)
+    seen = recording(robot, skill.seconds, 6)
+    at = {seconds: round(seconds / robot.dt) for seconds in (2.0, 3.0, 3.1)}
+    seen.qpos[: at[2.0], 1, 2] = 0.1
+    seen.qpos[: at[3.1], 2, 3:7] = UPSIDE_DOWN
+    seen.qpos[at[3.0] :, 3, 2] = 0.1
+    seen.qvel[:, 4, 6:] = 1.0
+    seen.ended_at[5] = at[2.0]
+    seen.torque[: at[2.0] + 1, 1], seen.qvel[: at[2.0], 1, 6] = 23.7, 2.0
+    found = skill.judge(robot, seen)
+    assert found["stands"] == pytest.approx(4 / 6) and found["stays"] == pytest.approx(2 / 6)
+    assert found["median"] == 0.0 and found["slowest"] == 2.0 and found["worst"] == 2
+    assert found["energy"] == pytest.approx(2.0 * 2.0 * 23.7 / 4)  # of four that stood, one spent 2 s at 47 W
+    result = skill.result(dict.fromkeys(skill.grounds, found))
+    assert not result["passed"] and "share that stands in time              0.667" in skill.table(result)
+    assert skill.result({name: {**found, "stands": 0.98, "stays": 1.0} for name in skill.grounds})["passed"] is False  # 0.99 on the plane
+    assert skill.result({name: {**found, "stands": 1.0 if name == "plane" else 0.98, "stays": 1.0} for name in skill.grounds})["passed"]
+
+
+def test_upright_is_by_gravity() -> None:
+    """On a slope of 10 degrees a robot that stands along the slope is 10 degrees off, and still up; one that leans 25 is not."""
+    env = on_ground(make("go1_getup", falls__states=4), Ground(slope=10.0, friction=0.4))
+    assert env.robot.physics.geom("floor").friction[0] == 0.4
+    expected = torch.tensor([math.sin(math.radians(10.0)), 0.0, -math.cos(math.radians(10.0))])
+    torch.testing.assert_close(env.gravity_dir[0], expected, atol=1e-6, rtol=0.0)
+    seen = recording(machine(env), 1.0, 2)
+    lean = math.radians(25.0) / 2
+    seen.qpos[:, 1, 3:7] = [math.cos(lean), 0.0, math.sin(lean), 0.0]  # nose down, downhill: 35 degrees
+    assert getup.standing(machine(env), seen).mean(axis=0).tolist() == [1.0, 0.0]
+
+
+def test_handstand_rewards_and_judge() -> None:
+    """On all fours, nose down, nose up."""
+    env: Any = make("go1_handstand", env__num_envs=3)
+    env.sim.qpos.copy_(torch.tensor([*env.start_place, 1.0, 0.0, 0.0, 0.0, *env.robot.pose]).expand(3, -1))
+    env.sim.qpos[1:, 3:7], env.sim.qpos[1:, 2] = torch.tensor([NOSE_DOWN, NOSE_UP]), 0.6
+    env._refresh_base()
+    torch.testing.assert_close(env._reward_stand_attitude(), torch.tensor([0.25, 1.0, 0.0]), atol=1e-6, rtol=0.0)
+    torch.testing.assert_close(env._reward_stand_height(), torch.tensor([math.exp(0.278 - 0.55), 1.0, 1.0]))
+    skill, here = handstand.Handstand(nose=-1.0, height=0.55, hands=["FR", "FL"]), machine(env)
+    seen = recording(here, skill.seconds, 4)
+    seen.qpos[:, :3, 2], seen.qpos[:, :3, 3:7] = 0.6, NOSE_DOWN
+    seen.qpos[round(4.0 / here.dt), 1, 3:7] = [1.0, 0.0, 0.0, 0.0]  # at 4 s: 4 s before, 4 s after
+    seen.qpos[:, 2, 2] = 0.2  # low: its head is in the ground
+    seen.qpos[:, 0, 0] += np.linspace(0.0, 0.8, len(seen.qpos))  # 0.1 m/s
+    found = skill.judge(here, seen)
+    assert found["holds"] == 0.25 and found["up"] == 0.5 and found["drift"] == pytest.approx(0.5, abs=0.01)
+    ends = {env.robot.contact_geoms[i] for i in env.contacts.terminating.tolist()}
+    parts = ("hip_1", "hip_2", "thigh_1", "thigh_2", "thigh_3", "calf_1", "calf_2")
+    assert ends == {f"{leg}_{part}" for leg in ("FR", "FL") for part in parts}
+    assert isinstance(env, Handstand)
+
+
+# ---- a task from training to deploy
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exams of a few robots and of a second."""
+    monkeypatch.setattr(getup.Getup, "robots", 3)
+    monkeypatch.setattr(getup.Getup, "grounds", {"plane": Ground(), "changed": Ground(slope=10.0, friction=0.3, load=2.0)})
+    monkeypatch.setattr(getup, "SETTLING", 0.4)
+    monkeypatch.setattr(getup, "STAY", 0.2)
+    monkeypatch.setattr(strip, "PICTURES", 2)
+
+
+def test_getup_from_training_to_deploy(tmp_path: Path, small: None) -> None:
+    """Training with its exam, the report of --eval with an export's column, and the export alone give one result."""
+    flags = ["--task", "go1_getup", "--num_envs", "8", "--device", "cpu", "--max_iterations", "1"]
+    sizes = [f"{part}.hidden_dims=[16]" for part in ("actor", "critic")]
+    more = [*sizes, "falls.states=4", "runner.exam_interval=1", "runner.num_steps_per_env=8", "exam.within=0.4"]
+    result = run("train", tmp_path, *flags, *(word for change in more for word in ("--set", change)))
+    assert result.code == 0, result.err
+    assert re.search(r"exam after 1 iterations: stands 0\.\d{3}, stays 0\.\d{3}", result.out)
+    [folder] = tmp_path.glob("logs/*/*")
+    result = run("play", tmp_path, "--task", "go1_getup", "--device", "cpu", "--eval")
+    assert result.code == 0, result.err
+    assert "falls.share" not in result.out and "share that stands in time" in result.out and "passes: no" in result.out
+    here, there = json.loads((folder / "eval/report.json").read_text())["columns"]
+    assert there["name"] == "the same, deployed in MuJoCo" and here["exam"]["asked"] == {"kind": "getup", "within": 0.4}
+    for name, part in here["exam"]["parts"].items():
+        assert part["at_limit"] == pytest.approx(there["exam"]["parts"][name]["at_limit"], abs=2e-3)
+    assert (folder / "eval/plane.png").is_file() and "data:image/png" in (folder / "eval/report.html").read_text()
+    contract = read_contract(folder / "export")
+    assert contract.exam == {"kind": "getup", "within": 0.4} and contract.action.origin == "joints"
+    assert run_skill(folder / "export") == there["exam"]
+    line = refused(tmp_path, "play", "--task", "go1_getup", "--device", "cpu", "--eval", "--set", "falls.pull=0.1")
+    assert "--eval sets falls.pull itself" in line
+    leaning = Fleet(folder / "export", contract, 1, threads=1, change=lambda model: put_on(model, Ground(slope=10.0)))
+    np.testing.assert_allclose(leaning.read().gravity[0], [math.sin(math.radians(10.0)), 0.0, -math.cos(math.radians(10.0))], atol=1e-9)
+    check_switch(folder / "export")
+    for section, words in (
+        ({"kind": "getpu"}, "policy.yaml: no exam 'getpu' in legged_mw/eval/skills.py; did you mean 'getup'?"),
+        ({"kind": "getup", "wihtin": 3}, "policy.yaml: exam: no field 'wihtin' in the exam getup; did you mean 'within'?"),
+    ):
+        with pytest.raises(ContractError, match=re.escape(words)):
+            contract_skill(contract.__class__(**{**vars(contract), "exam": section}))
+
+
+def check_switch(rescuer: Path) -> None:
+    """A walker that falls is handed over, and back when it stands; nobody is put back."""
+    stage = SwitchStage(POLICIES / "go1_flat", rescuer, 2, command=(0.5, 0.0, 0.0))
+    stage.step()
+    assert not stage.rescued.any() and not stage.fell().any()
+    stage.fleet.qpos[1, 2:7] = [0.1, *UPSIDE_DOWN]
+    stage.fleet.refresh()
+    stage.measured = stage.fleet.read()
+    stage.step()
+    assert stage.fell().tolist() == stage.rescued.tolist() == [False, True]
+    stage.step()
+    assert stage.rescued[1] and not stage.fell().any() and stage.qpos()[1, 2] < 0.2
+    assert stage.rescuer.last_actions[1].any() and not stage.controller.last_actions[1].any()
+    stage.put(np.tile(stage.fleet.model.key_qpos[0], (2, 1)), np.zeros_like(stage.fleet.qvel))  # as if it got up
+    stood = [bool(stage._stood(stage.measured)[1]) for _ in range(25)]
+    assert stood == [False] * 24 + [True]  # half a second
+    stage._stood = lambda measured: np.array([False, True])  # type: ignore[method-assign]
+    stage.step()
+    assert not stage.rescued[1]
+    with pytest.raises(UserError, match="--switch: joints of go1_flat and g1_flat differ, so they cannot drive one robot"):
+        SwitchStage(POLICIES / "go1_flat", POLICIES / "g1_flat")
+
+
+@pytest.mark.parametrize(
+    ("args", "line"),
+    [
+        (["go1_flat", "go2_flat"], "--switch fall is of two policies: python -m legged_mw.deploy DIR DIR2 --switch fall"),
+        (["go1_flat", "--switch", "fall"], "--switch fall is of two policies"),
+        (
+            ["go1_flat", "go2_flat", "--switch", "fall", "--eval"],
+            "--switch is watched in simulation, on flat ground: leave the other flags out",
+        ),
+    ],
+)
+def test_switch_flags(args: list[str], line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("sys.argv", ["deploy", *args])
+    with pytest.raises(SystemExit):
+        program.parse()
+    assert line in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["go2_getup", "go1_footstand", "go2_handstand", "go2_footstand"])
+def test_variants_step(name: str) -> None:
+    """Those that the suite leaves out, since they are others with other numbers."""
+    env = make(name, falls__states=2) if "getup" in name else make(name)
+    for _ in range(3):
+        obs, rewards, *_ = env.step(torch.randn(4, 12))
+        assert obs["state"].shape == (4, 42) and obs["state"].isfinite().all() and rewards.isfinite().all()
+    assert env.mirror is not None
+
+
+@pytest.mark.parametrize(
+    ("task", "path", "value", "line"),
+    [
+        ("go1_getup", "falls.share", 1.5, "falls.share is 1.5; it must be from 0 to 1"),
+        ("go1_getup", "falls.states", 0, "falls.states is 0; it must be positive"),
+        ("go1_getup", "falls.pull", -1.0, "falls.pull is -1.0; it must be from 0 to 1, a share of the weight"),
+        ("go1_getup", "terrain.slope", 80.0, "terrain.slope is 80.0; it must be from -60 to 60 degrees"),
+        ("go1_handstand", "exam.nose", 0.0, "exam.nose is 0.0; it must be -1, down, or 1, up"),
+        ("go1_handstand", "exam.hands", [], "exam.hands is []; it must be a list with at least one name"),
+        ("go1_handstand", "exam.hands", ["FX"], "exam.hands: no geom 'FX' in resources/robots/go1/go1.xml; there are: floor, "),
+    ],
+)
+def test_bad_values(task: str, path: str, value: Any, line: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(line)):
+        make(task, **{path.replace(".", "__"): value, "env__num_envs": 1})
