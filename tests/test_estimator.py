@@ -202,6 +202,12 @@ def test_an_estimator_that_cannot_be(changes: dict[str, Any], said: str) -> None
         make_runner(LeggedRobot(task.cfg, "cpu"), task.train, None, "cpu")
 
 
+def test_what_a_teacher_estimates_must_be_known_here() -> None:
+    task = task_with(actor__estimator__targets=[], observations__foot_height=False)
+    with pytest.raises(ConfigError, match="^the teacher's actor.estimator.targets: no .* 'foot_height' .*foot_height = True adds it"):
+        make_runner(LeggedRobot(task.cfg, "cpu"), task.train, None, "cpu", task_with().train)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

@@ -308,7 +308,11 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
     torch.set_float32_matmul_precision(cfg.runner.matmul_precision)
     check_mirror(env, cfg)
     try:
-        settings = adapt(rsl_rl_config(cfg, env), cfg, acting(teacher, env, [TEACHER]) if teacher else None)
+        theirs = acting(teacher, env, [TEACHER]) if teacher else None
+    except ConfigError as error:
+        raise ConfigError(f"the teacher's {error}") from None
+    try:
+        settings = adapt(rsl_rl_config(cfg, env), cfg, theirs)
         runner = Runner(env, settings, str(log_dir) if log_dir else None, device)
     except ValueError as error:  # a class, activation, optimizer or observation group that does not exist
         raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None
