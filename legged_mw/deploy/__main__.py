@@ -77,7 +77,7 @@ def main() -> None:
         drive.drive(robot, folder, contract, args, command, args.robot, contact)
         print(robot.report)
     elif args.drive:
-        robot = MujocoRobot(folder, contract, scene_file, whole=True, hoisted=drive.hoisted(args, contract))
+        robot = MujocoRobot(folder, contract, scene_file, whole=True, hoisted=drive.hoisted(args, contract), lift=drive.lift(args))
         drive.drive(robot, folder, contract, args, command, args.robot, contact)
     elif args.eval:
         examine(folder, Path(args.out) if args.out else folder / RESULT_FILE, args.ranges == "common", contact)

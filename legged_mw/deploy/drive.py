@@ -16,6 +16,7 @@ import numpy as np
 
 from legged_mw.deploy.contract import Contract
 from legged_mw.deploy.inputs import Gamepad, Keys, RobotRemote, Source, StopFile
+from legged_mw.deploy.joint_check import JointCheck
 from legged_mw.deploy.log import Log, log_path
 from legged_mw.deploy.mirror import FLAGS, LIVE, Mirror
 from legged_mw.deploy.odometry import Odometry
@@ -30,17 +31,20 @@ from legged_mw.view import launch
 from legged_mw.view.launch import FlagError
 from legged_mw.view.script import load_script
 
+CHECK_KEYS = "keys: s start, x damping, Esc emergency stop"
 KEYS = "keys: s start, a policy, x damping, Esc emergency stop, Ctrl-C end; arrows, q, e drive, space stops walking"
 GAMEPADS = Path("/dev/input")  # where Linux has them
+LIFT = 0.3  # [m] ours: higher than a robot stands hangs one whose feet must not touch the ground
 STATUS = 0.2  # [s] between two status lines
 
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of driving a robot, and of its log."""
     parser.add_argument("--drive", action="store_true", help="from the terminal as on a robot: states, safety limits, a log; in real time")
-    parser.add_argument(
-        "--hoist", choices=("yes", "no"), help="a simulated robot hangs until the policy starts (default: if it has two feet)"
-    )
+    checked = "in place of the policy: each joint goes 0.1 rad and back at a tenth of the stiffness, and what moved is compared"
+    parser.add_argument("--check_joints", action="store_true", help=checked)
+    hangs = "a simulated robot hangs until the policy starts (default: if it has two feet), high: its feet in the air, as in --check_joints"
+    parser.add_argument("--hoist", choices=("yes", "no", "high"), help=hangs)
     limits = "another limit of the safety layer, e.g. tilt=45 or frozen=off (docs/on_the_robot.md has them all)"
     parser.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE", help=limits)
     parser.add_argument("--gamepad", metavar="FILE", help="a gamepad that drives too (default: the first that is there), or off")
@@ -51,12 +55,21 @@ def add_flags(parser: argparse.ArgumentParser) -> None:
 
 def check_flags(args: argparse.Namespace) -> None:
     """Refuse flags that do not go together. Raises FlagError or LimitError."""
+    if args.check_joints and (others := [name for name in ("serve", "eval", "replay", "command", "commands") if getattr(args, name)]):
+        raise FlagError(f"--check_joints moves one joint of a robot at a time: leave --{others[0]} out")
+    args.drive |= args.check_joints
     several = {"eval": args.eval, "num_envs": args.num_envs != 1, "replay": args.replay}
     shown = ("--commands", *([f"--{name}" for name in FLAGS] if args.viewer in LIVE else []))
     watched = [flag.removeprefix("--") for flag in launch.asked(args) if flag not in shown]
     if args.drive and (given := [name for name, value in several.items() if value] + watched):
         raise FlagError(f"--drive is one robot in real time: leave --{given[0]} out")
-    alone = {"hoist": args.hoist, "limit": args.limit, "gamepad": args.gamepad, "stop_fd": args.stop_fd is not None, "log": args.log}
+    alone = {
+        "hoist": args.hoist and not args.serve,
+        "limit": args.limit,
+        "gamepad": args.gamepad,
+        "stop_fd": args.stop_fd is not None,
+        "log": args.log,
+    }
     if not args.drive and args.robot == "simulated" and (given := [name for name, value in alone.items() if value]):
         raise FlagError(f"--{given[0]} is of a robot that is driven: add --drive")
     parse_limits(args.limit)
@@ -64,7 +77,12 @@ def check_flags(args: argparse.Namespace) -> None:
 
 def hoisted(args: argparse.Namespace, contract: Contract) -> bool:
     """Whether a simulated robot begins on a hoist."""
-    return args.hoist == "yes" or (args.hoist is None and len(contract.feet) == 2)
+    return args.hoist in ("yes", "high") or (args.hoist is None and (len(contract.feet) == 2 or args.check_joints))
+
+
+def lift(args: argparse.Namespace) -> float:
+    """How far above its start it hangs [m]."""
+    return LIFT * (args.hoist == "high" or (args.hoist is None and args.check_joints))
 
 
 def drive(
@@ -76,7 +94,7 @@ def drive(
     kind: str,
     contact: str | None = None,
 ) -> None:
-    """Drive ``robot`` until Ctrl-C or for ``args.time``.
+    """Drive ``robot`` until Ctrl-C or for ``args.time``, or check its joints; one that is wrong ends the program with code 1.
 
     ``fixed`` (C,) is followed while nobody drives; None: the defaults. ``kind`` of robot, for the log. ``contact``: of Odometry, if any.
     """
@@ -89,9 +107,10 @@ def drive(
         console = stack.enter_context(Console(contract))
         controller, command = Controller(folder, contract), _commands(contract, args, fixed, console.say)
         sources = [*_sources(contract, args, console.say), *([mirror] if mirror else [])]
-        states = States(controller, sources, command, console.say)
+        checked = JointCheck(controller, sources, console.say, robot, safety.limits) if args.check_joints else None
+        states = checked or States(controller, sources, command, console.say)
         stack.callback(states.close)
-        console.say(f"{KEYS}\n{states.state}: {states.note}")
+        console.say(f"{CHECK_KEYS if args.check_joints else KEYS}\n{states.state}: {states.note}")
         stack.enter_context(_ended_by_signals())
         seconds = args.time or math.inf
         odometry = Odometry(folder, contract, 1, contact) if contact else None
@@ -102,7 +121,9 @@ def drive(
                 mirror.show(now, measured, states)
 
         done = run(robot, controller, command, seconds, watch=show, safety=safety, states=states, log=log, odometry=odometry)
-        console.say(f"{done.timing}\nthe joints are damped{f'; logged to {shown(path)}' if path else ''}")
+        console.say(f"{done.timing}\nthe joints are damped{f'; logged to {shown(path)}' if path else ''}{states.report}")
+    if not states.right:
+        raise SystemExit(1)
 
 
 def _sources(contract: Contract, args: argparse.Namespace, say: Callable[[str], None]) -> list[Source]:

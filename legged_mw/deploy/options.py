@@ -9,6 +9,7 @@ from contextlib import closing
 from pathlib import Path
 
 from legged_mw.deploy.contract import Contract
+from legged_mw.deploy.drive import lift
 from legged_mw.deploy.odometry import CONTACTS
 from legged_mw.deploy.unitree import client
 from legged_mw.deploy.unitree.client import UnitreeRobot
@@ -81,6 +82,8 @@ def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
             handset=hand,
             faults=faults,
             watchdog=args.watchdog or math.inf,
+            hoist=None if args.hoist is None else args.hoist != "no",
+            lift=lift(args),
         )
     print(served.text())
 

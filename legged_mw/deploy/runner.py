@@ -65,7 +65,7 @@ def run(
         with suppress(*([KeyboardInterrupt] if states else [])):  # a person ends a run with states so
             for now in loop.ticks(seconds):
                 measured = one.take(loop)
-                if one.summary.fell is not None:
+                if one.over:
                     break
                 if measured:
                     velocities.add(measured)
@@ -109,6 +109,11 @@ class _Step:
             raise RobotError(f"{type(robot).__name__} has no damp() and limp() of its own, which the states need")
         if states and controller.contract.action.origin == TORQUE:
             raise RobotError("a policy of torques cannot stand a robot up: its states need servos; run it without them")
+
+    @property
+    def over(self) -> bool:
+        """Whether the run ends with this step."""
+        return self.summary.fell is not None or (self.states is not None and self.states.over)
 
     def take(self, loop: Loop) -> Measurement | None:
         """One step; returns what was measured, None if nothing could be."""

@@ -179,12 +179,23 @@ class MujocoRobot(Robot):
     """One simulated robot behind the seam. Simulated time moves on in ``write``, ``damp`` and ``limp``, by one period."""
 
     def __init__(
-        self, folder: Path, contract: Contract, scene_file: str = SCENE_FILE, *, whole: bool = False, hoisted: bool = False
+        self,
+        folder: Path,
+        contract: Contract,
+        scene_file: str = SCENE_FILE,
+        *,
+        whole: bool = False,
+        hoisted: bool = False,
+        lift: float = 0.0,
     ) -> None:
-        """``whole``: its body touches the ground too. ``hoisted``: its base hangs at its start until targets come at its own gains."""
+        """``whole``: its body touches the ground too. ``hoisted``: its base hangs until targets come at its own gains.
+
+        It hangs ``lift`` [m] above its start.
+        """
         self.fleet, self.hoisted = Fleet(folder, contract, 1, threads=1, scene_file=scene_file, whole=whole), hoisted
         self._targets, self._gains, self._closed = contract.default_pose, (contract.stiffness, contract.damping), False
         self._start, self.can_change_gains = self.fleet.qpos[0, :7].copy(), contract.motors.law == "servo"
+        self._start[2] += lift
 
     def read(self) -> Measurement:
         return self.fleet.read().of(0)

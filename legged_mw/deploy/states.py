@@ -15,8 +15,8 @@ from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement
 from legged_mw.deploy.safety import Trip
 
-ZERO, STAND, POLICY, DAMPING = STATES = ("zero torque", "stand", "policy", "damping")
-ARMED = (STAND, POLICY)  # states in which limits are watched: in the others nothing pushes
+ZERO, STAND, POLICY, DAMPING, CHECK = STATES = ("zero torque", "stand", "policy", "damping", "joint check")
+ARMED = (STAND, POLICY, CHECK)  # states in which limits are watched: in the others nothing pushes
 RISE = 2.0  # [s] from wherever the joints are to the default pose [unitree_rl_gym]
 SOFT = 0.1  # [share of the stiffness] that standing up begins with
 NEAR = 0.15  # [rad] ours: a joint that is farther from the pose after RISE carries weight, and gets stiffer
@@ -40,13 +40,16 @@ class States:
     ``command`` gives (C,) at a time [s] since the policy began, while nobody drives; ``say`` gets a line for each change.
     """
 
+    first = STAND  # what start begins
+    over, report, right = False, "", True  # whether the run ends now; what is said at its end, and whether that is good
+
     def __init__(
         self, controller: Controller, sources: Sequence[Source], command: Callable[[float], Floats], say: Callable[[str], None] = print
     ) -> None:
         self.controller, self.sources, self._own, self._say = controller, list(sources), command, say
         self.state, self.since = ZERO, 0.0  # [s] since when
         self.command = controller.contract.held(command(0.0))  # (C,) as followed now
-        self.note = f"{START}: stand"
+        self.note = f"{START}: {self.first}"
         self._from: Floats = controller.contract.default_pose  # (D,) [rad] where standing up began
         self._stiffer = 1.0
         self._pressed = frozenset[str]()
@@ -99,7 +102,7 @@ class States:
             if self.state != DAMPING:
                 self._enter(DAMPING, now, f"{END} was pressed")
         elif START in pressed and self.state == DAMPING:
-            self._enter(ZERO, now, f"{START}: stand")
+            self._enter(ZERO, now, f"{START}: {self.first}")
         elif START in pressed and self.state == ZERO:
             self._from, self._stiffer = measured.joint_pos.copy(), 1.0
             self._enter(STAND, now, f"{RISE:g} s to the default pose; then {WALK}: policy")

@@ -92,7 +92,7 @@ class UnitreeRobot(Robot):
         """
         self.contract, self._owner, self._clock, self._echo = contract, owner, clock, echo
         self.machine = machine_of(contract.joints)
-        self.limits = self.machine.limits
+        self.limits, self.motors = self.machine.limits, self.machine.motors
         check_rows(contract, self.machine, odometry)
         self._slots = order(self.machine, contract.joints)
         self._state, self._stamp, self._open = self._decoded(first.body), first.stamp, True

@@ -119,6 +119,8 @@ def serve(
     handset: Handset | None = None,
     faults: Sequence[Fault] = (),
     watchdog: float = math.inf,
+    hoist: bool | None = None,
+    lift: float = 0.0,
 ) -> Served:
     """A simulated robot of the export on a network interface."""
     need_dds()
@@ -128,7 +130,7 @@ def serve(
     domain = default_domain(interface) if domain is None else domain
     machine = machine_of(contract.joints)
     end = RobotEnd(machine.package, interface, domain)
-    sim = SimulatedUnitree(folder, contract, end, watchdog=watchdog)
+    sim = SimulatedUnitree(folder, contract, end, watchdog=watchdog, hoist=hoist, lift=lift)
     how = "on a hoist" if sim.hoist else "on the ground"
     print(f"a simulated {machine.name}, limp, {how}, in domain {domain} on {interface}; Ctrl-C ends it", flush=True)
     return run(sim, handset or Handset(), seconds, faults)

@@ -37,6 +37,7 @@ _PARTS = ("q", "dq", "tau", "kp", "kd")  # of a motor's command
 _FAULT = 0x1  # motorstate of a motor with a fault
 _HOIST, _HOIST_DAMPING, _LOWERING = 12.0, 1.2, 1.0  # [weights/m], [weights s/m], [s] ours: a soft rope and how long it gives way
 
+_HOOK = 0.2  # [m] ours: above the root, of a rope that it hangs from freely
 
 LIMP, DAMPED, DRIVEN = "limp", "damped", "driven"  # what motors do: nothing, damping alone, more
 
@@ -80,22 +81,25 @@ class SimulatedUnitree:
         faults: Faults | None = None,
         watchdog: float = math.inf,
         hoist: bool | None = None,
+        lift: float = 0.0,
         seed: int = 0,
     ) -> None:
         """The robot of the export in ``folder``, limp: on the ground, or on a hoist (``hoist``; None: if it has two feet).
 
+        ``lift``: [m] above its start, where it hangs freely.
         ``watchdog``: seconds without a command until it damps by itself.
         """
         self.machine: Machine = machine_of(contract.joints)
         self.contract, self.end, self.faults, self.record, self._watchdog = contract, end, faults or Faults(), Record(), watchdog
-        self._scene = read_scene(folder, contract, whole=True)
+        self._scene, self._lift = read_scene(folder, contract, whole=True), lift
         self.model, self._rng = self._scene.model, np.random.default_rng(seed)
         self._limits = limits_of(self.model, contract)
         self._make_motors()
         self.data, self.remote = mujoco.MjData(self.model), encode()
         self._slots, self._state = order(self.machine, contract.joints), Message(LAYOUTS[self.machine.package, "LowState_"])
         self.reset()
-        self._height, self._weight = float(self.data.qpos[2]), 9.81 * float(self.model.body_subtreemass[1])
+        self._hung = int(np.argmax(self.model.body_mass)) if lift else 1  # the body that the rope holds: of a G1 in the air its torso
+        self._height, self._weight = float(self.data.xpos[self._hung, 2]), 9.81 * float(self.model.body_subtreemass[1])
         self.hoist = len(contract.feet) < 4 if hoist is None else hoist
         self._rope = 1.0 if self.hoist else 0.0  # share of the rope's force that is left
         self._fill()
@@ -107,6 +111,7 @@ class SimulatedUnitree:
         self.command: Message | None = None  # the last one that was taken
         self.acted = dict.fromkeys(_PARTS, np.zeros(len(self.contract.joints)))  # (D,) what the motors obey
         mujoco.mj_resetDataKeyframe(self.model, self.data, 0)
+        self.data.qpos[2] += self._lift
         self.data.time = time
         mujoco.mj_step1(self.model, self.data)
 
@@ -217,16 +222,18 @@ class SimulatedUnitree:
         self.model.actuator_biasprm[self._actuators, :3] = law
 
     def _pull(self) -> None:
-        """The rope of the hoist: it holds the root upright at its height, softly, and gives way slowly."""
+        """The rope of the hoist: it holds a body upright at its height, softly, and gives way slowly."""
         if not self.hoist:
             self._rope = max(0.0, self._rope - STEP / _LOWERING)
-        data, rope = self.data, self._rope * self._weight
-        lift = rope * (1.0 + _HOIST * (self._height - data.qpos[2]) - _HOIST_DAMPING * data.qvel[2])
-        side = rope * (-_HOIST * data.qpos[:2] - _HOIST_DAMPING * data.qvel[:2])
-        tilt = np.cross(data.xmat[1].reshape(3, 3)[:, 2], [0.0, 0.0, 1.0])
-        turn = data.xmat[1].reshape(3, 3) @ data.qvel[3:6]
-        data.xfrc_applied[1, :3] = [*side, max(0.0, lift)]
-        data.xfrc_applied[1, 3:] = rope * (2.0 * tilt - 0.2 * turn)
+        data, rope, body, moves = self.data, self._rope * self._weight, self._hung, np.zeros(6)
+        mujoco.mj_objectVelocity(self.model, data, mujoco.mjtObj.mjOBJ_XBODY, body, moves, 0)
+        (x, y, z), turn, (vx, vy, vz) = data.xpos[body], moves[:3], moves[3:]
+        lift = rope * (1.0 + _HOIST * (self._height - z) - _HOIST_DAMPING * vz)
+        upright = _HOOK if self._lift else 2.0
+        tilt = np.cross(data.xmat[body].reshape(3, 3)[:, 2], [0.0, 0.0, 1.0])
+        side = (rope * (-_HOIST * at - _HOIST_DAMPING * speed) for at, speed in ((x, vx), (y, vy)))
+        data.xfrc_applied[body, :3] = [*side, max(0.0, lift)]
+        data.xfrc_applied[body, 3:] = rope * (upright * tilt - 0.1 * upright * turn)
 
     def _fill(self) -> None:
         """The state message of this moment."""

@@ -1,0 +1,189 @@
+"""The joint check: each joint in turn goes 0.1 rad and back, softly, while the others are held; which one moved, and which way?
+
+It is a set of states in place of ``States``: zero torque -> (start) -> joint check -> damping, watched by the same safety layer.
+Angles are the motors' own. A motor that is plugged in or turned wrongly together with its encoder looks right to them: then the
+tilt of a body that hangs freely tells, for legs, which way they moved; else only the person who watches.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+
+from legged_mw.deploy.inputs import END, START, Source
+from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.robot import Floats, Measurement, Robot, RobotError
+from legged_mw.deploy.safety import Limits
+from legged_mw.deploy.simulated import read_scene
+from legged_mw.deploy.states import CHECK, DAMPING, SOFT, ZERO, Order, States
+
+STEP = 0.1  # [rad] that a joint is asked to move
+SETTLE, RAMP, REST = 2.0, 0.8, 0.6  # [s] ours: until all joints are held; from a pose to the next; after each joint
+SOFTLY, HOLD = 0.4, 1.2  # [s] ours, there: before it gets stiffer; before it is judged
+STIFFEN = 1.5  # [share of the stiffness a second] while nothing moves far enough: friction and weight, which a tenth may not overcome
+CLOSE, MOVED, FAR = 0.07, 0.03, 0.3  # [rad] ours: moved far enough; moved at all; so far that the check ends
+LEAN, ALONG = 2e-3, 0.3  # [rad] ours: of tilt that tells; cosine from which a tilt is as the joint tilts the body
+HEAVY = 0.4  # [share of the mass] ours: on one side of a joint from which the tilt does not tell: of a waist
+
+Moves = Generator[Order, Measurement, None]
+
+
+class Row(NamedTuple):
+    """What one joint did."""
+
+    joint: int
+    asked: float  # [rad]
+    moved: Floats  # (D,) [rad]
+    stiffness: float  # share of the contract's that it took
+    verdict: str  # "right", or what is wrong
+
+
+class JointCheck(States):
+    """The check of one robot; ``rows`` and ``report`` tell what came of it."""
+
+    first = CHECK
+
+    def __init__(self, controller: Controller, sources: Sequence[Source], say: Callable[[str], None], robot: Robot, limits: Limits) -> None:
+        """Raises RobotError if this robot cannot be moved softly."""
+        if not robot.can_change_gains:
+            raise RobotError(f"--check_joints is soft, and {type(robot).__name__} cannot change its gains: no joint was moved")
+        rest, self.rows = np.array([each.default for each in controller.contract.commands]), list[Row]()
+        super().__init__(controller, sources, lambda _: rest, say)
+        self.joints, self._limits, self._motors, self._moves = controller.contract.joints, limits, robot.motors, None
+        self._model = read_scene(controller.folder, controller.contract).model
+
+    @property
+    def over(self) -> bool:
+        return self.state == DAMPING and self._moves is not None
+
+    @property
+    def right(self) -> bool:
+        """Whether every joint is."""
+        return len(self.rows) == len(self.joints) and all(row.verdict == "right" for row in self.rows)
+
+    def step(self, measured: Measurement, now: float) -> Order:
+        if self._moves is None:
+            if self.state != ZERO or START not in self._pressed or END in self._pressed:
+                return super().step(measured, now)
+            self._enter(CHECK, now, f"each joint goes {STEP} rad and back; {END} if another one moves than the one that is named")
+            self.note, self._moves = "all joints are held", self._check(measured)
+            return next(self._moves)
+        if END in self._pressed:
+            self._enter(DAMPING, now, f"{END} was pressed")
+            return Order(DAMPING)
+        try:
+            return self._moves.send(measured)
+        except StopIteration:
+            self._enter(DAMPING, now, "the joint check is over")
+            return Order(DAMPING)
+
+    def _enter(self, state: str, now: float, note: str) -> None:
+        early = self.state == CHECK and len(self.rows) < len(self.joints)
+        super()._enter(state, now, f"{note}, while {self.note}" if early else note)
+
+    # ---- the moves: a generator that is sent measurements and yields orders
+
+    def _check(self, measured: Measurement) -> Moves:
+        limits, held = self._limits, np.ones(len(self.joints))
+        pose = np.clip(measured.joint_pos, limits.lowest, limits.highest)
+        settle = round(SETTLE / self.controller.contract.period)
+        for step in range(settle):
+            measured = yield self._order(pose, held * (step + 1) / settle)
+            if np.abs(away := measured.joint_pos - pose).max() > FAR:
+                joint = int(np.abs(away).argmax())
+                self._tell(f"{self.joints[joint]} was held where it was and went {away[joint]:+.2f} rad: WRONG JOINT or WRONG SIGN")
+                return
+        for joint in range(len(self.joints)):
+            yield from self._one(joint, pose)
+            if np.abs(self.rows[-1].moved).max() > FAR:
+                return
+
+    def _one(self, joint: int, pose: Floats) -> Moves:
+        """Up, a while there, and back; downwards where there is more room."""
+        contract, limits, gains, to = self.controller.contract, self._limits, np.ones(len(pose)), pose.copy()
+        top = min(limits.high[joint], limits.highest[joint])
+        step = STEP if pose[joint] + STEP <= top else -STEP
+        self._tell(f"{self.joints[joint]}{self._motor(joint, ' (motor {})')} goes {step:+.2f} rad")
+        ramp, soft, hold, rest = (round(seconds / contract.period) for seconds in (RAMP, SOFTLY, HOLD, REST))
+        gains[joint] = SOFT
+        before = measured = yield self._order(pose, gains)
+        moved = np.zeros(len(pose))
+        for tick in range(ramp + hold):
+            to[joint] = pose[joint] + step * min(1.0, (tick + 1) / ramp)
+            measured = yield self._order(to, gains)
+            moved = measured.joint_pos - before.joint_pos
+            if np.abs(moved).max() > FAR:
+                break
+            if tick >= ramp + soft and np.abs(moved).max() < CLOSE:
+                gains[joint] = min(1.0, gains[joint] + STIFFEN * contract.period)
+        there, back, took = measured, measured, float(gains[joint])
+        for tick in range(0 if np.abs(moved).max() > FAR else ramp + rest):
+            to[joint] = pose[joint] + step * max(0.0, 1.0 - (tick + 1) / ramp)
+            gains[joint] += (1.0 - gains[joint]) / max(1, ramp - tick)
+            back = yield self._order(to, gains)
+        self.rows.append(Row(joint, step, moved, took, self._verdict(joint, step, moved, self._tilts(joint, before, there, back))))
+
+    def _order(self, targets: Floats, share: Floats) -> Order:
+        contract = self.controller.contract
+        return Order(CHECK, targets.copy(), share * contract.stiffness, contract.damping)
+
+    # ---- what they mean
+
+    def _verdict(self, joint: int, step: float, moved: Floats, tilts: bool) -> str:
+        own, other = float(np.sign(step) * moved[joint]), self._other(joint, moved)
+        if abs(moved[other]) > max(abs(own), MOVED):
+            return f"WRONG JOINT: {self.joints[other]} moved in its place"
+        if abs(own) < MOVED:
+            return "STUCK: it did not move"
+        if own < 0.0:
+            return "WRONG SIGN: it turned the other way"
+        if own > 1.5 * STEP:
+            return "TOO FAR"
+        return "right" if tilts else "WRONG SIGN OR JOINT: the body did not tilt as this joint tilts it"
+
+    def _other(self, joint: int, moved: Floats) -> int:
+        """The other joint that moved most."""
+        return int(np.argmax(np.where(np.arange(len(moved)) == joint, 0.0, np.abs(moved))))
+
+    def _tilts(self, joint: int, before: Measurement, there: Measurement, back: Measurement) -> bool:
+        """False if the body tilted, there and back, otherwise than one that hangs freely: its centre of mass stays below the rope."""
+        model, data, centres = self._model, mujoco.MjData(self._model), []
+        for measured in (before, there):
+            data.qpos[3] = 1.0
+            data.qpos[[model.joint(name).qposadr[0] for name in self.joints]] = measured.joint_pos
+            mujoco.mj_kinematics(model, data)
+            mujoco.mj_comPos(model, data)
+            centres.append(data.subtree_com[1].copy())
+        shift = centres[1] - centres[0]
+        shift -= (shift @ before.gravity) * before.gravity
+        mass, body = model.body_subtreemass, model.joint(self.joints[joint]).bodyid[0]
+        tilts = [there.gravity - then.gravity for then in (before, back)]
+        sizes = [float(np.linalg.norm(tilt)) for tilt in tilts]
+        tells = mass[body] < HEAVY * mass[1] and min(sizes) > LEAN
+        return not tells or any(t @ shift > ALONG * n * np.linalg.norm(shift) for t, n in zip(tilts, sizes, strict=True))
+
+    def _motor(self, joint: int, form: str = "{}") -> str:
+        return form.format(self._motors[self.joints[joint]]) if self._motors else ""
+
+    @property
+    def report(self) -> str:
+        """A line a joint, and one of the whole; begins with a new line."""
+        width = max(map(len, self.joints))
+        form = f"{{:<{width}}} {{:>5}} {{:>6}} {{:>6}} {{:>9}}  {{:<{width + 7}}} {{}}"
+        lines = [form.format("joint", "motor", "asked", "moved", "stiffness", "most of the others", "verdict")]
+        for joint, asked, moved, stiffness, verdict in self.rows:
+            other = self._other(joint, moved)
+            most = f"{self.joints[other]} {moved[other]:+.3f}" if abs(moved[other]) >= 0.001 else "-"
+            own = f"{moved[joint]:+.3f}"
+            lines.append(
+                form.format(self.joints[joint], self._motor(joint) or "-", f"{asked:+.2f}", own, f"{stiffness:.0%}", most, verdict)
+            )
+        wrong = [self.joints[row.joint] for row in self.rows if row.verdict != "right"]
+        said = f"{len(self.rows)} of {len(self.joints)} joints checked" + (f"; wrong: {', '.join(wrong)}" if wrong else "")
+        early = "" if len(self.rows) == len(self.joints) else f"; ended early: {self.note}"
+        return "\n".join(["", *lines, said + (early or ("" if wrong else "; none is wrong"))])
