@@ -23,12 +23,12 @@ from legged_mw.check.recordable import recordable
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl.concurrent import ConcurrentModel, taught_worlds
+from legged_mw.rl.concurrent import ConcurrentModel, concurrent_settings, taught_worlds
 from legged_mw.rl.network import run_onnx
 from legged_mw.rl.policies import act, find_trained, load_policy
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
-from legged_mw.rl.transfer import begin_with
+from legged_mw.rl.transfer import begin_with, load_teacher, seat_teacher
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask
 
@@ -197,7 +197,10 @@ def test_a_checkpoint_goes_on_bit_for_bit(tmp_path: Path) -> None:
         ({"latent_dim": 0}, "latent_dim is 0; it must be"),
         ({"hidden_dims": []}, r"hidden_dims is \[\]; it must be whole numbers from 1, at least one"),
         ({"actor.class_name": "RNNModel"}, "groups: that goes with actor.class_name 'MLPModel', not 'RNNModel'"),
-        ({"algorithm.class_name": "PPO"}, "groups: only the recorded update of GraphedPPO trains that, and rsl-rl's own is used here"),
+        (
+            {"algorithm.class_name": "PPO"},
+            "groups: only GraphedPPO's recorded update trains that, and rsl-rl's own is used here: set it to",
+        ),
         ({"actor.estimator.targets": ["base_lin_vel"]}, "groups are both set: the actor reads an estimate or a latent; empty one"),
     ],
     ids=lambda value: "" if isinstance(value, str) else "".join(value),
@@ -278,10 +281,33 @@ def test_training_begins_with_a_checkpoint_and_not_with_an_export(run_folder: Pa
         begin_with(model, find_trained(str(run_folder / "export"), run_folder.parent, "--init"))
 
 
+@pytest.mark.parametrize("frames", [1, 5])
+def test_it_teaches_a_student_that_reads_other_frames(frames: int, policy: ConcurrentModel, run_folder: Path) -> None:
+    """Its newest frames are looked for among its own rows, not among those that the student's group of the same name has."""
+    task = task_with(**{"observations.history": {"state": frames}, "observations.leave_out": {}, "actor.concurrent.groups": []})
+    env, teacher = LeggedRobot(task.cfg, "cpu"), find_trained(str(run_folder), run_folder.parent, "--teacher")
+    seat_teacher(env, teacher)
+    runner: Any = make_runner(env, task.train, None, "cpu", teacher.task.train)
+    load_teacher(runner.alg.teacher, teacher, env)
+    obs = env.get_observations()
+    assert torch.equal(act(runner.alg.teacher, obs), act(policy, TensorDict({"state": obs["teacher"]}, obs.batch_size)))
+    assert runner.alg.teacher.obs_groups == ["teacher"] and obs["state"].shape[1] == 48 * frames
+
+
+def test_the_newest_frames_of_rows_within_a_group_of_groups() -> None:
+    """The critic's group begins with the actor's, three frames of each row, and shows one of its own rows."""
+    task = task_with(**{"obs_groups.actor": ["privileged_state"], "actor.concurrent.groups": ["privileged_state"]})
+    env = LeggedRobot(task.cfg, "cpu")
+    newest = concurrent_settings(task.train.to_dict(), env, learns=False)["newest"]
+    assert newest[:6] == [(6, 9), (15, 18), (42, 54), (78, 90), (114, 126), (132, 135)]
+    assert newest[-1][1] == env.observations.buffers["privileged_state"].shape[1]
+    assert sum(stop - start for start, stop in newest) == newest[-1][1] - 2 * 45
+
+
 def test_it_can_teach_a_student_that_is_distilled(run_folder: Path, tmp_path: Path) -> None:
     distil = ["--teacher", str(run_folder), "--max_iterations", "1"]
     result = run("train", tmp_path, *SMALL, *FLAGS[:4], *distil)
     assert result.code == 0, result.err
     assert "symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it" in result.out
     line = refused(tmp_path, "train", *SMALL, *FLAGS, *distil)
-    assert "actor.concurrent.groups: only the recorded update of GraphedPPO trains that" in line
+    assert "actor.concurrent.groups: only GraphedPPO's recorded update trains that" in line

@@ -184,8 +184,14 @@ def task_with(**changes: Any) -> LoadedTask:
         ({"observations__foot_height": False}, r"no observation row 'foot_height' in .* \(observations.foot_height = True adds it\)"),
         ({"actor__estimator__targets": ["base_lin_vel"] * 2}, "names 'base_lin_vel' twice"),
         ({"obs_groups__actor": ["privileged_state"]}, "no observation row 'foot_height' in 'state'"),
-        ({"algorithm__class_name": "PPO"}, "only the recorded update of GraphedPPO trains that, and rsl-rl's own is used here"),
-        ({"algorithm__optimizer": "sgd"}, "only the recorded update of GraphedPPO trains that, and rsl-rl's own is used here"),
+        (
+            {"algorithm__class_name": "PPO"},
+            "only GraphedPPO's recorded update trains that, and rsl-rl's own is used here: set it to",
+        ),
+        (
+            {"algorithm__optimizer": "sgd"},
+            "only GraphedPPO's recorded update trains that, and rsl-rl's own is used here: set it to",
+        ),
         ({"actor__class_name": "CNNModel"}, "that goes with actor.class_name 'MLPModel', not 'CNNModel'"),
     ],
     ids=lambda value: "" if isinstance(value, str) else "".join(value),
@@ -194,6 +200,12 @@ def test_an_estimator_that_cannot_be(changes: dict[str, Any], said: str) -> None
     task = task_with(**changes)
     with pytest.raises(ConfigError, match=f"^actor.estimator.targets:? {said}"):
         make_runner(LeggedRobot(task.cfg, "cpu"), task.train, None, "cpu")
+
+
+def test_what_a_teacher_estimates_must_be_known_here() -> None:
+    task = task_with(actor__estimator__targets=[], observations__foot_height=False)
+    with pytest.raises(ConfigError, match="^the teacher's actor.estimator.targets: no .* 'foot_height' .*foot_height = True adds it"):
+        make_runner(LeggedRobot(task.cfg, "cpu"), task.train, None, "cpu", task_with().train)
 
 
 @pytest.mark.parametrize(

@@ -495,7 +495,11 @@ def test_a_law_in_code_is_not_exported(made: Path, tmp_path: Path) -> None:
         ({"control.actuator": "torque", "control.action_origin": "joints"}, "control.action_origin is 'joints', an origin of angles, but "),
         (
             {"control.actuator": "servo", "control.action_origin": "speed"},
-            "control.action_origin is 'speed', but .* only a 'dc_motor' is driven",
+            "control.action_origin is 'speed', but control.actuator is 'servo': only a 'dc_motor' is driven by a speed: name that one, or",
+        ),
+        (
+            {"control.actuator": "torque", "control.action_origin": "speed"},
+            "action_origin is 'speed', but control.actuator is 'torque': only",
         ),
         ({"control.actuator": "network"}, "control.actuator is 'network', but control.network names no file of weights"),
         ({"control.actuator": "network", "control.network": "no.npz"}, "control.network: no file 'no.npz' in "),

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from benchmarks.unitree import begin
 from legged_mw.deploy.contract import ContractError, ContractRow, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import RobotError, damped
@@ -351,3 +352,10 @@ def test_a_policy_of_torques_or_speeds() -> None:
             check_rows(replace(contract, action=contract.action._replace(origin=origin)), GO2)
     with pytest.raises(RobotError, match="the policy commands speeds, which no limit here judges: grade and watch it in simulation"):
         Safety(replace(contract, action=contract.action._replace(origin="speed")), Limits.of(folder, contract))
+
+
+def test_the_exam_over_a_slow_wire_begins(domain: int) -> None:
+    """benchmarks/unitree.py: a reset moves the clock by a second, and the first state since must have arrived."""
+    both = pair("go2_flat", domain, faults=Faults(delay_ms=10.0, jitter_ms=2.0), hoist=False)
+    begin(both.sim, both.robot)
+    np.testing.assert_allclose(both.robot.read().joint_pos, both.contract.default_pose, atol=0.1)

@@ -100,7 +100,7 @@ class Actuators:
         self._origin, self._default, self._dof_pos, self._sim = cfg.control.action_origin, task.default_dof_pos, task.dof_pos, sim
         self.law, self._rand = task.motor_law, rand
         scale = robot.tables["control.action_scale"]
-        self.scale = torch.tensor(scale, device=sim.device)  # (D,) [rad], or [N m]
+        self.scale = torch.tensor(scale, device=sim.device)  # (D,) [rad], [rad/s] or [N m]
         self._gains = {name: torch.tensor(robot.tables[f"`{name}`"], device=sim.device) for name in ("stiffness", "damping")}
         self._same_scale = scale[0] if len(set(scale)) == 1 else None  # one number takes one operation less
         by_angle = self.law not in ("torque", OWN) and self._origin != "speed"
@@ -166,7 +166,7 @@ class Actuators:
         self._sim.ctrl.copy_(torques)
 
     def reset(self, mask: Tensor) -> None:
-        """Targets at the default pose, or torques zero, where ``mask`` (N,) is true; of delays and networks nothing is left."""
+        """Targets at the default pose, or torques and speeds zero, where ``mask`` (N,) is true; of delays and networks nothing is left."""
         assign(self.targets, mask, self._start)
         if self._offset is not None:
             assign(self._sent, mask, self._default - self._offset)

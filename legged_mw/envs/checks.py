@@ -195,14 +195,15 @@ def _check_motors(cfg: RobotTaskCfg) -> None:
     control, curve = cfg.control, cfg.control.stall_torque or cfg.control.no_load_speed
     if control.actuator == "network" and not control.network:
         raise ConfigError("control.actuator is 'network', but control.network names no file of weights (docs/motors.md)")
+    if control.actuator != "dc_motor" and control.action_origin == "speed":
+        raise ConfigError(
+            f"control.action_origin is 'speed', but control.actuator is {control.actuator!r}: only a 'dc_motor' is driven by a "
+            "speed: name that one, or leave action_origin out"
+        )
     if control.actuator == "torque" and control.action_origin != "default":
         raise ConfigError(
             f"control.action_origin is {control.action_origin!r}, an origin of angles, but under control.actuator 'torque' an action is a "
             "torque: leave action_origin out"
-        )
-    if control.actuator != "dc_motor" and control.action_origin == "speed":
-        raise ConfigError(
-            f"control.action_origin is 'speed', but control.actuator is {control.actuator!r}: only a 'dc_motor' is driven by a speed"
         )
     for name, unit in (("stall_torque", "N m"), ("no_load_speed", "rad/s")):
         if not getattr(control, name) and (control.actuator == "dc_motor" or (control.actuator != "servo" and curve)):

@@ -42,30 +42,31 @@ class Exam(NamedTuple):
 
 
 def _skill(kind: str) -> Exam:
+    """The exam of a kind of ``SKILLS``."""
     return Exam(
-        lambda task: {*perform.overrides(task), "env.num_envs"} - {"domain_rand.enable"},
-        perform.prepare,
-        perform.make_room,
-        perform.ask_alike,
-        partial(perform.examine, kind),
-        perform.deployed,
-        perform.table,
-        perform.write,
-        perform.InTraining,
+        sets=lambda task: {*perform.overrides(task), "env.num_envs"} - {"domain_rand.enable"},
+        prepare=perform.prepare,
+        make_room=perform.make_room,
+        ask_alike=perform.ask_alike,
+        examine=partial(perform.examine, kind),
+        deployed=perform.deployed,
+        table=perform.table,
+        write=perform.write,
+        in_training=perform.InTraining,
     )
 
 
 EXAMS = {
     "walking": Exam(
-        lambda task: exam.SETS,
-        report.prepare,
-        report.make_room,
-        report.ask_alike,
-        report.examine,
-        exam.deployed,
-        rules.table,
-        report.write,
-        TrainingExam,
+        sets=lambda task: exam.SETS,
+        prepare=report.prepare,
+        make_room=report.make_room,
+        ask_alike=report.ask_alike,
+        examine=report.examine,
+        deployed=exam.deployed,
+        table=rules.table,
+        write=report.write,
+        in_training=TrainingExam,
         rough=crossing,
     ),
     **{kind: _skill(kind) for kind in SKILLS},

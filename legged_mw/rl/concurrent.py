@@ -2,8 +2,8 @@
 student's of what a robot has felt.
 
 Part of the worlds act by the teacher's latent, the rest by the student's. PPO learns from all of them: the policy, and in the teacher's
-worlds the teacher's encoder with it. The student's encoder learns by regression to the teacher's latent alone. During an update the
-policy reads the student's latent that it acted with. What plays and is exported is the student's path.
+worlds the teacher's encoder with it. The student's encoder learns by regression to the teacher's latent alone, in all worlds. During an
+update the policy reads the student's latent that it acted with. What plays and is exported is the student's path.
 
 Wang et al., "CTS: Concurrent Teacher-Student Reinforcement Learning for Legged Locomotion", RA-L 2024.
 """
@@ -78,7 +78,7 @@ class ConcurrentModel(RegressingModel):
         output = run_mlp(self.mlp, self._take_over(latent, wanted, taught))
         return output, nn.functional.mse_loss(unit(run_mlp(self.estimator, seen)), unit(wanted).detach())
 
-    def learn_spread(self, obs: TensorDict, ranks: int) -> None:
+    def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
         if isinstance(normalizer := self.teacher[0], EmpiricalNormalization):
             update_normalizer(normalizer, self._known(obs), ranks)
 
@@ -130,15 +130,15 @@ def concurrent_settings(sections: dict[str, Any], env: RobotTask, learns: bool) 
 
     ``learns``: False for a student that only acts, and needs no teacher.
     """
-    concurrent, read, groups = sections["actor"]["concurrent"], sections["obs_groups"]["actor"], env.observations.groups
-    for group in concurrent["groups"]:
-        if group not in groups:
-            raise ConfigError(f"{FIELD}: {unknown('observation group', group, groups, 'the observation table')}")
+    concurrent, read = sections["actor"]["concurrent"], sections["obs_groups"]["actor"]
+    groups = concurrent["groups"] if learns else []
+    for group in groups:
+        if group not in env.observations.groups:
+            raise ConfigError(f"{FIELD}: {unknown('observation group', group, env.observations.groups, 'the observation table')}")
         if group in read:
             raise ConfigError(f"{FIELD}: the actor reads '{group}' itself; the teacher's encoder is for what a robot does not measure")
-    newest, start = [], 0
-    for group in read:
-        spans = [env.observations.newest(group, row.name) for row in groups[group]]
-        newest += [(start + span.start, start + span.stop) for span in spans]
-        start += env.observations.buffers[group].shape[1]
-    return {**concurrent, "newest": newest, "groups": concurrent["groups"] if learns else []}
+    newest, stop = [], 0
+    for row in (row for group in read for row in env.observations.rows(group)):
+        stop += row.size
+        newest.append((stop - row.value.shape[1], stop))
+    return {**concurrent, "newest": newest, "groups": groups}

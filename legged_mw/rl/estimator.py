@@ -46,7 +46,7 @@ class TargetNormalizer(EmpiricalNormalization):
 
 
 class RegressingModel(MLPModel):
-    """rsl-rl's MLPModel whose network also reads what its ``estimator`` makes of the observations, which learns by regression."""
+    """rsl-rl's MLPModel with an ``estimator``, which learns by regression; the network reads what it makes of the observations."""
 
     field: str  # of the config, that asks for it
     regression: str  # the name of the regression's loss
@@ -58,17 +58,20 @@ class RegressingModel(MLPModel):
         return self.get_latent(obs)
 
     def lesson(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
-        """What ``learn`` needs of observations (B,), beside ``get_latent``, that stays over an update. They are of ``worlds`` (B,).
+        """What ``learn`` needs besides the latent; it stays the same over an update.
 
-        Of mirror images, which come after what they are of, ``obs`` is longer.
+        ``obs`` (S * B,) were seen in ``worlds`` (B,); S is 2 where mirror images come after them, else 1.
         """
         raise NotImplementedError
 
     def learn(self, latent: Tensor, lesson: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """The network's output, and the loss () of the regression: of other parameters. ``latent`` may have more columns, of zeros."""
+        """The network's output, and the loss () of the regression, which is of other parameters.
+
+        ``latent`` may have more columns, of zeros.
+        """
         raise NotImplementedError
 
-    def learn_spread(self, obs: TensorDict, ranks: int) -> None:
+    def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
         """Update the normaliser of what the estimator learns from."""
         raise NotImplementedError
 
@@ -111,7 +114,7 @@ class EstimatingModel(RegressingModel):
         """The estimator reads the first columns of the latent, the observations."""
         return run_mlp(self.mlp, latent), nn.functional.mse_loss(run_mlp(self.estimator, latent), lesson[0])
 
-    def learn_spread(self, obs: TensorDict, ranks: int) -> None:
+    def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
         update_normalizer(self.target_normalizer, self.truth(obs), ranks)
 
     def truth(self, obs: TensorDict) -> Tensor:

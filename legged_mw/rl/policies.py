@@ -125,10 +125,16 @@ def load_policy(path: Path, env: RobotTask, cfg: Config, device: str) -> MLPMode
     return actor.eval()
 
 
-def acting(cfg: Config, env: RobotTask) -> dict[str, Any]:
-    """Section ``actor`` of the learner's config as rsl-rl takes it, of an actor that only acts in ``env``. Raises ConfigError."""
+def acting(cfg: Config, env: RobotTask, read: list[str] | None = None) -> dict[str, Any]:
+    """Section ``actor`` of the learner's config as rsl-rl takes it, of an actor that only acts in ``env``. Raises ConfigError.
+
+    ``read``: the observation groups of ``env`` that it reads, if they are not called as in the config.
+    """
     check_classes(cfg)
-    return network_section(actor_settings(copy.deepcopy(cfg.to_dict()), env, learns=False))
+    sections = copy.deepcopy(cfg.to_dict())
+    if read:
+        sections["obs_groups"]["actor"] = read
+    return network_section(actor_settings(sections, env, learns=False))
 
 
 def read_actor(path: Path, model: MLPModel, what: str = "actor") -> dict[str, Tensor]:

@@ -322,7 +322,7 @@ class GraphedPPO(Recorded, PPO):
                 inputs = torch.cat([obs[group] for group in model.obs_groups], dim=-1)
                 update_normalizer(model.obs_normalizer, inputs, self.gpu_world_size)
         if isinstance(self.actor, RegressingModel) and not self.critic_only:
-            self.actor.learn_spread(obs, self.gpu_world_size)
+            self.actor.update_regression_normalizer(obs, self.gpu_world_size)
 
     def _symmetry_loss(self, batch: Any) -> Tensor:
         """How far the policy is from its own mirror image; of an augmented batch, the forward pass is already made."""

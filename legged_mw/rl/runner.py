@@ -31,7 +31,7 @@ from legged_mw.rl.ranks import this_rank
 from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
 from legged_mw.rl.threads import UpdateThreads
-from legged_mw.rl.transfer import adapt
+from legged_mw.rl.transfer import TEACHER, adapt
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
 
@@ -308,7 +308,11 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
     torch.set_float32_matmul_precision(cfg.runner.matmul_precision)
     check_mirror(env, cfg)
     try:
-        settings = adapt(rsl_rl_config(cfg, env), cfg, acting(teacher, env) if teacher else None)
+        theirs = acting(teacher, env, [TEACHER]) if teacher else None
+    except ConfigError as error:
+        raise ConfigError(f"the teacher's {error}") from None
+    try:
+        settings = adapt(rsl_rl_config(cfg, env), cfg, theirs)
         runner = Runner(env, settings, str(log_dir) if log_dir else None, device)
     except ValueError as error:  # a class, activation, optimizer or observation group that does not exist
         raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None
@@ -316,7 +320,7 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
     if settings["critic_warmup"] and not graphed:
         raise ConfigError(f"warm_start.critic_warmup is {settings['critic_warmup']}, but only the recorded PPO knows it; set it to 0")
     if isinstance(policy := runner.alg.get_policy(), RegressingModel) and not graphed:
-        raise ConfigError(f"{policy.field}: only the recorded update of GraphedPPO trains that, and rsl-rl's own is used here")
+        raise ConfigError(f"{policy.field}: only GraphedPPO's recorded update trains that, and rsl-rl's own is used here: set it to []")
     return runner
 
 
