@@ -2,6 +2,7 @@
 #   make train ARGS="--max_iterations 5"     make test ARGS="tests/test_env.py -k reset"
 TASK ?= go1_flat
 ARGS ?=
+WORKERS ?= 2
 VENV := .venv
 BIN := $(VENV)/bin
 # the first Python on the path that this project runs on
@@ -16,7 +17,7 @@ play: $(VENV)/ready
 	$(BIN)/python play.py --task $(TASK) $(ARGS)
 
 test: $(VENV)/ready
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .
