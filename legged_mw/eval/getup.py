@@ -34,7 +34,7 @@ class Getup(Skill):
         Measure("energy", "energy until it stands, mean [J]", 0),
         Measure("at_limit", "share of torques at the limit", 3),
     )
-    overrides: ClassVar = {"falls.pull": 0.0}
+    overrides: ClassVar = {"falls.pull": 0.0, "falls.states": 1}  # its falls are those of `starts`
 
     @property
     def seconds(self) -> float:
