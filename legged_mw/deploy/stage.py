@@ -37,16 +37,17 @@ class DeployStage:
         ends: Ends | None = None,
         contact: str | None = None,
         change: Change | None = None,
+        whole: bool = False,
     ) -> None:
         """Load the export in ``folder``.
 
         ``command`` (C,) is what robots follow where ``step`` gets none; ``ends`` are other rules for a fall than the contract's;
-        ``change`` is made to the model first.
+        ``change`` is made to the model first. ``whole``: see Fleet.
         ``contact``: the policy sees the velocity of leg odometry, which finds feet on the ground so; None: the true one.
         """
         contract = read_contract(folder)
         self.contract = replace(contract, ends=ends or contract.ends)
-        self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file, change=change)
+        self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file, whole, change)
         self.controller = Controller(folder, self.contract, num_worlds)
         self.odometry = Odometry(folder, self.contract, num_worlds, contact) if contact else None
         self.spec, self.num_worlds, self.dt = self.fleet.spec, num_worlds, self.contract.period

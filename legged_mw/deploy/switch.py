@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,6 @@ import numpy as np
 from legged_mw.deploy.contract import OWN, Contract, Ends, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement
-from legged_mw.deploy.simulated import Fleet
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.utils.errors import UserError
 
@@ -27,16 +24,13 @@ class SwitchStage(DeployStage):
 
     def __init__(self, first: Path, second: Path, num_worlds: int = 1, command: Any = None) -> None:
         """Raises UserError for policies of two robots, ContractError for broken ones."""
-        super().__init__(first, num_worlds, command)
+        super().__init__(first, num_worlds, command, ends=Ends(max_tilt=FELL), whole=True)  # its body touches the ground, too
         other = read_contract(second)
         check_same(self.contract, other)
-        self.contract = replace(self.contract, ends=Ends(max_tilt=FELL))
-        self.fleet = Fleet(first, self.contract, num_worlds, whole=True)  # its body touches the ground, too
-        self.spec, self.rescuer = self.fleet.spec, Controller(second, other, num_worlds)
+        self.rescuer = Controller(second, other, num_worlds)
         self.rescued = np.zeros(num_worlds, dtype=bool)  # (N,) robots that follow the second policy
         self._standing = np.zeros(num_worlds, dtype=int)  # (N,) periods that it has stood
         self._none = np.array([[each.default for each in other.commands]] * num_worlds).reshape(num_worlds, -1)
-        self.measured = self._seen = self.fleet.read()
 
     def step(self, commands: Floats | None = None) -> None:
         self._commands = self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self._own.shape)
@@ -53,7 +47,7 @@ class SwitchStage(DeployStage):
 
     def _stood(self, measured: Measurement) -> np.ndarray:
         """(N,) Upright, near the first policy's default pose and slow, for HOLD."""
-        upright = measured.gravity[:, 2] < -math.cos(math.radians(UP))
+        upright = ~Ends(max_tilt=UP).tilted(measured.gravity)
         near = np.abs(measured.joint_pos - self.contract.default_pose).max(axis=1) < NEAR
         slow = np.abs(measured.joint_vel).mean(axis=1) < SLOW
         self._standing = np.where(upright & near & slow, self._standing + 1, 0)
