@@ -94,7 +94,8 @@ class Getup(RobotTask):
 
     def _update_curricula(self, mask: Tensor) -> None:
         super()._update_curricula(mask)
-        self.pull.update(mask & (self.episode_steps[:, 0] > 0.0), self._is_up())
+        if self.cfg.falls.pull:
+            self.pull.update(mask & (self.episode_steps[:, 0] > 0.0), self._is_up())
 
     def training_state(self) -> dict[str, Tensor]:
         return {**super().training_state(), "pull_level": self.pull.level.clone()}
@@ -110,7 +111,6 @@ class Getup(RobotTask):
         pick = torch.randint(len(self.fallen_qpos), (self.num_envs,), device=self.device)
         assign(self.sim.qpos, fall, self.fallen_qpos.index_select(0, pick))
         assign(self.sim.qvel, fall, self.fallen_qvel.index_select(0, pick))
-        self._forget_for_rewards(mask)
 
     def _body_rows(self) -> list[Row]:
         return [*super()._body_rows(), Row("base_height", self.base_height[:, None], mirror="scalar")]  # [m] [P]

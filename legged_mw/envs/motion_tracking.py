@@ -63,7 +63,6 @@ class MotionTracking(RobotTask):
         joints = (qpos[:, 7:] + bend).clamp(self.soft_lower, self.soft_upper)
         assign(self.sim.qpos, mask, torch.cat([qpos[:, :3] + place, attitude, joints], dim=1))
         assign(self.sim.qvel, mask, torch.cat([qvel[:, :6] + speed, qvel[:, 6:]], dim=1))
-        self._forget_for_rewards(mask)
         self.actuators.reset(mask)
         self.observations.restart(mask)
 

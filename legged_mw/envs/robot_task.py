@@ -156,6 +156,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         self.sim.reset(mask)
         self.domain_rand.reset(mask)
         self._reset_robots(mask)
+        self._forget_for_rewards(mask)
         self._reset_task(mask)
         self.perturbation.reset(mask)
         self._episode.masked_fill_(mask[:, None], 0.0)
@@ -192,7 +193,6 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         assign(self.sim.qvel[:, :6], mask, draw[:, 3:])  # the joints' velocity is zero from the reset
         if speed := self.cfg.init_state.dof_vel_range:
             assign(self.dof_vel, mask, torch.empty_like(self.dof_offset).uniform_(-speed, speed))
-        self._forget_for_rewards(mask)
         self.actuators.reset(mask)
         self.observations.restart(mask)
 
