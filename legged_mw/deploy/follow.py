@@ -15,7 +15,7 @@ from legged_mw.deploy.contract import SCENE_FILE, Contract, digest
 from legged_mw.deploy.motion import ATTITUDE, JOINT_POS, JOINT_VEL, MOTION_FILE, PLACE, POSITION, TURN
 from legged_mw.deploy.reader import ContractError
 from legged_mw.deploy.robot import Measurement
-from legged_mw.utils.clip import Clip, Floats, conjugate, multiply, read_clip
+from legged_mw.utils.clip import Clip, Floats, conjugate, heading, multiply, read_clip
 
 
 class Follower:
@@ -45,9 +45,9 @@ class Follower:
     def rows(self, measured: Measurement, fresh: NDArray[np.bool_]) -> dict[str, Floats]:
         """What the policy sees (N, ...); ``fresh`` (N,) are robots at their first step."""
         place, turn = self._measured(measured)
-        shift, heading = self._moved(place, turn, fresh)
+        shift, turned = self._moved(place, turn, fresh)
         frame = self._now()
-        there, wanted = _rotate(heading, self._place[frame]) + shift, multiply(heading, self._turn[frame])
+        there, wanted = _rotate(turned, self._place[frame]) + shift, multiply(turned, self._turn[frame])
         off = _matrix(multiply(conjugate(turn), wanted))
         rows = {JOINT_POS: self._joints[0][frame], JOINT_VEL: self._joints[1][frame]}
         return rows | {PLACE: _rotate(conjugate(turn), there - place), TURN: off[:, :, :2].reshape(len(off), 6)}
@@ -91,11 +91,9 @@ class Follower:
         if self.start is not None:
             return self._shift, self._heading
         before = self._now() - 1
-        w, x, y, z = np.moveaxis(multiply(turn, conjugate(self._turn[before])), -1, 0)
-        half = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) / 2.0
-        heading = np.where(fresh[:, None], np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)], axis=1), self._heading)
-        shift = (place - _rotate(heading, self._place[before])) * [1.0, 1.0, 0.0]
-        return np.where(fresh[:, None], shift, self._shift), heading
+        turned = np.where(fresh[:, None], heading(multiply(turn, conjugate(self._turn[before]))), self._heading)
+        shift = (place - _rotate(turned, self._place[before])) * [1.0, 1.0, 0.0]
+        return np.where(fresh[:, None], shift, self._shift), turned
 
 
 def _rotate(q: Floats, v: Floats) -> Floats:

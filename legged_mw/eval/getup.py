@@ -9,6 +9,7 @@ import numpy as np
 
 from legged_mw.eval.skill import Floats, Ground, Measure, Recording, Robot, Skill
 from legged_mw.sim.settle import fallen
+from legged_mw.utils.clip import rotate
 
 SEED, SETTLING = 20_000, 1.5  # of the falls, [s] from the drop; training has seeds of its own: falls.seed
 HIGH, TILT, SLOW = 0.9, 20.0, 0.5  # share of the standing height, [deg] from the vertical, [rad/s] mean joint speed: ours
@@ -67,9 +68,7 @@ class Getup(Skill):
 
 def standing(robot: Robot, recording: Recording) -> np.ndarray:
     """(T, N) High, upright and with joints at rest; where an episode ended, no more."""
-    i, j = recording.qpos[..., 4], recording.qpos[..., 5]
-    w, k = recording.qpos[..., 3], recording.qpos[..., 6]
-    axis = np.stack([2.0 * (i * k + w * j), 2.0 * (j * k - w * i), 1.0 - 2.0 * (i * i + j * j)], axis=2)  # the root's z, in the world
+    axis = rotate(recording.qpos[..., 3:7], np.array([0.0, 0.0, 1.0]))  # the root's z, in the world
     gravity = robot.model.opt.gravity / np.linalg.norm(robot.model.opt.gravity)
     upright = -(axis @ gravity) > np.cos(np.radians(TILT))
     high = recording.qpos[..., 2] > HIGH * robot.home[2]

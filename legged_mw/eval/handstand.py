@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.eval.skill import Floats, Ground, Measure, Recording, Robot, Skill
+from legged_mw.utils.clip import rotate
 
 SEED, OFFSET = 30_000, 0.05  # of the starts; each joint is off by U(-OFFSET, OFFSET) [rad] [ours]
 WITHIN, HOLD = 3.0, 5.0  # [s] in which it must be up, and stay [ours]
@@ -48,8 +49,8 @@ class Handstand(Skill):
 
     def judge(self, robot: Robot, recording: Recording) -> dict[str, float | None]:
         touching, hands = self._ground_contact(robot, recording.qpos)
-        w, i, j, k = np.moveaxis(recording.qpos[..., 3:7], 2, 0)
-        upright = self.nose * 2.0 * (i * k - w * j) > np.cos(np.radians(TILT))  # of the root's x axis in the world, the z
+        ahead = rotate(recording.qpos[..., 3:7], np.array([1.0, 0.0, 0.0]))  # the root's x axis, in the world
+        upright = self.nose * ahead[..., 2] > np.cos(np.radians(TILT))
         alive = np.arange(len(touching))[:, None] <= recording.ended_at
         up = upright & (recording.qpos[..., 2] > HIGH * self.height) & ~touching & alive  # (T, N)
         hold = round(HOLD / robot.dt)

@@ -116,6 +116,20 @@ def conjugate(q: Floats) -> Floats:
     return q * np.array([1.0, -1.0, -1.0, -1.0])
 
 
+def rotate(q: Floats, v: Floats) -> Floats:
+    """Vectors (..., 3) turned by ``q`` (..., 4)."""
+    u = q[..., 1:]
+    t = 2.0 * np.cross(u, v)
+    return v + q[..., :1] * t + np.cross(u, t)
+
+
+def heading(q: Floats) -> Floats:
+    """The turn about the vertical alone (..., 4)."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    half = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) / 2.0
+    return np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)], axis=-1)
+
+
 def rotation_vector(q: Floats) -> Floats:
     """Axis times angle (..., 3) [rad], the shorter way."""
     q = np.where(q[..., :1] < 0, -q, q)
