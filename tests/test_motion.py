@@ -103,6 +103,23 @@ def test_a_wrong_clip(change: Callable[[Clip], Clip], said: str, tmp_path: Path)
         read_clip(tmp_path / "other.npz")
 
 
+@pytest.mark.parametrize("kind", ["empty", "cut", "one array", "missing"])
+def test_a_damaged_clip_is_refused_in_one_line(kind: str, g1: RobotModel, tmp_path: Path) -> None:
+    file = tmp_path / "clip.npz"
+    save_clip(file, steady())
+    whole = file.read_bytes()
+    file.unlink()
+    if kind == "one array":
+        np.save(file.with_suffix(".npy"), np.zeros(3))
+        file.with_suffix(".npy").rename(file)
+    elif kind != "missing":
+        file.write_bytes(whole[:500] if kind == "cut" else b"")
+    with pytest.raises(ClipError, match="clip.npz cannot be read as a clip: "):
+        read_clip(file)
+    with pytest.raises(ClipError, match="clip.npz cannot be read as a motion: "):
+        read_motion(file, g1)
+
+
 @pytest.mark.parametrize("file", CLIPS, ids=lambda file: file.stem)
 def test_a_shipped_clip_is_what_the_robot_can_do(file: Path, g1: RobotModel) -> None:
     """Within the joints' ranges, no foot in the ground, none that slides."""
