@@ -131,3 +131,10 @@ def from_rotation_vector(v: Floats) -> Floats:
     """The quaternion (..., 4) of axis times angle [rad]."""
     half = np.linalg.norm(v, axis=-1, keepdims=True) / 2
     return np.concatenate([np.cos(half), v / 2 * np.sinc(half / np.pi)], axis=-1)
+
+
+def heading_of(q: Floats) -> Floats:
+    """The turn about the vertical alone (..., 4)."""
+    w, x, y, z = np.moveaxis(q, -1, 0)
+    half = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) / 2.0
+    return np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)], axis=-1)
