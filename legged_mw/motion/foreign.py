@@ -23,7 +23,7 @@ APART = 0.02  # [m] between the bodies of a file and ours, at most
 def read_motion(path: Path, robot: RobotModel, fps: float | None = None) -> Clip:
     """The motion in ``path``, a .csv or .npz, for ``robot``. ``fps``: frames a second of a file that does not say. Raises ClipError."""
     if path.suffix.lower() == ".csv":
-        return _read_csv(path, robot, fps or CSV_FPS)
+        return _read_csv(path, robot, CSV_FPS if fps is None else fps)
     if path.suffix.lower() != ".npz":
         raise ClipError(f"{path} is neither .csv nor .npz: a motion is Unitree's CSV, or an .npz of BeyondMimic, mjlab or legged_mw")
     try:

@@ -52,6 +52,8 @@ class Clip(NamedTuple):
         """The same motion with ``rate`` frames a second, between frames along straight lines and great circles."""
         if abs(rate - self.fps) < 1e-6:
             return self
+        if not self.seconds * rate + 1e-6 >= 1:
+            raise ClipError(f"{self.seconds:g} s have no two frames at {rate:g} frames a second; take a higher rate or a longer clip")
         places = np.arange(int(self.seconds * rate + 1e-6) + 1) / rate * self.fps
         first = np.minimum(places.astype(int), len(self.root_pos) - 2)
         share = (places - first)[:, None]
