@@ -78,10 +78,10 @@ class PosedRobots:
         """The same robots at the rows of `qpos` (N, nq), in the order of the last `pose`."""
         array = np.array(qpos, dtype=np.float64)[: self.count]
         array[:, :3] += self.offsets
-        self._ghost = self._ghost or mujoco.MjData(self.model)
-        self._ghost.qpos[:] = array[self._order].ravel()
-        mujoco.mj_kinematics(self.model, self._ghost)
-        return self._ghost
+        data = self._ghost = self._ghost or mujoco.MjData(self.model)
+        data.qpos[:] = array[self._order].ravel()
+        mujoco.mj_kinematics(self.model, data)
+        return data
 
     def patches(self, contacts: ArrayLike) -> list[Patch]:
         """Where feet touch: one for each foot of which `contacts` (N, G) marks a geom, the first G with a contact sensor."""
