@@ -15,7 +15,7 @@ from legged_mw.deploy.contract import SCENE_FILE, Contract, digest
 from legged_mw.deploy.motion import ATTITUDE, JOINT_POS, JOINT_VEL, MOTION_FILE, PLACE, POSITION, TURN
 from legged_mw.deploy.reader import ContractError
 from legged_mw.deploy.robot import Measurement
-from legged_mw.utils.clip import Clip, Floats, conjugate, multiply, read_clip
+from legged_mw.utils.clip import Clip, Floats, conjugate, heading_of, multiply, read_clip
 
 
 class Follower:
@@ -91,9 +91,7 @@ class Follower:
         if self.start is not None:
             return self._shift, self._heading
         before = self._now() - 1
-        w, x, y, z = np.moveaxis(multiply(turn, conjugate(self._turn[before])), -1, 0)
-        half = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) / 2.0
-        heading = np.where(fresh[:, None], np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)], axis=1), self._heading)
+        heading = np.where(fresh[:, None], heading_of(multiply(turn, conjugate(self._turn[before]))), self._heading)
         shift = (place - _rotate(heading, self._place[before])) * [1.0, 1.0, 0.0]
         return np.where(fresh[:, None], shift, self._shift), heading
 

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.eval.skill import Floats, Ground, Measure, Recording, Robot, Skill
-from legged_mw.utils.clip import conjugate, from_rotation_vector, multiply
+from legged_mw.utils.clip import conjugate, from_rotation_vector, heading_of, multiply
 
 JOINTS_OFF, HEADING_OFF, SPEED_OFF = 0.05, 0.1, 0.1  # [rad], [rad], [m/s] of a robot at the start, U(-off, off)
 LOST_HEIGHT, LOST_TILT = 0.25, 0.8  # [BeyondMimic] of the anchor against its reference, beyond which a robot does not follow any more
@@ -60,7 +60,7 @@ class Tracking(Skill):
         bodies, anchor = [model.body(name).id for name in motion.bodies], motion.bodies.index(motion.anchor)
         wanted, wanted_turn = _posed(model, motion.qpos[:, None], bodies)  # (T, 1, B, 3), (T, 1, B, 4)
         found, turn = _posed(model, recording.qpos, bodies)
-        heading = _heading(multiply(turn[:, :, anchor], conjugate(wanted_turn[:, :, anchor])))[:, :, None]
+        heading = heading_of(multiply(turn[:, :, anchor], conjugate(wanted_turn[:, :, anchor])))[:, :, None]
         there = _rotate(heading, wanted - wanted[:, :, anchor, None]) + wanted[:, :, anchor, None]
         off = found - there
         off[..., :2] -= (found - wanted)[:, :, anchor, None, :2]
@@ -92,13 +92,6 @@ def _posed(model: mujoco.MjModel, qpos: Floats, bodies: list[int]) -> tuple[Floa
         mujoco.mj_kinematics(model, data)
         places[i], turns[i] = data.xpos[bodies], data.xquat[bodies]
     return tuple(values.reshape(*qpos.shape[:-1], *values.shape[1:]) for values in (places, turns))  # type: ignore[return-value]
-
-
-def _heading(q: Floats) -> Floats:
-    """The turn about the vertical alone (..., 4)."""
-    w, x, y, z = np.moveaxis(q, -1, 0)
-    half = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)) / 2.0
-    return np.stack([np.cos(half), 0.0 * half, 0.0 * half, np.sin(half)], axis=-1)
 
 
 def _rotate(q: Floats, v: Floats) -> Floats:
