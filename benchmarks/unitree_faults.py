@@ -48,14 +48,14 @@ class Live(Rig):
     """The policy's process."""
 
     def walks(self) -> None:
-        tell(walks=clock())
+        report(walks=clock())
 
     def begin(self) -> None:
         super().begin()
-        tell(injected=self.injected)
+        report(injected=self.injected)
 
 
-def tell(**values: Any) -> None:
+def report(**values: Any) -> None:
     print(json.dumps(values), flush=True)
 
 
@@ -67,7 +67,7 @@ def policy(name: str, domain: int) -> None:
     robot = connect(folder, read_contract(folder), "lo", domain)
     rig = Live(robot, folder, clock, lambda seconds: time.sleep(seconds) if seconds else None, 0.0)
     rig.run(case, 10.0)
-    tell(read_at=rig.read_at, said=rig.said)
+    report(read_at=rig.read_at, said=rig.said)
 
 
 class Seen(NamedTuple):
@@ -80,27 +80,27 @@ class Seen(NamedTuple):
 
 @contextlib.contextmanager
 def driven(name: str, domain: int, side: Side) -> Iterator[dict[str, Any]]:
-    """A policy's process, and what it tells."""
-    told: dict[str, Any] = {"said": []}
+    """A policy's process, and its reports."""
+    reports: dict[str, Any] = {"said": []}
     program = [sys.executable, __file__, "--policy", name, "--domain", str(domain)]
     process = subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
     def listen() -> None:
         assert process.stdout
         for line in process.stdout:
-            told.update(json.loads(line) if line.startswith("{") else {})
-            if "walks" in told and side.walking is None:
+            reports.update(json.loads(line) if line.startswith("{") else {})
+            if "walks" in reports and side.walking is None:
                 side.walking = side.sim.time
 
     def listen_to_errors() -> None:
         assert process.stderr
-        told["errors"] = process.stderr.read()
+        reports["errors"] = process.stderr.read()
 
     threads = [threading.Thread(target=each, daemon=True) for each in (listen, listen_to_errors)]
     for thread in threads:
         thread.start()
     try:
-        yield told
+        yield reports
     finally:
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.send_signal(signal.SIGINT)
@@ -111,13 +111,13 @@ def driven(name: str, domain: int, side: Side) -> Iterator[dict[str, Any]]:
 
 
 def live(name: str, domain: int) -> tuple[float, str]:
-    """[ms] to damping with real processes, and the line that was said."""
+    """[ms] to damping with real processes, and the line that was printed."""
     case, contract = CASES[name], read_contract(POLICIES / CASES[name].task)
     package = machine_of(contract.joints).package
     sim = SimulatedUnitree(POLICIES / case.task, contract, RobotEnd(package, "lo", domain))
     side = Side(sim, case, Wire(package, "lo", domain), RobotEnd(package, "lo", domain) if case.robot is answers_too else None)
     moments, times = list[float](), list[float]()  # [s] by the clock of all processes, and by the robot's
-    with driven(name, domain, side) as told:
+    with driven(name, domain, side) as reports:
         begun = due = clock()
         damped = None
         while damped is None or sim.time < damped + AFTER:
@@ -130,17 +130,17 @@ def live(name: str, domain: int) -> tuple[float, str]:
             due = max(due + STEP, clock() - 0.05)
             time.sleep(max(0.0, due - clock()))
             if clock() > begun + LONGEST:
-                raise RuntimeError(f"{name}: not damped after {LONGEST:g} s: {told}, {sim.record.changes}")
+                raise RuntimeError(f"{name}: not damped after {LONGEST:g} s: {reports}, {sim.record.changes}")
 
     def moment(robots: float) -> float:
         return float(np.interp(robots, times, moments))
 
-    injected = told["injected"] if case.policy else moment(side.injected or 0.0)
+    injected = reports["injected"] if case.policy else moment(side.injected or 0.0)
     side.tilted = None if side.tilted is None else moment(side.tilted)
-    known = case.known(Seen(injected, told.get("read_at", 0.0), side)) if case.known else injected  # type: ignore[arg-type]
-    lines = [*told["said"], *told["errors"].splitlines()]
+    known = case.known(Seen(injected, reports.get("read_at", 0.0), side)) if case.known else injected  # type: ignore[arg-type]
+    lines = [*reports["said"], *reports["errors"].splitlines()]
     if not any(re.search(case.said, line) for line in lines):
-        raise RuntimeError(f"{name}: something else was said: {lines[-3:]}")
+        raise RuntimeError(f"{name}: another line was printed: {lines[-3:]}")
     return 1000 * (moment(damped) - known), line_of(case, lines)
 
 
@@ -157,7 +157,7 @@ def in_lockstep(name: str, domain: int) -> float:
 
 
 def line_of(case: Case, lines: list[str]) -> str:
-    """The first line that says it."""
+    """The first line that names the fault."""
     said = next((line for line in lines if case.said and re.search(case.said, line)), "")
     return said.removeprefix("damping: ").removeprefix("guard: ").removesuffix("; the joints are damped")
 
@@ -180,16 +180,16 @@ def main() -> None:
 def row(name: str) -> str:
     """One row of the table."""
     case, took, said = CASES[name], "", ""
-    exact = once_more(in_lockstep, name)
+    exact = with_retries(in_lockstep, name)
     if not case.in_lockstep:
-        milliseconds, said = once_more(live, name)
+        milliseconds, said = with_retries(live, name)
         took = f"{milliseconds:.0f}"
     flag = f"`{case.robot}`" if isinstance(case.robot, str) and case.robot else ""
     return f"| {name} | {flag} | {said and f'`{said}`'} | {exact:.0f} | {took} |"
 
 
-def once_more(measure: Callable[[str, int], Any], name: str) -> Any:
-    """Again, if it failed: in another domain, where no other program's guard is about to end."""
+def with_retries(measure: Callable[[str, int], Any], name: str) -> Any:
+    """Measure, at most three times: each time in another domain, where no other program's guard is about to end."""
     for attempt in range(3):
         with locked_domain() as domain:
             try:

@@ -54,9 +54,13 @@ def keyed(seconds: float, keys: Mapping[float, float | Sequence[float]]) -> Floa
     values = np.array(list(keys.values()), dtype=float)
     part = np.clip(np.searchsorted(times, now, side="right") - 1, 0, len(times) - 2)
     share = np.clip((now - times[part]) / (times[part + 1] - times[part]), 0.0, 1.0)
-    smooth = share**3 * (10 - 15 * share + 6 * share**2)
-    smooth = smooth[:, None] if values.ndim > 1 else smooth
-    return values[part] + smooth * (values[part + 1] - values[part])
+    done = smooth(share)[:, None] if values.ndim > 1 else smooth(share)
+    return values[part] + done * (values[part + 1] - values[part])
+
+
+def smooth(share: Floats) -> Floats:
+    """From 0 to 1 as ``share`` goes, without speed or acceleration at either end."""
+    return share**3 * (10 - 15 * share + 6 * share**2)
 
 
 class Body:
@@ -178,7 +182,7 @@ def step(plan: Plan, body: Body, start: float, headings: Sequence[float], first:
         stays = 1 - side
         pushes[begin + DOUBLE * STEP] = pushes[begin + STEP] = _sole(body, stays, heading[stays])
         share = np.clip((now - begin - DOUBLE * STEP) / ((1 - DOUBLE) * STEP), 0.0, 1.0)
-        turned = heading[side] + (wanted - heading[side]) * share**3 * (10 - 15 * share + 6 * share**2)
+        turned = heading[side] + (wanted - heading[side]) * smooth(share)
         from_here, foot = share > 0, plan.feet[side]
         foot[from_here, 3] = turned[from_here]
         foot[from_here, 0] = (-body.stance[side] * np.sin(turned))[from_here]

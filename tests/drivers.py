@@ -1,4 +1,4 @@
-"""What the tests of a driven robot share: a source that presses by a script, a robot that tells of itself, and its record."""
+"""What the tests of a driven robot share: a source that presses by a script, a robot that reports its health, and its record."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Watched(MujocoRobot):
         self.done: list[str] = []  # "write", "damp" or "limp" of each period
         self.heights: list[float] = []  # [m] of the base, after each
         self.joints: list[Floats] = []  # (D,) [rad], likewise
-        self.told = lambda _: Health(age_s=0.0)  # by the step
+        self.health_at = lambda _: Health(age_s=0.0)  # by the step
         self.changed: Callable[[int, Measurement], Measurement] = lambda _, measured: measured
 
     def read(self) -> Measurement:
@@ -52,7 +52,7 @@ class Watched(MujocoRobot):
         return self.changed(self.step, super().read())
 
     def health(self) -> Health:
-        return self.told(self.step)
+        return self.health_at(self.step)
 
     def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
         super().write(targets, stiffness=stiffness, damping=damping)

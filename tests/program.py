@@ -51,11 +51,11 @@ def run(program: str, root: Path, *args: str) -> Result:
     return Result(code, out.getvalue(), err.getvalue())
 
 
-def trained(root: Path, *args: str) -> Path:
-    """Train the small task below ``root`` and return its run folder."""
+def trained(root: Path, *args: str, prints: tuple[str, ...] = ()) -> Path:
+    """Train the small task below ``root`` and return its run folder. ``prints``: what the output must hold."""
     before = set(root.glob("logs/*/*"))
     result = run("train", root, *SMALL, *args)
-    assert result.code == 0, result.err
+    assert result.code == 0 and all(text in result.out for text in prints), result.err
     [folder] = set(root.glob("logs/*/*")) - before
     return folder
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 from learner import STEPS, WORLDS, collect, difference, make, parameters, share_experience
-from program import SMALL, refused, run
+from program import SMALL, refused, run, trained
 from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel, RNNModel
 from tensordict import TensorDict
@@ -224,12 +224,9 @@ def test_check_says_who_is_taught() -> None:
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three iterations in worlds that show the critic what was drawn; the last is exported to ``export`` beside the checkpoint."""
-    root = tmp_path_factory.mktemp("concurrent")
     drawn = ["--set", "domain_rand.enable=true", "--set", "domain_rand.observe=true", "--set", "runner.save_interval=1"]
-    result = run("train", root, *SMALL, *FLAGS, *drawn, "--max_iterations", "3", "--set", "runner.export=true")
-    assert result.code == 0 and "Student loss: " in result.out and "policy.onnx" in result.out, result.err
-    [folder] = root.glob("logs/*/*")
-    return folder
+    flags = [*FLAGS, *drawn, "--max_iterations", "3", "--set", "runner.export=true"]
+    return trained(tmp_path_factory.mktemp("concurrent"), *flags, prints=("Student loss: ", "policy.onnx"))
 
 
 @pytest.fixture(scope="module")

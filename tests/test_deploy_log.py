@@ -40,7 +40,7 @@ def contract() -> Contract:
 def walk(path: Path, contract: Contract, seconds: float = 5.0) -> Watched:
     """Hang, stand, walk ahead from 2.2 s on, and trip at 4.8 s."""
     robot, controller = Watched(GO2, contract, hoisted=True), Controller(GO2, contract)
-    robot.told = lambda step: Health(age_s=0.004, temperatures=np.full(12, 90.0 if step == 240 else 30.0))
+    robot.health_at = lambda step: Health(age_s=0.004, temperatures=np.full(12, 90.0 if step == 240 else 30.0))
     states = States(controller, [Script({5: "start", 110: "A"}, [0.8, 0.0, 0.0])], lambda _: np.zeros(3), lambda _: None)
     log = Log(path, contract, GO2, "the test's")
     run(robot, controller, lambda _: np.zeros(0), seconds, live=False, states=states, log=log)

@@ -1,4 +1,4 @@
-"""A driven robot in a viewer: what is told of it, what is shown, the button that damps, and the viewer's process."""
+"""A driven robot in a viewer: what is sent, what is shown, the button that damps, and the viewer's process."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -133,13 +133,13 @@ def test_it_walks_by_its_velocity_and_a_silent_robot_stays(ends: Ends, contract:
 def test_pictures_are_fewer_than_steps(ends: Ends, contract: Contract) -> None:
     for step in range(20):
         ends.mirror.show(step * 0.005, measurement(contract), state("policy", ""))
-    told = []
+    sent = []
     while True:
         try:
-            told.append(json.loads(ends.stage._channel.recv(1 << 16))["time"])
+            sent.append(json.loads(ends.stage._channel.recv(1 << 16))["time"])
         except BlockingIOError:
             break
-    assert told == pytest.approx([0.0, 0.04, 0.08])
+    assert sent == pytest.approx([0.0, 0.04, 0.08])
 
 
 def test_the_button_damps_and_nothing_else_is_asked(ends: Ends) -> None:
@@ -153,7 +153,7 @@ def test_the_button_damps_and_nothing_else_is_asked(ends: Ends) -> None:
 
 
 def test_the_viewer_is_a_process_of_its_own(contract: Contract) -> None:
-    """It serves the page, tells what is wrong before anything moves, and ends with the robot's program."""
+    """It serves the page, reports what is wrong before anything moves, and ends with the robot's program."""
     if reason := missing():
         pytest.skip(reason)
     port = free_port("127.0.0.1")

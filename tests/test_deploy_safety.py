@@ -92,7 +92,7 @@ HEALTH: dict[str, tuple[Health, Health, str]] = {
 
 
 @pytest.mark.parametrize("name", HEALTH)
-def test_what_the_robot_tells(name: str, contract: Contract, limits: Limits) -> None:
+def test_what_the_robot_reports(name: str, contract: Contract, limits: Limits) -> None:
     fine, wrong, text = HEALTH[name]
     assert Safety(contract, limits).sensed(at_rest(contract), fine, 0.0) is None
     assert Safety(contract, limits).sensed(at_rest(contract), wrong, 0.0) == Trip(name, text)
@@ -146,7 +146,7 @@ def test_gains_count_in_the_torque(contract: Contract, limits: Limits) -> None:
 
 
 def test_a_policy_of_torques(contract: Contract, limits: Limits) -> None:
-    """Its targets are torques: the motor's limit is theirs, and no servo stands such a robot up."""
+    """Its targets are torques: the motor's limit holds for them, and no servo stands such a robot up."""
     torques = replace(contract, action=contract.action._replace(origin="torque"))
     safety = Safety(torques, limits)
     assert safety.asked(at_rest(contract), put(np.zeros(12), 2, -45.4)) is None
@@ -191,7 +191,7 @@ def test_a_clock_that_went_back(contract: Contract, limits: Limits) -> None:
 
 def test_a_remote_that_is_lost(contract: Contract, limits: Limits) -> None:
     safety = Safety(contract, limits.but({"frozen": "off"}, "test"))
-    assert safety.sensed(at_rest(contract), Health(), 100.0) is None  # one that was never there is not missed
+    assert safety.sensed(at_rest(contract), Health(), 100.0) is None  # there was no remote to lose
     assert safety.sensed(at_rest(contract), Health(remote=Remote()), 100.0) is None
     assert safety.sensed(at_rest(contract), Health(), 102.98) is None
     assert safety.sensed(at_rest(contract), Health(), 103.0) == Trip("remote", "the remote was not heard for 3.0 s")
@@ -201,7 +201,7 @@ def test_a_remote_that_is_lost(contract: Contract, limits: Limits) -> None:
 
 
 def test_limits_of_an_export(contract: Contract) -> None:
-    """The scene's machine, the contract's section, then what the machine's class and the command line say."""
+    """The scene's machine, the contract's section, then the machine's class and the command line."""
     limits = Limits.of(GO2, contract)
     np.testing.assert_allclose((limits.low[5], limits.high[5], limits.motor[5]), (-2.7227, -0.83776, 45.43), atol=1e-4)
     assert limits.tilt == 60.0 and limits.voltage == -math.inf
@@ -264,7 +264,7 @@ def test_shipped_policies_trip_nothing(name: str) -> None:
             assert trip is None, f"robot {i} at step {step}: {trip}"
 
 
-# ---- faults of a walking robot: damped at once, said in one line, no joint beyond its limits
+# ---- faults of a walking robot: damped at once, reported in one line, no joint beyond its limits
 
 AT = 170  # the step of a fault: the policy walks since step 110
 Fault = Callable[[Watched, Controller, Script], None]
@@ -287,9 +287,9 @@ def measured_as(change: Callable[[Watched, Measurement], Measurement]) -> Fault:
     return fault
 
 
-def told(health: Health) -> Fault:
+def reports(health: Health) -> Fault:
     def fault(robot: Watched, _: Controller, __: Script) -> None:
-        robot.told = lambda step: health if step >= AT else Health(age_s=0.0, remote=Remote())
+        robot.health_at = lambda step: health if step >= AT else Health(age_s=0.0, remote=Remote())
 
     return fault
 
@@ -317,7 +317,7 @@ def ended(robot: Watched, controller: Controller, script: Script) -> None:
     script.presses[AT] = "select"
 
 
-FAULTS: dict[str, tuple[Fault, int, str]] = {  # fault, periods until it can be known, what is said
+FAULTS: dict[str, tuple[Fault, int, str]] = {  # fault, periods until it can be known, the line
     "NaN from the policy": (policy_of(lambda actions: np.nan * actions), 0, "the target of FL_hip_joint is not finite: nan"),
     "inf from the policy": (policy_of(lambda actions: np.inf * actions), 0, "the target of FL_hip_joint is not finite: nan"),
     "actions a hundred times too large": (policy_of(lambda actions: 100 * actions), 5, "damping: "),
@@ -339,11 +339,11 @@ FAULTS: dict[str, tuple[Fault, int, str]] = {  # fault, periods until it can be 
     ),
     "a frozen state": (measured_as(frozen), 3, "4 measurements in a row are the same"),
     "a silent robot": (measured_as(silent), 0, "the newest measurement is 100 ms old: the link is down"),
-    "a stale measurement": (told(Health(age_s=0.05)), 0, "the newest measurement is 50 ms old, more than 40"),
-    "a hot motor": (told(Health(temperatures=np.full(12, 90.0))), 0, "FL_hip_joint has a motor of 90 deg C, more than 85"),
-    "an empty battery": (told(Health(voltage=20.0)), 0, "the battery has 20.0 V, less than 24"),
-    "a motor's fault": (told(Health(motor_faults={"FR_calf_joint": "error 0x1"})), 0, "the motor of FR_calf_joint reports a fault"),
-    "the remote lost": (told(Health()), 149, "the remote was not heard for 3.0 s"),
+    "a stale measurement": (reports(Health(age_s=0.05)), 0, "the newest measurement is 50 ms old, more than 40"),
+    "a hot motor": (reports(Health(temperatures=np.full(12, 90.0))), 0, "FL_hip_joint has a motor of 90 deg C, more than 85"),
+    "an empty battery": (reports(Health(voltage=20.0)), 0, "the battery has 20.0 V, less than 24"),
+    "a motor's fault": (reports(Health(motor_faults={"FR_calf_joint": "error 0x1"})), 0, "the motor of FR_calf_joint reports a fault"),
+    "the remote lost": (reports(Health()), 149, "the remote was not heard for 3.0 s"),
     "an emergency stop": (stopped, 0, "the test"),
     "select": (ended, 0, "select was pressed"),
     "on its back": (measured_as(lambda _, m: replace(m, gravity=-m.gravity)), 0, " degrees, more than 60"),

@@ -101,7 +101,7 @@ def test_buttons_that_come_too_early(contract: Contract) -> None:
 def test_after_a_trip_a_person_starts_again(contract: Contract) -> None:
     """Three buttons, and what was measured before counts no more."""
     robot, controller = Watched(GO1, contract, hoisted=True), Controller(GO1, contract)
-    robot.told = lambda step: Health(voltage=20.0 if 60 <= step < 70 else 30.0)
+    robot.health_at = lambda step: Health(voltage=20.0 if 60 <= step < 70 else 30.0)
     source = Script({5: "start", 100: "start", 105: "start", 220: "A"})
     done, passed = driven(robot, controller, source, 5.0, voltage=24.0)
     assert passed == ["zero torque", "stand", "damping", "zero torque", "stand", "policy"]

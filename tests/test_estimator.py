@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from learner import STEPS, WORLDS, collect, make, parameters
-from program import SMALL, refused, run
+from program import refused, trained
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from test_deploy import main, put, rewrite, without
@@ -283,11 +283,8 @@ def test_go1_flat_blind_reads_what_a_robot_measures() -> None:
 @pytest.fixture(scope="module")
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three iterations; the last is exported to ``export`` beside the checkpoint."""
-    root = tmp_path_factory.mktemp("estimator")
-    result = run("train", root, *SMALL, *FLAGS, "--max_iterations", "3", "--set", "runner.export=true")
-    assert result.code == 0 and "Estimate loss: " in result.out and "policy.onnx" in result.out, result.err
-    [folder] = root.glob("logs/*/*")
-    return folder
+    flags = [*FLAGS, "--max_iterations", "3", "--set", "runner.export=true"]
+    return trained(tmp_path_factory.mktemp("estimator"), *flags, prints=("Estimate loss: ", "policy.onnx"))
 
 
 @pytest.fixture(scope="module")

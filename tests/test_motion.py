@@ -47,6 +47,12 @@ def test_a_clip_at_another_rate_is_the_same_motion() -> None:
     np.testing.assert_allclose(clip.qvel(), np.tile([1.0, 0, 0, *(2 * AXIS), 3.0], (51, 1)), atol=1e-9)  # turning is in the body's frame
 
 
+@pytest.mark.parametrize("rate", [0.9, 0.0, -50.0])
+def test_a_rate_that_leaves_no_two_frames_is_refused(rate: float) -> None:
+    with pytest.raises(ClipError, match=f"1 s have no two frames at {rate:g} frames a second; take a higher rate or a longer clip"):
+        steady().at(rate)
+
+
 def test_signs_of_quaternions_do_not_jump(tmp_path: Path) -> None:
     clip = steady()
     flipped = clip._replace(root_quat=clip.root_quat * np.where(np.arange(31) % 2, -1.0, 1.0)[:, None])
@@ -62,6 +68,8 @@ def test_unitrees_csv(g1: RobotModel, tmp_path: Path) -> None:
         read = read_motion(tmp_path / name, g1)
         assert read.fps == 30.0 and read.joint_names == g1.joint_names
         np.testing.assert_allclose(read.qpos(), clip.qpos(), atol=1e-7)
+    with pytest.raises(ClipError, match="no frame rate"):
+        read_motion(tmp_path / "plain.csv", g1, 0.0)
     np.savetxt(tmp_path / "legs.csv", table[:, :19], delimiter=",")
     with pytest.raises(ClipError, match="legs.csv has 19 columns; of this robot it must have 36: root x y z, quaternion x y z w"):
         read_motion(tmp_path / "legs.csv", g1)
@@ -101,6 +109,23 @@ def test_a_wrong_clip(change: Callable[[Clip], Clip], said: str, tmp_path: Path)
         ClipError, match="is no clip of legged_mw, for it has no 'fps'; convert it with: python -m legged_mw.motion other.npz"
     ):
         read_clip(tmp_path / "other.npz")
+
+
+@pytest.mark.parametrize("kind", ["empty", "cut", "one array", "missing"])
+def test_a_damaged_clip_is_refused_in_one_line(kind: str, g1: RobotModel, tmp_path: Path) -> None:
+    file = tmp_path / "clip.npz"
+    save_clip(file, steady())
+    whole = file.read_bytes()
+    file.unlink()
+    if kind == "one array":
+        np.save(file.with_suffix(".npy"), np.zeros(3))
+        file.with_suffix(".npy").rename(file)
+    elif kind != "missing":
+        file.write_bytes(whole[:500] if kind == "cut" else b"")
+    with pytest.raises(ClipError, match="clip.npz cannot be read as a clip: "):
+        read_clip(file)
+    with pytest.raises(ClipError, match="clip.npz cannot be read as a motion: "):
+        read_motion(file, g1)
 
 
 @pytest.mark.parametrize("file", CLIPS, ids=lambda file: file.stem)

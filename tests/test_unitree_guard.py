@@ -156,14 +156,14 @@ def test_a_guard_that_is_told_to_end_damps_first(bench: Bench) -> None:
 
 
 def test_a_guard_that_is_killed_while_it_writes(bench: Bench) -> None:
-    """The policy's process does not read for ever what will never be whole."""
+    """The policy's process does not wait for ever for the rest of a state."""
     bench.board._map[0] = 1
     with pytest.raises(RobotError, match="the guard of the wire is gone: the robot may hold its last command. Press its emergency stop"):
         bench.board.get()
 
 
 def test_the_end(bench: Bench) -> None:
-    """The last command is sent for a while, and the latency of the others is told."""
+    """The last command is sent for a while, and the latency of the others is reported."""
     bench.send(guard.MOVE, MOVING, stamp=clock())
     bench.send(guard.CLOSE, DAMPING)
     assert b"from a measurement to its target: median " in bench.here.recv(4096)
@@ -209,8 +209,8 @@ def live(sim: SimulatedUnitree, until: Any, seconds: float = 30.0) -> float:
 
 @contextlib.contextmanager
 def policy(domain: int, fault: str = "") -> Iterator[subprocess.Popen[str]]:
-    told = [sys.executable, "-c", POLICY, str(POLICIES / "go2_flat"), str(domain), fault]
-    process = subprocess.Popen(told, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=POLICIES.parents[1])
+    command = [sys.executable, "-c", POLICY, str(POLICIES / "go2_flat"), str(domain), fault]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=POLICIES.parents[1])
     try:
         yield process
     finally:
@@ -219,7 +219,7 @@ def policy(domain: int, fault: str = "") -> Iterator[subprocess.Popen[str]]:
 
 
 def second(domain: int, sim: SimulatedUnitree) -> str:
-    """What another program's guard says, which wants the same robot."""
+    """The error of another program's guard for the same robot."""
     said = list[str]()
 
     def start() -> None:

@@ -154,7 +154,7 @@ class JointCheck(States):
         """False if the body tilted, there and back, otherwise than one that hangs freely: its centre of mass stays below the rope."""
         model, data, centres = self._model, mujoco.MjData(self._model), []
         for measured in (before, there):
-            data.qpos[3] = 1.0
+            data.qpos[3:7] = (1.0, 0.0, 0.0, 0.0)  # in the body's frame, as gravity is
             data.qpos[[model.joint(name).qposadr[0] for name in self.joints]] = measured.joint_pos
             mujoco.mj_kinematics(model, data)
             mujoco.mj_comPos(model, data)

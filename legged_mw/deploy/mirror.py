@@ -1,7 +1,7 @@
 """A robot that is driven, in a window or on a web page: its measured joints, its state and why, and one button, which damps it.
 
 The picture is made by a process of its own, so it delays no step, and a viewer that is closed or dies stops nothing. It does not
-drive: a browser may be gone without a word. Where the robot is in the picture follows from its velocity, if that is known.
+drive: a browser may close without notice. Where the robot is in the picture follows from its velocity, if that is known.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -37,7 +37,7 @@ from legged_mw.view.stage import ViewError
 
 RATE = 25.0  # [Hz] of pictures
 START = 30.0  # [s] for a viewer to open
-ACTIONS = {"reset": "Damp", "camera": "", "help": ""}  # all that can be done, where another word than in BINDINGS fits
+ACTIONS = {"reset": "Damp", "camera": "", "help": ""}  # the only actions, each with its label; "": the label of BINDINGS
 DAMP = b"damp"
 _PARTS = ("joint_pos", "gravity", "ang_vel", "lin_vel", "foot_contact")  # of a measurement
 FLAGS = ("viewer", "camera", "host", "port")
@@ -45,7 +45,7 @@ LIVE = ("native", "web")  # of --viewer
 
 
 class Mirror:
-    """The side of the robot's program; also one who may drive (``inputs.Source``), whose only wish is to damp."""
+    """The end in the robot's program. It is a source of commands, too (``inputs.Source``), whose only command is to damp."""
 
     def __init__(self, folder: Path, contract: Contract, args: argparse.Namespace) -> None:
         """Open the viewer that ``args`` name (see ``launch.add_flags``). Raises ViewError."""
@@ -56,15 +56,15 @@ class Mirror:
         with theirs:
             settings["channel"] = theirs.fileno()
             command = [sys.executable, "-c", program, json.dumps(settings)]
-            self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), start_new_session=True)  # Ctrl-C is not for it
-        said = self._first_word()
+            self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), start_new_session=True)  # Ctrl-C must not end it
+        problem = self._problem()
         self._channel.setblocking(False)
-        if said:
+        if problem:
             self.close()
-            raise ViewError(said)
+            raise ViewError(problem)
 
-    def _first_word(self) -> str:
-        """What is wrong with the viewer; nothing once it is open."""
+    def _problem(self) -> str:
+        """Wait for the viewer: why it did not open, or an empty string."""
         end, alive = time.monotonic() + START, True
         self._channel.settimeout(0.1)
         while alive:
@@ -74,12 +74,12 @@ class Mirror:
         return f"the viewer did not start: it ended, or took longer than {START:g} s; leave --viewer out"
 
     def begin(self, contract: Contract, channel: socket.socket) -> None:
-        """Tell of the robot through ``channel`` from now on."""
+        """Send the robot's state through ``channel`` from now on."""
         self._period, self._channel, self._due, self._health = contract.period, channel, 0.0, Health()
         self._x = self._y = self._heading = 0.0  # [m], [rad] since the start
 
     def show(self, now: float, measured: Measurement | None, states: States) -> None:
-        """One step; of some a picture is made."""
+        """Called each step; sends the state RATE times a second."""
         if measured is not None:
             vx, vy, rate = (float(value) for value in (*measured.lin_vel[:2], -measured.gravity @ measured.ang_vel))
             if math.isfinite(vx + vy + rate):
@@ -90,18 +90,18 @@ class Mirror:
         if now < self._due:
             return
         self._due, health = now + 1.0 / RATE - 1e-9, self._health
-        told = {
+        message = {
             "time": now,
             "state": states.state,
             "note": states.note,
             "command": states.command.tolist() if states.state == POLICY else None,
         }
-        told |= {"place": [self._x, self._y, self._heading], "voltage": health.voltage, "age": health.age_s}
-        told["hottest"] = None if health.temperatures is None else float(health.temperatures.max())
+        message |= {"place": [self._x, self._y, self._heading], "voltage": health.voltage, "age": health.age_s}
+        message["hottest"] = None if health.temperatures is None else float(health.temperatures.max())
         if measured is not None:
-            told |= {name: getattr(measured, name).tolist() for name in _PARTS}
+            message |= {name: getattr(measured, name).tolist() for name in _PARTS}
         with suppress(OSError):  # the viewer was closed, or is busy
-            self._channel.send(json.dumps(told).encode())
+            self._channel.send(json.dumps(message).encode())
 
     def poll(self, health: Health) -> Wish:
         self._health = health
@@ -122,22 +122,22 @@ class Mirror:
 
 
 class MirroredStage:
-    """What is told of the robot, as a stage (the viewers' protocol ``Stage``). It steps nothing."""
+    """The robot's latest state, as a stage (the viewers' protocol ``Stage``). It steps nothing."""
 
     num_worlds, dt = 1, 1.0 / RATE
 
     def __init__(self, folder: Path, channel: socket.socket) -> None:
         self.contract = read_contract(folder)
-        scene = read_scene(folder, self.contract, whole=True)  # it may lie
+        scene = read_scene(folder, self.contract, whole=True)  # it may lie on the ground
         self.spec, self._model, self._data, self._channel = scene.spec, scene.model, mujoco.MjData(scene.model), channel
         mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
         self.command_table, self._parent = self.contract.commands, os.getppid()
-        # which foot each geom of the feet is of, in the order of the sensors
+        # the foot of each geom of the feet, in the order of the sensors
         self._foot = [foot for _, foot in sorted((at, foot) for foot, places in enumerate(scene.contacts) for at in set(places.tolist()))]
-        self.told: dict[str, Any] = {"command": None, "state": "", "note": "nothing was measured yet"}
+        self.latest: dict[str, Any] = {"command": None, "state": "", "note": "nothing was measured yet"}
 
     def step(self, commands: Floats | None) -> None:
-        """Take the newest that was told. The process ends with the robot's program."""
+        """Take the newest message. The process ends with the robot's program."""
         newest = None
         with suppress(BlockingIOError):
             while data := self._channel.recv(1 << 16):
@@ -146,17 +146,17 @@ class MirroredStage:
             raise SystemExit
         if newest is None:
             return
-        self.told |= newest
+        self.latest |= newest
         if "joint_pos" in newest and np.isfinite([*newest["joint_pos"], *newest["gravity"]]).all():
             self._data.qpos[:2] = newest["place"][:2]
             angles, gravity = np.array(newest["joint_pos"]), np.array(newest["gravity"])
             place(self._model, self._data, self.contract.joints, angles, gravity, newest["place"][2])
 
     def commands(self) -> Floats:
-        return np.array([self.told["command"] or [each.default for each in self.command_table]])
+        return np.array([self.latest["command"] or [each.default for each in self.command_table]])
 
     def velocity(self) -> Floats:
-        return np.nan_to_num(np.array([[*self.told.get("lin_vel", [0.0, 0.0])[:2], self.told.get("ang_vel", [0.0])[-1]]]))
+        return np.nan_to_num(np.array([[*self.latest.get("lin_vel", [0.0, 0.0])[:2], self.latest.get("ang_vel", [0.0])[-1]]]))
 
     def believed_velocity(self) -> None:
         return None
@@ -168,11 +168,11 @@ class MirroredStage:
         return None
 
     def contacts(self) -> Any:
-        touches = self.told.get("foot_contact", [0.0] * len(self.contract.feet))
+        touches = self.latest.get("foot_contact", [0.0] * len(self.contract.feet))
         return np.array([[touches[foot] > 0.0 for foot in self._foot]])
 
     def fell(self) -> Any:
-        return self.contract.ends.tilted(np.array([self.told.get("gravity", [0.0, 0.0, -1.0])]))
+        return self.contract.ends.tilted(np.array([self.latest.get("gravity", [0.0, 0.0, -1.0])]))
 
     def ground(self, world: int) -> str:
         return ""
@@ -186,16 +186,16 @@ class MirroredStage:
 
 
 class MirrorSession(Session):
-    """Shows what the robot tells."""
+    """Shows the robot's latest state."""
 
     stage: MirroredStage
 
     def _lines(self, command: Floats, velocity: Floats) -> tuple[tuple[str, str], ...]:
-        told = self.stage.told
-        followed = signed(command) if told["command"] else "-"
-        lines = [("state", told["state"]), ("", told["note"]), ("command", followed), ("measured", signed(velocity))]
+        latest = self.stage.latest
+        followed = signed(command) if latest["command"] else "-"
+        lines = [("state", latest["state"]), ("", latest["note"]), ("command", followed), ("measured", signed(velocity))]
         for name, key, form in (("battery", "voltage", "{:.1f} V"), ("hottest", "hottest", "{:.0f} deg C"), ("time", "time", "{:.1f} s")):
-            lines += [(name, form.format(told[key]))] if told.get(key) is not None else []
+            lines += [(name, form.format(latest[key]))] if latest.get(key) is not None else []
         return tuple(lines)
 
 

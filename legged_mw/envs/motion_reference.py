@@ -90,10 +90,9 @@ class Reference:
         Returns the states at ``start``: qpos (N, nq), qvel (N, nv).
         """
         start = torch.zeros_like(self.frame) if start is None else start
-        rows = self._table.index_select(0, start)
         self.frame.copy_(torch.where(mask, start + 1, self.frame))
         widths = [self.qpos.shape[1], self.qvel.shape[1]]
-        qpos, qvel = rows[:, : sum(widths)].split(widths, dim=1)
+        qpos, qvel = self._table[:, : sum(widths)].index_select(0, start).split(widths, dim=1)
         return qpos, qvel
 
 

@@ -11,7 +11,7 @@ from legged_mw.envs.loading import load_robot
 from legged_mw.motion.foreign import CSV_FPS, read_motion
 from legged_mw.motion.look import ClipStage, page
 from legged_mw.sim.model import RobotModel
-from legged_mw.utils.cli import Parser, one_line_errors
+from legged_mw.utils.cli import Parser, duration, one_line_errors
 from legged_mw.utils.clip import Clip, ClipError, save_clip
 from legged_mw.utils.errors import shown
 from legged_mw.utils.task import load_task
@@ -28,7 +28,7 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--lift", type=float, default=0.0, metavar="M", help="raise it by so many metres")
     parser.add_argument("--out", metavar="CLIP.npz", help="write the clip that a task can follow")
     parser.add_argument("--play", action="store_true", help="show it")
-    parser.add_argument("--time", type=float, metavar="S", help="seconds to show (default: the whole clip)")
+    parser.add_argument("--time", type=duration, metavar="T", help="how long to show it (default: the whole clip)")
     launch.add_flags(parser)
     args = parser.parse_args()
     args.command = None

@@ -13,7 +13,8 @@ import numpy as np
 
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.pose import posed
-from legged_mw.utils.clip import KEYS, Clip, ClipError, checked, read_clip
+from legged_mw.utils.arrays import read_arrays
+from legged_mw.utils.clip import KEYS, Clip, ClipError, checked, clip_of
 
 CSV_FPS = 30.0  # of LAFAN1 as retargeted by Unitree
 APART = 0.02  # [m] between the bodies of a file and ours, at most
@@ -22,16 +23,15 @@ APART = 0.02  # [m] between the bodies of a file and ours, at most
 def read_motion(path: Path, robot: RobotModel, fps: float | None = None) -> Clip:
     """The motion in ``path``, a .csv or .npz, for ``robot``. ``fps``: frames a second of a file that does not say. Raises ClipError."""
     if path.suffix.lower() == ".csv":
-        return _read_csv(path, robot, fps or CSV_FPS)
+        return _read_csv(path, robot, CSV_FPS if fps is None else fps)
     if path.suffix.lower() != ".npz":
         raise ClipError(f"{path} is neither .csv nor .npz: a motion is Unitree's CSV, or an .npz of BeyondMimic, mjlab or legged_mw")
     try:
-        with np.load(path, allow_pickle=False) as file:
-            held = {key: file[key] for key in file.files}
-    except (OSError, ValueError) as error:
+        held = read_arrays(path)
+    except ValueError as error:
         raise ClipError(f"{path} cannot be read as a motion: {error}") from None
     if {*KEYS} <= {*held}:
-        return read_clip(path).of(robot.joint_names, str(path))
+        return clip_of(path, held).of(robot.joint_names, str(path))
     return _read_bodies(path, robot, held, fps)
 
 

@@ -5,13 +5,14 @@ Quaternions are (w, x, y, z), unit, body to world.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from legged_mw.utils.arrays import read_arrays
 from legged_mw.utils.errors import UserError, unknown
 
 Floats = NDArray[np.float64]
@@ -44,14 +45,15 @@ class Clip(NamedTuple):
         """(T, 6 + D) root [m/s, world], its turning [rad/s, body], joints [rad/s]; central differences, at the ends one-sided."""
         turn = rotation_vector(multiply(conjugate(self.root_quat[:-1]), self.root_quat[1:])) * self.fps  # from frame to frame
         turning = np.concatenate([turn[:1], (turn[:-1] + turn[1:]) / 2, turn[-1:]])
-        along = (np.gradient(values, 1.0 / self.fps, axis=0) for values in (self.root_pos, self.joint_pos))
-        root, joints = along
+        root, joints = (np.gradient(values, 1.0 / self.fps, axis=0) for values in (self.root_pos, self.joint_pos))
         return np.concatenate([root, turning, joints], axis=1)
 
     def at(self, rate: float) -> Clip:
         """The same motion with ``rate`` frames a second, between frames along straight lines and great circles."""
         if abs(rate - self.fps) < 1e-6:
             return self
+        if not self.seconds * rate + 1e-6 >= 1:
+            raise ClipError(f"{self.seconds:g} s have no two frames at {rate:g} frames a second; take a higher rate or a longer clip")
         places = np.arange(int(self.seconds * rate + 1e-6) + 1) / rate * self.fps
         first = np.minimum(places.astype(int), len(self.root_pos) - 2)
         share = (places - first)[:, None]
@@ -71,10 +73,14 @@ class Clip(NamedTuple):
 def read_clip(path: Path) -> Clip:
     """The clip in an .npz as ``save_clip`` writes it. Raises ClipError."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            held = {key: file[key] for key in file.files}
-    except (OSError, ValueError) as error:
+        held = read_arrays(path)
+    except ValueError as error:
         raise ClipError(f"{path} cannot be read as a clip: {error}") from None
+    return clip_of(path, held)
+
+
+def clip_of(path: Path, held: Mapping[str, Any]) -> Clip:
+    """The clip of the arrays ``held``, which are from ``path``. Raises ClipError."""
     if missing := [key for key in KEYS if key not in held]:
         hint = f"convert it with: python -m legged_mw.motion {path.name} --task TASK --out CLIP.npz"
         raise ClipError(f"{path} is no clip of legged_mw, for it has no '{missing[0]}'; {hint}")

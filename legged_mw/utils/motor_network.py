@@ -5,7 +5,6 @@ The same network serves each joint. It is read from an .npz without running code
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from legged_mw.utils.arrays import read_arrays
 from legged_mw.utils.errors import UserError, unknown
 
 Floats = NDArray[Any]  # float32
@@ -61,9 +61,8 @@ class MotorNetwork:
 def read_network(file: Path) -> MotorNetwork:
     """The network in ``file``. Raises UserError for what is none, in one line."""
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            arrays = dict(archive)
-    except (ValueError, OSError, EOFError, TypeError, zipfile.BadZipFile):  # TypeError: an .npy, which is one array
+        arrays = read_arrays(file)
+    except ValueError:
         raise UserError(
             f"{file.name} is no .npz of plain arrays; a torchscript file becomes one by: python -m legged_mw.robot.actuator_net {file.name}"
         ) from None

@@ -47,6 +47,7 @@ class PosedRobots:
         self.count, self._nq = count, single.nq
         self.model, self._bases, self._feet = many_robots(spec, single, count)
         self.data, self.base = mujoco.MjData(self.model), self._bases[0]
+        self._ghost: mujoco.MjData | None = None  # made where there is one to draw
         self._forward()
         self.radius, self.top, self.bottom = self._measure()
         self.feet = self._feet[0]
@@ -77,10 +78,10 @@ class PosedRobots:
         """The same robots at the rows of `qpos` (N, nq), in the order of the last `pose`."""
         array = np.array(qpos, dtype=np.float64)[: self.count]
         array[:, :3] += self.offsets
-        self._ghost = getattr(self, "_ghost", None) or mujoco.MjData(self.model)
-        self._ghost.qpos[:] = array[self._order].ravel()
-        mujoco.mj_kinematics(self.model, self._ghost)
-        return self._ghost
+        data = self._ghost = self._ghost or mujoco.MjData(self.model)
+        data.qpos[:] = array[self._order].ravel()
+        mujoco.mj_kinematics(self.model, data)
+        return data
 
     def patches(self, contacts: ArrayLike) -> list[Patch]:
         """Where feet touch: one for each foot of which `contacts` (N, G) marks a geom, the first G with a contact sensor."""
