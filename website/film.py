@@ -1,13 +1,12 @@
-"""Films and stills of the shipped policies: robots walk past a camera that stands still, so that files stay small.
+"""Films of the shipped policies: robots walk past a camera over ground of one colour, so that files stay small.
 
-MUJOCO_GL=egl python -m website.film               # the README's film, the gallery's films and stills
+MUJOCO_GL=egl python -m website.film               # the README's film; website/gallery.py makes the gallery's
 """
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-import argparse
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -50,14 +49,14 @@ FILM = [  # of the README, from left to right
     Shot("go2_flat", (0.75, 0.0, 0.0), distance=1.9, elevation=-10.0),
     Shot("g1_flat", (0.7, 0.0, 0.0), distance=2.6, elevation=-6.0, height=-0.1),
 ]
-GALLERY = [
-    Shot("go1_flat", (0.9, 0.0, 0.6), distance=1.8, azimuth=110.0),
-    FILM[0]._replace(policy="go1_rough"),
-    FILM[0],
-    FILM[1],
-    FILM[0]._replace(policy="go2_rough", distance=2.3),
-    FILM[2],
-]
+BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
+    "go1_flat": Shot("go1_flat", (0.9, 0.0, 0.6), distance=1.8, azimuth=110.0),
+    "go1_rough": FILM[0]._replace(policy="go1_rough"),
+    "go1_rough_scan": FILM[0],
+    "go2_flat": FILM[1],
+    "go2_rough": FILM[0]._replace(policy="go2_rough", distance=2.3),
+    "g1_flat": FILM[2],
+}
 
 
 def record(shot: Shot, width: int, height: int) -> list[Frame]:
@@ -119,17 +118,7 @@ def save_webp(path: Path, frames: Sequence[Frame], quality: int = 25) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m website.film", description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("--out", type=Path, default=IMAGES, metavar="DIR")
-    parser.add_argument("--only", choices=("film", "gallery"))
-    args = parser.parse_args()
-    (args.out / "gallery").mkdir(parents=True, exist_ok=True)
-    if args.only != "gallery":
-        save_gif(args.out / "film.gif", side_by_side([record(shot, 272, 204) for shot in FILM]))
-    for shot in GALLERY if args.only != "film" else []:
-        frames = record(shot._replace(seconds=3.2), 256, 160)
-        save_webp(args.out / "gallery" / f"{shot.policy}.webp", frames)
-        Image.fromarray(frames[len(frames) // 2]).save(args.out / "gallery" / f"{shot.policy}.jpg", quality=70, optimize=True)
+    save_gif(IMAGES / "film.gif", side_by_side([record(shot, 272, 204) for shot in FILM]))
 
 
 if __name__ == "__main__":
