@@ -88,6 +88,21 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return MARK.sub(lambda found: made(found.group(1)), markdown)
 
 
+def on_post_page(output: str, page: Any, **_: Any) -> str:
+    """A Chinese page says so; the choice of a language leads to the same page where there are both."""
+    here = page.file.src_uri
+    chinese = here.startswith("zh/")
+    name = here.removeprefix("zh/")
+    if chinese:
+        output = output.replace('<html lang="en"', '<html lang="zh"', 1)
+    if (ROOT / "docs/zh" / name).exists() and (ROOT / "docs" / name).exists():
+        up, html = ("../" if chinese else ""), f"{name.removesuffix('.md')}.html"
+        for language, folder in (("en", ""), ("zh", "zh/")):
+            target = f"{up}{folder}{html}"
+            output = re.sub(rf'href="[^"]*" hreflang="{language}"', f'href="{target}" hreflang="{language}"', output)
+    return output
+
+
 def made(name: str) -> str:
     sys.path.insert(0, str(ROOT))  # mkdocs loads this file by its path
     from website.reference import MADE  # imports torch

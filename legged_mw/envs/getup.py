@@ -113,7 +113,7 @@ class Getup(RobotTask):
         assign(self.sim.qvel, fall, self.fallen_qvel.index_select(0, pick))
 
     def _body_rows(self) -> list[Row]:
-        return [*super()._body_rows(), Row("base_height", self.base_height[:, None], mirror="scalar")]  # [m] [P]
+        return [*super()._body_rows(), Row("base_height", self.base_height[:, None], mirror="scalar")]  # above the ground [m] [P]
 
     def _is_upright(self) -> Tensor:
         return self._reward_upright() > 0.98  # exp(-2 x 0.01), 5.7 degrees [P]
