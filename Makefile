@@ -25,7 +25,7 @@ lint: $(VENV)/ready
 	$(BIN)/pyright
 
 docs: $(VENV)/ready
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs $(or $(ARGS),build --quiet)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs $(or $(ARGS),build)
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache

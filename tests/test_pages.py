@@ -60,8 +60,8 @@ def test_tables_are_made_from_the_code(site: Path) -> None:
 
 def test_chinese_pages_say_so_and_lead_to_their_english_ones(site: Path) -> None:
     page = (site / "zh/concepts.html").read_text()
-    assert '<html lang="zh"' in page and 'href="../concepts.html" hreflang="en"' in page
-    assert 'href="zh/concepts.html" hreflang="zh"' in (site / "concepts.html").read_text()
+    assert '<html lang="zh"' in page and '<a class="language" href="../concepts.html">English</a>' in page
+    assert '<a class="language" href="zh/concepts.html">中文</a>' in (site / "concepts.html").read_text()
 
 
 # ---- the reference

@@ -85,22 +85,22 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     if source.suffix == ".md" and source.exists():
         parts = FENCE.split(markdown)
         markdown = "".join(part if i % 2 else LINK.sub(relinked, part) for i, part in enumerate(parts))
-    return MARK.sub(lambda found: made(found.group(1)), markdown)
+    return twin(here) + MARK.sub(lambda found: made(found.group(1)), markdown)
 
 
 def on_post_page(output: str, page: Any, **_: Any) -> str:
-    """A Chinese page says so; the choice of a language leads to the same page where there are both."""
-    here = page.file.src_uri
+    """A Chinese page says that it is one."""
+    chinese = page.file.src_uri.startswith("zh/") or page.file.src_uri.endswith(".zh-CN.md")
+    return output.replace('<html lang="en"', '<html lang="zh"', 1) if chinese else output
+
+
+def twin(here: str) -> str:
+    """A line that leads to the same page in the other language, where there is one."""
     chinese = here.startswith("zh/")
     name = here.removeprefix("zh/")
-    if chinese:
-        output = output.replace('<html lang="en"', '<html lang="zh"', 1)
-    if (ROOT / "docs/zh" / name).exists() and (ROOT / "docs" / name).exists():
-        up, html = ("../" if chinese else ""), f"{name.removesuffix('.md')}.html"
-        for language, folder in (("en", ""), ("zh", "zh/")):
-            target = f"{up}{folder}{html}"
-            output = re.sub(rf'href="[^"]*" hreflang="{language}"', f'href="{target}" hreflang="{language}"', output)
-    return output
+    if "/" in name or not all((ROOT / "docs" / folder / name).exists() for folder in ("", "zh")):
+        return ""
+    return f"[{'English' if chinese else '中文'}]({'../' if chinese else 'zh/'}{name}){{ .language }}\n\n"
 
 
 def made(name: str) -> str:
