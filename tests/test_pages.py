@@ -92,7 +92,7 @@ def test_a_comment_is_read(comment: str, words: str, unit: str, source: str) -> 
 def test_every_term_says_what_it_is_and_whose() -> None:
     said = {
         name: reference.read_comment(str(term.__doc__))
-        for _, owner, _, _ in reference.TERMS
+        for _, owner in reference.classes(reference.TERMS, reference.terms_of)
         for name, term in reference.terms_of(owner).items()
     }
     assert len(said) > 45
@@ -155,5 +155,7 @@ def test_pictures_are_small_and_current() -> None:
         assert (images / f"house{ending}").read_text() == pictures.house(language)
 
 
-def test_the_gallery_is_current() -> None:
-    assert gallery.PAGE.read_text() == gallery.page(), "python -m website.gallery --page"
+def test_the_gallery_has_every_policy(site: Path) -> None:
+    assert gallery.PAGE.read_text() == gallery.page(), "python -m website.gallery"
+    page = (site / "gallery.html").read_text()
+    assert page.count("falls in 22 commands") >= 6 and page.count("curve.png") == len(gallery.policies())

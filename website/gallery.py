@@ -34,22 +34,24 @@ def policies() -> list[str]:
 
 
 def page() -> str:
-    """The whole of docs/gallery.md."""
-    return "\n".join([HEAD, *map(_chapter, policies())])
+    """The whole of docs/gallery.md; the site writes what the policy's README says where the marks are."""
+    return "\n".join([HEAD, *map(_entry, policies())])
 
 
-def _chapter(name: str) -> str:
-    """One policy, in the words of its README."""
+def _entry(name: str) -> str:
+    film = f"![{name} walks](images/gallery/{name}.webp)\n\n" if (IMAGES / f"{name}.webp").exists() else ""
+    return f"## {name}\n\n{film}<!-- made: policy_{name} -->\n\nAll of it: [{name}](../resources/policies/{name}/README.md).\n"
+
+
+def chapter(name: str) -> str:
+    """What there is to say of a policy, in the words of its README: how it was made, its exam, its curve."""
     folder = POLICIES / name
     text = _relinked((folder / "README.md").read_text(), folder)
-    about = text.split("\n\n")[1]
-    made = re.findall(r"^```bash\n.*?^```$", text, re.MULTILINE | re.DOTALL)[0]
+    made = re.findall(r"^```bash\n.*?^```$", text, re.MULTILINE | re.DOTALL)[:1]
     tables = [part for part in text.split("\n\n") if part.startswith("|") and re.search("falls in|stands in time|holds", part)]
     exam = "\n".join(line for line in "\n".join(tables).splitlines() if line.startswith("|"))
-    film = IMAGES / f"{name}.webp"
-    parts = [f"## {name}", f"![{name} walks](images/gallery/{name}.webp)" if film.exists() else "", about.replace("\n", " "), made]
-    parts += [exam, f"![learning curve](../resources/policies/{name}/curve.png)" if (folder / "curve.png").exists() else ""]
-    return "\n\n".join([part for part in parts if part] + [f"All of it: [{name}](../resources/policies/{name}/README.md).\n"])
+    curve = [f"![learning curve](../resources/policies/{name}/curve.png)"] if (folder / "curve.png").exists() else []
+    return "\n\n".join([text.split("\n\n")[1].replace("\n", " "), *made, exam, *curve])
 
 
 def _relinked(text: str, folder: Path) -> str:
