@@ -11,6 +11,10 @@ from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
+from legged_mw.utils.bounds import (
+    Positive,
+    Sign,
+)
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
@@ -22,8 +26,8 @@ class HandstandCfg(RobotTaskCfg):
     class exam:
         """What is asked, of the reward and in the exam."""
 
-        nose: float = -1.0  # -1 down, a handstand; 1 up, a footstand
-        height: float = 0.55  # [m] of the root that is high enough [P]
+        nose: Sign = -1.0  # -1 down, a handstand; 1 up, a footstand
+        height: Positive = 0.55  # [m] of the root that is high enough [P]
         hands: list[str] = []  # geoms that stand: nothing else may touch the ground
 
     class control(RobotTaskCfg.control):
