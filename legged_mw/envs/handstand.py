@@ -12,10 +12,11 @@ from torch import Tensor
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
 from legged_mw.utils.bounds import (
+    Names,
     Positive,
     Sign,
 )
-from legged_mw.utils.config import ConfigError
+from legged_mw.utils.config import ConfigError, fit
 from legged_mw.utils.errors import unknown
 
 
@@ -76,6 +77,7 @@ class Handstand(RobotTask):
 
     def _init_buffers(self) -> None:
         super()._init_buffers()
+        fit(self.cfg.exam.hands, Names, "exam.hands")
         geoms = [self.robot.physics.geom(i).name for i in range(self.robot.physics.ngeom)]
         if wrong := [name for name in self.cfg.exam.hands if name not in geoms]:
             raise ConfigError(f"exam.hands: {unknown('geom', wrong[0], geoms, self.cfg.asset.file)}")

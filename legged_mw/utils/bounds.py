@@ -10,11 +10,10 @@ A number is finite whatever its type. Errors and the reference of fields show th
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable
 from types import UnionType
 from typing import Annotated, Any, NamedTuple, Union, get_args, get_origin
-
-FLOAT32_MAX, FINITE = 3.4e38, "finite"  # what is larger is infinite to tensors and to mujoco-warp
 
 
 class Bound(NamedTuple):
@@ -32,6 +31,14 @@ def at_least(low: float, most: float = math.inf, unit: str = "") -> Bound:
 def above(low: float, most: float = math.inf, unit: str = "") -> Bound:
     text = f"above {low:g}" if most == math.inf else f"above {low:g} and at most {most:g}"
     return Bound(f"{text}{unit and f' {unit}'}", lambda value: low < value <= most)
+
+
+_NOT_TEXT = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
+_ALWAYS = {
+    float: Bound("finite", lambda value: abs(value) <= 3.4e38),  # what is larger is infinite to float32, so to every tensor
+    int: Bound("below 10^24", lambda value: abs(value) < 10**24),  # more than any machine counts, and few enough digits to print
+    str: Bound("text without control characters", lambda value: not _NOT_TEXT.search(value)),  # which rule a terminal, or no file takes
+}
 
 
 def or_empty(bound: Bound) -> Bound:
@@ -84,8 +91,10 @@ def bare(kind: Any) -> Any:
 
 
 def bounds_of(kind: Any) -> list[Bound]:
-    """The bounds of the type itself, not of what it contains."""
-    return [bound for bound in get_args(kind)[1:] if isinstance(bound, Bound)] if get_origin(kind) is Annotated else []
+    """The bounds of the type itself, not of what it contains; a bare type has what holds always."""
+    if get_origin(kind) is Annotated:
+        return [bound for bound in get_args(kind)[1:] if isinstance(bound, Bound)]
+    return [_ALWAYS[kind]] if kind in _ALWAYS else []
 
 
 def bounds_text(kind: Any) -> str:

@@ -19,7 +19,7 @@ from types import NoneType, SimpleNamespace, UnionType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeGuard, Union, get_args, get_origin, get_type_hints
 from weakref import WeakKeyDictionary
 
-from legged_mw.utils.bounds import FINITE, FLOAT32_MAX, bare, bounds_of, bounds_text
+from legged_mw.utils.bounds import bare, bounds_of, bounds_text
 from legged_mw.utils.errors import ConfigError
 from legged_mw.utils.files import note_file
 from legged_mw.utils.renamed import new_name
@@ -29,8 +29,6 @@ __all__ = ["Config", "ConfigError", "OutOfBounds", "field_types", "fit", "load_y
 
 _TYPES = (int, float, bool, str, NoneType, list, dict, Any)
 _PLAIN = None | bool | int | float | str | list | dict  # `Any` in a config: whatever YAML can hold
-_NOT_TEXT = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")  # what rules a terminal, or no file takes
-_MOST = 10**24  # of a whole number: more than any machine counts, and few enough digits to print
 _SCHEMAS: WeakKeyDictionary[type, dict[str, Any]] = WeakKeyDictionary()
 
 
@@ -218,51 +216,51 @@ def _place(cls: type, name: str) -> str:
 
 def fit(value: Any, kind: Any, path: str) -> Any:
     """`value` as a `kind`: an int becomes a float where one is due, containers are copied. `path` names it in errors."""
-    origin, args = get_origin(kind) or kind, get_args(kind)
-    if origin is Annotated:
-        value = fit(value, args[0], path)
-        if all(bound.holds(value) for bound in bounds_of(kind)):
-            return value
-        raise OutOfBounds(f"{path} is {_say(value)}; it must be {bounds_text(kind)}")
+    origin: Any = get_origin(kind) or kind
+    args = get_args(kind)
     if _is_section(kind):
         raise ConfigError(f"{path} is a section, not a field; set one of its fields: {', '.join(_schema(kind))}")
-    if kind is Any:
-        return fit(value, _PLAIN, path)
-    if origin in (Union, UnionType):
-        outside: list[OutOfBounds] = []
-        # The value's own type goes first: 3 must stay an int in `float | int`.
-        for arm in sorted(args, key=lambda arm: (get_origin(bare(arm)) or bare(arm)) is not type(value)):
-            try:
-                return fit(value, arm, path)
-            except OutOfBounds as error:
-                outside.append(error)
-            except ConfigError:
-                continue
-        if outside:
-            bounds = bounds_text(kind)
-            raise outside[0] if len(outside) == 1 or not bounds else OutOfBounds(f"{path} is {_say(value)}; it must be {bounds}")
-    elif origin is Literal and any(type(value) is type(choice) and value == choice for choice in args):
+    if origin is Annotated:
+        return _within(fit(value, args[0], path), kind, path)
+    if kind is Any or origin in (Union, UnionType):
+        return _fit_one_of(value, _PLAIN if kind is Any else kind, path)
+    if origin is Literal and any(type(value) is type(choice) and value == choice for choice in args):
         return value
-    elif origin is list and isinstance(value, list | tuple):
+    if origin is list and isinstance(value, list | tuple):
         of = args[0] if args else Any
         return [fit(item, of, f"{path}[{i}]") for i, item in enumerate(value)]
-    elif origin is dict and isinstance(value, Mapping):
+    if origin is dict and isinstance(value, Mapping):
         of = args[1] if args else Any
         return {fit(key, str, f"{path}: key"): fit(item, of, f"{path}[{key!r}]") for key, item in value.items()}
-    elif origin is float and isinstance(value, Real) and not isinstance(value, bool):
-        if -FLOAT32_MAX <= value <= FLOAT32_MAX:  # type: ignore[operator]
-            return float(value)
-        raise OutOfBounds(f"{path} is {_say(value)}; it must be {FINITE}")
-    elif origin is int and isinstance(value, Integral) and not isinstance(value, bool):
-        if -_MOST < (number := int(value)) < _MOST:
-            return number
-        raise OutOfBounds(f"{path} is {_say(value)}; it must be below 10^24")
-    elif origin in (bool, str, NoneType) and type(value) is origin:
-        if not (isinstance(value, str) and _NOT_TEXT.search(value)):
-            return value
-        raise OutOfBounds(f"{path} is {_say(value)}; it must be text without control characters")
+    if isinstance(value, {float: Real, int: Integral}.get(origin, ())) and not isinstance(value, bool):
+        return (float if origin is float else int)(_within(value, kind, path))
+    if origin in (bool, str, NoneType) and type(value) is origin:
+        return _within(value, kind, path)
     hint = _nearest(value, map(str, args)) if origin is Literal and isinstance(value, str) else ""
     raise ConfigError(f"{path} must be {_show(kind)}, not {_say(value)} ({type(value).__name__}){hint}")
+
+
+def _fit_one_of(value: Any, kind: Any, path: str) -> Any:
+    """`value` as one type of a union, its own first: 3 must stay an int in `float | int`."""
+    outside: list[OutOfBounds] = []
+    for arm in sorted(get_args(kind), key=lambda arm: (get_origin(bare(arm)) or bare(arm)) is not type(value)):
+        try:
+            return fit(value, arm, path)
+        except OutOfBounds as error:
+            outside.append(error)
+        except ConfigError:
+            continue
+    if len(outside) == 1:
+        raise outside[0]
+    wrong = f"is {_say(value)}; it must be {bounds_text(kind)}" if outside else f"must be {_show(kind)}, not {_say(value)}"
+    raise ConfigError(f"{path} {wrong} ({type(value).__name__})")
+
+
+def _within(value: Any, kind: Any, path: str) -> Any:
+    for bound in bounds_of(kind):
+        if not bound.holds(value):
+            raise OutOfBounds(f"{path} is {_say(value)}; it must be {bounds_text(kind) or bound.text}")
+    return value
 
 
 def _parse(text: str, kind: Any, path: str) -> Any:
