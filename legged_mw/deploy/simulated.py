@@ -312,9 +312,9 @@ def _check_start(model: mujoco.MjModel) -> None:
         raise ValueError("its first keyframe is no pose: the root's quaternion has not length 1, or a value is enormous")
     mujoco.mj_forward(model, data)
     deep = [contact.dist for contact in data.contact if 0 in model.body_weldid[model.geom_bodyid[contact.geom]]]
-    below = data.qpos[2] if np.any(model.geom_type[model.geom_bodyid == 0] == mujoco.mjtGeom.mjGEOM_PLANE) else 0.0
-    if min(below, *deep, 0.0) < -_DEEP:
-        raise ValueError(f"its first keyframe is {-min(below, *deep):.2g} m under the ground")
+    planes = (model.geom_bodyid == 0) & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    if (lowest := min([0.0, *deep, *(data.qpos[2] - model.geom_pos[planes, 2])])) < -_DEEP:
+        raise ValueError(f"its first keyframe is {-lowest:.2g} m under the ground")
 
 
 def _index(model: mujoco.MjModel, file: str, kind: str, name: str, word: str) -> int:

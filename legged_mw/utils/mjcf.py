@@ -5,6 +5,7 @@ All that is refused is a ValueError in one line, without the file's name.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +15,10 @@ import numpy as np
 
 MOST_BYTES = 64 << 20  # of one file: the largest known robots, meshes inside, have a tenth
 HEAVIEST, WIDEST, FASTEST = 1e5, 1e6, 1e3  # of a body [kg]; of any length [m] or inertia [kg m^2]; gravity [m/s^2]: a file in cm has 981
-_COPIES = {"count": 1e4, "nrow": 2e4, "ncol": 2e4, "width": 16384, "height": 16384, "nkey": 1e4}  # attribute -> the most that makes sense
+_COPIES = 1e5  # of what a file repeats, all its counts multiplied
+_MOST = {"count": 1e4, "nrow": 2e4, "ncol": 2e4, "width": 16384, "height": 16384, "nkey": 1e4}  # attribute -> the most that makes sense
+_MOST |= {f"nuser_{kind}": 1e3 for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")} | {"nuserdata": 1e6}
+_MOST |= {"mass": HEAVIEST, "density": 1e6, "armature": WIDEST, "frictionloss": WIDEST, "diaginertia": WIDEST}
 _SIZES = ("mass", "inertia", "pos", "ipos", "size", "armature", "damping", "frictionloss", "stiffness")  # of the model's arrays
 _NAMES = ("name", "class", "childclass", "model", "file", "dir", "meshdir", "texturedir", "assetdir")
 _ATTRIBUTE = re.compile(r"""([\w.:]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
@@ -45,9 +49,13 @@ def check_text(text: str, where: str = "") -> None:
     if "<!ENTITY" in text:
         raise ValueError(f"{where}line {_line(text, text.index('<!ENTITY'))}: it defines entities; write out what they stand for")
     text = re.sub(r"<!--.*?-->", lambda match: re.sub(r"[^\n]", " ", match[0]), text, flags=re.DOTALL)
+    copies = 1.0
     for match in _ATTRIBUTE.finditer(text):
         name, value = match[1], match[2] if match[2] is not None else match[3]
-        wrong = "" if name in _NAMES or len(value) < 2 else _wrong(name, value)
+        wrong = "" if name in _NAMES else _wrong(name, value)
+        if name == "count" and not wrong:
+            copies *= math.prod(float(part) or 1.0 for part in value.split() if part.isdecimal())
+            wrong = f"makes more than {_COPIES:g} copies, with the others" if copies > _COPIES else ""
         if wrong:
             raise ValueError(f'{where}line {_line(text, match.start())}: {name}="{value[:60]}" {wrong}')
 
@@ -56,13 +64,13 @@ def _wrong(name: str, value: str) -> str:
     """What is wrong with the numbers of an attribute; "" if nothing is, or if they are none."""
     if "nan" in value.lower() and any(part.lower().strip("+-") == "nan" for part in value.split()):
         return "is not a number"
-    if name.endswith("range") or name in _COPIES:
+    if name.endswith("range") or name in _MOST:
         try:
             numbers = [float(part) for part in value.split()]
         except ValueError:
             return ""
-        if name in _COPIES and any(number > _COPIES[name] for number in numbers):
-            return f"is more than {_COPIES[name]:g}"
+        if name in _MOST and not all(0.0 <= number <= _MOST[name] for number in numbers):
+            return f"must be from 0 to {_MOST[name]:g}"
         if len(numbers) == 2 and name.endswith("range") and numbers[0] > numbers[1]:
             return "ends before it begins"
     return ""
