@@ -99,6 +99,20 @@ def test_every_term_says_what_it_is_and_whose() -> None:
     assert [name for name, each in said.items() if not (each.words and each.source)] == []
 
 
+def test_every_field_says_its_bounds() -> None:
+    lines = {
+        line.split(" | ")[0]: line for line in reference.config_fields().splitlines() if line.startswith("| `") and "overridden" not in line
+    }
+    for name, told in (
+        ("num_envs", "`int`: 1 or more"),
+        ("gamma", "from 0 to 1"),
+        ("actuator", "`servo`, `dc_motor`, `torque`, `network`"),
+        ("action_scale", "`float \\| dict[str, float]`: another number than 0"),
+        ("stall_torque", "each above 0"),
+    ):
+        assert told in lines[f"| `{name}`"], lines[f"| `{name}`"]
+
+
 def test_every_row_has_words() -> None:
     lines = [line for line in reference.observations().splitlines() if line.startswith("| `")]
     assert len(lines) > 80 and [line for line in lines if not line.split(" | ")[2].strip()] == []
