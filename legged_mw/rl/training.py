@@ -27,6 +27,7 @@ from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
+from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run, require_task
 from legged_mw.rl.transfer import TEACHER, begin_with, check_start, keep_teacher, load_teacher, seat_teacher
@@ -166,6 +167,7 @@ def build(task: LoadedTask, start: Start, device: str, eager: bool, check_record
         check_recordable(task)
     env = task.env_class(task.cfg, device, eager=eager)
     check_mirror(env, task.train)
+    check_room(task.train.to_dict(), env)
     if start.policy:
         check_start(env, task, start.policy)
     if start.teacher:

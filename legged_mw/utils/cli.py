@@ -118,13 +118,16 @@ def one_line_errors(program: str = "") -> Iterator[None]:
             raise
         print(f"\n{program}: stopped", file=sys.stderr)
         raise SystemExit(130) from None
-    except RuntimeError as error:
+    except (RuntimeError, MemoryError) as error:
         first: BaseException = error
         while first.__context__ is not None:
             first = first.__context__  # what ran out may show as the failure of what it interrupted
         if not out_of_memory(first) and not out_of_memory(error):
             raise
-        fail(program, f"out of memory ({str(first).splitlines()[0]}); fewer worlds need less: try half with --num_envs")
+        fail(
+            program,
+            f"out of memory ({(str(first) or 'memory').splitlines()[0]}); fewer worlds need less: try half with --num_envs",
+        )
 
 
 def fail(program: str, message: str) -> NoReturn:
