@@ -35,6 +35,7 @@ from legged_mw.sim.engines import pick_engine
 from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.files import writable
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
 
@@ -70,8 +71,10 @@ def parse(description: str | None) -> argparse.Namespace:
     parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")
     parser.add_argument("--picture", metavar="PNG", help="with --check: the robot's health page too, and a picture of the robot")
     args = parser.parse_args()
-    if args.picture and not args.check:
-        parser.error("--picture draws what --check shows: add --check")
+    if args.picture is not None:
+        writable(args.picture, "--picture")
+        if not args.check:
+            parser.error("--picture draws what --check shows: add --check")
     if not args.list:
         require_task(args, parser)
     if not args.resume and (args.load_run is not None or args.checkpoint != -1):
@@ -99,6 +102,8 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
         task.update({"actor": start.policy.task.train.to_dict()["actor"]}, where="--init")
     if fitted or start.policy:
         apply_overrides(task, args)  # again: what the user says wins
+    if this_rank().leads and not args.check:
+        writable(str(start.run or start.experiment), "runs go to", folder=True)
     _note_others(task, start)
     note_network(task.cfg)
     check_classes(task.train)
