@@ -138,7 +138,7 @@ class Getup(RobotTask):
         assign(self.sim.qvel, fall, self.fallen_qvel.index_select(0, pick))
 
     def _body_rows(self) -> list[Row]:
-        return [*super()._body_rows(), Row("base_height", self.base_height[:, None], mirror="scalar")]  # [m] [P]
+        return [*super()._body_rows(), Row("base_height", self.base_height[:, None], mirror="scalar")]  # above the ground [m] [P]
 
     def _near_upright(self) -> Tensor:
         return torch.exp(-4.0 * (1.0 - self.upright))  # exp(-2 |g + z|^2) of unit vectors [P]

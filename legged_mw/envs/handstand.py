@@ -88,7 +88,7 @@ class Handstand(RobotTask):
             raise ConfigError(f"exam.hands: {unknown('geom', wrong[0], geoms, self.cfg.asset.file)}")
 
     def _reward_stand_height(self) -> Tensor:
-        """Height of the root up to ``exam.height`` [m], exponential. [P]"""
+        """Height of the root up to ``exam.height``, exponential in metres. [P]"""
         return torch.exp(self.base_height.clamp(max=self.cfg.exam.height) - self.cfg.exam.height)
 
     def _reward_stand_attitude(self) -> Tensor:
