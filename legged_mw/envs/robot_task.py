@@ -55,7 +55,6 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         check_values(cfg, law=self.motor_law)
         self.terrain = self._make_terrain()
         self.robot = self._load_robot(pick_engine(cfg.sim.engine, device))
-        super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
         self.sim = make_simulation(
             self.robot.physics,
             cfg.env.num_envs,
@@ -68,6 +67,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
             terrain=self.terrain,
             eager=eager,
         )
+        super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
         self.domain_rand = DomainRand(cfg, self.robot, self.sim, self.motor_law)
         self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)

@@ -16,6 +16,7 @@ from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import actor_settings, check_classes, network_section
 from legged_mw.rl.network import LEARNING_ONLY, read_parameters
+from legged_mw.rl.room import check_room
 from legged_mw.rl.runs import CONFIG_FILE, check_fit, experiment_folder, find_checkpoint, find_run, load_tensors, runs, task_of
 from legged_mw.utils.config import Config, ConfigError, load_yaml
 from legged_mw.utils.errors import shown
@@ -134,6 +135,7 @@ def acting(cfg: Config, env: RobotTask, read: list[str] | None = None) -> dict[s
     sections = copy.deepcopy(cfg.to_dict())
     if read:
         sections["obs_groups"]["actor"] = read
+    check_room(sections, env, learns=False)
     return network_section(actor_settings(sections, env, learns=False))
 
 

@@ -36,7 +36,8 @@ class NotRecordable(StepError):
 
 def out_of_memory(error: BaseException) -> bool:
     """Whether an error of torch, CUDA or warp says that memory ran out."""
-    return bool(re.search(r"out of memory|failed to allocate|alloc_failed", str(error), re.IGNORECASE))
+    text = r"out of memory|failed to allocate|alloc_failed|can't allocate memory"
+    return isinstance(error, MemoryError) or bool(re.search(text, str(error), re.IGNORECASE))
 
 
 def line_of(code: CodeType, line: int) -> str:
