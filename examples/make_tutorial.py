@@ -2,9 +2,10 @@
 
     python examples/make_tutorial.py          # notebooks from pages; the code of the English page is that of the Chinese one too
     python examples/make_tutorial.py --run    # run it first; write what cells print and draw into both pages
+    python examples/make_tutorial.py --quick  # the same, but cells that train keep what they show
 
-In a page a block of ```python is a cell. A block of ```text right after it is what the cell prints, and a picture after that is what it draws:
-those are left out of the notebook. Needs nbclient and ipykernel, of the extra `dev`.
+In a page a block of ```python is a cell. A block of ```text right after it is what the cell prints, and a picture after that is what it
+draws: those are left out of the notebook. Needs nbclient and ipykernel, of the extra `dev`.
 """
 
 from __future__ import annotations
@@ -85,12 +86,14 @@ def printed(cell: dict[str, Any]) -> str:
     return "".join(output["text"] for output in cell["outputs"] if output["output_type"] == "stream" and output["name"] == "stdout")
 
 
-def _with_outputs(page: str, ran: list[dict[str, Any]]) -> str:
-    """The page with what its cells printed; their pictures go to the files that it names."""
+def _with_outputs(page: str, ran: list[dict[str, Any]], quick: bool) -> str:
+    """The page with what its cells printed; their pictures go to the files that it names. ``quick``: not those of cells that train."""
     cells = iter(ran)
 
     def write(cell: re.Match[str]) -> str:
         done = next(cells)
+        if quick and "train(" in cell[1]:
+            return cell[0]
         drawn = [output["data"]["image/png"] for output in done["outputs"] if "image/png" in output.get("data", {})]
         if len(drawn) != bool(cell[3]):
             raise SystemExit(f"a cell drew {len(drawn)} pictures, the page has {int(bool(cell[3]))}: {cell[1][:60]}")
@@ -117,10 +120,14 @@ def _save(png: bytes, path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--run", action="store_true", help="run the code; write its outputs and pictures")
+    parser.add_argument("--quick", action="store_true", help="likewise, with two iterations of training, whose outputs stay as they are")
+    args = parser.parse_args()
     english, *others = PAGES
     text = english.read_text(encoding="utf-8")
-    if parser.parse_args().run:
-        text = _with_outputs(text, run(notebook(text)))
+    if args.quick:
+        os.environ["ITERATIONS"] = "2"
+    if args.run or args.quick:
+        text = _with_outputs(text, run(notebook(text)), args.quick)
         english.write_text(text, encoding="utf-8")
     for page in others:
         page.write_text(translated(page.read_text(encoding="utf-8"), text), encoding="utf-8")
