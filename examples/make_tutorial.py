@@ -22,7 +22,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {ROOT / "docs/tutorial.md": "joystick_explained.ipynb", ROOT / "docs/zh/tutorial.md": "joystick_explained.zh.ipynb"}
 CELL = re.compile(r"```python\n(.*?)```\n(?:\n```text\n(.*?)```\n)?(?:\n!\[[^\]]*\]\((?:\.\./)?(images/tutorial/[^)]*)\)\n)?", re.DOTALL)
-COLORS, QUALITY = 16, 80  # of PNGs, of JPEGs
+PLOT_COLORS, COLORS, QUALITY = 1024, 16, 75  # what has more is a photo; of what is kept of a plot; of a photo
 
 
 def notebook(page: str) -> dict[str, Any]:
@@ -43,16 +43,16 @@ def _markdown(text: str) -> dict[str, Any]:
 
 
 def _from_examples(path: str) -> str:
-    return path.removeprefix("examples/") if path.startswith("examples/") else f"../docs/{path}"
+    return path.removeprefix("examples/") if path.startswith("examples/") else f"../{'' if (ROOT / path).exists() else 'docs/'}{path}"
 
 
 def _cell(kind: str, text: str) -> dict[str, Any]:
     extra: dict[str, Any] = {"execution_count": None, "outputs": []} if kind == "code" else {}
-    return {"cell_type": kind, "metadata": {}, **extra, "source": text.strip("\n").splitlines(keepends=True)}
+    return {"cell_type": kind, "metadata": {}, **extra, "source": text.strip("\n")}
 
 
 def as_json(cells: dict[str, Any]) -> str:
-    return json.dumps(cells, ensure_ascii=False, indent=1) + "\n"
+    return json.dumps(cells, ensure_ascii=False, indent=0) + "\n"
 
 
 def translated(page: str, original: str) -> str:
@@ -106,15 +106,15 @@ def _with_outputs(page: str, ran: list[dict[str, Any]], quick: bool) -> str:
 
 
 def _save(png: bytes, path: Path) -> None:
-    """A small file of it, a JPEG if its name says so."""
+    """A small WebP file of it: of a plot with few colours and without loss."""
     from PIL import Image
 
     picture = Image.open(io.BytesIO(png)).convert("RGB")
+    photo = picture.getcolors(PLOT_COLORS) is None
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".png":
-        picture.quantize(COLORS, dither=Image.Dither.NONE).save(path, optimize=True)
-    else:
-        picture.save(path, quality=QUALITY, optimize=True)
+    if not photo:
+        picture = picture.quantize(COLORS, dither=Image.Dither.NONE).convert("RGB")
+    picture.save(path, lossless=not photo, quality=QUALITY if photo else 100, method=6)
 
 
 def main() -> None:
