@@ -39,7 +39,7 @@ def notebook(page: str) -> dict[str, Any]:
 
 def _markdown(text: str) -> dict[str, Any]:
     """A cell of text; links to other pages lead out of examples/."""
-    return _cell("markdown", re.sub(r"\]\((?:\.\./)*([\w/]+\.(?:md|ipynb))", lambda link: f"]({_from_examples(link[1])}", text))
+    return _cell("markdown", re.sub(r"\]\((?:\.\./)*([\w/.]+\.(?:md|ipynb))", lambda link: f"]({_from_examples(link[1])}", text))
 
 
 def _from_examples(path: str) -> str:

@@ -9,6 +9,7 @@ import pytest
 
 from examples.make_tutorial import CELL, PAGES, ROOT, as_json, notebook, printed, run, translated
 from legged_mw.utils.task import load_task
+from website.formulas import on_page_content
 
 ENGLISH, CHINESE = PAGES
 TERM = re.compile(r"^\| `(\w+)` \| (-?[\d.]+) \|", re.MULTILINE)
@@ -65,6 +66,11 @@ def test_the_code_runs_and_prints_what_the_page_shows(monkeypatch: pytest.Monkey
         assert drew == bool(picture) or "No OpenGL context" in text, code
         if "No OpenGL context" not in text:
             assert words(text) == words(shown), f"{code}{MENDED}"
+
+
+def test_formulas_become_mathml() -> None:
+    shown = on_page_content(r'<p><span class="arithmatex">\(a &lt; b\)</span></p><div class="arithmatex">\[\sum_k w_k\]</div>')
+    assert shown.count("<math ") == 2 and 'display="block"' in shown and "&lt;" in shown and "arithmatex" not in shown
 
 
 def words(text: str) -> str:

@@ -13,4 +13,8 @@ FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>',
 
 def on_page_content(content: str, **_: Any) -> str:
     """The page's HTML with each formula, written in LaTeX, as MathML."""
-    return FORMULA.sub(lambda found: convert(html.unescape(found[2]), "block" if found[1] == "div" else "inline"), content)
+    return FORMULA.sub(lambda found: _mathml(html.unescape(found[2]), found[1] == "div"), content)
+
+
+def _mathml(latex: str, block: bool) -> str:
+    return convert(latex, display="block" if block else "inline")
