@@ -22,7 +22,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parent.parent
 PAGES = {ROOT / "docs/tutorial.md": "joystick_explained.ipynb", ROOT / "docs/zh/tutorial.md": "joystick_explained.zh.ipynb"}
 CELL = re.compile(r"```python\n(.*?)```\n(?:\n```text\n(.*?)```\n)?(?:\n!\[[^\]]*\]\((?:\.\./)?(images/tutorial/[^)]*)\)\n)?", re.DOTALL)
-PLOT_COLORS, COLORS, QUALITY = 1024, 16, 75  # what has more is a photo; of what is kept of a plot; of a photo
+COLORS, QUALITY = 16, 75  # of a plot; of a photo
 
 
 def notebook(page: str) -> dict[str, Any]:
@@ -106,11 +106,11 @@ def _with_outputs(page: str, ran: list[dict[str, Any]], quick: bool) -> str:
 
 
 def _save(png: bytes, path: Path) -> None:
-    """A small WebP file of it: of a plot with few colours and without loss."""
+    """A small WebP file of it: of a plot, which is mostly white, with few colours and without loss."""
     from PIL import Image
 
     picture = Image.open(io.BytesIO(png)).convert("RGB")
-    photo = picture.getcolors(PLOT_COLORS) is None
+    photo = picture.convert("L").histogram()[255] < 0.5 * picture.width * picture.height
     path.parent.mkdir(parents=True, exist_ok=True)
     if not photo:
         picture = picture.quantize(COLORS, dither=Image.Dither.NONE).convert("RGB")
