@@ -30,14 +30,8 @@ def test_both_languages_have_the_same_code_and_outputs() -> None:
     assert read(CHINESE) == translated(read(CHINESE), read(ENGLISH)), f"the pages differ in code or outputs{MENDED}"
 
 
-def test_both_languages_say_the_same() -> None:
-    for same in (
-        r"^(#+) ",
-        r"\*\*(?:\w+ )?(\d+\.\d)",
-        r"^\| (`\w+` \| \S+) \|",
-        r"^(\$\$.*)",
-        r"\]\((?:\.\./)*([\w/#-]+)",
-    ):
+def test_both_languages_have_the_same_exercises_and_formulas() -> None:
+    for same in (r"\*\*(?:\w+ )?(\d+\.\d)", r"^(\$\$.*)"):  # the rest: test_pages.py
         found = [re.findall(same, CELL.sub("", read(page)), re.MULTILINE) for page in PAGES]
         assert found[0] == found[1] and found[0], same
 
