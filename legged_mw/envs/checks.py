@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
+
+from torch import Tensor
 
 from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, active
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
+from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
 from legged_mw.utils.commands import HEADING
 from legged_mw.utils.config import Config, ConfigError
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import StepError, line_of, unknown
 
 Rule = tuple[str, Callable[[Any], bool]]
 
@@ -31,6 +35,45 @@ PROBABILITIES: Rule = (
     "three numbers from 0 to 1, and more for further commands",
     lambda v: len(v) >= 3 and all(0 <= p <= 1 for p in v),
 )
+
+
+def check_term(method: Callable[[], Any], count: int) -> Any:
+    """What a reward method returns, if it is a number an environment. Raises StepError with the method's place."""
+    value = method()
+    if not isinstance(value, Tensor) or value.shape != (count,):
+        got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        raise StepError(f"must return a tensor ({count},), one value an environment; it returned {got}", place_of(method))
+    return value
+
+
+def checked_rows(env: Any) -> Any:
+    """``env``'s table of observation rows, if all of it is of the kind that it must be. Raises StepError with its place."""
+    table, count = env.observation_rows(), env.num_envs
+    where = place_of(env.observation_rows)
+    if not isinstance(table, Mapping) or not all(isinstance(rows, list | tuple) and rows for rows in table.values()):
+        raise StepError(f"must return group -> list of rows; it returned {_kind(table)}", where)
+    for group, rows in table.items():
+        for row in rows:
+            if not isinstance(row, Row | str):
+                raise StepError(f"group '{group}' holds {_kind(row)}; write Row(name, value, ...), or the name of a group", where)
+            value = row.value if isinstance(row, Row) else None
+            if isinstance(row, Row) and not (isinstance(value, Tensor) and value.dim() == 2 and len(value) == count and value.numel()):
+                got = f"{tuple(value.shape)}" if isinstance(value, Tensor) else _kind(value)
+                raise StepError(
+                    f"row '{row.name}' of '{group}' is {got}; it must be a tensor ({count}, size), a line an environment", where
+                )
+    return table
+
+
+def place_of(method: Any) -> str:
+    """Where a method is written."""
+    method = getattr(method, "func", method)  # of a partial
+    function = inspect.unwrap(getattr(method, "__func__", method))
+    return line_of(function.__code__, function.__code__.co_firstlineno)
+
+
+def _kind(value: object) -> str:
+    return type(value).__name__
 
 
 def or_empty(rule: Rule) -> Rule:
