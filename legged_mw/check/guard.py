@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from legged_mw.check.recordable import Guard, recordable
-from legged_mw.envs.checks import check_term, place_of
+from legged_mw.envs.own_code import check_term, place_of
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.utils.config import Config

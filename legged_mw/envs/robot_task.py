@@ -19,13 +19,14 @@ from torch import Tensor
 
 from legged_mw.envs.actuators import Actuators, TorqueLaw
 from legged_mw.envs.base_task import BaseTask
-from legged_mw.envs.checks import check_term, check_values, checked_rows
+from legged_mw.envs.checks import check_values
 from legged_mw.envs.contacts import GroundContacts
 from legged_mw.envs.divergence import Divergence
 from legged_mw.envs.domain_rand import DomainRand, world_fields
 from legged_mw.envs.loading import load_robot, soft_limits, start_place
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
 from legged_mw.envs.observations import Observations, Row
+from legged_mw.envs.own_code import check_term, checked_rows
 from legged_mw.envs.perturbation import Perturbation
 from legged_mw.envs.robot_rewards import RobotRewards
 from legged_mw.envs.robot_task_config import RobotTaskCfg
@@ -247,7 +248,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
             Row("accelerometer", self.accelerometer, mirror="polar"),  # proper acceleration at the IMU [m/s^2]
             Row("projected_gravity", self.projected_gravity, mirror="polar"),
             Row("base_lin_vel", self.base_lin_vel, mirror="imu_velocity"),
-            Row("base_ang_vel_world", self.base_ang_vel_world, mirror="axial"),  # the world mirrors about its own x-z plane
+            Row("base_ang_vel_world", self.base_ang_vel_world, mirror="axial"),  # [rad/s]; the world mirrors about its own x-z plane
             Row("dof_pos", self.dof_offset, mirror="joint"),
             Row("dof_vel", self.dof_vel, mirror="joint"),
             Row("torques", self.torques, mirror="joint"),  # [N m]

@@ -168,9 +168,7 @@ def test_others(case: Case, tmp_path: Path) -> None:
 def test_names_that_are_ours(tmp_path: Path) -> None:
     """They are renamed, and what refers to them follows."""
     text = GO1.replace('name="FR_hip_1"', 'name="floor"').replace('name="trunk_box"', 'name="floor/0"').replace('"rubber"', '"ground"')
-    text = text.replace(
-        "</mujoco>", '<sensor><touch name="contact/FR" site="imu"/><rangefinder name="up/x" site="imu"/></sensor></mujoco>'
-    )
+    text = text.replace("</mujoco>", '<sensor><touch name="contact/FR" site="imu"/><rangefinder name="up/x" site="imu"/></sensor></mujoco>')
     given(text)(tmp_path)
     robot = read_robot(tmp_path / "robot.xml")
     names = {kind: [thing.name for thing in getattr(robot.spec, kind)] for kind in ("geoms", "materials", "sensors")}
