@@ -20,6 +20,7 @@ from legged_mw.rl.room import check_room
 from legged_mw.rl.runs import CONFIG_FILE, check_fit, experiment_folder, find_checkpoint, find_run, load_tensors, runs, task_of
 from legged_mw.utils.config import Config, ConfigError, load_yaml
 from legged_mw.utils.errors import shown
+from legged_mw.utils.files import finish_moving
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 NETWORK_FILE = "policy.onnx"  # of an export: legged_mw.deploy, which imports nothing from here, calls it so too
@@ -85,6 +86,7 @@ def find_rival(task: LoadedTask, run: str, experiment: str | None = None) -> Sou
 def _run_or_export(experiment: Path, name: str, checkpoint: int = -1) -> Source:
     """A run by its name or path, or an export by its path."""
     folder = Path(name).expanduser()
+    finish_moving(folder)  # of an export that was killed
     if (folder / NETWORK_FILE).is_file():
         return Source(folder, folder / NETWORK_FILE, shipped=False)
     found = find_run(experiment, name)

@@ -35,7 +35,7 @@ from legged_mw.sim.engines import pick_engine
 from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError, shown
-from legged_mw.utils.files import writable
+from legged_mw.utils.files import sweep, writable
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
 
@@ -236,6 +236,7 @@ def _open_run(runner: Runner, task: LoadedTask, start: Start) -> Path:
     """The folder that this training writes to, with the config in it; an earlier checkpoint begins a folder of its own."""
     newest = start.run is not None and start.checkpoint == find_checkpoint(start.run, -1)
     folder = start.run if start.run and newest else new_run(start.experiment, task.train.runner.run_name)
+    sweep(folder)
     save_yaml(folder / CONFIG_FILE, task.to_dict())
     if start.teacher:
         keep_teacher(start.teacher, folder)
