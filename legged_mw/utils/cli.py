@@ -15,7 +15,7 @@ from typing import NoReturn
 import numpy as np
 
 from legged_mw.utils.config import ConfigError, load_yaml
-from legged_mw.utils.errors import UserError, out_of_memory
+from legged_mw.utils.errors import UserError, out_of_memory, printable
 from legged_mw.utils.task import LoadedTask
 
 
@@ -129,7 +129,7 @@ def one_line_errors(program: str = "") -> Iterator[None]:
 
 def fail(program: str, message: str) -> NoReturn:
     """One line on standard error, exit code 2."""
-    print(f"{program}: {' '.join(message.split())}", file=sys.stderr)
+    print(f"{program}: {printable(' '.join(message.split()))}", file=sys.stderr)
     raise SystemExit(2)
 
 
