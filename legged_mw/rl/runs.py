@@ -111,9 +111,7 @@ def _not_brought(file: Path, run: Path) -> str:
     home, really = run.resolve(), file.resolve()
     logs = next((above for above in home.parents if above.name == "logs"), home)
     if really.is_relative_to(home) or really.is_relative_to(logs):
-        raise ConfigError(
-            f"{shown(run)} is of task {shown(file)}, which came with it: it is code. Look at it, then say --task {shown(file)}"
-        )
+        raise ConfigError(f"{shown(run)} is of task {shown(file)}, which came with it and is code: read it, then say --task {shown(file)}")
     if not re.search(rb"^TASK\b", really.read_bytes(), re.MULTILINE):
         raise ConfigError(f"{shown(run)} is of task {shown(file)}, which is no task: it has no line TASK = Task(...); say --task FILE")
     return str(file)
