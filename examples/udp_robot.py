@@ -127,7 +127,7 @@ class UdpRobot(Robot):
                 self._socket.settimeout(left)
                 packet = unpack(self._socket.recv(_MOST))
                 if packet and packet.kind == REFUSED:
-                    raise self._lost(printable(packet.body.decode("utf-8", "replace")))
+                    raise self._lost(printable(" ".join(packet.body[:200].decode("utf-8", "replace").split())))
                 if why := self._fault(packet):
                     self.dropped[why] += 1
                 elif packet:

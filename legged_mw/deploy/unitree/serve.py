@@ -165,7 +165,7 @@ class SimulatedUnitree:
         for body in self._out.due(self.time):
             self.end.send(body)
         self.end.answer()
-        if body := self.end.receive():
+        if (body := self.end.receive()) is not None:
             self._in.put(self.time, body, self.faults)
         for body in self._in.due(self.time):
             self._receive(body)
