@@ -1,16 +1,20 @@
 """Who may reach the web page: a browser that opened it by its own address, with its token where it has one.
 
-Headers in, a refusal out. Nothing here listens, and nothing knows MuJoCo.
+Headers in, a refusal out. Nothing here knows MuJoCo.
 """
 
 from __future__ import annotations
 
 import hmac
 import ipaddress
+import os
 import re
 import secrets
 import socket
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
 
 LOCAL = "127.0.0.1"
 SOCKETS = ("/ui", "/state")  # paths of Studio's WebSockets that a page needs
@@ -95,3 +99,34 @@ class Gate:
             return bool(ipaddress.ip_address(name))
         except ValueError:
             return name.rstrip(".") in self._names
+
+
+class OwnSocket(socket.socket):
+    """Listens on this machine for this process alone, where the system says whose a connection is (Linux); else for this machine."""
+
+    def __init__(self, port: int = 0) -> None:
+        super().__init__(socket.AF_INET, socket.SOCK_STREAM)
+        self.bind((LOCAL, port))
+        self.listen()
+
+    def accept(self) -> tuple[socket.socket, Any]:
+        """Raises BlockingIOError, as if nobody had come, for somebody else."""
+        connection, peer = super().accept()
+        if not is_own(peer[1], self.getsockname()[1]):
+            connection.close()
+            raise BlockingIOError
+        return connection, peer
+
+
+def is_own(port: int, listener: int) -> bool:
+    """Whether a socket of this process has ``port`` and is connected to ``listener`` on this machine."""
+    try:
+        lines = [line.split() for line in Path("/proc/self/net/tcp").read_text().splitlines()]
+    except OSError:
+        return True
+    inodes = {line[9] for line in lines if line[1:3] == [f"0100007F:{port:04X}", f"0100007F:{listener:04X}"]}
+    for each in os.listdir("/proc/self/fd"):
+        with suppress(OSError):
+            if os.readlink(f"/proc/self/fd/{each}") in {f"socket:[{inode}]" for inode in inodes}:
+                return True
+    return False

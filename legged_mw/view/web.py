@@ -22,7 +22,7 @@ from typing import Any
 import mujoco
 
 from legged_mw.view.drive import Pilot
-from legged_mw.view.gate import HEADERS, LOCAL, MOST, PATIENCE, Gate
+from legged_mw.view.gate import HEADERS, LOCAL, MOST, PATIENCE, Gate, OwnSocket
 from legged_mw.view.posed_robot import PosedRobots
 from legged_mw.view.stage import Moment, ViewError
 
@@ -115,17 +115,19 @@ def _bound_to(host: str, gate: Gate) -> Iterator[None]:
     from mujoco.studio import web_viewer
     from mujoco.studio.web import web_server
 
-    bind, serve = (getattr(web_server, name, None) for name in ("bind_public_socket", "serve"))
-    if bind is None or serve is None:
+    names = ("bind_public_socket", "bind_loopback_socket", "serve")
+    bind, inner, serve = (getattr(web_server, name, None) for name in names)
+    if bind is None or inner is None or serve is None:
         raise ViewError(f"--viewer web: the page of this mujoco ({mujoco.__version__}) cannot be bound to {host} and guarded")
     logging.getLogger("WebServer").setLevel(logging.WARNING)
     web_viewer.print = lambda *_, **__: None  # type: ignore[attr-defined]  # its banner names all interfaces
     web_server.bind_public_socket = lambda _, port=0: bind(host, port)
+    web_server.bind_loopback_socket = OwnSocket  # between its page's server and its panel, both in this process
     web_server.serve = lambda handler, **settings: serve(handler, **_guarded(settings, gate))
     try:
         yield
     finally:
-        web_server.bind_public_socket, web_server.serve = bind, serve
+        web_server.bind_public_socket, web_server.bind_loopback_socket, web_server.serve = bind, inner, serve
 
 
 def _guarded(settings: dict[str, Any], gate: Gate) -> dict[str, Any]:
