@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 import numpy as np
 
 from legged_mw.utils.config import ConfigError, fit, load_yaml
-from legged_mw.utils.errors import UserError, in_short, out_of_memory, users_fault
+from legged_mw.utils.errors import UserError, in_short, out_of_memory, printable, users_fault
 from legged_mw.utils.task import LoadedTask
 
 
@@ -170,7 +170,7 @@ def _show_all() -> None:
 
 def fail(program: str, message: str) -> NoReturn:
     """One line on standard error, exit code 2."""
-    print(f"{program}: {' '.join(message.split())}", file=sys.stderr)
+    print(f"{program}: {printable(' '.join(message.split()))}", file=sys.stderr)
     raise SystemExit(2)
 
 

@@ -85,12 +85,17 @@ def in_short(error: BaseException) -> str:
     return f"{type(error).__name__}: {text[:400]}" if text else type(error).__name__
 
 
+def printable(text: str) -> str:
+    """``text`` with what a terminal would obey, not print, written as \\x1b: names come from files, folders and the net."""
+    return "".join(each if each.isprintable() or each == "\n" else ascii(each)[1:-1] for each in text)
+
+
 def shown(path: Path) -> str:
     """A path for a message: as the user would type it."""
     try:
-        return str(path.resolve().relative_to(Path.cwd()))
-    except ValueError:
-        return str(path)
+        return printable(str(path.resolve().relative_to(Path.cwd())))
+    except (ValueError, OSError, RuntimeError):  # not below it; or a link to itself
+        return printable(str(path))
 
 
 def unknown(what: str, name: str, known: Iterable[str], where: str) -> str:

@@ -164,8 +164,8 @@ def web_page(stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, tit
     print(f"viewer: a web page ({why}): {page.url}  Ctrl-C ends it")
     if args.host == web.LOCAL and not has_display():
         print(f"  on another machine paste this into a terminal there, then open the page: {web.tunnel_line(page.port)}")
-    elif args.host != web.LOCAL:
-        print(f"  it has no password: whoever reaches this port can {'drive' if 'own' in pilot.can else 'damp the robot'}")
+    elif "?token=" in page.url:
+        print(f"  whoever has this address can {'drive' if 'own' in pilot.can else 'damp the robot'}; nothing is encrypted")
     sys.stdout.flush()
     return page
 
