@@ -17,14 +17,14 @@ def train() -> None:
     """Train a task. On 8 GPUs: torchrun --nproc_per_node=8 train.py --task go1_flat"""
     from legged_mw.check.describe import describe
     from legged_mw.check.guard import check_recordable
-    from legged_mw.eval.exams import make_exam
+    from legged_mw.eval.exams import find_exam, make_exam
     from legged_mw.rl import training
 
     args = training.parse(train.__doc__)
     if args.list:
         print(list_tasks())
         return
-    task = load_task(args.task)
+    find_exam(task := load_task(args.task))
     start, device = training.configure(task, args)
     env = training.build(task, start, device, args.eager, check_recordable)
     if args.check:

@@ -27,6 +27,7 @@ from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
+from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run, require_task
 from legged_mw.rl.transfer import TEACHER, begin_with, check_start, keep_teacher, load_teacher, seat_teacher
@@ -34,6 +35,7 @@ from legged_mw.sim.engines import pick_engine
 from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.files import sweep, writable
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
 
@@ -69,8 +71,10 @@ def parse(description: str | None) -> argparse.Namespace:
     parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")
     parser.add_argument("--picture", metavar="PNG", help="with --check: the robot's health page too, and a picture of the robot")
     args = parser.parse_args()
-    if args.picture and not args.check:
-        parser.error("--picture draws what --check shows: add --check")
+    if args.picture is not None:
+        writable(args.picture, "--picture")
+        if not args.check:
+            parser.error("--picture draws what --check shows: add --check")
     if not args.list:
         require_task(args, parser)
     if not args.resume and (args.load_run is not None or args.checkpoint != -1):
@@ -98,6 +102,8 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
         task.update({"actor": start.policy.task.train.to_dict()["actor"]}, where="--init")
     if fitted or start.policy:
         apply_overrides(task, args)  # again: what the user says wins
+    if this_rank().leads and not args.check:
+        writable(str(start.run or start.experiment), "runs go to", folder=True)
     _note_others(task, start)
     note_network(task.cfg)
     check_classes(task.train)
@@ -166,6 +172,7 @@ def build(task: LoadedTask, start: Start, device: str, eager: bool, check_record
         check_recordable(task)
     env = task.env_class(task.cfg, device, eager=eager)
     check_mirror(env, task.train)
+    check_room(task.train.to_dict(), env)
     if start.policy:
         check_start(env, task, start.policy)
     if start.teacher:
@@ -229,6 +236,7 @@ def _open_run(runner: Runner, task: LoadedTask, start: Start) -> Path:
     """The folder that this training writes to, with the config in it; an earlier checkpoint begins a folder of its own."""
     newest = start.run is not None and start.checkpoint == find_checkpoint(start.run, -1)
     folder = start.run if start.run and newest else new_run(start.experiment, task.train.runner.run_name)
+    sweep(folder)
     save_yaml(folder / CONFIG_FILE, task.to_dict())
     if start.teacher:
         keep_teacher(start.teacher, folder)
