@@ -35,7 +35,7 @@ def train() -> None:
             print(task_page(task, Path(args.picture)))
         return
     examine = make_exam(task, env, args.eager) if training.wants_exam(task) else None
-    training.train(task, env, start, examine, export, args.deadline)
+    training.train(task, env, start, examine, export, args.deadline, args.verbose)
 
 
 @one_line_errors()

@@ -78,6 +78,7 @@ def test_an_installed_package_trains_the_readmes_task_and_logs_where_it_is_start
         "8",
         "--max_iterations",
         "1",
+        "--verbose",
         "--set",
         "runner.num_steps_per_env=4",
         "--set",

@@ -26,6 +26,7 @@ from legged_mw.rl.classes import check_classes
 from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.progress import LOG_FILE
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run, require_task
@@ -41,6 +42,7 @@ _STEPS_PER_CORE = 6500  # a second, in training with the section `cpu` as it is 
 
 Check = Callable[[LoadedTask], None]  # raises where the step cannot be recorded
 Examine = Callable[[Any], dict[str, float]]  # policy -> figures by name
+Begun = Callable[[Runner, Path], None]  # with the run folder
 Export = Callable[[LoadedTask, Path, Path], str]  # task, checkpoint, folder to write -> what was written, in words
 
 
@@ -65,6 +67,7 @@ def parse(description: str | None) -> argparse.Namespace:
     parser.add_argument("--init", metavar="RUN", help="begin with the actor of another policy, named as a teacher is")
     parser.add_argument("--headless", action="store_true", help="accepted as in legged_gym; training never opens a window")
     parser.add_argument("--max_time", type=duration, metavar="T", help="end, after a checkpoint, after 90s, 5m, 1.5h ...")
+    parser.add_argument("--verbose", action="store_true", help=f"print all numbers of an iteration, as they stand in the run's {LOG_FILE}")
     parser.add_argument("--list", action="store_true", help="show the tasks and exit")
     parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")
     parser.add_argument("--picture", metavar="PNG", help="with --check: the robot's health page too, and a picture of the robot")
@@ -181,15 +184,29 @@ def wants_exam(task: LoadedTask) -> bool:
     return this_rank().leads and 0 < task.train.runner.exam_interval <= task.train.runner.max_iterations
 
 
-def train(task: LoadedTask, env: RobotTask, start: Start, examine: Examine | None, export: Export, deadline: float | None = None) -> None:
-    """Train from ``start`` to the last iteration or until stopped (at ``deadline`` [s], a time of the clock), then export."""
+def train(
+    task: LoadedTask,
+    env: RobotTask,
+    start: Start,
+    examine: Examine | None,
+    export: Export,
+    deadline: float | None = None,
+    verbose: bool = False,
+    begun: Begun | None = None,
+) -> None:
+    """Train from ``start`` to the last iteration or until stopped (at ``deadline`` [s], a time of the clock), then export.
+
+    ``begun`` is called before the first iteration, where the run folder is written; ``verbose`` prints whole blocks.
+    """
     teacher = start.teacher.task.train if start.teacher else None
     rank, runner = this_rank(), make_runner(env, task.train, None, str(env.device), teacher)
-    runner.examine = examine
+    runner.examine, runner.console.verbose = examine, verbose
     left = _load(runner, task, start)
     _stop_on_signals(runner, deadline)
     leave_when_stuck(rank)
     folder = _open_run(runner, task, start) if rank.leads else None  # one run folder, written by the first rank
+    if folder and begun:
+        begun(runner, folder)
     _learn(runner, left, rank)
     finished = folder is not None and _say_how_it_ended(runner, task, folder, rank)
     leave_together(rank)
@@ -233,6 +250,7 @@ def _open_run(runner: Runner, task: LoadedTask, start: Start) -> Path:
     if start.teacher:
         keep_teacher(start.teacher, folder)
     runner.logger.log_dir = str(folder)
+    runner.console.open(folder)
     print(f"writing to {shown(folder)}", flush=True)
     return folder
 
@@ -240,7 +258,8 @@ def _open_run(runner: Runner, task: LoadedTask, start: Start) -> Path:
 def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
     """Learn; if another rank is lost on the way, say so in a line."""
     try:
-        runner.learn(iterations)
+        with runner.console:
+            runner.learn(iterations)
         if isinstance(runner.alg, GraphedPPO | GraphedDistillation):
             runner.alg.release()
     except RuntimeError as error:
