@@ -31,6 +31,7 @@ from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, ra
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run, require_task
 from legged_mw.rl.transfer import TEACHER, begin_with, check_start, keep_teacher, load_teacher, seat_teacher
+from legged_mw.sim.device import device_facts
 from legged_mw.sim.engines import pick_engine
 from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
@@ -108,7 +109,7 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     if device != "cpu":
         torch.cuda.set_device(device)
     seed_everything(task.train.seed + rank.index)  # every rank its own worlds, commands and noise
-    _announce(task, device, rank)
+    args.eager |= not _announce(task, device, rank)
     return start, device
 
 
@@ -144,14 +145,16 @@ def _note_others(task: LoadedTask, start: Start) -> None:
         print("symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it again")
 
 
-def _announce(task: LoadedTask, device: str, rank: Rank) -> None:
-    """Say what is trained on what; on a CPU also how long it may take."""
+def _announce(task: LoadedTask, device: str, rank: Rank) -> bool:
+    """Say what is trained on what, and what makes that slow; on a CPU how long it may take. Returns whether it can be recorded."""
     worlds, engine = task.cfg.env.num_envs, pick_engine(task.cfg.sim.engine, device)
     where = device if rank.count == 1 else f"each of {rank.count} {'processes' if device == 'cpu' else 'GPUs'}"
-    compiles = "; a first run compiles kernels, about a minute" if engine == "mujoco_warp" else ""
-    print(f"{task.name}: {worlds} worlds on {where}, engine {engine}{compiles}", flush=True)
+    print(f"{task.name}: {worlds} worlds on {where}, engine {engine}", flush=True)
+    facts = device_facts(device) if engine == "mujoco_warp" else None
+    for line in facts.slow() if facts else ():
+        print(line, flush=True)
     if device != "cpu":
-        return
+        return facts is None or facts.pool
     cores, runner = usable_cores(), task.train.runner
     steps = runner.max_iterations * worlds * runner.num_steps_per_env
     minutes = steps / (_STEPS_PER_CORE * cores) / 60
@@ -161,6 +164,7 @@ def _announce(task: LoadedTask, device: str, rank: Rank) -> None:
         f"{steps:,} steps; {slow}" if rough else f"{runner.max_iterations} iterations, {steps / 1e6:.1f} M steps, about {minutes:.0f} min"
     )
     print(f"{cores} cores: {plan}", flush=True)
+    return True
 
 
 def build(task: LoadedTask, start: Start, device: str, eager: bool, check_recordable: Check) -> Any:
