@@ -6,6 +6,8 @@ Each imports what it needs when it starts: deploy also runs where torch is not i
 from __future__ import annotations
 
 import sys
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 from legged_mw.utils.cli import fail, one_line_errors
@@ -83,7 +85,24 @@ def robot() -> None:
         main()
 
 
-PROGRAMS = {"train": train, "play": play, "deploy": deploy, "robot": robot}
+def _tool(name: str) -> Callable[[], None]:
+    """A program whose ``main`` does all."""
+
+    def start() -> None:
+        with one_line_errors():
+            import_module(name).main()
+
+    return start
+
+
+PROGRAMS = {
+    "train": train,
+    "play": play,
+    "deploy": deploy,
+    "robot": robot,
+    "motion": _tool("legged_mw.motion.__main__"),
+    "doctor": _tool("legged_mw.tools.doctor"),
+}
 
 
 def main() -> None:

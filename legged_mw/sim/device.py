@@ -44,7 +44,7 @@ def device_facts(device: str) -> DeviceFacts:
 
     wp.config.log_level = wp.LOG_WARNING
     wp.init()
-    here, cache = wp.get_device(device), Path(wp.config.kernel_cache_dir)
+    here, cache = wp.get_device(device), Path(wp.config.kernel_cache_dir or "")
     kind = f"*.sm{here.get_cuda_compile_arch()}*" if here.is_cuda else "*.cpu*.o"
     compiled = len({file.parent for file in cache.glob(f"wp_mujoco_warp*/{kind}")})
     if not here.is_cuda:
