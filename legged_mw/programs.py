@@ -101,6 +101,10 @@ PROGRAMS = {
     "deploy": deploy,
     "robot": robot,
     "motion": _tool("legged_mw.motion.__main__"),
+    "compare": _tool("legged_mw.tools.compare"),
+    "sweep": _tool("legged_mw.tools.sweep"),
+    "warm": _tool("legged_mw.tools.warm"),
+    "completion": _tool("legged_mw.tools.completion"),
     "doctor": _tool("legged_mw.tools.doctor"),
 }
 

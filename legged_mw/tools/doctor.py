@@ -81,7 +81,9 @@ def machine() -> Iterator[Finding]:
     yield Finding("Python", f"{version}, {sys.executable}", "" if fits else "legged_mw runs on Python 3.11, 3.12 and 3.13", needed=not fits)
     yield Finding("system", f"{platform.system()} {platform.release()}, {platform.machine()}")
     memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB of memory" if hasattr(os, "sysconf") else ""
-    yield Finding("cores", f"{usable_cores()} for this process, of {os.cpu_count()}{memory}")
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    busy = "others use this machine: what is measured now is slower than it could be" if load > usable_cores() + 0.5 else ""
+    yield Finding("cores", f"{usable_cores()} for this process, of {os.cpu_count()}{memory}; load {load:.1f}", busy)
     free = shutil.disk_usage(Path.cwd()).free / 2**30
     mend = "" if free > 1.0 else "a run writes up to a few hundred MB: free some disk, or start elsewhere"
     yield Finding("disk", f"{free:.1f} GiB free in {Path.cwd()}", mend)
@@ -132,7 +134,7 @@ def pictures() -> Iterator[Finding]:
     for name in ("egl", "osmesa", "glfw"):
         fault = gl_fault(name) or (draws(name) if name != "glfw" or has_display() else "no screen")
         works += [name] * (not fault)
-        yield Finding(name, "draws" if not fault else fault)
+        yield Finding(name, fault or "draws")
     mend = "" if works else "apt install libegl1 libegl-mesa0 (or libosmesa6): without one no video, picture or window; training needs none"
     yield Finding("MUJOCO_GL", chosen or "not set", mend)
     from legged_mw.view import video, web
@@ -151,8 +153,10 @@ def extras() -> Iterator[Finding]:
         ("cyclonedds", "cyclonedds", "to drive a Go2 or G1"),
         ("tensorboard", "tensorboard", "curves of a training"),
     ):
-        there = importlib.util.find_spec(module) is not None
-        yield Finding(package, _version(package) or "yes" if there else f"not installed ({what})", "" if there else f"pip install {package}")
+        if importlib.util.find_spec(module) is None:
+            yield Finding(package, f"not installed ({what})", f"pip install {package}")
+        else:
+            yield Finding(package, _version(package) or "yes")
     git = shutil.which("git")
     yield Finding("git", git or "not installed (a run of a clone then does not keep its diff)")
 
@@ -179,7 +183,11 @@ def _records(device: str) -> str:
     from legged_mw.sim.graph import StepGraph
 
     counter = torch.zeros((), device=device)
-    graph = StepGraph(lambda: counter.add_(1.0) and None, device)
+
+    def count() -> None:
+        counter.add_(1.0)
+
+    graph = StepGraph(count, device)
     try:
         for _ in range(5):
             graph()
