@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 
@@ -37,7 +38,12 @@ def train() -> None:
             print(task_page(task, Path(args.picture)))
         return
     examine = make_exam(task, env, args.eager) if training.wants_exam(task) else None
-    training.train(task, env, start, examine, export, args.deadline, args.verbose)
+    begun = None
+    if args.play:
+        from legged_mw.tools.alongside import watch
+
+        begun = partial(watch, task)
+    training.train(task, env, start, examine, export, args.deadline, args.verbose, begun)
 
 
 @one_line_errors()

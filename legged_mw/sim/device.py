@@ -28,10 +28,10 @@ class DeviceFacts(NamedTuple):
         if not self.compiled:
             lines.append("kernels are compiled at this first start, a minute or two; `legged-mw warm` does it beforehand")
         if self.memory and not self.pool:
-            lines.append("this GPU has no memory pool, so that nothing can be recorded: it is trained with --eager, several times as long")
+            lines.append("this GPU has no memory pool, so that nothing can be recorded: every kernel is launched anew, which takes several times as long")
         if self.cuda and self.cuda < GRAPHS_SINCE:
             has, since = (".".join(map(str, version)) for version in (self.cuda, GRAPHS_SINCE))
-            lines.append(f"the driver supports CUDA {has}, and recording is reliable from {since} on: update it, or say --eager")
+            lines.append(f"the driver supports CUDA {has}, and recording is reliable from {since} on: update it")
         if self.taken > _OTHERS:
             shared = "another process holds"
             lines.append(f"{shared} {self.taken:.0f} of {self.memory:.0f} GiB of this GPU: both run slower (nvidia-smi shows which)")
