@@ -102,16 +102,19 @@ def test_an_installed_package_drafts_a_task(installed: Path, tmp_path: Path) -> 
 
 
 def test_without_a_program_the_programs_are_named(tmp_path: Path) -> None:
-    for words, said in (
-        ([], "there are: train, play, deploy, robot"),
-        (["trian"], "no program 'trian'; there are: train, play, deploy, robot"),
-    ):
+    names = "train, play, deploy, robot, motion, doctor, compare, sweep, warm, completion"
+    for words, said in (([], f"there are: {names}"), (["trian"], f"no program 'trian', did you mean 'train'? there are: {names}")):
         command = [sys.executable, "-m", "legged_mw.programs", *words]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
         assert (done.returncode, done.stderr) == (2, f"legged-mw: {said}; e.g. legged-mw train --task go1_flat\n")
 
 
-def test_help_names_the_programs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_says_what_each_program_does(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["legged-mw", "--help"])
     programs.main()
-    assert capsys.readouterr().out.startswith("legged-mw train | play | deploy | robot ...; each has --help")
+    said = capsys.readouterr().out
+    assert said.startswith("legged-mw PROGRAM ...; each has --help, e.g. legged-mw train --help\n")
+    assert [line.split()[0] for line in said.splitlines()[1:]] == list(programs.PROGRAMS)
+    monkeypatch.setattr(sys, "argv", ["legged-mw", "--version"])
+    programs.main()
+    assert capsys.readouterr().out.startswith("legged_mw 0.")
