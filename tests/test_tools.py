@@ -93,7 +93,7 @@ def test_a_slow_start_has_its_reasons() -> None:
     assert compiles.startswith("kernels are compiled at this first start, a minute or two; `legged-mw warm`")
     assert shared == "another process holds 12 of 80 GiB of this GPU: both run slower (nvidia-smi shows which)"
     pool, driver = ready._replace(pool=False, cuda=(12, 2)).slow()
-    assert pool.startswith("this GPU has no memory pool, so that nothing can be recorded: every kernel is launched anew")
+    assert pool.startswith("this GPU has no memory pool: nothing can be recorded")
     assert driver == "the driver supports CUDA 12.2, and recording is reliable from 12.4 on: update it"
     cpu = device_facts("cpu")
     assert cpu.cuda is None and cpu.memory == cpu.taken == 0.0 and len(cpu.slow()) == (not cpu.compiled)
@@ -210,10 +210,8 @@ def test_compare_refuses_in_a_line(
 
 def test_axes_have_round_numbers() -> None:
     assert chart.ticks(0.0, 9.7, 5) == [0, 2, 4, 6, 8, 10] and chart.ticks(-0.3, 0.4, 4) == pytest.approx([-0.4, -0.2, 0, 0.2, 0.4])
-    assert (
-        chart.ticks(5.0, 5.0, 4)[0] < 5.0 < chart.ticks(5.0, 5.0, 4)[-1]
+    assert chart.ticks(5.0, 5.0, 4)[0] < 5.0 < chart.ticks(5.0, 5.0, 4)[-1]
     assert chart.chart("x", "y", [("red", [1.0], [float("nan")])]) == ""
-    )
     assert [chart.short(value) for value in (0.25, 5000.0, 20000.0, 1.5e6)] == ["0.25", "5000", "20k", "1.5M"]
     assert len(chart.thin([(float(i), 1.0) for i in range(1000)])) <= chart.POINTS
 
@@ -390,7 +388,7 @@ programs.train()
 
 def test_a_training_on_a_cpu_imports_what_it_needs(tmp_path: Path) -> None:
     """What costs time to import, and only some programs need."""
-    command = [sys.executable, "-c", WHAT_IS_THERE, *"--task go1_flat --device cpu --num_envs 8".split()]
+    command = [sys.executable, "-c", WHAT_IS_THERE, *["--task", "go1_flat", "--device", "cpu", "--num_envs", "8"]]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "NAMES": " ".join([*NOT_TO_TRAIN, "torch"])}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

@@ -28,9 +28,7 @@ class DeviceFacts(NamedTuple):
         if not self.compiled:
             lines.append("kernels are compiled at this first start, a minute or two; `legged-mw warm` does it beforehand")
         if self.memory and not self.pool:
-            lines.append(
-                "this GPU has no memory pool, so that nothing can be recorded: every kernel is launched anew, which takes several times as long"
-            )
+            lines.append("this GPU has no memory pool: nothing can be recorded, and a step takes several times as long")
         if self.cuda and self.cuda < GRAPHS_SINCE:
             has, since = (".".join(map(str, version)) for version in (self.cuda, GRAPHS_SINCE))
             lines.append(f"the driver supports CUDA {has}, and recording is reliable from {since} on: update it")
