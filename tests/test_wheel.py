@@ -7,11 +7,13 @@ import re
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from legged_mw import ROOT, programs
 
@@ -46,6 +48,45 @@ def start(installed: Path, folder: Path, *args: str) -> str:
     where, _, out = done.stdout.partition("\n")
     assert where == str(installed / "legged_mw/__init__.py")
     return out
+
+
+def test_the_sdist_holds_what_the_wheel_is_built_from_and_tested_with(tmp_path: Path) -> None:
+    """What git tracks, but for pictures and the folders of services."""
+    source, out = tmp_path / "source", tmp_path / "out"
+    out.mkdir()
+    subprocess.run(["git", "checkout-index", "--all", f"--prefix={source}/"], cwd=ROOT, check=True)
+    build = "import sys; from setuptools import build_meta; build_meta.build_sdist(sys.argv[1])"
+    done = subprocess.run([sys.executable, "-c", build, str(out)], cwd=source, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    [file] = out.iterdir()
+    with tarfile.open(file) as archive:
+        inside = {name.partition("/")[2] for name in archive.getnames()}
+    tracked = {str(path.relative_to(source)) for path in source.rglob("*") if path.is_file()}
+    left_out = {name for name in tracked - inside if not name.startswith((".", "docs/images/"))}
+    assert left_out <= {"mkdocs.yml"} and not any("__pycache__" in name for name in inside)
+    assert {"LICENSE", "constraints.txt", "tests/program.py", "resources/policies/go1_flat/policy.onnx"} <= inside
+
+
+def test_the_image_is_built_from_files_that_are_there_and_from_constraints() -> None:
+    lines = (ROOT / "Dockerfile").read_text().splitlines()
+    copied = [name for line in lines if line.startswith("COPY ") for name in line.split()[1:-1]]
+    assert {"legged_mw", "configs", "resources", "constraints.txt"} <= set(copied) and all((ROOT / name).exists() for name in copied)
+    [install] = [line for line in lines if "pip install" in line]
+    assert "--constraint /src/constraints.txt" in install and not set(copied) & set((ROOT / ".dockerignore").read_text().split())
+
+
+def test_the_same_version_everywhere() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text() and f"## {version} (" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_what_is_installed_by_constraints_fits_the_ranges() -> None:
+    pinned = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line)
+    pinned = {name.lower().replace("_", "-"): version for name, version in pinned.items()}
+    for text in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]:
+        requirement = Requirement(text)
+        assert requirement.specifier.contains(pinned[requirement.name]), text
+        assert any(spec.operator == ">=" for spec in requirement.specifier), f"{text}: from which version on was it tested?"
 
 
 def test_every_package_is_in_the_list() -> None:
