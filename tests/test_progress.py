@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from program import SMALL, run
 
+from legged_mw.eval import training
 from legged_mw.rl import progress
 from legged_mw.rl.progress import LOG_FILE, Console
 
@@ -94,7 +95,9 @@ def test_without_a_disk_the_training_goes_on(tmp_path: Path, capsys: pytest.Capt
     assert line.startswith("Learning iteration 1/2: ")
 
 
-def test_a_run_has_its_log_and_the_next_exam(tmp_path: Path) -> None:
+def test_a_run_has_its_log_and_the_next_exam(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, seconds in (("SECONDS", 0.06), ("SETTLING", 0.02), ("PUSH_AT", 0.02)):
+        monkeypatch.setattr(training, name, seconds)
     result = run("train", tmp_path, *SMALL, "--max_iterations", "3", "--set", "runner.exam_interval=2")
     assert result.code == 0, result.err
     until = [line.rpartition(", ")[2].partition(" in ")[0] for line in result.out.splitlines() if line.startswith("Learning")]

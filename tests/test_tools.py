@@ -388,7 +388,7 @@ programs.train()
 
 def test_a_training_on_a_cpu_imports_what_it_needs(tmp_path: Path) -> None:
     """What costs time to import, and only some programs need."""
-    command = [sys.executable, "-c", WHAT_IS_THERE, *["--task", "go1_flat", "--device", "cpu", "--num_envs", "8"]]
+    command = [sys.executable, "-c", WHAT_IS_THERE, *["--task", "go1_flat", "--device", "cpu", "--num_envs", "8", "--eager"]]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "NAMES": " ".join([*NOT_TO_TRAIN, "torch"])}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
