@@ -34,10 +34,7 @@ class GetupCfg(RobotTaskCfg):
         pull_fades: float = 0.2  # of it, when every world has ended an episode up [ours]
 
     class control(RobotTaskCfg.control):
-        action_scale = 0.5  # [rad] [P, H: of the present angles; ours: of the default pose, where action 0 stands]
-
-    class normalization(RobotTaskCfg.normalization):
-        clip_actions = 4.0  # [ours: the servos' whole torque, wherever the joints are]
+        action_origin, action_scale = "joints", 0.5  # [P, H: about the default pose noise turns no robot over], [rad] [P]
 
     class observations(RobotTaskCfg.observations):
         leave_out = {"state": ["base_lin_vel"]}  # [P]
@@ -74,7 +71,7 @@ class GetupCfgPPO(RobotTaskCfgPPO):
         hidden_dims = [256, 128, 64]  # [ours]
 
         class distribution_cfg(RobotTaskCfgPPO.actor.distribution_cfg):
-            init_std, std_range = 0.6, [0.2, 1e6]  # [ours: those that stand want less noise, before the others have found how to turn over]
+            init_std, std_range = 1.0, [0.2, 1e6]  # [ours: those that stand want less noise, before the others have found how to turn over]
 
     class algorithm(RobotTaskCfgPPO.algorithm):
         gamma, num_mini_batches, entropy_coef = 0.98, 8, 0.01  # [P 0.97], [ours], [P]

@@ -27,10 +27,10 @@ class HandstandCfg(RobotTaskCfg):
         hands: list[str] = []  # geoms that stand: nothing else may touch the ground
 
     class control(RobotTaskCfg.control):
-        action_scale = 0.5  # [rad] [ours, of the default pose; P 0.3 of the last targets, which wander, and no row says where they are]
+        action_origin, action_scale = "targets", 0.3  # [rad] [P]
 
     class normalization(RobotTaskCfg.normalization):
-        clip_actions = 4.0  # [ours: the thighs turn by 1.6 rad]
+        clip_actions = 1.0  # [P: a tanh]
 
     class observations(RobotTaskCfg.observations):
         leave_out = {"state": ["base_lin_vel"]}  # [ours, P reads it: no sensor of the robot gives it]
@@ -63,7 +63,7 @@ class HandstandCfgPPO(RobotTaskCfgPPO):
         hidden_dims = [256, 128, 64]  # [ours]
 
         class distribution_cfg(RobotTaskCfgPPO.actor.distribution_cfg):
-            init_std, std_range = 0.8, [0.15, 1e6]  # [ours]
+            init_std, std_range = 0.6, [0.1, 1e6]  # [ours]
 
     class algorithm(RobotTaskCfgPPO.algorithm):
         num_mini_batches, entropy_coef = 8, 0.01  # [ours]
