@@ -104,7 +104,7 @@ DEPLOY_MAY = [
         "legged_mw.eval.skills",
     ),
     *("legged_mw.utils.cli", "legged_mw.utils.config", "legged_mw.utils.errors", "legged_mw.utils.machine", "legged_mw.utils.commands"),
-    *("legged_mw.utils.motor_network", "legged_mw.utils.files", "legged_mw.utils.clip"),
+    *("legged_mw.utils.motor_network", "legged_mw.utils.files", "legged_mw.utils.clip", "legged_mw.utils.mjcf"),
     *sys.stdlib_module_names,
 ]
 

@@ -423,7 +423,7 @@ def test_worlds_grow_with_the_cores_up_to_the_tasks_own_number() -> None:
     ("words", "line"),
     [
         (["--engine", "physx"], "--engine: sim.engine must be Literal['auto', 'mujoco_warp', 'mujoco'], not 'physx' (str)"),
-        (["--set", "sim.threads=-1"], "sim.threads is -1; it must be zero or more"),
+        (["--set", "sim.threads=-1"], "sim.threads is -1; it must be from 0 to 1024"),
     ],
 )
 def test_engine_that_cannot_be(tmp_path: Path, words: list[str], line: str) -> None:

@@ -66,8 +66,8 @@ def test_configs_robots_and_policies_are_inside(installed: Path) -> None:
     assert {path.name for path in installed.iterdir()} == {"legged_mw", points.parent.name}  # `configs` is nobody's top level
 
 
-def test_an_installed_package_trains_the_readmes_task_and_logs_where_it_is_started(installed: Path, tmp_path: Path) -> None:
-    [code] = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+def test_an_installed_package_trains_the_task_of_the_first_page_and_logs_where_it_is_started(installed: Path, tmp_path: Path) -> None:
+    [code] = re.findall(r"```python\n(.*?)```", (ROOT / "docs/index.md").read_text(), re.DOTALL)
     home = tmp_path / "robots"
     home.mkdir()
     (home / "go1_gentle.py").write_text(code)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
 from torch import Tensor
 
@@ -9,17 +11,20 @@ from legged_mw.envs.pull import Pull
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.skill_config import SkillCfg
 from legged_mw.sim.settle import fallen
+from legged_mw.utils.bounds import Count, Part, Share, Whole, above
 from legged_mw.utils.math import assign
+
+Settling = Annotated[float, above(0, 60, "s")]
 
 
 class FallsCfg(SkillCfg):
     class falls:
-        share: float = 0.75  # of episodes that begin in a fall; the others stand [P 0.6]
-        states: int = 2048  # settled falls to begin from; at most four a world are made [ours]
-        seconds: float = 1.0  # from the drop to the state [P 0.5; ours: a roll takes longer]
-        seed: int = 1  # the same seed makes the same falls; the exam has its own
-        pull: float = 0.0  # share of the weight that lifts the root of a robot that is not up; it fades as they learn [H 0.6]
-        pull_fades: float = 0.2  # of it, when every world has ended an episode up [ours]
+        share: Share = 0.75  # of episodes that begin in a fall; the others stand [P 0.6]
+        states: Count = 2048  # settled falls to begin from; at most four a world are made [ours]
+        seconds: Settling = 1.0  # from the drop to the state [P 0.5; ours: a roll takes longer]
+        seed: Whole = 1  # the same seed makes the same falls; the exam has its own
+        pull: Share = 0.0  # share of the weight that lifts the root of a robot that is not up; it fades as they learn [H 0.6]
+        pull_fades: Part = 0.2  # of it, when every world has ended an episode up [ours]
 
 
 class Falls(RobotTask):

@@ -11,6 +11,7 @@ from torch import Tensor
 from legged_mw.envs.falls import Falls, FallsCfg
 from legged_mw.envs.observations import Row
 from legged_mw.envs.skill_config import SkillCfgPPO
+from legged_mw.utils.bounds import Seconds
 
 UP_TILT, UP_HEIGHT = 0.966, 0.9  # cosine of the tilt (15 degrees), share of the standing height: it is up [ours: servos alone hold 0.92]
 
@@ -23,7 +24,7 @@ class GetupCfg(FallsCfg):
         self_collisions = True  # and all colliders touch the ground [P]
 
     class control(FallsCfg.control):
-        action_origin, action_scale = "joints", 0.5  # [P, H: about the default pose noise turns no robot over], [rad] [P]
+        action_origin, action_scale = "joints", 0.5  # [P, H: about the default pose noise turns no robot over; docs/skills.md], [rad] [P]
 
     class termination(FallsCfg.termination):
         max_tilt = 180.0  # [deg]: no attitude ends an episode [P, H]
@@ -33,7 +34,7 @@ class GetupCfg(FallsCfg):
         stiffness, damping, strength = [0.9, 1.1], [0.9, 1.1], [0.9, 1.1]  # [H 0.85 to 1.15]
 
     class exam:
-        within: float = 3.0  # [s] in which it must stand
+        within: Seconds = 3.0  # [s] in which it must stand
 
     class rewards(FallsCfg.rewards):
         only_positive_rewards = False  # [ours, P True: nothing ends an episode, and while it thrashes all would be clipped]
@@ -68,7 +69,7 @@ class Getup(Falls):
         self.up.copy_((self.upright > UP_TILT) & (self.base_height > UP_HEIGHT * self.up_height))
 
     def _body_rows(self) -> list[Row]:
-        return [*super()._body_rows(), Row("base_height", self.base_height[:, None], mirror="scalar")]  # [m] [P]
+        return [*super()._body_rows(), Row("base_height", self.base_height[:, None], mirror="scalar")]  # above the ground [m] [P]
 
     def _near_upright(self) -> Tensor:
         return torch.exp(-4.0 * (1.0 - self.upright))  # exp(-2 |g + z|^2) of unit vectors [P]

@@ -247,7 +247,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
             Row("accelerometer", self.accelerometer, mirror="polar"),  # proper acceleration at the IMU [m/s^2]
             Row("projected_gravity", self.projected_gravity, mirror="polar"),
             Row("base_lin_vel", self.base_lin_vel, mirror="imu_velocity"),
-            Row("base_ang_vel_world", self.base_ang_vel_world, mirror="axial"),  # the world mirrors about its own x-z plane
+            Row("base_ang_vel_world", self.base_ang_vel_world, mirror="axial"),  # [rad/s]; the world mirrors about its own x-z plane
             Row("dof_pos", self.dof_offset, mirror="joint"),
             Row("dof_vel", self.dof_vel, mirror="joint"),
             Row("torques", self.torques, mirror="joint"),  # [N m]

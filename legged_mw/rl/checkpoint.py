@@ -37,7 +37,11 @@ def damage(content: bytes) -> str:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             if note := archive.comment:
-                return "" if sealed(content[: -len(note) - 2] + b"\0\0") == content else "it is damaged: its SHA-256 is another than the one in it"
+                return (
+                    ""
+                    if sealed(content[: -len(note) - 2] + b"\0\0") == content
+                    else "it is damaged: its SHA-256 is another than the one in it"
+                )
             if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
                 return "it is damaged: parts of it are compressed"
             return f"it is damaged: the checksum of its part {part} is wrong" if (part := archive.testzip()) else ""

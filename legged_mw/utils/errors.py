@@ -18,6 +18,10 @@ class UserError(Exception):
     """A mistake in what was asked, or something that the machine lacks; the text says what exists and what to do."""
 
 
+class ConfigError(UserError, TypeError):
+    """A field or file of a config: which one, where that was written, what exists, what to write."""
+
+
 class StepError(UserError):
     """A task's step goes wrong in the user's code: ``what`` is wrong and what to write instead, and ``where`` it stands."""
 

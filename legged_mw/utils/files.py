@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+import os
+import re
+import shutil
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -41,6 +45,58 @@ def find_file(cfg: Any, path: str, one: str = "") -> Path:
     if written.is_absolute():
         raise UserError(f"{path}: no file at {written}; an absolute path is of one machine: name the file relative to the task's")
     raise UserError(f"{path}: no file '{written}' in {', '.join(map(str, places))}")
+
+
+STAGED = ".export.new"  # in an export's folder: the files of a newer one, all of them, on the way to their places
+
+
+def finish_moving(folder: Path) -> None:
+    """Move the files of an export that is whole to their places, where a kill came in between; an empty one leaves none there.
+
+    Raises UserError where the folder cannot be written to. Any number of programs may do it at once.
+    """
+    staged = folder / STAGED
+    try:
+        if not staged.is_dir() or staged.is_symlink():
+            return
+        for file in sorted(staged.iterdir(), key=lambda file: (file.suffix == ".yaml", file.name)):
+            with suppress(FileNotFoundError):  # somebody else has just moved it
+                if file.stat().st_size:
+                    os.replace(file, folder / file.name)
+                else:
+                    (folder / file.name).unlink(missing_ok=True)
+                    file.unlink()
+        with suppress(FileNotFoundError):
+            staged.rmdir()
+    except OSError as error:
+        raise UserError(f"{folder}: a newer export is on its way into it and cannot be finished: {error.strerror or error}") from None
+
+
+def flush(path: Path) -> None:
+    """Have a file, or a folder's list of files, on the disk itself, where a power cut does not reach it."""
+    opened = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
+
+
+def sweep(folder: Path) -> None:
+    """Remove what programs that were killed left half written in ``folder``: ``.NAME.PID.tmp`` of a process that is gone."""
+    for path in folder.glob(".*.tmp"):
+        name = re.fullmatch(r"\.(export|.+\.(?:pt|yaml))\.(\d{1,9})\.tmp", path.name)
+        if name and not _lives(int(name[2])):
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
+
+
+def _lives(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except OSError:  # it is another user's
+        return True
+    return True
 
 
 def digest(file: Path) -> str:

@@ -1,11 +1,61 @@
-"""What this process may use of the machine it runs on."""
+"""What this process may use of the machine it runs on, and what a call in it may take."""
 
 from __future__ import annotations
 
 import os
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 
 def usable_cores() -> int:
     """CPU cores of this process: those it may run on, shared with the other processes that torchrun started here."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+
+
+def contained(work: Callable[[], Any], seconds: float, room: int, stop: Callable[[], None] = lambda: None) -> Any:
+    """What ``work`` returns, or raises, within that time and ``room`` [byte] of new memory; for a call that a stranger's file decides.
+
+    Past its time it is asked to ``stop``, and a TimeoutError raised; if it does not, it is left behind. Memory is limited on Linux.
+    """
+    ended: list[tuple[Any, BaseException | None]] = []
+
+    def run() -> None:
+        try:
+            ended.append((work(), None))
+        except BaseException as error:
+            ended.append((None, error))
+
+    thread = threading.Thread(target=run, daemon=True)
+    with _room(room):
+        thread.start()
+        thread.join(seconds)
+        if late := thread.is_alive():
+            stop()
+            thread.join(1.0)
+    if late:
+        raise TimeoutError(f"it has not ended within {seconds:g} s")
+    [(value, error)] = ended
+    if error:
+        raise error
+    return value
+
+
+@contextmanager
+def _room(size: int) -> Iterator[None]:
+    """Meanwhile the process may take ``size`` [byte] more than it has."""
+    if not Path("/proc/self/statm").exists():
+        yield
+        return
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    most = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() + size
+    resource.setrlimit(resource.RLIMIT_AS, (most if soft == resource.RLIM_INFINITY else min(most, soft), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
