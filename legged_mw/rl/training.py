@@ -26,7 +26,6 @@ from legged_mw.rl.classes import check_classes
 from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.progress import LOG_FILE
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
