@@ -35,7 +35,8 @@ def train() -> None:
             print(task_page(task, Path(args.picture)))
         return
     examine = make_exam(task, env, args.eager) if training.wants_exam(task) else None
-    training.train(task, env, start, examine, export, args.deadline)
+    if not training.train(task, env, start, examine, export, args.deadline):
+        raise SystemExit(training.STOPPED)
 
 
 @one_line_errors()

@@ -186,6 +186,7 @@ class RobotTaskCfgPPO(Config):
         num_steps_per_env: int = 24  # control steps a world between two updates [P]
         max_iterations: int = 300  # [ours: a robot of one's own shows something by then]
         save_interval: int = 50  # [iterations] between checkpoints
+        keep_checkpoints: int = 0  # newest ones that stay; 0: all [ours]
         exam_interval: int = (
             200  # [iterations] between small exams, and one at the end; 0, or more than max_iterations: none [ours: docs/grading.md]
         )
