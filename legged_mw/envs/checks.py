@@ -127,9 +127,8 @@ LEARNER: dict[str, Rule] = {
     "actor.concurrent.teacher_share": ("above 0 and at most 1", lambda v: 0 < v <= 1),
     **dict.fromkeys(("distillation.learning_rate", "distillation.num_learning_epochs", "distillation.gradient_length"), POSITIVE),
     **dict.fromkeys(("distillation.init_std", "warm_start.init_std"), POSITIVE),
-    **dict.fromkeys(
-        ("runner.exam_interval", "runner.keep_checkpoints", "distillation.max_grad_norm", "warm_start.critic_warmup"), NOT_NEGATIVE
-    ),
+    **dict.fromkeys((f"runner.{name}" for name in ("exam_interval", "keep_checkpoints")), NOT_NEGATIVE),
+    **dict.fromkeys(("distillation.max_grad_norm", "warm_start.critic_warmup"), NOT_NEGATIVE),
     "runner.run_name": ("part of a folder's name, without / or \\", lambda v: "/" not in v and "\\" not in v),
 }
 

@@ -33,19 +33,12 @@ class Health:
             cause = f"{' and '.join(brought[:4])} held what is not finite or beyond {BOUND:g}" if brought else "loss or weights"
             warnings.append(f"the update was not finite ({cause}) and is undone: {self._row} in a row, {self.undone} so far")
             if self._row >= IN_A_ROW:
-                advice = (
-                    "look at how that is computed" if brought else "lower algorithm.learning_rate, and look for a reward without a bound"
-                )
-                return (
-                    warnings,
-                    f"{IN_A_ROW} updates in a row were not finite ({cause}); the networks are those of the last good one; {advice}",
-                )
+                advice = "look at how that is computed" if brought else "lower algorithm.learning_rate; look for rewards without a bound"
+                kept = "the networks are those of the last good one"
+                return warnings, f"{IN_A_ROW} updates in a row were not finite ({cause}); {kept}; {advice}"
         if self._sick >= IN_A_ROW:
-            share = f"{found[worst]:.0f} of {steps} steps of a world"
-            return (
-                warnings,
-                f"{worst} is not finite, or beyond {BOUND:g}, in {share}, for {IN_A_ROW} iterations; look at how it is computed",
-            )
+            share = f"{found[worst]:.0f} of {steps} steps of a world, for {IN_A_ROW} iterations"
+            return warnings, f"{worst} is not finite, or beyond {BOUND:g}, in {share}; look at how it is computed"
         return warnings, ""
 
     def _by_name(self, counts: Sequence[float]) -> dict[str, float]:
@@ -62,6 +55,5 @@ class Health:
         before, self._said[name] = self._said.get(name, 0.0), total
         if before and len(str(int(before))) == len(str(int(total))):
             return ""
-        return (
-            f"{name} was not finite, or beyond {BOUND:g}, in {count:.0f} of {steps} steps of a world; 0 took its place ({total:.0f} so far)"
-        )
+        share = f"{count:.0f} of {steps} steps of a world"
+        return f"{name} was not finite, or beyond {BOUND:g}, in {share}; 0 took its place ({total:.0f} so far)"

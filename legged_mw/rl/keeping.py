@@ -24,28 +24,28 @@ LOCK_FILE = ".lock"
 
 
 class RunLock:
-    """That this process trains in a folder. It ends with the process, however that ends; what the last one left half written is swept."""
+    """That this process trains in a folder. It ends with the process, however that ends."""
 
     def __init__(self, folder: Path) -> None:
-        """Raises ConfigError if another process has it."""
-        self._file = open(folder / LOCK_FILE, "a+")  # noqa: SIM115 (open until it is released)
-        if fcntl is None:
-            return
+        """Raises ConfigError if another process has it, OSError if nothing can be written there."""
+        self._folder, self._file = folder, open(folder / LOCK_FILE, "a+")  # noqa: SIM115 (open until it is released)
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if fcntl:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             self._file.seek(0)
             who = self._file.read().strip() or "another process"
             self._file.close()
-            raise ConfigError(
-                f"{shown(folder)} is being trained by {who}; wait for its end, or stop it, or name another --load_run"
-            ) from None
+            raise ConfigError(f"{shown(folder)} is being trained by {who}; wait for its end, stop it, or name another run") from None
         except OSError as error:  # a file system without locks
             print(f"WARNING: {shown(folder)} cannot be locked ({error.strerror}): do not resume it while it trains", flush=True)
+
+    def begin(self) -> None:
+        """Say who it is, and sweep what a process that was killed left half written."""
         self._file.truncate(0)
         self._file.write(f"process {os.getpid()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
         self._file.flush()
-        for torn in folder.glob(".*.tmp"):
+        for torn in self._folder.glob(".*.tmp"):
             torn.unlink(missing_ok=True)
 
     def __enter__(self) -> Self:
@@ -66,7 +66,7 @@ class Keeper:
     """Writes what a training needs to go on, as often as asked; what cannot be written is said, and the training goes on in memory."""
 
     def __init__(self, folder: Path, keep: int, rank: Rank, prepare: Callable[[], bool] = lambda: False) -> None:
-        """``keep`` newest checkpoints; 0: all. ``prepare`` makes the folder anew, with what else belongs there, if it is gone, and says so."""
+        """``keep`` newest checkpoints; 0: all. ``prepare`` makes the folder and what else belongs there, if it is gone, and says so."""
         self.folder, self._keep, self._rank, self._prepare = folder, keep, rank, prepare
         self.failed = ""  # why the newest checkpoint could not be written, '' if it could
         self.written: Path | None = None  # the newest one that could

@@ -28,16 +28,12 @@ def worlds_file(checkpoint: Path, rank: Rank) -> Path:
 
 def worlds_content(runner: Any) -> dict[str, Any]:
     """What to write: tensors and plain numbers only."""
-    return {
-        **_kind(runner.env),
-        "random_state": random_state(runner.device),
-        "worlds": worlds_state(runner.env),
-        "memories": _memories(runner),
-    }
+    random = random_state(runner.device)
+    return {**_kind(runner.env), "random_state": random, "worlds": worlds_state(runner.env), "memories": _memories(runner)}
 
 
 def take_worlds(runner: Any, checkpoint: Path, rank: Rank, random: dict[str, Tensor]) -> str:
-    """Put worlds and memories of ``runner`` back as they were at ``checkpoint``, whose generators were as ``random``. Returns why not, or ''."""
+    """Put worlds and memories back as they were at ``checkpoint``, whose generators were as ``random``; returns why not, or ''."""
     file = worlds_file(checkpoint, rank)
     if not file.is_file():
         return f"there is no {file.name} beside it"

@@ -44,8 +44,8 @@ class Runner(OnPolicyRunner):
 
     ``current_learning_iteration`` counts finished iterations: a checkpoint ``model_100.pt`` has done 100 of them, and a
     resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after the iteration and a checkpoint;
-    ``diverged`` says why the runner set it by itself, ``begins_anew`` why ``load`` did not find the worlds of a checkpoint. Set ``examine`` to what grades a policy: it is called every ``exam_interval`` iterations and
-    after the last, and its figures are logged.
+    ``diverged`` says why the runner set it by itself, ``begins_anew`` why ``load`` did not find the worlds of a checkpoint. Set
+    ``examine`` to what grades a policy: it is called every ``exam_interval`` iterations and after the last, and its figures are logged.
     """
 
     env: RobotTask
@@ -244,12 +244,11 @@ class Runner(OnPolicyRunner):
 
     def _stored_names(self) -> list[str]:
         """What the columns are that an update learns from, in words: of each observation group, then the rewards'."""
-        table = self.env.observations
+        table, names = self.env.observations, []
         rows = {group: [row.name for row in table.rows(group) for _ in range(row.size)] for group in table.groups}
-        names = [rows[group][i] if group in rows else f"of column {i}" for group, i in self._undo.columns]
-        return [f"observation row '{name}' of '{group}'" for name, (group, _) in zip(names, self._undo.columns, strict=True)] + [
-            "the rewards"
-        ]
+        for group, i in self._undo.columns:
+            names.append(f"observation row '{rows[group][i]}' of '{group}'" if group in rows else f"observation group '{group}'")
+        return [*names, "the rewards"]
 
     # ---- curves: what they are written to may fail, and training goes on ---------------------------------------------
 

@@ -25,7 +25,7 @@ from legged_mw.envs.checks import check_values
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.distillation import GraphedDistillation
-from legged_mw.rl.keeping import Keeper, RunLock, reason_of
+from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
 from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
@@ -121,8 +121,8 @@ def _resume(task: LoadedTask, args: argparse.Namespace) -> Start:
     experiment = experiment_folder(task, args.experiment_name)
     run = find_run(experiment, args.load_run or "-1")
     start, config = Start(experiment, run, find_checkpoint(run, args.checkpoint)), run / CONFIG_FILE
-    if start.continues() and this_rank().leads and not args.check:
-        RunLock(run).release()  # else it is known only after the environment is made
+    if start.continues() and this_rank().leads and not args.check and (run / LOCK_FILE).is_file():
+        _lock(run).release()  # else it is known only after the environment is made
     for section in task.update_from_run(load_yaml(config), where=shown(config)):
         print(f"{shown(config)} is older than the section {section}: left as it was then")
     return start
@@ -199,7 +199,7 @@ def train(task: LoadedTask, env: RobotTask, start: Start, examine: Examine | Non
     rank, runner = this_rank(), make_runner(env, task.train, None, str(env.device), teacher)
     runner.examine = examine
     with ExitStack() as held:
-        lock = held.enter_context(RunLock(start.run)) if start.run and rank.leads and start.continues() else None
+        lock = held.enter_context(_lock(start.run)) if start.run and rank.leads and start.continues() else None
         left = _load(runner, task, start)
         folder = _open_run(runner, task, start, rank, held, lock)
         _stop_on_signals(runner, deadline)
@@ -253,6 +253,14 @@ def _begin(runner: Runner, start: Start) -> None:
             print(f"the critic learns alone for {warmup} iterations (warm_start.critic_warmup)", flush=True)
 
 
+def _lock(run: Path) -> RunLock:
+    """Raises ConfigError if ``run`` is being trained, or cannot be."""
+    try:
+        return RunLock(run)
+    except OSError as error:
+        raise ConfigError(f"{shown(run)} cannot be written: {reason_of(error)}") from None
+
+
 def _open_run(runner: Runner, task: LoadedTask, start: Start, rank: Rank, held: ExitStack, lock: RunLock | None) -> Path:
     """The folder that this training writes to, with the config in it; an earlier checkpoint begins a folder of its own.
 
@@ -265,6 +273,7 @@ def _open_run(runner: Runner, task: LoadedTask, start: Start, rank: Rank, held: 
         if not lock or lock.lost():
             folder[0].mkdir(parents=True, exist_ok=True)
             lock = held.enter_context(RunLock(folder[0]))
+        lock.begin()
         save_yaml(folder[0] / CONFIG_FILE, task.to_dict())
         if start.teacher:
             keep_teacher(start.teacher, folder[0])

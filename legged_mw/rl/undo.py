@@ -58,7 +58,8 @@ class Undo:
         self.undone.copy_(~sound)
         for kind, before, after in states:
             parts = torch.where(sound.to(after.device), after, before).split([value.numel() for value in kind])
-            torch._foreach_copy_(kind, [part.view_as(value) for part, value in zip(parts, kind, strict=True)])
+            shaped = [part.view_as(value) for part, value in zip(parts, kind, strict=True)]
+            torch._foreach_copy_(kind, shaped)  # pyright: ignore[reportPrivateImportUsage]
         del self._before
 
 
