@@ -6,6 +6,7 @@ import contextlib
 import io
 import signal
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,17 +65,24 @@ def files(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
-def refused(root: Path, program: str, *args: str) -> str:
-    """The one line that ``program`` ends with; nothing may have been written."""
-    before = files(root)
+@contextlib.contextmanager
+def stopped_at_work() -> Iterator[None]:
+    """What is refused never comes to train, play, grade or export, which would run for minutes: here that is an error."""
 
     def begin(*_: object, **__: object) -> None:
-        raise AssertionError("it was not refused")  # and would run for minutes
+        raise AssertionError("it was not refused")
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Runner, "learn", begin)
         for owner, name in ((launch, "watch"), (grading, "make_column"), (programs, "export")):
             patch.setattr(owner, name, begin)
+        yield
+
+
+def refused(root: Path, program: str, *args: str) -> str:
+    """The one line that ``program`` ends with; nothing may have been written."""
+    before = files(root)
+    with stopped_at_work():
         result = run(program, root, *args)
     assert result.code == 2, result
     assert files(root) == before

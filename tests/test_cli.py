@@ -248,7 +248,8 @@ def test_damaged_checkpoint(first: Path, tmp_path: Path, program: str, damage: s
     more = ["--resume", "--max_iterations", "2"] if program == "train" else []
     line = refused(tmp_path, program, *TASK, "--device", "cpu", *more)
     said = {"other": "is not a checkpoint of this project: it has no actor_state_dict", "keyless": "does not fit this task: actor "}
-    assert f"model_1.pt {said.get(damage, 'cannot be read as a checkpoint: it is damaged, or holds more than tensors and numbers')}" in line
+    said["code"] = "cannot be read as a checkpoint: it is damaged, or holds more than tensors and numbers"
+    assert f"model_1.pt {said.get(damage, 'cannot be read as a checkpoint: it is damaged: File is not a zip file')}" in line
     assert ("is missing there and " in line) == (damage == "keyless")
     assert not (tmp_path / "evil").exists()
 

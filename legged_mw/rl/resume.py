@@ -6,6 +6,7 @@ goes after it, so that a kill at any moment leaves the newest checkpoint with it
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.worlds import put_worlds, worlds_state
+from legged_mw.rl.checkpoint import damage
 from legged_mw.rl.ranks import Rank
 from legged_mw.rl.recurrent import HiddenStates
 
@@ -38,7 +40,9 @@ def take_worlds(runner: Any, checkpoint: Path, rank: Rank, random: dict[str, Ten
     if not file.is_file():
         return f"there is no {file.name} beside it"
     try:
-        content = torch.load(file, map_location="cpu", weights_only=True)
+        if why := damage(written := file.read_bytes()):
+            return f"{file.name} cannot be read: {why}"
+        content = torch.load(io.BytesIO(written), map_location="cpu", weights_only=True)
         there, here = ({key: content[key] for key in ("engine", "device", "config")}, _kind(runner.env))
         state, worlds, memories = (dict(content[key]) for key in ("random_state", "worlds", "memories"))
     except Exception:  # a zip, pickle or tensor error, by how the file is broken

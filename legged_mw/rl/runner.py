@@ -22,6 +22,7 @@ from legged_mw.envs.divergence import Watch
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.envs.wording import config_words
+from legged_mw.rl.checkpoint import check_resume
 from legged_mw.rl.estimator import RegressingModel
 from legged_mw.rl.health import Health
 from legged_mw.rl.keeping import Keeper, reason_of
@@ -313,6 +314,7 @@ class Runner(OnPolicyRunner):
         if not {f"{second}_state_dict", "optimizer_state_dict"} <= content.keys():
             raise ConfigError(f"{path} holds an actor only; it can be played, but not resumed")
         check_fit(content[f"{second}_state_dict"], other.state_dict(), Path(path), second)
+        check_resume(content, Path(path), self.alg.optimizer, self.env.training_state())
         if self.alg.load(content, load_cfg, strict):
             self.current_learning_iteration = content["iter"]
         if isinstance(self.alg, GraphedPPO):  # as in the last update: the first one may be the first after a warm-up

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import re
+from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from legged_mw.rl.checkpoint import EARLIER, check_content, damage, sealed
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import shown, unknown
 from legged_mw.utils.task import LoadedTask, task_names
@@ -42,15 +45,19 @@ def new_run(experiment: Path, run_name: str) -> Path:
 
 
 def runs(experiment: Path) -> list[Path]:
-    """Run folders that hold a checkpoint, oldest first by the time of their newest checkpoint."""
-    found = [folder for folder in experiment.glob("*") if folder.is_dir() and checkpoints(folder)]
-    return sorted(found, key=lambda folder: max(path.stat().st_mtime_ns for path in checkpoints(folder).values()))
+    """Run folders that hold a checkpoint, oldest first by the time of their newest checkpoint. What cannot be read is none."""
+    found: dict[Path, int] = {}
+    for folder in experiment.glob("*"):
+        with suppress(OSError):  # a link to itself, a folder of another user's, a checkpoint that is thinned out as it is looked at
+            if there := checkpoints(folder):
+                found[folder] = max(path.stat().st_mtime_ns for path in there.values())
+    return sorted(found, key=lambda folder: found[folder])
 
 
 def checkpoints(run: Path) -> dict[int, Path]:
     """Iteration -> checkpoint of a run, in rising order."""
-    found = {int(m[1]): path for path in run.glob("model_*.pt") if (m := re.fullmatch(r"model_(\d+)\.pt", path.name))}
-    return dict(sorted(found.items()))
+    named = {path: re.fullmatch(r"model_(\d{1,18})\.pt", path.name) for path in run.glob("model_*.pt")}
+    return dict(sorted((int(match[1]), path) for path, match in named.items() if match and path.is_file()))
 
 
 def find_run(experiment: Path, name: str) -> Path:
@@ -104,11 +111,12 @@ def require_task(args: argparse.Namespace, parser: argparse.ArgumentParser) -> N
 
 
 def save_whole(content: dict[str, Any], path: Path, sync: bool = True) -> None:
-    """Write a checkpoint so that a kill at any moment leaves either all of it or nothing; with ``sync`` a power cut too."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    """Write a checkpoint, with its checksum, so that a kill at any moment (``sync``: a power cut too) leaves all of it or nothing."""
+    temporary, archive = path.with_name(f".{path.name}.{os.getpid()}.tmp"), io.BytesIO()
+    torch.save(content, archive)
     try:
         with open(temporary, "wb") as file:
-            torch.save(content, file)
+            file.write(sealed(archive.getvalue()))
             file.flush()
             if sync:
                 os.fsync(file.fileno())
@@ -118,22 +126,31 @@ def save_whole(content: dict[str, Any], path: Path, sync: bool = True) -> None:
 
 
 def load_tensors(path: Path, device: str) -> dict[str, Any]:
-    """Read a checkpoint without running code from it (``weights_only``)."""
+    """Read a checkpoint, whole and of finite numbers, without running code from it (``weights_only``). Raises ConfigError."""
     try:
-        content = torch.load(path, map_location=device, weights_only=True)
+        written = path.read_bytes()
     except FileNotFoundError:
         raise ConfigError(f"no checkpoint at {path}") from None
+    except OSError as error:
+        raise ConfigError(f"{path} cannot be read: {error.strerror}") from None
+    why = damage(written)
+    try:
+        content = None if why else torch.load(io.BytesIO(written), map_location=device, weights_only=True)
     except Exception:  # a zip, pickle or tensor error, by how the file is broken; torch's own advice is to load it unsafely
-        raise ConfigError(f"{path} cannot be read as a checkpoint: it is damaged, or holds more than tensors and numbers") from None
-    if not isinstance(content, dict) or not {"actor_state_dict", "student_state_dict"} & content.keys():
-        raise ConfigError(f"{path} is not a checkpoint of this project: it has no actor_state_dict")
-    return content
+        why = "it is damaged, or holds more than tensors and numbers"
+    if why:
+        raise ConfigError(f"{path} cannot be read as a checkpoint: {why}; {EARLIER}")
+    return check_content(content, path)
 
 
 def check_fit(saved: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], path: Path, what: str) -> None:
     """One clear line if the parameters in a checkpoint are not those of the network that config makes."""
     for name in [*wanted, *saved]:
         here, there = wanted.get(name), saved.get(name)
-        if here is None or there is None or here.shape != there.shape:
+        if here is None or there is None or here.shape != there.shape or here.is_floating_point() != there.is_floating_point():
             shapes = ["missing" if t is None else str(tuple(t.shape)) for t in (there, here)]
+            if here is not None and there is not None and here.shape == there.shape:
+                shapes = [str(t.dtype).removeprefix("torch.") for t in (there, here)]
             raise ConfigError(f"{path} does not fit this task: {what} {name} is {shapes[0]} there and {shapes[1]} here")
+        if not bool(there.isfinite().all()):
+            raise ConfigError(f"{path}: {what} {name} has values that are not finite")

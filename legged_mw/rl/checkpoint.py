@@ -1,0 +1,179 @@
+"""What a checkpoint must be before anything of it is used: whole by its own checksum, its parts of the kind that training writes.
+
+Nothing is loaded into a network or an optimizer here.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import math
+import re
+import struct
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from legged_mw.utils.config import ConfigError
+
+_SEAL = b"sha256:"
+EARLIER = "an earlier one is named by --checkpoint"
+_KINDS = {int: "a whole number from 0", dict: "a mapping"}
+
+
+def sealed(archive: bytes) -> bytes:
+    """The zip ``archive``, as torch writes one, with its SHA-256 as the zip's comment; torch reads it as before."""
+    head = archive[:-2]  # what is cut off is the length of the comment, 0
+    note = _SEAL + hashlib.sha256(head).hexdigest().encode()
+    return head + struct.pack("<H", len(note)) + note
+
+
+def damage(content: bytes) -> str:
+    """Why a checkpoint's file is not the one that was written; "" if it is. One without a checksum has the zip's own of each part."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            if note := archive.comment:
+                return (
+                    ""
+                    if sealed(content[: -len(note) - 2] + b"\0\0") == content
+                    else "it is damaged: its SHA-256 is another than the one in it"
+                )
+            if any(part.compress_type != zipfile.ZIP_STORED for part in archive.infolist()):
+                return "it is damaged: parts of it are compressed"
+            return f"it is damaged: the checksum of its part {part} is wrong" if (part := archive.testzip()) else ""
+    except Exception as error:  # zipfile's own, one for each way that an archive is broken
+        return f"it is damaged: {error}"
+
+
+class Checker:
+    """Looks at the parts of one checkpoint; what is wrong is one line with the file's name and the part's."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def fail(self, what: str) -> ConfigError:
+        return ConfigError(f"{self.path}: {what}; {EARLIER}")
+
+    def take(self, holder: Mapping[Any, Any], name: str, kind: type, where: str = "") -> Any:
+        """``holder[name]``, of the ``kind``; int stands for a whole number from 0."""
+        value = holder.get(name)
+        below = isinstance(value, int) and value < 0
+        if below or isinstance(value, bool) or not isinstance(value, Mapping if kind is dict else kind):
+            raise self.fail(f"{where}{name} is {_short(value)}, it must be {_KINDS[kind]}")
+        return value
+
+    def tensor(self, value: Any, what: str, shape: torch.Size | None = None) -> Tensor:
+        """A plain tensor of finite numbers, all of them in the file."""
+        if not isinstance(value, Tensor) or value.layout != torch.strided or value.is_meta or value.is_quantized:
+            raise self.fail(f"{what} is {_short(value)}, it must be a tensor")
+        if shape is not None and value.shape != shape:
+            raise self.fail(f"{what} is {tuple(value.shape)}, it must be {tuple(shape)}")
+        if value.numel() * value.element_size() > value.untyped_storage().nbytes():
+            raise self.fail(f"{what} shows {value.numel()} numbers and has fewer")
+        if not bool(value.isfinite().all()):
+            raise self.fail(f"{what} has values that are not finite")
+        return value
+
+    def weights(self, content: Mapping[str, Any], name: str) -> None:
+        """A network's parameters, by name; variances, deviations and counts are none below 0."""
+        for key, value in self.take(content, name, dict).items():
+            if not isinstance(key, str):
+                raise self.fail(f"{name} has a parameter called {_short(key)}, which is no text")
+            self.tensor(value, f"{name}: {key}")
+            if re.search(r"(\._var|\._std|\.count)$", key) and bool((value < 0).any()):
+                raise self.fail(f"{name}: {key} is negative")
+
+    def memory(self, content: Mapping[str, Any], name: str, optimizer: torch.optim.Optimizer) -> None:
+        """An optimizer's state: that of ``optimizer``, whose parameters are counted group by group."""
+        saved, start, shapes = self.take(content, name, dict), 0, {}
+        groups, own = saved.get("param_groups"), optimizer.state_dict()["param_groups"]
+        counts = [len(group["params"]) for group in own]
+        if not isinstance(groups, list) or [self._group(group, f"{name}: ") for group in groups] != counts:
+            raise self.fail(f"{name}: param_groups must be {len(own)}, of {', '.join(map(str, counts))} parameters")
+        for saved_group, group in zip(groups, optimizer.param_groups, strict=True):
+            if saved_group["params"] != [*range(start, start := start + len(group["params"]))]:
+                raise self.fail(f"{name}: params is {_short(saved_group['params'])}, it must count the parameters")
+            shapes |= dict(zip(saved_group["params"], (parameter.shape for parameter in group["params"]), strict=True))
+        for index, held in self.take(saved, "state", dict, f"{name}: ").items():
+            if index not in shapes or not isinstance(held, Mapping):
+                raise self.fail(f"{name}: state {_short(index)} is of no parameter")
+            for key, value in held.items():
+                what = f"{name}: {key} of parameter {index}"
+                value = self.tensor(value, what, torch.Size([]) if key == "step" else shapes[index])
+                if key != "exp_avg" and bool((value < 0).any()):
+                    raise self.fail(f"{what} is negative")
+
+    def _group(self, group: Any, where: str) -> int:
+        """How many parameters a group has, once its numbers are looked at."""
+        if not isinstance(group, Mapping) or not isinstance(group.get("params"), list):
+            raise self.fail(f"{where}a group is {_short(group)}")
+        for key in group.keys() - {"params"}:
+            for value in group[key] if isinstance(group[key], list | tuple) else [group[key]]:
+                if isinstance(value, int | float | Tensor) and not 0.0 <= float(value) < math.inf:
+                    raise self.fail(f"{where}{key} is {_short(group[key])}, it must be finite and not negative")
+        if not all(isinstance(beta, float) and beta < 1.0 for beta in group.get("betas", ())):
+            raise self.fail(f"{where}betas is {group['betas']!r:.60}, each must be below 1")
+        if not isinstance(group.get("lr"), float | Tensor) or not float(group["lr"]) > 0.0:
+            raise self.fail(f"{where}lr is {_short(group.get('lr'))}, it must be above 0")
+        return len(group["params"])
+
+    def random_state(self, infos: Mapping[str, Any]) -> None:
+        """What torch's generators may be set to."""
+        for name, value in self.take(infos, "random_state", dict, "infos: ").items() if "random_state" in infos else ():
+            self.tensor(value, f"infos: random_state: {name}")
+            if name == "cpu":
+                try:
+                    torch.Generator().set_state(value.cpu())
+                except (RuntimeError, TypeError):
+                    raise self.fail("infos: random_state: cpu is no state of torch's generator") from None
+
+    def task(self, infos: Mapping[str, Any], own: Mapping[str, Tensor]) -> None:
+        """Levels and counts of a task, as ``own`` has them; a world's may be of another number of worlds."""
+        saved = self.take(infos, "env", dict, "infos: ") if "env" in infos else {}
+        for name in saved.keys() & own.keys():
+            value, mine, what = self.tensor(saved[name], f"infos: env: {name}"), own[name], f"infos: env: {name}"
+            if value.dtype != mine.dtype or value.shape[1:] != mine.shape[1:] or value.dim() != mine.dim() or not value.numel():
+                raise self.fail(f"{what} is {_short(value)}, it must be as {_short(mine)}")
+            if bool((value < 0).any()):
+                raise self.fail(f"{what} is negative")
+
+
+def check_content(content: Any, path: Path) -> dict[str, Any]:
+    """``content``, as training writes it: networks, and what else there is, each of its kind and finite. Raises ConfigError."""
+    networks = ("actor_state_dict", "student_state_dict")
+    if not isinstance(content, dict) or not {*networks} & content.keys():
+        raise ConfigError(f"{path} is not a checkpoint of this project: it has no actor_state_dict")
+    check = Checker(path)
+    for name in content:
+        if name in (*networks, "critic_state_dict", "teacher_state_dict"):
+            check.weights(content, name)
+    if "iter" in content:
+        check.take(content, "iter", int)
+    if content.get("infos") is not None:
+        infos = check.take(content, "infos", dict)
+        if "total_steps" in infos:
+            check.take(infos, "total_steps", int, "infos: ")
+        check.random_state(infos)
+    return content
+
+
+def check_resume(content: Mapping[str, Any], path: Path, optimizer: torch.optim.Optimizer, task: Mapping[str, Tensor]) -> None:
+    """What a training goes on from: counters as the file's name has them, ``optimizer``'s state, and the ``task``'s. Raises ConfigError."""
+    check = Checker(path)
+    done = check.take(content, "iter", int)
+    if (named := re.fullmatch(r"model_(\d+)\.pt", path.name)) and int(named[1]) != done:
+        raise check.fail(f"its name says {int(named[1])} iterations, and it has done {done}: call it model_{done}.pt")
+    check.memory(content, "optimizer_state_dict", optimizer)
+    check.task(content.get("infos") or {}, task)
+
+
+def _short(value: object) -> str:
+    """A value for a message, however long it is."""
+    if isinstance(value, Tensor):
+        return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+    text = repr(value) if isinstance(value, int | float | str | None) and not (isinstance(value, int) and abs(value) > 1 << 64) else ""
+    return text[:60] or f"a {type(value).__name__}"
