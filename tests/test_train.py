@@ -33,8 +33,8 @@ from legged_mw.rl.network import save_onnx
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.rl.report import console_rows
 from legged_mw.rl.runner import Runner, make_runner
-from legged_mw.rl.settings import rsl_rl_config
 from legged_mw.rl.runs import checkpoints, find_checkpoint, find_run, new_run, runs
+from legged_mw.rl.settings import rsl_rl_config
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
 

@@ -157,10 +157,18 @@ class Runner(OnPolicyRunner):
 
     def _update(self) -> dict[str, Any]:
         with self.update_threads:
-            losses = self.alg.update()
-            if self._settles:
+            if not self._settles:
+                return self.alg.update()
+            try:
+                losses = self.alg.update()
+            except (RuntimeError, ValueError):  # rsl-rl's own draws from distributions that are not finite
                 self._undo.settle()
-        return losses
+                if not self._undo.undone:
+                    raise
+                self.alg.storage.clear()
+                return {}
+            self._undo.settle()
+            return losses
 
     def _exam_is_due(self) -> bool:
         """Every ``exam_interval`` iterations; the last iteration's exam waits until the last checkpoint is written."""

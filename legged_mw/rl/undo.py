@@ -50,14 +50,14 @@ class Undo:
         states = [(kind, before, _join(kind)) for kind, before in self._before]
         states += [(kind, torch.zeros_like(after), after) for kind in _kinds(new) for after in [_join(kind)]]
         for _, _, after in states:
-            sound = sound & after.isfinite().all().to(sound.device)
+            sound = sound & _on(after.isfinite().all(), sound.device)
         if getattr(self._learner, "is_multi_gpu", False):
             shared = sound.float()
             torch.distributed.all_reduce(shared, op=torch.distributed.ReduceOp.MIN)
             sound = shared > 0.5
         self.undone.copy_(~sound)
         for kind, before, after in states:
-            parts = torch.where(sound.to(after.device), after, before).split([value.numel() for value in kind])
+            parts = torch.where(_on(sound, after.device), after, before).split([value.numel() for value in kind])
             shaped = [part.view_as(value) for part, value in zip(parts, kind, strict=True)]
             torch._foreach_copy_(kind, shaped)  # pyright: ignore[reportPrivateImportUsage]
         del self._before
@@ -69,6 +69,11 @@ def _kinds(tensors: Iterable[Tensor]) -> list[list[Tensor]]:
     for tensor in tensors:
         kinds.setdefault((tensor.dtype, tensor.device), []).append(tensor)
     return list(kinds.values())
+
+
+def _on(value: Tensor, device: torch.device) -> Tensor:
+    """``value`` on ``device``: rsl-rl's own Adam counts its steps on the host."""
+    return value if value.device == device else value.to(device)
 
 
 def _join(tensors: list[Tensor]) -> Tensor:
