@@ -5,25 +5,34 @@ Each imports what it needs when it starts: deploy also runs where torch is not i
 
 from __future__ import annotations
 
+import argparse
 import sys
 from pathlib import Path
 
 from legged_mw.utils.cli import fail, one_line_errors
+from legged_mw.utils.console import patient_console
 from legged_mw.utils.task import LoadedTask, list_tasks, load_task
 
 
 @one_line_errors()
 def train() -> None:
     """Train a task. On 8 GPUs: torchrun --nproc_per_node=8 train.py --task go1_flat"""
-    from legged_mw.check.describe import describe
-    from legged_mw.check.guard import check_recordable
-    from legged_mw.eval.exams import make_exam
     from legged_mw.rl import training
 
     args = training.parse(train.__doc__)
     if args.list:
         print(list_tasks())
         return
+    with patient_console():
+        _train(args)
+
+
+def _train(args: argparse.Namespace) -> None:
+    from legged_mw.check.describe import describe
+    from legged_mw.check.guard import check_recordable
+    from legged_mw.eval.exams import make_exam
+    from legged_mw.rl import training
+
     task = load_task(args.task)
     start, device = training.configure(task, args)
     env = training.build(task, start, device, args.eager, check_recordable)

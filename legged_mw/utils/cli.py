@@ -7,7 +7,7 @@ import random
 import re
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from ctypes import ArgumentError
 from pathlib import Path
 from typing import NoReturn
@@ -129,7 +129,8 @@ def one_line_errors(program: str = "") -> Iterator[None]:
 
 def fail(program: str, message: str) -> NoReturn:
     """One line on standard error, exit code 2."""
-    print(f"{program}: {' '.join(message.split())}", file=sys.stderr)
+    with suppress(OSError):  # nobody may be there to read it
+        print(f"{program}: {' '.join(message.split())}", file=sys.stderr, flush=True)
     raise SystemExit(2)
 
 

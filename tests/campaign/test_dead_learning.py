@@ -168,7 +168,7 @@ def test_weights_that_explode_are_undone(tmp_path: Path, monkeypatch: pytest.Mon
 
     monkeypatch.setattr(GraphedPPO, "_value_loss", explode)
     result = train(tmp_path, 9)
-    said = "train.py: 3 updates in a row were not finite (loss or weights); the networks are those of the last good one; lower algorithm.learni"
+    said = "train.py: 3 updates in a row were not finite (loss or weights); the networks are those of the last good one; lower"
     assert result.code == 2 and result.err.startswith(said), result.err
     assert all_finite(newest(tmp_path))
 
