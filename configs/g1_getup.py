@@ -25,10 +25,10 @@ class G1GetupCfg(GetupCfg):
 
     class control(GetupCfg.control):
         stiffness, damping = G1FlatCfg.control.stiffness, G1FlatCfg.control.damping
-        action_scale, decimation = G1FlatCfg.control.action_scale, G1FlatCfg.control.decimation  # of 4: the motors' whole torque [M]
+        action_scale, decimation = G1FlatCfg.control.action_scale, G1FlatCfg.control.decimation  # 4 of it: the motors' whole torque [M]
 
     class normalization(GetupCfg.normalization):
-        clip_actions = 4.0
+        clip_actions = 5.0  # [ours]
 
     class rewards(GetupCfg.rewards):
         pose_weights = {"": 0.3, "hip": 1.0, "knee": 1.0, "waist": 1.0}  # [ours]

@@ -10,7 +10,7 @@ from legged_mw.utils.task import Task
 
 class Go1FootstandCfg(Go1HandstandCfg):
     class asset(Go1HandstandCfg.asset):
-        terminate_after_contacts_on = ["R?_hip*", "R?_thigh*", "R?_calf*"]
+        terminate_after_contacts_on = ["trunk", "R?_hip*", "R?_thigh*", "R?_calf*"]
         penalize_contacts_on = ["FR*", "FL*"]
 
     class exam(Go1HandstandCfg.exam):

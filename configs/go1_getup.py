@@ -18,7 +18,6 @@ class Go1GetupCfg(GetupCfg):
 
     class control(GetupCfg.control):
         stiffness, damping = Go1FlatCfg.control.stiffness, Go1FlatCfg.control.damping
-        action_scale = 0.5  # [rad] [P]
 
 
 TASK = Task(Getup, Go1GetupCfg, GetupCfgPPO)

@@ -12,7 +12,7 @@ class Go1HandstandCfg(HandstandCfg):
     class asset(HandstandCfg.asset):
         file, imu_site = Go1FlatCfg.asset.file, Go1FlatCfg.asset.imu_site
         joint_speed_limits = Go1FlatCfg.asset.joint_speed_limits
-        terminate_after_contacts_on = ["F?_hip*", "F?_thigh*", "F?_calf*"]  # [P]
+        terminate_after_contacts_on = ["trunk", "F?_hip*", "F?_thigh*", "F?_calf*"]  # [P]
         penalize_contacts_on = ["RR*", "RL*"]
 
     class init_state(HandstandCfg.init_state):

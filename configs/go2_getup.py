@@ -15,10 +15,6 @@ class Go2GetupCfg(GetupCfg):
 
     class control(GetupCfg.control):
         stiffness, damping = Go2FlatCfg.control.stiffness, Go2FlatCfg.control.damping
-        action_scale = 0.5  # [rad]
-
-    class normalization(GetupCfg.normalization):
-        clip_actions = 4.0  # [ours: with 20 N m/rad that is 40 N m, nearly what the knees have]
 
 
 TASK = Task(Getup, Go2GetupCfg, GetupCfgPPO)

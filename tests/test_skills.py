@@ -89,12 +89,12 @@ def test_rewards_of_getup(go1: Getup) -> None:
     go1.sim.qpos[3, 7] += 0.2
     go1.dof_vel[3, 0] = 6.0 * math.pi
     go1._refresh_base()
-    still = math.exp(-2.0 * (6.0 * math.pi) ** 2 / 12)
+    still = math.exp(-0.5 * (6.0 * math.pi) ** 2 / 12)
     expected = {
-        "upright": [1.0, math.exp(-8.0), 1.0, 1.0],
-        "height": [1.0, 1.0, 0.1 / (0.99 * 0.278), 1.0],
-        "posture": [1.0, 0.0, 1.0, math.exp(-2.0 * 0.04 / 12)],
-        "stand_still": [1.0, 0.0, 0.0, still],
+        "upright": [1.0, 0.5 * math.exp(-8.0), 1.0, 1.0],
+        "height": [1.0, 0.0, 0.1 / (0.99 * 0.278), 1.0],
+        "posture": [1.0, math.exp(-8.0), 1.0, math.exp(-2.0 * 0.04 / 12)],
+        "stand_still": [1.0, math.exp(-8.0), 0.0, still],
         "fast_joints": [0.0, 0.0, 0.0, (4.0 * math.pi) ** 2],
     }
     for name, values in expected.items():
@@ -106,6 +106,7 @@ def test_pull_lifts_who_is_down_and_fades() -> None:
     """Half of the weight on those that are down; a quarter of episodes that end down undo three that end up; it is in a checkpoint."""
     env = make("go1_getup", falls__states=4, falls__pull=0.5, falls__share=0.0)
     env.sim.qpos[:2, 2] = 0.1
+    env._refresh_base()
     env._apply_actions()
     half = 0.5 * 9.81 * env.total_mass
     torch.testing.assert_close(env.sim.xfrc_applied[:, env.root_body, 2], torch.tensor([half, half, 0.0, 0.0]))
@@ -182,7 +183,7 @@ def test_handstand_rewards_and_judge() -> None:
     assert found["holds"] == 0.25 and found["up"] == 0.5 and found["drift"] == pytest.approx(0.5, abs=0.01)
     ends = {env.robot.contact_geoms[i] for i in env.contacts.terminating.tolist()}
     parts = ("hip_1", "hip_2", "thigh_1", "thigh_2", "thigh_3", "calf_1", "calf_2")
-    assert ends == {f"{leg}_{part}" for leg in ("FR", "FL") for part in parts}
+    assert ends == {"trunk_box", "trunk_left", "trunk_right"} | {f"{leg}_{part}" for leg in ("FR", "FL") for part in parts}
     assert isinstance(env, Handstand)
 
 
@@ -214,10 +215,10 @@ def test_getup_from_training_to_deploy(tmp_path: Path, small: None) -> None:
     here, there = json.loads((folder / "eval/report.json").read_text())["columns"]
     assert there["name"] == "the same, deployed in MuJoCo" and here["exam"]["asked"] == {"kind": "getup", "within": 0.4}
     for name, part in here["exam"]["parts"].items():
-        assert part["at_limit"] == pytest.approx(there["exam"]["parts"][name]["at_limit"], abs=2e-3)
+        assert part["at_limit"] == pytest.approx(there["exam"]["parts"][name]["at_limit"], abs=5e-3)
     assert (folder / "eval/plane.png").is_file() and "data:image/png" in (folder / "eval/report.html").read_text()
     contract = read_contract(folder / "export")
-    assert contract.exam == {"kind": "getup", "within": 0.4} and contract.action.origin == "joints"
+    assert contract.exam == {"kind": "getup", "within": 0.4} and contract.action.origin == "default"
     assert run_skill(folder / "export") == there["exam"]
     line = refused(tmp_path, "play", "--task", "go1_getup", "--device", "cpu", "--eval", "--set", "falls.pull=0.1")
     assert "--eval sets falls.pull itself" in line

@@ -134,7 +134,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
 
     def _fallen(self) -> Tensor:
         """(N,) The robot failed: too tilted, too low, or on the ground with what must not touch it."""
-        down = self.projected_gravity[:, 2] > -math.cos(math.radians(self.cfg.termination.max_tilt))
+        down = self.projected_gravity[:, 2] > 1e-5 - math.cos(math.radians(self.cfg.termination.max_tilt))  # at 180 degrees never
         if len(self.contacts.terminating):
             down |= self.contact_count[:, self.contacts.terminating].amax(dim=1) > 0.0
         if self.cfg.termination.min_base_height:

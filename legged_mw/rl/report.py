@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-CURRICULA = ("terrain_level", "command_share", "body_error")  # what such statistics, and others of the moment, begin with
+CURRICULA = ("terrain_level", "command_share", "body_error", "pull")  # what such statistics, and others of the moment, begin with
 
 Mark = torch.cuda.Event | float
 
