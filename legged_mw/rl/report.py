@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -69,6 +70,18 @@ class Report(NamedTuple):
         """The rollout's and the update's."""
         begin, collected, end = self.marks
         return Clock.seconds(begin, collected), Clock.seconds(collected, end)
+
+
+def quiet_writers() -> None:
+    """TensorBoard's own thread hands its error to who writes the next curve: it need not print a traceback as well."""
+    hook = threading.excepthook
+
+    def show(died: threading.ExceptHookArgs) -> None:
+        if type(died.thread).__name__ != "_AsyncWriterThread":
+            hook(died)
+
+    if hook.__module__ != __name__:
+        threading.excepthook = show
 
 
 def console_block(title: str, rows: dict[str, str]) -> str:

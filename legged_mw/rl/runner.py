@@ -29,7 +29,7 @@ from legged_mw.rl.keeping import Keeper, reason_of
 from legged_mw.rl.policies import acting
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import this_rank
-from legged_mw.rl.report import Clock, Mark, Message, Report, console_block, console_rows, curves
+from legged_mw.rl.report import Clock, Mark, Message, Report, console_block, console_rows, curves, quiet_writers
 from legged_mw.rl.resume import random_state, set_random_state, take_worlds, worlds_content
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
 from legged_mw.rl.settings import rsl_rl_config
@@ -262,6 +262,7 @@ class Runner(OnPolicyRunner):
     # ---- curves: what they are written to may fail, and training goes on ---------------------------------------------
 
     def _open_curves(self) -> None:
+        quiet_writers()
         try:
             self.logger.init_logging_writer()
         except Exception as error:  # whatever a logging service may throw

@@ -56,9 +56,7 @@ class Start(NamedTuple):
     teacher: Trained | None = None  # the policy to distil
     policy: Trained | None = None  # the policy whose actor a new run begins with
 
-    def continues(self) -> bool:
-        """Whether the run goes on in its own folder: from its newest checkpoint."""
-        return self.run is not None and self.checkpoint == find_checkpoint(self.run, -1)
+    goes_on: bool = False  # in the folder of ``run``: from its newest checkpoint
 
 
 def parse(description: str | None) -> argparse.Namespace:
@@ -120,9 +118,10 @@ def _resume(task: LoadedTask, args: argparse.Namespace) -> Start:
     """Find the run to go on with and take over its config."""
     experiment = experiment_folder(task, args.experiment_name)
     run = find_run(experiment, args.load_run or "-1")
-    start, config = Start(experiment, run, find_checkpoint(run, args.checkpoint)), run / CONFIG_FILE
-    if start.continues() and this_rank().leads and not args.check and (run / LOCK_FILE).is_file():
-        _lock(run).release()  # else it is known only after the environment is made
+    checkpoint, config = find_checkpoint(run, args.checkpoint), run / CONFIG_FILE
+    start = Start(experiment, run, checkpoint, goes_on=checkpoint == find_checkpoint(run, -1))
+    if start.goes_on and this_rank().leads and not args.check and (run / LOCK_FILE).is_file():
+        _lock(start).release()  # else it is known only after the environment is made
     for section in task.update_from_run(load_yaml(config), where=shown(config)):
         print(f"{shown(config)} is older than the section {section}: left as it was then")
     return start
@@ -199,7 +198,7 @@ def train(task: LoadedTask, env: RobotTask, start: Start, examine: Examine | Non
     rank, runner = this_rank(), make_runner(env, task.train, None, str(env.device), teacher)
     runner.examine = examine
     with ExitStack() as held:
-        lock = held.enter_context(_lock(start.run)) if start.run and rank.leads and start.continues() else None
+        lock = held.enter_context(_lock(start)) if start.goes_on and rank.leads else None
         left = _load(runner, task, start)
         folder = _open_run(runner, task, start, rank, held, lock)
         _stop_on_signals(runner, deadline)
@@ -253,12 +252,17 @@ def _begin(runner: Runner, start: Start) -> None:
             print(f"the critic learns alone for {warmup} iterations (warm_start.critic_warmup)", flush=True)
 
 
-def _lock(run: Path) -> RunLock:
-    """Raises ConfigError if ``run`` is being trained, or cannot be."""
+def _lock(start: Start) -> RunLock:
+    """Of the run to go on with. Raises ConfigError if it is being trained, or was meanwhile, or cannot be."""
+    assert start.run
     try:
-        return RunLock(run)
+        lock = RunLock(start.run)
     except OSError as error:
-        raise ConfigError(f"{shown(run)} cannot be written: {reason_of(error)}") from None
+        raise ConfigError(f"{shown(start.run)} cannot be written: {reason_of(error)}") from None
+    if (newest := find_checkpoint(start.run, -1)) == start.checkpoint:
+        return lock
+    lock.release()
+    raise ConfigError(f"{shown(start.run)} has gone on since this began, to {newest.name}: another process trained there; resume it again")
 
 
 def _open_run(runner: Runner, task: LoadedTask, start: Start, rank: Rank, held: ExitStack, lock: RunLock | None) -> Path:
