@@ -26,11 +26,10 @@ from test_resume import EXACTLY, assert_equal  # noqa: E402
 from legged_mw.rl.checkpoint import damage  # noqa: E402
 from legged_mw.rl.runs import checkpoints  # noqa: E402
 
-ITERATIONS = 12
-FLAGS = ["--seed", "5", "--eager", "--set", "runner.save_interval=1", "--set", "cpu.update_threads=1", "--set", "runner.export=true"]
+FLAGS = ["--seed", "5", "--eager", "--set", "runner.save_interval=1", "--set", "cpu.update_threads=1"]
 
 
-def train(root: Path, resume: bool) -> int:
+def train(root: Path, resume: bool, iterations: int, export: bool) -> int:
     """As a child of this process, which it returns: a new run, or the one there resumed."""
     child = os.fork()
     if child:
@@ -40,7 +39,8 @@ def train(root: Path, resume: bool) -> int:
         signal.signal(number, signal.SIG_DFL)
     go_on = ["--task", "go1_flat", "--device", "cpu", "--eager", "--resume"]
     try:
-        done = run("train", root, *(go_on if resume else [*SMALL, *FLAGS, "--max_iterations", str(ITERATIONS)]))
+        new = [*SMALL, *FLAGS, "--max_iterations", str(iterations), "--set", f"runner.export={export}"]
+        done = run("train", root, *(go_on if resume else new))
         (root / f"said_{os.getpid()}").write_text(done.out + done.err)
         os._exit(done.code)
     except BaseException as error:  # a traceback
@@ -78,21 +78,21 @@ def _wait(child: int, home: Path, new: int, pause: float) -> None:
     time.sleep(pause)
 
 
-def campaign(root: Path, kills: int, numbers: tuple[int, ...], seed: int = 0, pause: float = 0.4) -> dict[str, int]:
-    """``kills`` signals from ``numbers``, each up to ``pause`` [s] after 0 to 4 new checkpoints; counts of what happened."""
+def campaign(root: Path, kills: int, numbers: tuple[int, ...], seed: int = 0, iterations: int = 12, export: bool = True) -> dict[str, int]:
+    """``kills`` signals from ``numbers``, each up to 0.4 s after 0 to 4 new checkpoints; counts of what happened."""
     dice, counts = random.Random(seed), dict.fromkeys(("kills", "resumed exactly", "ended by itself", "compared"), 0)
-    assert waited(train(root / "whole", False)) == 0
+    assert waited(train(root / "whole", False, iterations, export)) == 0
     whole = folder_of(root / "whole")
     assert whole
-    wanted: Any = torch.load(whole / f"model_{ITERATIONS}.pt", weights_only=True)
+    wanted: Any = torch.load(whole / f"model_{iterations}.pt", weights_only=True)
     while counts["kills"] < kills:
         home = root / f"run{counts['compared']}"
         home.mkdir(exist_ok=True)
         resume = folder_of(home) is not None
         if not resume:
             shutil.rmtree(home / "logs", ignore_errors=True)
-        child = train(home, resume)
-        _wait(child, home, dice.randrange(5), dice.uniform(0.0, pause))
+        child = train(home, resume, iterations, export)
+        _wait(child, home, dice.randrange(5), dice.uniform(0.0, 0.4))
         os.kill(child, number := dice.choice(numbers))
         code = waited(child)
         code = 99 if (home / f"raised_{child}").is_file() else code
@@ -103,9 +103,9 @@ def campaign(root: Path, kills: int, numbers: tuple[int, ...], seed: int = 0, pa
         counts["resumed exactly"] += resume and code != -number
         if folder := folder_of(home):
             check_whole(folder)
-            if code == 0 or ITERATIONS in checkpoints(folder):
-                assert_equal(torch.load(folder / f"model_{ITERATIONS}.pt", weights_only=True), wanted)
-                assert list(checkpoints(folder)) == list(range(1, ITERATIONS + 1))
+            if code == 0 or iterations in checkpoints(folder):
+                assert_equal(torch.load(folder / f"model_{iterations}.pt", weights_only=True), wanted)
+                assert list(checkpoints(folder)) == list(range(1, iterations + 1))
                 counts["compared"] += 1
     return counts
 
@@ -115,11 +115,13 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--polite", action="store_true", help="SIGTERM and SIGINT instead of SIGKILL")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--iterations", type=int, default=12, help="of each run")
+    parser.add_argument("--no_export", action="store_true")
     args = parser.parse_args()
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         numbers = (signal.SIGTERM, signal.SIGINT) if args.polite else (signal.SIGKILL,)
-        print(campaign(Path(folder), args.kills, numbers, args.seed), flush=True)
+        print(campaign(Path(folder), args.kills, numbers, args.seed, args.iterations, not args.no_export), flush=True)
 
 
 if __name__ == "__main__":

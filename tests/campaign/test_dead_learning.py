@@ -23,7 +23,7 @@ from legged_mw.rl.runner import Runner
 from legged_mw.rl.runs import checkpoints
 
 BAD = [math.nan, math.inf, -math.inf, 1e20, -1e38]
-RUN = ["--num_envs", "8", "--seed", "1", "--set", "runner.save_interval=1", "--set", "cpu.update_threads=1"]
+RUN = ["--num_envs", "8", "--eager", "--seed", "1", "--set", "runner.save_interval=1", "--set", "cpu.update_threads=1"]
 
 
 def train(root: Path, iterations: int, *flags: str) -> Result:
@@ -105,8 +105,7 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize("value", [math.nan, 1e20])
-@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize(("way", "value"), [("reward", math.nan), ("row", 1e20), ("handed out", 1e20), ("handed out", math.nan)])
 def test_once_in_one_world_of_eight_ruins_nothing(way: str, value: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spoil, said = WAYS[way]
     spoil(monkeypatch, Spoiler(value, lambda call: call == 20))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 from typing import Any
@@ -14,37 +15,36 @@ from legged_mw.rl.keeping import Keeper
 from legged_mw.rl.runs import checkpoints
 
 EXACTLY = "exactly: worlds and generators go on where they were"
-THREE = ["--set", "runner.save_interval=1", "--max_iterations", "3", "--seed", "3", "--set", "cpu.update_threads=1"]
+THREE = ["--set", "runner.save_interval=1", "--max_iterations", "3", "--seed", "3", "--set", "cpu.update_threads=1", "--eager"]
 DELAYS = ["action_delay=[0, 2]", "observation_delay=[0, 2]", "delay_ms=[0.0, 12.0]", "encoder_offset=[-0.02, 0.02]"]
-# what is trained -> flags; all with symmetry, kicks, noise and episodes that end on the way
+# what is trained -> flags; with symmetry, kicks, noise and episodes that end on the way
+TILES = ["--set", "terrain.num_rows=2", "--set", "terrain.num_cols=8"]
 TASKS = {
-    "go1_flat": [],
-    "go1_rough": ["--task", "go1_rough", "--set", "terrain.num_rows=2", "--set", "terrain.num_cols=8"],
-    "drawn worlds, delays": [
-        *("--task", "go1_flat_dr", "--set", "domain_rand.redraw_iterations=1"),
+    "go1_rough": ["--task", "go1_rough", *TILES],
+    "drawn worlds, delays, history": [
+        *("--task", "go1_flat_dr", "--set", "domain_rand.redraw_iterations=1", "--set", "observations.history={state: 3}"),
         *(word for each in DELAYS for word in ("--set", f"domain_rand.{each}")),
     ],
-    "curricula": ["--set", "commands.curriculum=true", "--set", "perturbation.curriculum=true", "--set", "perturbation.push=true"],
-    "history": ["--set", "observations.history={state: 3}"],
-    "estimator": ["--task", "go1_flat_blind", "--set", "actor.estimator.targets=[base_lin_vel]"],
-    "memory": ["--set", "actor.class_name=RNNModel", "--set", "actor.rnn_hidden_dim=8", "--set", "cpu.rnn_hidden_dim=8"],
-    "getup": ["--task", "go1_getup"],
-    "tracking": ["--task", "g1_track"],
-    "handstand": ["--task", "go1_handstand"],
-    "concurrent": [
-        "--task",
-        "go1_rough_student",
-        "--set",
-        "actor.concurrent.groups=[privileged_state]",
-        "--set",
-        "terrain.num_rows=2",
-        "--set",
-        "terrain.num_cols=8",
+    "curricula, memory": [
+        *("--set", "commands.curriculum=true", "--set", "perturbation.curriculum=true", "--set", "perturbation.push=true"),
+        *("--set", "actor.class_name=RNNModel", "--set", "actor.rnn_hidden_dim=8", "--set", "cpu.rnn_hidden_dim=8"),
     ],
-    "fast": ["--task", "g1_flat"],
-    "stock": ["--set", "algorithm.class_name=PPO"],
-    "no symmetry": ["--set", "symmetry.use_data_augmentation=false", "--set", "algorithm.schedule=fixed"],
+    "estimator": ["--task", "go1_flat_blind", "--set", "actor.estimator.targets=[base_lin_vel]"],
 }
+BY_HAND = {  # LEGGED_MW_CAMPAIGN=all pytest tests/campaign/test_resume.py
+    "go1_flat": [],
+    "no symmetry": ["--set", "symmetry.use_data_augmentation=false", "--set", "algorithm.schedule=fixed"],
+    "rsl-rl's own": ["--set", "algorithm.class_name=PPO"],
+    "getup": ["--task", "go1_getup"],
+    "handstand": ["--task", "go1_handstand"],
+    "tracking": ["--task", "g1_track"],
+    "g1": ["--task", "g1_flat"],
+    "concurrent": ["--task", "go1_rough_student", "--set", "actor.concurrent.groups=[privileged_state]", *TILES],
+    "mujoco_warp": ["--engine", "mujoco_warp"],
+    "mujoco_warp, drawn worlds": ["--engine", "mujoco_warp", "--task", "go1_flat_dr"],
+}
+if os.environ.get("LEGGED_MW_CAMPAIGN") == "all":
+    TASKS |= BY_HAND
 
 
 def assert_equal(a: Any, b: Any, where: str = "") -> None:
@@ -87,7 +87,7 @@ def interrupted(root: Path, *flags: str, after: int = 2) -> tuple[Path, Path]:
 
 def resume(root: Path, folder: Path, *flags: str) -> Result:
     task = flags[flags.index("--task") + 1] if "--task" in flags else "go1_flat"
-    return run("train", root, "--task", task, "--device", "cpu", "--resume", "--load_run", str(folder), *flags)
+    return run("train", root, "--task", task, "--device", "cpu", "--eager", "--resume", "--load_run", str(folder), *flags)
 
 
 @pytest.mark.parametrize("name", TASKS)
