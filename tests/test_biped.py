@@ -348,8 +348,8 @@ CLOCK = "there is no gait clock; set gait.period \\[s\\]$"
         ),
         (BIPED, {"rewards.hip_joints": ["hipp"]}, r"^rewards.hip_joints: no joint 'hipp' in the robot; .*left_hip"),
         (BIPED, {"gait.offsets": [0.0]}, r"^gait.offsets has 1 numbers; write one share of the period a foot \(left, right\)$"),
-        (BIPED, {"gait.offsets": [0.0, 1.5]}, r"^gait.offsets is \[0.0, 1.5\]; it must be shares of the period, from 0 to 1$"),
-        (BIPED, {"gait.stance": 1.0}, r"^gait.stance is 1.0; it must be above 0 and below 1$"),
+        (BIPED, {"gait.offsets": [0.0, 1.5]}, r"gait.offsets\[1\] is 1.5; it must be from 0 to 1$"),
+        (BIPED, {"gait.stance": 1.0}, r"gait.stance is 1.0; it must be above 0 and below 1$"),
         (
             "go1_flat",
             {"gait.period": 0.5},
@@ -366,8 +366,8 @@ CLOCK = "there is no gait clock; set gait.period \\[s\\]$"
             {"rewards.scales.single_stance": 1.0},
             "^rewards.scales.single_stance is on, but it is for robots with two feet; asset.foot_names has 4$",
         ),
-        (BIPED, {"init_state.dof_pos_offset": [0.1]}, r"^init_state.dof_pos_offset is \[0.1\]; it must be two numbers, the lower first$"),
-        (BIPED, {"init_state.dof_vel_range": -1.0}, r"^init_state.dof_vel_range is -1.0; it must be zero or more$"),
+        (BIPED, {"init_state.dof_pos_offset": [0.1]}, r"init_state.dof_pos_offset is \[0.1\]; it must be two numbers, the lower first$"),
+        (BIPED, {"init_state.dof_vel_range": -1.0}, r"init_state.dof_vel_range is -1.0; it must be 0 or more$"),
     ],
 )
 def test_what_is_asked_without_what_it_needs(task: str, settings: dict[str, Any], text: str) -> None:

@@ -1,16 +1,18 @@
-"""Values that no type can refuse are refused by name before anything is built or written."""
+"""Values that do not fit their field, or not each other, are refused by name before anything is built or written."""
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
 from worlds import make_env
 
-from legged_mw.envs.checks import ENVIRONMENT, LEARNER, WALKING, check_values
+from legged_mw.envs.checks import check_values
 from legged_mw.sim.errors import ModelError
-from legged_mw.utils.config import ConfigError
-from legged_mw.utils.task import load_task, task_names
+from legged_mw.utils.bounds import bare, bounds_text
+from legged_mw.utils.config import ConfigError, field_types
+from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 
 @pytest.mark.parametrize("name", task_names())
@@ -22,35 +24,106 @@ def test_tasks_as_they_ship_pass(name: str) -> None:
 @pytest.mark.parametrize(
     ("path", "value", "wanted"),
     [
-        ("env.num_envs", 0, "positive"),
-        ("sim.dt", -0.004, "positive"),
-        ("control.decimation", 0, "positive"),
-        ("env.episode_length_s", float("inf"), "positive"),
-        ("terrain.friction", -1.0, "zero or more"),
-        ("terrain.condim", 2, "1, 3, 4 or 6"),
-        ("terrain.seed", -1, "zero or more"),
+        ("env.num_envs", 0, "1 or more"),
+        ("sim.dt", -0.004, "from 0.0001 to 0.1 s"),
+        ("control.decimation", 0, "from 1 to 1000"),
+        ("env.episode_length_s", math.inf, "finite"),
+        ("terrain.friction", -1.0, "0 or more"),
+        ("terrain.seed", -1, "0 or more"),
         ("terrain.horizontal_scale", 0.3, "above 0 and at most 0.25 m, or a cell would be wider than a step of stairs"),
-        ("terrain.terrain_proportions", {"stairs_up": float("inf")}, "kinds with shares from 0"),
-        ("terrain.measured_points_y", [float("nan")], "at least one number, all finite"),
         ("commands.ranges.lin_vel_x", [1.0, -1.0], "two numbers, the lower first"),
         ("commands.ranges.lin_vel_y", [0.5], "two numbers, the lower first"),
-        ("commands.keep_probability", [0.9, 0.25], "three numbers from 0 to 1"),
-        ("commands.mirror", {"lin_vel_x": 0.5}, "1 or -1 for each command"),
-        ("perturbation.duration", [0.0, 0.2], "two numbers above zero, the lower first"),
-        ("asset.foot_names", [], "a list with at least one name"),
+        ("commands.keep_probability", [0.9, 0.25], "three numbers, and more for further commands; each from 0 to 1"),
+        ("perturbation.duration", [0.2, 0.1], "two numbers, the lower first; each above 0"),
+        ("domain_rand.link_mass", [0.9], "two numbers, the lower first, or an empty list; each above 0"),
+        ("rewards.mirror_joints", [["FR_", "RL_"], ["FL_"]], "pairs: lists of two names or patterns each"),
         ("termination.max_tilt", 0.0, "above 0 and at most 180 degrees"),
-        ("init_state.pos", [0.0, 0.3], "three numbers, x, y, z"),
-        ("runner.save_interval", 0, "positive"),
-        ("algorithm.num_mini_batches", -1, "positive"),
-        ("runner.run_name", "a/b", "part of a folder's name"),
+        ("init_state.pos", [0.0, 0.3], "three numbers, or an empty list; each from -1000 to 1000 m"),
+        ("viewer.camera", [0.0, 0.0, 1.0], "three numbers, not straight above or below, or an empty list"),
+        ("runner.save_interval", 0, "1 or more"),
+        ("actor.hidden_dims", [], "a list of at least one; each 1 or more"),
+        ("algorithm.num_mini_batches", -1, "1 or more"),
+        ("algorithm.gamma", 5.0, "from 0 to 1"),
+        ("runner.run_name", "a/b", "part of a folder's name, without / or \\"),
     ],
 )
 def test_mistake_is_named(path: str, value: Any, wanted: str) -> None:
+    """By a flag, a file, an assignment, and in the class statement, where it has its place too."""
     task = load_task("go1_flat")
-    task.set(path, value)
+    text = f"{path} is {value!r}; it must be {wanted}"
     with pytest.raises(ConfigError) as error:
+        task.set(path, value)
+    assert str(error.value) == f"--set: {text}"
+    *sections, name = path.split(".")
+    owner, body = type(task.cfg if sections[0] in task.cfg.to_dict() else task.train), {name: value}
+    parents = [owner]
+    for section in sections:
+        parents.append(getattr(parents[-1], section))
+    for parent in parents[:0:-1]:
+        body = {parent.__name__: type(parent.__name__, (parent,), {**body, "__qualname__": f"Bad.{path}".rpartition(".")[0]})}
+    with pytest.raises(ConfigError) as error:
+        type("Bad", (owner,), body)
+    assert f"{name} is {value!r}; it must be {wanted}" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "text"),
+    [
+        ("asset.foot_names", [], "asset.foot_names is []; it must be a list of at least one name, one for each foot"),
+        ("asset.foot_names", ["*_foot"], "asset.foot_names is ['*_foot']; it must be a list of at least one name"),
+        ("control.stiffness", {"": 35.0, "hip": -35.0}, "control.stiffness['hip'] is -35.0; it must be 0 or more"),
+        ("domain_rand.friction", [0.0, 1.0], "domain_rand.friction[0] is 0.0; it must be above 0"),
+        (
+            "domain_rand.model_factors",
+            {"dof_armature": [2.0, 1.0]},
+            "domain_rand.model_factors['dof_armature'] is [2.0, 1.0]; it must be two",
+        ),
+        ("commands.mirror", {"lin_vel_x": 0.5}, "commands.mirror['lin_vel_x'] is 0.5; it must be 1 or -1"),
+        ("terrain.condim", 2, "terrain.condim must be Literal[1, 3, 4, 6], not 2 (int)"),
+        ("terrain.terrain_proportions", {"stairs_up": math.inf}, "terrain.terrain_proportions['stairs_up'] is inf; it must be finite"),
+        ("terrain.measured_points_y", [math.nan], "terrain.measured_points_y[0] is nan; it must be finite"),
+        ("control.action_scale", {"": 0.0}, "control.action_scale[''] is 0.0; it must be another number than 0"),
+        ("control.action_scale", 0.0, "control.action_scale is 0.0; it must be another number than 0"),
+        ("seed", 10**30, f"seed is {10**30}; it must be below 10^24"),
+        ("rewards.scales.torques", 1e39, "rewards.scales.torques is 1e+39; it must be finite"),
+        ("cpu.overrides", {"sim.dt": math.nan}, "cpu.overrides['sim.dt'] is nan; it must be finite"),
+    ],
+)
+def test_where_in_a_table_or_list_is_named(path: str, value: Any, text: str) -> None:
+    task = load_task("go1_flat")
+    with pytest.raises(ConfigError) as error:
+        task.set(path, value)
         check_values(task.cfg, task.train)
-    assert str(error.value).startswith(f"{path} is {value!r}; it must be {wanted}")
+    assert text in str(error.value)
+
+
+def test_a_command_of_a_users_own_has_a_range() -> None:
+    task = load_task("go1_flat")
+    vars(task.cfg.commands.ranges)["height"] = [0.3, 0.2]
+    with pytest.raises(ConfigError, match=r"^commands.ranges.height is \[0.3, 0.2\]; it must be two numbers, the lower first$"):
+        check_values(task.cfg)
+
+
+def fields() -> list[tuple[LoadedTask, str, Any]]:
+    """(task, path, type) of every field of every task."""
+    tasks = [load_task(name) for name in task_names()]
+    return [(task, *field) for task in tasks for cfg in (task.cfg, task.train) for field in field_types(type(cfg))]
+
+
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, 1e39, 10**5000], ids=["nan", "inf", "-inf", "1e39", "5000 digits"])
+def test_no_field_takes_a_number_that_is_not_finite(number: float) -> None:
+    """Nor one that is infinite in float32, wherever a number may stand: alone, in a list, in a table."""
+    whole = {float: number, list[float]: [number] * 3, dict[str, float]: {"": number}, dict[str, list[float]]: {"": [number]}}
+    found = [(task, path, whole[bare(kind)]) for task, path, kind in fields() if bare(kind) in whole]
+    assert len(found) > 1000
+    for task, path, value in found:
+        with pytest.raises(ConfigError, match="it must be "):
+            task.set(path, value)
+
+
+def test_every_whole_number_says_its_bounds() -> None:
+    whole = (int, list[int], dict[str, int])
+    assert not [path for _, path, kind in fields() if bare(kind) in whole and not bounds_text(kind)]
 
 
 def test_no_number_is_cut_off_in_silence() -> None:
@@ -72,16 +145,6 @@ def test_a_table_of_joints_is_checked_when_the_environment_is_made(name: str) ->
         thighs = ", ".join(joint for joint in legs if "thigh" in joint)
         with pytest.raises(ModelError, match=rf"^{section}\.{name}: no value for {thighs}: none of \['hip', 'calf'\] is a part of these"):
             make_env(1, {f"{section}.{name}": {"hip": 1.0, "calf": 1.0}})
-
-
-def test_rules_name_fields_that_exist() -> None:
-    task = load_task("go1_flat")
-    known = task.to_dict()
-    for path in [*ENVIRONMENT, *WALKING, *LEARNER]:
-        node = known
-        for part in path.split("."):
-            assert part in node, path
-            node = node[part]
 
 
 def test_fewer_samples_than_minibatches_are_named() -> None:

@@ -193,9 +193,6 @@ def test_a_checkpoint_goes_on_bit_for_bit(tmp_path: Path) -> None:
     [
         ({"groups": ["privileged"]}, "groups: no observation group 'privileged' .* did you mean 'privileged_state'"),
         ({"groups": ["state"]}, "groups: the actor reads 'state' itself; the teacher's encoder is for what a robot does not measure"),
-        ({"teacher_share": 0.0}, "teacher_share is 0.0; it must be above 0 and at most 1"),
-        ({"latent_dim": 0}, "latent_dim is 0; it must be"),
-        ({"hidden_dims": []}, r"hidden_dims is \[\]; it must be whole numbers from 1, at least one"),
         ({"actor.class_name": "RNNModel"}, "groups: that goes with actor.class_name 'MLPModel', not 'RNNModel'"),
         (
             {"algorithm.class_name": "PPO"},
@@ -226,7 +223,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three iterations in worlds that show the critic what was drawn; the last is exported to ``export`` beside the checkpoint."""
     drawn = ["--set", "domain_rand.enable=true", "--set", "domain_rand.observe=true", "--set", "runner.save_interval=1"]
     flags = [*FLAGS, *drawn, "--max_iterations", "3", "--set", "runner.export=true"]
-    return trained(tmp_path_factory.mktemp("concurrent"), *flags, prints=("Student loss: ", "policy.onnx"))
+    return trained(tmp_path_factory.mktemp("concurrent"), *flags, "--verbose", prints=("Student loss: ", "policy.onnx"))
 
 
 @pytest.fixture(scope="module")

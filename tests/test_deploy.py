@@ -22,7 +22,7 @@ from recorder import Recorder
 
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
-from legged_mw.deploy.contract import Contract, ContractError, ContractRow, Ends, read_contract
+from legged_mw.deploy.contract import Contract, ContractError, ContractRow, Ends, checksum, read_contract
 from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement, RobotError
@@ -60,7 +60,7 @@ def rewrite(folder: Path, change: Callable[[Any], Any]) -> None:
     """Change what policy.yaml says."""
     said = load_yaml(folder / "policy.yaml")
     change(said)
-    (folder / "policy.yaml").write_text(yaml.safe_dump(said, sort_keys=False))
+    (folder / "policy.yaml").write_text(yaml.safe_dump(said | {"checksum": checksum(said)}, sort_keys=False))
 
 
 def main(capsys: pytest.CaptureFixture[str], *args: str | Path) -> tuple[int, str, str]:

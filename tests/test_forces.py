@@ -306,7 +306,7 @@ def test_sensed_motion_and_self_contacts() -> None:
         ),
         ("dof_vel_limits", {"asset.joint_speed_limits": {}}, "no joint has a highest speed; write asset.joint_speed_limits"),
         ("stumble", {"asset.sense": ["forces"]}, "asset.sense: no value 'forces' in LeggedRobot"),
-        ("feet_contact_forces", {"rewards.max_contact_force": -1.0}, "rewards.max_contact_force is -1.0; it must be zero or more"),
+        ("feet_contact_forces", {"rewards.max_contact_force": -1.0}, "rewards.max_contact_force is -1.0; it must be 0 or more"),
     ],
 )
 def test_what_a_term_lacks(name: str, more: dict[str, Any], error: str) -> None:

@@ -300,7 +300,7 @@ def test_trains_and_is_graded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
             {"asset.penalize_contacts_on": []},
             r"^rewards.scales.collision is on, but asset.penalize_contacts_on names nothing; name what should not touch$",
         ),
-        ({"init_state.dof_pos_range": [1.5, 0.5]}, r"^init_state.dof_pos_range is \[1.5, 0.5\]; it must be two numbers, the lower first$"),
+        ({"init_state.dof_pos_range": [1.5, 0.5]}, r"init_state.dof_pos_range is \[1.5, 0.5\]; it must be two numbers, the lower first$"),
     ],
 )
 def test_mistakes_are_one_clear_line(overrides: dict[str, Any], message: str) -> None:

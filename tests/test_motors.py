@@ -441,6 +441,7 @@ def test_an_export_with_servos_is_as_it_was(made: Path) -> None:
 def test_a_contract_with_other_motors_is_refused(exported: Callable[[dict[str, Any]], Path]) -> None:
     folder = exported(DC)
     contract = load_yaml(folder / "policy.yaml")
+    del contract["checksum"]  # else it would be that which differs
     for change, message in (
         ({"law": "magic"}, "policy.yaml: motors: 'law' is 'magic'; it must be one of servo, dc_motor, torque, network"),
         ({"no_load_speed": [0.0] * 12}, "policy.yaml: motors: 'no_load_speed' is .*; it must be numbers above zero"),
@@ -480,8 +481,8 @@ def test_a_law_in_code_is_not_exported(made: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"control.no_load_speed": {"": 0.0}}, r"control.no_load_speed is \{'': 0.0\}; it must be a table of numbers above 0"),
-        ({"control.gear": {"": -1.0}}, "control.gear is .* a table of numbers above 0"),
+        ({"control.no_load_speed": {"": 0.0}}, r"control.no_load_speed\[''\] is 0.0; it must be above 0"),
+        ({"control.gear": {"": -1.0}}, "control.gear.* above 0"),
         ({"control.stall_torque": {"hip": 20.0}}, "control.stall_torque: no value for FR_thigh_joint, .*add keys, or '' for all others"),
         (
             {"control.stall_torque": {}},
@@ -504,7 +505,7 @@ def test_a_law_in_code_is_not_exported(made: Path, tmp_path: Path) -> None:
         ({"control.actuator": "network"}, "control.actuator is 'network', but control.network names no file of weights"),
         ({"control.actuator": "network", "control.network": "no.npz"}, "control.network: no file 'no.npz' in "),
         ({"control.actuator": "motor"}, "control.actuator"),
-        ({"domain_rand.delay_ms": [-1.0, 2.0]}, "domain_rand.delay_ms is .* two numbers from zero, the lower first, or an empty list"),
+        ({"domain_rand.delay_ms": [-1.0, 2.0]}, "domain_rand.delay_ms.* is -1.0; it must be 0 or more"),
         (
             {
                 "control.actuator": "servo",

@@ -283,7 +283,7 @@ def test_names_do_not_run_into_each_other(levels: int, kinds: list[str], size: t
     [
         (["a.jpg"], "a.jpg: the picture is a PNG; give it a name that ends in .png"),
         (["a.png", "--task", "go1_flat"], "go1_flat is on a plane; to see its section terrain all the same add --set terrain.mesh_type="),
-        (["a.png", "--set", "terrain.num_rows=0"], "terrain.num_rows is 0; it must be positive"),
+        (["a.png", "--set", "terrain.num_rows=0"], "terrain.num_rows is 0; it must be 1 or more"),
         (["a.png", "--set", "terrain.terrain_proportions={moon: 1}"], "no kind of terrain 'moon' in terrain.terrain_proportions"),
     ],
 )

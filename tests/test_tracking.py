@@ -176,7 +176,7 @@ def test_the_step_can_be_recorded(left_out: dict[str, list[str]], rows: int) -> 
         ({"motion.clips": []}, "motion.clips is empty; name a clip"),
         ({"motion.clips": ["g1_kik.npz"]}, "motion.clips: no file 'g1_kik.npz' in"),
         ({"motion.uniform": 0.0}, "motion.uniform is 0.0; it must be above 0 and at most 1"),
-        ({"motion.start_pos": [0.1, 0.1]}, "it must be three numbers from 0"),
+        ({"motion.start_pos": [0.1, 0.1]}, "it must be three numbers; each 0 or more"),
         ({"motion.anchor": "torso"}, "motion.anchor: no body 'torso' in motion.bodies; did you mean 'torso_link'?"),
         ({"motion.end_bodies": ["head"]}, "motion.end_bodies: no body 'head' in motion.bodies"),
     ],

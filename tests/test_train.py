@@ -341,7 +341,7 @@ def test_sigterm_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
         "--max_iterations",
         "1000000",
         "--experiment_name",
-        str(tmp_path / "my runs"),
+        "my runs",
     ]
     process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -354,7 +354,7 @@ def test_sigterm_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
     rest, err = process.communicate(timeout=120)
     text = "".join(out) + rest
     assert process.returncode == 3 and "Traceback" not in err, err
-    [folder] = (tmp_path / "my runs").iterdir()
+    [folder] = (tmp_path / "logs/my runs").iterdir()
     last = max(int(number) for number in re.findall(r"Learning iteration (\d+)/", text))
     [(iteration, file)] = checkpoints(folder).items()
     assert iteration == last == load(file)["iter"] >= 2

@@ -117,4 +117,4 @@ def test_a_short_run_has_no_exam_and_a_negative_interval_is_refused(tmp_path: Pa
     monkeypatch.setattr("legged_mw.eval.exams.make_exam", begin)
     trained(tmp_path, "--max_iterations", "1")  # fewer than an interval
     line = refused(tmp_path, "train", "--task", "go1_flat", "--device", "cpu", "--set", "runner.exam_interval=-1")
-    assert "runner.exam_interval is -1; it must be zero or more" in line
+    assert "runner.exam_interval is -1; it must be 0 or more" in line

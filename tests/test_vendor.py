@@ -350,8 +350,9 @@ def test_a_second_ground_is_dropped(tmp_path: Path) -> None:
 
 
 def test_a_geom_of_the_robot_that_is_called_as_the_ground(tmp_path: Path) -> None:
-    with pytest.raises(ModelError, match="^toy.xml calls a geom of the robot 'floor', which is the name of the ground; give it another$"):
-        build_toy(toy(tmp_path, inside='<geom name="floor" size="0.1"/>'))
+    robot = build_toy(toy(tmp_path, inside='<geom name="floor" size="0.1"/>'))
+    assert robot.spec.geom("robot_floor").parent.name == "base" and robot.physics.geom("floor").bodyid == 0
+    assert "geom 'floor' is called 'robot_floor': the first name is one of ours" in robot.overrides
 
 
 def test_of_keyframes_home_or_the_only_one_is_read(tmp_path: Path) -> None:

@@ -5,6 +5,8 @@ The export writes it from here and ``legged_mw.deploy`` reads it with this. Noth
 
 from __future__ import annotations
 
+import hashlib
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,12 +19,12 @@ from legged_mw.deploy.estimate import ESTIMATE, Estimated, read_estimated
 from legged_mw.deploy.memory import MEMORY, Memory, read_memory
 from legged_mw.deploy.motion import JOINT_POS, JOINT_VEL, MOTION, PLACE, REFERENCE, TURN, Motion, read_motion
 from legged_mw.deploy.motors import MOTORS, SERVOS, Motors, read_motors
+from legged_mw.deploy.reader import MOST_VALUES, Reader, is_list, is_number
 from legged_mw.deploy.reader import ContractError as ContractError
-from legged_mw.deploy.reader import Reader, is_list, is_number
 from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import unknown
-from legged_mw.utils.files import digest
+from legged_mw.utils.files import digest, finish_moving
 
 FORMATS = (2, 3, 4)  # 3: a memory, an estimate, motors; 4: a motion. A file has the lowest that suffices: old readers read what they can
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"
@@ -70,6 +72,10 @@ SCAN = "height_scan"  # ContractRow.measured of the height scan
 CLOCK = "gait_clock"  # ContractRow.measured of the gait clock
 OWN = (SENSORS, SCAN, "")  # rows that come whole, in Measurement.others, by their names
 ORIGINS = ("default", "joints", "targets", "torque", "speed")
+CHECKSUM = "checksum"  # of what the network's numbers mean, which may not change without the network
+_FREE = ("format", "task", "ends", "exam", "safety", CHECKSUM)  # what may: how the policy is judged and watched
+_FARTHEST = 100.0  # [rad] or [m] of a joint's default, either way
+_LARGEST_ACTION = 1000.0  # [L] clips at 100
 
 
 @dataclass(frozen=True)
@@ -171,7 +177,7 @@ class Contract:
         """What policy.yaml holds."""
         ends = {name: list(value) if isinstance(value, tuple) else value for name, value in self.ends._asdict().items() if value}
         network = {"file": NETWORK_FILE, "sha256": self.digest, "input": self.input, "output": self.output}
-        return {
+        said = {
             "format": FORMATS[2 if self.motion else 1 if self.memory or self.estimate or self.motors != SERVOS else 0],
             "task": self.task,
             "network": network | ({MEMORY: self.memory.to_dict()} if self.memory else {}),
@@ -194,6 +200,7 @@ class Contract:
             **self.motors.to_dict(),
             **({MOTION: self.motion.to_dict()} if self.motion else {}),
         }
+        return {**said, CHECKSUM: checksum(said)}
 
 
 def _row_to_dict(row: ContractRow) -> dict[str, Any]:
@@ -207,6 +214,12 @@ def _short(values: Sequence[float]) -> float | list[float]:
     return values[0] if len(set(values)) == 1 else list(values)
 
 
+def checksum(said: Mapping[str, Any]) -> str:
+    """SHA-256 of all in a contract that the network was trained with: joints, rows, scales and the rest, in their order."""
+    bound = {name: value for name, value in said.items() if name not in _FREE}
+    return hashlib.sha256(json.dumps(bound, default=str).encode()).hexdigest()
+
+
 # ---- reading -------------------------------------------------------------------------------------------------------
 
 
@@ -215,16 +228,22 @@ def read_contract(folder: Path) -> Contract:
 
     Raises ContractError (or ConfigError, if the YAML is broken) with one line.
     """
+    finish_moving(folder)
     path = folder / CONTRACT_FILE
     for file in (path, folder / NETWORK_FILE, folder / SCENE_FILE):
         if not file.is_file():
             raise ContractError(f"no {file.name} in {folder}; make an export with: python play.py --task <task> --export {folder}")
-    contract = _read(Reader(load_yaml(path), CONTRACT_FILE))
+    contract = _read(Reader(said := load_yaml(path), CONTRACT_FILE))
     _check_rows(contract)
     if digest(folder / NETWORK_FILE) != contract.digest:
         raise ContractError(
             f"{NETWORK_FILE} is not the file that {CONTRACT_FILE} was written for (its SHA-256 differs): "
             "it is damaged, or of another export; export the policy again"
+        )
+    if CHECKSUM in said and checksum(said) != said[CHECKSUM]:  # older exports have none
+        raise ContractError(
+            f"{CONTRACT_FILE} was changed in what the network was trained with (its {CHECKSUM} differs); only {', '.join(_FREE[1:-1])} "
+            "may be: undo the change, or export the policy again"
         )
     return contract
 
@@ -232,19 +251,21 @@ def read_contract(folder: Path) -> Contract:
 def _read(top: Reader) -> Contract:
     top.take("format", f"one of {', '.join(map(str, FORMATS))}, which this version reads; export the policy again", lambda v: v in FORMATS)
     network, action, robot, physics, measured = (top.section(name) for name in ("network", "action", "robot", "physics", "sensors"))
+    network.file("file", NETWORK_FILE)
+    physics.file("file", SCENE_FILE)
     joints, feet = top.texts("joints"), robot.section("feet")
     top.take("joints", "names, each once", lambda names: len(set(names)) == len(names))
-    count, timestep, decimation = len(joints), physics.above_zero("timestep"), physics.count("decimation")
+    count, timestep, decimation = len(joints), physics.above_zero("timestep"), physics.count("decimation", 10_000)
     step = timestep * decimation
     top.take("period", f"physics: timestep * decimation = {step:g}", lambda v: is_number(v) and math.isclose(v, step, rel_tol=1e-6))
     return Contract(
         task=top.text("task"),
         joints=joints,
-        default_pose=top.numbers("default_pose", count, "joint"),
+        default_pose=top.numbers("default_pose", count, "joint", -_FARTHEST, _FARTHEST),
         action=_read_action(action, count),
-        stiffness=top.numbers("stiffness", count, "joint"),
-        damping=top.numbers("damping", count, "joint"),
-        period=top.above_zero("period"),
+        stiffness=top.numbers("stiffness", count, "joint", 0.0),
+        damping=top.numbers("damping", count, "joint", 0.0),
+        period=top.above_zero("period", 10.0),
         timestep=timestep,
         decimation=decimation,
         commands=tuple(map(_read_command, top.sections("commands", empty=True))),
@@ -269,25 +290,29 @@ def _read(top: Reader) -> Contract:
 
 def _read_action(action: Reader, joints: int) -> Action:
     origin = action.take("origin", f"one of {', '.join(ORIGINS)}", lambda v: v in ORIGINS)
-    return Action(origin, action.scale(joints, "joint"), action.above_zero("clip"))
+    scale = action.scale(joints, "joint")
+    action.take("scale", "other than 0, which moves nothing", lambda _: bool(scale.any()))
+    return Action(origin, scale, action.above_zero("clip", _LARGEST_ACTION))
 
 
 def _read_command(command: Reader) -> Command:
-    low, high = command.number("lowest"), command.number("highest")
+    low = command.number("lowest")
+    high = command.number("highest", low)
     return Command(command.text("name"), low, high, command.text("unit", empty=True), default=command.number("default", low, high))
 
 
 def _read_row(row: Reader) -> ContractRow:
+    size = row.count("size")
     return ContractRow(
         name=row.text("name"),
-        size=row.count("size"),
+        size=size,
         unit=row.text("unit", empty=True),
         frame=row.text("frame", empty=True),
         noise=row.number("noise", 0.0),
         measured=row.text("measured", empty=True),
         sensors=row.texts("sensors") if "sensors" in row.values else (),
-        scale=tuple(row.scale(row.count("size"), "value of the row").tolist()),
-        history=row.count("history") if "history" in row.values else 1,
+        scale=tuple(row.scale(size, "value of the row").tolist()),
+        history=row.count("history", MOST_VALUES // size) if "history" in row.values else 1,
     )
 
 
@@ -298,7 +323,7 @@ def _read_ends(ends: Reader) -> Ends:
             raise ContractError(f"{ends.where}: {unknown('rule', name, Ends._fields, 'the rules that end a walk')}")
     return Ends(
         max_tilt=ends.number("max_tilt", 0.0, 180.0) if "max_tilt" in ends.values else None,
-        min_base_height=ends.number("min_base_height") if "min_base_height" in ends.values else None,
+        min_base_height=ends.number("min_base_height", -_FARTHEST, _FARTHEST) if "min_base_height" in ends.values else None,
         falls_on=ends.texts("falls_on") if "falls_on" in ends.values else (),
         not_covered=ends.texts("not_covered") if "not_covered" in ends.values else (),
     )
@@ -310,7 +335,7 @@ def _read_scan(top: Reader) -> HeightScan | None:
         return None
     scan = top.section(SCAN)
     x, y = (tuple(map(float, scan.take(key, "a list of numbers", lambda v: is_list(v, is_number)))) for key in "xy")
-    return HeightScan(x, y, scan.above_zero("standing"))
+    return HeightScan(x, y, scan.above_zero("standing", _FARTHEST))
 
 
 def _read_gait(top: Reader) -> Gait | None:

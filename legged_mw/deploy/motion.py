@@ -26,4 +26,5 @@ class Motion(NamedTuple):
 def read_motion(section: Reader) -> Motion:
     """From the contract's reader of the section."""
     bodies = section.texts("bodies")
+    section.file("file", MOTION_FILE)
     return Motion(section.take("anchor", "one of `bodies`", lambda v: v in bodies), bodies, section.text("sha256"))

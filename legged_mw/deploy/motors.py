@@ -60,6 +60,7 @@ SERVOS = Motors()
 def read_motors(section: Reader, joints: int) -> Motors:
     """The motors from the contract's reader of the section ``motors``."""
     law = section.take("law", f"one of {', '.join(LAWS)}", lambda value: value in LAWS)
+    section.file("file", MOTORS_FILE)
     names = ("stall_torque", "no_load_speed") if law == "dc_motor" or "stall_torque" in section.values else ()
     curve = {name: tuple(section.numbers(name, joints, "joint").tolist()) for name in names}
     for name in names:

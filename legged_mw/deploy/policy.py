@@ -15,8 +15,10 @@ from legged_mw.deploy.follow import Follower
 from legged_mw.deploy.gait import GaitClock
 from legged_mw.deploy.robot import Measurement
 from legged_mw.utils.errors import UserError
+from legged_mw.utils.machine import contained
 
 Floats = NDArray[np.floating[Any]]
+_FIRST_SECONDS, _FIRST_ROOM = 10.0, 2 << 30  # of the first call: networks of robots take a thousandth of either
 
 
 class Network:
@@ -31,19 +33,39 @@ class Network:
             import onnxruntime
         except ImportError:
             raise UserError("running an exported policy needs onnxruntime: pip install onnxruntime") from None
-        options = onnxruntime.SessionOptions()
+        options, self._run = onnxruntime.SessionOptions(), onnxruntime.RunOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1  # a network this small loses by a second
-        options.log_severity_level = 4
-        try:
-            self._session = onnxruntime.InferenceSession((folder / NETWORK_FILE).read_bytes(), options, providers=["CPUExecutionProvider"])
-        except Exception:  # onnxruntime raises a type of its own for each way that a file is broken
-            raise ContractError(f"{NETWORK_FILE} cannot be read as an ONNX network: it is damaged; export the policy again") from None
+        options.log_severity_level = self._run.log_severity_level = 4
+        network = (folder / NETWORK_FILE).read_bytes()
+        self._session = self._first(lambda: onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"]), "read")
         memory, guessed = contract.memory, sum(row.size for row in contract.estimate)
         self._inputs = {contract.input: [contract.size]} | ({memory.input: [*memory.shape]} if memory else {})  # name -> shape
         self._outputs = {contract.output: [len(contract.joints)]} | ({memory.output: [*memory.shape]} if memory else {})
         self._outputs |= {ESTIMATE: [guessed]} if guessed else {}
         self._one_by_one = self._check(contract)
         self.estimate: NDArray[np.float32] | None = None
+        self._try()
+
+    def _first(self, work: Callable[[], Any], what: str) -> Any:
+        """The first time that the file decides what happens here. Raises ContractError for what takes no end or no measure."""
+        try:
+            return contained(work, _FIRST_SECONDS, _FIRST_ROOM, stop=lambda: setattr(self._run, "terminate", True))
+        except TimeoutError:
+            raise ContractError(f"{NETWORK_FILE} cannot be {what}: its first call takes longer than {_FIRST_SECONDS:g} s") from None
+        except Exception as error:  # onnxruntime raises a type of its own for each way that a file is broken
+            if isinstance(error, MemoryError) or "alloc" in str(error):
+                raise ContractError(f"{NETWORK_FILE} cannot be {what}: it asks for more than {_FIRST_ROOM >> 30} GiB") from None
+            text = "cannot be read as an ONNX network" if what == "read" else "cannot be run"
+            raise ContractError(f"{NETWORK_FILE} {text}: it is damaged; export the policy again") from None
+
+    def _try(self) -> None:
+        """One call with zeros."""
+        zeros = {name: np.zeros((1, *shape), dtype=np.float32) for name, shape in self._inputs.items()}
+        found = self._first(lambda: self._session.run([*self._outputs], zeros, self._run), "run")
+        for (name, shape), value in zip(self._outputs.items(), found, strict=True):
+            if np.shape(value) != (1, *shape) or not np.isfinite(value).all():
+                got = np.shape(value) if np.shape(value) != (1, *shape) else "what is not finite"
+                raise ContractError(f"{NETWORK_FILE}: its output '{name}' for an observation of zeros is {got}; export the policy again")
 
     def _check(self, contract: Contract) -> bool:
         """Inputs and outputs of the contract's names and sizes; returns whether the batch is fixed to 1."""

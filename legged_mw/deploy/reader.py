@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from legged_mw.utils.errors import UserError
+
+MOST = 1e6  # no quantity of a robot is larger, in any unit
+MOST_VALUES = 10_000_000  # of an observation: a camera's picture has a tenth
 
 
 class ContractError(UserError, ValueError):
@@ -24,7 +26,7 @@ class Reader:
     def take(self, key: str, wanted: str, fits: Callable[[Any], bool]) -> Any:
         """The value of ``key`` if it fits; ``wanted`` are the words for what does."""
         if key not in self.values or not fits(self.values[key]):
-            found = f"is {self.values[key]!r}" if key in self.values else "is missing"
+            found = f"is {brief(self.values[key])}" if key in self.values else "is missing"
             raise ContractError(f"{self.where}: '{key}' {found}; it must be {wanted}")
         return self.values[key]
 
@@ -41,29 +43,47 @@ class Reader:
     def texts(self, key: str, empty: bool = False) -> tuple[str, ...]:
         return tuple(self.take(key, "a list of names", lambda v: is_list(v, lambda item: isinstance(item, str), empty)))
 
-    def count(self, key: str) -> int:
-        return self.take(key, "a whole number from 1", lambda v: isinstance(v, int) and not isinstance(v, bool) and v >= 1)
+    def count(self, key: str, most: int = MOST_VALUES) -> int:
+        value = self.take(key, "a whole number from 1", lambda v: isinstance(v, int) and not isinstance(v, bool) and v >= 1)
+        return value if value <= most else self.take(key, f"{most} at most", lambda v: False)
 
-    def number(self, key: str, low: float = -math.inf, high: float = math.inf) -> float:
-        limits = (f" from {low:g}" if low > -math.inf else "") + (f" to {high:g}" if high < math.inf else "")
+    def number(self, key: str, low: float = -MOST, high: float = MOST) -> float:
+        beyond = is_number(self.values.get(key)) and abs(self.values[key]) > MOST
+        limits = (f" from {low:g}" if beyond or low > -MOST else "") + (f" to {high:g}" if beyond or high < MOST else "")
         return float(self.take(key, f"a number{limits}", lambda v: is_number(v) and low <= v <= high))
 
-    def above_zero(self, key: str) -> float:
-        self.number(key)
+    def above_zero(self, key: str, high: float = MOST) -> float:
+        self.number(key, -MOST, high)
         return float(self.take(key, "above zero", lambda v: v > 0))
 
-    def numbers(self, key: str, count: int, of: str) -> np.ndarray:
-        return np.array(self.take(key, f"{count} numbers, one a {of}", lambda v: is_list(v, is_number) and len(v) == count), dtype=float)
+    def numbers(self, key: str, count: int, of: str, low: float = -MOST, high: float = MOST) -> np.ndarray:
+        value = self.take(key, f"{count} numbers, one a {of}", lambda v: is_list(v, is_number) and len(v) == count)
+        self.take(key, f"numbers from {low:g} to {high:g}", lambda v: low <= min(v) and max(v) <= high)
+        return np.array(value, dtype=float)
+
+    def file(self, key: str, name: str) -> None:
+        """An export's files have fixed names and lie beside the contract, whoever wrote it."""
+        if key in self.values:
+            self.take(key, f"{name}, which lies beside {self.where.partition(':')[0]}", lambda v: v == name)
 
     def scale(self, count: int, of: str) -> np.ndarray:
         """``scale`` as one number a value; one for all may stand for them."""
         wanted = f"a number, or {count} numbers, one a {of}"
         value = self.take("scale", wanted, lambda v: is_number(v) or (is_list(v, is_number) and len(v) == count))
+        self.take("scale", f"of {MOST:g} at most", lambda v: np.max(np.abs(v)) <= MOST)
         return np.full(count, value, dtype=float) if is_number(value) else np.array(value, dtype=float)
 
 
 def is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300  # a whole number may be no float
+
+
+def brief(value: object) -> str:
+    """A value for a message, however large it is."""
+    if isinstance(value, int) and abs(value) > 1 << 64:
+        return "a number of many digits"
+    text = repr(value) if not isinstance(value, str | list | dict) or len(value) <= 200 else f"{type(value).__name__} of {len(value)}"
+    return text if len(text) <= 400 else f"{text[:400]}..."
 
 
 def is_list(value: object, fits: Callable[[Any], bool], empty: bool = False) -> bool:

@@ -25,12 +25,14 @@ from legged_mw.deploy.motors import make_network
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, damped, layout
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import usable_cores
+from legged_mw.utils.mjcf import check_files, check_model
 
 Change = Callable[[mujoco.MjModel], None]
 _NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # sensors of position and velocity describe the new state
 
 _GROUND_GROUP = [1, 0, 0, 0, 0, 0]  # geom groups that a height scan sees: a robot's own are others
 _SHAPES = 3  # geom group of a robot's collision shapes
+_DEEP, _FAR = 0.1, 1e4  # [m] of a start under the ground, and away from the middle of the world, that is none
 _ABOVE = 2.0  # [m] over the root, where its rays begin
 
 
@@ -267,12 +269,15 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
     if not (folder / file).is_file():
         raise ContractError(f"no {file} in {folder}; an export has one if its task was trained on ground with steps or blocks")
     try:
+        check_files(folder / file)
         spec = mujoco.MjSpec.from_file(str(folder / file))
         for body in spec.bodies[1:] if whole else ():
             shapes = [geom for geom in body.geoms if geom.group == _SHAPES]
             for geom in shapes if not any(geom.conaffinity for geom in shapes) else ():
                 geom.conaffinity = 1
         model = spec.compile()
+        check_model(model)
+        _check_start(model)
         if whole:
             model.opt.iterations, model.opt.ls_iterations = 100, 50  # MuJoCo's own
     except ValueError as error:
@@ -280,8 +285,6 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
     joints = [_index(model, file, "joint", name, "joint") for name in contract.joints]
     actuators = [_index(model, file, "actuator", name, "servo") for name in contract.joints]
     _check_machine(model, file, contract, joints, actuators)
-    if model.nkey < 1:
-        raise ContractError(f"{file} has no keyframe; the first one says where the robot starts")
     needed = [*SENSED, *([FALL] if contract.ends.falls_on else [])]
     if missing := [name for name in needed if name not in contract.sensors]:
         raise ContractError(f"{CONTRACT_FILE}: sensors: '{missing[0]}' is missing; name the sensors of {file} that measure it")
@@ -295,6 +298,23 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
     feet = [_places(model, file, names, foot) for foot, names in contract.feet.items()]
     _check_order(model, contract)
     return Scene(spec, model, np.array(actuators), model.jnt_dofadr[joints], places, feet)
+
+
+def _check_start(model: mujoco.MjModel) -> None:
+    """Raises ValueError where the first keyframe is no place to start from."""
+    if model.nkey < 1:
+        raise ValueError("it has no keyframe; the first one says where the robot starts")
+    if not np.any(model.opt.gravity):
+        raise ValueError("it has no gravity, so no direction is down")
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    if not 0.9 < np.linalg.norm(data.qpos[3:7]) < 1.1 or np.abs(data.qpos).max() > _FAR:
+        raise ValueError("its first keyframe is no pose: the root's quaternion has not length 1, or a value is enormous")
+    mujoco.mj_forward(model, data)
+    deep = [contact.dist for contact in data.contact if 0 in model.body_weldid[model.geom_bodyid[contact.geom]]]
+    planes = (model.geom_bodyid == 0) & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
+    if (lowest := min([0.0, *deep, *(data.qpos[2] - model.geom_pos[planes, 2])])) < -_DEEP:
+        raise ValueError(f"its first keyframe is {-lowest:.2g} m under the ground")
 
 
 def _index(model: mujoco.MjModel, file: str, kind: str, name: str, word: str) -> int:

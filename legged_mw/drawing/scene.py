@@ -55,7 +55,7 @@ def reach(robot: RobotModel) -> float:
 def ground_model(terrain: Terrain) -> mujoco.MjModel:
     """The ground alone, to be looked at from afar."""
     spec = mujoco.MjSpec()
-    add_ground(spec, Ground(terrain=terrain), "the ground", [])
+    add_ground(spec, Ground(terrain=terrain), [])
     add_scene(spec)
     add_relief(spec, terrain, GROUND, squares=False)
     return spec.compile()

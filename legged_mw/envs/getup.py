@@ -5,6 +5,8 @@ Sources: [P] MuJoCo Playground's Go1 getup (commit d5e6b47); [H] HoST (OpenRobot
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import torch
 from torch import Tensor
 
@@ -13,8 +15,10 @@ from legged_mw.envs.pull import Pull
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
 from legged_mw.sim.settle import fallen
+from legged_mw.utils.bounds import Count, Part, Seconds, Share, Whole, above
 from legged_mw.utils.math import assign
 
+Settling = Annotated[float, above(0, 60, "s")]
 UP_TILT, UP_HEIGHT = 0.966, 0.9  # cosine of the tilt (15 degrees), share of the standing height: it is up [ours: servos alone hold 0.92]
 
 
@@ -26,12 +30,12 @@ class GetupCfg(RobotTaskCfg):
         self_collisions = True  # and all colliders touch the ground [P]
 
     class falls:
-        share: float = 0.75  # of episodes that begin in a fall; the others stand [P 0.6]
-        states: int = 2048  # settled falls to begin from; at most four a world are made [ours]
-        seconds: float = 1.0  # from the drop to the state [P 0.5; ours: a roll takes longer]
-        seed: int = 1  # the same seed makes the same falls; the exam has its own
-        pull: float = 0.0  # share of the weight that lifts the root of a robot that is not up; it fades as they learn [H 0.6]
-        pull_fades: float = 0.2  # of it, when every world has ended an episode up [ours]
+        share: Share = 0.75  # of episodes that begin in a fall; the others stand [P 0.6]
+        states: Count = 2048  # settled falls to begin from; at most four a world are made [ours]
+        seconds: Settling = 1.0  # from the drop to the state [P 0.5; ours: a roll takes longer]
+        seed: Whole = 1  # the same seed makes the same falls; the exam has its own
+        pull: Share = 0.0  # share of the weight that lifts the root of a robot that is not up; it fades as they learn [H 0.6]
+        pull_fades: Part = 0.2  # of it, when every world has ended an episode up [ours]
 
     class control(RobotTaskCfg.control):
         action_scale = 0.5  # [rad] [P, H: of the present angles; ours: of the default pose, where action 0 stands]
@@ -55,7 +59,7 @@ class GetupCfg(RobotTaskCfg):
         iterations, ls_iterations = 3, 10  # [ours: a robot that lies has many contacts]
 
     class exam:
-        within: float = 3.0  # [s] in which it must stand
+        within: Seconds = 3.0  # [s] in which it must stand
 
     class rewards(RobotTaskCfg.rewards):
         only_positive_rewards = False  # [ours, P True: nothing ends an episode, and while it thrashes all would be clipped]
@@ -134,7 +138,7 @@ class Getup(RobotTask):
         assign(self.sim.qvel, fall, self.fallen_qvel.index_select(0, pick))
 
     def _body_rows(self) -> list[Row]:
-        return [*super()._body_rows(), Row("base_height", self.base_height[:, None], mirror="scalar")]  # [m] [P]
+        return [*super()._body_rows(), Row("base_height", self.base_height[:, None], mirror="scalar")]  # above the ground [m] [P]
 
     def _near_upright(self) -> Tensor:
         return torch.exp(-4.0 * (1.0 - self.upright))  # exp(-2 |g + z|^2) of unit vectors [P]

@@ -11,7 +11,8 @@ from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
-from legged_mw.utils.config import ConfigError
+from legged_mw.utils.bounds import Names, Positive, Sign
+from legged_mw.utils.config import ConfigError, fit
 from legged_mw.utils.errors import unknown
 
 
@@ -22,8 +23,8 @@ class HandstandCfg(RobotTaskCfg):
     class exam:
         """What is asked, of the reward and in the exam."""
 
-        nose: float = -1.0  # -1 down, a handstand; 1 up, a footstand
-        height: float = 0.55  # [m] of the root that is high enough [P]
+        nose: Sign = -1.0  # -1 down, a handstand; 1 up, a footstand
+        height: Positive = 0.55  # [m] of the root that is high enough [P]
         hands: list[str] = []  # geoms that stand: nothing else may touch the ground
 
     class control(RobotTaskCfg.control):
@@ -81,12 +82,13 @@ class Handstand(RobotTask):
 
     def _init_buffers(self) -> None:
         super()._init_buffers()
+        fit(self.cfg.exam.hands, Names, "exam.hands")
         geoms = [self.robot.physics.geom(i).name for i in range(self.robot.physics.ngeom)]
         if wrong := [name for name in self.cfg.exam.hands if name not in geoms]:
             raise ConfigError(f"exam.hands: {unknown('geom', wrong[0], geoms, self.cfg.asset.file)}")
 
     def _reward_stand_height(self) -> Tensor:
-        """Height of the root up to ``exam.height`` [m], exponential. [P]"""
+        """Height of the root up to ``exam.height``, exponential in metres. [P]"""
         return torch.exp(self.base_height.clamp(max=self.cfg.exam.height) - self.cfg.exam.height)
 
     def _reward_stand_attitude(self) -> Tensor:

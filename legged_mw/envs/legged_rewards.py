@@ -123,13 +123,13 @@ class LeggedRewards(RobotRewards):
         return torch.exp(error / -self.tracking_sigma)
 
     def _reward_stand_still(self) -> Tensor:
-        """Joints away from the default pose while the command is to stand. [L]"""
+        """Joints away from the default pose while the command is to stand [rad]. [L]"""
         return self.dof_offset.abs().sum(dim=1).masked_fill_(self.moving, 0.0)
 
     # ---- feet
 
     def _reward_feet_clearance(self) -> Tensor:
-        """Feet that move fast away from the swing height. [P]"""
+        """Feet that move fast away from the swing height [m^1.5/s^0.5]. [P]"""
         return ((self.foot_height - self.cfg.rewards.swing_height).abs() * self.foot_speed.sqrt()).sum(dim=1)
 
     def _reward_feet_height(self) -> Tensor:
@@ -138,7 +138,7 @@ class LeggedRewards(RobotRewards):
         return (error * (self.first_contact & self.moving[:, None])).sum(dim=1)
 
     def _reward_feet_slip(self) -> Tensor:
-        """Squared horizontal speed of feet in contact, while moving. [P]"""
+        """Squared horizontal speed of feet in contact, while moving [m^2/s^2]. [P]"""
         return (self.foot_speed.square() * (self.foot_contact & self.moving[:, None])).sum(dim=1)
 
     def _reward_feet_air_time(self) -> Tensor:

@@ -223,7 +223,7 @@ class LeggedRobot(LeggedRewards, RobotTask):
                 *self._body_rows(),
                 Row("foot_contact", self.foot_contact, mirror="foot"),  # 0 or 1
                 Row("foot_lin_vel", self.foot_vel.flatten(1), mirror="foot_polar", unit="m/s", frame="world"),
-                Row("feet_air_time", self.feet_air_time, mirror="foot", unit="s"),
+                Row("feet_air_time", self.feet_air_time, mirror="foot", unit="s"),  # since lift-off; 0 in contact
                 *self._asked_foot_rows(),
                 *self._disturbance_rows(),
                 *self._height_rows("privileged_state"),

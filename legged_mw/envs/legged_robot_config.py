@@ -5,9 +5,16 @@ Sources: [P] MuJoCo Playground's Go1 joystick task; [L] legged_gym; [ours] with 
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
+from legged_mw.utils.bounds import THREE, Bound, Count, NonNegative, Part, Points, Positive, Range, Share, ShareRange, Sign, Whole, or_empty
+
+Probabilities = Annotated[list[Share], Bound("three numbers, and more for further commands", lambda v: len(v) >= 3)]
+Stance = Annotated[float, Bound("above 0 and below 1", lambda v: 0 < v < 1)]
+CellSize = Annotated[float, Bound("above 0 and at most 0.25 m, or a cell would be wider than a step of stairs", lambda v: 0 < v <= 0.25)]
+Border = Annotated[float, Bound("1 m or more, for a robot that leaves the tiles to turn back", lambda v: v >= 1)]
+Marks = Annotated[list[Positive], or_empty(THREE)]
 
 
 class LeggedRobotCfg(RobotTaskCfg):
@@ -22,45 +29,45 @@ class LeggedRobotCfg(RobotTaskCfg):
         contact_forces: bool = False  # a row of `privileged_state`: the ground's force on each foot, world frame [N] [ours: off]
 
     class commands:
-        resampling_time: float = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]
-        change_probability: float = 0.5  # that a component changes at all when the timer ends [P]
-        keep_probability: list[float] = [0.9, 0.25, 0.5]  # of each command: that a changed one is not its default; beyond the list 1 [P]
+        resampling_time: NonNegative = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]
+        change_probability: Share = 0.5  # that a component changes at all when the timer ends [P]
+        keep_probability: Probabilities = [0.9, 0.25, 0.5]  # of each command: that a changed one is not its default; beyond the list 1 [P]
 
         curriculum: bool = False  # begin with a share of the ranges, and widen it while the velocity is tracked well [L]
-        curriculum_start: float = 0.4  # that share [-] [ours]
-        curriculum_step: float = 0.1  # by which it grows, where worlds' last episodes have 0.8 of the best tracking_lin_vel [L, ours]
+        curriculum_start: Part = 0.4  # that share [-] [ours]
+        curriculum_step: Part = 0.1  # by which it grows, where worlds' last episodes have 0.8 of the best tracking_lin_vel [L, ours]
 
         heading_command: bool = False  # the yaw rate steers to a heading that is drawn in its place [L]
-        heading_gain: float = 0.5  # yaw rate a heading error, within its range [1/s] [L]
+        heading_gain: Positive = 0.5  # yaw rate a heading error, within its range [1/s] [L]
         units: dict[str, str] = {}  # of commands of your own, by name
-        mirror: dict[str, float] = {}  # likewise: 1.0, or -1.0 where left and right change its sign
+        mirror: dict[str, Sign] = {}  # likewise: 1.0, or -1.0 where left and right change its sign
         default: dict[str, float] = {}  # likewise: its value when nothing is asked; else 0, or the nearest to it in the range
 
         class ranges:
             """Lowest and highest of each command, in the order that the policy sees them. A task may declare its own after these."""
 
-            lin_vel_x: list[float] = [-1.5, 1.5]  # [m/s] [P]
-            lin_vel_y: list[float] = [-0.8, 0.8]  # [m/s] [P]
-            ang_vel_yaw: list[float] = [-1.2, 1.2]  # [rad/s] [P]
-            heading: list[float] = [-3.14, 3.14]  # [rad], world; not seen by the policy, only for heading_command [L]
+            lin_vel_x: Range = [-1.5, 1.5]  # [m/s] [P]
+            lin_vel_y: Range = [-0.8, 0.8]  # [m/s] [P]
+            ang_vel_yaw: Range = [-1.2, 1.2]  # [rad/s] [P]
+            heading: Range = [-3.14, 3.14]  # [rad], world; not seen by the policy, only for heading_command [L]
 
     class gait:
         """A clock (legged_mw/envs/gait.py): where each foot is in its step, for the policy and the terms feet_phase, contact_phase."""
 
-        period: float = 0.0  # of a step of both legs [s]; 0: no clock [unitree_rl_gym: 0.8]
-        offsets: list[float] = []  # where each foot is when the clock is at 0, share of the period; empty: of two feet [0.0, 0.5]
-        stance: float = 0.55  # share of the period that a foot stands, from its phase 0 [unitree_rl_gym]
+        period: NonNegative = 0.0  # of a step of both legs [s]; 0: no clock [unitree_rl_gym: 0.8]
+        offsets: list[Share] = []  # where each foot is when the clock is at 0, share of the period; empty: of two feet [0.0, 0.5]
+        stance: Stance = 0.55  # share of the period that a foot stands, from its phase 0 [unitree_rl_gym]
         random_start: bool = True  # episodes begin anywhere in the period, so that each leg learns to lead; False: at 0, as deploy does
 
     class rewards(RobotTaskCfg.rewards):
-        tracking_sigma: float = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
-        tracking_sigma_end: float = 0.0  # where it goes in a straight line over max_iterations; 0: it stays [ours]
-        swing_height: float = 0.1  # wanted height of a swinging foot [m] [P]
-        min_air_time: float = 0.1  # a step that lasts less is penalised [s] [P]
-        min_command: float = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]
-        min_feet_distance: float = 0.2  # sideways between left and right feet, of `feet_distance` [m] [P: T1, G1]
-        max_contact_force: float = 100.0  # on a foot, above which `feet_contact_forces` counts [N] [L]
-        max_single_stance: float = 0.4  # on one foot, from where `single_stance` grows no more [s] [Isaac Lab: G1]
+        tracking_sigma: Positive = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
+        tracking_sigma_end: NonNegative = 0.0  # where it goes in a straight line over max_iterations; 0: it stays [ours]
+        swing_height: Positive = 0.1  # wanted height of a swinging foot [m] [P]
+        min_air_time: NonNegative = 0.1  # a step that lasts less is penalised [s] [P]
+        min_command: NonNegative = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]
+        min_feet_distance: NonNegative = 0.2  # sideways between left and right feet, of `feet_distance` [m] [P: T1, G1]
+        max_contact_force: NonNegative = 100.0  # on a foot, above which `feet_contact_forces` counts [N] [L]
+        max_single_stance: Positive = 0.4  # on one foot, from where `single_stance` grows no more [s] [Isaac Lab: G1]
 
         class scales(RobotTaskCfg.rewards.scales):
             """Reward terms by name: each number switches on the method _reward_<name>, 0 switches it off. All [P]."""
@@ -85,38 +92,38 @@ class LeggedRobotCfg(RobotTaskCfg):
 
     class noise(RobotTaskCfg.noise):
         class scales(RobotTaskCfg.noise.scales):
-            height_scan: float = 0.1  # [m] [L]
+            height_scan: NonNegative = 0.1  # [m] [L]
 
     class terrain(RobotTaskCfg.terrain):
         mesh_type: Literal["plane", "heightfield"] = "plane"  # heightfield: a grid of tiles, all below is about it
-        num_rows: int = 10  # levels of difficulty, along x [L]
-        num_cols: int = 20  # tiles side by side along y, each column of one kind [L]
-        tile_size: float = 8.0  # edge of a tile [m] [L]
-        horizontal_scale: float = 0.05  # between two heights [m] [ours: L 0.1 makes a step of stairs a slope of 50 degrees]
-        border_size: float = 5.0  # flat ground around all tiles; a robot that leaves half of it behind starts again, timed out [m] [L 25]
-        difficulty: list[float] = [0.0, 1.0]  # of the first and the last row, from 0 to 1 [L]
-        terrain_proportions: dict[str, float] = {  # kind (legged_mw/sim/terrain.py) -> share of the columns [ours]
+        num_rows: Count = 10  # levels of difficulty, along x [L]
+        num_cols: Count = 20  # tiles side by side along y, each column of one kind [L]
+        tile_size: Positive = 8.0  # edge of a tile [m] [L]
+        horizontal_scale: CellSize = 0.05  # between two heights [m] [ours: L 0.1 makes a step of stairs a slope of 50 degrees]
+        border_size: Border = 5.0  # flat ground around all tiles; a robot that leaves half of it behind starts again, timed out [m] [L 25]
+        difficulty: ShareRange = [0.0, 1.0]  # of the first and the last row, from 0 to 1 [L]
+        terrain_proportions: dict[str, NonNegative] = {  # kind (legged_mw/sim/terrain.py) -> share of the columns [ours]
             **{"flat": 0.05, "smooth_slope": 0.1, "rough_slope": 0.15, "stairs_up": 0.25, "stairs_down": 0.15},
             **{"obstacles": 0.15, "waves": 0.05, "low_random": 0.1},
         }
-        seed: int = 1  # of all that is random in it
+        seed: Whole = 1  # of all that is random in it
         curriculum: bool = True  # levels by what a robot can do; False: a random one at each reset [L]
-        max_init_terrain_level: int = 5  # highest level at the start of training; the last one, if there are fewer [L]
-        measured_points_x: list[float] = [i / 10 for i in range(-8, 9)]  # of the height scan, ahead of the root [m] [L]
-        measured_points_y: list[float] = [i / 10 for i in range(-5, 6)]  # to its left [m] [L]
-        height_scan: list[str] = []  # groups of observations that get the row: "state", "privileged_state"
+        max_init_terrain_level: Whole = 5  # highest level at the start of training; the last one, if there are fewer [L]
+        measured_points_x: Points = [i / 10 for i in range(-8, 9)]  # of the height scan, ahead of the root [m] [L]
+        measured_points_y: Points = [i / 10 for i in range(-5, 6)]  # to its left [m] [L]
+        height_scan: list[Literal["state", "privileged_state"]] = []  # groups of observations that get the row
 
     class exam:
         """The walking exam of --eval and of training (docs/grading.md); all [ours]."""
 
-        ranges: dict[str, list[float]] = {}  # lowest and highest lin_vel_x, lin_vel_y, ang_vel_yaw asked; not named: commands.ranges
-        push_speeds: list[float] = []  # jumps of the base's velocity [m/s]; empty: 0.5, 1, 1.5, 2, 3, and 4, 5, 6 if not on two feet
+        ranges: dict[str, Range] = {}  # lowest and highest lin_vel_x, lin_vel_y, ang_vel_yaw asked; not named: commands.ranges
+        push_speeds: list[Positive] = []  # jumps of the base's velocity [m/s]; empty: 0.5, 1, 1.5, 2, 3, and 4, 5, 6 if not on two feet
         push_vx: float = 0.0  # vx of a robot that is pushed [m/s]; 0: half of the highest
         transport_vx: float = 0.0  # vx of the cost of transport [m/s]; 0: half of the highest
-        marks: list[float] = []  # walks: of vx, vy [m/s], yaw rate [rad/s]; empty: errors 0.06 of the highest, 0.06, 0.1 of the highest
+        marks: Marks = []  # walks: of vx, vy [m/s], yaw rate [rad/s]; empty: errors 0.06 of the highest, 0.06, 0.1 of the highest
         # and offsets 0.06, 0.06, 0.12
         marks_of: Literal["", "error", "offset"] = ""  # offset: of the mean velocity; empty: that on two feet, which sway, else error
-        push_mark: float = 0.0  # walks: all pushes of this speed are survived [m/s]; 0: 1 on two feet, else 2
+        push_mark: NonNegative = 0.0  # walks: all pushes of this speed are survived [m/s]; 0: 1 on two feet, else 2
         peer: str = ""  # the robot (go1, go2, g1) whose published policies of legged_mw/eval/peers.py stand beside; empty: none
 
 

@@ -100,7 +100,7 @@ class MotionTracking(RobotTask):
                 *clip,
                 *anchors,
                 Row("body_pos", self.body_pos, mirror="body_polar"),  # of each body in the anchor's frame [m]
-                Row("body_ori", self.body_ori, mirror="body_turn"),
+                Row("body_ori", self.body_ori, mirror="body_turn"),  # two columns of the rotation of each
                 *self._body_rows(),
                 Row("last_actions", self.last_actions, mirror="joint"),
                 *self._disturbance_rows(),

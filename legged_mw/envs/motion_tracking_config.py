@@ -6,6 +6,7 @@ Source: BeyondMimic (arXiv 2508.08241), as its code and mjlab's have it; [ours] 
 from __future__ import annotations
 
 from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.utils.bounds import NonNegative, NonNegativeVector, Part, Positive, Seconds
 
 
 class MotionTrackingCfg(RobotTaskCfg):
@@ -20,32 +21,30 @@ class MotionTrackingCfg(RobotTaskCfg):
         anchor: str = ""  # one of them, at which they are
         end_bodies: list[str] = []  # of them: far too high or low with one of these, it fell
         random_start: bool = True  # episodes begin anywhere in the clips, by the bins below; False: at the first clip's first frame
-        hold_s: float = 1.0  # a clip's last frame is held for so long, then the episode times out [s] [ours: deploy holds it, too]
-        bin_s: float = 1.0  # length of a bin [s]
-        failure_rate: float = 0.001  # share of a step in the moving average of the failures in each bin
-        uniform: float = (
-            0.1  # share of the episodes that begin in any bin [-] [ours: B's code adds it to the failures, where it is nothing]
-        )
-        start_pos: list[float] = [0.05, 0.05, 0.01]  # off the reference as an episode begins, each U(-range, range): x, y, z [m]
-        start_turn: list[float] = [0.1, 0.1, 0.2]  # about x, y, z [rad]
-        start_lin_vel: list[float] = [0.5, 0.5, 0.2]  # [m/s]
-        start_ang_vel: list[float] = [0.52, 0.52, 0.78]  # [rad/s]
-        start_joints: float = 0.1  # each joint, within its soft limits [rad]
+        hold_s: NonNegative = 1.0  # a clip's last frame is held for so long, then the episode times out [s] [ours: deploy holds it, too]
+        bin_s: Seconds = 1.0  # length of a bin [s]
+        failure_rate: Part = 0.001  # share of a step in the moving average of the failures in each bin
+        uniform: Part = 0.1  # share of the episodes that begin in any bin [-] [ours: B's code adds it to the failures, where it is nothing]
+        start_pos: NonNegativeVector = [0.05, 0.05, 0.01]  # off the reference as an episode begins, each U(-range, range): x, y, z [m]
+        start_turn: NonNegativeVector = [0.1, 0.1, 0.2]  # about x, y, z [rad]
+        start_lin_vel: NonNegativeVector = [0.5, 0.5, 0.2]  # [m/s]
+        start_ang_vel: NonNegativeVector = [0.52, 0.52, 0.78]  # [rad/s]
+        start_joints: NonNegative = 0.1  # each joint, within its soft limits [rad]
 
     class termination(RobotTaskCfg.termination):
-        max_anchor_height: float = 0.25  # between the anchor's height and its reference's; beyond it, it fell [m]
-        max_anchor_tilt: float = 0.8  # between their vertical axes' heights, of 1 [-]
-        max_end_height: float = 0.25  # between the heights of an end body [m]
+        max_anchor_height: Positive = 0.25  # between the anchor's height and its reference's; beyond it, it fell [m]
+        max_anchor_tilt: Positive = 0.8  # between their vertical axes' heights, of 1 [-]
+        max_end_height: Positive = 0.25  # between the heights of an end body [m]
 
     class rewards(RobotTaskCfg.rewards):
         only_positive_rewards = False
         soft_dof_pos_limit = 0.9
-        anchor_pos_sigma: float = 0.3  # a term is exp(-(error / sigma)^2) [m]
-        anchor_ori_sigma: float = 0.4  # [rad]
-        body_pos_sigma: float = 0.3  # the error: root mean square of all bodies [m]
-        body_ori_sigma: float = 0.4  # [rad]
-        body_lin_vel_sigma: float = 1.0  # [m/s]
-        body_ang_vel_sigma: float = 3.14  # [rad/s]
+        anchor_pos_sigma: Positive = 0.3  # a term is exp(-(error / sigma)^2) [m]
+        anchor_ori_sigma: Positive = 0.4  # [rad]
+        body_pos_sigma: Positive = 0.3  # the error: root mean square of all bodies [m]
+        body_ori_sigma: Positive = 0.4  # [rad]
+        body_lin_vel_sigma: Positive = 1.0  # [m/s]
+        body_ang_vel_sigma: Positive = 3.14  # [rad/s]
 
         class scales(RobotTaskCfg.rewards.scales):
             tracking_anchor_pos: float = 0.5
@@ -60,5 +59,5 @@ class MotionTrackingCfg(RobotTaskCfg):
     class noise(RobotTaskCfg.noise):
         class scales(RobotTaskCfg.noise.scales):
             lin_vel, dof_pos, dof_vel = 0.5, 0.01, 0.5
-            anchor_pos: float = 0.25  # [m]
-            anchor_ori: float = 0.05  # of an entry of the rotation matrix [-]
+            anchor_pos: NonNegative = 0.25  # [m]
+            anchor_ori: NonNegative = 0.05  # of an entry of the rotation matrix [-]

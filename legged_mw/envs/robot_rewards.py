@@ -162,11 +162,11 @@ class RobotRewards:
         return torch.ones_like(self.rew_buf)
 
     def _reward_lin_vel_z(self) -> Tensor:
-        """Square of the vertical velocity at the IMU, world frame (gravity points down, hence the same square). [P]"""
+        """Square of the vertical velocity at the IMU, world frame [m^2/s^2] (gravity points down: the same square). [P]"""
         return (self.base_lin_vel * self.projected_gravity).sum(dim=1).square()
 
     def _reward_ang_vel_xy(self) -> Tensor:
-        """Roll and pitch rates, world frame. [P]"""
+        """Squared roll and pitch rates, world frame [rad^2/s^2]. [P]"""
         return self.base_ang_vel_world[:, :2].square().sum(dim=1)
 
     def _reward_orientation(self) -> Tensor:
@@ -237,7 +237,7 @@ class RobotRewards:
         return self.torques.square().sum(dim=1).sqrt() + self.torques.abs().sum(dim=1)
 
     def _reward_action_rate(self) -> Tensor:
-        """Change of the clipped action. [L]"""
+        """Change of the clipped action, squared. [L]"""
         return (self.actions - self.last_actions).square().sum(dim=1)
 
     def _reward_action_smoothness(self) -> Tensor:

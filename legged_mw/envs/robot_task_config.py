@@ -6,9 +6,44 @@ Sources: [P] MuJoCo Playground's Go1 joystick task and its learner settings; [L]
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+from legged_mw.utils.bounds import (
+    THREE,
+    Bound,
+    Count,
+    Delays,
+    Factors,
+    Few,
+    Names,
+    NonNegative,
+    NonZero,
+    Offsets,
+    Part,
+    Positive,
+    PositiveRange,
+    Range,
+    Seconds,
+    Seed,
+    Share,
+    Sizes,
+    Whole,
+    WholeDelays,
+    above,
+    at_least,
+    or_empty,
+)
 from legged_mw.utils.config import Config
+
+Place = Annotated[list[Annotated[float, at_least(-1000, 1000, "m")]], or_empty(THREE)]
+Camera = Annotated[list[float], or_empty(Bound("three numbers, not straight above or below", lambda v: len(v) == 3 and any(v[:2])))]
+Pairs = Annotated[list[list[str]], Bound("pairs: lists of two names or patterns each", lambda v: all(len(pair) == 2 for pair in v))]
+Tilt = Annotated[float, above(0, 180, "degrees")]
+Slope = Annotated[float, at_least(-60, 60, "degrees")]
+TimeStep = Annotated[float, at_least(1e-4, 0.1, "s")]
+Pixels = Annotated[int, at_least(1, 8192)]
+Threads = Annotated[int, at_least(0, 1024)]
+FolderPart = Annotated[str, Bound("part of a folder's name, without / or \\", lambda v: "/" not in v and "\\" not in v)]
 
 
 class RobotTaskCfg(Config):
@@ -17,75 +52,75 @@ class RobotTaskCfg(Config):
     """
 
     class env:
-        num_envs: int = 4096  # worlds stepped together
-        episode_length_s: float = 20.0  # [s], then the episode times out [P]
+        num_envs: Count = 4096  # worlds stepped together
+        episode_length_s: Seconds = 20.0  # [s], then the episode times out [P]
 
     class asset:
         file: str = ""  # MJCF or URDF, as its vendor wrote it; beside the file of the class that says so, or in the repository
         imu_site: str = ""  # site, or body, that is fixed to the root; empty: "imu" if it is so, or else the root's origin [ours]
         # names of geoms; of bodies, which mean their own geoms that collide; or patterns. Geoms that touch the ground:
-        colliders: list[str] = ["*"]  # of those that collide in the file
+        colliders: Names = ["*"]  # of those that collide in the file
         self_collisions: bool = False  # among the colliders
         penalize_contacts_on: list[str] = []  # likewise, colliders: `collision` counts their bodies on the ground [L]
         terminate_after_contacts_on: list[str] = []  # likewise: to touch the ground with one of these is a fall [L]
         sense: list[str] = []  # of contact_forces, self_contacts, angular_momentum, what code of yours reads outside of reward terms
         held_joints: list[str] = []  # names or patterns: welded at their default angle, so that they are no joints any more
         # tables a joint that need not name every joint; the others keep the file's
-        effort: dict[str, float] = {}  # highest force of the servo, both ways [N m]
-        armature: dict[str, float] = {}  # inertia of the rotor at the joint [kg m^2]
-        frictionloss: dict[str, float] = {}  # dry friction [N m]
-        joint_speed_limits: dict[str, float] = {}  # the motor's highest speed [rad/s] (a URDF has it); for report and rewards only
+        effort: dict[str, Positive] = {}  # highest force of the servo, both ways [N m]
+        armature: dict[str, NonNegative] = {}  # inertia of the rotor at the joint [kg m^2]
+        frictionloss: dict[str, NonNegative] = {}  # dry friction [N m]
+        joint_speed_limits: dict[str, Positive] = {}  # the motor's highest speed [rad/s] (a URDF has it); for report and rewards only
 
     class init_state:
-        pos: list[float] = []  # root at reset [m]; empty: feet as high as in the keyframe "home" or the only one, or on the ground
+        pos: Place = []  # root at reset [m]; empty: feet as high as in the keyframe "home" or the only one, or on the ground
         default_joint_angles: dict[str, float] = {}  # table a joint [rad]: the pose of action 0; joints without a key: that keyframe's
-        dof_pos_range: list[float] = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
-        dof_pos_offset: list[float] = [0.0, 0.0]  # added to each joint at reset, U(low, high), within its range [rad]
-        dof_vel_range: float = 0.0  # each joint's velocity at reset, U(-range, range) [rad/s]
-        pos_xy_range: float = 0.5  # root x and y + U(-range, range) [m] [P]
-        yaw_range: float = 3.141592653589793  # U(-range, range) [rad] [P]
-        lin_vel_range: float = 0.5  # root velocity, world frame, each axis U(-range, range) [m/s] [P]
-        ang_vel_range: float = 0.5  # root angular velocity, body frame, each axis U(-range, range) [rad/s] [P]
+        dof_pos_range: Range = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
+        dof_pos_offset: Range = [0.0, 0.0]  # added to each joint at reset, U(low, high), within its range [rad]
+        dof_vel_range: NonNegative = 0.0  # each joint's velocity at reset, U(-range, range) [rad/s]
+        pos_xy_range: NonNegative = 0.5  # root x and y + U(-range, range) [m] [P]
+        yaw_range: NonNegative = 3.141592653589793  # U(-range, range) [rad] [P]
+        lin_vel_range: NonNegative = 0.5  # root velocity, world frame, each axis U(-range, range) [m/s] [P]
+        ang_vel_range: NonNegative = 0.5  # root angular velocity, body frame, each axis U(-range, range) [rad/s] [P]
 
     class control:
         # servo: kp (target - angle), damped in the joint; dc_motor: kp (target - angle) - kd speed within a torque-speed curve;
         # torque: the action is one, scaled; network: a file's weights make the torque (docs/motors.md)
         actuator: Literal["servo", "dc_motor", "torque", "network"] = "servo"  # [P]
-        stiffness: dict[str, float] = {}  # table a joint: position gain [N m/rad]
-        damping: dict[str, float] = {}  # table a joint: passive damping; of a dc_motor its velocity gain, within its curve [N m s/rad]
+        stiffness: dict[str, NonNegative] = {}  # table a joint: position gain [N m/rad]
+        damping: dict[str, NonNegative] = {}  # table a joint: passive damping; of a dc_motor its velocity gain, in its curve [N m s/rad]
         # tables a joint of a torque-speed curve, which dc_motor needs and torque and network may have: at angular velocity w a motor
         # gives from -stall_torque (1 + w / no_load_speed) to stall_torque (1 - w / no_load_speed), and at most asset.effort
-        stall_torque: dict[str, float] = {}  # [N m]
-        no_load_speed: dict[str, float] = {}  # [rad/s]
-        gear: dict[str, float] = {"": 1.0}  # turns of the motor a turn of the joint; 1: the two tables are the joint's own
+        stall_torque: dict[str, Positive] = {}  # [N m]
+        no_load_speed: dict[str, Positive] = {}  # [rad/s]
+        gear: dict[str, Positive] = {"": 1.0}  # turns of the motor a turn of the joint; 1: the two tables are the joint's own
         network: str = ""  # of `network`: an .npz, as `python -m legged_mw.robot.actuator_net` writes it
         network_digest: dict[str, str] = {}  # written by train.py: that name -> SHA-256 of the file; a changed file is refused
-        action_scale: float | dict[str, float] = 0.5  # target = origin + scale * action [rad or rad/s]; a number, or a table a joint [P]
+        action_scale: NonZero | dict[str, NonZero] = 0.5  # target = origin + scale * action [rad, rad/s]; a number, or a table a joint [P]
         # the default pose, the measured angles or the last targets [P]; "speed": none, a dc_motor gives damping (scale action - speed)
         action_origin: Literal["default", "joints", "targets", "speed"] = "default"
-        decimation: int = 5  # simulation steps a control step [P]
+        decimation: Few = 5  # simulation steps a control step [P]
 
     class observations:
         leave_out: dict[str, list[str]] = {}  # group -> rows of the table that it does without: {"state": ["base_lin_vel"]}
-        history: dict[str, int] = {}  # group, or "group.row" -> frames of each row, oldest first: {"state": 5}
+        history: dict[str, Count] = {}  # group, or "group.row" -> frames of each row, oldest first: {"state": 5}
 
     class termination:
-        max_tilt: float = 90.0  # [deg] between the root's z axis and the vertical; beyond it, it fell [P]
-        min_base_height: float = 0.0  # [m] of the root above the ground under it; lower, it fell; 0: anything [ours]
-        max_speed: float = 1.0e4  # [m/s, rad/s] of any degree of freedom; beyond it the state counts as not finite [ours]
+        max_tilt: Tilt = 90.0  # [deg] between the root's z axis and the vertical; beyond it, it fell [P]
+        min_base_height: NonNegative = 0.0  # [m] of the root above the ground under it; lower, it fell; 0: anything [ours]
+        max_speed: Positive = 1.0e4  # [m/s, rad/s] of any degree of freedom; beyond it the state counts as not finite [ours]
 
     class rewards:
         only_positive_rewards: bool = True  # clip the sum at 0: without it the robot learns to stand still [P, L]
         clip_termination: bool = False  # True: `termination` is inside that clip, where a fall costs nothing [P]; False [L]
-        max_reward: float = 10000.0  # upper clip of the sum, a step [P]
-        soft_dof_pos_limit: float = 0.95  # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
-        pose_weights: dict[str, float] = {"": 1.0}  # table a joint: weight in `pose` [-]
-        base_height_target: float = 0.0  # of `base_height`: of the root above the ground under it [m]
+        max_reward: Positive = 10000.0  # upper clip of the sum, a step [P]
+        soft_dof_pos_limit: Part = 0.95  # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
+        pose_weights: dict[str, NonNegative] = {"": 1.0}  # table a joint: weight in `pose` [-]
+        base_height_target: NonNegative = 0.0  # of `base_height`: of the root above the ground under it [m]
         hip_joints: list[str] = []  # of `hip_pos`: joints' names, patterns, or parts of names
-        mirror_joints: list[list[str]] = []  # of `joint_mirror`: pairs of joints, likewise: [["FR_", "RL_"], ["FL_", "RR_"]]
-        deviation_weights: dict[str, float] = {"": 1.0}  # table a joint: weight in `joint_deviation` [-]
-        soft_torque_limit: float = 0.9  # share of the servo's force limit, of `torque_limits` [L: Cassie; L 1.0, which none exceeds]
-        soft_dof_vel_limit: float = 0.9  # share of asset.joint_speed_limits, of `dof_vel_limits` [L: Cassie; L 1.0]
+        mirror_joints: Pairs = []  # of `joint_mirror`: pairs of joints, likewise: [["FR_", "RL_"], ["FL_", "RR_"]]
+        deviation_weights: dict[str, NonNegative] = {"": 1.0}  # table a joint: weight in `joint_deviation` [-]
+        soft_torque_limit: Positive = 0.9  # share of the servo's force limit, of `torque_limits` [L: Cassie; L 1.0, which none exceeds]
+        soft_dof_vel_limit: Positive = 0.9  # share of asset.joint_speed_limits, of `dof_vel_limits` [L: Cassie; L 1.0]
         torques_as: Literal["norms", "squares"] = "norms"  # `torques` is the 2-norm plus the 1-norm [P], or the sum of squares [L]
 
         class scales:
@@ -94,19 +129,19 @@ class RobotTaskCfg(Config):
             _open = True
 
     class normalization:
-        clip_actions: float = 2.0  # the clipped action is applied, penalised, observed and exported [ours: P has no bound, and thrashes]
+        clip_actions: Positive = 2.0  # the clipped action is applied, penalised, observed and exported [ours: P has no bound, and thrashes]
 
     class noise:
-        level: float = 1.0  # multiplies every scale; 0: no noise [P]
+        level: NonNegative = 1.0  # multiplies every scale; 0: no noise [P]
 
         class scales:
             """Half width of uniform noise on a row of `state`. All [P]."""
 
-            lin_vel: float = 0.1  # [m/s]
-            ang_vel: float = 0.2  # [rad/s]
-            gravity: float = 0.05  # [-]
-            dof_pos: float = 0.03  # [rad]
-            dof_vel: float = 1.5  # [rad/s]
+            lin_vel: NonNegative = 0.1  # [m/s]
+            ang_vel: NonNegative = 0.2  # [rad/s]
+            gravity: NonNegative = 0.05  # [-]
+            dof_pos: NonNegative = 0.03  # [rad]
+            dof_vel: NonNegative = 1.5  # [rad/s]
 
     class perturbation:
         """A kick is a force on the root, a half sine over the duration: one of dv changes its velocity by dv / pi.
@@ -115,63 +150,63 @@ class RobotTaskCfg(Config):
         """
 
         kick: bool = False  # [P]
-        interval: list[float] = [1.0, 3.0]  # pause between kicks [s] [P]
-        duration: list[float] = [0.05, 0.2]  # [s] [P]
-        velocity: list[float] = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
+        interval: PositiveRange = [1.0, 3.0]  # pause between kicks [s] [P]
+        duration: PositiveRange = [0.05, 0.2]  # [s] [P]
+        velocity: Range = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
         curriculum: bool = False  # a world's dv grows with the share of an episode that it survives, from 0 [ours]
-        curriculum_rate: float = 0.5  # by which share of the way it does, at the end of an episode, from above 0 to 1 [ours]
+        curriculum_rate: Part = 0.5  # by which share of the way it does, at the end of an episode, from above 0 to 1 [ours]
         push: bool = False  # the root's horizontal velocity becomes a random one; beside kicks or alone [L]
-        push_interval_s: float = 15.0  # between pushes, each world's clock its own [s] [L]
-        max_push_vel_xy: float = 1.0  # each axis U(-max, max) [m/s] [L]
+        push_interval_s: Seconds = 15.0  # between pushes, each world's clock its own [s] [L]
+        max_push_vel_xy: NonNegative = 1.0  # each axis U(-max, max) [m/s] [L]
 
     class domain_rand:
         """What differs between worlds. Two numbers are the ends of a uniform distribution; an empty list leaves the model's value."""
 
         enable: bool = False  # [P]
-        link_mass: list[float] = [0.9, 1.1]  # factor on each link's mass, its inertia with it [P; inertia ours]
-        base_mass: list[float] = [-1.0, 1.0]  # added to the root's [kg], its inertia in proportion [P; inertia ours]
-        base_com: list[float] = [-0.05, 0.05]  # added to the place of the root's centre of mass, each axis [m] [P]
-        armature: list[float] = [1.0, 1.05]  # factor on each joint's [P]
-        friction: list[float] = [0.4, 1.0]  # sliding friction of the ground [-] [P]
-        contact_time: list[float] = []  # time constant of the ground's contacts (solref) [s]: longer is softer, 0.02 is MuJoCo's
-        frictionloss: list[float] = [0.9, 1.1]  # factor on each joint's dry friction [P]
-        stiffness: list[float] = []  # factor on each servo's position gain
-        damping: list[float] = []  # factor on each joint's damping
-        strength: list[float] = []  # factor on each motor's force limit, asset.effort or the file's
-        encoder_offset: list[float] = [-0.05, 0.05]  # what each encoder reads beside the true angle [rad] [P]
-        stall_torque: list[float] = []  # factor on each motor's, of control.stall_torque
-        no_load_speed: list[float] = []  # factor on each motor's, of control.no_load_speed
-        action_delay: list[int] = []  # control steps from an action to its servo, whole numbers, both ends included
-        delay_ms: list[float] = []  # from an action to its motor [ms], rounded to the nearest simulation step, a half up
-        observation_delay: list[int] = []  # control steps that what `state` measures is old
-        model_factors: dict[str, list[float]] = {}  # any other field of the model that may differ: a factor per world on all of it
+        link_mass: Factors = [0.9, 1.1]  # factor on each link's mass, its inertia with it [P; inertia ours]
+        base_mass: Offsets = [-1.0, 1.0]  # added to the root's [kg], its inertia in proportion [P; inertia ours]
+        base_com: Offsets = [-0.05, 0.05]  # added to the place of the root's centre of mass, each axis [m] [P]
+        armature: Factors = [1.0, 1.05]  # factor on each joint's [P]
+        friction: Factors = [0.4, 1.0]  # sliding friction of the ground [-] [P]
+        contact_time: Factors = []  # time constant of the ground's contacts (solref) [s]: longer is softer, 0.02 is MuJoCo's
+        frictionloss: Factors = [0.9, 1.1]  # factor on each joint's dry friction [P]
+        stiffness: Factors = []  # factor on each servo's position gain
+        damping: Factors = []  # factor on each joint's damping
+        strength: Factors = []  # factor on each motor's force limit, asset.effort or the file's
+        encoder_offset: Offsets = [-0.05, 0.05]  # what each encoder reads beside the true angle [rad] [P]
+        stall_torque: Factors = []  # factor on each motor's, of control.stall_torque
+        no_load_speed: Factors = []  # factor on each motor's, of control.no_load_speed
+        action_delay: WholeDelays = []  # control steps from an action to its servo, whole numbers, both ends included
+        delay_ms: Delays = []  # from an action to its motor [ms], rounded to the nearest simulation step, a half up
+        observation_delay: WholeDelays = []  # control steps that what `state` measures is old
+        model_factors: dict[str, Factors] = {}  # any other field of the model that may differ: a factor per world on all of it
         redraw_at_reset: list[str] = [  # drawn at every reset of a world; the others once, at the start
             *["friction", "contact_time", "frictionloss", "stiffness", "damping", "strength", "stall_torque", "no_load_speed"],
             *["encoder_offset", "action_delay", "delay_ms", "observation_delay"],
         ]
-        redraw_iterations: int = 0  # draw everything again every so many iterations of training, and when it is resumed; 0: never
+        redraw_iterations: Whole = 0  # draw everything again every so many iterations of training, and when it is resumed; 0: never
         observe: bool = False  # rows in `privileged_state` with what was drawn
 
     class terrain:
-        friction: float = 0.6  # sliding friction of the ground, which overrules the robot's [-] [P]
-        condim: int = 3  # contact dimensions: 3 is sliding without torsion [P]
-        slope: float = 0.0  # [deg] of the plane, downhill along x: gravity leans, the plane and heights above it stay as they are
+        friction: NonNegative = 0.6  # sliding friction of the ground, which overrules the robot's [-] [P]
+        condim: Literal[1, 3, 4, 6] = 3  # contact dimensions: 3 is sliding without torsion [P]
+        slope: Slope = 0.0  # [deg] of the plane, downhill along x: gravity leans, the plane and heights above it stay as they are
 
     class sim:
         engine: Literal["auto", "mujoco_warp", "mujoco"] = "auto"  # auto: mujoco_warp on a GPU, MuJoCo's own on a CPU
-        threads: int = 0  # of MuJoCo's own engine; 0: one a core
-        dt: float = 0.004  # simulation step [s] [P]
-        iterations: int = 1  # Newton iterations [P]
-        ls_iterations: int = 5  # line-search iterations [P]
+        threads: Threads = 0  # of MuJoCo's own engine; 0: one a core
+        dt: TimeStep = 0.004  # simulation step [s] [P]
+        iterations: Few = 1  # Newton iterations [P]
+        ls_iterations: Few = 5  # line-search iterations [P]
         integrator: Literal["euler", "implicitfast"] = "euler"  # implicitfast: joint damping is stable however large [P: euler]
-        nconmax: int = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model, as --check says [ours: sim/room.py]
-        njmax: int = 0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
+        nconmax: Whole = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model, as --check says [ours: sim/room.py]
+        njmax: Whole = 0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
 
     class viewer:
-        width: int = 1280  # [pixel]
-        height: int = 720  # [pixel]
-        camera: list[float] = []  # place of the camera "track", from the robot, world axes [m]; empty: by its size, Go1's is 0.9 -1.1 0.6
-        fps: int = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
+        width: Pixels = 1280  # [pixel]
+        height: Pixels = 720  # [pixel]
+        camera: Camera = []  # place of the camera "track", from the robot, world axes [m]; empty: by its size, Go1's is 0.9 -1.1 0.6
+        fps: Few = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
 
 
 class RobotTaskCfgPPO(Config):
@@ -180,18 +215,16 @@ class RobotTaskCfgPPO(Config):
     What is marked [ours] was found by measurement: docs/lab.md.
     """
 
-    seed: int = 1
+    seed: Seed = 1
 
     class runner:
-        num_steps_per_env: int = 24  # control steps a world between two updates [P]
-        max_iterations: int = 300  # [ours: a robot of one's own shows something by then]
-        save_interval: int = 50  # [iterations] between checkpoints
-        keep_checkpoints: int = 0  # newest ones that stay; 0: all [ours]
-        exam_interval: int = (
-            200  # [iterations] between small exams, and one at the end; 0, or more than max_iterations: none [ours: docs/grading.md]
-        )
+        num_steps_per_env: Count = 24  # control steps a world between two updates [P]
+        max_iterations: Count = 300  # [ours: a robot of one's own shows something by then]
+        save_interval: Count = 50  # [iterations] between checkpoints
+        keep_checkpoints: Whole = 0  # newest ones that stay; 0: all [ours]
+        exam_interval: Whole = 200  # [iterations] between small exams, and one at the end; 0, or over max_iterations: none [ours]
         experiment_name: str = ""  # folder below logs/; empty: the task's name
-        run_name: str = ""  # appended to the run folder's time stamp
+        run_name: FolderPart = ""  # appended to the run folder's time stamp
         logger: Literal["tensorboard", "wandb"] = "tensorboard"
         wandb_project: str = "legged_mw"
         export: bool = True  # a finished training writes <run folder>/export/, as play.py --export does [ours]
@@ -203,73 +236,73 @@ class RobotTaskCfgPPO(Config):
 
     class actor:
         class_name: str = "MLPModel"  # or "RNNModel": a GRU or LSTM before the MLP, a memory (docs/training.md)
-        hidden_dims: list[int] = [512, 256, 128]  # [P]
+        hidden_dims: Sizes = [512, 256, 128]  # [P]
         activation: str = "elu"  # [P]
         obs_normalization: bool = True  # [P]
         rnn_type: Literal["gru", "lstm"] = "gru"  # of RNNModel alone, as the next two [ours: three quarters of an LSTM's work; R lstm]
-        rnn_hidden_dim: int = 256  # values that a layer remembers [R]
-        rnn_num_layers: int = 1  # [R]
+        rnn_hidden_dim: Count = 256  # values that a layer remembers [R]
+        rnn_num_layers: Few = 1  # [R]
 
         class distribution_cfg:
             class_name: str = "GaussianDistribution"
-            init_std: float = 0.6  # [ours: from 1.0 it thrashes, from 0.4 it may stand for good]
+            init_std: Positive = 0.6  # [ours: from 1.0 it thrashes, from 0.4 it may stand for good]
             std_type: Literal["scalar", "log"] = "scalar"  # [R]
-            std_range: list[float] = [1e-6, 1e6]  # [R]
+            std_range: PositiveRange = [1e-6, 1e6]  # [R]
 
         class estimator:
             """A network from what the actor reads to rows that it does not; the actor reads its estimate, too (rl/estimator.py)."""
 
             targets: list[str] = []  # rows of the critic's groups: ["base_lin_vel", "foot_contact"]; empty: no estimator
-            hidden_dims: list[int] = [256, 128]  # [genesis_lr's explicit estimator of a Go2]
+            hidden_dims: Sizes = [256, 128]  # [genesis_lr's explicit estimator of a Go2]
             activation: str = "elu"
-            learning_rate: float = 1e-3  # fixed [HIMLoco]
+            learning_rate: Part = 1e-3  # fixed [HIMLoco]
 
         class concurrent:
             """The actor reads its newest frame and a latent: a teacher's of ``groups``, or a student's of all frames (rl/concurrent.py)."""
 
             groups: list[str] = []  # that the teacher's encoder reads: ["privileged_state"]; empty: no teacher [CTS, arXiv 2405.10830]
-            teacher_share: float = 0.75  # of the worlds, that act by the teacher's latent [CTS]
-            latent_dim: int = 32  # values of a latent, whose length is 1 [go2_rl_gym]
-            hidden_dims: list[int] = [512, 256]  # of both encoders [go2_rl_gym]
+            teacher_share: Part = 0.75  # of the worlds, that act by the teacher's latent [CTS]
+            latent_dim: Count = 32  # values of a latent, whose length is 1 [go2_rl_gym]
+            hidden_dims: Sizes = [512, 256]  # of both encoders [go2_rl_gym]
             activation: str = "elu"
-            learning_rate: float = 1e-3  # of the student's encoder, fixed [go2_rl_gym]
+            learning_rate: Part = 1e-3  # of the student's encoder, fixed [go2_rl_gym]
 
     class critic:
         class_name: str = "MLPModel"
-        hidden_dims: list[int] = [512, 256, 128]  # [P]
+        hidden_dims: Sizes = [512, 256, 128]  # [P]
         activation: str = "elu"  # [P]
         obs_normalization: bool = True  # [P]
         rnn_type: Literal["gru", "lstm"] = "gru"  # as the actor's
-        rnn_hidden_dim: int = 256
-        rnn_num_layers: int = 1
+        rnn_hidden_dim: Count = 256
+        rnn_num_layers: Few = 1
 
     class algorithm:
         class_name: str = "legged_mw.rl.ppo:GraphedPPO"  # or "PPO": rsl-rl's own, same results, slower on a GPU
-        num_learning_epochs: int = 5  # [P]
-        num_mini_batches: int = 4  # [P]
-        clip_param: float = 0.2  # [P]
-        gamma: float = 0.99  # [P]
-        lam: float = 0.95  # [P]
-        value_loss_coef: float = 1.0  # [P]
-        entropy_coef: float = 0.005  # [ours; P 0.001]
-        learning_rate: float = 1e-3  # at the start [R; P 3e-4]
-        max_grad_norm: float = 1.0  # [P]
+        num_learning_epochs: Few = 5  # [P]
+        num_mini_batches: Count = 4  # [P]
+        clip_param: Positive = 0.2  # [P]
+        gamma: Share = 0.99  # [P]
+        lam: Share = 0.95  # [P]
+        value_loss_coef: NonNegative = 1.0  # [P]
+        entropy_coef: NonNegative = 0.005  # [ours; P 0.001]
+        learning_rate: Part = 1e-3  # at the start [R; P 3e-4]
+        max_grad_norm: Positive = 1.0  # [P]
         optimizer: str = "adam"  # [P]
         use_clipped_value_loss: bool = True  # [P]
         schedule: Literal["adaptive", "fixed"] = "adaptive"  # fixed: `learning_rate` throughout [R; P fixed]
-        desired_kl: float = 0.01  # between updates, for the adaptive schedule [R]
+        desired_kl: Positive = 0.01  # between updates, for the adaptive schedule [R]
         normalize_advantage_per_mini_batch: bool = False  # [R]
 
     class distillation:
         """Takes the place of `algorithm` where there is a teacher: the actor learns to act like it. After init_std rsl-rl's own keys."""
 
         teacher: str = ""  # its run, checkpoint or export, or a task for its last or shipped policy (train.py --teacher)
-        init_std: float = 0.1  # of the student's noise while it learns; nothing changes it [Isaac Lab]
+        init_std: Positive = 0.1  # of the student's noise while it learns; nothing changes it [Isaac Lab]
         class_name: str = "legged_mw.rl.distillation:GraphedDistillation"  # or "Distillation": rsl-rl's own, same results, slower
-        num_learning_epochs: int = 5  # [R 1; ours: docs/lab.md]
-        gradient_length: int = 4  # steps a gradient; it divides num_steps_per_env [ours: R 15 leaves 9 of 24 unused]
-        learning_rate: float = 1e-3  # [R]
-        max_grad_norm: float = 1.0  # 0: no bound [R none; ours: as in PPO]
+        num_learning_epochs: Few = 5  # [R 1; ours: docs/lab.md]
+        gradient_length: Count = 4  # steps a gradient; it divides num_steps_per_env [ours: R 15 leaves 9 of 24 unused]
+        learning_rate: Part = 1e-3  # [R]
+        max_grad_norm: NonNegative = 1.0  # 0: no bound [R none; ours: as in PPO]
         loss_type: Literal["mse", "huber"] = "mse"  # [R]
         optimizer: str = "adam"  # [R]
 
@@ -277,33 +310,33 @@ class RobotTaskCfgPPO(Config):
         """Training that begins with the actor of another run: `train.py --init`."""
 
         policy: str = ""  # the run, checkpoint or export, or a task for its last or shipped policy
-        init_std: float = 0.2  # of exploration at the start [ours: less than from nothing, as it can walk]
-        critic_warmup: int = 20  # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
+        init_std: Positive = 0.2  # of exploration at the start [ours: less than from nothing, as it can walk]
+        critic_warmup: Whole = 20  # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
 
     class anneal:
         """What a number of `algorithm` goes to, in a straight line over max_iterations; 0: it stays [ours]."""
 
-        entropy_coef: float = 0.0
-        desired_kl: float = 0.0
+        entropy_coef: NonNegative = 0.0
+        desired_kl: NonNegative = 0.0
 
     class cpu:
         """What train.py takes on a CPU instead, before the command line has its say [ours: docs/lab.md]."""
 
         enable: bool = True
-        envs_per_core: int = 256  # worlds; the task's own number, if that is less
-        num_steps_per_env: int = 16
-        num_learning_epochs: int = 5
-        num_mini_batches: int = 4
-        desired_kl: float = 0.02
-        hidden_dims: list[int] = [128, 64, 32]  # of actor and critic
-        rnn_hidden_dim: int = 64  # likewise
-        max_iterations: int = 2600
+        envs_per_core: Count = 256  # worlds; the task's own number, if that is less
+        num_steps_per_env: Count = 16
+        num_learning_epochs: Few = 5
+        num_mini_batches: Count = 4
+        desired_kl: Positive = 0.02
+        hidden_dims: Sizes = [128, 64, 32]  # of actor and critic
+        rnn_hidden_dim: Count = 64  # likewise
+        max_iterations: Count = 2600
         overrides: dict[str, Any] = {}  # fields of the environment: dotted path -> value
-        update_threads: int = 0  # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one
+        update_threads: Threads = 0  # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one
 
     class symmetry:
         """Left-right symmetry in the update, as in Mittal et al. 2024. Rows of observations say how they mirror: envs/mirror.py."""
 
         use_data_augmentation: bool = False  # learn from the mirror image of every sample too: twice the batch [R]
         use_mirror_loss: bool = False  # pull the mean action in the mirrored state to the mirrored mean action [R]
-        mirror_loss_coeff: float = 0.0  # weight of that pull, mean square over actions [-] [R]
+        mirror_loss_coeff: NonNegative = 0.0  # weight of that pull, mean square over actions [-] [R]

@@ -10,7 +10,7 @@ import dataclasses
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,6 +34,7 @@ from legged_mw.deploy.contract import (
     Ends,
     Gait,
     HeightScan,
+    read_contract,
 )
 from legged_mw.deploy.estimate import Estimated
 from legged_mw.deploy.memory import Memory
@@ -68,7 +69,7 @@ from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.utils.clip import save_clip
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import shown
-from legged_mw.utils.files import digest, find_file
+from legged_mw.utils.files import STAGED, digest, find_file, finish_moving, flush, sweep
 from legged_mw.utils.task import LoadedTask
 
 FILES = (CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
@@ -146,6 +147,8 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
             gap = _gap(acted, _run(exact, clip, observations, remembered)[0])
         replay(env, contract, steps, new)
         no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
+        if all(row.measured for row in contract.rows):
+            read_contract(new)  # as every reader will
         files = (*FILES, *(name for name in SOMETIMES if (new / name).exists()))
     unknown_rows = tuple(row.name for row in contract.rows if not row.measured)
     return Exported(files, gap, len(observations), unknown_rows, no_terrain, contract.ends.not_covered, half)
@@ -202,24 +205,30 @@ def _compare(got: np.ndarray, wanted: np.ndarray, does: str = "acts") -> float:
 
 @contextmanager
 def _all_or_nothing(folder: Path) -> Iterator[Path]:
-    """A temporary folder beside ``folder``, whose files move into place once all of them are there."""
+    """A temporary folder in ``folder``; once all files are in it a rename makes them the export: a kill after that leaves it to finish."""
     if folder.exists() and not folder.is_dir():
         raise ExportError(f"{folder} is a file; name a folder to export to")
-    new = folder.with_name(f".{folder.name}.{os.getpid()}.tmp") if folder.name else folder / f".export.{os.getpid()}.tmp"
+    new, mine = folder / f".export.{os.getpid()}.tmp", [part for part in (folder, *folder.parents) if not part.exists()]
     try:
-        new.mkdir(parents=True)
+        folder.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(new, ignore_errors=True)  # of a process that had this one's number
+        new.mkdir()
+        finish_moving(folder)  # of an export that was killed before
+        sweep(folder)
         yield new
-        if folder.exists():
-            for name in (name for name in SOMETIMES if not (new / name).exists()):  # one of an earlier export would be another policy's
-                (folder / name).unlink(missing_ok=True)
-            for name in [name for name in (*SOMETIMES, *FILES) if (new / name).exists()]:
-                os.replace(new / name, folder / name)
-        else:
-            os.replace(new, folder)
+        for name in (*FILES, *SOMETIMES):
+            (new / name).touch()  # empty: one of an earlier export, which would be another policy's
+            flush(new / name)
+        flush(new)
+        os.replace(new, folder / STAGED)
+        finish_moving(folder)
     except OSError as error:
         raise ExportError(f"cannot write an export to {folder}: {error.strerror or error}") from None
     finally:
         shutil.rmtree(new, ignore_errors=True)
+        with suppress(OSError):
+            for part in mine:  # those that are empty: nothing was written
+                part.rmdir()
 
 
 # ---- the contract --------------------------------------------------------------------------------------------------

@@ -19,6 +19,7 @@ from legged_mw.rl.resume import worlds_file
 from legged_mw.rl.runs import checkpoints, save_whole
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import shown
+from legged_mw.utils.files import sweep
 
 LOCK_FILE = ".lock"
 
@@ -45,8 +46,7 @@ class RunLock:
         self._file.truncate(0)
         self._file.write(f"process {os.getpid()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
         self._file.flush()
-        for torn in self._folder.glob(".*.tmp"):
-            torn.unlink(missing_ok=True)
+        sweep(self._folder)
 
     def __enter__(self) -> Self:
         return self

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,8 +27,9 @@ from legged_mw.rl.health import Health
 from legged_mw.rl.keeping import Keeper, reason_of
 from legged_mw.rl.policies import acting
 from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.progress import Console
 from legged_mw.rl.ranks import this_rank
-from legged_mw.rl.report import Clock, Mark, Message, Report, console_block, console_rows, curves, quiet_writers
+from legged_mw.rl.report import Clock, Mark, Message, Report, console_rows, curves, quiet_writers
 from legged_mw.rl.resume import random_state, set_random_state, take_worlds, worlds_content
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
 from legged_mw.rl.settings import rsl_rl_config
@@ -67,6 +67,7 @@ class Runner(OnPolicyRunner):
         self.examine: Callable[[Any], dict[str, float]] | None = None
         self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
         self.update_threads = UpdateThreads(self.cfg["cpu"]["update_threads"], usable_cores()) if device == "cpu" else nullcontext()
+        self.console = Console()
         self._warned_overflow = self._curves_lost = False
         self._last_means: dict[str, float] = {}
 
@@ -98,8 +99,8 @@ class Runner(OnPolicyRunner):
             self.keeper = Keeper(Path(self.logger.log_dir), self.cfg["keep_checkpoints"], this_rank())
         self._open_curves()
         self.env.take_statistics()
-        first, clock, waiting = self.current_learning_iteration, Clock(self.device), None
-        self._last, self._begun, self._first = first + num_learning_iterations, time.time(), first
+        clock, waiting = Clock(self.device), None
+        self._last = self.current_learning_iteration + num_learning_iterations
         self._all_stop = False
         start = clock.mark()
         while self.current_learning_iteration < self._last and not self._must_stop():
@@ -175,6 +176,11 @@ class Runner(OnPolicyRunner):
         interval, done = self.cfg["exam_interval"], self.current_learning_iteration
         return self.examine is not None and interval > 0 and done % interval == 0 and done < self._last
 
+    def _next_exam(self, done: int) -> int | None:
+        """The iteration after which the next exam comes, if any does."""
+        interval = self.cfg["exam_interval"]
+        return min((done // interval + 1) * interval, self._last) if self.examine is not None and interval > 0 else None
+
     def _examine(self) -> None:
         """Grade the policy as it is now; of the ranks, only the first has an exam, and the others wait in the next update."""
         assert self.examine is not None
@@ -194,8 +200,7 @@ class Runner(OnPolicyRunner):
         self.last_exam = self.current_learning_iteration, figures
         found = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
         self._draw_curves(found, self.current_learning_iteration)
-        title = f"Exam after iteration {self.current_learning_iteration}/{self._last}"
-        print(console_block(title, {name: f"{value:.3f}" for name, value in figures.items()}), flush=True)
+        self.console.exam(self.current_learning_iteration, self._last, figures)
 
     # ---- what the user sees ---------------------------------------------------------------------------------------
 
@@ -235,11 +240,8 @@ class Runner(OnPolicyRunner):
         numbers["learning_rate"], numbers["action_std"] = settings
         collect, learn = report.seconds()
         speed = report.steps / (collect + learn)
-        left = (time.time() - self._begun) / (report.iteration - self._first) * (self._last - report.iteration)
-        rows = console_rows(numbers, losses, speed, collect, learn)
-        rows["Total steps"] = f"{report.total_steps}"
-        rows["Time elapsed, left"] = ", ".join(str(timedelta(seconds=round(t))) for t in (time.time() - self._begun, left))
-        print(console_block(f"Learning iteration {report.iteration}/{self._last}", rows), flush=True)
+        rows = {**console_rows(numbers, losses, speed, collect, learn), "Total steps": f"{report.total_steps}"}
+        self.console.iteration(report.iteration, self._last, self._next_exam(report.iteration), numbers, rows, speed)
         warnings, verdict = self._health.judge(suspects, report.steps, undone > 0, wrong)
         print("".join(f"WARNING: iteration {report.iteration}: {line}\n" for line in warnings), end="", flush=True)
         if verdict:

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from legged_mw.sim.errors import ModelError
 from legged_mw.sim.terrain import LEVEL, Heights, Terrain
 
 GROUND = "floor"  # name of the ground geom
@@ -31,10 +30,8 @@ class Ground:
     slope: float = 0.0  # [deg] by which gravity leans from -z to x: the plane slopes down along x, and stays z = 0
 
 
-def add_ground(spec: mujoco.MjSpec, ground: Ground, where: str, notes: list[str]) -> None:
+def add_ground(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> None:
     """Add the plane or the height field to ``spec``."""
-    if any(geom.name == GROUND for geom in spec.geoms):
-        raise ModelError(f"{where} calls a geom of the robot '{GROUND}', which is the name of the ground; give it another")
     floor = spec.worldbody.add_geom(name=GROUND, contype=1, conaffinity=0, priority=1, condim=ground.condim)
     floor.friction = [ground.friction, 0.005, 0.0001]
     if ground.terrain:

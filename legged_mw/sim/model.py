@@ -123,7 +123,7 @@ def build_model(
         imu = "" if imu_site is None else sensed_site(spec, posed.model, robot.root, imu_site, robot.where, notes)
         fuse_fixed(spec, notes)
         _set_options(spec, solver, notes)
-        add_ground(spec, ground, robot.where, notes)
+        add_ground(spec, ground, notes)
         _set_collisions(spec, names.find(colliders, "`colliders`", colliding=True), self_collisions, notes)
         if self_collisions:
             leave_out_neighbours(spec, posed.joints, posed.angles, notes)

@@ -111,6 +111,8 @@ def sensed_site(spec: mujoco.MjSpec, model: mujoco.MjModel, root: str, asked: st
         else:
             made, place = f"{name}_aligned" if is_site else name, axes @ (there.xpos - base.xpos)
             why = f"at the place of '{name}' on '{body.name}', with the axes of the root '{root}'"
+    while spec.site(made):
+        made += "_"
     spec.body(root).add_site(name=made, pos=place, group=3)
     notes.append(f"site '{made}' made {why}")
     return made

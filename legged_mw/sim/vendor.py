@@ -7,6 +7,7 @@ Whatever is dropped, added or renamed is a line of ``Loaded.notes``. Host only; 
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -17,8 +18,10 @@ import numpy as np
 
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.meshes import compile_readable
+from legged_mw.sim.names import give_way
 from legged_mw.sim.servos import Range, take_limits
 from legged_mw.sim.urdf import is_urdf, read_urdf
+from legged_mw.utils.mjcf import check_files, check_model
 
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 _FREE = mujoco.mjtJoint.mjJNT_FREE
@@ -69,10 +72,9 @@ def read_robot(file: Path) -> Loaded:
     if not file.is_file():
         raise ModelError(f"no {_kind(file)} at {file}")
     where, notes = file.name, []
-    text = file.read_text(encoding="utf-8", errors="replace")
-    urdf, speeds = is_urdf(text), {}
     with naming(file):
-        if urdf:
+        text, speeds = check_files(file), {}
+        if is_urdf(text):
             spec, speeds = read_urdf(file, text, notes)
         else:
             spec = mujoco.MjSpec.from_file(str(file))
@@ -84,7 +86,11 @@ def read_robot(file: Path) -> Loaded:
         _forget_defaults(spec)
         _free_root(spec, where, notes)
         _balance(spec, notes)
-        model = compile_readable(spec, where, notes)
+        give_way(spec, notes)
+        with warnings.catch_warnings(record=True) as said:
+            model = compile_readable(spec, where, notes)
+        check_model(model)
+        notes += [f"warning: {' '.join(str(each.message).split())}" for each in said]
     _check_joints(spec, where)
     return Loaded(spec, model, where, notes, limits, speeds, keyframe)
 
@@ -96,8 +102,9 @@ def naming(file: Path) -> Iterator[None]:
         yield
     except ModelError:
         raise
-    except ValueError as error:  # parsing does not see a name that is used twice, compiling does
-        raise ModelError(f"{file.name} is not a valid {_kind(file)}: {' '.join(str(error).split())}") from None
+    except (ValueError, RecursionError) as error:  # parsing does not see a name that is used twice, compiling does
+        why = "it is nested too deeply" if isinstance(error, RecursionError) else str(error).partition("The visual elements of the spec")[0]
+        raise ModelError(f"{file.name} is not a valid {_kind(file)}: {' '.join(why.split())}") from None
 
 
 def _kind(file: Path) -> str:

@@ -1,6 +1,6 @@
 """Class-based configuration: a field is declared once, with a type, and every later word about it is checked.
 
-Here live the rule (annotated = declares, bare = overrides), the types that fields may have, and configs as YAML.
+Here live the rule (annotated = declares, bare = overrides) and the types that fields may have; utils/bounds.py has their bounds.
 No field of any robot, simulator or trainer lives here, nor anything that gives a number its meaning.
 """
 
@@ -10,30 +10,30 @@ import ast
 import difflib
 import inspect
 import keyword
-import os
 import re
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping
 from numbers import Integral, Real
-from pathlib import Path
 from types import NoneType, SimpleNamespace, UnionType
-from typing import TYPE_CHECKING, Any, Literal, TypeGuard, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeGuard, Union, get_args, get_origin, get_type_hints
 from weakref import WeakKeyDictionary
 
-import yaml
-
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.bounds import bare, bounds_of, bounds_text
+from legged_mw.utils.errors import ConfigError
 from legged_mw.utils.files import note_file
 from legged_mw.utils.renamed import new_name
+from legged_mw.utils.yaml_file import load_yaml, parse_yaml, save_yaml
+
+__all__ = ["Config", "ConfigError", "OutOfBounds", "field_types", "fit", "load_yaml", "save_yaml", "type_text"]
 
 _TYPES = (int, float, bool, str, NoneType, list, dict, Any)
 _PLAIN = None | bool | int | float | str | list | dict  # `Any` in a config: whatever YAML can hold
 _SCHEMAS: WeakKeyDictionary[type, dict[str, Any]] = WeakKeyDictionary()
 
 
-class ConfigError(UserError, TypeError):
-    """The one error of this module: which field, where that was written, what exists, what to write."""
+class OutOfBounds(ConfigError):
+    """A value of the right type that its field does not take."""
 
 
 def _schema(cls: type) -> dict[str, Any]:
@@ -86,7 +86,7 @@ def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
         raise ConfigError(f"{path} overrides nothing{hint}; if the field is new, declare it with a type: {declaration}")
     else:
         kind = float if inherited is None else inherited
-    setattr(cls, name, _fit(value, kind, path))
+    setattr(cls, name, fit(value, kind, path))
     return kind
 
 
@@ -94,7 +94,7 @@ def _check_section(cls: type, name: str, section: type, inherited: Any) -> type:
     """`section`, if it extends every section of this name that the parents of `cls` have."""
     path = f"{_path(cls)}.{name}"
     if inherited is not None and not _is_section(inherited):
-        raise ConfigError(f"{path} is a field ({_show(inherited)}), not a section; write `{name} = ...`")
+        raise ConfigError(f"{path} is a field ({type_text(inherited)}), not a section; write `{name} = ...`")
     theirs = [_schema(base)[name] for base in cls.__bases__ if name in _schema(base)]
     for dropped in theirs:
         if not issubclass(section, dropped):
@@ -111,23 +111,27 @@ def _declared_type(cls: type, name: str, inherited: Any) -> Any:
     path, written = f"{_path(cls)}.{name}", inspect.get_annotations(cls)[name]
     module = sys.modules.get(cls.__module__)
     try:
-        kind = get_type_hints(SimpleNamespace(__annotations__={name: written}), vars(module) if module else {})[name]
+        kind = get_type_hints(SimpleNamespace(__annotations__={name: written}), vars(module) if module else {}, include_extras=True)[name]
     except (NameError, AttributeError, SyntaxError, TypeError) as error:
         hint = f"import what it names at the top level of module {cls.__module__}"
         raise ConfigError(f"{path}: its type {written!r} cannot be resolved ({error}); {hint}") from None
     if not _is_supported(kind):
         choice = "int, float, bool, str, None, list[T], dict[str, T], Literal[...], Any, T | U; `class` makes a section"
-        raise ConfigError(f"{path}: type {_show(kind)} is not supported; there are {choice}")
+        raise ConfigError(f"{path}: type {type_text(kind)} is not supported; there are {choice}")
     if name not in vars(cls):
-        raise ConfigError(f"{path} has a type but no value; write `{name}: {_show(kind)} = ...`")
-    if inherited is not None and inherited != kind:
+        raise ConfigError(f"{path} has a type but no value; write `{name}: {type_text(kind)} = ...`")
+    if inherited is not None and bare(inherited) == bare(kind) and bounds_text(kind) in ("", bounds_text(inherited)):
+        return inherited
+    if inherited is not None:
         first = next(base for base in cls.__mro__[1:] if name in _schema(base))
-        raise ConfigError(f"{path} is a {_show(inherited)} in {_path(first)}, not a {_show(kind)}; to override it write `{name} = ...`")
+        raise ConfigError(f"{path} is a {_full(inherited)} in {_path(first)}, not a {_full(kind)}; to override it write `{name} = ...`")
     return kind
 
 
 def _is_supported(kind: Any) -> bool:
     origin, args = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return _is_supported(args[0])
     if origin is Literal:
         return all(type(choice) in _TYPES for choice in args)
     if origin is dict:
@@ -150,10 +154,26 @@ def _parents(cls: type, name: str) -> str:
     return ", ".join(f"{_path(base)}.{name}" for base in cls.__bases__ if name in _schema(base))
 
 
-def _show(kind: Any) -> str:
+def type_text(kind: Any) -> str:
+    """A type as Python writes it, without its bounds."""
+    kind = bare(kind)
     if get_origin(kind) is Union:  # a union with a Literal
-        return " | ".join("None" if arm is NoneType else _show(arm) for arm in get_args(kind))
+        return " | ".join("None" if arm is NoneType else type_text(arm) for arm in get_args(kind))
     return kind.__name__ if isinstance(kind, type) else str(kind).replace("typing.", "")
+
+
+def _full(kind: Any) -> str:
+    """A type with its bounds."""
+    return type_text(kind) + (f" ({bounds})" if (bounds := bounds_text(kind)) else "")
+
+
+def _say(value: Any) -> str:
+    """``value`` for an error: what would fill the screen is cut, what cannot be written is described."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # Python writes no whole number of more than 4300 digits
+        return f"an {type(value).__name__} too large to show"
+    return text if len(text) <= 200 else f"{text[:200]}..."
 
 
 def _suggest(path: str, fields: Mapping[str, Any]) -> str:
@@ -166,13 +186,18 @@ def _nearest(name: str, fields: Mapping[str, Any] | Iterable[str]) -> str:
     """`; did you mean ...?`: the nearest name here, else the same name in a section further down, else nothing."""
     near = difflib.get_close_matches(name, fields, n=1)
     if not near and isinstance(fields, Mapping):
-        near = [path for path in _field_paths(fields) if path.rpartition(".")[2] == name]
+        near = [path for path, _ in _walk(fields) if path.rpartition(".")[2] == name]
     return f"; did you mean '{near[0]}'?" if near else ""
 
 
-def _field_paths(fields: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+def field_types(cls: type) -> Iterator[tuple[str, Any]]:
+    """(dotted path, type) of every field of a config class, in the order of declaration. `bounds_text` says a type's bounds."""
+    yield from _walk(_schema(cls))
+
+
+def _walk(fields: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
     for name, kind in fields.items():
-        yield from _field_paths(_schema(kind), f"{prefix}{name}.") if _is_section(kind) else [prefix + name]
+        yield from _walk(_schema(kind), f"{prefix}{name}.") if _is_section(kind) else [(prefix + name, kind)]
 
 
 def _place(cls: type, name: str) -> str:
@@ -190,51 +215,68 @@ def _place(cls: type, name: str) -> str:
         return f"module {cls.__module__}"
 
 
-def _fit(value: Any, kind: Any, path: str) -> Any:
+def fit(value: Any, kind: Any, path: str) -> Any:
     """`value` as a `kind`: an int becomes a float where one is due, containers are copied. `path` names it in errors."""
-    origin, args = get_origin(kind) or kind, get_args(kind)
+    origin: Any = get_origin(kind) or kind
+    args = get_args(kind)
     if _is_section(kind):
         raise ConfigError(f"{path} is a section, not a field; set one of its fields: {', '.join(_schema(kind))}")
-    if kind is Any:
-        return _fit(value, _PLAIN, path)
-    if origin in (Union, UnionType):
-        # The value's own type goes first: 3 must stay an int in `float | int`.
-        for arm in sorted(args, key=lambda arm: (get_origin(arm) or arm) is not type(value)):
-            try:
-                return _fit(value, arm, path)
-            except ConfigError:
-                continue
-    elif origin is Literal and any(type(value) is type(choice) and value == choice for choice in args):
+    if origin is Annotated:
+        return _within(fit(value, args[0], path), kind, path)
+    if kind is Any or origin in (Union, UnionType):
+        return _fit_one_of(value, _PLAIN if kind is Any else kind, path)
+    if origin is Literal and any(type(value) is type(choice) and value == choice for choice in args):
         return value
-    elif origin is list and isinstance(value, list | tuple):
+    if origin is list and isinstance(value, list | tuple):
         of = args[0] if args else Any
-        return [_fit(item, of, f"{path}[{i}]") for i, item in enumerate(value)]
-    elif origin is dict and isinstance(value, Mapping):
+        return [fit(item, of, f"{path}[{i}]") for i, item in enumerate(value)]
+    if origin is dict and isinstance(value, Mapping):
         of = args[1] if args else Any
-        return {_fit(key, str, f"{path}: key"): _fit(item, of, f"{path}[{key!r}]") for key, item in value.items()}
-    elif origin is float and isinstance(value, Real) and not isinstance(value, bool):
-        return float(value)
-    elif origin is int and isinstance(value, Integral) and not isinstance(value, bool):
-        return int(value)
-    elif origin in (bool, str, NoneType) and type(value) is origin:
-        return value
+        return {fit(key, str, f"{path}: key"): fit(item, of, f"{path}[{key!r}]") for key, item in value.items()}
+    if isinstance(value, {float: Real, int: Integral}.get(origin, ())) and not isinstance(value, bool):
+        return (float if origin is float else int)(_within(value, kind, path))
+    if origin in (bool, str, NoneType) and type(value) is origin:
+        return _within(value, kind, path)
     hint = _nearest(value, map(str, args)) if origin is Literal and isinstance(value, str) else ""
-    raise ConfigError(f"{path} must be {_show(kind)}, not {value!r} ({type(value).__name__}){hint}")
+    raise ConfigError(f"{path} must be {type_text(kind)}, not {_say(value)} ({type(value).__name__}){hint}")
+
+
+def _fit_one_of(value: Any, kind: Any, path: str) -> Any:
+    """`value` as one type of a union, its own first: 3 must stay an int in `float | int`."""
+    outside: list[OutOfBounds] = []
+    for arm in sorted(get_args(kind), key=lambda arm: (get_origin(bare(arm)) or bare(arm)) is not type(value)):
+        try:
+            return fit(value, arm, path)
+        except OutOfBounds as error:
+            outside.append(error)
+        except ConfigError:
+            continue
+    if len(outside) == 1:
+        raise outside[0]
+    wrong = f"is {_say(value)}; it must be {bounds_text(kind)}" if outside else f"must be {type_text(kind)}, not {_say(value)}"
+    raise ConfigError(f"{path} {wrong} ({type(value).__name__})")
+
+
+def _within(value: Any, kind: Any, path: str) -> Any:
+    for bound in bounds_of(kind):
+        if not bound.holds(value):
+            raise OutOfBounds(f"{path} is {_say(value)}; it must be {bounds_text(kind) or bound.text}")
+    return value
 
 
 def _parse(text: str, kind: Any, path: str) -> Any:
     """`text` as a `kind`: verbatim for a str, else read as YAML, else verbatim (`run_7` for a `str | int`)."""
     try:
-        value = text if kind is str else yaml.load(text, Loader=_Loader)
+        value = text if bare(kind) is str else parse_yaml(text, path)
         if isinstance(value, dict) and any(":" in str(key) and item is None for key, item in value.items()):
-            value = yaml.load(re.sub(r":(?=\S)", ": ", text), Loader=_Loader)  # {a:1}, which to YAML is a key without a value
-    except yaml.YAMLError:
+            value = parse_yaml(re.sub(r":(?=\S)", ": ", text), path)  # {a:1}, which to YAML is a key without a value
+    except ConfigError:
         value = text
     try:
-        return _fit(value, kind, path)
+        return fit(value, kind, path)
     except ConfigError as error:
         try:
-            return _fit(text, kind, path)
+            return fit(text, kind, path)
         except ConfigError:
             raise error from None
 
@@ -254,7 +296,7 @@ def _kind(cls: type, name: str, path: str) -> Any:
 def _guarded_setattr(self: Any, name: str, value: Any) -> None:
     if not name.startswith("_"):
         path = f"{_path(type(self))}.{name}"
-        value = _fit(value, _kind(type(self), name, path), path)
+        value = fit(value, _kind(type(self), name, path), path)
     object.__setattr__(self, name, value)
 
 
@@ -263,7 +305,7 @@ def _fill(node: Any) -> Any:
     cls = type(node)
     for name, kind in _schema(cls).items():
         default = getattr(cls, name)
-        vars(node)[name] = _fill(object.__new__(kind)) if _is_section(kind) else _fit(default, kind, f"{_path(cls)}.{name}")
+        vars(node)[name] = _fill(object.__new__(kind)) if _is_section(kind) else fit(default, kind, f"{_path(cls)}.{name}")
     return node
 
 
@@ -286,14 +328,14 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 def _edits(node: Any, values: Any, path: str = "") -> Iterator[tuple[Any, str, Any]]:
     """(section, name, value) for every field that the nested `values` name, each checked."""
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{path or _path(type(node))} is a section and needs a mapping of its fields, not {values!r}")
+        raise ConfigError(f"{path or _path(type(node))} is a section and needs a mapping of its fields, not {_say(values)}")
     for name, value in values.items():
         here = f"{path}.{name}" if path else str(name)
         kind = _kind(type(node), str(name), here)
         if _is_section(kind):
             yield from _edits(getattr(node, name), value, here)
         else:
-            yield node, name, _fit(value, kind, here)
+            yield node, name, fit(value, kind, here)
 
 
 class Config:
@@ -329,10 +371,10 @@ class Config:
                 kind = _kind(type(node), section, here)
                 if not _is_section(kind):
                     whole = f": {here}={{{path.removeprefix(f'{here}.')}: ...}}" if get_origin(kind) is dict else ""
-                    raise ConfigError(f"{path} does not exist: {here} is a field ({_show(kind)}), not a section; set it whole{whole}")
+                    raise ConfigError(f"{path} does not exist: {here} is a field ({type_text(kind)}), not a section; set it whole{whole}")
                 node = getattr(node, section)
             kind = _kind(type(node), name, path)
-            vars(node)[name] = _parse(value, kind, path) if isinstance(value, str) else _fit(value, kind, path)
+            vars(node)[name] = _parse(value, kind, path) if isinstance(value, str) else fit(value, kind, path)
         except ConfigError as error:
             raise ConfigError(f"{where}: {error}") from None
 
@@ -350,50 +392,3 @@ class Config:
         mine, theirs = dict(_leaves(self)), dict(_leaves(other))
         both = mine.keys() & theirs.keys()
         return [(path, mine.get(path), theirs.get(path)) for path in mine | theirs if path not in both or mine[path] != theirs[path]]
-
-
-class _Loader(yaml.SafeLoader):
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        """Refuses a key written twice: plain YAML would let the second silently win."""
-        keys = [key.value for key, _ in node.value]
-        for i, (key, _) in enumerate(node.value):
-            if key.value in keys[:i]:
-                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' is written twice", key.start_mark)
-        return super().construct_mapping(node, deep)
-
-
-class _Dumper(yaml.SafeDumper):
-    def ignore_aliases(self, data: Any) -> bool:
-        return True  # a list used twice is written twice: anchors are not for readers
-
-
-for _side in (_Loader, _Dumper):
-    # To plain YAML 1.1, 1e-4 is a string. The writer learns it too, so that it quotes a run called `1e4`.
-    _side.add_implicit_resolver("tag:yaml.org,2002:float", re.compile(r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"), list("-+.0123456789"))
-
-
-def save_yaml(path: str | os.PathLike[str], mapping: Mapping[str, Any]) -> None:
-    """Writes `mapping` whole or not at all: neither a reader nor a crash ever meets half a file."""
-    path = Path(path)
-    text = yaml.dump(dict(mapping), Dumper=_Dumper, sort_keys=False, allow_unicode=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """The mapping in a YAML file, its numbers read as people write them."""
-    try:
-        loaded = yaml.load(Path(path).read_bytes(), Loader=_Loader)
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot read this config file: {error.strerror}") from None
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f":{mark.line + 1}" if mark else ""
-        raise ConfigError(f"{path}{line}: not valid YAML: {getattr(error, 'problem', error)}") from None
-    if not isinstance(loaded, dict):
-        raise ConfigError(f"{path}: holds {type(loaded).__name__}, not a mapping of sections and fields")
-    return loaded

@@ -1,0 +1,116 @@
+"""What an MJCF or URDF may hold, looked at before MuJoCo builds something of it, and once more in what it has built.
+
+All that is refused is a ValueError in one line, without the file's name.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+MOST_BYTES = 64 << 20  # of one file: the largest known robots, meshes inside, have a tenth
+HEAVIEST, WIDEST, FASTEST = 1e5, 1e6, 1e3  # of a body [kg]; of any length [m] or inertia [kg m^2]; gravity [m/s^2]: a file in cm has 981
+_COPIES = 1e5  # of what a file repeats, all its counts multiplied
+_MOST = {"count": 1e4, "nrow": 2e4, "ncol": 2e4, "width": 16384, "height": 16384, "nkey": 1e4}  # attribute -> the most that makes sense
+_MOST |= {f"nuser_{kind}": 1e3 for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")} | {"nuserdata": 1e6}
+_MOST |= {"mass": HEAVIEST, "density": 1e6, "armature": WIDEST, "frictionloss": WIDEST, "diaginertia": WIDEST}
+_SIZES = ("mass", "inertia", "pos", "ipos", "size", "armature", "damping", "frictionloss", "stiffness")  # of the model's arrays
+_NAMES = ("name", "class", "childclass", "model", "file", "dir", "meshdir", "texturedir", "assetdir")
+_ATTRIBUTE = re.compile(r"""([\w.:]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
+_TAG = re.compile(r"""<(include|model)\b((?:[^>"']|"[^"]*"|'[^']*')*)>""")
+
+
+def check_files(file: Path) -> str:
+    """The text of ``file``, once it and what it includes hold no bomb, no NaN and no range that ends before it begins."""
+    folder, left, seen, first = file.resolve().parent, [file], set[Path](), ""
+    while left:
+        part = left.pop()
+        if part.stat().st_size > MOST_BYTES:
+            raise ValueError(f"{part.name} has {part.stat().st_size >> 20} MiB; a robot's file has {MOST_BYTES >> 20} at most")
+        text = part.read_text(encoding="utf-8", errors="replace")
+        first, seen = first or text, seen | {part.resolve()}
+        check_text(text, "" if part == file else f"{part.name}: ")
+        for name in _included(text):
+            path = (folder / name).resolve()
+            if not path.is_relative_to(folder):
+                raise ValueError(f"it includes {name}, which lies outside of its own folder; put that file beside it")
+            if path.is_file() and path not in seen:
+                left.append(path)
+    return first
+
+
+def check_text(text: str, where: str = "") -> None:
+    """Raises ValueError with the line for what no robot needs and a reader may choke on."""
+    if "<!ENTITY" in text:
+        raise ValueError(f"{where}line {_line(text, text.index('<!ENTITY'))}: it defines entities; write out what they stand for")
+    text = re.sub(r"<!--.*?-->", lambda match: re.sub(r"[^\n]", " ", match[0]), text, flags=re.DOTALL)
+    copies = 1.0
+    for match in _ATTRIBUTE.finditer(text):
+        name, value = match[1], match[2] if match[2] is not None else match[3]
+        wrong = "" if name in _NAMES else _wrong(name, value)
+        if name == "count" and not wrong:
+            copies *= math.prod(float(part) or 1.0 for part in value.split() if part.isdecimal())
+            wrong = f"makes more than {_COPIES:g} copies, with the others" if copies > _COPIES else ""
+        if wrong:
+            raise ValueError(f'{where}line {_line(text, match.start())}: {name}="{value[:60]}" {wrong}')
+
+
+def _wrong(name: str, value: str) -> str:
+    """What is wrong with the numbers of an attribute; "" if nothing is, or if they are none."""
+    if "nan" in value.lower() and any(part.lower().strip("+-") == "nan" for part in value.split()):
+        return "is not a number"
+    if name.endswith("range") or name in _MOST:
+        try:
+            numbers = [float(part) for part in value.split()]
+        except ValueError:
+            return ""
+        if name in _MOST and not all(0.0 <= number <= _MOST[name] for number in numbers):
+            return f"must be from 0 to {_MOST[name]:g}"
+        if len(numbers) == 2 and name.endswith("range") and numbers[0] > numbers[1]:
+            return "ends before it begins"
+    return ""
+
+
+def _line(text: str, place: int) -> int:
+    return text.count("\n", 0, place) + 1
+
+
+def _included(text: str) -> Iterator[str]:
+    """Names of other MJCF files that the text takes in."""
+    for tag in _TAG.finditer(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)):
+        yield from (match[2] or match[3] or "" for match in _ATTRIBUTE.finditer(tag[2]) if match[1] == "file")
+
+
+def check_model(model: Any) -> None:
+    """Raises ValueError for a compiled model that no world can step: numbers that are none, or that no machine has."""
+    gravity = model.opt.gravity
+    if not np.linalg.norm(gravity) <= FASTEST:
+        raise ValueError(f"gravity is {' '.join(f'{g:g}' for g in gravity)} m/s^2; it must be {FASTEST:g} at most")
+    if not 0.0 < model.opt.timestep <= 1.0:
+        raise ValueError(f"timestep is {model.opt.timestep:g} s; it must be above 0 and 1 at most")
+    for kind, what in (("body", "mass"), *((kind, what) for kind in ("body", "geom", "dof", "jnt", "site") for what in _SIZES)):
+        values = getattr(model, f"{kind}_{what}", None)
+        most = HEAVIEST if what == "mass" else WIDEST
+        if values is not None and (wrong := np.argwhere(~(np.abs(values) <= most))).size:
+            value, index = values[tuple(wrong[0])], int(wrong[0][0])
+            whose = f"joint '{model.joint(model.dof_jntid[index]).name}'" if kind == "dof" else _name(model, kind, index)
+            raise ValueError(f"{what} of {whose} is {value:g}; it must be {most:g} at most")
+    for kind in ("jnt", "actuator", "tendon"):
+        for name in ("range", "ctrlrange", "forcerange", "actrange", "actfrcrange"):
+            ranges: Any = getattr(model, f"{kind}_{name}", ())
+            for index, (low, high) in enumerate(ranges):
+                if not low <= high:
+                    raise ValueError(f"{name} of {_name(model, kind, index)} is from {low:g} to {high:g}")
+    for name in ("qpos0", "key_qpos", "key_qvel", "key_ctrl", "actuator_gainprm", "actuator_biasprm", "actuator_gear", "geom_friction"):
+        if not np.isfinite(getattr(model, name)).all():
+            raise ValueError(f"{name} has values that are not finite")
+
+
+def _name(model: Any, kind: str, index: int) -> str:
+    word = {"jnt": "joint"}.get(kind, kind)
+    return f"{word} '{getattr(model, word)(index).name}'"

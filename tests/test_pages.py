@@ -1,0 +1,159 @@
+"""The site as it is built: strict, nothing from the net, tables made from the code; both languages say the same; pictures are current."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mkdocs.commands.build import build
+from mkdocs.config import load_config
+
+from legged_mw import ROOT
+from legged_mw.envs.getup import Getup
+from legged_mw.envs.legged_robot import LeggedRobot
+from website import gallery, pictures, reference
+from website.formula import formula
+
+DOCS = ROOT / "docs"
+TWINS = [(ROOT / "README.md", ROOT / "README.zh-CN.md"), *((DOCS / path.name, path) for path in sorted((DOCS / "zh").glob("*.md")))]
+FORMULAS = {  # by hand from the code
+    "lin_vel_z": "(Σ (base_lin_vel · projected_gravity))²",
+    "action_rate": "Σ (actions - last_actions)²",
+    "tracking_ang_vel": "exp(-error / tracking_sigma), where error = (commands_z - base_ang_vel_z)²",
+    "feet_clearance": "Σ (|foot_height - swing_height| · √(foot_speed))",
+    "stand_still": "0 if moving else Σ |dof_offset|",
+    "dof_vel_limits": "Σ (clip(|dof_vel| - soft_speed, 0, 1))",
+    "no_fly": "on exactly one foot if moving else all foot_contact",
+    "torques": "Σ torques² if torques_as = 'squares'; √(Σ torques²) + Σ |torques|",
+}
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """As `make docs` builds it: a warning, such as a link that leads nowhere, is an error."""
+    out = tmp_path_factory.mktemp("site")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NO_MKDOCS_2_WARNING", "1")
+        build(load_config(str(ROOT / "mkdocs.yml"), site_dir=str(out)))
+    return out
+
+
+def test_nothing_is_loaded_from_the_net(site: Path) -> None:
+    pages = sorted(site.rglob("*.html"))
+    assert len(pages) > 40
+    loads = re.compile(r"""<(?:script|img|source|iframe|link)\b[^>]*?(?:src|href)=["']?(https?:)?//[^"'> ]+""")
+    assert [(page.name, found.group(0)) for page in pages for found in loads.finditer(page.read_text())] == []
+    styles = [path for path in site.rglob("*.css") if re.search(r"url\(['\"]?(https?:)?//", path.read_text())]
+    assert styles == []
+
+
+def test_tables_are_made_from_the_code(site: Path) -> None:
+    terms, config = (site / "rewards.html").read_text(), (site / "config.html").read_text()
+    assert "made:" not in terms + config
+    for name in (*FORMULAS, "tracking_body_pos", "fast_joints", "height_scan", "kick_force", "reference_joint_pos"):
+        assert f"<code>{name}</code>" in terms, name
+    for name in ("num_envs", "tracking_sigma", "gamma", "pull_fades", "concurrent", "clips"):
+        assert f"<code>{name}</code>" in config or name in config, name
+
+
+def test_chinese_pages_say_so_and_lead_to_their_english_ones(site: Path) -> None:
+    page = (site / "zh/concepts.html").read_text()
+    assert '<html lang="zh"' in page and '<a class="language" href="../concepts.html">English</a>' in page
+    assert '<a class="language" href="zh/concepts.html">中文</a>' in (site / "concepts.html").read_text()
+
+
+# ---- the reference
+
+
+@pytest.mark.parametrize("name", FORMULAS)
+def test_a_formula_is_what_the_code_computes(name: str) -> None:
+    assert formula(getattr(LeggedRobot, f"_reward_{name}")) == FORMULAS[name]
+
+
+def test_a_formula_of_another_task() -> None:
+    assert formula(Getup._reward_fast_joints) == "Σ (max(|dof_vel| - 2π, 0))²"
+
+
+@pytest.mark.parametrize(
+    ("comment", "words", "unit", "source"),
+    [
+        ("[s], then the episode times out [P]", "then the episode times out", "s", "P"),
+        ("mean over pairs [rad^2]. [UL]", "mean over pairs", "rad^2", "UL"),
+        ("a height [m] [L 0.5; ours: why] of `x`", "a height of `x`", "m", "L 0.5; ours: why"),
+        ("an .npz, as written; {[kept]}", "an .npz, as written; {[kept]}", "", ""),
+    ],
+)
+def test_a_comment_is_read(comment: str, words: str, unit: str, source: str) -> None:
+    assert reference.read_comment(comment) == (words, unit, source)
+
+
+def test_every_term_says_what_it_is_and_whose() -> None:
+    said = {
+        name: reference.read_comment(str(term.__doc__))
+        for _, owner, _, _ in reference.TERMS
+        for name, term in reference.terms_of(owner).items()
+    }
+    assert len(said) > 45
+    assert [name for name, each in said.items() if not (each.words and each.source)] == []
+
+
+def test_every_row_has_words() -> None:
+    lines = [line for line in reference.observations().splitlines() if line.startswith("| `")]
+    assert len(lines) > 80 and [line for line in lines if not line.split(" | ")[2].strip()] == []
+
+
+# ---- two languages
+
+
+def blocks(text: str) -> list[str]:
+    """Code, its comments gone: those are in the page's language."""
+    return [re.sub(r"\s*#.*", "", block) for block in re.findall(r"^```\w*\n(.*?)^```", text, re.MULTILINE | re.DOTALL)]
+
+
+def shape(page: Path) -> dict[str, Any]:
+    """What two languages must have in common: levels of headings, commands, tables with what is no word in them, links."""
+    text = page.read_text()
+    prose = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
+    rows = [line for line in prose.splitlines() if line.startswith("|")]
+    known = {link.rpartition("/")[2].replace(".zh.", ".") for link in re.findall(r"\]\(([^)#\s]+)", text) if not link.startswith("http")}
+    return {
+        "headings": [len(mark) for mark in re.findall(r"^(#+) ", prose, re.MULTILINE)],
+        "commands": blocks(text),
+        "rows": [line.count("|") for line in rows],
+        "code in tables": [sorted(re.findall(r"`[^`]+`", line)) for line in rows],
+        "figures in tables": [re.findall(r"\d[\d.]*", re.sub(r"`[^`]+`|\]\([^)]*\)", "", line)) for line in rows],
+        "links": sorted(known - {"README.md", "README.zh-CN.md", "step.svg", "house.svg"}),
+    }
+
+
+@pytest.mark.parametrize(("english", "chinese"), TWINS, ids=[chinese.name for _, chinese in TWINS])
+def test_both_languages_say_the_same(english: Path, chinese: Path) -> None:
+    theirs = shape(chinese)
+    assert {name: theirs[name] for name in theirs} == shape(english)
+    assert len(re.findall(r"[一-鿿]", chinese.read_text())) > 500
+
+
+def test_which_pages_are_in_chinese() -> None:
+    assert {page.stem for _, page in TWINS[1:]} >= {"index", "concepts", "your_own_robot", "coming_from"}
+
+
+# ---- the README, pictures
+
+
+def test_the_readme_is_short() -> None:
+    assert all(len(page.read_text().splitlines()) <= 120 for page in TWINS[0])
+
+
+def test_pictures_are_small_and_current() -> None:
+    images = DOCS / "images"
+    assert (images / "film.gif").stat().st_size < 800_000
+    assert all(path.stat().st_size < 80_000 for path in (images / "gallery").iterdir())
+    for language, ending in (("en", ".svg"), ("zh", ".zh.svg")):
+        assert (images / f"step{ending}").read_text() == pictures.step(language)
+        assert (images / f"house{ending}").read_text() == pictures.house(language)
+
+
+def test_the_gallery_is_current() -> None:
+    assert gallery.PAGE.read_text() == gallery.page(), "python -m website.gallery --page"

@@ -1,0 +1,88 @@
+"""The gallery: a page of all policies that ship, from their folders: film, still, exam, curve, how each was made.
+
+MUJOCO_GL=egl python -m website.gallery                # films, stills and docs/gallery.md
+python -m website.gallery --page                       # the page alone
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+from pathlib import Path
+
+from legged_mw import ROOT
+
+POLICIES, PAGE, IMAGES = ROOT / "resources/policies", ROOT / "docs/gallery.md", ROOT / "docs/images/gallery"
+ORDER = ("go1_flat", "go1_rough", "go1_rough_scan", "go2_flat", "go2_rough", "g1_flat")  # then all others by name
+HEAD = """# Gallery
+
+Every policy that ships, as it walks in MuJoCo's C engine. `MUJOCO_GL=egl python -m website.gallery` makes this page, its films and
+stills from `resources/policies/`. To watch one and drive it:
+
+```bash
+python play.py --task g1_flat --load_run shipped
+python -m legged_mw.deploy go2_rough --terrain        # without torch, among stairs and blocks
+```
+"""
+
+
+def policies() -> list[str]:
+    """Those that ship, in the order of the page."""
+    names = {path.parent.name for path in POLICIES.glob("*/README.md")}
+    return [*(name for name in ORDER if name in names), *sorted(names - {*ORDER})]
+
+
+def page() -> str:
+    """The whole of docs/gallery.md."""
+    return "\n".join([HEAD, *map(_chapter, policies())])
+
+
+def _chapter(name: str) -> str:
+    """One policy, in the words of its README."""
+    folder = POLICIES / name
+    text = _relinked((folder / "README.md").read_text(), folder)
+    about = text.split("\n\n")[1]
+    made = re.findall(r"^```bash\n.*?^```$", text, re.MULTILINE | re.DOTALL)[0]
+    tables = [part for part in text.split("\n\n") if part.startswith("|") and re.search("falls in|stands in time|holds", part)]
+    exam = "\n".join(line for line in "\n".join(tables).splitlines() if line.startswith("|"))
+    film = IMAGES / f"{name}.webp"
+    parts = [f"## {name}", f"![{name} walks](images/gallery/{name}.webp)" if film.exists() else "", about.replace("\n", " "), made]
+    parts += [exam, f"![learning curve](../resources/policies/{name}/curve.png)" if (folder / "curve.png").exists() else ""]
+    return "\n\n".join([part for part in parts if part] + [f"All of it: [{name}](../resources/policies/{name}/README.md).\n"])
+
+
+def _relinked(text: str, folder: Path) -> str:
+    """``text`` of a page in ``folder``, for docs/."""
+
+    def moved(found: re.Match[str]) -> str:
+        name, mark, anchor = found.group(1).partition("#")
+        return f"]({os.path.relpath(folder / name, PAGE.parent)}{mark}{anchor})"
+
+    return re.sub(r"\]\((?!http|#)([^)\s]+)\)", moved, text)
+
+
+def films() -> None:
+    """A film and a still of each."""
+    from PIL import Image
+
+    from website.film import BY_NAME, Shot, record, save_webp
+
+    IMAGES.mkdir(parents=True, exist_ok=True)
+    for name in policies():
+        shot = BY_NAME.get(name, Shot(name, BY_NAME["go1_flat"].command))
+        frames = record(shot._replace(seconds=3.2), 256, 160)
+        save_webp(IMAGES / f"{name}.webp", frames)
+        Image.fromarray(frames[len(frames) // 2]).save(IMAGES / f"{name}.jpg", quality=70, optimize=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m website.gallery", description=str(__doc__).splitlines()[0])
+    parser.add_argument("--page", action="store_true", help="write the page alone")
+    if not parser.parse_args().page:
+        films()
+    PAGE.write_text(page())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,255 @@
+"""Tables of all reward terms, observation rows and config fields, made from the code: formulas, comments, defaults, environments."""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import io
+import re
+import textwrap
+import tokenize
+from collections.abc import Iterable, Iterator
+from typing import Any, NamedTuple
+
+from legged_mw.deploy.contract import ROWS
+from legged_mw.envs.getup import Getup, GetupCfg, GetupCfgPPO
+from legged_mw.envs.handstand import Handstand, HandstandCfg, HandstandCfgPPO
+from legged_mw.envs.legged_rewards import LeggedRewards
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_mw.envs.motion_tracking import MotionTracking
+from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
+from legged_mw.envs.robot_rewards import RobotRewards
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
+from legged_mw.envs.sim_to_real_config import BipedCfg, BipedRoughCfg, SimToRealCfg, SimToRealCfgPPO, SimToRealRoughCfg
+from legged_mw.utils.bounds import bounds_text
+from legged_mw.utils.config import field_types, type_text
+from legged_mw.utils.task import load_task
+from website.formula import formula
+
+UNITS = {*["m", "rad", "s", "ms", "N", "kg", "W", "deg", "mm", "Hz", "pixel", "iterations"], "-", ""}
+TERMS: list[tuple[str, type, type, str]] = [  # heading, where the terms stand, whose scales are the defaults, what those are
+    ("Of every task", RobotRewards, LeggedRobotCfg, "a walking task's"),
+    ("Of walking by command", LeggedRewards, LeggedRobotCfg, "a walking task's"),
+    ("Of getting up", Getup, GetupCfg, "the task's"),
+    ("Of handstand and footstand", Handstand, HandstandCfg, "the task's"),
+    ("Of following a motion", MotionTracking, MotionTrackingCfg, "the task's"),
+]
+TASKS = ["go1_flat", "go1_rough", "go2_flat", "go2_rough", "g1_flat", "g1_rough"]
+EVERYTHING = {  # of a walking task: all rows that a flag switches on
+    **{"env.num_envs": 1, "observations.foot_height": True, "observations.contact_forces": True, "gait.period": 0.8},
+    **{"gait.offsets": [0.0, 0.5, 0.5, 0.0], "domain_rand.enable": True, "domain_rand.observe": True, "observations.leave_out": {}},
+    **{"terrain.num_rows": 1, "terrain.num_cols": 8, "terrain.height_scan": ["state", "privileged_state"]},
+}
+ENVS: list[tuple[str, str, dict[str, Any]]] = [
+    ("Walking by command, everything switched on (`go1_rough_scan`: 12 joints, 4 feet)", "go1_rough_scan", EVERYTHING),
+    ("Getting up, handstand (`go1_getup`)", "go1_getup", {"env.num_envs": 1, "falls.states": 4}),
+    ("Following a motion (`g1_track`: 29 joints, 14 bodies)", "g1_track", {"env.num_envs": 1}),
+]
+CONFIGS: list[tuple[str, type, str]] = [
+    ("The environment of every task", RobotTaskCfg, ""),
+    ("Walking by command adds", LeggedRobotCfg, ""),
+    ("For a real robot on four legs", SimToRealCfg, "`SimToRealCfg(LeggedRobotCfg)` changes:"),
+    ("On rough ground", SimToRealRoughCfg, "`SimToRealRoughCfg(SimToRealCfg)` changes:"),
+    ("On two legs", BipedCfg, "`BipedCfg(SimToRealCfg)` changes:"),
+    ("On two legs and rough ground", BipedRoughCfg, "`BipedRoughCfg(BipedCfg)` changes:"),
+    ("Getting up", GetupCfg, ""),
+    ("Handstand and footstand", HandstandCfg, ""),
+    ("Following a motion", MotionTrackingCfg, ""),
+    ("The learner of every task", RobotTaskCfgPPO, ""),
+    ("The learner of a walking task", LeggedRobotCfgPPO, ""),
+    ("The learner for a real robot", SimToRealCfgPPO, ""),
+    ("The learner of getting up", GetupCfgPPO, ""),
+    ("The learner of a handstand", HandstandCfgPPO, ""),
+]
+
+
+class Said(NamedTuple):
+    """What a docstring or comment says: words, units, sources."""
+
+    words: str
+    unit: str
+    source: str
+
+
+def read_comment(text: str) -> Said:
+    """Square brackets hold a unit, `[m/s]`, or a source, `[P]`, `[ours: why]`; what is left are the words."""
+    inside = re.findall(r"\[([^\[\]]*)\]", text)
+    units = [each for each in inside if is_unit(each)]
+    sources = [each for each in inside if not is_unit(each) and re.match(r"[A-Z]|ours|unitree|genesis|go2_rl", each)]
+    words = text
+    for each in [*units, *sources]:
+        words = words.replace(f"[{each}]", "")
+    return Said(
+        re.sub(r"\s+([.,:;)])(?=\s|$)", r"\1", " ".join(words.replace("``", "`").split())).strip(" ;,."),
+        ", ".join(dict.fromkeys(units)),
+        "; ".join(sources),
+    )
+
+
+def is_unit(text: str) -> bool:
+    """Whether ``text`` is `m/s`, `kg m^2`, `rad or rad/s`, `m, world`, and not a source."""
+    words = re.split(r"[ ,/]+|\bor\b|\^-?[\d.]+", re.sub(r",? (world|body)( frame)?$", "", text))
+    return all(word in UNITS or word == "1" for word in words)
+
+
+def cell(text: Any) -> str:
+    return str(text).replace("|", "\\|").replace("\n", " ")
+
+
+def code(text: Any) -> str:
+    return f"`{text}`".replace("|", "\\|") if str(text) else ""
+
+
+def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
+    head = list(head)
+    lines = [f"| {' | '.join(row)} |" for row in rows]
+    return "\n".join([f"| {' | '.join(head)} |", "| " + " | ".join("---" for _ in head) + " |", *lines])
+
+
+# ---- reward terms
+
+
+def terms_of(owner: type) -> dict[str, Any]:
+    return {name.removeprefix("_reward_"): term for name, term in vars(owner).items() if name.startswith("_reward_")}
+
+
+def rewards() -> str:
+    """All terms by the class that has them, then their scales in the tasks that ship."""
+    parts = []
+    for heading, owner, config, whose in TERMS:
+        scales = config().to_dict()["rewards"]["scales"]  # pyright: ignore[reportCallIssue]
+        rows = []
+        for name, term in terms_of(owner).items():
+            said = read_comment(inspect.getdoc(term) or "")
+            scale = scales.get(name, 0)
+            default = f"{scale:g}" if scale else "off"
+            rows.append([code(name), cell(said.words), code(formula(term)), cell(said.unit) or "1", cell(said.source), default])
+        parts += [f"### {heading}", table(["term", "what it measures", "formula", "unit", "source", f"{whose} scale"], rows)]
+    return "\n\n".join([*parts, "### Scales in the tasks", _scales()])
+
+
+def _scales() -> str:
+    configs = [load_task(task).cfg.to_dict()["rewards"]["scales"] for task in TASKS]
+    names = sorted({name for scales in configs for name, scale in scales.items() if scale})
+    return table(["term", *map(code, TASKS)], [[code(name), *(f"{s[name]:g}" if s.get(name) else "" for s in configs)] for name in names])
+
+
+# ---- observation rows
+
+
+def row_comments() -> dict[str, Said]:
+    """What stands behind a row where the code makes it."""
+    said: dict[str, Said] = {}
+    for owner in (RobotTask, LeggedRobot, MotionTracking, Getup):
+        for name, comment in re.findall(r'Row\("(\w+)",[^\n]*?\)?,?  # ([^\n]*)', inspect.getsource(owner)):
+            said.setdefault(name, read_comment(comment))
+    for path, field in fields(RobotTaskCfg).items():
+        if path.startswith("domain_rand."):
+            said.setdefault(path.removeprefix("domain_rand."), field.said)
+    return said
+
+
+def observations() -> str:
+    """The rows of each group of three environments, built with all that a flag switches on."""
+    comments, parts = row_comments(), []
+    for heading, name, overrides in ENVS:
+        task = load_task(name)
+        for path, value in overrides.items():
+            task.set(path, value)
+        env = task.env_class(task.cfg, "cpu")
+        for group, rows in env.observations.groups.items():
+            lines = []
+            for row in rows:
+                known, said = ROWS.get(row.name), comments.get(row.name, Said("", "", ""))
+                unit = row.unit or (known.unit if known else "") or said.unit
+                words = known.frame if known else " · ".join(filter(None, [said.words, row.frame]))
+                words = f"the group `{row.name}`, the same noisy sample" if row.group else words
+                noise = f"±{row.noise * env.cfg.noise.level:g}" if row.noise else ""
+                lines.append([code(row.name), str(row.size), cell(words), cell(unit), noise, cell(row.mirror or "")])
+            size = sum(row.size for row in rows)
+            parts.append(f"**`{group}`**, {size} columns\n\n" + table(["row", "columns", "what", "unit", "noise", "mirror"], lines))
+        parts.insert(len(parts) - len(env.observations.groups), f"### {heading}")
+    return "\n\n".join(parts)
+
+
+# ---- config fields
+
+
+class Field(NamedTuple):
+    """A field where a class declares or overrides it."""
+
+    kind: str  # its annotation, "" where it is overridden
+    value: Any
+    said: Said
+
+
+def fields(config: type) -> dict[str, Field]:
+    """Fields that ``config`` writes itself, by their dotted path."""
+    source = textwrap.dedent(inspect.getsource(config))
+    comments = {
+        token.start[0]: (token.string.lstrip("# "), token.line.strip().startswith("#"))
+        for token in tokenize.generate_tokens(io.StringIO(source).readline)
+        if token.type == tokenize.COMMENT and token.string != "# fmt: skip"
+    }
+    [tree] = ast.parse(source).body
+    assert isinstance(tree, ast.ClassDef)
+    return dict(_fields(tree, config, "", comments))
+
+
+def _fields(tree: ast.ClassDef, owner: Any, prefix: str, comments: dict[int, tuple[str, bool]]) -> Iterator[tuple[str, Field]]:
+    for line in tree.body:
+        if isinstance(line, ast.ClassDef):
+            yield from _fields(line, getattr(owner, line.name), f"{prefix}{line.name}.", comments)
+        if not isinstance(line, ast.Assign | ast.AnnAssign):
+            continue
+        above, number = [], line.lineno - 1
+        while number in comments and comments[number][1]:
+            above.insert(0, comments[number][0])
+            number -= 1
+        behind = [comments[n][0] for n in range(line.lineno, (line.end_lineno or line.lineno) + 1) if n in comments]
+        said = read_comment(" ".join([*above, *behind]).replace("fmt: skip", ""))
+        kind = ast.unparse(line.annotation) if isinstance(line, ast.AnnAssign) else ""
+        targets = [line.target] if isinstance(line, ast.AnnAssign) else line.targets
+        for target in targets:
+            for name in target.elts if isinstance(target, ast.Tuple) else [target]:
+                if isinstance(name, ast.Name) and not name.id.startswith("_"):
+                    yield f"{prefix}{name.id}", Field(kind, getattr(owner, name.id), said)
+
+
+def bounds(kind: Any) -> str:
+    """What values a field may have, as its annotation says it."""
+    choices, words = re.fullmatch(r"Literal\[(.*)\]", text := type_text(kind)), bounds_text(kind)
+    return choices.group(1).replace("'", "`").replace('"', "`") if choices else code(text) + (f" {words}" if words else "")
+
+
+def config_fields() -> str:
+    """Every field of every config class, in sections as they are written."""
+    parts = []
+    for heading, config, changes in CONFIGS:
+        parts.append(f"## {heading}\n\n" + (changes or f"`{config.__name__}`"))
+        sections: dict[str, list[list[str]]] = {}
+        kinds = dict(field_types(config))
+        for path, field in fields(config).items():
+            section, _, name = path.rpartition(".")
+            text = f"{field.value:g}" if isinstance(field.value, float) else repr(field.value)
+            text = text if len(text) < 70 else text[:60] + " ..."
+            line = [
+                code(name),
+                code(text),
+                bounds(kinds[path]) if field.kind else "overridden",
+                cell(field.said.unit),
+                cell(field.said.words),
+            ]
+            sections.setdefault(section, []).append([*line, cell(field.said.source)])
+        head = ["field", "default", "type, bounds", "unit", "what", "source"]
+        if changes:
+            whole = [[code(f"{section}.{row[0].strip('`')}"), row[1], *row[3:]] for section, rows in sections.items() for row in rows]
+            parts.append(table(["field", "default", "unit", "what", "source"], whole))
+            continue
+        parts += [(f"### `{section}`\n\n" if section else "") + table(head, rows) for section, rows in sections.items()]
+    return "\n\n".join(parts)
+
+
+MADE = {"rewards": rewards, "observations": observations, "config": config_fields}  # what `<!-- made: NAME -->` becomes
