@@ -8,7 +8,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from ctypes import ArgumentError
 from pathlib import Path
 from typing import Any, NoReturn
@@ -25,7 +25,9 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.add_argument("--verbose", action="store_true", help="show the whole traceback of an error")
+        self.add_argument(
+            "--verbose", action="store_true", help="say more: the whole traceback of an error; all numbers of an iteration while training"
+        )
 
     def error(self, message: str) -> NoReturn:
         fail(self.prog, f"{message if len(message) <= 500 else f'{message[:500]}...'} (--help lists the flags)")
@@ -170,7 +172,8 @@ def _show_all() -> None:
 
 def fail(program: str, message: str) -> NoReturn:
     """One line on standard error, exit code 2."""
-    print(f"{program}: {printable(' '.join(message.split()))}", file=sys.stderr)
+    with suppress(OSError):  # nobody may be there to read it
+        print(f"{program}: {printable(' '.join(message.split()))}", file=sys.stderr, flush=True)
     raise SystemExit(2)
 
 
