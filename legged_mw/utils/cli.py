@@ -25,7 +25,9 @@ class Parser(argparse.ArgumentParser):
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.add_argument("--verbose", action="store_true", help="show the whole traceback of an error")
+        self.add_argument(
+            "--verbose", action="store_true", help="say more: the whole traceback of an error; all numbers of an iteration while training"
+        )
 
     def error(self, message: str) -> NoReturn:
         fail(self.prog, f"{message if len(message) <= 500 else f'{message[:500]}...'} (--help lists the flags)")

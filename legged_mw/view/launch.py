@@ -12,9 +12,10 @@ from typing import Any
 from legged_mw.utils.commands import Command, outside, parse_command
 from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import writable
+from legged_mw.utils.renderer import has_display
 from legged_mw.view import web
 from legged_mw.view.drive import CAMERAS, NO_COMMANDS, Pilot
-from legged_mw.view.native import NativeViewer, has_display
+from legged_mw.view.native import NativeViewer
 from legged_mw.view.recorder import Recorder
 from legged_mw.view.script import load_script
 from legged_mw.view.session import Outcome, Session
