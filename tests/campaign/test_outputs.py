@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
@@ -29,9 +30,9 @@ def logs_is_a_file(root: Path) -> None:
     (root / "logs").write_text("")
 
 
-def results_are_a_file(root: Path) -> None:
-    (root / "logs/go1_flat").mkdir(parents=True)
-    (root / "logs/go1_flat/shipped").write_text("")
+def report_is_a_file(root: Path) -> None:
+    shutil.copytree(SHIPPED, root / "theirs")
+    (root / "theirs/eval").write_text("")
 
 
 CASES = [
@@ -55,7 +56,12 @@ CASES = [
     Case("export onto a file", program(*PLAY, "--export", "file"), "--export file: that is a file; name a folder", given=a_file),
     Case("export below a file", program(*PLAY, "--export", "file/out"), "file is a file, not a folder", given=a_file),
     Case("export into nowhere", program(*PLAY, "--export", "/proc/nosuch/out"), "--export /proc/nosuch/out: cannot be written"),
-    Case("report onto a file", program(*PLAY, "--eval"), "shipped is a file, not a folder", given=results_are_a_file),
+    Case(
+        "report onto a file",
+        program("play", "--load_run", "ROOT/theirs", "--eval"),
+        "eval: that is a file; name a folder",
+        given=report_is_a_file,
+    ),
     Case("picture to no name", program(*CHECK, "--picture", ""), "--picture is empty: name the file to write"),
     Case("picture into nowhere", program(*CHECK, "--picture", "/proc/nosuch/x.png"), "--picture /proc/nosuch/x.png: cannot be written"),
     Case("picture of a robot", program("robot", GO1, "--picture", "/proc/nosuch/x.png"), "--picture /proc/nosuch/x.png: cannot be written"),
