@@ -15,7 +15,7 @@ from legged_mw.deploy.switch import SwitchStage
 from legged_mw.eval import rules
 from legged_mw.utils.cli import Parser, duration, one_line_errors, positive
 from legged_mw.utils.errors import UserError, shown, unknown
-from legged_mw.utils.files import writable
+from legged_mw.utils.files import check_folder, typed, writable
 from legged_mw.view import launch
 
 RESULT_FILE = "exam.json"
@@ -92,8 +92,8 @@ def main() -> None:
 def find(name: str) -> Path:
     """The folder of an export, or of the shipped policy of this name. Raises UserError if it is neither."""
     shipped = ROOT / "resources" / "policies"
-    if Path(name).exists():
-        return Path(name)
+    if (folder := typed(name)).exists():
+        return check_folder(folder)
     if not (shipped / name).is_dir():
         there = sorted(path.parent.name for path in shipped.glob(f"*/{CONTRACT_FILE}"))
         raise UserError(f"no folder {name}, and {unknown('policy', name, there, 'resources/policies')}")

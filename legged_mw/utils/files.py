@@ -1,4 +1,4 @@
-"""Files that a config names: found by where the name was written, so that a task and its robot may be moved together."""
+"""Files and folders by their names: those that a config names, found by where the name was written, and those of strangers."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import hashlib
 import os
 import re
 import shutil
+import stat
 import sys
 import tempfile
 from contextlib import suppress
@@ -15,8 +16,10 @@ from typing import Any
 from weakref import WeakKeyDictionary
 
 from legged_mw import ROOT
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.errors import UserError, shown
 
+STAGED = ".export.new"  # in an export's folder: the files of a newer one, all of them, on the way to their places
+MOST_LETTERS = 100  # of a folder's name, in bytes: systems allow 255, and ours is put before or behind it
 _FILES: WeakKeyDictionary[type, Path] = WeakKeyDictionary()  # class -> the Python file with its body
 
 
@@ -78,7 +81,45 @@ def _cut(name: str) -> str:
     return name if len(name) <= 200 else f"{name[:200]}..."
 
 
-STAGED = ".export.new"  # in an export's folder: the files of a newer one, all of them, on the way to their places
+def check_name(name: str, where: str) -> str:
+    """``name`` if a folder may be called so, in any system and terminal, and it leads nowhere else. Raises UserError."""
+    why = next((f"{each!r} is in it" for each in name if each in '/\\:*?"<>|' or not each.isprintable()), "")
+    if name.startswith(("-", "~")) or (name and not name.strip(". ")):
+        why = "it begins with - or ~, or is made of dots"
+    if (size := len(name.encode(errors="replace"))) > MOST_LETTERS:
+        why = f"it has {size} bytes, more than {MOST_LETTERS}"
+    if why:
+        raise UserError(f"{where}: {name[:60]!r} cannot be the name of a folder below logs: {why}; write a plain name, e.g. go1_fast")
+    return name
+
+
+def typed(path: str) -> Path:
+    """A path as a user typed it, with ~ replaced; it need not be there. Raises UserError for one that no file can have."""
+    try:
+        found = Path(path).expanduser()
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+            found.stat()
+    except (OSError, ValueError, RuntimeError) as error:  # too long, a link to itself; a null character; ~ of an unknown user
+        raise UserError(f"'{path[:60]}' is no path here: {getattr(error, 'strerror', None) or error}") from None
+    return found
+
+
+def check_folder(folder: Path) -> Path:
+    """A run or an export, which may be a stranger's, if it holds files and folders, and links that stay in it. Raises UserError.
+
+    What a link leads to would be read, or written over, in place of a file; a pipe would be waited for.
+    """
+    home = folder.resolve()
+    for place, folders, files in os.walk(home):
+        for path in (Path(place, name) for name in (*folders, *files)):
+            kind, why = path.lstat().st_mode, ""
+            if stat.S_ISLNK(kind) and not Path(os.path.realpath(path)).is_relative_to(home):
+                why = f"a link that leads out of it, to {os.readlink(path)}"
+            elif not stat.S_ISLNK(kind) and not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
+                why = "a pipe, a socket or a device"
+            if why:
+                raise UserError(f"{shown(folder)}: {path.relative_to(home)} is {why}: delete it; a run or an export holds files alone")
+    return folder
 
 
 def finish_moving(folder: Path) -> None:
