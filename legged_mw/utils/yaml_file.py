@@ -17,7 +17,7 @@ import yaml
 
 from legged_mw.utils.errors import ConfigError
 
-MOST_BYTES, MOST_NODES, MOST_DEPTH, MOST_DIGITS = 1 << 20, 100_000, 50, 40  # a run's config has 10 kB, 700 nodes, depth 5
+MOST_BYTES, MOST_NODES, MOST_DEPTH, MOST_DIGITS = 1 << 20, 50_000, 50, 40  # a run's config has 10 kB and 700 nodes
 _EXPONENT = r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"
 _PLAIN = ("null", "bool", "int", "float", "str", "seq", "map")
 
