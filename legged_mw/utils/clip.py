@@ -116,6 +116,7 @@ def checked(path: Path, fps: float, names: Sequence[str], root_pos: ArrayLike, r
 def save_clip(path: Path, clip: Clip) -> None:
     """Write ``path`` (.npz), float32."""
     arrays = {key: np.asarray(getattr(clip, key), dtype=np.float32) for key in KEYS if key != "joint_names"}
+    path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(path, joint_names=np.array(clip.joint_names), **arrays)  # type: ignore[arg-type]
 
 

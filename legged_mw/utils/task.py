@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from legged_mw import ROOT
 from legged_mw.utils.config import Config, ConfigError
 from legged_mw.utils.errors import UserError, in_short, shown, unknown, users_fault
-from legged_mw.utils.files import find_file
+from legged_mw.utils.files import find_file, typed
 from legged_mw.utils.renamed import with_new_names
 from legged_mw.utils.task_module import import_task
 
@@ -139,7 +139,7 @@ def load_task(name: str) -> LoadedTask:
 
     The file may import its neighbours. A relative ``asset.file`` is looked for beside the file that wrote it, then in the repository.
     """
-    path = Path(name).expanduser()
+    path = typed(name)
     if path.suffix in ROBOT_FILES:
         raise ConfigError(f"{name} is a robot, not a task; make a task for it: python -m legged_mw.robot {name} --new NAME")
     if path.suffix != ".py":
