@@ -5,6 +5,8 @@ refused by a UserError of one line; nothing else may be raised, take two seconds
 is also walked for a few steps in simulation, if it was read.
 """
 
+# pyright: reportCallIssue=false, reportArgumentType=false, reportMissingImports=false
+# (hypothesis hands a composite's first argument over by itself)
 from __future__ import annotations
 
 import copy
