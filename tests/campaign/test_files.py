@@ -31,8 +31,11 @@ from legged_mw.rl import runner as running
 from legged_mw.rl.checkpoint import sealed
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.runs import checkpoints, find_run, load_tensors, runs, save_whole
+from legged_mw.utils import arrays
+from legged_mw.utils.clip import read_clip
 from legged_mw.utils.config import load_yaml, save_yaml
 from legged_mw.utils.files import digest
+from legged_mw.utils.motor_network import read_network
 from legged_mw.utils.task import load_task
 
 SHIPPED = ROOT / "resources/policies/go1_flat"
@@ -333,6 +336,31 @@ def test_what_may_be_changed(tmp_path: Path) -> None:
 
     says_else(change, stamped=False)(tmp_path)
     assert read_contract(tmp_path / "out").task == "mine"
+
+
+# ---- motions and motors
+
+CLIP = {"fps": 50.0, "joint_names": ["a"], "root_pos": np.zeros((3, 3)), "root_quat": np.eye(4)[[0, 0, 0]], "joint_pos": np.zeros((3, 1))}
+MOTOR = {"weight0": np.zeros((1, 2)), "bias0": np.zeros(1)}
+ARRAYS: list[tuple[str, Callable[[Path], Any], dict[str, Any], str]] = [
+    ("no rate", read_clip, {"fps": np.nan}, "or no frame rate"),
+    ("a rate of 10^30", read_clip, {"fps": 1e30}, "1e+30 frames a second; there must be from 0.1 to 1e+05"),
+    ("two rates", read_clip, {"fps": [50.0, 50.0]}, "fps is float64 along 1 axes; it must be numbers along 0 axes"),
+    ("joints are numbers", read_clip, {"joint_names": [1]}, "joint_names is int64 along 1 axes; it must be text along 1 axes"),
+    ("complex places", read_clip, {"root_pos": np.zeros((3, 3)) * 1j}, "root_pos is complex128 along 2 axes"),
+    ("far away", read_clip, {"root_pos": np.full((3, 3), 1e30)}, "a place or an angle beyond 10000 m or rad"),
+    ("a joint twice", read_clip, {"joint_names": ["a", "a"], "joint_pos": np.zeros((3, 2))}, "or a joint twice"),
+    ("more than there may be", read_clip, {"more": np.zeros(70_000, dtype=np.uint8)}, "it unpacks to 0 MiB; 0 are the most"),
+    ("frames of 10^9", read_network, {"frames": [0, 10**9]}, "the newest first, 10000 at most"),
+    ("infinite frames", read_network, {"frames": [np.inf]}, "file.npz: cannot convert float infinity"),
+]
+
+
+@pytest.mark.parametrize(("read", "change", "says"), [entry[1:] for entry in ARRAYS], ids=[entry[0] for entry in ARRAYS])
+def test_arrays(read: Callable[[Path], Any], change: dict[str, Any], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arrays, "MOST_BYTES", 1 << 16)
+    content = (CLIP if read is read_clip else MOTOR) | {name: np.asarray(value) for name, value in change.items()}
+    attack(Case("", lambda root: read(root / "file.npz"), says, given=lambda root: np.savez(root / "file.npz", allow_pickle=False, **content)), tmp_path)
 
 
 # ---- scenes
