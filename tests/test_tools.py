@@ -134,12 +134,17 @@ def test_doctor_says_what_is_there_and_what_mends(monkeypatch: pytest.MonkeyPatc
 
 def test_doctor_fails_where_nothing_can_train(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     version = doctor._version
-    monkeypatch.setattr(doctor, "_version", lambda name: "" if name == "mujoco-warp" else version(name))
+    others = {"mujoco-warp": "", "onnxscript": "0.5.4"}
+    monkeypatch.setattr(doctor, "_version", lambda name: others.get(name, version(name)))
+    monkeypatch.setattr(
+        doctor.metadata, "requires", lambda _: ["mujoco-warp<4.1,>=4.0", "onnxscript>=0.6", "torch", 'av; extra == "video"']
+    )
     monkeypatch.setattr(doctor, "draws", lambda name: "")
     with pytest.raises(SystemExit, match="1"):
         program("doctor", monkeypatch=monkeypatch)
     said = capsys.readouterr().out
-    assert "  mujoco-warp: pip install mujoco-warp\n" in said and "Speed" not in said
+    assert "  mujoco-warp: pip install 'mujoco-warp<4.1,>=4.0'\n" in said and "Speed" not in said
+    assert "  ! onnxscript     0.5.4, which is not >=0.6\n" in said and "  onnxscript: pip install 'onnxscript>=0.6'\n" in said
 
 
 def test_drawing_is_tried_in_another_process() -> None:
