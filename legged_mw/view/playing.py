@@ -14,6 +14,7 @@ from legged_mw.rl.policies import Source, introduce, load_policy, read_actor
 from legged_mw.rl.runs import load_tensors, require_task
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, pick_device, seed_everything
 from legged_mw.utils.commands import Command, command_table
+from legged_mw.utils.files import writable
 from legged_mw.utils.task import LoadedTask
 from legged_mw.view import launch
 from legged_mw.view.env_stage import EnvStage
@@ -53,7 +54,7 @@ def parse(description: str | None) -> argparse.Namespace:
     parser.add_argument("--half", action="store_true", help="with --export: round the weights to float16; the network takes half the space")
     args = parser.parse_args()
     require_task(args, parser)
-    asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag)]
+    asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag) not in (None, False)]
     if len(asked) > 1 or (args.eval and args.command is not None):
         parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
     if args.compare is not None and not args.eval:
@@ -69,6 +70,8 @@ def parse(description: str | None) -> argparse.Namespace:
     if (args.eval or args.export) and (watching := launch.asked(args)):
         parser.error(f"--eval and --export show nothing: leave {', '.join(watching)} out")
     launch.check_flags(args)
+    if args.export is not None:
+        writable(args.export, "--export", folder=True)
     torch.set_num_threads(1)  # a step of few worlds stalls on more
     return args
 
