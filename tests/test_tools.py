@@ -121,8 +121,7 @@ def test_doctor_says_what_is_there_and_what_mends(monkeypatch: pytest.MonkeyPatc
         "    egl            EGLError: no device\n",
         "    osmesa         draws\n",
         "    glfw           no screen\n",
-        "  ! onnxruntime    not installed (to run an export: legged-mw deploy)\n",
-        "  onnxruntime: pip install onnxruntime\n",
+        "    onnxruntime    not installed; it runs an export: pip install 'legged_mw[deploy]'\n",
         "load 99.0\n",
         "  cores: others use this machine: what is measured now is slower than it could be\n",
     ):

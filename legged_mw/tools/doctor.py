@@ -157,16 +157,10 @@ def pictures() -> Iterator[Finding]:
 
 
 def extras() -> Iterator[Finding]:
-    """What only some programs need."""
-    for package, module, what in (
-        ("onnxruntime", "onnxruntime", "to run an export: legged-mw deploy"),
-        ("cyclonedds", "cyclonedds", "to drive a Go2 or G1"),
-        ("tensorboard", "tensorboard", "curves of a training"),
-    ):
-        if importlib.util.find_spec(module) is None:
-            yield Finding(package, f"not installed ({what})", f"pip install {package}")
-        else:
-            yield Finding(package, _version(package) or "yes")
+    """What only some programs need, and nobody has to mend."""
+    for package, extra, what in (("onnxruntime", "deploy", "runs an export"), ("cyclonedds", "unitree", "drives a Go2 or G1")):
+        version = _version(package) if importlib.util.find_spec(package) else ""
+        yield Finding(package, version or f"not installed; it {what}: pip install 'legged_mw[{extra}]'")
     git = shutil.which("git")
     yield Finding("git", git or "not installed (a run of a clone then does not keep its diff)")
 
