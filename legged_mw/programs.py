@@ -107,7 +107,7 @@ def _tool(name: str) -> Callable[[], None]:
     """A program whose ``main`` does all."""
 
     def start() -> None:
-        with one_line_errors():
+        with one_line_errors(), patient_console():
             import_module(name).main()
 
     return start

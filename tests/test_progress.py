@@ -79,6 +79,7 @@ def test_a_terminal_keeps_a_bar_below_the_lines(monkeypatch: pytest.MonkeyPatch,
             clock[0] += 1.0
             console.iteration(done, 40, 20, NUMBERS, {}, 1.0)
         print("WARNING: above")
+        print("", end="")
         *lines, warning, bar = shown(terminal.getvalue())
         assert [line.split(":")[0] for line in lines] == [f"Learning iteration {done}/40" for done in range(1, 11)]
         assert "left" not in lines[-1] and warning == "WARNING: above"

@@ -17,6 +17,7 @@ from program import SMALL, run
 from torch.utils.tensorboard import SummaryWriter
 
 from legged_mw import ROOT, programs
+from legged_mw.rl import training
 from legged_mw.rl.runs import save_whole
 from legged_mw.sim.device import DeviceFacts, device_facts
 from legged_mw.tools import alongside, chart, completion, doctor, sweep, warm
@@ -237,6 +238,18 @@ def test_a_sweep_trains_every_combination_and_ends_with_a_table(tmp_path: Path) 
     assert lines[0] == ["b", "seed", "iterations", "M", "steps", "minutes", "steps/s", "reward", "falls"]
     assert [(line[0], line[1], line[6]) for line in lines[1:4]] == [("1", "1", "10.00"), ("1", "2", "20.00"), ("2", "1", "30.00")]
     assert lines[4][:4] == ["1", "mean", "of", "2"] and "15.00 ± 7.07" in " ".join(lines[4])
+
+
+def test_a_sweep_ends_where_a_signal_stops_it(tmp_path: Path) -> None:
+    assert sweep.STOPPED == training.STOPPED
+    cells, flags = sweep.make_cells([], ["1", "2", "3"]), []
+
+    def start(asked: list[str]) -> tuple[int, str, str]:
+        flags.append(asked)
+        by = "SIGINT" if len(flags) == 2 else "--max_time"
+        return sweep.STOPPED, str(write_run(tmp_path / f"{len(flags)}")), f"stopped: {by}; go on with"
+
+    assert len(sweep.train_all(cells, [], start)) == len(flags) == 2
 
 
 def test_values_stand_apart_by_commas() -> None:

@@ -123,6 +123,8 @@ class _Above:
         self._console, self._terminal = console, console._out
 
     def write(self, text: str) -> int:
+        if not text:
+            return 0
         self._console.clear()
         self._terminal.write(text)
         if text.endswith("\n"):
