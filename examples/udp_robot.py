@@ -4,6 +4,7 @@
     python examples/udp_robot.py resources/policies/go1_flat --drive 127.0.0.1:9870 --command 0.8,0,0   # another
 
 Packets are little-endian: a header, then float64 values. Both ends read the same export: the header's digest shows whether they did.
+A packet that is malformed, late, not finite or from somebody else is counted and dropped; only new targets keep the servos on.
 Use it on one machine, or on a cable between two: nothing is encrypted, and anybody who can send to the port moves the robot.
 """
 
@@ -16,6 +17,7 @@ import json
 import socket
 import struct
 import time
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -30,12 +32,13 @@ from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import idle_command
 from legged_mw.utils.cli import Parser, duration, one_line_errors
 from legged_mw.utils.commands import parse_command, with_units
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.errors import UserError, printable
 
 VERSION = 1
 HELLO, MEASURED, TARGETS, CLOSE, REFUSED = range(1, 6)  # kinds of packet
 _HEADER = struct.Struct("<4sBB8sI")  # "LMWR", version, kind, digest of the contract's layout, count of TARGETS sent so far
 _MAGIC, _MOST = b"LMWR", 65507  # bytes that fit into one packet
+_FAR = 1e4  # [rad] or [N m]: a target beyond it is none
 
 
 class Packet(NamedTuple):
@@ -68,6 +71,16 @@ def unpack(data: bytes) -> Packet | None:
     return Packet(kind, digest, count, data[_HEADER.size :])
 
 
+def numbers(body: bytes, count: int) -> Floats | None:
+    """``count`` float64 values; None if the body has another size."""
+    return np.frombuffer(body, dtype="<f8").astype(float) if len(body) == 8 * count else None
+
+
+def counted(dropped: Counter[str]) -> str:
+    """What was dropped, in words to end a line with; nothing if nothing was."""
+    return f" ({sum(dropped.values())} packets dropped: {', '.join(f'{n} {why}' for why, n in dropped.items())})" if dropped else ""
+
+
 def parse_address(text: str) -> tuple[str, int]:
     """ "HOST:PORT" as what a socket wants."""
     host, colon, port = text.rpartition(":")
@@ -83,8 +96,8 @@ class UdpRobot(Robot):
         """Send a hello and take the first measurement; raises RobotError if no answer comes within ``timeout`` [s]."""
         self._layout, self._digest, self._name = layout(contract), contract_digest(contract), f"{address[0]}:{address[1]}"
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        self._socket.settimeout(timeout)
         self._count, self._timeout, self._open = 0, timeout, True
+        self.dropped: Counter[str] = Counter()  # packets that were no answer, by why
         try:
             self._socket.connect(address)
         except OSError as error:
@@ -106,36 +119,48 @@ class UdpRobot(Robot):
             self._socket.close()
 
     def _exchange(self, kind: int, body: bytes = b"") -> Measurement:
+        """Send a packet and take its answer; what else comes meanwhile is counted, and does not lengthen the wait."""
+        end = time.monotonic() + self._timeout
         try:
             self._socket.send(pack(kind, self._digest, self._count, body))
-            while True:
+            while (left := end - time.monotonic()) > 0:
+                self._socket.settimeout(left)
                 packet = unpack(self._socket.recv(_MOST))
                 if packet and packet.kind == REFUSED:
-                    raise self._lost(packet.body.decode("utf-8", "replace"))
-                if packet and packet.kind == MEASURED and packet.count == self._count:  # not a late answer to an older one
+                    raise self._lost(printable(" ".join(packet.body[:200].decode("utf-8", "replace").split())))
+                if why := self._fault(packet):
+                    self.dropped[why] += 1
+                elif packet:
                     return self._measurement(packet.body)
+            raise TimeoutError
         except TimeoutError:
-            raise self._lost(f"no answer within {self._timeout:g} s") from None
+            raise self._lost(f"no answer within {self._timeout:g} s{counted(self.dropped)}") from None
         except OSError as error:
             raise self._lost(f"{error.strerror or error}") from None
+
+    def _fault(self, packet: Packet | None) -> str:
+        """Why a packet is not the answer; empty if it is."""
+        if packet is None or packet.kind != MEASURED:
+            return "not of this link"
+        if packet.digest != self._digest or len(packet.body) != 8 * sum(self._layout.values()):
+            return "of another size or export"
+        return "" if packet.count == self._count else "late"
 
     def _lost(self, why: str) -> RobotError:
         self.close()
         return RobotError(f"robot at {self._name}: {why}; stopped (start one with: python examples/udp_robot.py DIR --serve {self._name})")
 
     def _measurement(self, body: bytes) -> Measurement:
-        values = np.frombuffer(body, dtype="<f8").astype(float)
-        if len(values) != sum(self._layout.values()):
-            raise self._lost(f"a measurement of {len(values)} values came, not of {sum(self._layout.values())}")
+        values = np.frombuffer(body, dtype="<f8").astype(float)  # what is not finite, or cannot be, is for the limits of ``safety``
         parts = dict(zip(self._layout, np.split(values, np.cumsum(list(self._layout.values()))[:-1]), strict=True))
         return Measurement(**{n: parts[n] for n in QUANTITIES}, others={n: v for n, v in parts.items() if n not in QUANTITIES})
 
 
 class UdpServer:
-    """Owns ``robot`` and obeys one client. When that client closes or sends nothing for too long, the servos are switched off."""
+    """Owns ``robot`` and obeys one client. When that client closes or sends no new targets for too long, the servos are switched off."""
 
     def __init__(self, robot: Robot, contract: Contract, address: tuple[str, int], timeout: float = 0.5) -> None:
-        """Listen at ``address`` (port 0: any free one); ``timeout`` [s] is the longest time between two packets of the client."""
+        """Listen at ``address`` (port 0: any free one); ``timeout`` [s] is the longest time between two targets of the client."""
         self._robot, self._contract, self._timeout = robot, contract, timeout
         self._layout, self._digest, self._count = layout(contract), contract_digest(contract), 0
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -145,6 +170,7 @@ class UdpServer:
             self._socket.close()
             raise UserError(f"cannot listen at {address[0]}:{address[1]}: {error.strerror or error}") from None
         self.address: tuple[str, int] = self._socket.getsockname()
+        self.dropped: Counter[str] = Counter()  # packets that moved nothing, by why
 
     def serve(self, say: Callable[[str], None] = print) -> str:
         """Serve one client from its hello until it closes or falls silent, then close the robot. Returns why it ended."""
@@ -155,71 +181,90 @@ class UdpServer:
         finally:
             self._robot.close()
             self._socket.close()
-            say(f"{why}; the joints are damped, no longer servoed")
+            say(f"{why}{counted(self.dropped)}; the joints are damped, no longer servoed")
         return why
 
     def _wait_for_client(self, say: Callable[[str], None]) -> tuple[str, int]:
-        """The first client that sends a hello with the same contract."""
-        self._socket.settimeout(None)
+        """The first client that sends a hello with the same contract, and can be answered."""
         while True:
-            data, sender = self._socket.recvfrom(_MOST)
-            kind, answer = self._answer(data, started=False)
-            if answer:
-                self._socket.sendto(answer, sender)
-            if kind == HELLO:
+            data, sender = self._hear(None)
+            packet = self._packet(data, sender)
+            if packet and packet.kind == TARGETS:
+                self._drop("before a hello", sender, "send a hello first")
+            if packet and packet.kind == HELLO and self._send(self._measured(), sender):
                 say(f"{sender[0]}:{sender[1]} took the robot")
                 return sender
 
     def _obey(self, client: tuple[str, int]) -> str:
-        """Obey ``client`` alone until it closes or falls silent; returns which."""
+        """Obey ``client`` alone until it closes or sends no new targets; returns which."""
         heard = time.monotonic()
         while (left := heard + self._timeout - time.monotonic()) > 0:
-            self._socket.settimeout(left)
             try:
-                data, sender = self._socket.recvfrom(_MOST)
+                data, sender = self._hear(left)
             except TimeoutError:
                 break
             if sender != client:
-                continue
-            kind, answer = self._answer(data, started=True)
-            if kind == CLOSE:
-                return f"{client[0]}:{client[1]} closed the link"
-            if kind:
-                heard = time.monotonic()
-            if answer:
-                self._socket.sendto(answer, client)
+                self.dropped["from somebody else"] += 1
+            elif packet := self._packet(data, client):
+                if packet.kind == CLOSE:
+                    return f"{client[0]}:{client[1]} closed the link"
+                if packet.kind == HELLO or self._move(packet, client):
+                    heard = time.monotonic() if packet.kind == TARGETS else heard
+                    self._send(self._measured(), client)
         return f"{client[0]}:{client[1]} fell silent for {self._timeout:g} s"
 
-    def _answer(self, data: bytes, started: bool) -> tuple[int, bytes | None]:
-        """Do what a packet asks; returns its kind, or 0 if it was refused or not of this link, and the reply."""
+    def _move(self, packet: Packet, client: tuple[str, int]) -> bool:
+        """Whether these targets are new and were written."""
+        targets = numbers(packet.body, len(self._contract.joints))
+        if targets is None or not (np.abs(targets) < _FAR).all():
+            self._drop("without targets", client, f"targets must be {len(self._contract.joints)} finite numbers, one a joint")
+            return False
+        if packet.count <= self._count:
+            self.dropped["late or sent twice"] += 1
+            return False
+        self._count = packet.count
+        self._robot.write(targets)
+        return True
+
+    def _hear(self, seconds: float | None) -> tuple[bytes, tuple[str, int]]:
+        """The next packet and its sender, within ``seconds``. Raises TimeoutError."""
+        self._socket.settimeout(seconds)
+        while True:
+            with contextlib.suppress(ConnectionError):  # some systems say here that an answer could not be delivered
+                return self._socket.recvfrom(_MOST)
+
+    def _packet(self, data: bytes, sender: tuple[str, int]) -> Packet | None:
+        """A packet that a client may send, with the same contract; others are counted, and refused if they are of this link."""
         try:
             packet = unpack(data)
         except RobotError as error:
-            return 0, self._refuse(str(error))
-        if packet is None:
-            return 0, None
+            return self._drop("of another version", sender, str(error))
+        if packet is None or packet.kind not in (HELLO, TARGETS, CLOSE):
+            return self._drop("not of this link")
         if packet.digest != self._digest:
-            return 0, self._refuse("its export has other joints, measurements or another period; use one export at both ends")
-        if packet.kind == TARGETS and started:
-            targets = np.frombuffer(packet.body[: len(packet.body) // 8 * 8], dtype="<f8")
-            if len(targets) != len(self._contract.joints) or not np.isfinite(targets).all():
-                return 0, self._refuse(f"targets must be {len(self._contract.joints)} finite numbers, one a joint")
-            if packet.count > self._count:  # a packet that comes twice or late moves nothing
-                self._count = packet.count
-                self._robot.write(targets)
-        elif packet.kind == TARGETS:
-            return 0, self._refuse("send a hello first")
-        elif packet.kind == CLOSE:
-            return CLOSE, None
-        return packet.kind, self._measured()
+            why = "its export has other joints, measurements or another period; use one export at both ends"
+            return self._drop("of another export", sender, why)
+        return packet
+
+    def _drop(self, why: str, sender: tuple[str, int] | None = None, say: str = "") -> None:
+        """Count a packet, and tell its sender."""
+        self.dropped[why] += 1
+        if sender:
+            self._send(pack(REFUSED, self._digest, self._count, say.encode()), sender)
+
+    def _send(self, answer: bytes, to: tuple[str, int]) -> bool:
+        """Whether it could be sent: nobody can be answered at port 0."""
+        try:
+            self._socket.sendto(answer, to)
+        except OSError:
+            self.dropped["that cannot be answered"] += 1
+            return False
+        return True
 
     def _measured(self) -> bytes:
         measured = self._robot.read()
         parts = [measured.others[name] if name in measured.others else getattr(measured, name) for name in self._layout]
         return pack(MEASURED, self._digest, self._count, np.concatenate(parts).astype("<f8").tobytes())
-
-    def _refuse(self, why: str) -> bytes:
-        return pack(REFUSED, self._digest, self._count, why.encode())
 
 
 # ---- the program -----------------------------------------------------------------------------------------------------

@@ -35,7 +35,8 @@ from legged_mw.rl.estimator import SMALLEST, EstimatingModel
 from legged_mw.rl.network import ESTIMATE, ExportedPolicy, run_onnx
 from legged_mw.rl.policies import act, find_trained, load_policy
 from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.runner import make_runner, rsl_rl_config
+from legged_mw.rl.runner import make_runner
+from legged_mw.rl.settings import rsl_rl_config
 from legged_mw.rl.transfer import begin_with
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.task import LoadedTask, load_task
@@ -270,7 +271,7 @@ def test_go1_flat_blind_reads_what_a_robot_measures() -> None:
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three iterations; the last is exported to ``export`` beside the checkpoint."""
     flags = [*FLAGS, "--max_iterations", "3", "--set", "runner.export=true"]
-    return trained(tmp_path_factory.mktemp("estimator"), *flags, prints=("Estimate loss: ", "policy.onnx"))
+    return trained(tmp_path_factory.mktemp("estimator"), *flags, "--verbose", prints=("Estimate loss: ", "policy.onnx"))
 
 
 @pytest.fixture(scope="module")

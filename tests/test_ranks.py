@@ -80,10 +80,10 @@ def test_one_asked_to_stop_stops_all(tmp_path: Path) -> None:
 
 def test_train_writes_one_run_folder(tmp_path: Path) -> None:
     small = ["--num_envs", "8", "--set", "actor.hidden_dims=[16]", "--set", "critic.hidden_dims=[16]"]
-    small += ["--experiment_name", str(tmp_path / "runs"), "--max_iterations", "2", "--seed", "4"]
-    result = launch("train.py", "--task", "go1_flat", "--device", "cpu", *small)
+    small += ["--experiment_name", "runs", "--max_iterations", "2", "--seed", "4"]
+    result = launch(str(ROOT / "train.py"), "--task", "go1_flat", "--device", "cpu", *small, cwd=tmp_path)
     assert result.returncode == 0, result.stderr
-    [folder] = (tmp_path / "runs").iterdir()
+    [folder] = (tmp_path / "logs/runs").iterdir()
     assert {"config.yaml", "model_2.pt"} <= {path.name for path in folder.iterdir()}
     assert load_yaml(folder / "config.yaml")["seed"] == 4
     assert result.stdout.count("Learning iteration 2/2") == result.stdout.count("policy.onnx") == 1

@@ -15,6 +15,7 @@ from legged_mw.deploy.switch import SwitchStage
 from legged_mw.eval import rules
 from legged_mw.utils.cli import Parser, duration, one_line_errors, positive
 from legged_mw.utils.errors import UserError, shown, unknown
+from legged_mw.utils.files import check_folder, typed, writable
 from legged_mw.view import launch
 
 RESULT_FILE = "exam.json"
@@ -51,6 +52,8 @@ def parse() -> argparse.Namespace:
         parser.error("--ranges says what the exam asks: add --eval")
     if args.command is not None and args.commands:
         parser.error("--commands brings its own commands: leave --command out")
+    if args.out is not None:
+        writable(args.out, "--out")
     launch.check_flags(args)
     options.check_flags(args)
     drive.check_flags(args)
@@ -89,8 +92,8 @@ def main() -> None:
 def find(name: str) -> Path:
     """The folder of an export, or of the shipped policy of this name. Raises UserError if it is neither."""
     shipped = ROOT / "resources" / "policies"
-    if Path(name).exists():
-        return Path(name)
+    if (folder := typed(name)).exists():
+        return check_folder(folder)
     if not (shipped / name).is_dir():
         there = sorted(path.parent.name for path in shipped.glob(f"*/{CONTRACT_FILE}"))
         raise UserError(f"no folder {name}, and {unknown('policy', name, there, 'resources/policies')}")
@@ -108,6 +111,7 @@ def show_log(path: Path, folder: Path | None) -> None:
 def examine(folder: Path, path: Path, common: bool = False, contact: str | None = None) -> None:
     """The exam: its table, and a JSON file at ``path``. ``contact``: see DeployStage."""
     contract = read_contract(folder)
+    writable(str(path), "--out")
     if contract.exam and "kind" in contract.exam:
         if common:
             raise UserError("--ranges says what the walking exam asks: leave it out")

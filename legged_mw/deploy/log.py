@@ -30,6 +30,7 @@ from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement, layout
 from legged_mw.deploy.states import POLICY, STATES, Order
 from legged_mw.utils.errors import UserError
+from legged_mw.utils.files import check_name
 
 FORMAT = 1
 CHUNK = 100  # steps a block
@@ -45,7 +46,7 @@ class LogError(UserError, ValueError):
 
 def log_path(contract: Contract, folder: Path = Path("logs/deploy")) -> Path:
     """Where a run is logged that was not told where."""
-    return folder / f"{contract.task}_{time.strftime('%Y-%m-%d_%H-%M-%S')}{SUFFIX}"
+    return folder / f"{check_name(contract.task, f'{CONTRACT_FILE}: task')}_{time.strftime('%Y-%m-%d_%H-%M-%S')}{SUFFIX}"
 
 
 def _columns(contract: Contract) -> dict[str, int]:

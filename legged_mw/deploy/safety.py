@@ -23,6 +23,9 @@ from legged_mw.utils.errors import UserError, unknown
 
 TORQUE = "torque"  # an action's origin: its targets are torques
 OFF = math.inf  # a limit that is never passed
+# What no joint and no gyro measures; ours: wheels turn far, and gyros end at 35 rad/s. Also NaN and infinity are beyond it.
+_ABSURD = {"joint_pos": (1e5, "rad"), "joint_vel": (1e4, "rad/s"), "ang_vel": (1e3, "rad/s")}
+_UNIT = 0.1  # by which the length of gravity may differ from 1; ours: a unit quaternion in float32 gives 1e-6
 
 
 class LimitError(UserError, ValueError):
@@ -188,6 +191,11 @@ class Safety:
         for name in ("joint_pos", "joint_vel", "gravity", "ang_vel"):
             if not np.isfinite(getattr(measured, name)).all():
                 return Trip("finite", f"what is measured is not finite: {name}")
+        for name, (most, unit) in _ABSURD.items():
+            if (found := np.abs(getattr(measured, name)).max()) > most:
+                return Trip("finite", f"what is measured cannot be: {name} of {found:.3g} {unit}")
+        if abs((length := float(np.linalg.norm(measured.gravity))) - 1.0) > _UNIT:
+            return Trip("finite", f"what is measured cannot be: gravity of length {length:.2f}, not 1: no orientation comes")
         return None
 
     def _fresh(self, measured: Measurement, health: Health) -> Trip | None:

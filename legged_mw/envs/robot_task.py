@@ -26,10 +26,12 @@ from legged_mw.envs.domain_rand import DomainRand, world_fields
 from legged_mw.envs.loading import load_robot, soft_limits, start_place
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
 from legged_mw.envs.observations import Observations, Row
+from legged_mw.envs.own_code import check_term, checked_rows
 from legged_mw.envs.perturbation import Perturbation
 from legged_mw.envs.robot_rewards import RobotRewards
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import Statistics
+from legged_mw.envs.suspects import Suspects
 from legged_mw.envs.wording import in_config_words
 from legged_mw.sim.engines import make_simulation, pick_engine
 from legged_mw.sim.mirror import Partners, find_partners
@@ -38,7 +40,7 @@ from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
-from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse
+from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse, spread
 
 
 class RobotTask(TorqueLaw, RobotRewards, BaseTask):
@@ -55,7 +57,6 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         check_values(cfg, law=self.motor_law)
         self.terrain = self._make_terrain()
         self.robot = self._load_robot(pick_engine(cfg.sim.engine, device))
-        super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
         self.sim = make_simulation(
             self.robot.physics,
             cfg.env.num_envs,
@@ -68,6 +69,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
             terrain=self.terrain,
             eager=eager,
         )
+        super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
         self.domain_rand = DomainRand(cfg, self.robot, self.sim, self.motor_law)
         self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
@@ -271,7 +273,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         if hasattr(self, "_observation_rows"):
             raise ConfigError(f"{type(self).__name__}._observation_rows: the method is now called observation_rows")
         self.observations = Observations(
-            self.observation_rows(),
+            checked_rows(self),
             self.cfg.observations,
             self.cfg.noise.level,
             self.num_envs,
@@ -307,6 +309,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         if self._reward_terms:
             terms = torch.stack([term() for term in self._reward_terms], dim=1).mul_(self.reward_scales)
             terms.masked_fill_(self.broken[:, None], 0.0)
+            self.suspects[0].clear(terms)
             total = terms[:, : self._num_clipped].sum(dim=1)
             if rewards.only_positive_rewards:
                 total.clamp_(0.0, rewards.max_reward)
@@ -328,11 +331,9 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
             where = f"{type(self).__name__} (a method _reward_<name>)"
             if name not in terms:
                 raise ConfigError(f"rewards.scales.{name} = {scales[name]:g}: {unknown('reward term', name, terms, where)}")
-            value = terms[name]()
-            if not isinstance(value, Tensor) or value.shape != (self.num_envs,):
-                got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-                raise ConfigError(f"_reward_{name} must return a tensor ({self.num_envs},), one value an environment; it returned {got}")
+            check_term(terms[name], self.num_envs)
         self._reward_terms = [terms[name] for name in self.reward_names]
+        self.suspects = [Suspects([f"reward term '{n}'" for n in self.reward_names], self.device), *self.observations.suspects()]
         self.reward_scales = torch.tensor([scales[name] for name in self.reward_names], device=self.device) * self.dt
         means = [*(f"rew_{name}" for name in self.reward_names), "reward", "episode_length"]
         self.statistics = Statistics(means, ["episodes", "fell", "broken"], self.device)
@@ -375,12 +376,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
     def load_training_state(self, state: dict[str, Tensor]) -> None:
         """Go on from ``training_state``, of several processes from the first one's. Worlds take what the nearest ones had."""
         if "kick_level" in state and self.cfg.perturbation.curriculum:
-            self.perturbation.kick_level.copy_(self._spread(state["kick_level"]))
-
-    def _spread(self, values: Tensor) -> Tensor:
-        """Values (M,) of M worlds for N worlds."""
-        values = values.to(self.device)
-        return values[torch.arange(self.num_envs, device=self.device) * len(values) // self.num_envs]
+            self.perturbation.kick_level.copy_(spread(state["kick_level"], self.num_envs))
 
     # ---- robot and buffers: born here, never rebound --------------------------------------------------------------------------
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from legged_mw.sim.errors import EngineError, ModelError
+from legged_mw.sim.simulation import Simulation
+from legged_mw.utils.errors import UserError
 
 FIELDS = {
     "engine": "sim.engine",
+    "num_envs": "env.num_envs",
     "nconmax": "sim.nconmax",
     "njmax": "sim.njmax",
     "integrator": "sim.integrator",
@@ -35,12 +37,25 @@ def config_words(text: str) -> str:
     return text
 
 
+def overflow_note(sim: Simulation, what: str) -> str:
+    """A line for who looks at ``what`` if contacts or constraints of ``sim`` did not fit, ''. Reads the device."""
+    report = config_words(sim.overflow_report())
+    return f"WARNING: {what} is not to be trusted: {report}" if report else ""
+
+
+def say_overflow(sim: Simulation, what: str) -> bool:
+    """Print that line; returns whether there was one."""
+    if note := overflow_note(sim, what):
+        print(note, flush=True)
+    return bool(note)
+
+
 @contextmanager
 def in_config_words() -> Iterator[None]:
     """An error of the simulator, raised inside, names the fields that its parameters come from."""
     try:
         yield
-    except (ModelError, EngineError) as error:
+    except UserError as error:
         text = config_words(str(error))
         if text == str(error):
             raise

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from legged_mw.envs.domain_rand import active
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.wording import overflow_note
 from legged_mw.eval.exams import Exam, require_exam
 from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
@@ -19,6 +20,7 @@ from legged_mw.rl.policies import Source, introduce, load_policy
 from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.files import writable
 from legged_mw.utils.task import LoadedTask
 
 
@@ -39,9 +41,10 @@ def grade(policies: list[tuple[Source, LoadedTask]], args: argparse.Namespace) -
     graded = [prepare(*first, args, common=args.ranges == "common"), *(prepare(*rival, args) for rival in rivals)]
     graded[0].exam.ask_alike([each.task for each in graded])
     introduce(graded[0].source, graded[0].task.changes_since(graded[0].trained))
+    folder = graded[0].source.results(graded[0].task) / "eval"
+    writable(str(folder), "the report goes to", folder=True)
     built = [(each, *build(each, args, device)) for each in graded]  # all, before one is graded in vain
     columns = [make_column(*each) for each in built]
-    folder = graded[0].source.results(graded[0].task) / "eval"
     graded[0].exam.write(folder, graded[0].task.name, columns, elsewhere(graded[0]))
     print(f"written to {shown(folder / 'report.html')}, with report.json and pictures beside it")
 
@@ -100,6 +103,7 @@ def make_column(graded: Graded, policy: Policy, env: RobotTask, rough: RobotTask
         print(f"{exam.rough.table(figures['crossing'])}\n")
     overrides = {path: now for path, (_, now) in graded.task.changes_since(graded.trained).items()}
     about = {"policy": "/".join(source.checkpoint.parts[-3:]), "engine": env.sim.engine, "device": env.device, "overrides": overrides}
+    about |= {"warning": note} if (note := " ".join(overflow_note(each.sim, "this exam") for each in (env, rough) if each).strip()) else {}
     return Column(name, about, result, figures)
 
 

@@ -16,6 +16,7 @@ import torch
 from legged_mw.rl.checkpoint import EARLIER, check_content, damage, sealed
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import shown, unknown
+from legged_mw.utils.files import check_folder, check_name, typed
 from legged_mw.utils.task import LoadedTask, task_names
 
 CONFIG_FILE = "config.yaml"
@@ -27,12 +28,14 @@ def logs_folder() -> Path:
 
 
 def experiment_folder(task: LoadedTask, name: str | None = None) -> Path:
-    """The folder of a task's runs, or of the experiment called ``name``."""
-    return logs_folder() / (name or task.train.runner.experiment_name or task.name)
+    """The folder of a task's runs, or of the experiment called ``name``. Raises UserError for a name that is none."""
+    check_name(task.train.runner.run_name, "runner.run_name")
+    return logs_folder() / check_name(name or task.train.runner.experiment_name or task.name, "the name of the experiment")
 
 
 def new_run(experiment: Path, run_name: str) -> Path:
     """Make and return a run folder below ``experiment``, named by the time."""
+    check_name(run_name, "runner.run_name")
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") + (f"_{run_name}" if run_name else "")
     for suffix in ["", *(f"_{i}" for i in range(2, 1000))]:
         folder = experiment / (stamp + suffix)
@@ -61,15 +64,15 @@ def checkpoints(run: Path) -> dict[int, Path]:
 
 
 def find_run(experiment: Path, name: str) -> Path:
-    """The run called ``name`` below ``experiment``, a path to one, or for "-1" the one last trained."""
-    found = runs(experiment)
+    """The run called ``name`` below ``experiment``, a path to one, or for "-1" the one last trained. It may be a stranger's."""
+    found, given = runs(experiment), typed(name)
     if name == "-1":
         if not found:
             raise ConfigError(f"no run with a checkpoint in {experiment}; train first, or name another --experiment_name")
-        return found[-1]
-    for folder in (experiment / name, Path(name).expanduser()):
+        return check_folder(found[-1])
+    for folder in (experiment / name, given):
         if folder.is_dir() and checkpoints(folder):
-            return folder
+            return check_folder(folder)
     raise ConfigError(unknown("run with a checkpoint", name, [folder.name for folder in found], str(experiment)))
 
 
@@ -97,28 +100,41 @@ def task_of(run: Path) -> str:
         return stored
     folders = [Path.cwd(), *run.resolve().parents[:4]]  # experiment, logs, what holds logs; of an export one more
     for file in (folder / name for name in (stored, Path(stored).name) for folder in folders):
-        if file.is_file():
-            return str(file)
+        with suppress(OSError, ValueError):  # a name that no file can have
+            if file.is_file():
+                return _not_brought(file, run)
     raise ConfigError(f"{shown(run)} is of task '{stored}', which is not there from {', '.join(map(str, folders))}; say --task FILE")
+
+
+def _not_brought(file: Path, run: Path) -> str:
+    """The task file of a run, which will be run as code: it is a task, and did not come with the run. Raises ConfigError."""
+    home, really = run.resolve(), file.resolve()
+    logs = next((above for above in home.parents if above.name == "logs"), home)
+    if really.is_relative_to(home) or really.is_relative_to(logs):
+        raise ConfigError(f"{shown(run)} is of task {shown(file)}, which came with it and is code: read it, then say --task {shown(file)}")
+    if not re.search(rb"^TASK\b", really.read_bytes(), re.MULTILINE):
+        raise ConfigError(f"{shown(run)} is of task {shown(file)}, which is no task: it has no line TASK = Task(...); say --task FILE")
+    return str(file)
 
 
 def require_task(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
     """Where ``--task`` is missing, take the one that the run at the path ``--load_run`` is of."""
-    if not args.task and args.load_run and (Path(args.load_run).expanduser() / CONFIG_FILE).is_file():
-        args.task = task_of(Path(args.load_run).expanduser())
+    if not args.task and args.load_run and ((run := typed(args.load_run)) / CONFIG_FILE).is_file():
+        args.task = task_of(check_folder(run))
     if not args.task:
         parser.error(f"--task is missing, and --load_run is no path of a run that would say it; tasks: {', '.join(task_names())}")
 
 
-def save_whole(content: dict[str, Any], path: Path) -> None:
-    """Write a checkpoint, with its checksum, so that a kill at any moment leaves either all of it or nothing."""
+def save_whole(content: dict[str, Any], path: Path, sync: bool = True) -> None:
+    """Write a checkpoint, with its checksum, so that a kill at any moment (``sync``: a power cut too) leaves all of it or nothing."""
     temporary, archive = path.with_name(f".{path.name}.{os.getpid()}.tmp"), io.BytesIO()
     torch.save(content, archive)
     try:
         with open(temporary, "wb") as file:
             file.write(sealed(archive.getvalue()))
             file.flush()
-            os.fsync(file.fileno())
+            if sync:
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -1,20 +1,25 @@
-"""Files that a config names: found by where the name was written, so that a task and its robot may be moved together."""
+"""Files and folders by their names: those that a config names, found by where the name was written, and those of strangers."""
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
 import shutil
+import stat
 import sys
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
 
 from legged_mw import ROOT
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.errors import UserError, shown
 
+STAGED = ".export.new"  # in an export's folder: the files of a newer one, all of them, on the way to their places
+MOST_LETTERS = 100  # of a folder's name, in bytes: systems allow 255, and ours is put before or behind it
 _FILES: WeakKeyDictionary[type, Path] = WeakKeyDictionary()  # class -> the Python file with its body
 
 
@@ -47,7 +52,72 @@ def find_file(cfg: Any, path: str, one: str = "") -> Path:
     raise UserError(f"{path}: no file '{written}' in {', '.join(map(str, places))}")
 
 
-STAGED = ".export.new"  # in an export's folder: the files of a newer one, all of them, on the way to their places
+def writable(name: str, flag: str, folder: bool = False) -> Path:
+    """The file, or folder, that ``flag`` says to write, if it can be: asked before the work. Raises UserError.
+
+    Folders on the way need not be there. A file without a name is tried beside it, which leaves nothing.
+    """
+    path = Path(name)
+    try:
+        if not name.strip():
+            raise UserError(f"{flag} is empty: name the {'folder' if folder else 'file'} to write")
+        if path.exists() and path.is_dir() != folder:
+            raise UserError(f"{flag} {name}: that is a {'file' if folder else 'folder'}; name a {'folder' if folder else 'file'}")
+        there = next(place for place in (path.absolute(), *path.absolute().parents) if place.is_dir())
+        if blocks := [place for place in path.absolute().parents if place.exists() and not place.is_dir()]:
+            raise UserError(f"{flag} {name}: {blocks[0]} is a file, not a folder")
+        with tempfile.TemporaryFile(dir=there):
+            pass
+        if path.is_file() and not os.access(path, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except (OSError, ValueError) as error:  # a name too long, or with a null character
+        raise UserError(f"{flag} {_cut(name)}: cannot be written: {getattr(error, 'strerror', None) or error}") from None
+    return path
+
+
+def _cut(name: str) -> str:
+    return name if len(name) <= 200 else f"{name[:200]}..."
+
+
+def check_name(name: str, where: str) -> str:
+    """``name`` if a folder may be called so, in any system and terminal, and it leads nowhere else. Raises UserError."""
+    why = next((f"{each!r} is in it" for each in name if each in '/\\:*?"<>|' or not each.isprintable()), "")
+    if name.startswith(("-", "~")) or (name and not name.strip(". ")):
+        why = "it begins with - or ~, or is made of dots"
+    if (size := len(name.encode(errors="replace"))) > MOST_LETTERS:
+        why = f"it has {size} bytes, more than {MOST_LETTERS}"
+    if why:
+        raise UserError(f"{where}: {name[:60]!r} cannot be the name of a folder below logs: {why}; write a plain name, e.g. go1_fast")
+    return name
+
+
+def typed(path: str) -> Path:
+    """A path as a user typed it, with ~ replaced; it need not be there. Raises UserError for one that no file can have."""
+    try:
+        found = Path(path).expanduser()
+        with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
+            found.stat()
+    except (OSError, ValueError, RuntimeError) as error:  # too long, a link to itself; a null character; ~ of an unknown user
+        raise UserError(f"'{path[:60]}' is no path here: {getattr(error, 'strerror', None) or error}") from None
+    return found
+
+
+def check_folder(folder: Path) -> Path:
+    """A run or an export, which may be a stranger's, if it holds files and folders, and links that stay in it. Raises UserError.
+
+    What a link leads to would be read, or written over, in place of a file; a pipe would be waited for.
+    """
+    home = folder.resolve()
+    for place, folders, files in os.walk(home):
+        for path in (Path(place, name) for name in (*folders, *files)):
+            kind, why = path.lstat().st_mode, ""
+            if stat.S_ISLNK(kind) and not Path(os.path.realpath(path)).is_relative_to(home):
+                why = f"a link that leads out of it, to {os.readlink(path)}"
+            elif not stat.S_ISLNK(kind) and not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
+                why = "a pipe, a socket or a device"
+            if why:
+                raise UserError(f"{shown(folder)}: {path.relative_to(home)} is {why}: delete it; a run or an export holds files alone")
+    return folder
 
 
 def finish_moving(folder: Path) -> None:

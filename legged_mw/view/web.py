@@ -1,13 +1,14 @@
 """A web page: MuJoCo Studio's web viewer with our panel. This process serves it and loads nothing from the net.
 
-The page has neither password nor encryption, so it is bound to 127.0.0.1 unless another host is asked for; `ssh -L` reaches
-it from afar. Studio is young: our only use of its undocumented parts is in `_bound_to`, and checked.
+The page is not encrypted, so it is bound to 127.0.0.1 unless another host is asked for; `ssh -L` reaches it from afar.
+`gate.py` says who may reach it. Studio is young: our only use of its undocumented parts is in `_bound_to` and `close`, and checked.
 """
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+import atexit
 import errno
 import getpass
 import logging
@@ -21,10 +22,10 @@ from typing import Any
 import mujoco
 
 from legged_mw.view.drive import Pilot
+from legged_mw.view.gate import HEADERS, LOCAL, MOST, PATIENCE, Gate, OwnSocket
 from legged_mw.view.posed_robot import PosedRobots
 from legged_mw.view.stage import Moment, ViewError
 
-LOCAL = "127.0.0.1"
 FIRST_PORT, PORTS = 8080, 20
 START_SECONDS = 20.0
 
@@ -39,7 +40,9 @@ def missing() -> str | None:
 
 
 class WebViewer:
-    """Serves the page at `url` until it is closed."""
+    """Serves the page at `url` until it is closed; one at a time in a process."""
+
+    _serving = ""  # the address of the one that is open
 
     def __init__(
         self, spec: mujoco.MjSpec, pilot: Pilot, count: int = 1, *, host: str = LOCAL, port: int = 0, title: str = "legged_mw"
@@ -52,13 +55,18 @@ class WebViewer:
 
         self.robots = PosedRobots(spec, count)
         port = free_port(host, port)
-        self._plugin = StudioPlugin(self.robots, pilot, title)
+        if WebViewer._serving:  # Studio's client of NetImgui is a global of C++: a second one never ends its first picture
+            raise ViewError(
+                f"--viewer web: this process serves {WebViewer._serving} already, and MuJoCo's web viewer can be there once: close it first"
+            )
+        self._plugin, gate = StudioPlugin(self.robots, pilot, title), Gate(host, port)
         config = viewer_protocol.ViewerConfig(title=title, gfx="web", http_port=port)
-        with _bound_to(host):
+        with _bound_to(host, gate):
             self._handle: Any = launch_web.launch(config, plugins=[self._plugin])
             self._wait(host, port)
-        self.url = f"http://{'localhost' if host == LOCAL else host}:{port}/"
-        self.port = port
+        self.url, self.port = gate.url(host), port
+        WebViewer._serving = self.url.partition("?")[0]
+        atexit.register(self.close)  # an open one ends the process in a segmentation fault
 
     def show(self, moment: Moment) -> None:
         """Send one moment to all browsers."""
@@ -73,8 +81,15 @@ class WebViewer:
         return bool(self._handle.is_running())
 
     def close(self) -> None:
-        """Stop serving; again is allowed."""
-        self._handle.close()
+        """Stop serving; again is allowed. Afterwards this process may serve another page."""
+        atexit.unregister(self.close)
+        try:
+            self._handle.close()
+        finally:
+            viewer, self._plugin.viewer = self._plugin._viewer, None
+            if viewer is not None and not self._handle._is_alive_fn():
+                vars(viewer).pop("_headless_ui", None)  # its last reference: C++ lets go of what it has once a process
+                WebViewer._serving = ""
 
     def _wait(self, host: str, port: int) -> None:
         """Wait until the page is served, and refuse any interface but the one asked for."""
@@ -82,11 +97,11 @@ class WebViewer:
         while not self._listens() and time.monotonic() < until and self._handle.is_running():  # raises what its thread raised
             time.sleep(0.02)
         if not self._listens():
-            self._handle.close()
+            self.close()
             raise ViewError("--viewer web: MuJoCo's web viewer did not start")
         bound = self._plugin.viewer._http_sock.getsockname()
         if host == LOCAL and bound[0] != LOCAL:
-            self._handle.close()
+            self.close()
             raise ViewError(f"--viewer web: the page would be open to the network ({bound[0]}:{port}); this mujoco binds it otherwise")
 
     def _listens(self) -> bool:
@@ -95,21 +110,54 @@ class WebViewer:
 
 
 @contextmanager
-def _bound_to(host: str) -> Iterator[None]:
-    """While Studio starts, bind its socket to `host`: it binds all interfaces and has no setting for it. Its log is quieter too."""
+def _bound_to(host: str, gate: Gate) -> Iterator[None]:
+    """While Studio starts, bind its socket to `host`, which it has no setting for, and put `gate` before it. Its log is quieter too."""
     from mujoco.studio import web_viewer
     from mujoco.studio.web import web_server
 
-    bind = getattr(web_server, "bind_public_socket", None)
-    if bind is None:
-        raise ViewError(f"--viewer web: the page of this mujoco ({mujoco.__version__}) cannot be bound to {host}")
+    names = ("bind_public_socket", "bind_loopback_socket", "serve")
+    bind, inner, serve = (getattr(web_server, name, None) for name in names)
+    if bind is None or inner is None or serve is None:
+        raise ViewError(f"--viewer web: the page of this mujoco ({mujoco.__version__}) cannot be bound to {host} and guarded")
     logging.getLogger("WebServer").setLevel(logging.WARNING)
     web_viewer.print = lambda *_, **__: None  # type: ignore[attr-defined]  # its banner names all interfaces
     web_server.bind_public_socket = lambda _, port=0: bind(host, port)
+    web_server.bind_loopback_socket = OwnSocket  # between its page's server and its panel, both in this process
+    web_server.serve = lambda handler, **settings: serve(handler, **_guarded(settings, gate))
     try:
         yield
     finally:
-        web_server.bind_public_socket = bind
+        web_server.bind_public_socket, web_server.bind_loopback_socket, web_server.serve = bind, inner, serve
+
+
+def _guarded(settings: dict[str, Any], gate: Gate) -> dict[str, Any]:
+    """The settings of Studio's server, with `gate` before each request and bounds on what a browser sends."""
+    from websockets.datastructures import Headers
+    from websockets.http11 import Response
+
+    answer, finish = settings["process_request"], settings["process_response"]
+
+    def answer_known(connection: Any, request: Any) -> Any:
+        status, reason, extra = 403, gate.refusal(request.path, request.headers.get_all), {}
+        if not reason and (extra := gate.greeting(request.path)):
+            status, reason = 303, "welcome"
+        if not reason:
+            return answer(connection, request)
+        body = f"{reason}\n".encode()
+        plain = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(body))}
+        plain |= {"Connection": "close", "Cache-Control": "no-store"}
+        return Response(status, "Forbidden" if status == 403 else "See Other", Headers({**plain, **extra}), body)
+
+    def finish_safely(connection: Any, request: Any, response: Any) -> Any:
+        finish(connection, request, response)
+        for name, value in {**HEADERS, "Access-Control-Allow-Origin": ""}.items():
+            if name in response.headers:
+                del response.headers[name]
+            if value:
+                response.headers[name] = value
+
+    guard = {"process_request": answer_known, "process_response": finish_safely}
+    return {**settings, **guard, "max_size": MOST, "open_timeout": PATIENCE}
 
 
 def free_port(host: str, port: int = 0) -> int:

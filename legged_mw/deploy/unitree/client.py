@@ -5,6 +5,7 @@ Motors are found by the names of their joints. Services that must be called befo
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Protocol
@@ -103,6 +104,7 @@ class UnitreeRobot(Robot):
         self._default = contract.stiffness, contract.damping
         self._lost = self._state["motor_state.lost"].astype(int) if self.machine.package == "unitree_go" else None
         self._left_out = 0  # states since the last good one
+        self.dropped: Counter[str] = Counter()  # states that were not taken, by why
         owner.arm(self._command(kd=damped(contract)))
 
     @property
@@ -129,7 +131,8 @@ class UnitreeRobot(Robot):
         return Measurement(
             lin_vel=np.zeros(3),
             ang_vel=state["imu_state.gyroscope"].astype(float),
-            gravity=-np.array([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+            # as long as the quaternion, squared: of zeros it is no gravity, not a robot that stands level
+            gravity=-np.array([2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z]),
             joint_pos=q,
             joint_vel=dq,
             joint_torque=torque,
@@ -152,6 +155,8 @@ class UnitreeRobot(Robot):
         if self._open:
             self._open = False
             self.report = self._owner.close(self._command(kd=damped(self.contract)))
+            if self.dropped:
+                self.report += f"{'; ' if self.report else ''}states dropped: {', '.join(f'{n} {why}' for why, n in self.dropped.items())}"
 
     def health(self) -> Health:
         self._listen()
@@ -180,8 +185,12 @@ class UnitreeRobot(Robot):
         state = self._decoded(received.body)
         if state["crc"] != 0 and not state.intact():
             self._left_out += 1
+            self.dropped["with a wrong checksum"] += 1
             return
-        back = (int(self._state["tick"]) - int(state["tick"])) / 1000
+        back = (int(self._state["tick"]) - int(state["tick"])) % 2**32 / 1000
+        if 0 < back <= TOO_OLD:  # overtaken by a newer one; a clock that goes back further is another robot's
+            self.dropped["late"] += 1
+            return
         if TOO_OLD < back < _WRAP / 2:
             raise RobotError(f"the robot's clock went back by {back:.1f} s: it was started again, or two robots answer")
         self._state, self._stamp, self._left_out = state, received.stamp, 0

@@ -252,9 +252,10 @@ class Guard:
             print(f"guard: {done}", file=sys.stderr, flush=True)
 
     def _report(self) -> str:
-        if not self._latencies:
-            return ""
-        return f"from a measurement to its target: {Spread.of(self._latencies)} ({len(self._latencies)} targets)"
+        lines = [f"{self.wire.dropped} states of another size dropped"] if getattr(self.wire, "dropped", 0) else []
+        if self._latencies:
+            lines.insert(0, f"from a measurement to its target: {Spread.of(self._latencies)} ({len(self._latencies)} targets)")
+        return "; ".join(lines)
 
     def tell(self, what: dict[str, Any]) -> None:
         with contextlib.suppress(OSError):

@@ -22,7 +22,7 @@ from legged_mw.deploy.unitree import clock
 from legged_mw.deploy.unitree.codec import LAYOUTS
 from legged_mw.deploy.unitree.idl import RAW, TYPES, wrong_hash
 from legged_mw.deploy.unitree.robots import known_motors
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import printable, unknown
 
 COMMANDS, STATES = "rt/lowcmd", "rt/lowstate"
 MOTION = "rt/api/motion_switcher/request", "rt/api/motion_switcher/response"
@@ -83,8 +83,13 @@ def _writer(participant: Any, topic: str, kind: Any) -> Any:
 
 
 def _taken(reader: Any, count: int = 1) -> list[Any]:
-    """Samples with data: a writer that goes leaves one without."""
-    return [sample for sample in reader.take(count) if sample.sample_info.valid_data]
+    """Samples with data: a writer that goes leaves one without. What cannot be decoded is dropped, and its neighbours with it."""
+    try:
+        return [sample for sample in reader.take(count) if sample.sample_info.valid_data]
+    except Exception as error:  # whatever cyclonedds' own codec meets in bytes that are no message
+        if isinstance(error, DDSException):
+            raise
+        return []
 
 
 def _request(call: int) -> Any:
@@ -126,12 +131,14 @@ class Wire:
         self._requests = _writer(self._participant, MOTION[0], TYPES["unitree_api", "Request_"])
         self._answers = _reader(self._participant, MOTION[1], TYPES["unitree_api", "Response_"], depth=10)
         self._sport = _writer(self._participant, SPORT, TYPES["unitree_api", "Request_"])
+        self.dropped = 0  # states of another size or encoding
 
     def receive(self) -> Received | None:
         """The newest state since the last call, with the moment of this call: ask often."""
         for sample in _taken(self._states):
             if len(sample.body) == self._size:
                 return Received(sample.body, self.clock())
+            self.dropped += 1
         return None
 
     def send(self, body: bytes) -> None:
@@ -176,7 +183,7 @@ class Wire:
             return
         name, moment = "", 0.2 if self._where.endswith(LOOPBACK) else 3.0  # [s; unitree_sdk2's examples wait 1 to 5 s]
         for attempt in range(tries):
-            if not (name := json.loads(self._ask(CHECK_MODE) or "{}").get("name", "")):
+            if not (name := self._program()):
                 return
             if lies_down and attempt == 0 and self._sport.get_matched_subscriptions():
                 self._sport.write(_request(STAND_DOWN))
@@ -184,6 +191,17 @@ class Wire:
             self._ask(RELEASE_MODE)
             self._until(lambda: False, moment)
         raise RobotError(f"the robot's own program '{name}' does not let go of the motors: end it with the remote (L2+A, then L2+R2)")
+
+    def _program(self) -> str:
+        """The program that holds the motors; "" if none does."""
+        try:
+            said = json.loads(answer := self._ask(CHECK_MODE) or "{}")
+            name = said.get("name", "") if isinstance(said, dict) else None
+        except (ValueError, RecursionError):
+            name = None
+        if not isinstance(name, str):
+            raise RobotError(f"the robot's motion service answers {answer[:80]!r}, which does not say which program runs: nothing was sent")
+        return printable(name)
 
     def _ask(self, call: int) -> str:
         """One call of the motion service; returns its data."""

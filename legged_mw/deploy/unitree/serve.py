@@ -47,7 +47,7 @@ class Record:
     """What a simulated robot was told and did, by its own clock."""
 
     commands: int = 0
-    refused: int = 0  # commands with a wrong checksum, head or mode_machine
+    refused: int = 0  # commands of another size, with a wrong checksum, head or mode_machine, or that are not finite
     watchdog: int = 0  # times that it damped by itself
     changes: deque[tuple[float, str]] = field(default_factory=lambda: deque([(0.0, LIMP)], maxlen=1000))  # [s], from when on they do what
     beyond: float = 0.0  # [rad] by which a joint was outside its range at most
@@ -165,10 +165,10 @@ class SimulatedUnitree:
         for body in self._out.due(self.time):
             self.end.send(body)
         self.end.answer()
-        if body := self.end.receive():
+        if (body := self.end.receive()) is not None:
             self._in.put(self.time, body, self.faults)
         for body in self._in.due(self.time):
-            self._take(Message(LAYOUTS[self.machine.package, "LowCmd_"], body))
+            self._receive(body)
         self._move()
         self._pull()
         mujoco.mj_step2(self.model, self.data)
@@ -176,13 +176,21 @@ class SimulatedUnitree:
         self.record.beyond = max(self.record.beyond, _outside(self.joint_pos, self._limits.low, self._limits.high))
         self.record.fastest = max(self.record.fastest, float(np.abs(self.joint_vel).max()))
 
+    def _receive(self, body: bytes) -> None:
+        """One message of the wire; it may be anything."""
+        layout = LAYOUTS[self.machine.package, "LowCmd_"]
+        if len(body) == layout.size:
+            self._take(Message(layout, body))
+        else:
+            self.record.refused += 1
+
     def _take(self, command: Message) -> None:
         """Obey a command from now on, if it is one."""
         if self.machine.package == "unitree_go":
             fits = (*command["head"], command["level_flag"]) == LOW_LEVEL
         else:
             fits = command["mode_machine"] == self._state["mode_machine"]
-        if not fits or not command.intact():
+        if not fits or not command.intact() or not all(np.isfinite(command[f"motor_cmd.{name}"]).all() for name in _PARTS):
             self.record.refused += 1
             return
         slots, signs = self._plugs()
