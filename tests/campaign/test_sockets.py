@@ -490,7 +490,7 @@ COMMANDS = [
     ("zeros", bytes(LAYOUTS["unitree_go", "LowCmd_"].size)),
     ("ones", b"\xff" * LAYOUTS["unitree_go", "LowCmd_"].size),
     ("not sealed", command(kp=20.0).body),
-    *((f"{name} is {value}", command(**{name: value}).seal()) for name in ("q", "dq", "tau", "kp", "kd") for value in (NAN, INF)),
+    *((f"{name} is {value}", command(**{name: value}).seal()) for name in ("q", "dq", "tau", "kp", "kd") for value in (NAN, INF, 1e30)),
 ]
 
 
