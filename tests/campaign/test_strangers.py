@@ -101,7 +101,6 @@ NAMES = [
         ("gpj\u202e.exe", r"'\u202e' is in it"),
     )),
     ("experiment by a field", ("--set", "runner.experiment_name=../out"), "'/' is in it"),
-    ("run name ../", ("--run_name", "../out"), "runner.run_name: '../out' cannot be the name"),
     ("run name of 5000", ("--run_name", "x" * 5000), "it has 5000 bytes"),
     ("run name with a colon", ("--run_name", "a:b"), "':' is in it"),
 ]  # fmt: skip
