@@ -5,7 +5,12 @@ Each imports what it needs when it starts: deploy also runs where torch is not i
 
 from __future__ import annotations
 
+import difflib
 import sys
+from collections.abc import Callable
+from functools import partial
+from importlib import import_module
+from importlib.metadata import version
 from pathlib import Path
 
 from legged_mw.utils.cli import fail, one_line_errors
@@ -17,14 +22,14 @@ def train() -> None:
     """Train a task. On 8 GPUs: torchrun --nproc_per_node=8 train.py --task go1_flat"""
     from legged_mw.check.describe import describe
     from legged_mw.check.guard import check_recordable
-    from legged_mw.eval.exams import make_exam
+    from legged_mw.eval.exams import find_exam, make_exam
     from legged_mw.rl import training
 
     args = training.parse(train.__doc__)
     if args.list:
         print(list_tasks())
         return
-    task = load_task(args.task)
+    find_exam(task := load_task(args.task))
     start, device = training.configure(task, args)
     env = training.build(task, start, device, args.eager, check_recordable)
     if args.check:
@@ -35,7 +40,12 @@ def train() -> None:
             print(task_page(task, Path(args.picture)))
         return
     examine = make_exam(task, env, args.eager) if training.wants_exam(task) else None
-    training.train(task, env, start, examine, export, args.deadline)
+    begun = None
+    if args.play:
+        from legged_mw.tools.alongside import watch
+
+        begun = partial(watch, task)
+    training.train(task, env, start, examine, export, args.deadline, args.verbose, begun)
 
 
 @one_line_errors()
@@ -83,19 +93,55 @@ def robot() -> None:
         main()
 
 
-PROGRAMS = {"train": train, "play": play, "deploy": deploy, "robot": robot}
+def _tool(name: str) -> Callable[[], None]:
+    """A program whose ``main`` does all."""
+
+    def start() -> None:
+        with one_line_errors():
+            import_module(name).main()
+
+    return start
+
+
+PROGRAMS = {
+    "train": train,
+    "play": play,
+    "deploy": deploy,
+    "robot": robot,
+    "motion": _tool("legged_mw.motion.__main__"),
+    "doctor": _tool("legged_mw.tools.doctor"),
+    "compare": _tool("legged_mw.tools.compare"),
+    "sweep": _tool("legged_mw.tools.sweep"),
+    "warm": _tool("legged_mw.tools.warm"),
+    "completion": _tool("legged_mw.tools.completion"),
+}
+HELP = """legged-mw PROGRAM ...; each has --help, e.g. legged-mw train --help
+  train       train a task: legged-mw train --task go1_flat
+  play        watch, grade or export a policy
+  deploy      run an exported policy without torch
+  robot       a robot's health page, and a first task for it
+  motion      read and look at reference motions
+  doctor      what this machine has, lacks and how fast it trains
+  compare     curves and exams of runs in one page
+  sweep       train over seeds and values, with a table at the end
+  warm        compile kernels ahead of the first training
+  completion  the Tab key for bash and zsh"""
 
 
 def main() -> None:
     """``legged-mw NAME ...``"""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if name in ("-h", "--help"):
-        print(f"legged-mw {' | '.join(PROGRAMS)} ...; each has --help, e.g. legged-mw train --help")
+        print(HELP)
+        return
+    if name == "--version":
+        print(f"legged_mw {version('legged_mw')}")
         return
     if name not in PROGRAMS:
-        fail(
-            "legged-mw", f"{f'no program {name!r}; ' if name else ''}there are: {', '.join(PROGRAMS)}; e.g. legged-mw train --task go1_flat"
-        )
+        close = difflib.get_close_matches(name, PROGRAMS, n=1)
+        hint = f", did you mean {close[0]!r}? " if close else "; "
+        asked = f"no program {name!r}{hint}" if name else ""
+        fail("legged-mw", f"{asked}there are: {', '.join(PROGRAMS)}; e.g. legged-mw train --task go1_flat")
     sys.argv = [f"legged-mw {name}", *sys.argv[2:]]
     PROGRAMS[name]()
 

@@ -489,7 +489,7 @@ def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path) -> None:
     assert 'mass="5.204"' in mjcf
     (home / "robot/dog.xml").write_text(mjcf.replace('mass="5.204"', 'mass="4.5"'))
     common = ["--device", "cpu", "--experiment_name", "my dogs"]
-    result = start("train", tmp_path, "--task", "my dog/dog.py", *common, "--num_envs", "8", "--max_iterations", "1")
+    result = start("train", tmp_path, "--task", "my dog/dog.py", *common, "--num_envs", "8", "--max_iterations", "1", "--verbose")
     assert result.code == 0, result.err
     assert "Learning iteration 1/1" in result.out and "rew_calm" in result.out
     [folder] = (tmp_path / "logs/my dogs").iterdir()

@@ -223,7 +223,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three iterations in worlds that show the critic what was drawn; the last is exported to ``export`` beside the checkpoint."""
     drawn = ["--set", "domain_rand.enable=true", "--set", "domain_rand.observe=true", "--set", "runner.save_interval=1"]
     flags = [*FLAGS, *drawn, "--max_iterations", "3", "--set", "runner.export=true"]
-    return trained(tmp_path_factory.mktemp("concurrent"), *flags, prints=("Student loss: ", "policy.onnx"))
+    return trained(tmp_path_factory.mktemp("concurrent"), *flags, "--verbose", prints=("Student loss: ", "policy.onnx"))
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.errors import NotRecordable
+from legged_mw.utils.errors import NotRecordable, StepError
 from legged_mw.utils.task import load_task
 
 HOME = [0.1, 0.9, -1.8, -0.1, 0.9, -1.8, 0.1, 0.9, -1.8, -0.1, 0.9, -1.8]  # [rad] FR, FL, RR, RL; hip, thigh, calf
@@ -189,10 +189,10 @@ class _Number(LeggedRobot):
         (
             {},
             _Column,
-            ConfigError,
-            r"^_reward_pose must return a tensor \(3,\), one value an environment; it returned \(3, 1\)$",
+            StepError,
+            r"^tests/test_env\.py:\d+, _Column\._reward_pose: must return a tensor \(3,\), one value an environment; it returned \(3, 1\)$",
         ),
-        ({}, _Number, ConfigError, r"^_reward_pose must return a tensor \(3,\), one value an environment; it returned float$"),
+        ({}, _Number, StepError, r"_Number\._reward_pose: must return a tensor \(3,\), one value an environment; it returned float$"),
         (
             {"asset.imu_site": "FR"},
             None,

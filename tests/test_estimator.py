@@ -270,7 +270,7 @@ def test_go1_flat_blind_reads_what_a_robot_measures() -> None:
 def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three iterations; the last is exported to ``export`` beside the checkpoint."""
     flags = [*FLAGS, "--max_iterations", "3", "--set", "runner.export=true"]
-    return trained(tmp_path_factory.mktemp("estimator"), *flags, prints=("Estimate loss: ", "policy.onnx"))
+    return trained(tmp_path_factory.mktemp("estimator"), *flags, "--verbose", prints=("Estimate loss: ", "policy.onnx"))
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,8 @@ PAGES = [
 ]
 ELSEWHERE = {"your_own_robot.md": "tests/test_your_own_robot.py runs its commands, one after the other"}
 WHY_NOT = {  # pattern of a command -> why no test runs it as it stands; those of our programs have their flags read all the same
-    r"^(pip|apt|source|make|tensorboard|git|sudo)\b": "sets up or looks at a machine; CI itself is make lint and make test",
+    r"^(pip|pipx|uvx|docker|eval|apt|source|make|tensorboard|git|sudo)\b": "sets up a machine; CI itself is make lint and make test",
+    r"^legged-mw ": "test_tools.py and test_wheel.py start the programs",
     r"^torchrun ": "several GPUs: test_ranks.py on a CPU, test_gpu.py",
     r"examples/cpp": "test_cpp_example.py compiles and runs it",
     r"udp_robot": "two programs: test_udp_example.py",

@@ -7,11 +7,13 @@ import re
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from legged_mw import ROOT, programs
 
@@ -48,6 +50,45 @@ def start(installed: Path, folder: Path, *args: str) -> str:
     return out
 
 
+def test_the_sdist_holds_what_the_wheel_is_built_from_and_tested_with(tmp_path: Path) -> None:
+    """What git tracks, but for the pictures of docs/ and the folders of services: MANIFEST.in lists it."""
+    source, out = tmp_path / "source", tmp_path / "out"
+    out.mkdir()
+    subprocess.run(["git", "checkout-index", "--all", f"--prefix={source}/"], cwd=ROOT, check=True)
+    build = "import sys; from setuptools import build_meta; build_meta.build_sdist(sys.argv[1])"
+    done = subprocess.run([sys.executable, "-c", build, str(out)], cwd=source, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    [file] = out.iterdir()
+    with tarfile.open(file) as archive:
+        inside = {name.partition("/")[2] for name in archive.getnames()}
+    tracked = {str(path.relative_to(source)) for path in source.rglob("*") if path.is_file()}
+    left_out = {name for name in tracked - inside if not name.startswith((".", "docs/images/"))}
+    assert left_out == set() and not any("__pycache__" in name for name in inside)
+    assert {"LICENSE", "constraints.txt", "tests/program.py", "resources/policies/go1_flat/policy.onnx"} <= inside
+
+
+def test_the_image_is_built_from_files_that_are_there_and_from_constraints() -> None:
+    lines = (ROOT / "Dockerfile").read_text().splitlines()
+    copied = [name for line in lines if line.startswith("COPY ") for name in line.split()[1:-1]]
+    assert {"legged_mw", "configs", "resources", "constraints.txt"} <= set(copied) and all((ROOT / name).exists() for name in copied)
+    [install] = [line for line in lines if "pip install" in line]
+    assert "--constraint /src/constraints.txt" in install and not set(copied) & set((ROOT / ".dockerignore").read_text().split())
+
+
+def test_the_same_version_everywhere() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text() and f"## {version} (" in (ROOT / "CHANGELOG.md").read_text()
+
+
+def test_what_is_installed_by_constraints_fits_the_ranges() -> None:
+    pinned = dict(line.split("==") for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line)
+    pinned = {name.lower().replace("_", "-"): version for name, version in pinned.items()}
+    for text in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]:
+        requirement = Requirement(text)
+        assert requirement.specifier.contains(pinned[requirement.name]), text
+        assert any(spec.operator == ">=" for spec in requirement.specifier), f"{text}: from which version on was it tested?"
+
+
 def test_every_package_is_in_the_list() -> None:
     packages = {str(path.parent.relative_to(ROOT)).replace("/", ".") for path in ROOT.glob("legged_mw/**/__init__.py")}
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
@@ -78,6 +119,7 @@ def test_an_installed_package_trains_the_task_of_the_first_page_and_logs_where_i
         "8",
         "--max_iterations",
         "1",
+        "--verbose",
         "--set",
         "runner.num_steps_per_env=4",
         "--set",
@@ -101,16 +143,19 @@ def test_an_installed_package_drafts_a_task(installed: Path, tmp_path: Path) -> 
 
 
 def test_without_a_program_the_programs_are_named(tmp_path: Path) -> None:
-    for words, said in (
-        ([], "there are: train, play, deploy, robot"),
-        (["trian"], "no program 'trian'; there are: train, play, deploy, robot"),
-    ):
+    names = "train, play, deploy, robot, motion, doctor, compare, sweep, warm, completion"
+    for words, said in (([], f"there are: {names}"), (["trian"], f"no program 'trian', did you mean 'train'? there are: {names}")):
         command = [sys.executable, "-m", "legged_mw.programs", *words]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
         assert (done.returncode, done.stderr) == (2, f"legged-mw: {said}; e.g. legged-mw train --task go1_flat\n")
 
 
-def test_help_names_the_programs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_says_what_each_program_does(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(sys, "argv", ["legged-mw", "--help"])
     programs.main()
-    assert capsys.readouterr().out.startswith("legged-mw train | play | deploy | robot ...; each has --help")
+    said = capsys.readouterr().out
+    assert said.startswith("legged-mw PROGRAM ...; each has --help, e.g. legged-mw train --help\n")
+    assert [line.split()[0] for line in said.splitlines()[1:]] == list(programs.PROGRAMS)
+    monkeypatch.setattr(sys, "argv", ["legged-mw", "--version"])
+    programs.main()
+    assert capsys.readouterr().out.startswith("legged_mw 0.")

@@ -23,6 +23,8 @@ from legged_mw.envs.robot_rewards import RobotRewards
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
 from legged_mw.envs.sim_to_real_config import BipedCfg, BipedRoughCfg, SimToRealCfg, SimToRealCfgPPO, SimToRealRoughCfg
+from legged_mw.utils.bounds import bounds_text
+from legged_mw.utils.config import field_types, type_text
 from legged_mw.utils.task import load_task
 from website.formula import formula
 
@@ -216,10 +218,10 @@ def _fields(tree: ast.ClassDef, owner: Any, prefix: str, comments: dict[int, tup
                     yield f"{prefix}{name.id}", Field(kind, getattr(owner, name.id), said)
 
 
-def bounds(kind: str) -> str:
+def bounds(kind: Any) -> str:
     """What values a field may have, as its annotation says it."""
-    choices = re.fullmatch(r"Literal\[(.*)\]", kind)
-    return choices.group(1).replace("'", "`").replace('"', "`") if choices else code(kind)
+    choices, words = re.fullmatch(r"Literal\[(.*)\]", text := type_text(kind)), bounds_text(kind)
+    return choices.group(1).replace("'", "`").replace('"', "`") if choices else code(text) + (f" {words}" if words else "")
 
 
 def config_fields() -> str:
@@ -228,11 +230,18 @@ def config_fields() -> str:
     for heading, config, changes in CONFIGS:
         parts.append(f"## {heading}\n\n" + (changes or f"`{config.__name__}`"))
         sections: dict[str, list[list[str]]] = {}
+        kinds = dict(field_types(config))
         for path, field in fields(config).items():
             section, _, name = path.rpartition(".")
             text = f"{field.value:g}" if isinstance(field.value, float) else repr(field.value)
             text = text if len(text) < 70 else text[:60] + " ..."
-            line = [code(name), code(text), bounds(field.kind) or "overridden", cell(field.said.unit), cell(field.said.words)]
+            line = [
+                code(name),
+                code(text),
+                bounds(kinds[path]) if field.kind else "overridden",
+                cell(field.said.unit),
+                cell(field.said.words),
+            ]
             sections.setdefault(section, []).append([*line, cell(field.said.source)])
         head = ["field", "default", "type, bounds", "unit", "what", "source"]
         if changes:

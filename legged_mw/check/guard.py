@@ -21,10 +21,11 @@ import torch
 from torch import Tensor
 
 from legged_mw.check.recordable import Guard, recordable
+from legged_mw.envs.own_code import check_term, place_of
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.utils.config import Config
-from legged_mw.utils.errors import NotRecordable, StepError, UserError, is_library, line_of, line_to_blame
+from legged_mw.utils.errors import NotRecordable, StepError, UserError, in_short, is_library, line_of, line_to_blame
 from legged_mw.utils.task import LoadedTask
 
 _WORLDS, _STEPS = 4, 3
@@ -53,9 +54,12 @@ def check_recordable(task: LoadedTask) -> None:
             raise
         except Exception as error:
             where, users = line_to_blame(error)
-            if not users:
+            own = [] if users else _own_methods(task.env_class)
+            if not users and not own:
                 raise
-            raise StepError(f"{type(error).__name__}: {error}", f"{task.name}: {where}") from error
+            doubt = f" ({'this does' if len(own) == 1 else 'one of these does'} not fit: {'; '.join(own)})" if own else ""
+            what = in_short(error) + doubt
+            raise StepError(what, f"{task.name}: {where}".removesuffix(": ")) from error
 
 
 def _tiny(cfg: RobotTaskCfg) -> RobotTaskCfg:
@@ -68,6 +72,15 @@ def _tiny(cfg: RobotTaskCfg) -> RobotTaskCfg:
     return tiny
 
 
+def _own_methods(env_class: type) -> list[str]:
+    """What the user's classes have in the place of ours, each with its line: where our code fails, one of these is not what it expects."""
+    own, found = [kind for kind in env_class.__mro__ if not kind.__module__.startswith("legged_mw.") and kind is not object], []
+    for kind in own:
+        names = [name for name in vars(kind) if name == "__init__" or not name.startswith(("__", "_abc"))]
+        found += [(kind, name, vars(kind)[name]) for name in names if hasattr(kind.__mro__[1], name) or name.startswith("_reward_")]
+    return [place_of(value) if inspect.isroutine(value) else f"{kind.__name__}.{name} = {value!r:.40}" for kind, name, value in found]
+
+
 def _watched(env_class: type[RobotTask], guard: Guard) -> type[Any]:
     """The same class, whose rewards are looked at: they only read, and return finite numbers (N,)."""
 
@@ -75,15 +88,12 @@ def _watched(env_class: type[RobotTask], guard: Guard) -> type[Any]:
         @functools.wraps(method)
         def term(self: RobotTask) -> Any:
             with guard.set(on_write=functools.partial(_check_written, self)):
-                value = method(self)
-            if not isinstance(value, Tensor) or value.shape != (self.num_envs,):
-                got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-                raise StepError(f"must return a tensor ({self.num_envs},), one value an environment; it returned {got}", _where(method))
+                value = check_term(functools.partial(method, self), self.num_envs)
             watched = guard.on
             with guard.set(on=False):
                 if watched and bool((~value.isfinite() & ~self.broken).any()):
                     raise StepError(
-                        "returned a value that is not finite; look for a division by 0 or a root of a negative number", _where(method)
+                        "returned a value that is not finite; look for a division by 0 or a root of a negative number", place_of(method)
                     )
             return value
 
@@ -121,7 +131,7 @@ def _check_rows(env: RobotTask) -> None:
         for row, again in zip(tables[0][group], tables[1][group], strict=True):
             if not isinstance(row, str) and not isinstance(again, str) and _place(row.value) != _place(again.value):
                 what = f"row '{row.name}' of '{group}' is computed when the table is made, which is once"
-                raise NotRecordable(f"{what}; give it a buffer, which _update_state writes in place", _where(env.observation_rows))
+                raise NotRecordable(f"{what}; give it a buffer, which _update_state writes in place", place_of(env.observation_rows))
 
 
 def _check_steps(env: RobotTask, guard: Guard) -> None:
@@ -139,7 +149,7 @@ def _check_steps(env: RobotTask, guard: Guard) -> None:
             bad = ~env.obs_buf[group].isfinite() & ~env.broken[:, None]
             for row in rows:
                 if not row.group and bool(bad[:, env.observations.span(group, row.name)].any()):
-                    raise StepError(f"row '{row.name}' of '{group}' is not finite", _where(env.observation_rows))
+                    raise StepError(f"row '{row.name}' of '{group}' is not finite", place_of(env.observation_rows))
 
 
 def _check_kept(env: RobotTask, before: dict[Path, Any], step: Callable[[], None], alone: bool = False) -> None:
@@ -209,11 +219,6 @@ def _at(owner: Any, path: Path) -> Any:
 
 def _shown(path: Path) -> str:
     return "self" + "".join(f".{key}" if i == 0 or isinstance(key, str) else f"[{key}]" for i, key in enumerate(path))
-
-
-def _where(method: Any) -> str:
-    function = inspect.unwrap(getattr(method, "__func__", method))
-    return line_of(function.__code__, function.__code__.co_firstlineno)
 
 
 def _put_back(owner: Any, path: Path, before: dict[Path, Any]) -> None:

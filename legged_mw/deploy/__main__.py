@@ -15,7 +15,7 @@ from legged_mw.deploy.switch import SwitchStage
 from legged_mw.eval import rules
 from legged_mw.utils.cli import Parser, duration, one_line_errors, positive
 from legged_mw.utils.errors import UserError, shown, unknown
-from legged_mw.utils.files import check_folder, typed
+from legged_mw.utils.files import check_folder, typed, writable
 from legged_mw.view import launch
 
 RESULT_FILE = "exam.json"
@@ -52,6 +52,8 @@ def parse() -> argparse.Namespace:
         parser.error("--ranges says what the exam asks: add --eval")
     if args.command is not None and args.commands:
         parser.error("--commands brings its own commands: leave --command out")
+    if args.out is not None:
+        writable(args.out, "--out")
     launch.check_flags(args)
     options.check_flags(args)
     drive.check_flags(args)
@@ -109,6 +111,7 @@ def show_log(path: Path, folder: Path | None) -> None:
 def examine(folder: Path, path: Path, common: bool = False, contact: str | None = None) -> None:
     """The exam: its table, and a JSON file at ``path``. ``contact``: see DeployStage."""
     contract = read_contract(folder)
+    writable(str(path), "--out")
     if contract.exam and "kind" in contract.exam:
         if common:
             raise UserError("--ranges says what the walking exam asks: leave it out")

@@ -27,6 +27,7 @@ from legged_mw.deploy.safety import Limits, Safety, parse_limits
 from legged_mw.deploy.states import States
 from legged_mw.utils.commands import with_units
 from legged_mw.utils.errors import shown
+from legged_mw.utils.files import writable
 from legged_mw.view import launch
 from legged_mw.view.launch import FlagError
 from legged_mw.view.script import load_script
@@ -103,7 +104,7 @@ def drive(
         stack.callback(robot.close)
         mirror = stack.enter_context(closing(Mirror(folder, contract, args))) if args.viewer in LIVE else None
         safety = Safety(contract, Limits.of(folder, contract, robot.limits, parse_limits(args.limit)))
-        path = None if args.log == "off" else Path(args.log) if args.log else log_path(contract)
+        path = None if args.log == "off" else log_path(contract) if args.log is None else writable(args.log, "--log")
         log = Log(path, contract, folder, kind) if path else None
         console = stack.enter_context(Console(contract))
         controller, command = Controller(folder, contract), _commands(contract, args, fixed, console.say)

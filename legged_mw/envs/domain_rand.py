@@ -20,6 +20,7 @@ from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.machine import require_memory
 from legged_mw.utils.math import assign
 
 
@@ -108,17 +109,26 @@ class DomainRand:
         self._writers = list(dict.fromkeys(writers.values()))
         self._writers_again = list(dict.fromkeys(writers[name] for name in again if name in writers))
         self._highest = {name: kinds[name][2] for name in order}
+        self._ends = {name: list(kinds[name][1:]) for name in order}
 
     def delay(self, name: str, width: int, start: float | None = None) -> Delay | None:
         """The delay line of ``action_delay`` or ``observation_delay``, or None if the config has none."""
-        return Delay(self.values[name], int(self._highest[name]), width, start) if name in self.values else None
+        if name not in self.values:
+            return None
+        self._require_memory(name, self._highest[name] + 1, width)
+        return Delay(self.values[name], int(self._highest[name]), width, start)
 
     def substep_delay(self, substeps: int, width: int) -> SubstepDelay | None:
         """The delay line of ``delay_ms``, for control steps of ``substeps``."""
         if "delay_ms" not in self.values:
             return None
         longest = self.rounded_delay(self._highest["delay_ms"])
+        self._require_memory("delay_ms", longest / self._substep_ms / substeps + 1, width)
         return SubstepDelay(self.values["delay_ms"], self._substep_ms, longest, substeps, width)
+
+    def _require_memory(self, name: str, frames: float, width: int) -> None:
+        need = 4 * frames * len(self._mask) * width
+        require_memory(need, self._sim.device, f"domain_rand.{name} = {self._ends[name]}", "every step of it keeps a frame of each world")
 
     def rounded_delay(self, delay: Any) -> Any:
         """[ms], a number or a tensor, to the nearest whole number of simulation steps, a half up."""

@@ -15,14 +15,7 @@ from legged_mw.envs.pull import Pull
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
 from legged_mw.sim.settle import fallen
-from legged_mw.utils.bounds import (
-    Count,
-    Part,
-    Seconds,
-    Share,
-    Whole,
-    above,
-)
+from legged_mw.utils.bounds import Count, Part, Seconds, Share, Whole, above
 from legged_mw.utils.math import assign
 
 Settling = Annotated[float, above(0, 60, "s")]

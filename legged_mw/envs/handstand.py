@@ -11,11 +11,7 @@ from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
-from legged_mw.utils.bounds import (
-    Names,
-    Positive,
-    Sign,
-)
+from legged_mw.utils.bounds import Names, Positive, Sign
 from legged_mw.utils.config import ConfigError, fit
 from legged_mw.utils.errors import unknown
 

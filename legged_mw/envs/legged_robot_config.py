@@ -8,21 +8,7 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
-from legged_mw.utils.bounds import (
-    THREE,
-    Bound,
-    Count,
-    NonNegative,
-    Part,
-    Points,
-    Positive,
-    Range,
-    Share,
-    ShareRange,
-    Sign,
-    Whole,
-    or_empty,
-)
+from legged_mw.utils.bounds import THREE, Bound, Count, NonNegative, Part, Points, Positive, Range, Share, ShareRange, Sign, Whole, or_empty
 
 Probabilities = Annotated[list[Share], Bound("three numbers, and more for further commands", lambda v: len(v) >= 3)]
 Stance = Annotated[float, Bound("above 0 and below 1", lambda v: 0 < v < 1)]

@@ -6,13 +6,7 @@ Source: BeyondMimic (arXiv 2508.08241), as its code and mjlab's have it; [ours] 
 from __future__ import annotations
 
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.utils.bounds import (
-    NonNegative,
-    NonNegativeVector,
-    Part,
-    Positive,
-    Seconds,
-)
+from legged_mw.utils.bounds import NonNegative, NonNegativeVector, Part, Positive, Seconds
 
 
 class MotionTrackingCfg(RobotTaskCfg):

@@ -12,6 +12,7 @@ from legged_mw.envs.delay import Delay
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
+from legged_mw.utils.machine import require_memory
 from legged_mw.utils.math import assign
 
 
@@ -144,6 +145,9 @@ class _Group:
         self.buffer = self.frame
         self.histories: list[tuple[Tensor, Tensor]] = []  # frames (N, F, size) in the buffer, newest (N, size) in the frame
         if any(row.history > 1 for row in rows):
+            long = max(rows, key=lambda row: row.size)
+            what = f"observations.history of '{long.name}' = {long.history}"
+            require_memory(4 * num_envs * sum(row.size for row in rows), device, what, "each frame is kept in each world")
             self.buffer = torch.zeros(num_envs, sum(row.size for row in rows), device=device)
             spans = self.buffer.split([row.size for row in rows], dim=1), self.frame.split([row.value.shape[1] for row in rows], dim=1)
             self.histories = [(all_.unflatten(1, (row.history, -1)), new) for row, all_, new in zip(rows, *spans, strict=True)]

@@ -26,6 +26,7 @@ from legged_mw.envs.domain_rand import DomainRand, world_fields
 from legged_mw.envs.loading import load_robot, soft_limits, start_place
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
 from legged_mw.envs.observations import Observations, Row
+from legged_mw.envs.own_code import check_term, checked_rows
 from legged_mw.envs.perturbation import Perturbation
 from legged_mw.envs.robot_rewards import RobotRewards
 from legged_mw.envs.robot_task_config import RobotTaskCfg
@@ -55,7 +56,6 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         check_values(cfg, law=self.motor_law)
         self.terrain = self._make_terrain()
         self.robot = self._load_robot(pick_engine(cfg.sim.engine, device))
-        super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
         self.sim = make_simulation(
             self.robot.physics,
             cfg.env.num_envs,
@@ -68,6 +68,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
             terrain=self.terrain,
             eager=eager,
         )
+        super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
         self.domain_rand = DomainRand(cfg, self.robot, self.sim, self.motor_law)
         self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
@@ -271,7 +272,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         if hasattr(self, "_observation_rows"):
             raise ConfigError(f"{type(self).__name__}._observation_rows: the method is now called observation_rows")
         self.observations = Observations(
-            self.observation_rows(),
+            checked_rows(self),
             self.cfg.observations,
             self.cfg.noise.level,
             self.num_envs,
@@ -328,10 +329,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
             where = f"{type(self).__name__} (a method _reward_<name>)"
             if name not in terms:
                 raise ConfigError(f"rewards.scales.{name} = {scales[name]:g}: {unknown('reward term', name, terms, where)}")
-            value = terms[name]()
-            if not isinstance(value, Tensor) or value.shape != (self.num_envs,):
-                got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-                raise ConfigError(f"_reward_{name} must return a tensor ({self.num_envs},), one value an environment; it returned {got}")
+            check_term(terms[name], self.num_envs)
         self._reward_terms = [terms[name] for name in self.reward_names]
         self.reward_scales = torch.tensor([scales[name] for name in self.reward_names], device=self.device) * self.dt
         means = [*(f"rew_{name}" for name in self.reward_names), "reward", "episode_length"]

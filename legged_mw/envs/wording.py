@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from legged_mw.sim.errors import EngineError, ModelError
+from legged_mw.utils.errors import UserError
 
 FIELDS = {
     "engine": "sim.engine",
+    "num_envs": "env.num_envs",
     "nconmax": "sim.nconmax",
     "njmax": "sim.njmax",
     "integrator": "sim.integrator",
@@ -40,7 +41,7 @@ def in_config_words() -> Iterator[None]:
     """An error of the simulator, raised inside, names the fields that its parameters come from."""
     try:
         yield
-    except (ModelError, EngineError) as error:
+    except UserError as error:
         text = config_words(str(error))
         if text == str(error):
             raise

@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 
-from legged_mw.deploy import exam as on_export
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval.rollout import Case, Policy, Push, Record, Signal, holding, roll_out
 from legged_mw.eval.rules import PUSH_AT, PUSH_DIRECTIONS, SECONDS, ExamRules, Velocity
@@ -75,7 +74,9 @@ def run_exam(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
 
 def deployed(folder: Path, task: LoadedTask) -> dict[str, Any]:
     """Grade the export in ``folder`` of a prepared task, as ``legged_mw.deploy`` does."""
-    return on_export.run_exam(folder, ExamRules.from_config(task.cfg))
+    from legged_mw.deploy.exam import run_exam  # MuJoCo alone, which training needs nothing of
+
+    return run_exam(folder, ExamRules.from_config(task.cfg))
 
 
 def grade(rules: ExamRules, record: Record) -> dict[str, Any]:

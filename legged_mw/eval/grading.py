@@ -19,6 +19,7 @@ from legged_mw.rl.policies import Source, introduce, load_policy
 from legged_mw.utils.cli import apply_overrides, pick_device, seed_everything
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.files import writable
 from legged_mw.utils.task import LoadedTask
 
 
@@ -39,9 +40,10 @@ def grade(policies: list[tuple[Source, LoadedTask]], args: argparse.Namespace) -
     graded = [prepare(*first, args, common=args.ranges == "common"), *(prepare(*rival, args) for rival in rivals)]
     graded[0].exam.ask_alike([each.task for each in graded])
     introduce(graded[0].source, graded[0].task.changes_since(graded[0].trained))
+    folder = graded[0].source.results(graded[0].task) / "eval"
+    writable(str(folder), "the report goes to", folder=True)
     built = [(each, *build(each, args, device)) for each in graded]  # all, before one is graded in vain
     columns = [make_column(*each) for each in built]
-    folder = graded[0].source.results(graded[0].task) / "eval"
     graded[0].exam.write(folder, graded[0].task.name, columns, elsewhere(graded[0]))
     print(f"written to {shown(folder / 'report.html')}, with report.json and pictures beside it")
 

@@ -157,7 +157,7 @@ def _published(rules: ExamRules, columns: Sequence[Column]) -> str:
         cells.append([name, str(found["falls"]), *triples, drift, cost, shares, vx])
     pushes = ", ".join(f"{speed:g}" for speed in rules.push_speeds)
     lead = f"All were asked the same commands. Cost of transport, and pushes of {pushes} m/s: walking ahead at the last column's vx [m/s]."
-    return f'<section class="peers"><h2>Published policies</h2><p class="lead">{lead}</p>{_table(heads, cells)}</section>'
+    return f'<section class="peers"><h2>Published policies</h2><p class="lead">{lead}</p>{table(heads, cells)}</section>'
 
 
 def _chapter(section: Section, panels: list[str], lead: str, extra: str) -> str:
@@ -181,7 +181,7 @@ def _extra(name: str, columns: Sequence[Column]) -> str:
         return ""
     make, heads, folded = tables[name]
     paired = zip_longest(*(make(column, f", {column.name}" if len(drawn) > 1 else "") for column in drawn))  # ranges may differ
-    return _table(heads, [row for rows in paired for row in rows if row], folded)
+    return table(heads, [row for rows in paired for row in rows if row], folded)
 
 
 def _crossing_rows(column: Column, whose: str) -> list[list[str]]:
@@ -222,12 +222,12 @@ def _joint_rows(column: Column, whose: str) -> list[list[str]]:
     return rows
 
 
-def _table(heads: list[str], rows: list[list[str]], folded: str = "") -> str:
+def table(heads: list[str], rows: list[list[str]], folded: str = "") -> str:
     """A table; folded away below its title if it has one."""
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join(f"<tr><th>{escape(row[0])}</th>{''.join(f'<td>{escape(text)}</td>' for text in row[1:])}</tr>" for row in rows)
-    table = f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-    return f"<details><summary>{folded}</summary>{table}</details>" if folded else table
+    drawn = f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    return f"<details><summary>{folded}</summary>{drawn}</details>" if folded else drawn
 
 
 def about(columns: Sequence[Column]) -> str:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 
-from legged_mw.deploy import exam as on_export
 from legged_mw.envs.domain_rand import KINDS
 from legged_mw.envs.motion_tracking import MotionTracking
 from legged_mw.envs.robot_task import RobotTask
@@ -132,7 +131,9 @@ def perform(env: RobotTask, policy: Policy, skill: Skill, ground: Ground = Groun
 
 def deployed(folder: Path, task: LoadedTask) -> dict[str, Any]:
     """Grade the export in ``folder`` of a prepared task, as ``legged_mw.deploy`` does."""
-    return on_export.run_skill(folder, skill_of(task.cfg, task.exam))
+    from legged_mw.deploy.exam import run_skill  # MuJoCo alone, which training needs nothing of
+
+    return run_skill(folder, skill_of(task.cfg, task.exam))
 
 
 class InTraining:

@@ -11,9 +11,11 @@ from legged_mw.envs.loading import load_robot
 from legged_mw.motion.foreign import CSV_FPS, read_motion
 from legged_mw.motion.look import ClipStage, page
 from legged_mw.sim.model import RobotModel
-from legged_mw.utils.cli import Parser, duration, one_line_errors
+from legged_mw.utils.bounds import Positive
+from legged_mw.utils.cli import Parser, duration, number, one_line_errors
 from legged_mw.utils.clip import Clip, ClipError, save_clip
 from legged_mw.utils.errors import shown
+from legged_mw.utils.files import writable
 from legged_mw.utils.task import load_task
 from legged_mw.view import launch
 
@@ -22,10 +24,10 @@ def parse() -> argparse.Namespace:
     parser = Parser(prog="python -m legged_mw.motion", description=__doc__, allow_abbrev=False)
     parser.add_argument("file", metavar="FILE", help="Unitree-style CSV, or an .npz of BeyondMimic, mjlab or legged_mw")
     parser.add_argument("--task", default="g1_track", metavar="NAME", help="whose robot moves so (default: g1_track)")
-    parser.add_argument("--fps", type=float, metavar="F", help=f"frames a second of a file that does not say (a CSV: {CSV_FPS:g})")
-    parser.add_argument("--rate", type=float, default=50.0, metavar="F", help="frames a second to resample to (default: 50)")
-    parser.add_argument("--cut", type=float, nargs=2, metavar=("FROM", "TO"), help="keep these seconds alone")
-    parser.add_argument("--lift", type=float, default=0.0, metavar="M", help="raise it by so many metres")
+    parser.add_argument("--fps", type=number(Positive), metavar="F", help=f"frames a second, if the file does not say (a CSV: {CSV_FPS:g})")
+    parser.add_argument("--rate", type=number(Positive), default=50.0, metavar="F", help="frames a second to resample to (default: 50)")
+    parser.add_argument("--cut", type=number(float), nargs=2, metavar=("FROM", "TO"), help="keep these seconds alone")
+    parser.add_argument("--lift", type=number(float), default=0.0, metavar="M", help="raise it by so many metres")
     parser.add_argument("--out", metavar="CLIP.npz", help="write the clip that a task can follow")
     parser.add_argument("--play", action="store_true", help="show it")
     parser.add_argument("--time", type=duration, metavar="T", help="how long to show it (default: the whole clip)")
@@ -33,7 +35,7 @@ def parse() -> argparse.Namespace:
     args = parser.parse_args()
     args.command = None
     launch.check_flags(args)
-    if args.out and Path(args.out).suffix != ".npz":
+    if args.out is not None and writable(args.out, "--out").suffix != ".npz":
         parser.error(f"--out {args.out}: a clip is an .npz")
     return args
 

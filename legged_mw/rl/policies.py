@@ -16,10 +16,11 @@ from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import actor_settings, check_classes, network_section
 from legged_mw.rl.network import LEARNING_ONLY, read_parameters
+from legged_mw.rl.room import check_room
 from legged_mw.rl.runs import CONFIG_FILE, check_fit, experiment_folder, find_checkpoint, find_run, load_tensors, runs, task_of
 from legged_mw.utils.config import Config, ConfigError, load_yaml
 from legged_mw.utils.errors import printable, shown
-from legged_mw.utils.files import check_folder, typed
+from legged_mw.utils.files import check_folder, finish_moving, typed
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 NETWORK_FILE = "policy.onnx"  # of an export: legged_mw.deploy, which imports nothing from here, calls it so too
@@ -85,6 +86,7 @@ def find_rival(task: LoadedTask, run: str, experiment: str | None = None) -> Sou
 def _run_or_export(experiment: Path, name: str, checkpoint: int = -1) -> Source:
     """A run by its name or path, or an export by its path."""
     folder = typed(name)
+    finish_moving(folder)  # of an export that was killed
     if (folder / NETWORK_FILE).is_file():
         return Source(check_folder(folder), folder / NETWORK_FILE, shipped=False)
     found = find_run(experiment, name)
@@ -135,6 +137,7 @@ def acting(cfg: Config, env: RobotTask, read: list[str] | None = None) -> dict[s
     sections = copy.deepcopy(cfg.to_dict())
     if read:
         sections["obs_groups"]["actor"] = read
+    check_room(sections, env, learns=False)
     return network_section(actor_settings(sections, env, learns=False))
 
 

@@ -8,7 +8,6 @@ import math
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
-from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +27,9 @@ from legged_mw.rl.classes import actor_settings, check_classes, network_section
 from legged_mw.rl.estimator import RegressingModel
 from legged_mw.rl.policies import acting
 from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.progress import Console
 from legged_mw.rl.ranks import this_rank
-from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_block, console_rows
+from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_rows
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
 from legged_mw.rl.threads import UpdateThreads
 from legged_mw.rl.transfer import TEACHER, adapt
@@ -58,6 +58,7 @@ class Runner(OnPolicyRunner):
         self.examine: Callable[[Any], dict[str, float]] | None = None
         self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
         self.update_threads = UpdateThreads(self.cfg["cpu"]["update_threads"], usable_cores()) if device == "cpu" else nullcontext()
+        self.console = Console()
         self._warned_overflow = False
         self._last_means: dict[str, float] = {}
 
@@ -87,8 +88,8 @@ class Runner(OnPolicyRunner):
             self.alg.broadcast_parameters()
         self.logger.init_logging_writer()
         self.env.take_statistics()
-        first, clock, waiting = self.current_learning_iteration, Clock(self.device), None
-        self._last, self._begun, self._first = first + num_learning_iterations, time.time(), first
+        clock, waiting = Clock(self.device), None
+        self._last = self.current_learning_iteration + num_learning_iterations
         self._all_stop = False
         start = clock.mark()
         while self.current_learning_iteration < self._last and not self._must_stop():
@@ -153,6 +154,11 @@ class Runner(OnPolicyRunner):
         interval, done = self.cfg["exam_interval"], self.current_learning_iteration
         return self.examine is not None and interval > 0 and done % interval == 0 and done < self._last
 
+    def _next_exam(self, done: int) -> int | None:
+        """The iteration after which the next exam comes, if any does."""
+        interval = self.cfg["exam_interval"]
+        return min((done // interval + 1) * interval, self._last) if self.examine is not None and interval > 0 else None
+
     def _examine(self) -> None:
         """Grade the policy as it is now; of the ranks, only the first has an exam, and the others wait in the next update."""
         assert self.examine is not None
@@ -175,8 +181,7 @@ class Runner(OnPolicyRunner):
             for name, value in curves.items():
                 if not math.isnan(value):
                     self.logger.writer.add_scalar(name, value, self.current_learning_iteration)
-        title = f"Exam after iteration {self.current_learning_iteration}/{self._last}"
-        print(console_block(title, {name: f"{value:.3f}" for name, value in figures.items()}), flush=True)
+        self.console.exam(self.current_learning_iteration, self._last, figures)
 
     # ---- what the user sees ---------------------------------------------------------------------------------------
 
@@ -219,11 +224,8 @@ class Runner(OnPolicyRunner):
             for name, value in self._curves(numbers, losses, speed, collect, learn, report.total_steps).items():
                 if not math.isnan(value):
                     self.logger.writer.add_scalar(name, value, report.iteration)
-        left = (time.time() - self._begun) / (report.iteration - self._first) * (self._last - report.iteration)
-        rows = console_rows(numbers, losses, speed, collect, learn)
-        rows["Total steps"] = f"{report.total_steps}"
-        rows["Time elapsed, left"] = ", ".join(str(timedelta(seconds=round(t))) for t in (time.time() - self._begun, left))
-        print(console_block(f"Learning iteration {report.iteration}/{self._last}", rows), flush=True)
+        rows = {**console_rows(numbers, losses, speed, collect, learn), "Total steps": f"{report.total_steps}"}
+        self.console.iteration(report.iteration, self._last, self._next_exam(report.iteration), numbers, rows, speed)
         if numbers["overflowed"] and not self._warned_overflow:
             others = f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks; raise `nconmax` and `njmax`"
             print(f"WARNING: {config_words(self.env.sim.overflow_report() or others)}", flush=True)

@@ -26,14 +26,18 @@ from legged_mw.rl.classes import check_classes
 from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.progress import LOG_FILE
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
+from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run, require_task
 from legged_mw.rl.transfer import TEACHER, begin_with, check_start, keep_teacher, load_teacher, seat_teacher
+from legged_mw.sim.device import device_facts
 from legged_mw.sim.engines import pick_engine
 from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.files import sweep, writable
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
 
@@ -41,6 +45,7 @@ _STEPS_PER_CORE = 6500  # a second, in training with the section `cpu` as it is 
 
 Check = Callable[[LoadedTask], None]  # raises where the step cannot be recorded
 Examine = Callable[[Any], dict[str, float]]  # policy -> figures by name
+Begun = Callable[[Runner, Path], None]  # with the run folder
 Export = Callable[[LoadedTask, Path, Path], str]  # task, checkpoint, folder to write -> what was written, in words
 
 
@@ -65,12 +70,15 @@ def parse(description: str | None) -> argparse.Namespace:
     parser.add_argument("--init", metavar="RUN", help="begin with the actor of another policy, named as a teacher is")
     parser.add_argument("--headless", action="store_true", help="accepted as in legged_gym; training never opens a window")
     parser.add_argument("--max_time", type=duration, metavar="T", help="end, after a checkpoint, after 90s, 5m, 1.5h ...")
+    parser.add_argument("--play", action="store_true", help="watch the policy as it trains: a window, or a web page without a screen")
     parser.add_argument("--list", action="store_true", help="show the tasks and exit")
     parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")
     parser.add_argument("--picture", metavar="PNG", help="with --check: the robot's health page too, and a picture of the robot")
     args = parser.parse_args()
-    if args.picture and not args.check:
-        parser.error("--picture draws what --check shows: add --check")
+    if args.picture is not None:
+        writable(args.picture, "--picture")
+        if not args.check:
+            parser.error("--picture draws what --check shows: add --check")
     if not args.list:
         require_task(args, parser)
     if not args.resume and (args.load_run is not None or args.checkpoint != -1):
@@ -98,6 +106,8 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
         task.update({"actor": start.policy.task.train.to_dict()["actor"]}, where="--init")
     if fitted or start.policy:
         apply_overrides(task, args)  # again: what the user says wins
+    if this_rank().leads and not args.check:
+        writable(str(start.run or start.experiment), "runs go to", folder=True)
     _note_others(task, start)
     note_network(task.cfg)
     check_classes(task.train)
@@ -105,7 +115,7 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     if device != "cpu":
         torch.cuda.set_device(device)
     seed_everything(task.train.seed + rank.index)  # every rank its own worlds, commands and noise
-    _announce(task, device, rank)
+    args.eager |= not _announce(task, device, rank)
     return start, device
 
 
@@ -141,14 +151,16 @@ def _note_others(task: LoadedTask, start: Start) -> None:
         print("symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it again")
 
 
-def _announce(task: LoadedTask, device: str, rank: Rank) -> None:
-    """Say what is trained on what; on a CPU also how long it may take."""
+def _announce(task: LoadedTask, device: str, rank: Rank) -> bool:
+    """Say what is trained on what, and what makes that slow; on a CPU how long it may take. Returns whether it can be recorded."""
     worlds, engine = task.cfg.env.num_envs, pick_engine(task.cfg.sim.engine, device)
     where = device if rank.count == 1 else f"each of {rank.count} {'processes' if device == 'cpu' else 'GPUs'}"
-    compiles = "; a first run compiles kernels, about a minute" if engine == "mujoco_warp" else ""
-    print(f"{task.name}: {worlds} worlds on {where}, engine {engine}{compiles}", flush=True)
+    print(f"{task.name}: {worlds} worlds on {where}, engine {engine}", flush=True)
+    facts = device_facts(device) if engine == "mujoco_warp" else None
+    for line in facts.slow() if facts else ():
+        print(line, flush=True)
     if device != "cpu":
-        return
+        return facts is None or facts.pool
     cores, runner = usable_cores(), task.train.runner
     steps = runner.max_iterations * worlds * runner.num_steps_per_env
     minutes = steps / (_STEPS_PER_CORE * cores) / 60
@@ -158,6 +170,7 @@ def _announce(task: LoadedTask, device: str, rank: Rank) -> None:
         f"{steps:,} steps; {slow}" if rough else f"{runner.max_iterations} iterations, {steps / 1e6:.1f} M steps, about {minutes:.0f} min"
     )
     print(f"{cores} cores: {plan}", flush=True)
+    return True
 
 
 def build(task: LoadedTask, start: Start, device: str, eager: bool, check_recordable: Check) -> Any:
@@ -166,6 +179,7 @@ def build(task: LoadedTask, start: Start, device: str, eager: bool, check_record
         check_recordable(task)
     env = task.env_class(task.cfg, device, eager=eager)
     check_mirror(env, task.train)
+    check_room(task.train.to_dict(), env)
     if start.policy:
         check_start(env, task, start.policy)
     if start.teacher:
@@ -181,15 +195,29 @@ def wants_exam(task: LoadedTask) -> bool:
     return this_rank().leads and 0 < task.train.runner.exam_interval <= task.train.runner.max_iterations
 
 
-def train(task: LoadedTask, env: RobotTask, start: Start, examine: Examine | None, export: Export, deadline: float | None = None) -> None:
-    """Train from ``start`` to the last iteration or until stopped (at ``deadline`` [s], a time of the clock), then export."""
+def train(
+    task: LoadedTask,
+    env: RobotTask,
+    start: Start,
+    examine: Examine | None,
+    export: Export,
+    deadline: float | None = None,
+    verbose: bool = False,
+    begun: Begun | None = None,
+) -> None:
+    """Train from ``start`` to the last iteration or until stopped (at ``deadline`` [s], a time of the clock), then export.
+
+    ``begun`` is called before the first iteration, where the run folder is written; ``verbose`` prints whole blocks.
+    """
     teacher = start.teacher.task.train if start.teacher else None
     rank, runner = this_rank(), make_runner(env, task.train, None, str(env.device), teacher)
-    runner.examine = examine
+    runner.examine, runner.console.verbose = examine, verbose
     left = _load(runner, task, start)
     _stop_on_signals(runner, deadline)
     leave_when_stuck(rank)
     folder = _open_run(runner, task, start) if rank.leads else None  # one run folder, written by the first rank
+    if folder and begun:
+        begun(runner, folder)
     _learn(runner, left, rank)
     finished = folder is not None and _say_how_it_ended(runner, task, folder, rank)
     leave_together(rank)
@@ -229,10 +257,12 @@ def _open_run(runner: Runner, task: LoadedTask, start: Start) -> Path:
     """The folder that this training writes to, with the config in it; an earlier checkpoint begins a folder of its own."""
     newest = start.run is not None and start.checkpoint == find_checkpoint(start.run, -1)
     folder = start.run if start.run and newest else new_run(start.experiment, task.train.runner.run_name)
+    sweep(folder)
     save_yaml(folder / CONFIG_FILE, task.to_dict())
     if start.teacher:
         keep_teacher(start.teacher, folder)
     runner.logger.log_dir = str(folder)
+    runner.console.open(folder)
     print(f"writing to {shown(folder)}", flush=True)
     return folder
 
@@ -240,7 +270,8 @@ def _open_run(runner: Runner, task: LoadedTask, start: Start) -> Path:
 def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
     """Learn; if another rank is lost on the way, say so in a line."""
     try:
-        runner.learn(iterations)
+        with runner.console:
+            runner.learn(iterations)
         if isinstance(runner.alg, GraphedPPO | GraphedDistillation):
             runner.alg.release()
     except RuntimeError as error:

@@ -18,6 +18,7 @@ from legged_mw.robot.measure import measure
 from legged_mw.robot.page import page
 from legged_mw.utils.cli import Parser, command, one_line_errors
 from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.files import writable
 from legged_mw.utils.task import ROBOT_FILES, LoadedTask, load_task
 
 
@@ -29,6 +30,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument("--out", metavar="DIR", default=".", help="where --new writes (default: here)")
     parser.add_argument("--force", action="store_true", help="--new may overwrite")
     args = parser.parse_args()
+    if args.picture is not None:
+        writable(args.picture, "--picture")
     if args.new and Path(args.file).suffix not in ROBOT_FILES:
         parser.error(f"--new makes a task for a robot's file ({', '.join(ROBOT_FILES)}); {args.file} is a task already")
     return args
@@ -42,7 +45,7 @@ def main() -> None:
         print(task_page(load_task(args.file), image))
         return
     if args.new:
-        new.targets(args.new, Path(args.out), args.force)  # refused before the page, not after it
+        new.targets(args.new, writable(args.out, "--out", folder=True), args.force)  # refused before the page, not after it
     found = draft(file)
     env = as_env(found, file)
     print(env_page(env, file.name, image, found))

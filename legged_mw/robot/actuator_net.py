@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from legged_mw.utils.cli import one_line_errors
+from legged_mw.utils.cli import number, one_line_errors
 from legged_mw.utils.errors import UserError
+from legged_mw.utils.files import writable
 from legged_mw.utils.motor_network import ACTIVATIONS, MotorNetwork, NetworkMotors
 
 _STEPS, _JOINTS = 12, 64  # of the comparison
@@ -132,8 +133,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, nargs="+", default=None, help="ages in simulation steps, 0 is now (default: 0 1 2 ...)")
     parser.add_argument("--in_turns", action="store_true", help="error, speed, error, speed ...; else errors first")
     for name, what in (("error", "of target - angle [rad]"), ("speed", "of the speed [rad/s]"), ("torque", "of what comes out")):
-        parser.add_argument(f"--{name}_scale", type=float, default=1.0, help=f"factor {what}")
+        parser.add_argument(f"--{name}_scale", type=number(float), default=1.0, help=f"factor {what}")
     args = parser.parse_args(argv)
+    writable(str(args.out), "OUT").parent.mkdir(parents=True, exist_ok=True)
     layout = {name: getattr(args, name) for name in ("in_turns", "error_scale", "speed_scale", "torque_scale")}
     network, gap = convert(args.file, args.frames or (), **layout)
     with args.out.open("wb") as out:

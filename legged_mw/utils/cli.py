@@ -6,25 +6,31 @@ import argparse
 import random
 import re
 import sys
-from collections.abc import Iterator
+import traceback
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from ctypes import ArgumentError
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 
-from legged_mw.utils.config import ConfigError, load_yaml
-from legged_mw.utils.errors import UserError, out_of_memory, printable
+from legged_mw.utils.config import ConfigError, fit, load_yaml
+from legged_mw.utils.errors import UserError, in_short, out_of_memory, printable, users_fault
 from legged_mw.utils.task import LoadedTask
 
 
 class Parser(argparse.ArgumentParser):
-    """argparse, but a mistake is one line and exit code 2."""
+    """argparse, but a mistake is one line and exit code 2; every program has --verbose."""
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_argument(
+            "--verbose", action="store_true", help="say more: the whole traceback of an error; all numbers of an iteration while training"
+        )
 
     def error(self, message: str) -> NoReturn:
-        print(f"{self.prog}: {message} (--help lists the flags)", file=sys.stderr)
-        raise SystemExit(2)
+        fail(self.prog, f"{message if len(message) <= 500 else f'{message[:500]}...'} (--help lists the flags)")
 
 
 def make_parser(description: str | None) -> Parser:
@@ -97,34 +103,71 @@ def positive(text: str) -> int:
     return value
 
 
+def number(kind: Any) -> Callable[[str], Any]:
+    """For argparse: a number of the type ``kind``, a bound of utils/bounds.py or a bare type."""
+
+    def read(text: str) -> Any:
+        try:
+            return fit(float(text), kind, "the value")
+        except ConfigError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return read
+
+
 def duration(text: str) -> float:
-    """Seconds in "90", "90s", "5m" or "1.5h", for argparse."""
+    """Seconds in "90", "90s", "5m" or "1.5h", for argparse; at most some thirty years, which every clock can hold."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh]?)", text)
-    if not match or float(match[1]) == 0:
-        raise argparse.ArgumentTypeError(f"'{text}' is no duration; write 90s, 5m or 1.5h")
-    return float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]]
+    seconds = float(match[1]) * {"": 1, "s": 1, "m": 60, "h": 3600}[match[2]] if match else 0.0
+    if not 0.0 < seconds < 1e9:
+        raise argparse.ArgumentTypeError(f"'{text[:60]}' is no duration; write 90s, 5m or 1.5h")
+    return seconds
 
 
 @contextmanager
 def one_line_errors(program: str = "") -> Iterator[None]:
-    """Turn mistakes of the user into one line and exit code 2, memory that runs out into advice, Ctrl-C into a word and code 130."""
+    """Turn mistakes of the user, in what was asked or in code of their own, into one line and exit code 2; with --verbose all of it.
+
+    Memory that runs out becomes advice, Ctrl-C a word and code 130. A mistake of ours stays a traceback.
+    """
     program = program or Path(sys.argv[0]).name
     try:
         yield
     except UserError as error:
+        _show_all()
         fail(program, str(error))
     except (KeyboardInterrupt, ArgumentError) as error:  # ctypes wraps one that comes while it converts an argument
         if "KeyboardInterrupt" not in repr(error):
             raise
         print(f"\n{program}: stopped", file=sys.stderr)
         raise SystemExit(130) from None
-    except RuntimeError as error:
+    except (RuntimeError, MemoryError) as error:
         first: BaseException = error
         while first.__context__ is not None:
             first = first.__context__  # what ran out may show as the failure of what it interrupted
         if not out_of_memory(first) and not out_of_memory(error):
+            _blame_user(program, error)
             raise
-        fail(program, f"out of memory ({str(first).splitlines()[0]}); fewer worlds need less: try half with --num_envs")
+        fail(
+            program,
+            f"out of memory ({(str(first) or 'memory').splitlines()[0]}); fewer worlds need less: try half with --num_envs",
+        )
+
+    except Exception as error:
+        _blame_user(program, error)
+        raise
+
+
+def _blame_user(program: str, error: Exception) -> None:
+    """Fail with the user's own lines, if some of them led to ``error``."""
+    if where := users_fault(error):
+        _show_all()
+        fail(program, f"{where}: {in_short(error)}; --verbose shows the whole traceback")
+
+
+def _show_all() -> None:
+    if "--verbose" in sys.argv:
+        traceback.print_exc()
 
 
 def fail(program: str, message: str) -> NoReturn:

@@ -16,6 +16,7 @@ from legged_mw.utils.arrays import read_arrays
 from legged_mw.utils.errors import UserError, unknown
 
 Floats = NDArray[np.float64]
+FARTHEST = 1e4  # [m] or [rad] of what a robot does in a clip
 KEYS = ("fps", "joint_names", "root_pos", "root_quat", "joint_pos")  # of a clip's .npz
 
 
@@ -84,8 +85,14 @@ def clip_of(path: Path, held: Mapping[str, Any]) -> Clip:
     if missing := [key for key in KEYS if key not in held]:
         hint = f"convert it with: python -m legged_mw.motion {path.name} --task TASK --out CLIP.npz"
         raise ClipError(f"{path} is no clip of legged_mw, for it has no '{missing[0]}'; {hint}")
-    names = tuple(map(str, held["joint_names"]))
-    return checked(path, float(held["fps"]), names, *(held[key] for key in KEYS[2:]))
+    arrays = {key: np.asarray(held[key]) for key in KEYS}
+    for key, array in arrays.items():
+        kinds, axes = ("US" if key == "joint_names" else "fiu"), {"fps": 0, "joint_names": 1}.get(key, 2)
+        if array.dtype.kind not in kinds or array.ndim != axes:
+            wanted = f"{'text' if kinds == 'US' else 'numbers'} along {axes} axes"
+            raise ClipError(f"{path}: {key} is {array.dtype} along {array.ndim} axes; it must be {wanted}")
+    names = tuple(map(str, arrays["joint_names"]))
+    return checked(path, float(arrays["fps"]), names, *(arrays[key] for key in KEYS[2:]))
 
 
 def checked(path: Path, fps: float, names: Sequence[str], root_pos: ArrayLike, root_quat: ArrayLike, joint_pos: ArrayLike) -> Clip:
@@ -96,8 +103,12 @@ def checked(path: Path, fps: float, names: Sequence[str], root_pos: ArrayLike, r
         raise ClipError(f"{path}: {found} for {len(names)} joints; there must be two frames or more: (T, 3), (T, 4), (T, {len(names)})")
     length = np.linalg.norm(quat, axis=1, keepdims=True)
     finite = all(np.isfinite(values).all() for values in (pos, quat, joints))
-    if not finite or fps <= 0 or (np.abs(length - 1.0) > 0.01).any():
+    if not finite or not fps > 0 or (np.abs(length - 1.0) > 0.01).any():
         raise ClipError(f"{path}: the clip has a value that is not finite, a quaternion that is not of unit length, or no frame rate")
+    if not 0.1 <= fps <= 1e5:
+        raise ClipError(f"{path}: {fps:g} frames a second; there must be from 0.1 to 1e+05")
+    if max(np.abs(pos).max(), np.abs(joints).max(initial=0.0)) > FARTHEST or len({*names}) < len(names):
+        raise ClipError(f"{path}: the clip has a place or an angle beyond {FARTHEST:g} m or rad, or a joint twice")
     flips = np.sign((quat[1:] * quat[:-1]).sum(axis=1))
     return Clip(fps, tuple(names), pos, quat / length * np.cumprod(np.r_[1.0, np.where(flips < 0, -1.0, 1.0)])[:, None], joints)
 
@@ -105,6 +116,7 @@ def checked(path: Path, fps: float, names: Sequence[str], root_pos: ArrayLike, r
 def save_clip(path: Path, clip: Clip) -> None:
     """Write ``path`` (.npz), float32."""
     arrays = {key: np.asarray(getattr(clip, key), dtype=np.float32) for key in KEYS if key != "joint_names"}
+    path.parent.mkdir(parents=True, exist_ok=True)
     np.savez_compressed(path, joint_names=np.array(clip.joint_names), **arrays)  # type: ignore[arg-type]
 
 

@@ -25,7 +25,7 @@ from legged_mw.utils.files import note_file
 from legged_mw.utils.renamed import new_name
 from legged_mw.utils.yaml_file import load_yaml, parse_yaml, save_yaml
 
-__all__ = ["Config", "ConfigError", "OutOfBounds", "field_types", "fit", "load_yaml", "save_yaml"]
+__all__ = ["Config", "ConfigError", "OutOfBounds", "field_types", "fit", "load_yaml", "save_yaml", "type_text"]
 
 _TYPES = (int, float, bool, str, NoneType, list, dict, Any)
 _PLAIN = None | bool | int | float | str | list | dict  # `Any` in a config: whatever YAML can hold
@@ -94,7 +94,7 @@ def _check_section(cls: type, name: str, section: type, inherited: Any) -> type:
     """`section`, if it extends every section of this name that the parents of `cls` have."""
     path = f"{_path(cls)}.{name}"
     if inherited is not None and not _is_section(inherited):
-        raise ConfigError(f"{path} is a field ({_show(inherited)}), not a section; write `{name} = ...`")
+        raise ConfigError(f"{path} is a field ({type_text(inherited)}), not a section; write `{name} = ...`")
     theirs = [_schema(base)[name] for base in cls.__bases__ if name in _schema(base)]
     for dropped in theirs:
         if not issubclass(section, dropped):
@@ -117,9 +117,9 @@ def _declared_type(cls: type, name: str, inherited: Any) -> Any:
         raise ConfigError(f"{path}: its type {written!r} cannot be resolved ({error}); {hint}") from None
     if not _is_supported(kind):
         choice = "int, float, bool, str, None, list[T], dict[str, T], Literal[...], Any, T | U; `class` makes a section"
-        raise ConfigError(f"{path}: type {_show(kind)} is not supported; there are {choice}")
+        raise ConfigError(f"{path}: type {type_text(kind)} is not supported; there are {choice}")
     if name not in vars(cls):
-        raise ConfigError(f"{path} has a type but no value; write `{name}: {_show(kind)} = ...`")
+        raise ConfigError(f"{path} has a type but no value; write `{name}: {type_text(kind)} = ...`")
     if inherited is not None and bare(inherited) == bare(kind) and bounds_text(kind) in ("", bounds_text(inherited)):
         return inherited
     if inherited is not None:
@@ -154,16 +154,17 @@ def _parents(cls: type, name: str) -> str:
     return ", ".join(f"{_path(base)}.{name}" for base in cls.__bases__ if name in _schema(base))
 
 
-def _show(kind: Any) -> str:
+def type_text(kind: Any) -> str:
+    """A type as Python writes it, without its bounds."""
     kind = bare(kind)
     if get_origin(kind) is Union:  # a union with a Literal
-        return " | ".join("None" if arm is NoneType else _show(arm) for arm in get_args(kind))
+        return " | ".join("None" if arm is NoneType else type_text(arm) for arm in get_args(kind))
     return kind.__name__ if isinstance(kind, type) else str(kind).replace("typing.", "")
 
 
 def _full(kind: Any) -> str:
     """A type with its bounds."""
-    return _show(kind) + (f" ({bounds})" if (bounds := bounds_text(kind)) else "")
+    return type_text(kind) + (f" ({bounds})" if (bounds := bounds_text(kind)) else "")
 
 
 def _say(value: Any) -> str:
@@ -237,7 +238,7 @@ def fit(value: Any, kind: Any, path: str) -> Any:
     if origin in (bool, str, NoneType) and type(value) is origin:
         return _within(value, kind, path)
     hint = _nearest(value, map(str, args)) if origin is Literal and isinstance(value, str) else ""
-    raise ConfigError(f"{path} must be {_show(kind)}, not {_say(value)} ({type(value).__name__}){hint}")
+    raise ConfigError(f"{path} must be {type_text(kind)}, not {_say(value)} ({type(value).__name__}){hint}")
 
 
 def _fit_one_of(value: Any, kind: Any, path: str) -> Any:
@@ -252,7 +253,7 @@ def _fit_one_of(value: Any, kind: Any, path: str) -> Any:
             continue
     if len(outside) == 1:
         raise outside[0]
-    wrong = f"is {_say(value)}; it must be {bounds_text(kind)}" if outside else f"must be {_show(kind)}, not {_say(value)}"
+    wrong = f"is {_say(value)}; it must be {bounds_text(kind)}" if outside else f"must be {type_text(kind)}, not {_say(value)}"
     raise ConfigError(f"{path} {wrong} ({type(value).__name__})")
 
 
@@ -370,7 +371,7 @@ class Config:
                 kind = _kind(type(node), section, here)
                 if not _is_section(kind):
                     whole = f": {here}={{{path.removeprefix(f'{here}.')}: ...}}" if get_origin(kind) is dict else ""
-                    raise ConfigError(f"{path} does not exist: {here} is a field ({_show(kind)}), not a section; set it whole{whole}")
+                    raise ConfigError(f"{path} does not exist: {here} is a field ({type_text(kind)}), not a section; set it whole{whole}")
                 node = getattr(node, section)
             kind = _kind(type(node), name, path)
             vars(node)[name] = _parse(value, kind, path) if isinstance(value, str) else fit(value, kind, path)

@@ -36,7 +36,8 @@ class NotRecordable(StepError):
 
 def out_of_memory(error: BaseException) -> bool:
     """Whether an error of torch, CUDA or warp says that memory ran out."""
-    return bool(re.search(r"out of memory|failed to allocate|alloc_failed", str(error), re.IGNORECASE))
+    text = r"out of memory|failed to allocate|alloc_failed|can't allocate memory"
+    return isinstance(error, MemoryError) or bool(re.search(text, str(error), re.IGNORECASE))
 
 
 def line_of(code: CodeType, line: int) -> str:
@@ -64,6 +65,24 @@ def line_to_blame(error: BaseException) -> tuple[str, bool]:
     for code, line, _ in reversed(users or ours):
         return line_of(code, line), bool(users)
     return "", False
+
+
+def users_fault(error: BaseException) -> str:
+    """Where an error comes from in the user's code that legged_mw called: the line, then those that led to it; "" if from none of it."""
+    lines, called = list[str](), False
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        module, file = frame.f_globals.get("__name__", ""), frame.f_code.co_filename
+        ours = module.startswith("legged_mw.") and module != "legged_mw.utils.cli"  # which catches the error, around all others
+        if called and not ours and not is_library(module, file):
+            lines.append(line_of(frame.f_code, line).removesuffix(", <module>"))
+        called = called or ours
+    return ", called from ".join(reversed(lines[-5:]))
+
+
+def in_short(error: BaseException) -> str:
+    """An error in one line: its type and what it says, without end."""
+    text = " ".join(f"{error}".split())
+    return f"{type(error).__name__}: {text[:400]}" if text else type(error).__name__
 
 
 def printable(text: str) -> str:

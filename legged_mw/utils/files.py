@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
 import re
 import shutil
 import stat
 import sys
+import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -48,6 +50,33 @@ def find_file(cfg: Any, path: str, one: str = "") -> Path:
     if written.is_absolute():
         raise UserError(f"{path}: no file at {written}; an absolute path is of one machine: name the file relative to the task's")
     raise UserError(f"{path}: no file '{written}' in {', '.join(map(str, places))}")
+
+
+def writable(name: str, flag: str, folder: bool = False) -> Path:
+    """The file, or folder, that ``flag`` says to write, if it can be: asked before the work. Raises UserError.
+
+    Folders on the way need not be there. A file without a name is tried beside it, which leaves nothing.
+    """
+    path = Path(name)
+    try:
+        if not name.strip():
+            raise UserError(f"{flag} is empty: name the {'folder' if folder else 'file'} to write")
+        if path.exists() and path.is_dir() != folder:
+            raise UserError(f"{flag} {name}: that is a {'file' if folder else 'folder'}; name a {'folder' if folder else 'file'}")
+        there = next(place for place in (path.absolute(), *path.absolute().parents) if place.is_dir())
+        if blocks := [place for place in path.absolute().parents if place.exists() and not place.is_dir()]:
+            raise UserError(f"{flag} {name}: {blocks[0]} is a file, not a folder")
+        with tempfile.TemporaryFile(dir=there):
+            pass
+        if path.is_file() and not os.access(path, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+    except (OSError, ValueError) as error:  # a name too long, or with a null character
+        raise UserError(f"{flag} {_cut(name)}: cannot be written: {getattr(error, 'strerror', None) or error}") from None
+    return path
+
+
+def _cut(name: str) -> str:
+    return name if len(name) <= 200 else f"{name[:200]}..."
 
 
 def check_name(name: str, where: str) -> str:

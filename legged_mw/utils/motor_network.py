@@ -74,8 +74,8 @@ def read_network(file: Path) -> MotorNetwork:
 
 def _read(arrays: Mapping[str, Any]) -> MotorNetwork:
     frames = tuple(int(age) for age in np.ravel(arrays.get("frames", 0)))
-    if not frames or list(frames) != sorted({*frames}) or frames[0] < 0:
-        raise ValueError(f"frames is {list(frames)}; they must be ages in simulation steps, the newest first")
+    if not frames or list(frames) != sorted({*frames}) or frames[0] < 0 or frames[-1] > 10_000:
+        raise ValueError(f"frames is {list(frames)[:99]}; they must be ages in simulation steps, the newest first, 10000 at most")
     activation = str(arrays.get("activation", "elu"))
     if activation not in ACTIVATIONS:
         raise ValueError(unknown("activation", activation, ACTIVATIONS, "motor networks"))

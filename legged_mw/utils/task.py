@@ -9,11 +9,12 @@ from typing import Any, NamedTuple
 
 from legged_mw import ROOT
 from legged_mw.utils.config import Config, ConfigError
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import UserError, in_short, shown, unknown, users_fault
 from legged_mw.utils.files import find_file, typed
 from legged_mw.utils.renamed import with_new_names
 from legged_mw.utils.task_module import import_task
 
+_ENDS = "must end with TASK = Task(Env, Cfg, CfgPPO)"
 ROBOT_FILES = (".xml", ".mjcf", ".urdf")
 
 
@@ -148,8 +149,30 @@ def load_task(name: str) -> LoadedTask:
         path = ROOT / "configs" / f"{name}.py"
     if not path.is_file():
         raise ConfigError(f"no config file at {path.absolute()}")
-    module = import_task(path)
+    try:
+        module = import_task(path)
+    except UserError:
+        raise
+    except SyntaxError as error:
+        line = f":{error.lineno}" if error.lineno else ""
+        raise ConfigError(f"{shown(Path(error.filename or path))}{line}: {error.msg}: {(error.text or '').strip()[:100]}") from error
+    except (Exception, SystemExit) as error:
+        raise ConfigError(f"{users_fault(error) or shown(path)}: {in_short(error)}; {shown(path)} {_ENDS}") from error
     task = getattr(module, "TASK", None)
     if not isinstance(task, Task):
-        raise ConfigError(f"{path} must end with TASK = Task(Env, Cfg, CfgPPO); its TASK is {task!r}")
+        raise ConfigError(f"{path} {_ENDS}; its TASK is {task!r:.100}")
+    _check_task(task, path)
     return LoadedTask(path.stem, path, task, about=(module.__doc__ or "").partition("\n")[0])
+
+
+def _check_task(task: Task, path: Path) -> None:
+    """Three classes of the kinds that are expected, and an exam's name."""
+    for name, kind, wanted, has in (
+        ("env", task.env, "an environment, as LeggedRobot is", lambda kind: hasattr(kind, "observation_rows")),
+        ("cfg", task.cfg, "an environment's config, as LeggedRobotCfg is", lambda kind: issubclass(kind, Config) and hasattr(kind, "env")),
+        ("train", task.train, "a learner's, as LeggedRobotCfgPPO is", lambda kind: issubclass(kind, Config) and hasattr(kind, "runner")),
+    ):
+        if not isinstance(kind, type) or not has(kind):
+            raise ConfigError(f"{path}: TASK: {name} is {kind!r:.100}; it must be a class: {wanted}")
+    if not isinstance(task.exam, str | None):
+        raise ConfigError(f"{path}: TASK: exam is {task.exam!r:.100}; it must be the name of an exam, or None")

@@ -18,6 +18,7 @@ from legged_mw.rl.estimator import believed_velocity
 from legged_mw.rl.recurrent import forget
 from legged_mw.sim.terrain import name_tile
 from legged_mw.utils.commands import Command
+from legged_mw.view.follow import Newest
 from legged_mw.view.stage import BoolArray, FloatArray
 
 
@@ -26,11 +27,17 @@ class EnvStage:
 
     The environment's step may be a recorded graph, so a pilot's changes are written into its buffers between two steps.
     The policy sees a command in the same step: the observations' rows "commands" and "gait_clock" are written again. Those
-    only, because noise and delays of the others belong to the step.
+    only, because noise and delays of the others belong to the step. ``newest`` renews the policy as it trains.
     """
 
-    def __init__(self, env: RobotTask, policy: Callable[[TensorDict], Tensor], command_table: Sequence[Command] | None = None) -> None:
-        self.env, self.policy = env, policy
+    def __init__(
+        self,
+        env: RobotTask,
+        policy: Callable[[TensorDict], Tensor],
+        command_table: Sequence[Command] | None = None,
+        newest: Newest | None = None,
+    ) -> None:
+        self.env, self.policy, self._newest = env, policy, newest
         self.spec, self.num_worlds, self.dt = visual_spec(env.robot, env.cfg.viewer.camera), env.num_envs, env.dt
         self.command_table = env.command_table if command_table is None else tuple(command_table)
         # a task with a table has a buffer for it, (N, C)
@@ -45,6 +52,8 @@ class EnvStage:
     @torch.no_grad()
     def step(self, commands: FloatArray | None) -> None:
         env = self.env
+        if self._newest:
+            self._newest()
         if commands is not None:
             self._commands.copy_(torch.as_tensor(commands, dtype=torch.float, device=env.device))
             for group, columns, scales in self._command_columns:
@@ -57,6 +66,11 @@ class EnvStage:
         self._believed = believed_velocity(self.policy, self._obs)
         self._obs, _, dones, _ = env.step(self.policy(self._obs))
         forget(self.policy, dones)
+
+    @property
+    def news(self) -> str:
+        """Which policy it is, where that changes."""
+        return self._newest.news if self._newest else ""
 
     def commands(self) -> FloatArray:
         return _array(self._commands)

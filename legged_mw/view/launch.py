@@ -11,9 +11,11 @@ from typing import Any
 
 from legged_mw.utils.commands import Command, outside, parse_command
 from legged_mw.utils.errors import UserError, shown
+from legged_mw.utils.files import writable
+from legged_mw.utils.renderer import has_display
 from legged_mw.view import web
 from legged_mw.view.drive import CAMERAS, NO_COMMANDS, Pilot
-from legged_mw.view.native import NativeViewer, has_display
+from legged_mw.view.native import NativeViewer
 from legged_mw.view.recorder import Recorder
 from legged_mw.view.script import load_script
 from legged_mw.view.session import Outcome, Session
@@ -43,14 +45,13 @@ def add_flags(parser: argparse.ArgumentParser, viewer: str = "auto") -> None:
 
 def check_flags(args: argparse.Namespace) -> None:
     """Refuse wrong flags before anything is loaded. Raises FlagError or ViewError."""
-    files = [flag for flag in ("video", "sheet") if getattr(args, flag)]
+    files = [flag for flag in ("video", "sheet") if getattr(args, flag) is not None]
     if files and args.viewer not in ("auto", "video"):
         raise FlagError(f"--{files[0]} records and --viewer {args.viewer} does not: leave one of them out")
+    for flag in files:
+        writable(getattr(args, flag), f"--{flag}")
     if args.video:
         check_format(Path(args.video))
-    for name in filter(None, (args.video, args.sheet)):
-        if not (taken := next(folder for folder in Path(name).absolute().parents if folder.exists())).is_dir():
-            raise ViewError(f"Cannot write {name}: {taken} is a file, not a folder.")
     if args.sheet and Path(args.sheet).suffix.lower() != ".png":
         raise ViewError(f"Cannot write {Path(args.sheet).name!r}: a contact sheet is a .png.")
     if not 0 <= args.port < 65536:

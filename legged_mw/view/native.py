@@ -12,6 +12,7 @@ from typing import Any
 
 import mujoco
 
+from legged_mw.utils.renderer import has_display
 from legged_mw.view.camera import RobotCamera
 from legged_mw.view.drive import BINDINGS, KEY_ACTION, Binding, Pilot
 from legged_mw.view.overlay import draw
@@ -22,13 +23,6 @@ CLOSE_SECONDS = 5.0
 TEXT_SECONDS = 0.1  # between two changes of text
 _GLFW = {"right": 262, "left": 263, "down": 264, "up": 265, "space": 32, "backspace": 259, "enter": 257}
 KEY_CODES = {_GLFW.get(key, ord(key[0].upper())): key for key in KEY_ACTION}  # GLFW's code of a letter is its capital's ASCII
-
-
-def has_display() -> bool:
-    """Whether a window could open here. Linux needs an X or Wayland display; other systems have one."""
-    if not sys.platform.startswith("linux"):
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 Text = tuple[int | None, int | None, str, str]  # font, place, left column, right column

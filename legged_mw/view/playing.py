@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import argparse
 import copy
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from legged_mw.rl.classes import check_classes
-from legged_mw.rl.policies import Source, introduce, load_policy
-from legged_mw.rl.runs import require_task
+from legged_mw.rl.policies import Source, introduce, load_policy, read_actor
+from legged_mw.rl.runs import load_tensors, require_task
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, pick_device, seed_everything
 from legged_mw.utils.commands import Command, command_table
+from legged_mw.utils.files import writable
 from legged_mw.utils.task import LoadedTask
 from legged_mw.view import launch
 from legged_mw.view.env_stage import EnvStage
+from legged_mw.view.follow import Newest
 
 NOMINAL = {  # what playing changes in the trained config
     "env.num_envs": 1,
@@ -42,6 +45,7 @@ def parse(description: str | None) -> argparse.Namespace:
         "--time", type=duration, default=None, metavar="T", help="how long to play (default: 10s of video, a window until closed)"
     )
     launch.add_flags(parser)
+    parser.add_argument("--follow", action="store_true", help="read the policy again as its run trains on")
     parser.add_argument("--eval", action="store_true", help="run the task's exam (on rough ground too), print its tables, write a report")
     parser.add_argument("--compare", metavar="RUN", help="with --eval: grade this run beside it; its name or path, or 'shipped'")
     common = "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
@@ -50,13 +54,15 @@ def parse(description: str | None) -> argparse.Namespace:
     parser.add_argument("--half", action="store_true", help="with --export: round the weights to float16; the network takes half the space")
     args = parser.parse_args()
     require_task(args, parser)
-    asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag)]
+    asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag) not in (None, False)]
     if len(asked) > 1 or (args.eval and args.command is not None):
         parser.error("--eval, --export and --video are one thing each, and --eval brings its own commands")
     if args.compare is not None and not args.eval:
         parser.error("--compare grades two policies side by side: add --eval")
     if args.ranges and not args.eval:
         parser.error("--ranges says what the exam asks: add --eval")
+    if args.follow and (args.eval or args.export or args.checkpoint != -1):
+        parser.error("--follow watches the newest policy: leave --eval, --export and --checkpoint out")
     if args.half and not args.export:
         parser.error("--half rounds what is exported: add --export DIR")
     if args.commands and (args.eval or args.export or args.command is not None):
@@ -64,6 +70,8 @@ def parse(description: str | None) -> argparse.Namespace:
     if (args.eval or args.export) and (watching := launch.asked(args)):
         parser.error(f"--eval and --export show nothing: leave {', '.join(watching)} out")
     launch.check_flags(args)
+    if args.export is not None:
+        writable(args.export, "--export", folder=True)
     torch.set_num_threads(1)  # a step of few worlds stalls on more
     return args
 
@@ -118,5 +126,10 @@ def watch(source: Source, task: LoadedTask, commands: tuple[Command, ...], args:
     env = task.env_class(task.cfg, device, eager=args.eager)
     policy = load_policy(source.checkpoint, env, task.train, device)
     sizes = {name: getattr(task.cfg.viewer, name) for name in ("width", "height", "fps")}
-    stage = EnvStage(env, policy, commands)
+
+    def renew(path: Path) -> int:
+        policy.load_state_dict(read_actor(path, policy))
+        return int(load_tensors(path, device)["iter"])
+
+    stage = EnvStage(env, policy, commands, Newest(source.folder, renew, source.checkpoint) if args.follow else None)
     launch.watch(stage, args, source.results(task), title=task.name, **sizes)

@@ -188,6 +188,8 @@ class Session:
             lines.append(("estimated", signed(believed[pilot.world])))
         if stage.command_table:
             lines = [("command", signed(command)), *lines, ("driven by", self._driver())]
+        if news := getattr(stage, "news", ""):  # of a stage whose policy trains on
+            lines.append(("policy", news))
         if stage.num_worlds > 1:
             lines.append(("robot", f"{pilot.world + 1} of {stage.num_worlds}"))
         if ground := stage.ground(pilot.world):

@@ -92,6 +92,7 @@ def attack(case: Case, root: Path, allowed: tuple[Path, ...] = ()) -> str:
     assert code == case.code, f"exit code {code}: {said[0]}"
     assert said[0].endswith("\n") and said[0].count("\n") == 1, said[0]
     assert said[0].startswith(f"{name}: "), said[0]
+    assert "out of memory" not in said[0], "it was tried, not refused"
     for text in (case.says,) if isinstance(case.says, str) else case.says:
         assert text in said[0], said[0]
     assert not (strange := [path for path in written if not any(path.is_relative_to(place) for place in places)]), strange

@@ -1,0 +1,53 @@
+"""What warp and CUDA offer on a device, and what makes a start slow there. For messages: nothing steps by it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+
+GRAPHS_SINCE = (12, 4)  # CUDA of the driver: below, mujoco-warp warns that recording may be unreliable
+_OTHERS = 1.0  # GiB on a GPU: a desktop takes less, a training more
+
+
+class DeviceFacts(NamedTuple):
+    """A device as warp sees it; memory in GiB."""
+
+    name: str
+    cuda: tuple[int, int] | None  # what the driver supports
+    pool: bool  # memory can be allocated while a graph is recorded
+    cache: Path  # of compiled kernels
+    compiled: int  # modules of kernels in it for this device
+    memory: float = 0.0
+    taken: float = 0.0  # by all processes
+
+    def slow(self) -> list[str]:
+        """A line a reason for which the first minute, or all of the training, is slow here."""
+        lines = []
+        if not self.compiled:
+            lines.append("kernels are compiled at this first start, a minute or two; `legged-mw warm` does it beforehand")
+        if self.memory and not self.pool:
+            lines.append("this GPU has no memory pool: nothing can be recorded, and a step takes several times as long")
+        if self.cuda and self.cuda < GRAPHS_SINCE:
+            has, since = (".".join(map(str, version)) for version in (self.cuda, GRAPHS_SINCE))
+            lines.append(f"the driver supports CUDA {has}, and recording is reliable from {since} on: update it")
+        if self.taken > _OTHERS:
+            shared = "another process holds"
+            lines.append(f"{shared} {self.taken:.0f} of {self.memory:.0f} GiB of this GPU: both run slower (nvidia-smi shows which)")
+        return lines
+
+
+def device_facts(device: str) -> DeviceFacts:
+    """Ask warp and CUDA. Ask before anything is allocated: what this process holds would count as taken."""
+    import warp as wp  # a second to import, and MuJoCo's own engine needs none of it
+
+    wp.config.log_level = wp.LOG_WARNING
+    wp.init()
+    here, cache = wp.get_device(device), Path(wp.config.kernel_cache_dir or "")
+    kind = f"*.sm{here.get_cuda_compile_arch()}*" if here.is_cuda else "*.cpu*.o"
+    compiled = len({file.parent for file in cache.glob(f"wp_mujoco_warp*/{kind}")})
+    if not here.is_cuda:
+        return DeviceFacts(here.name, None, True, cache, compiled)
+    free, memory = (size / 2**30 for size in torch.cuda.mem_get_info(device))
+    return DeviceFacts(here.name, wp.get_cuda_driver_version(), wp.is_mempool_supported(here), cache, compiled, memory, memory - free)

@@ -1,0 +1,159 @@
+"""legged-mw compare RUN RUN ...: curves and exams of runs in one page that needs nothing else."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable, Iterable, Sequence
+from html import escape
+from itertools import groupby
+from pathlib import Path
+
+from legged_mw.eval.page import CSS, table
+from legged_mw.tools.chart import chart
+from legged_mw.tools.curves import Run, differences, find_runs
+from legged_mw.utils.cli import Parser
+from legged_mw.utils.errors import UserError, shown
+
+LONGEST = 40  # letters of a setting in a table
+MOST = 8  # colours that one can tell apart (Okabe and Ito's)
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6d31", "#68707d")
+ON_DARK = ("#56b4e9", "#ff8a3d", "#2fc99b", "#e6a5c9", "#f0c04a", "#9fd4f5", "#c9a66b", "#9aa3b0")
+STYLE = f""":root{{{"".join(f"--run{i}:{colour};" for i, colour in enumerate(COLOURS))}}}
+@media (prefers-color-scheme:dark){{:root{{{"".join(f"--run{i}:{colour};" for i, colour in enumerate(ON_DARK))}}}}}
+.swatch{{vertical-align:middle}}figure text{{font:11px var(--font);fill:var(--muted)}}figure .name{{fill:var(--ink);font-size:13px}}
+figure path{{fill:none;stroke-width:1.6;stroke-linejoin:round}}figure line{{stroke:var(--faint)}}"""
+TOTAL = "Train/total_steps"
+FIRST = ("Train/mean_reward", "Train/mean_episode_length", "Episode/fell", "Policy/mean_std", "Perf/total_fps")
+CHAPTERS = {  # what a curve's name begins with -> title; later ones are folded away
+    "Exam/": "Exams during training",
+    "Train/": "Training",
+    "Curriculum/": "Curriculum",
+    "Episode/rew_": "Reward terms",
+    "Loss/": "Losses",
+    "": "Everything else",
+}
+ACROSS: dict[str, Callable[[Run, float], float]] = {
+    "iterations": lambda run, iteration: iteration,
+    "steps": lambda run, iteration: iteration * steps_an_iteration(run) / 1e6,
+    "minutes": lambda run, iteration: run.seconds.get(iteration, math.nan) / 60,
+}
+UNITS = {"iterations": "iterations", "steps": "million steps", "minutes": "minutes of training"}
+
+
+def parse() -> argparse.Namespace:
+    parser = Parser(prog="legged-mw compare", description=__doc__, allow_abbrev=False)
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="a run's path, TASK/RUN, or a task for its last run")
+    parser.add_argument("--out", default="compare.html", metavar="FILE", help="the page to write (default: compare.html)")
+    parser.add_argument("--over", choices=ACROSS, default="steps", help="what curves are drawn over (default: steps)")
+    args = parser.parse_args()
+    if len(args.runs) > MOST:
+        parser.error(f"{len(args.runs)} runs cannot be told apart in one picture: name at most {MOST}")
+    return args
+
+
+def main() -> None:
+    args = parse()
+    runs = find_runs(args.runs)
+    print(text_table(runs))
+    write(runs, Path(args.out), args.over)
+    print(f"written to {shown(Path(args.out))}")
+
+
+def write(runs: Sequence[Run], path: Path, over: str = "steps") -> None:
+    """The page. Raises UserError if it cannot be written."""
+    try:
+        path.write_text(html(runs, over), encoding="utf-8")
+    except OSError as error:
+        raise UserError(f"cannot write {path}: {error.strerror}; say --out FILE.html") from None
+
+
+def steps_an_iteration(run: Run) -> float:
+    """Of the last iteration: its number is what the total was divided into."""
+    total = run.last(TOTAL)
+    return total / run.iterations if total and run.iterations else math.nan
+
+
+def rows(runs: Sequence[Run]) -> list[list[str]]:
+    """A row a run: what it is, how long it trained, and its last figures."""
+    exams = list(dict.fromkeys(name for run in runs for name in run.curves if name.startswith("Exam/")))
+    heads = ["run", "iterations", "M steps", "minutes", "steps/s", "reward", *(name.removeprefix("Exam/") for name in exams)]
+    lines = [heads]
+    for run in runs:
+        minutes = run.seconds.get(run.iterations, 0.0) / 60
+        said = [f"{run.iterations}", f"{run.iterations * steps_an_iteration(run) / 1e6:.1f}", f"{minutes:.1f}"]
+        figures = [("Perf/total_fps", ",.0f"), ("Train/mean_reward", ".2f"), *((name, ".3f") for name in exams)]
+        values = [(run.last(name), digits) for name, digits in figures]
+        lines.append([run.name, *said, *("-" if value is None else f"{value:{digits}}" for value, digits in values)])
+    return lines
+
+
+def text_table(runs: Sequence[Run]) -> str:
+    """``rows`` for a terminal."""
+    lines = rows(runs)
+    first, *widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    cells = [[cell.rjust(width) for cell, width in zip(line[1:], widths, strict=True)] for line in lines]
+    return "\n".join("  ".join([line[0].ljust(first), *right]) for line, right in zip(lines, cells, strict=True))
+
+
+def html(runs: Sequence[Run], over: str = "steps") -> str:
+    """The whole page."""
+    heads, *lines = rows(runs)
+    names = "".join(
+        f'<li><i class="swatch" style="background:var(--run{i})"></i><b>{escape(run.name)}</b> '
+        f'<span class="muted">{escape(shown(run.folder))}</span></li>'
+        for i, run in enumerate(runs)
+    )
+    differ = [[path, *map(_said, values)] for path, values in differences(list(runs)).items() if path != "runner.run_name"]
+    graded = list(dict.fromkeys(name for run in runs for name in run.graded))
+    exam = [[name, *(f"{run.graded[name]:.3g}" if name in run.graded else "-" for run in runs)] for name in graded]
+    columns = ["", *(run.name for run in runs)]
+    settings = table(columns, differ, f"{len(differ)} settings" if len(differ) > 12 else "") if differ else "<p class=lead>None.</p>"
+    parts = [
+        f"<section><h2>At the end</h2>{table(heads, lines)}</section>",
+        *_chapters(runs, over),
+        f"<section><h2>The whole exam</h2>{table(columns, exam)}</section>" if exam else "",
+        f"<section><h2>Settings that differ</h2>{settings}</section>",
+    ]
+    title = " and ".join(dict.fromkeys(str(run.settings.get("task", run.folder.resolve().parent.name)) for run in runs))
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark"><title>{escape(title)}: {len(runs)} runs</title><style>{CSS}{STYLE}</style></head>
+<body><main><header><p class="above">Training runs</p><h1>{escape(title)}</h1><ul class="names">{names}</ul></header>
+{"".join(parts)}</main></body></html>
+"""
+
+
+def _said(value: object) -> str:
+    text = "" if value is None else " ".join(str(value).split())
+    return text if len(text) <= LONGEST else f"{text[: LONGEST - 3]}..."
+
+
+def _chapters(runs: Sequence[Run], over: str) -> Iterable[str]:
+    """Charts by what their curves are about; the common ones open, the others folded."""
+    names = sorted(dict.fromkeys(name for run in runs for name in run.curves if name != TOTAL), key=_order)
+    for chapter, group in groupby(names, key=_chapter):
+        drawn = [chart(name.rpartition("/")[2].replace("_", " "), UNITS[over], _lines(runs, name, over)) for name in group]
+        figures = f'<div class="panels">{"".join(f"<figure>{svg}</figure>" for svg in drawn if svg)}</div>'
+        if chapter in ("Exam/", "Train/"):
+            yield f"<section><h2>{CHAPTERS[chapter]}</h2>{figures}</section>"
+        else:
+            yield f"<section><details><summary>{CHAPTERS[chapter]} ({len(drawn)})</summary>{figures}</details></section>"
+
+
+def _chapter(name: str) -> str:
+    return "Train/" if name in FIRST else next(begin for begin in CHAPTERS if name.startswith(begin))
+
+
+def _order(name: str) -> tuple[int, int, str]:
+    return list(CHAPTERS).index(_chapter(name)), FIRST.index(name) if name in FIRST else len(FIRST), name
+
+
+def _lines(runs: Sequence[Run], name: str, over: str) -> list[tuple[str, list[float], list[float]]]:
+    """(colour, x, y) of each run that has the curve."""
+    found = []
+    for i, run in enumerate(runs):
+        if name in run.curves:
+            iterations, values = run.curves[name]
+            found.append((f"var(--run{i})", [ACROSS[over](run, iteration) for iteration in iterations], values))
+    return found

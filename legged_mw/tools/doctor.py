@@ -1,0 +1,232 @@
+"""legged-mw doctor: what this machine has, what it lacks and the command that mends it, and how fast it trains."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import io
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import NamedTuple
+
+from legged_mw import ROOT
+from legged_mw.utils.cli import Parser, pick_device, seed_everything
+from legged_mw.utils.machine import usable_cores
+from legged_mw.utils.renderer import gl_fault, has_display
+from legged_mw.utils.task import load_task, task_names
+
+SPEED_TASKS = ("go1_flat", "g1_flat", "go1_rough")
+_CUDA_WHEELS = "pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/cu130"
+_DRAW = "import mujoco\nc = mujoco.GLContext(64, 64)\nc.make_current()\nmujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), 100)"
+
+
+class Finding(NamedTuple):
+    """One line of the page. ``mend`` is a command or what to do, where something is missing."""
+
+    what: str
+    said: str
+    mend: str = ""
+    needed: bool = False  # nothing trains without it
+
+
+def parse() -> tuple[str | None, float]:
+    """The device, and the seconds to spend on speed."""
+    parser = Parser(prog="legged-mw doctor", description=__doc__, allow_abbrev=False)
+    parser.add_argument("--device", metavar="D", help="what to measure on: cuda:0, cpu (default: the GPU if there is one)")
+    parser.add_argument("--seconds", type=float, default=30.0, metavar="S", help="how long to train for the speed; 0 leaves it out")
+    args = parser.parse_args()
+    return args.device, args.seconds
+
+
+def main() -> None:
+    asked, seconds = parse()
+    missing: list[Finding] = []
+    sections: tuple[tuple[str, Callable[[], Iterator[Finding]]], ...] = (
+        ("This machine", machine),
+        ("Training", training),
+        ("GPUs", gpus),
+        ("Pictures", pictures),
+        ("Extras", extras),
+    )
+    for title, find in sections:
+        print(f"\n{title}")
+        for finding in find():
+            print(f"  {'!' if finding.mend else ' '} {finding.what:<14} {finding.said}", flush=True)
+            missing += [finding] * bool(finding.mend)
+    if seconds > 0 and not any(finding.needed for finding in missing):
+        device = pick_device(asked)
+        print(f"\nSpeed on {device}, {seconds:g} s", flush=True)
+        for name in SPEED_TASKS:
+            print(f"    {name:<14} {speed(name, device, seconds / len(SPEED_TASKS))}", flush=True)
+    print("\nNothing is missing." if not missing else "\nTo mend:")
+    for finding in missing:
+        print(f"  {finding.what}: {finding.mend}")
+    if any(finding.needed for finding in missing):
+        raise SystemExit(1)
+
+
+# ---- what is there
+
+
+def machine() -> Iterator[Finding]:
+    """Python, cores, memory, disk, where the package is."""
+    version = platform.python_version()
+    fits = (3, 11) <= sys.version_info[:2] <= (3, 13)
+    yield Finding("Python", f"{version}, {sys.executable}", "" if fits else "legged_mw runs on Python 3.11, 3.12 and 3.13", needed=not fits)
+    yield Finding("system", f"{platform.system()} {platform.release()}, {platform.machine()}")
+    memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB of memory" if hasattr(os, "sysconf") else ""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
+    busy = "others use this machine: what is measured now is slower than it could be" if load > usable_cores() + 0.5 else ""
+    yield Finding("cores", f"{usable_cores()} for this process, of {os.cpu_count()}{memory}; load {load:.1f}", busy)
+    free = shutil.disk_usage(Path.cwd()).free / 2**30
+    mend = "" if free > 1.0 else "a run writes up to a few hundred MB: free some disk, or start elsewhere"
+    yield Finding("disk", f"{free:.1f} GiB free in {Path.cwd()}", mend)
+    policies = len(list((ROOT / "resources/policies").glob("*/policy.onnx")))
+    kind = "a clone" if (ROOT / "pyproject.toml").exists() else "installed"
+    yield Finding("legged_mw", f"{_version('legged_mw')}, {kind} at {ROOT}: {len(task_names())} tasks, {policies} policies")
+
+
+def training() -> Iterator[Finding]:
+    """The libraries that step and learn, and the kernels that are compiled for a CPU."""
+    for name in ("mujoco", "mujoco-warp", "warp-lang", "torch", "rsl-rl-lib", "tensordict"):
+        version = _version(name)
+        yield Finding(name, version or "missing", "" if version else f"pip install {name}", needed=not version)
+
+
+def gpus() -> Iterator[Finding]:
+    """Each GPU: driver, memory pool, graphs, kernels, who else is on it."""
+    import torch
+
+    from legged_mw.sim.device import device_facts
+
+    if not torch.cuda.is_available():
+        has_one = Path("/proc/driver/nvidia/version").exists() or shutil.which("nvidia-smi") is not None
+        if has_one and torch.version.cuda is None:
+            yield Finding("none", f"there is an NVIDIA driver, but torch {torch.__version__} is built for CPUs", _CUDA_WHEELS)
+        elif has_one:
+            mend = "update the driver, or take an older torch; nvidia-smi shows what the driver supports"
+            yield Finding("none", f"torch {torch.__version__} for CUDA {torch.version.cuda} finds no usable GPU", mend)
+        else:
+            yield Finding("none", "trains on the CPU, with MuJoCo's own engine, which compiles nothing")
+        return
+    for index in range(torch.cuda.device_count()):
+        facts = device_facts(device := f"cuda:{index}")
+        driver = ".".join(map(str, facts.cuda or ()))
+        said = f"{facts.name}, {facts.memory:.0f} GiB, driver for CUDA {driver}, torch {torch.__version__}"
+        yield Finding(device, said)
+        yield Finding("memory pool", "yes" if facts.pool else "no")
+        yield Finding("graphs", _records(device))
+        yield Finding("kernels", f"{facts.compiled} modules of mujoco-warp are compiled for it in {facts.cache}")
+        for line in facts.slow():
+            yield Finding("note", line, "legged-mw warm" if "kernels" in line else "see the note")
+
+
+def pictures() -> Iterator[Finding]:
+    """What MuJoCo can draw through, and what can be watched and recorded."""
+    chosen = os.environ.get("MUJOCO_GL", "")
+    works = []
+    for name in ("egl", "osmesa", "glfw"):
+        fault = gl_fault(name) or (draws(name) if name != "glfw" or has_display() else "no screen")
+        works += [name] * (not fault)
+        yield Finding(name, fault or "draws")
+    mend = "" if works else "apt install libegl1 libegl-mesa0 (or libosmesa6): without one no video, picture or window; training needs none"
+    yield Finding("MUJOCO_GL", chosen or "not set", mend)
+    from legged_mw.view import video, web
+
+    yield Finding("window", "yes" if has_display() else "no screen: play shows a web page instead")
+    reason = web.missing()
+    yield Finding("web page", reason or "yes", "pip install --force-reinstall mujoco mujoco-studio" if reason else "")
+    reason = video.no_encoder()
+    yield Finding("video", reason or "yes", "pip install av" if reason else "")
+
+
+def extras() -> Iterator[Finding]:
+    """What only some programs need."""
+    for package, module, what in (
+        ("onnxruntime", "onnxruntime", "to run an export: legged-mw deploy"),
+        ("cyclonedds", "cyclonedds", "to drive a Go2 or G1"),
+        ("tensorboard", "tensorboard", "curves of a training"),
+    ):
+        if importlib.util.find_spec(module) is None:
+            yield Finding(package, f"not installed ({what})", f"pip install {package}")
+        else:
+            yield Finding(package, _version(package) or "yes")
+    git = shutil.which("git")
+    yield Finding("git", git or "not installed (a run of a clone then does not keep its diff)")
+
+
+# ---- trying it
+
+
+def draws(name: str) -> str:
+    """Why MuJoCo cannot draw a picture with this MUJOCO_GL; "" if it can. In another process: it may crash."""
+    environment = {**os.environ, "MUJOCO_GL": name}
+    environment.pop("PYOPENGL_PLATFORM", None)
+    try:
+        done = subprocess.run([sys.executable, "-c", _DRAW], env=environment, capture_output=True, text=True, timeout=60)
+    except subprocess.TimeoutExpired:
+        return "does not answer"
+    lines = [line for line in done.stderr.strip().splitlines() if "Error" in line] or ["it crashed"]
+    return "" if done.returncode == 0 else lines[-1].strip()[:100]
+
+
+def _records(device: str) -> str:
+    """Whether torch and warp record into one graph there."""
+    import torch
+
+    from legged_mw.sim.graph import StepGraph
+
+    counter = torch.zeros((), device=device)
+
+    def count() -> None:
+        counter.add_(1.0)
+
+    graph = StepGraph(count, device)
+    try:
+        for _ in range(5):
+            graph()
+    except Exception as error:  # whatever a driver may say
+        return f"cannot be recorded: {' '.join(str(error).split())[:100]}"
+    return "recorded and replayed" if graph.recorded and int(counter) == 5 else "not replayed"
+
+
+def speed(name: str, device: str, seconds: float) -> str:
+    """Train a task for so long and say how fast that was, and how long the whole training would take."""
+    import torch
+
+    from legged_mw.rl.runner import make_runner
+
+    task, threads = load_task(name), torch.get_num_threads()
+    if device == "cpu":
+        task.fit_cpu(usable_cores())
+        torch.set_num_threads(1)  # as train.py does
+    seed_everything(1)
+    begun, quiet = time.perf_counter(), io.StringIO()
+    with contextlib.redirect_stdout(quiet):
+        env = task.env_class(task.cfg, device)
+        runner = make_runner(env, task.train, None, device)
+        runner.learn(5 if device != "cpu" else 1)  # records, and tries threads
+        start, done = time.perf_counter(), 0
+        while done == 0 or time.perf_counter() < begun + seconds:
+            runner.learn(4 if device != "cpu" else 1, init_at_random_ep_len=False)
+            done += 4 if device != "cpu" else 1
+        took = time.perf_counter() - start
+    torch.set_num_threads(threads)
+    steps = env.num_envs * task.train.runner.num_steps_per_env
+    minutes = task.train.runner.max_iterations * took / done / 60
+    worlds = f"{env.num_envs} worlds, ready after {start - begun:.0f} s"
+    return f"{steps * done / took:>10,.0f} steps/s, all {task.train.runner.max_iterations} iterations in {minutes:.0f} min ({worlds})"
+
+
+def _version(package: str) -> str:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return ""

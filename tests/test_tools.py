@@ -1,0 +1,401 @@
+"""The programs around training: doctor, compare, sweep, warm, completion, and the viewer beside a training."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from program import SMALL, run
+from torch.utils.tensorboard import SummaryWriter
+
+from legged_mw import ROOT, programs
+from legged_mw.rl.runs import save_whole
+from legged_mw.sim.device import DeviceFacts, device_facts
+from legged_mw.tools import alongside, chart, completion, doctor, sweep, warm
+from legged_mw.utils import renderer
+from legged_mw.utils.cli import one_line_errors
+from legged_mw.utils.task import LoadedTask, load_task
+from legged_mw.view.follow import PLAYING, Newest
+
+
+def program(name: str, *args: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """``legged-mw name args`` in this process."""
+    monkeypatch.setattr(sys, "argv", ["legged-mw", name, *args])
+    programs.main()
+
+
+# ---- what the machine draws through
+
+
+@pytest.mark.parametrize(
+    ("asked", "present", "chosen", "line"),
+    [
+        (None, ["libEGL.so.1"], "egl", ""),
+        (None, ["libOSMesa.so.8"], "osmesa", ""),
+        (None, [], None, ""),
+        ("disable", [], "disable", ""),
+        ("glfw", [], "glfw", ""),
+        ("egl", ["libEGL.so.1"], "egl", ""),
+        (
+            *("osmesa", ["libEGL.so.1"], "egl"),
+            "MUJOCO_GL=osmesa does not work here: libOSMesa.so.8 is missing (apt install libosmesa6); going on with MUJOCO_GL=egl",
+        ),
+        (
+            *("egl", [], "disable"),
+            "MUJOCO_GL=egl does not work here: libEGL.so.1 is missing (apt install libegl1); going on with MUJOCO_GL=disable",
+        ),
+        (
+            *("vulkan", [], "disable"),
+            "MUJOCO_GL=vulkan does not work here: there are egl, osmesa, glfw and disable; going on with MUJOCO_GL=disable",
+        ),
+    ],
+)
+def test_a_renderer_that_does_not_work_is_replaced_in_one_line(
+    asked: str | None, present: list[str], chosen: str | None, line: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def load(name: str) -> None:
+        if name not in present:
+            raise OSError(name)
+
+    monkeypatch.setattr(renderer.ctypes, "CDLL", load)
+    monkeypatch.setattr(sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM", "MUJOCO_GL"):
+        monkeypatch.delenv(name, raising=False)
+    if asked is not None:
+        monkeypatch.setenv("MUJOCO_GL", asked)
+    assert renderer.choose_renderer() == line
+    assert os.environ.get("MUJOCO_GL") == chosen
+
+
+def test_a_wrong_renderer_is_no_traceback() -> None:
+    code = "import legged_mw, mujoco"
+    environment = {key: value for key, value in os.environ.items() if "DISPLAY" not in key} | {"MUJOCO_GL": "none of these"}
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stderr.count("\n") == 1, done.stderr
+    assert done.stderr.startswith("legged_mw: MUJOCO_GL=none of these does not work here: there are ")
+
+
+# ---- doctor and warm
+
+
+def test_a_slow_start_has_its_reasons() -> None:
+    ready = DeviceFacts("H100", (13, 0), True, Path("cache"), 9, memory=80.0, taken=0.6)
+    assert ready.slow() == []
+    compiles, shared = ready._replace(compiled=0).slow() + ready._replace(taken=12.3).slow()
+    assert compiles.startswith("kernels are compiled at this first start, a minute or two; `legged-mw warm`")
+    assert shared == "another process holds 12 of 80 GiB of this GPU: both run slower (nvidia-smi shows which)"
+    pool, driver = ready._replace(pool=False, cuda=(12, 2)).slow()
+    assert pool.startswith("this GPU has no memory pool: nothing can be recorded")
+    assert driver == "the driver supports CUDA 12.2, and recording is reliable from 12.4 on: update it"
+    cpu = device_facts("cpu")
+    assert cpu.cuda is None and cpu.memory == cpu.taken == 0.0 and len(cpu.slow()) == (not cpu.compiled)
+
+
+def small_task(name: str) -> LoadedTask:
+    task = load_task(name)
+    few = {"envs_per_core": 4, "num_steps_per_env": 4, "hidden_dims": [16]}
+    task.update({"cpu": few, "terrain": {"mesh_type": "plane"}} if name != "go1_rough" else {"cpu": few}, where="test")
+    return task
+
+
+def test_doctor_says_what_is_there_and_what_mends(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(doctor, "draws", lambda name: "EGLError: no device" if name == "egl" else "")
+    monkeypatch.setattr(doctor, "gl_fault", lambda name: "")
+    monkeypatch.setattr(doctor, "has_display", lambda: False)
+    monkeypatch.setattr(doctor, "load_task", small_task)
+    monkeypatch.setattr(doctor, "SPEED_TASKS", ("go1_flat",))
+    monkeypatch.setattr(os, "getloadavg", lambda: (99.0, 0.0, 0.0))
+    found = doctor.importlib.util.find_spec
+    monkeypatch.setattr(doctor.importlib.util, "find_spec", lambda name: None if name == "onnxruntime" else found(name))
+    program("doctor", "--device", "cpu", "--seconds", "0.1", monkeypatch=monkeypatch)
+    said = capsys.readouterr().out
+    for line in (
+        "    egl            EGLError: no device\n",
+        "    osmesa         draws\n",
+        "    glfw           no screen\n",
+        "  ! onnxruntime    not installed (to run an export: legged-mw deploy)\n",
+        "  onnxruntime: pip install onnxruntime\n",
+        "load 99.0\n",
+        "  cores: others use this machine: what is measured now is slower than it could be\n",
+    ):
+        assert line in said
+    assert f"torch          {torch.__version__}\n" in said and "tasks, " in said
+    [speed] = [line for line in said.splitlines() if "steps/s" in line]
+    assert speed.startswith("    go1_flat ") and "iterations in " in speed and "worlds, ready after" in speed
+
+
+def test_doctor_fails_where_nothing_can_train(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    version = doctor._version
+    monkeypatch.setattr(doctor, "_version", lambda name: "" if name == "mujoco-warp" else version(name))
+    monkeypatch.setattr(doctor, "draws", lambda name: "")
+    with pytest.raises(SystemExit, match="1"):
+        program("doctor", monkeypatch=monkeypatch)
+    said = capsys.readouterr().out
+    assert "  mujoco-warp: pip install mujoco-warp\n" in said and "Speed" not in said
+
+
+def test_drawing_is_tried_in_another_process() -> None:
+    assert doctor.draws("no such thing") == "RuntimeError: invalid value for environment variable MUJOCO_GL: no such thing"
+
+
+def test_warm_steps_each_task(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    warmed: list[tuple[str, str]] = []
+    monkeypatch.setattr(warm, "warm", lambda *args: warmed.append(args))
+    program("warm", "go1_flat", "--device", "cpu", monkeypatch=monkeypatch)
+    assert warmed == [("go1_flat", "cpu")]
+    assert "on a CPU MuJoCo's own engine trains, and compiles nothing" in capsys.readouterr().out
+
+
+# ---- compare and sweep
+
+
+def write_run(folder: Path, seed: int = 1, gamma: float = 0.99, reward: float = 1.0) -> Path:
+    """A run of ten iterations, and its curves."""
+    folder.mkdir(parents=True)
+    (folder / "config.yaml").write_text(f"task: go1_flat\nalgorithm:\n  gamma: {gamma}\nseed: {seed}\n")
+    with SummaryWriter(folder) as writer:
+        for i in range(1, 11):
+            curves = {"Train/mean_reward": reward * i, "Train/total_steps": 1e6 * i, "Perf/total_fps": 5000.0, "Loss/value": float("nan")}
+            curves |= {"Exam/falls": 1.0} if i == 10 else {}
+            for name, value in curves.items():
+                writer.add_scalar(name, value, i, walltime=1000.0 + 2.0 * i + (500.0 if i > 5 else 0.0))  # resumed after a pause
+    return folder
+
+
+def test_compare_writes_one_page_that_needs_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    one, two = write_run(tmp_path / "logs/go1_flat/one"), write_run(tmp_path / "logs/go1_flat/two", gamma=0.97, reward=3.0)
+    (two / "eval").mkdir()
+    exam = {"falls": 2, "error": [0.01, 0.02, 0.03], "walks": True, "rules": {"x": 1}}
+    (two / "eval/report.json").write_text(json.dumps({"columns": [{"exam": exam}]}))
+    os.utime(next(two.glob("events*")), (2e9, 2e9))  # the last run of the task
+    program("compare", str(one), "go1_flat", monkeypatch=monkeypatch)
+    head, first, second, written = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert head == ["run", "iterations", "M", "steps", "minutes", "steps/s", "reward", "falls"]
+    assert first == ["one", "10", "10.0", "0.3", "5,000", "10.00", "1.000"] and second[0] == "two" and second[5] == "30.00"
+    assert written == ["written", "to", "compare.html"]
+    page = (tmp_path / "compare.html").read_text()
+    assert (
+        "<tr><th>algorithm.gamma</th><td>0.99</td><td>0.97</td></tr>" in page and "<th>error yaw rate</th><td>-</td><td>0.03</td>" in page
+    )
+    assert page.count('style="stroke:var(--run1)"') == 2 and page.count("<circle") == 2  # reward, speed; one exam each
+    assert "http" not in page and "<script" not in page and "mean reward" in page and "total steps" not in page
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        (["nothing"], "no run with curves at nothing or in logs/nothing; name it by its path, as TASK/RUN, or by its task"),
+        (["a"] * 9, "9 runs cannot be told apart in one picture: name at most 8"),
+    ],
+)
+def test_compare_refuses_in_a_line(
+    args: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="2"):
+        program("compare", *args, monkeypatch=monkeypatch)
+    assert said in capsys.readouterr().err
+
+
+def test_axes_have_round_numbers() -> None:
+    assert chart.ticks(0.0, 9.7, 5) == [0, 2, 4, 6, 8, 10] and chart.ticks(-0.3, 0.4, 4) == pytest.approx([-0.4, -0.2, 0, 0.2, 0.4])
+    assert chart.ticks(5.0, 5.0, 4)[0] < 5.0 < chart.ticks(5.0, 5.0, 4)[-1]
+    assert chart.chart("x", "y", [("red", [1.0], [float("nan")])]) == ""
+    assert [chart.short(value) for value in (0.25, 5000.0, 20000.0, 1.5e6)] == ["0.25", "5000", "20k", "1.5M"]
+    assert len(chart.thin([(float(i), 1.0) for i in range(1000)])) <= chart.POINTS
+
+
+def test_a_sweep_trains_every_combination_and_ends_with_a_table(tmp_path: Path) -> None:
+    cells = sweep.make_cells(["a.b=1,2", "c.d=[3, 4]"], ["1", "2"])
+    assert [cell.name for cell in cells] == ["b=1 seed=1", "b=1 seed=2", "b=2 seed=1", "b=2 seed=2"]
+    asked: list[list[str]] = []
+
+    def start(flags: list[str]) -> tuple[int, str, str]:
+        asked.append(flags)
+        if len(asked) == 4:
+            return 2, "", "train.py: wrong"
+        return 0, str(write_run(tmp_path / f"{len(asked)}", reward=len(asked))), ""
+
+    found = sweep.train_all(cells, ["--task", "go1_flat"], start)
+    assert asked[0] == [*["--task", "go1_flat", "--set", "a.b=1", "--set"], "c.d=[3, 4]", *["--set", "seed=1", "--run_name", "b=1_seed=1"]]
+    lines = [line.split() for line in sweep.table(found).splitlines()]
+    assert lines[0] == ["b", "seed", "iterations", "M", "steps", "minutes", "steps/s", "reward", "falls"]
+    assert [(line[0], line[1], line[6]) for line in lines[1:4]] == [("1", "1", "10.00"), ("1", "2", "20.00"), ("2", "1", "30.00")]
+    assert lines[4][:4] == ["1", "mean", "of", "2"] and "15.00 ± 7.07" in " ".join(lines[4])
+
+
+def test_values_stand_apart_by_commas() -> None:
+    assert sweep.values("1,2") == ["1", "2"] and sweep.values("[1,2],[3]") == ["[1,2]", "[3]"] and sweep.values("") == []
+    assert sweep.values("{a: [1,2]},'x,y'") == ["{a: [1,2]}", "'x,y'"]
+
+
+def test_a_sweep_refuses_what_is_of_one_training(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    for args, said in (
+        (["--resume"], "--resume is of one training: leave it out"),
+        (["--seeds", "a"], "--seeds a: write whole numbers apart by commas: --seeds 1,2,3"),
+    ):
+        with pytest.raises(SystemExit, match="2"):
+            program("sweep", "--task", "go1_flat", *args, monkeypatch=monkeypatch)
+        assert said in capsys.readouterr().err
+
+
+def test_a_training_of_a_sweep_says_where_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = "import sys\nprint('writing to logs/x')\nprint('Learning iteration 1/2: ...')\nprint('stopped: SIGINT; go on with')\n"
+    (tmp_path / "fake").write_text(fake + "print('bad\\nlast', file=sys.stderr)")
+    monkeypatch.setattr(sys, "executable", shutil.which("sh"))
+    real = subprocess.Popen
+    python = [os.path.realpath("/proc/self/exe"), str(tmp_path / "fake")]
+    monkeypatch.setattr(sweep.subprocess, "Popen", lambda command, **rest: real(python, **rest))
+    assert sweep.start([]) == (0, "logs/x", "stopped: SIGINT; go on with")
+
+
+# ---- completion
+
+
+@pytest.fixture(scope="module")
+def bash() -> str:
+    return completion.script("bash", programs.PROGRAMS)
+
+
+def completed(script: str, line: str, folder: Path) -> set[str]:
+    """What bash offers at the end of ``line``; words are apart by spaces."""
+    words = line.split(" ")
+    array = " ".join(f"'{word}'" for word in words)
+    code = f"{script}\nCOMP_WORDS=({array}); COMP_CWORD={len(words) - 1}\n_legged_mw\n" + 'printf "%s\\n" "${COMPREPLY[@]}"'
+    done = subprocess.run(["bash", "--norc", "-c", code], cwd=folder, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.split())
+
+
+def test_completion_knows_programs_flags_tasks_fields_and_runs(bash: str, tmp_path: Path) -> None:
+    (tmp_path / "logs/go1_flat/a_run").mkdir(parents=True)
+    (tmp_path / "mine.py").touch()
+    for line, offered in (
+        ("legged-mw d", {"deploy", "doctor"}),
+        ("legged-mw train --max", {"--max_iterations", "--max_time"}),
+        ("legged-mw train --task g1_t", {"g1_track"}),
+        ("legged-mw play --task m", {"mine.py"}),
+        ("legged-mw train --set rewards.scales.tracking_l", {"rewards.scales.tracking_lin_vel="}),
+        ("legged-mw play --viewer n", {"native", "none"}),
+        ("legged-mw play --load_run logs", {"logs/go1_flat/a_run"}),
+        ("legged-mw compare l", {"logs/go1_flat/a_run"}),
+        ("legged-mw deploy go1_r", {"go1_rough", "go1_rough_scan"}),
+        ("legged-mw train --set env.num_envs = 6", set()),
+    ):
+        assert completed(bash, line, tmp_path) == offered, line
+
+
+def test_zsh_reads_the_same_functions(bash: str) -> None:
+    zsh = completion.script("zsh", {"warm": programs.PROGRAMS["warm"]})
+    assert zsh.splitlines()[1] == "autoload -U +X bashcompinit && bashcompinit" and "complete -F _legged_mw legged-mw" in zsh
+
+
+# ---- a viewer beside a training
+
+
+def test_play_follows_the_newest_policy(made: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "logs/go1_flat/run"
+    folder.mkdir(parents=True)
+    for file in (*made.parent.glob("model_*.pt"), made.parent / "config.yaml"):
+        shutil.copy2(file, folder)
+    newest = max(folder.glob("model_*.pt"))
+    content = torch.load(newest, weights_only=True)
+    save_whole({"actor_state_dict": content["actor_state_dict"], "iter": 7}, folder / PLAYING)
+    said: list[str] = []
+    with pytest.MonkeyPatch.context() as patch:
+        step = Newest.__call__
+
+        def note(self: Newest) -> None:
+            step(self)
+            said.append(self.news)
+
+        patch.setattr(Newest, "__call__", note)
+        flags = ["--task", "go1_flat", "--device", "cpu", "--follow", "--viewer", "none", "--time", "0.1s"]
+        result = run("play", tmp_path, *flags)
+    assert result.code == 0 and set(said) == {"iteration 7"}, result.err
+    refused = run("play", tmp_path, "--task", "go1_flat", "--follow", "--eval")
+    assert refused.code == 2 and "--follow watches the newest policy: leave --eval, --export and --checkpoint out" in refused.err
+
+
+def test_a_viewer_ends_with_its_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "model_3.pt").touch()
+    newest = Newest(tmp_path, lambda path: 3, tmp_path / "model_3.pt")
+    newest()
+    assert newest.news == "iteration 3"
+    monkeypatch.setattr(os, "getppid", lambda: 1)
+    newest._next = 0.0
+    with pytest.raises(KeyboardInterrupt):
+        newest()
+
+
+def test_training_with_play_starts_a_viewer_and_feeds_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[list[str]] = []
+    ended: list[Any] = []
+
+    def popen(command: list[str], **_: Any) -> Any:
+        started.append(command)
+        return SimpleNamespace(poll=lambda: None, terminate=lambda: ended.append(True))
+
+    monkeypatch.setattr(alongside.subprocess, "Popen", popen)
+    monkeypatch.setattr(alongside, "_SECONDS", 0.0)
+    monkeypatch.setattr(alongside, "has_display", lambda: False)
+    kept: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(alongside.atexit, "register", lambda *args: kept.append(args))
+    result = run("train", tmp_path, *SMALL, "--max_iterations", "2", "--play")
+    assert result.code == 0, result.err
+    [folder] = (tmp_path / "logs/go1_flat").iterdir()
+    [command] = started
+    assert command[command.index("play") :] == [
+        *("play", "--task", "go1_flat", "--load_run", str(folder), "--follow", "--device", "cpu", "--viewer", "web")
+    ]
+    assert torch.load(folder / PLAYING, weights_only=True)["iter"] == 2 and (folder / "model_0.pt").exists()
+    [(end, viewer, file)] = kept
+    end(viewer, file)
+    assert ended and not file.exists()
+
+
+# ---- what a start imports
+
+
+NOT_TO_TRAIN = [
+    *("matplotlib", "onnxscript", "onnxruntime", "warp", "mujoco_warp", "PIL", "mujoco.studio", "mujoco.viewer", "av", "cyclonedds"),
+    *("wandb", "scipy", "pandas"),
+    *("legged_mw.view", "legged_mw.deploy", "legged_mw.robot", "legged_mw.drawing", "legged_mw.rl.export", "legged_mw.tools"),
+]
+WHAT_IS_THERE = """
+import os, sys
+from legged_mw import programs
+from legged_mw.rl.runner import Runner
+def learn(self, *_):
+    self.env.step(self.env.actions)
+    print("there:", *[name for name in os.environ["NAMES"].split() if name in sys.modules])
+    raise SystemExit
+Runner.learn = learn
+programs.train()
+"""
+
+
+def test_a_training_on_a_cpu_imports_what_it_needs(tmp_path: Path) -> None:
+    """What costs time to import, and only some programs need."""
+    command = [sys.executable, "-c", WHAT_IS_THERE, *["--task", "go1_flat", "--device", "cpu", "--num_envs", "8", "--eager"]]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "NAMES": " ".join([*NOT_TO_TRAIN, "torch"])}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines()[-1] == "there: torch"
+
+
+def test_errors_of_tools_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit), one_line_errors("legged-mw completion"):
+        completion.parser_of("nothing", lambda: None)
+    assert capsys.readouterr().err == "legged-mw completion: legged-mw nothing reads no flags\n"
