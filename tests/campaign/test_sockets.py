@@ -135,7 +135,7 @@ def test_which_pages_have_a_token_and_what_is_opened() -> None:
     assert not gate.greeting("/?token=abc") and not gate.greeting(f"/ui?token={gate.token}")
 
 
-SPEC = mujoco.MjSpec.from_string(
+SPEC = mujoco.MjSpec.from_string(  # pyright: ignore[reportAttributeAccessIssue]
     "<mujoco><worldbody><geom type='plane' size='1 1 .1'/><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
 )
 
