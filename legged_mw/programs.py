@@ -5,6 +5,7 @@ Each imports what it needs when it starts: deploy also runs where torch is not i
 
 from __future__ import annotations
 
+import argparse
 import difflib
 import sys
 from collections.abc import Callable
@@ -14,21 +15,29 @@ from importlib.metadata import version
 from pathlib import Path
 
 from legged_mw.utils.cli import fail, one_line_errors
+from legged_mw.utils.console import patient_console
 from legged_mw.utils.task import LoadedTask, list_tasks, load_task
 
 
 @one_line_errors()
 def train() -> None:
     """Train a task. On 8 GPUs: torchrun --nproc_per_node=8 train.py --task go1_flat"""
-    from legged_mw.check.describe import describe
-    from legged_mw.check.guard import check_recordable
-    from legged_mw.eval.exams import find_exam, make_exam
     from legged_mw.rl import training
 
     args = training.parse(train.__doc__)
     if args.list:
         print(list_tasks())
         return
+    with patient_console():
+        _train(args)
+
+
+def _train(args: argparse.Namespace) -> None:
+    from legged_mw.check.describe import describe
+    from legged_mw.check.guard import check_recordable
+    from legged_mw.eval.exams import find_exam, make_exam
+    from legged_mw.rl import training
+
     find_exam(task := load_task(args.task))
     start, device = training.configure(task, args)
     env = training.build(task, start, device, args.eager, check_recordable)
@@ -45,7 +54,8 @@ def train() -> None:
         from legged_mw.tools.alongside import watch
 
         begun = partial(watch, task)
-    training.train(task, env, start, examine, export, args.deadline, args.verbose, begun)
+    if not training.train(task, env, start, examine, export, args.deadline, args.verbose, begun):
+        raise SystemExit(training.STOPPED)
 
 
 @one_line_errors()

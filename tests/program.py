@@ -36,7 +36,7 @@ class Result(NamedTuple):
 def run(program: str, root: Path, *args: str) -> Result:
     """As ``python <program>.py <args>`` would, but below ``root``; a traceback is raised, as no user should see one."""
     out, err, code = io.StringIO(), io.StringIO(), 0
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         patch.setattr(sys, "argv", [f"{program}.py", *args])
         patch.setattr(runs, "logs_folder", lambda: root / "logs")

@@ -297,7 +297,11 @@ MISTAKES: dict[str, tuple[str, str, str]] = {
         "(self.base_height - 100.0).sqrt()",
         "Mine._reward_pose: returned a value that is not finite; look for a division by 0 or a root of a negative number",
     ),
-    "row of NaN": (TABLE, "Row('past', self.past.fill_(torch.nan)[:, None])", "Mine.observation_rows: row 'past' of 'state' is not finite"),
+    "row of NaN": (
+        TABLE,
+        "Row('past', self.past.fill_(torch.nan)[:, None])",
+        "Mine.observation_rows: row 'past' of 'state' is not finite, or beyond 1e+06",
+    ),
 }
 
 

@@ -12,7 +12,7 @@ from program import SMALL, refused, run, trained
 
 from legged_mw.rl.classes import ALLOWED, check_classes
 from legged_mw.rl.policies import load_policy
-from legged_mw.rl.runner import rsl_rl_config
+from legged_mw.rl.settings import rsl_rl_config
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.task import load_task
 

@@ -20,7 +20,7 @@ from legged_mw.check.recordable import recordable
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
-from legged_mw.rl.runner import rsl_rl_config
+from legged_mw.rl.settings import rsl_rl_config
 from legged_mw.rl.symmetry import mirror
 from legged_mw.sim.mirror import find_partners
 from legged_mw.sim.model import Ground, ModelError, RobotModel, Solver, build_model

@@ -164,8 +164,14 @@ def test_the_end_of_a_warm_up_is_not_lost_when_it_is_resumed(tuned: Path, env: L
     runner.load(str(tuned / "model_1.pt"))
     assert runner.alg.critic_only and runner.alg.learning_rate == pytest.approx(1e-3)
     rates: list[float] = []
-    runner._rollout = lambda obs: rates.append(runner.alg.learning_rate) or setattr(runner, "stop", "seen") or obs  # type: ignore[func-returns-value]
-    runner.learn(1)
+
+    def look(obs: object) -> None:
+        rates.append(runner.alg.learning_rate)
+        raise InterruptedError
+
+    runner._rollout = look  # type: ignore[method-assign]
+    with pytest.raises(InterruptedError):
+        runner.learn(1)
     assert rates == [pytest.approx(1e-5)] and not runner.alg.critic_only
 
 

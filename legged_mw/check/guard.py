@@ -24,6 +24,7 @@ from legged_mw.check.recordable import Guard, recordable
 from legged_mw.envs.own_code import check_term, place_of
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.envs.suspects import BOUND
 from legged_mw.utils.config import Config
 from legged_mw.utils.errors import NotRecordable, StepError, UserError, in_short, is_library, line_of, line_to_blame
 from legged_mw.utils.task import LoadedTask
@@ -146,10 +147,10 @@ def _check_steps(env: RobotTask, guard: Guard) -> None:
     for _ in range(_STEPS):
         _check_kept(env, dict(_held(env)), step)
         for group, rows in env.observations.groups.items():
-            bad = ~env.obs_buf[group].isfinite() & ~env.broken[:, None]
             for row in rows:
-                if not row.group and bool(bad[:, env.observations.span(group, row.name)].any()):
-                    raise StepError(f"row '{row.name}' of '{group}' is not finite", place_of(env.observation_rows))
+                bad = ~(row.value.float().abs() <= BOUND) & ~env.broken[:, None]  # what the step puts 0 for
+                if not row.group and bool(bad.any()):
+                    raise StepError(f"row '{row.name}' of '{group}' is not finite, or beyond {BOUND:g}", place_of(env.observation_rows))
 
 
 def _check_kept(env: RobotTask, before: dict[Path, Any], step: Callable[[], None], alone: bool = False) -> None:

@@ -22,7 +22,7 @@ from legged_mw.sim.mirror import Partners, find_partners
 from legged_mw.sim.terrain import PLATFORM, Terrain
 from legged_mw.utils.commands import VELOCITY, Command, command_table
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.math import assign, maybe_any, wrap_to_pi, yaw_of
+from legged_mw.utils.math import assign, maybe_any, spread, wrap_to_pi, yaw_of
 
 
 class LeggedRobot(LeggedRewards, RobotTask):
@@ -303,7 +303,7 @@ class LeggedRobot(LeggedRewards, RobotTask):
             self._set_command_ranges()
         if "terrain_levels" in state and self.tiles:
             self._episode.zero_()  # what was under way counts for nothing
-            levels, last = self._spread(state["terrain_levels"]), self.tiles.num_levels - 1
+            levels, last = spread(state["terrain_levels"], self.num_envs), self.tiles.num_levels - 1
             if beyond := int((levels > last).sum()):
                 print(f"terrain: {beyond} worlds go on on level {last}, the last one here; the checkpoint has them higher", flush=True)
             self.tiles.put(levels.clamp(max=last))

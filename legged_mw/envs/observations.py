@@ -10,6 +10,7 @@ from torch import Tensor
 
 from legged_mw.envs.delay import Delay
 from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.envs.suspects import Suspects
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import require_memory
@@ -67,7 +68,7 @@ class Observations:
             rows = [row for row in rows if row.name not in cfg.leave_out.get(group, [])]
             frames = {row.name: cfg.history.get(f"{group}.{row.name}", cfg.history.get(group, 1)) for row in rows}
             self.groups[group] = [row._replace(history=frames[row.name]) for row in rows]
-            part = _Group(self.groups[group], noise_level, num_envs, device)
+            part = _Group(group, self.groups[group], noise_level, num_envs, device)
             if any(row.measured for row in rows):
                 part.delay = make_delay(part.frame.shape[1])
             self._parts[group], self.buffers[group] = part, part.buffer
@@ -97,6 +98,10 @@ class Observations:
                 part.delay.restart(mask)
             if part.histories:
                 part.fresh.logical_or_(mask)
+
+    def suspects(self) -> list[Suspects]:
+        """What counts values of rows that are not finite, a group each."""
+        return [part.suspects for part in self._parts.values()]
 
     def remember(self) -> list[tuple[Tensor, Tensor]]:
         """Everything that ``compute`` changes, and copies of it."""
@@ -132,7 +137,7 @@ class Observations:
 class _Group:
     """One group: how its rows become a buffer."""
 
-    def __init__(self, rows: list[Row], noise_level: float, num_envs: int, device: str) -> None:
+    def __init__(self, name: str, rows: list[Row], noise_level: float, num_envs: int, device: str) -> None:
         noise = [row.noise * noise_level for row in rows for _ in range(row.value.shape[1])]
         scales = [scale for row in rows for scale in row.column_scales()]
         self._values = [row.value for row in rows]
@@ -140,6 +145,7 @@ class _Group:
         self._scales = torch.tensor(scales, device=device) if any(scale != 1.0 for scale in scales) else None
         self._measured = torch.tensor([row.measured for row in rows for _ in range(row.value.shape[1])], device=device)
         self.delay: Delay | None = None
+        self.suspects = Suspects([f"observation row '{row.name}' of '{name}'" for row in rows for _ in range(row.value.shape[1])], device)
         self.fresh = torch.ones(num_envs, dtype=torch.bool, device=device)  # no frame of this episode is there yet
         self.frame = torch.zeros(num_envs, len(noise), device=device)  # the newest frame of each row
         self.buffer = self.frame
@@ -154,6 +160,7 @@ class _Group:
 
     def compute(self) -> None:
         torch.cat(self._values, dim=1, out=self.frame)
+        self.suspects.clear(self.frame)
         if self._noise is not None:
             self.frame.addcmul_(torch.empty_like(self.frame).uniform_(-1.0, 1.0), self._noise)
         if self._scales is not None:

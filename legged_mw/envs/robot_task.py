@@ -31,6 +31,7 @@ from legged_mw.envs.perturbation import Perturbation
 from legged_mw.envs.robot_rewards import RobotRewards
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import Statistics
+from legged_mw.envs.suspects import Suspects
 from legged_mw.envs.wording import in_config_words
 from legged_mw.sim.engines import make_simulation, pick_engine
 from legged_mw.sim.mirror import Partners, find_partners
@@ -39,7 +40,7 @@ from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
-from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse
+from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse, spread
 
 
 class RobotTask(TorqueLaw, RobotRewards, BaseTask):
@@ -308,6 +309,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         if self._reward_terms:
             terms = torch.stack([term() for term in self._reward_terms], dim=1).mul_(self.reward_scales)
             terms.masked_fill_(self.broken[:, None], 0.0)
+            self.suspects[0].clear(terms)
             total = terms[:, : self._num_clipped].sum(dim=1)
             if rewards.only_positive_rewards:
                 total.clamp_(0.0, rewards.max_reward)
@@ -331,6 +333,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
                 raise ConfigError(f"rewards.scales.{name} = {scales[name]:g}: {unknown('reward term', name, terms, where)}")
             check_term(terms[name], self.num_envs)
         self._reward_terms = [terms[name] for name in self.reward_names]
+        self.suspects = [Suspects([f"reward term '{n}'" for n in self.reward_names], self.device), *self.observations.suspects()]
         self.reward_scales = torch.tensor([scales[name] for name in self.reward_names], device=self.device) * self.dt
         means = [*(f"rew_{name}" for name in self.reward_names), "reward", "episode_length"]
         self.statistics = Statistics(means, ["episodes", "fell", "broken"], self.device)
@@ -373,12 +376,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
     def load_training_state(self, state: dict[str, Tensor]) -> None:
         """Go on from ``training_state``, of several processes from the first one's. Worlds take what the nearest ones had."""
         if "kick_level" in state and self.cfg.perturbation.curriculum:
-            self.perturbation.kick_level.copy_(self._spread(state["kick_level"]))
-
-    def _spread(self, values: Tensor) -> Tensor:
-        """Values (M,) of M worlds for N worlds."""
-        values = values.to(self.device)
-        return values[torch.arange(self.num_envs, device=self.device) * len(values) // self.num_envs]
+            self.perturbation.kick_level.copy_(spread(state["kick_level"], self.num_envs))
 
     # ---- robot and buffers: born here, never rebound --------------------------------------------------------------------------
 

@@ -221,6 +221,7 @@ class RobotTaskCfgPPO(Config):
         num_steps_per_env: Count = 24  # control steps a world between two updates [P]
         max_iterations: Count = 300  # [ours: a robot of one's own shows something by then]
         save_interval: Count = 50  # [iterations] between checkpoints
+        keep_checkpoints: Whole = 0  # newest ones that stay; 0: all [ours]
         exam_interval: Whole = 200  # [iterations] between small exams, and one at the end; 0, or over max_iterations: none [ours]
         experiment_name: str = ""  # folder below logs/; empty: the task's name
         run_name: FolderPart = ""  # appended to the run folder's time stamp

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from legged_mw.sim.simulation import Simulation
 from legged_mw.utils.errors import UserError
 
 FIELDS = {
@@ -34,6 +35,19 @@ def config_words(text: str) -> str:
     for parameter, field in FIELDS.items():
         text = text.replace(f"`{parameter}`", field)
     return text
+
+
+def overflow_note(sim: Simulation, what: str) -> str:
+    """A line for who looks at ``what`` if contacts or constraints of ``sim`` did not fit, ''. Reads the device."""
+    report = config_words(sim.overflow_report())
+    return f"WARNING: {what} is not to be trusted: {report}" if report else ""
+
+
+def say_overflow(sim: Simulation, what: str) -> bool:
+    """Print that line; returns whether there was one."""
+    if note := overflow_note(sim, what):
+        print(note, flush=True)
+    return bool(note)
 
 
 @contextmanager

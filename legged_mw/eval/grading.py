@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 from legged_mw.envs.domain_rand import active
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.wording import overflow_note
 from legged_mw.eval.exams import Exam, require_exam
 from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
@@ -102,6 +103,7 @@ def make_column(graded: Graded, policy: Policy, env: RobotTask, rough: RobotTask
         print(f"{exam.rough.table(figures['crossing'])}\n")
     overrides = {path: now for path, (_, now) in graded.task.changes_since(graded.trained).items()}
     about = {"policy": "/".join(source.checkpoint.parts[-3:]), "engine": env.sim.engine, "device": env.device, "overrides": overrides}
+    about |= {"warning": note} if (note := " ".join(overflow_note(each.sim, "this exam") for each in (env, rough) if each).strip()) else {}
     return Column(name, about, result, figures)
 
 

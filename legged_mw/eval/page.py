@@ -52,7 +52,7 @@ class Column(NamedTuple):
     """One policy in one physics."""
 
     name: str
-    about: dict[str, Any]  # policy, engine, device, overrides
+    about: dict[str, Any]  # policy, engine, device, overrides; warning, if the physics had too little room
     exam: dict[str, Any]  # what ``ExamRules.grade`` gives
     figures: dict[str, Any] | None = None  # None: only the exam is known
 
@@ -239,5 +239,6 @@ def about(columns: Sequence[Column]) -> str:
         listed = "".join(f"<li><code>{escape(path)}</code> {escape(str(value))}</li>" for path, value in sorted(changed.items()))
         where = ", ".join(str(about[key]) for key in ("policy", "engine", "device") if about.get(key))
         fields = f"<details><summary>Config fields that differ from training</summary><ul>{listed}</ul></details>" if listed else ""
-        parts.append(f"<p><b>{escape(column.name)}</b> {escape(where)}</p>{fields}")
+        warning = f"<p><b>{escape(str(about['warning']))}</b></p>" if about.get("warning") else ""
+        parts.append(f"<p><b>{escape(column.name)}</b> {escape(where)}</p>{warning}{fields}")
     return "".join(parts)

@@ -15,6 +15,7 @@ from legged_mw.envs.domain_rand import KINDS
 from legged_mw.envs.motion_tracking import MotionTracking
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.envs.wording import say_overflow
 from legged_mw.eval import exam, skill_page
 from legged_mw.eval.page import Column
 from legged_mw.eval.rollout import Policy
@@ -125,6 +126,7 @@ def perform(env: RobotTask, policy: Policy, skill: Skill, ground: Ground = Groun
         obs, _, dones, _ = env.step(actions)
         forget(policy, dones)
         ended_at = torch.where(dones & ended_at.isinf(), torch.full_like(ended_at, step), ended_at)
+    say_overflow(env.sim, "this exam")
     arrays = {name: values.cpu().numpy().astype(float) for name, values in kept.items()}
     return Recording(**arrays, ended_at=ended_at.cpu().numpy())
 

@@ -17,6 +17,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.wording import say_overflow
 from legged_mw.rl.estimator import believed_velocity
 from legged_mw.rl.recurrent import forget, with_own_state
 
@@ -75,8 +76,7 @@ def roll_out(
     commands = getattr(env, "commands", asked[0])  # a task without commands has no buffer for them
     commands.copy_(asked[0])
     obs, actor = env.first_observations(), _Actor(policy, env.num_envs, alone)
-    fell_at = torch.full((env.num_envs,), math.inf, device=env.device)
-    kept: dict[str, Tensor] = {}
+    fell_at, kept = torch.full((env.num_envs,), math.inf, device=env.device), dict[str, Tensor]()
     for step in range(steps):
         sampled = {name: signal(env) for name, signal in signals.items()} | actor.believed(obs)
         for name, value in sampled.items():
@@ -92,6 +92,7 @@ def roll_out(
         obs, _, dones, _ = env.step(actions)
         actor.forget(dones)
         fell_at = torch.where(dones & (fell_at == math.inf), torch.full_like(fell_at, step), fell_at)
+    say_overflow(env.sim, "this exam")
     return Record(
         dt=env.dt,
         mass=env.total_mass,

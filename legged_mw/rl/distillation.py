@@ -21,6 +21,7 @@ from legged_mw.rl.estimator import EstimatingModel
 from legged_mw.rl.layers import run_mlp, sample, update_normalizer
 from legged_mw.rl.recorded import Recorded, why_stock
 from legged_mw.rl.recurrent import HiddenStates, step
+from legged_mw.rl.undo import Undo
 from legged_mw.sim.graph import StepGraph
 
 
@@ -44,6 +45,7 @@ class GraphedDistillation(Recorded, Distillation):
         self._obs = TensorDict({name: value[0].clone() for name, value in seen.items()}, [storage.num_envs], device=self.device)
         storage.observations = storage.observations.select(*student.obs_groups)  # what the teacher sees is not learned from
         self._loss = torch.zeros((), device=self.device)
+        self.undo = Undo(self, (self.student,))
         self._begin()
 
     def _why_stock(self) -> str | None:
@@ -96,6 +98,7 @@ class GraphedDistillation(Recorded, Distillation):
         return {"behavior": self._loss.clone()}
 
     def _update(self) -> None:
+        self.undo.remember()
         st, memory = self.storage, self._memories.get(self.student)
         with torch.no_grad():
             seen = torch.cat([st.observations[group] for group in self.student.obs_groups], dim=-1).flatten(0, 1)
@@ -114,6 +117,7 @@ class GraphedDistillation(Recorded, Distillation):
         if isinstance(self.student.obs_normalizer, EmpiricalNormalization):
             with torch.no_grad():
                 update_normalizer(self.student.obs_normalizer, seen, self.gpu_world_size)
+        self.undo.settle(self._loss)
 
     def _unroll(self, inputs: Tensor, ended: Tensor, state: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """What the student's MLP reads (S * N, size) of S steps (S, N, size), and its hidden state after them, detached.

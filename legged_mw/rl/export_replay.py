@@ -18,6 +18,7 @@ from legged_mw.deploy.simulated import Fleet
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.motion_tracking import MotionTracking
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.wording import say_overflow
 from legged_mw.rl.network import MEMORY_OUTPUT, run_onnx
 from legged_mw.rl.policies import act
 from legged_mw.rl.recurrent import forget, memory_of
@@ -69,6 +70,7 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
         forget(policy, dones)
         arrays = (tensor.numpy().copy() for tensor in (actions, taken, env.actuators.sent(), dones.bool()))
         steps.append(Step(observation, measured, commands, *arrays, clock=clock, frame=frame, memory=memory))
+    say_overflow(env.sim, "the comparison with deploy")
     return steps
 
 

@@ -29,6 +29,7 @@ from legged_mw.rl.estimator import EstimatingModel, RegressingModel, trained_par
 from legged_mw.rl.layers import run_mlp, sample, update_normalizer
 from legged_mw.rl.recorded import Recorded, why_stock
 from legged_mw.rl.recurrent import HiddenStates, SequenceInput, check_recurrent, unroll
+from legged_mw.rl.undo import Undo
 from legged_mw.sim.graph import StepGraph
 
 _MIN_RATE, _MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
@@ -77,6 +78,7 @@ class GraphedPPO(Recorded, PPO):
         groups = [{"params": part, "lr": rate} for part, rate in zip(learners, self._rates, strict=True)]
         self.optimizer = type(self.optimizer)(groups)
         make_recordable(self.optimizer, self._rates, str(self.device))
+        self.undo = Undo(self, (self.actor, self.critic))
         self._begin()
 
     def _why_stock(self) -> str | None:
@@ -194,6 +196,7 @@ class GraphedPPO(Recorded, PPO):
         return dict(zip(self._loss_names, self._losses.clone().unbind(), strict=True))
 
     def _update(self) -> None:
+        self.undo.remember()
         self._losses.zero_()
         batches = [self._prepare(indices) for indices in self._order.split(self._share)]
         for _ in range(self.num_learning_epochs):
@@ -202,6 +205,7 @@ class GraphedPPO(Recorded, PPO):
         self._losses /= self.num_learning_epochs * self.num_mini_batches
         with torch.no_grad():
             self._update_normalizers()
+        self.undo.settle(self._losses)
 
     def _prepare(self, indices: Tensor) -> Minibatch:
         """All of a minibatch that the epochs share: its samples and their mirror images, normalised inputs, advantages."""

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -39,18 +41,19 @@ class Clock:
 class Message:
     """A vector that travels from the device to the host while both go on."""
 
-    def __init__(self, values: Tensor) -> None:
-        self._host, self._event = values, None
+    def __init__(self, values: Tensor, sizes: Sequence[int]) -> None:
+        """``sizes`` of the parts of ``values``."""
+        self._host, self._event, self._sizes = values, None, list(sizes)
         if values.is_cuda:
             self._host = torch.empty(values.shape, dtype=values.dtype, pin_memory=True).copy_(values, non_blocking=True)
             self._event = torch.cuda.Event()
             self._event.record(torch.cuda.current_stream(values.device))
 
-    def read(self) -> list[float]:
-        """The numbers; waits until the device has computed them."""
+    def read(self) -> list[list[float]]:
+        """The numbers of each part; waits until the device has computed them."""
         if self._event is not None:
             self._event.synchronize()
-        return self._host.tolist()
+        return [part.tolist() for part in self._host.split(self._sizes)]
 
 
 class Report(NamedTuple):
@@ -60,13 +63,25 @@ class Report(NamedTuple):
     total_steps: int  # since the beginning of training, over all ranks
     steps: int  # of this iteration, over all ranks
     losses: list[str]
-    message: Message  # statistics of the episodes, stop flag, losses, learning rate, std of the actions
+    message: Message  # statistics of the episodes, suspects, stop; losses, learning rate and std of the actions, undone, wrong columns
     marks: tuple[Mark, Mark, Mark]  # begin, end of the rollout, end of the update
 
     def seconds(self) -> tuple[float, float]:
         """The rollout's and the update's."""
         begin, collected, end = self.marks
         return Clock.seconds(begin, collected), Clock.seconds(collected, end)
+
+
+def quiet_writers() -> None:
+    """TensorBoard's own thread hands its error to who writes the next curve: it need not print a traceback as well."""
+    hook = threading.excepthook
+
+    def show(died: threading.ExceptHookArgs) -> None:
+        if type(died.thread).__name__ != "_AsyncWriterThread":
+            hook(died)
+
+    if hook.__module__ != __name__:
+        threading.excepthook = show
 
 
 def console_block(title: str, rows: dict[str, str]) -> str:
@@ -90,4 +105,20 @@ def console_rows(numbers: dict[str, float], losses: dict[str, float], speed: flo
         **{name: mean(name, 4) for name in numbers if name.startswith("rew_")},
         **{name.replace("_", " ").replace("/", ", ").capitalize(): mean(name, 2) for name in numbers if name.startswith(CURRICULA)},
         "Episodes ended": f"{numbers['episodes']:.0f} ({numbers['fell']:.0f} falls, {numbers['broken']:.0f} not finite)",
+    }
+
+
+def curves(
+    numbers: dict[str, float], losses: dict[str, float], speed: float, collect: float, learn: float, total_steps: int
+) -> dict[str, float]:
+    """Curve -> value, under rsl-rl's names where it has them."""
+    return {
+        **{f"Loss/{name}": value for name, value in losses.items()},
+        **{"Loss/learning_rate": numbers["learning_rate"], "Policy/mean_std": numbers["action_std"]},
+        **{"Perf/total_fps": speed, "Perf/collection_time": collect, "Perf/learning_time": learn},
+        **{"Train/mean_reward": numbers["reward"], "Train/mean_episode_length": numbers["episode_length"]},
+        **{f"Episode/{name}": value for name, value in numbers.items() if name.startswith("rew_")},
+        **{"Episode/fell": numbers["fell"], "Episode/broken": numbers["broken"], "Train/total_steps": total_steps},
+        "Sim/overflowed_worlds": numbers["overflowed"],  # so far
+        **{f"Curriculum/{name}": value for name, value in numbers.items() if name.startswith(CURRICULA)},
     }

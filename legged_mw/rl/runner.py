@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import copy
-import importlib.util
 import math
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,16 +22,20 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.envs.wording import config_words
 from legged_mw.rl.checkpoint import check_resume
-from legged_mw.rl.classes import actor_settings, check_classes, network_section
 from legged_mw.rl.estimator import RegressingModel
+from legged_mw.rl.health import Health
+from legged_mw.rl.keeping import Keeper, reason_of
 from legged_mw.rl.policies import acting
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.progress import Console
 from legged_mw.rl.ranks import this_rank
-from legged_mw.rl.report import CURRICULA, Clock, Mark, Message, Report, console_rows
+from legged_mw.rl.report import Clock, Mark, Message, Report, console_rows, curves, quiet_writers
+from legged_mw.rl.resume import random_state, set_random_state, take_worlds, worlds_content
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
+from legged_mw.rl.settings import rsl_rl_config
 from legged_mw.rl.threads import UpdateThreads
 from legged_mw.rl.transfer import TEACHER, adapt
+from legged_mw.rl.undo import Undo
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import usable_cores
 
@@ -41,9 +44,9 @@ class Runner(OnPolicyRunner):
     """Trains with rsl-rl's algorithm, storage and writers.
 
     ``current_learning_iteration`` counts finished iterations: a checkpoint ``model_100.pt`` has done 100 of them, and a
-    resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after a checkpoint; ``diverged`` says
-    why the runner set it by itself. Set ``examine`` to what grades a policy: it is called every ``exam_interval`` iterations and
-    after the last, and its figures are logged.
+    resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after the iteration and a checkpoint;
+    ``diverged`` says why the runner set it by itself, ``begins_anew`` why ``load`` did not find the worlds of a checkpoint. Set
+    ``examine`` to what grades a policy: it is called every ``exam_interval`` iterations and after the last, and its figures are logged.
     """
 
     env: RobotTask
@@ -54,12 +57,18 @@ class Runner(OnPolicyRunner):
         self.total_steps = 0
         self.stop: str | None = None
         self.diverged = ""  # why training had to end, in words
+        self.begins_anew = "it is a new run"
+        self.keeper: Keeper | None = None  # writes checkpoints; made in `learn` where there is a folder
         self._watch = Watch()
+        recorded = getattr(self.alg, "graphed", False)
+        self._undo: Undo = self.alg.undo if recorded else Undo(self.alg, self._networks().values())  # type: ignore[union-attr]
+        self._settles = not recorded  # the recorded update undoes itself
+        self._health = Health([name for each in env.suspects for name in each.names], self._stored_names())
         self.examine: Callable[[Any], dict[str, float]] | None = None
         self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
         self.update_threads = UpdateThreads(self.cfg["cpu"]["update_threads"], usable_cores()) if device == "cpu" else nullcontext()
         self.console = Console()
-        self._warned_overflow = False
+        self._warned_overflow = self._curves_lost = False
         self._last_means: dict[str, float] = {}
 
     def _configure_multi_gpu(self) -> None:
@@ -86,7 +95,9 @@ class Runner(OnPolicyRunner):
         self.alg.train_mode()
         if self.is_distributed:
             self.alg.broadcast_parameters()
-        self.logger.init_logging_writer()
+        if self.logger.log_dir and not self.keeper:
+            self.keeper = Keeper(Path(self.logger.log_dir), self.cfg["keep_checkpoints"], this_rank())
+        self._open_curves()
         self.env.take_statistics()
         clock, waiting = Clock(self.device), None
         self._last = self.current_learning_iteration + num_learning_iterations
@@ -94,15 +105,13 @@ class Runner(OnPolicyRunner):
         start = clock.mark()
         while self.current_learning_iteration < self._last and not self._must_stop():
             self._anneal()  # first, so that a resumed rollout is what it would have been
+            if self._settles:
+                self._undo.remember()
             obs = self._rollout(obs)
-            if self._must_stop():
-                self.alg.storage.clear()  # an unfinished rollout is dropped
-                break
             with torch.inference_mode():
                 self.alg.compute_returns(obs)
             collected = clock.mark()
-            with self.update_threads:
-                losses = self.alg.update()
+            losses = self._update()
             report = self._report(losses, (start, collected, start := clock.mark()))
             if waiting:
                 self._log(waiting)
@@ -145,9 +154,22 @@ class Runner(OnPolicyRunner):
             for _ in range(self.cfg["num_steps_per_env"]):
                 obs, rewards, dones, extras = self.env.step(self.alg.act(obs))
                 self.alg.process_env_step(obs, rewards, dones, extras)
-                if self.stop is not None and not self.is_distributed:
-                    break
         return obs
+
+    def _update(self) -> dict[str, Any]:
+        with self.update_threads:
+            if not self._settles:
+                return self.alg.update()
+            try:
+                losses = self.alg.update()
+            except (RuntimeError, ValueError):  # rsl-rl's own draws from distributions that are not finite
+                self._undo.settle()
+                if not self._undo.undone:
+                    raise
+                self.alg.storage.clear()
+                return {}
+            self._undo.settle()
+            return losses
 
     def _exam_is_due(self) -> bool:
         """Every ``exam_interval`` iterations; the last iteration's exam waits until the last checkpoint is written."""
@@ -176,11 +198,8 @@ class Runner(OnPolicyRunner):
             policy.train(training)
             policy.reset(hidden_state=memory)  # of the worlds in training
         self.last_exam = self.current_learning_iteration, figures
-        if self.logger.writer is not None:
-            curves = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
-            for name, value in curves.items():
-                if not math.isnan(value):
-                    self.logger.writer.add_scalar(name, value, self.current_learning_iteration)
+        found = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
+        self._draw_curves(found, self.current_learning_iteration)
         self.console.exam(self.current_learning_iteration, self._last, figures)
 
     # ---- what the user sees ---------------------------------------------------------------------------------------
@@ -191,13 +210,14 @@ class Runner(OnPolicyRunner):
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         self.total_steps += steps
         stop = torch.full((1,), float(self.stop is not None), device=self.device)
-        summed = torch.cat([self.env.take_statistics(), stop])
+        parts = [self.env.take_statistics(), torch.cat([each.take() for each in self.env.suspects]), stop]
+        summed, sizes = torch.cat(parts), [len(part) for part in parts]
         if self.is_distributed:
             torch.distributed.all_reduce(summed)
-        own = torch.stack([torch.as_tensor(value, dtype=torch.float, device=self.device) for value in losses.values()])
+        own = [torch.as_tensor(value, dtype=torch.float, device=self.device) for value in losses.values()]
         rate = self.alg.rate if isinstance(self.alg, GraphedPPO) else torch.full((), self.alg.learning_rate, device=self.device)
-        own = torch.cat([own, rate.to(own)[None], self._action_std()[None]])
-        message = Message(torch.cat([summed, own]))
+        own += [rate.to(self.device, torch.float), self._action_std(), self._undo.undone]
+        message = Message(torch.cat([summed, torch.stack(own), self._undo.wrong]), [*sizes, len(losses), 2, 1, len(self._undo.wrong)])
         return Report(self.current_learning_iteration, self.total_steps, steps, list(losses), message, marks)
 
     def _action_std(self) -> Tensor:
@@ -209,43 +229,59 @@ class Runner(OnPolicyRunner):
 
     def _log(self, report: Report) -> None:
         """One block on the console and one point a curve in the writer."""
-        values, count = report.message.read(), len(report.losses)
-        numbers = self.env.name_statistics(values[: -count - 3])
-        self._all_stop = values[-count - 3] > 0
+        statistics, suspects, (stop,), lost, settings, (undone,), wrong = report.message.read()
+        numbers = self.env.name_statistics(statistics)
+        self._all_stop = stop > 0
         if verdict := self._watch.verdict(numbers):
             self.diverged, self.stop = verdict, self.stop or "what it simulates is not finite"
-        losses = dict(zip(report.losses, values[-count - 2 : -2], strict=True))
+        losses = dict(zip(report.losses, lost, strict=True))
         self._last_means.update({name: value for name, value in numbers.items() if not math.isnan(value)})
         numbers = {name: self._last_means.get(name, math.nan) for name in numbers}
-        numbers["learning_rate"], numbers["action_std"] = values[-2:]
+        numbers["learning_rate"], numbers["action_std"] = settings
         collect, learn = report.seconds()
         speed = report.steps / (collect + learn)
-        if self.logger.writer is not None:
-            for name, value in self._curves(numbers, losses, speed, collect, learn, report.total_steps).items():
-                if not math.isnan(value):
-                    self.logger.writer.add_scalar(name, value, report.iteration)
         rows = {**console_rows(numbers, losses, speed, collect, learn), "Total steps": f"{report.total_steps}"}
         self.console.iteration(report.iteration, self._last, self._next_exam(report.iteration), numbers, rows, speed)
+        warnings, verdict = self._health.judge(suspects, report.steps, undone > 0, wrong)
+        print("".join(f"WARNING: iteration {report.iteration}: {line}\n" for line in warnings), end="", flush=True)
+        if verdict:
+            self.diverged, self.stop = self.diverged or verdict, self.stop or "learning has died"
+        drawn = curves(numbers, losses, speed, collect, learn, report.total_steps)
+        self._draw_curves({**drawn, "Train/undone_updates": float(self._health.undone)}, report.iteration)
         if numbers["overflowed"] and not self._warned_overflow:
             others = f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks; raise `nconmax` and `njmax`"
             print(f"WARNING: {config_words(self.env.sim.overflow_report() or others)}", flush=True)
             self._warned_overflow = True
 
-    @staticmethod
-    def _curves(
-        numbers: dict[str, float], losses: dict[str, float], speed: float, collect: float, learn: float, total_steps: int
-    ) -> dict[str, float]:
-        """Curve -> value, under rsl-rl's names where it has them."""
-        return {
-            **{f"Loss/{name}": value for name, value in losses.items()},
-            **{"Loss/learning_rate": numbers["learning_rate"], "Policy/mean_std": numbers["action_std"]},
-            **{"Perf/total_fps": speed, "Perf/collection_time": collect, "Perf/learning_time": learn},
-            **{"Train/mean_reward": numbers["reward"], "Train/mean_episode_length": numbers["episode_length"]},
-            **{f"Episode/{name}": value for name, value in numbers.items() if name.startswith("rew_")},
-            **{"Episode/fell": numbers["fell"], "Episode/broken": numbers["broken"], "Train/total_steps": total_steps},
-            "Sim/overflowed_worlds": numbers["overflowed"],  # so far
-            **{f"Curriculum/{name}": value for name, value in numbers.items() if name.startswith(CURRICULA)},
-        }
+    def _stored_names(self) -> list[str]:
+        """What the columns are that an update learns from, in words: of each observation group, then the rewards'."""
+        table, names = self.env.observations, []
+        rows = {group: [row.name for row in table.rows(group) for _ in range(row.size)] for group in table.groups}
+        for group, i in self._undo.columns:
+            names.append(f"observation row '{rows[group][i]}' of '{group}'" if group in rows else f"observation group '{group}'")
+        return [*names, "the rewards"]
+
+    # ---- curves: what they are written to may fail, and training goes on ---------------------------------------------
+
+    def _open_curves(self) -> None:
+        quiet_writers()
+        try:
+            self.logger.init_logging_writer()
+        except Exception as error:  # whatever a logging service may throw
+            self._lose_curves(error)
+
+    def _draw_curves(self, values: dict[str, float], iteration: int) -> None:
+        try:
+            for name, value in values.items():
+                if self.logger.writer is not None and not math.isnan(value):
+                    self.logger.writer.add_scalar(name, value, iteration)
+        except Exception as error:
+            self._lose_curves(error)
+
+    def _lose_curves(self, error: Exception) -> None:
+        """Go on without curves until the next checkpoint."""
+        print(f"WARNING: no curves until the next checkpoint, they cannot be written: {reason_of(error)}", flush=True)
+        self.logger.writer, self._curves_lost = None, True
 
     # ---- checkpoints ----------------------------------------------------------------------------------------------
 
@@ -260,21 +296,29 @@ class Runner(OnPolicyRunner):
         if not all(bool(weight.isfinite().all()) for weight in weights):
             print(f"WARNING: after iteration {self.current_learning_iteration} the networks are not finite; not saved", flush=True)
             return
-        if self.logger.writer is not None:
-            assert self.logger.log_dir is not None
-            self.save(str(Path(self.logger.log_dir) / f"model_{self.current_learning_iteration}.pt"))
+        if not self.keeper:
+            return
+        if self.keeper.write(self.current_learning_iteration, self._content, partial(worlds_content, self)):
+            self.logger.save_model(str(self.keeper.written), self.current_learning_iteration)
+        if self._curves_lost or self.keeper.moved:
+            self._curves_lost = False
+            self._open_curves()
 
     def save(self, path: str, infos: dict | None = None) -> None:
-        """Write all that training needs to go on; whole or not at all, tensors and plain numbers only."""
-        content = self.alg.save()
-        content["iter"] = self.current_learning_iteration
-        content["infos"] = {**(infos or {}), "total_steps": self.total_steps, "random_state": _random_state(self.device)}
-        content["infos"]["env"] = self.env.training_state()
-        save_whole(content, Path(path))
+        """Write what learning needs to go on; whole or not at all."""
+        save_whole(self._content(infos), Path(path))
         self.logger.save_model(path, self.current_learning_iteration)
 
+    def _content(self, infos: dict | None = None) -> dict[str, Any]:
+        """A checkpoint: tensors and plain numbers only."""
+        content = self.alg.save()
+        content["iter"] = self.current_learning_iteration
+        content["infos"] = {**(infos or {}), "total_steps": self.total_steps, "random_state": random_state(self.device)}
+        content["infos"]["env"] = self.env.training_state()
+        return content
+
     def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
-        """Go on from a checkpoint: networks, normalisers, optimizer, learning rate, counters and random state."""
+        """Go on from a checkpoint: networks, normalisers, optimizer, learning rate, counters, random state; worlds, where they are kept."""
         content = load_tensors(Path(path), map_location or self.device)
         (first, actor), (second, other) = self._networks().items()
         check_fit(content.get(f"{first}_state_dict", {}), actor.state_dict(), Path(path), first)
@@ -297,9 +341,11 @@ class Runner(OnPolicyRunner):
         infos = content.get("infos") or {}
         self.total_steps = infos.get("total_steps", 0)
         self.env.load_training_state(infos.get("env", {}))  # before the random state: it begins episodes
+        random = infos.get("random_state", {})
+        self.begins_anew = take_worlds(self, Path(path), this_rank(), random)
         if self.gpu_global_rank == 0:
-            _set_random_state(infos.get("random_state", {}), self.device)
-        else:  # the file holds the first rank's; the others must not draw the same
+            set_random_state(random, self.device)
+        elif self.begins_anew:  # the file holds the first rank's; the others must not draw the same
             torch.manual_seed(hash((self.gpu_global_rank, self.total_steps, torch.initial_seed())) % 2**63)
         return infos
 
@@ -332,41 +378,3 @@ def check_mirror(env: RobotTask, cfg: RobotTaskCfgPPO) -> None:
     """Name what has no mirror image now, not after a rollout, if learning wants one. Raises ConfigError."""
     if (cfg.symmetry.use_data_augmentation or cfg.symmetry.use_mirror_loss) and not cfg.distillation.teacher:
         _ = env.mirror
-
-
-def rsl_rl_config(cfg: RobotTaskCfgPPO, env: RobotTask | None = None) -> dict[str, Any]:
-    """The learner's config as rsl-rl's flat dict; a deep copy, since rsl-rl writes into it. Raises ConfigError.
-
-    ``env`` has the rows that ``actor.estimator`` names; without one there is no estimator.
-    """
-    check_classes(cfg)
-    sections = copy.deepcopy(cfg.to_dict())
-    sections["actor"] = actor_settings(sections, env)
-    runner = sections.pop("runner")
-    logger = runner["logger"]
-    if logger == "wandb":
-        if importlib.util.find_spec("wandb") is None:
-            raise ConfigError("runner.logger is wandb, but wandb is not installed: pip install wandb")
-        logger = {"class_name": "WandbLogWriter", "project_name": runner["wandb_project"]}
-    keys = ("num_steps_per_env", "save_interval", "exam_interval", "experiment_name", "run_name")
-    symmetry = sections.pop("symmetry")
-    mirrors = symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]
-    symmetry_cfg = {"data_augmentation_func": "legged_mw.rl.symmetry:mirror", **symmetry} if mirrors else None
-    algorithm = {"rnd_cfg": None, "symmetry_cfg": symmetry_cfg, **sections.pop("algorithm")}
-    anneal = {name: (algorithm[name], end) for name, end in sections.pop("anneal").items()}
-    flat = {key: runner[key] for key in keys} | {name: network_section(sections[name]) for name in ("actor", "critic")}
-    return {**sections, **flat, "algorithm": algorithm, "anneal": anneal, "logger": logger, "check_for_nan": False}
-
-
-def _random_state(device: str) -> dict[str, Tensor]:
-    state = {"cpu": torch.get_rng_state()}
-    if device.startswith("cuda"):
-        state["cuda"] = torch.cuda.get_rng_state(device)
-    return state
-
-
-def _set_random_state(state: dict[str, Tensor], device: str) -> None:
-    if "cpu" in state:
-        torch.set_rng_state(state["cpu"].cpu())
-    if "cuda" in state and device.startswith("cuda"):
-        torch.cuda.set_rng_state(state["cuda"].cpu(), device)

@@ -125,15 +125,16 @@ def require_task(args: argparse.Namespace, parser: argparse.ArgumentParser) -> N
         parser.error(f"--task is missing, and --load_run is no path of a run that would say it; tasks: {', '.join(task_names())}")
 
 
-def save_whole(content: dict[str, Any], path: Path) -> None:
-    """Write a checkpoint, with its checksum, so that a kill at any moment leaves either all of it or nothing."""
+def save_whole(content: dict[str, Any], path: Path, sync: bool = True) -> None:
+    """Write a checkpoint, with its checksum, so that a kill at any moment (``sync``: a power cut too) leaves all of it or nothing."""
     temporary, archive = path.with_name(f".{path.name}.{os.getpid()}.tmp"), io.BytesIO()
     torch.save(content, archive)
     try:
         with open(temporary, "wb") as file:
             file.write(sealed(archive.getvalue()))
             file.flush()
-            os.fsync(file.fileno())
+            if sync:
+                os.fsync(file.fileno())
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)

@@ -13,6 +13,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,9 +25,9 @@ from legged_mw.envs.checks import check_values
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.distillation import GraphedDistillation
+from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
 from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.progress import LOG_FILE
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
@@ -37,10 +38,11 @@ from legged_mw.sim.engines import pick_engine
 from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError, shown
-from legged_mw.utils.files import sweep, writable
+from legged_mw.utils.files import writable
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
 
+STOPPED = 3  # exit code of a training that ended early and can go on
 _STEPS_PER_CORE = 6500  # a second, in training with the section `cpu` as it is (docs/performance.md)
 
 Check = Callable[[LoadedTask], None]  # raises where the step cannot be recorded
@@ -57,6 +59,8 @@ class Start(NamedTuple):
     checkpoint: Path | None = None
     teacher: Trained | None = None  # the policy to distil
     policy: Trained | None = None  # the policy whose actor a new run begins with
+
+    goes_on: bool = False  # in the folder of ``run``: from its newest checkpoint
 
 
 def parse(description: str | None) -> argparse.Namespace:
@@ -123,7 +127,10 @@ def _resume(task: LoadedTask, args: argparse.Namespace) -> Start:
     """Find the run to go on with and take over its config."""
     experiment = experiment_folder(task, args.experiment_name)
     run = find_run(experiment, args.load_run or "-1")
-    start, config = Start(experiment, run, find_checkpoint(run, args.checkpoint)), run / CONFIG_FILE
+    checkpoint, config = find_checkpoint(run, args.checkpoint), run / CONFIG_FILE
+    start = Start(experiment, run, checkpoint, goes_on=checkpoint == find_checkpoint(run, -1))
+    if start.goes_on and this_rank().leads and not args.check and (run / LOCK_FILE).is_file():
+        _lock(start).release()  # else it is known only after the environment is made
     for section in task.update_from_run(load_yaml(config), where=shown(config)):
         print(f"{shown(config)} is older than the section {section}: left as it was then")
     return start
@@ -204,27 +211,42 @@ def train(
     deadline: float | None = None,
     verbose: bool = False,
     begun: Begun | None = None,
-) -> None:
+) -> bool:
     """Train from ``start`` to the last iteration or until stopped (at ``deadline`` [s], a time of the clock), then export.
 
-    ``begun`` is called before the first iteration, where the run folder is written; ``verbose`` prints whole blocks.
+    ``begun`` is called before the first iteration, where the run folder is written; ``verbose`` prints whole blocks. Returns
+    whether all is done.
     """
     teacher = start.teacher.task.train if start.teacher else None
     rank, runner = this_rank(), make_runner(env, task.train, None, str(env.device), teacher)
     runner.examine, runner.console.verbose = examine, verbose
-    left = _load(runner, task, start)
-    _stop_on_signals(runner, deadline)
-    leave_when_stuck(rank)
-    folder = _open_run(runner, task, start) if rank.leads else None  # one run folder, written by the first rank
-    if folder and begun:
-        begun(runner, folder)
-    _learn(runner, left, rank)
-    finished = folder is not None and _say_how_it_ended(runner, task, folder, rank)
-    leave_together(rank)
-    if runner.diverged:
-        raise UserError(runner.diverged)
-    if folder and finished and task.train.runner.export:
-        _export(task, folder, export)
+    with ExitStack() as held:
+        lock = held.enter_context(_lock(start)) if start.goes_on and rank.leads else None
+        left = _load(runner, task, start)
+        _stop_on_signals(runner, deadline)
+        leave_when_stuck(rank)
+        folder = _open_run(runner, task, start, rank, held, lock)
+        if rank.leads and begun:
+            begun(runner, folder)
+        _learn(runner, left, rank)
+        lost = _not_saved(runner)
+        finished = not lost and _say_how_it_ended(runner, task, folder, rank)
+        leave_together(rank)
+        if error := runner.diverged or lost:
+            raise UserError(error)
+        if rank.leads and finished and task.train.runner.export:
+            _export(task, folder, export)
+    return finished or rank.count > 1  # torchrun would take another code for a crash
+
+
+def _not_saved(runner: Runner) -> str:
+    """That the last checkpoint could not be written; ''."""
+    keeper, done = runner.keeper, runner.current_learning_iteration
+    if not (keeper and keeper.failed):
+        return ""
+    kept = keeper.written
+    newest = f"the newest that is written is {shown(kept)}" if kept else "none of this training is written"
+    return f"the last checkpoint, of iteration {done}, cannot be written to {shown(keeper.folder)}: {keeper.failed}; {newest}"
 
 
 def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
@@ -232,6 +254,8 @@ def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
     if start.checkpoint:
         runner.load(str(start.checkpoint))
         print(f"resuming {shown(start.checkpoint)}")
+        anew = f"worlds begin anew ({runner.begins_anew}); networks, counters and curricula go on"
+        print(anew if runner.begins_anew else "exactly: worlds and generators go on where they were", flush=True)
     else:
         _begin(runner, start)
     done, wanted = runner.current_learning_iteration, task.train.runner.max_iterations
@@ -253,25 +277,60 @@ def _begin(runner: Runner, start: Start) -> None:
             print(f"the critic learns alone for {warmup} iterations (warm_start.critic_warmup)", flush=True)
 
 
-def _open_run(runner: Runner, task: LoadedTask, start: Start) -> Path:
-    """The folder that this training writes to, with the config in it; an earlier checkpoint begins a folder of its own."""
-    newest = start.run is not None and start.checkpoint == find_checkpoint(start.run, -1)
-    folder = start.run if start.run and newest else new_run(start.experiment, task.train.runner.run_name)
-    sweep(folder)
-    save_yaml(folder / CONFIG_FILE, task.to_dict())
-    if start.teacher:
-        keep_teacher(start.teacher, folder)
-    runner.logger.log_dir = str(folder)
-    runner.console.open(folder)
-    print(f"writing to {shown(folder)}", flush=True)
-    return folder
+def _lock(start: Start) -> RunLock:
+    """Of the run to go on with. Raises ConfigError if it is being trained, or was meanwhile, or cannot be."""
+    assert start.run
+    try:
+        lock = RunLock(start.run)
+    except OSError as error:
+        raise ConfigError(f"{shown(start.run)} cannot be written: {reason_of(error)}") from None
+    if (newest := find_checkpoint(start.run, -1)) == start.checkpoint:
+        return lock
+    lock.release()
+    raise ConfigError(f"{shown(start.run)} has gone on since this began, to {newest.name}: another process trained there; resume it again")
+
+
+def _open_run(runner: Runner, task: LoadedTask, start: Start, rank: Rank, held: ExitStack, lock: RunLock | None) -> Path:
+    """The folder that this training writes to, with the config in it; an earlier checkpoint begins a folder of its own.
+
+    One for all ranks, made by the first. It has a ``lock`` until ``held`` ends, and is made anew if somebody deletes it.
+    """
+    folder = [start.run if start.run and lock else new_run(start.experiment, task.train.runner.run_name) if rank.leads else Path()]
+
+    def write() -> None:
+        nonlocal lock
+        if not lock or lock.lost():
+            folder[0].mkdir(parents=True, exist_ok=True)
+            lock = held.enter_context(RunLock(folder[0]))
+        lock.begin()
+        runner.console.open(folder[0])
+        save_yaml(folder[0] / CONFIG_FILE, task.to_dict())
+        if start.teacher:
+            keep_teacher(start.teacher, folder[0])
+
+    def restore() -> bool:
+        if gone := rank.leads and not (folder[0] / CONFIG_FILE).is_file():
+            write()
+        return gone
+
+    if rank.leads:
+        try:
+            write()
+        except OSError as error:
+            raise ConfigError(f"{shown(folder[0])} cannot be written: {reason_of(error)}") from None
+        runner.logger.log_dir = str(folder[0])
+        print(f"writing to {shown(folder[0])}", flush=True)
+    if rank.count > 1:
+        torch.distributed.broadcast_object_list(folder, device=torch.device(runner.device))
+    runner.keeper = Keeper(folder[0], task.train.runner.keep_checkpoints, rank, restore)
+    return folder[0]
 
 
 def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
     """Learn; if another rank is lost on the way, say so in a line."""
     try:
         with runner.console:
-            runner.learn(iterations)
+            runner.learn(iterations, bool(runner.begins_anew))
         if isinstance(runner.alg, GraphedPPO | GraphedDistillation):
             runner.alg.release()
     except RuntimeError as error:
@@ -291,7 +350,7 @@ def _say_how_it_ended(runner: Runner, task: LoadedTask, folder: Path, rank: Rank
         print(f"exam after {iteration} iterations: {', '.join(f'{figure} {value:.3f}' for figure, value in figures.items())}")
     flags = _flags(task, folder)
     if runner.stop and runner.current_learning_iteration < task.train.runner.max_iterations:
-        print(f"stopped: {runner.stop}; go on with\n  {command('train', rank.count)} --resume {flags}")
+        print(f"stopped: {runner.stop}; go on with\n  {command('train', rank.count)} --resume {flags}", flush=True)
         return False
     print(f"done: {shown(folder)}; watch it with\n  {command('play')} {flags}", flush=True)
     return True
@@ -315,16 +374,19 @@ def _export(task: LoadedTask, run: Path, export: Export) -> None:
 
 
 def _stop_on_signals(runner: Runner, deadline: float | None) -> None:
-    """Ctrl-C, SIGTERM and the clock ask the runner to save and stop; a second Ctrl-C stops at once."""
+    """Ctrl-C, SIGTERM, a hang-up and the clock ask the runner to save and stop; a second Ctrl-C stops at once."""
 
     def ask(number: int, _: object) -> None:
         runner.stop = signal.Signals(number).name
         # os.write, since print must not be called while another print is interrupted
-        os.write(1, f"{runner.stop}: saving and stopping after this step; again to stop at once\n".encode())
+        with suppress(OSError):  # nobody may be there to read it
+            os.write(1, f"{runner.stop}: saving and stopping after this iteration; again to stop at once\n".encode())
         signal.signal(number, signal.SIG_DFL)
 
     signal.signal(signal.SIGINT, ask)
     signal.signal(signal.SIGTERM, ask)
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # nohup has it ignored
+        signal.signal(signal.SIGHUP, ask)
     if deadline is not None:
         timer = threading.Timer(max(0.0, deadline - time.time()), lambda: setattr(runner, "stop", "--max_time"))
         timer.daemon = True

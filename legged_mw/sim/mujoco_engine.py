@@ -82,6 +82,11 @@ class MujocoSimulation(Simulation):
         for tensor in self._cleared:
             tensor[worlds] = 0.0
 
+    def memory(self) -> dict[str, Tensor]:
+        own = {name: getattr(self, name) for name in (*_STATE, *_WRITTEN, *_READ)}
+        rows = {"rows": torch.from_numpy(self._batch.state), "failed": torch.from_numpy(self._failed)}
+        return {**own, **rows, **{f"model.{name}": value for name, value in self._fields.items()}}
+
     def set_constants(self) -> None:
         self._write_fields()
         self._batch.set_const()

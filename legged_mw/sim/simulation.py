@@ -66,6 +66,13 @@ class Simulation(ABC):
         return self._fields[name]
 
     @abstractmethod
+    def memory(self) -> dict[str, Tensor]:
+        """All that the worlds' next steps depend on, and what was sensed last, by name; of the model as ``model.<field>``.
+
+        To be copied, or to be written in place in worlds of the same model; then call ``set_constants`` where fields need it.
+        """
+
+    @abstractmethod
     def set_constants(self) -> None:
         """Bring what the model derives from masses, inertias, armatures and zero angles up to date with what was written
         into their fields, in every world. Slow, and not for inside a recorded step.

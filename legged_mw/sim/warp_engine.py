@@ -26,6 +26,8 @@ from legged_mw.utils.errors import unknown
 wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it loads; a first run would drown in it
 
 _STATE = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xquat", "xfrc_applied", "overflow")
+# What else a step leaves to the next one.
+_CARRIED = ("time", "act", "qacc_warmstart", "qfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "history", "plastic", "userdata")
 # With 1 Newton and 5 line-search iterations these two are always set: they say "not converged", which is the plan.
 _EXPECTED = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
 # From this many Newton iterations on, a conditional loop in the graph is worth its launch.
@@ -88,6 +90,10 @@ class WarpSimulation(Simulation):
         self._run("reset", lambda: mjw.reset_data(self._model, self._data, reset=self._reset_mask_wp))
         for stale in (self.actuator_force, self.site_xpos, self.xquat):  # reset_data leaves the dead episode's values, even NaN
             stale.masked_fill_(mask.view(-1, *[1] * (stale.dim() - 1)), 0.0)
+
+    def memory(self) -> dict[str, Tensor]:
+        own = {name: wp.to_torch(getattr(self._data, name)) for name in (*_STATE, *_CARRIED) if getattr(self._data, name).size}
+        return {**own, "overflow_seen": self._overflow_seen, **{f"model.{name}": value for name, value in self._fields.items()}}
 
     def set_constants(self) -> None:
         with wp.ScopedDevice(self._device):

@@ -8,7 +8,7 @@ import re
 import sys
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from ctypes import ArgumentError
 from pathlib import Path
 from typing import Any, NoReturn
@@ -172,7 +172,8 @@ def _show_all() -> None:
 
 def fail(program: str, message: str) -> NoReturn:
     """One line on standard error, exit code 2."""
-    print(f"{program}: {printable(' '.join(message.split()))}", file=sys.stderr)
+    with suppress(OSError):  # nobody may be there to read it
+        print(f"{program}: {printable(' '.join(message.split()))}", file=sys.stderr, flush=True)
     raise SystemExit(2)
 
 

@@ -57,6 +57,11 @@ def maybe_any(mask: Tensor) -> bool:
     return mask.device.type != "cpu" or bool(mask.any())
 
 
+def spread(values: Tensor, count: int) -> Tensor:
+    """Values (M, ...) of M worlds for ``count`` worlds, each that of the nearest."""
+    return values[torch.arange(count, device=values.device) * len(values) // count]
+
+
 def columns(num_rows: int, device: str, **widths: int) -> tuple[Tensor, dict[str, Tensor]]:
     """One float matrix of zeros and a named view (N, width) of each span of its columns: cleared together, used apart."""
     matrix = torch.zeros(num_rows, sum(widths.values()), device=device)

@@ -14,6 +14,7 @@ from legged_mw.drawing.scene import visual_spec
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.motion_tracking import MotionTracking
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.wording import say_overflow
 from legged_mw.rl.estimator import believed_velocity
 from legged_mw.rl.recurrent import forget
 from legged_mw.sim.terrain import name_tile
@@ -48,6 +49,7 @@ class EnvStage:
         self._foot_contacts = env.contact_count[:, :geoms]
         self._obs = env.get_observations()
         self._believed: Tensor | None = None  # vx, vy (N, 2) when it acted last
+        self._overflowed = False  # and was said
 
     @torch.no_grad()
     def step(self, commands: FloatArray | None) -> None:
@@ -66,6 +68,7 @@ class EnvStage:
         self._believed = believed_velocity(self.policy, self._obs)
         self._obs, _, dones, _ = env.step(self.policy(self._obs))
         forget(self.policy, dones)
+        self._overflowed = self._overflowed or say_overflow(env.sim, "what is shown")
 
     @property
     def news(self) -> str:

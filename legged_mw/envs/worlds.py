@@ -1,0 +1,89 @@
+"""All that the worlds of an environment remember, as tensors by name: to go on another day as if nothing had been.
+
+Found, not listed, so that a task's own buffers are there too: whatever is written in place, as the rules of the step demand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from enum import Enum
+from types import FunctionType, MethodType, ModuleType
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
+from legged_mw.utils.config import Config
+
+_OTHERS = (str, bytes, int, float, type, Enum, Config, nn.Module, ModuleType, FunctionType, MethodType, Simulation)
+_LIBRARIES = ("torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl")
+_FACTS = ("robot", "terrain", "clips")  # of the task, which no step changes
+
+
+def worlds_state(env: RobotTask) -> dict[str, Tensor]:
+    """Copies on the host of what was ever written in place: in the simulation, and in whatever else ``env`` holds."""
+    own = {name: value for name, (value, written) in _memory(env).items() if written}
+    return {name: value.detach().to("cpu", copy=True) for name, value in (_simulation(env) | own).items()}
+
+
+def put_worlds(env: RobotTask, state: dict[str, Tensor]) -> str:
+    """Put back what ``worlds_state`` returned. Returns why that cannot be, and then nothing has changed; '' if it is done."""
+    own = _simulation(env) | {name: value for name, (value, _) in _memory(env).items()}
+    for name, value in state.items():
+        if name not in own or own[name].shape != value.shape or own[name].dtype != value.dtype:
+            return f"{name} is {_words(value)} there and {_words(own.get(name))} here"
+    fields = [name for name in state if name.startswith("sim.model.")]
+    with torch.inference_mode():
+        for name in fields:
+            own[name].copy_(state[name])
+        if {name.removeprefix("sim.model.") for name in fields} & {*CONSTANTS_READ}:
+            env.sim.set_constants()  # before the rest: it may touch the state
+        for name in state.keys() - {*fields}:
+            own[name].copy_(state[name])
+    return ""
+
+
+def _words(value: Tensor | None) -> str:
+    return "missing" if value is None else f"{value.dtype} {(*value.shape,)}".removeprefix("torch.")
+
+
+def _simulation(env: RobotTask) -> dict[str, Tensor]:
+    return {f"sim.{name}": value for name, value in env.sim.memory().items()}
+
+
+def _memory(env: RobotTask) -> dict[str, tuple[Tensor, bool]]:
+    """Name -> a piece of memory that ``env`` reaches, all of it and flat, and whether it was ever written; not the simulation's."""
+    seen = {value.untyped_storage().data_ptr() for value in env.sim.memory().values()}
+    found: dict[str, tuple[Tensor, bool]] = {}
+    for name, value, written in _reach(env, "", set()):
+        storage = value.untyped_storage()
+        if storage.nbytes() and storage.data_ptr() not in seen:
+            seen.add(storage.data_ptr())
+            found[name] = value.as_strided((storage.nbytes() // value.element_size(),), (1,), 0), written
+    return found
+
+
+def _reach(thing: Any, path: str, done: set[int]) -> Iterator[tuple[str, Tensor, bool]]:
+    """(dotted name, tensor, whether it was ever written) of all tensors and arrays of numbers that ``thing`` holds."""
+    if isinstance(thing, Tensor):
+        yield path, thing, thing.is_inference() or thing._version > 0
+    elif isinstance(thing, np.ndarray):
+        if thing.flags.writeable and thing.flags.c_contiguous and thing.dtype.kind in "fib":
+            yield path, torch.from_numpy(thing), True
+    elif thing is not None and not isinstance(thing, _OTHERS) and id(thing) not in done:
+        done.add(id(thing))
+        for name, value in _parts(thing):
+            yield from _reach(value, f"{path}.{name}" if path else name, done)
+
+
+def _parts(thing: Any) -> list[tuple[str, Any]]:
+    if isinstance(thing, dict):
+        return [(str(key), value) for key, value in thing.items()]
+    if isinstance(thing, list | tuple):
+        return [(str(i), value) for i, value in enumerate(thing)]
+    if type(thing).__module__.partition(".")[0] in _LIBRARIES:
+        return []
+    return [(name, value) for name, value in getattr(thing, "__dict__", {}).items() if name not in _FACTS]

@@ -1,0 +1,59 @@
+"""Is learning still alive? Says what an iteration brought that is not finite, and when a training must end for it. On the host."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from legged_mw.envs.divergence import SHARE
+from legged_mw.envs.suspects import BOUND
+
+IN_A_ROW = 3  # ours: iterations; one bad value is an accident, and the next rollout is another
+
+
+class Health:
+    """What the last iterations were like."""
+
+    def __init__(self, names: Sequence[str], stored: Sequence[str]) -> None:
+        """``names`` of the values that the step looks at, and of the ``stored`` columns that an update learns from; in words."""
+        self._names, self._stored = names, stored
+        self.undone = 0  # updates, in all
+        self._row, self._sick = 0, 0  # updates undone, and iterations with too many suspects, one after the other
+        self._said: dict[str, float] = {}  # name -> count when it was said last
+
+    def judge(self, counts: Sequence[float], steps: int, undone: bool, wrong: Sequence[float]) -> tuple[list[str], str]:
+        """Warnings, and why training must end, '' to go on; ``counts`` of suspects in ``steps`` steps of a world, ``wrong`` columns."""
+        found = self._by_name(counts)
+        warnings = [line for name, count in found.items() if (line := self._warning(name, count, steps))]
+        worst = max(found, key=lambda name: found[name], default="")
+        self._sick = self._sick + 1 if worst and found[worst] > SHARE * steps else 0
+        self._row = self._row + 1 if undone else 0
+        if undone:
+            self.undone += 1
+            brought = list(dict.fromkeys(name for name, bad in zip(self._stored, wrong, strict=True) if bad))
+            cause = f"{' and '.join(brought[:4])} held what is not finite or beyond {BOUND:g}" if brought else "loss or weights"
+            warnings.append(f"the update was not finite ({cause}) and is undone: {self._row} in a row, {self.undone} so far")
+            if self._row >= IN_A_ROW:
+                advice = "look at how that is computed" if brought else "lower algorithm.learning_rate; look for rewards without a bound"
+                kept = "the networks are those of the last good one"
+                return warnings, f"{IN_A_ROW} updates in a row were not finite ({cause}); {kept}; {advice}"
+        if self._sick >= IN_A_ROW:
+            share = f"{found[worst]:.0f} of {steps} steps of a world, for {IN_A_ROW} iterations"
+            return warnings, f"{worst} is not finite, or beyond {BOUND:g}, in {share}; look at how it is computed"
+        return warnings, ""
+
+    def _by_name(self, counts: Sequence[float]) -> dict[str, float]:
+        """Those that were found: of a row with several columns the worst one's count."""
+        found: dict[str, float] = {}
+        for name, count in zip(self._names, counts, strict=True):
+            if count:
+                found[name] = max(found.get(name, 0.0), count)
+        return found
+
+    def _warning(self, name: str, count: float, steps: int) -> str:
+        """A line when it is first found, and each time that ten times as much has been."""
+        total = self._said.get(name, 0.0) + count
+        before, self._said[name] = self._said.get(name, 0.0), total
+        if before and len(str(int(before))) == len(str(int(total))):
+            return ""
+        share = f"{count:.0f} of {steps} steps of a world"
+        return f"{name} was not finite, or beyond {BOUND:g}, in {share}; 0 took its place ({total:.0f} so far)"

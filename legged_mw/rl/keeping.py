@@ -1,0 +1,112 @@
+"""A run's folder while it trains: who may write there, checkpoints that are written as long as it can be, old ones that go."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Self
+
+try:
+    import fcntl
+except ImportError:  # not on Windows: nothing is locked there
+    fcntl = None
+
+from legged_mw.rl.ranks import Rank
+from legged_mw.rl.resume import worlds_file
+from legged_mw.rl.runs import checkpoints, save_whole
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import shown
+from legged_mw.utils.files import sweep
+
+LOCK_FILE = ".lock"
+
+
+class RunLock:
+    """That this process trains in a folder. It ends with the process, however that ends."""
+
+    def __init__(self, folder: Path) -> None:
+        """Raises ConfigError if another process has it, OSError if nothing can be written there."""
+        self._folder, self._file = folder, open(folder / LOCK_FILE, "a+")  # noqa: SIM115 (open until it is released)
+        try:
+            if fcntl:
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            self._file.seek(0)
+            who = self._file.read().strip() or "another process"
+            self._file.close()
+            raise ConfigError(f"{shown(folder)} is being trained by {who}; wait for its end, stop it, or name another run") from None
+        except OSError as error:  # a file system without locks
+            print(f"WARNING: {shown(folder)} cannot be locked ({error.strerror}): do not resume it while it trains", flush=True)
+
+    def begin(self) -> None:
+        """Say who it is, and sweep what a process that was killed left half written."""
+        self._file.truncate(0)
+        self._file.write(f"process {os.getpid()} since {time.strftime('%Y-%m-%d %H:%M:%S')}\n")
+        self._file.flush()
+        sweep(self._folder)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.release()
+
+    def release(self) -> None:
+        self._file.close()
+
+    def lost(self) -> bool:
+        """Whether the folder with the lock is gone."""
+        return os.fstat(self._file.fileno()).st_nlink == 0
+
+
+class Keeper:
+    """Writes what a training needs to go on, as often as asked; what cannot be written is said, and the training goes on in memory."""
+
+    def __init__(self, folder: Path, keep: int, rank: Rank, prepare: Callable[[], bool] = lambda: False) -> None:
+        """``keep`` newest checkpoints; 0: all. ``prepare`` makes the folder and what else belongs there, if it is gone, and says so."""
+        self.folder, self._keep, self._rank, self._prepare = folder, keep, rank, prepare
+        self.failed = ""  # why the newest checkpoint could not be written, '' if it could
+        self.written: Path | None = None  # the newest one that could
+        self.moved = False  # the folder had to be made anew
+
+    def write(self, iteration: int, checkpoint: Callable[[], dict[str, Any]], worlds: Callable[[], dict[str, Any]]) -> bool:
+        """Worlds, then the checkpoint, then sweep the ones before; returns whether it is all there."""
+        path = self.folder / f"model_{iteration}.pt"
+        try:
+            self.moved = self._prepare()
+            beside = worlds_file(path, self._rank)
+            save_whole(worlds(), beside, sync=False)  # one that a power cut tears is found out by its reader
+            if self._rank.leads:
+                save_whole(checkpoint(), path)
+        except (OSError, RuntimeError) as error:  # torch's writer turns the one into the other
+            self.failed = reason_of(error)
+            newest = f"the newest is {shown(self.written)}" if self.written else "none of this training is written"
+            print(f"WARNING: checkpoint {path.name} cannot be written: {self.failed}; {newest}; going on in memory", flush=True)
+            return False
+        self.failed, self.written = "", path
+        with contextlib.suppress(OSError):
+            self._sweep(beside)
+        return True
+
+    def _sweep(self, beside: Path) -> None:
+        """Worlds of earlier checkpoints, and the checkpoints that are too many."""
+        of = beside.stem.removeprefix("worlds_").partition("_")[2]
+        for old in self.folder.glob(f"worlds_*{f'_{of}' if of else ''}.pt"):
+            if old != beside and old.stem.removeprefix("worlds_").partition("_")[2] == of:
+                old.unlink(missing_ok=True)
+        if self._keep and self._rank.leads:
+            for old in list(checkpoints(self.folder).values())[: -self._keep]:
+                old.unlink(missing_ok=True)
+
+
+def reason_of(error: BaseException) -> str:
+    """Why a file could not be written, in words: the system's, if it is behind a library's."""
+    first: BaseException | None = error
+    while first is not None and not isinstance(first, OSError):
+        first = first.__cause__ or first.__context__
+    if isinstance(first, OSError) and first.strerror:
+        return first.strerror
+    return str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__

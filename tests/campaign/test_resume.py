@@ -1,0 +1,102 @@
+"""A training that was killed and resumed is the uninterrupted one, bit for bit: networks, optimizer, generators, worlds."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from program import SMALL, Result, run
+
+from legged_mw.rl.keeping import Keeper
+from legged_mw.rl.runs import checkpoints
+
+EXACTLY = "exactly: worlds and generators go on where they were"
+THREE = ["--set", "runner.save_interval=1", "--max_iterations", "3", "--seed", "3", "--set", "cpu.update_threads=1", "--eager"]
+DELAYS = ["action_delay=[0, 2]", "observation_delay=[0, 2]", "delay_ms=[0.0, 12.0]", "encoder_offset=[-0.02, 0.02]"]
+# what is trained -> flags; with symmetry, kicks, noise and episodes that end on the way
+TILES = ["--set", "terrain.num_rows=2", "--set", "terrain.num_cols=8"]
+TASKS = {
+    "go1_rough": ["--task", "go1_rough", *TILES],
+    "drawn worlds, delays, history": [
+        *("--task", "go1_flat_dr", "--set", "domain_rand.redraw_iterations=1", "--set", "observations.history={state: 3}"),
+        *(word for each in DELAYS for word in ("--set", f"domain_rand.{each}")),
+    ],
+    "curricula, memory": [
+        *("--set", "commands.curriculum=true", "--set", "perturbation.curriculum=true", "--set", "perturbation.push=true"),
+        *("--set", "actor.class_name=RNNModel", "--set", "actor.rnn_hidden_dim=8", "--set", "cpu.rnn_hidden_dim=8"),
+    ],
+    "estimator": ["--task", "go1_flat_blind", "--set", "actor.estimator.targets=[base_lin_vel]"],
+}
+BY_HAND = {  # LEGGED_MW_CAMPAIGN=all pytest tests/campaign/test_resume.py
+    "go1_flat": [],
+    "no symmetry": ["--set", "symmetry.use_data_augmentation=false", "--set", "algorithm.schedule=fixed"],
+    "rsl-rl's own": ["--set", "algorithm.class_name=PPO"],
+    "getup": ["--task", "go1_getup"],
+    "handstand": ["--task", "go1_handstand"],
+    "tracking": ["--task", "g1_track"],
+    "g1": ["--task", "g1_flat"],
+    "concurrent": ["--task", "go1_rough_student", "--set", "actor.concurrent.groups=[privileged_state]", *TILES],
+    "mujoco_warp": ["--engine", "mujoco_warp"],
+    "mujoco_warp, drawn worlds": ["--engine", "mujoco_warp", "--task", "go1_flat_dr"],
+}
+if os.environ.get("LEGGED_MW_CAMPAIGN") == "all":
+    TASKS |= BY_HAND
+
+
+def assert_equal(a: Any, b: Any, where: str = "") -> None:
+    assert type(a) is type(b), where
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            assert_equal(a[key], b[key], f"{where}.{key}")
+    elif isinstance(a, list | tuple):
+        assert len(a) == len(b), where
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_equal(x, y, f"{where}[{i}]")
+    elif isinstance(a, torch.Tensor):
+        assert torch.equal(a.nan_to_num(7.0), b.nan_to_num(7.0)) if a.is_floating_point() else torch.equal(a, b), where
+    else:
+        assert a == b, where
+
+
+def load(path: Path) -> Any:
+    return torch.load(path, weights_only=True)
+
+
+def interrupted(root: Path, *flags: str, after: int = 2) -> tuple[Path, Path]:
+    """A run of three iterations, and a copy of its folder as a kill after iteration ``after`` would have left it."""
+    killed, write = root / "killed/logs/go1_flat/run", Keeper.write
+
+    def write_and_copy(self: Keeper, iteration: int, *content: Any) -> bool:
+        done = write(self, iteration, *content)
+        if iteration == after:
+            shutil.copytree(self.folder, killed)
+        return done
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Keeper, "write", write_and_copy)
+        result = run("train", root, *SMALL, *THREE, "--experiment_name", str(root / "whole"), *flags)
+    assert result.code == 0, result.err
+    [whole] = (root / "whole").iterdir()
+    return whole, killed
+
+
+def resume(root: Path, folder: Path, *flags: str) -> Result:
+    task = flags[flags.index("--task") + 1] if "--task" in flags else "go1_flat"
+    return run("train", root, "--task", task, "--device", "cpu", "--eager", "--resume", "--load_run", str(folder), *flags)
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_a_resumed_training_is_the_uninterrupted_one(name: str, tmp_path: Path) -> None:
+    whole, killed = interrupted(tmp_path, *TASKS[name])
+    assert [path.name for path in whole.glob("worlds_*.pt")] == ["worlds_3.pt"] and len(checkpoints(whole)) == 3
+    result = resume(tmp_path, killed, *TASKS[name][: TASKS[name].count("--task") * 2])
+    assert result.code == 0 and EXACTLY in result.out, result
+    assert_equal(load(killed / "model_3.pt"), load(whole / "model_3.pt"))
+    resumed, uninterrupted = (load(folder / "worlds_3.pt") for folder in (killed, whole))
+    resumed["worlds"] = {name: resumed["worlds"][name] for name in uninterrupted["worlds"]}  # loading wrote more
+    assert_equal(resumed, uninterrupted)
