@@ -17,8 +17,8 @@ def test_other_worlds_do_not_notice_a_break(monkeypatch: pytest.MonkeyPatch) -> 
     for breaks in (True, False):
         soak = Soak(args, breaks)
         soak.every = 20
-        before, end, _ = soak.run(steps=20 * len(KINDS) + 10, seconds=math.inf)
-        assert not soak.faults(end, end) and before.files == end.files
+        _, end, _ = soak.run(steps=20 * len(KINDS) + 10, seconds=math.inf)
+        assert not soak.faults(end, end)
         ends.append(soak)
     broken, whole = ends
     assert broken.broke == broken.totals[1] == len(KINDS) and whole.totals[1] == 0
