@@ -28,7 +28,7 @@ class G1GetupCfg(GetupCfg):
         action_scale, decimation = G1FlatCfg.control.action_scale, G1FlatCfg.control.decimation  # 4 of it: the motors' whole torque [M]
 
     class normalization(GetupCfg.normalization):
-        clip_actions = 5.0  # [ours]
+        clip_actions = 4.0
 
     class rewards(GetupCfg.rewards):
         pose_weights = {"": 0.3, "hip": 1.0, "knee": 1.0, "waist": 1.0}  # [ours]

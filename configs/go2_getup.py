@@ -15,6 +15,7 @@ class Go2GetupCfg(GetupCfg):
 
     class control(GetupCfg.control):
         stiffness, damping = Go2FlatCfg.control.stiffness, Go2FlatCfg.control.damping
+        action_scale = 0.9  # [rad] [ours: as much torque as Go1's 0.5; at 2 nearly what the knees have]
 
 
 TASK = Task(Getup, Go2GetupCfg, GetupCfgPPO)

@@ -92,11 +92,25 @@ def test_a_comment_is_read(comment: str, words: str, unit: str, source: str) -> 
 def test_every_term_says_what_it_is_and_whose() -> None:
     said = {
         name: reference.read_comment(str(term.__doc__))
-        for _, owner, _, _ in reference.TERMS
+        for _, owner in reference.classes(reference.TERMS, reference.terms_of)
         for name, term in reference.terms_of(owner).items()
     }
     assert len(said) > 45
     assert [name for name, each in said.items() if not (each.words and each.source)] == []
+
+
+def test_every_field_says_its_bounds() -> None:
+    lines = {
+        line.split(" | ")[0]: line for line in reference.config_fields().splitlines() if line.startswith("| `") and "overridden" not in line
+    }
+    for name, told in (
+        ("num_envs", "`int`: 1 or more"),
+        ("gamma", "from 0 to 1"),
+        ("actuator", "`servo`, `dc_motor`, `torque`, `network`"),
+        ("action_scale", "`float \\| dict[str, float]`: another number than 0"),
+        ("stall_torque", "each above 0"),
+    ):
+        assert told in lines[f"| `{name}`"], lines[f"| `{name}`"]
 
 
 def test_every_row_has_words() -> None:
@@ -155,5 +169,7 @@ def test_pictures_are_small_and_current() -> None:
         assert (images / f"house{ending}").read_text() == pictures.house(language)
 
 
-def test_the_gallery_is_current() -> None:
-    assert gallery.PAGE.read_text() == gallery.page(), "python -m website.gallery --page"
+def test_the_gallery_has_every_policy(site: Path) -> None:
+    assert gallery.PAGE.read_text() == gallery.page(), "python -m website.gallery"
+    page = (site / "gallery.html").read_text()
+    assert page.count("falls in 22 commands") >= 6 and page.count("curve.png") == len(gallery.policies())

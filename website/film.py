@@ -56,6 +56,7 @@ BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
     "go2_flat": FILM[1],
     "go2_rough": FILM[0]._replace(policy="go2_rough", distance=2.3),
     "g1_flat": FILM[2],
+    "g1_rough": Shot("g1_rough", (0.5, 0.0, 0.0), 2.0, distance=2.6, elevation=-14.0, azimuth=75.0, follow=0.0, rough=True),
 }
 
 

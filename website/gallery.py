@@ -1,6 +1,7 @@
 """The gallery: a page of all policies that ship, from their folders: film, still, exam, curve, how each was made.
 
 MUJOCO_GL=egl python -m website.gallery                # films, stills and docs/gallery.md
+MUJOCO_GL=egl python -m website.gallery g1_rough       # the films of these, and the page
 python -m website.gallery --page                       # the page alone
 """
 
@@ -9,12 +10,13 @@ from __future__ import annotations
 import argparse
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 from legged_mw import ROOT
 
 POLICIES, PAGE, IMAGES = ROOT / "resources/policies", ROOT / "docs/gallery.md", ROOT / "docs/images/gallery"
-ORDER = ("go1_flat", "go1_rough", "go1_rough_scan", "go2_flat", "go2_rough", "g1_flat")  # then all others by name
+ORDER = ("go1_flat", "go1_rough", "go1_rough_scan", "go2_flat", "go2_rough", "g1_flat", "g1_rough")  # then all others by name
 HEAD = """# Gallery
 
 Every policy that ships, as it walks in MuJoCo's C engine. `MUJOCO_GL=egl python -m website.gallery` makes this page, its films and
@@ -34,22 +36,24 @@ def policies() -> list[str]:
 
 
 def page() -> str:
-    """The whole of docs/gallery.md."""
-    return "\n".join([HEAD, *map(_chapter, policies())])
+    """The whole of docs/gallery.md; the site writes what the policy's README says where the marks are."""
+    return "\n".join([HEAD, *map(_entry, policies())])
 
 
-def _chapter(name: str) -> str:
-    """One policy, in the words of its README."""
+def _entry(name: str) -> str:
+    film = f"![{name} walks](images/gallery/{name}.webp)\n\n" if (IMAGES / f"{name}.webp").exists() else ""
+    return f"## {name}\n\n{film}<!-- made: policy_{name} -->\n\nAll of it: [{name}](../resources/policies/{name}/README.md).\n"
+
+
+def chapter(name: str) -> str:
+    """What there is to say of a policy, in the words of its README: how it was made, its exam, its curve."""
     folder = POLICIES / name
     text = _relinked((folder / "README.md").read_text(), folder)
-    about = text.split("\n\n")[1]
-    made = re.findall(r"^```bash\n.*?^```$", text, re.MULTILINE | re.DOTALL)[0]
+    made = re.findall(r"^```bash\n.*?^```$", text, re.MULTILINE | re.DOTALL)[:1]
     tables = [part for part in text.split("\n\n") if part.startswith("|") and re.search("falls in|stands in time|holds", part)]
     exam = "\n".join(line for line in "\n".join(tables).splitlines() if line.startswith("|"))
-    film = IMAGES / f"{name}.webp"
-    parts = [f"## {name}", f"![{name} walks](images/gallery/{name}.webp)" if film.exists() else "", about.replace("\n", " "), made]
-    parts += [exam, f"![learning curve](../resources/policies/{name}/curve.png)" if (folder / "curve.png").exists() else ""]
-    return "\n\n".join([part for part in parts if part] + [f"All of it: [{name}](../resources/policies/{name}/README.md).\n"])
+    curve = [f"![learning curve](../resources/policies/{name}/curve.png)"] if (folder / "curve.png").exists() else []
+    return "\n\n".join([text.split("\n\n")[1].replace("\n", " "), *made, exam, *curve])
 
 
 def _relinked(text: str, folder: Path) -> str:
@@ -62,14 +66,14 @@ def _relinked(text: str, folder: Path) -> str:
     return re.sub(r"\]\((?!http|#)([^)\s]+)\)", moved, text)
 
 
-def films() -> None:
+def films(names: Sequence[str]) -> None:
     """A film and a still of each."""
     from PIL import Image
 
     from website.film import BY_NAME, Shot, record, save_webp
 
     IMAGES.mkdir(parents=True, exist_ok=True)
-    for name in policies():
+    for name in names:
         shot = BY_NAME.get(name, Shot(name, BY_NAME["go1_flat"].command))
         frames = record(shot._replace(seconds=3.2), 256, 160)
         save_webp(IMAGES / f"{name}.webp", frames)
@@ -79,8 +83,10 @@ def films() -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m website.gallery", description=str(__doc__).splitlines()[0])
     parser.add_argument("--page", action="store_true", help="write the page alone")
-    if not parser.parse_args().page:
-        films()
+    parser.add_argument("names", nargs="*", metavar="NAME", help="policies to film (default: all)")
+    args = parser.parse_args()
+    if not args.page:
+        films(args.names or policies())
     PAGE.write_text(page())
 
 

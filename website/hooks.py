@@ -27,7 +27,8 @@ def targets(path: Path) -> list[Path]:
     """Files and folders that a page links to, its code left out."""
     parts = FENCE.split(path.read_text())
     links = [link for part in parts[::2] for _, link, _ in LINK.findall(part) if not outside(link)]
-    return [(path.parent / link.partition("#")[0]).resolve() for link in links]
+    curves = [f"../resources/policies/{name}/curve.png" for name in re.findall(r"<!-- made: policy_(\w+) -->", path.read_text())]
+    return [(path.parent / link.partition("#")[0]).resolve() for link in [*links, *curves]]
 
 
 def readable(path: Path) -> Path:
@@ -82,10 +83,11 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
         there = page_of((source.parent / name).resolve())
         return f"{before}{os.path.relpath(there, os.path.dirname(here) or '.')}{mark}{anchor}{after}"
 
+    markdown = MARK.sub(lambda found: made(found.group(1)), markdown)
     if source.suffix == ".md" and source.exists():
         parts = FENCE.split(markdown)
         markdown = "".join(part if i % 2 else LINK.sub(relinked, part) for i, part in enumerate(parts))
-    return twin(here) + MARK.sub(lambda found: made(found.group(1)), markdown)
+    return twin(here) + markdown
 
 
 def on_post_page(output: str, page: Any, **_: Any) -> str:
@@ -105,6 +107,6 @@ def twin(here: str) -> str:
 
 def made(name: str) -> str:
     sys.path.insert(0, str(ROOT))  # mkdocs loads this file by its path
-    from website.reference import MADE  # imports torch
+    from website import gallery, reference  # imports torch
 
-    return MADE[name]()
+    return gallery.chapter(name.removeprefix("policy_")) if name.startswith("policy_") else reference.MADE[name]()

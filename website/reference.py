@@ -3,39 +3,35 @@
 from __future__ import annotations
 
 import ast
+import importlib
 import inspect
 import io
+import pkgutil
 import re
+import sys
 import textwrap
 import tokenize
-from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from types import ModuleType, SimpleNamespace, UnionType
+from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
+from legged_mw import envs
 from legged_mw.deploy.contract import ROWS
-from legged_mw.envs.getup import Getup, GetupCfg, GetupCfgPPO
-from legged_mw.envs.handstand import Handstand, HandstandCfg, HandstandCfgPPO
-from legged_mw.envs.legged_rewards import LeggedRewards
-from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
-from legged_mw.envs.motion_tracking import MotionTracking
-from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
-from legged_mw.envs.robot_rewards import RobotRewards
-from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
-from legged_mw.envs.sim_to_real_config import BipedCfg, BipedRoughCfg, SimToRealCfg, SimToRealCfgPPO, SimToRealRoughCfg
-from legged_mw.utils.bounds import bounds_text
-from legged_mw.utils.config import field_types, type_text
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.utils.bounds import bare, bounds_text
+from legged_mw.utils.config import Config
 from legged_mw.utils.task import load_task
 from website.formula import formula
 
 UNITS = {*["m", "rad", "s", "ms", "N", "kg", "W", "deg", "mm", "Hz", "pixel", "iterations"], "-", ""}
-TERMS: list[tuple[str, type, type, str]] = [  # heading, where the terms stand, whose scales are the defaults, what those are
-    ("Of every task", RobotRewards, LeggedRobotCfg, "a walking task's"),
-    ("Of walking by command", LeggedRewards, LeggedRobotCfg, "a walking task's"),
-    ("Of getting up", Getup, GetupCfg, "the task's"),
-    ("Of handstand and footstand", Handstand, HandstandCfg, "the task's"),
-    ("Of following a motion", MotionTracking, MotionTrackingCfg, "the task's"),
-]
+TERMS: dict[str, str] = {  # a class with terms of its own -> heading; others come after these, by their names
+    "RobotRewards": "Of every task",
+    "LeggedRewards": "Of walking by command",
+    "Getup": "Of getting up",
+    "Handstand": "Of handstand and footstand",
+    "MotionTracking": "Of following a motion",
+}
 TASKS = ["go1_flat", "go1_rough", "go2_flat", "go2_rough", "g1_flat", "g1_rough"]
 EVERYTHING = {  # of a walking task: all rows that a flag switches on
     **{"env.num_envs": 1, "observations.foot_height": True, "observations.contact_forces": True, "gait.period": 0.8},
@@ -47,22 +43,19 @@ ENVS: list[tuple[str, str, dict[str, Any]]] = [
     ("Getting up, handstand (`go1_getup`)", "go1_getup", {"env.num_envs": 1, "falls.states": 4}),
     ("Following a motion (`g1_track`: 29 joints, 14 bodies)", "g1_track", {"env.num_envs": 1}),
 ]
-CONFIGS: list[tuple[str, type, str]] = [
-    ("The environment of every task", RobotTaskCfg, ""),
-    ("Walking by command adds", LeggedRobotCfg, ""),
-    ("For a real robot on four legs", SimToRealCfg, "`SimToRealCfg(LeggedRobotCfg)` changes:"),
-    ("On rough ground", SimToRealRoughCfg, "`SimToRealRoughCfg(SimToRealCfg)` changes:"),
-    ("On two legs", BipedCfg, "`BipedCfg(SimToRealCfg)` changes:"),
-    ("On two legs and rough ground", BipedRoughCfg, "`BipedRoughCfg(BipedCfg)` changes:"),
-    ("Getting up", GetupCfg, ""),
-    ("Handstand and footstand", HandstandCfg, ""),
-    ("Following a motion", MotionTrackingCfg, ""),
-    ("The learner of every task", RobotTaskCfgPPO, ""),
-    ("The learner of a walking task", LeggedRobotCfgPPO, ""),
-    ("The learner for a real robot", SimToRealCfgPPO, ""),
-    ("The learner of getting up", GetupCfgPPO, ""),
-    ("The learner of a handstand", HandstandCfgPPO, ""),
-]
+CONFIGS: dict[str, str] = {  # likewise
+    "RobotTaskCfg": "The environment of every task",
+    "LeggedRobotCfg": "Walking by command adds",
+    "SimToRealCfg": "For a real robot on four legs",
+    "SimToRealRoughCfg": "On rough ground",
+    "BipedCfg": "On two legs",
+    "BipedRoughCfg": "On two legs and rough ground",
+    "GetupCfg": "Getting up",
+    "HandstandCfg": "Handstand and footstand",
+    "MotionTrackingCfg": "Following a motion",
+    "RobotTaskCfgPPO": "The learner of every task",
+    "LeggedRobotCfgPPO": "The learner of a walking task",
+}
 
 
 class Said(NamedTuple):
@@ -108,6 +101,18 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
     return "\n".join([f"| {' | '.join(head)} |", "| " + " | ".join("---" for _ in head) + " |", *lines])
 
 
+def classes(headings: Mapping[str, str], wanted: Callable[[type], object]) -> list[tuple[str, Any]]:
+    """Heading and class of those in legged_mw/envs that are ``wanted``."""
+    modules = [importlib.import_module(f"legged_mw.envs.{module.name}") for module in pkgutil.iter_modules(envs.__path__)]
+    found = {each.__name__: each for module in modules for each in vars(module).values() if _is_ours(each) and wanted(each)}
+    order = [*(name for name in headings if name in found), *sorted(found.keys() - headings.keys())]
+    return [(headings.get(name, f"`{name}`"), found[name]) for name in order]
+
+
+def _is_ours(each: object) -> bool:
+    return isinstance(each, type) and each.__module__.startswith("legged_mw.envs.")
+
+
 # ---- reward terms
 
 
@@ -118,16 +123,22 @@ def terms_of(owner: type) -> dict[str, Any]:
 def rewards() -> str:
     """All terms by the class that has them, then their scales in the tasks that ship."""
     parts = []
-    for heading, owner, config, whose in TERMS:
-        scales = config().to_dict()["rewards"]["scales"]  # pyright: ignore[reportCallIssue]
+    for heading, owner in classes(TERMS, terms_of):
         rows = []
         for name, term in terms_of(owner).items():
             said = read_comment(inspect.getdoc(term) or "")
-            scale = scales.get(name, 0)
-            default = f"{scale:g}" if scale else "off"
-            rows.append([code(name), cell(said.words), code(formula(term)), cell(said.unit) or "1", cell(said.source), default])
-        parts += [f"### {heading}", table(["term", "what it measures", "formula", "unit", "source", f"{whose} scale"], rows)]
+            rows.append(
+                [code(name), cell(said.words), code(formula(term)), cell(said.unit) or "1", cell(said.source), default_scale(owner, name)]
+            )
+        parts += [f"### {heading}", table(["term", "what it measures", "formula", "unit", "source", "default scale"], rows)]
     return "\n\n".join([*parts, "### Scales in the tasks", _scales()])
+
+
+def default_scale(owner: type, name: str) -> str:
+    """Of the config that stands with a class: a walking task's for terms that all tasks have."""
+    named = {config.__name__: config for _, config in classes(CONFIGS, is_config)}
+    scales = named.get(f"{owner.__name__}Cfg", LeggedRobotCfg)().to_dict()["rewards"]["scales"]
+    return f"{scales[name]:g}" if scales.get(name) else "off"
 
 
 def _scales() -> str:
@@ -142,7 +153,7 @@ def _scales() -> str:
 def row_comments() -> dict[str, Said]:
     """What stands behind a row where the code makes it."""
     said: dict[str, Said] = {}
-    for owner in (RobotTask, LeggedRobot, MotionTracking, Getup):
+    for _, owner in classes({}, lambda each: "observation_rows" in dir(each)):
         for name, comment in re.findall(r'Row\("(\w+)",[^\n]*?\)?,?  # ([^\n]*)', inspect.getsource(owner)):
             said.setdefault(name, read_comment(comment))
     for path, field in fields(RobotTaskCfg).items():
@@ -218,30 +229,44 @@ def _fields(tree: ast.ClassDef, owner: Any, prefix: str, comments: dict[int, tup
                     yield f"{prefix}{name.id}", Field(kind, getattr(owner, name.id), said)
 
 
-def bounds(kind: Any) -> str:
-    """What values a field may have, as its annotation says it."""
-    choices, words = re.fullmatch(r"Literal\[(.*)\]", text := type_text(kind)), bounds_text(kind)
-    return choices.group(1).replace("'", "`").replace('"', "`") if choices else code(text) + (f" {words}" if words else "")
+def bounds(kind: str, module: ModuleType) -> str:
+    """The type that an annotation stands for, and what a value of it must be, in the words that errors use."""
+    if not kind:
+        return ""
+    holder = SimpleNamespace(__annotations__={"field": kind})
+    given = get_type_hints(holder, {**vars(module)}, include_extras=True)["field"]
+    plain = bare(given)
+    if get_origin(plain) is Literal:
+        return ", ".join(f"`{choice}`" for choice in get_args(plain))
+    kinds = get_args(plain) if get_origin(plain) in (Union, UnionType) else (plain,)
+    name = " | ".join(each.__name__ if isinstance(each, type) and not get_args(each) else str(each) for each in kinds)
+    text = re.sub(r"; (each )?(finite|below 10\^24|text without control characters)$", "", bounds_text(given))
+    text = "" if re.fullmatch(r"(each )*(finite|below 10\^24|text without control characters)", text) else text
+    return code(name.replace("typing.", "")) + (f": {cell(text)}" if text else "")
+
+
+def is_config(each: type) -> bool:
+    return issubclass(each, Config)
 
 
 def config_fields() -> str:
     """Every field of every config class, in sections as they are written."""
     parts = []
-    for heading, config, changes in CONFIGS:
-        parts.append(f"## {heading}\n\n" + (changes or f"`{config.__name__}`"))
+    for heading, config in classes(CONFIGS, is_config):
+        written = fields(config)
+        if not written:
+            continue
+        changes = not any(field.kind for field in written.values())
+        parent = config.__mro__[1].__name__
+        whose = f"`{config.__name__}`" if parent == "Config" else f"`{config.__name__}({parent})`{' changes:' if changes else ''}"
+        parts.append(f"## {heading}\n\n{whose}")
         sections: dict[str, list[list[str]]] = {}
-        kinds = dict(field_types(config))
-        for path, field in fields(config).items():
+        for path, field in written.items():
             section, _, name = path.rpartition(".")
             text = f"{field.value:g}" if isinstance(field.value, float) else repr(field.value)
             text = text if len(text) < 70 else text[:60] + " ..."
-            line = [
-                code(name),
-                code(text),
-                bounds(kinds[path]) if field.kind else "overridden",
-                cell(field.said.unit),
-                cell(field.said.words),
-            ]
+            limits = bounds(field.kind, sys.modules[config.__module__]) or "overridden"
+            line = [code(name), code(text), limits, cell(field.said.unit), cell(field.said.words)]
             sections.setdefault(section, []).append([*line, cell(field.said.source)])
         head = ["field", "default", "type, bounds", "unit", "what", "source"]
         if changes:

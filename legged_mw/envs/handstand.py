@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
+from legged_mw.envs.skill_config import SkillCfg, SkillCfgPPO
 from legged_mw.utils.bounds import Names, Positive, Sign
 from legged_mw.utils.config import ConfigError, fit
 from legged_mw.utils.errors import unknown
 
 
-class HandstandCfg(RobotTaskCfg):
-    class env(RobotTaskCfg.env):
-        num_envs, episode_length_s = 8192, 10.0  # [-], [s] [P]
+class HandstandCfg(SkillCfg):
+    class env(SkillCfg.env):
+        episode_length_s = 10.0  # [s] [P]
 
     class exam:
         """What is asked, of the reward and in the exam."""
@@ -27,53 +27,31 @@ class HandstandCfg(RobotTaskCfg):
         height: Positive = 0.55  # [m] of the root that is high enough [P]
         hands: list[str] = []  # geoms that stand: nothing else may touch the ground
 
-    class control(RobotTaskCfg.control):
-        action_scale = 0.5  # [rad] [ours, of the default pose; P 0.3 of the last targets, which wander, and no row says where they are]
+    class control(SkillCfg.control):
+        action_scale = 0.5  # [rad] [ours, of the default pose; P 0.3 of the last targets, and no row says where they are]
 
-    class normalization(RobotTaskCfg.normalization):
+    class normalization(SkillCfg.normalization):
         clip_actions = 4.0  # [ours: the thighs turn by 1.6 rad]
 
-    class observations(RobotTaskCfg.observations):
-        leave_out = {"state": ["base_lin_vel"]}  # [ours, P reads it: no sensor of the robot gives it]
-
-    class termination(RobotTaskCfg.termination):
+    class termination(SkillCfg.termination):
         max_tilt = 104.5  # [deg]: the trunk's z axis 0.25 below the horizon [P]
 
-    class domain_rand(RobotTaskCfg.domain_rand):
-        enable, observe = True, True  # [ours, P none]
+    class domain_rand(SkillCfg.domain_rand):
         base_mass, base_com, friction = [-0.5, 1.5], [-0.02, 0.02], [0.3, 1.2]  # [kg], [m], [-]
-        encoder_offset = [-0.015, 0.015]  # [rad]
 
-    class sim(RobotTaskCfg.sim):
-        iterations, ls_iterations = 3, 10  # [ours: as Getup]
-
-    class rewards(RobotTaskCfg.rewards):
+    class rewards(SkillCfg.rewards):
         soft_dof_pos_limit = 0.9  # [P]
 
-        class scales(RobotTaskCfg.rewards.scales):  # [P]; what it calls pose and contact is here joint_deviation, of angles, and collision
+        class scales(SkillCfg.rewards.scales):  # [P]; what it calls pose and contact is here joint_deviation, of angles, and collision
             stand_height, stand_attitude = 1.0, 1.0
             collision, dof_pos_limits, joint_deviation = -0.1, -0.5, -0.1
             action_rate, energy, dof_acc = -0.002, -1e-4, -1e-8  # [P in its fine-tuning 0, -0.003, -2.5e-7: as much as it gains, at first]
 
 
-class HandstandCfgPPO(RobotTaskCfgPPO):
-    class runner(RobotTaskCfgPPO.runner):
-        num_steps_per_env, max_iterations = 20, 1000  # [P], [ours]
-
-    class actor(RobotTaskCfgPPO.actor):
-        hidden_dims = [256, 128, 64]  # [ours]
-
-        class distribution_cfg(RobotTaskCfgPPO.actor.distribution_cfg):
+class HandstandCfgPPO(SkillCfgPPO):
+    class actor(SkillCfgPPO.actor):
+        class distribution_cfg(SkillCfgPPO.actor.distribution_cfg):
             init_std, std_range = 0.8, [0.15, 1e6]  # [ours]
-
-    class algorithm(RobotTaskCfgPPO.algorithm):
-        num_mini_batches, entropy_coef = 8, 0.01  # [ours]
-
-    class anneal(RobotTaskCfgPPO.anneal):
-        entropy_coef, desired_kl = 0.001, 0.003  # [ours]
-
-    class symmetry(RobotTaskCfgPPO.symmetry):
-        use_data_augmentation = True  # [ours]
 
 
 class Handstand(RobotTask):

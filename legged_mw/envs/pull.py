@@ -20,9 +20,15 @@ class Pull:
 
     def apply(self, up: Tensor) -> None:
         """Before a step, in which ``up`` (N,) says who needs none."""
-        self._force.copy_(torch.where(up, 0.0, self._highest * self.level))
+        if self._highest:
+            self._force.copy_(torch.where(up, 0.0, self._highest * self.level))
 
     def update(self, ended: Tensor, up: Tensor) -> None:
         """Episodes have ended, (N,) each."""
-        change = torch.where(up, -1.0, GIVEN_BACK).masked_fill(~ended, 0.0).mean()
-        self.level.add_(change, alpha=self._fades).clamp_(0.0, 1.0)
+        if self._highest:
+            change = torch.where(up, -1.0, GIVEN_BACK).masked_fill(~ended, 0.0).mean()
+            self.level.add_(change, alpha=self._fades).clamp_(0.0, 1.0)
+
+    def statistics(self) -> dict[str, Tensor]:
+        """The level, a sum and what to divide it by."""
+        return {"pull": torch.stack([self.level, torch.ones_like(self.level)])} if self._highest else {}

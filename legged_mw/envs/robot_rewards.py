@@ -226,6 +226,10 @@ class RobotRewards:
         """What joints exceed ``rewards.soft_dof_vel_limit`` of their highest speed by, at most 1 each [rad/s]. [L]"""
         return (self.dof_vel.abs() - self.soft_speed).clamp(0.0, 1.0).sum(dim=1)
 
+    def _reward_fast_joints(self) -> Tensor:
+        """What joints are faster than a turn a second, squared [rad^2/s^2]. [P]"""
+        return (self.dof_vel.abs() - 2.0 * torch.pi).clamp(min=0.0).square().sum(dim=1)
+
     def _reward_torque_limits(self) -> Tensor:
         """What torques exceed ``rewards.soft_torque_limit`` of the servo's limit by [N m]. [L]"""
         return (self.torques - self.torques.clamp(*self.soft_effort)).abs().sum(dim=1)
