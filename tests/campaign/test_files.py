@@ -360,7 +360,10 @@ ARRAYS: list[tuple[str, Callable[[Path], Any], dict[str, Any], str]] = [
 def test_arrays(read: Callable[[Path], Any], change: dict[str, Any], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arrays, "MOST_BYTES", 1 << 16)
     content = (CLIP if read is read_clip else MOTOR) | {name: np.asarray(value) for name, value in change.items()}
-    attack(Case("", lambda root: read(root / "file.npz"), says, given=lambda root: np.savez(root / "file.npz", allow_pickle=False, **content)), tmp_path)
+    attack(
+        Case("", lambda root: read(root / "file.npz"), says, given=lambda root: np.savez(root / "file.npz", allow_pickle=False, **content)),
+        tmp_path,
+    )
 
 
 # ---- scenes
