@@ -4,6 +4,7 @@ Whatever is read either becomes data or is a ConfigError of one line. What a tas
 or is refused by the rules between fields. A file outside of the temporary folder, another error or ten seconds for one input end it.
 """
 
+# pyright: reportMissingImports=false, reportCallIssue=false
 from __future__ import annotations
 
 import argparse

@@ -416,9 +416,13 @@ def test_the_contract_brings_the_rules_of_the_exam(export: Path) -> None:
 
 
 def test_a_result_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Refused before the exam; or after it, where the disk changed meanwhile: the table is out by then."""
     monkeypatch.setattr(program, "run_exam", lambda *_, **__: {})
     monkeypatch.setattr(rules, "table", lambda _: "the table")
     (tmp_path / "file").write_text("")
+    code, out, err = main(capsys, SHIPPED, "--eval", "--out", tmp_path / "file/exam.json")
+    assert code == 2 and out == "" and f"--out {tmp_path}/file/exam.json: {tmp_path}/file is a file, not a folder" in err
+    monkeypatch.setattr(program, "writable", lambda *_, **__: None)
     code, out, err = main(capsys, SHIPPED, "--eval", "--out", tmp_path / "file/exam.json")
     assert code == 2 and out == "the table\n" and f"cannot write {tmp_path}/file/exam.json: " in err and "say --out FILE" in err
 
