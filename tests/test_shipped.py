@@ -1,4 +1,4 @@
-"""The policies that ship: they load, both formats agree, play.py finds them, and they walk."""
+"""The policies that ship: they load, both formats agree, play.py finds them, and they walk, or do what they are for."""
 
 from __future__ import annotations
 
@@ -9,31 +9,59 @@ import onnxruntime
 import pytest
 import torch
 from program import run
+from rsl_rl.models import MLPModel
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.exam import contract_skill, perform
 from legged_mw.deploy.simulated import read_scene
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.eval import exam, rules
 from legged_mw.rl.export import FILES
 from legged_mw.rl.network import ExportedPolicy
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.files import digest
-from legged_mw.utils.task import load_task
+from legged_mw.utils.task import LoadedTask, load_task
 
 POLICIES = sorted(path.parent for path in (ROOT / "resources/policies").glob("*/policy.onnx"))
+SKILLED = [folder for folder in POLICIES if (read_contract(folder).exam or {}).get("kind")]
 
 
 def test_there_are_some() -> None:
     assert {"go1_flat", "go1_rough", "go1_rough_scan"} <= {folder.name for folder in POLICIES}
+    assert {"go1_getup", "go1_handstand", "go1_footstand", "g1_track"} <= {folder.name for folder in SKILLED}
 
 
-@pytest.mark.parametrize("folder", POLICIES, ids=lambda folder: folder.name)
-def test_walks_and_both_formats_agree(folder: Path) -> None:
+def trained(folder: Path) -> LoadedTask:
     task = load_task(folder.name)
     task.update_from_run(load_yaml(folder / "config.yaml"), where="config.yaml")
-    exam.prepare(task)
+    return task
+
+
+@pytest.mark.parametrize("folder", [folder for folder in POLICIES if folder not in SKILLED], ids=lambda folder: folder.name)
+def test_walks_and_both_formats_agree(folder: Path) -> None:
+    exam.prepare(task := trained(folder))
     env = task.env_class(task.cfg, "cpu")
+    policy = check_formats(folder, task, env)
+    result = exam.run_exam(env, lambda state: act(policy, state))
+    assert result["walks"], rules.table(result)
+
+
+@pytest.mark.parametrize("folder", SKILLED, ids=lambda folder: folder.name)
+def test_passes_its_exam_and_both_formats_agree(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the first of its grounds, by a few robots."""
+    task = trained(folder)
+    task.cfg.env.num_envs = 1
+    check_formats(folder, task, task.env_class(task.cfg, "cpu"))
+    skill = contract_skill(read_contract(folder))
+    monkeypatch.setattr(type(skill), "robots", 4)
+    name, ground = next(iter(skill.grounds.items()))
+    part = skill.judge(*perform(folder, skill, ground))
+    assert all(figure.passes() is not False for figure in skill.figures({name: part}, name)), part
+
+
+def check_formats(folder: Path, task: LoadedTask, env: RobotTask) -> MLPModel:
     policy = load_policy(folder / "policy.onnx", env, task.train, "cpu")
 
     obs = torch.randn(32, policy.obs_dim, generator=torch.Generator().manual_seed(0)) * 2.0
@@ -47,9 +75,7 @@ def test_walks_and_both_formats_agree(folder: Path) -> None:
 
     contract = read_contract(folder)
     assert contract.digest == digest(folder / "policy.onnx") and read_scene(folder, contract).model.nu == env.num_actions
-
-    result = exam.run_exam(env, lambda state: act(policy, state))
-    assert result["walks"], rules.table(result)
+    return policy
 
 
 def test_play_takes_the_shipped_policy_where_nothing_is_trained(tmp_path: Path) -> None:
