@@ -80,7 +80,7 @@ def _wait(child: int, home: Path, new: int, pause: float) -> None:
 
 def campaign(root: Path, kills: int, numbers: tuple[int, ...], seed: int = 0, iterations: int = 12, export: bool = True) -> dict[str, int]:
     """``kills`` signals from ``numbers``, each up to 0.4 s after 0 to 4 new checkpoints; counts of what happened."""
-    dice, counts = random.Random(seed), dict.fromkeys(("kills", "resumed exactly", "ended by itself", "compared"), 0)
+    dice, counts = random.Random(seed), dict[str, int](kills=0, compared=0, **{"resumed exactly": 0, "ended by itself": 0})
     assert waited(train(root / "whole", False, iterations, export)) == 0
     whole = folder_of(root / "whole")
     assert whole

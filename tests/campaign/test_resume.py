@@ -79,9 +79,9 @@ def interrupted(root: Path, *flags: str, after: int = 2) -> tuple[Path, Path]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Keeper, "write", write_and_copy)
-        result = run("train", root, *SMALL, *THREE, "--experiment_name", str(root / "whole"), *flags)
+        result = run("train", root, *SMALL, *THREE, "--experiment_name", "whole", *flags)
     assert result.code == 0, result.err
-    [whole] = (root / "whole").iterdir()
+    [whole] = (root / "logs/whole").iterdir()
     return whole, killed
 
 
