@@ -69,6 +69,11 @@ class Held(NamedTuple):
         ]
 
 
+def who_ask() -> list[Any]:
+    """Modules of environments that ask on a CPU whether there is a world to draw for."""
+    return [each for name, each in sys.modules.items() if name.startswith("legged_mw.envs") and hasattr(each, "maybe_any")]
+
+
 class Soak:
     """One run."""
 
@@ -76,8 +81,6 @@ class Soak:
         task = load_task(args.task)
         for path, value in {"env.num_envs": args.num_envs, "sim.engine": args.engine, **BUSY}.items():
             task.set(path, value)
-        for module in [each for name, each in sys.modules.items() if name.startswith("legged_mw.envs") and hasattr(each, "maybe_any")]:
-            vars(module)["maybe_any"] = lambda _: True
         torch.manual_seed(args.seed)
         self.env = task.env_class(task.cfg, args.device)
         self.device, self.breaks, self.count = args.device, breaks, args.num_envs
@@ -102,7 +105,7 @@ class Soak:
         bits = torch.cat(parts, dim=1).contiguous().view(torch.int32).long()
         self.digest.mul_(6364136223846793005).add_((bits * torch.arange(1, 2 * bits.shape[1], 2, device=self.device)).sum(dim=1))
         self.reward += reward
-        wild = sum((~part.isfinite()).sum() for part in parts)
+        wild = (~torch.cat(parts, dim=1).isfinite()).sum()
         self.totals += torch.stack([ended.sum(), env.broken.sum(), env.fell.sum(), env.time_out_buf.sum(), wild])
         self.done += 1
 
@@ -158,6 +161,9 @@ def main() -> None:
     args.device = pick_device(args.device)
     if args.device == "cpu":
         torch.set_num_threads(1)
+    load_task(args.task)
+    for module in who_ask():
+        vars(module)["maybe_any"] = lambda _: True
     broken, steps = Soak(args, breaks=True), math.ceil(args.steps / args.num_envs)
     before, end, rate = broken.run(steps, args.seconds / 2)
     wrong = broken.faults(before, end)

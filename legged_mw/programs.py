@@ -11,7 +11,7 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from legged_mw.utils.cli import fail, one_line_errors
@@ -107,7 +107,7 @@ def _tool(name: str) -> Callable[[], None]:
     """A program whose ``main`` does all."""
 
     def start() -> None:
-        with one_line_errors():
+        with one_line_errors(), patient_console():
             import_module(name).main()
 
     return start
@@ -145,7 +145,10 @@ def main() -> None:
         print(HELP)
         return
     if name == "--version":
-        print(f"legged_mw {version('legged_mw')}")
+        try:
+            print(f"legged_mw {version('legged_mw')}")
+        except PackageNotFoundError:
+            print("legged_mw, on the path but not installed")
         return
     if name not in PROGRAMS:
         close = difflib.get_close_matches(name, PROGRAMS, n=1)

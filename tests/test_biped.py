@@ -367,7 +367,7 @@ CLOCK = "there is no gait clock; set gait.period \\[s\\]$"
             "^rewards.scales.single_stance is on, but it is for robots with two feet; asset.foot_names has 4$",
         ),
         (BIPED, {"init_state.dof_pos_offset": [0.1]}, r"init_state.dof_pos_offset is \[0.1\]; it must be two numbers, the lower first$"),
-        (BIPED, {"init_state.dof_vel_range": -1.0}, r"init_state.dof_vel_range is -1.0; it must be 0 or more$"),
+        (BIPED, {"init_state.dof_vel_range": -1.0}, r"init_state.dof_vel_range is -1.0; it must be from 0 to 1000$"),
     ],
 )
 def test_what_is_asked_without_what_it_needs(task: str, settings: dict[str, Any], text: str) -> None:

@@ -35,7 +35,7 @@ def test_tasks_as_they_ship_pass(name: str) -> None:
         ("commands.ranges.lin_vel_y", [0.5], "two numbers, the lower first"),
         ("commands.keep_probability", [0.9, 0.25], "three numbers, and more for further commands; each from 0 to 1"),
         ("perturbation.duration", [0.2, 0.1], "two numbers, the lower first; each above 0"),
-        ("domain_rand.link_mass", [0.9], "two numbers, the lower first, or an empty list; each above 0"),
+        ("domain_rand.link_mass", [0.9], "two numbers, the lower first, or an empty list; each above 0 and at most 1000"),
         ("rewards.mirror_joints", [["FR_", "RL_"], ["FL_"]], "pairs: lists of two names or patterns each"),
         ("termination.max_tilt", 0.0, "above 0 and at most 180 degrees"),
         ("init_state.pos", [0.0, 0.3], "three numbers, or an empty list; each from -1000 to 1000 m"),
@@ -71,7 +71,7 @@ def test_mistake_is_named(path: str, value: Any, wanted: str) -> None:
     [
         ("asset.foot_names", [], "asset.foot_names is []; it must be a list of at least one name, one for each foot"),
         ("asset.foot_names", ["*_foot"], "asset.foot_names is ['*_foot']; it must be a list of at least one name"),
-        ("control.stiffness", {"": 35.0, "hip": -35.0}, "control.stiffness['hip'] is -35.0; it must be 0 or more"),
+        ("control.stiffness", {"": 35.0, "hip": -35.0}, "control.stiffness['hip'] is -35.0; it must be from 0 to 1,000,000"),
         ("domain_rand.friction", [0.0, 1.0], "domain_rand.friction[0] is 0.0; it must be above 0"),
         (
             "domain_rand.model_factors",

@@ -19,6 +19,7 @@ from test_recurrent import IMAGES, NETWORKS, share_memory
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
+from legged_mw.envs.worlds import worlds_state
 from legged_mw.eval.training import TrainingExam
 from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.policies import Source, Trained
@@ -468,3 +469,35 @@ def test_a_students_iteration_never_waits_for_the_host() -> None:
     finally:
         torch.cuda.set_sync_debug_mode("default")
     assert all(math.isfinite(value) for value in report.message.read()[-3:])
+
+
+def test_a_replayed_update_is_undone_to_the_last_bit() -> None:
+    """What three eager updates and one replay have learned; then one that is good is taken over."""
+    alg = make(GraphedPPO, DEVICE)
+    for seed in range(6):
+        collect(alg, DEVICE, seed=seed)
+        before = {name: value.clone() for name, value in parameters(alg).items()}
+        if seed in (0, 4):
+            alg.storage.rewards[1, 2] = math.nan
+            alg.compute_returns(alg.storage.observations[-1])
+        alg.update()
+        assert bool(alg.undo.undone) == (seed in (0, 4)) == (difference(before, parameters(alg)) == 0.0)
+    assert alg._update_graph.recorded
+    assert all(bool(value.isfinite().all()) for memory in alg.optimizer.state.values() for value in memory.values())
+
+
+def test_a_run_goes_on_in_the_worlds_that_it_left(tmp_path: Path) -> None:
+    """Their state comes back to the bit; what follows differs by mujoco-warp's sums alone."""
+    task = load_task("go1_flat_dr")
+    for path, value in {"env.num_envs": 64, "runner.num_steps_per_env": 8, "runner.save_interval": 2}.items():
+        task.set(path, value)
+    env, other = (task.env_class(task.cfg, DEVICE) for _ in range(2))
+    runner = make_runner(env, task.train, tmp_path, DEVICE)
+    runner.learn(6)
+    kept = worlds_state(env)
+    again = make_runner(other, task.train, None, DEVICE)
+    again.load(str(tmp_path / "model_6.pt"))
+    restored = worlds_state(other)
+    assert again.begins_anew == "" and all(torch.equal(restored[name].nan_to_num(), value.nan_to_num()) for name, value in kept.items())
+    again.learn(5, init_at_random_ep_len=False)
+    assert again.current_learning_iteration == 11

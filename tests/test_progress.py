@@ -56,7 +56,7 @@ def test_a_pipe_gets_a_line_an_iteration(tmp_path: Path, capsys: pytest.CaptureF
             clock[0] += 2.0
             console.iteration(done, 100, 50 if done < 50 else None, NUMBERS, {}, 1234.5)
     first, *_, last = capsys.readouterr().out.splitlines()
-    said = "reward 1.23, length -, 2 falls in 7 episodes, 1,234 steps/s"
+    said = "reward 1.23, length -, episodes 7, falls 2, 1,234 steps/s"
     assert first == f"Learning iteration 1/100: {said}, 1:39:00 left, exam in 0:49:00"
     assert last == f"Learning iteration 61/100: {said}, 0:01:18 left"  # at the pace of the last ones, 2 s each
     blocks = (tmp_path / LOG_FILE).read_text()
@@ -79,6 +79,7 @@ def test_a_terminal_keeps_a_bar_below_the_lines(monkeypatch: pytest.MonkeyPatch,
             clock[0] += 1.0
             console.iteration(done, 40, 20, NUMBERS, {}, 1.0)
         print("WARNING: above")
+        print("", end="")
         *lines, warning, bar = shown(terminal.getvalue())
         assert [line.split(":")[0] for line in lines] == [f"Learning iteration {done}/40" for done in range(1, 11)]
         assert "left" not in lines[-1] and warning == "WARNING: above"

@@ -17,6 +17,7 @@ from program import SMALL, run
 from torch.utils.tensorboard import SummaryWriter
 
 from legged_mw import ROOT, programs
+from legged_mw.rl import training
 from legged_mw.rl.runs import save_whole
 from legged_mw.sim.device import DeviceFacts, device_facts
 from legged_mw.tools import alongside, chart, completion, doctor, sweep, warm
@@ -121,8 +122,7 @@ def test_doctor_says_what_is_there_and_what_mends(monkeypatch: pytest.MonkeyPatc
         "    egl            EGLError: no device\n",
         "    osmesa         draws\n",
         "    glfw           no screen\n",
-        "  ! onnxruntime    not installed (to run an export: legged-mw deploy)\n",
-        "  onnxruntime: pip install onnxruntime\n",
+        "    onnxruntime    not installed; it runs an export: pip install 'legged_mw[deploy]'\n",
         "load 99.0\n",
         "  cores: others use this machine: what is measured now is slower than it could be\n",
     ):
@@ -134,12 +134,17 @@ def test_doctor_says_what_is_there_and_what_mends(monkeypatch: pytest.MonkeyPatc
 
 def test_doctor_fails_where_nothing_can_train(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     version = doctor._version
-    monkeypatch.setattr(doctor, "_version", lambda name: "" if name == "mujoco-warp" else version(name))
+    others = {"mujoco-warp": "", "onnxscript": "0.5.4"}
+    monkeypatch.setattr(doctor, "_version", lambda name: others.get(name, version(name)))
+    monkeypatch.setattr(
+        doctor.metadata, "requires", lambda _: ["mujoco-warp<4.1,>=4.0", "onnxscript>=0.6", "torch", 'av; extra == "video"']
+    )
     monkeypatch.setattr(doctor, "draws", lambda name: "")
     with pytest.raises(SystemExit, match="1"):
         program("doctor", monkeypatch=monkeypatch)
     said = capsys.readouterr().out
-    assert "  mujoco-warp: pip install mujoco-warp\n" in said and "Speed" not in said
+    assert "  mujoco-warp: pip install 'mujoco-warp<4.1,>=4.0'\n" in said and "Speed" not in said
+    assert "  ! onnxscript     0.5.4, which is not >=0.6\n" in said and "  onnxscript: pip install 'onnxscript>=0.6'\n" in said
 
 
 def test_drawing_is_tried_in_another_process() -> None:
@@ -233,6 +238,18 @@ def test_a_sweep_trains_every_combination_and_ends_with_a_table(tmp_path: Path) 
     assert lines[0] == ["b", "seed", "iterations", "M", "steps", "minutes", "steps/s", "reward", "falls"]
     assert [(line[0], line[1], line[6]) for line in lines[1:4]] == [("1", "1", "10.00"), ("1", "2", "20.00"), ("2", "1", "30.00")]
     assert lines[4][:4] == ["1", "mean", "of", "2"] and "15.00 ± 7.07" in " ".join(lines[4])
+
+
+def test_a_sweep_ends_where_a_signal_stops_it(tmp_path: Path) -> None:
+    assert sweep.STOPPED == training.STOPPED
+    cells, flags = sweep.make_cells([], ["1", "2", "3"]), []
+
+    def start(asked: list[str]) -> tuple[int, str, str]:
+        flags.append(asked)
+        by = "SIGINT" if len(flags) == 2 else "--max_time"
+        return sweep.STOPPED, str(write_run(tmp_path / f"{len(flags)}")), f"stopped: {by}; go on with"
+
+    assert len(sweep.train_all(cells, [], start)) == len(flags) == 2
 
 
 def test_values_stand_apart_by_commas() -> None:

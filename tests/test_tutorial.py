@@ -62,6 +62,13 @@ def test_the_code_runs_and_prints_what_the_page_shows(monkeypatch: pytest.Monkey
             assert words(text) == words(shown), f"{code}{MENDED}"
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)
+def test_formulas_stand_apart_as_github_wants_them(page: Path) -> None:
+    text = re.sub(r"```.*?```|`[^`\n]*`|^\$\$.*?\$\$$", "", read(page), flags=re.MULTILINE | re.DOTALL)
+    found = list(re.finditer(r"(.?)\$[^$\n]+\$(.?)", text))
+    assert len(found) > 80 and [each[0] for each in found if each[1].strip() or re.match(r"[A-Za-z0-9]", each[2])] == []
+
+
 def test_formulas_become_mathml() -> None:
     shown = on_page_content(r'<p><span class="arithmatex">\(a &lt; b\)</span></p><div class="arithmatex">\[\sum_k w_k\]</div>')
     assert shown.count("<math ") == 2 and 'display="block"' in shown and "&#x0003C;" in shown and "arithmatex" not in shown

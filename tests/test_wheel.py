@@ -50,6 +50,7 @@ def start(installed: Path, folder: Path, *args: str) -> str:
     return out
 
 
+@pytest.mark.skipif(not (ROOT / ".git").exists(), reason="compares with what git tracks")
 def test_the_sdist_holds_what_the_wheel_is_built_from_and_tested_with(tmp_path: Path) -> None:
     """What git tracks, but for the pictures of docs/ and the folders of services: MANIFEST.in lists it."""
     source, out = tmp_path / "source", tmp_path / "out"

@@ -8,19 +8,17 @@ import inspect
 import io
 import pkgutil
 import re
-import sys
 import textwrap
 import tokenize
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from types import ModuleType, SimpleNamespace, UnionType
-from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+from typing import Any, NamedTuple
 
 from legged_mw import envs
 from legged_mw.deploy.contract import ROWS
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.utils.bounds import bare, bounds_text
-from legged_mw.utils.config import Config
+from legged_mw.utils.bounds import bounds_text
+from legged_mw.utils.config import Config, field_types, type_text
 from legged_mw.utils.task import load_task
 from website.formula import formula
 
@@ -229,20 +227,10 @@ def _fields(tree: ast.ClassDef, owner: Any, prefix: str, comments: dict[int, tup
                     yield f"{prefix}{name.id}", Field(kind, getattr(owner, name.id), said)
 
 
-def bounds(kind: str, module: ModuleType) -> str:
-    """The type that an annotation stands for, and what a value of it must be, in the words that errors use."""
-    if not kind:
-        return ""
-    holder = SimpleNamespace(__annotations__={"field": kind})
-    given = get_type_hints(holder, {**vars(module)}, include_extras=True)["field"]
-    plain = bare(given)
-    if get_origin(plain) is Literal:
-        return ", ".join(f"`{choice}`" for choice in get_args(plain))
-    kinds = get_args(plain) if get_origin(plain) in (Union, UnionType) else (plain,)
-    name = " | ".join(each.__name__ if isinstance(each, type) and not get_args(each) else str(each) for each in kinds)
-    text = re.sub(r"; (each )?(finite|below 10\^24|text without control characters)$", "", bounds_text(given))
-    text = "" if re.fullmatch(r"(each )*(finite|below 10\^24|text without control characters)", text) else text
-    return code(name.replace("typing.", "")) + (f": {cell(text)}" if text else "")
+def bounds(kind: Any) -> str:
+    """The type, and what a value of it must be, in the words that errors use."""
+    choices, words = re.fullmatch(r"Literal\[(.*)\]", text := type_text(kind)), bounds_text(kind)
+    return choices.group(1).replace("'", "`").replace('"', "`") if choices else code(text) + (f": {cell(words)}" if words else "")
 
 
 def is_config(each: type) -> bool:
@@ -261,11 +249,12 @@ def config_fields() -> str:
         whose = f"`{config.__name__}`" if parent == "Config" else f"`{config.__name__}({parent})`{' changes:' if changes else ''}"
         parts.append(f"## {heading}\n\n{whose}")
         sections: dict[str, list[list[str]]] = {}
+        kinds = dict(field_types(config))
         for path, field in written.items():
             section, _, name = path.rpartition(".")
             text = f"{field.value:g}" if isinstance(field.value, float) else repr(field.value)
             text = text if len(text) < 70 else text[:60] + " ..."
-            limits = bounds(field.kind, sys.modules[config.__module__]) or "overridden"
+            limits = bounds(kinds[path]) if field.kind else "overridden"
             line = [code(name), code(text), limits, cell(field.said.unit), cell(field.said.words)]
             sections.setdefault(section, []).append([*line, cell(field.said.source)])
         head = ["field", "default", "type, bounds", "unit", "what", "source"]

@@ -24,7 +24,7 @@ from legged_mw.deploy.motion import ATTITUDE, POSITION
 from legged_mw.deploy.motors import make_network
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, damped, layout
 from legged_mw.utils.errors import unknown
-from legged_mw.utils.machine import usable_cores
+from legged_mw.utils.machine import require_memory, usable_cores
 from legged_mw.utils.mjcf import check_files, check_model
 
 Change = Callable[[mujoco.MjModel], None]
@@ -59,6 +59,7 @@ class Fleet:
             change(self.model)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world counts as fallen; nothing is printed
         _keep_quiet()
+        require_memory(0.2 * mujoco.MjData(self.model).nbuffer * count, "cpu", f"--num_envs {count}", "take fewer")  # as sim/engines.py
         self._batch = Batch(self.model, count, threads or min(usable_cores(), count))
         self._sensors, self._layout = self._batch.bind("sensordata"), layout(contract)
         self.qpos: Floats = self._batch.bind("qpos")  # (N, nq), a view: position [m], quaternion, joints in MuJoCo's order

@@ -8,7 +8,22 @@ from __future__ import annotations
 from typing import Annotated, Literal
 
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
-from legged_mw.utils.bounds import THREE, Bound, Count, NonNegative, Part, Points, Positive, Range, Share, ShareRange, Sign, Whole, or_empty
+from legged_mw.utils.bounds import (
+    THREE,
+    Bound,
+    Count,
+    NonNegative,
+    Part,
+    Points,
+    Positive,
+    Range,
+    Share,
+    ShareRange,
+    Sign,
+    Span,
+    Whole,
+    or_empty,
+)
 
 Probabilities = Annotated[list[Share], Bound("three numbers, and more for further commands", lambda v: len(v) >= 3)]
 Stance = Annotated[float, Bound("above 0 and below 1", lambda v: 0 < v < 1)]
@@ -29,7 +44,7 @@ class LeggedRobotCfg(RobotTaskCfg):
         contact_forces: bool = False  # a row of `privileged_state`: the ground's force on each foot, world frame [N] [ours: off]
 
     class commands:
-        resampling_time: NonNegative = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]
+        resampling_time: Span = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]
         change_probability: Share = 0.5  # that a component changes at all when the timer ends [P]
         keep_probability: Probabilities = [0.9, 0.25, 0.5]  # of each command: that a changed one is not its default; beyond the list 1 [P]
 
@@ -54,7 +69,7 @@ class LeggedRobotCfg(RobotTaskCfg):
     class gait:
         """A clock (legged_mw/envs/gait.py): where each foot is in its step, for the policy and the terms feet_phase, contact_phase."""
 
-        period: NonNegative = 0.0  # of a step of both legs [s]; 0: no clock [unitree_rl_gym: 0.8]
+        period: Span = 0.0  # of a step of both legs [s]; 0: no clock [unitree_rl_gym: 0.8]
         offsets: list[Share] = []  # where each foot is when the clock is at 0, share of the period; empty: of two feet [0.0, 0.5]
         stance: Stance = 0.55  # share of the period that a foot stands, from its phase 0 [unitree_rl_gym]
         random_start: bool = True  # episodes begin anywhere in the period, so that each leg learns to lead; False: at 0, as deploy does

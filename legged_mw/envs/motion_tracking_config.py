@@ -6,7 +6,7 @@ Source: BeyondMimic (arXiv 2508.08241), as its code and mjlab's have it; [ours] 
 from __future__ import annotations
 
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.utils.bounds import NonNegative, NonNegativeVector, Part, Positive, Seconds
+from legged_mw.utils.bounds import FileNames, NonNegative, NonNegativeVector, Part, Positive, Seconds, Span
 
 
 class MotionTrackingCfg(RobotTaskCfg):
@@ -16,12 +16,12 @@ class MotionTrackingCfg(RobotTaskCfg):
         episode_length_s = 10.0
 
     class motion:
-        clips: list[str] = []  # .npz as `python -m legged_mw.motion --out` writes them; any frame rate
+        clips: FileNames = []  # .npz as `python -m legged_mw.motion --out` writes them; any frame rate
         bodies: list[str] = []  # that are compared
         anchor: str = ""  # one of them, at which they are
         end_bodies: list[str] = []  # of them: far too high or low with one of these, it fell
         random_start: bool = True  # episodes begin anywhere in the clips, by the bins below; False: at the first clip's first frame
-        hold_s: NonNegative = 1.0  # a clip's last frame is held for so long, then the episode times out [s] [ours: deploy holds it, too]
+        hold_s: Span = 1.0  # a clip's last frame is held for so long, then the episode times out [s] [ours: deploy holds it, too]
         bin_s: Seconds = 1.0  # length of a bin [s]
         failure_rate: Part = 0.001  # share of a step in the moving average of the failures in each bin
         uniform: Part = 0.1  # share of the episodes that begin in any bin [-] [ours: B's code adds it to the failures, where it is nothing]

@@ -9,12 +9,14 @@ from __future__ import annotations
 from typing import Annotated, Any, Literal
 
 from legged_mw.utils.bounds import (
+    PAIR,
     THREE,
     Bound,
     Count,
     Delays,
     Factors,
     Few,
+    Gain,
     Names,
     NonNegative,
     NonZero,
@@ -27,6 +29,7 @@ from legged_mw.utils.bounds import (
     Seed,
     Share,
     Sizes,
+    Speed,
     Whole,
     WholeDelays,
     above,
@@ -38,6 +41,7 @@ from legged_mw.utils.config import Config
 Place = Annotated[list[Annotated[float, at_least(-1000, 1000, "m")]], or_empty(THREE)]
 Camera = Annotated[list[float], or_empty(Bound("three numbers, not straight above or below", lambda v: len(v) == 3 and any(v[:2])))]
 Pairs = Annotated[list[list[str]], Bound("pairs: lists of two names or patterns each", lambda v: all(len(pair) == 2 for pair in v))]
+Kicks = Annotated[list[Annotated[float, at_least(-1000, 1000, "m/s")]], PAIR]
 Tilt = Annotated[float, above(0, 180, "degrees")]
 Slope = Annotated[float, at_least(-60, 60, "degrees")]
 TimeStep = Annotated[float, at_least(1e-4, 0.1, "s")]
@@ -67,8 +71,8 @@ class RobotTaskCfg(Config):
         held_joints: list[str] = []  # names or patterns: welded at their default angle, so that they are no joints any more
         # tables a joint that need not name every joint; the others keep the file's
         effort: dict[str, Positive] = {}  # highest force of the servo, both ways [N m]
-        armature: dict[str, NonNegative] = {}  # inertia of the rotor at the joint [kg m^2]
-        frictionloss: dict[str, NonNegative] = {}  # dry friction [N m]
+        armature: dict[str, Gain] = {}  # inertia of the rotor at the joint [kg m^2]
+        frictionloss: dict[str, Gain] = {}  # dry friction [N m]
         joint_speed_limits: dict[str, Positive] = {}  # the motor's highest speed [rad/s] (a URDF has it); for report and rewards only
 
     class init_state:
@@ -76,18 +80,18 @@ class RobotTaskCfg(Config):
         default_joint_angles: dict[str, float] = {}  # table a joint [rad]: the pose of action 0; joints without a key: that keyframe's
         dof_pos_range: Range = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
         dof_pos_offset: Range = [0.0, 0.0]  # added to each joint at reset, U(low, high), within its range [rad]
-        dof_vel_range: NonNegative = 0.0  # each joint's velocity at reset, U(-range, range) [rad/s]
+        dof_vel_range: Speed = 0.0  # each joint's velocity at reset, U(-range, range) [rad/s]
         pos_xy_range: NonNegative = 0.5  # root x and y + U(-range, range) [m] [P]
         yaw_range: NonNegative = 3.141592653589793  # U(-range, range) [rad] [P]
-        lin_vel_range: NonNegative = 0.5  # root velocity, world frame, each axis U(-range, range) [m/s] [P]
-        ang_vel_range: NonNegative = 0.5  # root angular velocity, body frame, each axis U(-range, range) [rad/s] [P]
+        lin_vel_range: Speed = 0.5  # root velocity, world frame, each axis U(-range, range) [m/s] [P]
+        ang_vel_range: Speed = 0.5  # root angular velocity, body frame, each axis U(-range, range) [rad/s] [P]
 
     class control:
         # servo: kp (target - angle), damped in the joint; dc_motor: kp (target - angle) - kd speed within a torque-speed curve;
         # torque: the action is one, scaled; network: a file's weights make the torque (docs/motors.md)
         actuator: Literal["servo", "dc_motor", "torque", "network"] = "servo"  # [P]
-        stiffness: dict[str, NonNegative] = {}  # table a joint: position gain [N m/rad]
-        damping: dict[str, NonNegative] = {}  # table a joint: passive damping; of a dc_motor its velocity gain, in its curve [N m s/rad]
+        stiffness: dict[str, Gain] = {}  # table a joint: position gain [N m/rad]
+        damping: dict[str, Gain] = {}  # table a joint: passive damping; of a dc_motor its velocity gain, in its curve [N m s/rad]
         # tables a joint of a torque-speed curve, which dc_motor needs and torque and network may have: at angular velocity w a motor
         # gives from -stall_torque (1 + w / no_load_speed) to stall_torque (1 - w / no_load_speed), and at most asset.effort
         stall_torque: dict[str, Positive] = {}  # [N m]
@@ -152,12 +156,12 @@ class RobotTaskCfg(Config):
         kick: bool = False  # [P]
         interval: PositiveRange = [1.0, 3.0]  # pause between kicks [s] [P]
         duration: PositiveRange = [0.05, 0.2]  # [s] [P]
-        velocity: Range = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
+        velocity: Kicks = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
         curriculum: bool = False  # a world's dv grows with the share of an episode that it survives, from 0 [ours]
         curriculum_rate: Part = 0.5  # by which share of the way it does, at the end of an episode, from above 0 to 1 [ours]
         push: bool = False  # the root's horizontal velocity becomes a random one; beside kicks or alone [L]
         push_interval_s: Seconds = 15.0  # between pushes, each world's clock its own [s] [L]
-        max_push_vel_xy: NonNegative = 1.0  # each axis U(-max, max) [m/s] [L]
+        max_push_vel_xy: Speed = 1.0  # each axis U(-max, max) [m/s] [L]
 
     class domain_rand:
         """What differs between worlds. Two numbers are the ends of a uniform distribution; an empty list leaves the model's value."""

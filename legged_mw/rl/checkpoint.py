@@ -11,7 +11,7 @@ import math
 import re
 import struct
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,8 @@ from legged_mw.utils.config import ConfigError
 
 _SEAL = b"sha256:"
 EARLIER = "an earlier one is named by --checkpoint"
+_ADAM = ("step", "exp_avg", "exp_avg_sq")  # what Adam remembers of a parameter
+_CHOSEN = ("amsgrad", "maximize", "differentiable")  # by the config
 _KINDS = {int: "a whole number from 0", dict: "a mapping"}
 
 
@@ -74,8 +76,8 @@ class Checker:
             raise self.fail(f"{what} is {tuple(value.shape)}, it must be {tuple(shape)}")
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
             raise self.fail(f"{what} shows {value.numel()} numbers and has fewer")
-        if not bool(value.isfinite().all()):
-            raise self.fail(f"{what} has values that are not finite")
+        if value.is_complex() or not bool(value.isfinite().all()):
+            raise self.fail(f"{what} has values that are not finite" if not value.is_complex() else f"{what} is {_short(value)}")
         return value
 
     def weights(self, content: Mapping[str, Any], name: str) -> None:
@@ -89,37 +91,44 @@ class Checker:
 
     def memory(self, content: Mapping[str, Any], name: str, optimizer: torch.optim.Optimizer) -> None:
         """An optimizer's state: that of ``optimizer``, whose parameters are counted group by group."""
-        saved, start, shapes = self.take(content, name, dict), 0, {}
-        groups, own = saved.get("param_groups"), optimizer.state_dict()["param_groups"]
-        counts = [len(group["params"]) for group in own]
-        if not isinstance(groups, list) or [self._group(group, f"{name}: ") for group in groups] != counts:
-            raise self.fail(f"{name}: param_groups must be {len(own)}, of {', '.join(map(str, counts))} parameters")
-        for saved_group, group in zip(groups, optimizer.param_groups, strict=True):
-            if saved_group["params"] != [*range(start, start := start + len(group["params"]))]:
-                raise self.fail(f"{name}: params is {_short(saved_group['params'])}, it must count the parameters")
-            shapes |= dict(zip(saved_group["params"], (parameter.shape for parameter in group["params"]), strict=True))
+        saved, parameters = self.take(content, name, dict), list[Tensor]()
+        groups, own = saved.get("param_groups"), optimizer.param_groups
+        if not isinstance(groups, list) or len(groups) != len(own):
+            raise self.fail(f"{name}: param_groups must be a list of {len(own)}")
+        for group, mine in zip(groups, own, strict=True):
+            count = range(len(parameters), len(parameters) + len(mine["params"]))
+            self._group(group, mine, f"{name}: ")
+            if not isinstance(group.get("params"), list) or [*map(_short, group["params"])] != [*map(_short, count)]:
+                raise self.fail(f"{name}: params must count the parameters, from {count.start} to {count.stop - 1}")
+            parameters += mine["params"]
         for index, held in self.take(saved, "state", dict, f"{name}: ").items():
-            if index not in shapes or not isinstance(held, Mapping):
+            if type(index) is not int or not 0 <= index < len(parameters) or not isinstance(held, Mapping):
                 raise self.fail(f"{name}: state {_short(index)} is of no parameter")
+            if "betas" in own[0] and not {*_ADAM} <= held.keys():
+                raise self.fail(f"{name}: state of parameter {index} must have {', '.join(_ADAM)}")
             for key, value in held.items():
                 what = f"{name}: {key} of parameter {index}"
-                value = self.tensor(value, what, torch.Size([]) if key == "step" else shapes[index])
-                if key != "exp_avg" and bool((value < 0).any()):
-                    raise self.fail(f"{what} is negative")
+                value = self.tensor(value, what, torch.Size([]) if key == "step" else parameters[index].shape)
+                if not value.is_floating_point() or (key != "exp_avg" and bool((value < 0).any())):
+                    raise self.fail(f"{what} is {'negative' if value.is_floating_point() else _short(value)}")
 
-    def _group(self, group: Any, where: str) -> int:
-        """How many parameters a group has, once its numbers are looked at."""
-        if not isinstance(group, Mapping) or not isinstance(group.get("params"), list):
+    def _group(self, group: Any, own: Mapping[str, Any], where: str) -> None:
+        """The numbers of a group, of the kinds of those in ``own``."""
+        if not isinstance(group, Mapping):
             raise self.fail(f"{where}a group is {_short(group)}")
-        for key in group.keys() - {"params"}:
-            for value in group[key] if isinstance(group[key], list | tuple) else [group[key]]:
-                if isinstance(value, int | float | Tensor) and not 0.0 <= float(value) < math.inf:
-                    raise self.fail(f"{where}{key} is {_short(group[key])}, it must be finite and not negative")
-        if not all(isinstance(beta, float) and beta < 1.0 for beta in group.get("betas", ())):
-            raise self.fail(f"{where}betas is {group['betas']!r:.60}, each must be below 1")
-        if not isinstance(group.get("lr"), float | Tensor) or not float(group["lr"]) > 0.0:
-            raise self.fail(f"{where}lr is {_short(group.get('lr'))}, it must be above 0")
-        return len(group["params"])
+        for key in group.keys() & own.keys() - {"params"}:
+            value: Any = group[key]
+            numbers: Sequence[Any] = value if key == "betas" and isinstance(value, list | tuple) and len(value) == 2 else [value]
+            if own[key] is None or isinstance(own[key], bool):
+                good = (value is None or isinstance(value, bool)) and (key not in _CHOSEN or value == own[key])
+            else:
+                plain = all(isinstance(number, int | float) and not isinstance(number, bool) for number in numbers)
+                good = plain and all(0.0 <= number < (1.0 if key == "betas" else math.inf) for number in numbers)
+                good = good and len(numbers) == (2 if key == "betas" else 1) and (key != "lr" or numbers[0] > 0.0)
+            if not good:
+                raise self.fail(f"{where}{key} is {_short(value)}; that is none")
+        if missing := [key for key in ("lr", "betas", "eps", "weight_decay") if key in own and key not in group]:
+            raise self.fail(f"{where}{missing[0]} is missing")
 
     def random_state(self, infos: Mapping[str, Any]) -> None:
         """What torch's generators may be set to."""
@@ -175,5 +184,7 @@ def _short(value: object) -> str:
     """A value for a message, however long it is."""
     if isinstance(value, Tensor):
         return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
+    if isinstance(value, tuple | list) and len(value) < 5:
+        return f"{'[' if isinstance(value, list) else '('}{', '.join(map(_short, value))}{']' if isinstance(value, list) else ')'}"
     text = repr(value) if isinstance(value, int | float | str | None) and not (isinstance(value, int) and abs(value) > 1 << 64) else ""
     return text[:60] or f"a {type(value).__name__}"

@@ -123,6 +123,8 @@ class _Above:
         self._console, self._terminal = console, console._out
 
     def write(self, text: str) -> int:
+        if not text:
+            return 0
         self._console.clear()
         self._terminal.write(text)
         if text.endswith("\n"):
@@ -137,7 +139,7 @@ def summary(numbers: Mapping[str, float]) -> str:
     """What one looks at first, in words; "-" until an episode has ended."""
     shares = {"reward": ".2f", "episode_length": ".1f"}
     said = [f"{name.replace('_', ' ').removeprefix('episode ')} {_number(numbers[name], digits)}" for name, digits in shares.items()]
-    return ", ".join([*said, f"{numbers['fell']:.0f} falls in {numbers['episodes']:.0f} episodes"])
+    return ", ".join([*said, f"episodes {numbers['episodes']:.0f}, falls {numbers['fell']:.0f}"])
 
 
 def _number(value: float, digits: str) -> str:

@@ -16,6 +16,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import NamedTuple
 
+from packaging.requirements import Requirement
+
 from legged_mw import ROOT
 from legged_mw.utils.cli import Parser, pick_device, seed_everything
 from legged_mw.utils.machine import usable_cores
@@ -23,6 +25,7 @@ from legged_mw.utils.renderer import gl_fault, has_display
 from legged_mw.utils.task import load_task, task_names
 
 SPEED_TASKS = ("go1_flat", "g1_flat", "go1_rough")
+_LIBRARIES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "rsl-rl-lib", "tensordict")  # where legged_mw is only on the path
 _CUDA_WHEELS = "pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/cu130"
 _DRAW = "import mujoco\nc = mujoco.GLContext(64, 64)\nc.make_current()\nmujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), 100)"
 
@@ -90,14 +93,20 @@ def machine() -> Iterator[Finding]:
     yield Finding("disk", f"{free:.1f} GiB free in {Path.cwd()}", mend)
     policies = len(list((ROOT / "resources/policies").glob("*/policy.onnx")))
     kind = "a clone" if (ROOT / "pyproject.toml").exists() else "installed"
-    yield Finding("legged_mw", f"{_version('legged_mw')}, {kind} at {ROOT}: {len(task_names())} tasks, {policies} policies")
+    yield Finding(
+        "legged_mw", f"{_version('legged_mw') or 'not installed'}, {kind} at {ROOT}: {len(task_names())} tasks, {policies} policies"
+    )
 
 
 def training() -> Iterator[Finding]:
-    """The libraries that step and learn, and the kernels that are compiled for a CPU."""
-    for name in ("mujoco", "mujoco-warp", "warp-lang", "torch", "rsl-rl-lib", "tensordict"):
-        version = _version(name)
-        yield Finding(name, version or "missing", "" if version else f"pip install {name}", needed=not version)
+    """The libraries that step and learn, each in the range that this version was tested with."""
+    for text in metadata.requires("legged_mw") or [] if _version("legged_mw") else _LIBRARIES:
+        needs = Requirement(text)
+        if needs.marker is None:
+            version = _version(needs.name)
+            fits = bool(version) and needs.specifier.contains(version, prereleases=True)
+            wanted = "" if fits or not version else f", which is not {needs.specifier}"
+            yield Finding(needs.name, f"{version or 'missing'}{wanted}", "" if fits else f"pip install '{needs}'", needed=not version)
 
 
 def gpus() -> Iterator[Finding]:
@@ -148,16 +157,10 @@ def pictures() -> Iterator[Finding]:
 
 
 def extras() -> Iterator[Finding]:
-    """What only some programs need."""
-    for package, module, what in (
-        ("onnxruntime", "onnxruntime", "to run an export: legged-mw deploy"),
-        ("cyclonedds", "cyclonedds", "to drive a Go2 or G1"),
-        ("tensorboard", "tensorboard", "curves of a training"),
-    ):
-        if importlib.util.find_spec(module) is None:
-            yield Finding(package, f"not installed ({what})", f"pip install {package}")
-        else:
-            yield Finding(package, _version(package) or "yes")
+    """What only some programs need, and nobody has to mend."""
+    for package, extra, what in (("onnxruntime", "deploy", "runs an export"), ("cyclonedds", "unitree", "drives a Go2 or G1")):
+        version = _version(package) if importlib.util.find_spec(package) else ""
+        yield Finding(package, version or f"not installed; it {what}: pip install 'legged_mw[{extra}]'")
     git = shutil.which("git")
     yield Finding("git", git or "not installed (a run of a clone then does not keep its diff)")
 

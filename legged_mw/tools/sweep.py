@@ -22,6 +22,7 @@ from legged_mw.tools.curves import Run, find_runs
 from legged_mw.utils.cli import Parser
 from legged_mw.utils.errors import shown
 
+STOPPED = 3  # exit code of a training that ended early, by the clock or a signal: rl/training.py's
 Start = Callable[[list[str]], tuple[int, str, str]]  # flags of train -> exit code, run folder or "", last line
 
 
@@ -97,10 +98,11 @@ def train_all(cells: Sequence[Cell], common: list[str], start: Start) -> list[tu
     for number, cell in enumerate(cells, 1):
         label = re.sub(r"[^\w.=-]+", "_", cell.name).strip("_")
         code, folder, said = start([*common, *cell.flags, *(["--run_name", label] if label else [])])
-        print(f"{number}/{len(cells)} {cell.name or 'as it is'}: {said if code or not folder else folder}", flush=True)
-        if code == 0 and folder:
+        ended = bool(folder) and code in (0, STOPPED)
+        print(f"{number}/{len(cells)} {cell.name or 'as it is'}: {folder if ended else said}", flush=True)
+        if ended:
             found.append((cell, find_runs([folder])[0]))
-        if code == 0 and said.startswith("stopped: SIG"):
+        if code == STOPPED and said.startswith("stopped: SIG"):
             break
     return found
 

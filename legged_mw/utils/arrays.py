@@ -23,4 +23,4 @@ def read_arrays(file: Path) -> dict[str, Any]:
     except TypeError:
         raise ValueError("it is one array, no archive of them") from None
     except Exception as error:  # numpy's, zipfile's and zlib's, by how it is broken
-        raise ValueError(" ".join(str(error).split())) from None
+        raise ValueError(" ".join(str(error).split())[:200]) from None

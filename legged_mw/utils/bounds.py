@@ -23,13 +23,17 @@ class Bound(NamedTuple):
     holds: Callable[[Any], bool]
 
 
+def _written(number: float) -> str:
+    return f"{number:,.0f}" if number >= 1e4 else f"{number:g}"
+
+
 def at_least(low: float, most: float = math.inf, unit: str = "") -> Bound:
-    text = f"{low:g} or more" if most == math.inf else f"from {low:g} to {most:g}"
+    text = f"{low:g} or more" if most == math.inf else f"from {low:g} to {_written(most)}"
     return Bound(f"{text}{unit and f' {unit}'}", lambda value: low <= value <= most)
 
 
 def above(low: float, most: float = math.inf, unit: str = "") -> Bound:
-    text = f"above {low:g}" if most == math.inf else f"above {low:g} and at most {most:g}"
+    text = f"above {low:g}" if most == math.inf else f"above {low:g} and at most {_written(most)}"
     return Bound(f"{text}{unit and f' {unit}'}", lambda value: low < value <= most)
 
 
@@ -55,6 +59,9 @@ NonZero = Annotated[float, Bound("another number than 0", lambda value: value !=
 Share = Annotated[float, at_least(0, 1)]
 Part = Annotated[float, above(0, 1)]  # a share that is not 0
 Seconds = Annotated[float, above(0, 1e6, "s")]  # a million: what counts steps never overflows
+Span = Annotated[float, at_least(0, 1e6, "s")]  # such a time, or none
+Speed = Annotated[float, at_least(0, 1000)]  # [m/s, rad/s]: no machine is as fast
+Gain = Annotated[float, at_least(0, 1e6)]  # in SI units, of a joint or motor: no robot has more
 Sign = Annotated[float, Bound("1 or -1", lambda value: value in (1, -1))]
 
 Count = Annotated[int, at_least(1)]
@@ -63,7 +70,8 @@ Few = Annotated[int, at_least(1, 1000)]  # of what is repeated in a loop, where 
 Seed = Annotated[int, Bound("a whole number below 2^63", lambda value: abs(value) < 2**63)]
 
 Names = Annotated[list[str], SOME]
-Points = Annotated[list[float], SOME]
+Points = Annotated[list[Annotated[float, at_least(-100, 100, "m")]], SOME]
+FileNames = list[Annotated[str, Bound("the name of a file", bool)]]
 Sizes = Annotated[list[Count], SOME]  # of layers
 Vector = Annotated[list[float], THREE]
 NonNegativeVector = Annotated[list[NonNegative], THREE]
@@ -72,7 +80,7 @@ PositiveRange = Annotated[list[Positive], PAIR]
 ShareRange = Annotated[list[Share], PAIR]
 
 # Of a range that nothing needs to be drawn from: empty, it is left out
-Factors = Annotated[list[Positive], or_empty(PAIR)]
+Factors = Annotated[list[Annotated[float, above(0, 1000)]], or_empty(PAIR)]
 Offsets = Annotated[list[float], or_empty(PAIR)]
 Delays = Annotated[list[NonNegative], or_empty(PAIR)]
 WholeDelays = Annotated[list[Whole], or_empty(PAIR)]

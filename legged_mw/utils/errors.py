@@ -6,6 +6,7 @@ import difflib
 import re
 import sysconfig
 import traceback
+import unicodedata
 from collections.abc import Iterable
 from pathlib import Path
 from types import CodeType
@@ -87,7 +88,7 @@ def in_short(error: BaseException) -> str:
 
 def printable(text: str) -> str:
     """``text`` with what a terminal would obey, not print, written as \\x1b: names come from files, folders and the net."""
-    return "".join(each if each.isprintable() or each == "\n" else ascii(each)[1:-1] for each in text)
+    return "".join(each if each.isprintable() or each == "\n" or unicodedata.category(each) == "Zs" else ascii(each)[1:-1] for each in text)
 
 
 def shown(path: Path) -> str:

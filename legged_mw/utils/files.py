@@ -61,6 +61,8 @@ def writable(name: str, flag: str, folder: bool = False) -> Path:
     try:
         if not name.strip():
             raise UserError(f"{flag} is empty: name the {'folder' if folder else 'file'} to write")
+        with suppress(FileNotFoundError, NotADirectoryError):
+            path.lstat()  # raises for a name that no file can have
         if path.exists() and path.is_dir() != folder:
             raise UserError(f"{flag} {name}: that is a {'file' if folder else 'folder'}; name a {'folder' if folder else 'file'}")
         there = next(place for place in (path.absolute(), *path.absolute().parents) if place.is_dir())

@@ -68,7 +68,7 @@ def read_network(file: Path) -> MotorNetwork:
         ) from None
     try:
         return _read(arrays)
-    except (KeyError, ValueError, TypeError) as error:
+    except (KeyError, ValueError, TypeError, OverflowError) as error:
         raise UserError(f"{file.name}: {error.args[0]}") from None
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import stat
+import unicodedata
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ import yaml
 
 from legged_mw.utils.errors import ConfigError
 
-MOST_BYTES, MOST_NODES, MOST_DEPTH, MOST_DIGITS = 1 << 20, 100_000, 50, 40  # a run's config has 10 kB, 700 nodes, depth 5
+MOST_BYTES, MOST_NODES, MOST_DEPTH, MOST_DIGITS = 1 << 20, 50_000, 50, 40  # a run's config has 10 kB and 700 nodes
 _EXPONENT = r"[-+]?(\d+\.?\d*|\.\d+)[eE][-+]?\d+$"
 _PLAIN = ("null", "bool", "int", "float", "str", "seq", "map")
 
@@ -61,7 +62,7 @@ class _Loader(yaml.SafeLoader):
 
     def construct_scalar(self, node: Any) -> Any:
         text = super().construct_scalar(node)
-        if bad := [char for char in text if char == "\0" or "\ud800" <= char <= "\udfff"]:
+        if bad := [char for char in text if unicodedata.category(char) in ("Cc", "Cs") and char not in "\t\n\r"]:  # a terminal obeys these
             raise _error(f"the character {bad[0]!a} is not text", node.start_mark)
         return text
 

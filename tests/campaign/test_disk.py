@@ -215,7 +215,7 @@ def test_logs_that_cannot_be_written_are_refused_before_training(tmp_path: Path)
 def test_a_run_that_is_being_trained_is_not_resumed(tmp_path: Path) -> None:
     assert train(tmp_path, 2).code == 0
     folder = only_run(tmp_path)
-    (folder / ".model_9.pt.1.tmp").write_text("half")
+    (folder / ".model_9.pt.999999999.tmp").write_text("half")
     go_on = [*GO_ON, "--max_iterations", "4"]
     with RunLock(folder) as lock:
         lock.begin()
@@ -228,17 +228,16 @@ def test_a_run_that_is_being_trained_is_not_resumed(tmp_path: Path) -> None:
 
 
 def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
-    ready, go = os.pipe()
-    child = os.fork()
-    if child == 0:
-        RunLock(tmp_path).begin()
-        os.write(go, b"x")
-        signal.pause()
-    os.read(ready, 1)
-    with pytest.raises(ConfigError, match=f"is being trained by process {child} since"):
+    program = "import sys, time\nfrom pathlib import Path\nfrom legged_mw.rl.keeping import RunLock\nRunLock(Path(sys.argv[1])).begin()\n"
+    program = (
+        program.replace("RunLock(P", "lock = RunLock(P").replace(".begin()", "; lock.begin()") + "print(1, flush=True)\ntime.sleep(60)"
+    )
+    child = subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    assert child.stdout and child.stdout.readline() == "1\n"
+    with pytest.raises(ConfigError, match=f"is being trained by process {child.pid} since"):
         RunLock(tmp_path)
-    os.kill(child, signal.SIGKILL)
-    os.waitpid(child, 0)
+    child.kill()
+    child.wait()
     RunLock(tmp_path).release()
     assert (tmp_path / LOCK_FILE).is_file()
 

@@ -31,8 +31,11 @@ from legged_mw.rl import runner as running
 from legged_mw.rl.checkpoint import sealed
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.runs import checkpoints, find_run, load_tensors, runs, save_whole
+from legged_mw.utils import arrays
+from legged_mw.utils.clip import read_clip
 from legged_mw.utils.config import load_yaml, save_yaml
 from legged_mw.utils.files import digest
+from legged_mw.utils.motor_network import read_network
 from legged_mw.utils.task import load_task
 
 SHIPPED = ROOT / "resources/policies/go1_flat"
@@ -89,20 +92,20 @@ CONTENTS: list[tuple[str, Change, str]] = [
     ("counter is text", set_at("iter", "5"), "iter is '5'"),
     ("another counter than the name", set_at("iter", 6), "its name says 5 iterations, and it has done 6: call it model_6.pt"),
     ("steps below 0", set_at("infos|total_steps", -3), "infos: total_steps is -3"),
-    ("infos is a list", set_at("infos", [1]), "infos is a list"),
+    ("infos is a list", set_at("infos", [1]), "infos is [1], it must be a mapping"),
     ("NaN in a weight", set_at(f"{ACTOR}|mlp.0.weight", poisoned), "actor_state_dict: mlp.0.weight has values that are not finite"),
     ("infinite bias", set_at(f"{ACTOR}|mlp.0.bias", partial(poisoned, value=torch.inf)), "mlp.0.bias has values that are not finite"),
     ("NaN in the critic", set_at("critic_state_dict|mlp.0.weight", poisoned), "critic_state_dict: mlp.0.weight has values"),
     ("weight of another shape", set_at(f"{ACTOR}|mlp.0.weight", torch.zeros(2, 2)), "mlp.0.weight is (2, 2) there"),
     ("weight of whole numbers", set_at(f"{ACTOR}|mlp.0.weight", lambda w: w.long()), "mlp.0.weight is int64 there and float32 here"),
-    ("weight is a list", set_at(f"{ACTOR}|mlp.0.weight", [1.0]), "mlp.0.weight is a list, it must be a tensor"),
+    ("weight is a list", set_at(f"{ACTOR}|mlp.0.weight", [1.0]), "mlp.0.weight is [1.0], it must be a tensor"),
     ("weight is shown wider", set_at(f"{ACTOR}|mlp.0.weight", torch.zeros(1).expand(10**9)), "shows 1000000000 numbers and has fewer"),
     ("sparse weight", set_at(f"{ACTOR}|mlp.0.weight", lambda w: w.to_sparse()), "it must be a tensor"),
     ("a number as a name", lambda content: content[ACTOR].update({3: torch.zeros(1)}), "has a parameter called 3"),
     ("a weight too many", lambda content: content[ACTOR].update(more=torch.zeros(1)), "actor more is (1,) there and missing here"),
     ("negative variance", set_at(f"{ACTOR}|obs_normalizer._var", lambda v: -v), "obs_normalizer._var is negative"),
     ("negative count", set_at(f"{ACTOR}|obs_normalizer.count", lambda c: c - 9), "obs_normalizer.count is negative"),
-    ("networks are a list", set_at(ACTOR, []), "actor_state_dict is a list, it must be a mapping"),
+    ("networks are a list", set_at(ACTOR, []), "actor_state_dict is [], it must be a mapping"),
     ("moments of another shape", set_at(f"{ADAM}|state|0|exp_avg", torch.zeros(3)), "exp_avg of parameter 0 is (3,)"),
     ("moments of one number", set_at(f"{ADAM}|state|0|exp_avg_sq", torch.zeros(())), "exp_avg_sq of parameter 0 is ()"),
     ("moments are NaN", set_at(f"{ADAM}|state|0|exp_avg", poisoned), "exp_avg of parameter 0 has values that are not finite"),
@@ -112,13 +115,25 @@ CONTENTS: list[tuple[str, Change, str]] = [
         "exp_avg_sq of parameter 0 is negative",
     ),
     ("steps of Adam below 0", set_at(f"{ADAM}|state|0|step", torch.tensor(-1.0)), "step of parameter 0 is negative"),
+    (
+        "moments of complex numbers",
+        set_at(f"{ADAM}|state|0|exp_avg_sq", lambda m: m.to(torch.complex64)),
+        "is (12,) complex64",
+    ),
+    ("no second moments", lambda content: content[ADAM]["state"][0].pop("exp_avg_sq"), "state of parameter 0 must have step, exp_avg, exp"),
+    ("a rate of many numbers", set_at(f"{ADAM}|param_groups|0|lr", torch.ones(3)), "lr is (3,) float32; that is none"),
+    ("Adam backwards", set_at(f"{ADAM}|param_groups|0|maximize", True), "maximize is True; that is none"),
     ("state of no parameter", lambda content: content[ADAM]["state"].update({99: {}}), "state 99 is of no parameter"),
-    ("rate below 0", set_at(f"{ADAM}|param_groups|0|lr", -1e-3), "lr is -0.001, it must be finite and not negative"),
-    ("rate is NaN", set_at(f"{ADAM}|param_groups|0|lr", float("nan")), "lr is nan"),
-    ("rate is text", set_at(f"{ADAM}|param_groups|0|lr", "fast"), "lr is 'fast', it must be above 0"),
-    ("betas above 1", set_at(f"{ADAM}|param_groups|0|betas", (5.0, 5.0)), "betas is (5.0, 5.0), each must be below 1"),
-    ("no groups", set_at(f"{ADAM}|param_groups", []), "param_groups must be "),
-    ("groups of other parameters", set_at(f"{ADAM}|param_groups|0|params", lambda p: p[::-1]), "it must count the parameters"),
+    ("rate below 0", set_at(f"{ADAM}|param_groups|0|lr", -1e-3), "lr is -0.001; that is none"),
+    ("rate is NaN", set_at(f"{ADAM}|param_groups|0|lr", float("nan")), "lr is nan; that is none"),
+    ("rate is text", set_at(f"{ADAM}|param_groups|0|lr", "fast"), "lr is 'fast'; that is none"),
+    ("betas above 1", set_at(f"{ADAM}|param_groups|0|betas", (5.0, 5.0)), "betas is (5.0, 5.0); that is none"),
+    ("no groups", set_at(f"{ADAM}|param_groups", []), "param_groups must be a list of "),
+    (
+        "groups of other parameters",
+        set_at(f"{ADAM}|param_groups|0|params", lambda p: p[::-1]),
+        "params must count the parameters, from",
+    ),
     ("random state of floats", set_at("infos|random_state|cpu", torch.zeros(9)), "cpu is no state of torch's generator"),
     ("random state cut", set_at("infos|random_state|cpu", lambda state: state[:7]), "cpu is no state of torch's generator"),
     ("level below 0", set_at(f"{ENV}|kick_level", lambda level: level - 3), "infos: env: kick_level is negative"),
@@ -321,6 +336,34 @@ def test_what_may_be_changed(tmp_path: Path) -> None:
 
     says_else(change, stamped=False)(tmp_path)
     assert read_contract(tmp_path / "out").task == "mine"
+
+
+# ---- motions and motors
+
+CLIP = {"fps": 50.0, "joint_names": ["a"], "root_pos": np.zeros((3, 3)), "root_quat": np.eye(4)[[0, 0, 0]], "joint_pos": np.zeros((3, 1))}
+MOTOR = {"weight0": np.zeros((1, 2)), "bias0": np.zeros(1)}
+ARRAYS: list[tuple[str, Callable[[Path], Any], dict[str, Any], str]] = [
+    ("no rate", read_clip, {"fps": np.nan}, "or no frame rate"),
+    ("a rate of 10^30", read_clip, {"fps": 1e30}, "1e+30 frames a second; there must be from 0.1 to 1e+05"),
+    ("two rates", read_clip, {"fps": [50.0, 50.0]}, "fps is float64 along 1 axes; it must be numbers along 0 axes"),
+    ("joints are numbers", read_clip, {"joint_names": [1]}, "joint_names is int64 along 1 axes; it must be text along 1 axes"),
+    ("complex places", read_clip, {"root_pos": np.zeros((3, 3)) * 1j}, "root_pos is complex128 along 2 axes"),
+    ("far away", read_clip, {"root_pos": np.full((3, 3), 1e30)}, "a place or an angle beyond 10000 m or rad"),
+    ("a joint twice", read_clip, {"joint_names": ["a", "a"], "joint_pos": np.zeros((3, 2))}, "or a joint twice"),
+    ("more than there may be", read_clip, {"more": np.zeros(70_000, dtype=np.uint8)}, "it unpacks to 0 MiB; 0 are the most"),
+    ("frames of 10^9", read_network, {"frames": [0, 10**9]}, "the newest first, 10000 at most"),
+    ("infinite frames", read_network, {"frames": [np.inf]}, "file.npz: cannot convert float infinity"),
+]
+
+
+@pytest.mark.parametrize(("read", "change", "says"), [entry[1:] for entry in ARRAYS], ids=[entry[0] for entry in ARRAYS])
+def test_arrays(read: Callable[[Path], Any], change: dict[str, Any], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arrays, "MOST_BYTES", 1 << 16)
+    content = (CLIP if read is read_clip else MOTOR) | {name: np.asarray(value) for name, value in change.items()}
+    attack(
+        Case("", lambda root: read(root / "file.npz"), says, given=lambda root: np.savez(root / "file.npz", allow_pickle=False, **content)),
+        tmp_path,
+    )
 
 
 # ---- scenes

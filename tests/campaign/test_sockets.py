@@ -135,7 +135,7 @@ def test_which_pages_have_a_token_and_what_is_opened() -> None:
     assert not gate.greeting("/?token=abc") and not gate.greeting(f"/ui?token={gate.token}")
 
 
-SPEC = mujoco.MjSpec.from_string(
+SPEC = mujoco.MjSpec.from_string(  # pyright: ignore[reportAttributeAccessIssue]
     "<mujoco><worldbody><geom type='plane' size='1 1 .1'/><body><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
 )
 
@@ -490,7 +490,7 @@ COMMANDS = [
     ("zeros", bytes(LAYOUTS["unitree_go", "LowCmd_"].size)),
     ("ones", b"\xff" * LAYOUTS["unitree_go", "LowCmd_"].size),
     ("not sealed", command(kp=20.0).body),
-    *((f"{name} is {value}", command(**{name: value}).seal()) for name in ("q", "dq", "tau", "kp", "kd") for value in (NAN, INF)),
+    *((f"{name} is {value}", command(**{name: value}).seal()) for name in ("q", "dq", "tau", "kp", "kd") for value in (NAN, INF, 1e30)),
 ]
 
 

@@ -98,13 +98,11 @@ NAMES = [
         ("../out", "'/' is in it"), ("/tmp/out", "'/' is in it"), ("a/b", "'/' is in it"), ("a\\b", r"is in it; write a plain name"),
         ("..", "is made of dots"), (".", "is made of dots"), (". .", "is made of dots"), ("~root", "it begins with - or ~"),
         ("C:evil", "':' is in it"), ("x" * 300, "it has 300 bytes, more than 100"), ("\N{PILE OF POO}" * 60, "it has 240 bytes"),
-        (CLEAR, r"'\x1b' is in it"), ("a\nb", r"'\n' is in it"), ("gpj\u202e.exe", r"'\u202e' is in it"), ("a\0b", r"'\x00' is in it"),
+        ("gpj\u202e.exe", r"'\u202e' is in it"),
     )),
     ("experiment by a field", ("--set", "runner.experiment_name=../out"), "'/' is in it"),
-    ("run name ../", ("--run_name", "../out"), "runner.run_name: '../out' cannot be the name"),
-    ("run name with an escape", ("--run_name", CLEAR), r"'\x1b' is in it"),
     ("run name of 5000", ("--run_name", "x" * 5000), "it has 5000 bytes"),
-    ("run name by a field", ("--set", "runner.run_name=a/../../b"), "'/' is in it"),
+    ("run name with a colon", ("--run_name", "a:b"), "':' is in it"),
 ]  # fmt: skip
 LOAD = [
     ("a name of 5000", "x" * 5000, "is no path here: File name too long"),
@@ -126,6 +124,11 @@ TAGS = [
 TOLD = program("play", "--load_run", RUN, "--task", "")  # the run tells its task
 CASES = [
     *(Case(f"name: {name}", program(*check, *flags), (NAME, why)) for name, flags, why in NAMES),
+    *(Case(f"name: {name!r}", program(*check, flag, name), "it must be text without control characters")
+      for flag in ("--experiment_name", "--run_name") for name in (CLEAR, "a\0b")),
+    *(Case(f"name: run {name!r}", program(*check, "--set", f"runner.run_name={name}"), "it must be part of a folder's name")
+      for name in ("../out", "a/../../b", "a\\b")),
+    Case("name: two lines", program(*check, "--run_name", "a\nb"), r"'\n' is in it"),
     Case("name: experiment by a file", program(*check, "--override", "ROOT/o.yaml"), (NAME, "'/' is in it"),
          given=text("o.yaml", "runner: {experiment_name: ../out}")),
     Case("name: experiment of play", play("--experiment_name", "../../out"), (NAME, "'/' is in it")),

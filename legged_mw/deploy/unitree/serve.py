@@ -33,6 +33,7 @@ LOW_LEVEL = (0xFE, 0xEF, 0xFF)  # head and level_flag of unitree_go
 _MACHINE = {"g1": 5}  # mode_machine that a simulated one says
 _TOUCH = 60  # foot_force of a foot that touches the ground, in the robot's own unit; ours
 _FULL = 4.1  # [V] of a full battery's cell
+_MOST = 1e10  # of any part, which NaN is not below; ours: above POSITION_STOP, and its square is a number
 _PARTS = ("q", "dq", "tau", "kp", "kd")  # of a motor's command
 _FAULT = 0x1  # motorstate of a motor with a fault
 _HOIST, _HOIST_DAMPING, _LOWERING = 12.0, 1.2, 1.0  # [weights/m], [weights s/m], [s] ours: a soft rope and how long it gives way
@@ -190,7 +191,7 @@ class SimulatedUnitree:
             fits = (*command["head"], command["level_flag"]) == LOW_LEVEL
         else:
             fits = command["mode_machine"] == self._state["mode_machine"]
-        if not fits or not command.intact() or not all(np.isfinite(command[f"motor_cmd.{name}"]).all() for name in _PARTS):
+        if not fits or not command.intact() or not all((np.abs(command[f"motor_cmd.{name}"]) < _MOST).all() for name in _PARTS):
             self.record.refused += 1
             return
         slots, signs = self._plugs()
