@@ -27,7 +27,7 @@ from legged_mw.view.video import Frame
 IMAGES = ROOT / "docs/images"
 LEVEL, STEP, EDGE = (1.0, 1.0, 1.0, 1.0), (0.84, 0.87, 0.90, 1.0), (0.66, 0.71, 0.76, 1.0)  # ground; steps; every other one
 SKY = (0.95, 0.96, 0.97)
-FPS, COLOURS, FINER = 12.5, 64, 2  # [1/s]; of a GIF's palette; drawn so many times larger and made smaller, which smooths
+FPS, COLOURS, FINER = 12.5, 40, 2  # [1/s]; of a GIF's palette; drawn so many times larger and made smaller, which smooths
 
 
 class Shot(NamedTuple):
@@ -36,7 +36,7 @@ class Shot(NamedTuple):
     policy: str  # a folder of resources/policies
     command: tuple[float, ...]  # vx, vy [m/s], yaw rate [rad/s]
     begin: float = 1.0  # [s] of walking before the film
-    seconds: float = 4.0
+    seconds: float = 3.6
     distance: float = 2.3  # of the camera [m]
     azimuth: float = 90.0  # [deg]: along y, so that a robot that walks along x goes to the right
     elevation: float = -12.0  # [deg]
@@ -123,7 +123,7 @@ def save_gif(path: Path, frames: Sequence[Frame]) -> None:
     first.save(path, save_all=True, append_images=others, duration=round(1000 / FPS), loop=0, optimize=True, disposal=1)
 
 
-def save_webp(path: Path, frames: Sequence[Frame], quality: int = 18) -> None:
+def save_webp(path: Path, frames: Sequence[Frame], quality: int = 10) -> None:
     first, *others = map(Image.fromarray, frames)
     first.save(path, save_all=True, append_images=others, duration=round(1000 / FPS), loop=0, quality=quality, method=6, minimize_size=True)
 
