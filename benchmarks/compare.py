@@ -10,6 +10,7 @@ its meshes with git when it first runs.
 
 Each framework runs its own default task and learner; only the number of worlds is set. One after the other, each in a
 process of its own, so that device memory, settings and crashes stay apart. What differs is printed under the table.
+--verbose shows what the frameworks print, tracebacks too.
 """
 
 # The peers are imported only where they are installed, and the child may run where this project's packages are not:
@@ -375,7 +376,6 @@ def parse() -> argparse.Namespace:
         parser.add_argument(f"--python-{peer}", default=sys.executable, metavar="PATH", help=f"interpreter of {peer}'s environment")
     parser.add_argument("--playground-impl", choices=("warp", "jax"), help="its physics (default: warp; on a CPU jax, the faster one)")
     parser.add_argument("--timeout", type=float, default=1800, metavar="S", help="seconds that one measurement may take")
-    parser.add_argument("--verbose", action="store_true", help="show what the frameworks print, tracebacks too")
     return parser.parse_args()
 
 

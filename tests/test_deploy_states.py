@@ -290,7 +290,7 @@ def test_a_signal_damps_and_ends(ending: signal.Signals, tmp_path: Path) -> None
         (["--drive", "--gamepad", "/dev/input/js99"], "no gamepad at /dev/input/js99: No such file or directory"),
         (["--drive", "--eval"], "--drive is one robot in real time: leave --eval out"),
         (["--drive", "--num_envs", "2"], "--drive is one robot in real time: leave --num_envs out"),
-        (["--drive", "--log", "/proc/x.lmwlog"], "cannot write the log /proc/x.lmwlog: "),
+        (["--drive", "--log", "/proc/x.lmwlog"], "--log /proc/x.lmwlog: cannot be written: "),
     ],
 )
 def test_wrong_flags(args: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

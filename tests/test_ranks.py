@@ -40,7 +40,8 @@ def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("ranks") / "ours"
     result = learn("ours", folder)
     assert result.returncode == 0, result.stderr
-    assert sorted(path.name for path in folder.glob("*.pt")) == ["model_1.pt", "model_2.pt", "model_3.pt", "rank0.pt", "rank1.pt"]
+    written = ["model_1.pt", "model_2.pt", "model_3.pt", "rank0.pt", "rank1.pt", "worlds_3_0of2.pt"]  # the other rank has no folder here
+    assert sorted(path.name for path in folder.glob("*.pt")) == written
     return folder
 
 
@@ -85,6 +86,7 @@ def test_train_writes_one_run_folder(tmp_path: Path) -> None:
     assert result.returncode == 0, result.stderr
     [folder] = (tmp_path / "logs/runs").iterdir()
     assert {"config.yaml", "model_2.pt"} <= {path.name for path in folder.iterdir()}
+    assert sorted(path.name for path in folder.glob("worlds_*")) == ["worlds_2_0of2.pt", "worlds_2_1of2.pt"]
     assert load_yaml(folder / "config.yaml")["seed"] == 4
     assert result.stdout.count("Learning iteration 2/2") == result.stdout.count("policy.onnx") == 1
     assert (folder / "export/policy.yaml").is_file()
@@ -100,8 +102,9 @@ def test_a_rank_that_dies_ends_the_run(tmp_path: Path) -> None:
     folder = tmp_path / "dies"
     result = learn("ours", folder, 2)
     assert result.returncode != 0
-    assert sorted(path.name for path in folder.glob("*.pt")) == ["model_1.pt", "model_2.pt"]
-    assert torch.load(folder / "model_2.pt", weights_only=True)["iter"] == 2
+    assert sorted(path.name for path in folder.glob("*.pt")) == ["model_1.pt", "model_2.pt", "worlds_2_0of2.pt"]
+    saved, beside = (torch.load(folder / name, weights_only=True) for name in ("model_2.pt", "worlds_2_0of2.pt"))
+    assert saved["iter"] == 2 and torch.equal(saved["infos"]["random_state"]["cpu"], beside["random_state"]["cpu"])
 
 
 def test_a_rank_that_waits_for_a_lost_one_leaves_after_sigterm() -> None:
