@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +16,7 @@ except ImportError:  # not on Windows: nothing is locked there
     fcntl = None
 
 from legged_mw.rl.ranks import Rank
-from legged_mw.rl.resume import worlds_file
+from legged_mw.rl.resume import suffix_of, worlds_file
 from legged_mw.rl.runs import checkpoints, save_whole
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import shown
@@ -77,28 +78,32 @@ class Keeper:
         path = self.folder / f"model_{iteration}.pt"
         try:
             self.moved = self._prepare()
-            beside = worlds_file(path, self._rank)
-            save_whole(worlds(), beside, sync=False)  # one that a power cut tears is found out by its reader
+            save_whole(worlds(), worlds_file(path, self._rank), sync=False)  # one that a power cut tears is found out by its reader
             if self._rank.leads:
                 save_whole(checkpoint(), path)
-        except (OSError, RuntimeError) as error:  # torch's writer turns the one into the other
+        except (OSError, MemoryError) as error:  # the file is put together in memory
             self.failed = reason_of(error)
             newest = f"the newest is {shown(self.written)}" if self.written else "none of this training is written"
             print(f"WARNING: checkpoint {path.name} cannot be written: {self.failed}; {newest}; going on in memory", flush=True)
             return False
         self.failed, self.written = "", path
         with contextlib.suppress(OSError):
-            self._sweep(beside)
+            self._sweep()
         return True
 
-    def _sweep(self, beside: Path) -> None:
-        """Worlds of earlier checkpoints, and the checkpoints that are too many."""
-        of = beside.stem.removeprefix("worlds_").partition("_")[2]
-        for old in self.folder.glob(f"worlds_*{f'_{of}' if of else ''}.pt"):
-            if old != beside and old.stem.removeprefix("worlds_").partition("_")[2] == of:
+    def _sweep(self) -> None:
+        """Worlds of checkpoints before the newest, and the checkpoints that are too many.
+
+        Another rank than the first may come here before the newest is written: then the worlds of the one before stay.
+        """
+        there = checkpoints(self.folder)
+        newest, suffix = max(there, default=0), suffix_of(self._rank)
+        for old in self.folder.glob(f"worlds_*{suffix}.pt"):
+            named = re.fullmatch(rf"worlds_(\d+){suffix}\.pt", old.name)
+            if named and int(named[1]) < newest:
                 old.unlink(missing_ok=True)
         if self._keep and self._rank.leads:
-            for old in list(checkpoints(self.folder).values())[: -self._keep]:
+            for old in list(there.values())[: -self._keep]:
                 old.unlink(missing_ok=True)
 
 

@@ -24,8 +24,12 @@ _FREE = ("rewards", "noise", "viewer", "exam", "termination")  # sections that m
 
 def worlds_file(checkpoint: Path, rank: Rank) -> Path:
     """The file of the worlds of ``rank`` beside ``checkpoint``."""
-    of = f"_{rank.index}of{rank.count}" if rank.count > 1 else ""
-    return checkpoint.with_name(f"worlds_{checkpoint.stem.removeprefix('model_')}{of}.pt")
+    return checkpoint.with_name(f"worlds_{checkpoint.stem.removeprefix('model_')}{suffix_of(rank)}.pt")
+
+
+def suffix_of(rank: Rank) -> str:
+    """What tells the files of ranks apart; of a process alone ''."""
+    return f"_{rank.index}of{rank.count}" if rank.count > 1 else ""
 
 
 def worlds_content(runner: Any) -> dict[str, Any]:

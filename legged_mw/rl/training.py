@@ -374,14 +374,18 @@ def _export(task: LoadedTask, run: Path, export: Export) -> None:
 
 
 def _stop_on_signals(runner: Runner, deadline: float | None) -> None:
-    """Ctrl-C, SIGTERM, a hang-up and the clock ask the runner to save and stop; a second Ctrl-C stops at once."""
+    """Ctrl-C, SIGTERM, a hang-up and the clock ask the runner to save and stop; a second Ctrl-C stops at once.
+
+    A second hang-up does nothing: of a terminal that closes, the shell and the system send one each.
+    """
 
     def ask(number: int, _: object) -> None:
-        runner.stop = signal.Signals(number).name
+        runner.stop = name = signal.Signals(number).name
         # os.write, since print must not be called while another print is interrupted
         with suppress(OSError):  # nobody may be there to read it
-            os.write(1, f"{runner.stop}: saving and stopping after this iteration; again to stop at once\n".encode())
-        signal.signal(number, signal.SIG_DFL)
+            again = "" if name == "SIGHUP" else "; again to stop at once"
+            os.write(1, f"{name}: saving and stopping after this iteration{again}\n".encode())
+        signal.signal(number, signal.SIG_IGN if name == "SIGHUP" else signal.SIG_DFL)
 
     signal.signal(signal.SIGINT, ask)
     signal.signal(signal.SIGTERM, ask)

@@ -5,7 +5,7 @@ Recorded with the update: masks, and no question to the host. After an update th
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import torch
@@ -25,18 +25,21 @@ class Undo:
         self.undone = torch.zeros((), device=device)  # 1: the last update was
         self.wrong = torch.zeros(len(self.columns) + 1, device=device)  # 1 where it had such a value: by columns, and last rewards
 
-    def _learned(self) -> list[Tensor]:
-        """Parameters, normalisers, the optimizer's memory and the learning rates."""
-        optimizer, rate = self._learner.optimizer, getattr(self._learner, "_rate", None)
-        values = [each for network in self._networks for each in (*network.parameters(), *network.buffers())]
-        values += [value for memory in optimizer.state.values() for _, value in sorted(memory.items())]
-        values += [*(group["lr"] for group in optimizer.param_groups), rate]
-        return list({id(value): value for value in values if isinstance(value, Tensor) and value.numel()}.values())
+    def _learned(self) -> dict[str, Tensor]:
+        """Parameters, normalisers, the optimizer's memory and the learning rates, by name: rsl-rl's own normaliser rebinds its std."""
+        optimizer, values = self._learner.optimizer, dict[str, Any]()
+        for i, network in enumerate(self._networks):
+            values |= {f"{i}.{name}": value for name, value in (*network.named_parameters(), *network.named_buffers())}
+        for i, memory in enumerate(optimizer.state.values()):
+            values |= {f"memory {i}.{name}": value for name, value in memory.items()}
+        values |= {f"rate {i}": group["lr"] for i, group in enumerate(optimizer.param_groups)}
+        values["rate"] = getattr(self._learner, "_rate", None)
+        return {name: value for name, value in values.items() if isinstance(value, Tensor) and value.numel()}
 
     @torch.no_grad()
     def remember(self) -> None:
         """What is learned now is good."""
-        self._before = [(kind, _join(kind)) for kind in _kinds(self._learned())]
+        self._before = [(list(kind), _join(kind.values())) for kind in _kinds(self._learned())]
 
     @torch.no_grad()
     def settle(self, losses: Tensor | None = None) -> None:
@@ -45,10 +48,12 @@ class Undo:
         wrong = [_beyond(value.flatten(0, 1).flatten(1)) for value in (*stored.observations.values(), stored.rewards)]
         self.wrong.copy_(torch.cat([*wrong[:-1], wrong[-1].any()[None]]))
         sound = ~self.wrong.any() if losses is None else losses.isfinite().all() & ~self.wrong.any()
-        old = {id(value) for kind, _ in self._before for value in kind}
-        new = [value for value in self._learned() if id(value) not in old]  # Adam's memory, of its first step: it begins with zeros
-        states = [(kind, before, _join(kind)) for kind, before in self._before]
-        states += [(kind, torch.zeros_like(after), after) for kind in _kinds(new) for after in [_join(kind)]]
+        new, states = self._learned(), list[tuple[list[Tensor], Tensor, Tensor]]()
+        for names, before in self._before:
+            kind = [new.pop(name) for name in names]
+            states.append((kind, before, _join(kind)))
+        for kind in [list(kind.values()) for kind in _kinds(new)]:  # Adam's memory, of its first step: it begins with zeros
+            states.append((kind, torch.zeros_like(after := _join(kind)), after))
         for _, _, after in states:
             sound = sound & _on(after.isfinite().all(), sound.device)
         if getattr(self._learner, "is_multi_gpu", False):
@@ -63,11 +68,11 @@ class Undo:
         del self._before
 
 
-def _kinds(tensors: Iterable[Tensor]) -> list[list[Tensor]]:
+def _kinds(tensors: Mapping[str, Tensor]) -> list[dict[str, Tensor]]:
     """The tensors by type and device: what can be joined."""
-    kinds: dict[Any, list[Tensor]] = {}
-    for tensor in tensors:
-        kinds.setdefault((tensor.dtype, tensor.device), []).append(tensor)
+    kinds: dict[Any, dict[str, Tensor]] = {}
+    for name, tensor in tensors.items():
+        kinds.setdefault((tensor.dtype, tensor.device), {})[name] = tensor
     return list(kinds.values())
 
 
@@ -76,7 +81,7 @@ def _on(value: Tensor, device: torch.device) -> Tensor:
     return value if value.device == device else value.to(device)
 
 
-def _join(tensors: list[Tensor]) -> Tensor:
+def _join(tensors: Iterable[Tensor]) -> Tensor:
     return torch.cat([tensor.reshape(-1) for tensor in tensors])
 
 

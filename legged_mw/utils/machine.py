@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,7 +29,10 @@ def free_memory(device: str = "cpu") -> float:
     lines = _read("/proc/meminfo").splitlines()
     free = [1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
     limit, used = (_read(f"/sys/fs/cgroup/memory.{name}") for name in ("max", "current"))  # of a container
-    return min([*free, float(limit) - float(used) if limit.isdigit() and used.isdigit() else math.inf])
+    cached = re.search(r"^inactive_file (\d+)$", _read("/sys/fs/cgroup/memory.stat"), re.MULTILINE)  # of files; given back when asked for
+    if limit.isdigit() and used.isdigit():
+        free.append(float(limit) - float(used) + float(cached[1] if cached else 0))
+    return min(free, default=math.inf)
 
 
 def require_memory(need: float, device: str, what: str, instead: str) -> None:

@@ -6,12 +6,15 @@ import math
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import torch
 from learner import collect, make, parameters
 from program import SMALL, Result, run
+from rsl_rl.modules import EmpiricalNormalization
+from torch import nn
 
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.legged_robot import LeggedRobot
@@ -21,6 +24,7 @@ from legged_mw.rl.health import Health
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import Runner
 from legged_mw.rl.runs import checkpoints
+from legged_mw.rl.undo import Undo
 
 BAD = [math.nan, math.inf, -math.inf, 1e20, -1e38]
 RUN = ["--num_envs", "8", "--eager", "--seed", "1", "--set", "runner.save_interval=1", "--set", "cpu.update_threads=1"]
@@ -157,6 +161,18 @@ def test_rsl_rls_own_learner_is_undone_too(tmp_path: Path, monkeypatch: pytest.M
     spoil_handed_out(monkeypatch, Spoiler(math.nan, lambda call: call == 20))
     result = train(tmp_path, 5, "--set", "algorithm.class_name=PPO")
     assert result.code == 0 and "1 in a row, 1 so far" in result.out and all_finite(newest(tmp_path))
+
+
+def test_rsl_rls_own_normaliser_rebinds_its_std_and_gets_the_old_one_back() -> None:
+    network = nn.ModuleDict({"layer": nn.Linear(3, 2), "normaliser": EmpiricalNormalization(3)})
+    stored = SimpleNamespace(observations={"state": torch.zeros(4, 5, 3)}, rewards=torch.zeros(4, 5, 1))
+    undo = Undo(SimpleNamespace(storage=stored, optimizer=torch.optim.Adam(network.parameters())), [network])
+    network["normaliser"].update(3.0 * torch.randn(50, 3))
+    before = {name: value.clone() for name, value in network.state_dict().items()}
+    undo.remember()
+    network["normaliser"].update(torch.full((50, 3), math.nan))
+    undo.settle()
+    assert undo.undone == 1 and all(torch.equal(before[name], value) for name, value in network.state_dict().items())
 
 
 def test_weights_that_explode_are_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

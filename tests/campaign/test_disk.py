@@ -23,6 +23,7 @@ from torch.utils.tensorboard import SummaryWriter
 from legged_mw import ROOT
 from legged_mw.rl import runs
 from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock
+from legged_mw.rl.ranks import Rank
 from legged_mw.rl.runner import Runner
 from legged_mw.rl.runs import checkpoints
 from legged_mw.utils.config import ConfigError
@@ -177,7 +178,8 @@ def test_a_line_that_does_not_fit_is_lost_and_the_next_one_is_not() -> None:
 def test_a_signal_ends_the_run_after_the_iteration_and_resumes_exactly(
     number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    before_iteration(monkeypatch, lambda _, i: i == 2 and os.kill(os.getpid(), number))
+    """A hang-up comes twice: from the shell, and from the system."""
+    before_iteration(monkeypatch, lambda _, i: i == 2 and [os.kill(os.getpid(), number) for _ in range(2)])
     result = train(tmp_path, 4)
     name = signal.Signals(number).name
     assert result.code == 3 and f"stopped: {name}; go on with" in result.out, result
@@ -201,6 +203,20 @@ def test_old_checkpoints_are_thinned(tmp_path: Path) -> None:
     assert train(tmp_path, 5, "--set", "runner.keep_checkpoints=2").code == 0
     assert sound(only_run(tmp_path)) == [4, 5]
     refused(tmp_path, "train", *SMALL, "--set", "runner.keep_checkpoints=-1")
+
+
+def test_worlds_of_a_rank_stay_until_the_first_one_has_written_the_checkpoint(tmp_path: Path) -> None:
+    """Else a kill in between would leave the newest checkpoint without them."""
+    follower, first = (Keeper(tmp_path, 0, Rank(index, index, 2)) for index in (1, 0))
+
+    def write(keeper: Keeper, iteration: int) -> set[str]:
+        assert keeper.write(iteration, dict, dict)
+        return {path.name for path in tmp_path.glob("worlds_*.pt")}
+
+    assert write(first, 1) | write(follower, 1) == {"worlds_1_0of2.pt", "worlds_1_1of2.pt"}
+    assert write(follower, 2) == {"worlds_1_0of2.pt", "worlds_1_1of2.pt", "worlds_2_1of2.pt"}
+    assert write(first, 2) == {"worlds_1_1of2.pt", "worlds_2_0of2.pt", "worlds_2_1of2.pt"}
+    assert write(follower, 3) == {"worlds_2_0of2.pt", "worlds_2_1of2.pt", "worlds_3_1of2.pt"}
 
 
 def test_logs_that_cannot_be_written_are_refused_before_training(tmp_path: Path) -> None:
