@@ -31,7 +31,7 @@ from legged_mw.utils.task import load_task
 
 BIPED, DT = "examples/toy_biped.py", 0.02
 LEFT, RIGHT = 0, 1
-TERMS = ("alive", "base_height", "dof_acc", "dof_vel", "hip_pos")
+TERMS = ("alive", "base_height", "dof_acc", "dof_vel", "fast_joints", "hip_pos")
 FEET = ("feet_distance", "single_stance", "feet_phase", "contact_phase", "no_fly", "feet_orientation")
 ON = {f"rewards.scales.{name}": 1.0 for name in (*TERMS, *FEET)} | {
     "rewards.base_height_target": 0.5,
@@ -79,6 +79,8 @@ def test_base_and_joints() -> None:
     assert term(env, "dof_acc") == [0.0, 0.0]
     env.sim.qvel[:, 6:] += 1.0
     assert term(env, "dof_acc") == pytest.approx([6.0 / DT**2] * 2, rel=1e-4)
+    env.sim.qvel[:, 6] = torch.tensor([8.0, -7.0])  # the others are slower than a turn a second
+    assert term(env, "fast_joints") == pytest.approx([(8.0 - 2 * math.pi) ** 2, (7.0 - 2 * math.pi) ** 2], rel=1e-4)
 
 
 def test_acceleration_starts_from_the_velocity_of_the_reset() -> None:

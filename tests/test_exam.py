@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -284,6 +285,7 @@ class FakeRobot:
         self.cfg = task.cfg
         self.num_envs = worlds = ExamRules.from_config(task.cfg).worlds()
         self.device, self.dt, self.total_mass = "cpu", 0.02, 10.0
+        self.sim = SimpleNamespace(overflow_report=lambda: "")
         self.script, self.falls, self.time = script, falls or {}, 0
         self.command_table = tuple(Command(name, -1.5, 1.5) for name in RANGES)
         self.root_pos, self.root_lin_vel = torch.zeros(worlds, 3), torch.zeros(worlds, 3)

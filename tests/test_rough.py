@@ -351,10 +351,10 @@ def test_a_resume_with_other_numbers_of_worlds_and_levels_keeps_what_fits(tmp_pa
 
 
 def test_a_mistake_is_named() -> None:
-    with pytest.raises(ConfigError, match=r"terrain.border_size is 0.5; it must be 1 m at least"):
+    with pytest.raises(ConfigError, match=r"terrain.border_size is 0.5; it must be 1 m or more"):
         rough(2, terrain__border_size=0.5)
     assert max(rough(64, terrain__max_init_terrain_level=50).tiles.levels.tolist()) == 3  # type: ignore[union-attr]
-    with pytest.raises(ConfigError, match=r"terrain.height_scan is \['actor'\]; it must be a list of groups"):
+    with pytest.raises(ConfigError, match=r"terrain.height_scan\[0\] must be Literal\['state', 'privileged_state'\], not 'actor'"):
         rough(2, terrain__height_scan=["actor"])
     assert math.isfinite(rough(2).base_height.sum())
 

@@ -21,12 +21,13 @@ from PIL import Image
 from legged_mw import ROOT
 from legged_mw.deploy.contract import SCENE_FILE, TERRAIN_FILE
 from legged_mw.deploy.stage import DeployStage
+from legged_mw.sim.settle import fallen
 from legged_mw.view.video import Frame
 
 IMAGES = ROOT / "docs/images"
 LEVEL, STEP, EDGE = (1.0, 1.0, 1.0, 1.0), (0.84, 0.87, 0.90, 1.0), (0.66, 0.71, 0.76, 1.0)  # ground; steps; every other one
 SKY = (0.95, 0.96, 0.97)
-FPS, COLOURS, FINER = 12.5, 64, 2  # [1/s]; of a GIF's palette; drawn so many times larger and made smaller, which smooths
+FPS, COLOURS, FINER = 12.5, 40, 2  # [1/s]; of a GIF's palette; drawn so many times larger and made smaller, which smooths
 
 
 class Shot(NamedTuple):
@@ -35,19 +36,21 @@ class Shot(NamedTuple):
     policy: str  # a folder of resources/policies
     command: tuple[float, ...]  # vx, vy [m/s], yaw rate [rad/s]
     begin: float = 1.0  # [s] of walking before the film
-    seconds: float = 4.0
+    seconds: float = 3.6
     distance: float = 2.3  # of the camera [m]
     azimuth: float = 90.0  # [deg]: along y, so that a robot that walks along x goes to the right
     elevation: float = -12.0  # [deg]
     height: float = 0.0  # where it looks, above the robot's root [m]
     follow: float = 0.5  # share of the robot's way that the camera goes along; plain ground looks the same
     rough: bool = False  # among steps and blocks
+    fall: int = 0  # it begins in the settled fall that this seed makes; 0: standing
 
 
 FILM = [  # of the README, from left to right
     Shot("go1_rough_scan", (0.6, 0.0, 0.0), begin=3.6, distance=2.3, elevation=-16.0, azimuth=75.0, follow=0.0, rough=True),
     Shot("go2_flat", (0.75, 0.0, 0.0), distance=1.9, elevation=-10.0),
     Shot("g1_flat", (0.7, 0.0, 0.0), distance=2.6, elevation=-6.0, height=-0.1),
+    Shot("go1_getup", (), begin=0.0, seconds=3.0, distance=1.45, elevation=-14.0, fall=6),
 ]
 BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
     "go1_flat": Shot("go1_flat", (0.9, 0.0, 0.6), distance=1.8, azimuth=110.0),
@@ -56,6 +59,10 @@ BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
     "go2_flat": FILM[1],
     "go2_rough": FILM[0]._replace(policy="go2_rough", distance=2.3),
     "g1_flat": FILM[2],
+    "go1_getup": FILM[3],
+    "go1_handstand": Shot("go1_handstand", (), begin=0.0, distance=1.9, height=0.1),
+    "go1_footstand": Shot("go1_footstand", (), begin=0.0, distance=1.9, height=0.1),
+    "g1_track": Shot("g1_track", (), begin=0.0, distance=2.6, elevation=-6.0, azimuth=40.0),
     "g1_rough": Shot("g1_rough", (0.5, 0.0, 0.0), 2.0, distance=2.6, elevation=-14.0, azimuth=75.0, follow=0.0, rough=True),
 }
 
@@ -63,7 +70,10 @@ BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
 def record(shot: Shot, width: int, height: int) -> list[Frame]:
     """The frames of ``shot``, (height, width, 3)."""
     stage = DeployStage(ROOT / "resources/policies" / shot.policy, 1, shot.command, scene_file=TERRAIN_FILE if shot.rough else SCENE_FILE)
-    every, path = round(1.0 / FPS / stage.dt), []
+    if shot.fall:
+        stage.put(*fallen(stage.fleet.model, 1, shot.fall, seconds=1.0))
+    lies = [stage.qpos()[0]] * round(FPS) if shot.fall else []  # a second, before it gets up
+    every, path = round(1.0 / FPS / stage.dt), lies
     for step in range(round((shot.begin + shot.seconds) / stage.dt)):
         stage.step()
         if step * stage.dt >= shot.begin and step % every == 0:
@@ -113,13 +123,13 @@ def save_gif(path: Path, frames: Sequence[Frame]) -> None:
     first.save(path, save_all=True, append_images=others, duration=round(1000 / FPS), loop=0, optimize=True, disposal=1)
 
 
-def save_webp(path: Path, frames: Sequence[Frame], quality: int = 25) -> None:
+def save_webp(path: Path, frames: Sequence[Frame], quality: int = 10) -> None:
     first, *others = map(Image.fromarray, frames)
     first.save(path, save_all=True, append_images=others, duration=round(1000 / FPS), loop=0, quality=quality, method=6, minimize_size=True)
 
 
 def main() -> None:
-    save_gif(IMAGES / "film.gif", side_by_side([record(shot, 272, 204) for shot in FILM]))
+    save_gif(IMAGES / "film.gif", side_by_side([record(shot, 216, 168) for shot in FILM]))
 
 
 if __name__ == "__main__":

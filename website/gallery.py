@@ -75,7 +75,7 @@ def films(names: Sequence[str]) -> None:
     IMAGES.mkdir(parents=True, exist_ok=True)
     for name in names:
         shot = BY_NAME.get(name, Shot(name, BY_NAME["go1_flat"].command))
-        frames = record(shot._replace(seconds=3.2), 256, 160)
+        frames = record(shot._replace(seconds=min(shot.seconds, 2.4)), 256, 160)
         save_webp(IMAGES / f"{name}.webp", frames)
         Image.fromarray(frames[len(frames) // 2]).save(IMAGES / f"{name}.jpg", quality=70, optimize=True)
 
