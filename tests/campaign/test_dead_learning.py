@@ -164,13 +164,14 @@ def test_rsl_rls_own_learner_is_undone_too(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_rsl_rls_own_normaliser_rebinds_its_std_and_gets_the_old_one_back() -> None:
-    network = nn.ModuleDict({"layer": nn.Linear(3, 2), "normaliser": EmpiricalNormalization(3)})
+    layer, normaliser = nn.Linear(3, 2), EmpiricalNormalization(3)
+    network = nn.ModuleList([layer, normaliser])
     stored = SimpleNamespace(observations={"state": torch.zeros(4, 5, 3)}, rewards=torch.zeros(4, 5, 1))
     undo = Undo(SimpleNamespace(storage=stored, optimizer=torch.optim.Adam(network.parameters())), [network])
-    network["normaliser"].update(3.0 * torch.randn(50, 3))
+    normaliser.update(3.0 * torch.randn(50, 3))
     before = {name: value.clone() for name, value in network.state_dict().items()}
     undo.remember()
-    network["normaliser"].update(torch.full((50, 3), math.nan))
+    normaliser.update(torch.full((50, 3), math.nan))
     undo.settle()
     assert undo.undone == 1 and all(torch.equal(before[name], value) for name, value in network.state_dict().items())
 
