@@ -20,6 +20,7 @@ from legged_mw.deploy.__main__ import main as deploy
 from legged_mw.deploy.__main__ import parse as parse_deploy
 from legged_mw.motion.__main__ import main as motion
 from legged_mw.rl import runs, training
+from legged_mw.sim import terrain
 from legged_mw.view import playing
 
 PAGES = [
@@ -50,6 +51,17 @@ SMALL += " --set runner.export=false --set cpu.hidden_dims=[16] --set cpu.num_st
 GROUND = "--set terrain.num_rows=1 --set terrain.num_cols=8 --set terrain.border_size=1"
 OF_TASKS = {"rough": GROUND, "craters": GROUND, "getup": "--set falls.states=8"}
 FILES = {"go1_gentle.py": "index.md", "go1_estimator.py": "tasks.md", "go1_craters.py": "terrain.md"}  # that pages say to save
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _kinds_of_ground() -> Iterator[None]:
+    """Pages add kinds of their own; other tests list those of the package."""
+    tables = (terrain.KINDS, terrain.MEASURES)
+    kept = [dict(table) for table in tables]
+    yield
+    for table, before in zip(tables, kept, strict=True):
+        table.clear()
+        table.update(before)  # type: ignore[arg-type]
 
 
 def commands(page: Path) -> list[str]:

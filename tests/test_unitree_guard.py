@@ -196,7 +196,7 @@ def served(domain: int) -> SimulatedUnitree:
     return SimulatedUnitree(folder, read_contract(folder), RobotEnd("unitree_go", "lo", domain))
 
 
-def live(sim: SimulatedUnitree, until: Any, seconds: float = 30.0) -> float:
+def live(sim: SimulatedUnitree, until: Any, seconds: float = 90.0) -> float:
     """Step in real time until something is true; returns how long it took [s]."""
     start = due = time.monotonic()
     while not until():

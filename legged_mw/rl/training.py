@@ -385,11 +385,11 @@ def _stop_on_signals(runner: Runner, deadline: float | None) -> None:
         with suppress(OSError):  # nobody may be there to read it
             again = "" if name == "SIGHUP" else "; again to stop at once"
             os.write(1, f"{name}: saving and stopping after this iteration{again}\n".encode())
-        signal.signal(number, signal.SIG_IGN if name == "SIGHUP" else signal.SIG_DFL)
+        signal.signal(number, (lambda *_: None) if name == "SIGHUP" else signal.SIG_DFL)
 
     signal.signal(signal.SIGINT, ask)
     signal.signal(signal.SIGTERM, ask)
-    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:  # nohup has it ignored
+    if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored
         signal.signal(signal.SIGHUP, ask)
     if deadline is not None:
         timer = threading.Timer(max(0.0, deadline - time.time()), lambda: setattr(runner, "stop", "--max_time"))
