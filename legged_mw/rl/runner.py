@@ -303,6 +303,11 @@ class Runner(OnPolicyRunner):
         if self._curves_lost or self.keeper.moved:
             self._curves_lost = False
             self._open_curves()
+        try:
+            if flush := getattr(self.logger.writer, "flush", None):  # else a thread writes later, into a run that has ended
+                flush()
+        except Exception as error:  # whatever a logging service may throw
+            self._lose_curves(error)
 
     def save(self, path: str, infos: dict | None = None) -> None:
         """Write what learning needs to go on; whole or not at all."""
