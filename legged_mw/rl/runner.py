@@ -129,7 +129,7 @@ class Runner(OnPolicyRunner):
         self._save_checkpoint()
         if self.examine and self.stop is None:
             self._examine()
-        self.logger.stop_logging_writer()
+        self._end_curves()
 
     def _anneal(self) -> None:
         """Move what has an end value towards it, in a straight line from the first iteration to the last; end a critic's warm-up."""
@@ -278,6 +278,15 @@ class Runner(OnPolicyRunner):
         except Exception as error:
             self._lose_curves(error)
 
+    def _end_curves(self) -> None:
+        """All of them are written when the training ends; else a thread writes on, into a run that is over."""
+        try:
+            self.logger.stop_logging_writer()
+            if flush := getattr(self.logger.writer, "flush", None):
+                flush()
+        except Exception as error:  # whatever a logging service may throw
+            self._lose_curves(error)
+
     def _lose_curves(self, error: Exception) -> None:
         """Go on without curves until the next checkpoint."""
         print(f"WARNING: no curves until the next checkpoint, they cannot be written: {reason_of(error)}", flush=True)
@@ -303,11 +312,6 @@ class Runner(OnPolicyRunner):
         if self._curves_lost or self.keeper.moved:
             self._curves_lost = False
             self._open_curves()
-        try:
-            if flush := getattr(self.logger.writer, "flush", None):  # else a thread writes later, into a run that has ended
-                flush()
-        except Exception as error:  # whatever a logging service may throw
-            self._lose_curves(error)
 
     def save(self, path: str, infos: dict | None = None) -> None:
         """Write what learning needs to go on; whole or not at all."""
