@@ -8,9 +8,10 @@ import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
+import torch
 
 from legged_mw import programs
 from legged_mw.eval import grading
@@ -25,6 +26,27 @@ SMALL = [
     *("--set", "runner.num_steps_per_env=8", "--set", "env.episode_length_s=0.4"),
     *("--set", "runner.export=false"),  # takes as long as the training
 ]
+
+
+def load(path: Path) -> dict[str, Any]:
+    return torch.load(path, weights_only=True)
+
+
+def assert_equal(a: Any, b: Any, where: str = "") -> None:
+    """Nested dicts, lists and tensors, bit for bit; NaN is equal to NaN."""
+    assert type(a) is type(b), where
+    if isinstance(a, dict):
+        assert a.keys() == b.keys(), where
+        for key in a:
+            assert_equal(a[key], b[key], f"{where}.{key}")
+    elif isinstance(a, list | tuple):
+        assert len(a) == len(b), where
+        for i, (x, y) in enumerate(zip(a, b, strict=True)):
+            assert_equal(x, y, f"{where}[{i}]")
+    elif isinstance(a, torch.Tensor):
+        torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True, msg=where)
+    else:
+        assert a == b, where
 
 
 class Result(NamedTuple):

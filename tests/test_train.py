@@ -22,7 +22,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from program import SMALL, refused, run, trained
+from program import SMALL, assert_equal, load, refused, run, trained
 from rsl_rl.runners import OnPolicyRunner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensordict import TensorDict
@@ -75,27 +75,6 @@ def three(root: Path, seen_at_start: dict[str, bool]) -> Path:
 def copied(three: Path, tmp_path: Path) -> Path:
     """A copy of that run in a tree of its own, tmp_path/logs/go1_flat/run."""
     return Path(shutil.copytree(three, tmp_path / "logs/go1_flat/run"))
-
-
-def load(path: Path) -> dict[str, Any]:
-    return torch.load(path, weights_only=True)
-
-
-def assert_equal(a: Any, b: Any, where: str = "") -> None:
-    """Nested dicts, lists and tensors, bit for bit."""
-    assert type(a) is type(b), where
-    if isinstance(a, dict):
-        assert a.keys() == b.keys(), where
-        for key in a:
-            assert_equal(a[key], b[key], f"{where}.{key}")
-    elif isinstance(a, list | tuple):
-        assert len(a) == len(b), where
-        for i, (x, y) in enumerate(zip(a, b, strict=True)):
-            assert_equal(x, y, f"{where}[{i}]")
-    elif isinstance(a, torch.Tensor):
-        assert torch.equal(a, b), where
-    else:
-        assert a == b, where
 
 
 def small_task() -> LoadedTask:

@@ -51,8 +51,8 @@ class Health:
 
     def _warning(self, name: str, count: float, steps: int) -> str:
         """A line when it is first found, and each time that ten times as much has been."""
-        total = self._said.get(name, 0.0) + count
-        before, self._said[name] = self._said.get(name, 0.0), total
+        before = self._said.get(name, 0.0)
+        total = self._said[name] = before + count
         if before and len(str(int(before))) == len(str(int(total))):
             return ""
         share = f"{count:.0f} of {steps} steps of a world"

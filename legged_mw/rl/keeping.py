@@ -71,14 +71,14 @@ class Keeper:
         self.folder, self._keep, self._rank, self._prepare = folder, keep, rank, prepare
         self.failed = ""  # why the newest checkpoint could not be written, '' if it could
         self.written: Path | None = None  # the newest one that could
-        self.moved = False  # the folder had to be made anew
+        self.moved = False  # the folder had to be made again
 
     def write(self, iteration: int, checkpoint: Callable[[], dict[str, Any]], worlds: Callable[[], dict[str, Any]]) -> bool:
-        """Worlds, then the checkpoint, then sweep the ones before; returns whether it is all there."""
+        """Worlds, then the checkpoint, then sweep the ones before; returns whether the checkpoint is there."""
         path = self.folder / f"model_{iteration}.pt"
         try:
             self.moved = self._prepare()
-            save_whole(worlds(), worlds_file(path, self._rank), sync=False)  # one that a power cut tears is found out by its reader
+            self._write_worlds(worlds, worlds_file(path, self._rank), path)
             if self._rank.leads:
                 save_whole(checkpoint(), path)
         except (OSError, MemoryError) as error:  # the file is put together in memory
@@ -90,6 +90,13 @@ class Keeper:
         with contextlib.suppress(OSError):
             self._sweep()
         return True
+
+    def _write_worlds(self, worlds: Callable[[], dict[str, Any]], file: Path, checkpoint: Path) -> None:
+        """They are many times as large as the checkpoint, which may have room without them."""
+        try:
+            save_whole(worlds(), file, sync=False)  # one that a power cut tears is found out by its reader
+        except (OSError, MemoryError) as error:
+            print(f"WARNING: {file.name} cannot be written: {reason_of(error)}; from {checkpoint.name} worlds begin anew", flush=True)
 
     def _sweep(self) -> None:
         """Worlds of checkpoints before the newest, and the checkpoints that are too many.

@@ -23,9 +23,8 @@ def check_room(sections: dict[str, Any], env: RobotTask, learns: bool = True) ->
         for field, count in _weights(sections, name, sum(sizes.get(group, 0) for group in sections["obs_groups"][name])).items()
     }
     field = max(counts, key=lambda field: counts[field])
-    section, _, name = field.rpartition(".")
     value = sections
-    for part in (*section.split("."), name):
+    for part in field.split("."):
         value = value[part]
     copies = 4 if learns else 1  # beside the weights their gradients, and Adam's two moments
     require_memory(_FLOAT * copies * sum(counts.values()), device, f"{field} = {value}", "fewer values a layer need less")

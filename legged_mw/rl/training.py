@@ -253,15 +253,16 @@ def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
     """Load the checkpoint to go on from, if there is one; returns how many iterations are left."""
     if start.checkpoint:
         runner.load(str(start.checkpoint))
-        print(f"resuming {shown(start.checkpoint)}")
-        anew = f"worlds begin anew ({runner.begins_anew}); networks, counters and curricula go on"
-        print(anew if runner.begins_anew else "exactly: worlds and generators go on where they were", flush=True)
     else:
         _begin(runner, start)
     done, wanted = runner.current_learning_iteration, task.train.runner.max_iterations
     if done >= wanted:
         what = shown(start.checkpoint or start.experiment)
         raise ConfigError(f"{what} has done {done} iterations of {wanted}; raise --max_iterations to go on")
+    if start.checkpoint:
+        print(f"resuming {shown(start.checkpoint)}")
+        anew = f"worlds begin anew ({runner.begins_anew}); networks, counters and curricula go on"
+        print(anew if runner.begins_anew else "exactly: worlds and generators go on where they were", flush=True)
     return wanted - done
 
 
@@ -293,7 +294,7 @@ def _lock(start: Start) -> RunLock:
 def _open_run(runner: Runner, task: LoadedTask, start: Start, rank: Rank, held: ExitStack, lock: RunLock | None) -> Path:
     """The folder that this training writes to, with the config in it; an earlier checkpoint begins a folder of its own.
 
-    One for all ranks, made by the first. It has a ``lock`` until ``held`` ends, and is made anew if somebody deletes it.
+    One for all ranks, made by the first. It has a ``lock`` until ``held`` ends, and is made again if somebody deletes it.
     """
     folder = [start.run if start.run and lock else new_run(start.experiment, task.train.runner.run_name) if rank.leads else Path()]
 

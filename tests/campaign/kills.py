@@ -20,8 +20,8 @@ from typing import Any
 import torch
 
 sys.path[:0] = [str(Path(__file__).parents[2]), str(Path(__file__).parents[1]), str(Path(__file__).parent)]
-from program import SMALL, run  # noqa: E402
-from test_resume import EXACTLY, assert_equal  # noqa: E402
+from program import SMALL, assert_equal, run  # noqa: E402
+from test_resume import EXACTLY  # noqa: E402
 
 from legged_mw.rl.checkpoint import damage  # noqa: E402
 from legged_mw.rl.runs import checkpoints  # noqa: E402

@@ -9,17 +9,17 @@ from typing import Any
 
 import pytest
 import torch
-from program import SMALL, Result, run
+from program import SMALL, Result, assert_equal, load, run
 
+from legged_mw.rl.checkpoint import Checker
 from legged_mw.rl.keeping import Keeper
 from legged_mw.rl.runs import checkpoints
 
 EXACTLY = "exactly: worlds and generators go on where they were"
 THREE = ["--set", "runner.save_interval=1", "--max_iterations", "3", "--seed", "3", "--set", "cpu.update_threads=1", "--eager"]
 DELAYS = ["action_delay=[0, 2]", "observation_delay=[0, 2]", "delay_ms=[0.0, 12.0]", "encoder_offset=[-0.02, 0.02]"]
-# what is trained -> flags; with symmetry, kicks, noise and episodes that end on the way
 TILES = ["--set", "terrain.num_rows=2", "--set", "terrain.num_cols=8"]
-TASKS = {
+TASKS = {  # what is trained -> flags; with symmetry, kicks, noise and episodes that end on the way
     "go1_rough": ["--task", "go1_rough", *TILES],
     "drawn worlds, delays, history": [
         *("--task", "go1_flat_dr", "--set", "domain_rand.redraw_iterations=1", "--set", "observations.history={state: 3}"),
@@ -45,26 +45,6 @@ BY_HAND = {  # LEGGED_MW_CAMPAIGN=all pytest tests/campaign/test_resume.py
 }
 if os.environ.get("LEGGED_MW_CAMPAIGN") == "all":
     TASKS |= BY_HAND
-
-
-def assert_equal(a: Any, b: Any, where: str = "") -> None:
-    assert type(a) is type(b), where
-    if isinstance(a, dict):
-        assert a.keys() == b.keys(), where
-        for key in a:
-            assert_equal(a[key], b[key], f"{where}.{key}")
-    elif isinstance(a, list | tuple):
-        assert len(a) == len(b), where
-        for i, (x, y) in enumerate(zip(a, b, strict=True)):
-            assert_equal(x, y, f"{where}[{i}]")
-    elif isinstance(a, torch.Tensor):
-        assert torch.equal(a.nan_to_num(7.0), b.nan_to_num(7.0)) if a.is_floating_point() else torch.equal(a, b), where
-    else:
-        assert a == b, where
-
-
-def load(path: Path) -> Any:
-    return torch.load(path, weights_only=True)
 
 
 def interrupted(root: Path, *flags: str, after: int = 2) -> tuple[Path, Path]:
@@ -100,3 +80,8 @@ def test_a_resumed_training_is_the_uninterrupted_one(name: str, tmp_path: Path) 
     resumed, uninterrupted = (load(folder / "worlds_3.pt") for folder in (killed, whole))
     resumed["worlds"] = {name: resumed["worlds"][name] for name in uninterrupted["worlds"]}  # loading wrote more
     assert_equal(resumed, uninterrupted)
+
+
+def test_a_number_of_a_users_task_may_be_below_zero() -> None:
+    best = {"best_reward": torch.tensor([-3.0])}
+    Checker(Path("model_1.pt")).task({"env": best}, best)
