@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import brief
 
 _SEAL = b"sha256:"
 EARLIER = "an earlier one is named by --checkpoint"
@@ -186,5 +187,4 @@ def _short(value: object) -> str:
         return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
     if isinstance(value, tuple | list) and len(value) < 5:
         return f"{'[' if isinstance(value, list) else '('}{', '.join(map(_short, value))}{']' if isinstance(value, list) else ')'}"
-    text = repr(value) if isinstance(value, int | float | str | None) and not (isinstance(value, int) and abs(value) > 1 << 64) else ""
-    return text[:60] or f"a {type(value).__name__}"
+    return brief(value, 60) if isinstance(value, int | float | str | None) else f"a {type(value).__name__}"
