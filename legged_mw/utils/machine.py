@@ -71,7 +71,7 @@ def contained(work: Callable[[], Any], seconds: float, room: int, stop: Callable
             ended.set_exception(error)
 
     thread = threading.Thread(target=run, daemon=True)
-    with _room(room):
+    with limited_memory(room):
         thread.start()
         thread.join(seconds)
         if late := thread.is_alive():
@@ -83,7 +83,7 @@ def contained(work: Callable[[], Any], seconds: float, room: int, stop: Callable
 
 
 @contextmanager
-def _room(size: int) -> Iterator[None]:
+def limited_memory(size: int) -> Iterator[None]:
     """Meanwhile the process may take ``size`` [byte] more than it has."""
     if not Path("/proc/self/statm").exists():
         yield
