@@ -11,7 +11,7 @@ import math
 import re
 import struct
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -118,16 +118,8 @@ class Checker:
         if not isinstance(group, Mapping):
             raise self.fail(f"{where}a group is {_short(group)}")
         for key in group.keys() & own.keys() - {"params"}:
-            value: Any = group[key]
-            numbers: Sequence[Any] = value if key == "betas" and isinstance(value, list | tuple) and len(value) == 2 else [value]
-            if own[key] is None or isinstance(own[key], bool):
-                good = (value is None or isinstance(value, bool)) and (key not in _CHOSEN or value == own[key])
-            else:
-                plain = all(isinstance(number, int | float) and not isinstance(number, bool) for number in numbers)
-                good = plain and all(0.0 <= number < (1.0 if key == "betas" else math.inf) for number in numbers)
-                good = good and len(numbers) == (2 if key == "betas" else 1) and (key != "lr" or numbers[0] > 0.0)
-            if not good:
-                raise self.fail(f"{where}{key} is {_short(value)}; that is none")
+            if not _is_setting(key, group[key], own[key]):
+                raise self.fail(f"{where}{key} is {_short(group[key])}; that is none")
         if missing := [key for key in ("lr", "betas", "eps", "weight_decay") if key in own and key not in group]:
             raise self.fail(f"{where}{missing[0]} is missing")
 
@@ -179,6 +171,19 @@ def check_resume(content: Mapping[str, Any], path: Path, optimizer: torch.optim.
         raise check.fail(f"its name says {int(named[1])} iterations, and it has done {done}: call it model_{done}.pt")
     check.memory(content, "optimizer_state_dict", optimizer)
     check.task(content.get("infos") or {}, task)
+
+
+def _is_setting(key: str, value: Any, own: Any) -> bool:
+    """Whether Adam's ``key`` may be ``value``, where ours is ``own``."""
+    if own is None or isinstance(own, bool):
+        return (value is None or isinstance(value, bool)) and (key not in _CHOSEN or value == own)
+    if key == "betas":
+        return isinstance(value, list | tuple) and len(value) == 2 and all(_is_number(beta) and beta < 1.0 for beta in value)
+    return _is_number(value) and (key != "lr" or value > 0.0)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0.0 <= value < math.inf
 
 
 def _short(value: object) -> str:
