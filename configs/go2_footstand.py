@@ -8,7 +8,7 @@ from legged_mw.utils.task import Task
 
 class Go2FootstandCfg(Go2HandstandCfg):
     class asset(Go2HandstandCfg.asset):
-        terminate_after_contacts_on = ["base", *Go1FootstandCfg.asset.terminate_after_contacts_on[1:]]
+        terminate_after_contacts_on = ["base", "R?_hip*", "R?_thigh*", "R?_calf*"]
         penalize_contacts_on = Go1FootstandCfg.asset.penalize_contacts_on
 
     class exam(Go2HandstandCfg.exam):

@@ -10,7 +10,7 @@ class Go2HandstandCfg(Go1HandstandCfg):
     class asset(Go1HandstandCfg.asset):
         file, imu_site = Go2FlatCfg.asset.file, Go2FlatCfg.asset.imu_site
         joint_speed_limits = Go2FlatCfg.asset.joint_speed_limits
-        terminate_after_contacts_on = ["base", *Go1HandstandCfg.asset.terminate_after_contacts_on[1:]]
+        terminate_after_contacts_on = ["base", "F?_hip*", "F?_thigh*", "F?_calf*"]
 
     class init_state(Go1HandstandCfg.init_state):
         pos, default_joint_angles = Go2FlatCfg.init_state.pos, Go2FlatCfg.init_state.default_joint_angles

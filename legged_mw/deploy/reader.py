@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.errors import UserError, brief
 
 MOST = 1e6  # no quantity of a robot is larger, in any unit
 MOST_VALUES = 10_000_000  # of an observation: a camera's picture has a tenth
@@ -76,14 +76,6 @@ class Reader:
 
 def is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300  # a whole number may be no float
-
-
-def brief(value: object) -> str:
-    """A value for a message, however large it is."""
-    if isinstance(value, int) and abs(value) > 1 << 64:
-        return "a number of many digits"
-    text = repr(value) if not isinstance(value, str | list | dict) or len(value) <= 200 else f"{type(value).__name__} of {len(value)}"
-    return text if len(text) <= 400 else f"{text[:400]}..."
 
 
 def is_list(value: object, fits: Callable[[Any], bool], empty: bool = False) -> bool:

@@ -108,21 +108,20 @@ class DomainRand:
         writers = {name: self._writer(name, field) for name in order for field in kinds[name][0].fields[:1]}
         self._writers = list(dict.fromkeys(writers.values()))
         self._writers_again = list(dict.fromkeys(writers[name] for name in again if name in writers))
-        self._highest = {name: kinds[name][2] for name in order}
         self._ends = {name: list(kinds[name][1:]) for name in order}
 
     def delay(self, name: str, width: int, start: float | None = None) -> Delay | None:
         """The delay line of ``action_delay`` or ``observation_delay``, or None if the config has none."""
         if name not in self.values:
             return None
-        self._require_memory(name, self._highest[name] + 1, width)
-        return Delay(self.values[name], int(self._highest[name]), width, start)
+        self._require_memory(name, self._ends[name][1] + 1, width)
+        return Delay(self.values[name], int(self._ends[name][1]), width, start)
 
     def substep_delay(self, substeps: int, width: int) -> SubstepDelay | None:
         """The delay line of ``delay_ms``, for control steps of ``substeps``."""
         if "delay_ms" not in self.values:
             return None
-        longest = self.rounded_delay(self._highest["delay_ms"])
+        longest = self.rounded_delay(self._ends["delay_ms"][1])
         self._require_memory("delay_ms", longest / self._substep_ms / substeps + 1, width)
         return SubstepDelay(self.values["delay_ms"], self._substep_ms, longest, substeps, width)
 

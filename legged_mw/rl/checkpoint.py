@@ -11,7 +11,7 @@ import math
 import re
 import struct
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import brief
 
 _SEAL = b"sha256:"
 EARLIER = "an earlier one is named by --checkpoint"
@@ -118,16 +119,8 @@ class Checker:
         if not isinstance(group, Mapping):
             raise self.fail(f"{where}a group is {_short(group)}")
         for key in group.keys() & own.keys() - {"params"}:
-            value: Any = group[key]
-            numbers: Sequence[Any] = value if key == "betas" and isinstance(value, list | tuple) and len(value) == 2 else [value]
-            if own[key] is None or isinstance(own[key], bool):
-                good = (value is None or isinstance(value, bool)) and (key not in _CHOSEN or value == own[key])
-            else:
-                plain = all(isinstance(number, int | float) and not isinstance(number, bool) for number in numbers)
-                good = plain and all(0.0 <= number < (1.0 if key == "betas" else math.inf) for number in numbers)
-                good = good and len(numbers) == (2 if key == "betas" else 1) and (key != "lr" or numbers[0] > 0.0)
-            if not good:
-                raise self.fail(f"{where}{key} is {_short(value)}; that is none")
+            if not _is_setting(key, group[key], own[key]):
+                raise self.fail(f"{where}{key} is {_short(group[key])}; that is none")
         if missing := [key for key in ("lr", "betas", "eps", "weight_decay") if key in own and key not in group]:
             raise self.fail(f"{where}{missing[0]} is missing")
 
@@ -181,11 +174,23 @@ def check_resume(content: Mapping[str, Any], path: Path, optimizer: torch.optim.
     check.task(content.get("infos") or {}, task)
 
 
+def _is_setting(key: str, value: Any, own: Any) -> bool:
+    """Whether Adam's ``key`` may be ``value``, where ours is ``own``."""
+    if own is None or isinstance(own, bool):
+        return (value is None or isinstance(value, bool)) and (key not in _CHOSEN or value == own)
+    if key == "betas":
+        return isinstance(value, list | tuple) and len(value) == 2 and all(_is_number(beta) and beta < 1.0 for beta in value)
+    return _is_number(value) and (key != "lr" or value > 0.0)
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and 0.0 <= value < math.inf
+
+
 def _short(value: object) -> str:
     """A value for a message, however long it is."""
     if isinstance(value, Tensor):
         return f"{tuple(value.shape)} {str(value.dtype).removeprefix('torch.')}"
     if isinstance(value, tuple | list) and len(value) < 5:
         return f"{'[' if isinstance(value, list) else '('}{', '.join(map(_short, value))}{']' if isinstance(value, list) else ')'}"
-    text = repr(value) if isinstance(value, int | float | str | None) and not (isinstance(value, int) and abs(value) > 1 << 64) else ""
-    return text[:60] or f"a {type(value).__name__}"
+    return brief(value, 60) if isinstance(value, int | float | str | None) else f"a {type(value).__name__}"

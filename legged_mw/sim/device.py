@@ -33,8 +33,8 @@ class DeviceFacts(NamedTuple):
             has, since = (".".join(map(str, version)) for version in (self.cuda, GRAPHS_SINCE))
             lines.append(f"the driver supports CUDA {has}, and recording is reliable from {since} on: update it")
         if self.taken > _OTHERS:
-            shared = "another process holds"
-            lines.append(f"{shared} {self.taken:.0f} of {self.memory:.0f} GiB of this GPU: both run slower (nvidia-smi shows which)")
+            held = f"{self.taken:.0f} of {self.memory:.0f} GiB"
+            lines.append(f"another process holds {held} of this GPU: both run slower (nvidia-smi shows which)")
         return lines
 
 

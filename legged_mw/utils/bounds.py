@@ -73,7 +73,6 @@ Names = Annotated[list[str], SOME]
 Points = Annotated[list[Annotated[float, at_least(-100, 100, "m")]], SOME]
 FileNames = list[Annotated[str, Bound("the name of a file", bool)]]
 Sizes = Annotated[list[Count], SOME]  # of layers
-Vector = Annotated[list[float], THREE]
 NonNegativeVector = Annotated[list[NonNegative], THREE]
 Range = Annotated[list[float], PAIR]
 PositiveRange = Annotated[list[Positive], PAIR]

@@ -152,7 +152,6 @@ def one_line_errors(program: str = "") -> Iterator[None]:
             program,
             f"out of memory ({(str(first) or 'memory').splitlines()[0]}); fewer worlds need less: try half with --num_envs",
         )
-
     except Exception as error:
         _blame_user(program, error)
         raise

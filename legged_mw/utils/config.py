@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeGuard, Union, get
 from weakref import WeakKeyDictionary
 
 from legged_mw.utils.bounds import bare, bounds_of, bounds_text
-from legged_mw.utils.errors import ConfigError
+from legged_mw.utils.errors import ConfigError, brief
 from legged_mw.utils.files import note_file
 from legged_mw.utils.renamed import new_name
 from legged_mw.utils.yaml_file import load_yaml, parse_yaml, save_yaml
@@ -167,15 +167,6 @@ def _full(kind: Any) -> str:
     return type_text(kind) + (f" ({bounds})" if (bounds := bounds_text(kind)) else "")
 
 
-def _say(value: Any) -> str:
-    """``value`` for an error: what would fill the screen is cut, what cannot be written is described."""
-    try:
-        text = repr(value)
-    except (ValueError, RecursionError):  # Python writes no whole number of more than 4300 digits
-        return f"an {type(value).__name__} too large to show"
-    return text if len(text) <= 200 else f"{text[:200]}..."
-
-
 def _suggest(path: str, fields: Mapping[str, Any]) -> str:
     """`; it is called ... now` where the field at `path` was renamed, else `_nearest`."""
     new = new_name(path)
@@ -238,7 +229,7 @@ def fit(value: Any, kind: Any, path: str) -> Any:
     if origin in (bool, str, NoneType) and type(value) is origin:
         return _within(value, kind, path)
     hint = _nearest(value, map(str, args)) if origin is Literal and isinstance(value, str) else ""
-    raise ConfigError(f"{path} must be {type_text(kind)}, not {_say(value)} ({type(value).__name__}){hint}")
+    raise ConfigError(f"{path} must be {type_text(kind)}, not {brief(value)} ({type(value).__name__}){hint}")
 
 
 def _fit_one_of(value: Any, kind: Any, path: str) -> Any:
@@ -253,14 +244,14 @@ def _fit_one_of(value: Any, kind: Any, path: str) -> Any:
             continue
     if len(outside) == 1:
         raise outside[0]
-    wrong = f"is {_say(value)}; it must be {bounds_text(kind)}" if outside else f"must be {type_text(kind)}, not {_say(value)}"
+    wrong = f"is {brief(value)}; it must be {bounds_text(kind)}" if outside else f"must be {type_text(kind)}, not {brief(value)}"
     raise ConfigError(f"{path} {wrong} ({type(value).__name__})")
 
 
 def _within(value: Any, kind: Any, path: str) -> Any:
     for bound in bounds_of(kind):
         if not bound.holds(value):
-            raise OutOfBounds(f"{path} is {_say(value)}; it must be {bounds_text(kind) or bound.text}")
+            raise OutOfBounds(f"{path} is {brief(value)}; it must be {bounds_text(kind) or bound.text}")
     return value
 
 
@@ -328,7 +319,7 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 def _edits(node: Any, values: Any, path: str = "") -> Iterator[tuple[Any, str, Any]]:
     """(section, name, value) for every field that the nested `values` name, each checked."""
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{path or _path(type(node))} is a section and needs a mapping of its fields, not {_say(values)}")
+        raise ConfigError(f"{path or _path(type(node))} is a section and needs a mapping of its fields, not {brief(values)}")
     for name, value in values.items():
         here = f"{path}.{name}" if path else str(name)
         kind = _kind(type(node), str(name), here)

@@ -86,6 +86,15 @@ def in_short(error: BaseException) -> str:
     return f"{type(error).__name__}: {text[:400]}" if text else type(error).__name__
 
 
+def brief(value: object, most: int = 200) -> str:
+    """A value for a message: what would fill the screen is cut, what cannot be written is described."""
+    try:
+        text = repr(value)
+    except (ValueError, RecursionError):  # Python writes no whole number of more than 4300 digits
+        return f"an {type(value).__name__} too large to show"
+    return text if len(text) <= most else f"{text[:most]}..."
+
+
 def printable(text: str) -> str:
     """``text`` with what a terminal would obey, not print, written as \\x1b: names come from files, folders and the net."""
     return "".join(each if each.isprintable() or each == "\n" or unicodedata.category(each) == "Zs" else ascii(each)[1:-1] for each in text)

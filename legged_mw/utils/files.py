@@ -73,12 +73,8 @@ def writable(name: str, flag: str, folder: bool = False) -> Path:
         if path.is_file() and not os.access(path, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except (OSError, ValueError) as error:  # a name too long, or with a null character
-        raise UserError(f"{flag} {_cut(name)}: cannot be written: {getattr(error, 'strerror', None) or error}") from None
+        raise UserError(f"{flag} {name[:200]}: cannot be written: {getattr(error, 'strerror', None) or error}") from None
     return path
-
-
-def _cut(name: str) -> str:
-    return name if len(name) <= 200 else f"{name[:200]}..."
 
 
 def check_name(name: str, where: str) -> str:

@@ -7,6 +7,7 @@ import os
 import re
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -61,16 +62,16 @@ def contained(work: Callable[[], Any], seconds: float, room: int, stop: Callable
 
     Past its time it is asked to ``stop``, and a TimeoutError raised; if it does not, it is left behind. Memory is limited on Linux.
     """
-    ended: list[tuple[Any, BaseException | None]] = []
+    ended: Future[Any] = Future()
 
     def run() -> None:
         try:
-            ended.append((work(), None))
+            ended.set_result(work())
         except BaseException as error:
-            ended.append((None, error))
+            ended.set_exception(error)
 
     thread = threading.Thread(target=run, daemon=True)
-    with _room(room):
+    with limited_memory(room):
         thread.start()
         thread.join(seconds)
         if late := thread.is_alive():
@@ -78,14 +79,11 @@ def contained(work: Callable[[], Any], seconds: float, room: int, stop: Callable
             thread.join(1.0)
     if late:
         raise TimeoutError(f"it has not ended within {seconds:g} s")
-    [(value, error)] = ended
-    if error:
-        raise error
-    return value
+    return ended.result()
 
 
 @contextmanager
-def _room(size: int) -> Iterator[None]:
+def limited_memory(size: int) -> Iterator[None]:
     """Meanwhile the process may take ``size`` [byte] more than it has."""
     if not Path("/proc/self/statm").exists():
         yield

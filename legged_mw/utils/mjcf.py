@@ -34,8 +34,7 @@ def check_files(file: Path) -> str:
             raise ValueError(f"{part.name} has {part.stat().st_size >> 20} MiB; a robot's file has {MOST_BYTES >> 20} at most")
         text = part.read_text(encoding="utf-8", errors="replace")
         first, seen = first or text, seen | {part.resolve()}
-        check_text(text, "" if part == file else f"{part.name}: ")
-        for name in _included(text):
+        for name in _included(_checked(text, "" if part == file else f"{part.name}: ")):
             path = (folder / name).resolve()
             if not path.is_relative_to(folder):
                 raise ValueError(f"it includes {name}, which lies outside of its own folder; put that file beside it")
@@ -44,8 +43,8 @@ def check_files(file: Path) -> str:
     return first
 
 
-def check_text(text: str, where: str = "") -> None:
-    """Raises ValueError with the line for what no robot needs and a reader may choke on."""
+def _checked(text: str, where: str) -> str:
+    """``text`` with its comments blank. Raises ValueError with the line for what no robot needs and a reader may choke on."""
     if "<!ENTITY" in text:
         raise ValueError(f"{where}line {_line(text, text.index('<!ENTITY'))}: it defines entities; write out what they stand for")
     text = re.sub(r"<!--.*?-->", lambda match: re.sub(r"[^\n]", " ", match[0]), text, flags=re.DOTALL)
@@ -58,6 +57,7 @@ def check_text(text: str, where: str = "") -> None:
             wrong = f"makes more than {_COPIES:g} copies, with the others" if copies > _COPIES else ""
         if wrong:
             raise ValueError(f'{where}line {_line(text, match.start())}: {name}="{value[:60]}" {wrong}')
+    return text
 
 
 def _wrong(name: str, value: str) -> str:
@@ -82,7 +82,7 @@ def _line(text: str, place: int) -> int:
 
 def _included(text: str) -> Iterator[str]:
     """Names of other MJCF files that the text takes in."""
-    for tag in _TAG.finditer(re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)):
+    for tag in _TAG.finditer(text):
         yield from (match[2] or match[3] or "" for match in _ATTRIBUTE.finditer(tag[2]) if match[1] == "file")
 
 

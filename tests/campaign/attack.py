@@ -24,7 +24,6 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-import resource
 import signal
 import sys
 import tempfile
@@ -38,6 +37,7 @@ from program import files, stopped_at_work
 from legged_mw import programs
 from legged_mw.rl import policies, runs
 from legged_mw.utils.cli import one_line_errors
+from legged_mw.utils.machine import limited_memory
 
 ROOM, SECONDS = 6 << 30, 60  # what an input may take before it counts as not refused: memory [byte], time [s]
 _EVENTS = {  # of Python's audit hooks: which arguments are paths, and whether what stood there is gone afterwards
@@ -138,15 +138,12 @@ def limits() -> Iterator[None]:
     def late(*_: object) -> None:
         raise TimeoutError(f"not refused within {SECONDS} s")
 
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     was = signal.signal(signal.SIGALRM, late)
     signal.alarm(SECONDS)
-    resource.setrlimit(resource.RLIMIT_AS, (taken + ROOM, hard))
     try:
-        yield
+        with limited_memory(ROOM):
+            yield
     finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
         signal.alarm(0)
         signal.signal(signal.SIGALRM, was)
 

@@ -89,9 +89,13 @@ def test_task_files(text: str, says: tuple[str, ...], tmp_path: Path) -> None:
 OTHERS = [
     Case("a folder", loads, "no config file at ", given=lambda root: (root / "mine.py").mkdir()),
     Case("a link to itself", loads, "", given=lambda root: (root / "mine.py").symlink_to("mine.py")),
-    Case("no exam of that name", program("train", "--check", "--task", "ROOT/mine.py"), ("mine.py: no exam 'nosuch' in ",)),
+    Case(
+        "no exam of that name",
+        program("train", "--check", "--task", "ROOT/mine.py"),
+        "mine.py: no exam 'nosuch' in ",
+        given=written("TASK = Task(LeggedRobot, Cfg, CfgPPO, 'nosuch')"),
+    ),
 ]
-OTHERS[2] = OTHERS[2]._replace(given=written("TASK = Task(LeggedRobot, Cfg, CfgPPO, 'nosuch')"))
 
 
 @pytest.mark.parametrize("case", OTHERS, ids=lambda case: case.id)
