@@ -57,7 +57,7 @@ BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
     "go1_rough": FILM[0]._replace(policy="go1_rough"),
     "go1_rough_scan": FILM[0],
     "go2_flat": FILM[1],
-    "go2_rough": FILM[0]._replace(policy="go2_rough", distance=2.3),
+    "go2_rough": FILM[0]._replace(policy="go2_rough"),
     "g1_flat": FILM[2],
     "go1_getup": FILM[3],
     "go1_handstand": Shot("go1_handstand", (), begin=0.0, distance=1.9, height=0.1),
