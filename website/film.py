@@ -62,7 +62,7 @@ BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
     "go1_getup": FILM[3],
     "go1_handstand": Shot("go1_handstand", (), begin=0.0, distance=1.9, height=0.1),
     "go1_footstand": Shot("go1_footstand", (), begin=0.0, distance=1.9, height=0.1),
-    "g1_track": Shot("g1_track", (), begin=0.0, distance=2.6, elevation=-6.0, azimuth=40.0),
+    "g1_track": Shot("g1_track", (), begin=2.2, distance=2.6, elevation=-6.0, azimuth=40.0),
     "g1_rough": Shot("g1_rough", (0.5, 0.0, 0.0), 2.0, distance=2.6, elevation=-14.0, azimuth=75.0, follow=0.0, rough=True),
 }
 
