@@ -56,18 +56,21 @@ def write_csv(curve: dict[str, dict[int, float]], path: Path, every: int) -> Non
 
 
 def draw(curve: dict[str, dict[int, float]], path: Path) -> None:
-    """Reward, and the exam's errors, against seconds of training; 256 colours, for a small file."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.2), layout="constrained")
+    """Reward, and where exams were taken their errors, against seconds of training; 256 colours, for a small file."""
+    panels = 1 + ("error_vx" in curve)
+    figure, axes = plt.subplots(1, panels, figsize=(4.5 * panels, 3.2), layout="constrained", squeeze=False)
+    left, right = axes[0, 0], axes[0, -1]
     seconds = curve["seconds"]
     left.plot([*seconds.values()], [curve["reward"][step] for step in seconds], lw=1)
     left.set(xlabel="seconds of training", ylabel="return of an episode")
-    for column, unit in (("error_vx", "m/s"), ("error_vy", "m/s"), ("error_yaw", "rad/s")):
-        values = curve.get(column, {})
-        right.plot([seconds[step] for step in values], [*values.values()], marker="o", ms=3, lw=1, label=f"{column} [{unit}]")
-    right.set(xlabel="seconds of training", ylabel="small exam, mean error", ylim=(0, 0.5))
-    right.legend(frameon=False)
-    for axes in (left, right):
-        axes.grid(alpha=0.3)
+    left.grid(alpha=0.3)
+    if right is not left:
+        for column, unit in (("error_vx", "m/s"), ("error_vy", "m/s"), ("error_yaw", "rad/s")):
+            values = curve[column]
+            right.plot([seconds[step] for step in values], [*values.values()], marker="o", ms=3, lw=1, label=f"{column} [{unit}]")
+        right.set(xlabel="seconds of training", ylabel="small exam, mean error", ylim=(0, 0.5))
+        right.legend(frameon=False)
+        right.grid(alpha=0.3)
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=100)
     small = Image.open(buffer).convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE)

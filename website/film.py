@@ -57,12 +57,12 @@ BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
     "go1_rough": FILM[0]._replace(policy="go1_rough"),
     "go1_rough_scan": FILM[0],
     "go2_flat": FILM[1],
-    "go2_rough": FILM[0]._replace(policy="go2_rough", distance=2.3),
+    "go2_rough": FILM[0]._replace(policy="go2_rough"),
     "g1_flat": FILM[2],
     "go1_getup": FILM[3],
     "go1_handstand": Shot("go1_handstand", (), begin=0.0, distance=1.9, height=0.1),
     "go1_footstand": Shot("go1_footstand", (), begin=0.0, distance=1.9, height=0.1),
-    "g1_track": Shot("g1_track", (), begin=0.0, distance=2.6, elevation=-6.0, azimuth=40.0),
+    "g1_track": Shot("g1_track", (), begin=2.2, distance=2.6, elevation=-6.0, azimuth=40.0),
     "g1_rough": Shot("g1_rough", (0.5, 0.0, 0.0), 2.0, distance=2.6, elevation=-14.0, azimuth=75.0, follow=0.0, rough=True),
 }
 

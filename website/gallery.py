@@ -19,7 +19,7 @@ POLICIES, PAGE, IMAGES = ROOT / "resources/policies", ROOT / "docs/gallery.md", 
 ORDER = ("go1_flat", "go1_rough", "go1_rough_scan", "go2_flat", "go2_rough", "g1_flat", "g1_rough")  # then all others by name
 HEAD = """# Gallery
 
-Every policy that ships, as it walks in MuJoCo's C engine. `MUJOCO_GL=egl python -m website.gallery` makes this page, its films and
+Every policy that ships, in MuJoCo's C engine. `MUJOCO_GL=egl python -m website.gallery` makes this page, its films and
 stills from `resources/policies/`. To watch one and drive it:
 
 ```bash
@@ -41,8 +41,8 @@ def page() -> str:
 
 
 def _entry(name: str) -> str:
-    film = f"![{name} walks](images/gallery/{name}.webp)\n\n" if (IMAGES / f"{name}.webp").exists() else ""
-    return f"## {name}\n\n{film}<!-- made: policy_{name} -->\n\nAll of it: [{name}](../resources/policies/{name}/README.md).\n"
+    film = f"![{name}](images/gallery/{name}.webp)"
+    return f"## {name}\n\n{film}\n\n<!-- made: policy_{name} -->\n\nAll of it: [{name}](../resources/policies/{name}/README.md).\n"
 
 
 def chapter(name: str) -> str:
@@ -50,7 +50,7 @@ def chapter(name: str) -> str:
     folder = POLICIES / name
     text = _relinked((folder / "README.md").read_text(), folder)
     made = re.findall(r"^```bash\n.*?^```$", text, re.MULTILINE | re.DOTALL)[:1]
-    tables = [part for part in text.split("\n\n") if part.startswith("|") and re.search("falls in|stands in time|holds", part)]
+    tables = [part for part in text.split("\n\n") if part.startswith("|") and re.search("falls in|stands within|holds|finishes", part)]
     exam = "\n".join(line for line in "\n".join(tables).splitlines() if line.startswith("|"))
     curve = [f"![learning curve](../resources/policies/{name}/curve.png)"] if (folder / "curve.png").exists() else []
     return "\n\n".join([text.split("\n\n")[1].replace("\n", " "), *made, exam, *curve])
