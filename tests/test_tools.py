@@ -18,7 +18,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from legged_mw import ROOT, programs
 from legged_mw.rl import training
-from legged_mw.rl.runs import save_whole
+from legged_mw.rl.runs import load_tensors, save_whole
 from legged_mw.sim.device import DeviceFacts, device_facts
 from legged_mw.tools import alongside, chart, completion, doctor, sweep, warm
 from legged_mw.utils import renderer
@@ -343,6 +343,26 @@ def test_play_follows_the_newest_policy(made: Path, tmp_path: Path) -> None:
     assert result.code == 0 and set(said) == {"iteration 7"}, result.err
     refused = run("play", tmp_path, "--task", "go1_flat", "--follow", "--eval")
     assert refused.code == 2 and "--follow watches the newest policy: leave --eval, --export and --checkpoint out" in refused.err
+
+
+def test_a_viewer_outlives_a_checkpoint_that_is_thinned_out(tmp_path: Path) -> None:
+    def load(path: Path) -> int:
+        path.unlink(missing_ok=True)
+        return load_tensors(path, "cpu")["iter"]
+
+    newest = Newest(tmp_path, load, tmp_path / "model_3.pt")
+    (tmp_path / "model_4.pt").touch()
+    newest()
+    assert newest.news == "iteration 3"
+
+
+def test_a_training_begins_without_a_viewer_where_nothing_can_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def save(_: str) -> None:
+        raise OSError(28, "No space left on device")
+
+    runner: Any = SimpleNamespace(save=save)
+    alongside.watch(load_task("go1_flat"), runner, tmp_path)
+    assert capsys.readouterr().out == "WARNING: no viewer opens: cannot write model_0.pt (No space left on device)\n"
 
 
 def test_a_viewer_ends_with_its_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

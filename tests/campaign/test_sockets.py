@@ -44,7 +44,7 @@ _spec.loader.exec_module(udp)
 
 HERE, PAGE = "localhost:8080", {"Origin": "http://localhost:8080"}
 NAMES, SITE = "answers to localhost, to this machine's name and to addresses", "a page of another site may not"
-REQUESTS = [  # what it is, path, headers beside Host, what it is told ("": it is let in)
+REQUESTS = [  # what it is, path, headers beside Host, why it is refused ("": it is let in)
     ("the page", "/", {}, ""),
     ("a link of another site", "/", {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}, ""),
     ("a script of the page", "/web_client.js", {"Sec-Fetch-Site": "same-origin"}, ""),
@@ -80,7 +80,7 @@ REQUESTS = [  # what it is, path, headers beside Host, what it is told ("": it i
     ("a frame of another port", "/", {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "frame"}, SITE),
     ("a dropped model", "/drop?sid=1", PAGE, "models cannot be dropped on this page"),
 ]  # fmt: skip
-TOKENS = [  # with a token: path, headers, what it is told
+TOKENS = [  # with a token: path, headers, why it is refused
     ("none", "/", {}, "this page has a token"),
     ("a wrong one", "/?token=abc", {}, "this page has a token"),
     ("an empty one", "/?token=", {}, "this page has a token"),
@@ -95,7 +95,7 @@ TOKENS = [  # with a token: path, headers, what it is told
 ]
 
 
-def told(gate: Gate, path: str, headers: dict[str, Any]) -> str:
+def refusal(gate: Gate, path: str, headers: dict[str, Any]) -> str:
     """What ``gate`` says to a request. A token is named in it by its place."""
     path = path.replace("TOKEN", gate.token).replace("HALF", gate.token[:8])
 
@@ -109,14 +109,14 @@ def told(gate: Gate, path: str, headers: dict[str, Any]) -> str:
 
 @pytest.mark.parametrize(("what", "path", "headers", "says"), REQUESTS, ids=[each[0] for each in REQUESTS])
 def test_who_reaches_the_page(what: str, path: str, headers: dict[str, Any], says: str) -> None:
-    answer = told(Gate("127.0.0.1", 8080), path, headers)
+    answer = refusal(Gate("127.0.0.1", 8080), path, headers)
     assert answer.startswith(says) if says == SITE else says in answer and bool(answer) == bool(says), answer
 
 
 @pytest.mark.parametrize(("what", "path", "headers", "says"), TOKENS, ids=[each[0] for each in TOKENS])
 def test_a_page_for_others_has_a_token(what: str, path: str, headers: dict[str, Any], says: str) -> None:
     gate = Gate("0.0.0.0", 8080)
-    answer = told(gate, path, headers)
+    answer = refusal(gate, path, headers)
     assert says in answer and bool(answer) == bool(says), answer
     assert len(gate.token) > 20 and gate.token != Gate("0.0.0.0", 8080).token
 
@@ -321,7 +321,7 @@ TO_CLIENT = [  # what it is, bytes, why it was dropped
 
 @pytest.mark.parametrize(("what", "data", "why"), TO_CLIENT, ids=[each[0] for each in TO_CLIENT])
 def test_the_udp_client_drops(what: str, data: bytes, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """For ever as it comes: the client waits no longer than it would for silence."""
+    """However many come, the client waits no longer than it would for silence."""
     fake = FakeSocket([(0.1, data, CLIENT)] * 50, monkeypatch)
     monkeypatch.setattr(fake, "connect", lambda _: None, raising=False)
     monkeypatch.setattr(udp.socket, "socket", lambda *_: fake)
@@ -355,7 +355,7 @@ ABSURD = [
 
 
 @pytest.mark.parametrize(("what", "changed", "says"), ABSURD, ids=[each[0] for each in ABSURD])
-def test_nobody_walks_on_what_cannot_be(what: str, changed: dict[str, Floats], says: str) -> None:
+def test_impossible_measurements_end_the_walk(what: str, changed: dict[str, Floats], says: str) -> None:
     """Also where every limit that can be switched off is off."""
     limits = Limits.of(POLICIES / "go1_flat", GO1, asked=dict.fromkeys(("position", "speed", "tilt", "frozen", "age", "late"), "off"))
     safety = Safety(GO1, replace(limits, low=np.full(12, -INF), high=np.full(12, INF)))
