@@ -432,6 +432,11 @@ def test_a_training_on_a_cpu_imports_what_it_needs(tmp_path: Path) -> None:
     assert done.stdout.splitlines()[-1] == "there: torch"
 
 
+def test_comparing_runs_needs_no_torch() -> None:
+    code = "import sys, legged_mw.tools.sweep; sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+
+
 def test_errors_of_tools_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit), one_line_errors("legged-mw completion"):
         completion.parser_of("nothing", lambda: None)
