@@ -346,23 +346,16 @@ def test_play_follows_the_newest_policy(made: Path, tmp_path: Path) -> None:
 
 
 def test_a_viewer_outlives_a_checkpoint_that_is_thinned_out(tmp_path: Path) -> None:
-    def load(path: Path) -> int:
-        path.unlink(missing_ok=True)
-        return load_tensors(path, "cpu")["iter"]
-
-    newest = Newest(tmp_path, load, tmp_path / "model_3.pt")
-    (tmp_path / "model_4.pt").touch()
+    (gone := tmp_path / "model_4.pt").touch()
+    newest = Newest(tmp_path, lambda path: gone.unlink() or load_tensors(path, "cpu")["iter"], tmp_path / "model_3.pt")
     newest()
     assert newest.news == "iteration 3"
 
 
-def test_a_training_begins_without_a_viewer_where_nothing_can_be_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def save(_: str) -> None:
-        raise OSError(28, "No space left on device")
-
-    runner: Any = SimpleNamespace(save=save)
-    alongside.watch(load_task("go1_flat"), runner, tmp_path)
-    assert capsys.readouterr().out == "WARNING: no viewer opens: cannot write model_0.pt (No space left on device)\n"
+def test_a_training_goes_on_without_a_viewer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runner: Any = SimpleNamespace(save=lambda path: Path(path).write_bytes(b""))
+    alongside.watch(load_task("go1_flat"), runner, tmp_path / "gone")
+    assert capsys.readouterr().out == "WARNING: no viewer opens: cannot write model_0.pt (No such file or directory)\n"
 
 
 def test_a_viewer_ends_with_its_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

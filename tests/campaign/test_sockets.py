@@ -9,7 +9,7 @@ import time
 import urllib.error
 import urllib.request
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
 from types import SimpleNamespace
@@ -39,6 +39,12 @@ _spec = importlib.util.spec_from_file_location("udp_robot", ROOT / "examples/udp
 assert _spec and _spec.loader
 udp: Any = importlib.util.module_from_spec(_spec)
 _spec.loader.exec_module(udp)
+
+
+def each(names: str, rows: Sequence[tuple[Any, ...]]) -> pytest.MarkDecorator:
+    """A test a row; the first of a row says what it is."""
+    return pytest.mark.parametrize(names, [pytest.param(*row[1:], id=row[0]) for row in rows])
+
 
 # ---- the web page
 
@@ -107,14 +113,14 @@ def refusal(gate: Gate, path: str, headers: dict[str, Any]) -> str:
     return gate.refusal(path, header)
 
 
-@pytest.mark.parametrize(("what", "path", "headers", "says"), REQUESTS, ids=[each[0] for each in REQUESTS])
-def test_who_reaches_the_page(what: str, path: str, headers: dict[str, Any], says: str) -> None:
+@each("path, headers, says", REQUESTS)
+def test_who_reaches_the_page(path: str, headers: dict[str, Any], says: str) -> None:
     answer = refusal(Gate("127.0.0.1", 8080), path, headers)
     assert answer.startswith(says) if says == SITE else says in answer and bool(answer) == bool(says), answer
 
 
-@pytest.mark.parametrize(("what", "path", "headers", "says"), TOKENS, ids=[each[0] for each in TOKENS])
-def test_a_page_for_others_has_a_token(what: str, path: str, headers: dict[str, Any], says: str) -> None:
+@each("path, headers, says", TOKENS)
+def test_a_page_for_others_has_a_token(path: str, headers: dict[str, Any], says: str) -> None:
     gate = Gate("0.0.0.0", 8080)
     answer = refusal(gate, path, headers)
     assert says in answer and bool(answer) == bool(says), answer
@@ -217,6 +223,8 @@ class FakeSocket:
     def send(self, data: bytes) -> None:
         self.sent.append(data)
 
+    def connect(self, _: Any) -> None: ...
+
     def close(self) -> None: ...
 
 
@@ -276,8 +284,8 @@ TO_SERVER = [  # what it is, bytes, why it was dropped
 ]
 
 
-@pytest.mark.parametrize(("what", "data", "why"), TO_SERVER, ids=[each[0] for each in TO_SERVER])
-def test_the_udp_server_drops(what: str, data: bytes, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@each("data, why", TO_SERVER)
+def test_the_udp_server_drops(data: bytes, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """It moves nothing, and does not keep the servos on: those are off half a second after the last new targets."""
     robot, said = Standing(GO1), list[str]()
     server = udp.UdpServer(robot, GO1, ("127.0.0.1", 0), timeout=0.5)
@@ -319,11 +327,10 @@ TO_CLIENT = [  # what it is, bytes, why it was dropped
 ]
 
 
-@pytest.mark.parametrize(("what", "data", "why"), TO_CLIENT, ids=[each[0] for each in TO_CLIENT])
-def test_the_udp_client_drops(what: str, data: bytes, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+@each("data, why", TO_CLIENT)
+def test_the_udp_client_drops(data: bytes, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """However many come, the client waits no longer than it would for silence."""
     fake = FakeSocket([(0.1, data, CLIENT)] * 50, monkeypatch)
-    monkeypatch.setattr(fake, "connect", lambda _: None, raising=False)
     monkeypatch.setattr(udp.socket, "socket", lambda *_: fake)
     with pytest.raises(RobotError, match=rf"no answer within 0\.5 s \(4 packets dropped: 4 {why}\); stopped"):
         udp.UdpRobot(GO1, CLIENT, timeout=0.5)
@@ -332,7 +339,6 @@ def test_the_udp_client_drops(what: str, data: bytes, why: str, monkeypatch: pyt
 
 def test_a_refusal_paints_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     fake = FakeSocket([(0.1, udp.pack(udp.REFUSED, DIGEST, 0, b"\x1b[2J\nno\xff" + b"x" * 60000), CLIENT)], monkeypatch)
-    monkeypatch.setattr(fake, "connect", lambda _: None, raising=False)
     monkeypatch.setattr(udp.socket, "socket", lambda *_: fake)
     with pytest.raises(RobotError, match=r"robot at 10\.0\.0\.1:5000: \\x1b\[2J no") as error:
         udp.UdpRobot(GO1, CLIENT)
@@ -354,8 +360,8 @@ ABSURD = [
 ]
 
 
-@pytest.mark.parametrize(("what", "changed", "says"), ABSURD, ids=[each[0] for each in ABSURD])
-def test_impossible_measurements_end_the_walk(what: str, changed: dict[str, Floats], says: str) -> None:
+@each("changed, says", ABSURD)
+def test_impossible_measurements_end_the_walk(changed: dict[str, Floats], says: str) -> None:
     """Also where every limit that can be switched off is off."""
     limits = Limits.of(POLICIES / "go1_flat", GO1, asked=dict.fromkeys(("position", "speed", "tilt", "frozen", "age", "late"), "off"))
     safety = Safety(GO1, replace(limits, low=np.full(12, -INF), high=np.full(12, INF)))
@@ -434,8 +440,8 @@ STATES: list[tuple[str, Callable[[bytes], bytes], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("what", "make", "why"), STATES, ids=[each[0] for each in STATES])
-def test_the_client_of_a_robot_drops_states(what: str, make: Callable[[bytes], bytes], why: str, state: bytes) -> None:
+@each("make, why", STATES)
+def test_the_client_of_a_robot_drops_states(make: Callable[[bytes], bytes], why: str, state: bytes) -> None:
     """However many: they are no news, so the newest good one grows old and the run ends."""
     owner, now = FakeOwner(), [10.0]
     robot = UnitreeRobot(GO2, owner, Received(state, 10.0), clock=lambda: now[0])
@@ -464,8 +470,8 @@ TRIPS: list[tuple[str, dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("what", "parts", "says"), TRIPS, ids=[each[0] for each in TRIPS])
-def test_a_whole_state_that_cannot_be_ends_the_walk(what: str, parts: dict[str, Any], says: str, state: bytes) -> None:
+@each("parts, says", TRIPS)
+def test_a_whole_state_that_cannot_be_ends_the_walk(parts: dict[str, Any], says: str, state: bytes) -> None:
     owner = FakeOwner()
     robot = UnitreeRobot(GO2, owner, Received(state, 1.0), clock=lambda: 1.0)
     owner.states.append(Received(changed(state, tick=tick(state) + 2, **parts), 1.0))
@@ -494,8 +500,8 @@ COMMANDS = [
 ]
 
 
-@pytest.mark.parametrize(("what", "body"), COMMANDS, ids=[each[0] for each in COMMANDS])
-def test_a_served_robot_refuses_commands(what: str, body: bytes, served: SimulatedUnitree) -> None:
+@each("body", COMMANDS)
+def test_a_served_robot_refuses_commands(body: bytes, served: SimulatedUnitree) -> None:
     end: Any = served.end
     before = served.record.refused, served.record.commands
     end.commands.append(body)
