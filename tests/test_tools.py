@@ -304,6 +304,7 @@ def test_completion_knows_programs_flags_tasks_fields_and_runs(bash: str, tmp_pa
         ("legged-mw train --task g1_t", {"g1_track"}),
         ("legged-mw play --task m", {"mine.py"}),
         ("legged-mw train --set rewards.scales.tracking_l", {"rewards.scales.tracking_lin_vel="}),
+        ("legged-mw train --set control.damp", {"control.damping="}),
         ("legged-mw play --viewer n", {"native", "none"}),
         ("legged-mw play --load_run logs", {"logs/go1_flat/a_run"}),
         ("legged-mw compare l", {"logs/go1_flat/a_run"}),
