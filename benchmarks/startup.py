@@ -38,7 +38,6 @@ def child(task_name: str, num_envs: int | None, device: str | None, started: flo
         import_module("warp").init()
     done("import warp, mujoco_warp (for a GPU)")
     import_module("rsl_rl.runners")
-    import_module("tensordict")
     done("import rsl_rl, tensordict")
     from legged_mw.rl.runner import make_runner
     from legged_mw.utils.cli import pick_device, seed_everything

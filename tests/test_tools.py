@@ -346,7 +346,7 @@ def test_play_follows_the_newest_policy(made: Path, tmp_path: Path) -> None:
     assert refused.code == 2 and "--follow watches the newest policy: leave --eval, --export and --checkpoint out" in refused.err
 
 
-def test_a_viewer_outlives_a_checkpoint_that_is_thinned_out(tmp_path: Path) -> None:
+def test_a_viewer_outlives_a_thinned_checkpoint(tmp_path: Path) -> None:
     (gone := tmp_path / "model_4.pt").touch()
     newest = Newest(tmp_path, lambda path: gone.unlink() or load_tensors(path, "cpu")["iter"], tmp_path / "model_3.pt")
     newest()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import math
 import socket
 import time
@@ -19,7 +19,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from legged_mw import ROOT
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.robot import QUANTITIES, Floats, Health, Measurement, Robot, RobotError
 from legged_mw.deploy.safety import Limits, Safety
@@ -35,10 +34,7 @@ from legged_mw.view.web import WebViewer
 from tests.wires import POLICIES
 
 NAN, INF = math.nan, math.inf
-_spec = importlib.util.spec_from_file_location("udp_robot", ROOT / "examples/udp_robot.py")
-assert _spec and _spec.loader
-udp: Any = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(udp)
+udp: Any = importlib.import_module("examples.udp_robot")
 
 
 def each(names: str, rows: Sequence[tuple[Any, ...]]) -> pytest.MarkDecorator:
@@ -50,7 +46,7 @@ def each(names: str, rows: Sequence[tuple[Any, ...]]) -> pytest.MarkDecorator:
 
 HERE, PAGE = "localhost:8080", {"Origin": "http://localhost:8080"}
 NAMES, SITE = "answers to localhost, to this machine's name and to addresses", "a page of another site may not"
-REQUESTS = [  # what it is, path, headers beside Host, why it is refused ("": it is let in)
+REQUESTS = [  # name, path, headers beside Host, refusal
     ("the page", "/", {}, ""),
     ("a link of another site", "/", {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}, ""),
     ("a script of the page", "/web_client.js", {"Sec-Fetch-Site": "same-origin"}, ""),
@@ -86,7 +82,7 @@ REQUESTS = [  # what it is, path, headers beside Host, why it is refused ("": it
     ("a frame of another port", "/", {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "frame"}, SITE),
     ("a dropped model", "/drop?sid=1", PAGE, "models cannot be dropped on this page"),
 ]  # fmt: skip
-TOKENS = [  # with a token: path, headers, why it is refused
+TOKENS = [  # with a token: name, path, headers, refusal
     ("none", "/", {}, "this page has a token"),
     ("a wrong one", "/?token=abc", {}, "this page has a token"),
     ("an empty one", "/?token=", {}, "this page has a token"),
@@ -199,6 +195,7 @@ class FakeSocket:
     def __init__(self, packets: list[tuple[float, bytes, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
         self.packets, self.sent, self.now, self.left = deque(packets), list[bytes](), 0.0, INF
         monkeypatch.setattr(udp.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr(udp.socket, "socket", lambda *_: self)
 
     def settimeout(self, seconds: float | None) -> None:
         self.left = INF if seconds is None else seconds
@@ -286,7 +283,7 @@ TO_SERVER = [  # what it is, bytes, why it was dropped
 
 @each("data, why", TO_SERVER)
 def test_the_udp_server_drops(data: bytes, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It moves nothing, and does not keep the servos on: those are off half a second after the last new targets."""
+    """It moves nothing, and the servos are off half a second after the last new targets."""
     robot, said = Standing(GO1), list[str]()
     server = udp.UdpServer(robot, GO1, ("127.0.0.1", 0), timeout=0.5)
     server._socket.close()
@@ -331,15 +328,13 @@ TO_CLIENT = [  # what it is, bytes, why it was dropped
 def test_the_udp_client_drops(data: bytes, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """However many come, the client waits no longer than it would for silence."""
     fake = FakeSocket([(0.1, data, CLIENT)] * 50, monkeypatch)
-    monkeypatch.setattr(udp.socket, "socket", lambda *_: fake)
     with pytest.raises(RobotError, match=rf"no answer within 0\.5 s \(4 packets dropped: 4 {why}\); stopped"):
         udp.UdpRobot(GO1, CLIENT, timeout=0.5)
     assert fake.now == pytest.approx(0.5)
 
 
 def test_a_refusal_paints_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake = FakeSocket([(0.1, udp.pack(udp.REFUSED, DIGEST, 0, b"\x1b[2J\nno\xff" + b"x" * 60000), CLIENT)], monkeypatch)
-    monkeypatch.setattr(udp.socket, "socket", lambda *_: fake)
+    FakeSocket([(0.1, udp.pack(udp.REFUSED, DIGEST, 0, b"\x1b[2J\nno\xff" + b"x" * 60000), CLIENT)], monkeypatch)
     with pytest.raises(RobotError, match=r"robot at 10\.0\.0\.1:5000: \\x1b\[2J no") as error:
         udp.UdpRobot(GO1, CLIENT)
     assert str(error.value).isprintable() and len(str(error.value)) < 400
@@ -431,7 +426,7 @@ def tick(state: bytes) -> int:
     return int(Message(LAYOUTS["unitree_go", "LowState_"], state)["tick"])
 
 
-STATES: list[tuple[str, Callable[[bytes], bytes], str]] = [
+STATES = [
     ("a flipped bit", lambda s: changed(s, False, motor_state__q=1.0), "with a wrong checksum"),
     ("NaN, not sealed", lambda s: changed(s, False, motor_state__q=NAN), "with a wrong checksum"),
     ("ones", lambda s: b"\xff" * len(s), "with a wrong checksum"),
@@ -458,7 +453,7 @@ def test_the_client_of_a_robot_drops_states(make: Callable[[bytes], bytes], why:
     assert robot.report == f"states dropped: 6 {why}"
 
 
-TRIPS: list[tuple[str, dict[str, Any], str]] = [
+TRIPS = [
     ("no orientation", {"imu_state__quaternion": 0.0}, "gravity of length 0.00, not 1"),
     ("half an orientation", {"imu_state__quaternion": [0.5, 0, 0, 0]}, "gravity of length 0.25, not 1"),
     ("a huge one", {"imu_state__quaternion": [1e19, 0, 0, 0]}, "gravity of length"),
@@ -534,7 +529,7 @@ def test_a_motion_service_that_answers_anything(data: str, monkeypatch: pytest.M
 
 
 class FakeReader:
-    """A reader of cyclonedds with bytes that its own codec would never hand out, or stumbles over."""
+    """A reader of cyclonedds with bytes that break its codec."""
 
     def __init__(self, *bodies: bytes) -> None:
         self.bodies = deque(bodies)
