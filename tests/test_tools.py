@@ -427,8 +427,7 @@ def test_a_training_on_a_cpu_imports_what_it_needs(tmp_path: Path) -> None:
 
 
 def test_comparing_runs_needs_no_torch() -> None:
-    code = "import sys, legged_mw.tools.sweep; sys.exit('torch' in sys.modules)"
-    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True)
+    subprocess.run([sys.executable, "-c", "import sys, legged_mw.tools.sweep; sys.exit('torch' in sys.modules)"], cwd=ROOT, check=True)
 
 
 def test_errors_of_tools_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -38,7 +38,7 @@ udp: Any = importlib.import_module("examples.udp_robot")
 
 
 def each(names: str, rows: Sequence[tuple[Any, ...]]) -> pytest.MarkDecorator:
-    """A test a row; the first of a row says what it is."""
+    """A test a row, after its name."""
     return pytest.mark.parametrize(names, [pytest.param(*row[1:], id=row[0]) for row in rows])
 
 
