@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from importlib import import_module
 from pathlib import Path
 
 FIRST = "iteration 1 (records the step)"
@@ -30,21 +31,13 @@ def child(task_name: str, num_envs: int | None, device: str | None, started: flo
     import torch
 
     done("import torch")
-    import mujoco
-
-    assert mujoco
+    import_module("mujoco")
     done("import mujoco")
     if torch.cuda.is_available() and device != "cpu":  # elsewhere MuJoCo's own engine steps
-        import mujoco_warp
-        import warp
-
-        assert mujoco_warp and warp
-        warp.init()
+        import_module("mujoco_warp")
+        import_module("warp").init()
     done("import warp, mujoco_warp (for a GPU)")
-    import rsl_rl.runners
-    import tensordict
-
-    assert rsl_rl and tensordict
+    import_module("rsl_rl.runners")
     done("import rsl_rl, tensordict")
     from legged_mw.rl.runner import make_runner
     from legged_mw.utils.cli import pick_device, seed_everything

@@ -17,7 +17,8 @@ from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import crossing, exam, grading
-from legged_mw.eval.crossing import LEVELS, TILES
+from legged_mw.eval.crossing import TILES
+from legged_mw.eval.rules import LEVELS
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask, load_task
 

@@ -18,7 +18,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from legged_mw import ROOT, programs
 from legged_mw.rl import training
-from legged_mw.rl.runs import save_whole
+from legged_mw.rl.runs import load_tensors, save_whole
 from legged_mw.sim.device import DeviceFacts, device_facts
 from legged_mw.tools import alongside, chart, completion, doctor, sweep, warm
 from legged_mw.utils import renderer
@@ -304,6 +304,7 @@ def test_completion_knows_programs_flags_tasks_fields_and_runs(bash: str, tmp_pa
         ("legged-mw train --task g1_t", {"g1_track"}),
         ("legged-mw play --task m", {"mine.py"}),
         ("legged-mw train --set rewards.scales.tracking_l", {"rewards.scales.tracking_lin_vel="}),
+        ("legged-mw train --set control.damp", {"control.damping="}),
         ("legged-mw play --viewer n", {"native", "none"}),
         ("legged-mw play --load_run logs", {"logs/go1_flat/a_run"}),
         ("legged-mw compare l", {"logs/go1_flat/a_run"}),
@@ -343,6 +344,19 @@ def test_play_follows_the_newest_policy(made: Path, tmp_path: Path) -> None:
     assert result.code == 0 and set(said) == {"iteration 7"}, result.err
     refused = run("play", tmp_path, "--task", "go1_flat", "--follow", "--eval")
     assert refused.code == 2 and "--follow watches the newest policy: leave --eval, --export and --checkpoint out" in refused.err
+
+
+def test_a_viewer_outlives_a_thinned_checkpoint(tmp_path: Path) -> None:
+    (gone := tmp_path / "model_4.pt").touch()
+    newest = Newest(tmp_path, lambda path: gone.unlink() or load_tensors(path, "cpu")["iter"], tmp_path / "model_3.pt")
+    newest()
+    assert newest.news == "iteration 3"
+
+
+def test_a_training_goes_on_without_a_viewer(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    runner: Any = SimpleNamespace(save=lambda path: Path(path).write_bytes(b""))
+    alongside.watch(load_task("go1_flat"), runner, tmp_path / "gone")
+    assert capsys.readouterr().out == "WARNING: no viewer opens: cannot write model_0.pt (No such file or directory)\n"
 
 
 def test_a_viewer_ends_with_its_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -410,6 +424,10 @@ def test_a_training_on_a_cpu_imports_what_it_needs(tmp_path: Path) -> None:
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "there: torch"
+
+
+def test_comparing_runs_needs_no_torch() -> None:
+    subprocess.run([sys.executable, "-c", "import sys, legged_mw.tools.sweep; sys.exit('torch' in sys.modules)"], cwd=ROOT, check=True)
 
 
 def test_errors_of_tools_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:

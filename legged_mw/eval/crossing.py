@@ -16,13 +16,14 @@ from torch import Tensor
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exam
 from legged_mw.eval.rollout import Policy
+from legged_mw.eval.rules import LEVELS
 from legged_mw.rl.recurrent import forget
 from legged_mw.sim.terrain import KINDS, MEASURES, measure
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask
 
 SPEED, SECONDS = 0.6, 15.0  # [m/s] commanded; [s] in which the edge must be reached: 9 m at that speed, and the corner is 5.7 m away
-LEVELS, TILES, REPEATS = 10, 2, 5  # of each kind; tiles of each level, of a slope one goes up and one down; robots on each tile
+TILES, REPEATS = 2, 5  # tiles of each level, of a slope one goes up and one down; robots on each tile
 
 OVERRIDES: dict[str, Any] = {
     **{path: value for path, value in exam.OVERRIDES.items() if path != "termination.min_base_height"},  # a trunk in a step is a fall

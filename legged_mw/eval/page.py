@@ -9,8 +9,7 @@ from pathlib import Path
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from legged_mw.eval.crossing import LEVELS
-from legged_mw.eval.rules import AXES, PUSH_DIRECTIONS, ExamRules, Figure, verdicts
+from legged_mw.eval.rules import AXES, LEVELS, PUSH_DIRECTIONS, ExamRules, Figure, verdicts
 
 if TYPE_CHECKING:
     from legged_mw.eval.plots import Section

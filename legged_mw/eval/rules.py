@@ -23,6 +23,7 @@ from legged_mw.utils.errors import unknown
 SECONDS, SETTLING = 10.0, 2.0  # [s] of a tracking command, and of its start that is not counted
 PUSH_AT, PUSH_UNTIL, PUSH_DIRECTIONS = 3.0, 6.0, 16  # [s] of the first direction; [s] survived if it still stands then
 GRAVITY = 9.81  # [m/s^2]
+LEVELS = 10  # of each kind of rough ground
 SLOW = 0.1  # [m/s] below which a cost of transport says nothing
 EQUAL_DRIFT = 0.005  # [m], below which drifts count as equal
 # Where no config says others: pushes [m/s], the one that is to be survived, what the marks are of, and they [m/s, m/s, rad/s] if fixed.

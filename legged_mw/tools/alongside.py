@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+from legged_mw.rl.keeping import reason_of
 from legged_mw.rl.runner import Runner
 from legged_mw.rl.runs import checkpoints, save_whole
 from legged_mw.utils.renderer import has_display
@@ -21,7 +22,11 @@ _SECONDS = 15.0  # between two policies for the viewer
 def watch(task: LoadedTask, runner: Runner, folder: Path) -> None:
     """Open the viewer on a run that begins: a window, or without a screen a web page. It closes with the training."""
     if not checkpoints(folder):
-        runner.save(str(folder / "model_0.pt"))  # what a viewer can begin with
+        try:
+            runner.save(str(folder / "model_0.pt"))  # what a viewer can begin with
+        except (OSError, MemoryError) as error:
+            print(f"WARNING: no viewer opens: cannot write model_0.pt ({reason_of(error)})", flush=True)
+            return
     flags = ["--task", task.name if task.ships else str(task.path), "--load_run", str(folder), "--follow", "--device", "cpu"]
     command = [sys.executable, "-m", "legged_mw.programs", "play", *flags, "--viewer", "native" if has_display() else "web"]
     if hasattr(os, "nice"):
@@ -38,8 +43,8 @@ def watch(task: LoadedTask, runner: Runner, folder: Path) -> None:
         shown = time.monotonic()
         try:
             save_whole({"actor_state_dict": runner.alg.get_policy().state_dict(), "iter": iteration}, folder / PLAYING)
-        except OSError as error:
-            print(f"WARNING: the viewer keeps its policy: cannot write {PLAYING} ({error.strerror})", flush=True)
+        except (OSError, MemoryError) as error:
+            print(f"WARNING: the viewer keeps its policy: cannot write {PLAYING} ({reason_of(error)})", flush=True)
             runner.console.listeners.remove(show)
 
     runner.console.listeners.append(show)

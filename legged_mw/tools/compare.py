@@ -55,7 +55,7 @@ def parse() -> argparse.Namespace:
 def main() -> None:
     args = parse()
     runs = find_runs(args.runs)
-    print(text_table(runs))
+    print(text_table(rows(runs)))
     write(runs, Path(args.out), args.over)
     print(f"written to {shown(Path(args.out))}")
 
@@ -88,9 +88,8 @@ def rows(runs: Sequence[Run]) -> list[list[str]]:
     return lines
 
 
-def text_table(runs: Sequence[Run]) -> str:
+def text_table(lines: Sequence[Sequence[str]]) -> str:
     """``rows`` for a terminal."""
-    lines = rows(runs)
     first, *widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     cells = [[cell.rjust(width) for cell, width in zip(line[1:], widths, strict=True)] for line in lines]
     return "\n".join("  ".join([line[0].ljust(first), *right]) for line, right in zip(lines, cells, strict=True))

@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 
 from legged_mw import ROOT
 from legged_mw.utils.cli import Parser
+from legged_mw.utils.config import field_types
 from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import load_task, task_names
 
@@ -75,16 +76,8 @@ def script(shell: str, programs: Mapping[str, Callable[[], None]]) -> str:
 
 def fields() -> list[str]:
     """Dotted path of every config field that any of the tasks has."""
-    return sorted({path for name in task_names() for path in _paths(load_task(name).to_dict()) if path != "task"})
-
-
-def _paths(values: Mapping[str, Any], path: str = "") -> Iterable[str]:
-    for name, value in values.items():
-        here = f"{path}.{name}" if path else name
-        if isinstance(value, dict) and value and path.count(".") < 1:
-            yield from _paths(value, here)
-        else:
-            yield here
+    tasks = map(load_task, task_names())
+    return sorted({path for task in tasks for cfg in (task.cfg, task.train) for path, _ in field_types(type(cfg))})
 
 
 def parser_of(name: str, start: Callable[[], None]) -> argparse.ArgumentParser:

@@ -17,7 +17,7 @@ from itertools import product
 from statistics import mean, stdev
 from typing import NamedTuple
 
-from legged_mw.tools.compare import MOST, rows, write
+from legged_mw.tools.compare import MOST, rows, text_table, write
 from legged_mw.tools.curves import Run, find_runs
 from legged_mw.utils.cli import Parser
 from legged_mw.utils.errors import shown
@@ -143,9 +143,7 @@ def table(found: Sequence[tuple[Cell, Run]]) -> str:
         for line in cells:
             groups.setdefault(tuple(line[: len(fields) - 1]), []).append(line[len(fields) :])
         means = [[*group, f"mean of {len(of)}", *map(_mean, zip(*of, strict=True))] for group, of in groups.items() if len(of) > 1]
-    every = [[*short, *heads], *cells, *means]
-    widths = [max(map(len, column)) for column in zip(*every, strict=True)]
-    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(line, widths, strict=True)) for line in every)
+    return text_table([[*short, *heads], *cells, *means])
 
 
 def _mean(texts: Sequence[str]) -> str:

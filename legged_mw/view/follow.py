@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+from legged_mw.utils.config import ConfigError
+
 PLAYING = "playing.pt"  # what train --play writes into its run for the viewer: an actor, more often than checkpoints
 _SECONDS = 2.0  # between two looks at the folder
 
@@ -29,11 +31,14 @@ class Newest:
         self._next = time.monotonic() + _SECONDS
         if os.getppid() != self._parent:
             raise KeyboardInterrupt  # which ends a session as closing its viewer does
-        found = [path for path in (*self._folder.glob("model_*.pt"), self._folder / PLAYING) if path.is_file()]
-        newest = max(found, key=_stamp, default=None)
-        if newest and _stamp(newest) > self._stamp:
-            self._stamp = _stamp(newest)
-            self.news = f"iteration {self._load(newest)}"
+        stamp, newest = max((_stamp(path), path) for path in (*self._folder.glob("model_*.pt"), self._folder / PLAYING))
+        if stamp > self._stamp:
+            self._stamp = stamp
+            try:
+                self.news = f"iteration {self._load(newest)}"
+            except ConfigError:
+                if newest.exists():  # else it was thinned out meanwhile
+                    raise
 
 
 def _stamp(path: Path) -> int:

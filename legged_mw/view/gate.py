@@ -54,7 +54,7 @@ class Gate:
     def refusal(self, target: str, header: Callable[[str], list[str]]) -> str:
         """Why a request for ``target`` (path and query) is not answered; empty if it is. ``header`` gives all values of a name.
 
-        A name that was bound anew to this machine's address (DNS rebinding) shows in Host, a page of another site in Origin or
+        A name that was rebound to this machine's address (DNS rebinding) shows in Host, a page of another site in Origin or
         Sec-Fetch-Site. A browser sets these three itself; no page can.
         """
         host, origin, path = header("Host"), header("Origin"), target.partition("?")[0]
@@ -90,7 +90,7 @@ class Gate:
         return [value for name, _, value in pairs if name == self._cookie]
 
     def _known(self, host: str) -> bool:
-        """Whether a Host is ours: a name that we have, or an address in numbers, which no name server can bind anew."""
+        """Whether a Host is ours: a name that we have, or an address in numbers, which no name server can rebind."""
         match = re.fullmatch(r"(\[[0-9a-fA-F:.]+\]|[^:\[\]]+)(?::\d{1,5})?", host)
         if not match:
             return False

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import math
 import socket
 import time
 import urllib.error
 import urllib.request
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing, suppress
 from dataclasses import replace
 from types import SimpleNamespace
@@ -19,7 +19,6 @@ import mujoco
 import numpy as np
 import pytest
 
-from legged_mw import ROOT
 from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.robot import QUANTITIES, Floats, Health, Measurement, Robot, RobotError
 from legged_mw.deploy.safety import Limits, Safety
@@ -35,16 +34,19 @@ from legged_mw.view.web import WebViewer
 from tests.wires import POLICIES
 
 NAN, INF = math.nan, math.inf
-_spec = importlib.util.spec_from_file_location("udp_robot", ROOT / "examples/udp_robot.py")
-assert _spec and _spec.loader
-udp: Any = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(udp)
+udp: Any = importlib.import_module("examples.udp_robot")
+
+
+def each(names: str, rows: Sequence[tuple[Any, ...]]) -> pytest.MarkDecorator:
+    """A test a row, after its name."""
+    return pytest.mark.parametrize(names, [pytest.param(*row[1:], id=row[0]) for row in rows])
+
 
 # ---- the web page
 
 HERE, PAGE = "localhost:8080", {"Origin": "http://localhost:8080"}
 NAMES, SITE = "answers to localhost, to this machine's name and to addresses", "a page of another site may not"
-REQUESTS = [  # what it is, path, headers beside Host, what it is told ("": it is let in)
+REQUESTS = [  # name, path, headers beside Host, refusal
     ("the page", "/", {}, ""),
     ("a link of another site", "/", {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "document"}, ""),
     ("a script of the page", "/web_client.js", {"Sec-Fetch-Site": "same-origin"}, ""),
@@ -80,7 +82,7 @@ REQUESTS = [  # what it is, path, headers beside Host, what it is told ("": it i
     ("a frame of another port", "/", {"Sec-Fetch-Site": "same-site", "Sec-Fetch-Mode": "navigate", "Sec-Fetch-Dest": "frame"}, SITE),
     ("a dropped model", "/drop?sid=1", PAGE, "models cannot be dropped on this page"),
 ]  # fmt: skip
-TOKENS = [  # with a token: path, headers, what it is told
+TOKENS = [  # with a token: name, path, headers, refusal
     ("none", "/", {}, "this page has a token"),
     ("a wrong one", "/?token=abc", {}, "this page has a token"),
     ("an empty one", "/?token=", {}, "this page has a token"),
@@ -95,7 +97,7 @@ TOKENS = [  # with a token: path, headers, what it is told
 ]
 
 
-def told(gate: Gate, path: str, headers: dict[str, Any]) -> str:
+def refusal(gate: Gate, path: str, headers: dict[str, Any]) -> str:
     """What ``gate`` says to a request. A token is named in it by its place."""
     path = path.replace("TOKEN", gate.token).replace("HALF", gate.token[:8])
 
@@ -107,16 +109,16 @@ def told(gate: Gate, path: str, headers: dict[str, Any]) -> str:
     return gate.refusal(path, header)
 
 
-@pytest.mark.parametrize(("what", "path", "headers", "says"), REQUESTS, ids=[each[0] for each in REQUESTS])
-def test_who_reaches_the_page(what: str, path: str, headers: dict[str, Any], says: str) -> None:
-    answer = told(Gate("127.0.0.1", 8080), path, headers)
+@each("path, headers, says", REQUESTS)
+def test_who_reaches_the_page(path: str, headers: dict[str, Any], says: str) -> None:
+    answer = refusal(Gate("127.0.0.1", 8080), path, headers)
     assert answer.startswith(says) if says == SITE else says in answer and bool(answer) == bool(says), answer
 
 
-@pytest.mark.parametrize(("what", "path", "headers", "says"), TOKENS, ids=[each[0] for each in TOKENS])
-def test_a_page_for_others_has_a_token(what: str, path: str, headers: dict[str, Any], says: str) -> None:
+@each("path, headers, says", TOKENS)
+def test_a_page_for_others_has_a_token(path: str, headers: dict[str, Any], says: str) -> None:
     gate = Gate("0.0.0.0", 8080)
-    answer = told(gate, path, headers)
+    answer = refusal(gate, path, headers)
     assert says in answer and bool(answer) == bool(says), answer
     assert len(gate.token) > 20 and gate.token != Gate("0.0.0.0", 8080).token
 
@@ -193,6 +195,7 @@ class FakeSocket:
     def __init__(self, packets: list[tuple[float, bytes, Any]], monkeypatch: pytest.MonkeyPatch) -> None:
         self.packets, self.sent, self.now, self.left = deque(packets), list[bytes](), 0.0, INF
         monkeypatch.setattr(udp.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr(udp.socket, "socket", lambda *_: self)
 
     def settimeout(self, seconds: float | None) -> None:
         self.left = INF if seconds is None else seconds
@@ -216,6 +219,8 @@ class FakeSocket:
 
     def send(self, data: bytes) -> None:
         self.sent.append(data)
+
+    def connect(self, _: Any) -> None: ...
 
     def close(self) -> None: ...
 
@@ -276,9 +281,9 @@ TO_SERVER = [  # what it is, bytes, why it was dropped
 ]
 
 
-@pytest.mark.parametrize(("what", "data", "why"), TO_SERVER, ids=[each[0] for each in TO_SERVER])
-def test_the_udp_server_drops(what: str, data: bytes, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It moves nothing, and does not keep the servos on: those are off half a second after the last new targets."""
+@each("data, why", TO_SERVER)
+def test_the_udp_server_drops(data: bytes, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It moves nothing, and the servos are off half a second after the last new targets."""
     robot, said = Standing(GO1), list[str]()
     server = udp.UdpServer(robot, GO1, ("127.0.0.1", 0), timeout=0.5)
     server._socket.close()
@@ -319,21 +324,17 @@ TO_CLIENT = [  # what it is, bytes, why it was dropped
 ]
 
 
-@pytest.mark.parametrize(("what", "data", "why"), TO_CLIENT, ids=[each[0] for each in TO_CLIENT])
-def test_the_udp_client_drops(what: str, data: bytes, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """For ever as it comes: the client waits no longer than it would for silence."""
+@each("data, why", TO_CLIENT)
+def test_the_udp_client_drops(data: bytes, why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many come, the client waits no longer than it would for silence."""
     fake = FakeSocket([(0.1, data, CLIENT)] * 50, monkeypatch)
-    monkeypatch.setattr(fake, "connect", lambda _: None, raising=False)
-    monkeypatch.setattr(udp.socket, "socket", lambda *_: fake)
     with pytest.raises(RobotError, match=rf"no answer within 0\.5 s \(4 packets dropped: 4 {why}\); stopped"):
         udp.UdpRobot(GO1, CLIENT, timeout=0.5)
     assert fake.now == pytest.approx(0.5)
 
 
 def test_a_refusal_paints_no_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    fake = FakeSocket([(0.1, udp.pack(udp.REFUSED, DIGEST, 0, b"\x1b[2J\nno\xff" + b"x" * 60000), CLIENT)], monkeypatch)
-    monkeypatch.setattr(fake, "connect", lambda _: None, raising=False)
-    monkeypatch.setattr(udp.socket, "socket", lambda *_: fake)
+    FakeSocket([(0.1, udp.pack(udp.REFUSED, DIGEST, 0, b"\x1b[2J\nno\xff" + b"x" * 60000), CLIENT)], monkeypatch)
     with pytest.raises(RobotError, match=r"robot at 10\.0\.0\.1:5000: \\x1b\[2J no") as error:
         udp.UdpRobot(GO1, CLIENT)
     assert str(error.value).isprintable() and len(str(error.value)) < 400
@@ -354,8 +355,8 @@ ABSURD = [
 ]
 
 
-@pytest.mark.parametrize(("what", "changed", "says"), ABSURD, ids=[each[0] for each in ABSURD])
-def test_nobody_walks_on_what_cannot_be(what: str, changed: dict[str, Floats], says: str) -> None:
+@each("changed, says", ABSURD)
+def test_impossible_measurements_end_the_walk(changed: dict[str, Floats], says: str) -> None:
     """Also where every limit that can be switched off is off."""
     limits = Limits.of(POLICIES / "go1_flat", GO1, asked=dict.fromkeys(("position", "speed", "tilt", "frozen", "age", "late"), "off"))
     safety = Safety(GO1, replace(limits, low=np.full(12, -INF), high=np.full(12, INF)))
@@ -425,7 +426,7 @@ def tick(state: bytes) -> int:
     return int(Message(LAYOUTS["unitree_go", "LowState_"], state)["tick"])
 
 
-STATES: list[tuple[str, Callable[[bytes], bytes], str]] = [
+STATES = [
     ("a flipped bit", lambda s: changed(s, False, motor_state__q=1.0), "with a wrong checksum"),
     ("NaN, not sealed", lambda s: changed(s, False, motor_state__q=NAN), "with a wrong checksum"),
     ("ones", lambda s: b"\xff" * len(s), "with a wrong checksum"),
@@ -434,8 +435,8 @@ STATES: list[tuple[str, Callable[[bytes], bytes], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("what", "make", "why"), STATES, ids=[each[0] for each in STATES])
-def test_the_client_of_a_robot_drops_states(what: str, make: Callable[[bytes], bytes], why: str, state: bytes) -> None:
+@each("make, why", STATES)
+def test_the_client_of_a_robot_drops_states(make: Callable[[bytes], bytes], why: str, state: bytes) -> None:
     """However many: they are no news, so the newest good one grows old and the run ends."""
     owner, now = FakeOwner(), [10.0]
     robot = UnitreeRobot(GO2, owner, Received(state, 10.0), clock=lambda: now[0])
@@ -452,7 +453,7 @@ def test_the_client_of_a_robot_drops_states(what: str, make: Callable[[bytes], b
     assert robot.report == f"states dropped: 6 {why}"
 
 
-TRIPS: list[tuple[str, dict[str, Any], str]] = [
+TRIPS = [
     ("no orientation", {"imu_state__quaternion": 0.0}, "gravity of length 0.00, not 1"),
     ("half an orientation", {"imu_state__quaternion": [0.5, 0, 0, 0]}, "gravity of length 0.25, not 1"),
     ("a huge one", {"imu_state__quaternion": [1e19, 0, 0, 0]}, "gravity of length"),
@@ -464,8 +465,8 @@ TRIPS: list[tuple[str, dict[str, Any], str]] = [
 ]
 
 
-@pytest.mark.parametrize(("what", "parts", "says"), TRIPS, ids=[each[0] for each in TRIPS])
-def test_a_whole_state_that_cannot_be_ends_the_walk(what: str, parts: dict[str, Any], says: str, state: bytes) -> None:
+@each("parts, says", TRIPS)
+def test_a_whole_state_that_cannot_be_ends_the_walk(parts: dict[str, Any], says: str, state: bytes) -> None:
     owner = FakeOwner()
     robot = UnitreeRobot(GO2, owner, Received(state, 1.0), clock=lambda: 1.0)
     owner.states.append(Received(changed(state, tick=tick(state) + 2, **parts), 1.0))
@@ -494,8 +495,8 @@ COMMANDS = [
 ]
 
 
-@pytest.mark.parametrize(("what", "body"), COMMANDS, ids=[each[0] for each in COMMANDS])
-def test_a_served_robot_refuses_commands(what: str, body: bytes, served: SimulatedUnitree) -> None:
+@each("body", COMMANDS)
+def test_a_served_robot_refuses_commands(body: bytes, served: SimulatedUnitree) -> None:
     end: Any = served.end
     before = served.record.refused, served.record.commands
     end.commands.append(body)
@@ -528,7 +529,7 @@ def test_a_motion_service_that_answers_anything(data: str, monkeypatch: pytest.M
 
 
 class FakeReader:
-    """A reader of cyclonedds with bytes that its own codec would never hand out, or stumbles over."""
+    """A reader of cyclonedds with bytes that break its codec."""
 
     def __init__(self, *bodies: bytes) -> None:
         self.bodies = deque(bodies)

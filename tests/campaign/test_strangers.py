@@ -121,7 +121,7 @@ TAGS = [
     ("python/object/new", '!!python/object/new:os.system ["touch pwned"]'),
     ("a tag of its own", "!evil 1"),
 ]
-TOLD = program("play", "--load_run", RUN, "--task", "")  # the run tells its task
+BARE = program("play", "--load_run", RUN, "--task", "")  # the run names its task
 CASES = [
     *(Case(f"name: {name}", program(*check, *flags), (NAME, why)) for name, flags, why in NAMES),
     *(Case(f"name: {name!r}", program(*check, flag, name), "it must be text without control characters")
@@ -188,23 +188,23 @@ CASES = [
     Case("pickle: an older checkpoint", program("play", "--load_run", RUN, "--checkpoint", "2"), "cannot be read as a checkpoint",
          given=text(f"{RUN}/model_2.pt", pickle.dumps({"actor_state_dict": _Code()}))),
     # a task that comes with the run is code
-    Case("task: in the run", TOLD, "came with it and is code", given=both(text(f"{RUN}/evil.py", CODE), config(task="run/evil.py"))),
-    Case("task: beside the run", TOLD, "came with it and is code",
+    Case("task: in the run", BARE, "came with it and is code", given=both(text(f"{RUN}/evil.py", CODE), config(task="run/evil.py"))),
+    Case("task: beside the run", BARE, "came with it and is code",
          given=both(text("gift/logs/go1_flat/evil.py", CODE), config(task="evil.py"))),
-    Case("task: in logs", TOLD, "came with it and is code", given=both(text("gift/logs/evil.py", CODE), config(task="evil.py"))),
-    Case("task: from here into the run", TOLD, "came with it and is code",
+    Case("task: in logs", BARE, "came with it and is code", given=both(text("gift/logs/evil.py", CODE), config(task="evil.py"))),
+    Case("task: from here into the run", BARE, "came with it and is code",
          given=both(text(f"{RUN}/evil.py", CODE), config(task=f"{RUN}/evil.py"))),
-    Case("task: by a link", TOLD, "came with it and is code",
+    Case("task: by a link", BARE, "came with it and is code",
          given=both(text(f"{RUN}/evil.txt", CODE), link("gift/evil.py", "logs/go1_flat/run/evil.txt"), config(task="evil.py"))),
     Case("task: in an export", program("play", "--load_run", f"{RUN}/export", "--task", ""), "came with it and is code",
          given=both(text(f"{RUN}/export/evil.py", CODE), text(f"{RUN}/export/config.yaml", "task: export/evil.py\n"))),
     Case("task: of a teacher", program(*check, "--teacher", RUN), "came with it and is code",
          given=both(text(f"{RUN}/evil.py", CODE), config(task="run/evil.py"))),
-    Case("task: a program of the user's", TOLD, "which is no task: it has no line TASK",
+    Case("task: a program of the user's", BARE, "which is no task: it has no line TASK",
          given=both(text("wipe.py", "open('pwned', 'w')\n"), config(task="wipe.py"))),
-    Case("task: an escape", TOLD, "", given=config(task=r'"\e[2J\e]0;x\a.py"')),
-    Case("task: a name of 5000", TOLD, "which is not there", given=config(task="x" * 5000 + ".py")),
-    Case("task: another user's home", TOLD, "", given=config(task="~nobody_here/x.py")),
+    Case("task: an escape", BARE, "", given=config(task=r'"\e[2J\e]0;x\a.py"')),
+    Case("task: a name of 5000", BARE, "which is not there", given=config(task="x" * 5000 + ".py")),
+    Case("task: another user's home", BARE, "", given=config(task="~nobody_here/x.py")),
     # names that are printed
     Case("escape: the folder of a run", play("--load_run", "no_such"), r"there are: \x1b[2J\x1b]0;owned\x07",
          given=lambda root: shutil.copytree(root / RUN, root / "logs/go1_flat" / CLEAR)),
