@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from legged_mw.rl.layers import kernels_for
+
 _ALIGNED = 64  # values: each parameter begins at a multiple, as fast matrix products want it
 
 
@@ -79,9 +81,7 @@ class FlatAdam:
         self._take_over()
         group, (mean, square), norm = self._group, self._memory, torch.linalg.vector_norm(gradient)
         rate, (beta1, beta2), eps, decay = (group[name] for name in ("lr", "betas", "eps", "weight_decay"))
-        if gradient.is_cuda:
-            from legged_mw.rl import kernels
-
+        if kernels := kernels_for(gradient):
             kernels.launch(kernels.begin_adam, 1, norm, self._limit, rate, beta1, beta2, decay, self._step, self._factors)
             kernels.launch(kernels.adam, len(gradient), gradient, self._factors, beta1, beta2, eps, self._values, mean, square)
             return

@@ -5,6 +5,7 @@ All of them go into the stream that torch uses, and so into the graph that it re
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportOperatorIssue=false, reportReturnType=false
 # pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false, reportAttributeAccessIssue=false, reportAssignmentType=false
+# pyright: reportRedeclaration=false
 # ruff: noqa: UP018
 # (warp compiles what it finds written here as its own language: int() makes a variable, and functions differ by their types)
 from __future__ import annotations

@@ -11,6 +11,7 @@ from rsl_rl.modules import EmpiricalNormalization
 from torch import Tensor, nn
 
 Layers = list[tuple[Tensor, Tensor]]  # weight and bias of each
+FUSED_ON = ["cuda"]  # devices whose updates use the kernels of kernels.py
 _SUM_ROWS = 128  # summed by a thread; the rest of the rows is summed side by side
 
 
@@ -34,6 +35,15 @@ class Linear(torch.autograd.Function):
         (grad,), (x, weight) = grads, ctx.saved_tensors
         columns = getattr(ctx, "columns", None)
         return grad @ weight if ctx.needs_input_grad[0] else None, (grad.t() @ x)[:, :columns], sum_rows(grad)
+
+
+def kernels_for(x: Tensor) -> Any:
+    """The module of kernels if ``x`` is where they are used, else None."""
+    if x.device.type not in FUSED_ON:
+        return None
+    from legged_mw.rl import kernels  # with warp, a second to import, and only for a GPU
+
+    return kernels
 
 
 def sum_rows(x: Tensor) -> Tensor:
@@ -81,12 +91,9 @@ class EluBackward:
         self._outs, sizes = outs, [out.shape[1] for out in outs]
         self._sums: list[Tensor] = [outs[0]] * len(outs) if outs else []
         self._table: Tensor | None = None
-        if outs and outs[0].is_cuda and outs[0].dtype in (torch.float32, torch.bfloat16):
-            from legged_mw.rl import kernels
-
-            self._kernels, rows = kernels, len(outs[0])
-            if kernels.fits(rows, sizes):
-                self._table = outs[0].new_empty(-(-rows // kernels.ROWS), sum(sizes), dtype=torch.float32)
+        self._kernels: Any = kernels_for(outs[0]) if outs else None
+        if self._kernels and self._kernels.fits(rows := len(outs[0]), sizes):
+            self._table = outs[0].new_empty(-(-rows // self._kernels.ROWS), sum(sizes), dtype=torch.float32)
 
     def __call__(self, grad: Tensor, i: int) -> Tensor:
         """The gradient (B, size) before ELU ``i``, of its output's type."""

@@ -13,7 +13,7 @@ from rsl_rl.modules.distribution import GaussianDistribution
 from rsl_rl.storage import RolloutStorage
 from torch import Tensor
 
-from legged_mw.rl.layers import sum_rows
+from legged_mw.rl.layers import kernels_for, sum_rows
 
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 
@@ -42,10 +42,8 @@ def policy_loss(mean: Tensor, std: Tensor, batch: RolloutStorage.Batch, clip: fl
     """PPO's clipped surrogate loss less ``entropy_coef`` times the entropy. Entropy and divergence are not of mirror images."""
     assert batch.old_distribution_params is not None
     size, width = batch.old_distribution_params[0].shape
-    if mean.is_cuda and std.dim() == 1:
-        of_mean, of_std, surrogate, kl = _on_gpu(mean, std, batch, clip)
-    else:
-        of_mean, of_std, surrogate, kl = _anywhere(mean, std, batch, clip)
+    fused = _fused if kernels_for(mean) and std.dim() == 1 else _anywhere
+    of_mean, of_std, surrogate, kl = fused(mean, std, batch, clip)
     if std.dim() == 1:
         entropy = std.log().sum() + width * (0.5 + _HALF_LOG_2PI)
         of_std = of_std - entropy_coef / std
@@ -55,11 +53,9 @@ def policy_loss(mean: Tensor, std: Tensor, batch: RolloutStorage.Batch, clip: fl
     return PolicyLoss(of_mean, of_std, surrogate / len(mean), entropy, kl / size)
 
 
-def _on_gpu(mean: Tensor, std: Tensor, batch: RolloutStorage.Batch, clip: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _fused(mean: Tensor, std: Tensor, batch: RolloutStorage.Batch, clip: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The gradients of the surrogate loss; its sum and that of the divergence."""
-    from legged_mw.rl import kernels
-
-    (rows, width), of_mean = mean.shape, torch.empty_like(mean)
+    (rows, width), of_mean, kernels = mean.shape, torch.empty_like(mean), kernels_for(mean)
     terms = mean.new_empty(rows, width + 2)
     samples = batch.actions, batch.advantages, batch.old_actions_log_prob, *(batch.old_distribution_params or ())
     kernels.launch(kernels.policy_loss, rows, mean, std, *samples, clip, of_mean, terms)
@@ -68,7 +64,7 @@ def _on_gpu(mean: Tensor, std: Tensor, batch: RolloutStorage.Batch, clip: float)
 
 
 def _anywhere(mean: Tensor, std: Tensor, batch: RolloutStorage.Batch, clip: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """As ``_on_gpu``."""
+    """As ``_fused``."""
     old_mean, old_std = batch.old_distribution_params  # type: ignore[misc]
     size, advantages = len(old_mean), batch.advantages
     z = (batch.actions - mean) / std  # type: ignore[operator]
@@ -86,9 +82,7 @@ def _anywhere(mean: Tensor, std: Tensor, batch: RolloutStorage.Batch, clip: floa
 @torch.no_grad()
 def value_loss(values: Tensor, batch: RolloutStorage.Batch, clip: float, coef: float) -> tuple[Tensor, Tensor]:
     """The gradient (B, 1) of ``coef`` times the value loss, and the value loss (); clipped, unless ``clip`` is 0."""
-    if values.is_cuda:
-        from legged_mw.rl import kernels
-
+    if kernels := kernels_for(values):
         of_values, terms = torch.empty_like(values), torch.empty_like(values)
         kernels.launch(kernels.value_loss, len(values), values, batch.values, batch.returns, clip, coef, of_values, terms)
         return of_values, terms.mean()

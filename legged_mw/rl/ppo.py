@@ -26,7 +26,7 @@ from torch import Tensor, nn
 from legged_mw.rl.adam import FlatAdam, make_recordable
 from legged_mw.rl.concurrent import ConcurrentModel
 from legged_mw.rl.estimator import EstimatingModel, RegressingModel, trained_parts
-from legged_mw.rl.layers import HalfWeights, elu_layers, run_mlp, sample, update_normalizer
+from legged_mw.rl.layers import HalfWeights, elu_layers, kernels_for, run_mlp, sample, update_normalizer
 from legged_mw.rl.losses import own_std, policy_loss, value_loss
 from legged_mw.rl.recorded import Recorded, why_stock
 from legged_mw.rl.recurrent import HiddenStates, SequenceInput, check_recurrent, unroll
@@ -128,8 +128,9 @@ class GraphedPPO(Recorded, PPO):
 
     def learn_in_half(self) -> None:
         """From now on the hidden layers of plain networks of ELUs compute in bfloat16, acting too: else the policy that learns is not
-        quite the one that acted. Weights, the last layer, losses and gradients of weights stay float32.
+        quite the one that acted. Weights, the last layer, losses and gradients of weights stay float32, sums too.
         """
+        torch.backends.cuda.matmul.allow_bf16_reduced_precision_reduction = False
         self.half = True
         self.release()
 
@@ -334,9 +335,7 @@ class GraphedPPO(Recorded, PPO):
     def _adapt_rate(self, kl: Tensor) -> None:
         """rsl-rl's rule: slower where the policy moved more than twice as far as wanted, faster where less than half."""
         assert self._rate is not None
-        if kl.is_cuda:
-            from legged_mw.rl import kernels
-
+        if kernels := kernels_for(kl):
             kernels.launch(kernels.adapt_rate, 1, kl, self._desired_kl, self._rate, self._adam_rate, _RATE_STEP, _MIN_RATE, _MAX_RATE)
             return
         slower = (self._rate / _RATE_STEP).clamp(min=_MIN_RATE)
