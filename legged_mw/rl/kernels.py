@@ -158,6 +158,26 @@ def policy_loss(
 
 
 @wp.kernel(enable_backward=False)
+def policy_sums(
+    sums: wp.array[float],  # (A + 2,) of the terms over all samples
+    std: wp.array[float],
+    entropy_coef: wp.array[float],
+    rows: float,
+    size: float,  # of the samples that are no mirror images
+    of_std: wp.array[float],
+    parts: wp.array[float],  # surrogate loss, entropy, KL divergence
+):
+    width = std.shape[0]
+    entropy = float(0.0)
+    for a in range(width):
+        entropy += wp.log(std[a]) + 0.5 + _HALF_LOG_2PI
+        of_std[a] = sums[a] - entropy_coef[0] / std[a]
+    parts[0] = sums[width] / rows
+    parts[1] = entropy
+    parts[2] = sums[width + 1] / size
+
+
+@wp.kernel(enable_backward=False)
 def value_loss(
     values: wp.array2d[float],
     old: wp.array2d[float],
