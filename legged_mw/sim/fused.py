@@ -192,9 +192,8 @@ def _schedule(nodes: Sequence[Node], worlds: int, trace: Trace) -> Iterator[Kern
     def wake(i: int) -> None:
         heapq.heappush(ready[codes[i] is not None], i)
 
-    for i in range(len(nodes)):
-        if not waits[i]:
-            wake(i)
+    for i in (i for i, count in enumerate(waits) if not count):
+        wake(i)
 
     def done(i: int) -> None:
         for j in wakes[i]:
@@ -220,8 +219,7 @@ def _schedule(nodes: Sequence[Node], worlds: int, trace: Trace) -> Iterator[Kern
             else:  # not even alone
                 yield nodes[i]
                 done(i)
-        for i in later:
-            heapq.heappush(ready[1], i)
+        ready[1].extend(sorted(later))
         if together:
             yield Kernel(together, worlds)
 
