@@ -18,7 +18,7 @@ from mujoco.batch import MODEL_FIELDS, Batch, SimulationError
 from torch import Tensor
 
 from legged_mw.sim.errors import ModelError
-from legged_mw.sim.simulation import Simulation
+from legged_mw.sim.simulation import GRAVITY, Simulation
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.trace import not_traced
@@ -129,7 +129,7 @@ class MujocoSimulation(Simulation):
     def _expand(self, name: str) -> Tensor:
         """The engine's rows (N, ...) of a field of the model."""
         known = sorted(field for field in MODEL_FIELDS if getattr(getattr(self._batch.model, field, None), "dtype", None) == np.float64)
-        if name not in known:
+        if name not in (*known, GRAVITY):
             raise ModelError(unknown("per-world model field", name, known, "MuJoCo's Model"))
         return _tensor(self._batch.expand(name))
 
