@@ -21,6 +21,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
 from legged_mw.envs.worlds import worlds_state
 from legged_mw.eval.training import TrainingExam
+from legged_mw.rl import layers
 from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.policies import Source, Trained
 from legged_mw.rl.ppo import GraphedPPO
@@ -294,6 +295,42 @@ def six_equal_updates(other: PPO, ours: GraphedPPO) -> Iterator[dict[str, float]
         assert got == pytest.approx(expected, rel=1e-3, abs=1e-5)
         yield got
     assert ours._update_graph.recorded
+
+
+def test_recorded_update_in_bfloat16_learns_what_float32_does() -> None:
+    """Six updates, the last three replayed, from equal states and experience; at first the policy that learns is the one that acted."""
+    full, half = make(GraphedPPO, DEVICE), make(GraphedPPO, DEVICE)
+    half.learn_in_half()
+    for seed in range(6):
+        collect(full, DEVICE, seed=seed)
+        share_experience(full, half)
+        take_over(half, full)
+        before, expected, got = parameters(full), update(full), update(half)
+        moved = [torch.cat([(p - before[k]).flatten() for k, p in parameters(alg).items() if "mlp" in k]) for alg in (full, half)]
+        assert 0.0 < (moved[1] - moved[0]).norm() < 0.15 * moved[0].norm()
+        assert got == pytest.approx(expected, rel=0.05, abs=2e-3)
+    assert half._update_graph.recorded and {p.dtype for p in half.actor.parameters()} == {torch.float32}
+    collect(half, DEVICE)
+    acted = half.storage.distribution_params[0].flatten(0, 1)
+    half._share = half._size = len(acted)
+    with torch.no_grad():
+        learns = half._forward(half.actor, half._prepare(torch.arange(len(acted), device=DEVICE)).actor_input)
+    assert half._act_graph.recorded and (learns - acted).norm() < 5e-3 * acted.norm()
+
+
+@pytest.mark.parametrize("settings", VARIANTS.values(), ids=VARIANTS.keys())
+@pytest.mark.parametrize("half", [False, True], ids=["float32", "bfloat16"])
+def test_kernels_of_the_update_are_torchs_own(settings: dict, half: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One update beside one whose losses, ELUs, rate and Adam are torch's."""
+    plain, fused = make(GraphedPPO, DEVICE, **settings), make(GraphedPPO, DEVICE, **settings)
+    for alg in (plain, fused) if half else ():
+        alg.learn_in_half()
+    collect(plain, DEVICE)
+    share_experience(plain, fused)
+    got = update(fused)
+    monkeypatch.setattr(layers, "FUSED_ON", [])
+    assert got == pytest.approx(update(plain), rel=0.05 if half else 1e-3, abs=2e-3 if half else 1e-5)
+    assert difference(parameters(plain), parameters(fused)) < (0.05 if half else 1e-4)
 
 
 @pytest.mark.parametrize("loss", ["estimate", "student"])

@@ -235,7 +235,9 @@ class RobotTaskCfgPPO(Config):
         logger: Literal["tensorboard", "wandb"] = "tensorboard"
         wandb_project: str = "legged_mw"
         export: bool = True  # a finished training writes <run folder>/export/, as play.py --export does [ours]
-        matmul_precision: Literal["highest", "high"] = "high"  # of the networks on a GPU: high is TF32, highest float32
+        # of the networks on a GPU: highest is float32, high TF32; with bf16 the hidden layers of a plain MLP of ELUs learn and act in
+        # bfloat16, on a CPU too, and what else there is (memory, estimator, concurrent student, other activations) in TF32
+        matmul_precision: Literal["highest", "high", "bf16"] = "high"
 
     class obs_groups:
         actor: list[str] = ["state"]
