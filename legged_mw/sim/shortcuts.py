@@ -52,6 +52,8 @@ class Shortcuts:
             self._idle.add("_next_activation")
         if not {int(kinds.mjSENS_FORCE), int(kinds.mjSENS_TORQUE)} & set(mj.sensor_type):
             self._idle.add("_cfrc_world")
+        if set(mj.sensor_intprm[mj.sensor_type == kinds.mjSENS_CONTACT, 1]) <= {0, 3}:  # reduced to none, or to the net force
+            self._idle.add("_contact_sort")
         if not mj.ntendon and not mj.neq and set(mj.actuator_trntype) <= {int(mujoco.mjtTrn.mjTRN_JOINT)}:
             self._idle_unsensed.add("_site_local_to_global")
 

@@ -16,6 +16,7 @@ import warp as wp
 from mujoco_warp import OverflowType
 from torch import Tensor
 
+from legged_mw.sim.contact_count import count_contacts
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND
 from legged_mw.sim.ground_contact import touch_ground
@@ -68,6 +69,7 @@ class WarpSimulation(Simulation):
             option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
             self._shortcuts = Shortcuts(model, self._model, world_fields)
+            self._count_contacts = count_contacts(model, self._model)
             self._data = mjw.make_data(model, nworld=num_envs, nconmax=nconmax, njmax=njmax)
         for name in _STATE:
             setattr(self, name, wp.to_torch(getattr(self._data, name)))
@@ -134,6 +136,8 @@ class WarpSimulation(Simulation):
             with self._shortcuts(sensed=last):
                 mjw.step(self._model, self._data)
         option.disableflags = flags
+        if which[-1] == count - 1:
+            self._count_contacts(self._data)
 
     def _run(self, name: str, fn) -> None:
         with wp.ScopedDevice(self._device):
