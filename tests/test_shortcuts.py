@@ -62,6 +62,12 @@ def test_a_step_equals_the_whole_one(case: str, whole: Callable[[], None]) -> No
     assert max(int(a["contacts"].max()) for a in short) and min(float(a["contacts"].min()) for a in short) == 0.0
 
 
+def warp_simulation() -> WarpSimulation:
+    sim = make_env(2, {"sim.engine": "mujoco_warp"}).sim
+    assert isinstance(sim, WarpSimulation)
+    return sim
+
+
 def launched(sim: WarpSimulation, substeps: int = 2) -> list[str]:
     """Names of the kernels of a control step, those left out too."""
     names, launch, tiled = [], wp.launch, wp.launch_tiled
@@ -79,9 +85,8 @@ def launched(sim: WarpSimulation, substeps: int = 2) -> list[str]:
 
 def test_what_is_left_out_is_what_the_library_launches(whole: Callable[[], None]) -> None:
     """A kernel that the library calls otherwise in a new version would be launched again, unseen."""
-    env = make_env(2, {"sim.engine": "mujoco_warp"})
-    short = env.sim._shortcuts
-    names = launched(env.sim)
+    sim = warp_simulation()
+    short, names = sim._shortcuts, launched(sim)
     assert short._idle == {"_gravity_force", "_next_activation", "_cfrc_world", "_contact_sort"} and not short._idle & {*names}
     assert short._idle_unsensed == {"_site_local_to_global"} and names.count("_site_local_to_global") == 1
     assert names.count("_update_gradient_cholesky") == names.count("_linesearch_iterative_kernel") == 2
@@ -89,7 +94,7 @@ def test_what_is_left_out_is_what_the_library_launches(whole: Callable[[], None]
     assert not {"_qfrc_constraint_from_grad", "_solve_done", "_tile_cholesky_factorize_solve_block", "_contact_match"} & {*names}
     assert wp.launch.__module__.startswith("warp")
     whole()
-    names = launched(make_env(2, {"sim.engine": "mujoco_warp"}).sim)
+    names = launched(warp_simulation())
     assert {*names} >= short._idle | {shortcuts._SEARCH, shortcuts._SOLVED, *shortcuts._FORCES, "_tile_cholesky_factorize_solve_block"}
     assert names.count("_update_gradient_cholesky") == names.count("_update_constraint_efc") == 4
 
@@ -116,8 +121,7 @@ def test_a_world_without_constraint_rows_falls_as_before(whole: Callable[[], Non
 
 
 def test_conditions_that_need_a_launch_keep_it() -> None:
-    env = make_env(1, {"sim.engine": "mujoco_warp"})
-    model, put = env.robot.physics, env.sim._model
+    model, put = make_env(1).robot.physics, warp_simulation()._model
     assert "_gravity_force" not in shortcuts.Shortcuts(model, put, ["body_gravcomp"])._idle
     put.opt.graph_conditional = True  # as many iterations as are needed: nobody knows the last
     assert not shortcuts.Shortcuts(model, put)._iterations

@@ -1,7 +1,7 @@
 """How many contacts sensed geoms have with another geom, counted by one kernel in place of mujoco-warp's search, sort and readout."""
 
-# pyright: reportAttributeAccessIssue=false, reportIndexIssue=false, reportArgumentType=false
-# (mujoco ships no type stubs; warp's kernels are its own dialect)
+# pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false, reportCallIssue=false, reportAssignmentType=false
+# (mujoco ships no type stubs, and warp compiles what it finds written here as its own language)
 from __future__ import annotations
 
 from collections.abc import Callable
