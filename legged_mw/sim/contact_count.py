@@ -1,6 +1,7 @@
 """How many contacts sensed geoms have with another geom, counted by one kernel in place of mujoco-warp's search, sort and readout."""
 
 # pyright: reportAttributeAccessIssue=false, reportGeneralTypeIssues=false, reportCallIssue=false, reportAssignmentType=false
+# pyright: reportArgumentType=false, reportIndexIssue=false
 # (mujoco ships no type stubs, and warp compiles what it finds written here as its own language)
 from __future__ import annotations
 
