@@ -127,20 +127,9 @@ def gpu_row(task: str, worlds: int, device: str, iterations: int, others: int) -
 def rows(args: argparse.Namespace, task: str, worlds: Sequence[int], device: str) -> Iterator[dict[str, Any]]:
     """What a process of its own says of a task, row by row."""
     others = 0 if device == "cpu" else Peak(device).read()
-    command = [
-        sys.executable,
-        __file__,
-        "--child",
-        task,
-        "--device",
-        device,
-        "--iterations",
-        args.iterations,
-        "--others",
-        others,
-        "--worlds",
-    ]
-    process = subprocess.Popen([*map(str, [*command, *worlds])], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
+    options = ["--child", task, "--device", device, "--iterations", args.iterations, "--others", others, "--worlds", *worlds]
+    command = [sys.executable, __file__, *map(str, options)]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     assert process.stdout and process.stderr
     said: list[str] = []  # what goes wrong, read beside: a full pipe would stop the child
     reader = threading.Thread(target=lambda: said.extend(process.stderr or ()), daemon=True)
@@ -151,11 +140,8 @@ def rows(args: argparse.Namespace, task: str, worlds: Sequence[int], device: str
     reader.join(5)
     if process.wait():
         text = "".join(said)
-        yield {
-            "task": task,
-            "worlds": worlds[-1],
-            "error": "out of memory" if "out of memory" in text else text.strip().splitlines()[-1][:200],
-        }
+        last = (text.strip().splitlines() or ["it was killed"])[-1][:200]
+        yield {"task": task, "worlds": worlds[-1], "error": "out of memory" if out_of_memory(RuntimeError(text)) else last}
 
 
 class Ballast:
