@@ -18,9 +18,11 @@ import warp as wp
 from mujoco_warp import OverflowType
 from torch import Tensor
 
+from legged_mw.sim.contact_count import count_contacts
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND
 from legged_mw.sim.ground_contact import touch_ground
+from legged_mw.sim.shortcuts import Shortcuts
 from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ, GRAVITY, Simulation
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import unknown
@@ -72,6 +74,8 @@ class WarpSimulation(Simulation):
                 option.gravity = wp.array(np.tile(model.opt.gravity, (num_envs, 1)), dtype=wp.vec3)
             option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
+            self._shortcuts = Shortcuts(model, self._model, world_fields)
+            self._count_contacts = count_contacts(model, self._model)
             self._data = mjw.make_data(model, nworld=num_envs, nconmax=nconmax, njmax=njmax)
         for name in _STATE:
             setattr(self, name, wp.to_torch(getattr(self._data, name)))
@@ -135,9 +139,13 @@ class WarpSimulation(Simulation):
         option = self._model.opt
         flags = option.disableflags
         for i in which:
-            option.disableflags = flags if i == count - 1 else flags | mjw.DisableBit.SENSOR
-            mjw.step(self._model, self._data)
+            last = i == count - 1
+            option.disableflags = flags if last else flags | mjw.DisableBit.SENSOR
+            with self._shortcuts(sensed=last):
+                mjw.step(self._model, self._data)
         option.disableflags = flags
+        if which[-1] == count - 1:
+            self._count_contacts(self._data)
 
     def _run(self, name: str, fn) -> None:
         with wp.ScopedDevice(self._device):
