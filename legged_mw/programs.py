@@ -25,10 +25,10 @@ def train() -> None:
     from legged_mw.rl import flags
 
     args = flags.parse(train.__doc__)
+    quick_start.begin("cpu" if args.list else args.device)
     if args.list:
         print(list_tasks())
         return
-    quick_start.begin(args.device)
     with patient_console():
         _train(args)
 

@@ -1,4 +1,4 @@
-"""The flags of train.py. Read before torch is imported: a mistake in them, --help and --list answer at once."""
+"""The flags of train.py. Read before torch is imported: a mistake in them and --help answer at once."""
 
 from __future__ import annotations
 

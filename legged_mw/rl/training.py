@@ -137,6 +137,8 @@ def _announce(task: LoadedTask, device: str, rank: Rank) -> bool:
     facts = device_facts(device) if engine == "mujoco_warp" else None
     for line in facts.slow() if facts else ():
         print(line, flush=True)
+    if facts:
+        facts.say_compiling()
     if device != "cpu":
         return facts is None or facts.pool
     cores, runner = usable_cores(), task.train.runner
