@@ -203,6 +203,7 @@ class RobotTaskCfg(Config):
         iterations: Few = 1  # Newton iterations [P]
         ls_iterations: Few = 5  # line-search iterations [P]
         integrator: Literal["euler", "implicitfast"] = "euler"  # implicitfast: joint damping is stable however large [P: euler]
+        fuse: bool = True  # a recorded step's small operations go together in few kernels, equal to float32 rounding [ours: docs/lab.md]
         nconmax: Whole = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model, as --check says [ours: sim/room.py]
         njmax: Whole = 0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
 

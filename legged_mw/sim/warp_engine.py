@@ -22,6 +22,7 @@ from legged_mw.sim.ground_contact import touch_ground
 from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ, Simulation
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import unknown
+from legged_mw.utils.trace import not_traced
 
 wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it loads; a first run would drown in it
 
@@ -75,6 +76,7 @@ class WarpSimulation(Simulation):
         self._reset_mask_wp = wp.from_torch(self._reset_mask)
         self._recorded: dict[str, object] = {}
 
+    @not_traced
     def step(self, substeps: int = 1, before: Callable[[int], None] | None = None) -> None:
         if before is None:
             self._run(f"step{substeps}", lambda: self._substeps(range(substeps), substeps))
@@ -85,6 +87,7 @@ class WarpSimulation(Simulation):
                 self._run(name, partial(self._substeps, [i], substeps))
         torch.bitwise_or(self._overflow_seen, self.overflow, out=self._overflow_seen)
 
+    @not_traced
     def reset(self, mask: Tensor) -> None:
         self._reset_mask.copy_(mask)
         self._run("reset", lambda: mjw.reset_data(self._model, self._data, reset=self._reset_mask_wp))
