@@ -74,6 +74,7 @@ ONLY_IN = {
 NEVER_IN = {
     "legged_mw/envs/*": ["mujoco"],
     "legged_mw/sim/*": ["legged_mw.utils.config", "legged_mw.utils.task"],
+    "legged_mw/rl/flags.py": ["torch"],
     "legged_mw/eval/rules.py": ["torch", "mujoco"],  # numbers in, numbers out: of use to whoever drives the robot otherwise
     "legged_mw/eval/figures.py": ["torch", "mujoco"],
     "legged_mw/eval/skill*.py": ["torch", "legged_mw.envs", "legged_mw.rl", "legged_mw.eval.perform"],

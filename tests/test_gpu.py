@@ -28,6 +28,7 @@ from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.recurrent import memory_of
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.transfer import seat_teacher
+from legged_mw.sim.fused import Fused
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.task import load_task
 
@@ -128,6 +129,7 @@ FORCES: dict[str, object] = {
 def test_replay_equals_eager_over_100_steps(task: str, settings: dict[str, object]) -> None:
     """Bit for bit, with noise, kicks, falls, time outs and resets: the same random numbers are drawn in both."""
     overrides = {"perturbation__kick": True, "env__episode_length_s": 1.0, "termination__max_tilt": 10.0, **settings}
+    overrides["sim__fuse"] = False
     eager, recorded = (without_constraints(make_env(eager, task, **overrides)) for eager in (True, False))
     actions = torch.randn(100, 64, eager.num_actions, generator=torch.Generator().manual_seed(0)).to(DEVICE)
     expected, got = roll_out(eager, actions), roll_out(recorded, actions)
@@ -137,13 +139,35 @@ def test_replay_equals_eager_over_100_steps(task: str, settings: dict[str, objec
         assert torch.equal(a, b), f"step {i // 5}, output {i % 5}: largest difference {(a.float() - b.float()).abs().max():g}"
 
 
+@pytest.mark.parametrize(
+    ("task", "settings"),
+    [("go1_flat", {}), ("go1_flat", RANDOMIZED), ("go1_flat", ROUGH), ("g1_flat", BIPED), ("go1_getup", {}), ("g1_track", {})],
+    ids=["nominal", "randomized", "rough", "biped", "falls", "a motion"],
+)
+def test_a_fused_step_is_the_eager_one_to_rounding(
+    task: str, settings: dict[str, object], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    overrides = {"perturbation__kick": True, "env__episode_length_s": 1.0, "termination__max_tilt": 10.0, **settings}
+    eager, fused = (without_constraints(make_env(eager, task, **overrides)) for eager in (True, False))
+    assert fused._graph._fusion
+    actions = torch.randn(40, 64, eager.num_actions, generator=torch.Generator().manual_seed(0)).to(DEVICE)
+    begin = fused._graph._fusion.compile
+    monkeypatch.setattr(fused._graph._fusion, "compile", lambda wait: begin(None))  # however long it takes
+    expected, got = roll_out(eager, actions), roll_out(fused, actions)
+    assert fused._graph.recorded and isinstance(fused._graph._fn, Fused)
+    assert "not fused" not in capsys.readouterr().out
+    for i, (a, b) in enumerate(zip(expected, got, strict=True)):
+        off = ~torch.isclose(a.float(), b.float(), rtol=1e-3, atol=1e-3)
+        assert off.float().mean() < 0.01, f"step {i // 5}, output {i % 5}: {off.float().mean():.3f} of the values differ"
+
+
 @pytest.mark.parametrize("law", ["servo", "dc_motor", "speed", "torque", "network", "own"])
 def test_motors_replay_as_they_run_eager(law: str, tmp_path: Path) -> None:
     """Bit for bit, delayed by 0 to 30 ms, with drawn gains and curves, and episodes that end."""
     net = save(mlp(torque_scale=20.0)[1], tmp_path)
     drawn = {f"domain_rand.{name}": [0.8, 1.2] for name in ("stiffness", "damping", "strength", "stall_torque", "no_load_speed")}
     fields: dict[str, object] = {**CURVE, **drawn, "domain_rand.enable": True, "domain_rand.delay_ms": [0.0, 30.0]}
-    fields |= {"control.actuator": "servo" if law == "own" else law, "control.network": net, "env.episode_length_s": 0.5}
+    fields |= {"sim.fuse": False, "control.actuator": "servo" if law == "own" else law, "control.network": net, "env.episode_length_s": 0.5}
     fields |= {"control.action_scale": 5.0} if law in ("torque", "speed") else {}
     if law == "speed":
         law, fields = "dc_motor", fields | {"control.actuator": "dc_motor", "control.action_origin": "speed"}
