@@ -34,6 +34,11 @@ def launch(kernel: Any, dim: int | tuple[int, ...], *inputs: Any) -> None:
     wp.launch(kernel, dim=dim, inputs=arrays, device=str(device), stream=stream, block_dim=_BLOCK)
 
 
+def load(device: str) -> None:
+    """Compile all of them for a device, or find them compiled."""
+    wp.load_module(__name__, device=device)
+
+
 def _array(x: Tensor) -> wp.array:
     """As warp sees it: three dimensions are two of fours, none is one of one."""
     return wp.from_torch(x, dtype=wp.vec4) if x.dim() == 3 else wp.from_torch(x.view(x.shape or 1))

@@ -7,6 +7,7 @@ import time
 import torch
 
 from legged_mw.eval.exams import make_exam
+from legged_mw.rl.layers import kernels_for
 from legged_mw.sim.device import device_facts
 from legged_mw.utils.cli import Parser, pick_device
 from legged_mw.utils.task import load_task, task_names
@@ -33,7 +34,7 @@ def main() -> None:
 
 
 def warm(name: str, device: str) -> None:
-    """Step a task and its exam a few times."""
+    """Step a task and its exam a few times; on a GPU load the update's kernels, too."""
     task = load_task(name)
     task.set("sim.engine", "mujoco_warp")
     if device == "cpu":
@@ -44,3 +45,5 @@ def warm(name: str, device: str) -> None:
     for each in [env, *([exam.env] if exam else [])]:
         for _ in range(_STEPS):
             each.step(torch.zeros_like(each.actions))
+    if kernels := kernels_for(env.actions):
+        kernels.load(device)
