@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import difflib
 import sys
+import time
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
@@ -22,9 +23,10 @@ from legged_mw.utils.task import LoadedTask, list_tasks, load_task
 @one_line_errors()
 def train() -> None:
     """Train a task. On 8 GPUs: torchrun --nproc_per_node=8 train.py --task go1_flat"""
+    begun = time.time()  # --max_time counts what is imported now
     from legged_mw.rl import training
 
-    args = training.parse(train.__doc__)
+    args = training.parse(train.__doc__, begun)
     if args.list:
         print(list_tasks())
         return
