@@ -177,7 +177,8 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     cores, todo, trained = sorted(os.sched_getaffinity(0)), jobs(args), queue.SimpleQueue[Job | None]()
     base = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])}
-    places: list[tuple[dict[str, str], set[int]]] = [({**base, "CUDA_VISIBLE_DEVICES": str(i)}, set(cores)) for i in range(args.gpus)]
+    gpus = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each] or [str(i) for i in range(args.gpus)]
+    places: list[tuple[dict[str, str], set[int]]] = [({**base, "CUDA_VISIBLE_DEVICES": gpu}, set(cores)) for gpu in gpus[: args.gpus]]
     if args.device == "cpu":
         places = [(base, set(cores[i : i + args.cores])) for i in range(0, len(cores) - args.cores + 1, args.cores)]
     waiting = queue.SimpleQueue[Job | None]()
