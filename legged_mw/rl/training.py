@@ -62,8 +62,8 @@ class Start(NamedTuple):
     goes_on: bool = False  # in the folder of ``run``: from its newest checkpoint
 
 
-def parse(description: str | None, begun: float) -> argparse.Namespace:
-    """The flags of training, which the user asked for at the time ``begun`` [s]. From here on only the first of several ranks prints."""
+def parse(description: str | None, begun: float | None = None) -> argparse.Namespace:
+    """The flags of training, asked for at the time ``begun`` [s], or now. From here on only the first of several ranks prints."""
     parser = make_parser(description)
     parser.add_argument("--max_iterations", type=positive, metavar="N", help="train until this iteration, resumed or not")
     parser.add_argument("--run_name", metavar="NAME", help="appended to the run folder's name")
@@ -88,7 +88,7 @@ def parse(description: str | None, begun: float) -> argparse.Namespace:
         parser.error("--load_run and --checkpoint say what to go on with: add --resume")
     if args.resume and (args.teacher is not None or args.init is not None):
         parser.error("--resume goes on with what a run began with: leave --teacher and --init out")
-    args.deadline = begun + args.max_time if args.max_time else None
+    args.deadline = (begun or time.time()) + args.max_time if args.max_time else None
     quiet(this_rank())
     if not torch.cuda.is_available():
         torch.set_num_threads(1)  # hundreds of small operations a step stall on a second thread
