@@ -118,7 +118,7 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     if device != "cpu":
         torch.cuda.set_device(device)
     seed_everything(task.train.seed + rank.index)  # every rank its own worlds, commands and noise
-    args.eager |= not _announce(task, device, rank)
+    args.eager |= not _announce(task, device, rank, args.max_time)
     return start, device
 
 
@@ -157,8 +157,8 @@ def _note_others(task: LoadedTask, start: Start) -> None:
         print("symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it again")
 
 
-def _announce(task: LoadedTask, device: str, rank: Rank) -> bool:
-    """Say what is trained on what, and what makes that slow; on a CPU how long it may take. Returns whether it can be recorded."""
+def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> bool:
+    """Say what is trained on what, and what makes that slow; on a CPU how long it may take, at ``most`` [s]. Returns whether it can be recorded."""
     worlds, engine = task.cfg.env.num_envs, pick_engine(task.cfg.sim.engine, device)
     where = device if rank.count == 1 else f"each of {rank.count} {'processes' if device == 'cpu' else 'GPUs'}"
     print(f"{task.name}: {worlds} worlds on {where}, engine {engine}", flush=True)
@@ -175,7 +175,7 @@ def _announce(task: LoadedTask, device: str, rank: Rank) -> bool:
     plan = (
         f"{steps:,} steps; {slow}" if rough else f"{runner.max_iterations} iterations, {steps / 1e6:.1f} M steps, about {minutes:.0f} min"
     )
-    print(f"{cores} cores: {plan}", flush=True)
+    print(f"{cores} cores: {plan}{f'; --max_time ends it after {most / 60:.3g} min' if most and most < 60 * minutes else ''}", flush=True)
     return True
 
 
