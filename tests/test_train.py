@@ -359,6 +359,7 @@ def test_the_time_that_is_asked_for_is_a_training(tmp_path: Path) -> None:
     assert told == f"{len(done)} iterations within --max_time; --resume goes on towards 1000" and ended.startswith("done: ")
     assert shlex.split(watch) == ["python", "play.py", "--task", "go1_flat", "--load_run", folder.name]
     assert 0.0 < load(folder / f"model_{len(done)}.pt")["infos"]["seconds"] < 60.0
+    assert re.search(r"^\d+ cores: 1000 iterations, .* min; --max_time ends it after 0\.0167 min$", result.out, re.MULTILINE)
 
 
 def test_who_is_stopped_is_told_how_much_time_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

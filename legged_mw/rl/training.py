@@ -158,7 +158,7 @@ def _note_others(task: LoadedTask, start: Start) -> None:
 
 
 def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> bool:
-    """Say what is trained on what, and what makes that slow; on a CPU how long it may take, at ``most`` [s]. Returns whether it can be recorded."""
+    """Say what is trained on what, and what makes that slow; on a CPU how long, or at ``most`` [s]. Returns whether it is recordable."""
     worlds, engine = task.cfg.env.num_envs, pick_engine(task.cfg.sim.engine, device)
     where = device if rank.count == 1 else f"each of {rank.count} {'processes' if device == 'cpu' else 'GPUs'}"
     print(f"{task.name}: {worlds} worlds on {where}, engine {engine}", flush=True)
