@@ -35,7 +35,7 @@ TOOLS = (
     "legged_mw.tools",
 )
 ONLY_IN = {
-    "warp": ["legged_mw/sim/*"],
+    "warp": ["legged_mw/sim/*", "legged_mw/rl/kernels.py"],
     "mujoco_warp": ["legged_mw/sim/*"],
     "rsl_rl": ["legged_mw/rl/*"],
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],

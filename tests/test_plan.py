@@ -106,13 +106,15 @@ def small() -> LoadedTask:
     return task
 
 
-def timed(task: LoadedTask, clock: list[float], seconds: float, checkpoint: Path | None = None) -> tuple[Runner, list[float]]:
+def timed(
+    task: LoadedTask, clock: list[float], seconds: float, checkpoint: Path | None = None
+) -> tuple[Runner, list[tuple[float, float, float]]]:
     """A runner that has learned for so long, each iteration 1 s, and the numbers of each iteration."""
     env = LeggedRobot(task.cfg, "cpu")
     runner = make_runner(env, task.train, None, "cpu")
     if checkpoint:
         runner.load(str(checkpoint))
-    alg, update, seen = runner.alg, runner.alg.update, []
+    alg, update, seen = runner.alg, runner.alg.update, list[tuple[float, float, float]]()
 
     def one_second() -> dict:
         clock[0] += 1.0

@@ -45,10 +45,9 @@ class Runner(OnPolicyRunner):
     """Trains with rsl-rl's algorithm, storage and writers.
 
     ``current_learning_iteration`` counts finished iterations: a checkpoint ``model_100.pt`` has done 100 of them, and a
-    resumed run goes on with the 101st. Set ``deadline`` to the time [s] at which it shall be done and annealed, and ``stop`` to a reason,
-    at any time, to end it after the iteration and a checkpoint; ``diverged`` says why the runner set it by itself, ``begins_anew`` why
-    ``load`` did not find the worlds of a checkpoint. Set ``examine`` to what grades a policy: it is called every ``exam_interval``
-    iterations and after the last, and its figures are logged.
+    resumed run goes on with the 101st. Set ``stop`` to a reason, at any time, to end the run after the iteration and a checkpoint;
+    ``diverged`` says why the runner set it by itself, ``begins_anew`` why ``load`` did not find the worlds of a checkpoint. Set
+    ``examine`` to what grades a policy: it is called every ``exam_interval`` iterations and after the last, and its figures are logged.
     """
 
     env: RobotTask
@@ -58,7 +57,7 @@ class Runner(OnPolicyRunner):
         self.logger.git_status_repos = [str(ROOT)] if (ROOT / ".git").exists() else []
         self.total_steps = 0
         self.stop: str | None = None
-        self.deadline: float | None = None
+        self.deadline: float | None = None  # the time at which `learn` shall be done, and all annealed [s]
         self.plan = Plan()
         self.diverged = ""  # why training had to end, in words
         self.begins_anew = "it is a new run"
@@ -219,8 +218,8 @@ class Runner(OnPolicyRunner):
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         self.total_steps += steps
         asks = float(self.stop is not None), self.plan.room() if self.gpu_global_rank == 0 else 0.0
-        stop = torch.cat([torch.full((1,), value, device=self.device) for value in asks])
-        parts = [self.env.take_statistics(), torch.cat([each.take() for each in self.env.suspects]), stop]
+        taken = [each.take() for each in self.env.suspects], [torch.full((1,), value, device=self.device) for value in asks]
+        parts = [self.env.take_statistics(), *map(torch.cat, taken)]
         summed, sizes = torch.cat(parts), [len(part) for part in parts]
         if self.is_distributed:
             torch.distributed.all_reduce(summed)
@@ -332,9 +331,8 @@ class Runner(OnPolicyRunner):
     def _content(self, infos: dict | None = None) -> dict[str, Any]:
         """A checkpoint: tensors and plain numbers only."""
         content = self.alg.save()
-        content["iter"] = self.current_learning_iteration
-        content["infos"] = {**(infos or {}), "total_steps": self.total_steps, "random_state": random_state(self.device)}
-        return content | {"infos": {**content["infos"], "env": self.env.training_state(), **self.plan.saved()}}
+        told = {**(infos or {}), "total_steps": self.total_steps, "random_state": random_state(self.device), **self.plan.saved()}
+        return content | {"iter": self.current_learning_iteration, "infos": {**told, "env": self.env.training_state()}}
 
     def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
         """Go on from a checkpoint: networks, normalisers, optimizer, learning rate, counters, random state; worlds, where they are kept."""
@@ -374,7 +372,8 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
 
     With a ``teacher``, of which this is the learner's config, it distils.
     """
-    torch.set_float32_matmul_precision(cfg.runner.matmul_precision)
+    half = cfg.runner.matmul_precision == "bf16"
+    torch.set_float32_matmul_precision("high" if half else cfg.runner.matmul_precision)
     check_mirror(env, cfg)
     try:
         theirs = acting(teacher, env, [TEACHER]) if teacher else None
@@ -386,6 +385,8 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
     except ValueError as error:  # a class, activation, optimizer or observation group that does not exist
         raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None
     graphed = isinstance(runner.alg, GraphedPPO) and runner.alg.graphed
+    if half and isinstance(runner.alg, GraphedPPO):
+        runner.alg.learn_in_half()
     if settings["critic_warmup"] and not graphed:
         raise ConfigError(f"warm_start.critic_warmup is {settings['critic_warmup']}, but only the recorded PPO knows it; set it to 0")
     if isinstance(policy := runner.alg.get_policy(), RegressingModel) and not graphed:

@@ -22,6 +22,7 @@ from rsl_rl.algorithms import Distillation
 from legged_mw.envs.actuators import note_network
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.worlds import fuse_for
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
@@ -184,6 +185,7 @@ def build(task: LoadedTask, start: Start, device: str, eager: bool, check_record
     if this_rank().leads and not eager:
         check_recordable(task)
     env = task.env_class(task.cfg, device, eager=eager)
+    fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)
     check_mirror(env, task.train)
     check_room(task.train.to_dict(), env)
     if start.policy:
