@@ -173,4 +173,4 @@ def test_the_gallery_has_every_policy(site: Path) -> None:
     assert gallery.PAGE.read_text() == gallery.page(), "python -m website.gallery"
     assert [name for name in gallery.policies() if "| --- |" not in gallery.chapter(name)] == [], "an exam's table"
     page = (site / "gallery.html").read_text()
-    assert page.count("falls in 22 commands") >= 6 and page.count("curve.png") == len(list(gallery.POLICIES.glob("*/curve.png")))
+    assert page.count("falls in 22 commands") >= 6 and page.count("curve.webp") == len(list(gallery.POLICIES.glob("*/curve.webp")))
