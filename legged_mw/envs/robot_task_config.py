@@ -207,6 +207,7 @@ class RobotTaskCfg(Config):
         iterations: Few = 1  # Newton iterations [P]
         ls_iterations: Few = 5  # line-search iterations [P]
         integrator: Literal["euler", "implicitfast"] = "euler"  # implicitfast: joint damping is stable however large [P: euler]
+        fuse: bool = True  # a recorded step's small operations go together in few kernels, equal to float32 rounding [ours: docs/lab.md]
         nconmax: Whole = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model, as --check says [ours: sim/room.py]
         njmax: Whole = 0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
 
@@ -236,7 +237,9 @@ class RobotTaskCfgPPO(Config):
         logger: Literal["tensorboard", "wandb"] = "tensorboard"
         wandb_project: str = "legged_mw"
         export: bool = True  # a finished training writes <run folder>/export/, as play.py --export does [ours]
-        matmul_precision: Literal["highest", "high"] = "high"  # of the networks on a GPU: high is TF32, highest float32
+        # of the networks on a GPU: highest is float32, high TF32; with bf16 the hidden layers of a plain MLP of ELUs learn and act in
+        # bfloat16, on a CPU too, and what else there is (memory, estimator, concurrent student, other activations) in TF32
+        matmul_precision: Literal["highest", "high", "bf16"] = "high"
 
     class obs_groups:
         actor: list[str] = ["state"]
@@ -322,7 +325,7 @@ class RobotTaskCfgPPO(Config):
         critic_warmup: Whole = 20  # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
 
     class anneal:
-        """What a number of `algorithm` goes to, in a straight line over max_iterations; 0: it stays [ours]."""
+        """What a number of `algorithm` goes to, in a straight line over max_iterations or --max_time; 0: it stays [ours]."""
 
         entropy_coef: NonNegative = 0.0
         desired_kl: NonNegative = 0.0

@@ -10,7 +10,6 @@ import os
 import re
 import shlex
 import signal
-import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -23,23 +22,25 @@ from rsl_rl.algorithms import Distillation
 from legged_mw.envs.actuators import note_network
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.worlds import fuse_for
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
 from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
+from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
-from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run, require_task
+from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
 from legged_mw.rl.transfer import TEACHER, begin_with, check_start, keep_teacher, load_teacher, seat_teacher
 from legged_mw.sim.device import device_facts
 from legged_mw.sim.engines import pick_engine
-from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything
+from legged_mw.utils.cli import apply_overrides, command, pick_device, seed_everything
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import writable
 from legged_mw.utils.machine import usable_cores
+from legged_mw.utils.quick_start import settle
 from legged_mw.utils.task import LoadedTask, load_task
 
 STOPPED = 3  # exit code of a training that ended early and can go on
@@ -63,41 +64,11 @@ class Start(NamedTuple):
     goes_on: bool = False  # in the folder of ``run``: from its newest checkpoint
 
 
-def parse(description: str | None) -> argparse.Namespace:
-    """The flags of training. From here on only the first of several processes prints."""
-    parser = make_parser(description)
-    parser.add_argument("--max_iterations", type=positive, metavar="N", help="train until this iteration, resumed or not")
-    parser.add_argument("--run_name", metavar="NAME", help="appended to the run folder's name")
-    parser.add_argument("--resume", action="store_true", help="go on with the last run, or the one of --load_run")
-    source = "its run, checkpoint or export, or a task for its last or shipped policy"
-    parser.add_argument("--teacher", metavar="RUN", help=f"distil: learn to act like a policy that may see more; {source}")
-    parser.add_argument("--init", metavar="RUN", help="begin with the actor of another policy, named as a teacher is")
-    parser.add_argument("--headless", action="store_true", help="accepted as in legged_gym; training never opens a window")
-    parser.add_argument("--max_time", type=duration, metavar="T", help="end, after a checkpoint, after 90s, 5m, 1.5h ...")
-    parser.add_argument("--play", action="store_true", help="watch the policy as it trains: a window, or a web page without a screen")
-    parser.add_argument("--list", action="store_true", help="show the tasks and exit")
-    parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")
-    parser.add_argument("--picture", metavar="PNG", help="with --check: the robot's health page too, and a picture of the robot")
-    args = parser.parse_args()
-    if args.picture is not None:
-        writable(args.picture, "--picture")
-        if not args.check:
-            parser.error("--picture draws what --check shows: add --check")
-    if not args.list:
-        require_task(args, parser)
-    if not args.resume and (args.load_run is not None or args.checkpoint != -1):
-        parser.error("--load_run and --checkpoint say what to go on with: add --resume")
-    if args.resume and (args.teacher is not None or args.init is not None):
-        parser.error("--resume goes on with what a run began with: leave --teacher and --init out")
-    args.deadline = time.time() + args.max_time if args.max_time else None
-    quiet(this_rank())
-    if not torch.cuda.is_available():
-        torch.set_num_threads(1)  # hundreds of small operations a step stall on a second thread
-    return args
-
-
 def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     """Give ``task`` its final config: the resumed run's, the user's, a CPU's. Returns what to begin with and the device."""
+    quiet(this_rank())  # from here on only the first of several processes prints
+    if not torch.cuda.is_available():
+        torch.set_num_threads(1)  # hundreds of small operations a step stall on a second thread
     start = _resume(task, args) if args.resume else None
     apply_overrides(task, args)
     start = _find_others(task, start or Start(experiment_folder(task)))
@@ -119,7 +90,7 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     if device != "cpu":
         torch.cuda.set_device(device)
     seed_everything(task.train.seed + rank.index)  # every rank its own worlds, commands and noise
-    args.eager |= not _announce(task, device, rank)
+    args.eager |= not _announce(task, device, rank, args.max_time)
     return start, device
 
 
@@ -158,14 +129,16 @@ def _note_others(task: LoadedTask, start: Start) -> None:
         print("symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it again")
 
 
-def _announce(task: LoadedTask, device: str, rank: Rank) -> bool:
-    """Say what is trained on what, and what makes that slow; on a CPU how long it may take. Returns whether it can be recorded."""
+def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> bool:
+    """Say what is trained on what, and what makes that slow; on a CPU how long, or at ``most`` [s]. Returns whether it is recordable."""
     worlds, engine = task.cfg.env.num_envs, pick_engine(task.cfg.sim.engine, device)
     where = device if rank.count == 1 else f"each of {rank.count} {'processes' if device == 'cpu' else 'GPUs'}"
     print(f"{task.name}: {worlds} worlds on {where}, engine {engine}", flush=True)
     facts = device_facts(device) if engine == "mujoco_warp" else None
     for line in facts.slow() if facts else ():
         print(line, flush=True)
+    if facts:
+        facts.say_compiling()
     if device != "cpu":
         return facts is None or facts.pool
     cores, runner = usable_cores(), task.train.runner
@@ -176,7 +149,7 @@ def _announce(task: LoadedTask, device: str, rank: Rank) -> bool:
     plan = (
         f"{steps:,} steps; {slow}" if rough else f"{runner.max_iterations} iterations, {steps / 1e6:.1f} M steps, about {minutes:.0f} min"
     )
-    print(f"{cores} cores: {plan}", flush=True)
+    print(f"{cores} cores: {plan}{f'; --max_time ends it after {most / 60:.3g} min' if most and most < 60 * minutes else ''}", flush=True)
     return True
 
 
@@ -185,6 +158,7 @@ def build(task: LoadedTask, start: Start, device: str, eager: bool, check_record
     if this_rank().leads and not eager:
         check_recordable(task)
     env = task.env_class(task.cfg, device, eager=eager)
+    fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)
     check_mirror(env, task.train)
     check_room(task.train.to_dict(), env)
     if start.policy:
@@ -212,18 +186,18 @@ def train(
     verbose: bool = False,
     begun: Begun | None = None,
 ) -> bool:
-    """Train from ``start`` to the last iteration or until stopped (at ``deadline`` [s], a time of the clock), then export.
+    """Train from ``start`` to the last iteration, or to ``deadline`` [s], a time of the clock, or until stopped; if not, export.
 
     ``begun`` is called before the first iteration, where the run folder is written; ``verbose`` prints whole blocks. Returns
     whether all is done.
     """
     teacher = start.teacher.task.train if start.teacher else None
     rank, runner = this_rank(), make_runner(env, task.train, None, str(env.device), teacher)
-    runner.examine, runner.console.verbose = examine, verbose
+    runner.examine, runner.console.verbose, runner.deadline = examine, verbose, deadline
     with ExitStack() as held:
         lock = held.enter_context(_lock(start)) if start.goes_on and rank.leads else None
         left = _load(runner, task, start)
-        _stop_on_signals(runner, deadline)
+        _stop_on_signals(runner)
         leave_when_stuck(rank)
         folder = _open_run(runner, task, start, rank, held, lock)
         if rank.leads and begun:
@@ -321,14 +295,14 @@ def _open_run(runner: Runner, task: LoadedTask, start: Start, rank: Rank, held: 
             raise ConfigError(f"{shown(folder[0])} cannot be written: {reason_of(error)}") from None
         runner.logger.log_dir = str(folder[0])
         print(f"writing to {shown(folder[0])}", flush=True)
-    if rank.count > 1:
-        torch.distributed.broadcast_object_list(folder, device=torch.device(runner.device))
+    folder[0] = first_ranks(folder[0], runner.device)
     runner.keeper = Keeper(folder[0], task.train.runner.keep_checkpoints, rank, restore)
     return folder[0]
 
 
 def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
     """Learn; if another rank is lost on the way, say so in a line."""
+    settle()
     try:
         with runner.console:
             runner.learn(iterations, bool(runner.begins_anew))
@@ -349,10 +323,13 @@ def _say_how_it_ended(runner: Runner, task: LoadedTask, folder: Path, rank: Rank
     if runner.last_exam:
         iteration, figures = runner.last_exam
         print(f"exam after {iteration} iterations: {', '.join(f'{figure} {value:.3f}' for figure, value in figures.items())}")
-    flags = _flags(task, folder)
-    if runner.stop and runner.current_learning_iteration < task.train.runner.max_iterations:
-        print(f"stopped: {runner.stop}; go on with\n  {command('train', rank.count)} --resume {flags}", flush=True)
+    flags, plan, done = _flags(task, folder), runner.plan, runner.current_learning_iteration
+    if runner.stop and done < plan.last:
+        left = f" --max_time {max(1, round(plan.deadline - time.time()))}s" if plan.deadline else ""
+        print(f"stopped: {runner.stop}; go on with\n  {command('train', rank.count)} --resume {flags}{left}", flush=True)
         return False
+    if done < task.train.runner.max_iterations:
+        print(f"{done} iterations within --max_time; --resume goes on towards {task.train.runner.max_iterations}")
     print(f"done: {shown(folder)}; watch it with\n  {command('play')} {flags}", flush=True)
     return True
 
@@ -374,8 +351,8 @@ def _export(task: LoadedTask, run: Path, export: Export) -> None:
         print(f"not exported: {reason}\n  to try again: {command('play')} {_flags(task, run)} --export {shown(folder)}")
 
 
-def _stop_on_signals(runner: Runner, deadline: float | None) -> None:
-    """Ctrl-C, SIGTERM, a hang-up and the clock ask the runner to save and stop; a second Ctrl-C stops at once.
+def _stop_on_signals(runner: Runner) -> None:
+    """Ctrl-C, SIGTERM and a hang-up ask the runner to save and stop; a second Ctrl-C stops at once.
 
     A second hang-up does nothing: of a terminal that closes, the shell and the system send one each.
     """
@@ -392,7 +369,3 @@ def _stop_on_signals(runner: Runner, deadline: float | None) -> None:
     signal.signal(signal.SIGTERM, ask)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored
         signal.signal(signal.SIGHUP, ask)
-    if deadline is not None:
-        timer = threading.Timer(max(0.0, deadline - time.time()), lambda: setattr(runner, "stop", "--max_time"))
-        timer.daemon = True
-        timer.start()

@@ -18,12 +18,15 @@ import warp as wp
 from mujoco_warp import OverflowType
 from torch import Tensor
 
+from legged_mw.sim.contact_count import count_contacts
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND
 from legged_mw.sim.ground_contact import touch_ground
+from legged_mw.sim.shortcuts import Shortcuts
 from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ, GRAVITY, Simulation
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import unknown
+from legged_mw.utils.trace import not_traced
 
 wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it loads; a first run would drown in it
 
@@ -71,6 +74,8 @@ class WarpSimulation(Simulation):
                 option.gravity = wp.array(np.tile(model.opt.gravity, (num_envs, 1)), dtype=wp.vec3)
             option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
+            self._shortcuts = Shortcuts(model, self._model, world_fields)
+            self._count_contacts = count_contacts(model, self._model)
             self._data = mjw.make_data(model, nworld=num_envs, nconmax=nconmax, njmax=njmax)
         for name in _STATE:
             setattr(self, name, wp.to_torch(getattr(self._data, name)))
@@ -80,6 +85,7 @@ class WarpSimulation(Simulation):
         self._reset_mask_wp = wp.from_torch(self._reset_mask)
         self._recorded: dict[str, object] = {}
 
+    @not_traced
     def step(self, substeps: int = 1, before: Callable[[int], None] | None = None) -> None:
         if before is None:
             self._run(f"step{substeps}", lambda: self._substeps(range(substeps), substeps))
@@ -90,6 +96,7 @@ class WarpSimulation(Simulation):
                 self._run(name, partial(self._substeps, [i], substeps))
         torch.bitwise_or(self._overflow_seen, self.overflow, out=self._overflow_seen)
 
+    @not_traced
     def reset(self, mask: Tensor) -> None:
         self._reset_mask.copy_(mask)
         self._run("reset", lambda: mjw.reset_data(self._model, self._data, reset=self._reset_mask_wp))
@@ -132,9 +139,13 @@ class WarpSimulation(Simulation):
         option = self._model.opt
         flags = option.disableflags
         for i in which:
-            option.disableflags = flags if i == count - 1 else flags | mjw.DisableBit.SENSOR
-            mjw.step(self._model, self._data)
+            last = i == count - 1
+            option.disableflags = flags if last else flags | mjw.DisableBit.SENSOR
+            with self._shortcuts(sensed=last):
+                mjw.step(self._model, self._data)
         option.disableflags = flags
+        if which[-1] == count - 1:
+            self._count_contacts(self._data)
 
     def _run(self, name: str, fn) -> None:
         with wp.ScopedDevice(self._device):

@@ -1,0 +1,97 @@
+"""What ``mujoco_warp.step`` computes and nothing here reads, left out of it: the same state, bit for bit, in less time.
+
+The library launches each of its kernels through ``warp.launch`` or ``warp.launch_tiled``. While a substep runs or is recorded,
+these two pass over the kernels that are named here. So nothing of the library is edited or copied, and a kernel that is
+called otherwise one day is launched as before. ``KNOWN`` names the versions that were looked at; another's step runs whole.
+tests/test_shortcuts.py compares both.
+
+What then holds what was there before: ``qacc_smooth`` and the factorized inertia, ``qfrc_constraint``, ``solver_niter``, the
+overflow bit ITERATIONS, states of constraint rows; in substeps without sensors also forces of constraint rows and places of sites.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import mujoco
+import mujoco_warp as mjw
+import warp as wp
+
+KNOWN = ("4.0.0",)  # of mujoco-warp
+_ALONE = threading.RLock()  # warp.launch is everybody's
+_SEARCH, _SOLVED = "_linesearch_iterative_kernel", "_qfrc_constraint_from_grad"  # of an iteration, of a solve: the last but for its end
+_FORCES = ("_zero_change_counters", "_update_constraint_efc")  # what follows the search, and sensors read: forces of constraint rows
+
+
+class Shortcuts:
+    """What is left out of the steps of one model: ``with shortcuts(sensed): mujoco_warp.step(...)``.
+
+    After the last Newton iteration's line search the acceleration stands; the library goes on to the gradient, the Hessian
+    and its factors, for a direction that would be the next iteration's.
+    """
+
+    def __init__(self, mj: mujoco.MjModel, model: mjw.Model, world_fields: Collection[str] = ()) -> None:
+        option, kinds = model.opt, mujoco.mjtSensor
+        known = mjw.__version__ in KNOWN
+        if known:  # a world without constraint rows reaches the same acceleration in its first iteration, to float32 rounding
+            option.run_qacc_smooth = False
+        plain = option.solver == mjw.SolverType.NEWTON and option.cone == mjw.ConeType.PYRAMIDAL and not option.noslip_iterations
+        plain = plain and not option.enableflags & mjw.EnableBit.SLEEP and option.integrator != mjw.IntegratorType.DISCRETE
+        self._iterations = option.iterations if known and plain and not option.graph_conditional else 0
+        self._idle, self._idle_unsensed = set(), set()
+        if not known:
+            return
+        if not mj.body_gravcomp.any() and "body_gravcomp" not in world_fields:
+            self._idle.add("_gravity_force")
+        if not mj.na:
+            self._idle.add("_next_activation")
+        if not {int(kinds.mjSENS_FORCE), int(kinds.mjSENS_TORQUE)} & set(mj.sensor_type):
+            self._idle.add("_cfrc_world")
+        if set(mj.sensor_intprm[mj.sensor_type == kinds.mjSENS_CONTACT, 1]) <= {0, 3}:  # reduced to none, or to the net force
+            self._idle.add("_contact_sort")
+        if not mj.ntendon and not mj.neq and set(mj.actuator_trntype) <= {int(mujoco.mjtTrn.mjTRN_JOINT)}:
+            self._idle_unsensed.add("_site_local_to_global")
+
+    @contextmanager
+    def __call__(self, sensed: bool) -> Iterator[None]:
+        """``sensed``: this substep computes sensors."""
+        skip = _Skip(self._idle if sensed else self._idle | self._idle_unsensed, self._iterations, _FORCES if sensed else ())
+        with _ALONE:
+            whole = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
+            try:
+                for name, launch in whole.items():
+                    setattr(wp, name, skip.around(launch))
+                yield
+            finally:
+                for name, launch in whole.items():
+                    setattr(wp, name, launch)
+
+
+class _Skip:
+    """Which launches of one step are passed over."""
+
+    def __init__(self, idle: Collection[str], iterations: int, keep: Collection[str]) -> None:
+        self._idle, self._iterations, self._keep = idle, iterations, keep
+        self._searches = 0  # of the solve that runs
+
+    def __contains__(self, kernel: str) -> bool:
+        if kernel in self._idle:
+            return True
+        after = self._iterations and self._searches == self._iterations
+        if kernel == _SEARCH:
+            self._searches += 1
+        elif kernel == _SOLVED:
+            self._searches = 0
+        return bool(after) and kernel not in self._keep
+
+    def around(self, launch: Callable[..., Any]) -> Callable[..., Any]:
+        def launch_unless_skipped(kernel: wp.Kernel, *args: Any, **kwargs: Any) -> Any:
+            name = kernel.key.partition("__locals__")[0]  # of the function that makes it
+            return None if name in self else launch(kernel, *args, **kwargs)
+
+        return launch_unless_skipped
