@@ -1,4 +1,4 @@
-"""The learning curve of a run as curve.csv and curve.png: python benchmarks/curve.py logs/go2_flat/<time> resources/policies/go2_flat
+"""The learning curve of a run as curve.csv and curve.webp: python benchmarks/curve.py logs/go2_flat/<time> resources/policies/go2_flat
 
 Seconds are of training: from the end of its first iteration, which records the step and compiles kernels that are not cached. Pauses are
 left out: where a run was resumed, or an iteration took over 5 s for another reason.
@@ -74,7 +74,7 @@ def draw(curve: dict[str, dict[int, float]], path: Path) -> None:
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=100)
     small = Image.open(buffer).convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE)
-    small.save(path, optimize=True)
+    small.convert("RGB").save(path, lossless=True, quality=100, method=6)
 
 
 def main() -> None:
@@ -85,7 +85,7 @@ def main() -> None:
     args = parser.parse_args()
     curve = read(args.run)
     write_csv(curve, args.out / "curve.csv", args.every)
-    draw(curve, args.out / "curve.png")
+    draw(curve, args.out / "curve.webp")
     last = max(curve["seconds"])
     print(f"{args.run}: {last} iterations, {curve['steps'][last] / 1e6:.0f} M steps, {curve['seconds'][last]:.0f} s of training")
 

@@ -44,7 +44,7 @@ def test_tasks_as_they_ship_pass(name: str) -> None:
         ("actor.hidden_dims", [], "a list of at least one; each 1 or more"),
         ("algorithm.num_mini_batches", -1, "1 or more"),
         ("algorithm.gamma", 5.0, "from 0 to 1"),
-        ("runner.run_name", "a/b", "part of a folder's name, without / or \\"),
+        ("runner.run_name", "a/b", "a plain name such as wide_net, of 100 bytes at most"),
     ],
 )
 def test_mistake_is_named(path: str, value: Any, wanted: str) -> None:

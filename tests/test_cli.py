@@ -167,7 +167,7 @@ def test_config_file_with_a_mistake(root: Path, tmp_path: Path) -> None:
         ("control.stiffness={hip: 30}", ("control.stiffness: no value for FR_thigh_joint, ",)),
         ("init_state.default_joint_angles={joint: 0, wheel: 1}", ("init_state.default_joint_angles: no joint 'wheel'",)),
         ("rewards.scales.torqes=-1", ("rewards.scales.torqes = -1: no reward term 'torqes'", "did you mean 'torques'?")),
-        ("actor.activation=elo", ("the learner's config does not fit rsl-rl: ", "'elo'", "'elu'")),
+        ("algorithm.optimizer=adom", ("the learner's config does not fit rsl-rl: ", "'adom'", "'adam'")),
         ("obs_groups.actor=[stat]", ("the learner's config does not fit rsl-rl: ", "'stat'", "'state'")),
     ],
 )

@@ -106,6 +106,11 @@ def test_train_writes_one_run_folder(tmp_path: Path) -> None:
         torch.load(folder / "model_2.pt", weights_only=True)["infos"]["total_steps"]
         == 2 * 2 * 8 * load_yaml(folder / "config.yaml")["runner"]["num_steps_per_env"]
     )
+    (folder / "worlds_2_1of2.pt").unlink()  # of one rank: then all begin anew
+    again = ["--experiment_name", "runs", "--max_iterations", "3", "--resume", "--set", "runner.export=false"]
+    result = launch(str(ROOT / "train.py"), "--task", "go1_flat", "--device", "cpu", *again, cwd=tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "worlds begin anew (rank 1: there is no worlds_2_1of2.pt beside it); networks, " in result.stdout
 
 
 def test_a_rank_that_dies_ends_the_run(tmp_path: Path) -> None:

@@ -31,7 +31,7 @@ def test_both_languages_have_the_same_code_and_outputs() -> None:
 
 
 def test_both_languages_have_the_same_exercises_and_formulas() -> None:
-    for same in (r"\*\*(?:\w+ )?(\d+\.\d)", r"^(\$\$.*)"):  # the rest: test_pages.py
+    for same in (r"\*\*(?:\w+ )?(\d+\.\d)", r"^(\$\$.*)"):  # the rest: test_built_site.py
         found = [re.findall(same, CELL.sub("", read(page)), re.MULTILINE) for page in PAGES]
         assert found[0] == found[1] and found[0], same
 

@@ -27,7 +27,7 @@ from legged_mw.view.video import Frame
 IMAGES = ROOT / "docs/images"
 LEVEL, STEP, EDGE = (1.0, 1.0, 1.0, 1.0), (0.84, 0.87, 0.90, 1.0), (0.66, 0.71, 0.76, 1.0)  # ground; steps; every other one
 SKY = (0.95, 0.96, 0.97)
-FPS, COLOURS, FINER = 12.5, 40, 2  # [1/s]; of a GIF's palette; drawn so many times larger and made smaller, which smooths
+FPS, FINER = 12.5, 2  # [1/s]; drawn so many times larger and made smaller, which smooths
 
 
 class Shot(NamedTuple):
@@ -115,21 +115,13 @@ def side_by_side(films: Sequence[Sequence[Frame]]) -> list[Frame]:
     return [np.concatenate(frames, axis=1) for frames in zip(*films, strict=False)]
 
 
-def save_gif(path: Path, frames: Sequence[Frame]) -> None:
-    """One palette for all frames and no dither: what stands still is not stored again."""
-    montage = Image.fromarray(np.concatenate(frames[:: max(len(frames) // 6, 1)], axis=0))
-    palette = montage.quantize(COLOURS, method=Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
-    first, *others = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
-    first.save(path, save_all=True, append_images=others, duration=round(1000 / FPS), loop=0, optimize=True, disposal=1)
-
-
 def save_webp(path: Path, frames: Sequence[Frame], quality: int = 10) -> None:
     first, *others = map(Image.fromarray, frames)
     first.save(path, save_all=True, append_images=others, duration=round(1000 / FPS), loop=0, quality=quality, method=6, minimize_size=True)
 
 
 def main() -> None:
-    save_gif(IMAGES / "film.gif", side_by_side([record(shot, 216, 168) for shot in FILM]))
+    save_webp(IMAGES / "film.webp", side_by_side([record(shot, 216, 168) for shot in FILM]), quality=20)
 
 
 if __name__ == "__main__":

@@ -27,7 +27,7 @@ def targets(path: Path) -> list[Path]:
     """Files and folders that a page links to, its code left out."""
     parts = FENCE.split(path.read_text())
     links = [link for part in parts[::2] for _, link, _ in LINK.findall(part) if not outside(link)]
-    curves = [f"../resources/policies/{name}/curve.png" for name in re.findall(r"<!-- made: policy_(\w+) -->", path.read_text())]
+    curves = [f"../resources/policies/{name}/curve.webp" for name in re.findall(r"<!-- made: policy_(\w+) -->", path.read_text())]
     return [(path.parent / link.partition("#")[0]).resolve() for link in [*links, *curves]]
 
 

@@ -270,7 +270,7 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
     if not (folder / file).is_file():
         raise ContractError(f"no {file} in {folder}; an export has one if its task was trained on ground with steps or blocks")
     try:
-        check_files(folder / file)
+        check_files(folder / file, alone=True)
         spec = mujoco.MjSpec.from_file(str(folder / file))
         for body in spec.bodies[1:] if whole else ():
             shapes = [geom for geom in body.geoms if geom.group == _SHAPES]

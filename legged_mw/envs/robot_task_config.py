@@ -37,6 +37,7 @@ from legged_mw.utils.bounds import (
     or_empty,
 )
 from legged_mw.utils.config import Config
+from legged_mw.utils.files import MOST_LETTERS, wrong_name
 
 Place = Annotated[list[Annotated[float, at_least(-1000, 1000, "m")]], or_empty(THREE)]
 Camera = Annotated[list[float], or_empty(Bound("three numbers, not straight above or below", lambda v: len(v) == 3 and any(v[:2])))]
@@ -48,7 +49,8 @@ Slopes = Annotated[list[Slope], or_empty(PAIR)]
 TimeStep = Annotated[float, at_least(1e-4, 0.1, "s")]
 Pixels = Annotated[int, at_least(1, 8192)]
 Threads = Annotated[int, at_least(0, 1024)]
-FolderPart = Annotated[str, Bound("part of a folder's name, without / or \\", lambda v: "/" not in v and "\\" not in v)]
+FolderPart = Annotated[str, Bound(f"a plain name such as wide_net, of {MOST_LETTERS} bytes at most", lambda v: not wrong_name(v))]
+Activation = Literal["elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish", "identity"]  # [R]
 
 
 class RobotTaskCfg(Config):
@@ -246,7 +248,7 @@ class RobotTaskCfgPPO(Config):
     class actor:
         class_name: str = "MLPModel"  # or "RNNModel": a GRU or LSTM before the MLP, a memory (docs/training.md)
         hidden_dims: Sizes = [512, 256, 128]  # [P]
-        activation: str = "elu"  # [P]
+        activation: Activation = "elu"  # [P]
         obs_normalization: bool = True  # [P]
         rnn_type: Literal["gru", "lstm"] = "gru"  # of RNNModel alone, as the next two [ours: three quarters of an LSTM's work; R lstm]
         rnn_hidden_dim: Count = 256  # values that a layer remembers [R]
@@ -263,7 +265,7 @@ class RobotTaskCfgPPO(Config):
 
             targets: list[str] = []  # rows of the critic's groups: ["base_lin_vel", "foot_contact"]; empty: no estimator
             hidden_dims: Sizes = [256, 128]  # [genesis_lr's explicit estimator of a Go2]
-            activation: str = "elu"
+            activation: Activation = "elu"
             learning_rate: Part = 1e-3  # fixed [HIMLoco]
 
         class concurrent:
@@ -273,13 +275,13 @@ class RobotTaskCfgPPO(Config):
             teacher_share: Part = 0.75  # of the worlds, that act by the teacher's latent [CTS]
             latent_dim: Count = 32  # values of a latent, whose length is 1 [go2_rl_gym]
             hidden_dims: Sizes = [512, 256]  # of both encoders [go2_rl_gym]
-            activation: str = "elu"
+            activation: Activation = "elu"
             learning_rate: Part = 1e-3  # of the student's encoder, fixed [go2_rl_gym]
 
     class critic:
         class_name: str = "MLPModel"
         hidden_dims: Sizes = [512, 256, 128]  # [P]
-        activation: str = "elu"  # [P]
+        activation: Activation = "elu"  # [P]
         obs_normalization: bool = True  # [P]
         rnn_type: Literal["gru", "lstm"] = "gru"  # as the actor's
         rnn_hidden_dim: Count = 256

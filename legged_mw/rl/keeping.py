@@ -85,6 +85,9 @@ class Keeper:
             self.failed = reason_of(error)
             newest = f"the newest is {shown(self.written)}" if self.written else "none of this training is written"
             print(f"WARNING: checkpoint {path.name} cannot be written: {self.failed}; {newest}; going on in memory", flush=True)
+            if not path.exists():
+                with contextlib.suppress(OSError):
+                    worlds_file(path, self._rank).unlink(missing_ok=True)  # of use to no checkpoint, and the disk is full
             return False
         self.failed, self.written = "", path
         with contextlib.suppress(OSError):

@@ -143,13 +143,17 @@ def acting(cfg: Config, env: RobotTask, read: list[str] | None = None) -> dict[s
 
 def read_actor(path: Path, model: MLPModel, what: str = "actor") -> dict[str, Tensor]:
     """The parameters for ``model`` in a checkpoint, of PPO or of a student, or in a ``policy.onnx``. Raises ConfigError for others."""
+    if path.suffix != ".onnx":
+        return actor_in(load_tensors(path, str(next(model.parameters()).device)), path, model, what)
+    check_fit(saved := read_parameters(path, model), model.state_dict(), path, what)
+    return saved
+
+
+def actor_in(content: dict[str, Any], path: Path, model: MLPModel, what: str = "actor") -> dict[str, Tensor]:
+    """The parameters for ``model`` in the ``content`` of the checkpoint at ``path``. Raises ConfigError for others."""
     own = model.state_dict()
-    if path.suffix == ".onnx":
-        saved = read_parameters(path, model)
-    else:
-        content = load_tensors(path, str(next(model.parameters()).device))
-        saved = content["student_state_dict" if "student_state_dict" in content else "actor_state_dict"]
-        saved = {name: value for name, value in saved.items() if name in own or not name.startswith(LEARNING_ONLY)}
+    saved = content["student_state_dict" if "student_state_dict" in content else "actor_state_dict"]
+    saved = {name: value for name, value in saved.items() if name in own or not name.startswith(LEARNING_ONLY)}
     check_fit(saved, own, path, what)
     return saved
 

@@ -63,6 +63,15 @@ def quiet(rank: Rank) -> None:
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115 (open until the process ends)
 
 
+def first_word(word: str) -> str:
+    """Of the ranks' words the first that is not empty, the same for all of them; alone, its own."""
+    if not torch.distributed.is_initialized():
+        return word
+    words: list[str] = [""] * torch.distributed.get_world_size()
+    torch.distributed.all_gather_object(words, word)
+    return next((f"rank {index}: {each}" for index, each in enumerate(words) if each), "")
+
+
 def leave_together(rank: Rank, patience: float = _PATIENCE) -> None:
     """End the connection once every rank is done. Nothing recorded may name it any more.
 

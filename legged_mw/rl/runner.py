@@ -29,7 +29,7 @@ from legged_mw.rl.plan import Plan
 from legged_mw.rl.policies import acting
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.progress import Console
-from legged_mw.rl.ranks import first_ranks, this_rank
+from legged_mw.rl.ranks import first_ranks, first_word, this_rank
 from legged_mw.rl.report import Clock, Mark, Message, Report, console_rows, curves, quiet_writers
 from legged_mw.rl.resume import random_state, set_random_state, take_worlds, worlds_content
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
@@ -353,13 +353,13 @@ class Runner(OnPolicyRunner):
             for group in self.alg.optimizer.param_groups:
                 if not isinstance(group["lr"], Tensor):  # a recorded optimizer reads the algorithm's
                     group["lr"] = self.alg.learning_rate
-        if self.env.cfg.domain_rand.redraw_iterations:  # the worlds that it was in are not in the file; the first ones it has left
-            self.env.domain_rand.redraw()
         infos = content.get("infos") or {}
         self.total_steps, self.plan = infos.get("total_steps", 0), Plan(used=infos.get("seconds", 0.0))
         self.env.load_training_state(infos.get("env", {}))  # before the random state: it begins episodes
         random = infos.get("random_state", {})
-        self.begins_anew = take_worlds(self, Path(path), this_rank(), random)
+        self.begins_anew = first_word(take_worlds(self, Path(path), this_rank(), random))
+        if self.begins_anew and self.env.cfg.domain_rand.redraw_iterations:  # the first ones, of the seed, it has left
+            self.env.domain_rand.redraw()
         if self.gpu_global_rank == 0:
             set_random_state(random, self.device)
         elif self.begins_anew:  # the file holds the first rank's; the others must not draw the same

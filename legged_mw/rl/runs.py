@@ -28,13 +28,11 @@ def logs_folder() -> Path:
 
 def experiment_folder(task: LoadedTask, name: str | None = None) -> Path:
     """The folder of a task's runs, or of the experiment called ``name``. Raises UserError for a name that is none."""
-    check_name(task.train.runner.run_name, "runner.run_name")
     return logs_folder() / check_name(name or task.train.runner.experiment_name or task.name, "the name of the experiment")
 
 
 def new_run(experiment: Path, run_name: str) -> Path:
     """Make and return a run folder below ``experiment``, named by the time."""
-    check_name(run_name, "runner.run_name")
     stamp = datetime.now().strftime("%Y-%m-%d_%H-%M-%S") + (f"_{run_name}" if run_name else "")
     for suffix in ["", *(f"_{i}" for i in range(2, 1000))]:
         folder = experiment / (stamp + suffix)

@@ -79,14 +79,19 @@ def writable(name: str, flag: str, folder: bool = False) -> Path:
 
 def check_name(name: str, where: str) -> str:
     """``name`` if a folder may be called so, in any system and terminal, and it leads nowhere else. Raises UserError."""
+    if why := wrong_name(name):
+        raise UserError(f"{where}: {name[:60]!r} cannot be the name of a folder below logs: {why}; write a plain name, e.g. go1_fast")
+    return name
+
+
+def wrong_name(name: str) -> str:
+    """Why no folder may be called so, or ''."""
     why = next((f"{each!r} is in it" for each in name if each in '/\\:*?"<>|' or not each.isprintable()), "")
     if name.startswith(("-", "~")) or (name and not name.strip(". ")):
         why = "it begins with - or ~, or is made of dots"
     if (size := len(name.encode(errors="replace"))) > MOST_LETTERS:
         why = f"it has {size} bytes, more than {MOST_LETTERS}"
-    if why:
-        raise UserError(f"{where}: {name[:60]!r} cannot be the name of a folder below logs: {why}; write a plain name, e.g. go1_fast")
-    return name
+    return why
 
 
 def typed(path: str) -> Path:

@@ -25,8 +25,11 @@ _ATTRIBUTE = re.compile(r"""([\w.:]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
 _TAG = re.compile(r"""<(include|model)\b((?:[^>"']|"[^"]*"|'[^']*')*)>""")
 
 
-def check_files(file: Path) -> str:
-    """The text of ``file``, once it and what it includes hold no bomb, no NaN and no range that ends before it begins."""
+def check_files(file: Path, alone: bool = False) -> str:
+    """The text of ``file``, once it and what it includes hold no bomb, no NaN and no range that ends before it begins.
+
+    ``alone``: it names no file outside of its own folder, meshes and textures too; a vendor's meshes may lie beside that folder.
+    """
     folder, left, seen, first = file.resolve().parent, [file], set[Path](), ""
     while left:
         part = left.pop()
@@ -34,7 +37,10 @@ def check_files(file: Path) -> str:
             raise ValueError(f"{part.name} has {part.stat().st_size >> 20} MiB; a robot's file has {MOST_BYTES >> 20} at most")
         text = part.read_text(encoding="utf-8", errors="replace")
         first, seen = first or text, seen | {part.resolve()}
-        for name in _included(_checked(text, "" if part == file else f"{part.name}: ")):
+        text = _checked(text, "" if part == file else f"{part.name}: ")
+        if alone and (far := [name for name in _named(text) if not (folder / name).resolve().is_relative_to(folder)]):
+            raise ValueError(f"it names {far[0][:200]}, which lies outside of its own folder; an export stands alone")
+        for name in _included(text):
             path = (folder / name).resolve()
             if not path.is_relative_to(folder):
                 raise ValueError(f"it includes {name}, which lies outside of its own folder; put that file beside it")
@@ -84,6 +90,13 @@ def _included(text: str) -> Iterator[str]:
     """Names of other MJCF files that the text takes in."""
     for tag in _TAG.finditer(text):
         yield from (match[2] or match[3] or "" for match in _ATTRIBUTE.finditer(tag[2]) if match[1] == "file")
+
+
+def _named(text: str) -> Iterator[str]:
+    """Files and folders that the text names, whatever for."""
+    for match in _ATTRIBUTE.finditer(text):
+        if match[1].startswith("file") or match[1] in ("meshdir", "texturedir", "assetdir"):
+            yield match[2] or match[3] or ""
 
 
 def check_model(model: Any) -> None:

@@ -11,7 +11,7 @@ import torch
 
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.flags import require_task
-from legged_mw.rl.policies import Source, introduce, load_policy, read_actor
+from legged_mw.rl.policies import Source, actor_in, introduce, load_policy
 from legged_mw.rl.runs import load_tensors
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, pick_device, seed_everything
 from legged_mw.utils.commands import Command, command_table
@@ -129,8 +129,9 @@ def watch(source: Source, task: LoadedTask, commands: tuple[Command, ...], args:
     sizes = {name: getattr(task.cfg.viewer, name) for name in ("width", "height", "fps")}
 
     def renew(path: Path) -> int:
-        policy.load_state_dict(read_actor(path, policy))
-        return int(load_tensors(path, device)["iter"])
+        content = load_tensors(path, device)
+        policy.load_state_dict(actor_in(content, path, policy))
+        return int(content["iter"])
 
     stage = EnvStage(env, policy, commands, Newest(source.folder, renew, source.checkpoint) if args.follow else None)
     launch.watch(stage, args, source.results(task), title=task.name, **sizes)

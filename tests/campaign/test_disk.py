@@ -72,8 +72,11 @@ def test_a_checkpoint_that_cannot_be_written_is_said_and_the_next_one_tried(
         replace(source, target)
 
     monkeypatch.setattr(runs.os, "replace", fail)
+    worlds = list[list[str]]()
+    before_iteration(monkeypatch, lambda *_: worlds.append([path.name for path in only_run(tmp_path).glob("worlds_*")]))
     result = train(tmp_path, 4)
     assert result.code == 0, result
+    assert worlds == [[], ["worlds_1.pt"], ["worlds_1.pt"], []], "those of a checkpoint that could not be written go"
     assert f"WARNING: checkpoint model_2.pt cannot be written: {os.strerror(code)}; the newest is " in result.out
     assert f"WARNING: worlds_3.pt cannot be written: {os.strerror(code)}; from model_3.pt worlds begin anew" in result.out
     assert sound(only_run(tmp_path)) == [1, 3, 4]

@@ -86,7 +86,7 @@ SETS = [  # (what --set, --override or a flag says, what the line says)
     ("cpu.overrides={sim.dt: .nan}", "cpu.overrides['sim.dt'] is nan; it must be finite"),
     ("anneal.entropy_coef=.nan", "anneal.entropy_coef is nan; it must be finite"),
     ("env.episode_length_s=0", "env.episode_length_s is 0.0; it must be above 0 and at most 1,000,000 s"),
-    ("runner.run_name='a\\eb'", "runner.run_name is \"'a\\\\eb'\"; it must be part of a folder's name"),
+    ("runner.run_name=a:b", "runner.run_name is 'a:b'; it must be a plain name such as wide_net, of 100 bytes at most"),
 ]
 DRAWN = ["--set", "domain_rand.enable=true", "--set"]
 RECURRENT = ["--set", "actor.class_name=RNNModel", "--set", "critic.class_name=RNNModel", "--set"]

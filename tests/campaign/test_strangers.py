@@ -17,6 +17,7 @@ from legged_mw import ROOT
 from legged_mw.utils.files import check_folder
 
 RUN = "gift/logs/go1_flat/run"  # what was given to us
+PLAIN = "it must be a plain name such as wide_net, of 100 bytes at most"
 NAME = "cannot be the name of a folder below logs: "
 CODE = "import pathlib\npathlib.Path('pwned').touch()\nTASK = 1\n"
 CLEAR = "\x1b[2J\x1b]0;owned\x07"  # what a terminal would obey
@@ -101,8 +102,6 @@ NAMES = [
         ("gpj\u202e.exe", r"'\u202e' is in it"),
     )),
     ("experiment by a field", ("--set", "runner.experiment_name=../out"), "'/' is in it"),
-    ("run name of 5000", ("--run_name", "x" * 5000), "it has 5000 bytes"),
-    ("run name with a colon", ("--run_name", "a:b"), "':' is in it"),
 ]  # fmt: skip
 LOAD = [
     ("a name of 5000", "x" * 5000, "is no path here: File name too long"),
@@ -126,9 +125,9 @@ CASES = [
     *(Case(f"name: {name}", program(*check, *flags), (NAME, why)) for name, flags, why in NAMES),
     *(Case(f"name: {name!r}", program(*check, flag, name), "it must be text without control characters")
       for flag in ("--experiment_name", "--run_name") for name in (CLEAR, "a\0b")),
-    *(Case(f"name: run {name!r}", program(*check, "--set", f"runner.run_name={name}"), "it must be part of a folder's name")
-      for name in ("../out", "a/../../b", "a\\b")),
-    Case("name: two lines", program(*check, "--run_name", "a\nb"), r"'\n' is in it"),
+    *(Case(f"name: run {name!r}", program(*check, "--set", f"runner.run_name={name}"), PLAIN)
+      for name in ("../out", "a/../../b", "a\\b", "a:b", "x" * 5000)),
+    Case("name: two lines", program(*check, "--run_name", "a\nb"), PLAIN),
     Case("name: experiment by a file", program(*check, "--override", "ROOT/o.yaml"), (NAME, "'/' is in it"),
          given=text("o.yaml", "runner: {experiment_name: ../out}")),
     Case("name: experiment of play", play("--experiment_name", "../../out"), (NAME, "'/' is in it")),

@@ -162,7 +162,7 @@ def test_the_readme_is_short() -> None:
 
 def test_pictures_are_small_and_current() -> None:
     images = DOCS / "images"
-    assert (images / "film.gif").stat().st_size < 800_000
+    assert (images / "film.webp").stat().st_size < 200_000
     assert all(path.stat().st_size < 80_000 for path in (images / "gallery").iterdir())
     for language, ending in (("en", ".svg"), ("zh", ".zh.svg")):
         assert (images / f"step{ending}").read_text() == pictures.step(language)
@@ -173,4 +173,4 @@ def test_the_gallery_has_every_policy(site: Path) -> None:
     assert gallery.PAGE.read_text() == gallery.page(), "python -m website.gallery"
     assert [name for name in gallery.policies() if "| --- |" not in gallery.chapter(name)] == [], "an exam's table"
     page = (site / "gallery.html").read_text()
-    assert page.count("falls in 22 commands") >= 6 and page.count("curve.png") == len(list(gallery.POLICIES.glob("*/curve.png")))
+    assert page.count("falls in 22 commands") >= 6 and page.count("curve.webp") == len(list(gallery.POLICIES.glob("*/curve.webp")))
