@@ -11,8 +11,6 @@ from torch import Tensor
 from legged_mw.sim.fusion import Fusion
 from legged_mw.utils.errors import NotRecordable, line_to_blame, out_of_memory
 
-_PATIENCE = 1.0  # [s] that kernels are waited for: so long takes their loading from a cache
-
 
 class StepGraph:
     """Calls ``fn``; on a GPU every call after the first three replays one CUDA graph of torch and warp work together.
@@ -72,7 +70,7 @@ class StepGraph:
             fusion = self._fusion
             self._aside(stream, fusion.trace if fusion and self._warmup == 1 else self._fn)
             if fusion and not self._warmup:
-                fusion.compile(wait=_PATIENCE)
+                fusion.compile(wait=0.0)
             return
         import warp as wp
 
