@@ -18,11 +18,13 @@ from torch.utils.tensorboard import SummaryWriter
 
 from legged_mw import ROOT, programs
 from legged_mw.rl import training
+from legged_mw.rl.runner import Runner
 from legged_mw.rl.runs import load_tensors, save_whole
 from legged_mw.sim.device import DeviceFacts, device_facts
 from legged_mw.tools import alongside, chart, completion, doctor, sweep, warm
 from legged_mw.utils import renderer
 from legged_mw.utils.cli import one_line_errors
+from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
 from legged_mw.view.follow import PLAYING, Newest
 
@@ -172,9 +174,21 @@ def test_drawing_is_tried_in_another_process() -> None:
 def test_warm_steps_each_task(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     warmed: list[tuple[str, str]] = []
     monkeypatch.setattr(warm, "warm", lambda *args: warmed.append(args))
+    monkeypatch.setattr(warm, "warm_engine", lambda *args: warmed.append(args))
     program("warm", "go1_flat", "--device", "cpu", monkeypatch=monkeypatch)
-    assert warmed == [("go1_flat", "cpu")]
-    assert "on a CPU MuJoCo's own engine trains, and compiles nothing" in capsys.readouterr().out
+    assert warmed == [("go1_flat", "cpu"), ("go1_flat",)]
+    assert "on a CPU MuJoCo's own engine trains: few kernels" in capsys.readouterr().out
+
+
+def test_warm_trains_an_iteration(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """So that the learner's own kernels are compiled too; and the fused step's, of as many worlds as will train."""
+    learned, fused = list[int](), list[int]()
+    learn = Runner.learn
+    monkeypatch.setattr(Runner, "learn", lambda self, count: (learned.append(self.env.num_envs), learn(self, count)))
+    monkeypatch.setattr(warm, "fuse_for", lambda env, steps: fused.append(env.num_envs))
+    monkeypatch.setattr(warm, "load_task", small_task)
+    warm.warm("go1_flat", "cpu")
+    assert learned == fused == [4 * usable_cores()] and capsys.readouterr().out == ""
 
 
 # ---- compare and sweep
