@@ -21,6 +21,9 @@ from torch import Tensor
 from legged_mw.sim.fused_code import HELPERS, TYPES, Access, Code, Unfit, Writer
 from legged_mw.utils.trace import Call, Node, Trace
 
+if wp.config.log_level < wp.LOG_WARNING:  # no engine of warp's steps here, and nobody asks what warp finds and loads
+    wp.config.log_level = wp.LOG_ERROR
+
 BLOCK = 32  # threads of a block: 4096 worlds occupy every part of a large GPU
 _CLOSE = 1e-4  # relative and absolute, of values that are the same to float32 rounding after some operations
 _STRAYS = 0.002  # share of elements that may be another: a comparison that rounding turned
