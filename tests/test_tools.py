@@ -104,19 +104,26 @@ def test_a_slow_start_has_its_reasons() -> None:
 
 def test_compiling_says_so(tmp_path: Path) -> None:
     """Kernels of a task that are missing in a cache which holds others; of the GPU, not of the CPU."""
-    said: list[str] = []
+    said = list[str]()
     facts = DeviceFacts("H100", (13, 0), True, tmp_path, 9, binaries="*.sm90*")
     for name, ending in (("old", "sm90.cubin"), ("new", "sm90.cubin"), ("other", "cpu1.o")):
         (tmp_path / f"wp_{name}").mkdir()
         (tmp_path / f"wp_{name}" / f"wp_{name}.{ending}").touch()
     os.utime(tmp_path / "wp_old/wp_old.sm90.cubin", (0, 0))
     assert facts.compiled_since(1.0) == 1
-    facts.say_compiling(said.append, waits=[0.0]).join()
-    assert said == []  # compiled before this start
+
+    def listen(facts: DeviceFacts) -> list[str]:
+        with facts.say_compiling(said.append, waits=[0.0, 0.0]) as thread:
+            thread.join()
+        return said
+
+    assert listen(facts) == []  # compiled before this start
     os.utime(tmp_path / "wp_new/wp_new.sm90.cubin", (4e9, 4e9))
-    facts.say_compiling(said.append, waits=[0.0, 0.0]).join()
-    assert said == ["kernels that this task needs are being compiled, 1 modules so far; the next start has them"]
-    facts._replace(compiled=0).say_compiling(said.append, waits=[0.0]).join()
+    assert listen(facts._replace(compiled=0)) == []
+    assert listen(facts) == ["kernels that this task needs are being compiled, 1 modules so far; the next start has them"]
+    with facts.say_compiling(said.append, waits=[60.0]) as thread:
+        pass
+    thread.join()
     assert len(said) == 1
 
 

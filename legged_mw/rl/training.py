@@ -12,7 +12,7 @@ import shlex
 import signal
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -137,8 +137,6 @@ def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> 
     facts = device_facts(device) if engine == "mujoco_warp" else None
     for line in facts.slow() if facts else ():
         print(line, flush=True)
-    if facts:
-        facts.say_compiling()
     if device != "cpu":
         return facts is None or facts.pool
     cores, runner = usable_cores(), task.train.runner
@@ -151,6 +149,11 @@ def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> 
     )
     print(f"{cores} cores: {plan}{f'; --max_time ends it after {most / 60:.3g} min' if most and most < 60 * minutes else ''}", flush=True)
     return True
+
+
+def say_compiling(task: LoadedTask, device: str) -> AbstractContextManager[object]:
+    """Inside, a line says so if the start waits for kernels."""
+    return device_facts(device).say_compiling() if pick_engine(task.cfg.sim.engine, device) == "mujoco_warp" else nullcontext()
 
 
 def build(task: LoadedTask, start: Start, device: str, eager: bool, check_recordable: Check) -> Any:
