@@ -12,6 +12,7 @@ import torch
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.worlds import fuse_for
 from legged_mw.eval.exams import make_exam
+from legged_mw.rl.layers import kernels_for
 from legged_mw.rl.runner import make_runner
 from legged_mw.sim.device import device_facts
 from legged_mw.utils.cli import Parser, pick_device
@@ -50,6 +51,8 @@ def warm(name: str, device: str) -> None:
     env = task.env_class(task.cfg, device)
     fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)
     exam = make_exam(task, env)
+    if kernels := kernels_for(env.actions):
+        kernels.load(device)
     if not task.train.distillation.teacher:  # which a task of its own would have to train first
         with redirect_stdout(StringIO()):
             make_runner(env, task.train, None, device).learn(1)
