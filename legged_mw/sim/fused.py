@@ -21,6 +21,9 @@ from torch import Tensor
 from legged_mw.sim.fused_code import ADD_ROWS, HELPERS, TYPES, Access, Code, Unfit, Writer
 from legged_mw.utils.trace import Call, Node, Trace
 
+if wp.config.log_level < wp.LOG_WARNING:  # no engine of warp's steps here, and nobody asks what warp finds and loads
+    wp.config.log_level = wp.LOG_ERROR
+
 BLOCK, LANES = 32, 8  # threads of a block, of a world: 4096 worlds occupy every part of a large GPU
 _ROOM = 44_000 * LANES // BLOCK  # bytes of a world's own values in a block's shared memory
 _CLOSE = 1e-4  # relative and absolute, of values that are the same to float32 rounding after some operations

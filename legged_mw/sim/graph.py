@@ -31,6 +31,11 @@ class StepGraph:
         """Whether calls are replays by now."""
         return self._graph is not None
 
+    @property
+    def fusing(self) -> bool:
+        """Whether kernels of the fused step are still compiled, or not yet in use."""
+        return self._fusion is not None
+
     def fuse(self, worlds: int, keep: Callable[[], Callable[[], None]], watched: Iterable[Tensor]) -> None:
         """On a CPU: fuse now. ``keep`` remembers all that ``fn`` writes, and returns what puts it back; ``watched`` as in ``Trace``."""
         put_back = keep()
