@@ -14,13 +14,15 @@ overflow bit ITERATIONS, states of constraint rows; in substeps without sensors 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
+
+from legged_mw.sim.friction_rows import friction_rows
 
 KNOWN = ("4.0.0",)  # of mujoco-warp
 _ALONE = threading.RLock()  # warp.launch is everybody's
@@ -35,7 +37,7 @@ class Shortcuts:
     and its factors, for a direction that would be the next iteration's.
     """
 
-    def __init__(self, mj: mujoco.MjModel, model: mjw.Model, world_fields: Collection[str] = ()) -> None:
+    def __init__(self, mj: mujoco.MjModel, model: mjw.Model, data: mjw.Data, world_fields: Collection[str] = ()) -> None:
         option, kinds = model.opt, mujoco.mjtSensor
         known = mjw.__version__ in KNOWN
         if known:  # a world without constraint rows reaches the same acceleration in its first iteration, to float32 rounding
@@ -44,6 +46,7 @@ class Shortcuts:
         plain = plain and not option.enableflags & mjw.EnableBit.SLEEP and option.integrator != mjw.IntegratorType.DISCRETE
         self._iterations = option.iterations if known and plain and not option.graph_conditional else 0
         self._idle, self._idle_unsensed = set(), set()
+        self._instead: dict[str, wp.Kernel] = {}
         if not known:
             return
         if not mj.body_gravcomp.any() and "body_gravcomp" not in world_fields:
@@ -56,11 +59,14 @@ class Shortcuts:
             self._idle.add("_contact_sort")
         if not mj.ntendon and not mj.neq and set(mj.actuator_trntype) <= {int(mujoco.mjtTrn.mjTRN_JOINT)}:
             self._idle_unsensed.add("_site_local_to_global")
+        if plain and not mj.neq and mj.nv <= data.njmax and (not model.is_sparse or mj.nv <= data.njmax_nnz):
+            self._instead["_friction_dof"] = friction_rows(model.is_sparse)
 
     @contextmanager
     def __call__(self, sensed: bool) -> Iterator[None]:
         """``sensed``: this substep computes sensors."""
-        skip = _Skip(self._idle if sensed else self._idle | self._idle_unsensed, self._iterations, _FORCES if sensed else ())
+        idle = self._idle if sensed else self._idle | self._idle_unsensed
+        skip = _Skip(idle, self._iterations, _FORCES if sensed else (), self._instead)
         with _ALONE:
             whole = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
             try:
@@ -73,10 +79,10 @@ class Shortcuts:
 
 
 class _Skip:
-    """Which launches of one step are passed over."""
+    """Which launches of one step are passed over, and which are of another kernel."""
 
-    def __init__(self, idle: Collection[str], iterations: int, keep: Collection[str]) -> None:
-        self._idle, self._iterations, self._keep = idle, iterations, keep
+    def __init__(self, idle: Collection[str], iterations: int, keep: Collection[str], instead: Mapping[str, wp.Kernel]) -> None:
+        self._idle, self._iterations, self._keep, self._instead = idle, iterations, keep, instead
         self._searches = 0  # of the solve that runs
 
     def __contains__(self, kernel: str) -> bool:
@@ -92,6 +98,6 @@ class _Skip:
     def around(self, launch: Callable[..., Any]) -> Callable[..., Any]:
         def launch_unless_skipped(kernel: wp.Kernel, *args: Any, **kwargs: Any) -> Any:
             name = kernel.key.partition("__locals__")[0]  # of the function that makes it
-            return None if name in self else launch(kernel, *args, **kwargs)
+            return None if name in self else launch(self._instead.get(name, kernel), *args, **kwargs)
 
         return launch_unless_skipped

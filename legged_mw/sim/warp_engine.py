@@ -68,9 +68,9 @@ class WarpSimulation(Simulation):
             option = self._model.opt
             option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
-            self._shortcuts = Shortcuts(model, self._model, world_fields)
-            self._count_contacts = count_contacts(model, self._model)
             self._data = mjw.make_data(model, nworld=num_envs, nconmax=nconmax, njmax=njmax)
+            self._shortcuts = Shortcuts(model, self._model, self._data, world_fields)
+            self._count_contacts = count_contacts(model, self._model)
         for name in _STATE:
             setattr(self, name, wp.to_torch(getattr(self._data, name)))
         self._fields = {name: wp.to_torch(getattr(self._model, name)) for name in world_fields}
