@@ -11,9 +11,9 @@ import sys
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from legged_mw.utils import quick_start
 from legged_mw.utils.cli import fail, one_line_errors
 from legged_mw.utils.console import patient_console
 from legged_mw.utils.task import LoadedTask, list_tasks, load_task
@@ -22,9 +22,10 @@ from legged_mw.utils.task import LoadedTask, list_tasks, load_task
 @one_line_errors()
 def train() -> None:
     """Train a task. On 8 GPUs: torchrun --nproc_per_node=8 train.py --task go1_flat"""
-    from legged_mw.rl import training
+    from legged_mw.rl import flags
 
-    args = training.parse(train.__doc__)
+    args = flags.parse(train.__doc__)
+    quick_start.begin("cpu" if args.list else args.device)
     if args.list:
         print(list_tasks())
         return
@@ -61,6 +62,7 @@ def _train(args: argparse.Namespace) -> None:
 @one_line_errors()
 def play() -> None:
     """Watch, grade or export a policy."""
+    quick_start.begin()
     from legged_mw.eval import grading
     from legged_mw.rl.policies import find_policy, find_rival, load_trained
     from legged_mw.view import playing
@@ -69,6 +71,7 @@ def play() -> None:
     task = load_task(args.task)
     source = find_policy(task, args.load_run, args.checkpoint, args.experiment_name)
     trained = load_trained(args.task, source)
+    quick_start.settle()
     if args.eval:
         rivals = [find_rival(task, args.compare, args.experiment_name)] if args.compare is not None else []
         grading.grade([(source, trained), *((rival, load_trained(args.task, rival)) for rival in rivals)], args)
@@ -145,6 +148,8 @@ def main() -> None:
         print(HELP)
         return
     if name == "--version":
+        from importlib.metadata import PackageNotFoundError, version
+
         try:
             print(f"legged_mw {version('legged_mw')}")
         except PackageNotFoundError:

@@ -46,12 +46,13 @@ def make(
     estimator: dict[str, Any] | None = None,
     memory: dict[str, dict[str, Any]] | None = None,
     concurrent: dict[str, Any] | None = None,
+    multi_gpu: dict[str, int] | None = None,
     **settings: Any,
 ) -> Any:
     """A learner whose networks come from a fixed seed.
 
     ``estimator``, ``concurrent``: what an actor that has one differs in from ESTIMATOR or CONCURRENT; ``memory``: what makes "actor" or
-    "critic" recurrent.
+    "critic" recurrent; ``multi_gpu``: rsl-rl's word for this rank among several.
     """
     torch.manual_seed(1)
     distribution = {"class_name": "GaussianDistribution", "init_std": 0.7} | (distribution or {})
@@ -66,7 +67,7 @@ def make(
         "critic": network | (memory or {}).get("critic", {}),
         "algorithm": {"class_name": kind, "rnd_cfg": None, "symmetry_cfg": None, **settings},
         "num_steps_per_env": STEPS,
-        "multi_gpu": None,
+        "multi_gpu": multi_gpu,
     }
     obs = observations(torch.Generator().manual_seed(0), device)
     alg = kind.construct_algorithm(obs, Env(), copy.deepcopy(cfg), device)  # type: ignore[arg-type]

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import torch
 from learner import parameters
-from rsl_rl.algorithms import PPO
 
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import leave_together, this_rank
@@ -16,7 +15,7 @@ from legged_mw.rl.runner import make_runner
 from legged_mw.utils.cli import seed_everything
 from legged_mw.utils.task import load_task
 
-kind, folder, dies_in, on_gpus = sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]), sys.argv[4:] == ["gpus"]
+folder, dies_in, on_gpus = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:] == ["gpus"]
 rank = this_rank()
 device = f"cuda:{rank.local}" if on_gpus else "cpu"
 if on_gpus:
@@ -30,11 +29,10 @@ task.train.runner.save_interval = 1
 task.train.runner.num_steps_per_env = 12
 seed_everything(10 + rank.index)
 env = task.env_class(task.cfg, device)
-if kind == "ours" and dies_in < 0:
+if dies_in < 0:
     task.train.actor.estimator.targets = ["base_lin_vel"]
-task.train.algorithm.class_name = {"ours": "legged_mw.rl.ppo:GraphedPPO", "stock": "PPO"}[kind]
 runner = make_runner(env, task.train, folder if rank.leads else None, device)
-assert type(runner.alg) is {"ours": GraphedPPO, "stock": PPO}[kind]
+assert isinstance(runner.alg, GraphedPPO)
 act, steps = runner.alg.act, 0
 
 
@@ -46,16 +44,8 @@ def mortal_act(obs: object) -> torch.Tensor:
     return act(obs)  # type: ignore[arg-type]
 
 
-def update_after_a_move() -> dict[str, float]:
-    """As in learner.share_experience: else rounding decides about the first step of the adaptive rate."""
-    with torch.inference_mode():
-        runner.alg.storage.distribution_params[0].add_(0.02)  # type: ignore[index]
-    return update()
-
-
-update = runner.alg.update
-runner.alg.act, runner.alg.update = mortal_act, update_after_a_move  # type: ignore[method-assign]
-if kind == "ours" and dies_in < 0 and not rank.leads:
+runner.alg.act = mortal_act  # type: ignore[method-assign]
+if dies_in < 0 and not rank.leads:
     runner.stop = "asked"  # one rank alone is asked to stop
 runner.learn(3 if not on_gpus else 8)  # on GPUs long enough to be recorded
 end = {
@@ -64,7 +54,6 @@ end = {
     "means": runner._last_means,
 }
 end |= {"iteration": runner.current_learning_iteration, "steps": runner.total_steps, "stop": runner.stop, "rate": runner.alg.learning_rate}
-if isinstance(runner.alg, GraphedPPO):
-    runner.alg.release()
+runner.alg.release()
 torch.save(end, folder / f"rank{rank.index}.pt")
 leave_together(rank)

@@ -35,7 +35,7 @@ TOOLS = (
     "legged_mw.tools",
 )
 ONLY_IN = {
-    "warp": ["legged_mw/sim/*"],
+    "warp": ["legged_mw/sim/*", "legged_mw/rl/kernels.py"],
     "mujoco_warp": ["legged_mw/sim/*"],
     "rsl_rl": ["legged_mw/rl/*"],
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
@@ -74,6 +74,7 @@ ONLY_IN = {
 NEVER_IN = {
     "legged_mw/envs/*": ["mujoco"],
     "legged_mw/sim/*": ["legged_mw.utils.config", "legged_mw.utils.task"],
+    "legged_mw/rl/flags.py": ["torch"],
     "legged_mw/eval/rules.py": ["torch", "mujoco"],  # numbers in, numbers out: of use to whoever drives the robot otherwise
     "legged_mw/eval/figures.py": ["torch", "mujoco"],
     "legged_mw/eval/skill*.py": ["torch", "legged_mw.envs", "legged_mw.rl", "legged_mw.eval.perform"],

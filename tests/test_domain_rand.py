@@ -16,11 +16,13 @@ from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, world_fields
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.sim.engines import make_simulation
 from legged_mw.sim.model import GROUND, ModelError
+from legged_mw.sim.simulation import GRAVITY
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
 
 ENGINES = ["mujoco", "mujoco_warp"]
 NOTHING: dict[str, Any] = {f"domain_rand.{name}": [] for name in KINDS} | {"domain_rand.enable": True}
+STILL: dict[str, Any] = {"init_state.lin_vel_range": 0.0, "init_state.ang_vel_range": 0.0, "init_state.yaw_range": 0.0}
 ALL: dict[str, Any] = {
     "domain_rand.enable": True,
     "domain_rand.contact_time": [0.01, 0.03],
@@ -29,6 +31,7 @@ ALL: dict[str, Any] = {
     "domain_rand.strength": [0.9, 1.1],
     "domain_rand.action_delay": [0, 2],
     "domain_rand.observation_delay": [0, 1],
+    "domain_rand.slope": [0.0, 12.0],
     "domain_rand.observe": True,
 }
 
@@ -36,8 +39,7 @@ ALL: dict[str, Any] = {
 def make(num_envs: int, engine: str = "mujoco", **ranges: list[float]) -> LeggedRobot:
     """A quiet environment that randomizes ``ranges`` and nothing else."""
     asked = {f"domain_rand.{name}": span for name, span in ranges.items()}
-    still = {"init_state.lin_vel_range": 0.0, "init_state.ang_vel_range": 0.0, "init_state.yaw_range": 0.0}
-    return make_env(num_envs, {**QUIET, **still, **NOTHING, **asked, "sim.engine": engine})
+    return make_env(num_envs, {**QUIET, **STILL, **NOTHING, **asked, "sim.engine": engine})
 
 
 def nominal(env: LeggedRobot, field: str) -> Tensor:
@@ -138,6 +140,29 @@ def test_draws_fill_their_ranges_and_whole_numbers_are_equally_likely() -> None:
     assert friction.min() < 0.41 and friction.max() > 0.99 and abs(friction.mean() - 0.7) < 0.01
     shares = [(delay == d).float().mean().item() for d in (1, 2, 3)]
     assert sum(shares) == pytest.approx(1.0) and max(shares) - min(shares) < 0.06
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_slope_for_each_world(engine: str) -> None:
+    """It is what ``terrain.slope`` is, with an angle of its own: world k falls as in an environment that is all on its slope."""
+    env = make(3, engine, slope=[0.0, 12.0])
+    slopes = env.domain_rand.values["slope"][:, 0]
+    lean = torch.deg2rad(slopes)
+    assert len({*slopes.tolist()}) == 3 and slopes.min() >= 0.0 and slopes.max() <= 12.0
+    down = torch.stack([lean.sin(), torch.zeros(3), -lean.cos()], dim=1)
+    torch.testing.assert_close(env.gravity_dir, down)
+    torch.testing.assert_close(env.sim.field(GRAVITY), 9.81 * down)
+    for _ in range(5):
+        env.step(torch.zeros(3, 12))
+    for world in range(3):
+        other = make_env(1, {**QUIET, **STILL, **NOTHING, "sim.engine": engine, "terrain.slope": float(slopes[world])})
+        for _ in range(5):
+            other.step(torch.zeros(1, 12))
+        torch.testing.assert_close(env.sim.qpos[world, 2:], other.sim.qpos[0, 2:], atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(env.projected_gravity[world], other.projected_gravity[0], atol=1e-5, rtol=0.0)
+    before = env.gravity_dir.clone()
+    env.reset_envs(torch.tensor([True, False, False]))
+    assert (env.gravity_dir != before).any(dim=1).tolist() == [True, False, False]
 
 
 def test_any_other_field_of_the_model() -> None:

@@ -21,12 +21,14 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
 from legged_mw.envs.worlds import worlds_state
 from legged_mw.eval.training import TrainingExam
+from legged_mw.rl import layers
 from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.policies import Source, Trained
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.recurrent import memory_of
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.transfer import seat_teacher
+from legged_mw.sim.fused import Fused
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.task import load_task
 
@@ -127,6 +129,7 @@ FORCES: dict[str, object] = {
 def test_replay_equals_eager_over_100_steps(task: str, settings: dict[str, object]) -> None:
     """Bit for bit, with noise, kicks, falls, time outs and resets: the same random numbers are drawn in both."""
     overrides = {"perturbation__kick": True, "env__episode_length_s": 1.0, "termination__max_tilt": 10.0, **settings}
+    overrides["sim__fuse"] = False
     eager, recorded = (without_constraints(make_env(eager, task, **overrides)) for eager in (True, False))
     actions = torch.randn(100, 64, eager.num_actions, generator=torch.Generator().manual_seed(0)).to(DEVICE)
     expected, got = roll_out(eager, actions), roll_out(recorded, actions)
@@ -136,13 +139,35 @@ def test_replay_equals_eager_over_100_steps(task: str, settings: dict[str, objec
         assert torch.equal(a, b), f"step {i // 5}, output {i % 5}: largest difference {(a.float() - b.float()).abs().max():g}"
 
 
+@pytest.mark.parametrize(
+    ("task", "settings"),
+    [("go1_flat", {}), ("go1_flat", RANDOMIZED), ("go1_flat", ROUGH), ("g1_flat", BIPED), ("go1_getup", {}), ("g1_track", {})],
+    ids=["nominal", "randomized", "rough", "biped", "falls", "a motion"],
+)
+def test_a_fused_step_is_the_eager_one_to_rounding(
+    task: str, settings: dict[str, object], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    overrides = {"perturbation__kick": True, "env__episode_length_s": 1.0, "termination__max_tilt": 10.0, **settings}
+    eager, fused = (without_constraints(make_env(eager, task, **overrides)) for eager in (True, False))
+    assert fused._graph._fusion
+    actions = torch.randn(40, 64, eager.num_actions, generator=torch.Generator().manual_seed(0)).to(DEVICE)
+    begin = fused._graph._fusion.compile
+    monkeypatch.setattr(fused._graph._fusion, "compile", lambda wait: begin(None))  # however long it takes
+    expected, got = roll_out(eager, actions), roll_out(fused, actions)
+    assert fused._graph.recorded and isinstance(fused._graph._fn, Fused)
+    assert "not fused" not in capsys.readouterr().out
+    for i, (a, b) in enumerate(zip(expected, got, strict=True)):
+        off = ~torch.isclose(a.float(), b.float(), rtol=1e-3, atol=1e-3)
+        assert off.float().mean() < 0.01, f"step {i // 5}, output {i % 5}: {off.float().mean():.3f} of the values differ"
+
+
 @pytest.mark.parametrize("law", ["servo", "dc_motor", "speed", "torque", "network", "own"])
 def test_motors_replay_as_they_run_eager(law: str, tmp_path: Path) -> None:
     """Bit for bit, delayed by 0 to 30 ms, with drawn gains and curves, and episodes that end."""
     net = save(mlp(torque_scale=20.0)[1], tmp_path)
     drawn = {f"domain_rand.{name}": [0.8, 1.2] for name in ("stiffness", "damping", "strength", "stall_torque", "no_load_speed")}
     fields: dict[str, object] = {**CURVE, **drawn, "domain_rand.enable": True, "domain_rand.delay_ms": [0.0, 30.0]}
-    fields |= {"control.actuator": "servo" if law == "own" else law, "control.network": net, "env.episode_length_s": 0.5}
+    fields |= {"sim.fuse": False, "control.actuator": "servo" if law == "own" else law, "control.network": net, "env.episode_length_s": 0.5}
     fields |= {"control.action_scale": 5.0} if law in ("torque", "speed") else {}
     if law == "speed":
         law, fields = "dc_motor", fields | {"control.actuator": "dc_motor", "control.action_origin": "speed"}
@@ -270,6 +295,42 @@ def six_equal_updates(other: PPO, ours: GraphedPPO) -> Iterator[dict[str, float]
         assert got == pytest.approx(expected, rel=1e-3, abs=1e-5)
         yield got
     assert ours._update_graph.recorded
+
+
+def test_recorded_update_in_bfloat16_learns_what_float32_does() -> None:
+    """Six updates, the last three replayed, from equal states and experience; at first the policy that learns is the one that acted."""
+    full, half = make(GraphedPPO, DEVICE), make(GraphedPPO, DEVICE)
+    half.learn_in_half()
+    for seed in range(6):
+        collect(full, DEVICE, seed=seed)
+        share_experience(full, half)
+        take_over(half, full)
+        before, expected, got = parameters(full), update(full), update(half)
+        moved = [torch.cat([(p - before[k]).flatten() for k, p in parameters(alg).items() if "mlp" in k]) for alg in (full, half)]
+        assert 0.0 < (moved[1] - moved[0]).norm() < 0.15 * moved[0].norm()
+        assert got == pytest.approx(expected, rel=0.05, abs=2e-3)
+    assert half._update_graph.recorded and {p.dtype for p in half.actor.parameters()} == {torch.float32}
+    collect(half, DEVICE)
+    acted = half.storage.distribution_params[0].flatten(0, 1)
+    half._share = half._size = len(acted)
+    with torch.no_grad():
+        learns = half._forward(half.actor, half._prepare(torch.arange(len(acted), device=DEVICE)).actor_input)
+    assert half._act_graph.recorded and (learns - acted).norm() < 5e-3 * acted.norm()
+
+
+@pytest.mark.parametrize("settings", VARIANTS.values(), ids=VARIANTS.keys())
+@pytest.mark.parametrize("half", [False, True], ids=["float32", "bfloat16"])
+def test_kernels_of_the_update_are_torchs_own(settings: dict, half: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One update beside one whose losses, ELUs, rate and Adam are torch's."""
+    plain, fused = make(GraphedPPO, DEVICE, **settings), make(GraphedPPO, DEVICE, **settings)
+    for alg in (plain, fused) if half else ():
+        alg.learn_in_half()
+    collect(plain, DEVICE)
+    share_experience(plain, fused)
+    got = update(fused)
+    monkeypatch.setattr(layers, "FUSED_ON", [])
+    assert got == pytest.approx(update(plain), rel=0.05 if half else 1e-3, abs=2e-3 if half else 1e-5)
+    assert difference(parameters(plain), parameters(fused)) < (0.05 if half else 1e-4)
 
 
 @pytest.mark.parametrize("loss", ["estimate", "student"])

@@ -27,9 +27,9 @@ def launch(*words: str, cwd: Path = ROOT) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*LAUNCH, *words], cwd=cwd, env=ENVIRONMENT, capture_output=True, text=True, timeout=300)
 
 
-def learn(kind: str, folder: Path, dies_in: int = 0, *more: str) -> subprocess.CompletedProcess[str]:
+def learn(folder: Path, dies_in: int = 0, *more: str) -> subprocess.CompletedProcess[str]:
     folder.mkdir()
-    return launch(str(ROOT / "tests/ranks_program.py"), kind, str(folder), str(dies_in), *more)
+    return launch(str(ROOT / "tests/ranks_program.py"), str(folder), str(dies_in), *more)
 
 
 def ends(folder: Path) -> list[dict[str, Any]]:
@@ -39,7 +39,7 @@ def ends(folder: Path) -> list[dict[str, Any]]:
 @pytest.fixture(scope="module")
 def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("ranks") / "ours"
-    result = learn("ours", folder)
+    result = learn(folder)
     assert result.returncode == 0, result.stderr
     written = ["model_1.pt", "model_2.pt", "model_3.pt", "rank0.pt", "rank1.pt", "worlds_3_0of2.pt"]  # the other rank has no folder here
     assert sorted(path.name for path in folder.glob("*.pt")) == written
@@ -58,20 +58,25 @@ def test_statistics_are_of_all_ranks(ours: Path) -> None:
     assert one["means"] == other["means"] and one["means"]["episodes"] > 0
 
 
-def test_same_update_as_rsl_rls_own_on_two_ranks(ours: Path, tmp_path: Path) -> None:
-    """Averaged gradients, KL divergence, learning rate and normalisers. One iteration: afterwards they draw other noise."""
-    result = learn("stock", tmp_path / "stock")
+def check_updates(folder: Path, *more: str) -> None:
+    """On each of two ranks, from equal states and experience of its own: averaged gradients, KL divergence, rate and normalisers."""
+    result = launch(str(ROOT / "tests/ranks_update.py"), str(folder), *more)
     assert result.returncode == 0, result.stderr
-    expected, got = (torch.load(folder / "model_1.pt", weights_only=True) for folder in (tmp_path / "stock", ours))
-    for name in ("actor_state_dict", "critic_state_dict"):
-        assert difference(expected[name], got[name]) < 1e-4
-    rates = [content["optimizer_state_dict"]["param_groups"][0]["lr"] for content in (expected, got)]
-    assert rates[0] == pytest.approx(rates[1], rel=1e-9)
+    one, other = ends(folder)
+    assert difference(one["parameters"], other["parameters"]) == 0.0 and not torch.equal(one["obs"], other["obs"])
+    for end in (one, other):
+        for update in end["updates"]:
+            assert update["difference"] < 1e-4
+            assert update["rates"][0] == pytest.approx(update["rates"][1], rel=1e-6)
+
+
+def test_same_update_as_rsl_rls_own_on_two_ranks(tmp_path: Path) -> None:
+    check_updates(tmp_path)
 
 
 def test_one_asked_to_stop_stops_all(tmp_path: Path) -> None:
     """Until then they learned one policy, with the estimator that these have."""
-    result = learn("ours", tmp_path / "asked", -1)
+    result = learn(tmp_path / "asked", -1)
     assert result.returncode == 0, result.stderr
     one, other = ends(tmp_path / "asked")
     assert (one["stop"], other["stop"]) == ("another rank was asked to", "asked")
@@ -101,7 +106,7 @@ def test_train_writes_one_run_folder(tmp_path: Path) -> None:
 def test_a_rank_that_dies_ends_the_run(tmp_path: Path) -> None:
     """The other does not wait for ever, and what was saved can be loaded."""
     folder = tmp_path / "dies"
-    result = learn("ours", folder, 2)
+    result = learn(folder, 2)
     assert result.returncode != 0
     newest = max(checkpoints(folder))
     assert newest in (1, 2)  # the second is on its way to the disk while the other rank dies
@@ -149,23 +154,24 @@ def test_each_rank_gets_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.two_gpus
-def test_two_gpus_learn_one_policy_and_the_stock_one(tmp_path: Path) -> None:
-    """Through NCCL inside the recorded update: equal on both ranks after eight iterations, and after one as rsl-rl's own."""
-    for kind in ("stock", "ours"):
-        result = learn(kind, tmp_path / kind, 0, "gpus")
-        assert result.returncode == 0, result.stderr
-        assert "does not close" not in result.stderr
+def test_two_gpus_learn_one_policy(tmp_path: Path) -> None:
+    """Through NCCL inside the recorded update: equal on both ranks after eight iterations."""
+    result = learn(tmp_path / "ours", 0, "gpus")
+    assert result.returncode == 0, result.stderr
+    assert "does not close" not in result.stderr
     one, other = ends(tmp_path / "ours")
     assert difference(one["parameters"], other["parameters"]) == 0.0 and one["rate"] == other["rate"]
     assert not torch.equal(one["obs"], other["obs"]) and one["means"] == other["means"]
-    expected, got = (torch.load(tmp_path / kind / "model_1.pt", weights_only=True, map_location="cpu") for kind in ("stock", "ours"))
-    for name in ("actor_state_dict", "critic_state_dict"):
-        assert difference(expected[name], got[name]) < 1e-3
+
+
+@pytest.mark.two_gpus
+def test_same_update_as_rsl_rls_own_on_two_gpus(tmp_path: Path) -> None:
+    check_updates(tmp_path, "gpus")
 
 
 @pytest.mark.two_gpus
 def test_on_two_gpus_a_rank_that_dies_ends_the_run(tmp_path: Path) -> None:
-    result = learn("ours", tmp_path / "dies", 6, "gpus")
+    result = learn(tmp_path / "dies", 6, "gpus")
     assert result.returncode != 0
     newest = max(int(file.stem.partition("_")[2]) for file in (tmp_path / "dies").glob("model_*.pt"))
     assert newest >= 5  # of the sixth update, the dying rank's share may still have been on its way

@@ -19,7 +19,7 @@ from legged_mw.check import guard
 from legged_mw.deploy.__main__ import main as deploy
 from legged_mw.deploy.__main__ import parse as parse_deploy
 from legged_mw.motion.__main__ import main as motion
-from legged_mw.rl import runs, training
+from legged_mw.rl import flags, runs
 from legged_mw.sim import terrain
 from legged_mw.view import playing
 
@@ -147,7 +147,7 @@ def test_every_command_runs(command: str, home: Path) -> None:
 def test_flags_of_the_others_are_read(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a flag is called may change; a page that is not run would not notice."""
     words = shlex.split(command)
-    programs_of = {"train.py": training.parse, "play.py": playing.parse, "-m": lambda _: parse_deploy()}
+    programs_of = {"train.py": flags.parse, "play.py": playing.parse, "-m": lambda _: parse_deploy()}
     monkeypatch.setattr(sys, "argv", words[1:] if words[1] != "-m" else words[2:])
     programs_of[words[1]]("")
 

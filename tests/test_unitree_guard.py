@@ -22,7 +22,7 @@ import pytest
 
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.robot import RobotError
-from legged_mw.deploy.unitree import client, clock, guard, program
+from legged_mw.deploy.unitree import client, clock, guard, link, program
 from legged_mw.deploy.unitree.codec import LAYOUTS
 from legged_mw.deploy.unitree.faults import Faults, parse_faults
 from legged_mw.deploy.unitree.guard import Board, Guard, Guarded
@@ -176,17 +176,23 @@ POLICY = """
 import itertools, sys, time
 from pathlib import Path
 from legged_mw.deploy.contract import read_contract
-from legged_mw.deploy.unitree import clock
-from legged_mw.deploy.unitree.client import connect
+from legged_mw.deploy.robot import RobotError
+from legged_mw.deploy.unitree import client, clock, guard
 folder, domain, fault = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 contract = read_contract(folder)
-robot = connect(folder, contract, "lo", domain)
+if fault == "dies":  # of that alone, not because this computer is busy
+    guard.LATE = client.TOO_OLD = 60.0
+robot = client.connect(folder, contract, "lo", domain)
 print("pid", robot._owner.process.pid, flush=True)
 for step in itertools.count():
     if fault == "clock" and step == 30:
         robot._clock = lambda: clock() + 10.0
-    robot.read()
-    robot.write(contract.default_pose)
+    try:
+        robot.read()
+        robot.write(contract.default_pose)
+    except RobotError:
+        if fault != "dies":
+            raise
     time.sleep(0.08 if fault == "late" and step > 30 else 0.01)
 """
 
@@ -228,21 +234,19 @@ def second(domain: int, sim: SimulatedUnitree) -> str:
         except RobotError as error:
             said.append(str(error))
 
-    for _ in range(5):  # a policy's process that stands still for as long as the guard listens is not heard
-        if said:
-            break
-        thread = threading.Thread(target=start)
-        thread.start()
-        live(sim, lambda thread=thread: not thread.is_alive())
+    thread = threading.Thread(target=start)
+    thread.start()
+    live(sim, lambda: not thread.is_alive())
     return said[0]
 
 
 LATE = "no targets for [0-9]+ ms: the policy's process hangs or is late; the joints are damped"
-PROCESSES: dict[str, tuple[signal.Signals | None, str]] = {  # a computer that is too busy is late, too
-    "dies": (signal.SIGKILL, f"the policy's process ended; the joints are damped|{LATE}"),
-    "hangs": (signal.SIGSTOP, LATE),
-    "late": (None, LATE),
-    "clock": (None, f"the newest measurement is 100[0-9]+ ms old|{LATE}"),
+STOOD = "nothing was sent for [0-9]+ ms: the guard stood still, or this computer slept; the joints are damped"
+PROCESSES: dict[str, tuple[signal.Signals | None, str]] = {  # a computer that is too busy is late, too, and stands still
+    "dies": (signal.SIGKILL, f"the policy's process ended; the joints are damped|{STOOD}"),
+    "hangs": (signal.SIGSTOP, f"{LATE}|{STOOD}"),
+    "late": (None, f"{LATE}|{STOOD}"),
+    "clock": (None, f"the newest measurement is 100[0-9]+ ms old|{LATE}|{STOOD}"),
 }
 
 
@@ -273,6 +277,20 @@ def test_a_guard_that_is_killed_leaves_the_last_command(domain: int) -> None:
         live(sim, lambda: process.poll() is not None)
         assert sim.acted["kp"].any()
         assert "the guard of the wire is gone: the robot may hold its last command" in process.communicate()[1]
+
+
+def test_one_process_of_a_computer_commands_a_robot(domain: int) -> None:
+    """Whether or not it has sent already, or is silent for a moment; the right ends with its holder."""
+    begun, first = clock(), link.claim("lo", domain, 0.0)
+    if first is None:
+        pytest.skip("only Linux has abstract sockets")
+    with pytest.raises(RobotError, match=f"another program sends rt/lowcmd in domain {domain} on lo: end it first; nothing was sent"):
+        link.claim("lo", domain, 0.2)
+    assert clock() - begun >= 0.2
+    first.close()
+    again = link.claim("lo", domain, 0.0)
+    assert again
+    again.close()
 
 
 def test_a_guard_that_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -136,7 +136,8 @@ def _moves(args: tuple, kwargs: dict[str, Any]) -> bool:
 def recordable(guard: Guard | None = None) -> Iterator[None]:
     """Inside, calls that a CUDA graph cannot record raise NotRecordable; what only a CPU asks is not asked."""
     guard = guard or Guard()
-    asks = [module for module in list(sys.modules.values()) if getattr(module, "maybe_any", None) is math.maybe_any]
+    held = [(module, getattr(module, "__dict__", {})) for module in list(sys.modules.values())]  # getattr would import what is lazy
+    asks = [module for module, names in held if names.get("maybe_any") is math.maybe_any]
     original = math.maybe_any
     try:
         for module in asks:

@@ -8,6 +8,7 @@ nothing is computed.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -18,7 +19,7 @@ from legged_mw.envs.delay import Delay, SubstepDelay
 from legged_mw.envs.loading import has_curve
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
+from legged_mw.sim.simulation import CONSTANTS_READ, GRAVITY, Simulation
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.machine import require_memory
 from legged_mw.utils.math import assign
@@ -51,6 +52,7 @@ KINDS: dict[str, Kind] = {
     "action_delay": Kind("world", 0.0, "scalar", whole=True),
     "delay_ms": Kind("world", 0.0, "scalar"),
     "observation_delay": Kind("world", 0.0, "scalar", whole=True),
+    "slope": Kind("world", 0.0, "scalar", (GRAVITY,)),
 }
 _RESISTANCE, _CONSTANT, _STIFFNESS, _DAMPING = 0, 1, 4, 6  # places in actuator_gainprm of MuJoCo's DC motor
 # Constants of the model depend on them: derived once they are drawn, never within a recorded step.
@@ -103,6 +105,9 @@ class DomainRand:
         self._whole = [name for name in order if kinds[name][0].whole]
         self._nominal = {field: sim.field(field)[:1].clone() for field in world_fields(cfg, law)}
         _check_mass(cfg, robot)
+        gravity = robot.physics.opt.gravity
+        self._gravity = math.hypot(*gravity) or 1.0  # [m/s^2]
+        self.gravity_dir = torch.tensor(gravity / self._gravity, dtype=torch.float, device=sim.device).repeat(sim.num_envs, 1)  # (N, 3)
         self._root, self._ground = robot.id("body", robot.root), robot.ground_geoms()
         self._link_of_body = _links(robot).to(sim.device)
         writers = {name: self._writer(name, field) for name in order for field in kinds[name][0].fields[:1]}
@@ -171,6 +176,7 @@ class DomainRand:
             "body_mass": self._write_masses,
             "body_ipos": self._write_com,
             "actuator_gainprm": self._write_motors if self._has_curves else self._write_stiffness,
+            GRAVITY: self._write_gravity,
         }
         if name in KINDS and field in special:
             return special[field]
@@ -212,6 +218,12 @@ class DomainRand:
         for place, name in ((_STIFFNESS, "stiffness"), (_DAMPING, "damping")):
             gains[:, :, place] *= self.values.get(name, one)
         assign(self._sim.field("actuator_gainprm"), mask, gains)
+
+    def _write_gravity(self, mask: Tensor) -> None:
+        """Downhill along x, which is any direction for robots with any heading."""
+        angle = torch.deg2rad(self.values["slope"])
+        assign(self.gravity_dir, mask, torch.cat([angle.sin(), torch.zeros_like(angle), -angle.cos()], dim=1))
+        assign(self._sim.field(GRAVITY), mask, self._gravity * self.gravity_dir)
 
 
 def _check_mass(cfg: RobotTaskCfg, robot: RobotModel) -> None:

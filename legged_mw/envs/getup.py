@@ -32,6 +32,7 @@ class GetupCfg(FallsCfg):
     class domain_rand(FallsCfg.domain_rand):
         base_mass, base_com, friction = [-1.0, 3.0], [-0.03, 0.03], [0.25, 1.2]  # [kg] [H -2 to 5], [m], [-] [H 0.1 to 1]
         stiffness, damping, strength = [0.9, 1.1], [0.9, 1.1], [0.9, 1.1]  # [H 0.85 to 1.15]
+        slope = [0.0, 12.0]  # [deg] [ours: the exam asks 10]
 
     class exam:
         within: Seconds = 3.0  # [s] in which it must stand

@@ -69,7 +69,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
             terrain=self.terrain,
             eager=eager,
         )
-        super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
+        super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager, cfg.sim.fuse)
         self.domain_rand = DomainRand(cfg, self.robot, self.sim, self.motor_law)
         self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
@@ -416,7 +416,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         for name, view in views.items():
             setattr(self, name, view)
         model = self.robot.physics
-        self.gravity_dir = self._tensor(model.opt.gravity / (math.hypot(*model.opt.gravity) or 1.0)).expand(n, 3)
+        self.gravity_dir = self.domain_rand.gravity_dir  # (N, 3) world frame
         self.total_mass = float(model.body_subtreemass[0])  # [kg]
         self.root_body = self.robot.id("body", self.robot.root)
         self.imu_pos = self._tensor(model.site_pos[self.robot.id("site", self.robot.imu)]).expand(n, 3)  # body frame [m]

@@ -44,6 +44,7 @@ Pairs = Annotated[list[list[str]], Bound("pairs: lists of two names or patterns 
 Kicks = Annotated[list[Annotated[float, at_least(-1000, 1000, "m/s")]], PAIR]
 Tilt = Annotated[float, above(0, 180, "degrees")]
 Slope = Annotated[float, at_least(-60, 60, "degrees")]
+Slopes = Annotated[list[Slope], or_empty(PAIR)]
 TimeStep = Annotated[float, at_least(1e-4, 0.1, "s")]
 Pixels = Annotated[int, at_least(1, 8192)]
 Threads = Annotated[int, at_least(0, 1024)]
@@ -183,10 +184,11 @@ class RobotTaskCfg(Config):
         action_delay: WholeDelays = []  # control steps from an action to its servo, whole numbers, both ends included
         delay_ms: Delays = []  # from an action to its motor [ms], rounded to the nearest simulation step, a half up
         observation_delay: WholeDelays = []  # control steps that what `state` measures is old
+        slope: Slopes = []  # [deg] of the plane, downhill along x, in place of terrain.slope: with any heading, any direction
         model_factors: dict[str, Factors] = {}  # any other field of the model that may differ: a factor per world on all of it
         redraw_at_reset: list[str] = [  # drawn at every reset of a world; the others once, at the start
             *["friction", "contact_time", "frictionloss", "stiffness", "damping", "strength", "stall_torque", "no_load_speed"],
-            *["encoder_offset", "action_delay", "delay_ms", "observation_delay"],
+            *["encoder_offset", "action_delay", "delay_ms", "observation_delay", "slope"],
         ]
         redraw_iterations: Whole = 0  # draw everything again every so many iterations of training, and when it is resumed; 0: never
         observe: bool = False  # rows in `privileged_state` with what was drawn
@@ -203,6 +205,7 @@ class RobotTaskCfg(Config):
         iterations: Few = 1  # Newton iterations [P]
         ls_iterations: Few = 5  # line-search iterations [P]
         integrator: Literal["euler", "implicitfast"] = "euler"  # implicitfast: joint damping is stable however large [P: euler]
+        fuse: bool = True  # a recorded step's small operations go together in few kernels, equal to float32 rounding [ours: docs/lab.md]
         nconmax: Whole = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model, as --check says [ours: sim/room.py]
         njmax: Whole = 0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
 
@@ -232,7 +235,9 @@ class RobotTaskCfgPPO(Config):
         logger: Literal["tensorboard", "wandb"] = "tensorboard"
         wandb_project: str = "legged_mw"
         export: bool = True  # a finished training writes <run folder>/export/, as play.py --export does [ours]
-        matmul_precision: Literal["highest", "high"] = "high"  # of the networks on a GPU: high is TF32, highest float32
+        # of the networks on a GPU: highest is float32, high TF32; with bf16 the hidden layers of a plain MLP of ELUs learn and act in
+        # bfloat16, on a CPU too, and what else there is (memory, estimator, concurrent student, other activations) in TF32
+        matmul_precision: Literal["highest", "high", "bf16"] = "high"
 
     class obs_groups:
         actor: list[str] = ["state"]

@@ -5,7 +5,7 @@ Found, not listed, so that a task's own buffers are there too: whatever is writt
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from enum import Enum
 from types import FunctionType, MethodType, ModuleType
 from typing import Any
@@ -15,11 +15,13 @@ import torch
 from torch import Tensor, nn
 
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.sim.graph import StepGraph
 from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
 from legged_mw.utils.config import Config
 
-_OTHERS = (str, bytes, int, float, type, Enum, Config, nn.Module, ModuleType, FunctionType, MethodType, Simulation)
+_OTHERS = (str, bytes, int, float, type, Enum, Config, nn.Module, ModuleType, FunctionType, MethodType, Simulation, StepGraph)
 _LIBRARIES = ("torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl")
+_WORTH_FUSING = 5_000  # control steps: kernels take a CPU seconds to compile, once a machine
 _FACTS = ("robot", "terrain", "clips")  # of the task, which no step changes
 
 
@@ -44,6 +46,33 @@ def put_worlds(env: RobotTask, state: dict[str, Tensor]) -> str:
         for name in state.keys() - {*fields}:
             own[name].copy_(state[name])
     return ""
+
+
+def keep_worlds(env: RobotTask) -> Callable[[], None]:
+    """Remember all that ``env`` and torch's generator hold on a CPU; returns what puts it back."""
+    memory = _simulation(env) | {name: value for name, (value, _) in _memory(env).items()}
+    kept, draws = {name: value.clone() for name, value in memory.items()}, torch.get_rng_state()
+
+    def put_back() -> None:
+        for name, value in kept.items():
+            if not torch.equal(memory[name], value):  # what no step writes is not counted as written
+                memory[name].copy_(value)
+        torch.set_rng_state(draws)
+
+    return put_back
+
+
+def fuse(env: RobotTask) -> None:
+    """Fuse the step on a CPU, where no world may notice: runs of one kind stay equal to the last bit."""
+    fields = [value for name, value in env.sim.memory().items() if name.startswith("model.")]
+    with torch.inference_mode():
+        env._graph.fuse(env.num_envs, lambda: keep_worlds(env), fields)
+
+
+def fuse_for(env: RobotTask, steps: int) -> None:
+    """Fuse the step on a CPU if so many control ``steps`` are worth it."""
+    if str(env.device) == "cpu" and env.cfg.sim.fuse and not env.eager and steps >= _WORTH_FUSING:
+        fuse(env)
 
 
 def _words(value: Tensor | None) -> str:

@@ -75,7 +75,8 @@ class GraphedDistillation(Recorded, Distillation):
         return self._acted[0].clone()
 
     def _act(self) -> None:
-        actions, wanted = sample(self.student, self._latent(self.student)), self._mean(self.teacher, self._latent(self.teacher))
+        actions = sample(self.student, self.student.mlp(self._latent(self.student)))
+        wanted = self._mean(self.teacher, self._latent(self.teacher))
         self._acted = actions.detach(), wanted.detach()
 
     def _latent(self, model: MLPModel) -> Tensor:

@@ -155,9 +155,9 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
 
 
 def _small_env(task: LoadedTask) -> RobotTask:
-    """The task as trained, kicks and pushes too, but small, on a CPU, and without what stands between a robot and its policy."""
+    """The task as trained, kicks and pushes too, but small, on a CPU, and without slopes and what stands between a robot and its policy."""
     settings = {"env.num_envs": WORLDS, "sim.engine": "mujoco", "noise.level": 0.0}
-    settings |= {f"domain_rand.{name}": [] for name in ("action_delay", "delay_ms", "observation_delay")}
+    settings |= {f"domain_rand.{name}": [] for name in ("action_delay", "delay_ms", "observation_delay", "slope")}
     if hasattr(task.cfg, "motion"):
         settings["motion.clips"] = task.cfg.motion.clips[:1]  # that a deployed robot follows
     if hasattr(task.cfg.terrain, "mesh_type"):

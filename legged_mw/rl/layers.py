@@ -10,6 +10,8 @@ from rsl_rl.models import MLPModel
 from rsl_rl.modules import EmpiricalNormalization
 from torch import Tensor, nn
 
+Layers = list[tuple[Tensor, Tensor]]  # weight and bias of each
+FUSED_ON = ["cuda"]  # devices whose updates use the kernels of kernels.py
 _SUM_ROWS = 128  # summed by a thread; the rest of the rows is summed side by side
 
 
@@ -35,22 +37,144 @@ class Linear(torch.autograd.Function):
         return grad @ weight if ctx.needs_input_grad[0] else None, (grad.t() @ x)[:, :columns], sum_rows(grad)
 
 
+def kernels_for(x: Tensor) -> Any:
+    """The module of kernels if ``x`` is where they are used, else None."""
+    if x.device.type not in FUSED_ON:
+        return None
+    from legged_mw.rl import kernels  # with warp, a second to import, and only for a GPU
+
+    return kernels
+
+
 def sum_rows(x: Tensor) -> Tensor:
     """Sum over the rows of ``x`` (B, size), in two passes."""
     return x.view(-1, math.gcd(len(x), _SUM_ROWS), x.shape[1]).sum(dim=1).sum(dim=0)
 
 
-def run_mlp(layers: nn.Module, x: Tensor) -> Tensor:
-    """The output of an rsl-rl MLP for inputs (B, size)."""
-    for layer in layers:  # type: ignore[attr-defined]
+class EluLayers(torch.autograd.Function):
+    """Linear layers with an ELU after each but the last, which reads and says float32.
+
+    ``read``: weight and bias of each as the products read them: their own, or rounded to bfloat16, in which all before the last
+    is then computed; sums and the gradients of weights are float32 all the same. ``x`` and the first weight may have more columns,
+    of zeros.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, read: Layers, *parameters: Tensor) -> Tensor:
+        ctx.read, ctx.columns = read, parameters[0].shape[1]
+        outs = [x]
+        for weight, bias in read[:-1]:
+            outs.append(nn.functional.elu_(torch.addmm(bias, outs[-1], weight.t())))
+        weight, bias = read[-1]
+        last = outs[-1].to(weight.dtype)
+        ctx.save_for_backward(*outs, last)
+        return torch.addmm(bias, last, weight.t())
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        (grad,), (*outs, last), read = grads, ctx.saved_tensors, ctx.read
+        elu = EluBackward(outs[1:])
+        biases, weights = [sum_rows(grad)], [grad.t() @ last]
+        for i in reversed(range(1, len(read))):
+            grad = elu(grad @ read[i][0], i - 1)
+            weights.append(_float_product(grad.t(), outs[i - 1]))
+        weights[-1] = weights[-1][:, : ctx.columns]
+        pairs = zip(weights[::-1], [*elu.sums(), *biases], strict=True)
+        return grad @ read[0][0] if ctx.needs_input_grad[0] else None, None, *(value for pair in pairs for value in pair)
+
+
+class EluBackward:
+    """Gradients before the ELUs of a network from those after them, and their sums over all rows: on a GPU in one kernel."""
+
+    def __init__(self, outs: list[Tensor]) -> None:
+        """``outs``: (B, size) of each ELU."""
+        self._outs, sizes = outs, [out.shape[1] for out in outs]
+        self._sums: list[Tensor] = [outs[0]] * len(outs) if outs else []
+        self._table: Tensor | None = None
+        self._kernels: Any = kernels_for(outs[0]) if outs else None
+        if self._kernels and self._kernels.fits(rows := len(outs[0]), sizes):
+            self._table = outs[0].new_empty(-(-rows // self._kernels.ROWS), sum(sizes), dtype=torch.float32)
+
+    def __call__(self, grad: Tensor, i: int) -> Tensor:
+        """The gradient (B, size) before ELU ``i``, of its output's type."""
+        if self._table is not None:
+            return self._kernels.elu_backward(grad, self._outs[i], self._table, sum(out.shape[1] for out in self._outs[:i]))
+        out = self._outs[i]
+        grad = torch.ops.aten.elu_backward(grad.to(out.dtype), 1.0, 1.0, 1.0, True, out)
+        self._sums[i] = sum_rows(grad.float() if out.dtype == torch.bfloat16 else grad)
+        return grad
+
+    def sums(self) -> list[Tensor]:
+        """The sums (size,) by layer, float32 at least; once all are called."""
+        if self._table is None:
+            return self._sums
+        return list(self._table.sum(dim=0).split([out.shape[1] for out in self._outs]))
+
+
+def _float_product(a: Tensor, b: Tensor) -> Tensor:
+    """``a @ b``, of bfloat16 in float32: it is summed so in any case."""
+    if a.dtype != torch.bfloat16:
+        return a @ b
+    return torch.mm(a, b, out_dtype=torch.float32) if a.is_cuda else a.float() @ b.float()  # type: ignore[call-overload]
+
+
+def elu_layers(layers: nn.Module) -> list[nn.Linear]:
+    """The linear layers of an rsl-rl MLP if ``EluLayers`` computes them, else none. Behind the last may stand what has no parameters."""
+    linear = [layer for layer in layers if isinstance(layer, nn.Linear)]  # type: ignore[attr-defined]
+    between = [layer for layer in layers if not isinstance(layer, nn.Linear)][: len(linear) - 1]  # type: ignore[attr-defined]
+    order = [layer for pair in zip(linear, between, strict=False) for layer in pair] + linear[-1:]
+    fits = all(type(layer) is nn.ELU and layer.alpha == 1.0 for layer in between) and [*layers][: len(order)] == order  # type: ignore[misc]
+    return linear if fits else []
+
+
+def run_mlp(layers: nn.Module, x: Tensor, read: Layers | None = None) -> Tensor:
+    """The output of an rsl-rl MLP for inputs (B, size); ``read``: what ``EluLayers`` reads in place of the weights."""
+    rest = [*layers]  # type: ignore[misc]
+    if linear := elu_layers(layers):
+        with torch.no_grad():
+            read = read or [(_padded(layer.weight, x.shape[1] if layer is linear[0] else 0), layer.bias) for layer in linear]
+        x = EluLayers.apply(x, read, *(value for layer in linear for value in (layer.weight, layer.bias)))  # type: ignore[assignment]
+        rest = rest[2 * len(linear) - 1 :]
+    for layer in rest:
         x = Linear.apply(x, layer.weight, layer.bias) if type(layer) is nn.Linear else layer(x)  # type: ignore[misc]
     return x
 
 
-def sample(model: MLPModel, latent: Tensor) -> Tensor:
-    """Actions (N, A) drawn from a policy with a Gaussian, for what its MLP reads; torch.normal would check the std on the host."""
+def _padded(weight: Tensor, columns: int) -> Tensor:
+    return nn.functional.pad(weight, (0, columns - weight.shape[1])) if columns > weight.shape[1] else weight
+
+
+class HalfWeights:
+    """A network's weights as ``EluLayers`` reads them in bfloat16: copies of all but the last layer's."""
+
+    ALIGNED = 8  # columns: what products of bfloat16 want a multiple of
+
+    def __init__(self, linear: list[nn.Linear]) -> None:
+        hidden = linear[:-1]
+        self._own = [value for layer in hidden for value in (layer.weight, layer.bias)]
+        first = self._own[0]
+        wide = first.new_zeros(len(first), -(-first.shape[1] // self.ALIGNED) * self.ALIGNED, dtype=torch.bfloat16)
+        self._copies = [wide[:, : first.shape[1]], *(torch.empty_like(value, dtype=torch.bfloat16) for value in self._own[1:])]
+        weights = [wide, *self._copies[2::2]]
+        self._layers = [*zip(weights, self._copies[1::2], strict=True), (linear[-1].weight, linear[-1].bias)]
+
+    @torch.no_grad()
+    def read(self) -> Layers:
+        """The layers, rounded from what they are now."""
+        self._copies[0].copy_(self._own[0])
+        torch._foreach_copy_(self._copies[1:], self._own[1:])  # pyright: ignore[reportPrivateImportUsage]
+        return self._layers
+
+    @torch.no_grad()
+    def prepare(self, latent: Tensor) -> Tensor:
+        """What the network reads (B, size), in bfloat16 and with columns of zeros."""
+        return nn.functional.pad(latent.bfloat16(), (0, -latent.shape[1] % self.ALIGNED))
+
+
+def sample(model: MLPModel, output: Tensor) -> Tensor:
+    """Actions (N, A) drawn from a policy with a Gaussian, for its MLP's output; torch.normal would check the std on the host."""
     assert model.distribution is not None
-    model.distribution.update(model.mlp(latent))  # the forward pass without its own sample
+    model.distribution.update(output)  # the forward pass without its own sample
     mean = model.output_mean
     return mean + model.output_std * torch.randn_like(mean)
 

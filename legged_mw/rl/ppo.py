@@ -23,10 +23,11 @@ from rsl_rl.storage import RolloutStorage
 from tensordict import TensorDict
 from torch import Tensor, nn
 
-from legged_mw.rl.adam import make_recordable
+from legged_mw.rl.adam import FlatAdam, make_recordable
 from legged_mw.rl.concurrent import ConcurrentModel
 from legged_mw.rl.estimator import EstimatingModel, RegressingModel, trained_parts
-from legged_mw.rl.layers import run_mlp, sample, update_normalizer
+from legged_mw.rl.layers import HalfWeights, elu_layers, kernels_for, run_mlp, sample, update_normalizer
+from legged_mw.rl.losses import own_std, policy_loss, value_loss
 from legged_mw.rl.recorded import Recorded, why_stock
 from legged_mw.rl.recurrent import HiddenStates, SequenceInput, check_recurrent, unroll
 from legged_mw.rl.undo import Undo
@@ -55,6 +56,7 @@ class GraphedPPO(Recorded, PPO):
     """
 
     critic_only = False  # of a warm start: the actor stays as it is
+    half = False  # see ``learn_in_half``
     _plain_rate: float  # the learning rate where nothing is recorded
     _rate: Tensor | None = None  # else: () float64, as precise as rsl-rl's Python number
 
@@ -78,6 +80,8 @@ class GraphedPPO(Recorded, PPO):
         groups = [{"params": part, "lr": rate} for part, rate in zip(learners, self._rates, strict=True)]
         self.optimizer = type(self.optimizer)(groups)
         make_recordable(self.optimizer, self._rates, str(self.device))
+        flat = [] if self._recurrent else enumerate(self._parts)  # cuDNN wants the weights of its own layers in its own order
+        self._adams = [FlatAdam(self.optimizer, max(0, i - 1), part, self.max_grad_norm) for i, part in flat]
         self.undo = Undo(self, (self.actor, self.critic))
         self._begin()
 
@@ -105,6 +109,8 @@ class GraphedPPO(Recorded, PPO):
         self._loss_names = ("value", "surrogate", "entropy", *more)
         self._losses = torch.zeros(len(self._loss_names), device=device)
         self._entropy_coef, self._desired_kl = torch.zeros((), device=device), torch.zeros((), dtype=torch.float64, device=device)
+        plain = [model for model in (self.actor, self.critic) if self.half and type(model) is MLPModel]
+        self._half = {model: HalfWeights(linear) for model in plain if (linear := elu_layers(model.mlp))}
         self._side = torch.cuda.Stream(device) if str(device).startswith("cuda") else None
         self._act_graph, self._returns_graph, self._update_graph = (
             StepGraph(fn, str(device)) for fn in (self._act, self._compute_returns, self._update)
@@ -119,6 +125,14 @@ class GraphedPPO(Recorded, PPO):
             self.critic_only, self._update_graph = on, StepGraph(self._update, str(self.device))
             if not on and self.schedule == "adaptive":
                 self.learning_rate = _MIN_RATE
+
+    def learn_in_half(self) -> None:
+        """From now on the hidden layers of plain networks of ELUs compute in bfloat16, acting too: else the policy that learns is not
+        quite the one that acted. Weights, the last layer, losses and gradients of weights stay float32, sums too.
+        """
+        torch.backends.cuda.matmul.allow_bf16_reduced_precision_reduction = False
+        self.half = True
+        self.release()
 
     @contextmanager
     def _beside(self) -> Iterator[None]:
@@ -154,11 +168,16 @@ class GraphedPPO(Recorded, PPO):
         if self._memories and self.symmetry:
             seen, _ = self.symmetry.data_augmentation_func(env=self.symmetry.env, obs=seen, actions=None)
         with self._beside():
-            values = self.critic.mlp(self._latent(self.critic, seen))
-        actions = sample(actor, self._latent(actor, seen))
+            values = self._act_by(self.critic, seen)
+        actions = sample(actor, self._act_by(actor, seen))
         self._acted = (actions, values, actor.get_output_log_prob(actions))
         self._acted_params = tuple(actor.output_distribution_params)
         self._meet()
+
+    def _act_by(self, model: MLPModel, seen: TensorDict) -> Tensor:
+        """The output of a network's MLP."""
+        latent = self._latent(model, seen)
+        return self._forward(model, self._half[model].prepare(latent)) if model in self._half else model.mlp(latent)
 
     def _latent(self, model: MLPModel, seen: TensorDict) -> Tensor:
         """What a network's MLP reads; a memory takes in what is ``seen``, with mirror images where it is to learn from those."""
@@ -235,9 +254,11 @@ class GraphedPPO(Recorded, PPO):
 
     @torch.no_grad()
     def _input(self, model: MLPModel, obs: Any, indices: Tensor) -> Tensor | SequenceInput:
-        """What the network sees of observations, normalised, with columns of zeros up to a multiple of four."""
+        """What the network sees of observations, normalised, with columns of zeros up to a multiple of four or eight."""
         memory = self._memories.get(model)
         latent = memory.normalised(obs) if memory else model.get_latent(obs)
+        if model in self._half:
+            return self._half[model].prepare(latent)
         padded = nn.functional.pad(latent, (0, -latent.shape[1] % 4))
         return memory.sequence(padded, indices, self.storage.dones) if memory else padded
 
@@ -246,63 +267,64 @@ class GraphedPPO(Recorded, PPO):
         batch, actor_input, critic_input, lesson = minibatch
         self.optimizer.zero_grad()
         with self._beside():
-            value_loss = self._value_loss(batch, _forward(self.critic, critic_input))
-            (self.value_loss_coef * value_loss).backward()
+            values = self._forward(self.critic, critic_input)
+            clip = self.clip_param if self.use_clipped_value_loss else 0.0
+            of_values, of_critic = value_loss(values.detach(), batch, clip, self.value_loss_coef)
+            values.backward(of_values)
         with torch.set_grad_enabled(not self.critic_only):  # an actor that stands keeps nothing for a gradient
             if isinstance(self.actor, RegressingModel) and isinstance(actor_input, Tensor):
                 output, *regression = self.actor.learn(actor_input, lesson)
             else:
-                output, regression = _forward(self.actor, actor_input), []
-            loss, parts, kl = self._policy_loss(batch, output)
-            loss = sum(regression, loss)  # of other parameters
+                output, regression = self._forward(self.actor, actor_input), []
+            gradients, parts, kl = self._policy_loss(batch, output)
         if self.critic_only:
             kl = None  # of an actor that stands still it is rounding noise
         else:
-            loss.backward()
+            gradients += [(loss, torch.ones_like(loss)) for loss in regression]  # of other parameters
+            wanted = [(value, gradient) for value, gradient in gradients if value.requires_grad]
+            torch.autograd.backward(*zip(*wanted, strict=True))  # type: ignore[arg-type]
         self._meet()
-        if self.is_multi_gpu:
-            self._average_over_ranks(kl)
-        if kl is not None:
-            self._adapt_rate(kl)
-        for part in self._parts:
-            nn.utils.clip_grad_norm_(part, self.max_grad_norm)
-        self.optimizer.step()
-        self._losses.add_(torch.stack([value.detach() for value in (value_loss, *parts, *regression)]))
+        self._step(kl)
+        self._losses.add_(torch.stack([value.detach() for value in (of_critic, *parts, *regression)]))
 
-    def _value_loss(self, batch: Any, values: Tensor) -> Tensor:
-        error = (values - batch.returns).square()
-        if self.use_clipped_value_loss:
-            clipped = batch.values + (values - batch.values).clamp(-self.clip_param, self.clip_param)
-            error = torch.max(error, (clipped - batch.returns).square())
-        return error.mean()
-
-    def _policy_loss(self, batch: Any, output: Tensor) -> tuple[Tensor, list[Tensor], Tensor | None]:
-        """The actor's loss, its parts by ``_loss_names``, and the KL divergence from the policy that acted (None: fixed rate)."""
+    def _policy_loss(self, batch: Any, output: Tensor) -> tuple[list[tuple[Tensor, Tensor]], list[Tensor], Tensor | None]:
+        """What of the actor has which gradient, the loss's parts by ``_loss_names``, and the KL divergence (None: fixed rate)."""
         assert self.actor.distribution is not None
         self.actor.distribution.update(output)
-        log_prob = self.actor.get_output_log_prob(batch.actions)
-        # of the samples themselves, not of their mirror images
-        params = tuple(param[: self._size] for param in self.actor.output_distribution_params)
-        entropy = self.actor.output_entropy[: self._size].mean()
-        kl = None
-        if self.desired_kl is not None and self.schedule == "adaptive":
-            with torch.no_grad():
-                kl = self.actor.get_kl_divergence(batch.old_distribution_params, params).mean()
-        advantages = batch.advantages.squeeze()
-        ratio = torch.exp(log_prob - batch.old_actions_log_prob.squeeze())
-        clipped_ratio = ratio.clamp(1.0 - self.clip_param, 1.0 + self.clip_param)
-        surrogate = torch.max(-advantages * ratio, -advantages * clipped_ratio).mean()
-        loss, parts = surrogate - self._entropy_coef * entropy, [surrogate, entropy]
+        mean, std = self.actor.output_mean, own_std(self.actor.distribution)  # type: ignore[arg-type]
+        loss = policy_loss(mean.detach(), std.detach(), batch, self.clip_param, self._entropy_coef)
+        gradients, parts = [(mean, loss.of_mean), (std, loss.of_std)], [loss.surrogate, loss.entropy]
         if self.symmetry:
             parts.append(self._symmetry_loss(batch))
             if self.symmetry.use_mirror_loss:
-                loss = loss + self.symmetry.mirror_loss_coeff * parts[-1]
-        return loss, parts, kl
+                gradients.append((parts[-1], torch.full_like(parts[-1], self.symmetry.mirror_loss_coeff)))
+        return gradients, parts, loss.kl if self.desired_kl is not None and self.schedule == "adaptive" else None
 
-    def _average_over_ranks(self, kl: Tensor | None) -> None:
-        """Gradients and KL divergence become their means over all ranks, in one message."""
-        grads = [p.grad for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
-        parts = grads if kl is None else [*grads, kl]
+    def _forward(self, model: MLPModel, inputs: Tensor | SequenceInput) -> Tensor:
+        """The network's output for normalised inputs (B, size), or over a sequence."""
+        if model in self._half:
+            return run_mlp(model.mlp, inputs, self._half[model].read())  # type: ignore[arg-type]
+        return run_mlp(model.mlp, unroll(model.rnn.rnn, inputs) if isinstance(inputs, SequenceInput) else inputs)  # type: ignore[attr-defined]
+
+    def _step(self, kl: Tensor | None) -> None:
+        """Adapt the rate by ``kl``, clip each part's gradient, and step; with several ranks by their means."""
+        adams, gradients = self._adams, [adam.gradient() for adam in self._adams]
+        if not adams:
+            gradients = [p.grad for group in self.optimizer.param_groups for p in group["params"]]
+        if self.is_multi_gpu:
+            self._average_over_ranks([each for each in (*gradients, kl) if each is not None])
+        if kl is not None:
+            self._adapt_rate(kl)
+        for adam, gradient in zip(adams, gradients if adams else [], strict=True):
+            if gradient is not None:
+                adam.step(gradient)
+        if not adams:
+            for part in self._parts:
+                nn.utils.clip_grad_norm_(part, self.max_grad_norm)
+            self.optimizer.step()
+
+    def _average_over_ranks(self, parts: list[Tensor]) -> None:
+        """They become their means over all ranks, in one message."""
         message = torch.cat([part.flatten() for part in parts])
         torch.distributed.all_reduce(message)
         message /= self.gpu_world_size
@@ -313,6 +335,9 @@ class GraphedPPO(Recorded, PPO):
     def _adapt_rate(self, kl: Tensor) -> None:
         """rsl-rl's rule: slower where the policy moved more than twice as far as wanted, faster where less than half."""
         assert self._rate is not None
+        if kernels := kernels_for(kl):
+            kernels.launch(kernels.adapt_rate, 1, kl, self._desired_kl, self._rate, self._adam_rate, _RATE_STEP, _MIN_RATE, _MAX_RATE)
+            return
         slower = (self._rate / _RATE_STEP).clamp(min=_MIN_RATE)
         faster = (self._rate * _RATE_STEP).clamp(max=_MAX_RATE)
         rate = torch.where((kl < self._desired_kl / 2.0) & (kl > 0.0), faster, self._rate)
@@ -357,8 +382,3 @@ class GraphedPPO(Recorded, PPO):
         else:
             self._rate.fill_(float(rate))
             self._adam_rate.fill_(float(rate))
-
-
-def _forward(model: MLPModel, inputs: Tensor | SequenceInput) -> Tensor:
-    """The network's output for normalised inputs (B, size), or over a sequence."""
-    return run_mlp(model.mlp, unroll(model.rnn.rnn, inputs) if isinstance(inputs, SequenceInput) else inputs)  # type: ignore[attr-defined]

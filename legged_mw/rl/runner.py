@@ -364,7 +364,8 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
 
     With a ``teacher``, of which this is the learner's config, it distils.
     """
-    torch.set_float32_matmul_precision(cfg.runner.matmul_precision)
+    half = cfg.runner.matmul_precision == "bf16"
+    torch.set_float32_matmul_precision("high" if half else cfg.runner.matmul_precision)
     check_mirror(env, cfg)
     try:
         theirs = acting(teacher, env, [TEACHER]) if teacher else None
@@ -376,6 +377,8 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
     except ValueError as error:  # a class, activation, optimizer or observation group that does not exist
         raise ConfigError(f"the learner's config does not fit rsl-rl: {error}") from None
     graphed = isinstance(runner.alg, GraphedPPO) and runner.alg.graphed
+    if half and isinstance(runner.alg, GraphedPPO):
+        runner.alg.learn_in_half()
     if settings["critic_warmup"] and not graphed:
         raise ConfigError(f"warm_start.critic_warmup is {settings['critic_warmup']}, but only the recorded PPO knows it; set it to 0")
     if isinstance(policy := runner.alg.get_policy(), RegressingModel) and not graphed:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import io
 import os
 import re
@@ -17,7 +16,7 @@ from legged_mw.rl.checkpoint import EARLIER, check_content, damage, sealed
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import shown, unknown
 from legged_mw.utils.files import check_folder, check_name, typed
-from legged_mw.utils.task import LoadedTask, task_names
+from legged_mw.utils.task import LoadedTask
 
 CONFIG_FILE = "config.yaml"
 
@@ -117,12 +116,10 @@ def _not_brought(file: Path, run: Path) -> str:
     return str(file)
 
 
-def require_task(args: argparse.Namespace, parser: argparse.ArgumentParser) -> None:
-    """Where ``--task`` is missing, take the one that the run at the path ``--load_run`` is of."""
-    if not args.task and args.load_run and ((run := typed(args.load_run)) / CONFIG_FILE).is_file():
-        args.task = task_of(check_folder(run))
-    if not args.task:
-        parser.error(f"--task is missing, and --load_run is no path of a run that would say it; tasks: {', '.join(task_names())}")
+def task_at(path: str) -> str:
+    """``task_of`` the run that the user named by its path; "" if there is no run."""
+    run = typed(path)
+    return task_of(check_folder(run)) if (run / CONFIG_FILE).is_file() else ""
 
 
 def save_whole(content: dict[str, Any], path: Path, sync: bool = True) -> None:

@@ -23,6 +23,7 @@ from rsl_rl.algorithms import Distillation
 from legged_mw.envs.actuators import note_network
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.worlds import fuse_for
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
@@ -31,15 +32,16 @@ from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
-from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run, require_task
+from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
 from legged_mw.rl.transfer import TEACHER, begin_with, check_start, keep_teacher, load_teacher, seat_teacher
 from legged_mw.sim.device import device_facts
 from legged_mw.sim.engines import pick_engine
-from legged_mw.utils.cli import apply_overrides, command, duration, make_parser, pick_device, positive, seed_everything
+from legged_mw.utils.cli import apply_overrides, command, pick_device, seed_everything
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import writable
 from legged_mw.utils.machine import usable_cores
+from legged_mw.utils.quick_start import settle
 from legged_mw.utils.task import LoadedTask, load_task
 
 STOPPED = 3  # exit code of a training that ended early and can go on
@@ -63,41 +65,11 @@ class Start(NamedTuple):
     goes_on: bool = False  # in the folder of ``run``: from its newest checkpoint
 
 
-def parse(description: str | None) -> argparse.Namespace:
-    """The flags of training. From here on only the first of several processes prints."""
-    parser = make_parser(description)
-    parser.add_argument("--max_iterations", type=positive, metavar="N", help="train until this iteration, resumed or not")
-    parser.add_argument("--run_name", metavar="NAME", help="appended to the run folder's name")
-    parser.add_argument("--resume", action="store_true", help="go on with the last run, or the one of --load_run")
-    source = "its run, checkpoint or export, or a task for its last or shipped policy"
-    parser.add_argument("--teacher", metavar="RUN", help=f"distil: learn to act like a policy that may see more; {source}")
-    parser.add_argument("--init", metavar="RUN", help="begin with the actor of another policy, named as a teacher is")
-    parser.add_argument("--headless", action="store_true", help="accepted as in legged_gym; training never opens a window")
-    parser.add_argument("--max_time", type=duration, metavar="T", help="end, after a checkpoint, after 90s, 5m, 1.5h ...")
-    parser.add_argument("--play", action="store_true", help="watch the policy as it trains: a window, or a web page without a screen")
-    parser.add_argument("--list", action="store_true", help="show the tasks and exit")
-    parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")
-    parser.add_argument("--picture", metavar="PNG", help="with --check: the robot's health page too, and a picture of the robot")
-    args = parser.parse_args()
-    if args.picture is not None:
-        writable(args.picture, "--picture")
-        if not args.check:
-            parser.error("--picture draws what --check shows: add --check")
-    if not args.list:
-        require_task(args, parser)
-    if not args.resume and (args.load_run is not None or args.checkpoint != -1):
-        parser.error("--load_run and --checkpoint say what to go on with: add --resume")
-    if args.resume and (args.teacher is not None or args.init is not None):
-        parser.error("--resume goes on with what a run began with: leave --teacher and --init out")
-    args.deadline = time.time() + args.max_time if args.max_time else None
-    quiet(this_rank())
-    if not torch.cuda.is_available():
-        torch.set_num_threads(1)  # hundreds of small operations a step stall on a second thread
-    return args
-
-
 def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     """Give ``task`` its final config: the resumed run's, the user's, a CPU's. Returns what to begin with and the device."""
+    quiet(this_rank())  # from here on only the first of several processes prints
+    if not torch.cuda.is_available():
+        torch.set_num_threads(1)  # hundreds of small operations a step stall on a second thread
     start = _resume(task, args) if args.resume else None
     apply_overrides(task, args)
     start = _find_others(task, start or Start(experiment_folder(task)))
@@ -166,6 +138,8 @@ def _announce(task: LoadedTask, device: str, rank: Rank) -> bool:
     facts = device_facts(device) if engine == "mujoco_warp" else None
     for line in facts.slow() if facts else ():
         print(line, flush=True)
+    if facts:
+        facts.say_compiling()
     if device != "cpu":
         return facts is None or facts.pool
     cores, runner = usable_cores(), task.train.runner
@@ -185,6 +159,7 @@ def build(task: LoadedTask, start: Start, device: str, eager: bool, check_record
     if this_rank().leads and not eager:
         check_recordable(task)
     env = task.env_class(task.cfg, device, eager=eager)
+    fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)
     check_mirror(env, task.train)
     check_room(task.train.to_dict(), env)
     if start.policy:
@@ -329,6 +304,7 @@ def _open_run(runner: Runner, task: LoadedTask, start: Start, rank: Rank, held: 
 
 def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
     """Learn; if another rank is lost on the way, say so in a line."""
+    settle()
     try:
         with runner.console:
             runner.learn(iterations, bool(runner.begins_anew))

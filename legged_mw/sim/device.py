@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from threading import Thread
 from typing import NamedTuple
 
 import torch
 
 GRAPHS_SINCE = (12, 4)  # CUDA of the driver: below, mujoco-warp warns that recording may be unreliable
 _OTHERS = 1.0  # GiB on a GPU: a desktop takes less, a training more
+_WAITS = (6.0, 6.0, 12.0)  # [s] after which compiled kernels are looked for; a start that compiles none is over before the first
 
 
 class DeviceFacts(NamedTuple):
@@ -21,12 +25,13 @@ class DeviceFacts(NamedTuple):
     compiled: int  # modules of kernels in it for this device
     memory: float = 0.0
     taken: float = 0.0  # by all processes
+    binaries: str = ""  # pattern of a module's compiled file
 
     def slow(self) -> list[str]:
         """A line a reason for which the first minute, or all of the training, is slow here."""
         lines = []
         if not self.compiled:
-            lines.append("kernels are compiled at this first start, a minute or two; `legged-mw warm` does it beforehand")
+            lines.append("some 50 modules of kernels are compiled at this first start, a minute or two; `legged-mw warm` does it ahead")
         if self.memory and not self.pool:
             lines.append("this GPU has no memory pool: nothing can be recorded, and a step takes several times as long")
         if self.cuda and self.cuda < GRAPHS_SINCE:
@@ -36,6 +41,26 @@ class DeviceFacts(NamedTuple):
             held = f"{self.taken:.0f} of {self.memory:.0f} GiB"
             lines.append(f"another process holds {held} of this GPU: both run slower (nvidia-smi shows which)")
         return lines
+
+    def compiled_since(self, begun: float) -> int:
+        """Modules of kernels, of any package, that were compiled after ``begun``, a time of the clock [s]."""
+        files = self.cache.glob(f"wp_*/{self.binaries}")
+        return len({file.parent for file in files if file.stat().st_mtime >= begun})
+
+    def say_compiling(self, say: Callable[[str], object] = print, waits: Sequence[float] = _WAITS) -> Thread:
+        """Say once, from a thread, that what follows waits for kernels. An empty cache is told of by ``slow``."""
+
+        def watch() -> None:
+            begun = time.time()
+            for seconds in waits if self.compiled else ():
+                time.sleep(seconds)
+                if count := self.compiled_since(begun):
+                    say(f"kernels that this task needs are being compiled, {count} modules so far; the next start has them")
+                    return
+
+        thread = Thread(target=watch, daemon=True)
+        thread.start()
+        return thread
 
 
 def device_facts(device: str) -> DeviceFacts:
@@ -48,6 +73,7 @@ def device_facts(device: str) -> DeviceFacts:
     kind = f"*.sm{here.get_cuda_compile_arch()}*" if here.is_cuda else "*.cpu*.o"
     compiled = len({file.parent for file in cache.glob(f"wp_mujoco_warp*/{kind}")})
     if not here.is_cuda:
-        return DeviceFacts(here.name, None, True, cache, compiled)
+        return DeviceFacts(here.name, None, True, cache, compiled, binaries=kind)
     free, memory = (size / 2**30 for size in torch.cuda.mem_get_info(device))
-    return DeviceFacts(here.name, wp.get_cuda_driver_version(), wp.is_mempool_supported(here), cache, compiled, memory, memory - free)
+    driver, pool = wp.get_cuda_driver_version(), wp.is_mempool_supported(here)
+    return DeviceFacts(here.name, driver, pool, cache, compiled, memory, memory - free, kind)

@@ -18,9 +18,10 @@ from mujoco.batch import MODEL_FIELDS, Batch, SimulationError
 from torch import Tensor
 
 from legged_mw.sim.errors import ModelError
-from legged_mw.sim.simulation import Simulation
+from legged_mw.sim.simulation import GRAVITY, Simulation
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import usable_cores
+from legged_mw.utils.trace import not_traced
 
 _STATE, _WRITTEN = ("qpos", "qvel"), ("ctrl", "xfrc_applied")  # a step reads and writes the state, and reads the rest
 _READ = ("sensordata", "actuator_force", "site_xpos", "xquat")  # computed by a step
@@ -53,6 +54,7 @@ class MujocoSimulation(Simulation):
         self._failed, self._reason = np.zeros(num_envs, dtype=bool), ""  # worlds that MuJoCo ever refused to step
         self._qpos0 = torch.tensor(model.qpos0, dtype=torch.float)
 
+    @not_traced
     def step(self, substeps: int = 1, before: Callable[[int], None] | None = None) -> None:
         if before is not None:  # between substeps the state is float32, as for who reads it
             for i in range(substeps):
@@ -72,6 +74,7 @@ class MujocoSimulation(Simulation):
         if refused is not None:
             self.qpos[torch.from_numpy(refused).long()] = torch.nan
 
+    @not_traced
     def reset(self, mask: Tensor) -> None:
         which = mask.numpy()
         if not which.any():
@@ -126,7 +129,7 @@ class MujocoSimulation(Simulation):
     def _expand(self, name: str) -> Tensor:
         """The engine's rows (N, ...) of a field of the model."""
         known = sorted(field for field in MODEL_FIELDS if getattr(getattr(self._batch.model, field, None), "dtype", None) == np.float64)
-        if name not in known:
+        if name not in (*known, GRAVITY):
             raise ModelError(unknown("per-world model field", name, known, "MuJoCo's Model"))
         return _tensor(self._batch.expand(name))
 

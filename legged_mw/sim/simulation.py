@@ -13,6 +13,7 @@ from legged_mw.utils.errors import unknown
 # Model fields that others are derived from, and those others: they need a value per world as soon as one of the former has.
 CONSTANTS_READ = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "qpos0")
 CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
+GRAVITY = "opt.gravity"  # (N, 3) [m/s^2], the one option that may differ between worlds
 
 
 class Simulation(ABC):

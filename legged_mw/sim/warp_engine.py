@@ -8,9 +8,11 @@ import copy
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import partial
+from operator import attrgetter
 
 import mujoco
 import mujoco_warp as mjw
+import numpy as np
 import torch
 import warp as wp
 from mujoco_warp import OverflowType
@@ -21,9 +23,10 @@ from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND
 from legged_mw.sim.ground_contact import touch_ground
 from legged_mw.sim.shortcuts import Shortcuts
-from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ, Simulation
+from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ, GRAVITY, Simulation
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import unknown
+from legged_mw.utils.trace import not_traced
 
 wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it loads; a first run would drown in it
 
@@ -64,8 +67,11 @@ class WarpSimulation(Simulation):
         _check_fields(world_fields)
         with wp.ScopedDevice(self._device):
             derived = CONSTANTS if {*CONSTANTS_READ} & {*world_fields} else ()  # else every world silently has the first one's
-            self._model = make_model(model, terrain, dict.fromkeys([*world_fields, *derived], num_envs))
+            batched = [name for name in (*world_fields, *derived) if name != GRAVITY]
+            self._model = make_model(model, terrain, dict.fromkeys(batched, num_envs))
             option = self._model.opt
+            if GRAVITY in world_fields:
+                option.gravity = wp.array(np.tile(model.opt.gravity, (num_envs, 1)), dtype=wp.vec3)
             option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
             self._data = mjw.make_data(model, nworld=num_envs, nconmax=nconmax, njmax=njmax)
@@ -73,12 +79,13 @@ class WarpSimulation(Simulation):
             self._count_contacts = count_contacts(model, self._model)
         for name in _STATE:
             setattr(self, name, wp.to_torch(getattr(self._data, name)))
-        self._fields = {name: wp.to_torch(getattr(self._model, name)) for name in world_fields}
+        self._fields = {name: wp.to_torch(attrgetter(name)(self._model)) for name in world_fields}
         self._overflow_seen = torch.zeros_like(self.overflow)
         self._reset_mask = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._reset_mask_wp = wp.from_torch(self._reset_mask)
         self._recorded: dict[str, object] = {}
 
+    @not_traced
     def step(self, substeps: int = 1, before: Callable[[int], None] | None = None) -> None:
         if before is None:
             self._run(f"step{substeps}", lambda: self._substeps(range(substeps), substeps))
@@ -89,6 +96,7 @@ class WarpSimulation(Simulation):
                 self._run(name, partial(self._substeps, [i], substeps))
         torch.bitwise_or(self._overflow_seen, self.overflow, out=self._overflow_seen)
 
+    @not_traced
     def reset(self, mask: Tensor) -> None:
         self._reset_mask.copy_(mask)
         self._run("reset", lambda: mjw.reset_data(self._model, self._data, reset=self._reset_mask_wp))
@@ -152,7 +160,7 @@ class WarpSimulation(Simulation):
 def _check_fields(names: Sequence[str]) -> None:
     known = [f.name for f in dataclasses.fields(mjw.Model) if getattr(f.type, "shape", ("",))[:1] == ("*",)]
     for name in names:
-        if name not in known:
+        if name not in (*known, GRAVITY):
             raise ModelError(unknown("per-world model field", name, known, "mujoco-warp's Model"))
 
 

@@ -1,4 +1,4 @@
-"""What the programs share on the command line: flags, one-line errors, durations, seeds. Imports without torch."""
+"""What the programs share on the command line: flags, one-line errors, durations, seeds. Imports without torch and numpy."""
 
 from __future__ import annotations
 
@@ -12,8 +12,6 @@ from contextlib import contextmanager, suppress
 from ctypes import ArgumentError
 from pathlib import Path
 from typing import Any, NoReturn
-
-import numpy as np
 
 from legged_mw.utils.config import ConfigError, fit, load_yaml
 from legged_mw.utils.errors import UserError, in_short, out_of_memory, printable, users_fault
@@ -88,6 +86,7 @@ def pick_device(asked: str | None) -> str:
 
 def seed_everything(seed: int) -> None:
     """Seed Python, numpy and torch on every device."""
+    import numpy as np
     import torch
 
     random.seed(seed)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from legged_mw.utils.trace import tracing
+
 
 def quat_rotate(q: Tensor, v: Tensor) -> Tensor:
     """The body-frame vector ``v`` (..., 3) of a body with attitude ``q`` (..., 4), in the world frame."""
@@ -53,8 +55,8 @@ def assign(dst: Tensor, mask: Tensor, src: Tensor | float) -> None:
 
 
 def maybe_any(mask: Tensor) -> bool:
-    """False if ``mask`` is true nowhere. A GPU is not asked, since its steps are recorded: there the answer is True."""
-    return mask.device.type != "cpu" or bool(mask.any())
+    """False if ``mask`` is true nowhere. A GPU is not asked, nor is anything of a step that is traced: there the answer is True."""
+    return mask.device.type != "cpu" or tracing() or bool(mask.any())
 
 
 def spread(values: Tensor, count: int) -> Tensor:

@@ -10,8 +10,9 @@ from typing import Any
 import torch
 
 from legged_mw.rl.classes import check_classes
+from legged_mw.rl.flags import require_task
 from legged_mw.rl.policies import Source, introduce, load_policy, read_actor
-from legged_mw.rl.runs import load_tensors, require_task
+from legged_mw.rl.runs import load_tensors
 from legged_mw.utils.cli import apply_overrides, duration, make_parser, pick_device, seed_everything
 from legged_mw.utils.commands import Command, command_table
 from legged_mw.utils.files import writable

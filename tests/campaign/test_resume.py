@@ -41,7 +41,7 @@ BY_HAND = {  # LEGGED_MW_CAMPAIGN=all pytest tests/campaign/test_resume.py
     "g1": ["--task", "g1_flat"],
     "concurrent": ["--task", "go1_rough_student", "--set", "actor.concurrent.groups=[privileged_state]", *TILES],
     "mujoco_warp": ["--engine", "mujoco_warp"],
-    "mujoco_warp, drawn worlds": ["--engine", "mujoco_warp", "--task", "go1_flat_dr"],
+    "mujoco_warp, drawn worlds": ["--task", "go1_flat_dr", "--engine", "mujoco_warp"],
 }
 if os.environ.get("LEGGED_MW_CAMPAIGN") == "all":
     TASKS |= BY_HAND

@@ -263,12 +263,13 @@ class Guard:
 
 
 def main() -> None:
-    from legged_mw.deploy.unitree.link import Wire
+    from legged_mw.deploy.unitree.link import Wire, claim
 
     settings = json.loads(sys.argv[1])
     channel = socket.socket(fileno=settings["channel"])
     real_time(PRIORITY, heirs=True)  # before DDS starts its threads
     try:
+        claimed = claim(settings["interface"], settings["domain"], 2 * AFTER)  # a guard before this one may still damp
         wire = Wire(settings["package"], settings["interface"], settings["domain"])
         first = wire.prepare(settings["find"], lies_down=settings["lies_down"])
     except RobotError as error:
@@ -283,3 +284,5 @@ def main() -> None:
     gc.freeze()
     gc.disable()
     guard.run()
+    if claimed:
+        claimed.close()

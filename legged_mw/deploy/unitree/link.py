@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import socket
+import sys
 import time
 from collections.abc import Callable
 from importlib.metadata import version
@@ -69,6 +70,30 @@ def join(interface: str, domain: int) -> Any:
         return DomainParticipant(domain)
     except DDSException as error:
         raise RobotError(f"cannot join DDS domain {domain} on {interface}: {str(error).splitlines()[0]}") from None
+
+
+def claim(interface: str, domain: int, seconds: float) -> socket.socket | None:
+    """What one process of this computer can hold at a time, and holds until it ends: the right to command the robot there.
+
+    Listening alone would miss another program that has not sent yet, or is silent for a moment. Waits ``seconds`` for one that is
+    about to end; raises RobotError if it does not. Systems without abstract sockets have no such thing.
+    """
+    if not sys.platform.startswith("linux"):
+        return None
+    held, end = socket.socket(socket.AF_UNIX), clock() + seconds
+    while True:
+        try:
+            held.bind(f"\0legged_mw/{COMMANDS}/{interface}/{domain}")
+            return held
+        except OSError:
+            if clock() >= end:
+                held.close()
+                raise RobotError(taken(f"domain {domain} on {interface}")) from None
+            time.sleep(0.01)
+
+
+def taken(where: str) -> str:
+    return f"another program sends {COMMANDS} in {where}: end it first; nothing was sent"
 
 
 def _reader(participant: Any, topic: str, kind: Any, depth: int = 1, foreign: bool = False) -> Any:
@@ -158,7 +183,7 @@ class Wire:
             raise RobotError(self._nobody(seconds))
         self._release(lies_down)
         if self._until(self.other_commander, listen):
-            raise RobotError(f"another program sends {COMMANDS} in {self._where}: end it first; nothing was sent")
+            raise RobotError(taken(self._where))
         return self._until(self.receive, 0.1) or state
 
     def _until(self, found: Callable[[], Any], seconds: float) -> Any:

@@ -1,0 +1,265 @@
+"""Warp kernels of the recorded update, each in place of a dozen of torch's. Callers run torch's own on a CPU.
+
+All of them go into the stream that torch uses, and so into the graph that it records.
+"""
+
+# pyright: reportArgumentType=false, reportCallIssue=false, reportIndexIssue=false, reportOperatorIssue=false, reportReturnType=false
+# pyright: reportGeneralTypeIssues=false, reportInvalidTypeForm=false, reportAttributeAccessIssue=false, reportAssignmentType=false
+# pyright: reportRedeclaration=false
+# ruff: noqa: UP018
+# (warp compiles what it finds written here as its own language: int() makes a variable, and functions differ by their types)
+from __future__ import annotations
+
+import functools
+import math
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+ROWS = 64  # summed by a thread
+_AT_ONCE = 8  # rows that it reads before it writes any: it waits for memory once for them
+_Pairs = wp.types.matrix(shape=(_AT_ONCE, 2), dtype=float)
+_HALF_LOG_2PI = wp.constant(0.5 * math.log(2.0 * math.pi))
+
+
+def launch(kernel: Any, dim: int | tuple[int, ...], *inputs: Any) -> None:
+    """Run a kernel over tensors and numbers in torch's stream."""
+    wp.init()  # which is nothing where a simulation has done so
+    device = next(each.device for each in inputs if isinstance(each, Tensor))
+    arrays = [_array(each.detach()) if isinstance(each, Tensor) else each for each in inputs]
+    stream = _stream(torch.cuda.current_stream(device)) if device.type == "cuda" else None
+    wp.launch(kernel, dim=dim, inputs=arrays, device=str(device), stream=stream)
+
+
+def _array(x: Tensor) -> wp.array:
+    """As warp sees it: three dimensions are two of pairs, none is one of one."""
+    return wp.from_torch(x, dtype=wp.vec2) if x.dim() == 3 else wp.from_torch(x.view(x.shape or 1))
+
+
+_stream = functools.cache(wp.stream_from_torch)  # none is made while a graph is recorded
+
+
+# ---- the networks ---------------------------------------------------------------------------------------------------
+
+
+@wp.func
+def _unpack(x: wp.vec2):
+    return x
+
+
+@wp.func
+def _unpack(x: wp.int32):
+    bits = wp.cast(x, wp.uint32)
+    high = (bits >> wp.uint32(16)) << wp.uint32(16)
+    return wp.vec2(wp.cast(bits << wp.uint32(16), float), wp.cast(high, float))
+
+
+@wp.func
+def _bfloat16(x: float):
+    """Its bits, rounded to the nearest, ties to even; what is not a number stays so."""
+    bits = wp.cast(x, wp.uint32)
+    if (bits & wp.uint32(0x7FFFFFFF)) > wp.uint32(0x7F800000):
+        return wp.uint32(0x7FC0)
+    return (bits + wp.uint32(0x7FFF) + ((bits >> wp.uint32(16)) & wp.uint32(1))) >> wp.uint32(16)
+
+
+@wp.func
+def _pack(x: wp.vec2, like: wp.vec2):
+    return x
+
+
+@wp.func
+def _pack(x: wp.vec2, like: wp.int32):
+    return wp.cast((_bfloat16(x[1]) << wp.uint32(16)) | _bfloat16(x[0]), wp.int32)
+
+
+@wp.kernel(enable_backward=False)
+def _elu_backward(grad: wp.array2d[Any], out: wp.array2d[Any], into: wp.array2d[Any], sums: wp.array2d[wp.vec2], first: int):
+    block, c = wp.tid()
+    total = wp.vec2()
+    for row in range(block * ROWS, wp.min((block + 1) * ROWS, grad.shape[0]), _AT_ONCE):
+        g = _Pairs()
+        y = _Pairs()
+        for k in range(_AT_ONCE):
+            g[k] = _unpack(grad[row + k, c])
+            y[k] = _unpack(out[row + k, c])
+        for k in range(_AT_ONCE):
+            value = wp.cw_mul(g[k], wp.vec2(wp.min(y[k, 0], 0.0) + 1.0, wp.min(y[k, 1], 0.0) + 1.0))
+            into[row + k, c] = _pack(value, into[row + k, c])
+            total += value
+    sums[block, first + c] = total
+
+
+for _types in ((wp.vec2, wp.vec2, wp.vec2), (wp.int32, wp.int32, wp.int32), (wp.vec2, wp.int32, wp.int32)):
+    wp.overload(_elu_backward, [*(wp.array2d(dtype=each) for each in _types), wp.array2d(dtype=wp.vec2), int])
+
+
+def _pairs(x: Tensor) -> Tensor:
+    """(B, C) as C / 2 columns of two values: of bfloat16 a whole number, of float32 a vector."""
+    return x.view(torch.int32) if x.dtype == torch.bfloat16 else x.unflatten(1, (-1, 2))
+
+
+def fits(rows: int, sizes: list[int]) -> bool:
+    """Whether ``elu_backward`` takes layers of such sizes."""
+    return rows % _AT_ONCE == 0 and not any(size % 2 for size in sizes)
+
+
+def elu_backward(grad: Tensor, out: Tensor, sums: Tensor, first: int) -> Tensor:
+    """The gradient before an ELU, from that after it and its output, all (B, C); of the output's type.
+
+    Its sums over every ROWS rows go to the columns of ``sums`` (B / ROWS, ...) that begin at ``first``. float32 or bfloat16.
+    """
+    into = torch.empty_like(out)
+    launch(_elu_backward, (len(sums), out.shape[1] // 2), *map(_pairs, (grad, out, into, sums)), first // 2)
+    return into
+
+
+# ---- the losses -----------------------------------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def policy_loss(
+    mean: wp.array2d[float],
+    std: wp.array[float],
+    actions: wp.array2d[float],
+    advantages: wp.array2d[float],
+    old_log_prob: wp.array2d[float],
+    old_mean: wp.array2d[float],  # of the first samples, which are no mirror images; as the next
+    old_std: wp.array2d[float],
+    clip: float,
+    of_mean: wp.array2d[float],
+    terms: wp.array2d[float],  # (B, A + 2): by which the std's gradient is the sum, the surrogate loss, the KL divergence
+):
+    i = wp.tid()
+    width = mean.shape[1]
+    log_prob = float(0.0)
+    kl = float(0.0)
+    for a in range(width):
+        z = (actions[i, a] - mean[i, a]) / std[a]
+        log_prob -= 0.5 * z * z + wp.log(std[a]) + _HALF_LOG_2PI
+        if i < old_mean.shape[0]:
+            ratio_of_std = old_std[i, a] / std[a]
+            moved = (old_mean[i, a] - mean[i, a]) / std[a]
+            kl += 0.5 * (ratio_of_std * ratio_of_std + moved * moved - 1.0) - wp.log(ratio_of_std)
+    ratio = wp.exp(log_prob - old_log_prob[i, 0])
+    plain = -advantages[i, 0] * ratio
+    clipped = -advantages[i, 0] * wp.clamp(ratio, 1.0 - clip, 1.0 + clip)
+    weight = plain / float(mean.shape[0])
+    if plain < clipped:
+        weight = 0.0
+    for a in range(width):
+        z = (actions[i, a] - mean[i, a]) / std[a]
+        of_mean[i, a] = weight * z / std[a]
+        terms[i, a] = weight * (z * z - 1.0) / std[a]
+    terms[i, width] = wp.max(plain, clipped)
+    terms[i, width + 1] = kl
+
+
+@wp.kernel(enable_backward=False)
+def policy_sums(
+    sums: wp.array[float],  # (A + 2,) of the terms over all samples
+    std: wp.array[float],
+    entropy_coef: wp.array[float],
+    rows: float,
+    size: float,  # of the samples that are no mirror images
+    of_std: wp.array[float],
+    parts: wp.array[float],  # surrogate loss, entropy, KL divergence
+):
+    width = std.shape[0]
+    entropy = float(0.0)
+    for a in range(width):
+        entropy += wp.log(std[a]) + 0.5 + _HALF_LOG_2PI
+        of_std[a] = sums[a] - entropy_coef[0] / std[a]
+    parts[0] = sums[width] / rows
+    parts[1] = entropy
+    parts[2] = sums[width + 1] / size
+
+
+@wp.kernel(enable_backward=False)
+def value_loss(
+    values: wp.array2d[float],
+    old: wp.array2d[float],
+    returns: wp.array2d[float],
+    clip: float,  # 0: none
+    scale: float,
+    of_values: wp.array2d[float],
+    terms: wp.array2d[float],
+):
+    i = wp.tid()
+    error = values[i, 0] - returns[i, 0]
+    loss = error * error
+    slope = 2.0 * error
+    if clip > 0.0:
+        moved = values[i, 0] - old[i, 0]
+        near = old[i, 0] + wp.clamp(moved, -clip, clip) - returns[i, 0]
+        if near * near > loss:
+            loss = near * near
+            if wp.abs(moved) > clip:
+                slope = 0.0
+    of_values[i, 0] = scale * slope / float(values.shape[0])
+    terms[i, 0] = loss
+
+
+# ---- the step -------------------------------------------------------------------------------------------------------
+
+
+@wp.kernel(enable_backward=False)
+def adapt_rate(
+    kl: wp.array[float],
+    wanted: wp.array[wp.float64],
+    rate: wp.array[wp.float64],
+    adam_rate: wp.array[float],
+    step: wp.float64,
+    low: wp.float64,
+    high: wp.float64,
+):
+    found = wp.float64(kl[0])
+    if found > wanted[0] * wp.float64(2.0):
+        rate[0] = wp.max(rate[0] / step, low)
+    elif found < wanted[0] / wp.float64(2.0) and found > wp.float64(0.0):
+        rate[0] = wp.min(rate[0] * step, high)
+    adam_rate[0] = float(rate[0])
+
+
+@wp.kernel(enable_backward=False)
+def begin_adam(
+    norm: wp.array[float],
+    limit: float,
+    rate: wp.array[float],
+    beta1: wp.float64,
+    beta2: wp.float64,
+    decay: float,
+    step: wp.array[float],
+    factors: wp.array[float],
+):
+    step[0] = step[0] + 1.0
+    count = wp.float64(step[0])
+    one = wp.float64(1.0)
+    factors[0] = wp.min(limit / (norm[0] + 1.0e-6), 1.0)
+    if not wp.isfinite(norm[0]):
+        factors[0] = limit / norm[0]
+    factors[1] = float(wp.float64(rate[0]) / (one - wp.pow(beta1, count)))
+    factors[2] = float(wp.sqrt(one - wp.pow(beta2, count)))
+    factors[3] = rate[0] * decay
+
+
+@wp.kernel(enable_backward=False)
+def adam(
+    grad: wp.array[float],
+    factors: wp.array[float],
+    beta1: float,
+    beta2: float,
+    eps: float,
+    values: wp.array[float],
+    mean: wp.array[float],
+    square: wp.array[float],
+):
+    i = wp.tid()
+    g = grad[i] * factors[0]
+    m = mean[i] + (1.0 - beta1) * (g - mean[i])
+    v = beta2 * square[i] + (1.0 - beta2) * g * g
+    values[i] = values[i] - factors[3] * values[i] - factors[1] * m / (wp.sqrt(v) / factors[2] + eps)
+    mean[i] = m
+    square[i] = v

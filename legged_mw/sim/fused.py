@@ -1,0 +1,338 @@
+"""A recorded step's many small operations, fused: a thread runs a world through as many of them as it can, in one warp kernel.
+
+The step stays the Python that it is. One real call of it is traced; what each world does for itself goes into a few kernels, what
+does not fit (random numbers, sums over worlds) stays torch's, and the simulator's calls stay where they are. Before a fused
+step is used it is held, part by part, against the operations it replaces, on a real step's data.
+"""
+
+# pyright: reportInvalidTypeForm=false
+# (warp compiles what it finds written here as its own language)
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from typing import Any
+
+import torch
+import warp as wp
+from torch import Tensor
+
+from legged_mw.sim.fused_code import HELPERS, TYPES, Access, Code, Unfit, Writer
+from legged_mw.utils.trace import Call, Node, Trace
+
+BLOCK = 32  # threads of a block: 4096 worlds occupy every part of a large GPU
+_CLOSE = 1e-4  # relative and absolute, of values that are the same to float32 rounding after some operations
+_STRAYS = 0.002  # share of elements that may be another: a comparison that rounding turned
+
+
+class Kernel:
+    """Nodes that one thread a world runs through."""
+
+    def __init__(self, nodes: Sequence[Node], worlds: int) -> None:
+        self.nodes, self._worlds = nodes, worlds
+
+    def write(self, trace: Trace, own: set[int]) -> None:
+        """Make the source, with the blocks that are a thread's ``own``."""
+        names: dict[int, tuple[str, bool]] = {}
+        for view in (view for node in self.nodes for view in (*node.reads, *node.writes)):
+            mine = view.block in own
+            names.setdefault(view.block, (f"t{len(names)}" if mine else f"p{len(names)}", mine))
+        writer = Writer(self._worlds, trace.view, names.__getitem__)
+        lines, self._blocks = [HELPERS], list[Tensor]()
+        for block, (name, mine) in names.items():
+            tensor = trace.blocks[block]
+            kind = TYPES[tensor.dtype]
+            if mine:
+                world = tensor.dim() > 0 and tensor.shape[0] == self._worlds
+                lines.append(f"{kind} {name}[{tensor.numel() // (self._worlds if world else 1)}];")
+            else:
+                lines.append(f"{kind}* __restrict__ {name} = ({kind}*)table[{len(self._blocks)}];")
+                self._blocks.append(tensor)
+        for node in self.nodes:
+            lines += writer.emit(node).lines
+        self._source = "\n".join(lines)
+
+        self._device = str(self._blocks[0].device)
+        self._kernel = _kernel_of(wp.func_native(self._source)(_body))
+
+    def compile(self) -> None:
+        """Into warp's cache of kernels, if it is not there; nothing is loaded."""
+        wp.compile_aot_module(self._kernel.module, device=self._device)
+
+    def load(self) -> None:
+        addresses = [tensor.untyped_storage().data_ptr() for tensor in self._blocks]
+        self._table = wp.array(addresses, dtype=wp.uint64, device=self._device)
+        wp.load_module(self._kernel.module, device=self._device, block_dim=BLOCK)
+
+    def __call__(self) -> None:
+        wp.launch(self._kernel, dim=self._worlds, inputs=[self._table], device=self._device, block_dim=BLOCK)
+
+
+def _body(table: wp.array(dtype=wp.uint64), w: int) -> None: ...
+
+
+def _kernel_of(body: Any) -> Any:
+    def fused(table: wp.array(dtype=wp.uint64)) -> None:
+        body(table, wp.tid())
+
+    return wp.kernel(fused, enable_backward=False, module="unique", module_options={"block_dim": BLOCK})
+
+
+class Region:
+    """Operations between two calls of the simulator: as they were, and fused."""
+
+    def __init__(self, nodes: Sequence[Node], worlds: int, trace: Trace) -> None:
+        self.nodes = list(nodes)
+        self.steps = list[Kernel | Node](_schedule(self.nodes, worlds, trace))
+        self._fresh = trace.made
+        written = {view.block for node in self.nodes for view in node.writes} - trace.made
+        self._written = [_whole(trace.blocks[block]) for block in sorted(written)]
+
+    @property
+    def kernels(self) -> list[Kernel]:
+        return [step for step in self.steps if isinstance(step, Kernel)]
+
+    def __call__(self) -> None:
+        for step in self.steps:
+            step() if isinstance(step, Kernel) else _replay(step)
+
+    def verify(self, device: str) -> bool:
+        """Run as it was, then fused from the same state. Returns whether both did the same; if not, it stays as it was."""
+        before, random = [value.clone() for value in self._written], _generator(device).get_state()
+        for node in self.nodes:
+            _replay(node)
+        after = [value.clone() for value in self._written]
+        for value, old in zip(self._written, before, strict=True):
+            value.copy_(old)
+        _generator(device).set_state(random)
+        self()
+        if same := all(_same(a, b) for a, b in zip(after, self._written, strict=True)):
+            return same
+        for value, right in zip(self._written, after, strict=True):
+            value.copy_(right)
+        self.steps = list(self.nodes)
+        return same
+
+
+class Fused:
+    """A step, from a trace of one call: ``compile`` it (in a thread, if wanted), ``verify`` it on a real step, call it."""
+
+    def __init__(self, trace: Trace, worlds: int, device: str) -> None:
+        self._device, self.parts = device, list[Region | Call]()
+        nodes: list[Node] = []
+        for step in [*trace.steps, None]:
+            if isinstance(step, Node):
+                nodes.append(step)
+                continue
+            if nodes:
+                self.parts.append(Region(nodes, worlds, trace))
+                nodes = []
+            if step:
+                self.parts.append(step)
+        used: dict[int, set[int]] = {}
+        for number, blocks in enumerate(self._uses()):
+            for block in blocks:
+                used.setdefault(block, set()).add(number)
+        kernels = self.kernels
+        for number, what in enumerate(self._steps()):
+            if isinstance(what, Kernel):
+                what.write(trace, {block for block in trace.made if used.get(block) == {number}})
+        self.compiled = not kernels
+        trace.steps.clear()
+
+    def _steps(self) -> Iterator[Kernel | Node | Call]:
+        for part in self.parts:
+            yield from part.steps if isinstance(part, Region) else [part]
+
+    def _uses(self) -> Iterator[set[int]]:
+        for step in self._steps():
+            if isinstance(step, Call):
+                yield set(step.given)
+            else:
+                nodes = step.nodes if isinstance(step, Kernel) else [step]
+                yield {view.block for node in nodes for view in (*node.reads, *node.writes)}
+
+    @property
+    def kernels(self) -> list[Kernel]:
+        return [kernel for part in self.parts if isinstance(part, Region) for kernel in part.kernels]
+
+    def compile(self) -> None:
+        """Compile what warp's cache does not have; nothing that a recording on the same GPU would mind."""
+        for kernel in self.kernels:
+            kernel.compile()
+        self.compiled = True
+
+    def verify(self) -> int:
+        """Load what is compiled and run one real step with it; returns how many of its parts have to stay as they were."""
+        for kernel in self.kernels:
+            kernel.load()
+        wrong = 0
+        for part in self.parts:
+            if isinstance(part, Region):
+                wrong += not part.verify(self._device)
+            else:
+                part.run()
+        return wrong
+
+    def __call__(self) -> None:
+        for part in self.parts:
+            part() if isinstance(part, Region) else part.run()
+
+
+# ---- which operations go together -----------------------------------------------------------------------------------------
+
+
+def _schedule(nodes: Sequence[Node], worlds: int, trace: Trace) -> Iterator[Kernel | Node]:
+    """The nodes in an order that is as good, those that fit together in kernels that are as few as may be."""
+    codes = [_code(node, worlds, trace) for node in nodes]
+    waits, wakes = _dependencies(nodes)
+    ready: tuple[list[int], list[int]] = ([], [])  # torch's, and ours
+
+    def wake(i: int) -> None:
+        heapq.heappush(ready[codes[i] is not None], i)
+
+    for i in (i for i, count in enumerate(waits) if not count):
+        wake(i)
+
+    def done(i: int) -> None:
+        for j in wakes[i]:
+            waits[j] -= 1
+            if not waits[j]:
+                wake(j)
+
+    while ready[0] or ready[1]:
+        while ready[0]:
+            i = heapq.heappop(ready[0])
+            yield nodes[i]
+            done(i)
+        together, rows, later = list[Node](), _Rows(worlds), list[int]()
+        while ready[1]:
+            i = heapq.heappop(ready[1])
+            code = codes[i]
+            assert code is not None
+            if rows.take(code):
+                together.append(nodes[i])
+                done(i)
+            elif together:
+                later.append(i)
+            else:  # not even alone
+                yield nodes[i]
+                done(i)
+        ready[1].extend(sorted(later))
+        if together:
+            yield Kernel(together, worlds)
+
+
+def _code(node: Node, worlds: int, trace: Trace) -> Code | None:
+    """What the node does for a world, where it can be said."""
+    if (
+        node.random
+        or node.writes[0].block in trace.watched
+        or (node.writes[0].block not in trace.made and worlds not in node.writes[0].shape[:1])
+    ):
+        return None
+    with suppress(Unfit):
+        return Writer(worlds, trace.view, lambda block: (f"p{block}", False)).emit(node)
+    return None
+
+
+def _dependencies(nodes: Sequence[Node]) -> tuple[list[int], list[set[int]]]:
+    """How many nodes each waits for, and which ones wait for it: by blocks of memory, and draws in turn."""
+    after: list[set[int]] = [set() for _ in nodes]
+    wrote, read, drew = dict[int, int](), dict[int, set[int]](), -1
+    for i, node in enumerate(nodes):
+        for view in node.reads:
+            if view.block in wrote:
+                after[i].add(wrote[view.block])
+            read.setdefault(view.block, set()).add(i)
+        for view in node.writes:
+            after[i] |= read.pop(view.block, set())
+            if view.block in wrote:
+                after[i].add(wrote[view.block])
+            wrote[view.block] = i
+        if node.random:
+            after[i] |= {drew} if drew >= 0 else set()
+            drew = i
+        after[i].discard(i)
+    wakes: list[set[int]] = [set() for _ in nodes]
+    for i, before in enumerate(after):
+        for j in before:
+            wakes[j].add(i)
+    return [len(before) for before in after], wakes
+
+
+class _Rows:
+    """What the nodes of a kernel reach: where one writes, every one keeps to the rows of its own world."""
+
+    def __init__(self, worlds: int) -> None:
+        self._worlds = worlds
+        self._pitches: dict[int, set[int]] = {}
+        self._written: set[int] = set()
+
+    def take(self, code: Code) -> bool:
+        """Take the node in, if it fits."""
+        block = code.write.view.block
+        reached = {block: {self._row(code.write)}}
+        for access in code.reads:
+            reached.setdefault(access.view.block, set()).add(self._row(access))
+        for name, pitches in reached.items():
+            pitches = pitches | self._pitches.get(name, set())
+            if (name == block or name in self._written) and (len(pitches) > 1 or -1 in pitches):
+                return False
+        for name, pitches in reached.items():
+            self._pitches.setdefault(name, set()).update(pitches)
+        self._written.add(block)
+        return True
+
+    def _row(self, access: Access) -> int:
+        """The pitch of the rows that the access keeps to; 0: of a value that all share; -1: it does not keep to any."""
+        if access.pitch == 0:
+            return 0
+        low = access.low % (self._worlds * access.pitch)
+        return access.pitch if low + access.high - access.low <= access.pitch else -1
+
+
+# ---- what stays torch's ---------------------------------------------------------------------------------------------------
+
+
+def _replay(node: Node) -> None:
+    """Do again what the node did, to the same memory."""
+    if node.func.overloadpacket in (torch.ops.aten.rand, torch.ops.aten.rand_like):
+        node.outs[0].uniform_()
+    elif node.name.startswith(("empty", "new_empty")):
+        pass
+    elif into := _INTO.get(str(node.func)):
+        into(*node.args, **{**node.kwargs, "out": node.outs[0]})
+    else:
+        result = node.func(*node.args, **node.kwargs)
+        if not node.func._schema.is_mutable:
+            for kept, new in zip(node.outs, [result] if isinstance(result, Tensor) else result, strict=True):
+                kept.copy_(new)
+
+
+_INTO: dict[str, Callable[..., Any]] = {
+    "aten.sum.dim_IntList": torch.ops.aten.sum.IntList_out,
+    "aten.div.Tensor": torch.ops.aten.div.out,
+    "aten.mul.Tensor": torch.ops.aten.mul.out,
+    "aten.add.Tensor": torch.ops.aten.add.out,
+}
+
+
+def _whole(tensor: Tensor) -> Tensor:
+    """All of a tensor's memory as one row."""
+    storage = tensor.untyped_storage()
+    return tensor.as_strided((storage.nbytes() // tensor.element_size(),), (1,), 0)
+
+
+def _generator(device: str) -> torch.Generator:
+    if device == "cpu":
+        return torch.default_generator
+    index = torch.device(device).index
+    return torch.cuda.default_generators[torch.cuda.current_device() if index is None else index]
+
+
+def _same(a: Tensor, b: Tensor) -> bool:
+    """Equal to rounding, but for a few."""
+    other = ~torch.isclose(a, b, rtol=_CLOSE, atol=_CLOSE, equal_nan=True) if a.is_floating_point() else a != b
+    return int(other.sum()) <= 1 + _STRAYS * a.numel()

@@ -1,0 +1,393 @@
+"""Torch's operations as lines of C, for one world each: what a thread does that runs a world through many of them.
+
+An operation fits if each world's result depends on that world's values and on what all worlds share. What does not fit, or is
+not known here, is left to torch: ``emit`` raises ``Unfit``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from legged_mw.utils.trace import Node, View
+
+TYPES = {torch.float32: "float", torch.float64: "double", torch.int64: "long long", torch.int32: "int", torch.bool: "bool"}
+SMALL = 64  # elements of a value that all worlds share: each thread computes it for itself
+WORLD = "w"
+
+HELPERS = """
+#define NAN_OR(a, b, x) ((a) != (a) ? (a) : (b) != (b) ? (b) : (x))
+#define MAXIMUM(a, b) NAN_OR(a, b, (a) > (b) ? (a) : (b))
+#define MINIMUM(a, b) NAN_OR(a, b, (a) < (b) ? (a) : (b))
+#define FINITE(x) ((x) - (x) == 0)
+"""
+
+
+class Unfit(Exception):
+    """The operation is left to torch."""
+
+
+class Access(NamedTuple):
+    """What a world reaches of a view: elements [low, high) of a row every ``pitch`` elements; all worlds the same where pitch is 0."""
+
+    view: View
+    pitch: int
+    low: int
+    high: int
+
+
+class Code(NamedTuple):
+    """An operation's lines, and what it reaches: reads first, the write last."""
+
+    lines: list[str]
+    reads: list[Access]
+    write: Access
+
+
+_ONE = {  # name -> C, of one value a
+    "neg": "-{a}", "abs": "({a} < 0 ? -{a} : {a})", "sqrt": "sqrtf({a})", "rsqrt": "1.0f / sqrtf({a})", "exp": "expf({a})",
+    "log": "logf({a})",
+    "sin": "sinf({a})", "cos": "cosf({a})", "tan": "tanf({a})", "asin": "asinf({a})", "acos": "acosf({a})", "atan": "atanf({a})",
+    "tanh": "tanhf({a})", "sigmoid": "1.0f / (1.0f + expf(-{a}))", "floor": "floorf({a})", "ceil": "ceilf({a})", "round": "rintf({a})",
+    "trunc": "truncf({a})", "reciprocal": "1.0f / {a}", "sign": "({a} > 0) - ({a} < 0)", "logical_not": "!{a}",
+    "copy": "{a}", "clone": "{a}", "to_copy": "{a}", "to": "{a}",
+    "sinc": "({a} == 0.0f ? 1.0f : sinf(3.14159265358979f * {a}) / (3.14159265358979f * {a}))",
+    "isnan": "{a} != {a}", "isfinite": "FINITE({a})", "square": "{a} * {a}",
+}  # fmt: skip
+_TWO = {  # of a and b
+    "add": "{a} + {b}", "sub": "{a} - {b}", "rsub": "{b} - {a}", "mul": "{a} * {b}", "div": "{a} / {b}", "atan2": "atan2f({a}, {b})",
+    "hypot": "sqrtf({a} * {a} + {b} * {b})", "maximum": "MAXIMUM({a}, {b})", "minimum": "MINIMUM({a}, {b})",
+    "clamp_min": "MAXIMUM({a}, {b})", "clamp_max": "MINIMUM({a}, {b})", "remainder": "({a} - {b} * floorf({a} / {b}))",
+    "eq": "{a} == {b}", "ne": "{a} != {b}", "lt": "{a} < {b}", "le": "{a} <= {b}", "gt": "{a} > {b}", "ge": "{a} >= {b}",
+    "logical_and": "{a} && {b}", "logical_or": "{a} || {b}", "logical_xor": "!{a} != !{b}",
+    "bitwise_and": "{a} & {b}", "bitwise_or": "{a} | {b}", "bitwise_xor": "{a} ^ {b}", "and": "{a} & {b}",
+    "or": "{a} | {b}", "xor": "{a} ^ {b}", "iand": "{a} & {b}", "ior": "{a} | {b}",
+}  # fmt: skip
+_THREE = {
+    "where": "({a} ? {b} : {c})", "masked_fill": "({b} ? {c} : {a})",
+    "addcmul": "{a} + {s} * {b} * {c}", "addcdiv": "{a} + {s} * {b} / {c}",
+    "lerp": "({c} < 0.5f ? {a} + {c} * ({b} - {a}) : {b} - ({b} - {a}) * (1.0f - {c}))",
+}  # fmt: skip
+_COPIES = {"copy", "clone", "to_copy", "to"}
+_COMPARING = {"eq", "ne", "lt", "le", "gt", "ge", "isnan", "isfinite", "logical_and", "logical_or", "logical_not", "logical_xor"}
+_FLOATS = {name for name, text in {**_ONE, **_TWO, **_THREE}.items() if "f(" in text or "." in text}  # only of float32
+_CONSTANTS = {"zeros_like": 0, "zeros": 0, "zero": 0, "new_zeros": 0, "ones_like": 1, "ones": 1, "new_ones": 1}
+_REDUCTIONS = {  # name -> start, step from the sum so far and a value
+    "sum": ("0", "{s} + {a}"), "mean": ("0", "{s} + {a}"), "linalg_vector_norm": ("0", "{s} + {a} * {a}"), "any": ("0", "{s} || {a}"),
+    "all": ("1", "{s} && {a}"), "amax": ("", "MAXIMUM({s}, {a})"), "amin": ("", "MINIMUM({s}, {a})"), "prod": ("1", "{s} * {a}"),
+}  # fmt: skip
+
+
+class Writer:
+    """Writes the lines of operations on ``worlds`` worlds. ``place`` gives the C name of a block and whether it is a thread's own."""
+
+    def __init__(self, worlds: int, view: Callable[[Tensor], View], place: Callable[[int], tuple[str, bool]]) -> None:
+        self._worlds, self._view, self._place = worlds, view, place
+
+    def emit(self, node: Node) -> Code:
+        """The lines of ``node``. Raises Unfit."""
+        if len(node.writes) != 1 or any(view.dtype not in TYPES for view in (*node.reads, *node.writes)):
+            raise Unfit
+        out, name = node.writes[0], node.name
+        self._shared = not out.shape or out.shape[0] != self._worlds
+        if self._shared and math.prod(out.shape) > SMALL:
+            raise Unfit
+        self._out, self._reads = out, list[Access]()
+        if name.startswith("empty") or name.startswith("new_empty"):
+            lines = []
+        elif name in _REDUCTIONS:
+            lines = self._reduce(node, name)
+        elif special := getattr(self, f"_emit_{name}", None):
+            lines = special(*node.args, **node.kwargs)
+        else:
+            lines = self._elementwise(node, name)
+        return Code(["{", *lines, "}"], self._reads, self._access(out, out.shape))
+
+    # ---- memory ----------------------------------------------------------------------------------------------------------
+
+    def _access(self, view: View, shape: Sequence[int]) -> Access:
+        """What a world reaches of ``view`` when it is spread over ``shape``, whose first dimension are worlds."""
+        strides = _spread(view, shape)
+        pitch = 0 if self._shared or not strides else strides[0]
+        inner = strides if self._shared else strides[1:]
+        sizes = shape if self._shared else shape[1:]
+        span = sum((n - 1) * s for n, s in zip(sizes, inner, strict=True)) if all(sizes) else 0
+        return Access(view, pitch, view.offset, view.offset + span + 1)
+
+    def _at(self, view: View, strides: Sequence[int], index: Sequence[str], offset: int = 0) -> str:
+        name, own = self._place(view.block)
+        terms = [str(view.offset + offset)] if view.offset + offset else []
+        for stride, i in zip(strides, index, strict=True):
+            if stride and i != "0" and not (own and i == WORLD):
+                terms.append(i if stride == 1 else f"{stride} * {i}")
+        return f"{name}[{' + '.join(terms) or '0'}]"
+
+    def _read(self, tensor: Tensor, shape: Sequence[int], index: Sequence[str]) -> str:
+        """An element of ``tensor`` spread over ``shape``."""
+        view = self._view(tensor)
+        self._reads.append(self._access(view, shape))
+        return self._at(view, _spread(view, shape), index)
+
+    def _write(self, index: Sequence[str]) -> str:
+        return self._at(self._out, self._out.strides, index)
+
+    def _index(self, shape: Sequence[int], letter: str = "i") -> list[str]:
+        """Names of an element's indices."""
+        names = ["0" if n == 1 else f"{letter}{d}" for d, n in enumerate(shape)]
+        return names if self._shared else [WORLD, *names[1:]]
+
+    def _loops(self, shape: Sequence[int], index: Sequence[str], body: Iterable[str]) -> list[str]:
+        heads = [f"for (int {i} = 0; {i} < {n}; ++{i})" for n, i in zip(shape, index, strict=True) if i not in ("0", WORLD)]
+        return [" ".join(heads) + " {", *body, "}"]
+
+    def _store(self, shape: Sequence[int], index: Sequence[str], value: str, reads: Iterable[Tensor] = ()) -> list[str]:
+        """Write ``value`` everywhere; by way of a copy where it is read from the same memory elsewhere."""
+        kind = TYPES[self._out.dtype]
+        views = [self._view(tensor) for tensor in reads]
+        if all(view.block != self._out.block or view[2:] == self._out[2:] for view in views):
+            return self._loops(shape, index, [f"{self._write(index)} = ({kind})({value});"])
+        sizes = shape if self._shared else shape[1:]
+        inner = index if self._shared else index[1:]
+        at = " + ".join(f"{math.prod(sizes[d + 1 :])} * {i}" for d, i in enumerate(inner) if i != "0") or "0"
+        copied = self._loops(shape, index, [f"copy[{at}] = ({kind})({value});"])
+        return [f"{kind} copy[{math.prod(sizes)}];", *copied, *self._loops(shape, index, [f"{self._write(index)} = copy[{at}];"])]
+
+    # ---- operations ------------------------------------------------------------------------------------------------------
+
+    def _elementwise(self, node: Node, name: str) -> list[str]:
+        shape, args = self._out.shape, list(node.args)
+        index = self._index(shape)
+        if name in _CONSTANTS or name in ("fill", "full", "full_like", "scalar_tensor", "new_full"):
+            value = _CONSTANTS.get(name, node.args[-1])
+            return self._store(shape, index, self._value(value, shape, index, self._out.dtype))
+        if node.kwargs.get("rounding_mode") or (name == "copy" and len(args) > 2 and args[2]):
+            raise Unfit
+        if name == "copy":
+            args = args[1:2]
+        if name in _COPIES or (name == "bitwise_not" and self._out.dtype == torch.bool):
+            name, args = ("logical_not", args) if name == "bitwise_not" else (name, args[:1])
+        text = _ONE.get(name) or _TWO.get(name) or _THREE.get(name)
+        wanted = 1 if name in _ONE else 2 if name in _TWO else 3
+        if text is None or len(args) < wanted:
+            raise Unfit
+        kinds = self._kinds(name, args)
+        if name in _FLOATS and torch.float32 not in (kinds[0], self._out.dtype):
+            raise Unfit
+        values = [self._value(arg, shape, index, kind) for arg, kind in zip(args, kinds, strict=False)]
+        scale = node.kwargs.get("alpha", args[2] if name in ("add", "sub", "rsub") and len(args) > 2 else 1)
+        if scale != 1 and name in ("add", "sub", "rsub"):
+            text = text.replace("{b}", "{s} * {b}") if name != "rsub" else "{b} - {s} * {a}"
+        factor = self._value(node.kwargs.get("value", scale), shape, index, self._out.dtype)
+        value = text.format(**dict(zip("abc", values, strict=False)), s=factor)
+        return self._store(shape, index, value, [arg for arg in args if isinstance(arg, Tensor)])
+
+    def _kinds(self, name: str, args: Sequence[Any]) -> list[torch.dtype]:
+        """The types that the operands are brought to."""
+        if name in _COPIES:
+            return [args[0].dtype]
+        if name in _COMPARING:
+            both = args[0].dtype if len(args) == 1 else torch.result_type(args[0], args[1])
+            return [both] * len(args)
+        out = self._out.dtype
+        return {"where": [torch.bool, out, out], "masked_fill": [out, torch.bool, out]}.get(name, [out] * len(args))
+
+    def _value(self, value: Any, shape: Sequence[int], index: Sequence[str], kind: torch.dtype) -> str:
+        """An operand as C: an element of a tensor, or a number, in the type ``kind``."""
+        if kind not in TYPES:
+            raise Unfit
+        if isinstance(value, Tensor):
+            element = self._read(value, shape, index)
+            return element if value.dtype == kind else f"(({TYPES[kind]}){element})"
+        if value is None or isinstance(value, complex):
+            raise Unfit
+        if kind in (torch.float32, torch.float64):
+            number = float(value)
+            if not math.isfinite(number):
+                return "(0.0f / 0.0f)" if math.isnan(number) else "(1.0f / 0.0f)" if number > 0 else "(-1.0f / 0.0f)"
+            return f"({number!r}{'f' if kind == torch.float32 else ''})"
+        return f"(({TYPES[kind]}){int(value)}LL)"
+
+    def _emit_clamp(self, x: Tensor, low: Any = None, high: Any = None, **more: Any) -> list[str]:
+        low, high, shape = more.get("min", low), more.get("max", high), self._out.shape
+        index, kind = self._index(shape), self._out.dtype
+        value = self._value(x, shape, index, kind)
+        for bound, macro in ((low, "<"), (high, ">")):
+            if bound is not None:
+                limit = self._value(bound, shape, index, kind)
+                value = f"({value} {macro} {limit} ? {limit} : {value})"
+        return self._store(shape, index, value, [v for v in (x, low, high) if isinstance(v, Tensor)])
+
+    def _emit_nan_to_num(self, x: Tensor, nan: Any = None, posinf: Any = None, neginf: Any = None, **more: Any) -> list[str]:
+        shape, index = self._out.shape, self._index(self._out.shape)
+        if self._out.dtype != torch.float32:
+            raise Unfit
+        a, top = self._value(x, shape, index, torch.float32), torch.finfo(torch.float32).max
+        most, least = (
+            self._value(v, shape, index, torch.float32) for v in (top if posinf is None else posinf, -top if neginf is None else neginf)
+        )
+        zero = self._value(nan or 0.0, shape, index, torch.float32)
+        return self._store(shape, index, f"({a} != {a} ? {zero} : FINITE({a}) ? {a} : {a} > 0 ? {most} : {least})", [x])
+
+    def _emit_constant_pad_nd(self, x: Tensor, pad: Sequence[int], value: Any = 0) -> list[str]:
+        shape, index = self._out.shape, self._index(self._out.shape)
+        before = [0] * x.dim()
+        for d in range(len(pad) // 2):
+            before[-1 - d] = pad[2 * d]
+        if min(pad) < 0 or (not self._shared and before[0]) or "0" in index[1:]:
+            raise Unfit
+        view, inside = self._view(x), []
+        self._reads.append(self._access(view, view.shape))
+        for d, i in enumerate(index):
+            if i != WORLD:
+                inside.append(f"{i} >= {before[d]} && {i} < {before[d] + x.shape[d]}")
+        shift = -sum(b * s for b, s in zip(before, view.strides, strict=True))
+        element = self._at(view, view.strides, index, shift)
+        return self._store(
+            shape, index, f"(({' && '.join(inside)}) ? {element} : {self._value(value, shape, index, self._out.dtype)})", [x]
+        )
+
+    def _emit_pad(self, x: Tensor, pad: Sequence[int], mode: str = "constant", value: Any = None) -> list[str]:
+        if mode != "constant":
+            raise Unfit
+        return self._emit_constant_pad_nd(x, pad, value or 0)
+
+    def _emit_flatten(self, x: Tensor, *_: Any) -> list[str]:
+        """The same elements in a new shape, where that takes a copy."""
+        view, strides = self._view(x), [math.prod(x.shape[d + 1 :]) for d in range(x.dim())]
+        if self._shared or x.shape[0] != self._worlds or self._out.dtype != x.dtype:
+            raise Unfit
+        index = self._index(view.shape)
+        self._reads.append(self._access(view, view.shape))
+        return self._loops(view.shape, index, [f"{self._at(self._out, strides, index)} = {self._at(view, view.strides, index)};"])
+
+    _emit_reshape = _emit_unsafe_view = _emit_flatten
+
+    def _reduce(self, node: Node, name: str) -> list[str]:
+        args: tuple[Any, ...] = (*node.args, None)
+        x, view = args[0], self._view(args[0])
+        dims = args[2 if name == "linalg_vector_norm" else 1]
+        dims = range(x.dim()) if dims is None or dims == [] else [dims] if isinstance(dims, int) else dims
+        dims = {d % max(x.dim(), 1) for d in dims}
+        if (not self._shared and (0 in dims or x.shape[0] != self._worlds)) or (name == "linalg_vector_norm" and args[1] != 2):
+            raise Unfit
+        if (self._shared and math.prod(x.shape) > SMALL) or node.kwargs.get("dtype") not in (None, self._out.dtype):
+            raise Unfit
+        index, kind = self._index(x.shape, "k"), TYPES[self._out.dtype]
+        kept = ["0" if d in dims else i for d, i in enumerate(index)]
+        out = kept if len(self._out.shape) == x.dim() else [i for d, i in enumerate(index) if d not in dims]
+        self._reads.append(self._access(view, x.shape))
+        start, step = _REDUCTIONS[name]
+        element, first = (f"({kind})({self._at(view, view.strides, where)})" for where in (index, kept))
+        inner = self._loops([n if d in dims else 1 for d, n in enumerate(x.shape)], [i if d in dims else "0" for d, i in enumerate(index)],
+                            [f"{kind} a = {element};", f"s = {step.format(s='s', a='a')};"])  # fmt: skip
+        end = {"mean": f"s / {math.prod(x.shape[d] for d in dims)}", "linalg_vector_norm": "sqrtf(s)"}.get(name, "s")
+        body = [f"{kind} s = {start or first};", *inner, f"{self._write(out)} = {end};"]
+        return self._loops([1 if d in dims else n for d, n in enumerate(x.shape)], kept, body)
+
+    def _join(self, tensors: Sequence[Tensor], dim: int, stacked: bool) -> list[str]:
+        """cat and stack: each tensor goes to its place along ``dim``."""
+        shape, lines, start = self._out.shape, list[str](), 0
+        dim %= len(shape)
+        if dim == 0 and not self._shared:
+            raise Unfit
+        for tensor in tensors:
+            if not tensor.numel():
+                continue
+            part = tensor.unsqueeze(dim) if stacked else tensor
+            view = self._view(part)
+            self._reads.append(self._access(view, view.shape))
+            index, offset = self._index(view.shape), start * self._out.strides[dim]
+            to = self._at(self._out, self._out.strides, index, offset)
+            lines += self._loops(view.shape, index, [f"{to} = ({TYPES[self._out.dtype]}){self._at(view, view.strides, index)};"])
+            start += view.shape[dim]
+        if any(self._view(tensor).block == self._out.block for tensor in tensors if tensor.numel()):
+            raise Unfit
+        return lines
+
+    def _emit_cat(self, tensors: Sequence[Tensor], dim: int = 0, **_: Any) -> list[str]:
+        return self._join(tensors, dim, stacked=False)
+
+    def _emit_stack(self, tensors: Sequence[Tensor], dim: int = 0, **_: Any) -> list[str]:
+        return self._join(tensors, dim, stacked=True)
+
+    def _picked(self, x: Tensor, place: Sequence[str]) -> str:
+        """An element of ``x`` at indices that are known at run time; of worlds' own values only the world's own."""
+        view = self._view(x)
+        own = bool(place) and place[0] == WORLD and x.shape[0] == self._worlds
+        access = self._access(view, view.shape) if own else Access(view, 0, view.offset, view.offset + _span(view))
+        self._reads.append(access)
+        return self._at(view, view.strides, place)
+
+    def _emit_index_select(self, x: Tensor, dim: int, index: Tensor, **_: Any) -> list[str]:
+        shape, at = self._out.shape, self._index(self._out.shape)
+        dim %= x.dim()
+        where = self._view(index)
+        self._reads.append(
+            self._access(where, index.shape)
+            if not self._shared and dim == 0
+            else Access(where, 0, where.offset, where.offset + _span(where))
+        )
+        at[dim] = f"(int){self._at(where, where.strides, [at[dim]])}"
+        return self._store(shape, self._index(shape), self._picked(x, at), [x])
+
+    def _emit_gather(self, x: Tensor, dim: int, index: Tensor, **_: Any) -> list[str]:
+        shape = self._out.shape
+        at = self._index(shape)
+        dim %= x.dim()
+        if dim == 0 and not self._shared:
+            raise Unfit
+        chosen = [*at]
+        chosen[dim] = f"(int){self._read(index, shape, at)}"
+        return self._store(shape, at, self._picked(x, chosen), [x, index])
+
+    def _emit_index(self, x: Tensor, indices: Sequence[Tensor | None]) -> list[str]:
+        shape = self._out.shape
+        used = [d for d, i in enumerate(indices) if i is not None]
+        if not used or used != list(range(used[0], used[-1] + 1)) or any(i is not None and i.dtype == torch.bool for i in indices):
+            raise Unfit
+        spread = torch.broadcast_shapes(*(indices[d].shape for d in used))  # type: ignore[union-attr]
+        at, first = self._index(shape), used[0]
+        inner, place = at[first : first + len(spread)], at[:first]
+        for d in used:
+            tensor = indices[d]
+            assert tensor is not None
+            view = self._view(tensor)
+            world = not self._shared and first == 0
+            self._reads.append(self._access(view, spread) if world else Access(view, 0, view.offset, view.offset + _span(view)))
+            j = self._at(view, _spread(view, spread), inner)
+            place.append(f"(int)({j} < 0 ? {j} + {x.shape[d]} : {j})")
+        return self._store(shape, at, self._picked(x, [*place, *at[first + len(spread) :]]), [x])
+
+    def _emit_mm(self, a: Tensor, b: Tensor, **_: Any) -> list[str]:
+        if self._shared or self._out.dtype != torch.float32:
+            raise Unfit
+        (columns,) = self._out.shape[1:]
+        left, right = self._view(a), self._view(b)
+        self._reads += [self._access(left, left.shape), Access(right, 0, right.offset, right.offset + _span(right))]
+        j = "0" if columns == 1 else "j"
+        term = f"s += {self._at(left, left.strides, [WORLD, 'k'])} * {self._at(right, right.strides, ['k', j])};"
+        body = ["float s = 0;", *self._loops([a.shape[1]], ["k"], [term]), f"{self._write([WORLD, j])} = s;"]
+        return self._loops([columns], [j], body)
+
+    def _emit_linalg_cross(self, a: Tensor, b: Tensor, dim: int = -1, **_: Any) -> list[str]:
+        shape = self._out.shape
+        if dim % len(shape) != len(shape) - 1:
+            raise Unfit
+        at = self._index(shape)[:-1]
+        x, y = ([self._read(v, shape, [*at, str(k)]) if k else self._read(v, shape, [*at, "0"]) for k in range(3)] for v in (a, b))
+        values = [f"float c{k} = {x[i]} * {y[j]} - {x[j]} * {y[i]};" for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1)))]
+        return self._loops(shape[:-1], at, [*values, *(f"{self._write([*at, str(k) if k else '0'])} = c{k};" for k in range(3))])
+
+
+def _spread(view: View, shape: Sequence[int]) -> list[int]:
+    """Strides of ``view`` spread over ``shape``: 0 where it is repeated."""
+    strides = [s if n != 1 else 0 for n, s in zip(view.shape, view.strides, strict=True)]
+    return [0] * (len(shape) - len(strides)) + strides
+
+
+def _span(view: View) -> int:
+    return sum((n - 1) * s for n, s in zip(view.shape, view.strides, strict=True)) + 1

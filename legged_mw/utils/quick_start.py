@@ -1,0 +1,131 @@
+"""What makes a program start quickly: garbage is left alone, the GPU opens beside the imports, torch's compiler waits until it is used.
+
+tensordict marks three functions for torch's compiler as it is imported, and torch's optimizers mark their methods at the first
+call. Either imports ``torch._dynamo``, some 900 modules, and nothing in a training compiles. So a stand-in notes the marks. Whoever
+asks it for anything else gets the compiler itself, with the marks made.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import importlib
+import os
+import sys
+from collections.abc import Callable, Sequence
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from threading import RLock, Thread
+from types import ModuleType
+from typing import Any
+
+_COMPILER = "torch._dynamo"
+_KNOWN = (2, 11), (2, 13)  # the first and last version of torch that this was tried with; others import as they always did
+_DISABLED = "__dynamo_disable"  # where torch/_compile.py keeps what `disable` gave it
+
+Marked = Callable[..., Any]
+
+
+def begin(gpu: str | None = "cpu") -> None:
+    """To be called first, before torch is imported. From here until ``settle`` no garbage is collected.
+
+    ``gpu`` is the device that will be used: "cpu", "cuda:0", or None for the GPU of this process, if there is one.
+    """
+    if "torch" in sys.modules:
+        return  # too late to gain from it: another program calls this one
+    gc.disable()  # a start makes a million objects that stay; to look through them again and again takes a third of it
+    if gpu != "cpu":
+        index = int(gpu.partition(":")[2] or 0) if gpu else int(os.environ.get("LOCAL_RANK", "0"))
+        Thread(target=open_gpu, args=(index,), daemon=True).start()
+    put_off_compiler()
+
+
+def open_gpu(index: int) -> bool:
+    """Make the context of a GPU, which torch and warp share and then find; False where there is none. Python runs on meanwhile."""
+    try:
+        cuda = ctypes.CDLL("libcuda.so.1")
+    except OSError:
+        return False
+    device, context = ctypes.c_int(), ctypes.c_void_p()
+    calls = (
+        (cuda.cuInit, 0),
+        (cuda.cuDeviceGet, ctypes.byref(device), index),
+        (cuda.cuDevicePrimaryCtxRetain, ctypes.byref(context), device),
+    )
+    return all(call(*args) == 0 for call, *args in calls)  # what fails is told by torch, which asks the same again
+
+
+def settle() -> None:
+    """All that stays is made: it is never looked through again, and what comes is collected as ever."""
+    if not gc.isenabled():
+        gc.freeze()
+        gc.enable()
+
+
+def put_off_compiler() -> bool:
+    """Put the stand-in where torch's compiler would be; False if that is there already, or torch is of an unknown version."""
+    import torch
+
+    version = tuple(int(part) for part in torch.__version__.split(".")[:2])
+    if _COMPILER in sys.modules or not _KNOWN[0] <= version <= _KNOWN[1]:
+        return False
+    sys.modules[_COMPILER] = _Compiler(_COMPILER)
+    sys.meta_path.insert(0, _Found())
+    return True
+
+
+class _Compiler(ModuleType):
+    """Notes marks, which mean nothing until something is compiled; asked for anything else it imports the compiler."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.__file__ = str(Path(sys.modules["torch"].__file__ or "").parent / "_dynamo" / "__init__.py")  # inspect walks over all files
+        self._lock, self._marks = RLock(), list[tuple[str, Marked]]()
+
+    def allow_in_graph(self, fn: Marked) -> Marked:
+        self._marks.append(("allow_in_graph", fn))
+        return fn
+
+    def assume_constant_result(self, fn: Marked) -> Marked:
+        self._marks.append(("assume_constant_result", fn))
+        return fn
+
+    def disable(self, fn: Any = None, recursive: bool = True, **more: Any) -> Any:
+        """As torch/_compile.py calls it, which asks again once what it was given is deleted."""
+        if fn is None or more != {"wrapping": False}:
+            return self._real().disable(fn, recursive, **more)
+        self._marks.append((_DISABLED, fn))
+        return fn
+
+    def graph_break(self, msg: str = "") -> None:
+        """Nothing is compiled, and so nothing is broken off."""
+
+    def __getattr__(self, name: str) -> Any:  # also `__path__`, which is asked for before a module inside is imported
+        return getattr(self._real(), name)
+
+    def _real(self) -> ModuleType:
+        with self._lock:
+            if sys.modules.get(_COMPILER) is self:
+                del sys.modules[_COMPILER]
+                compiler = importlib.import_module(_COMPILER)
+                for name, fn in self._marks:
+                    if name != _DISABLED:
+                        getattr(compiler, name)(fn)
+                    elif getattr(fn, _DISABLED, None) is fn:
+                        delattr(fn, _DISABLED)
+                self._marks.clear()
+        return sys.modules[_COMPILER]
+
+
+class _Found:
+    """A finder, and loader, of modules that came with the compiler while one of them was looked for: they are not run twice."""
+
+    def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+        there = name.startswith(f"{_COMPILER}.") and target is None and name in sys.modules
+        return ModuleSpec(name, self, origin=sys.modules[name].__file__) if there else None  # type: ignore[arg-type]
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        return sys.modules[spec.name]
+
+    def exec_module(self, module: ModuleType) -> None:
+        """It has run."""

@@ -1,0 +1,68 @@
+"""legged_mw/utils/quick_start.py: torch's compiler waits until somebody asks for it, and is then what it always was."""
+
+from __future__ import annotations
+
+import gc
+import subprocess
+import sys
+
+import torch
+
+from legged_mw import ROOT
+from legged_mw.utils import quick_start
+
+ASKED_LATER = """
+import sys, gc
+from legged_mw.utils import quick_start
+quick_start.begin()
+assert not gc.isenabled()
+import inspect, torch, tensordict
+network = torch.nn.Linear(2, 1)
+optimizer = torch.optim.Adam(network.parameters())
+network(torch.ones(3, 2)).sum().backward()
+optimizer.step()
+optimizer.zero_grad()
+inspect.getmodule(inspect.currentframe())  # walks over all modules
+later = sys.modules["torch._dynamo"]
+assert later is torch._dynamo and "torch._dynamo.eval_frame" not in sys.modules and "sympy" not in sys.modules
+quick_start.settle()
+assert gc.isenabled() and gc.get_freeze_count() > 10_000
+
+marked = torch.optim.Optimizer.zero_grad.__wrapped__
+assert getattr(marked, "__dynamo_disable") is marked
+import torch._dynamo.config as config  # as `import` meets it, and as torch.compile does
+real = sys.modules["torch._dynamo"]
+assert real is torch._dynamo is not later and real.config is config is sys.modules["torch._dynamo.config"]
+assert config.__spec__.loader is not None and later.config is config
+assert not hasattr(marked, "__dynamo_disable")
+from tensordict.base import _foreach_copy_compiled as first
+assert id(first) in real.trace_rules._allowed_callable_ids
+compiled = torch.compile(lambda x: x.sin() + 1, backend="eager")
+assert torch.equal(compiled(torch.ones(2)), torch.ones(2).sin() + 1)
+optimizer.zero_grad()
+assert getattr(marked, "__dynamo_disable") is not marked
+print("as ever")
+"""
+
+
+def test_the_compiler_is_there_when_it_is_asked_for() -> None:
+    done = subprocess.run([sys.executable, "-c", ASKED_LATER], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout == "as ever\n", done.stderr
+
+
+def test_torch_is_one_that_this_was_tried_with() -> None:
+    """A later torch than that imports its compiler at every start: look at torch/_compile.py, torch/optim, and raise ``_KNOWN``."""
+    version = tuple(int(part) for part in torch.__version__.split(".")[:2])
+    assert quick_start._KNOWN[0] <= version <= quick_start._KNOWN[1]
+
+
+def test_a_program_that_others_call_changes_nothing() -> None:
+    before = sys.modules.get("torch._dynamo"), list(sys.meta_path), gc.get_freeze_count()
+    quick_start.begin("cuda:0")
+    assert gc.isenabled()
+    quick_start.settle()
+    assert (sys.modules.get("torch._dynamo"), list(sys.meta_path), gc.get_freeze_count()) == before
+
+
+def test_a_gpu_that_is_not_there_is_not_opened() -> None:
+    assert quick_start.open_gpu(99) is False
