@@ -1,4 +1,4 @@
-"""The exam of many checkpoints of a run, in one environment: when it first walks, or stands, and how it goes on.
+"""The exam of many checkpoints of a run, in one environment: when it first walks, or stands, or beats its peers, and how it goes on.
 
     python benchmarks/checkpoints.py logs/go2_flat/<time> --every 25 --until 500
     python benchmarks/checkpoints.py logs/go2_flat/<time> --ranges common --crossing
@@ -50,7 +50,7 @@ def line(result: dict[str, Any]) -> str:
     figures = [f"{name} {', '.join(f'{value:.3f}' for value in result[name])}" for name in ("error", "offset", "worst")]
     drift, cost = (f"{result[name]:.3f}" if result[name] is not None else "-" for name in ("drift", "cost_of_transport"))
     pushes = ", ".join(f"{share:g}" for share in result["pushes"].values())
-    walks = "walks" if result["walks"] else "-----"
+    walks = "beats" if result.get("beats_peer") and result["walks"] else "walks" if result["walks"] else "-----"
     return f"{start}  {walks}  falls {result['falls']}  {'  '.join(figures)}  drift {drift}  pushes {pushes}  cost {cost}"
 
 

@@ -64,6 +64,16 @@ def test_a_pipe_gets_a_line_an_iteration(tmp_path: Path, capsys: pytest.CaptureF
     assert "rew_pose: 0.1\n" in blocks and "Time elapsed, left: 0:03:00, 0:01:18\n" in blocks
 
 
+def test_the_time_that_is_left_ends_with_the_deadline(capsys: pytest.CaptureFixture[str], clock: list[float]) -> None:
+    console = Console()
+    console.deadline = clock[0] + 45.0
+    for done in (1, 2):
+        clock[0] += 10.0
+        console.iteration(done, 3 if done == 2 else 1000, None, NUMBERS, {}, 1.0)
+    first, second = capsys.readouterr().out.splitlines()
+    assert first.endswith(" 0:00:35 left") and second.endswith(" 0:00:10 left"), "at the latest then, or when the iterations are done"
+
+
 def test_verbose_prints_the_block(capsys: pytest.CaptureFixture[str]) -> None:
     Console(verbose=True).iteration(1, 2, None, NUMBERS, {"rew_pose": "0.1"}, 1.0)
     assert re.fullmatch(r"#+ Learning iteration 1/2 #+\n +rew_pose: 0.1\n +Time elapsed, left: .*\n", capsys.readouterr().out)

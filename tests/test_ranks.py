@@ -53,6 +53,11 @@ def test_ranks_learn_one_policy_from_worlds_of_their_own(ours: Path) -> None:
     assert one["iteration"] == other["iteration"] == 3 and one["steps"] == other["steps"] == 2 * 3 * 12 * 8
 
 
+def test_ranks_anneal_by_the_first_ones_clock(ours: Path) -> None:
+    one, other = ends(ours)
+    assert one["done"] == other["done"] == pytest.approx([0.0, 0.5, 1.0])
+
+
 def test_statistics_are_of_all_ranks(ours: Path) -> None:
     one, other = ends(ours)
     assert one["means"] == other["means"] and one["means"]["episodes"] > 0

@@ -348,15 +348,33 @@ def test_sigterm_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
     assert re.findall(r"Learning iteration (\d+)/", result.out) == [str(last + 1)]
 
 
-def test_time_limit_ends_a_run(tmp_path: Path) -> None:
-    result = run("train", tmp_path, *SMALL, "--max_iterations", "1000", "--max_time", "1s")
-    assert result.code == 3, result.err
-    *_, stopped, hint = result.out.splitlines()
-    assert stopped == "stopped: --max_time; go on with"
+def test_the_time_that_is_asked_for_is_a_training(tmp_path: Path) -> None:
+    """It ends as one that has done all its iterations does; the next one's plan counts its time."""
+    result = run("train", tmp_path, *SMALL, "--max_iterations", "1000", "--max_time", "1s", "--set", "runner.exam_interval=0")
+    assert result.code == 0, result.err
+    *_, told, ended, watch = result.out.splitlines()
     done = [int(number) for number in re.findall(r"Learning iteration (\d+)/", result.out)]
     [folder] = (tmp_path / "logs/go1_flat").iterdir()
     assert list(checkpoints(folder)) == [len(done)] and done == list(range(1, len(done) + 1))
-    assert shlex.split(hint) == ["python", "train.py", "--resume", "--task", "go1_flat", "--load_run", folder.name]
+    assert told == f"{len(done)} iterations within --max_time; --resume goes on towards 1000" and ended.startswith("done: ")
+    assert shlex.split(watch) == ["python", "play.py", "--task", "go1_flat", "--load_run", folder.name]
+    assert 0.0 < load(folder / f"model_{len(done)}.pt")["infos"]["seconds"] < 60.0
+    assert re.search(r"^\d+ cores: 1000 iterations, .* min; --max_time ends it after 0\.0167 min$", result.out, re.MULTILINE)
+
+
+def test_who_is_stopped_is_told_how_much_time_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    update = Runner._log
+
+    def stop_after(self: Runner, *args: Any) -> None:
+        update(self, *args)
+        self.stop = "SIGTERM"
+
+    monkeypatch.setattr(Runner, "_log", stop_after)
+    result = run("train", tmp_path, *SMALL, "--max_iterations", "1000", "--max_time", "10h", "--set", "runner.exam_interval=0")
+    assert result.code == 3, result.err
+    *_, stopped, hint = result.out.splitlines()
+    left = re.fullmatch(r" +python train.py --resume --task go1_flat --load_run \S+ --max_time (\d+)s", hint)
+    assert stopped == "stopped: SIGTERM; go on with" and left and 35_000 < int(left[1]) <= 36_000
 
 
 KILLED = """

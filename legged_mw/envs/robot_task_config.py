@@ -323,7 +323,7 @@ class RobotTaskCfgPPO(Config):
         critic_warmup: Whole = 20  # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
 
     class anneal:
-        """What a number of `algorithm` goes to, in a straight line over max_iterations; 0: it stays [ours]."""
+        """What a number of `algorithm` goes to, in a straight line over max_iterations or --max_time; 0: it stays [ours]."""
 
         entropy_coef: NonNegative = 0.0
         desired_kl: NonNegative = 0.0

@@ -160,6 +160,8 @@ def check_content(content: Any, path: Path) -> dict[str, Any]:
         infos = check.take(content, "infos", dict)
         if "total_steps" in infos:
             check.take(infos, "total_steps", int, "infos: ")
+        if not _is_number(seconds := infos.get("seconds", 0.0)):
+            raise check.fail(f"infos: seconds is {_short(seconds)}, it must be a number from 0")
         check.random_state(infos)
     return content
 

@@ -20,7 +20,7 @@ def parse(description: str | None) -> argparse.Namespace:
     parser.add_argument("--teacher", metavar="RUN", help=f"distil: learn to act like a policy that may see more; {source}")
     parser.add_argument("--init", metavar="RUN", help="begin with the actor of another policy, named as a teacher is")
     parser.add_argument("--headless", action="store_true", help="accepted as in legged_gym; training never opens a window")
-    parser.add_argument("--max_time", type=duration, metavar="T", help="end, after a checkpoint, after 90s, 5m, 1.5h ...")
+    parser.add_argument("--max_time", type=duration, metavar="T", help="be done, annealed, after 90s, 5m, 1.5h ... or --max_iterations")
     parser.add_argument("--play", action="store_true", help="watch the policy as it trains: a window, or a web page without a screen")
     parser.add_argument("--list", action="store_true", help="show the tasks and exit")
     parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")

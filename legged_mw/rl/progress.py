@@ -26,6 +26,7 @@ class Console:
 
     def __init__(self, verbose: bool = False) -> None:
         self.verbose = verbose  # print whole blocks
+        self.deadline: float | None = None  # the time at which the training ends at the latest [s]
         self.listeners: list[Callable[[int], None]] = []
         self._file: TextIO | None = None
         self._begun, self._times = time.time(), deque[tuple[int, float]](maxlen=_WINDOW)
@@ -42,11 +43,11 @@ class Console:
         self._times.append((done, time.time()))
         if len(self._times) == 1:
             self._times.appendleft((done - 1, self._begun))
-        rows["Time elapsed, left"] = f"{_clock(time.time() - self._begun)}, {_clock(self._seconds(last - done))}"
+        rows["Time elapsed, left"] = f"{_clock(time.time() - self._begun)}, {_clock(self._left(done, last))}"
         line = f"Learning iteration {done}/{last}: {summary(numbers)}, {speed:,.0f} steps/s"
         if self._out is None:
             until = f", exam in {_clock(self._seconds(exam - done))}" if exam is not None and exam > done else ""
-            line += f", {_clock(self._seconds(last - done))} left{until}"
+            line += f", {_clock(self._left(done, last))} left{until}"
         self._bar = done, last, exam
         self._say(console_block(f"Learning iteration {done}/{last}", rows), line)
         for listener in self.listeners:
@@ -77,6 +78,11 @@ class Console:
         (first, then), (last, now) = self._times[0], self._times[-1]
         return iterations * (now - then) / max(last - first, 1)
 
+    def _left(self, done: int, last: int) -> float:
+        """How long the training still takes [s]."""
+        seconds = self._seconds(last - done)
+        return min(seconds, max(0.0, self.deadline - time.time())) if self.deadline else seconds
+
     # ---- the bar
 
     def __enter__(self) -> Console:
@@ -106,7 +112,7 @@ class Console:
             return
         done, last, exam = self._bar
         until = f"  exam in {_clock(self._seconds(exam - done))}" if exam is not None and exam > done else ""
-        text = f" {done / max(last, 1):4.0%}  {_clock(self._seconds(last - done))} left{until}"
+        text = f" {done / max(last, 1):4.0%}  {_clock(self._left(done, last))} left{until}"
         width = min(40, shutil.get_terminal_size().columns - len(text) - 2)
         full, empty = "█░" if "utf" in (self._out.encoding or "").lower() else "#."
         filled = round(width * done / max(last, 1))

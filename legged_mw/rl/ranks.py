@@ -8,7 +8,7 @@ import socket
 import sys
 import threading
 from contextlib import suppress
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 
@@ -47,6 +47,14 @@ def rank_device(rank: Rank, asked: str | None) -> str | None:
         advice = f"use --nproc_per_node={seen}" if seen else "say --device cpu to train on the CPU"
         raise ConfigError(f"torchrun started process {rank.local} on a machine with {seen} GPUs; {advice}")
     return f"cuda:{rank.local}"
+
+
+def first_ranks(value: Any, device: str) -> Any:
+    """What the first rank gives for ``value``, on all of them."""
+    if this_rank().count == 1:
+        return value
+    torch.distributed.broadcast_object_list(agreed := [value], device=torch.device(device))
+    return agreed[0]
 
 
 def quiet(rank: Rank) -> None:

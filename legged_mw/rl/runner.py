@@ -25,10 +25,11 @@ from legged_mw.rl.checkpoint import check_resume
 from legged_mw.rl.estimator import RegressingModel
 from legged_mw.rl.health import Health
 from legged_mw.rl.keeping import Keeper, reason_of
+from legged_mw.rl.plan import Plan
 from legged_mw.rl.policies import acting
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.progress import Console
-from legged_mw.rl.ranks import this_rank
+from legged_mw.rl.ranks import first_ranks, this_rank
 from legged_mw.rl.report import Clock, Mark, Message, Report, console_rows, curves, quiet_writers
 from legged_mw.rl.resume import random_state, set_random_state, take_worlds, worlds_content
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
@@ -56,6 +57,8 @@ class Runner(OnPolicyRunner):
         self.logger.git_status_repos = [str(ROOT)] if (ROOT / ".git").exists() else []
         self.total_steps = 0
         self.stop: str | None = None
+        self.deadline: float | None = None  # the time at which `learn` shall be done, and all annealed [s]
+        self.plan = Plan()
         self.diverged = ""  # why training had to end, in words
         self.begins_anew = "it is a new run"
         self.keeper: Keeper | None = None  # writes checkpoints; made in `learn` where there is a folder
@@ -100,10 +103,10 @@ class Runner(OnPolicyRunner):
         self._open_curves()
         self.env.take_statistics()
         clock, waiting = Clock(self.device), None
-        self._last = self.current_learning_iteration + num_learning_iterations
+        self._make_plan(self.current_learning_iteration + num_learning_iterations)
         self._all_stop = False
         start = clock.mark()
-        while self.current_learning_iteration < self._last and not self._must_stop():
+        while self.current_learning_iteration < self.plan.last and not self._must_stop():
             self._anneal()  # first, so that a resumed rollout is what it would have been
             if self._settles:
                 self._undo.remember()
@@ -119,7 +122,7 @@ class Runner(OnPolicyRunner):
             redraw = self.env.cfg.domain_rand.redraw_iterations
             if redraw and self.current_learning_iteration % redraw == 0:
                 self.env.domain_rand.redraw()
-            if self.current_learning_iteration % self.cfg["save_interval"] == 0 and self.current_learning_iteration < self._last:
+            if self.current_learning_iteration % self.cfg["save_interval"] == 0 and self.current_learning_iteration < self.plan.last:
                 self._save_checkpoint()
             if self._exam_is_due():  # what waits to be logged still does: ranks must hear of a stop in the same iteration
                 self._examine()
@@ -131,11 +134,16 @@ class Runner(OnPolicyRunner):
             self._examine()
         self._end_curves()
 
+    def _make_plan(self, last: int) -> None:
+        """Until the iteration ``last`` or the deadline. Ranks go by the first one's clock."""
+        self.plan = Plan(last, self.deadline, self.plan.seconds)
+        self.plan.done, self.console.deadline = first_ranks(self.plan.done, self.device), self.deadline
+
     def _anneal(self) -> None:
         """Move what has an end value towards it, in a straight line from the first iteration to the last; end a critic's warm-up."""
         if isinstance(self.alg, GraphedPPO):
             self.alg.learn_critic_only(self.current_learning_iteration < self.cfg["critic_warmup"])
-        done = self.current_learning_iteration / max(self._last - 1, 1)
+        done = self.plan.begin(self.current_learning_iteration)
         for name, (begin, end) in self.cfg["anneal"].items():
             if end and begin is not None:
                 setattr(self.alg, name, begin + (end - begin) * done)
@@ -174,12 +182,12 @@ class Runner(OnPolicyRunner):
     def _exam_is_due(self) -> bool:
         """Every ``exam_interval`` iterations; the last iteration's exam waits until the last checkpoint is written."""
         interval, done = self.cfg["exam_interval"], self.current_learning_iteration
-        return self.examine is not None and interval > 0 and done % interval == 0 and done < self._last
+        return self.examine is not None and interval > 0 and done % interval == 0 and done < self.plan.last
 
     def _next_exam(self, done: int) -> int | None:
         """The iteration after which the next exam comes, if any does."""
         interval = self.cfg["exam_interval"]
-        return min((done // interval + 1) * interval, self._last) if self.examine is not None and interval > 0 else None
+        return min((done // interval + 1) * interval, self.plan.last) if self.examine is not None and interval > 0 else None
 
     def _examine(self) -> None:
         """Grade the policy as it is now; of the ranks, only the first has an exam, and the others wait in the next update."""
@@ -200,7 +208,7 @@ class Runner(OnPolicyRunner):
         self.last_exam = self.current_learning_iteration, figures
         found = {**{f"Exam/{name}": value for name, value in figures.items()}, "Perf/exam_time": time.time() - begun}
         self._draw_curves(found, self.current_learning_iteration)
-        self.console.exam(self.current_learning_iteration, self._last, figures)
+        self.console.exam(self.current_learning_iteration, self.plan.last, figures)
 
     # ---- what the user sees ---------------------------------------------------------------------------------------
 
@@ -209,8 +217,9 @@ class Runner(OnPolicyRunner):
         self.current_learning_iteration += 1
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         self.total_steps += steps
-        stop = torch.full((1,), float(self.stop is not None), device=self.device)
-        parts = [self.env.take_statistics(), torch.cat([each.take() for each in self.env.suspects]), stop]
+        asks = float(self.stop is not None), self.plan.room() if self.gpu_global_rank == 0 else 0.0
+        taken = [each.take() for each in self.env.suspects], [torch.full((1,), value, device=self.device) for value in asks]
+        parts = [self.env.take_statistics(), *map(torch.cat, taken)]
         summed, sizes = torch.cat(parts), [len(part) for part in parts]
         if self.is_distributed:
             torch.distributed.all_reduce(summed)
@@ -229,9 +238,10 @@ class Runner(OnPolicyRunner):
 
     def _log(self, report: Report) -> None:
         """One block on the console and one point a curve in the writer."""
-        statistics, suspects, (stop,), lost, settings, (undone,), wrong = report.message.read()
+        statistics, suspects, (stop, room), lost, settings, (undone,), wrong = report.message.read()
         numbers = self.env.name_statistics(statistics)
         self._all_stop = stop > 0
+        self.plan.hear(report.iteration, room)
         if verdict := self._watch.verdict(numbers):
             self.diverged, self.stop = verdict, self.stop or "what it simulates is not finite"
         losses = dict(zip(report.losses, lost, strict=True))
@@ -241,7 +251,7 @@ class Runner(OnPolicyRunner):
         collect, learn = report.seconds()
         speed = report.steps / (collect + learn)
         rows = {**console_rows(numbers, losses, speed, collect, learn), "Total steps": f"{report.total_steps}"}
-        self.console.iteration(report.iteration, self._last, self._next_exam(report.iteration), numbers, rows, speed)
+        self.console.iteration(report.iteration, self.plan.last, self._next_exam(report.iteration), numbers, rows, speed)
         warnings, verdict = self._health.judge(suspects, report.steps, undone > 0, wrong)
         print("".join(f"WARNING: iteration {report.iteration}: {line}\n" for line in warnings), end="", flush=True)
         if verdict:
@@ -321,10 +331,8 @@ class Runner(OnPolicyRunner):
     def _content(self, infos: dict | None = None) -> dict[str, Any]:
         """A checkpoint: tensors and plain numbers only."""
         content = self.alg.save()
-        content["iter"] = self.current_learning_iteration
-        content["infos"] = {**(infos or {}), "total_steps": self.total_steps, "random_state": random_state(self.device)}
-        content["infos"]["env"] = self.env.training_state()
-        return content
+        told = {**(infos or {}), "total_steps": self.total_steps, "random_state": random_state(self.device), **self.plan.saved()}
+        return content | {"iter": self.current_learning_iteration, "infos": {**told, "env": self.env.training_state()}}
 
     def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
         """Go on from a checkpoint: networks, normalisers, optimizer, learning rate, counters, random state; worlds, where they are kept."""
@@ -348,7 +356,7 @@ class Runner(OnPolicyRunner):
         if self.env.cfg.domain_rand.redraw_iterations:  # the worlds that it was in are not in the file; the first ones it has left
             self.env.domain_rand.redraw()
         infos = content.get("infos") or {}
-        self.total_steps = infos.get("total_steps", 0)
+        self.total_steps, self.plan = infos.get("total_steps", 0), Plan(used=infos.get("seconds", 0.0))
         self.env.load_training_state(infos.get("env", {}))  # before the random state: it begins episodes
         random = infos.get("random_state", {})
         self.begins_anew = take_worlds(self, Path(path), this_rank(), random)

@@ -10,7 +10,6 @@ import os
 import re
 import shlex
 import signal
-import threading
 import time
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -29,7 +28,7 @@ from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
 from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.ranks import Rank, leave_together, leave_when_stuck, quiet, rank_device, this_rank
+from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
@@ -91,7 +90,7 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     if device != "cpu":
         torch.cuda.set_device(device)
     seed_everything(task.train.seed + rank.index)  # every rank its own worlds, commands and noise
-    args.eager |= not _announce(task, device, rank)
+    args.eager |= not _announce(task, device, rank, args.max_time)
     return start, device
 
 
@@ -130,8 +129,8 @@ def _note_others(task: LoadedTask, start: Start) -> None:
         print("symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it again")
 
 
-def _announce(task: LoadedTask, device: str, rank: Rank) -> bool:
-    """Say what is trained on what, and what makes that slow; on a CPU how long it may take. Returns whether it can be recorded."""
+def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> bool:
+    """Say what is trained on what, and what makes that slow; on a CPU how long, or at ``most`` [s]. Returns whether it is recordable."""
     worlds, engine = task.cfg.env.num_envs, pick_engine(task.cfg.sim.engine, device)
     where = device if rank.count == 1 else f"each of {rank.count} {'processes' if device == 'cpu' else 'GPUs'}"
     print(f"{task.name}: {worlds} worlds on {where}, engine {engine}", flush=True)
@@ -150,7 +149,7 @@ def _announce(task: LoadedTask, device: str, rank: Rank) -> bool:
     plan = (
         f"{steps:,} steps; {slow}" if rough else f"{runner.max_iterations} iterations, {steps / 1e6:.1f} M steps, about {minutes:.0f} min"
     )
-    print(f"{cores} cores: {plan}", flush=True)
+    print(f"{cores} cores: {plan}{f'; --max_time ends it after {most / 60:.3g} min' if most and most < 60 * minutes else ''}", flush=True)
     return True
 
 
@@ -187,18 +186,18 @@ def train(
     verbose: bool = False,
     begun: Begun | None = None,
 ) -> bool:
-    """Train from ``start`` to the last iteration or until stopped (at ``deadline`` [s], a time of the clock), then export.
+    """Train from ``start`` to the last iteration, or to ``deadline`` [s], a time of the clock, or until stopped; if not, export.
 
     ``begun`` is called before the first iteration, where the run folder is written; ``verbose`` prints whole blocks. Returns
     whether all is done.
     """
     teacher = start.teacher.task.train if start.teacher else None
     rank, runner = this_rank(), make_runner(env, task.train, None, str(env.device), teacher)
-    runner.examine, runner.console.verbose = examine, verbose
+    runner.examine, runner.console.verbose, runner.deadline = examine, verbose, deadline
     with ExitStack() as held:
         lock = held.enter_context(_lock(start)) if start.goes_on and rank.leads else None
         left = _load(runner, task, start)
-        _stop_on_signals(runner, deadline)
+        _stop_on_signals(runner)
         leave_when_stuck(rank)
         folder = _open_run(runner, task, start, rank, held, lock)
         if rank.leads and begun:
@@ -296,8 +295,7 @@ def _open_run(runner: Runner, task: LoadedTask, start: Start, rank: Rank, held: 
             raise ConfigError(f"{shown(folder[0])} cannot be written: {reason_of(error)}") from None
         runner.logger.log_dir = str(folder[0])
         print(f"writing to {shown(folder[0])}", flush=True)
-    if rank.count > 1:
-        torch.distributed.broadcast_object_list(folder, device=torch.device(runner.device))
+    folder[0] = first_ranks(folder[0], runner.device)
     runner.keeper = Keeper(folder[0], task.train.runner.keep_checkpoints, rank, restore)
     return folder[0]
 
@@ -325,10 +323,13 @@ def _say_how_it_ended(runner: Runner, task: LoadedTask, folder: Path, rank: Rank
     if runner.last_exam:
         iteration, figures = runner.last_exam
         print(f"exam after {iteration} iterations: {', '.join(f'{figure} {value:.3f}' for figure, value in figures.items())}")
-    flags = _flags(task, folder)
-    if runner.stop and runner.current_learning_iteration < task.train.runner.max_iterations:
-        print(f"stopped: {runner.stop}; go on with\n  {command('train', rank.count)} --resume {flags}", flush=True)
+    flags, plan, done = _flags(task, folder), runner.plan, runner.current_learning_iteration
+    if runner.stop and done < plan.last:
+        left = f" --max_time {max(1, round(plan.deadline - time.time()))}s" if plan.deadline else ""
+        print(f"stopped: {runner.stop}; go on with\n  {command('train', rank.count)} --resume {flags}{left}", flush=True)
         return False
+    if done < task.train.runner.max_iterations:
+        print(f"{done} iterations within --max_time; --resume goes on towards {task.train.runner.max_iterations}")
     print(f"done: {shown(folder)}; watch it with\n  {command('play')} {flags}", flush=True)
     return True
 
@@ -350,8 +351,8 @@ def _export(task: LoadedTask, run: Path, export: Export) -> None:
         print(f"not exported: {reason}\n  to try again: {command('play')} {_flags(task, run)} --export {shown(folder)}")
 
 
-def _stop_on_signals(runner: Runner, deadline: float | None) -> None:
-    """Ctrl-C, SIGTERM, a hang-up and the clock ask the runner to save and stop; a second Ctrl-C stops at once.
+def _stop_on_signals(runner: Runner) -> None:
+    """Ctrl-C, SIGTERM and a hang-up ask the runner to save and stop; a second Ctrl-C stops at once.
 
     A second hang-up does nothing: of a terminal that closes, the shell and the system send one each.
     """
@@ -368,7 +369,3 @@ def _stop_on_signals(runner: Runner, deadline: float | None) -> None:
     signal.signal(signal.SIGTERM, ask)
     if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup has it ignored
         signal.signal(signal.SIGHUP, ask)
-    if deadline is not None:
-        timer = threading.Timer(max(0.0, deadline - time.time()), lambda: setattr(runner, "stop", "--max_time"))
-        timer.daemon = True
-        timer.start()

@@ -22,7 +22,7 @@ from legged_mw.tools.curves import Run, find_runs
 from legged_mw.utils.cli import Parser
 from legged_mw.utils.errors import shown
 
-STOPPED = 3  # exit code of a training that ended early, by the clock or a signal: rl/training.py's
+STOPPED = 3  # exit code of a training that a signal ended: rl/training.py's
 Start = Callable[[list[str]], tuple[int, str, str]]  # flags of train -> exit code, run folder or "", last line
 
 
@@ -102,7 +102,7 @@ def train_all(cells: Sequence[Cell], common: list[str], start: Start) -> list[tu
         print(f"{number}/{len(cells)} {cell.name or 'as it is'}: {folder if ended else said}", flush=True)
         if ended:
             found.append((cell, find_runs([folder])[0]))
-        if code == STOPPED and said.startswith("stopped: SIG"):
+        if code == STOPPED:
             break
     return found
 

@@ -92,6 +92,7 @@ CONTENTS: list[tuple[str, Change, str]] = [
     ("counter is text", set_at("iter", "5"), "iter is '5'"),
     ("another counter than the name", set_at("iter", 6), "its name says 5 iterations, and it has done 6: call it model_6.pt"),
     ("steps below 0", set_at("infos|total_steps", -3), "infos: total_steps is -3"),
+    ("seconds are NaN", set_at("infos|seconds", float("nan")), "infos: seconds is nan, it must be a number from 0"),
     ("infos is a list", set_at("infos", [1]), "infos is [1], it must be a mapping"),
     ("NaN in a weight", set_at(f"{ACTOR}|mlp.0.weight", poisoned), "actor_state_dict: mlp.0.weight has values that are not finite"),
     ("infinite bias", set_at(f"{ACTOR}|mlp.0.bias", partial(poisoned, value=torch.inf)), "mlp.0.bias has values that are not finite"),
