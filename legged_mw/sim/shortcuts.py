@@ -45,35 +45,51 @@ class Shortcuts:
         plain = option.solver == mjw.SolverType.NEWTON and option.cone == mjw.ConeType.PYRAMIDAL and not option.noslip_iterations
         plain = plain and not option.enableflags & mjw.EnableBit.SLEEP and option.integrator != mjw.IntegratorType.DISCRETE
         self._iterations = option.iterations if known and plain and not option.graph_conditional else 0
-        self._idle, self._idle_unsensed = set(), set()
+        self._idle, self._idle_unsensed, self._idle_later = set(), set(), set()
+        self._zero: set[int] = set()  # addresses of arrays that are zero, and are set to zero in every substep
+        self._sensordata = data.sensordata.ptr
         self._instead: dict[str, wp.Kernel] = {}
         if not known:
             return
+        sensors, joints_alone = set(mj.sensor_type), set(mj.actuator_trntype) <= {int(mujoco.mjtTrn.mjTRN_JOINT)}
+        self._idle_later.add("_cacc_world")  # gravity, as before
+        self._idle_unsensed.add("_subtree_com_world")
         if not mj.body_gravcomp.any() and "body_gravcomp" not in world_fields:
             self._idle.add("_gravity_force")
+            self._zero.add(data.qfrc_gravcomp.ptr)
+            if not mj.jnt_actfrclimited.any():
+                self._idle.add("_qfrc_actuator_gravcomp_limits")
         if not mj.na:
             self._idle.add("_next_activation")
-        if not {int(kinds.mjSENS_FORCE), int(kinds.mjSENS_TORQUE)} & set(mj.sensor_type):
+        if not {int(kinds.mjSENS_FORCE), int(kinds.mjSENS_TORQUE)} & sensors:
             self._idle.add("_cfrc_world")
+        if not {int(kinds.mjSENS_E_POTENTIAL), int(kinds.mjSENS_E_KINETIC)} & sensors and not option.enableflags & mjw.EnableBit.ENERGY:
+            self._zero.add(data.energy.ptr)
         if set(mj.sensor_intprm[mj.sensor_type == kinds.mjSENS_CONTACT, 1]) <= {0, 3}:  # reduced to none, or to the net force
             self._idle.add("_contact_sort")
-        if not mj.ntendon and not mj.neq and set(mj.actuator_trntype) <= {int(mujoco.mjtTrn.mjTRN_JOINT)}:
+        if not mj.ntendon and not mj.neq and joints_alone:
             self._idle_unsensed.add("_site_local_to_global")
+        if self._iterations == 1:  # what it sets is read by the test of convergence, and by further iterations
+            self._idle.add("_update_gradient_zero_grad_dot")
         if plain and not mj.neq and mj.nv <= data.njmax and (not model.is_sparse or mj.nv <= data.njmax_nnz):
             self._instead["_friction_dof"] = friction_rows(model.is_sparse)
 
     @contextmanager
-    def __call__(self, sensed: bool) -> Iterator[None]:
-        """``sensed``: this substep computes sensors."""
-        idle = self._idle if sensed else self._idle | self._idle_unsensed
+    def __call__(self, sensed: bool, later: bool = False) -> Iterator[None]:
+        """``sensed``: this substep computes sensors. ``later``: it follows another one, with nothing in between."""
+        idle = self._idle | (set() if sensed else self._idle_unsensed) | (self._idle_later if later else set())
         skip = _Skip(idle, self._iterations, _FORCES if sensed else (), self._instead)
+        zero = wp.array.zero_
+        kept = self._zero if sensed or not self._zero else self._zero | {self._sensordata}
         with _ALONE:
             whole = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
             try:
                 for name, launch in whole.items():
                     setattr(wp, name, skip.around(launch))
+                wp.array.zero_ = lambda array: None if array.ptr in kept else zero(array)
                 yield
             finally:
+                wp.array.zero_ = zero
                 for name, launch in whole.items():
                     setattr(wp, name, launch)
 

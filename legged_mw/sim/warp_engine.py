@@ -141,7 +141,7 @@ class WarpSimulation(Simulation):
         for i in which:
             last = i == count - 1
             option.disableflags = flags if last else flags | mjw.DisableBit.SENSOR
-            with self._shortcuts(sensed=last):
+            with self._shortcuts(sensed=last, later=i != which[0]):
                 mjw.step(self._model, self._data)
         option.disableflags = flags
         if which[-1] == count - 1:
