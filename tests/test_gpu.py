@@ -28,6 +28,7 @@ from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.recurrent import memory_of
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.transfer import seat_teacher
+from legged_mw.sim import contact_count, shortcuts
 from legged_mw.sim.fused import Fused
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils import quick_start
@@ -228,6 +229,19 @@ def test_replay_equals_eager_with_contacts() -> None:
     expected, got = roll_out(make_env(True), actions), roll_out(make_env(False), actions)
     for a, b in zip(expected[0::5], got[0::5], strict=True):
         assert torch.quantile((a - b).abs(), 0.99) < 1e-3
+
+
+@pytest.mark.parametrize("task", ["go1_flat", "g1_flat"])
+def test_what_physics_leaves_out_is_missed_by_nothing(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Recorded, with and without: alike as two runs of the same are."""
+    actions = 0.3 * torch.randn(8, 64, {"go1_flat": 12, "g1_flat": 29}[task], generator=torch.Generator().manual_seed(0)).to(DEVICE)
+    short = roll_out(make_env(False, task), actions)
+    monkeypatch.setattr(shortcuts, "KNOWN", ())
+    monkeypatch.setattr(contact_count, "countable", lambda model: {})
+    whole = roll_out(make_env(False, task), actions)
+    for group, (quantile, most) in enumerate([(0.99, 1e-3), (0.98, 1e-2)]):  # the second has an accelerometer and forces
+        for a, b in zip(short[group::5], whole[group::5], strict=True):
+            assert torch.quantile((a - b).abs(), quantile) < most
 
 
 def test_feet_carry_the_weight() -> None:

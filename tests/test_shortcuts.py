@@ -87,15 +87,19 @@ def test_what_is_left_out_is_what_the_library_launches(whole: Callable[[], None]
     """A kernel that the library calls otherwise in a new version would be launched again, unseen."""
     sim = warp_simulation()
     short, names = sim._shortcuts, launched(sim)
-    assert short._idle == {"_gravity_force", "_next_activation", "_cfrc_world", "_contact_sort"} and not short._idle & {*names}
-    assert short._idle_unsensed == {"_site_local_to_global"} and names.count("_site_local_to_global") == 1
+    idle = {"_gravity_force", "_qfrc_actuator_gravcomp_limits", "_next_activation", "_cfrc_world", "_contact_sort"}
+    idle.add("_update_gradient_zero_grad_dot")
+    assert short._idle == idle and not idle & {*names}
+    assert "_friction_dof" not in names and names.count("friction_rows") == 2
+    once = {"_subtree_com_world", "_site_local_to_global", "_cacc_world"}
+    assert short._idle_unsensed | short._idle_later == once and [names.count(name) for name in once] == [1, 1, 1]
     assert names.count("_update_gradient_cholesky") == names.count("_linesearch_iterative_kernel") == 2
     assert names.count("_update_constraint_efc") == 3  # the last substep's forces are sensed
     assert not {"_qfrc_constraint_from_grad", "_solve_done", "_tile_cholesky_factorize_solve_block", "_contact_match"} & {*names}
     assert wp.launch.__module__.startswith("warp")
     whole()
     names = launched(warp_simulation())
-    assert {*names} >= short._idle | {shortcuts._SEARCH, shortcuts._SOLVED, *shortcuts._FORCES, "_tile_cholesky_factorize_solve_block"}
+    assert {*names} >= idle | once | {shortcuts._SEARCH, shortcuts._SOLVED, *shortcuts._FORCES, "_tile_cholesky_factorize_solve_block"}
     assert names.count("_update_gradient_cholesky") == names.count("_update_constraint_efc") == 4
 
 
@@ -121,7 +125,11 @@ def test_a_world_without_constraint_rows_falls_as_before(whole: Callable[[], Non
 
 
 def test_conditions_that_need_a_launch_keep_it() -> None:
-    model, put = make_env(1).robot.physics, warp_simulation()._model
-    assert "_gravity_force" not in shortcuts.Shortcuts(model, put, ["body_gravcomp"])._idle
+    model, sim = make_env(1).robot.physics, warp_simulation()
+    put, data = sim._model, sim._data
+    assert "_gravity_force" not in shortcuts.Shortcuts(model, put, data, ["body_gravcomp"])._idle
     put.opt.graph_conditional = True  # as many iterations as are needed: nobody knows the last
-    assert not shortcuts.Shortcuts(model, put)._iterations
+    assert not shortcuts.Shortcuts(model, put, data)._iterations
+    assert shortcuts.Shortcuts(model, put, data)._instead
+    data.njmax = model.nv - 1  # no room for a row a degree of freedom: the library drops some
+    assert not shortcuts.Shortcuts(model, put, data)._instead

@@ -18,7 +18,8 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from legged_mw.sim.fused_code import ADD_ROWS, HELPERS, TYPES, Access, Code, Unfit, Writer
+from legged_mw.sim.fused_code import ADD_ROWS, Writer
+from legged_mw.sim.fused_memory import HELPERS, TYPES, Access, Code, Unfit
 from legged_mw.utils.trace import Call, Node, Trace
 
 if wp.config.log_level < wp.LOG_WARNING:  # no engine of warp's steps here, and nobody asks what warp finds and loads

@@ -7,35 +7,16 @@ not known here, is left to torch: ``emit`` raises ``Unfit``.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from legged_mw.utils.trace import Node, View
+from legged_mw.sim.fused_memory import TYPES, WORLD, Access, Code, Lines, Unfit, span_of
+from legged_mw.utils.trace import Node
 
-TYPES = {torch.float32: "float", torch.float64: "double", torch.int64: "long long", torch.int32: "int", torch.bool: "bool"}
 SMALL = 64  # elements of a value that all worlds share: each thread computes it for itself
-WORLD = "w"
-
-HELPERS = """
-#ifdef __CUDA_ARCH__
-#define SYNC __syncwarp(lanes);
-#define ADD(to, x) atomicAdd(&(to), x)
-#define OWN(type, name, n) __shared__ type all_##name[BLOCK / LANES][n]; type* name = all_##name[threadIdx.x / LANES];
-const unsigned lanes = __activemask();
-#else
-#define SYNC
-#define ADD(to, x) (to) += (x)
-#define OWN(type, name, n) type name[n];
-#endif
-const int lane = thread % LANES, w = thread / LANES;
-#define NAN_OR(a, b, x) ((a) != (a) ? (a) : (b) != (b) ? (b) : (x))
-#define MAXIMUM(a, b) NAN_OR(a, b, (a) > (b) ? (a) : (b))
-#define MINIMUM(a, b) NAN_OR(a, b, (a) < (b) ? (a) : (b))
-#define FINITE(x) ((x) - (x) == 0)
-"""
 
 
 class _AddRows:
@@ -49,27 +30,6 @@ class _AddRows:
 
 
 ADD_ROWS = _AddRows()
-
-
-class Unfit(Exception):
-    """The operation is left to torch."""
-
-
-class Access(NamedTuple):
-    """What a world reaches of a view: elements [low, high) of a row every ``pitch`` elements; all worlds the same where pitch is 0."""
-
-    view: View
-    pitch: int
-    low: int
-    high: int
-
-
-class Code(NamedTuple):
-    """An operation's lines, and what it reaches: reads first, the write last."""
-
-    lines: list[str]
-    reads: list[Access]
-    write: Access
 
 
 _ONE = {  # name -> C, of one value a
@@ -106,11 +66,8 @@ _REDUCTIONS = {  # name -> start, step from the sum so far and a value
 }  # fmt: skip
 
 
-class Writer:
-    """Writes the lines of operations on ``worlds`` worlds. ``place`` gives the C name of a block and whether it is a thread's own."""
-
-    def __init__(self, worlds: int, view: Callable[[Tensor], View], place: Callable[[int], tuple[str, bool]]) -> None:
-        self._worlds, self._view, self._place = worlds, view, place
+class Writer(Lines):
+    """Writes the lines of operations."""
 
     def emit(self, node: Node) -> Code:
         """The lines of ``node``. Raises Unfit."""
@@ -132,60 +89,6 @@ class Writer:
         else:
             lines = self._elementwise(node, name)
         return Code(["{", *lines, "}", "SYNC"], self._reads, self._access(out, out.shape))
-
-    # ---- memory ----------------------------------------------------------------------------------------------------------
-
-    def _access(self, view: View, shape: Sequence[int]) -> Access:
-        """What a world reaches of ``view`` when it is spread over ``shape``, whose first dimension are worlds."""
-        strides = _spread(view, shape)
-        pitch = 0 if self._shared or not strides else strides[0]
-        inner = strides if self._shared else strides[1:]
-        sizes = shape if self._shared else shape[1:]
-        span = sum((n - 1) * s for n, s in zip(sizes, inner, strict=True)) if all(sizes) else 0
-        return Access(view, pitch, view.offset, view.offset + span + 1)
-
-    def _at(self, view: View, strides: Sequence[int], index: Sequence[str], offset: int = 0) -> str:
-        name, own = self._place(view.block)
-        terms = [str(view.offset + offset)] if view.offset + offset else []
-        for stride, i in zip(strides, index, strict=True):
-            if stride and i != "0" and not (own and i == WORLD):
-                terms.append(i if stride == 1 else f"{stride} * {i}")
-        return f"{name}[{' + '.join(terms) or '0'}]"
-
-    def _read(self, tensor: Tensor, shape: Sequence[int], index: Sequence[str]) -> str:
-        """An element of ``tensor`` spread over ``shape``."""
-        view = self._view(tensor)
-        self._reads.append(self._access(view, shape))
-        return self._at(view, _spread(view, shape), index)
-
-    def _write(self, index: Sequence[str]) -> str:
-        return self._at(self._out, self._out.strides, index)
-
-    def _index(self, shape: Sequence[int], letter: str = "i") -> list[str]:
-        """Names of an element's indices."""
-        names = ["0" if n == 1 else f"{letter}{d}" for d, n in enumerate(shape)]
-        return names if self._shared else [WORLD, *names[1:]]
-
-    def _loops(self, shape: Sequence[int], index: Sequence[str], body: Iterable[str], alone: bool = False) -> list[str]:
-        """``body`` for each element, the first loop shared among a world's lanes; or by a lane ``alone``."""
-        loops = [(n, i) for n, i in zip(shape, index, strict=True) if i not in ("0", WORLD)]
-        heads = [f"for (int {i} = 0; {i} < {n}; ++{i})" for n, i in loops]
-        if not alone:
-            first = f"for (int {loops[0][1]} = lane; {loops[0][1]} < {loops[0][0]}; {loops[0][1]} += LANES)" if loops else "if (lane == 0)"
-            heads = [first, *heads[1:]]
-        return [" ".join(heads) + " {", *body, "}"]
-
-    def _store(self, shape: Sequence[int], index: Sequence[str], value: str, reads: Iterable[Tensor] = ()) -> list[str]:
-        """Write ``value`` everywhere; by way of a copy where it is read from the same memory elsewhere."""
-        kind = TYPES[self._out.dtype]
-        views = [self._view(tensor) for tensor in reads]
-        if all(view.block != self._out.block or view[2:] == self._out[2:] for view in views):
-            return self._loops(shape, index, [f"{self._write(index)} = ({kind})({value});"])
-        sizes = shape if self._shared else shape[1:]
-        inner = index if self._shared else index[1:]
-        at = " + ".join(f"{math.prod(sizes[d + 1 :])} * {i}" for d, i in enumerate(inner) if i != "0") or "0"
-        copied = self._loops(shape, index, [f"copy[{at}] = ({kind})({value});"])
-        return [f"{kind} copy[{math.prod(sizes)}];", *copied, "SYNC", *self._loops(shape, index, [f"{self._write(index)} = copy[{at}];"])]
 
     def _add_rows(self, to: Tensor, rows: Tensor) -> Code:
         """Sums over worlds of what is nearly everywhere 0, such as counts: who has something adds it."""
@@ -363,7 +266,7 @@ class Writer:
         """An element of ``x`` at indices that are known at run time; of worlds' own values only the world's own."""
         view = self._view(x)
         own = bool(place) and place[0] == WORLD and x.shape[0] == self._worlds
-        access = self._access(view, view.shape) if own else Access(view, 0, view.offset, view.offset + _span(view))
+        access = self._access(view, view.shape) if own else Access(view, 0, view.offset, view.offset + span_of(view))
         self._reads.append(access)
         return self._at(view, view.strides, place)
 
@@ -374,7 +277,7 @@ class Writer:
         self._reads.append(
             self._access(where, index.shape)
             if not self._shared and dim == 0
-            else Access(where, 0, where.offset, where.offset + _span(where))
+            else Access(where, 0, where.offset, where.offset + span_of(where))
         )
         at[dim] = f"(int){self._at(where, where.strides, [at[dim]])}"
         return self._store(shape, self._index(shape), self._picked(x, at), [x])
@@ -394,25 +297,25 @@ class Writer:
         used = [d for d, i in enumerate(indices) if i is not None]
         if not used or used != list(range(used[0], used[-1] + 1)) or any(i is not None and i.dtype == torch.bool for i in indices):
             raise Unfit
-        spread = torch.broadcast_shapes(*(indices[d].shape for d in used))  # type: ignore[union-attr]
+        common = torch.broadcast_shapes(*(indices[d].shape for d in used))  # type: ignore[union-attr]
         at, first = self._index(shape), used[0]
-        inner, place = at[first : first + len(spread)], at[:first]
+        inner, place = at[first : first + len(common)], at[:first]
         for d in used:
             tensor = indices[d]
             assert tensor is not None
             view = self._view(tensor)
             world = not self._shared and first == 0
-            self._reads.append(self._access(view, spread) if world else Access(view, 0, view.offset, view.offset + _span(view)))
-            j = self._at(view, _spread(view, spread), inner)
+            self._reads.append(self._access(view, common) if world else Access(view, 0, view.offset, view.offset + span_of(view)))
+            j = self._at(view, spread(view, common), inner)
             place.append(f"(int)({j} < 0 ? {j} + {x.shape[d]} : {j})")
-        return self._store(shape, at, self._picked(x, [*place, *at[first + len(spread) :]]), [x])
+        return self._store(shape, at, self._picked(x, [*place, *at[first + len(common) :]]), [x])
 
     def _emit_mm(self, a: Tensor, b: Tensor, **_: Any) -> list[str]:
         if self._shared or self._out.dtype != torch.float32:
             raise Unfit
         (columns,) = self._out.shape[1:]
         left, right = self._view(a), self._view(b)
-        self._reads += [self._access(left, left.shape), Access(right, 0, right.offset, right.offset + _span(right))]
+        self._reads += [self._access(left, left.shape), Access(right, 0, right.offset, right.offset + span_of(right))]
         j = "0" if columns == 1 else "j"
         term = f"s += {self._at(left, left.strides, [WORLD, 'k'])} * {self._at(right, right.strides, ['k', j])};"
         body = ["float s = 0;", *self._loops([a.shape[1]], ["k"], [term], alone=True), f"{self._write([WORLD, j])} = s;"]
@@ -426,13 +329,3 @@ class Writer:
         x, y = ([self._read(v, shape, [*at, str(k)]) if k else self._read(v, shape, [*at, "0"]) for k in range(3)] for v in (a, b))
         values = [f"float c{k} = {x[i]} * {y[j]} - {x[j]} * {y[i]};" for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1)))]
         return self._loops(shape[:-1], at, [*values, *(f"{self._write([*at, str(k) if k else '0'])} = c{k};" for k in range(3))])
-
-
-def _spread(view: View, shape: Sequence[int]) -> list[int]:
-    """Strides of ``view`` spread over ``shape``: 0 where it is repeated."""
-    strides = [s if n != 1 else 0 for n, s in zip(view.shape, view.strides, strict=True)]
-    return [0] * (len(shape) - len(strides)) + strides
-
-
-def _span(view: View) -> int:
-    return sum((n - 1) * s for n, s in zip(view.shape, view.strides, strict=True)) + 1

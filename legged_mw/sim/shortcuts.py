@@ -1,12 +1,13 @@
 """What ``mujoco_warp.step`` computes and nothing here reads, left out of it: the same state, bit for bit, in less time.
 
 The library launches each of its kernels through ``warp.launch`` or ``warp.launch_tiled``. While a substep runs or is recorded,
-these two pass over the kernels that are named here. So nothing of the library is edited or copied, and a kernel that is
-called otherwise one day is launched as before. ``KNOWN`` names the versions that were looked at; another's step runs whole.
-tests/test_shortcuts.py compares both.
+these two pass over the kernels that are named here, and ``array.zero_`` over arrays that are zero anyway. So nothing of the
+library is edited or copied, and a kernel that is called otherwise one day is launched as before. ``KNOWN`` names the versions
+that were looked at; another's step runs whole. tests/test_shortcuts.py compares both.
 
 What then holds what was there before: ``qacc_smooth`` and the factorized inertia, ``qfrc_constraint``, ``solver_niter``, the
-overflow bit ITERATIONS, states of constraint rows; in substeps without sensors also forces of constraint rows and places of sites.
+overflow bit ITERATIONS, states of constraint rows; in substeps without sensors also forces of constraint rows, places of sites,
+the world's centre of mass, and ``sensordata``.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -14,13 +15,15 @@ overflow bit ITERATIONS, states of constraint rows; in substeps without sensors 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
+
+from legged_mw.sim.friction_rows import friction_rows
 
 KNOWN = ("4.0.0",)  # of mujoco-warp
 _ALONE = threading.RLock()  # warp.launch is everybody's
@@ -35,7 +38,7 @@ class Shortcuts:
     and its factors, for a direction that would be the next iteration's.
     """
 
-    def __init__(self, mj: mujoco.MjModel, model: mjw.Model, world_fields: Collection[str] = ()) -> None:
+    def __init__(self, mj: mujoco.MjModel, model: mjw.Model, data: mjw.Data, world_fields: Collection[str] = ()) -> None:
         option, kinds = model.opt, mujoco.mjtSensor
         known = mjw.__version__ in KNOWN
         if known:  # a world without constraint rows reaches the same acceleration in its first iteration, to float32 rounding
@@ -43,40 +46,60 @@ class Shortcuts:
         plain = option.solver == mjw.SolverType.NEWTON and option.cone == mjw.ConeType.PYRAMIDAL and not option.noslip_iterations
         plain = plain and not option.enableflags & mjw.EnableBit.SLEEP and option.integrator != mjw.IntegratorType.DISCRETE
         self._iterations = option.iterations if known and plain and not option.graph_conditional else 0
-        self._idle, self._idle_unsensed = set(), set()
+        self._idle, self._idle_unsensed, self._idle_later = set(), set(), set()
+        self._zero: set[int] = set()  # addresses of arrays that are zero, and are set to zero in every substep
+        self._sensordata = data.sensordata.ptr
+        self._instead: dict[str, wp.Kernel] = {}
         if not known:
             return
+        sensors, joints_alone = set(mj.sensor_type), set(mj.actuator_trntype) <= {int(mujoco.mjtTrn.mjTRN_JOINT)}
+        self._idle_later.add("_cacc_world")  # gravity, as before
+        self._idle_unsensed.add("_subtree_com_world")
         if not mj.body_gravcomp.any() and "body_gravcomp" not in world_fields:
             self._idle.add("_gravity_force")
+            self._zero.add(data.qfrc_gravcomp.ptr)
+            if not mj.jnt_actfrclimited.any():
+                self._idle.add("_qfrc_actuator_gravcomp_limits")
         if not mj.na:
             self._idle.add("_next_activation")
-        if not {int(kinds.mjSENS_FORCE), int(kinds.mjSENS_TORQUE)} & set(mj.sensor_type):
+        if not {int(kinds.mjSENS_FORCE), int(kinds.mjSENS_TORQUE)} & sensors:
             self._idle.add("_cfrc_world")
+        if not {int(kinds.mjSENS_E_POTENTIAL), int(kinds.mjSENS_E_KINETIC)} & sensors and not option.enableflags & mjw.EnableBit.ENERGY:
+            self._zero.add(data.energy.ptr)
         if set(mj.sensor_intprm[mj.sensor_type == kinds.mjSENS_CONTACT, 1]) <= {0, 3}:  # reduced to none, or to the net force
             self._idle.add("_contact_sort")
-        if not mj.ntendon and not mj.neq and set(mj.actuator_trntype) <= {int(mujoco.mjtTrn.mjTRN_JOINT)}:
+        if not mj.ntendon and not mj.neq and joints_alone:
             self._idle_unsensed.add("_site_local_to_global")
+        if self._iterations == 1:  # what it sets is read by the test of convergence, and by further iterations
+            self._idle.add("_update_gradient_zero_grad_dot")
+        if plain and not mj.neq and mj.nv <= data.njmax and (not model.is_sparse or mj.nv <= data.njmax_nnz):
+            self._instead["_friction_dof"] = friction_rows(model.is_sparse)
 
     @contextmanager
-    def __call__(self, sensed: bool) -> Iterator[None]:
-        """``sensed``: this substep computes sensors."""
-        skip = _Skip(self._idle if sensed else self._idle | self._idle_unsensed, self._iterations, _FORCES if sensed else ())
+    def __call__(self, sensed: bool, later: bool = False) -> Iterator[None]:
+        """``sensed``: this substep computes sensors. ``later``: it follows another one, with nothing in between."""
+        idle = self._idle | (set() if sensed else self._idle_unsensed) | (self._idle_later if later else set())
+        skip = _Skip(idle, self._iterations, _FORCES if sensed else (), self._instead)
+        zero = wp.array.zero_
+        kept = self._zero if sensed or not self._zero else self._zero | {self._sensordata}
         with _ALONE:
             whole = {name: getattr(wp, name) for name in ("launch", "launch_tiled")}
             try:
                 for name, launch in whole.items():
                     setattr(wp, name, skip.around(launch))
+                wp.array.zero_ = lambda array: None if array.ptr in kept else zero(array)
                 yield
             finally:
+                wp.array.zero_ = zero
                 for name, launch in whole.items():
                     setattr(wp, name, launch)
 
 
 class _Skip:
-    """Which launches of one step are passed over."""
+    """Which launches of one step are passed over, and which are of another kernel."""
 
-    def __init__(self, idle: Collection[str], iterations: int, keep: Collection[str]) -> None:
-        self._idle, self._iterations, self._keep = idle, iterations, keep
+    def __init__(self, idle: Collection[str], iterations: int, keep: Collection[str], instead: Mapping[str, wp.Kernel]) -> None:
+        self._idle, self._iterations, self._keep, self._instead = idle, iterations, keep, instead
         self._searches = 0  # of the solve that runs
 
     def __contains__(self, kernel: str) -> bool:
@@ -92,6 +115,6 @@ class _Skip:
     def around(self, launch: Callable[..., Any]) -> Callable[..., Any]:
         def launch_unless_skipped(kernel: wp.Kernel, *args: Any, **kwargs: Any) -> Any:
             name = kernel.key.partition("__locals__")[0]  # of the function that makes it
-            return None if name in self else launch(kernel, *args, **kwargs)
+            return None if name in self else launch(self._instead.get(name, kernel), *args, **kwargs)
 
         return launch_unless_skipped

@@ -74,9 +74,9 @@ class WarpSimulation(Simulation):
                 option.gravity = wp.array(np.tile(model.opt.gravity, (num_envs, 1)), dtype=wp.vec3)
             option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
-            self._shortcuts = Shortcuts(model, self._model, world_fields)
-            self._count_contacts = count_contacts(model, self._model)
             self._data = mjw.make_data(model, nworld=num_envs, nconmax=nconmax, njmax=njmax)
+            self._shortcuts = Shortcuts(model, self._model, self._data, world_fields)
+            self._count_contacts = count_contacts(model, self._model)
         for name in _STATE:
             setattr(self, name, wp.to_torch(getattr(self._data, name)))
         self._fields = {name: wp.to_torch(attrgetter(name)(self._model)) for name in world_fields}
@@ -141,7 +141,7 @@ class WarpSimulation(Simulation):
         for i in which:
             last = i == count - 1
             option.disableflags = flags if last else flags | mjw.DisableBit.SENSOR
-            with self._shortcuts(sensed=last):
+            with self._shortcuts(sensed=last, later=i != which[0]):
                 mjw.step(self._model, self._data)
         option.disableflags = flags
         if which[-1] == count - 1:
