@@ -12,6 +12,7 @@ from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from legged_mw.utils import quick_start
 from legged_mw.utils.cli import fail, one_line_errors
@@ -34,13 +35,21 @@ def train() -> None:
 
 
 def _train(args: argparse.Namespace) -> None:
-    from legged_mw.check.describe import describe
-    from legged_mw.check.guard import check_recordable
-    from legged_mw.eval.exams import find_exam, make_exam
+    from legged_mw.eval.exams import find_exam
     from legged_mw.rl import training
 
     find_exam(task := load_task(args.task))
     start, device = training.configure(task, args)
+    with training.say_compiling(task, device):
+        _build_and_train(task, start, device, args)
+
+
+def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.Namespace) -> None:
+    from legged_mw.check.describe import describe
+    from legged_mw.check.guard import check_recordable
+    from legged_mw.eval.exams import make_exam
+    from legged_mw.rl import training
+
     env = training.build(task, start, device, args.eager, check_recordable)
     if args.check:
         print(describe(env, task) + ("" if args.eager else "\nthe step can be recorded as a CUDA graph"))

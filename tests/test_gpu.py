@@ -30,10 +30,15 @@ from legged_mw.rl.runner import make_runner
 from legged_mw.rl.transfer import seat_teacher
 from legged_mw.sim.fused import Fused
 from legged_mw.sim.graph import StepGraph
+from legged_mw.utils import quick_start
 from legged_mw.utils.task import load_task
 
 pytestmark = pytest.mark.gpu
 DEVICE = "cuda:0"
+
+
+def test_the_gpu_opens_beside_the_imports() -> None:
+    assert quick_start.open_gpu(0) and not quick_start.open_gpu(torch.cuda.device_count())
 
 
 def make_env(eager: bool, task_name: str = "go1_flat", **overrides: object) -> LeggedRobot:

@@ -6,6 +6,7 @@ import gc
 import subprocess
 import sys
 
+import pytest
 import torch
 
 from legged_mw import ROOT
@@ -62,6 +63,18 @@ def test_a_program_that_others_call_changes_nothing() -> None:
     assert gc.isenabled()
     quick_start.settle()
     assert (sys.modules.get("torch._dynamo"), list(sys.meta_path), gc.get_freeze_count()) == before
+
+
+@pytest.mark.parametrize(("asked", "opened"), [(None, [3]), ("cuda", [0]), ("cuda:2", [2]), ("cpu", []), ("cuda:x", []), ("tpu", [])])
+def test_the_gpu_that_was_asked_for_is_opened(asked: str | None, opened: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    found = list[int]()
+    monkeypatch.setenv("LOCAL_RANK", "3")
+    monkeypatch.delitem(sys.modules, "torch")
+    monkeypatch.setattr(quick_start, "open_gpu", found.append)
+    monkeypatch.setattr(quick_start, "put_off_compiler", lambda: True)
+    monkeypatch.setattr(quick_start.gc, "disable", lambda: None)
+    quick_start.begin(asked)
+    assert found == opened
 
 
 def test_a_gpu_that_is_not_there_is_not_opened() -> None:

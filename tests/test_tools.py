@@ -18,11 +18,13 @@ from torch.utils.tensorboard import SummaryWriter
 
 from legged_mw import ROOT, programs
 from legged_mw.rl import training
+from legged_mw.rl.runner import Runner
 from legged_mw.rl.runs import load_tensors, save_whole
 from legged_mw.sim.device import DeviceFacts, device_facts
 from legged_mw.tools import alongside, chart, completion, doctor, sweep, warm
 from legged_mw.utils import renderer
 from legged_mw.utils.cli import one_line_errors
+from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
 from legged_mw.view.follow import PLAYING, Newest
 
@@ -102,19 +104,26 @@ def test_a_slow_start_has_its_reasons() -> None:
 
 def test_compiling_says_so(tmp_path: Path) -> None:
     """Kernels of a task that are missing in a cache which holds others; of the GPU, not of the CPU."""
-    said: list[str] = []
+    said = list[str]()
     facts = DeviceFacts("H100", (13, 0), True, tmp_path, 9, binaries="*.sm90*")
     for name, ending in (("old", "sm90.cubin"), ("new", "sm90.cubin"), ("other", "cpu1.o")):
         (tmp_path / f"wp_{name}").mkdir()
         (tmp_path / f"wp_{name}" / f"wp_{name}.{ending}").touch()
     os.utime(tmp_path / "wp_old/wp_old.sm90.cubin", (0, 0))
     assert facts.compiled_since(1.0) == 1
-    facts.say_compiling(said.append, waits=[0.0]).join()
-    assert said == []  # compiled before this start
+
+    def listen(facts: DeviceFacts) -> list[str]:
+        with facts.say_compiling(said.append, waits=[0.0, 0.0]) as thread:
+            thread.join()
+        return said
+
+    assert listen(facts) == []  # compiled before this start
     os.utime(tmp_path / "wp_new/wp_new.sm90.cubin", (4e9, 4e9))
-    facts.say_compiling(said.append, waits=[0.0, 0.0]).join()
-    assert said == ["kernels that this task needs are being compiled, 1 modules so far; the next start has them"]
-    facts._replace(compiled=0).say_compiling(said.append, waits=[0.0]).join()
+    assert listen(facts._replace(compiled=0)) == []
+    assert listen(facts) == ["kernels that this task needs are being compiled, 1 modules so far; the next start has them"]
+    with facts.say_compiling(said.append, waits=[60.0]) as thread:
+        pass
+    thread.join()
     assert len(said) == 1
 
 
@@ -172,9 +181,21 @@ def test_drawing_is_tried_in_another_process() -> None:
 def test_warm_steps_each_task(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     warmed: list[tuple[str, str]] = []
     monkeypatch.setattr(warm, "warm", lambda *args: warmed.append(args))
+    monkeypatch.setattr(warm, "warm_engine", lambda *args: warmed.append(args))
     program("warm", "go1_flat", "--device", "cpu", monkeypatch=monkeypatch)
-    assert warmed == [("go1_flat", "cpu")]
-    assert "on a CPU MuJoCo's own engine trains, and compiles nothing" in capsys.readouterr().out
+    assert warmed == [("go1_flat", "cpu"), ("go1_flat",)]
+    assert "on a CPU MuJoCo's own engine trains: few kernels" in capsys.readouterr().out
+
+
+def test_warm_trains_an_iteration(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """So that the learner's own kernels are compiled too; and the fused step's, of as many worlds as will train."""
+    learned, fused = list[int](), list[int]()
+    learn = Runner.learn
+    monkeypatch.setattr(Runner, "learn", lambda self, count: (learned.append(self.env.num_envs), learn(self, count)))
+    monkeypatch.setattr(warm, "fuse_for", lambda env, steps: fused.append(env.num_envs))
+    monkeypatch.setattr(warm, "load_task", small_task)
+    warm.warm("go1_flat", "cpu")
+    assert learned == fused == [4 * usable_cores()] and capsys.readouterr().out == ""
 
 
 # ---- compare and sweep
@@ -419,7 +440,7 @@ def test_training_with_play_starts_a_viewer_and_feeds_it(tmp_path: Path, monkeyp
 
 NOT_TO_TRAIN = [
     *("matplotlib", "onnxscript", "onnxruntime", "warp", "mujoco_warp", "PIL", "mujoco.studio", "mujoco.viewer", "av", "cyclonedds"),
-    *("wandb", "scipy", "pandas", "sympy", "torch._dynamo.eval_frame", "torch._inductor", "legged_mw.motion"),
+    *("wandb", "scipy", "pandas", "torch._dynamo.eval_frame", "torch._inductor", "legged_mw.motion"),
     *("legged_mw.view", "legged_mw.deploy", "legged_mw.robot", "legged_mw.drawing", "legged_mw.rl.export", "legged_mw.tools"),
 ]
 WHAT_IS_THERE = """

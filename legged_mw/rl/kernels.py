@@ -18,9 +18,10 @@ import torch
 import warp as wp
 from torch import Tensor
 
-ROWS = 64  # summed by a thread
+ROWS = 32  # summed by a thread
 _AT_ONCE = 8  # rows that it reads before it writes any: it waits for memory once for them
-_Pairs = wp.types.matrix(shape=(_AT_ONCE, 2), dtype=float)
+_Rows = wp.types.matrix(shape=(_AT_ONCE, 4), dtype=float)
+_BLOCK = 128  # threads: of small layers, too, each processor gets some
 _HALF_LOG_2PI = wp.constant(0.5 * math.log(2.0 * math.pi))
 
 
@@ -30,12 +31,17 @@ def launch(kernel: Any, dim: int | tuple[int, ...], *inputs: Any) -> None:
     device = next(each.device for each in inputs if isinstance(each, Tensor))
     arrays = [_array(each.detach()) if isinstance(each, Tensor) else each for each in inputs]
     stream = _stream(torch.cuda.current_stream(device)) if device.type == "cuda" else None
-    wp.launch(kernel, dim=dim, inputs=arrays, device=str(device), stream=stream)
+    wp.launch(kernel, dim=dim, inputs=arrays, device=str(device), stream=stream, block_dim=_BLOCK)
+
+
+def load(device: str) -> None:
+    """Compile all of them for a device, or find them compiled."""
+    wp.load_module(__name__, device=device)
 
 
 def _array(x: Tensor) -> wp.array:
-    """As warp sees it: three dimensions are two of pairs, none is one of one."""
-    return wp.from_torch(x, dtype=wp.vec2) if x.dim() == 3 else wp.from_torch(x.view(x.shape or 1))
+    """As warp sees it: three dimensions are two of fours, none is one of one."""
+    return wp.from_torch(x, dtype=wp.vec4) if x.dim() == 3 else wp.from_torch(x.view(x.shape or 1))
 
 
 _stream = functools.cache(wp.stream_from_torch)  # none is made while a graph is recorded
@@ -45,65 +51,72 @@ _stream = functools.cache(wp.stream_from_torch)  # none is made while a graph is
 
 
 @wp.func
-def _unpack(x: wp.vec2):
+def _unpack(x: wp.vec4):
     return x
 
 
 @wp.func
-def _unpack(x: wp.int32):
-    bits = wp.cast(x, wp.uint32)
-    high = (bits >> wp.uint32(16)) << wp.uint32(16)
-    return wp.vec2(wp.cast(bits << wp.uint32(16), float), wp.cast(high, float))
+def _unpack(x: wp.int64):
+    """Four values of bfloat16, whose bits are the upper half of a float's; the first is the lowest."""
+    bits = wp.cast(x, wp.uint64)
+    low = wp.uint32(bits)
+    high = wp.uint32(bits >> wp.uint64(32))
+    mask = wp.uint32(65535) << wp.uint32(16)
+    return wp.vec4(
+        wp.cast(low << wp.uint32(16), float),
+        wp.cast(low & mask, float),
+        wp.cast(high << wp.uint32(16), float),
+        wp.cast(high & mask, float),
+    )
 
 
 @wp.func
-def _bfloat16(x: float):
-    """Its bits, rounded to the nearest, ties to even; what is not a number stays so."""
-    bits = wp.cast(x, wp.uint32)
-    if (bits & wp.uint32(0x7FFFFFFF)) > wp.uint32(0x7F800000):
-        return wp.uint32(0x7FC0)
-    return (bits + wp.uint32(0x7FFF) + ((bits >> wp.uint32(16)) & wp.uint32(1))) >> wp.uint32(16)
+def _round(low: float, high: float):
+    """The bits of two values in bfloat16, beside each other."""
+    return (wp.uint32(wp.cast(wp.bfloat16(high), wp.uint16)) << wp.uint32(16)) | wp.uint32(wp.cast(wp.bfloat16(low), wp.uint16))
 
 
 @wp.func
-def _pack(x: wp.vec2, like: wp.vec2):
+def _pack(x: wp.vec4, like: wp.vec4):
     return x
 
 
 @wp.func
-def _pack(x: wp.vec2, like: wp.int32):
-    return wp.cast((_bfloat16(x[1]) << wp.uint32(16)) | _bfloat16(x[0]), wp.int32)
+def _pack(x: wp.vec4, like: wp.int64):
+    return wp.cast((wp.uint64(_round(x[2], x[3])) << wp.uint64(32)) | wp.uint64(_round(x[0], x[1])), wp.int64)
 
 
 @wp.kernel(enable_backward=False)
-def _elu_backward(grad: wp.array2d[Any], out: wp.array2d[Any], into: wp.array2d[Any], sums: wp.array2d[wp.vec2], first: int):
+def _elu_backward(grad: wp.array2d[Any], out: wp.array2d[Any], into: wp.array2d[Any], sums: wp.array2d[wp.vec4], first: int):
     block, c = wp.tid()
-    total = wp.vec2()
+    total = wp.vec4()
     for row in range(block * ROWS, wp.min((block + 1) * ROWS, grad.shape[0]), _AT_ONCE):
-        g = _Pairs()
-        y = _Pairs()
+        g = _Rows()
+        y = _Rows()
         for k in range(_AT_ONCE):
             g[k] = _unpack(grad[row + k, c])
             y[k] = _unpack(out[row + k, c])
         for k in range(_AT_ONCE):
-            value = wp.cw_mul(g[k], wp.vec2(wp.min(y[k, 0], 0.0) + 1.0, wp.min(y[k, 1], 0.0) + 1.0))
+            value = g[k]
+            for j in range(4):
+                value[j] = value[j] * (wp.min(y[k, j], 0.0) + 1.0)
             into[row + k, c] = _pack(value, into[row + k, c])
             total += value
     sums[block, first + c] = total
 
 
-for _types in ((wp.vec2, wp.vec2, wp.vec2), (wp.int32, wp.int32, wp.int32), (wp.vec2, wp.int32, wp.int32)):
-    wp.overload(_elu_backward, [*(wp.array2d(dtype=each) for each in _types), wp.array2d(dtype=wp.vec2), int])
+for _types in ((wp.vec4, wp.vec4, wp.vec4), (wp.int64, wp.int64, wp.int64), (wp.vec4, wp.int64, wp.int64)):
+    wp.overload(_elu_backward, [*(wp.array2d(dtype=each) for each in _types), wp.array2d(dtype=wp.vec4), int])
 
 
-def _pairs(x: Tensor) -> Tensor:
-    """(B, C) as C / 2 columns of two values: of bfloat16 a whole number, of float32 a vector."""
-    return x.view(torch.int32) if x.dtype == torch.bfloat16 else x.unflatten(1, (-1, 2))
+def _fours(x: Tensor) -> Tensor:
+    """(B, C) as C / 4 columns of four values: of bfloat16 a whole number, of float32 a vector."""
+    return x.view(torch.int64) if x.dtype == torch.bfloat16 else x.unflatten(1, (-1, 4))
 
 
 def fits(rows: int, sizes: list[int]) -> bool:
     """Whether ``elu_backward`` takes layers of such sizes."""
-    return rows % _AT_ONCE == 0 and not any(size % 2 for size in sizes)
+    return rows % _AT_ONCE == 0 and not any(size % 4 for size in sizes)
 
 
 def elu_backward(grad: Tensor, out: Tensor, sums: Tensor, first: int) -> Tensor:
@@ -112,7 +125,7 @@ def elu_backward(grad: Tensor, out: Tensor, sums: Tensor, first: int) -> Tensor:
     Its sums over every ROWS rows go to the columns of ``sums`` (B / ROWS, ...) that begin at ``first``. float32 or bfloat16.
     """
     into = torch.empty_like(out)
-    launch(_elu_backward, (len(sums), out.shape[1] // 2), *map(_pairs, (grad, out, into, sums)), first // 2)
+    launch(_elu_backward, (len(sums), out.shape[1] // 4), *map(_fours, (grad, out, into, sums)), first // 4)
     return into
 
 

@@ -12,7 +12,7 @@ import shlex
 import signal
 import time
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -137,8 +137,6 @@ def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> 
     facts = device_facts(device) if engine == "mujoco_warp" else None
     for line in facts.slow() if facts else ():
         print(line, flush=True)
-    if facts:
-        facts.say_compiling()
     if device != "cpu":
         return facts is None or facts.pool
     cores, runner = usable_cores(), task.train.runner
@@ -153,12 +151,16 @@ def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> 
     return True
 
 
+def say_compiling(task: LoadedTask, device: str) -> AbstractContextManager[object]:
+    """Inside, a line says so if the start waits for kernels."""
+    return device_facts(device).say_compiling() if pick_engine(task.cfg.sim.engine, device) == "mujoco_warp" else nullcontext()
+
+
 def build(task: LoadedTask, start: Start, device: str, eager: bool, check_recordable: Check) -> Any:
     """The environment, if its step can be recorded and learning can work in it. With ``eager`` nothing is recorded."""
     if this_rank().leads and not eager:
         check_recordable(task)
     env = task.env_class(task.cfg, device, eager=eager)
-    fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)
     check_mirror(env, task.train)
     check_room(task.train.to_dict(), env)
     if start.policy:
@@ -191,6 +193,7 @@ def train(
     ``begun`` is called before the first iteration, where the run folder is written; ``verbose`` prints whole blocks. Returns
     whether all is done.
     """
+    fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)
     teacher = start.teacher.task.train if start.teacher else None
     rank, runner = this_rank(), make_runner(env, task.train, None, str(env.device), teacher)
     runner.examine, runner.console.verbose, runner.deadline = examine, verbose, deadline

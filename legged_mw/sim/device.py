@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from typing import NamedTuple
 
 import torch
@@ -47,20 +48,25 @@ class DeviceFacts(NamedTuple):
         files = self.cache.glob(f"wp_*/{self.binaries}")
         return len({file.parent for file in files if file.stat().st_mtime >= begun})
 
-    def say_compiling(self, say: Callable[[str], object] = print, waits: Sequence[float] = _WAITS) -> Thread:
-        """Say once, from a thread, that what follows waits for kernels. An empty cache is told of by ``slow``."""
+    @contextmanager
+    def say_compiling(self, say: Callable[[str], object] = print, waits: Sequence[float] = _WAITS) -> Iterator[Thread]:
+        """Inside, say once, from a thread, that what is done waits for kernels. An empty cache is told of by ``slow``."""
+        begun, over = time.time(), Event()
 
         def watch() -> None:
-            begun = time.time()
             for seconds in waits if self.compiled else ():
-                time.sleep(seconds)
+                if over.wait(seconds):
+                    return
                 if count := self.compiled_since(begun):
                     say(f"kernels that this task needs are being compiled, {count} modules so far; the next start has them")
                     return
 
         thread = Thread(target=watch, daemon=True)
         thread.start()
-        return thread
+        try:
+            yield thread
+        finally:
+            over.set()
 
 
 def device_facts(device: str) -> DeviceFacts:

@@ -18,47 +18,58 @@ import torch
 import warp as wp
 from torch import Tensor
 
-from legged_mw.sim.fused_code import HELPERS, TYPES, Access, Code, Unfit, Writer
+from legged_mw.sim.fused_code import ADD_ROWS, HELPERS, TYPES, Access, Code, Unfit, Writer
 from legged_mw.utils.trace import Call, Node, Trace
 
-BLOCK = 32  # threads of a block: 4096 worlds occupy every part of a large GPU
+if wp.config.log_level < wp.LOG_WARNING:  # no engine of warp's steps here, and nobody asks what warp finds and loads
+    wp.config.log_level = wp.LOG_ERROR
+
+BLOCK, LANES = 32, 8  # threads of a block, of a world: 4096 worlds occupy every part of a large GPU
+_ROOM = 44_000 * LANES // BLOCK  # bytes of a world's own values in a block's shared memory
 _CLOSE = 1e-4  # relative and absolute, of values that are the same to float32 rounding after some operations
 _STRAYS = 0.002  # share of elements that may be another: a comparison that rounding turned
 
 
 class Kernel:
-    """Nodes that one thread a world runs through."""
+    """Nodes that a thread runs a world through; on a GPU a few threads, lanes, that share the elements of its values."""
 
     def __init__(self, nodes: Sequence[Node], worlds: int) -> None:
         self.nodes, self._worlds = nodes, worlds
 
     def write(self, trace: Trace, own: set[int]) -> None:
-        """Make the source, with the blocks that are a thread's ``own``."""
-        names: dict[int, tuple[str, bool]] = {}
-        for view in (view for node in self.nodes for view in (*node.reads, *node.writes)):
-            mine = view.block in own
-            names.setdefault(view.block, (f"t{len(names)}" if mine else f"p{len(names)}", mine))
+        """Make the source. The ``own`` blocks are needed nowhere else: they stay with the thread, as far as there is room."""
+        used = dict.fromkeys(view.block for node in self.nodes for view in (*node.reads, *node.writes))
+        self._device = str(trace.blocks[next(iter(used))].device)
+        self._lanes = 1 if self._device == "cpu" else LANES
+        sizes = {block: self._size(trace.blocks[block]) for block in used if block in own}
+        room, kept = _ROOM, dict[int, int]()
+        for block in sorted(sizes, key=sizes.__getitem__):
+            room -= sizes[block] * trace.blocks[block].element_size()
+            if self._lanes == 1 or room >= 0:
+                kept[block] = sizes[block]
+        names = {block: (f"t{i}" if block in kept else f"p{i}", block in kept) for i, block in enumerate(used)}
         writer = Writer(self._worlds, trace.view, names.__getitem__)
-        lines, self._blocks = [HELPERS], list[Tensor]()
+        lines, self._blocks = [f"#define LANES {self._lanes}\n#define BLOCK {BLOCK}", HELPERS], list[Tensor]()
         for block, (name, mine) in names.items():
-            tensor = trace.blocks[block]
-            kind = TYPES[tensor.dtype]
+            kind = TYPES[trace.blocks[block].dtype]
             if mine:
-                world = tensor.dim() > 0 and tensor.shape[0] == self._worlds
-                lines.append(f"{kind} {name}[{tensor.numel() // (self._worlds if world else 1)}];")
+                lines.append(f"OWN({kind}, {name}, {kept[block]})")
             else:
                 lines.append(f"{kind}* __restrict__ {name} = ({kind}*)table[{len(self._blocks)}];")
-                self._blocks.append(tensor)
+                self._blocks.append(trace.blocks[block])
         for node in self.nodes:
             lines += writer.emit(node).lines
         self._source = "\n".join(lines)
-
-        self._device = str(self._blocks[0].device)
         self._kernel = _kernel_of(wp.func_native(self._source)(_body))
 
+    def _size(self, tensor: Tensor) -> int:
+        """Elements of a world's part of a tensor, or of one that all share."""
+        return tensor.numel() // (self._worlds if tensor.shape[:1] == (self._worlds,) else 1)
+
     def compile(self) -> None:
-        """Into warp's cache of kernels, if it is not there; nothing is loaded."""
-        wp.compile_aot_module(self._kernel.module, device=self._device)
+        """Into warp's cache of kernels, if it is not there; nothing is loaded. On a CPU that is done when it is loaded."""
+        if self._device != "cpu":
+            wp.compile_aot_module(self._kernel.module, device=self._device)
 
     def load(self) -> None:
         addresses = [tensor.untyped_storage().data_ptr() for tensor in self._blocks]
@@ -66,10 +77,10 @@ class Kernel:
         wp.load_module(self._kernel.module, device=self._device, block_dim=BLOCK)
 
     def __call__(self) -> None:
-        wp.launch(self._kernel, dim=self._worlds, inputs=[self._table], device=self._device, block_dim=BLOCK)
+        wp.launch(self._kernel, dim=self._worlds * self._lanes, inputs=[self._table], device=self._device, block_dim=BLOCK)
 
 
-def _body(table: wp.array(dtype=wp.uint64), w: int) -> None: ...
+def _body(table: wp.array(dtype=wp.uint64), thread: int) -> None: ...
 
 
 def _kernel_of(body: Any) -> Any:
@@ -83,7 +94,7 @@ class Region:
     """Operations between two calls of the simulator: as they were, and fused."""
 
     def __init__(self, nodes: Sequence[Node], worlds: int, trace: Trace) -> None:
-        self.nodes = list(nodes)
+        self.nodes = _join_sums(nodes)
         self.steps = list[Kernel | Node](_schedule(self.nodes, worlds, trace))
         self._fresh = trace.made
         written = {view.block for node in self.nodes for view in node.writes} - trace.made
@@ -224,13 +235,26 @@ def _schedule(nodes: Sequence[Node], worlds: int, trace: Trace) -> Iterator[Kern
             yield Kernel(together, worlds)
 
 
+def _join_sums(nodes: Sequence[Node]) -> list[Node]:
+    """A sum over worlds that is then added to a fixed value becomes one operation; the sum itself nobody reads."""
+    joined = list[Node]()
+    for node in nodes:
+        total = joined[-1] if joined else node
+        if node.name == "add" and total.name == "sum" and node.func._schema.is_mutable and not node.kwargs and len(node.args) == 2:
+            rows, dims = total.args[0], [*total.args[1]] if len(total.args) > 1 and total.args[1] else []
+            over_worlds = len(total.args) < 3 and (dims == [0] or (not dims and rows.dim() == 1))
+            if over_worlds and node.args[1] is total.outs[0] and total.writes[0].shape == node.writes[0].shape:
+                joined[-1] = Node(ADD_ROWS, (node.args[0], rows), {}, (), (total.reads[0], node.writes[0]), node.writes)
+                continue
+        joined.append(node)
+    return joined
+
+
 def _code(node: Node, worlds: int, trace: Trace) -> Code | None:
     """What the node does for a world, where it can be said."""
-    if (
-        node.random
-        or node.writes[0].block in trace.watched
-        or (node.writes[0].block not in trace.made and worlds not in node.writes[0].shape[:1])
-    ):
+    out = node.writes[0]
+    shared = worlds not in out.shape[:1] and node.func is not ADD_ROWS
+    if node.random or out.block in trace.watched or (shared and out.block not in trace.made):
         return None
     with suppress(Unfit):
         return Writer(worlds, trace.view, lambda block: (f"p{block}", False)).emit(node)
@@ -273,6 +297,13 @@ class _Rows:
     def take(self, code: Code) -> bool:
         """Take the node in, if it fits."""
         block = code.write.view.block
+        if code.write.pitch < 0:  # a sum over worlds: complete only when all are through
+            whole = {access.view.block for access in code.reads if self._row(access) <= 0}
+            if block in self._pitches or whole & self._written:
+                return False
+            self._pitches[block] = {-1}
+            self._written.add(block)
+            return True
         reached = {block: {self._row(code.write)}}
         for access in code.reads:
             reached.setdefault(access.view.block, set()).add(self._row(access))
@@ -298,7 +329,9 @@ class _Rows:
 
 def _replay(node: Node) -> None:
     """Do again what the node did, to the same memory."""
-    if node.func.overloadpacket in (torch.ops.aten.rand, torch.ops.aten.rand_like):
+    if node.func is ADD_ROWS:
+        ADD_ROWS(*node.args)
+    elif node.func.overloadpacket in (torch.ops.aten.rand, torch.ops.aten.rand_like):
         node.outs[0].uniform_()
     elif node.name.startswith(("empty", "new_empty")):
         pass

@@ -20,11 +20,35 @@ SMALL = 64  # elements of a value that all worlds share: each thread computes it
 WORLD = "w"
 
 HELPERS = """
+#ifdef __CUDA_ARCH__
+#define SYNC __syncwarp(lanes);
+#define ADD(to, x) atomicAdd(&(to), x)
+#define OWN(type, name, n) __shared__ type all_##name[BLOCK / LANES][n]; type* name = all_##name[threadIdx.x / LANES];
+const unsigned lanes = __activemask();
+#else
+#define SYNC
+#define ADD(to, x) (to) += (x)
+#define OWN(type, name, n) type name[n];
+#endif
+const int lane = thread % LANES, w = thread / LANES;
 #define NAN_OR(a, b, x) ((a) != (a) ? (a) : (b) != (b) ? (b) : (x))
 #define MAXIMUM(a, b) NAN_OR(a, b, (a) > (b) ? (a) : (b))
 #define MINIMUM(a, b) NAN_OR(a, b, (a) < (b) ? (a) : (b))
 #define FINITE(x) ((x) - (x) == 0)
 """
+
+
+class _AddRows:
+    """Stands for ``to.add_(rows.sum(dim=0))``, which torch does in two operations."""
+
+    tags = ()
+    overloadpacket = None
+
+    def __call__(self, to: Tensor, rows: Tensor) -> Tensor:
+        return to.add_(rows.sum(dim=0))
+
+
+ADD_ROWS = _AddRows()
 
 
 class Unfit(Exception):
@@ -92,6 +116,8 @@ class Writer:
         """The lines of ``node``. Raises Unfit."""
         if len(node.writes) != 1 or any(view.dtype not in TYPES for view in (*node.reads, *node.writes)):
             raise Unfit
+        if node.func is ADD_ROWS:
+            return self._add_rows(*node.args)
         out, name = node.writes[0], node.name
         self._shared = not out.shape or out.shape[0] != self._worlds
         if self._shared and math.prod(out.shape) > SMALL:
@@ -105,7 +131,7 @@ class Writer:
             lines = special(*node.args, **node.kwargs)
         else:
             lines = self._elementwise(node, name)
-        return Code(["{", *lines, "}"], self._reads, self._access(out, out.shape))
+        return Code(["{", *lines, "}", "SYNC"], self._reads, self._access(out, out.shape))
 
     # ---- memory ----------------------------------------------------------------------------------------------------------
 
@@ -140,8 +166,13 @@ class Writer:
         names = ["0" if n == 1 else f"{letter}{d}" for d, n in enumerate(shape)]
         return names if self._shared else [WORLD, *names[1:]]
 
-    def _loops(self, shape: Sequence[int], index: Sequence[str], body: Iterable[str]) -> list[str]:
-        heads = [f"for (int {i} = 0; {i} < {n}; ++{i})" for n, i in zip(shape, index, strict=True) if i not in ("0", WORLD)]
+    def _loops(self, shape: Sequence[int], index: Sequence[str], body: Iterable[str], alone: bool = False) -> list[str]:
+        """``body`` for each element, the first loop shared among a world's lanes; or by a lane ``alone``."""
+        loops = [(n, i) for n, i in zip(shape, index, strict=True) if i not in ("0", WORLD)]
+        heads = [f"for (int {i} = 0; {i} < {n}; ++{i})" for n, i in loops]
+        if not alone:
+            first = f"for (int {loops[0][1]} = lane; {loops[0][1]} < {loops[0][0]}; {loops[0][1]} += LANES)" if loops else "if (lane == 0)"
+            heads = [first, *heads[1:]]
         return [" ".join(heads) + " {", *body, "}"]
 
     def _store(self, shape: Sequence[int], index: Sequence[str], value: str, reads: Iterable[Tensor] = ()) -> list[str]:
@@ -154,7 +185,21 @@ class Writer:
         inner = index if self._shared else index[1:]
         at = " + ".join(f"{math.prod(sizes[d + 1 :])} * {i}" for d, i in enumerate(inner) if i != "0") or "0"
         copied = self._loops(shape, index, [f"copy[{at}] = ({kind})({value});"])
-        return [f"{kind} copy[{math.prod(sizes)}];", *copied, *self._loops(shape, index, [f"{self._write(index)} = copy[{at}];"])]
+        return [f"{kind} copy[{math.prod(sizes)}];", *copied, "SYNC", *self._loops(shape, index, [f"{self._write(index)} = copy[{at}];"])]
+
+    def _add_rows(self, to: Tensor, rows: Tensor) -> Code:
+        """Sums over worlds of what is nearly everywhere 0, such as counts: who has something adds it."""
+        out, source = self._view(to), self._view(rows)
+        if out.dtype != torch.float32 or math.prod(rows.shape[1:]) != to.numel():
+            raise Unfit
+        self._shared, self._out, self._reads = False, out, []
+        index = self._index(source.shape)
+        self._reads.append(self._access(source, source.shape))
+        value = f"float a = (float){self._at(source, source.strides, index)};"
+        lines = self._loops(
+            source.shape, index, [value, f"if (a != 0) ADD({self._at(out, out.strides, index[-1:] if to.dim() else [])}, a);"]
+        )
+        return Code(["{", *lines, "}", "SYNC"], self._reads, Access(out, -1, 0, 0))
 
     # ---- operations ------------------------------------------------------------------------------------------------------
 
@@ -237,12 +282,12 @@ class Writer:
         before = [0] * x.dim()
         for d in range(len(pad) // 2):
             before[-1 - d] = pad[2 * d]
-        if min(pad) < 0 or (not self._shared and before[0]) or "0" in index[1:]:
+        if min(pad) < 0 or (not self._shared and before[0]) or any(i == "0" and n != 1 for i, n in zip(index, x.shape, strict=True)):
             raise Unfit
         view, inside = self._view(x), []
         self._reads.append(self._access(view, view.shape))
         for d, i in enumerate(index):
-            if i != WORLD:
+            if i not in (WORLD, "0"):
                 inside.append(f"{i} >= {before[d]} && {i} < {before[d] + x.shape[d]}")
         shift = -sum(b * s for b, s in zip(before, view.strides, strict=True))
         element = self._at(view, view.strides, index, shift)
@@ -283,7 +328,7 @@ class Writer:
         start, step = _REDUCTIONS[name]
         element, first = (f"({kind})({self._at(view, view.strides, where)})" for where in (index, kept))
         inner = self._loops([n if d in dims else 1 for d, n in enumerate(x.shape)], [i if d in dims else "0" for d, i in enumerate(index)],
-                            [f"{kind} a = {element};", f"s = {step.format(s='s', a='a')};"])  # fmt: skip
+                            [f"{kind} a = {element};", f"s = {step.format(s='s', a='a')};"], alone=True)  # fmt: skip
         end = {"mean": f"s / {math.prod(x.shape[d] for d in dims)}", "linalg_vector_norm": "sqrtf(s)"}.get(name, "s")
         body = [f"{kind} s = {start or first};", *inner, f"{self._write(out)} = {end};"]
         return self._loops([1 if d in dims else n for d, n in enumerate(x.shape)], kept, body)
@@ -370,7 +415,7 @@ class Writer:
         self._reads += [self._access(left, left.shape), Access(right, 0, right.offset, right.offset + _span(right))]
         j = "0" if columns == 1 else "j"
         term = f"s += {self._at(left, left.strides, [WORLD, 'k'])} * {self._at(right, right.strides, ['k', j])};"
-        body = ["float s = 0;", *self._loops([a.shape[1]], ["k"], [term]), f"{self._write([WORLD, j])} = s;"]
+        body = ["float s = 0;", *self._loops([a.shape[1]], ["k"], [term], alone=True), f"{self._write([WORLD, j])} = s;"]
         return self._loops([columns], [j], body)
 
     def _emit_linalg_cross(self, a: Tensor, b: Tensor, dim: int = -1, **_: Any) -> list[str]:

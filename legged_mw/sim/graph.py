@@ -11,8 +11,6 @@ from torch import Tensor
 from legged_mw.sim.fusion import Fusion
 from legged_mw.utils.errors import NotRecordable, line_to_blame, out_of_memory
 
-_PATIENCE = 1.0  # [s] that kernels are waited for: so long takes their loading from a cache
-
 
 class StepGraph:
     """Calls ``fn``; on a GPU every call after the first three replays one CUDA graph of torch and warp work together.
@@ -32,6 +30,11 @@ class StepGraph:
     def recorded(self) -> bool:
         """Whether calls are replays by now."""
         return self._graph is not None
+
+    @property
+    def fusing(self) -> bool:
+        """Whether kernels of the fused step are still compiled, or not yet in use."""
+        return self._fusion is not None
 
     def fuse(self, worlds: int, keep: Callable[[], Callable[[], None]], watched: Iterable[Tensor]) -> None:
         """On a CPU: fuse now. ``keep`` remembers all that ``fn`` writes, and returns what puts it back; ``watched`` as in ``Trace``."""
@@ -72,7 +75,7 @@ class StepGraph:
             fusion = self._fusion
             self._aside(stream, fusion.trace if fusion and self._warmup == 1 else self._fn)
             if fusion and not self._warmup:
-                fusion.compile(wait=_PATIENCE)
+                fusion.compile(wait=0.0)
             return
         import warp as wp
 

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import time
+from contextlib import redirect_stdout
+from io import StringIO
+from itertools import count
 
 import torch
 
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.worlds import fuse_for
 from legged_mw.eval.exams import make_exam
+from legged_mw.rl.layers import kernels_for
+from legged_mw.rl.runner import make_runner
 from legged_mw.sim.device import device_facts
 from legged_mw.utils.cli import Parser, pick_device
+from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import load_task, task_names
 
-_FEW = 8  # worlds on a CPU: kernels do not depend on their number
+_FEW = 8  # worlds of mujoco-warp on a CPU
 _STEPS = 5  # three before the step is recorded, two replays
 
 
@@ -22,25 +30,47 @@ def main() -> None:
     args = parser.parse_args()
     device = pick_device(args.device)
     if device == "cpu":
-        print("on a CPU MuJoCo's own engine trains, and compiles nothing; these kernels are for --engine mujoco_warp", flush=True)
+        print("on a CPU MuJoCo's own engine trains: few kernels; most of these are for --engine mujoco_warp", flush=True)
     before = device_facts(device)
     print(f"kernels of {before.name} go to {before.cache}", flush=True)
     for name in args.tasks or task_names():
         begun = time.perf_counter()
         warm(name, device)
+        if device == "cpu":
+            warm_engine(name)
         print(f"{name:<20} {time.perf_counter() - begun:>6.1f} s", flush=True)
     print(f"{device_facts(device).compiled} modules of mujoco-warp are compiled, {before.compiled} were before")
 
 
 def warm(name: str, device: str) -> None:
-    """Step a task and its exam a few times."""
+    """Train a task for an iteration, and step its exam: all kernels that its training launches."""
+    task = load_task(name)
+    if device == "cpu":
+        task.fit_cpu(usable_cores())
+        torch.set_num_threads(1)  # as train.py does
+    env = task.env_class(task.cfg, device)
+    fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)
+    exam = make_exam(task, env)
+    if kernels := kernels_for(env.actions):
+        kernels.load(device)
+    if not task.train.distillation.teacher:  # which a task of its own would have to train first
+        with redirect_stdout(StringIO()):
+            make_runner(env, task.train, None, device).learn(1)
+    for each in [env, *([exam.env] if exam else [])]:
+        _step(each)
+
+
+def warm_engine(name: str) -> None:
+    """The kernels of a task's step in mujoco-warp on a CPU: they are the same for few worlds."""
     task = load_task(name)
     task.set("sim.engine", "mujoco_warp")
-    if device == "cpu":
-        task.set("env.num_envs", _FEW)
-        torch.set_num_threads(1)
-    env = task.env_class(task.cfg, device)
-    exam = make_exam(task, env)
-    for each in [env, *([exam.env] if exam else [])]:
-        for _ in range(_STEPS):
-            each.step(torch.zeros_like(each.actions))
+    task.set("env.num_envs", _FEW)
+    _step(task.env_class(task.cfg, "cpu"))
+
+
+def _step(env: RobotTask) -> None:
+    """A few steps, until all that is compiled beside them is in use."""
+    for i in count():
+        env.step(torch.zeros_like(env.actions))
+        if i >= _STEPS and not env._graph.fusing:
+            return

@@ -29,14 +29,14 @@ Marked = Callable[..., Any]
 def begin(gpu: str | None = "cpu") -> None:
     """To be called first, before torch is imported. From here until ``settle`` no garbage is collected.
 
-    ``gpu`` is the device that will be used: "cpu", "cuda:0", or None for the GPU of this process, if there is one.
+    ``gpu`` is the device that was asked for: "cpu", "cuda:0", or None for the GPU of this process, if there is one.
     """
     if "torch" in sys.modules:
         return  # too late to gain from it: another program calls this one
     gc.disable()  # a start makes a million objects that stay; to look through them again and again takes a third of it
-    if gpu != "cpu":
-        index = int(gpu.partition(":")[2] or 0) if gpu else int(os.environ.get("LOCAL_RANK", "0"))
-        Thread(target=open_gpu, args=(index,), daemon=True).start()
+    index = os.environ.get("LOCAL_RANK", "0") if gpu is None else gpu.removeprefix("cuda").removeprefix(":") or "0"
+    if index.isdecimal():  # no other name is one of a GPU
+        Thread(target=open_gpu, args=(int(index),), daemon=True).start()
     put_off_compiler()
 
 

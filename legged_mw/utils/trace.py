@@ -41,7 +41,7 @@ class Node(NamedTuple):
     @property
     def name(self) -> str:
         """As torch calls it, without what says where the result goes: ``add`` for ``add_`` and ``add.out``."""
-        return str(self.func._schema.name).removeprefix("aten::").strip("_")
+        return self.func._schema.name.removeprefix("aten::").strip("_") if hasattr(self.func, "_schema") else ""
 
     @property
     def random(self) -> bool:
