@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.worlds import fuse, keep_worlds
+from legged_mw.envs.worlds import everything, fused_step
 from legged_mw.sim.fused import Fused, Kernel, Region
-from legged_mw.sim.fusion import Fusion
+from legged_mw.sim.fusion import fused as fuse
+from legged_mw.sim.fusion import remember
 from legged_mw.utils.task import load_task
 from legged_mw.utils.trace import Trace, not_traced, tracing
 
@@ -170,31 +171,54 @@ def test_calls_of_the_simulator_stay_where_they_are() -> None:
     assert calls[-1] == 8.0 and memory.out[2, 2].item() == pytest.approx(2.0 * (before + 1.0))
 
 
-def test_a_part_that_gives_other_values_stays_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_part_that_gives_other_values_stays_as_it_is(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     memory = Memory()
-    fusion = Fusion(lambda: memory.out.copy_(memory.row * 2.0 + memory.b), N, "cpu")
-    fusion.trace()
-    fusion.compile(wait=None)
-    assert fusion._fused
-    kernel = fusion._fused.kernels[0]
-    type(kernel).__call__, right = lambda self: memory.out.zero_(), type(kernel).__call__
-    try:
-        fusion.verify()()
-    finally:
-        type(kernel).__call__ = right
-    assert capsys.readouterr().out.endswith("1 of 1 parts of the step are not fused: they gave other values\n")
+    monkeypatch.setattr(Kernel, "__call__", lambda self: memory.out.zero_())
+    step = fuse(lambda: [memory.out.copy_(memory.row * 2.0 + memory.b)].clear(), N, {"out": memory.out})
+    step()
+    assert capsys.readouterr().out == "1 of 1 parts of the step are not fused: they gave other values\n"
     torch.testing.assert_close(memory.out, memory.row * 2.0 + memory.b)
+
+
+def test_what_torch_does_not_see_leaves_the_step_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
+    memory = Memory()
+    numbers = memory.one.numpy()
+
+    def step() -> None:
+        memory.out.copy_(memory.b * 2.0)
+        numbers[:] += 1.0
+
+    assert fuse(step, N, {"out": memory.out, "one": memory.one}) is step and not numbers.any()
+    said = "the step is not fused: one is another than by the step as it is written; does it do something that torch does not see?\n"
+    assert capsys.readouterr().out == said
 
 
 def test_a_compiler_that_fails_leaves_the_step_as_it_is(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     memory = Memory()
     monkeypatch.setattr(Fused, "compile", lambda self: 1 / 0)
-    fusion = Fusion(lambda: [memory.out.add_(1.0)].clear(), N, "cpu")
-    fusion.trace()
-    fusion.compile(wait=None)
-    fusion.verify()()
-    assert memory.out[0, 0] == 3.0
+
+    def step() -> None:
+        memory.out.add_(1.0)
+
+    assert fuse(step, N, {"out": memory.out}) is step and not memory.out.any()
     assert capsys.readouterr().out == "the step is not fused: division by zero\n"
+
+
+def test_what_a_call_returns_is_there_when_it_is_called_again() -> None:
+    """As of the lookup of the ground's height, which is a kernel of warp."""
+    memory = Memory()
+
+    class Lookup:
+        @not_traced
+        def __call__(self, places: Tensor) -> Tensor:
+            return places * 3.0
+
+    lookup = Lookup()
+    step = fuse(lambda: [memory.out.copy_(lookup(memory.b + 1.0) - 1.0)].clear(), N, {"out": memory.out})
+    assert isinstance(step, Fused)
+    memory.b.fill_(2.0)
+    step()
+    assert (memory.out == 8.0).all()
 
 
 @pytest.fixture(scope="module")
@@ -208,9 +232,7 @@ def robot() -> RobotTask:
 
 def test_a_task_is_fused_into_few_kernels_and_does_what_it_did(robot: RobotTask, capsys: pytest.CaptureFixture[str]) -> None:
     """From the same worlds and draws, over episodes that end: each step as it is, then fused."""
-    put_back = keep_worlds(robot)
-    fuse(robot)
-    program = robot._graph._fn
+    program = fused_step(robot)
     assert isinstance(program, Fused) and "not fused" not in capsys.readouterr().out
     torch_s = {"rand", "rand_like", "exponential", "uniform"} | {"copy"}  # the last into what the engine watches
     assert len(program.kernels) <= 6 and {*left_to_torch(program)} <= torch_s
@@ -221,7 +243,7 @@ def test_a_task_is_fused_into_few_kernels_and_does_what_it_did(robot: RobotTask,
 
     ended = 0
     for action in torch.randn(30, 32, 12):
-        put_back = keep_worlds(robot)
+        put_back = remember(everything(robot))
         robot._graph._fn = as_it_is
         obs, reward, done, extras = robot.step(action)
         put_back()
@@ -236,10 +258,8 @@ def test_a_task_is_fused_into_few_kernels_and_does_what_it_did(robot: RobotTask,
 
 
 def test_fusing_moves_no_world_and_no_draw(robot: RobotTask) -> None:
-    before, draws = keep_worlds(robot), torch.get_rng_state()
-    values = {name: value.clone() for name, value in robot.sim.memory().items()}
-    fuse(robot)
+    before, draws = {name: value.clone() for name, value in everything(robot).items()}, torch.get_rng_state()
+    assert isinstance(fused_step(robot), Fused)
     assert torch.equal(torch.get_rng_state(), draws)
-    for name, value in robot.sim.memory().items():
-        assert torch.equal(value, values[name]), name
-    before()
+    for name, value in everything(robot).items():
+        assert torch.equal(value, before[name]), name

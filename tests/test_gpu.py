@@ -19,7 +19,7 @@ from test_recurrent import IMAGES, NETWORKS, share_memory
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
-from legged_mw.envs.worlds import worlds_state
+from legged_mw.envs.worlds import fuse_for, worlds_state
 from legged_mw.eval.training import TrainingExam
 from legged_mw.rl import layers
 from legged_mw.rl.distillation import GraphedDistillation
@@ -135,7 +135,6 @@ FORCES: dict[str, object] = {
 def test_replay_equals_eager_over_100_steps(task: str, settings: dict[str, object]) -> None:
     """Bit for bit, with noise, kicks, falls, time outs and resets: the same random numbers are drawn in both."""
     overrides = {"perturbation__kick": True, "env__episode_length_s": 1.0, "termination__max_tilt": 10.0, **settings}
-    overrides["sim__fuse"] = False
     eager, recorded = (without_constraints(make_env(eager, task, **overrides)) for eager in (True, False))
     actions = torch.randn(100, 64, eager.num_actions, generator=torch.Generator().manual_seed(0)).to(DEVICE)
     expected, got = roll_out(eager, actions), roll_out(recorded, actions)
@@ -155,10 +154,8 @@ def test_a_fused_step_is_the_eager_one_to_rounding(
 ) -> None:
     overrides = {"perturbation__kick": True, "env__episode_length_s": 1.0, "termination__max_tilt": 10.0, **settings}
     eager, fused = (without_constraints(make_env(eager, task, **overrides)) for eager in (True, False))
-    assert fused._graph._fusion
+    fuse_for(fused, steps=1_000_000)
     actions = torch.randn(40, 64, eager.num_actions, generator=torch.Generator().manual_seed(0)).to(DEVICE)
-    begin = fused._graph._fusion.compile
-    monkeypatch.setattr(fused._graph._fusion, "compile", lambda wait: begin(None))  # however long it takes
     expected, got = roll_out(eager, actions), roll_out(fused, actions)
     assert fused._graph.recorded and isinstance(fused._graph._fn, Fused)
     assert "not fused" not in capsys.readouterr().out
@@ -173,7 +170,7 @@ def test_motors_replay_as_they_run_eager(law: str, tmp_path: Path) -> None:
     net = save(mlp(torque_scale=20.0)[1], tmp_path)
     drawn = {f"domain_rand.{name}": [0.8, 1.2] for name in ("stiffness", "damping", "strength", "stall_torque", "no_load_speed")}
     fields: dict[str, object] = {**CURVE, **drawn, "domain_rand.enable": True, "domain_rand.delay_ms": [0.0, 30.0]}
-    fields |= {"sim.fuse": False, "control.actuator": "servo" if law == "own" else law, "control.network": net, "env.episode_length_s": 0.5}
+    fields |= {"control.actuator": "servo" if law == "own" else law, "control.network": net, "env.episode_length_s": 0.5}
     fields |= {"control.action_scale": 5.0} if law in ("torque", "speed") else {}
     if law == "speed":
         law, fields = "dc_motor", fields | {"control.actuator": "dc_motor", "control.action_origin": "speed"}

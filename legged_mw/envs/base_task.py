@@ -23,14 +23,14 @@ class BaseTask(VecEnv):
     obs_buf: dict[str, Tensor]  # group -> (N, size)
     max_episode_length: int  # [control steps]
 
-    def __init__(self, num_envs: int, num_actions: int, device: str, eager: bool = False, fuse: bool = False) -> None:
+    def __init__(self, num_envs: int, num_actions: int, device: str, eager: bool = False) -> None:
         self.num_envs, self.num_actions, self.device, self.eager = num_envs, num_actions, device, eager
         self.actions = torch.zeros(num_envs, num_actions, device=device)
         self.rew_buf = torch.zeros(num_envs, device=device)
         self.reset_buf = torch.zeros(num_envs, dtype=torch.bool, device=device)  # the episode ended in this step
         self.time_out_buf = torch.zeros(num_envs, dtype=torch.bool, device=device)  # it ended by the clock, or off the terrain; no fall
         self._episode_length_buf = torch.zeros(num_envs, dtype=torch.long, device=device)  # [control steps]
-        self._graph = StepGraph(self._step, device, eager, worlds=num_envs if fuse else 0)
+        self._graph = StepGraph(self._step, device, eager)
 
     @property
     def episode_length_buf(self) -> Tensor:

@@ -69,7 +69,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
             terrain=self.terrain,
             eager=eager,
         )
-        super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager, cfg.sim.fuse)
+        super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
         self.domain_rand = DomainRand(cfg, self.robot, self.sim, self.motor_law)
         self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.sim.fusion import fused
 from legged_mw.sim.graph import StepGraph
 from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
 from legged_mw.utils.config import Config
@@ -33,7 +34,7 @@ def worlds_state(env: RobotTask) -> dict[str, Tensor]:
 
 def put_worlds(env: RobotTask, state: dict[str, Tensor]) -> str:
     """Put back what ``worlds_state`` returned. Returns why that cannot be, and then nothing has changed; '' if it is done."""
-    own = _simulation(env) | {name: value for name, (value, _) in _memory(env).items()}
+    own = everything(env)
     for name, value in state.items():
         if name not in own or own[name].shape != value.shape or own[name].dtype != value.dtype:
             return f"{name} is {_words(value)} there and {_words(own.get(name))} here"
@@ -48,31 +49,27 @@ def put_worlds(env: RobotTask, state: dict[str, Tensor]) -> str:
     return ""
 
 
-def keep_worlds(env: RobotTask) -> Callable[[], None]:
-    """Remember all that ``env`` and torch's generator hold on a CPU; returns what puts it back."""
-    memory = _simulation(env) | {name: value for name, (value, _) in _memory(env).items()}
-    kept, draws = {name: value.clone() for name, value in memory.items()}, torch.get_rng_state()
-
-    def put_back() -> None:
-        for name, value in kept.items():
-            if not torch.equal(memory[name], value):  # what no step writes is not counted as written
-                memory[name].copy_(value)
-        torch.set_rng_state(draws)
-
-    return put_back
+def fused_step(env: RobotTask) -> Callable[[], None]:
+    """The step of ``env`` fused, if that can be; no world moves and no number is drawn."""
+    state = env.sim.memory()
+    fields = [value for name, value in state.items() if name.startswith("model.")] if env.sim.engine == "mujoco" else []
+    return fused(env._step, env.num_envs, everything(env), fields)
 
 
-def fuse(env: RobotTask) -> None:
-    """Fuse the step on a CPU, where no world may notice: runs of one kind stay equal to the last bit."""
-    fields = [value for name, value in env.sim.memory().items() if name.startswith("model.")]
-    with torch.inference_mode():
-        env._graph.fuse(env.num_envs, lambda: keep_worlds(env), fields)
+def everything(env: RobotTask) -> dict[str, Tensor]:
+    """All memory that ``env`` reaches, by name: the simulation's, and whatever else it holds."""
+    return _simulation(env) | {name: value for name, (value, _) in _memory(env).items()}
 
 
 def fuse_for(env: RobotTask, steps: int) -> None:
-    """Fuse the step on a CPU if so many control ``steps`` are worth it."""
-    if str(env.device) == "cpu" and env.cfg.sim.fuse and not env.eager and steps >= _WORTH_FUSING:
-        fuse(env)
+    """Fuse the step of ``env``, which is to make so many ``steps``: on a CPU now, if that pays; on a GPU before it is recorded."""
+    if not env.cfg.sim.fuse or env.eager:
+        return
+    if str(env.device) != "cpu":
+        env._graph.better = lambda: fused_step(env)
+    elif steps >= _WORTH_FUSING:
+        with torch.inference_mode():
+            env._graph.improve(fused_step(env))
 
 
 def _words(value: Tensor | None) -> str:

@@ -169,6 +169,12 @@ class Writer(Lines):
                 value = f"({value} {macro} {limit} ? {limit} : {value})"
         return self._store(shape, index, value, [v for v in (x, low, high) if isinstance(v, Tensor)])
 
+    def _emit_pow(self, x: Tensor, exponent: Any) -> list[str]:
+        if isinstance(exponent, Tensor) or self._out.dtype != torch.float32 or not isinstance(x, Tensor):
+            raise Unfit
+        a = self._value(x, self._out.shape, index := self._index(self._out.shape), torch.float32)
+        return self._store(self._out.shape, index, f"{a} * {a}" if exponent == 2 else f"powf({a}, {float(exponent)!r}f)", [x])
+
     def _emit_nan_to_num(self, x: Tensor, nan: Any = None, posinf: Any = None, neginf: Any = None, **more: Any) -> list[str]:
         shape, index = self._out.shape, self._index(self._out.shape)
         if self._out.dtype != torch.float32:

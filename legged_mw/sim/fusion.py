@@ -1,62 +1,68 @@
-"""From a step as it is written to the same step fused: trace a call, compile in a thread, verify on another call."""
+"""From a step as it is written to the same step fused: traced, compiled, and held against the original before it is used."""
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Callable, Iterable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Mapping
 
+import torch
 from torch import Tensor
 
+from legged_mw.utils.math import alike
 from legged_mw.utils.trace import Trace
 
-if TYPE_CHECKING:  # it needs warp
-    from legged_mw.sim.fused import Fused
+_CLOSE, _STRAYS = 1e-3, 0.01  # of all that a step writes: rounding goes through physics, and may turn a comparison
 
 
-class Fusion:
-    """Of the step ``fn`` of ``worlds``. What cannot be fused stays as it is, and a line says so."""
+def fused(fn: Callable[[], None], worlds: int, memory: Mapping[str, Tensor], watched: Iterable[Tensor] = ()) -> Callable[[], None]:
+    """The step ``fn`` of ``worlds``, fused; or ``fn`` itself, and a line says why. No world has moved when it returns.
 
-    def __init__(self, fn: Callable[[], None], worlds: int, device: str) -> None:
-        self._fn, self._worlds, self._device = fn, worlds, device
-        self._fused: Fused | None = None
-        self._error: Exception | None = None
-        self._thread: threading.Thread | None = None
+    ``memory`` is all that ``fn`` writes, by name. Only torch may write to what is ``watched``.
+    """
+    put_back = remember(memory)
+    try:
+        program, reason = _fused(fn, worlds, memory, watched, put_back), ""
+    except Exception as error:  # whatever a compiler may throw: the step goes on as it is
+        program, reason = None, " ".join(f"{error}".split())[:200] or type(error).__name__
+    put_back()
+    if program:
+        return program
+    print(f"the step is not fused: {reason}", flush=True)
+    return fn
 
-    def trace(self, watched: Iterable[Tensor] = ()) -> None:
-        """A real call, which is written down; only torch may write to what is ``watched``."""
-        with Trace(watched) as self._trace:
-            self._fn()
 
-    def compile(self, wait: float | None) -> None:
-        """Begin to compile, and wait so long [s] for the end; None: as long as it takes."""
-        self._thread = threading.Thread(target=self._compile, daemon=True)
-        self._thread.start()
-        self._thread.join(wait)
+def _fused(
+    fn: Callable[[], None], worlds: int, memory: Mapping[str, Tensor], watched: Iterable[Tensor], put_back: Callable[[], None]
+) -> Callable[[], None]:
+    from legged_mw.sim.fused import Fused  # it needs warp
 
-    def _compile(self) -> None:
-        try:
-            from legged_mw.sim.fused import Fused
+    with Trace(watched) as trace:
+        fn()
+    expected = {name: value.clone() for name, value in memory.items()}
+    put_back()
+    program = Fused(trace, worlds, str(next(iter(memory.values())).device))
+    program.compile()
+    if wrong := program.verify():
+        print(f"{wrong} of {len(program.parts)} parts of the step are not fused: they gave other values", flush=True)
+    put_back()
+    program()
+    for name, value in memory.items():
+        if not alike(expected[name], value, _CLOSE, _STRAYS):
+            raise RuntimeError(f"{name} is another than by the step as it is written; does it do something that torch does not see?")
+    return program
 
-            fused = Fused(self._trace, self._worlds, self._device)
-            fused.compile()
-            self._fused = fused
-        except Exception as error:  # whatever a compiler may throw: the step goes on as it is
-            self._error = error
 
-    @property
-    def ready(self) -> bool:
-        """Whether ``verify`` may be called."""
-        return self._thread is not None and not self._thread.is_alive()
+def remember(memory: Mapping[str, Tensor]) -> Callable[[], None]:
+    """Remember ``memory`` and torch's generators; returns what puts them back."""
+    kept, draws = {name: value.clone() for name, value in memory.items()}, torch.get_rng_state()
+    device = next(iter(memory.values())).device
+    draws_there = torch.cuda.get_rng_state(device) if device.type == "cuda" else None
 
-    def verify(self) -> Callable[[], None]:
-        """A real call, held against the step as it is. Returns what to call from now on."""
-        fused, error = self._fused, self._error
-        if fused:
-            wrong = fused.verify()
-            if wrong:
-                print(f"{wrong} of {len(fused.parts)} parts of the step are not fused: they gave other values", flush=True)
-            return fused
-        print(f"the step is not fused: {' '.join(str(error).split())[:200] or type(error).__name__}", flush=True)
-        self._fn()
-        return self._fn
+    def put_back() -> None:
+        for name, value in kept.items():
+            if not torch.equal(memory[name], value):  # what no step writes is not counted as written
+                memory[name].copy_(value)
+        torch.set_rng_state(draws)
+        if draws_there is not None:
+            torch.cuda.set_rng_state(draws_there, device)
+
+    return put_back

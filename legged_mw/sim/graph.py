@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from legged_mw.sim.fusion import Fusion
 from legged_mw.utils.errors import NotRecordable, line_to_blame, out_of_memory
 
 
@@ -17,72 +15,50 @@ class StepGraph:
 
     ``fn`` may touch only tensors that outlive it, in place, and may not ask the host for a value.
     The first calls are real ones: they compile kernels and warm the allocators, and no step is thrown away.
-    A step of many ``worlds`` is fused meanwhile (``fused.py``); its kernels are compiled beside it, and recorded when they are there.
     """
 
-    def __init__(self, fn: Callable[[], None], device: str, eager: bool = False, warmup: int = 3, worlds: int = 0) -> None:
-        self._fn, self._device, self._warmup = fn, device, warmup
+    better: Callable[[], Callable[[], None]] | None = None  # asked once, before recording, for what does the same in fewer kernels
+
+    def __init__(self, fn: Callable[[], None], device: str, eager: bool = False, warmup: int = 3) -> None:
+        self._fn, self._warmup = fn, warmup
         self._graph: torch.cuda.CUDAGraph | None = None
         self._stream = torch.cuda.Stream(device) if device.startswith("cuda") and not eager else None
-        self._fusion = Fusion(fn, worlds, device) if worlds and self._stream else None
 
     @property
     def recorded(self) -> bool:
         """Whether calls are replays by now."""
         return self._graph is not None
 
-    @property
-    def fusing(self) -> bool:
-        """Whether kernels of the fused step are still compiled, or not yet in use."""
-        return self._fusion is not None
-
-    def fuse(self, worlds: int, keep: Callable[[], Callable[[], None]], watched: Iterable[Tensor]) -> None:
-        """On a CPU: fuse now. ``keep`` remembers all that ``fn`` writes, and returns what puts it back; ``watched`` as in ``Trace``."""
-        put_back = keep()
-        fusion = Fusion(self._fn, worlds, self._device)
-        fusion.trace(watched)
-        put_back()
-        fusion.compile(wait=None)
-        self._fn = fusion.verify()
-        put_back()
+    def improve(self, fn: Callable[[], None]) -> None:
+        """Call ``fn`` from now on, which does the same."""
+        self._fn = fn
 
     def __call__(self) -> None:
-        if self._fusion and self._fusion.ready and self._stream:
-            fusion, self._fusion, self._graph = self._fusion, None, None
-            self._aside(self._stream, lambda: setattr(self, "_fn", fusion.verify()))
-        elif self._graph is not None:
+        if self._graph is not None:
             self._graph.replay()
         elif self._stream is None:
             self._fn()
         else:
             self._first_calls(self._stream)
 
-    def _aside(self, stream: torch.cuda.Stream, fn: Callable[[], None]) -> None:
-        """Run ``fn`` on the side stream that capture demands."""
+    def _first_calls(self, stream: torch.cuda.Stream) -> None:
+        """Eager while warming up, then record and replay; all on one side stream, as capture demands."""
         import warp as wp  # a second to import, and only for a GPU
 
         wp.init()  # which is nothing where a simulation has done so
         current = torch.cuda.current_stream(stream.device)
         stream.wait_stream(current)
-        with torch.cuda.stream(stream), wp.ScopedStream(wp.stream_from_torch(stream), sync_enter=False):
-            fn()
-        current.wait_stream(stream)
-
-    def _first_calls(self, stream: torch.cuda.Stream) -> None:
-        """Eager while warming up, then record and replay."""
+        wp_stream = wp.stream_from_torch(stream)
         if self._warmup:
             self._warmup -= 1
-            fusion = self._fusion
-            self._aside(stream, fusion.trace if fusion and self._warmup == 1 else self._fn)
-            if fusion and not self._warmup:
-                fusion.compile(wait=0.0)
+            with torch.cuda.stream(stream), wp.ScopedStream(wp_stream, sync_enter=False):
+                self._fn()
+                if self.better and not self._warmup:
+                    self.improve(self.better())
+            current.wait_stream(stream)
             return
-        import warp as wp
-
         torch.cuda.synchronize(stream.device)
-        current = torch.cuda.current_stream(stream.device)
-        stream.wait_stream(current)
-        self._graph = self._record(stream, wp, wp.stream_from_torch(stream))
+        self._graph = self._record(stream, wp, wp_stream)
         current.wait_stream(stream)
         self._graph.replay()
 

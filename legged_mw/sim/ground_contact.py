@@ -29,6 +29,7 @@ from torch import Tensor
 from legged_mw.sim.ground import PROBE_SPACING
 from legged_mw.sim.shapes import spheres_on
 from legged_mw.sim.terrain import Terrain
+from legged_mw.utils.trace import not_traced
 
 wp.set_module_options({"enable_backward": False})
 
@@ -66,6 +67,7 @@ class HeightLookup:
         with wp.ScopedDevice(self._device):
             self._field = _field(terrain)
 
+    @not_traced
     def __call__(self, points: Tensor) -> Tensor:
         """Height [m] of the ground under ``points`` (..., 2) [m, world]; outside of the field, of its rim."""
         heights = torch.empty(points.shape[:-1], device=points.device)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from contextlib import redirect_stdout
 from io import StringIO
-from itertools import count
 
 import torch
 
@@ -69,8 +68,6 @@ def warm_engine(name: str) -> None:
 
 
 def _step(env: RobotTask) -> None:
-    """A few steps, until all that is compiled beside them is in use."""
-    for i in count():
+    """A few steps, until the step is recorded."""
+    for _ in range(_STEPS):
         env.step(torch.zeros_like(env.actions))
-        if i >= _STEPS and not env._graph.fusing:
-            return

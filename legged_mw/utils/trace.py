@@ -98,13 +98,18 @@ class Trace(TorchDispatchMode):
         return result
 
     def call(self, run: Callable[[], object], given: Iterable[Tensor] = ()) -> Any:
-        """Run what is not looked into; it reads and writes what it is ``given``, and more."""
+        """Run what is not looked into; it reads and writes what it is ``given``, and more. A tensor that it returns is kept."""
         self._paused = True
         try:
             result = run()
         finally:
             self._paused = False
-        self.steps.append(Call(run, tuple(self.view(tensor).block for tensor in given)))
+        blocks = [self.view(tensor).block for tensor in given]
+        if isinstance(result, Tensor):
+            blocks.append(self.view(result).block)
+            self.steps.append(Call(lambda: result.copy_(run()), tuple(blocks)))  # type: ignore[arg-type]
+        else:
+            self.steps.append(Call(run, tuple(blocks)))
         return result
 
     def __enter__(self) -> Trace:
