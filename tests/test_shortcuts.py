@@ -90,7 +90,6 @@ def test_what_is_left_out_is_what_the_library_launches(whole: Callable[[], None]
     idle = {"_gravity_force", "_qfrc_actuator_gravcomp_limits", "_next_activation", "_cfrc_world", "_contact_sort"}
     idle.add("_update_gradient_zero_grad_dot")
     assert short._idle == idle and not idle & {*names}
-    assert "_friction_dof" not in names and names.count("friction_rows") == 2
     once = {"_subtree_com_world", "_site_local_to_global", "_cacc_world"}
     assert short._idle_unsensed | short._idle_later == once and [names.count(name) for name in once] == [1, 1, 1]
     assert names.count("_update_gradient_cholesky") == names.count("_linesearch_iterative_kernel") == 2

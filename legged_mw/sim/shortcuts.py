@@ -15,15 +15,13 @@ the world's centre of mass, and ``sensordata``.
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from typing import Any
 
 import mujoco
 import mujoco_warp as mjw
 import warp as wp
-
-from legged_mw.sim.friction_rows import friction_rows
 
 KNOWN = ("4.0.0",)  # of mujoco-warp
 _ALONE = threading.RLock()  # warp.launch is everybody's
@@ -49,7 +47,6 @@ class Shortcuts:
         self._idle, self._idle_unsensed, self._idle_later = set(), set(), set()
         self._zero: set[int] = set()  # addresses of arrays that are zero, and are set to zero in every substep
         self._sensordata = data.sensordata.ptr
-        self._instead: dict[str, wp.Kernel] = {}
         if not known:
             return
         sensors, joints_alone = set(mj.sensor_type), set(mj.actuator_trntype) <= {int(mujoco.mjtTrn.mjTRN_JOINT)}
@@ -72,14 +69,12 @@ class Shortcuts:
             self._idle_unsensed.add("_site_local_to_global")
         if self._iterations == 1:  # what it sets is read by the test of convergence, and by further iterations
             self._idle.add("_update_gradient_zero_grad_dot")
-        if plain and not mj.neq and mj.nv <= data.njmax and (not model.is_sparse or mj.nv <= data.njmax_nnz):
-            self._instead["_friction_dof"] = friction_rows(model.is_sparse)
 
     @contextmanager
     def __call__(self, sensed: bool, later: bool = False) -> Iterator[None]:
         """``sensed``: this substep computes sensors. ``later``: it follows another one, with nothing in between."""
         idle = self._idle | (set() if sensed else self._idle_unsensed) | (self._idle_later if later else set())
-        skip = _Skip(idle, self._iterations, _FORCES if sensed else (), self._instead)
+        skip = _Skip(idle, self._iterations, _FORCES if sensed else ())
         zero = wp.array.zero_
         kept = self._zero if sensed or not self._zero else self._zero | {self._sensordata}
         with _ALONE:
@@ -96,10 +91,10 @@ class Shortcuts:
 
 
 class _Skip:
-    """Which launches of one step are passed over, and which are of another kernel."""
+    """Which launches of one step are passed over."""
 
-    def __init__(self, idle: Collection[str], iterations: int, keep: Collection[str], instead: Mapping[str, wp.Kernel]) -> None:
-        self._idle, self._iterations, self._keep, self._instead = idle, iterations, keep, instead
+    def __init__(self, idle: Collection[str], iterations: int, keep: Collection[str]) -> None:
+        self._idle, self._iterations, self._keep = idle, iterations, keep
         self._searches = 0  # of the solve that runs
 
     def __contains__(self, kernel: str) -> bool:
@@ -115,6 +110,6 @@ class _Skip:
     def around(self, launch: Callable[..., Any]) -> Callable[..., Any]:
         def launch_unless_skipped(kernel: wp.Kernel, *args: Any, **kwargs: Any) -> Any:
             name = kernel.key.partition("__locals__")[0]  # of the function that makes it
-            return None if name in self else launch(self._instead.get(name, kernel), *args, **kwargs)
+            return None if name in self else launch(kernel, *args, **kwargs)
 
         return launch_unless_skipped
