@@ -146,6 +146,44 @@ def test_random_numbers_are_those_of_the_step_as_it_is() -> None:
         torch.testing.assert_close(getattr(kept[0], name), getattr(kept[1], name))
 
 
+def test_a_sum_that_is_read_twice_is_a_sum() -> None:
+    memory = Memory()
+
+    def step() -> None:
+        ended = memory.flags[:, 0].float().sum(dim=0)
+        memory.sums[0].add_(ended)
+        memory.sums[1].copy_(ended / N)
+
+    program = fuse(step, N, {"sums": memory.sums})
+    memory.flags.fill_(True)
+    program()
+    assert memory.sums[1] == 1.0
+
+
+def test_a_sum_of_what_is_not_of_worlds_is_torchs() -> None:
+    memory = Memory()
+    program = fuse(lambda: [memory.row[:3].add_(memory.table.sum(dim=0))].clear(), N, {"row": memory.row})
+    before = memory.row.clone()
+    program()
+    torch.testing.assert_close(memory.row[:3], before[:3] + memory.table.sum(dim=0))
+    assert left_to_torch(program) == ["sum", "add"] or not program.kernels  # type: ignore[arg-type, union-attr]
+
+
+def test_a_value_that_all_share_is_changed_once() -> None:
+    memory = Memory()
+
+    def step() -> None:
+        half = memory.table.sum(dim=0)
+        half.mul_(0.5)
+        memory.out[:, :3].copy_(torch.where(memory.flags[:, :1], half, memory.b[:, :3]))
+
+    memory.flags.fill_(False)  # rare at the check
+    program = fuse(step, N, {"out": memory.out})
+    memory.flags.fill_(True)
+    program()
+    torch.testing.assert_close(memory.out[:, :3], (memory.table.sum(dim=0) * 0.5).expand(N, 3))
+
+
 def test_calls_of_the_simulator_stay_where_they_are() -> None:
     memory, calls = Memory(), list[float]()
 

@@ -95,11 +95,11 @@ def _kernel_of(body: Any) -> Any:
 class Region:
     """Operations between two calls of the simulator: as they were, and fused."""
 
-    def __init__(self, nodes: Sequence[Node], worlds: int, trace: Trace) -> None:
+    def __init__(self, nodes: Sequence[Node], worlds: int, trace: Trace, device: str, there: set[int]) -> None:
+        """``there``: blocks of memory that were there before."""
         self.nodes = _join_sums(nodes)
-        self.steps = list[Kernel | Node](_schedule(self.nodes, worlds, trace))
-        self._fresh = trace.made
-        written = {view.block for node in self.nodes for view in node.writes} - trace.made
+        self.steps = list[Kernel | Node](_schedule(self.nodes, worlds, trace, device))
+        written = {view.block for node in self.nodes for view in node.writes} & there
         self._written = [_whole(trace.blocks[block]) for block in sorted(written)]
 
     @property
@@ -133,13 +133,14 @@ class Fused:
 
     def __init__(self, trace: Trace, worlds: int, device: str) -> None:
         self._device, self.parts = device, list[Region | Call]()
-        nodes: list[Node] = []
+        nodes, there = list[Node](), {*range(len(trace.blocks))} - trace.made
         for step in [*trace.steps, None]:
             if isinstance(step, Node):
                 nodes.append(step)
                 continue
             if nodes:
-                self.parts.append(Region(nodes, worlds, trace))
+                self.parts.append(Region(nodes, worlds, trace, device, there))
+                there |= {view.block for node in nodes for view in node.writes}
                 nodes = []
             if step:
                 self.parts.append(step)
@@ -196,9 +197,9 @@ class Fused:
 # ---- which operations go together -----------------------------------------------------------------------------------------
 
 
-def _schedule(nodes: Sequence[Node], worlds: int, trace: Trace) -> Iterator[Kernel | Node]:
+def _schedule(nodes: Sequence[Node], worlds: int, trace: Trace, device: str) -> Iterator[Kernel | Node]:
     """The nodes in an order that is as good, those that fit together in kernels that are as few as may be."""
-    codes = [_code(node, worlds, trace) for node in nodes]
+    codes = [_code(node, worlds, trace, device) for node in nodes]
     waits, wakes = _dependencies(nodes)
     ready: tuple[list[int], list[int]] = ([], [])  # torch's, and ours
 
@@ -245,20 +246,24 @@ def _join_sums(nodes: Sequence[Node]) -> list[Node]:
         if node.name == "add" and total.name == "sum" and node.func._schema.is_mutable and not node.kwargs and len(node.args) == 2:
             rows, dims = total.args[0], [*total.args[1]] if len(total.args) > 1 and total.args[1] else []
             over_worlds = len(total.args) < 3 and (dims == [0] or (not dims and rows.dim() == 1))
-            if over_worlds and node.args[1] is total.outs[0] and total.writes[0].shape == node.writes[0].shape:
+            unread = sum(view.block == total.writes[0].block for each in nodes for view in each.reads) == 1
+            if unread and over_worlds and node.args[1] is total.outs[0] and total.writes[0].shape == node.writes[0].shape:
                 joined[-1] = Node(ADD_ROWS, (node.args[0], rows), {}, (), (total.reads[0], node.writes[0]), node.writes)
                 continue
         joined.append(node)
     return joined
 
 
-def _code(node: Node, worlds: int, trace: Trace) -> Code | None:
+def _code(node: Node, worlds: int, trace: Trace, device: str) -> Code | None:
     """What the node does for a world, where it can be said."""
     out = node.writes[0]
     shared = worlds not in out.shape[:1] and node.func is not ADD_ROWS
     if node.random or out.block in trace.watched or (shared and out.block not in trace.made):
         return None
-    with suppress(Unfit):
+    for view in (*node.reads, *node.writes):
+        if str(trace.blocks[view.block].device) != device or trace.blocks[view.block].dtype != view.dtype:
+            return None
+    with suppress(Unfit, TypeError, ValueError, IndexError):  # of arguments in a form that is not known here
         return Writer(worlds, trace.view, lambda block: (f"p{block}", False)).emit(node)
     return None
 
@@ -306,6 +311,8 @@ class _Rows:
             self._pitches[block] = {-1}
             self._written.add(block)
             return True
+        if code.write.pitch == 0 and (block in self._pitches or any(access.view.block == block for access in code.reads)):
+            return False
         reached = {block: {self._row(code.write)}}
         for access in code.reads:
             reached.setdefault(access.view.block, set()).add(self._row(access))
@@ -333,7 +340,7 @@ def _replay(node: Node) -> None:
     """Do again what the node did, to the same memory."""
     if node.func is ADD_ROWS:
         ADD_ROWS(*node.args)
-    elif node.func.overloadpacket in (torch.ops.aten.rand, torch.ops.aten.rand_like):
+    elif node.func.overloadpacket in (torch.ops.aten.rand, torch.ops.aten.rand_like) and not node.kwargs.get("generator"):
         node.outs[0].uniform_()
     elif node.name.startswith(("empty", "new_empty")):
         pass

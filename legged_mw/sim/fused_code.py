@@ -93,15 +93,13 @@ class Writer(Lines):
     def _add_rows(self, to: Tensor, rows: Tensor) -> Code:
         """Sums over worlds of what is nearly everywhere 0, such as counts: who has something adds it."""
         out, source = self._view(to), self._view(rows)
-        if out.dtype != torch.float32 or math.prod(rows.shape[1:]) != to.numel():
+        if out.dtype != torch.float32 or rows.shape[0] != self._worlds or math.prod(rows.shape[1:]) != to.numel():
             raise Unfit
         self._shared, self._out, self._reads = False, out, []
         index = self._index(source.shape)
         self._reads.append(self._access(source, source.shape))
         value = f"float a = (float){self._at(source, source.strides, index)};"
-        lines = self._loops(
-            source.shape, index, [value, f"if (a != 0) ADD({self._at(out, out.strides, index[-1:] if to.dim() else [])}, a);"]
-        )
+        lines = self._loops(source.shape, index, [value, f"if (a != 0) ADD({self._at(out, out.strides, index[1:])}, a);"])
         return Code(["{", *lines, "}", "SYNC"], self._reads, Access(out, -1, 0, 0))
 
     # ---- operations ------------------------------------------------------------------------------------------------------
@@ -191,7 +189,11 @@ class Writer(Lines):
         before = [0] * x.dim()
         for d in range(len(pad) // 2):
             before[-1 - d] = pad[2 * d]
-        if min(pad) < 0 or (not self._shared and before[0]) or any(i == "0" and n != 1 for i, n in zip(index, x.shape, strict=True)):
+        if (
+            min(pad) < 0
+            or (not self._shared and (before[0] or x.shape[0] != self._worlds))
+            or any(i == "0" and n != 1 for i, n in zip(index, x.shape, strict=True))
+        ):
             raise Unfit
         view, inside = self._view(x), []
         self._reads.append(self._access(view, view.shape))

@@ -18,12 +18,14 @@ def fused(fn: Callable[[], None], worlds: int, memory: Mapping[str, Tensor], wat
 
     ``memory`` is all that ``fn`` writes, by name. Only torch may write to what is ``watched``.
     """
-    put_back = remember(memory)
+    put_back = None
     try:
+        put_back = remember(memory)
         program, reason = _fused(fn, worlds, memory, watched, put_back), ""
-    except Exception as error:  # whatever a compiler may throw: the step goes on as it is
+    except Exception as error:  # whatever a compiler may throw, or no room for a copy: the step goes on as it is
         program, reason = None, " ".join(f"{error}".split())[:200] or type(error).__name__
-    put_back()
+    if put_back:
+        put_back()
     if program:
         return program
     print(f"the step is not fused: {reason}", flush=True)
@@ -44,6 +46,8 @@ def _fused(
     if wrong := program.verify():
         print(f"{wrong} of {len(program.parts)} parts of the step are not fused: they gave other values", flush=True)
     put_back()
+    for block in trace.made:  # each is written anew
+        trace.blocks[block].fill_(float("nan") if trace.blocks[block].is_floating_point() else 1)
     program()
     for name, value in memory.items():
         if not alike(expected[name], value, _CLOSE, _STRAYS):

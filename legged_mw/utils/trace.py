@@ -98,7 +98,7 @@ class Trace(TorchDispatchMode):
         return result
 
     def call(self, run: Callable[[], object], given: Iterable[Tensor] = ()) -> Any:
-        """Run what is not looked into; it reads and writes what it is ``given``, and more. A tensor that it returns is kept."""
+        """Run what is not looked into; of what the trace made it reads what it is ``given``. A tensor that it returns is kept."""
         self._paused = True
         try:
             result = run()
