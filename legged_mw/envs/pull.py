@@ -11,11 +11,11 @@ GIVEN_BACK = 3.0  # times: an episode that ends down raises the level by this mu
 
 
 class Pull:
-    """An upward force on the root of each robot that is not up: ``level`` (), from 1 to 0, times ``force`` [N]."""
+    """An upward force on a body of each robot that is not up: ``level`` (), from 1 to 0, times ``force`` [N]."""
 
-    def __init__(self, sim: Simulation, root: int, force: float, fades: float) -> None:
+    def __init__(self, sim: Simulation, body: int, force: float, fades: float) -> None:
         """``fades``: by how much the level falls when every world has ended an episode up."""
-        self._force, self._fades = sim.xfrc_applied[:, root, 2], fades  # a view (N,)
+        self._force, self._fades = sim.xfrc_applied[:, body, 2], fades  # a view (N,)
         self._highest, self.level = force, torch.ones((), device=sim.device)
 
     def apply(self, up: Tensor) -> None:
