@@ -223,7 +223,7 @@ def test_check_prints_the_page_and_draws_the_robot(tmp_path: Path) -> None:
     assert result.out.index("observation state") < result.out.index("health of go1_rough")
     for text in (
         "mass                 12.74 kg",
-        "at rest              4 contacts, 28 constraint rows; room for more (sim.nconmax, sim.njmax): 8, 40",
+        "at rest              4 contacts, 28 constraint rows; room for more (sim.nconmax, sim.njmax): 8, 56",  # of its rough ground
         "stands on its servos for 5 s",
         "substep              4 ms, euler; servos in the air: stable",
         "nothing: all numbers are within bounds",
@@ -358,7 +358,10 @@ def test_what_of_the_file_is_changed_is_on_its_page(monkeypatch: pytest.MonkeyPa
     a1, t1 = ROOT / "tests/data/a1_style.urdf", ROOT / "tests/data/t1_style.xml"
     text = show(monkeypatch, capsys, a1)
     assert "in the file\n  looks left out (MuJoCo reads no .dae, " in text and "\n  free joint added to 'base'\n" in text
-    assert "\n  12 actuators replaced\n  keyframe 'stand' read" in show(monkeypatch, capsys, t1)
+    changed = show(monkeypatch, capsys, t1)
+    assert "\n  12 actuators replaced\n  keyframe 'stand' read" in changed
+    assert "\n  site 'imu_aligned' made at the place of 'imu' on 'Waist', with the axes of the root 'Trunk'\n" in changed
+    assert "\n  fused into 'Trunk', to which they are fixed: H2, AL, left_hand_link, AR, right_hand_link, Waist\n" in changed
     assert 'joint_speed_limits = {"": 28.6, "hip": 52.0}  # [rad/s] the file\'s' in config_text(draft(a1), a1, "mine")
     assert "joint_speed_limits" not in config_text(draft(t1), t1, "mine")
 
@@ -367,6 +370,12 @@ def test_a_file_without_feet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     file = tmp_path / "wheel.xml"
     file.write_text(WHEEL.format(half=0.2, offset=0.0, more=""))
     assert "no part that ends a limb collides, so that no feet can be guessed" in complaint(monkeypatch, capsys, file)
+    file.write_text(
+        '<mujoco><worldbody><body name="arm"><inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/><body name="hand" pos="0 0 0.4">'
+        '<joint name="wrist" axis="0 1 0" range="-1 1" limited="true"/><geom size="0.02"/></body></body></worldbody></mujoco>'
+    )
+    text = "'arm', the root, is not above the lowest ends of limbs, hand; the health page is of robots that stand on them"
+    assert text in complaint(monkeypatch, capsys, file)
 
 
 def test_names_beside_the_robot_do_not_overlap() -> None:

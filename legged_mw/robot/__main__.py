@@ -63,15 +63,16 @@ def task_page(task: LoadedTask, image: Path | None) -> str:
     one.set("control.actuator", "servo")  # what the page is about: gains, and what a simulation step makes of them
     on_servos: type[Any] = type(one.env_class.__name__, (one.env_class,), {"_compute_torques": RobotTask._compute_torques})
     one.env_class = on_servos
-    if isinstance(one.cfg.to_dict()["terrain"].get("mesh_type"), str):
+    ground = one.cfg.to_dict()["terrain"].get("mesh_type", "plane")
+    if rough := ground != "plane":
         one.set("terrain.mesh_type", "plane")
-    return env_page(one.env_class(one.cfg, "cpu"), task.name, image)
+    return env_page(one.env_class(one.cfg, "cpu"), task.name, image, rough=rough)
 
 
-def env_page(env: RobotTask, title: str, image: Path | None, found: Draft | None = None) -> str:
-    """The page as text, with what was guessed if the task is a draft; the picture goes to ``image``."""
+def env_page(env: RobotTask, title: str, image: Path | None, found: Draft | None = None, rough: bool = False) -> str:
+    """The page as text, with what was guessed if the task is a draft; the picture goes to ``image``. Room is that of ``rough`` ground."""
     robot, feet = env.robot, env.foot_geoms if isinstance(env, LeggedRobot) else {}
-    health = measure(robot, robot.pose, env.start_place, env.cfg.control.decimation)
+    health = measure(robot, robot.pose, env.start_place, env.cfg.control.decimation, rough)
     text = page(health, title, found.guessed, found.notes) if found else page(health, title)
     if image is None:
         return text
