@@ -17,6 +17,7 @@ import torch
 from legged_mw import ROOT
 from legged_mw.envs.divergence import Divergence, Watch
 from legged_mw.robot import __main__ as program
+from legged_mw.robot import picture
 from legged_mw.robot.draft import Draft, as_env, draft, table
 from legged_mw.robot.measure import Health, Joint, inside_by, measure, tilt
 from legged_mw.robot.new import config_text, write
@@ -26,6 +27,7 @@ from legged_mw.robot.suggest import family, suggest
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
 from legged_mw.utils.cli import one_line_errors
+from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import load_task
 from tests.program import SMALL, refused, run
 
@@ -232,6 +234,19 @@ def test_check_prints_the_page_and_draws_the_robot(tmp_path: Path) -> None:
     row = next(line for line in result.out.splitlines() if line.startswith("  FL_calf_joint") and "35.55" in line and "20.06" in line)
     assert row.split()[-2:] == ["36", "0.9"]
     assert png_size(picture) == (2 * WIDTH, HEIGHT)
+
+
+def test_a_picture_that_cannot_be_drawn_leaves_the_page(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """As on a machine without OpenGL."""
+
+    def fails(*_: object) -> None:
+        raise UserError("No OpenGL context")
+
+    monkeypatch.setattr(picture, "draw", fails)
+    monkeypatch.setattr(sys, "argv", ["robot", str(TOY), "--picture", "robot.png"])
+    with pytest.raises(UserError, match="No OpenGL context"):
+        program.main()
+    assert "health of toy_biped.xml" in (out := capsys.readouterr().out) and "what to look at" in out and "picture: " not in out
 
 
 def test_picture_wants_check_and_a_png(tmp_path: Path) -> None:
