@@ -1,4 +1,4 @@
-"""A force that lifts robots while they learn to stand, and fades as they do. [HoST: 200 N on a G1, until its head is up]"""
+"""A force that lifts robots while they learn to stand, and fades as they do. [HoST: 200 N on a G1]"""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ GIVEN_BACK = 3.0  # times: an episode that ends down raises the level by this mu
 
 
 class Pull:
-    """An upward force on the root of each robot that is not up: ``level`` (), from 1 to 0, times ``force`` [N]."""
+    """An upward force on a body of each robot: ``level`` (), from 1 to 0, times ``force`` [N]. One that is up keeps it too:
+    else robots learn to lean in it rather than to stand without, and it never fades."""
 
-    def __init__(self, sim: Simulation, root: int, force: float, fades: float) -> None:
+    def __init__(self, sim: Simulation, body: int, force: float, fades: float) -> None:
         """``fades``: by how much the level falls when every world has ended an episode up."""
-        self._force, self._fades = sim.xfrc_applied[:, root, 2], fades  # a view (N,)
+        self._force, self._fades = sim.xfrc_applied[:, body, 2], fades  # a view (N,)
         self._highest, self.level = force, torch.ones((), device=sim.device)
 
-    def apply(self, up: Tensor) -> None:
-        """Before a step, in which ``up`` (N,) says who needs none."""
+    def apply(self) -> None:
+        """Before a step."""
         if self._highest:
-            self._force.copy_(torch.where(up, 0.0, self._highest * self.level))
+            self._force.copy_(self._highest * self.level)
 
     def update(self, ended: Tensor, up: Tensor) -> None:
         """Episodes have ended, (N,) each."""
