@@ -368,6 +368,14 @@ def test_feet_and_poses_of_vendors_files(file: Path) -> None:
         assert sum(angle[f"left_{part}_joint"] for part in ("hip_pitch", "knee", "ankle_pitch")) == pytest.approx(0.0, abs=1e-6)
 
 
+def test_feet_that_the_pose_lifts_are_feet(tmp_path: Path) -> None:
+    """A keyframe that sits on its hind legs made a biped of a quadruped."""
+    text = (ROOT / "tests/data/go2_style.xml").read_text()
+    (tmp_path / "sits.xml").write_text(text.replace("0 0 0 0 0.9 -1.8  0 0.9 -1.8 ", "0 0 0 0 -1.2 -1.8  0 -1.2 -1.8 "))
+    found = draft(tmp_path / "sits.xml")
+    assert found.pose[:6] == [0.0, -1.2, -1.8] * 2 and [foot.name for foot in found.feet] == FEET["go2_style"]
+
+
 def test_what_of_the_file_is_changed_is_on_its_page(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """--new makes an MJCF of a URDF: what was left out of it is said here or nowhere, and its speed limits go into the config."""
     a1, t1 = ROOT / "tests/data/a1_style.urdf", ROOT / "tests/data/t1_style.xml"
