@@ -48,10 +48,6 @@ class G1GetupCfgPPO(GetupCfgPPO):
     class runner(GetupCfgPPO.runner):
         max_iterations = 4000
 
-    class actor(GetupCfgPPO.actor):
-        class distribution_cfg(GetupCfgPPO.actor.distribution_cfg):
-            init_std = 0.5  # [ours: as it stands in the pull]
-
     class algorithm(GetupCfgPPO.algorithm):
         gamma = 0.99  # [ours: it takes seconds]
         desired_kl, entropy_coef = 0.02, 0.005  # [ours: of 29 joints together], [M]
