@@ -122,7 +122,7 @@ def save_webp(path: Path, frames: Sequence[Frame], quality: int = 10) -> None:
 
 
 def main() -> None:
-    save_webp(IMAGES / "film.webp", side_by_side([record(shot, 216, 168) for shot in FILM]), quality=20)
+    save_webp(IMAGES / "film.webp", side_by_side([record(shot, 216, 168) for shot in FILM]), quality=19)
 
 
 if __name__ == "__main__":
