@@ -25,10 +25,11 @@ class G1GetupCfg(GetupCfg):
 
     class control(GetupCfg.control):
         stiffness, damping = G1FlatCfg.control.stiffness, G1FlatCfg.control.damping
+        action_origin = "default"  # [ours: its servos stand it up in the pull, which of the present angles none did; docs/skills.md]
         action_scale, decimation = G1FlatCfg.control.action_scale, G1FlatCfg.control.decimation  # 4 of it: the motors' whole torque [M]
 
     class normalization(GetupCfg.normalization):
-        clip_actions = 4.0
+        clip_actions = 8.0  # [ours: folded knees are 2.6 rad away]
 
     class rewards(GetupCfg.rewards):
         pose_weights = {"": 0.3, "hip": 1.0, "knee": 1.0, "waist": 1.0}  # [ours]

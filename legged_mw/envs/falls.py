@@ -40,7 +40,7 @@ class Falls(RobotTask):
         self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in states)  # (P, nq), (P, nv)
         self.up = self._zeros(dtype=torch.bool)  # (N,) as high and upright as one that stands
         lifted = self.robot.id("body", falls.pull_on) if falls.pull_on else self.root_body
-        self.pull = Pull(self.sim, lifted, falls.pull * 9.81 * self.total_mass, falls.pull_fades)
+        self.pull = Pull(self.sim, lifted, self.gravity_dir, falls.pull * 9.81 * self.total_mass, falls.pull_fades)
 
     def _reset_robots(self, mask: Tensor) -> None:
         """Standing as any task begins, or, by chance, in one of the settled falls."""
