@@ -18,20 +18,24 @@ class G1GetupCfg(GetupCfg):
 
     class falls(GetupCfg.falls):
         seconds = 1.5  # [s] [ours: it falls from higher]
-        pull = 0.6  # of its weight [H]
+        pull, pull_on = 0.8, "torso_link"  # of its weight [H 0.6], [ours: lifted by the pelvis it hangs head down]
 
     class init_state(GetupCfg.init_state):
         default_joint_angles = G1FlatCfg.init_state.default_joint_angles
 
     class control(GetupCfg.control):
         stiffness, damping = G1FlatCfg.control.stiffness, G1FlatCfg.control.damping
+        action_origin = "default"  # [ours: its servos stand it up in the pull, which of the present angles none did; docs/skills.md]
         action_scale, decimation = G1FlatCfg.control.action_scale, G1FlatCfg.control.decimation  # 4 of it: the motors' whole torque [M]
 
     class normalization(GetupCfg.normalization):
-        clip_actions = 4.0
+        clip_actions = 8.0  # [ours: folded knees are 2.6 rad away]
 
     class rewards(GetupCfg.rewards):
         pose_weights = {"": 0.3, "hip": 1.0, "knee": 1.0, "waist": 1.0}  # [ours]
+
+        class scales(GetupCfg.rewards.scales):
+            action_rate, action_smoothness = -0.002, -0.0004  # [ours: sums over 29 joints; a Go1 has 12]
 
     class sim(GetupCfg.sim):
         dt = G1FlatCfg.sim.dt
@@ -46,7 +50,7 @@ class G1GetupCfgPPO(GetupCfgPPO):
 
     class algorithm(GetupCfgPPO.algorithm):
         gamma = 0.99  # [ours: it takes seconds]
-        desired_kl = 0.02  # [ours: of 29 joints together]
+        desired_kl, entropy_coef = 0.02, 0.005  # [ours: of 29 joints together], [M]
 
 
 TASK = Task(Getup, G1GetupCfg, G1GetupCfgPPO)

@@ -102,14 +102,13 @@ def test_rewards_of_getup(go1: Getup) -> None:
     assert not go1._fallen().any()
 
 
-def test_pull_lifts_who_is_down_and_fades() -> None:
-    """Half of the weight on those that are down; a quarter of episodes that end down undo three that end up; it is in a checkpoint."""
-    env = make("go1_getup", falls__states=4, falls__pull=0.5, falls__share=0.0)
-    env.sim.qpos[:2, 2] = 0.1
-    env._refresh_base()
+def test_pull_lifts_and_fades() -> None:
+    """On the body that was asked for; a quarter of episodes that end down undo three that end up; it is in a checkpoint."""
+    env = make("go1_getup", falls__states=4, falls__pull=0.5, falls__pull_on="FR_hip")
     env._apply_actions()
-    half = 0.5 * 9.81 * env.total_mass
-    torch.testing.assert_close(env.sim.xfrc_applied[:, env.root_body, 2], torch.tensor([half, half, 0.0, 0.0]))
+    lifted = env.sim.xfrc_applied[:, env.robot.id("body", "FR_hip"), :3]
+    torch.testing.assert_close(lifted, -0.5 * 9.81 * env.total_mass * env.gravity_dir)  # also on a slope
+    assert not env.sim.xfrc_applied[:, env.root_body].any()
     env.pull.level.fill_(0.5)
     everyone, up = torch.ones(4, dtype=torch.bool), torch.tensor([True, True, True, False])
     env.pull.update(everyone, up)

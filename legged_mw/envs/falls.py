@@ -23,7 +23,8 @@ class FallsCfg(SkillCfg):
         states: Count = 2048  # settled falls to begin from; at most four a world are made [ours]
         seconds: Settling = 1.0  # from the drop to the state [P 0.5; ours: a roll takes longer]
         seed: Whole = 1  # the same seed makes the same falls; the exam has its own
-        pull: Share = 0.0  # share of the weight that lifts the root of a robot that is not up; it fades as they learn [H 0.6]
+        pull: Share = 0.0  # share of the weight that lifts a robot; it fades as they learn [H 0.6]
+        pull_on: str = ""  # body that it lifts; empty: the root, from which a robot whose trunk is heavier than its legs hangs head down
         pull_fades: Part = 0.2  # of it, when every world has ended an episode up [ours]
 
 
@@ -38,7 +39,8 @@ class Falls(RobotTask):
         states = fallen(self.robot.physics, min(falls.states, 4 * self.num_envs), falls.seed, falls.seconds)
         self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in states)  # (P, nq), (P, nv)
         self.up = self._zeros(dtype=torch.bool)  # (N,) as high and upright as one that stands
-        self.pull = Pull(self.sim, self.root_body, falls.pull * 9.81 * self.total_mass, falls.pull_fades)
+        lifted = self.robot.id("body", falls.pull_on) if falls.pull_on else self.root_body
+        self.pull = Pull(self.sim, lifted, self.gravity_dir, falls.pull * 9.81 * self.total_mass, falls.pull_fades)
 
     def _reset_robots(self, mask: Tensor) -> None:
         """Standing as any task begins, or, by chance, in one of the settled falls."""
@@ -50,7 +52,7 @@ class Falls(RobotTask):
 
     def _apply_actions(self) -> None:
         super()._apply_actions()
-        self.pull.apply(self.up)
+        self.pull.apply()
 
     def _update_curricula(self, mask: Tensor) -> None:
         super()._update_curricula(mask)

@@ -1,4 +1,4 @@
-"""A force that lifts robots while they learn to stand, and fades as they do. [HoST: 200 N on a G1, until its head is up]"""
+"""A force that lifts robots while they learn to stand, and fades as they do. [HoST: 200 N on a G1]"""
 
 from __future__ import annotations
 
@@ -11,17 +11,21 @@ GIVEN_BACK = 3.0  # times: an episode that ends down raises the level by this mu
 
 
 class Pull:
-    """An upward force on the root of each robot that is not up: ``level`` (), from 1 to 0, times ``force`` [N]."""
+    """A force against gravity on a body of each robot: ``level`` (), from 1 to 0, times ``force`` [N].
 
-    def __init__(self, sim: Simulation, root: int, force: float, fades: float) -> None:
-        """``fades``: by how much the level falls when every world has ended an episode up."""
-        self._force, self._fades = sim.xfrc_applied[:, root, 2], fades  # a view (N,)
+    One that is up keeps it: else robots learn to lean in it rather than to stand without, and it never fades.
+    """
+
+    def __init__(self, sim: Simulation, body: int, gravity_dir: Tensor, force: float, fades: float) -> None:
+        """``gravity_dir``: (N, 3) in the world, which leans where a slope was drawn. ``fades``: by how much the level falls when
+        every world has ended an episode up."""
+        self._force, self._down, self._fades = sim.xfrc_applied[:, body, :3], gravity_dir, fades  # a view (N, 3)
         self._highest, self.level = force, torch.ones((), device=sim.device)
 
-    def apply(self, up: Tensor) -> None:
-        """Before a step, in which ``up`` (N,) says who needs none."""
+    def apply(self) -> None:
+        """Before a step."""
         if self._highest:
-            self._force.copy_(torch.where(up, 0.0, self._highest * self.level))
+            torch.mul(self._down, -self._highest * self.level, out=self._force)
 
     def update(self, ended: Tensor, up: Tensor) -> None:
         """Episodes have ended, (N,) each."""
