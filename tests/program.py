@@ -84,7 +84,9 @@ def trained(root: Path, *args: str, prints: tuple[str, ...] = ()) -> Path:
 
 
 def files(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
+    """All but what Python keeps of the modules that it has compiled."""
+    found = [path for path in sorted(root.rglob("*")) if path.is_file() and "__pycache__" not in path.parts]
+    return {str(path.relative_to(root)): path.read_bytes() for path in found}
 
 
 @contextlib.contextmanager
