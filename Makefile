@@ -9,6 +9,9 @@ BIN := $(VENV)/bin
 PYTHON ?= $(shell for p in python3.12 python3.11 python3.13 python3 python; do \
 	$$p -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null && echo $$p && break; done)
 
+# a process that may not keep what it compiled of torch compiles all of it again: four seconds each, and tests start many
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: train play test lint dist docs clean
 train: $(VENV)/ready
 	$(BIN)/python train.py --task $(TASK) $(ARGS)

@@ -26,6 +26,7 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from legged_mw.envs.domain_rand import KINDS
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.worlds import fuse_for
 from legged_mw.sim.engines import ENGINES, pick_engine
 from legged_mw.utils.cli import pick_device
 from legged_mw.utils.machine import usable_cores
@@ -55,8 +56,8 @@ def lstm_network() -> MotorNetwork:
     return MotorNetwork(layers, [head], "elu", (0,))  # type: ignore[arg-type]
 
 
-def make_env(task_name: str, law: str, num_envs: int, device: str, engine: str, folder: Path) -> RobotTask:
-    """The task's environment with motors of ``law``."""
+def make_env(task_name: str, law: str, num_envs: int, device: str, engine: str, folder: Path, steps: int) -> RobotTask:
+    """The task's environment with motors of ``law``, fused as for a training of so many ``steps``."""
     task = load_task(task_name)
     task.set("env.num_envs", num_envs)
     task.set("sim.engine", engine)
@@ -85,7 +86,9 @@ def make_env(task_name: str, law: str, num_envs: int, device: str, engine: str, 
 
         env_class = Coded
     torch.manual_seed(0)
-    return env_class(task.cfg, device)
+    env = env_class(task.cfg, device)
+    fuse_for(env, steps)
+    return env
 
 
 LAWS = ("servo", "servo, 0 to 20 ms late", "dc_motor", "torque", "network, 32-32 MLP", "network, 2 x 8 LSTM", "_compute_torques")
@@ -120,7 +123,7 @@ def main() -> None:
     name = torch.cuda.get_device_name(device) if device != "cpu" else f"CPU, {usable_cores()} cores"
     print(f"{args.task}, {worlds} worlds on {name}, engine {pick_engine(args.engine, device)}")
     with tempfile.TemporaryDirectory() as folder:
-        envs = {law: make_env(args.task, law, worlds, device, args.engine, Path(folder)) for law in LAWS}
+        envs = {law: make_env(args.task, law, worlds, device, args.engine, Path(folder), args.calls * args.rounds) for law in LAWS}
     joints = next(iter(envs.values())).num_actions
     actions = [0.3 * torch.randn(worlds, joints, device=device) for _ in range(args.calls)]
     with torch.inference_mode():  # as in training

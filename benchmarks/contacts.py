@@ -16,6 +16,7 @@ import torch
 from step import timed
 
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.worlds import fuse_for
 from legged_mw.sim.engines import ENGINES, pick_engine
 from legged_mw.sim.room import count_room
 from legged_mw.utils.cli import pick_device
@@ -37,11 +38,14 @@ def variants(colliders: list[str]) -> dict[str, dict[str, Any]]:
     }
 
 
-def make_env(task_name: str, num_envs: int, device: str, overrides: dict[str, Any]) -> LeggedRobot:
+def make_env(task_name: str, num_envs: int, device: str, overrides: dict[str, Any], steps: int) -> LeggedRobot:
+    """The task with ``overrides``, its step fused as for a training of so many ``steps``."""
     task = load_task(task_name)
     for path, value in {"env.num_envs": num_envs, **overrides}.items():
         task.set(path, value)
-    return task.env_class(task.cfg, device)  # type: ignore[return-value]
+    env = task.env_class(task.cfg, device)
+    fuse_for(env, steps)
+    return env  # type: ignore[return-value]
 
 
 def main() -> None:
@@ -59,8 +63,8 @@ def main() -> None:
     num_envs = args.num_envs or (256 if device == "cpu" else 4096)
     name = torch.cuda.get_device_name(device) if device != "cpu" else "CPU"
     print(f"{args.task}, {num_envs} worlds on {name}, engine {pick_engine(args.engine, device)}")
-    engine = {"sim.engine": args.engine}
-    envs = {what: make_env(args.task, num_envs, device, engine | overrides) for what, overrides in variants(args.colliders).items()}
+    engine, steps = {"sim.engine": args.engine}, args.calls * args.rounds
+    envs = {what: make_env(args.task, num_envs, device, engine | more, steps) for what, more in variants(args.colliders).items()}
     times: dict[str, list[float]] = {what: [] for what in envs}
     with torch.inference_mode():
         actions = 0.3 * torch.randn(num_envs, next(iter(envs.values())).num_actions, device=device)

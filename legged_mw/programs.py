@@ -54,9 +54,9 @@ def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.N
     if args.check:
         print(describe(env, task) + ("" if args.eager else "\nthe step can be recorded as a CUDA graph"))
         if args.picture:
-            from legged_mw.robot.__main__ import task_page
+            from legged_mw.robot.__main__ import show_task
 
-            print(task_page(task, Path(args.picture)))
+            show_task(task, Path(args.picture))
         return
     examine = make_exam(task, env, args.eager) if training.wants_exam(task) else None
     begun = None

@@ -1,13 +1,27 @@
 """Shared by all tests: one torch thread; tests that need a GPU or a screen are left out where there is none."""
 
+# ruff: noqa: E402
+from legged_mw.utils import quick_start
+
+quick_start.begin()  # before torch, as train.py does
+
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
+from onnxscript._framework_apis import torch_2_5 as onnxscript_for_torch
 from program import trained
 
 from legged_mw.view.native import has_display
+
+# The exporter looks at each of the 500 functions that it can write, at every export: once a process is enough.
+onnxscript_for_torch.get_torchlib_ops = cache(onnxscript_for_torch.get_torchlib_ops)
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    quick_start.settle()  # what was imported is garbage never
 
 
 def pytest_configure(config: pytest.Config) -> None:

@@ -118,6 +118,12 @@ def difference(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> float:
     return max(float((a[k].double() - b[k].double()).abs().max() / a[k].double().abs().max().clamp(min=1e-3)) for k in a)
 
 
+def apart(before: dict[str, torch.Tensor], a: PPO, b: PPO) -> float:
+    """Distance of the networks of two learners, as a share of the way that the first one's went since ``before``."""
+    ways = [torch.cat([(p - before[k]).flatten() for k, p in parameters(alg).items() if "mlp" in k]) for alg in (a, b)]
+    return float((ways[1] - ways[0]).norm() / ways[0].norm())
+
+
 @torch.no_grad()
 def take_over(target: PPO, source: PPO) -> None:
     """``target`` gets the networks, Adam's memory and the rate of ``source``, in place: what is recorded stays recorded."""

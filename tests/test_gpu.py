@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import test_distillation as distilling
 import torch
-from learner import collect, difference, make, observations, parameters, share_experience, take_over
+from learner import apart, collect, difference, make, observations, parameters, share_experience, take_over
 from mujoco_warp import DisableBit
 from rsl_rl.algorithms import PPO, Distillation
 from test_forces import SCALES, SETTINGS
@@ -322,8 +322,7 @@ def test_recorded_update_in_bfloat16_learns_what_float32_does() -> None:
         share_experience(full, half)
         take_over(half, full)
         before, expected, got = parameters(full), update(full), update(half)
-        moved = [torch.cat([(p - before[k]).flatten() for k, p in parameters(alg).items() if "mlp" in k]) for alg in (full, half)]
-        assert 0.0 < (moved[1] - moved[0]).norm() < 0.15 * moved[0].norm()
+        assert 0.0 < apart(before, full, half) < 0.15
         assert got == pytest.approx(expected, rel=0.05, abs=2e-3)
     assert half._update_graph.recorded and {p.dtype for p in half.actor.parameters()} == {torch.float32}
     collect(half, DEVICE)
@@ -343,10 +342,13 @@ def test_kernels_of_the_update_are_torchs_own(settings: dict, half: bool, monkey
         alg.learn_in_half()
     collect(plain, DEVICE)
     share_experience(plain, fused)
-    got = update(fused)
+    before, got = parameters(plain), update(fused)
     monkeypatch.setattr(layers, "FUSED_ON", [])
     assert got == pytest.approx(update(plain), rel=0.05 if half else 1e-3, abs=2e-3 if half else 1e-5)
-    assert difference(parameters(plain), parameters(fused)) < (0.05 if half else 1e-4)
+    if half:  # a product's last bits turn Adam's first steps of weights whose gradients are near 0, whatever the rate
+        assert apart(before, plain, fused) < 0.15
+    else:
+        assert difference(parameters(plain), parameters(fused)) < 1e-4
 
 
 @pytest.mark.parametrize("loss", ["estimate", "student"])

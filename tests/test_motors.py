@@ -239,7 +239,7 @@ def test_mistakes_in_a_law_in_code_are_found_before_training(law: type[LeggedRob
 def mlp(activation: str = "softsign", frames: tuple[int, ...] = (0, 1, 2), **more: Any) -> tuple[nn.Module, MotorNetwork]:
     """A network as torch has it, and as ours."""
     torch.manual_seed(1)
-    layers = [nn.Linear(2 * len(frames), 32), nn.Linear(32, 32), nn.Linear(32, 1)]
+    layers = [nn.Linear(2 * len(frames), 32), nn.Linear(32, 30), nn.Linear(30, 1)]
     kinds = {"elu": nn.ELU, "relu": nn.ReLU, "softsign": nn.Softsign, "tanh": nn.Tanh}
     module = nn.Sequential(layers[0], kinds[activation](), layers[1], kinds[activation](), layers[2])
     return module, MotorNetwork([], [(x.weight.detach().numpy(), x.bias.detach().numpy()) for x in layers], activation, frames, **more)
@@ -332,7 +332,7 @@ def converted(module: nn.Module, folder: Path, *args: str) -> MotorNetwork:
 def test_torchscript_files_convert(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     module, network = mlp("softsign")
     found = converted(module, tmp_path, "--error_scale", "-1")
-    assert "layers 32, 32, 1, softsign, scales -1 1/rad, 1 s/rad, 1 N m; torques differ" in capsys.readouterr().out
+    assert "layers 32, 30, 1, softsign, scales -1 1/rad, 1 s/rad, 1 N m; torques differ" in capsys.readouterr().out
     assert (found.frames, found.activation, found.error_scale) == ((0, 1, 2), "softsign", -1.0)
     for ours, theirs in zip(found.linear, network.linear, strict=True):
         assert all(np.array_equal(a, b) for a, b in zip(ours, theirs, strict=True))
@@ -558,10 +558,10 @@ def changed_arrays(**changes: Any) -> dict[str, Any]:
     ("arrays", "message"),
     [
         (changed_arrays(frames=np.array([0, 1])), r"net.npz: array 'weight0' has shape \(32, 6\), it must be \(32, 4\)"),
-        (changed_arrays(weight1=np.zeros((32, 31))), r"net.npz: array 'weight1' has shape \(32, 31\), it must be \(32, 32\)"),
+        (changed_arrays(weight1=np.zeros((30, 31))), r"net.npz: array 'weight1' has shape \(30, 31\), it must be \(30, 32\)"),
         (changed_arrays(bias2=np.zeros(2)), r"net.npz: array 'bias2' has shape \(2,\), it must be \(1,\)"),
         (changed_arrays(bias0=None), "net.npz: array 'bias0' is missing"),
-        (changed_arrays(weight2=None), "net.npz: the last layer must give one value, a joint's torque; it gives 32"),
+        (changed_arrays(weight2=None), "net.npz: the last layer must give one value, a joint's torque; it gives 30"),
         (changed_arrays(activation="swish"), "net.npz: no activation 'swish' in motor networks"),
         (changed_arrays(frames=np.array([2, 1])), r"net.npz: frames is \[2, 1\]; they must be ages in simulation steps"),
         (
@@ -571,7 +571,7 @@ def changed_arrays(**changes: Any) -> dict[str, Any]:
         (changed_arrays(frames=np.array([])), r"net.npz: frames is \[\]; they must be ages in simulation steps"),
         (changed_arrays(weight0=np.float32(1)), r"array 'weight0' has shape \(\), it must be \(-1, 6\)"),
         (changed_arrays(torque_scale=np.ones(2)), r"array 'torque_scale' has shape \(2,\), it must be \(\)"),
-        (changed_arrays(bias1=np.full(32, np.nan)), "net.npz: array 'bias1' has values that are not finite"),
+        (changed_arrays(bias1=np.full(30, np.nan)), "net.npz: array 'bias1' has values that are not finite"),
         ({"weight0": np.array([object()])}, "net.npz: Object arrays cannot be loaded|net.npz is no .npz of plain arrays"),
     ],
 )

@@ -14,6 +14,9 @@ from rsl_rl.models import MLPModel
 
 from legged_mw.rl.layers import Linear
 from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.settings import rsl_rl_config
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.task import load_task
 
 SYMMETRY = {"data_augmentation_func": turned, "use_data_augmentation": True, "env": None}
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -160,6 +163,23 @@ def test_entropy_and_kl_target_may_change_between_updates() -> None:
     update(ours)
     assert difference(parameters(stock), parameters(ours)) < 1e-5
     assert ours.learning_rate == pytest.approx(1e-2)  # it grows to the end, since no step is far enough
+
+
+def test_the_adaptive_rate_goes_up_to_a_bound() -> None:
+    ours = make(GraphedPPO, max_learning_rate=2e-3, desired_kl=1.0)
+    collect(ours)
+    update(ours)
+    assert ours.learning_rate == pytest.approx(2e-3)
+
+
+def test_a_bound_that_rsl_rl_does_not_know_is_refused() -> None:
+    with pytest.raises(ConfigError, match=r"max_learning_rate is of the recorded update, and this is rsl-rl's own: the optimizer is SGD"):
+        make(GraphedPPO, max_learning_rate=2e-3, optimizer="sgd")
+    task = load_task("go1_flat")
+    task.set("algorithm.max_learning_rate", "0.002")
+    task.set("algorithm.class_name", "PPO")
+    with pytest.raises(ConfigError, match=r"rsl-rl's own PPO goes up to 0\.01; GraphedPPO takes another"):
+        rsl_rl_config(task.train)
 
 
 class Encoder(MLPModel):

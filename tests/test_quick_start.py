@@ -23,6 +23,17 @@ optimizer = torch.optim.Adam(network.parameters())
 network(torch.ones(3, 2)).sum().backward()
 optimizer.step()
 optimizer.zero_grad()
+output, of_output = network(torch.ones(3, 2)), torch.full((3, 1), 2.0)
+output.backward(of_output)
+assert network.bias.grad == 6.0
+output = network(torch.ones(3, 2))
+torch.autograd.backward([output, network.weight.sum()], [of_output, None])
+try:
+    network(torch.ones(3, 2)).backward(torch.ones(3, 2))
+except RuntimeError as error:
+    assert "grad_output[0] has a shape of torch.Size([3, 2]) and output[0] has a shape of torch.Size([3, 1])" in str(error)
+else:
+    raise AssertionError
 inspect.getmodule(inspect.currentframe())  # walks over all modules
 later = sys.modules["torch._dynamo"]
 assert later is torch._dynamo and "torch._dynamo.eval_frame" not in sys.modules and "sympy" not in sys.modules
@@ -38,6 +49,9 @@ assert config.__spec__.loader is not None and later.config is config
 assert not hasattr(marked, "__dynamo_disable")
 from tensordict.base import _foreach_copy_compiled as first
 assert id(first) in real.trace_rules._allowed_callable_ids
+from torch.fx.experimental import symbolic_shapes as shapes
+assert shapes is sys.modules[shapes.__name__] and shapes.ShapeEnv and shapes.__spec__.origin and "sympy" in sys.modules
+network(torch.ones(3, 2)).backward(of_output)
 compiled = torch.compile(lambda x: x.sin() + 1, backend="eager")
 assert torch.equal(compiled(torch.ones(2)), torch.ones(2).sin() + 1)
 optimizer.zero_grad()
@@ -48,6 +62,29 @@ print("as ever")
 
 def test_the_compiler_is_there_when_it_is_asked_for() -> None:
     done = subprocess.run([sys.executable, "-c", ASKED_LATER], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout == "as ever\n", done.stderr
+
+
+SHAPES = """
+import sys
+from legged_mw.utils import quick_start
+quick_start.begin()
+import torch
+from torch.fx.experimental.symbolic_shapes import expect_true, sym_eq
+assert sym_eq(torch.Size([2, 3]), torch.Size([2, 3])) is True and sym_eq((2, 3), (2,)) is False and expect_true(False) is False
+assert "sympy" not in sys.modules and not hasattr(sys.modules[expect_true.__module__], "__path__")
+from torch.fx.experimental.symbolic_shapes import ShapeEnv
+assert "sympy" in sys.modules
+symbol = ShapeEnv().create_unbacked_symint()
+assert type(sym_eq((symbol, 2), (3, 2))) is torch.SymBool and sym_eq([symbol], [3, 2]) is False
+assert expect_true(symbol == 3) is True
+print("as ever")
+"""
+
+
+def test_symbolic_shapes_are_there_when_they_are_asked_for() -> None:
+    """What has compared numbers until then compares symbols, too."""
+    done = subprocess.run([sys.executable, "-c", SHAPES], cwd=ROOT, capture_output=True, text=True)
     assert done.stdout == "as ever\n", done.stderr
 
 

@@ -17,6 +17,7 @@ import torch
 from legged_mw import ROOT
 from legged_mw.envs.divergence import Divergence, Watch
 from legged_mw.robot import __main__ as program
+from legged_mw.robot import picture
 from legged_mw.robot.draft import Draft, as_env, draft, table
 from legged_mw.robot.measure import Health, Joint, inside_by, measure, tilt
 from legged_mw.robot.new import config_text, write
@@ -26,6 +27,7 @@ from legged_mw.robot.suggest import family, suggest
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
 from legged_mw.utils.cli import one_line_errors
+from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import load_task
 from tests.program import SMALL, refused, run
 
@@ -223,7 +225,7 @@ def test_check_prints_the_page_and_draws_the_robot(tmp_path: Path) -> None:
     assert result.out.index("observation state") < result.out.index("health of go1_rough")
     for text in (
         "mass                 12.74 kg",
-        "at rest              4 contacts, 28 constraint rows; room for more (sim.nconmax, sim.njmax): 8, 40",
+        "at rest              4 contacts, 28 constraint rows; room for more (sim.nconmax, sim.njmax): 8, 56",  # of its rough ground
         "stands on its servos for 5 s",
         "substep              4 ms, euler; servos in the air: stable",
         "nothing: all numbers are within bounds",
@@ -232,6 +234,19 @@ def test_check_prints_the_page_and_draws_the_robot(tmp_path: Path) -> None:
     row = next(line for line in result.out.splitlines() if line.startswith("  FL_calf_joint") and "35.55" in line and "20.06" in line)
     assert row.split()[-2:] == ["36", "0.9"]
     assert png_size(picture) == (2 * WIDTH, HEIGHT)
+
+
+def test_a_picture_that_cannot_be_drawn_leaves_the_page(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """As on a machine without OpenGL."""
+
+    def fails(*_: object) -> None:
+        raise UserError("No OpenGL context")
+
+    monkeypatch.setattr(picture, "draw", fails)
+    monkeypatch.setattr(sys, "argv", ["robot", str(TOY), "--picture", "robot.png"])
+    with pytest.raises(UserError, match="No OpenGL context"):
+        program.main()
+    assert "health of toy_biped.xml" in (out := capsys.readouterr().out) and "what to look at" in out and "picture: " not in out
 
 
 def test_picture_wants_check_and_a_png(tmp_path: Path) -> None:
@@ -353,12 +368,23 @@ def test_feet_and_poses_of_vendors_files(file: Path) -> None:
         assert sum(angle[f"left_{part}_joint"] for part in ("hip_pitch", "knee", "ankle_pitch")) == pytest.approx(0.0, abs=1e-6)
 
 
+def test_feet_that_the_pose_lifts_are_feet(tmp_path: Path) -> None:
+    """A keyframe that sits on its hind legs made a biped of a quadruped."""
+    text = (ROOT / "tests/data/go2_style.xml").read_text()
+    (tmp_path / "sits.xml").write_text(text.replace("0 0 0 0 0.9 -1.8  0 0.9 -1.8 ", "0 0 0 0 -1.2 -1.8  0 -1.2 -1.8 "))
+    found = draft(tmp_path / "sits.xml")
+    assert found.pose[:6] == [0.0, -1.2, -1.8] * 2 and [foot.name for foot in found.feet] == FEET["go2_style"]
+
+
 def test_what_of_the_file_is_changed_is_on_its_page(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """--new makes an MJCF of a URDF: what was left out of it is said here or nowhere, and its speed limits go into the config."""
     a1, t1 = ROOT / "tests/data/a1_style.urdf", ROOT / "tests/data/t1_style.xml"
     text = show(monkeypatch, capsys, a1)
     assert "in the file\n  looks left out (MuJoCo reads no .dae, " in text and "\n  free joint added to 'base'\n" in text
-    assert "\n  12 actuators replaced\n  keyframe 'stand' read" in show(monkeypatch, capsys, t1)
+    changed = show(monkeypatch, capsys, t1)
+    assert "\n  12 actuators replaced\n  keyframe 'stand' read" in changed
+    assert "\n  site 'imu_aligned' made at the place of 'imu' on 'Waist', with the axes of the root 'Trunk'\n" in changed
+    assert "\n  fused into 'Trunk', to which they are fixed: H2, AL, left_hand_link, AR, right_hand_link, Waist\n" in changed
     assert 'joint_speed_limits = {"": 28.6, "hip": 52.0}  # [rad/s] the file\'s' in config_text(draft(a1), a1, "mine")
     assert "joint_speed_limits" not in config_text(draft(t1), t1, "mine")
 
@@ -367,6 +393,12 @@ def test_a_file_without_feet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     file = tmp_path / "wheel.xml"
     file.write_text(WHEEL.format(half=0.2, offset=0.0, more=""))
     assert "no part that ends a limb collides, so that no feet can be guessed" in complaint(monkeypatch, capsys, file)
+    file.write_text(
+        '<mujoco><worldbody><body name="arm"><inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/><body name="hand" pos="0 0 0.4">'
+        '<joint name="wrist" axis="0 1 0" range="-1 1" limited="true"/><geom size="0.02"/></body></body></worldbody></mujoco>'
+    )
+    text = "'arm', the root, is not above the lowest ends of limbs, hand; the health page is of robots that stand on them"
+    assert text in complaint(monkeypatch, capsys, file)
 
 
 def test_names_beside_the_robot_do_not_overlap() -> None:

@@ -157,11 +157,11 @@ def test_the_path_in_a_run_is_not_imported(home: Path) -> None:
 def test_every_allowed_class_is_one_that_rsl_rl_finds_under_that_name() -> None:
     from rsl_rl.utils import resolve_callable
 
-    from legged_mw.rl.classes import _spellings
+    from legged_mw.rl.classes import spellings
 
     for path, kinds in ALLOWED.items():
         for kind in kinds:
-            for name in _spellings(kind):
+            for name in spellings(kind):
                 assert resolve_callable(name) is kind
                 task = load_task("go1_flat")
                 if not path.startswith("critic.distribution"):  # a section that the critic has not

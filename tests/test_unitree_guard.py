@@ -181,7 +181,7 @@ from legged_mw.deploy.unitree import client, clock, guard
 folder, domain, fault = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 contract = read_contract(folder)
 if fault == "dies":  # of that alone, not because this computer is busy
-    guard.LATE = client.TOO_OLD = 60.0
+    guard.LATE = guard.STILL = client.TOO_OLD = 60.0
 robot = client.connect(folder, contract, "lo", domain)
 print("pid", robot._owner.process.pid, flush=True)
 for step in itertools.count():
@@ -195,6 +195,22 @@ for step in itertools.count():
             raise
     time.sleep(0.08 if fault == "late" and step > 30 else 0.01)
 """
+
+# The program on a computer that may be busy: nothing is late here, as what is late is tested above and in lockstep.
+DEPLOY = """
+from legged_mw.deploy import safety
+from legged_mw.deploy.unitree import client, guard
+guard.LATE = guard.STILL = client.TOO_OLD = 60.0
+safety.LATE = 1e9  # [periods]
+from legged_mw.deploy.__main__ import main
+main()
+"""
+
+
+def deploy(domain: int, *flags: str) -> list[str]:
+    """The command that drives a Go2."""
+    where = ["--interface", "lo", "--domain", str(domain), "--log", "off"]
+    return [sys.executable, "-c", DEPLOY, "go2_flat", "--robot", "unitree", *where, *flags]
 
 
 def served(domain: int) -> SimulatedUnitree:
@@ -311,12 +327,12 @@ def test_the_programs(domain: int, tmp_path: Path) -> None:
     """Two programs over loopback: the remote of the robot's side stands the robot up, starts the policy, walks and ends it."""
     press = [f"{{time: {0.5 * k}, press: [{button}]}}" for k, button in enumerate(["start", "A"] * 20, start=4)]
     (tmp_path / "remote.yaml").write_text(f"remote: [{{time: 0, ly: 0.4}}, {', '.join(press)}]")
-    command = [sys.executable, "-m", "legged_mw.deploy", "go2_flat", "--interface", "lo", "--domain", str(domain)]
+    command = [sys.executable, "-m", "legged_mw.deploy", "go2_flat", "--interface", "lo", "--domain", str(domain), "--serve", "unitree"]
     where: dict[str, Any] = {"cwd": POLICIES.parents[1], "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with contextlib.ExitStack() as stack:
-        robot = subprocess.Popen([*command, "--serve", "unitree", "--remote", str(tmp_path / "remote.yaml")], **where)
+        robot = subprocess.Popen([*command, "--remote", str(tmp_path / "remote.yaml")], **where)
         stack.callback(robot.kill)
-        policy = subprocess.Popen([*command, "--robot", "unitree", "--time", "6s", "--log", "off"], **where)
+        policy = subprocess.Popen(deploy(domain, "--time", "6s"), **where)
         stack.callback(policy.kill)
         said, errors = policy.communicate(timeout=60)
         assert policy.returncode == 0, errors
@@ -332,9 +348,8 @@ def test_the_program_with_motors_in_another_order(domain: int) -> None:
     """As soon as it would stand: the angles are not those of the joints."""
     sim = served(domain)
     sim.faults.joint_order = 1
-    command = [sys.executable, "-m", "legged_mw.deploy", "go2_flat", "--robot", "unitree", "--interface", "lo", "--domain", str(domain)]
     where: dict[str, Any] = {"cwd": POLICIES.parents[1], "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    with subprocess.Popen([*command, "--time", "1s", "--log", "off"], **where) as policy:
+    with subprocess.Popen(deploy(domain, "--time", "1s"), **where) as policy:
         live(sim, lambda: sim.record.commands > 50)
         sim.remote = encode(["start"])
         live(sim, lambda: policy.poll() is not None)

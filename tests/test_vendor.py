@@ -620,6 +620,16 @@ def test_a_urdf_that_is_none(tmp_path: Path) -> None:
     assert build(urdf(tmp_path / "mini.urdf", more="<!-- from <xacro:include/> -->")).root == "base", "a comment is no macro"
 
 
+def test_looks_of_no_size_are_left_out(tmp_path: Path) -> None:
+    """MuJoCo spoke of a geom without a name."""
+    point, box = ("<{0}><geometry><" + shape + "/></geometry></{0}>" for shape in ("sphere radius='0.0'", "box size='0.1 0.1 0.2'"))
+    file = urdf(tmp_path / "mini.urdf", leg=point.format("visual") + box.format("visual") + box.format("collision"))
+    robot = build(file)
+    assert "looks left out (of size 0): those of link 'leg'" in robot.overrides and visual_model(robot).ngeom == 4
+    with pytest.raises(ModelError, match=r"^mini.urdf: link 'base' collides as a shape of size 0; give it a size, or leave it out$"):
+        build(urdf(file, base=point.format("collision")))
+
+
 def test_a_link_world_is_dropped(tmp_path: Path) -> None:
     world = '<link name="world"/><joint name="stand" type="fixed"><parent link="world"/><child link="base"/></joint>'
     robot = build(urdf(tmp_path / "mini.urdf", more=world))

@@ -41,9 +41,9 @@ def check_classes(cfg: Config) -> None:
     for path, name in _class_names(cfg.to_dict()):
         if path in own and name == own[path]:
             continue
-        allowed = [spelling for kind in ALLOWED.get(path, ()) for spelling in _spellings(kind)]
+        allowed = [spelling for kind in ALLOWED.get(path, ()) for spelling in spellings(kind)]
         if name not in allowed:
-            shortest = [_spellings(kind)[0] for kind in ALLOWED.get(path, ())]
+            shortest = [spellings(kind)[0] for kind in ALLOWED.get(path, ())]
             raise ConfigError(
                 f"{path} is {name!r}: only the task's own Python file, which --task names, may choose that; "
                 f"a run's config.yaml, --set and --override may name {', '.join(shortest) or 'nothing else there'}"
@@ -83,12 +83,12 @@ def _check_distribution(section: dict[str, Any] | None, path: str) -> None:
     name = (section or {}).get("class_name")
     for kind in (*_DISTRIBUTIONS, BetaDistribution):
         surplus = sorted((section or {}).keys() - inspect.signature(kind).parameters.keys() - {"class_name"})
-        if surplus and name in _spellings(kind):
+        if surplus and name in spellings(kind):
             fit = ", ".join(other.__name__ for other in _DISTRIBUTIONS)
             raise ConfigError(f"{path}.class_name is {name!r}, which takes no {', '.join(surplus)}, fields of {path}; there fit: {fit}")
 
 
-def _spellings(kind: type) -> list[str]:
+def spellings(kind: type) -> list[str]:
     """All names under which rsl-rl finds a class, the shortest first."""
     module, name = kind.__module__, kind.__qualname__
     long = [f"{module}:{name}", f"{module}.{name}"]

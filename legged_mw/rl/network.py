@@ -1,4 +1,7 @@
-"""A policy's network as an ONNX file: writing it, halving it, running it, and reading its weights back."""
+"""A policy's network as an ONNX file: writing it, halving it, running it, and reading its weights back.
+
+onnx is imported where a file is written or read: a training begins without.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnx
 import torch
-from onnx import numpy_helper
 from rsl_rl.models import MLPModel, RNNModel
 from torch import Tensor, nn
 
@@ -64,6 +65,7 @@ def run_onnx(path: Path, observations: np.ndarray, output: str = OUTPUT, memory:
     try:
         import onnxruntime
     except ImportError:
+        import onnx
         from onnx.reference import ReferenceEvaluator
 
         [found] = ReferenceEvaluator(onnx.load(path)).run([output], inputs)
@@ -95,6 +97,8 @@ def save_onnx(policy: MLPModel, clip_actions: float, path: Path) -> None:
 
 def _strip(path: Path) -> None:
     """Drop what the exporter notes for debugging: stack traces, with the folders of the machine that it ran on."""
+    import onnx
+
     model = onnx.load(path)
     graph = model.graph
     for part in (model, graph, *graph.node, *graph.input, *graph.output, *graph.value_info, *graph.initializer):
@@ -124,6 +128,9 @@ def round_weights(policy: MLPModel) -> None:
 
 def halve(policy: MLPModel, path: Path) -> None:
     """Store the weights of the rounded ``policy`` in ``path`` as float16, each with a Cast, so that all is computed in float32."""
+    import onnx
+    from onnx import numpy_helper
+
     model = onnx.load(path)
     graph, names, casts = model.graph, {PREFIX + name for name in _weights(policy)}, []
     for each in graph.initializer:
@@ -150,6 +157,9 @@ def read_parameters(path: Path, policy: MLPModel) -> dict[str, Tensor]:
 
     The noise of exploration and the normalizer's count and variance are not in the file; ``policy`` keeps its own.
     """
+    import onnx
+    from onnx import numpy_helper
+
     try:
         graph = onnx.load(path, load_external_data=False).graph
         stored = {each.name: torch.from_numpy(numpy_helper.to_array(each).astype(np.float32)) for each in graph.initializer}
@@ -166,7 +176,7 @@ def read_parameters(path: Path, policy: MLPModel) -> dict[str, Tensor]:
     return {name: value for name, value in policy.state_dict().items() if name.startswith(UNWRITTEN)} | found
 
 
-def _divisor(graph: onnx.GraphProto, stored: dict[str, Tensor], path: Path) -> Tensor:
+def _divisor(graph: Any, stored: dict[str, Tensor], path: Path) -> Tensor:
     """std + eps of the normalizer, which the exporter adds up and names as it likes: the network begins with (obs - mean) / divisor.
 
     Less eps, rounded, plus eps, rounded, it is the same float32 again, as it was made by such a sum.

@@ -32,6 +32,7 @@ from legged_mw.rl.recorded import Recorded, why_stock
 from legged_mw.rl.recurrent import HiddenStates, SequenceInput, check_recurrent, unroll
 from legged_mw.rl.undo import Undo
 from legged_mw.sim.graph import StepGraph
+from legged_mw.utils.config import ConfigError
 
 _MIN_RATE, _MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
 
@@ -62,7 +63,7 @@ class GraphedPPO(Recorded, PPO):
 
     def __init__(self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> None:
         self._recurrent = actor.is_recurrent or critic.is_recurrent
-        symmetry = settings.pop("symmetry_cfg", None)
+        symmetry, self._max_rate = settings.pop("symmetry_cfg", None), settings.pop("max_learning_rate", _MAX_RATE)
         super().__init__(actor, critic, storage, symmetry_cfg=None if self._recurrent else symmetry, **settings)
         reason = self._why_stock()
         self.graphed = reason is None
@@ -70,6 +71,8 @@ class GraphedPPO(Recorded, PPO):
             check_recurrent(storage.num_envs, self.num_mini_batches, symmetry, self.graphed)
             self.symmetry = Symmetry(**symmetry) if symmetry else None  # rsl-rl refuses mirror images here
         if reason:
+            if self._max_rate != _MAX_RATE:
+                raise ConfigError(f"algorithm.max_learning_rate is of the recorded update, and this is rsl-rl's own: {reason}")
             print(f"PPO: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
             return
         self._adam_rate = torch.tensor(self.learning_rate, dtype=torch.float32, device=self.device)
@@ -336,10 +339,10 @@ class GraphedPPO(Recorded, PPO):
         """rsl-rl's rule: slower where the policy moved more than twice as far as wanted, faster where less than half."""
         assert self._rate is not None
         if kernels := kernels_for(kl):
-            kernels.launch(kernels.adapt_rate, 1, kl, self._desired_kl, self._rate, self._adam_rate, _RATE_STEP, _MIN_RATE, _MAX_RATE)
+            kernels.launch(kernels.adapt_rate, 1, kl, self._desired_kl, self._rate, self._adam_rate, _RATE_STEP, _MIN_RATE, self._max_rate)
             return
         slower = (self._rate / _RATE_STEP).clamp(min=_MIN_RATE)
-        faster = (self._rate * _RATE_STEP).clamp(max=_MAX_RATE)
+        faster = (self._rate * _RATE_STEP).clamp(max=self._max_rate)
         rate = torch.where((kl < self._desired_kl / 2.0) & (kl > 0.0), faster, self._rate)
         self._rate.copy_(torch.where(kl > self._desired_kl * 2.0, slower, rate))
         self._adam_rate.copy_(self._rate)

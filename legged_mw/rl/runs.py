@@ -95,7 +95,7 @@ def task_of(run: Path) -> str:
         raise ConfigError(f"{shown(run / CONFIG_FILE)} does not say of which task it is; say --task")
     if Path(stored).suffix != ".py":
         return stored
-    folders = [Path.cwd(), *run.resolve().parents[:4]]  # experiment, logs, what holds logs; of an export one more
+    folders = [*dict.fromkeys([Path.cwd(), *run.resolve().parents[:4]])]  # experiment, logs, what holds logs; of an export one more
     for file in (folder / name for name in (stored, Path(stored).name) for folder in folders):
         with suppress(OSError, ValueError):  # a name that no file can have
             if file.is_file():

@@ -6,9 +6,11 @@ import copy
 import importlib.util
 from typing import Any
 
+from rsl_rl.algorithms import PPO
+
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
-from legged_mw.rl.classes import actor_settings, check_classes, network_section
+from legged_mw.rl.classes import actor_settings, check_classes, network_section, spellings
 from legged_mw.utils.config import ConfigError
 
 
@@ -31,6 +33,10 @@ def rsl_rl_config(cfg: RobotTaskCfgPPO, env: RobotTask | None = None) -> dict[st
     mirrors = symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]
     symmetry_cfg = {"data_augmentation_func": "legged_mw.rl.symmetry:mirror", **symmetry} if mirrors else None
     algorithm = {"rnd_cfg": None, "symmetry_cfg": symmetry_cfg, **sections.pop("algorithm")}
+    if algorithm.get("max_learning_rate") == 1e-2:  # rsl-rl's, which knows no other
+        del algorithm["max_learning_rate"]
+    elif algorithm["class_name"] in spellings(PPO):
+        raise ConfigError(f"algorithm.max_learning_rate: rsl-rl's own {algorithm['class_name']} goes up to 0.01; GraphedPPO takes another")
     anneal = {name: (algorithm[name], end) for name, end in sections.pop("anneal").items()}
     flat = {key: runner[key] for key in keys} | {name: network_section(sections[name]) for name in ("actor", "critic")}
     return {**sections, **flat, "algorithm": algorithm, "anneal": anneal, "logger": logger, "check_for_nan": False}

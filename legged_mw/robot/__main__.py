@@ -42,44 +42,45 @@ def main() -> None:
     torch.set_num_threads(1)
     file, image = Path(args.file), Path(args.picture) if args.picture else None
     if file.suffix not in ROBOT_FILES:
-        print(task_page(load_task(args.file), image))
+        show_task(load_task(args.file), image)
         return
     if args.new:
         new.targets(args.new, writable(args.out, "--out", folder=True), args.force)  # refused before the page, not after it
     found = draft(file)
     env = as_env(found, file)
-    print(env_page(env, file.name, image, found))
+    show(env, file.name, image, found)
     if args.new:
         written = new.write(found, file, args.new, Path(args.out), args.force, has_mirror(env))
         flags = shlex.join(["--task", shown(written[1]), "--check"])
         print(f"written: {' and '.join(map(shown, written))}; next:\n  {command('train')} {flags}")
 
 
-def task_page(task: LoadedTask, image: Path | None) -> str:
-    """The page of a task's robot, one on a plane, and its picture to ``image``."""
+def show_task(task: LoadedTask, image: Path | None) -> None:
+    """Print the page of a task's robot, one on a plane; draw it to ``image``."""
     one = copy.deepcopy(task)
     one.set("env.num_envs", 1)
     one.set("sim.engine", "mujoco")
     one.set("control.actuator", "servo")  # what the page is about: gains, and what a simulation step makes of them
     on_servos: type[Any] = type(one.env_class.__name__, (one.env_class,), {"_compute_torques": RobotTask._compute_torques})
     one.env_class = on_servos
-    if isinstance(one.cfg.to_dict()["terrain"].get("mesh_type"), str):
+    ground = one.cfg.to_dict()["terrain"].get("mesh_type", "plane")
+    if rough := ground != "plane":
         one.set("terrain.mesh_type", "plane")
-    return env_page(one.env_class(one.cfg, "cpu"), task.name, image)
+    show(one.env_class(one.cfg, "cpu"), task.name, image, rough=rough)
 
 
-def env_page(env: RobotTask, title: str, image: Path | None, found: Draft | None = None) -> str:
-    """The page as text, with what was guessed if the task is a draft; the picture goes to ``image``."""
+def show(env: RobotTask, title: str, image: Path | None, found: Draft | None = None, rough: bool = False) -> None:
+    """Print the page, with what was guessed if the task is a draft; then draw the picture. Room is that of ``rough`` ground."""
     robot, feet = env.robot, env.foot_geoms if isinstance(env, LeggedRobot) else {}
-    health = measure(robot, robot.pose, env.start_place, env.cfg.control.decimation)
-    text = page(health, title, found.guessed, found.notes) if found else page(health, title)
+    health = measure(robot, robot.pose, env.start_place, env.cfg.control.decimation, rough)
+    print(page(health, title, found.guessed, found.notes) if found else page(health, title), flush=True)
     if image is None:
-        return text
+        return
     try:
         picture.draw(image, robot, health.rest.qpos, feet, title)
     except OSError as error:
         raise UserError(f"cannot write {image}: {error.strerror}; say --picture FILE.png") from None
-    return f"{text}\npicture: {shown(image)}"
+    print(f"picture: {shown(image)}")
 
 
 if __name__ == "__main__":

@@ -47,7 +47,7 @@ class Draft(NamedTuple):
     feet: list[Foot]
     guessed: list[str]  # what nobody said, a line each
     pose_from: str  # where the default pose is from, in words
-    notes: list[str]  # what was dropped, added or changed in the file as it was read, a line each
+    notes: list[str]  # what was dropped, added, changed or fused of the file, a line each
 
 
 def draft(file: Path) -> Draft:
@@ -68,13 +68,19 @@ def draft(file: Path) -> Draft:
     pose = (np.round(pose, 4) + 0.0).tolist()  # no -0.0
     height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
     place = [0.0, 0.0, round(height + CLEARANCE, 3)]
+    if height <= 0.0:
+        ends = ", ".join(foot.name for foot in feet)
+        raise ModelError(
+            f"'{robot.root}', the root, is not above the lowest ends of limbs, {ends}; the health page is of robots that stand on them"
+        )
     firmness, gains = _firm(robot, pose, place, joints, feet)
     guessed = [
         f"pose: {how}",
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest ends of limbs",
         "gains: as suggested below" if firmness == 1.0 else f"gains: {firmness:g} times what is suggested below, to stand on its servos",
     ]
-    return Draft(robot, pose, place, joints, gains, feet, guessed, how, read.notes)
+    more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]  # a bare robot's one site is its IMU
+    return Draft(robot, pose, place, joints, gains, feet, guessed, how, [*read.notes, *more])
 
 
 def _firm(

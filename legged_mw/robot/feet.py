@@ -1,4 +1,4 @@
-"""Guess a robot's feet: the lowest parts that carry no others."""
+"""Guess a robot's feet: the lowest parts that carry no others, and those of their name on other legs."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -14,6 +14,7 @@ from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.pose import posed
 from legged_mw.sim.shapes import surfaces
+from legged_mw.sim.tables import family
 
 _SAME, _SAME_SHARE = 0.03, 0.08  # [m], and of the robot's height: ends of limbs that are so much higher than the lowest are feet too
 _SOLE = 0.015  # [m] parts of a foot that are so much higher than its lowest are of its sole
@@ -40,8 +41,12 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
         raise ModelError("no part that ends a limb collides, so that no feet can be guessed; give the feet colliding geoms")
     lowest = min(min(these.values()) for these in of_body.values())
     near = lowest + max(_SAME, _SAME_SHARE * (float(qpos[2]) - lowest))
-    feet = [(body, these) for body, these in of_body.items() if min(these.values()) <= near]
-    return [_foot(robot, body, _sole(model, these)) for body, these in feet]
+    soles = {body: _sole(model, these) for body, these in of_body.items() if min(these.values()) <= near}
+    for body, these in of_body.items():  # a leg that the pose lifts has the same foot
+        same = [other for other in soles if family(model.body(other).name) == family(model.body(body).name or str(body))]
+        if body not in soles and same and len(of_body[same[0]]) == len(these):
+            soles[body] = [geom for geom, like in zip(these, of_body[same[0]], strict=True) if like in soles[same[0]]]
+    return [_foot(robot, body, soles[body]) for body in sorted(soles)]
 
 
 def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:

@@ -123,8 +123,11 @@ class Health:
     room: Room  # for contacts and constraint rows on mujoco-warp
 
 
-def measure(robot: RobotModel, pose: Sequence[float], place: Sequence[float], decimation: int = 5) -> Health:
-    """The health of ``robot`` on level ground, in ``pose`` (D,) [rad], with its root at ``place`` (3,) [m], upright."""
+def measure(robot: RobotModel, pose: Sequence[float], place: Sequence[float], decimation: int = 5, rough: bool = False) -> Health:
+    """The health of ``robot`` on level ground, in ``pose`` (D,) [rad], with its root at ``place`` (3,) [m], upright.
+
+    Room is counted for ``rough`` ground, if so.
+    """
     model, angles = robot.physics, np.array(pose, dtype=float)
     rest = stand_as_statue(robot, angles, np.array(place, dtype=float))
     matrices = mass_matrices(robot, angles)
@@ -140,7 +143,7 @@ def measure(robot: RobotModel, pose: Sequence[float], place: Sequence[float], de
         stand=stand_on_servos(robot, angles, place, decimation),
         dt=float(model.opt.timestep),
         implicit=implicit,
-        room=count_room(model, terrain=False),
+        room=count_room(model, terrain=rough),
     )
 
 

@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
@@ -46,6 +47,7 @@ def read_urdf(file: Path, text: str, notes: list[str]) -> tuple[mujoco.MjSpec, d
     joints = {joint.get("name", ""): joint for joint in robot.findall("joint")}
     if mimics := [name for name, joint in joints.items() if joint.find("mimic") is not None]:
         notes.append(f"mimic dropped: {', '.join(mimics)} move by themselves")
+    _drop_points(robot, file, notes)
     files = _find_meshes(robot, file, notes)
     extension = robot.find("mujoco")
     extension = ElementTree.SubElement(robot, "mujoco") if extension is None else extension
@@ -85,6 +87,27 @@ def _leads_elsewhere(joint: Element) -> bool:
     origin = joint.find("origin")
     numbers = [] if origin is None else f"{origin.get('xyz', '')} {origin.get('rpy', '')}".split()
     return joint.get("type") == "floating" or (joint.get("type") == "fixed" and any(float(number) for number in numbers))
+
+
+def _drop_points(robot: Element, file: Path, notes: list[str]) -> None:
+    """Leave out looks without a size, which MuJoCo does not compile. Raises ModelError for such a thing that collides."""
+    left_out: list[str] = []
+    for link in robot.findall("link"):
+        for part in [part for part in [*link.findall("visual"), *link.findall("collision")] if _has_no_size(part)]:
+            if part.tag == "collision":
+                raise ModelError(f"{file.name}: link '{link.get('name')}' collides as a shape of size 0; give it a size, or leave it out")
+            link.remove(part)
+            left_out.append(f"'{link.get('name')}'")
+    if left_out:
+        notes.append(f"looks left out (of size 0): those of link {', '.join(dict.fromkeys(left_out))}")
+
+
+def _has_no_size(part: Element) -> bool:
+    shape = part.find("geometry/*")
+    with suppress(ValueError):  # what is no number is MuJoCo's to say
+        if shape is not None and shape.tag != "mesh":
+            return any(not float(number) for name in ("radius", "length", "size") for number in shape.get(name, "").split())
+    return False
 
 
 def _find_meshes(robot: Element, file: Path, notes: list[str]) -> dict[str, Path]:

@@ -42,15 +42,16 @@ class _Net:
     in_turns: int
     units: wp.array[int]  # of each LSTM layer
     sizes: wp.array[int]  # values that go into each linear layer, and the one that comes out of the last
-    weights: wp.array[float]
+    weights: wp.array[wp.vec4]  # as ``_in_fours`` has them
     activation: int
 
 
 @wp.func
-def _dot(weights: wp.array[float], start: int, count: int, x: Any) -> float:
-    value = float(0.0)
+def _dot(weights: wp.array[wp.vec4], start: int, count: int, x: Any) -> wp.vec4:
+    """Four sums at once: a thread waits for one weight after another, so the fewer turns the better."""
+    value = wp.vec4()
     for i in range(count):
-        value += weights[start + i] * x[i]
+        value += x[i] * weights[start + i]
     return value
 
 
@@ -74,16 +75,11 @@ def _look(net: _Net, past: wp.array3d[wp.vec2], w: int, j: int, x: Any):
 def _recur(net: _Net, at: int, inputs: int, n: int, memory: wp.array4d[float], first: int, w: int, j: int, x: Any):
     """An LSTM layer of ``n`` units whose weights begin at ``at`` and whose memory at ``first``."""
     y = x * 0.0
-    hidden = at + 4 * n * inputs
-    biases = hidden + 4 * n * n
     for u in range(n):
-        gates = wp.vec4()
-        for gate in range(4):
-            row = gate * n + u
-            value = net.weights[biases + row] + net.weights[biases + 4 * n + row] + _dot(net.weights, at + row * inputs, inputs, x)
-            for i in range(n):
-                value += net.weights[hidden + row * n + i] * memory[0, w, j, first + i]
-            gates[gate] = value
+        start = at + u * (inputs + n + 1)
+        gates = net.weights[start + inputs + n] + _dot(net.weights, start, inputs, x)
+        for i in range(n):
+            gates += memory[0, w, j, first + i] * net.weights[start + inputs + i]
         c = _sigmoid(gates[1]) * memory[1, w, j, first + u] + _sigmoid(gates[0]) * wp.tanh(gates[2])
         memory[1, w, j, first + u] = c
         y[u] = _sigmoid(gates[3]) * wp.tanh(c)
@@ -96,14 +92,29 @@ def _recur(net: _Net, at: int, inputs: int, n: int, memory: wp.array4d[float], f
 def _combine(net: _Net, at: int, inputs: int, outputs: int, last: bool, x: Any):
     """A linear layer whose weights begin at ``at``, and its activation unless it is the last."""
     y = x * 0.0
-    for u in range(outputs):
-        value = _dot(net.weights, at + u * inputs, inputs, x) + net.weights[at + outputs * inputs + u]
-        y[u] = value if last else _activate(net.activation, value)
+    for four in range((outputs + 3) // 4):
+        start = at + four * (inputs + 1)
+        values = _dot(net.weights, start, inputs, x) + net.weights[start + inputs]
+        for k in range(4):
+            y[4 * four + k] = values[k] if last else _activate(net.activation, values[k])
     return y
 
 
+def _in_fours(network: MotorNetwork) -> np.ndarray:
+    """Its weights (W, 4): of an LSTM's unit the four gates side by side, of a linear layer four units; their biases come after them."""
+    blocks = []
+    for into, onward, *biases in network.recurrent:
+        block = np.concatenate([into, onward, (biases[0] + biases[1])[:, None]], axis=1)
+        blocks.append(block.reshape(4, -1, block.shape[1]).transpose(1, 2, 0))
+    for weight, bias in network.linear:
+        block = np.concatenate([weight, bias[:, None]], axis=1)
+        block = np.pad(block, ((0, -len(block) % 4), (0, 0)))
+        blocks.append(block.reshape(-1, 4, block.shape[1]).transpose(0, 2, 1))
+    return np.concatenate([block.reshape(-1, 4) for block in blocks]).astype(np.float32)
+
+
 def _make_kernel(width: int) -> Any:
-    """The kernel for networks of layers up to ``width``."""
+    """The kernel for networks of layers up to ``width``, a multiple of four."""
     vec = wp.types.vector(length=width, dtype=float)
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -127,13 +138,13 @@ def _make_kernel(width: int) -> Any:
         for layer in range(net.units.shape[0]):
             n = net.units[layer]
             x = _recur(net, at, inputs, n, memory, first, w, j, x)
-            at += 4 * n * (inputs + n + 2)
+            at += n * (inputs + n + 1)
             first += n
             inputs = n
         layers = net.sizes.shape[0] - 1
         for layer in range(layers):
             x = _combine(net, at, net.sizes[layer], net.sizes[layer + 1], layer == layers - 1, x)
-            at += (net.sizes[layer] + 1) * net.sizes[layer + 1]
+            at += (net.sizes[layer] + 1) * ((net.sizes[layer + 1] + 3) // 4)
         ctrl[w, j] = net.scales[2] * x[0]
 
     return torque
@@ -145,16 +156,16 @@ class WarpNetwork:
     def __init__(self, network: MotorNetwork, sim: Simulation) -> None:
         robots, joints = sim.ctrl.shape
         sizes = [network.linear[0][0].shape[1], *(len(bias) for _, bias in network.linear)]
-        weights = [value.ravel() for layer in (*network.recurrent, *network.linear) for value in layer]
         with wp.ScopedDevice(sim.device):
             net = _Net()
             net.scales = wp.vec3(network.error_scale, network.speed_scale, network.torque_scale)
             net.frames, net.units, net.sizes = (wp.array(values, dtype=int) for values in (network.frames, network.hidden, sizes))
-            net.weights = wp.array(np.concatenate(weights), dtype=float)
+            net.weights = wp.array(_in_fours(network), dtype=wp.vec4)
             net.in_turns, net.activation = int(network.in_turns), list(ACTIVATIONS).index(network.activation)
         self._past = torch.zeros(robots, joints, network.frames[-1] + 1, 2, device=sim.device)
         self._memory = torch.zeros(2, robots, joints, max(1, sum(network.hidden)), device=sim.device)
-        self._kernel = _make_kernel(max(*sizes, *network.hidden, 2 * len(network.frames)))
+        width = max(*sizes, *network.hidden, 2 * len(network.frames))
+        self._kernel = _make_kernel(width + -width % 4)
         self._net, self._ctrl = net, wp.from_torch(sim.ctrl)
         self._state = [wp.from_torch(sim.qpos[:, -joints:]), wp.from_torch(sim.qvel[:, -joints:])]
         self._state += [wp.from_torch(self._past, dtype=wp.vec2), wp.from_torch(self._memory)]

@@ -3,6 +3,9 @@
 tensordict marks three functions for torch's compiler as it is imported, and torch's optimizers mark their methods at the first
 call. Either imports ``torch._dynamo``, some 900 modules, and nothing in a training compiles. So a stand-in notes the marks. Whoever
 asks it for anything else gets the compiler itself, with the marks made.
+
+``Tensor.backward(gradient)`` compares two shapes by way of symbolic ones, which imports sympy, some 470 modules. A second stand-in
+compares shapes of plain numbers.
 """
 
 from __future__ import annotations
@@ -20,6 +23,7 @@ from types import ModuleType
 from typing import Any
 
 _COMPILER = "torch._dynamo"
+_SHAPES = "torch.fx.experimental.symbolic_shapes"
 _KNOWN = (2, 11), (2, 13)  # the first and last version of torch that this was tried with; others import as they always did
 _DISABLED = "__dynamo_disable"  # where torch/_compile.py keeps what `disable` gave it
 
@@ -63,24 +67,63 @@ def settle() -> None:
 
 
 def put_off_compiler() -> bool:
-    """Put the stand-in where torch's compiler would be; False if that is there already, or torch is of an unknown version."""
+    """Put stand-ins where torch's compiler would be; False if that is there already, or torch is of an unknown version."""
     import torch
 
     version = tuple(int(part) for part in torch.__version__.split(".")[:2])
-    if _COMPILER in sys.modules or not _KNOWN[0] <= version <= _KNOWN[1]:
+    if {_COMPILER, _SHAPES} & sys.modules.keys() or not _KNOWN[0] <= version <= _KNOWN[1]:
         return False
-    sys.modules[_COMPILER] = _Compiler(_COMPILER)
+    sys.modules[_COMPILER], sys.modules[_SHAPES] = (
+        _Compiler(_COMPILER, "_dynamo/__init__.py"),
+        _Shapes(_SHAPES, "fx/experimental/symbolic_shapes.py"),
+    )
     sys.meta_path.insert(0, _Found())
     return True
 
 
-class _Compiler(ModuleType):
+class _StandIn(ModuleType):
+    """Of a module that is imported when it is asked for what a stand-in has not."""
+
+    def __init__(self, name: str, file: str) -> None:
+        super().__init__(name)
+        self.__file__ = str(Path(sys.modules["torch"].__file__ or "").parent / file)  # inspect walks over all files
+        self._lock = RLock()
+
+    def __getattr__(self, name: str) -> Any:  # also `__path__`, which is asked for before a module inside is imported
+        return getattr(self._real(), name)
+
+    def _real(self) -> ModuleType:
+        with self._lock:
+            if sys.modules.get(self.__name__) is self:
+                del sys.modules[self.__name__]
+                self._hand_over(importlib.import_module(self.__name__))
+        return sys.modules[self.__name__]
+
+    def _hand_over(self, module: ModuleType) -> None: ...
+
+
+class _Shapes(_StandIn):
+    """Two functions of torch's symbolic shapes, for shapes of plain numbers."""
+
+    def __getattr__(self, name: str) -> Any:
+        if name == "__path__":  # is asked for by `from`: no module is inside of this one
+            raise AttributeError(name)
+        return super().__getattr__(name)
+
+    def sym_eq(self, x: Any, y: Any) -> Any:
+        plain = isinstance(x, tuple) and isinstance(y, tuple) and all(type(n) is int for n in (*x, *y))
+        return x == y if plain else self._real().sym_eq(x, y)
+
+    def expect_true(self, a: Any, skip: int = 0) -> bool:
+        return a if type(a) is bool else self._real().expect_true(a, skip + 1)
+
+
+class _Compiler(_StandIn):
     """Notes marks, which mean nothing until something is compiled; asked for anything else it imports the compiler."""
 
-    def __init__(self, name: str) -> None:
-        super().__init__(name)
-        self.__file__ = str(Path(sys.modules["torch"].__file__ or "").parent / "_dynamo" / "__init__.py")  # inspect walks over all files
-        self._lock, self._marks = RLock(), list[tuple[str, Marked]]()
+    def __init__(self, name: str, file: str) -> None:
+        super().__init__(name, file)
+        self._marks = list[tuple[str, Marked]]()
 
     def allow_in_graph(self, fn: Marked) -> Marked:
         self._marks.append(("allow_in_graph", fn))
@@ -100,21 +143,13 @@ class _Compiler(ModuleType):
     def graph_break(self, msg: str = "") -> None:
         """Nothing is compiled, and so nothing is broken off."""
 
-    def __getattr__(self, name: str) -> Any:  # also `__path__`, which is asked for before a module inside is imported
-        return getattr(self._real(), name)
-
-    def _real(self) -> ModuleType:
-        with self._lock:
-            if sys.modules.get(_COMPILER) is self:
-                del sys.modules[_COMPILER]
-                compiler = importlib.import_module(_COMPILER)
-                for name, fn in self._marks:
-                    if name != _DISABLED:
-                        getattr(compiler, name)(fn)
-                    elif getattr(fn, _DISABLED, None) is fn:
-                        delattr(fn, _DISABLED)
-                self._marks.clear()
-        return sys.modules[_COMPILER]
+    def _hand_over(self, module: ModuleType) -> None:
+        for name, fn in self._marks:
+            if name != _DISABLED:
+                getattr(module, name)(fn)
+            elif getattr(fn, _DISABLED, None) is fn:
+                delattr(fn, _DISABLED)
+        self._marks.clear()
 
 
 class _Found:

@@ -100,7 +100,7 @@ class Guarded:
             file.truncate(_BOARD.size + size)
             board, (channel, theirs) = Board(file.fileno(), size), socket.socketpair()
             with theirs:
-                settings = {"package": package, "interface": interface, "domain": domain, "late": late, "find": find}
+                settings = {"package": package, "interface": interface, "domain": domain, "late": late, "still": STILL, "find": find}
                 settings |= {"lies_down": lies_down, "channel": theirs.fileno(), "board": file.fileno()}
                 program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
                 process = subprocess.Popen(
@@ -166,9 +166,16 @@ class Guard:
     """The loop of the guard's process."""
 
     def __init__(
-        self, wire: Any, channel: socket.socket, board: Board, package: str, late: float = LATE, clock: Callable[[], float] = clock
+        self,
+        wire: Any,
+        channel: socket.socket,
+        board: Board,
+        package: str,
+        late: float = LATE,
+        clock: Callable[[], float] = clock,
+        still: float = STILL,
     ) -> None:
-        self.wire, self.channel, self.board, self.late, self.clock = wire, channel, board, late, clock
+        self.wire, self.channel, self.board, self.late, self.clock, self.still = wire, channel, board, late, clock, still
         self._size = _FRAME.size + LAYOUTS[package, "LowCmd_"].size
         self._buffer, self._latencies = b"", deque[float](maxlen=1 << 16)
         self._command, self._damping = b"", b""  # the command that is repeated; the one that replaces it after a trip
@@ -190,7 +197,7 @@ class Guard:
         """One look at both sides."""
         now = self.clock()
         still, self._looked = now - self._looked, now
-        if self._moving and still > STILL:
+        if self._moving and still > self.still:
             self.trip(f"nothing was sent for {1000 * still:.0f} ms: the guard stood still, or this computer slept")
         self._hear(now)
         if state := self.wire.receive():
@@ -277,7 +284,7 @@ def main() -> None:
         return
     board = Board(settings["board"], len(first.body))
     board.put(first.body, first.stamp)
-    guard = Guard(wire, channel, board, settings["package"], settings["late"])
+    guard = Guard(wire, channel, board, settings["package"], settings["late"], still=settings["still"])
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, guard.stop)
     guard.tell({"ready": True})
