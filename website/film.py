@@ -61,6 +61,7 @@ BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
     "g1_flat": FILM[2],
     "go1_getup": FILM[3],
     "go2_getup": FILM[3]._replace(policy="go2_getup"),
+    "g1_getup": FILM[3]._replace(policy="g1_getup", seconds=4.0, distance=2.4, elevation=-10.0),
     "go1_handstand": Shot("go1_handstand", (), begin=0.0, distance=1.9, height=0.1),
     "go1_footstand": Shot("go1_footstand", (), begin=0.0, distance=1.9, height=0.1),
     "g1_track": Shot("g1_track", (), begin=2.2, distance=2.6, elevation=-6.0, azimuth=40.0),

@@ -302,7 +302,7 @@ class RobotTaskCfgPPO(Config):
         use_clipped_value_loss: bool = True  # [P]
         schedule: Literal["adaptive", "fixed"] = "adaptive"  # fixed: `learning_rate` throughout [R; P fixed]
         desired_kl: Positive = 0.01  # between updates, for the adaptive schedule [R]
-        max_learning_rate: Part = 1e-2  # that the adaptive schedule goes up to; a memory wants 1e-3 (docs/training.md) [R]
+        max_learning_rate: Part = 1e-2  # that the adaptive schedule goes up to [R]; for a memory 1e-3: docs/training.md
         normalize_advantage_per_mini_batch: bool = False  # [R]
 
     class distillation:
