@@ -1,6 +1,11 @@
 """What one rank of tests/test_ranks.py does: learn a little together with the others, and write what it ended with."""
 
+# ruff: noqa: E402
 from __future__ import annotations
+
+from legged_mw.utils import quick_start
+
+quick_start.begin()  # before torch, as train.py does
 
 import os
 import sys
@@ -17,6 +22,7 @@ from legged_mw.rl.runner import make_runner
 from legged_mw.utils.cli import seed_everything
 from legged_mw.utils.task import load_task
 
+quick_start.settle()
 folder, dies_in, on_gpus = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:] == ["gpus"]
 rank = this_rank()
 device = f"cuda:{rank.local}" if on_gpus else "cpu"

@@ -1,6 +1,11 @@
 """What one rank of tests/test_ranks.py does: update rsl-rl's own learner and the recorded one from equal states and experience."""
 
+# ruff: noqa: E402
 from __future__ import annotations
+
+from legged_mw.utils import quick_start
+
+quick_start.begin()  # before torch, as train.py does
 
 import sys
 from pathlib import Path
@@ -12,6 +17,7 @@ from rsl_rl.algorithms import PPO
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import leave_together, this_rank
 
+quick_start.settle()
 folder, rank, on_gpus = Path(sys.argv[1]), this_rank(), sys.argv[2:] == ["gpus"]
 device = f"cuda:{rank.local}" if on_gpus else "cpu"
 if on_gpus:

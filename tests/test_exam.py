@@ -26,7 +26,7 @@ from legged_mw.deploy.exam import contract_rules
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.eval import exam, grading, report, rules
+from legged_mw.eval import exam, grading, plots, report, rules
 from legged_mw.eval.exams import EXAMS, find_exam, make_exam, require_exam
 from legged_mw.eval.peers import PEERS, best_of
 from legged_mw.eval.rollout import holding, roll_out
@@ -621,6 +621,7 @@ def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     """The table is printed, the figures go into the run folder; a user's own override still counts, the exam's worlds do not move."""
     for place in (exam, rules):  # by the environment, and by the export
         monkeypatch.setattr(place, "SECONDS", 2.1)
+    monkeypatch.setattr(plots, "sections", lambda *_: [])  # drawn in test_report
     folder = trained(tmp_path, "--max_iterations", "1")
     result = run("play", tmp_path, *SMALL[:2], "--device", "cpu", "--eval", "--set", "terrain.friction=0.4")
     assert result.code == 0, result.err
@@ -641,6 +642,7 @@ def test_ranges_from_the_command_line(tmp_path: Path, monkeypatch: pytest.Monkey
     """They scale the commands; the peer was asked others and is not spoken of. What the exam decides itself is refused."""
     monkeypatch.setattr(exam, "SECONDS", 2.1)
     monkeypatch.setattr(grading, "elsewhere", lambda *_: [])
+    monkeypatch.setattr(plots, "sections", lambda *_: [])
     folder = trained(tmp_path, "--max_iterations", "1")
     start = [*SMALL[:2], "--device", "cpu", "--eval"]
     result = run("play", tmp_path, *start, "--set", "exam.ranges={lin_vel_x: [0, 0.9]}")

@@ -58,19 +58,13 @@ def contacts(terrain: Terrain, places: np.ndarray, device: str) -> tuple[np.ndar
 def nearest(terrain: Terrain, place: np.ndarray) -> tuple[float, np.ndarray]:
     """Signed distance [m] of a point from the triangles around it, and the direction away from the ground; by brute force."""
     column, row = ((place[:2] - terrain.corner) / terrain.cell).astype(int)
-    best, direction = np.inf, np.zeros(3)
-    for r in range(row - 3, row + 4):
-        for c in range(column - 3, column + 4):
-            corners = [
-                np.array(
-                    [terrain.corner[0] + (c + i) * terrain.cell, terrain.corner[1] + (r + j) * terrain.cell, terrain.heights[r + j, c + i]]
-                )
-                for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))
-            ]
-            for triangle in ((0, 1, 2), (0, 2, 3)):
-                away = place - _closest(place, *(corners[k] for k in triangle))
-                if np.linalg.norm(away) < best:
-                    best, direction = float(np.linalg.norm(away)), away
+    c, r = np.meshgrid(np.arange(column - 3, column + 4), np.arange(row - 3, row + 4))
+    x, y = terrain.corner[0] + np.stack([c, c + 1]) * terrain.cell, terrain.corner[1] + np.stack([r, r + 1]) * terrain.cell
+    corners = np.array([[x[i], y[j], terrain.heights[r + j, c + i]] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
+    triangles = corners[[[0, 1, 2], [0, 2, 3]]].transpose(1, 3, 4, 0, 2).reshape(3, -1, 3)
+    each = place - _closest(place, *triangles)
+    direction = each[np.argmin(np.linalg.norm(each, axis=1))]
+    best = float(np.linalg.norm(direction))
     u, v = (place[:2] - terrain.corner) / terrain.cell - (column, row)
     a, b = terrain.heights[row, column], terrain.heights[row + 1, column + 1]
     side = terrain.heights[row, column + 1] if u >= v else terrain.heights[row + 1, column]
@@ -79,13 +73,17 @@ def nearest(terrain: Terrain, place: np.ndarray) -> tuple[float, np.ndarray]:
 
 
 def _closest(p: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
-    """The nearest point of a triangle: inside of it, or on one of its edges."""
-    n = np.cross(b - a, c - a)
-    foot = p - n * np.dot(p - a, n) / np.dot(n, n)
-    if all(np.dot(np.cross(e - s, foot - s), n) >= 0 for s, e in ((a, b), (b, c), (c, a))):
-        return foot
-    on_edges = [s + (e - s) * np.clip(np.dot(p - s, e - s) / np.dot(e - s, e - s), 0, 1) for s, e in ((a, b), (b, c), (c, a))]
-    return min(on_edges, key=lambda q: float(np.linalg.norm(p - q)))
+    """The nearest point of each triangle (T, 3): inside of it, or on one of its edges."""
+
+    def dot(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        return np.sum(x * y, axis=-1, keepdims=True)
+
+    n, edges = np.cross(b - a, c - a), ((a, b), (b, c), (c, a))
+    foot = p - n * dot(p - a, n) / dot(n, n)
+    inside = np.all([dot(np.cross(e - s, foot - s), n) >= 0 for s, e in edges], axis=0)
+    on_edges = np.array([s + (e - s) * np.clip(dot(p - s, e - s) / dot(e - s, e - s), 0, 1) for s, e in edges])
+    first = np.argmin(np.linalg.norm(p - on_edges, axis=2), axis=0)
+    return np.where(inside, foot, on_edges[first, np.arange(len(a))])
 
 
 def around(terrain: Terrain, count: int, low: float, high: float) -> np.ndarray:

@@ -35,6 +35,10 @@ except RuntimeError as error:
 else:
     raise AssertionError
 inspect.getmodule(inspect.currentframe())  # walks over all modules
+import tempfile
+group = dict(rank=0, world_size=1, init_method="file://" + tempfile.mktemp())
+torch.distributed.init_process_group("gloo", **group)
+torch.distributed.destroy_process_group()
 later = sys.modules["torch._dynamo"]
 assert later is torch._dynamo and "torch._dynamo.eval_frame" not in sys.modules and "sympy" not in sys.modules
 quick_start.settle()
@@ -44,6 +48,7 @@ marked = torch.optim.Optimizer.zero_grad.__wrapped__
 assert getattr(marked, "__dynamo_disable") is marked
 import torch._dynamo.config as config  # as `import` meets it, and as torch.compile does
 real = sys.modules["torch._dynamo"]
+assert later.trace_rules.lookup is real.trace_rules.lookup and real.trace_rules is sys.modules["torch._dynamo.trace_rules"]
 assert real is torch._dynamo is not later and real.config is config is sys.modules["torch._dynamo.config"]
 assert config.__spec__.loader is not None and later.config is config
 assert not hasattr(marked, "__dynamo_disable")

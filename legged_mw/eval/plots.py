@@ -130,13 +130,12 @@ def write_png(section: Section, path: Path) -> None:
     rows = math.ceil(len(section.panels) / across)
     width, height = section.panels[0].width, max(panel.height for panel in section.panels)
     with rc_context({**STYLE, "figure.facecolor": PAPER, "savefig.facecolor": PAPER}):
-        figure = Figure((across * width, rows * height + 0.4), layout="constrained")
+        figure = Figure((across * width, rows * height + 0.4), dpi=130, layout="constrained")
         figure.suptitle(section.title, x=0.012, ha="left", fontsize=11, fontweight="bold")
         figure.get_layout_engine().set(w_pad=0.12, h_pad=0.08)  # type: ignore[union-attr]
         for i, panel in enumerate(section.panels):
             panel.draw(figure.add_subplot(rows, across, i + 1, projection="polar" if panel.polar else None))
-        FigureCanvasAgg(figure)
-        figure.savefig(path, dpi=130)
+        FigureCanvasAgg(figure).print_png(path)  # savefig would draw it twice
 
 
 def _of(name: str, columns: Columns) -> str:

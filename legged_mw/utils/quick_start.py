@@ -118,12 +118,23 @@ class _Shapes(_StandIn):
         return a if type(a) is bool else self._real().expect_true(a, skip + 1)
 
 
+class _Rules(_StandIn):
+    """The compiler's rules, of which a process group clears what was looked up."""
+
+    def clear_lru_cache(self) -> None:
+        """Nothing was."""
+
+    def _real(self) -> ModuleType:
+        return importlib.import_module(self.__name__)
+
+
 class _Compiler(_StandIn):
     """Notes marks, which mean nothing until something is compiled; asked for anything else it imports the compiler."""
 
     def __init__(self, name: str, file: str) -> None:
         super().__init__(name, file)
         self._marks = list[tuple[str, Marked]]()
+        self.trace_rules: ModuleType = _Rules(f"{name}.trace_rules", "_dynamo/trace_rules.py")
 
     def allow_in_graph(self, fn: Marked) -> Marked:
         self._marks.append(("allow_in_graph", fn))
