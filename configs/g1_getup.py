@@ -25,7 +25,7 @@ class G1GetupCfg(GetupCfg):
 
     class control(GetupCfg.control):
         stiffness, damping = G1FlatCfg.control.stiffness, G1FlatCfg.control.damping
-        action_origin = "default"  # [ours: its servos stand it up in the pull, which of the present angles none did; docs/skills.md]
+        action_origin = "default"  # [ours: its servos alone stand it up in the pull; docs/skills.md]
         action_scale, decimation = G1FlatCfg.control.action_scale, G1FlatCfg.control.decimation  # 4 of it: the motors' whole torque [M]
 
     class normalization(GetupCfg.normalization):

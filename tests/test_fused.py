@@ -14,8 +14,6 @@ from legged_mw.envs.worlds import everything, fused_step
 from legged_mw.sim.fused import Fused, Kernel, Region
 from legged_mw.sim.fusion import fused as fuse
 from legged_mw.sim.fusion import remember
-from legged_mw.sim.ground_contact import HeightLookup
-from legged_mw.sim.terrain import make_terrain
 from legged_mw.utils.task import load_task
 from legged_mw.utils.trace import Trace, not_traced, tracing
 
@@ -244,21 +242,21 @@ def test_a_compiler_that_fails_leaves_the_step_as_it_is(monkeypatch: pytest.Monk
     assert capsys.readouterr().out == "the step is not fused: division by zero\n"
 
 
-def test_the_grounds_height_is_looked_up_within() -> None:
-    terrain = make_terrain(levels=2, proportions={"rough_slope": 1.0}, columns=1, tile=4.0, cell=0.05, border=1.0, seed=3)
-    lookup, draw = HeightLookup(terrain, "cpu"), torch.Generator().manual_seed(1)
-    places, out = torch.rand(N, 40, 2, generator=draw) * 10.0 - 4.0, torch.zeros(N, 40)  # some of them outside
+def test_what_a_call_returns_is_there_when_it_is_called_again() -> None:
+    """As of the lookup of the ground's height, which is a kernel of warp."""
+    memory = Memory()
 
-    def step() -> None:
-        out.copy_(lookup(places - 1.0) * 2.0)
+    class Lookup:
+        @not_traced
+        def __call__(self, places: Tensor) -> Tensor:
+            return places * 3.0
 
-    program = fused(step)
-    program.compile()
-    assert program.verify() == 0 and len(program.kernels) == 1 and not left_to_torch(program)
-    expected = out.clone()
-    program()
-    torch.testing.assert_close(out, expected)
-    assert len(out.unique()) > 40
+    lookup = Lookup()
+    step = fuse(lambda: [memory.out.copy_(lookup(memory.b + 1.0) - 1.0)].clear(), N, {"out": memory.out})
+    assert isinstance(step, Fused)
+    memory.b.fill_(2.0)
+    step()
+    assert (memory.out == 8.0).all()
 
 
 @pytest.fixture(scope="module")

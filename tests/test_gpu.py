@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 from collections.abc import Iterator
 from pathlib import Path
@@ -286,6 +287,26 @@ def test_more_iterations_are_recorded_too() -> None:
         for _ in range(6):
             _, reward, _, _ = env.step(torch.zeros(64, 12, device=DEVICE))
         assert env._graph.recorded and torch.isfinite(reward).all()
+
+
+def test_an_older_graph_that_nobody_needs_does_not_end_a_recording() -> None:
+    """Only the collector frees it, and one that frees it while another is recorded ends that."""
+    count = torch.zeros(4, device=DEVICE)
+
+    def step() -> None:
+        count.add_(1.0)
+        assert [[] for _ in range(100_000)]  # the collector's turn comes again and again
+
+    def recorded() -> StepGraph:
+        graph = StepGraph(step, DEVICE)
+        for _ in range(4):
+            graph()
+        return graph
+
+    ring: list[object] = [recorded()]
+    ring.append(ring)
+    del ring
+    assert recorded().recorded and (count == 8.0).all() and gc.isenabled()
 
 
 # ---- the learner ---------------------------------------------------------------------------------------------------

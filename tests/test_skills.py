@@ -119,6 +119,10 @@ def test_pull_lifts_and_fades() -> None:
     other = make("go1_getup", falls__states=4, falls__pull=0.5)
     other.load_training_state(env.training_state())
     assert other.pull.level == env.pull.level
+    with pytest.raises(ConfigError, match="falls.pull lifts the root, which perturbation.kick pushes: name another body in falls.pull_on"):
+        make("go1_getup", falls__states=4, falls__pull=0.5, perturbation__kick=True)
+    with pytest.raises(ConfigError, match="falls.pull_on: no body 'trunck' in .*; did you mean 'trunk'"):
+        make("go1_getup", falls__states=4, falls__pull=0.5, falls__pull_on="trunck")
 
 
 # ---- what an exam makes of a recording

@@ -15,7 +15,7 @@ from legged_mw.utils.errors import UserError
 
 FELL = 60.0  # [deg] between the robot's z axis and the vertical: the second policy takes over [ours: a walker does not come back]
 # It stands again, so that the first takes over, while it is [ours]:
-UP, NEAR, SLOW = 10.0, 0.35, 1.0  # [deg] tilted; [rad] from the first's default pose, each joint; [rad/s] of joints, the mean
+UP, NEAR, SLOW = 10.0, 0.3, 1.0  # [deg] tilted; [rad] from the first's default pose; [rad/s] of joints; means over them
 HOLD = 0.5  # [s] for so long
 
 
@@ -48,7 +48,7 @@ class SwitchStage(DeployStage):
     def _stood(self, measured: Measurement) -> np.ndarray:
         """(N,) Upright, near the first policy's default pose and slow, for HOLD."""
         upright = ~Ends(max_tilt=UP).tilted(measured.gravity)
-        near = np.abs(measured.joint_pos - self.contract.default_pose).max(axis=1) < NEAR
+        near = np.abs(measured.joint_pos - self.contract.default_pose).mean(axis=1) < NEAR
         slow = np.abs(measured.joint_vel).mean(axis=1) < SLOW
         self._standing = np.where(upright & near & slow, self._standing + 1, 0)
         return self._standing >= round(HOLD / self.dt)

@@ -12,6 +12,8 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.skill_config import SkillCfg
 from legged_mw.sim.settle import fallen
 from legged_mw.utils.bounds import Count, Part, Share, Whole, above
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
 from legged_mw.utils.math import assign
 
 Settling = Annotated[float, above(0, 60, "s")]
@@ -39,8 +41,18 @@ class Falls(RobotTask):
         states = fallen(self.robot.physics, min(falls.states, 4 * self.num_envs), falls.seed, falls.seconds)
         self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in states)  # (P, nq), (P, nv)
         self.up = self._zeros(dtype=torch.bool)  # (N,) as high and upright as one that stands
-        lifted = self.robot.id("body", falls.pull_on) if falls.pull_on else self.root_body
-        self.pull = Pull(self.sim, lifted, self.gravity_dir, falls.pull * 9.81 * self.total_mass, falls.pull_fades)
+        self.pull = Pull(self.sim, self._lifted(), self.gravity_dir, falls.pull * 9.81 * self.total_mass, falls.pull_fades)
+
+    def _lifted(self) -> int:
+        """The body that ``falls.pull`` lifts."""
+        falls, model = self.cfg.falls, self.robot.physics
+        names = [model.body(i).name for i in range(1, model.nbody)]
+        if falls.pull_on and falls.pull_on not in names:
+            raise ConfigError(f"falls.pull_on: {unknown('body', falls.pull_on, names, self.cfg.asset.file)}")
+        lifted = model.body(falls.pull_on).id if falls.pull_on else self.root_body
+        if falls.pull and lifted == self.root_body and self.cfg.perturbation.kick:
+            raise ConfigError("falls.pull lifts the root, which perturbation.kick pushes: name another body in falls.pull_on")
+        return lifted
 
     def _reset_robots(self, mask: Tensor) -> None:
         """Standing as any task begins, or, by chance, in one of the settled falls."""

@@ -84,7 +84,7 @@ class Writer(Lines):
             lines = []
         elif name in _REDUCTIONS:
             lines = self._reduce(node, name)
-        elif special := getattr(self, f"_emit_{name.replace('::', '_')}", None):
+        elif special := getattr(self, f"_emit_{name}", None):
             lines = special(*node.args, **node.kwargs)
         else:
             lines = self._elementwise(node, name)
@@ -337,20 +337,3 @@ class Writer(Lines):
         x, y = ([self._read(v, shape, [*at, str(k)]) if k else self._read(v, shape, [*at, "0"]) for k in range(3)] for v in (a, b))
         values = [f"float c{k} = {x[i]} * {y[j]} - {x[j]} * {y[i]};" for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1)))]
         return self._loops(shape[:-1], at, [*values, *(f"{self._write([*at, str(k) if k else '0'])} = c{k};" for k in range(3))])
-
-    def _emit_legged_mw_height(self, points: Tensor, heights: Tensor, x: float, y: float, per_cell: float) -> list[str]:
-        """As ``ground_contact._surface`` says it."""
-        at, place, field = self._index(self._out.shape), self._view(points), self._view(heights)
-        if self._shared or heights.dtype != torch.float32 or points.dtype != torch.float32:
-            raise Unfit
-        self._reads += [self._access(place, points.shape), Access(field, 0, field.offset, field.offset + span_of(field))]
-        lines = list[str]()
-        for k, (name, start, most) in enumerate((("u", x, heights.shape[1] - 2), ("v", y, heights.shape[0] - 2))):
-            value = self._at(place, place.strides, [*at, "0"], k * place.strides[-1])
-            lines.append(f"const float {name} = ({value} - {start!r}f) * {per_cell!r}f; int {name}0 = (int)floorf({name});")
-            lines.append(f"{name}0 = {name}0 < 0 ? 0 : {name}0 > {most} ? {most} : {name}0; float {name}1 = {name} - {name}0;")
-            lines.append(f"{name}1 = {name}1 > 0 ? {name}1 < 1 ? {name}1 : 1 : 0;")
-        corner = [self._at(field, field.strides, [f"(v0 + {row})", f"(u0 + {column})"]) for row, column in ((0, 0), (1, 1), (0, 1), (1, 0))]
-        lines.append(f"const float low = {corner[0]}, high = {corner[1]}, side = u1 >= v1 ? {corner[2]} : {corner[3]};")
-        value = "low + (side - low) * MAXIMUM(u1, v1) + (high - side) * MINIMUM(u1, v1)"
-        return self._loops(self._out.shape, at, [*lines, f"{self._write(at)} = {value};"])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from typing import Any
 
@@ -64,7 +65,8 @@ class StepGraph:
 
     def _record(self, stream: torch.cuda.Stream, wp: Any, wp_stream: Any) -> torch.cuda.CUDAGraph:
         """The graph of one call. Raises NotRecordable with the line of ``fn`` that failed, not with what then failed to end."""
-        graph, failed = torch.cuda.CUDAGraph(), None
+        graph, failed, collects = torch.cuda.CUDAGraph(), None, gc.isenabled()
+        gc.disable()  # an older graph that it frees meanwhile would end the recording
         try:
             with torch.cuda.graph(graph, stream=stream), wp.ScopedStream(wp_stream, sync_enter=False):
                 wp.capture_begin(stream=wp_stream, external=True)
@@ -80,6 +82,9 @@ class StepGraph:
             if isinstance(first, RuntimeError) and not out_of_memory(first):
                 raise _refused(first) from None
             raise first from None
+        finally:
+            if collects:
+                gc.enable()
         return graph
 
 

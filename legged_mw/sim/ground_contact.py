@@ -29,6 +29,7 @@ from torch import Tensor
 from legged_mw.sim.ground import PROBE_SPACING
 from legged_mw.sim.shapes import spheres_on
 from legged_mw.sim.terrain import Terrain
+from legged_mw.utils.trace import not_traced
 
 wp.set_module_options({"enable_backward": False})
 
@@ -62,26 +63,19 @@ class HeightLookup:
     """``height_map.HeightMap`` as one kernel: the contacts' own ground. For a GPU, where many small operations cost more than they do."""
 
     def __init__(self, terrain: Terrain, device: str) -> None:
-        self._heights = torch.tensor(terrain.heights, dtype=torch.float, device=device)
-        self._place = (*(float(x) for x in terrain.corner), 1.0 / terrain.cell)
+        self._device = wp.get_device(device)
+        with wp.ScopedDevice(self._device):
+            self._field = _field(terrain)
 
+    @not_traced
     def __call__(self, points: Tensor) -> Tensor:
         """Height [m] of the ground under ``points`` (..., 2) [m, world]; outside of the field, of its rim."""
-        return torch.ops.legged_mw.height(points, self._heights, *self._place)
-
-
-_OPERATIONS = torch.library.Library("legged_mw", "DEF")  # torch's dispatcher knows them, so that a fused step takes them in
-_OPERATIONS.define("height(Tensor points, Tensor heights, float x, float y, float per_cell) -> Tensor")
-
-
-@torch.library.impl(_OPERATIONS, "height", "CompositeExplicitAutograd")
-def _height(points: Tensor, heights: Tensor, x: float, y: float, per_cell: float) -> Tensor:
-    """What ``HeightLookup`` says, of a field of ``heights`` (rows, columns) [m] whose first one is at x, y [m]."""
-    device, field = wp.get_device(str(points.device)), _Field()
-    field.heights, field.corner, field.per_cell = wp.from_torch(heights), wp.vec2(x, y), per_cell
-    places, found = wp.from_torch(points.reshape(-1, 2), dtype=wp.vec2), torch.empty(points.shape[:-1], device=points.device)
-    wp.launch(_look_up, dim=found.numel(), inputs=[field, places], outputs=[wp.from_torch(found.view(-1))], device=device)
-    return found
+        heights = torch.empty(points.shape[:-1], device=points.device)
+        places = wp.from_torch(points.reshape(-1, 2), dtype=wp.vec2)
+        wp.launch(
+            _look_up, dim=heights.numel(), inputs=[self._field, places], outputs=[wp.from_torch(heights.view(-1))], device=self._device
+        )
+        return heights
 
 
 def touch_ground(model: mujoco.MjModel, ground: int, terrain: Terrain) -> Callable[[mjw.Model, mjw.Data], None]:

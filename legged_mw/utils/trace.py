@@ -97,14 +97,19 @@ class Trace(TorchDispatchMode):
         self.steps.append(Node(func, args, kwargs, outs, reads, writes))
         return result
 
-    def call(self, run: Callable[[], R], given: Iterable[Tensor] = ()) -> R:
-        """Run what is not looked into; of what the trace made it reads what it is ``given``."""
+    def call(self, run: Callable[[], object], given: Iterable[Tensor] = ()) -> Any:
+        """Run what is not looked into; of what the trace made it reads what it is ``given``. A tensor that it returns is kept."""
         self._paused = True
         try:
             result = run()
         finally:
             self._paused = False
-        self.steps.append(Call(run, tuple(self.view(tensor).block for tensor in given)))
+        blocks = [self.view(tensor).block for tensor in given]
+        if isinstance(result, Tensor):
+            blocks.append(self.view(result).block)
+            self.steps.append(Call(lambda: result.copy_(run()), tuple(blocks)))  # type: ignore[arg-type]
+        else:
+            self.steps.append(Call(run, tuple(blocks)))
         return result
 
     def __enter__(self) -> Trace:
