@@ -54,6 +54,7 @@ NOMINAL = {  # the robot as its contract states it
     "perturbation.kick": False,
     "perturbation.push": False,
     "gait.random_start": False,
+    "falls.pull": 0.0,
     "falls.share": 0.0,  # the many contacts of a robot that lies make much of rounding
     "motion.random_start": False,
     "motion.start_turn": [0.0, 0.0, 0.0],  # a deployed robot has the heading of its motion as it begins
