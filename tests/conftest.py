@@ -21,7 +21,7 @@ onnxscript_for_torch.get_torchlib_ops = cache(onnxscript_for_torch.get_torchlib_
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    quick_start.settle()  # what was imported is garbage never
+    quick_start.settle()  # what is imported by now stays
 
 
 def pytest_configure(config: pytest.Config) -> None:

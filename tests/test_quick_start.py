@@ -77,7 +77,12 @@ quick_start.begin()
 import torch
 from torch.fx.experimental.symbolic_shapes import expect_true, sym_eq
 assert sym_eq(torch.Size([2, 3]), torch.Size([2, 3])) is True and sym_eq((2, 3), (2,)) is False and expect_true(False) is False
-assert "sympy" not in sys.modules and not hasattr(sys.modules[expect_true.__module__], "__path__")
+import importlib.util
+import torch.fx.experimental.symbolic_shapes
+shapes = torch.fx.experimental.symbolic_shapes
+assert not hasattr(shapes, "__path__") and all(importlib.util.find_spec(name) for name in ("torch._dynamo", shapes.__name__))
+assert "sympy" not in sys.modules and shapes.guard_or_false(True) is True and "sympy" in sys.modules
+assert torch.fx.experimental.symbolic_shapes is sys.modules[shapes.__name__] is not shapes
 from torch.fx.experimental.symbolic_shapes import ShapeEnv
 assert "sympy" in sys.modules
 symbol = ShapeEnv().create_unbacked_symint()

@@ -73,21 +73,23 @@ def put_off_compiler() -> bool:
     version = tuple(int(part) for part in torch.__version__.split(".")[:2])
     if {_COMPILER, _SHAPES} & sys.modules.keys() or not _KNOWN[0] <= version <= _KNOWN[1]:
         return False
-    sys.modules[_COMPILER], sys.modules[_SHAPES] = (
-        _Compiler(_COMPILER, "_dynamo/__init__.py"),
-        _Shapes(_SHAPES, "fx/experimental/symbolic_shapes.py"),
-    )
+    shapes = _Shapes(_SHAPES, "fx/experimental/symbolic_shapes.py")
+    sys.modules[_COMPILER], sys.modules[_SHAPES] = _Compiler(_COMPILER, "_dynamo/__init__.py"), shapes
+    package, _, name = _SHAPES.rpartition(".")
+    setattr(importlib.import_module(package), name, shapes)  # as an import does; torch itself looks for its compiler in sys.modules
     sys.meta_path.insert(0, _Found())
     return True
 
 
 class _StandIn(ModuleType):
-    """Of a module that is imported when it is asked for what a stand-in has not."""
+    """Stands for a module, which is imported when something is asked for that this has not."""
+
+    _lock = RLock()  # one for all: each of the modules imports the other
 
     def __init__(self, name: str, file: str) -> None:
         super().__init__(name)
         self.__file__ = str(Path(sys.modules["torch"].__file__ or "").parent / file)  # inspect walks over all files
-        self._lock = RLock()
+        self.__spec__ = ModuleSpec(name, None, origin=self.__file__)  # for importlib.util.find_spec
 
     def __getattr__(self, name: str) -> Any:  # also `__path__`, which is asked for before a module inside is imported
         return getattr(self._real(), name)
