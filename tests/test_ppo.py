@@ -172,6 +172,16 @@ def test_the_adaptive_rate_goes_up_to_a_bound() -> None:
     assert ours.learning_rate == pytest.approx(2e-3)
 
 
+def test_a_rate_of_a_checkpoint_comes_down_to_the_bound() -> None:
+    fast, bounded = make(GraphedPPO), make(GraphedPPO, max_learning_rate=2e-3)
+    fast.learning_rate = 8e-3
+    bounded.load(fast.save(), None, True)
+    assert bounded.learning_rate == pytest.approx(2e-3)
+    same = make(GraphedPPO)
+    same.load(fast.save(), None, True)
+    assert same.learning_rate == pytest.approx(8e-3)
+
+
 def test_a_bound_that_rsl_rl_does_not_know_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"max_learning_rate is of the recorded update, and this is rsl-rl's own: the optimizer is SGD"):
         make(GraphedPPO, max_learning_rate=2e-3, optimizer="sgd")
@@ -179,6 +189,10 @@ def test_a_bound_that_rsl_rl_does_not_know_is_refused() -> None:
     task.set("algorithm.max_learning_rate", "0.002")
     task.set("algorithm.class_name", "PPO")
     with pytest.raises(ConfigError, match=r"rsl-rl's own PPO goes up to 0\.01; GraphedPPO takes another"):
+        rsl_rl_config(task.train)
+    task = load_task("go1_flat")
+    task.set("algorithm.max_learning_rate", "0.0005")
+    with pytest.raises(ConfigError, match=r"algorithm.learning_rate is 0\.001, above algorithm.max_learning_rate, 0\.0005; begin"):
         rsl_rl_config(task.train)
 
 

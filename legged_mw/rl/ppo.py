@@ -368,6 +368,13 @@ class GraphedPPO(Recorded, PPO):
 
     # ---- the learning rate --------------------------------------------------------------------------------------------
 
+    def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
+        """Take over a checkpoint; a rate that was learned without this bound comes down to it."""
+        iteration = super().load(loaded_dict, load_cfg, strict)
+        if self._max_rate != _MAX_RATE and self.schedule == "adaptive":
+            self.learning_rate = min(self.learning_rate, self._max_rate)
+        return iteration
+
     @property
     def rate(self) -> Tensor:
         """The learning rate as a tensor (), where it is: reading it waits for nothing."""

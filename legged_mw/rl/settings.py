@@ -37,6 +37,9 @@ def rsl_rl_config(cfg: RobotTaskCfgPPO, env: RobotTask | None = None) -> dict[st
         del algorithm["max_learning_rate"]
     elif algorithm["class_name"] in spellings(PPO):
         raise ConfigError(f"algorithm.max_learning_rate: rsl-rl's own {algorithm['class_name']} goes up to 0.01; GraphedPPO takes another")
+    elif algorithm.get("schedule") == "adaptive" and algorithm["learning_rate"] > algorithm["max_learning_rate"]:
+        rate, bound = algorithm["learning_rate"], algorithm["max_learning_rate"]
+        raise ConfigError(f"algorithm.learning_rate is {rate:g}, above algorithm.max_learning_rate, {bound:g}; begin at or below it")
     anneal = {name: (algorithm[name], end) for name, end in sections.pop("anneal").items()}
     flat = {key: runner[key] for key in keys} | {name: network_section(sections[name]) for name in ("actor", "critic")}
     return {**sections, **flat, "algorithm": algorithm, "anneal": anneal, "logger": logger, "check_for_nan": False}

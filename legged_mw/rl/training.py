@@ -195,7 +195,7 @@ def train(
     """
     teacher = start.teacher.task.train if start.teacher else None
     rank, runner = this_rank(), make_runner(env, task.train, None, str(env.device), teacher)
-    fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)  # now: a learner that cannot be takes no seconds
+    fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)  # last: it takes seconds
     runner.examine, runner.console.verbose, runner.deadline = examine, verbose, deadline
     with ExitStack() as held:
         lock = held.enter_context(_lock(start)) if start.goes_on and rank.leads else None
