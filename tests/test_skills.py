@@ -252,6 +252,12 @@ def check_switch(rescuer: Path) -> None:
     stage.put(np.tile(stage.fleet.model.key_qpos[0], (2, 1)), np.zeros_like(stage.fleet.qvel))  # as if it got up
     stood = [bool(stage._stood(stage.measured)[1]) for _ in range(25)]
     assert stood == [False] * 24 + [True]  # half a second
+    for joints, stands in ((slice(7, 10), True), (slice(7, 19), False)):  # a leg aside; folded
+        qpos = np.tile(stage.fleet.model.key_qpos[0], (2, 1))
+        qpos[:, joints] += 0.4
+        stage.put(qpos, np.zeros_like(stage.fleet.qvel))
+        assert [bool(stage._stood(stage.measured)[1]) for _ in range(25)][-1] is stands
+    stage.put(np.tile(stage.fleet.model.key_qpos[0], (2, 1)), np.zeros_like(stage.fleet.qvel))
     stage._stood = lambda measured: np.array([False, True])  # type: ignore[method-assign]
     stage.step()
     assert not stage.rescued[1]
