@@ -129,7 +129,7 @@ def write_png(section: Section, path: Path) -> None:
     across = min(section.across, len(section.panels))
     rows = math.ceil(len(section.panels) / across)
     width, height = section.panels[0].width, max(panel.height for panel in section.panels)
-    with rc_context({**STYLE, "figure.facecolor": PAPER, "savefig.facecolor": PAPER}):
+    with rc_context({**STYLE, "figure.facecolor": PAPER}):
         figure = Figure((across * width, rows * height + 0.4), dpi=130, layout="constrained")
         figure.suptitle(section.title, x=0.012, ha="left", fontsize=11, fontweight="bold")
         figure.get_layout_engine().set(w_pad=0.12, h_pad=0.08)  # type: ignore[union-attr]
