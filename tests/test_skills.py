@@ -252,7 +252,7 @@ def check_switch(rescuer: Path) -> None:
     stage.put(np.tile(stage.fleet.model.key_qpos[0], (2, 1)), np.zeros_like(stage.fleet.qvel))  # as if it got up
     stood = [bool(stage._stood(stage.measured)[1]) for _ in range(25)]
     assert stood == [False] * 24 + [True]  # half a second
-    for joints, stands in ((slice(7, 10), True), (slice(7, 19), False)):  # a leg aside; folded
+    for joints, stands in ((slice(7, 10), True), (slice(7, 19), False)):  # one leg aside; all of them
         qpos = np.tile(stage.fleet.model.key_qpos[0], (2, 1))
         qpos[:, joints] += 0.4
         stage.put(qpos, np.zeros_like(stage.fleet.qvel))
