@@ -1,8 +1,8 @@
 """Where the time goes from the command to the first iterations: python benchmarks/startup.py --task go1_flat
 
 A fresh process runs train.py, and each of its parts is timed; other flags are train.py's. Warm: the second of two runs, when kernels
-and files are cached. --plain leaves out what legged_mw/utils/quick_start.py does; --profile tells which functions the first iteration
-spends its time in, and which large packages were imported until then, by whom.
+and files are cached. --plain leaves out what legged_mw/utils/quick_start.py does; --profile shows which functions the first iteration
+spends its time in, and which large packages were imported until then, and from where.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Importers:
             calls = [f"{Path(f.filename).parent.name}/{Path(f.filename).name}:{f.lineno}" for f in traceback.extract_stack()[:-1]]
             self._by[package] = " < ".join([call for call in reversed(calls) if "importlib" not in call][:4])
 
-    def tell(self) -> None:
+    def show(self) -> None:
         """The large packages among all that is imported by now."""
         count = Counter(package_of(name) for name in sys.modules)
         for package, modules in count.most_common():
@@ -78,7 +78,7 @@ class Importers:
 
 
 def package_of(name: str) -> str:
-    """The package that a module counts for; torch's own are told apart."""
+    """The package that a module counts for; each of torch's own counts alone."""
     return ".".join(name.split(".")[: 2 if name.startswith("torch.") else 1])
 
 
@@ -127,7 +127,7 @@ def child(flags: list[str], device: str | None, plain: bool, profile: bool, star
             profiler.disable()
             for order in ("cumulative", "tottime"):
                 pstats.Stats(profiler).sort_stats(order).print_stats(60)
-            importers.tell()
+            importers.show()
 
     runner._update = count(clock, runner._update, first)
     sys.argv = ["train.py", *flags]
@@ -185,24 +185,24 @@ def main() -> None:
         child(flags, args.device, args.plain, args.profile, args.started)
         return
     table: dict[str, list[float]] = {}
-    modules, told = dict[str, int](), list[str]()
+    modules, others = dict[str, int](), list[str]()
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
     for _ in range(2):
         command = [sys.executable, __file__, *sys.argv[1:], "--started", str(time.time())]
         with tempfile.TemporaryDirectory() as folder:  # for logs/
             out = subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout
-        told.clear()
+        others.clear()
         for line in out.splitlines():
             if found := re.fullmatch(r"(\d+\.\d{3}) (\d+) (.+)", line):
                 table.setdefault(found[3], []).append(float(found[1]))
                 modules[found[3]] = int(found[2])
             else:
-                told.append(line)
+                others.append(line)
     parts = [what for what in table if what.startswith(PART)]
     table[FIRST] = [sum(each) for each in zip(*(table[what] for what in (*parts, FIRST)), strict=True)]
     modules[FIRST] += sum(modules[what] for what in parts)
     if args.profile:
-        print("\n".join(told))
+        print("\n".join(others))
     print(f"{'':<48}{'first':>8}{'warm':>8}   [s]  modules")
     for what, values in table.items():
         print(f"{what:<48}" + "".join(f"{value:>8.2f}" for value in values) + f"{modules[what]:>14}")

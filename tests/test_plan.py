@@ -24,14 +24,14 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
 
 def follow(plan: Plan, clock: list[float], seconds: dict[int, float], pace: float, begin: int = 0, late: int = 0) -> list[float]:
     """What is done in each iteration, of ``pace`` seconds or what ``seconds`` says of the n-th; heard of so many iterations ``late``."""
-    done, iteration, told = [], begin, []
+    done, iteration, estimates = [], begin, []
     while iteration < plan.last:
         done.append(plan.begin(iteration))
         iteration += 1
         clock[0] += seconds.get(len(done), pace)
-        told.append((iteration, plan.room()))
-        if len(told) > late:
-            plan.hear(*told[-1 - late])
+        estimates.append((iteration, plan.room()))
+        if len(estimates) > late:
+            plan.hear(*estimates[-1 - late])
     return done
 
 
