@@ -307,6 +307,27 @@ def test_kicks_grow_by_a_share_of_the_way() -> None:
         assert env.perturbation.kick_level.tolist() == [level, 0.0]
 
 
+@pytest.mark.parametrize("engine", ["mujoco", "mujoco_warp"])
+def test_kicks_grow_between_two_shares_of_a_training(engine: str) -> None:
+    """Not with an episode: a kick that was drawn before grows too. Where nothing trains they are all there."""
+    settings = {
+        **QUIET,
+        "sim.engine": engine,
+        "perturbation.kick": True,
+        "perturbation.velocity": [2.0, 2.0],
+        "perturbation.growth": [0.2, 0.6],
+    }
+    env, kicks = make_env(1, {**settings, "perturbation.interval": [0.02, 0.02], "perturbation.duration": [200.0, 200.0]}), []
+    env.perturbation._clock.fill_(5001.0)  # [control steps] in the middle of a kick of 200 s
+    for done in (None, 0.0, 0.2, 0.3, 0.6, 1.0):
+        if done is not None:
+            env.anneal(done)
+        env.step(torch.zeros(1, env.num_actions))
+        kicks.append(float(env.perturbation.kick_force.norm()))
+    full = env.perturbation._mass * 2.0 / 2.0 / 200.0
+    assert kicks == pytest.approx([full, 0.0, 0.0, 0.25 * full, full, full], rel=1e-3, abs=1e-9)
+
+
 def test_kicks_are_at_full_strength_without_the_curriculum() -> None:
     env = make_env(4, {"perturbation.kick": True, "perturbation.velocity": [2.0, 2.0]})
     env.reset()

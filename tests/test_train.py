@@ -515,16 +515,20 @@ def test_numbers_go_to_their_end_in_a_straight_line(monkeypatch: pytest.MonkeyPa
     task.set("anneal.entropy_coef", 0.0)
     task.set("rewards.tracking_sigma", 0.25)
     task.set("rewards.tracking_sigma_end", 0.05)
+    task.set("perturbation.growth", [0.25, 0.75])
     env = LeggedRobot(task.cfg, "cpu")
     runner = make_runner(env, task.train, None, "cpu")
     alg, update = runner.alg, runner.alg.update
-    monkeypatch.setattr(alg, "update", lambda: (seen.append((alg.desired_kl, alg.entropy_coef, float(env.tracking_sigma))), update())[1])
+    kicks = env.perturbation
+    now = lambda: (alg.desired_kl, alg.entropy_coef, float(env.tracking_sigma), float(kicks.growth))  # noqa: E731
+    monkeypatch.setattr(alg, "update", lambda: (seen.append(now()), update())[1])
     rolled, step = [], env.step
     monkeypatch.setattr(env, "step", lambda actions: (rolled.append(float(env.tracking_sigma)), step(actions))[1])
     runner.learn(5)
-    kl, entropy, sigma = zip(*seen, strict=True)
+    kl, entropy, sigma, growth = zip(*seen, strict=True)
     assert kl == pytest.approx([0.01, 0.008, 0.006, 0.004, 0.002])
     assert entropy == (0.005,) * 5
+    assert growth == (0.0, 0.0, 0.5, 1.0, 1.0)
     assert sigma == pytest.approx([0.25, 0.2, 0.15, 0.1, 0.05]) == list(dict.fromkeys(rolled))
     env.anneal(0.0)  # as a new environment has it
     runner.current_learning_iteration, first = 3, len(rolled)

@@ -61,6 +61,7 @@ class LeggedRewards(RobotRewards):
 
     def anneal(self, done: float) -> None:
         """A training is ``done`` so far, from 0 to 1: ``tracking_sigma`` on its way to ``rewards.tracking_sigma_end``."""
+        super().anneal(done)
         begin, end = self.cfg.rewards.tracking_sigma, self.cfg.rewards.tracking_sigma_end
         if isinstance(self.tracking_sigma, Tensor):
             self.tracking_sigma.fill_(begin + (end - begin) * done)

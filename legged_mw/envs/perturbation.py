@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +30,7 @@ class Perturbation:
         self.kick_force = zeros(3)  # (N, 3) on the root, world frame [N]
         self.kick_active = zeros(dtype=torch.bool)  # (N,)
         self.kick_level = zeros().fill_(0.0 if cfg.curriculum else 1.0)  # (N,) share of the range of dv that is drawn from
+        self.growth: Tensor | float = torch.ones((), device=device) if cfg.growth else 1.0  # () share of dv that a training has come to
         interval = cfg.push_interval_s / dt
         self._push_clock = zeros().uniform_(0.0, interval).round_() if cfg.push else zeros()  # [control steps] to go
 
@@ -38,6 +40,11 @@ class Perturbation:
             self._kick_robots()
         if self.cfg.push:
             self._push_robots()
+
+    def anneal(self, done: float) -> None:
+        """A training is ``done`` so far, from 0 to 1: kicks grow between the shares ``growth`` of it."""
+        if isinstance(self.growth, Tensor):
+            self.growth.fill_(float(np.interp(done, self.cfg.growth, [0.0, 1.0])))
 
     def update_level(self, mask: Tensor, survived: Tensor) -> None:
         """Where ``mask`` (N,) is true: go from the level so far towards the share of an episode that was ``survived`` (N,).
@@ -58,7 +65,7 @@ class Perturbation:
         wait, steps, angle, speed = self._kick.unbind(dim=1)
         elapsed = self._clock - wait
         self.kick_active.copy_((elapsed >= 0.0) & (elapsed < steps))
-        peak = 0.5 * self._mass * speed / (steps * self._dt)
+        peak = 0.5 * self._mass * speed * self.growth / (steps * self._dt)
         force = torch.where(self.kick_active, torch.sin(math.pi * elapsed / steps) * peak, 0.0)
         self.kick_force[:, 0] = force * torch.cos(angle)
         self.kick_force[:, 1] = force * torch.sin(angle)

@@ -141,7 +141,7 @@ class RobotRewards:
         return torch.tensor(indices, dtype=torch.long, device=self.device)
 
     def anneal(self, done: float) -> None:
-        """A training is ``done`` so far, from 0 to 1: what changes with it."""
+        """A training is ``done`` so far, from 0 to 1: what terms change with it."""
 
     def _remember_for_rewards(self) -> None:
         """The end of a step: what the next one compares with. ``last_actions`` are still those of the step before."""

@@ -3,6 +3,7 @@
 Everything under ``_step`` is recorded as one CUDA graph: fixed buffers, masks instead of index lists, no question to
 the host. Shapes: N environments, D joints, K reward terms. A reward is a method ``_reward_<name>``, switched on
 by a number of that name in ``cfg.rewards.scales``; it returns (N,) and only reads. The terms are in ``robot_rewards``.
+What the policy sees is a table of rows: ``robot_observations``.
 
 Freshness: ``qpos`` and ``qvel`` and all that is computed from them are current. What comes from sensors (contacts,
 places and velocities of sites, accelerometer, joint torque) is one simulation step old and zero in a world just reset.
@@ -11,7 +12,6 @@ places and velocities of sites, accelerometer, joint torque) is one simulation s
 from __future__ import annotations
 
 import math
-from functools import cached_property
 
 import torch
 from tensordict import TensorDict
@@ -24,17 +24,16 @@ from legged_mw.envs.contacts import GroundContacts
 from legged_mw.envs.divergence import Divergence
 from legged_mw.envs.domain_rand import DomainRand, world_fields
 from legged_mw.envs.loading import load_robot, soft_limits, start_place
-from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
-from legged_mw.envs.observations import Observations, Row
+from legged_mw.envs.observations import Observations
 from legged_mw.envs.own_code import check_term, checked_rows
 from legged_mw.envs.perturbation import Perturbation
+from legged_mw.envs.robot_observations import RobotObservations
 from legged_mw.envs.robot_rewards import RobotRewards
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import Statistics
 from legged_mw.envs.suspects import Suspects
 from legged_mw.envs.wording import in_config_words
 from legged_mw.sim.engines import make_simulation, pick_engine
-from legged_mw.sim.mirror import Partners, find_partners
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.commands import Command
@@ -43,7 +42,7 @@ from legged_mw.utils.errors import unknown
 from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse, spread
 
 
-class RobotTask(TorqueLaw, RobotRewards, BaseTask):
+class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
     """N robots in N worlds of their own, as one vectorized environment. A task is a subclass with its rewards and its rows."""
 
     cfg: RobotTaskCfg
@@ -184,6 +183,11 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         if self.cfg.perturbation.curriculum:
             self.perturbation.update_level(mask, self._share_survived())
 
+    def anneal(self, done: float) -> None:
+        """A training is ``done`` so far, from 0 to 1: kicks, and what the terms change with it."""
+        self.perturbation.anneal(done)
+        super().anneal(done)
+
     def _reset_robots(self, mask: Tensor) -> None:
         """Root near its start with any heading and a small velocity, joints and servo targets at (or near) the default pose."""
         n = self.num_envs
@@ -221,49 +225,7 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
         share = torch.where(self.time_out_buf, 1.0, self.episode_steps[:, 0] / self.max_episode_length)
         return torch.where(self.episode_steps[:, 0] > 0.0, share, -1.0)
 
-    # ---- observations: the table is the only place that states the layout ------------------------------------------------
-
-    def observation_rows(self) -> dict[str, list[Row | str]]:
-        """Rows of each group, in order; a name stands for a group above it. Asked once: values are buffers of the step."""
-        return {
-            "state": [*self._measured_rows()],
-            "privileged_state": ["state", *self._body_rows(), *self._disturbance_rows()],  # first the same noisy sample
-        }
-
-    def _measured_rows(self) -> list[Row]:
-        """What a robot measures or estimates of itself, with noise, and its last action."""
-        noise = self.cfg.noise.scales
-        return [
-            Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", measured=True),  # at the IMU, body frame [m/s]
-            Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", measured=True),  # gyro, body frame [rad/s]
-            Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar", measured=True),  # direction, body frame
-            Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", measured=True),  # minus the default pose [rad]
-            Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", measured=True),  # [rad/s]
-            Row("last_actions", self.last_actions, mirror="joint"),  # a_t, clipped
-        ]
-
-    def _body_rows(self) -> list[Row]:
-        """The same without noise, and more, as only a simulator knows it."""
-        return [
-            Row("base_ang_vel", self.base_ang_vel, mirror="axial"),
-            Row("accelerometer", self.accelerometer, mirror="polar"),  # proper acceleration at the IMU [m/s^2]
-            Row("projected_gravity", self.projected_gravity, mirror="polar"),
-            Row("base_lin_vel", self.base_lin_vel, mirror="imu_velocity"),
-            Row("base_ang_vel_world", self.base_ang_vel_world, mirror="axial"),  # [rad/s]; the world mirrors about its own x-z plane
-            Row("dof_pos", self.dof_offset, mirror="joint"),
-            Row("dof_vel", self.dof_vel, mirror="joint"),
-            Row("torques", self.torques, mirror="joint"),  # [N m]
-        ]
-
-    def _disturbance_rows(self) -> list[Row]:
-        """Kicks, and with ``domain_rand.observe`` what was drawn, in the config's units."""
-        rand = self.domain_rand
-        drawn = [Row(name, value, mirror=rand.mirrors[name]) for name, value in rand.values.items() if self.cfg.domain_rand.observe]
-        return [
-            Row("kick_force", self.perturbation.kick_force, mirror="polar"),  # on the root, world frame [N]
-            Row("kick_active", self.perturbation.kick_active[:, None], mirror="scalar"),  # 0 or 1
-            *drawn,
-        ]
+    # ---- observations -------------------------------------------------------------------------------------------------
 
     def compute_observations(self) -> None:
         """Fill ``obs_buf`` as the table says."""
@@ -281,24 +243,6 @@ class RobotTask(TorqueLaw, RobotRewards, BaseTask):
             lambda width: self.domain_rand.delay("observation_delay", width),
         )
         self.obs_buf = self.observations.buffers
-
-    @cached_property
-    def mirror(self) -> Mirror:
-        """Observations and actions left for right, from the table; made when first asked for, and not for the step."""
-        return make_mirror(self.observations.groups, self._mirror_blocks(), self._mirror_reach(), self.device)
-
-    def _mirror_blocks(self) -> dict[str, Block]:
-        """Kinds of mirror image that rows may have, by name."""
-        partners = self._partners()
-        check_pose(self.robot.joint_names, self.default_dof_pos.tolist(), partners)
-        return robot_blocks(partners)
-
-    def _partners(self) -> Partners:
-        return find_partners(self.robot)
-
-    def _mirror_reach(self) -> float:
-        """[m] from the mirrored IMU to the IMU."""
-        return 2.0 * float(self.imu_pos[0, 1])
 
     # ---- reward -------------------------------------------------------------------------------------------------------
 

@@ -28,6 +28,7 @@ from legged_mw.utils.bounds import (
     Seconds,
     Seed,
     Share,
+    Shares,
     Sizes,
     Speed,
     Whole,
@@ -162,6 +163,7 @@ class RobotTaskCfg(Config):
         velocity: Kicks = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
         curriculum: bool = False  # a world's dv grows with the share of an episode that it survives, from 0 [ours]
         curriculum_rate: Part = 0.5  # by which share of the way it does, at the end of an episode, from above 0 to 1 [ours]
+        growth: Shares = []  # kicks grow from none to all between these shares of a training, [0.2, 0.5]; empty: all at once [ours]
         push: bool = False  # the root's horizontal velocity becomes a random one; beside kicks or alone [L]
         push_interval_s: Seconds = 15.0  # between pushes, each world's clock its own [s] [L]
         max_push_vel_xy: Speed = 1.0  # each axis U(-max, max) [m/s] [L]
@@ -343,7 +345,7 @@ class RobotTaskCfgPPO(Config):
         hidden_dims: Sizes = [128, 64, 32]  # of actor and critic
         rnn_hidden_dim: Count = 64  # likewise
         max_iterations: Count = 2600
-        overrides: dict[str, Any] = {}  # fields of the environment: dotted path -> value
+        overrides: dict[str, Any] = {}  # any field of the task: dotted path -> value
         update_threads: Threads = 0  # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one
 
     class symmetry:

@@ -81,6 +81,7 @@ ShareRange = Annotated[list[Share], PAIR]
 # Of a range that nothing needs to be drawn from: empty, it is left out
 Factors = Annotated[list[Annotated[float, above(0, 1000)]], or_empty(PAIR)]
 Offsets = Annotated[list[float], or_empty(PAIR)]
+Shares = Annotated[list[Share], or_empty(PAIR)]
 Delays = Annotated[list[NonNegative], or_empty(PAIR)]
 WholeDelays = Annotated[list[Whole], or_empty(PAIR)]
 
