@@ -196,6 +196,16 @@ def test_a_bound_that_rsl_rl_does_not_know_is_refused() -> None:
         rsl_rl_config(task.train)
 
 
+def test_a_bound_beside_a_fixed_rate_is_refused() -> None:
+    task = load_task("go1_flat")
+    task.set("algorithm.schedule", "fixed")
+    assert "max_learning_rate" not in rsl_rl_config(task.train)["algorithm"]  # the default is not refused
+    task.set("algorithm.max_learning_rate", "0.002")
+    text = r"max_learning_rate is 0\.002, but algorithm.schedule is 'fixed', .* Leave the bound at 0\.01, or take the schedule 'adaptive'"
+    with pytest.raises(ConfigError, match=text):
+        rsl_rl_config(task.train)
+
+
 class Encoder(MLPModel):
     """Learns something in a place that the recorded update would not reach."""
 

@@ -34,7 +34,7 @@ from legged_mw.rl.undo import Undo
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.config import ConfigError
 
-_MIN_RATE, _MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
+_MIN_RATE, MAX_RATE, _RATE_STEP = 1e-5, 1e-2, 1.5  # of the adaptive learning rate, as in rsl-rl
 
 
 class Minibatch(NamedTuple):
@@ -58,12 +58,13 @@ class GraphedPPO(Recorded, PPO):
 
     critic_only = False  # of a warm start: the actor stays as it is
     half = False  # see ``learn_in_half``
+    _bound: float | None  # of the adaptive learning rate, where it is another than rsl-rl's
     _plain_rate: float  # the learning rate where nothing is recorded
     _rate: Tensor | None = None  # else: () float64, as precise as rsl-rl's Python number
 
     def __init__(self, actor: MLPModel, critic: MLPModel, storage: RolloutStorage, **settings: Any) -> None:
         self._recurrent = actor.is_recurrent or critic.is_recurrent
-        symmetry, self._max_rate = settings.pop("symmetry_cfg", None), settings.pop("max_learning_rate", _MAX_RATE)
+        symmetry, self._bound = settings.pop("symmetry_cfg", None), settings.pop("max_learning_rate", None)
         super().__init__(actor, critic, storage, symmetry_cfg=None if self._recurrent else symmetry, **settings)
         reason = self._why_stock()
         self.graphed = reason is None
@@ -71,7 +72,7 @@ class GraphedPPO(Recorded, PPO):
             check_recurrent(storage.num_envs, self.num_mini_batches, symmetry, self.graphed)
             self.symmetry = Symmetry(**symmetry) if symmetry else None  # rsl-rl refuses mirror images here
         if reason:
-            if self._max_rate != _MAX_RATE:
+            if self._bound:
                 raise ConfigError(f"algorithm.max_learning_rate is of the recorded update, and this is rsl-rl's own: {reason}")
             print(f"PPO: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
             return
@@ -338,11 +339,12 @@ class GraphedPPO(Recorded, PPO):
     def _adapt_rate(self, kl: Tensor) -> None:
         """rsl-rl's rule: slower where the policy moved more than twice as far as wanted, faster where less than half."""
         assert self._rate is not None
+        highest = self._bound or MAX_RATE
         if kernels := kernels_for(kl):
-            kernels.launch(kernels.adapt_rate, 1, kl, self._desired_kl, self._rate, self._adam_rate, _RATE_STEP, _MIN_RATE, self._max_rate)
+            kernels.launch(kernels.adapt_rate, 1, kl, self._desired_kl, self._rate, self._adam_rate, _RATE_STEP, _MIN_RATE, highest)
             return
         slower = (self._rate / _RATE_STEP).clamp(min=_MIN_RATE)
-        faster = (self._rate * _RATE_STEP).clamp(max=self._max_rate)
+        faster = (self._rate * _RATE_STEP).clamp(max=highest)
         rate = torch.where((kl < self._desired_kl / 2.0) & (kl > 0.0), faster, self._rate)
         self._rate.copy_(torch.where(kl > self._desired_kl * 2.0, slower, rate))
         self._adam_rate.copy_(self._rate)
@@ -371,8 +373,8 @@ class GraphedPPO(Recorded, PPO):
     def load(self, loaded_dict: dict, load_cfg: dict | None, strict: bool) -> bool:
         """Take over a checkpoint; a rate that was learned without this bound comes down to it."""
         iteration = super().load(loaded_dict, load_cfg, strict)
-        if self._max_rate != _MAX_RATE and self.schedule == "adaptive":
-            self.learning_rate = min(self.learning_rate, self._max_rate)
+        if self._bound:
+            self.learning_rate = min(self.learning_rate, self._bound)
         return iteration
 
     @property

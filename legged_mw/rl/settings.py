@@ -11,6 +11,7 @@ from rsl_rl.algorithms import PPO
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.rl.classes import actor_settings, check_classes, network_section, spellings
+from legged_mw.rl.ppo import MAX_RATE
 from legged_mw.utils.config import ConfigError
 
 
@@ -33,13 +34,24 @@ def rsl_rl_config(cfg: RobotTaskCfgPPO, env: RobotTask | None = None) -> dict[st
     mirrors = symmetry["use_data_augmentation"] or symmetry["use_mirror_loss"]
     symmetry_cfg = {"data_augmentation_func": "legged_mw.rl.symmetry:mirror", **symmetry} if mirrors else None
     algorithm = {"rnd_cfg": None, "symmetry_cfg": symmetry_cfg, **sections.pop("algorithm")}
-    if algorithm.get("max_learning_rate") == 1e-2:  # rsl-rl's, which knows no other
-        del algorithm["max_learning_rate"]
-    elif algorithm["class_name"] in spellings(PPO):
-        raise ConfigError(f"algorithm.max_learning_rate: rsl-rl's own {algorithm['class_name']} goes up to 0.01; GraphedPPO takes another")
-    elif algorithm.get("schedule") == "adaptive" and algorithm["learning_rate"] > algorithm["max_learning_rate"]:
-        rate, bound = algorithm["learning_rate"], algorithm["max_learning_rate"]
-        raise ConfigError(f"algorithm.learning_rate is {rate:g}, above algorithm.max_learning_rate, {bound:g}; begin at or below it")
+    _check_bound(algorithm)
     anneal = {name: (algorithm[name], end) for name, end in sections.pop("anneal").items()}
     flat = {key: runner[key] for key in keys} | {name: network_section(sections[name]) for name in ("actor", "critic")}
     return {**sections, **flat, "algorithm": algorithm, "anneal": anneal, "logger": logger, "check_for_nan": False}
+
+
+def _check_bound(algorithm: dict[str, Any]) -> None:
+    """Take ``max_learning_rate`` out where it is rsl-rl's own, so that any class may be named; refuse one that nothing would read."""
+    if algorithm["max_learning_rate"] == MAX_RATE:
+        del algorithm["max_learning_rate"]
+        return
+    name, rate, bound = (algorithm[key] for key in ("class_name", "learning_rate", "max_learning_rate"))
+    if name in spellings(PPO):
+        raise ConfigError(f"algorithm.max_learning_rate: rsl-rl's own {name} goes up to {MAX_RATE:g}; GraphedPPO takes another")
+    if algorithm["schedule"] == "fixed":
+        raise ConfigError(
+            f"algorithm.max_learning_rate is {bound:g}, but algorithm.schedule is 'fixed', which has no bound: "
+            f"the rate is algorithm.learning_rate throughout. Leave the bound at {MAX_RATE:g}, or take the schedule 'adaptive'"
+        )
+    if rate > bound:
+        raise ConfigError(f"algorithm.learning_rate is {rate:g}, above algorithm.max_learning_rate, {bound:g}; begin at or below it")
