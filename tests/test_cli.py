@@ -404,8 +404,9 @@ def test_a_cpu_takes_its_own_section_and_what_the_user_says_wins(tmp_path: Path)
     config, few = load_yaml(saved), load_task("go1_flat").train.cpu
     assert config["env"]["num_envs"] == 5 and config["algorithm"]["desired_kl"] == 0.015
     assert config["actor"]["hidden_dims"] == config["critic"]["hidden_dims"] == few.hidden_dims
-    assert config["perturbation"]["curriculum"] == few.overrides["perturbation.curriculum"] == True  # noqa: E712
-    assert config["commands"]["keep_probability"] == few.overrides["commands.keep_probability"] == [0.7, 0.25, 0.5]
+    assert config["perturbation"]["growth"] == few.overrides["perturbation.growth"] == [0.15, 0.4]
+    assert config["commands"]["keep_probability"] == few.overrides["commands.keep_probability"] == [0.6, 0.25, 0.75]
+    assert config["algorithm"]["entropy_coef"] == few.overrides["algorithm.entropy_coef"] == 0.01
     result = run("train", tmp_path / "off", *TASK, "--device", "cpu", *asked, "--set", "cpu.enable=false")
     assert result.code == 0, result.err
     [saved] = (tmp_path / "off/logs/go1_flat").glob("*/config.yaml")
@@ -451,6 +452,7 @@ def test_play_says_what_it_changes(root: Path, first: Path, tmp_path: Path) -> N
     changes = {line.split(": ")[0]: line.split(": ")[1] for line in lines if " -> " in line}
     commands = was["commands"]
     assert changes == {
+        "commands.curriculum": "True -> False",
         "commands.ranges.ang_vel_yaw": f"{commands['ranges']['ang_vel_yaw']} -> [0.25, 0.25]",
         "commands.ranges.lin_vel_x": f"{commands['ranges']['lin_vel_x']} -> [-0.5, -0.5]",
         "commands.ranges.lin_vel_y": f"{commands['ranges']['lin_vel_y']} -> [0.0, 0.0]",

@@ -881,6 +881,15 @@ def test_a_wrong_override_of_a_cpu_is_named(path: str, value: Any, text: str) ->
         task.fit_cpu(cores=1)
 
 
+@pytest.mark.parametrize("name", ["go1_flat_dr", "go1_flat_fast", "go1_rough", "examples/go1_playground.py", "examples/go1_mjlab.py"])
+def test_on_a_cpu_rewards_stay_those_of_a_task_that_subclasses_another(name: str) -> None:
+    task, first = load_task(name), load_task("go1_flat")
+    rewards = (task.cfg.to_dict()["rewards"], first.cfg.to_dict()["rewards"])
+    task.fit_cpu(cores=1)
+    first.fit_cpu(cores=1)
+    assert task.cfg.to_dict()["rewards"] == rewards[0] and first.cfg.to_dict()["rewards"] != rewards[1]
+
+
 # ---- the name `configs`
 
 FAST = """from configs.go1_flat import {base}
