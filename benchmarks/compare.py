@@ -202,23 +202,12 @@ def measure_playground(order: Order) -> Measured:
     os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_gpu_triton_gemm_any=True"
     os.environ["XLA_PYTHON_CLIENT_PREALLOCATE"] = "false"
     import jax
-    from brax.training.agents.ppo import networks
-    from brax.training.agents.ppo import train as ppo
-    from mujoco_playground import registry, wrapper
     from mujoco_playground.config import locomotion_params
 
-    task, impl = FRAMEWORKS["playground"].tasks[order.ground], order.impl
+    task = FRAMEWORKS["playground"].tasks[order.ground]
     machine = jax.devices()[0].device_kind if order.device != "cpu" else cpu_name()  # fails here without a GPU build of jax
-    notes = [f"MJX in {impl} (--playground-impl; its task says warp, its training script jax)"]
-    cfg = registry.get_default_config(task)
-    contacts = cfg.naconmax * math.ceil(order.num_envs / 8192)  # the default's buffer is for 8192 worlds
-    env = registry.load(task, config=cfg, config_overrides={"impl": impl, "naconmax": contacts})
-    if impl == "warp" and hasattr(env.mjx_model.opt._impl, "warn_overflow"):
-        env._mjx_model = env.mjx_model.tree_replace({"opt._impl.warn_overflow": 0})  # as for mjlab
-        notes.append(QUIET)
-    if not hasattr(jax, "device_put_replicated"):  # jax 0.10 dropped it, brax 0.14.2 calls it once, at the start
-        jax.device_put_replicated = lambda tree, devices: jax.tree.map(lambda x: jax.numpy.stack([x] * len(devices)), tree)
-    params = locomotion_params.brax_ppo_config(task, impl).to_dict()
+    env, rewards, changed = load_playground(task, order)
+    params = locomotion_params.brax_ppo_config(task, order.impl).to_dict()
     layers = params.pop("network_factory")
     sizes = env.observation_size
     facts = {
@@ -229,29 +218,56 @@ def measure_playground(order: Order) -> Measured:
         "critic": network(sizes[layers["value_obs_key"]][0], layers["value_hidden_layer_sizes"]),
         "matrix products": "jax's default, tf32",
         **physics_facts(env.mj_model, env.n_substeps),
-        "rewards": f"{sum(scale != 0 for scale in cfg.reward_config.scales.values())}",
+        "rewards": f"{rewards}",
     }
+    seconds, steps = time_brax(env, params, layers, order)
+    notes = [
+        f"MJX in {order.impl} (--playground-impl; its task says warp, its training script jax)",
+        *changed,
+        "an update takes its default of 8192 rollouts; beyond 8192 worlds one of each, and its buffer for contacts grows",
+        "its resets of all worlds and its evaluations, now and then between updates, are left out",
+    ]
+    return Measured(seconds, steps, steps // params["num_minibatches"], machine, facts, notes)
+
+
+def load_playground(task: str, order: Order) -> tuple[Any, int, list[str]]:
+    """Its environment, how many reward terms that has, and a note on what is changed of it, if anything is."""
+    from mujoco_playground import registry
+
+    cfg = registry.get_default_config(task)
+    contacts = cfg.naconmax * math.ceil(order.num_envs / 8192)  # the default's buffer is for 8192 worlds
+    env = registry.load(task, config=cfg, config_overrides={"impl": order.impl, "naconmax": contacts})
+    rewards = sum(scale != 0 for scale in cfg.reward_config.scales.values())
+    if order.impl == "warp" and hasattr(env.mjx_model.opt._impl, "warn_overflow"):
+        env._mjx_model = env.mjx_model.tree_replace({"opt._impl.warn_overflow": 0})  # as for mjlab
+        return env, rewards, [QUIET]
+    return env, rewards, []
+
+
+def time_brax(env: Any, params: dict[str, Any], layers: dict[str, Any], order: Order) -> tuple[list[float], int]:
+    """Train with brax's PPO: seconds an iteration, one figure a round, and environment steps an iteration."""
+    import jax
+    from brax.training.agents.ppo import networks
+    from brax.training.agents.ppo import train as ppo
+    from mujoco_playground import wrapper
+
+    if not hasattr(jax, "device_put_replicated"):  # jax 0.10 dropped it, brax 0.14.2 calls it once, at the start
+        jax.device_put_replicated = lambda tree, devices: jax.tree.map(lambda x: jax.numpy.stack([x] * len(devices)), tree)
     rollouts = order.num_envs * max(1, params["batch_size"] * params["num_minibatches"] // order.num_envs)
     if rollouts % params["num_minibatches"]:
         raise ValueError(f"{rollouts} rollouts are not {params['num_minibatches']} minibatches; take a power of two for --num_envs")
-    params["batch_size"] = rollouts // params["num_minibatches"]
     steps = rollouts * params["unroll_length"]
     marks: list[float] = []  # ends of epochs: the first two compile, each further one is a round
-    params |= {"num_envs": order.num_envs, "num_evals": 3 + ROUNDS, "num_timesteps": (2 + ROUNDS) * order.iterations * steps}
+    asked = {"num_envs": order.num_envs, "num_evals": 3 + ROUNDS, "num_timesteps": (2 + ROUNDS) * order.iterations * steps}
     ppo.train(
         env,
-        **{**params, "num_resets_per_eval": 0},
+        **{**params, **asked, "batch_size": rollouts // params["num_minibatches"], "num_resets_per_eval": 0},
         run_evals=False,
         network_factory=functools.partial(networks.make_ppo_networks, **layers),
         wrap_env_fn=wrapper.wrap_for_brax_training,
         progress_fn=lambda *_: marks.append(time.perf_counter()),  # called with the device idle
     )
-    seconds = [(end - start) / order.iterations for start, end in itertools.pairwise(marks[1:])]
-    notes += [
-        "an update takes its default of 8192 rollouts; beyond 8192 worlds one of each, and its buffer for contacts grows",
-        "its resets of all worlds and its evaluations, now and then between updates, are left out",
-    ]
-    return Measured(seconds, steps, steps // params["num_minibatches"], machine, facts, notes)
+    return [(end - start) / order.iterations for start, end in itertools.pairwise(marks[1:])], steps
 
 
 MEASURE: dict[str, Callable[[Order], Measured]] = {

@@ -93,18 +93,35 @@ def child(flags: list[str], device: str | None, plain: bool, profile: bool, star
     clock.done("interpreter, flags")
     if not plain:
         quick_start.begin(device)
+    gpu = import_libraries(clock, device)
+    runner = look_into_training(clock)
+    if gpu:
+        look_into_steps(clock)
+    runner._update = count(clock, runner._update, profile_learning(runner, importers) if profile else lambda: None)
+    sys.argv = ["train.py", *flags]
+    programs.train()
+
+
+def import_libraries(clock: Clock, device: str | None) -> bool:
+    """Time what train.py imports of others. Returns whether it is for a GPU."""
     import torch
 
     clock.done("import torch")
     import_module("mujoco")
     clock.done("import mujoco")
-    if torch.cuda.is_available() and device != "cpu":  # elsewhere MuJoCo's own engine steps
+    gpu = torch.cuda.is_available() and device != "cpu"
+    if gpu:  # elsewhere MuJoCo's own engine steps
         import_module("warp")
         clock.done("import warp (for a GPU)")
         import_module("mujoco_warp")
         clock.done("import mujoco_warp (for a GPU)")
     import_module("rsl_rl.runners")
     clock.done("import rsl_rl, tensordict")
+    return gpu
+
+
+def look_into_training(clock: Clock) -> Any:
+    """Import legged_mw, and time what a training does before its first step. Returns the class of its runner."""
     modules = {name: import_module(f"legged_mw.{name}") for name in ("rl.training", "check.guard", "check.describe", "eval.exams")}
     clock.done("import legged_mw")
     clock.after(modules["rl.training"], "configure", "task, config, open the device")
@@ -115,23 +132,21 @@ def child(flags: list[str], device: str | None, plain: bool, profile: bool, star
     clock.after(modules["rl.training"], "_open_run", "run folder")
     runner = import_module("legged_mw.rl.runner").Runner
     clock.after(runner, "_open_curves", "TensorBoard writer, git")
-    if torch.cuda.is_available() and device != "cpu":
-        look_into_steps(clock)
-    profiler = cProfile.Profile() if profile else None
-    if profiler:
-        learn = runner.learn
-        runner.learn = lambda *args, **kwargs: profiler.runcall(learn, *args, **kwargs)
+    return runner
 
-    def first() -> None:
-        if profiler:
-            profiler.disable()
-            for order in ("cumulative", "tottime"):
-                pstats.Stats(profiler).sort_stats(order).print_stats(60)
-            importers.show()
 
-    runner._update = count(clock, runner._update, first)
-    sys.argv = ["train.py", *flags]
-    programs.train()
+def profile_learning(runner: Any, importers: Importers) -> Callable[[], None]:
+    """Profile ``runner.learn`` until the function that this returns is called, which shows what was found."""
+    learn, profiler = runner.learn, cProfile.Profile()
+    runner.learn = lambda *args, **kwargs: profiler.runcall(learn, *args, **kwargs)
+
+    def show() -> None:
+        profiler.disable()
+        for order in ("cumulative", "tottime"):
+            pstats.Stats(profiler).sort_stats(order).print_stats(60)
+        importers.show()
+
+    return show
 
 
 def look_into_steps(clock: Clock) -> None:

@@ -168,59 +168,65 @@ def test_joints_that_cannot_be_told_apart(tmp_path: Path) -> None:
 # ---- observations and actions
 
 
-def test_one_observation_by_hand(env: LeggedRobot) -> None:
+Sides = tuple[list[float], list[float]]  # numbers, and those of their mirror image
+
+
+def joints_by_hand() -> Sides:
+    """1 to 12: right and left change places, and hips their sign."""
     joints = [f"{leg}{k}" for leg in FEET for k in range(3)]
     swapped = {"FR": "FL", "FL": "FR", "RR": "RL", "RL": "RR"}
-    value = {name: float(i + 1) for i, name in enumerate(joints)}  # 1 to 12
+    value = {name: float(i + 1) for i, name in enumerate(joints)}
     mirrored = [(-1.0 if name[2] == "0" else 1.0) * value[swapped[name[:2]] + name[2]] for name in joints]
     assert mirrored == [-4.0, 5.0, 6.0, -1.0, 2.0, 3.0, -10.0, 11.0, 12.0, -7.0, 8.0, 9.0]
-    plain = [value[name] for name in joints]
-    state = {
+    return [value[name] for name in joints], mirrored
+
+
+def rows_by_hand() -> dict[str, dict[str, Sides]]:
+    """Group -> row -> numbers."""
+    joints = joints_by_hand()
+    state: dict[str, Sides] = {
         "base_lin_vel": ([1.0, 2.0, 3.0], [1.0 + REACH * 3.0, -2.0, 3.0 - REACH * 1.0]),  # the IMU stays on its side
         "base_ang_vel": ([1.0, 2.0, 3.0], [-1.0, 2.0, -3.0]),
         "projected_gravity": ([0.1, 0.2, -0.9], [0.1, -0.2, -0.9]),
-        "dof_pos": (plain, mirrored),
-        "dof_vel": (plain, mirrored),
-        "last_actions": (plain, mirrored),
+        "dof_pos": joints,
+        "dof_vel": joints,
+        "last_actions": joints,
         "commands": ([0.5, 0.3, 0.7], [0.5 + REACH * 0.7, -0.3, -0.7]),
     }
-    whole = tuple([number for row in state.values() for number in row[side]] for side in (0, 1))
-    privileged = {
-        "state": whole,
+    privileged: dict[str, Sides] = {
+        "state": side_by_side(state),
         "base_ang_vel": state["base_ang_vel"],
         "accelerometer": ([1.0, 2.0, 9.0], [1.0, -2.0, 9.0]),
         "projected_gravity": state["projected_gravity"],
         "base_lin_vel": state["base_lin_vel"],
         "base_ang_vel_world": ([4.0, 5.0, 6.0], [-4.0, 5.0, -6.0]),
-        "dof_pos": (plain, mirrored),
-        "dof_vel": (plain, mirrored),
-        "torques": (plain, mirrored),
+        "dof_pos": joints,
+        "dof_vel": joints,
+        "torques": joints,
         "foot_contact": ([1.0, 0.0, 0.0, 1.0], [0.0, 1.0, 1.0, 0.0]),
-        "foot_lin_vel": (plain, [4.0, -5.0, 6.0, 1.0, -2.0, 3.0, 10.0, -11.0, 12.0, 7.0, -8.0, 9.0]),
+        "foot_lin_vel": (joints[0], [4.0, -5.0, 6.0, 1.0, -2.0, 3.0, 10.0, -11.0, 12.0, 7.0, -8.0, 9.0]),
         "feet_air_time": ([1.0, 2.0, 3.0, 4.0], [2.0, 1.0, 4.0, 3.0]),
         "kick_force": ([1.0, 2.0, 0.0], [1.0, -2.0, 0.0]),
         "kick_active": ([1.0], [1.0]),
     }
-    assert {group: list(rows) for group, rows in layout(env).items()} == {
-        "state": list(state),
-        "privileged_state": list(privileged),
-    }
-    sides = [
-        TensorDict(
-            {
-                "state": torch.tensor([whole[side]]),
-                "privileged_state": torch.tensor([[number for row in privileged.values() for number in row[side]]]),
-            },
-            batch_size=[1],
-        )
-        for side in (0, 1)
-    ]
-    obs, actions = mirror(env=env, obs=sides[0], actions=torch.tensor([plain]))  # by keyword, as rsl-rl calls it
+    return {"state": state, "privileged_state": privileged}
+
+
+def side_by_side(rows: dict[str, Sides]) -> Sides:
+    plain, mirrored = ([number for row in rows.values() for number in row[side]] for side in (0, 1))
+    return plain, mirrored
+
+
+def test_one_observation_by_hand(env: LeggedRobot) -> None:
+    rows = rows_by_hand()
+    assert {group: list(table) for group, table in layout(env).items()} == {group: list(table) for group, table in rows.items()}
+    numbers = {group: side_by_side(table) for group, table in rows.items()}
+    seen, image = (TensorDict({group: torch.tensor([both[i]]) for group, both in numbers.items()}, batch_size=[1]) for i in (0, 1))
+    plain, mirrored = joints_by_hand()
+    obs, actions = mirror(env=env, obs=seen, actions=torch.tensor([plain]))  # by keyword, as rsl-rl calls it
     assert obs is not None and actions is not None and obs.batch_size == torch.Size([2])
-    for group in ("state", "privileged_state"):
-        torch.testing.assert_close(
-            obs[group], torch.cat([sides[0][group], sides[1][group]]), msg=lambda text, group=group: f"{group}: {text}"
-        )
+    for group in numbers:
+        torch.testing.assert_close(obs[group], torch.cat([seen[group], image[group]]), msg=lambda text, group=group: f"{group}: {text}")
     assert actions.tolist() == [plain, mirrored]
 
 
