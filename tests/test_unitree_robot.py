@@ -318,6 +318,30 @@ def test_it_is_laid_down_before_its_own_program_lets_go(domain: int) -> None:
     assert sim.end.calls == [CHECK_MODE, STAND_DOWN, RELEASE_MODE, CHECK_MODE] and sim.end.program == ""
 
 
+@pytest.mark.parametrize("lost", [2, 5])
+def test_a_motion_service_whose_first_answers_are_lost_is_asked_again(domain: int, lost: int) -> None:
+    """A robot answers before it has discovered who listens; four more questions, a second apart, are enough of them."""
+    folder = POLICIES / "go2_flat"
+
+    class Lossy(RobotEnd):
+        heard = 0
+
+        def answer(self) -> None:
+            if self._requests.read(10):
+                self.heard += 1
+                self._requests.take(10) if self.heard <= lost else super().answer()
+
+    sim = SimulatedUnitree(folder, read_contract(folder), end := Lossy("unitree_go", "lo", domain))
+    wire = Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time)
+    if lost == 5:
+        with pytest.raises(RobotError, match="the robot's motion service does not answer"):
+            wire.prepare()
+        assert end.heard == lost and end.program == "normal"
+    else:
+        wire.prepare()
+        assert end.calls == [CHECK_MODE, RELEASE_MODE, CHECK_MODE] and end.program == ""
+
+
 def test_a_motion_program_that_does_not_let_go(domain: int) -> None:
     folder = POLICIES / "go2_flat"
 

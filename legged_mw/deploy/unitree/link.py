@@ -228,15 +228,19 @@ class Wire:
             raise RobotError(f"the robot's motion service answers {answer[:80]!r}, which does not say which program runs: nothing was sent")
         return printable(name)
 
-    def _ask(self, call: int) -> str:
-        """One call of the motion service; returns its data."""
-        request = _request(call)
-        self._requests.write(request)
-        mine = request.header.identity.id
-        found = self._until(lambda: [a for a in _taken(self._answers, 10) if a.header.identity.id == mine], 2.0)
-        if not found:
-            raise RobotError("the robot's motion service does not answer: nothing was sent; restart the robot")
-        return found[0].data
+    def _ask(self, call: int, tries: int = 5) -> str:
+        """One call of the motion service; returns its data.
+
+        Asked again each second: an answer is lost that the robot sent before it had discovered who listens for it.
+        """
+        asked: set[int] = set()
+        for _ in range(tries):
+            request = _request(call)
+            asked.add(request.header.identity.id)
+            self._requests.write(request)
+            if found := self._until(lambda: [a for a in _taken(self._answers, 10) if a.header.identity.id in asked], 1.0):
+                return found[0].data
+        raise RobotError("the robot's motion service does not answer: nothing was sent; restart the robot")
 
 
 class RobotEnd:
