@@ -279,7 +279,8 @@ def drive(folder: Path, contract: Contract, address: tuple[str, int], command: F
             velocity = f"vx {measured.lin_vel[0]:6.2f} m/s  vy {measured.lin_vel[1]:6.2f} m/s  yaw rate {measured.ang_vel[2]:6.2f} rad/s"
             print(f"{now:6.1f} s  {velocity}", flush=True)
 
-    done = run(UdpRobot(contract, address), Controller(folder, contract), lambda _: command, seconds, watch=tell)
+    controller = Controller(folder, contract)  # first: a robot that is taken waits half a second for a target
+    done = run(UdpRobot(contract, address), controller, lambda _: command, seconds, watch=tell)
     if done.fell is not None:
         print(f"it fell after {done.fell:.1f} s; its servos were switched off")
     if done.velocity is not None:
