@@ -76,7 +76,8 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     device = pick_device(rank_device(rank, args.device))
     if fitted := device == "cpu" and task.train.cpu.enable and not start.run:
         task.fit_cpu(usable_cores())
-        print("on a CPU the section cpu sets worlds, networks, learner and its overrides; flags win, --set cpu.enable=false leaves it out")
+        fields = ", ".join(["worlds", "networks", "learner", *task.train.cpu.overrides])
+        print(f"on a CPU the section cpu sets {fields}; flags win, --set cpu.enable=false leaves it out")
     if start.policy:
         task.update({"actor": start.policy.task.train.to_dict()["actor"]}, where="--init")
     if fitted or start.policy:
