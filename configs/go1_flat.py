@@ -79,7 +79,7 @@ class Go1FlatCfgPPO(LeggedRobotCfgPPO):
 class Go1FlatTaskCfgPPO(Go1FlatCfgPPO):
     """On a CPU this task changes rewards and commands too; a task of your own subclasses Go1FlatCfgPPO, which does not."""
 
-    class cpu(Go1FlatCfgPPO.cpu):  # [ours: given 8 minutes on two cores, three of five seeds walked; docs/lab.md]
+    class cpu(Go1FlatCfgPPO.cpu):  # [ours: five of five seeds walk; given 8 minutes on two cores, three; docs/lab.md]
         desired_kl = 0.03
         max_iterations = 1200
         overrides = {

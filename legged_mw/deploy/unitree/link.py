@@ -240,7 +240,9 @@ class Wire:
             self._requests.write(request)
             if found := self._until(lambda: [a for a in _taken(self._answers, 10) if a.header.identity.id in asked], 1.0):
                 return found[0].data
-        sent = "nothing was sent" if call == CHECK_MODE else "no motor command was sent, but its own program may have let go: hold the robot"
+        sent = "nothing was sent"
+        if call != CHECK_MODE:
+            sent = "no motor command was sent, but its own program may have let go: hold the robot"
         raise RobotError(f"the robot's motion service does not answer: {sent}; restart the robot")
 
 
