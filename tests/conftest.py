@@ -5,6 +5,7 @@ from legged_mw.utils import quick_start
 
 quick_start.begin()  # before torch, as train.py does
 
+import signal
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -26,6 +27,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     torch.set_num_threads(1)  # hundreds of small operations a step stall on a second thread
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # `make test &` ignores it, and so would programs that tests end
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
