@@ -399,6 +399,7 @@ def test_a_cpu_takes_its_own_section_and_what_the_user_says_wins(tmp_path: Path)
     result = run("train", tmp_path, *TASK, "--device", "cpu", *asked)
     assert result.code == 0, result.err
     assert "go1_flat: 5 worlds on cpu, engine mujoco\n" in result.out
+    assert "sets worlds, networks, learner, commands.keep_probability, " in result.out and "algorithm.entropy_coef; flags win" in result.out
     assert re.search(r"^\d+ cores: 1 iterations, 0.0 M steps, about 0 min$", result.out, re.MULTILINE)
     [saved] = (tmp_path / "logs/go1_flat").glob("*/config.yaml")
     config, few = load_yaml(saved), load_task("go1_flat").train.cpu

@@ -135,6 +135,8 @@ class Received(NamedTuple):
 class Wire:
     """The program's end: states come in, commands go out. Nothing is sent before ``send``."""
 
+    _sent = "nothing was sent"  # so far, for errors
+
     def __init__(
         self,
         package: str,
@@ -210,6 +212,7 @@ class Wire:
         for attempt in range(tries):
             if not (name := self._program()):
                 return
+            self._sent = "no motor command was sent, but its own program may have let go: hold the robot"
             if lies_down and attempt == 0 and self._sport.get_matched_subscriptions():
                 self._sport.write(_request(STAND_DOWN))
                 self._until(lambda: False, moment)
@@ -225,7 +228,7 @@ class Wire:
         except (ValueError, RecursionError):
             name = None
         if not isinstance(name, str):
-            raise RobotError(f"the robot's motion service answers {answer[:80]!r}, which does not say which program runs: nothing was sent")
+            raise RobotError(f"the robot's motion service answers {answer[:80]!r}, which does not say which program runs: {self._sent}")
         return printable(name)
 
     def _ask(self, call: int, tries: int = 5) -> str:
@@ -240,10 +243,7 @@ class Wire:
             self._requests.write(request)
             if found := self._until(lambda: [a for a in _taken(self._answers, 10) if a.header.identity.id in asked], 1.0):
                 return found[0].data
-        sent = "nothing was sent"
-        if call != CHECK_MODE:
-            sent = "no motor command was sent, but its own program may have let go: hold the robot"
-        raise RobotError(f"the robot's motion service does not answer: {sent}; restart the robot")
+        raise RobotError(f"the robot's motion service does not answer: {self._sent}; restart the robot")
 
 
 class RobotEnd:
