@@ -1,18 +1,29 @@
-"""go1_flat, ended after 400 iterations (52 M steps), with nothing annealed."""
+"""go1_flat in a minute and a half on one H200: less energy, kicks that grow, a narrower sigma at the end, and bfloat16."""
 
 from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.utils.task import Task
 
 
+class Go1FlatFastCfg(Go1FlatCfg):  # [ours: three of three seeds beat the peer after 58 to 74 s, one at its end; docs/lab.md]
+    class commands(Go1FlatCfg.commands):
+        keep_probability = [0.7, 0.25, 0.5]  # to stand and to turn on the spot are asked for more often
+
+    class rewards(Go1FlatCfg.rewards):
+        tracking_sigma_end = 0.12
+
+        class scales(Go1FlatCfg.rewards.scales):
+            energy = -0.002
+
+    class perturbation(Go1FlatCfg.perturbation):
+        curriculum = True
+        interval = [1.5, 4.0]  # [s]
+
+
 class Go1FlatFastCfgPPO(Go1FlatCfgPPO):
     class runner(Go1FlatCfgPPO.runner):
-        max_iterations = 400  # 52 M steps
-        save_interval = 30
-
-    class anneal(Go1FlatCfgPPO.anneal):
-        entropy_coef = 0.0  # stays
-        desired_kl = 0.0  # stays
+        max_iterations = 1040  # 136 M steps
+        matmul_precision = "bf16"
 
 
-TASK = Task(LeggedRobot, Go1FlatCfg, Go1FlatFastCfgPPO)
+TASK = Task(LeggedRobot, Go1FlatFastCfg, Go1FlatFastCfgPPO)
