@@ -2,7 +2,7 @@
 
 python benchmarks/odometry.py go1_flat              # the exam, each way of finding feet on the ground
 python benchmarks/odometry.py go1_flat --noise      # the same with the noise of sensors
-python benchmarks/odometry.py go1_rough --stairs    # six seconds outwards from the middle of each square of terrain.xml
+python benchmarks/odometry.py go1_rough --stairs    # six seconds outwards from the middle of each square of terrain.mjz
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -24,6 +24,7 @@ from legged_mw.deploy.contract import TERRAIN_FILE, Contract, read_contract
 from legged_mw.deploy.exam import run_exam
 from legged_mw.deploy.odometry import CONTACTS, Odometry
 from legged_mw.deploy.robot import Measurement
+from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.stage import DeployStage
 
 ACCELERATION, BIAS = 0.5, 0.2  # [m/s^2] standard deviation of each value, and of a constant a robot
@@ -90,8 +91,8 @@ def kicks(folder: Path, contract: Contract, contact: str | None) -> str:
 
 
 def stairs(folder: Path, contract: Contract, contact: str | None) -> str:
-    """A line of the table: from the middle of each square of terrain.xml in all directions."""
-    model = mujoco.MjModel.from_xml_path(str(folder / TERRAIN_FILE))
+    """A line of the table: from the middle of each square of terrain.mjz in all directions."""
+    model = read_scene(folder, contract, TERRAIN_FILE).model
     centre, middles = model.key_qpos[0][:3], squares(model)
     count = len(middles) * HEADINGS
     walk = DeployStage(folder, count, (SPEED, 0.0, 0.0), scene_file=TERRAIN_FILE, contact=contact)
@@ -117,7 +118,7 @@ def stairs(folder: Path, contract: Contract, contact: str | None) -> str:
 
 
 def squares(model: Any) -> list[tuple[float, float]]:
-    """Middles of the squares of terrain.xml, which are 8 m wide."""
+    """Middles of the squares of terrain.mjz, which are 8 m wide."""
     boxes = [i for i in range(model.ngeom) if model.geom_bodyid[i] == 0 and model.geom_type[i] == mujoco.mjtGeom.mjGEOM_BOX]
     inside = [place for place in model.geom_pos[boxes, :2] if np.abs(place).max() < 12.0]
     return sorted({(8.0 * round(float(x) / 8.0), 8.0 * round(float(y) / 8.0)) for x, y in inside})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import shutil
+import zipfile
 from pathlib import Path
 
 import mujoco
@@ -13,7 +14,7 @@ import torch
 from worlds import QUIET, make_env
 
 from legged_mw import ROOT
-from legged_mw.deploy.contract import ContractError, read_contract
+from legged_mw.deploy.contract import TERRAIN_FILE, ContractError, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.simulated import Fleet, MujocoRobot
 from legged_mw.deploy.stage import DeployStage
@@ -21,6 +22,7 @@ from legged_mw.rl.export_scene import among_steps
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import make_terrain
 from legged_mw.utils.config import load_yaml, save_yaml
+from legged_mw.utils.mjcf import MOST_BYTES, check_files, write_archive
 
 SHIPPED = ROOT / "resources/policies/go1_rough_scan"
 
@@ -101,7 +103,7 @@ def test_it_walks_behind_the_seam() -> None:
 
 def test_among_steps_it_stands_on_boxes_and_sees_them() -> None:
     contract = read_contract(SHIPPED)
-    fleet = Fleet(SHIPPED, contract, 1, scene_file="terrain.xml")
+    fleet = Fleet(SHIPPED, contract, 1, scene_file=TERRAIN_FILE)
     start = fleet.qpos[0].copy()
     scan = fleet.read().others["height_scan"].reshape(17, 11)
     assert np.abs(scan).max() < 1e-6 and start[2] < 0.0, "the middle of a pit, flat for 1 m"
@@ -115,7 +117,7 @@ def test_among_steps_it_stands_on_boxes_and_sees_them() -> None:
 
 @pytest.mark.parametrize("task", ["go1_rough", "go1_rough_scan"])
 def test_around_the_steps_the_ground_goes_on(task: str) -> None:
-    model = mujoco.MjModel.from_xml_path(str(ROOT / "resources/policies" / task / "terrain.xml"))
+    model = mujoco.MjSpec.from_file(str(ROOT / "resources/policies" / task / TERRAIN_FILE)).compile()  # an MJZ, as MuJoCo reads it
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     for x, y in ((15.9, 0.0), (16.1, 3.0), (-500.0, 0.0), (0.0, 900.0), (300.0, -300.0)):
@@ -132,23 +134,47 @@ def test_too_many_steps_for_an_export_are_said() -> None:
 
 def test_an_export_of_flat_ground_has_no_steps(export: Path) -> None:
     with pytest.raises(
-        ContractError, match=r"no terrain.xml in .*; an export has one if its task was trained on ground with steps or blocks"
+        ContractError, match=r"no terrain.mjz in .*; an export has one if its task was trained on ground with steps or blocks"
     ):
-        DeployStage(export, 1, scene_file="terrain.xml")
+        DeployStage(export, 1, scene_file=TERRAIN_FILE)
 
 
 @pytest.mark.parametrize(
     ("right", "wrong", "message"),
     [
-        ('gainprm="35"', 'gainprm="36"', r"policy.yaml: stiffness is \[35\..*, but terrain.xml has \[36\..*; export the policy again"),
-        ('name="gyro/imu"', 'name="gyro"', "no sensor 'gyro/imu' in terrain.xml; "),
-        ('<gyro site="imu" ', '<framequat objtype="site" objname="imu" ', r"terrain.xml: the sensors of 'ang_vel' .* have 4 values, not 3"),
+        ('gainprm="35"', 'gainprm="36"', r"policy.yaml: stiffness is \[35\..*, but terrain.mjz has \[36\..*; export the policy again"),
+        ('name="gyro/imu"', 'name="gyro"', "no sensor 'gyro/imu' in terrain.mjz; "),
+        ('<gyro site="imu" ', '<framequat objtype="site" objname="imu" ', r"terrain.mjz: the sensors of 'ang_vel' .* have 4 values, not 3"),
     ],
 )
 def test_what_is_wrong_with_terrain_is_not_said_of_the_scene(right: str, wrong: str, message: str, export: Path) -> None:
-    text = (SHIPPED / "terrain.xml").read_text()
-    (export / "terrain.xml").write_text(text.replace(right, wrong))
+    text = check_files(SHIPPED / TERRAIN_FILE)
+    assert right in text
+    write_archive(export / TERRAIN_FILE, text.replace(right, wrong))
     with pytest.raises(ContractError, match=message) as raised:
-        DeployStage(export, 1, scene_file="terrain.xml")
+        DeployStage(export, 1, scene_file=TERRAIN_FILE)
     assert "scene.xml" not in str(raised.value)
     DeployStage(export, 1)
+
+
+def test_an_archive_holds_one_model_and_no_surprise(tmp_path: Path) -> None:
+    file = tmp_path / "terrain.mjz"
+    write_archive(file, "<mujoco/>")
+    first = file.read_bytes()
+    write_archive(file, "<mujoco/>")
+    assert file.read_bytes() == first and check_files(file, alone=True) == "<mujoco/>"
+    write_archive(file, '<mujoco><include file="../other.xml"/></mujoco>')
+    with pytest.raises(ValueError, match="it names ../other.xml, which lies outside of its own folder"):
+        check_files(file, alone=True)
+    write_archive(file, " " * (MOST_BYTES + 1))
+    assert file.stat().st_size < 100_000
+    with pytest.raises(ValueError, match="model.xml has 64 MiB; a robot's file has 64 at most"):
+        check_files(file)
+    with zipfile.ZipFile(file, "a") as archive:
+        archive.writestr("terrain.xml", "<mujoco/>")
+    with pytest.raises(ValueError, match=r"it holds model.xml, terrain.xml; an export's has model.xml alone"):
+        check_files(file)
+    for broken in (first[:-30], first.replace(b"model", b"m\0del"), b"", first[:60] + bytes(len(first) - 60)):
+        file.write_bytes(broken)
+        with pytest.raises(ValueError, match="no zip file that can be read|it holds"):
+            check_files(file)

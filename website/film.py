@@ -36,7 +36,7 @@ class Shot(NamedTuple):
     policy: str  # a folder of resources/policies
     command: tuple[float, ...]  # vx, vy [m/s], yaw rate [rad/s]
     begin: float = 1.0  # [s] of walking before the film
-    seconds: float = 3.6
+    seconds: float = 2.8
     distance: float = 2.3  # of the camera [m]
     azimuth: float = 90.0  # [deg]: along y, so that a robot that walks along x goes to the right
     elevation: float = -12.0  # [deg]
@@ -58,7 +58,9 @@ BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
     "go1_rough_scan": FILM[0],
     "go2_flat": FILM[1],
     "go2_rough": FILM[0]._replace(policy="go2_rough"),
+    "go2_rough_scan": FILM[0]._replace(policy="go2_rough_scan"),
     "g1_flat": FILM[2],
+    "g1_12dof_flat": FILM[2]._replace(policy="g1_12dof_flat"),
     "go1_getup": FILM[3],
     "go2_getup": FILM[3]._replace(policy="go2_getup"),
     "g1_getup": FILM[3]._replace(policy="g1_getup", seconds=4.0, distance=2.4, elevation=-10.0),
@@ -123,7 +125,7 @@ def save_webp(path: Path, frames: Sequence[Frame], quality: int = 10) -> None:
 
 
 def main() -> None:
-    save_webp(IMAGES / "film.webp", side_by_side([record(shot, 216, 168) for shot in FILM]), quality=19)
+    save_webp(IMAGES / "film.webp", side_by_side([record(shot, 216, 168) for shot in FILM]), quality=15)
 
 
 if __name__ == "__main__":

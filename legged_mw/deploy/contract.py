@@ -28,7 +28,7 @@ from legged_mw.utils.files import digest, finish_moving
 
 FORMATS = (2, 3, 4)  # 3: a memory, an estimate, motors; 4: a motion. A file has the lowest that suffices: old readers read what they can
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"
-TERRAIN_FILE = "terrain.xml"  # the same robot among steps and blocks; only of policies that were trained on such ground
+TERRAIN_FILE = "terrain.mjz"  # the same robot among steps and blocks; only of policies that were trained on such ground
 
 
 class Quantity(NamedTuple):

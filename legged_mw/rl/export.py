@@ -70,6 +70,7 @@ from legged_mw.utils.clip import save_clip
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import shown
 from legged_mw.utils.files import STAGED, digest, find_file, finish_moving, flush, sweep
+from legged_mw.utils.mjcf import write_archive
 from legged_mw.utils.task import LoadedTask
 
 FILES = (CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
@@ -386,5 +387,5 @@ def _write_terrain(env: RobotTask, task: LoadedTask, folder: Path) -> str:
         xml = among_steps((folder / SCENE_FILE).read_text(encoding="utf-8"), terrain, start.tolist())
     except ModelError as error:
         return str(error)
-    (folder / TERRAIN_FILE).write_text(xml, encoding="utf-8")
+    write_archive(folder / TERRAIN_FILE, xml)
     return ""

@@ -7,12 +7,16 @@ from __future__ import annotations
 
 import math
 import re
+import zipfile
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+ARCHIVE = ".mjz"  # MuJoCo's name for a zipped model
+_INSIDE = "model.xml"
 MOST_BYTES = 64 << 20  # of one file: the largest known robots, meshes inside, have a tenth
 HEAVIEST, WIDEST, FASTEST = 1e5, 1e6, 1e3  # of a body [kg]; of any length [m] or inertia [kg m^2]; gravity [m/s^2]: a file in cm has 981
 _COPIES = 1e5  # of what a file repeats, all its counts multiplied
@@ -33,9 +37,7 @@ def check_files(file: Path, alone: bool = False) -> str:
     folder, left, seen, first = file.resolve().parent, [file], set[Path](), ""
     while left:
         part = left.pop()
-        if part.stat().st_size > MOST_BYTES:
-            raise ValueError(f"{part.name} has {part.stat().st_size >> 20} MiB; a robot's file has {MOST_BYTES >> 20} at most")
-        text = part.read_text(encoding="utf-8", errors="replace")
+        text = _text(part)
         first, seen = first or text, seen | {part.resolve()}
         text = _checked(text, "" if part == file else f"{part.name}: ")
         if alone and (far := [name for name in _named(text) if not (folder / name).resolve().is_relative_to(folder)]):
@@ -47,6 +49,32 @@ def check_files(file: Path, alone: bool = False) -> str:
             if path.is_file() and path not in seen:
                 left.append(path)
     return first
+
+
+def write_archive(file: Path, text: str) -> None:
+    """Write an MJCF as MuJoCo's MJZ, a zip file that holds it as model.xml. The same text makes the same file."""
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr(zipfile.ZipInfo(_INSIDE), text, zipfile.ZIP_DEFLATED, compresslevel=9)
+
+
+def _text(file: Path) -> str:
+    """What an MJCF or URDF says, or the one in an MJZ. Raises ValueError for too large a file, and for an MJZ with more in it."""
+    if file.suffix != ARCHIVE:
+        _check_size(file.name, file.stat().st_size)
+        return file.read_text(encoding="utf-8", errors="replace")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            if (names := archive.namelist()) != [_INSIDE]:
+                raise ValueError(f"it holds {', '.join(names)[:200] or 'nothing'}; an export's has {_INSIDE} alone")
+            _check_size(_INSIDE, archive.getinfo(_INSIDE).file_size)
+            return archive.read(_INSIDE).decode(errors="replace")
+    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:  # the last: it is encrypted
+        raise ValueError(f"no zip file that can be read: {error}") from None
+
+
+def _check_size(name: str, size: int) -> None:
+    if size > MOST_BYTES:
+        raise ValueError(f"{name} has {size >> 20} MiB; a robot's file has {MOST_BYTES >> 20} at most")
 
 
 def _checked(text: str, where: str) -> str:

@@ -537,7 +537,7 @@ def _made(root: Path, task: str, extra: bool) -> Path:
     save_yaml(folder / "policy.yaml", said | {"task": task})
     (folder / "config.yaml").write_text(f"task: {task}\n")
     if extra:
-        (folder / "terrain.xml").write_text(task)
+        (folder / "terrain.mjz").write_text(task)
     return folder.rename(root / task)
 
 
