@@ -16,7 +16,10 @@ from pathlib import Path
 from legged_mw import ROOT
 
 POLICIES, PAGE, IMAGES = ROOT / "resources/policies", ROOT / "docs/gallery.md", ROOT / "docs/images/gallery"
-ORDER = ("go1_flat", "go1_rough", "go1_rough_scan", "go2_flat", "go2_rough", "go2_rough_scan", "g1_flat", "g1_12dof_flat", "g1_rough")  # then all others by name
+ORDER = (  # then all others by name
+    *("go1_flat", "go1_rough", "go1_rough_scan", "go2_flat", "go2_rough", "go2_rough_scan"),
+    *("g1_flat", "g1_12dof_flat", "g1_rough"),
+)
 HEAD = """# Gallery
 
 Every policy that ships, in MuJoCo's C engine. `MUJOCO_GL=egl python -m website.gallery` makes this page, its films and
