@@ -268,7 +268,7 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
     Training leaves most bodies out and stops after the first iterations. Bodies that were on the ground stay as they were: feet.
     """
     if not (folder / file).is_file():
-        raise ContractError(f"no {file} in {folder}; an export has one if its task was trained on ground with steps or blocks")
+        raise ContractError(f"no {file} in {folder}; an export has one if its task had steps or blocks; export an older one again")
     try:
         text = check_files(folder / file, alone=True)
         spec = mujoco.MjSpec.from_string(text) if file.endswith(ARCHIVE) else mujoco.MjSpec.from_file(str(folder / file))
