@@ -28,6 +28,7 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 def pytest_configure(config: pytest.Config) -> None:
     torch.set_num_threads(1)  # hundreds of small operations a step stall on a second thread
     signal.signal(signal.SIGINT, signal.default_int_handler)  # `make test &` ignores it, and so would programs that tests end
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # likewise `nohup make test`
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
