@@ -75,6 +75,7 @@ from legged_mw.utils.task import LoadedTask
 
 FILES = (CONFIG_FILE, NETWORK_FILE, SCENE_FILE, CONTRACT_FILE)  # the contract last: it names the others
 SOMETIMES = (TERRAIN_FILE, MOTORS_FILE, MOTION_FILE)
+ONCE = ("terrain.xml",)  # what older exports had
 WORLDS = 8  # of the roll-out that the export is tried on
 TOLERANCE = 1e-4  # between actions of the same observation, relative above 1: float32 sums in another order
 
@@ -217,7 +218,7 @@ def _all_or_nothing(folder: Path) -> Iterator[Path]:
         finish_moving(folder)  # of an export that was killed before
         sweep(folder)
         yield new
-        for name in (*FILES, *SOMETIMES):
+        for name in (*FILES, *SOMETIMES, *ONCE):
             (new / name).touch()  # empty: one of an earlier export, which would be another policy's
             flush(new / name)
         flush(new)

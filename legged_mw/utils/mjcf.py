@@ -5,6 +5,7 @@ All that is refused is a ValueError in one line, without the file's name.
 
 from __future__ import annotations
 
+import io
 import math
 import re
 import zipfile
@@ -40,6 +41,8 @@ def check_files(file: Path, alone: bool = False) -> str:
         text = _text(part)
         first, seen = first or text, seen | {part.resolve()}
         text = _checked(text, "" if part == file else f"{part.name}: ")
+        if file.suffix == ARCHIVE and (named := list(_named(text))):
+            raise ValueError(f"it names {named[0][:200]}; the model of an archive stands alone")
         if alone and (far := [name for name in _named(text) if not (folder / name).resolve().is_relative_to(folder)]):
             raise ValueError(f"it names {far[0][:200]}, which lies outside of its own folder; an export stands alone")
         for name in _included(text):
@@ -59,17 +62,20 @@ def write_archive(file: Path, text: str) -> None:
 
 def _text(file: Path) -> str:
     """What an MJCF or URDF says, or the one in an MJZ. Raises ValueError for too large a file, and for an MJZ with more in it."""
+    _check_size(file.name, file.stat().st_size)
     if file.suffix != ARCHIVE:
-        _check_size(file.name, file.stat().st_size)
         return file.read_text(encoding="utf-8", errors="replace")
+    held = io.BytesIO(file.read_bytes())
     try:
-        with zipfile.ZipFile(file) as archive:
-            if (names := archive.namelist()) != [_INSIDE]:
-                raise ValueError(f"it holds {', '.join(names)[:200] or 'nothing'}; an export's has {_INSIDE} alone")
-            _check_size(_INSIDE, archive.getinfo(_INSIDE).file_size)
-            return archive.read(_INSIDE).decode(errors="replace")
-    except (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError) as error:  # the last: it is encrypted
-        raise ValueError(f"no zip file that can be read: {error}") from None
+        with zipfile.ZipFile(held) as archive:
+            inside = archive.infolist()
+            small = [entry for entry in inside if entry.file_size <= MOST_BYTES and entry.compress_type == zipfile.ZIP_DEFLATED]
+            if small == inside and [entry.filename for entry in inside] == [_INSIDE]:
+                return archive.read(_INSIDE).decode(errors="replace")
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, NotImplementedError, RuntimeError) as error:
+        raise ValueError(f"no zip file that can be read: {error}") from None  # RuntimeError: it is encrypted
+    names = ", ".join(entry.filename for entry in inside)[:200] or "nothing"
+    raise ValueError(f"it holds {names}; an export's holds {_INSIDE} alone, deflated and of {MOST_BYTES >> 20} MiB at most")
 
 
 def _check_size(name: str, size: int) -> None:

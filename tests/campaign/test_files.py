@@ -545,6 +545,7 @@ def _made(root: Path, task: str, extra: bool) -> Path:
 def test_killed_exports(tmp_path: Path, extra: bool) -> None:
     """At every call: afterwards there is the old export or the new one, whole, and a next start leaves nothing of the kill behind."""
     old, new = _made(tmp_path, "old", not extra), _made(tmp_path, "new", extra)
+    (old / "terrain.xml").write_text("of an older version")
     wanted = {"old": _contents(old), "new": _contents(new)}
     shutil.copytree(old, tmp_path / "count")
     count, seen = move_in(tmp_path / "count", new, 10**6), []
