@@ -340,6 +340,7 @@ def test_the_programs(domain: int, tmp_path: Path) -> None:
             said += line
             if line.startswith("policy: "):
                 break
+        time.sleep(2.0)  # it walks
         policy.send_signal(signal.SIGINT)
         rest, errors = policy.communicate(timeout=60)
         assert policy.returncode == 0, errors
