@@ -100,7 +100,10 @@ def test_garbage_is_collected_between_steps_alone() -> None:
 
 
 def test_memory_is_flat(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Thirty thousand steps, ten minutes at 50 Hz, keep no more than two thousand do."""
+    """From step 2000 to step 29000 memory grows by less than a byte a step: one reference kept by each would be eight.
+
+    What other threads of the process take meanwhile, a few kB, is counted too.
+    """
     clock = Clock(monkeypatch)
     sizes = []
     tracemalloc.start()
@@ -113,4 +116,4 @@ def test_memory_is_flat(monkeypatch: pytest.MonkeyPatch) -> None:
                     sizes.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()
-    assert len(sizes) == 2 and sizes[1] - sizes[0] < 2000
+    assert len(sizes) == 2 and sizes[1] - sizes[0] < 27_000
