@@ -52,6 +52,7 @@ def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.N
 
     env = training.build(task, start, device, args.eager, check_recordable)
     if args.check:
+        training.make_learner(task, env, start)  # what it refuses is found now
         print(describe(env, task) + ("" if args.eager else "\nthe step can be recorded as a CUDA graph"))
         if args.picture:
             from legged_mw.robot.__main__ import show_task
@@ -73,7 +74,7 @@ def play() -> None:
     """Watch, grade or export a policy."""
     quick_start.begin()
     from legged_mw.eval import grading
-    from legged_mw.rl.policies import find_policy, find_rival, load_trained
+    from legged_mw.rl.policies import find_policy, find_rival, introduce, load_trained
     from legged_mw.view import playing
 
     args = playing.parse(play.__doc__)
@@ -85,11 +86,11 @@ def play() -> None:
         rivals = [find_rival(task, args.compare, args.experiment_name)] if args.compare is not None else []
         grading.grade([(source, trained), *((rival, load_trained(args.task, rival)) for rival in rivals)], args)
         return
-    task, commands = playing.prepare(source, trained, args)
     if args.export:
+        introduce(source, {})
         print(export(trained, source.checkpoint, Path(args.export), args.half))
-    else:
-        playing.watch(source, task, commands, args)
+        return
+    playing.watch(source, *playing.prepare(source, trained, args), args)
 
 
 def export(task: LoadedTask, checkpoint: Path, folder: Path, half: bool = False) -> str:

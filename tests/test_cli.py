@@ -350,6 +350,22 @@ def test_check(tmp_path: Path) -> None:
     assert "pose 0" not in lines and "pose 0.5" not in lines
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (["actor.estimator.targets=[base_lin_vel]", "actor.class_name=RNNModel"], "actor.estimator"),
+        (["actor.concurrent.groups=[privileged]"], "privileged_state"),
+        (["actor.class_name=RNNModel", "algorithm.num_mini_batches=64"], "num_mini_batches"),
+    ],
+)
+def test_check_refuses_a_learner_that_training_refuses(wrong: list[str], said: str, tmp_path: Path) -> None:
+    flags = [flag for value in wrong for flag in ("--set", value)]
+    lines = [refused(tmp_path, "train", *SMALL, *flags, *more) for more in (["--check"], ["--max_iterations", "1"])]
+    assert lines[0] == lines[1] and said in lines[0]
+    result = run("train", tmp_path, *SMALL, "--check", "--set", "actor.class_name=RNNModel", "--set", "actor.rnn_type=lstm")
+    assert "the actor remembers: lstm, 64 units, layers: 1\n" in result.out and "domain_rand.enable is False: none" in result.out
+
+
 @pytest.mark.parametrize("more", [["--check"], ["--max_iterations", "1"]])
 def test_a_reward_that_asks_the_host_is_named_before_training(tmp_path: Path, more: list[str]) -> None:
     """A CPU would run it, a recorded step cannot; --eager records nothing."""
@@ -447,7 +463,8 @@ def test_experiment_name_by_flag_and_by_field(tmp_path: Path) -> None:
 
 def test_play_says_what_it_changes(root: Path, first: Path, tmp_path: Path) -> None:
     out, was = tmp_path / "out", load_yaml(first / "config.yaml")
-    result = run("play", root, *TASK, "--device", "cpu", "--command=-0.5,0,0.25", "--set", "sim.ls_iterations=7", "--export", str(out))
+    shown = ("--viewer", "none", "--time", "0.02s")
+    result = run("play", root, *TASK, "--device", "cpu", "--command=-0.5,0,0.25", "--set", "sim.ls_iterations=7", *shown)
     assert result.code == 0, result.err
     lines = [line.strip() for line in result.out.splitlines()]
     changes = {line.split(": ")[0]: line.split(": ")[1] for line in lines if " -> " in line}
@@ -464,8 +481,10 @@ def test_play_says_what_it_changes(root: Path, first: Path, tmp_path: Path) -> N
         "perturbation.kick": "True -> False",
         "sim.ls_iterations": f"{was['sim']['ls_iterations']} -> 7",
     }
+    result = run("play", root, *TASK, "--device", "cpu", "--export", str(out))
+    assert result.code == 0 and " -> " not in result.out, result.err  # as trained, not as played
     assert sorted(path.name for path in out.iterdir()) == sorted(FILES)
-    assert load_yaml(out / "config.yaml") == was  # as trained, not as played
+    assert load_yaml(out / "config.yaml") == was
 
 
 # ---- real processes: what only the programs themselves can show
@@ -506,13 +525,14 @@ def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path) -> None:
 
 
 def test_export_is_the_policy_as_trained(root: Path, tmp_path: Path) -> None:
-    """What a call overrides for playing reaches neither the config nor the clamp inside the network file."""
+    """Twice the same; what would play it otherwise is refused, since it would reach neither the config nor the network's clamp."""
     files = []
-    for more in ([], ["--set", "normalization.clip_actions=0.001"]):
-        out = tmp_path / f"out{len(files)}"
-        assert run("play", root, *TASK, "--device", "cpu", "--export", str(out), *more).code == 0
+    for out in (tmp_path / "one", tmp_path / "two"):
+        assert run("play", root, *TASK, "--device", "cpu", "--export", str(out)).code == 0
         files.append([(out / name).read_bytes() for name in ("config.yaml", "policy.onnx", "policy.yaml", "scene.xml")])
     assert files[0] == files[1]
+    line = refused(root, "play", *TASK, "--export", str(tmp_path / "three"), "--set", "normalization.clip_actions=0.001")
+    assert "--export writes the policy as it was trained: leave --set, --override and --command out" in line
 
 
 def test_a_run_of_another_task_is_refused(first: Path, tmp_path: Path) -> None:

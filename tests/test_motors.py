@@ -219,11 +219,24 @@ class Sums(LeggedRobot):
         return super()._compute_torques(actions).sum(dim=1, keepdim=True)
 
 
+class Returns(LeggedRobot):
+    def _compute_torques(self, actions: Tensor) -> Tensor:
+        super()._compute_torques(actions)
+        return None  # type: ignore[return-value]
+
+
+class Divides(LeggedRobot):
+    def _compute_torques(self, actions: Tensor) -> Tensor:
+        return super()._compute_torques(actions) / (self.dof_vel - self.dof_vel)
+
+
 @pytest.mark.parametrize(
     ("law", "message"),
     [
         (Asks, r"go1_flat: .*test_motors.py:\d+.*item\(\) reads a tensor to the host"),
         (Sums, r"_compute_torques must return a tensor \(4, 12\), a torque a joint; it returned \(4, 1\)"),
+        (Returns, r"Returns._compute_torques must return a tensor \(4, 12\), a torque a joint; it returned None"),
+        (Divides, r"test_motors.py:\d+, Divides._compute_torques: returned a value that is not finite; look for a division by 0"),
     ],
 )
 def test_mistakes_in_a_law_in_code_are_found_before_training(law: type[LeggedRobot], message: str) -> None:
@@ -572,7 +585,7 @@ def changed_arrays(**changes: Any) -> dict[str, Any]:
         (changed_arrays(weight0=np.float32(1)), r"array 'weight0' has shape \(\), it must be \(-1, 6\)"),
         (changed_arrays(torque_scale=np.ones(2)), r"array 'torque_scale' has shape \(2,\), it must be \(\)"),
         (changed_arrays(bias1=np.full(30, np.nan)), "net.npz: array 'bias1' has values that are not finite"),
-        ({"weight0": np.array([object()])}, "net.npz: Object arrays cannot be loaded|net.npz is no .npz of plain arrays"),
+        ({"weight0": np.array([object()])}, "net.npz: Object arrays cannot be loaded|net.npz is no .npz of a network's arrays"),
     ],
 )
 def test_files_that_are_no_network_are_refused(arrays: dict[str, Any], message: str, tmp_path: Path) -> None:
@@ -582,11 +595,15 @@ def test_files_that_are_no_network_are_refused(arrays: dict[str, Any], message: 
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("what", ["text", "empty", "one array"])
+@pytest.mark.parametrize("what", ["text", "empty", "one array", "torchscript", "state_dict"])
 def test_a_file_of_another_kind_is_refused(what: str, tmp_path: Path) -> None:
     (tmp_path / "net.pt").write_bytes(b"PK no" if what == "text" else b"")
     if what == "one array":
         with (tmp_path / "net.pt").open("wb") as out:
             np.save(out, np.zeros(3))
-    with pytest.raises(UserError, match="net.pt is no .npz of plain arrays; a torchscript file becomes one by: python -m legged_mw"):
+    if what == "torchscript":
+        torch.jit.save(torch.jit.script(nn.Linear(2, 1)), str(tmp_path / "net.pt"))
+    if what == "state_dict":
+        torch.save(nn.Linear(2, 1).state_dict(), tmp_path / "net.pt")
+    with pytest.raises(UserError, match="net.pt is no .npz of a network's arrays; a torchscript file becomes one by: python -m legged_mw"):
         read_network(tmp_path / "net.pt")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from legged_mw.envs.domain_rand import active
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.estimator import find_targets
 from legged_mw.sim.room import count_room
@@ -23,6 +24,7 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
     if (taught := task.train.actor.concurrent).groups:
         latent = f"a teacher's latent ({taught.latent_dim}) of {', '.join(taught.groups)}"
         lines.append(f"{taught.teacher_share:.0%} of the worlds act by {latent}")
+    lines += _memories(task)
     for command in env.command_table:
         lines.append(f"command {command.label:<14} [{command.low:g}, {command.high:g}] {command.unit}")
     lines.append(f"actions ({env.num_actions}), clipped at +-{task.cfg.normalization.clip_actions:g}, {1 / env.dt:g} Hz")
@@ -35,10 +37,19 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
         env.robot.joint_names, env.default_dof_pos.tolist(), env.robot.joint_range, env.robot.effort_range, strict=True
     ):
         lines.append(f"  {name:<{width}} {default:>7.3f}  [{low:.3f}, {high:.3f}]  {limit:g}")
-    lines += [_motors(env), _room(env)]
+    lines += [_motors(env), _randomized(env), _room(env)]
     lines.append(f"what was dropped, added or changed in {task.cfg.asset.file}")
     lines += [f"  {line}" for line in env.robot.overrides]
     return "\n".join(lines)
+
+
+def _memories(task: LoadedTask) -> list[str]:
+    networks = {"actor": task.train.actor, "critic": task.train.critic}
+    return [
+        f"the {name} remembers: {part.rnn_type}, {part.rnn_hidden_dim} units, layers: {part.rnn_num_layers}"
+        for name, part in networks.items()
+        if part.class_name.endswith("RNNModel")
+    ]
 
 
 def _motors(env: RobotTask) -> str:
@@ -51,6 +62,15 @@ def _motors(env: RobotTask) -> str:
     asked = ", ".join(f"{end:g}" for end in span)
     rounded = f"domain_rand.delay_ms [{asked}] to the nearest simulation step, of {step:g} ms"
     return f"{text}; what they are told takes {low:g} to {high:g} ms: {rounded}"
+
+
+def _randomized(env: RobotTask) -> str:
+    """What differs between worlds, or that nothing does."""
+    rand = env.cfg.domain_rand
+    if not rand.enable:
+        return "domain_rand.enable is False: none of its ranges is drawn"
+    spans = (f"{name} [{low:g}, {high:g}]" for name, (_, low, high) in active(env.cfg, env.motor_law).items())
+    return f"domain_rand draws: {', '.join(spans) or 'nothing, no range is given'}"
 
 
 def _room(env: RobotTask) -> str:

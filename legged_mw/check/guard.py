@@ -83,24 +83,39 @@ def _own_methods(env_class: type) -> list[str]:
 
 
 def _watched(env_class: type[RobotTask], guard: Guard) -> type[Any]:
-    """The same class, whose rewards are looked at: they only read, and return finite numbers (N,)."""
+    """The same class, whose rewards are looked at: they only read, and return finite numbers (N,). So do torques of its own law."""
+
+    def look(self: RobotTask, value: Tensor, method: Callable[..., Any]) -> None:
+        watched = guard.on
+        with guard.set(on=False):
+            wrong = ~value.isfinite().flatten(1).all(dim=1) if value.dim() > 1 else ~value.isfinite()
+            if watched and bool((wrong & ~self.broken).any()):
+                what = "returned a value that is not finite; look for a division by 0 or a root of a negative number"
+                raise StepError(what, place_of(method))
 
     def watch(method: Callable[[RobotTask], Any]) -> Callable[[RobotTask], Any]:
         @functools.wraps(method)
         def term(self: RobotTask) -> Any:
             with guard.set(on_write=functools.partial(_check_written, self)):
                 value = check_term(functools.partial(method, self), self.num_envs)
-            watched = guard.on
-            with guard.set(on=False):
-                if watched and bool((~value.isfinite() & ~self.broken).any()):
-                    raise StepError(
-                        "returned a value that is not finite; look for a division by 0 or a root of a negative number", place_of(method)
-                    )
+            look(self, value, method)
             return value
 
         return term
 
+    def watch_law(method: Callable[[RobotTask, Tensor], Any]) -> Callable[[RobotTask, Tensor], Any]:
+        @functools.wraps(method)
+        def law(self: RobotTask, actions: Tensor) -> Any:
+            value = method(self, actions)
+            if isinstance(value, Tensor) and len(value) == self.num_envs:  # else the motors say so
+                look(self, value, method)
+            return value
+
+        return law
+
     body: dict[str, Any] = {name: watch(getattr(env_class, name)) for name in dir(env_class) if name.startswith("_reward_")}
+    if env_class._compute_torques is not RobotTask._compute_torques:
+        body["_compute_torques"] = watch_law(env_class._compute_torques)
     body |= {"__module__": env_class.__module__, "__qualname__": env_class.__qualname__}
     return type(env_class.__name__, (env_class,), body)
 

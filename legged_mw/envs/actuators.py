@@ -159,10 +159,10 @@ class Actuators:
             self._network(sent)
             return
         torques = self._compute(sent) if self._compute else sent
-        if torques.shape != sent.shape:
-            raise ConfigError(
-                f"_compute_torques must return a tensor {tuple(sent.shape)}, a torque a joint; it returned {(*torques.shape,)}"
-            )
+        if not isinstance(torques, Tensor) or torques.shape != sent.shape:
+            law = getattr(self._compute, "__qualname__", "_compute_torques")
+            found = (*torques.shape,) if isinstance(torques, Tensor) else f"{torques!r:.40}"
+            raise ConfigError(f"{law} must return a tensor {tuple(sent.shape)}, a torque a joint; it returned {found}")
         self._sim.ctrl.copy_(torques)
 
     def reset(self, mask: Tensor) -> None:

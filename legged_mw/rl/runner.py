@@ -368,10 +368,7 @@ class Runner(OnPolicyRunner):
 
 
 def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, device: str, teacher: RobotTaskCfgPPO | None = None) -> Runner:
-    """A runner over ``env`` from the learner's config; it writes below ``log_dir``, or nothing if that is None.
-
-    With a ``teacher``, of which this is the learner's config, it distils.
-    """
+    """A runner over ``env`` from the learner's config; with that of a ``teacher`` it distils. Without ``log_dir`` it writes nothing."""
     half = cfg.runner.matmul_precision == "bf16"
     torch.set_float32_matmul_precision("high" if half else cfg.runner.matmul_precision)
     check_mirror(env, cfg)
@@ -390,7 +387,8 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
     if settings["critic_warmup"] and not graphed:
         raise ConfigError(f"warm_start.critic_warmup is {settings['critic_warmup']}, but only the recorded PPO knows it; set it to 0")
     if isinstance(policy := runner.alg.get_policy(), RegressingModel) and not graphed:
-        raise ConfigError(f"{policy.field}: only GraphedPPO's recorded update trains that, and rsl-rl's own is used here: set it to []")
+        who = "a student learns nothing but to act like its teacher" if teacher else "rsl-rl's own is used here"
+        raise ConfigError(f"{policy.field}: only GraphedPPO's recorded update trains that, and {who}: set it to []")
     return runner
 
 

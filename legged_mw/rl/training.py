@@ -174,6 +174,14 @@ def build(task: LoadedTask, start: Start, device: str, eager: bool, check_record
     return env
 
 
+def make_learner(task: LoadedTask, env: RobotTask, start: Start) -> Runner:
+    """The learner of a new run, with what another run has learned; one that goes on has not read its checkpoint yet."""
+    runner = make_runner(env, task.train, None, str(env.device), start.teacher.task.train if start.teacher else None)
+    if not start.checkpoint:
+        _begin(runner, start)
+    return runner
+
+
 def wants_exam(task: LoadedTask) -> bool:
     """Whether this process grades the policy during training."""
     return this_rank().leads and 0 < task.train.runner.exam_interval <= task.train.runner.max_iterations
@@ -194,8 +202,7 @@ def train(
     ``begun`` is called before the first iteration, where the run folder is written; ``verbose`` prints whole blocks. Returns
     whether all is done.
     """
-    teacher = start.teacher.task.train if start.teacher else None
-    rank, runner = this_rank(), make_runner(env, task.train, None, str(env.device), teacher)
+    rank, runner = this_rank(), make_learner(task, env, start)
     fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)  # last: it takes seconds
     runner.examine, runner.console.verbose, runner.deadline = examine, verbose, deadline
     with ExitStack() as held:
@@ -231,8 +238,6 @@ def _load(runner: Runner, task: LoadedTask, start: Start) -> int:
     """Load the checkpoint to go on from, if there is one; returns how many iterations are left."""
     if start.checkpoint:
         runner.load(str(start.checkpoint))
-    else:
-        _begin(runner, start)
     done, wanted = runner.current_learning_iteration, task.train.runner.max_iterations
     if done >= wanted:
         what = shown(start.checkpoint or start.experiment)

@@ -63,9 +63,12 @@ def read_network(file: Path) -> MotorNetwork:
     try:
         arrays = read_arrays(file)
     except ValueError:
+        arrays = {}
+    if not any(name.startswith("weight") for name in arrays):  # a torchscript file is a zip too
         raise UserError(
-            f"{file.name} is no .npz of plain arrays; a torchscript file becomes one by: python -m legged_mw.robot.actuator_net {file.name}"
-        ) from None
+            f"{file.name} is no .npz of a network's arrays; "
+            f"a torchscript file becomes one by: python -m legged_mw.robot.actuator_net {file.name}"
+        )
     try:
         return _read(arrays)
     except (KeyError, ValueError, TypeError, OverflowError) as error:

@@ -64,6 +64,8 @@ def parse(description: str | None) -> argparse.Namespace:
         parser.error("--ranges says what the exam asks: add --eval")
     if args.follow and (args.eval or args.export or args.checkpoint != -1):
         parser.error("--follow watches the newest policy: leave --eval, --export and --checkpoint out")
+    if args.export and (args.set or args.override or args.command is not None):
+        parser.error("--export writes the policy as it was trained: leave --set, --override and --command out")
     if args.half and not args.export:
         parser.error("--half rounds what is exported: add --export DIR")
     if args.commands and (args.eval or args.export or args.command is not None):
