@@ -74,6 +74,7 @@ def play() -> None:
     """Watch, grade or export a policy."""
     quick_start.begin()
     from legged_mw.eval import grading
+    from legged_mw.rl.classes import check_classes
     from legged_mw.rl.policies import find_policy, find_rival, introduce, load_trained
     from legged_mw.view import playing
 
@@ -87,6 +88,7 @@ def play() -> None:
         grading.grade([(source, trained), *((rival, load_trained(args.task, rival)) for rival in rivals)], args)
         return
     if args.export:
+        check_classes(trained.train)
         introduce(source, {})
         print(export(trained, source.checkpoint, Path(args.export), args.half))
         return

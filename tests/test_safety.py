@@ -121,7 +121,7 @@ def test_no_class_of_a_flag_or_an_override_file_is_imported(home: Path, name: st
         node = {key: node}
     save_yaml(file, node)
     for flags in (["--set", f"{path}={name}"], ["--override", str(file)]):
-        for program, more in (("play", ["--load_run", "some_run", "--export", str(home / "out")]), ("train", [])):
+        for program, more in (("play", ["--load_run", "some_run", "--viewer", "none", "--time", "0.02s"]), ("train", [])):
             assert f"{path} is '{name}': only the task's own Python file" in refused(home, program, *TASK, *more, *flags)
             assert nothing_ran(home)
 

@@ -42,9 +42,7 @@ def parse(description: str | None) -> argparse.Namespace:
     parser.add_argument(
         "--command", metavar="VX,VY,YAW", help="fixed command [m/s, m/s, rad/s]; --command=-0.5,0,0; others by name: base_height=0.25"
     )
-    parser.add_argument(
-        "--time", type=duration, default=None, metavar="T", help="how long to play (default: 10s of video, a window until closed)"
-    )
+    parser.add_argument("--time", type=duration, metavar="T", help="how long to play (default: 10s of video, a window until closed)")
     launch.add_flags(parser)
     parser.add_argument("--follow", action="store_true", help="read the policy again as its run trains on")
     parser.add_argument("--eval", action="store_true", help="run the task's exam (on rough ground too), print its tables, write a report")
