@@ -362,6 +362,9 @@ def test_check_refuses_a_learner_that_training_refuses(wrong: list[str], said: s
     flags = [flag for value in wrong for flag in ("--set", value)]
     lines = [refused(tmp_path, "train", *SMALL, *flags, *more) for more in (["--check"], ["--max_iterations", "1"])]
     assert lines[0] == lines[1] and said in lines[0]
+
+
+def test_check_says_what_remembers_and_that_nothing_is_drawn(tmp_path: Path) -> None:
     result = run("train", tmp_path, *SMALL, "--check", "--set", "actor.class_name=RNNModel", "--set", "actor.rnn_type=lstm")
     assert "the actor remembers: lstm, 64 units, layers: 1\n" in result.out and "domain_rand.enable is False: none" in result.out
 

@@ -219,6 +219,11 @@ class Sums(LeggedRobot):
         return super()._compute_torques(actions).sum(dim=1, keepdim=True)
 
 
+class Adds(LeggedRobot):
+    def _compute_torques(self, actions: Tensor) -> Tensor:
+        return super()._compute_torques(actions).sum()
+
+
 class Returns(LeggedRobot):
     def _compute_torques(self, actions: Tensor) -> Tensor:
         super()._compute_torques(actions)
@@ -235,6 +240,7 @@ class Divides(LeggedRobot):
     [
         (Asks, r"go1_flat: .*test_motors.py:\d+.*item\(\) reads a tensor to the host"),
         (Sums, r"_compute_torques must return a tensor \(4, 12\), a torque a joint; it returned \(4, 1\)"),
+        (Adds, r"Adds._compute_torques must return a tensor \(4, 12\), a torque a joint; it returned \(\)"),
         (Returns, r"Returns._compute_torques must return a tensor \(4, 12\), a torque a joint; it returned None"),
         (Divides, r"test_motors.py:\d+, Divides._compute_torques: returned a value that is not finite; look for a division by 0"),
     ],

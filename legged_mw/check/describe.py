@@ -44,6 +44,7 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
 
 
 def _memories(task: LoadedTask) -> list[str]:
+    """The networks that remember."""
     networks = {"actor": task.train.actor, "critic": task.train.critic}
     return [
         f"the {name} remembers: {part.rnn_type}, {part.rnn_hidden_dim} units, layers: {part.rnn_num_layers}"
@@ -65,9 +66,8 @@ def _motors(env: RobotTask) -> str:
 
 
 def _randomized(env: RobotTask) -> str:
-    """What differs between worlds, or that nothing does."""
-    rand = env.cfg.domain_rand
-    if not rand.enable:
+    """What differs between worlds' models, delays and encoders, or that nothing does."""
+    if not env.cfg.domain_rand.enable:
         return "domain_rand.enable is False: none of its ranges is drawn"
     spans = (f"{name} [{low:g}, {high:g}]" for name, (_, low, high) in active(env.cfg, env.motor_law).items())
     return f"domain_rand draws: {', '.join(spans) or 'nothing, no range is given'}"

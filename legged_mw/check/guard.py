@@ -83,12 +83,12 @@ def _own_methods(env_class: type) -> list[str]:
 
 
 def _watched(env_class: type[RobotTask], guard: Guard) -> type[Any]:
-    """The same class, whose rewards are looked at: they only read, and return finite numbers (N,). So do torques of its own law."""
+    """The same class, whose rewards are looked at: they only read, and return finite numbers (N,). Torques of its own law are finite."""
 
     def look(self: RobotTask, value: Tensor, method: Callable[..., Any]) -> None:
         watched = guard.on
         with guard.set(on=False):
-            wrong = ~value.isfinite().flatten(1).all(dim=1) if value.dim() > 1 else ~value.isfinite()
+            wrong = ~value.isfinite().reshape(self.num_envs, -1).all(dim=1)
             if watched and bool((wrong & ~self.broken).any()):
                 what = "returned a value that is not finite; look for a division by 0 or a root of a negative number"
                 raise StepError(what, place_of(method))
@@ -107,7 +107,7 @@ def _watched(env_class: type[RobotTask], guard: Guard) -> type[Any]:
         @functools.wraps(method)
         def law(self: RobotTask, actions: Tensor) -> Any:
             value = method(self, actions)
-            if isinstance(value, Tensor) and len(value) == self.num_envs:  # else the motors say so
+            if isinstance(value, Tensor) and value.shape == actions.shape:  # else the motors say so
                 look(self, value, method)
             return value
 
