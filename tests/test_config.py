@@ -392,6 +392,7 @@ def test_name_of_a_method() -> None:
         ("control.control_type", "v", "must be Literal['P', 'V', 'T'], not 'v' (str)"),
         ("control.stiffness", {"hip": None}, "['hip'] must be float, not None (NoneType)"),
         ("control.stiffness", {3: 1.0}, ": key must be str, not 3 (int)"),
+        ("control.stiffness", 35, "must be dict[str, float], not 35 (int); write {NAME: 35}, or in a table a joint {'': 35} for all"),
         ("control.stiffness", [1.0], "must be dict[str, float], not [1.0] (list)"),
         ("control.limits", 0.5, "must be int | list[float], not 0.5 (float)"),
         ("control.anything", {1, 2}, "must be None | bool | int | float | str | list | dict, not {1, 2} (set)"),

@@ -383,6 +383,12 @@ def test_torchscript_files_that_do_not_convert(module: nn.Module, args: tuple[st
     assert not (tmp_path / "net.npz").exists()
 
 
+def test_weights_without_their_code_are_no_torchscript(tmp_path: Path) -> None:
+    torch.save(mlp()[0].state_dict(), tmp_path / "net.pt")
+    with pytest.raises(UserError, match=r"net.pt is no torchscript file, which torch.jit.script\(network\).save\(FILE\) writes: "):
+        actuator_net.convert(tmp_path / "net.pt")
+
+
 # ---- exports
 
 

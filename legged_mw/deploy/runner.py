@@ -108,7 +108,8 @@ class _Step:
         if states and (type(robot).damp is Robot.damp or type(robot).limp is Robot.limp):
             raise RobotError(f"{type(robot).__name__} has no damp() and limp() of its own, which the states need")
         if states and controller.contract.action.origin == TORQUE:
-            raise RobotError("a policy of torques cannot stand a robot up: its states need servos; run it without them")
+            why = "a policy of torques cannot stand a robot up: its states need servos"
+            raise RobotError(f"{why}; run it without states, or watch it in simulation without --drive")
 
     @property
     def over(self) -> bool:

@@ -155,6 +155,10 @@ def load_tensors(path: Path, device: str) -> dict[str, Any]:
 
 def check_fit(saved: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], path: Path, what: str) -> None:
     """One clear line if the parameters in a checkpoint are not those of the network that config makes."""
+    remembers = [any(name.startswith("rnn.") for name in names) for names in (saved, wanted)]
+    if saved and remembers[0] != remembers[1]:
+        has, lacks = ("there", "here") if remembers[0] else ("here", "there")
+        raise ConfigError(f"{path} does not fit this task: the {what} has a memory (RNNModel) {has} and none {lacks}")
     for name in [*wanted, *saved]:
         here, there = wanted.get(name), saved.get(name)
         if here is None or there is None or here.shape != there.shape or here.is_floating_point() != there.is_floating_point():

@@ -36,7 +36,8 @@ def convert(file: Path, frames: Sequence[int] = (), **layout: Any) -> tuple[Moto
     try:
         module = torch.jit.load(str(file), map_location="cpu").eval()
     except (RuntimeError, ValueError, OSError) as error:
-        raise UserError(f"{file} is no torchscript file: {str(error).strip().splitlines()[0]}") from None
+        reason = str(error).strip().splitlines()[0]
+        raise UserError(f"{file} is no torchscript file, which torch.jit.script(network).save(FILE) writes: {reason}") from None
     found = _layers({name: value.detach().numpy() for name, value in module.state_dict().items()}, file)
     width = (found.recurrent or found.linear)[0][0].shape[1]
     frames = tuple(frames or range(width // 2))

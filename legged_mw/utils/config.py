@@ -229,6 +229,8 @@ def fit(value: Any, kind: Any, path: str) -> Any:
     if origin in (bool, str, NoneType) and type(value) is origin:
         return _within(value, kind, path)
     hint = _nearest(value, map(str, args)) if origin is Literal and isinstance(value, str) else ""
+    if origin is dict and args and bare(args[1]) is float and type(value) in (int, float):
+        hint = f"; write {{NAME: {value:g}}}, or in a table a joint {{'': {value:g}}} for all"
     raise ConfigError(f"{path} must be {type_text(kind)}, not {brief(value)} ({type(value).__name__}){hint}")
 
 
