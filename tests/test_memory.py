@@ -30,6 +30,7 @@ from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.recurrent import forget, memory_of
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.settings import rsl_rl_config
+from legged_mw.rl.training import advice_on_rate
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask, load_task
 from legged_mw.view.env_stage import EnvStage
@@ -156,6 +157,21 @@ def test_only_a_network_with_a_memory_gets_its_fields() -> None:
     learner = rsl_rl_config(task.train)
     assert (learner["actor"]["rnn_type"], learner["actor"]["rnn_num_layers"]) == ("lstm", 2)
     assert not [name for name in learner["critic"] if name.startswith("rnn_")] and learner["critic"]["hidden_dims"] == [16, 16]
+
+
+@pytest.mark.parametrize(
+    ("settings", "advised"),
+    [
+        ({}, True),
+        ({"actor.class_name": "MLPModel"}, True),  # the critic's memory
+        ({"actor.class_name": "MLPModel", "critic.class_name": "MLPModel"}, False),
+        ({"algorithm.max_learning_rate": 1e-3}, False),
+        ({"algorithm.schedule": "fixed"}, False),
+        ({"distillation.teacher": "go1_flat"}, False),
+    ],
+)
+def test_a_memory_is_advised_to_learn_slowly_on_a_gpu(settings: dict[str, Any], advised: bool) -> None:
+    assert ("--set algorithm.max_learning_rate=1e-3" in advice_on_rate(small_task(settings=settings))) == advised
 
 
 def test_a_cpu_gets_a_smaller_memory() -> None:

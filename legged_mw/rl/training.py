@@ -27,7 +27,7 @@ from legged_mw.rl.classes import check_classes
 from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
 from legged_mw.rl.policies import Trained, find_trained
-from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.ppo import MAX_RATE, GraphedPPO
 from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stuck, quiet, rank_device, this_rank
 from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
@@ -139,6 +139,7 @@ def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> 
     for line in facts.slow() if facts else ():
         print(line, flush=True)
     if device != "cpu":
+        print(advice_on_rate(task), end="", flush=True)
         return facts is None or facts.pool
     cores, runner = usable_cores(), task.train.runner
     steps = runner.max_iterations * worlds * runner.num_steps_per_env
@@ -150,6 +151,15 @@ def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> 
     )
     print(f"{cores} cores: {plan}{f'; --max_time ends it after {most / 60:.3g} min' if most and most < 60 * minutes else ''}", flush=True)
     return True
+
+
+def advice_on_rate(task: LoadedTask) -> str:
+    """A line where a memory may lose its way on a GPU, as many samples let the adaptive learning rate rise (docs/lab.md, Blind stairs)."""
+    algorithm, networks = task.train.algorithm, (task.train.actor, task.train.critic)
+    remembers = any(network.class_name.endswith("RNNModel") for network in networks) and not task.train.distillation.teacher
+    if not remembers or algorithm.schedule == "fixed" or algorithm.max_learning_rate < MAX_RATE:
+        return ""
+    return "a memory loses its way where the learning rate rises far: --set algorithm.max_learning_rate=1e-3 (docs/training.md, A memory)\n"
 
 
 def say_compiling(task: LoadedTask, device: str) -> AbstractContextManager[object]:
