@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import memory, step
+from benchmarks import heights, memory, step
 
 
 @pytest.mark.parametrize("engine", ["mujoco", "mujoco_warp"])
@@ -43,3 +43,10 @@ def test_another_failure_is_not_taken_for_want_of_memory(monkeypatch: pytest.Mon
     monkeypatch.setattr(memory, "rows", lambda *_: iter([{"error": "no task 'go9' in configs/"}]))
     gpu: Any = argparse.Namespace(leave=lambda size: None)
     assert memory.smallest(argparse.Namespace(sizes=[2.0, 4.0]), "go9", 1024, "cuda:0", gpu) == "no task 'go9' in configs/"
+
+
+def test_as_many_robots_as_asked_stand_before_each_height() -> None:
+    low, high = 6.0, 19.5
+    asked, crossed = heights.shares("go2_rough", "stairs_up", low, high, repeats=1, engine="mujoco", device="cpu")
+    assert (asked[0], asked[-1], len(asked), len(crossed)) == (low, high, 10, 10)
+    assert crossed[:3] == [1.0] * 3  # steps of 9 cm and less; it ships with 1.0 up to 15 cm
