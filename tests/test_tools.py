@@ -347,7 +347,7 @@ def test_completion_knows_programs_flags_tasks_fields_and_runs(bash: str, tmp_pa
         ("legged-mw play --viewer n", {"native", "none"}),
         ("legged-mw play --load_run logs", {"logs/go1_flat/a_run"}),
         ("legged-mw compare l", {"logs/go1_flat/a_run"}),
-        ("legged-mw deploy go1_r", {"go1_rough", "go1_rough_scan"}),
+        ("legged-mw deploy go1_r", {"go1_rough", "go1_rough_scan", "go1_rough_student"}),
         ("legged-mw train --set env.num_envs = 6", set()),
     ):
         assert completed(bash, line, tmp_path) == offered, line

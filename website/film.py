@@ -56,6 +56,7 @@ BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
     "go1_flat": Shot("go1_flat", (0.9, 0.0, 0.6), distance=1.8, azimuth=110.0),
     "go1_rough": FILM[0]._replace(policy="go1_rough"),
     "go1_rough_scan": FILM[0],
+    "go1_rough_student": FILM[0]._replace(policy="go1_rough_student"),
     "go2_flat": FILM[1],
     "go2_rough": FILM[0]._replace(policy="go2_rough"),
     "go2_rough_scan": FILM[0]._replace(policy="go2_rough_scan"),
