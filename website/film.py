@@ -54,12 +54,8 @@ FILM = [  # of the README, from left to right
 ]
 BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
     "go1_flat": Shot("go1_flat", (0.9, 0.0, 0.6), distance=1.8, azimuth=110.0),
-    "go1_rough": FILM[0]._replace(policy="go1_rough"),
-    "go1_rough_scan": FILM[0],
-    "go1_rough_student": FILM[0]._replace(policy="go1_rough_student"),
+    **{name: FILM[0]._replace(policy=name) for name in ("go1_rough", "go1_rough_scan", "go1_rough_student", "go2_rough", "go2_rough_scan")},
     "go2_flat": FILM[1],
-    "go2_rough": FILM[0]._replace(policy="go2_rough"),
-    "go2_rough_scan": FILM[0]._replace(policy="go2_rough_scan"),
     "g1_flat": FILM[2],
     "g1_12dof_flat": FILM[2]._replace(policy="g1_12dof_flat"),
     "go1_getup": FILM[3],
