@@ -57,6 +57,7 @@ def line(result: dict[str, Any]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="a run folder")
+    parser.add_argument("--task", help="its task, where that is a file outside of the clone")
     parser.add_argument("--every", type=int, default=1, help="iterations between graded checkpoints; the last one is always graded")
     parser.add_argument("--until", type=int, default=10**9, help="the last iteration to grade; then the newest checkpoint is not")
     parser.add_argument("--ranges", choices=["trained", "common"], default="trained")
@@ -64,10 +65,10 @@ def main() -> None:
     parser.add_argument("--device")
     parser.add_argument("--out", type=Path, help="write the results as JSON")
     args = parser.parse_args()
-    device, task = pick_device(args.device), load_task(task_of(args.run))
+    device, task = pick_device(args.device), load_task(name := args.task or task_of(args.run))
     task.update_from_run(load_yaml(args.run / CONFIG_FILE), where=str(args.run))
     if args.ranges == "common":
-        task.update({"exam": in_common(load_task(task_of(args.run)).cfg.exam.peer)}, where="--ranges common")
+        task.update({"exam": in_common(load_task(name).cfg.exam.peer)}, where="--ranges common")
     require_exam(task)
     if task.exam != "walking":
         perform.prepare(task)

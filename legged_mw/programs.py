@@ -37,8 +37,10 @@ def train() -> None:
 def _train(args: argparse.Namespace) -> None:
     from legged_mw.eval.exams import find_exam
     from legged_mw.rl import training
+    from legged_mw.rl.ranks import quiet, this_rank
 
-    find_exam(task := load_task(args.task))
+    quiet(this_rank())  # from here on only the first of several processes prints
+    find_exam(task := load_task(args.task, say=True))
     start, device = training.configure(task, args)
     with training.say_compiling(task, device):
         _build_and_train(task, start, device, args)
@@ -79,7 +81,7 @@ def play() -> None:
     from legged_mw.view import playing
 
     args = playing.parse(play.__doc__)
-    task = load_task(args.task)
+    task = load_task(args.task, say=True)
     source = find_policy(task, args.load_run, args.checkpoint, args.experiment_name)
     trained = load_trained(args.task, source)
     quick_start.settle()

@@ -130,9 +130,10 @@ def test_the_documented_task_trains_resumes_and_exports(tmp_path: Path) -> None:
     assert stage.controller.memory is not None and stage.controller.memory.all() and np.isfinite(stage.qpos()).all()
     stage.reset(1)
     assert stage.controller.memory[0].all() and not stage.controller.memory[1].any()
-    assert run("play", tmp_path, "--load_run", str(folder), "--device", "cpu", "--export", str(tmp_path / "again")).code == 0
+    play = [*args[:2], "--load_run", str(folder), "--device", "cpu"]
+    assert run("play", tmp_path, *play, "--export", str(tmp_path / "again")).code == 0
     assert (tmp_path / "again/policy.onnx").read_bytes() == (folder / "policy.onnx").read_bytes()
-    line = refused(tmp_path, "play", "--load_run", str(folder), "--device", "cpu", "--set", "actor.class_name=MLPModel")
+    line = refused(tmp_path, "play", *play, "--set", "actor.class_name=MLPModel")
     assert "policy.onnx does not fit this task: the actor has a memory (RNNModel) there and none here" in line
 
 

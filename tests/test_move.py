@@ -86,44 +86,54 @@ def test_a_folder_with_task_robot_and_runs_moves(tmp_path: Path, monkeypatch: py
     assert result.code == 0 and (run_folder / "model_2.pt").exists(), result
     monkeypatch.chdir(tmp_path)
     still = ["--device", "cpu", "--viewer", "none", "--time", "0.1s"]
-    result = run("play", tmp_path, "--load_run", str(run_folder), *still)  # the run says of which task it is
-    assert result.code == 0 and "model_2.pt" in result.out, result
+    result = run("play", tmp_path, "--task", str(new / "dog.py"), "--load_run", str(run_folder), *still)
+    assert result.code == 0 and "task: second/machine/dog.py\n" in result.out and "model_2.pt" in result.out, result
     other = kennel(tmp_path / "third")
     for gone in (new / "dog.py", new / "robot/dog.xml"):
         gone.unlink()
     result = run("play", tmp_path, "--task", str(other), "--load_run", str(run_folder), *still)
     assert result.code == 0, result
     line = refused(tmp_path, "play", "--load_run", str(run_folder), "--device", "cpu")
-    assert f"{run_folder.relative_to(tmp_path)} is of task 'dog.py', which is not there from {tmp_path}, " in line
-    assert line.endswith("; say --task FILE\n")
+    assert f"{run_folder.relative_to(tmp_path)} is of task 'dog.py', somebody's code" in line and line.endswith("--task dog.py\n")
 
 
-def test_the_task_of_a_run_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As stored, then from above the run, then by its bare name; a name in configs/ stays one."""
-    home = tmp_path / "home"
-    file = kennel(home / "tasks")
-    folder = home / "logs/dog/one"
+def test_the_task_of_a_run_is_the_projects_or_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A name in configs/, a file in the clone's examples/ whichever way it is written, or one that the user's task is or extends."""
+    file, folder = kennel(tmp_path / "tasks"), tmp_path / "logs/dog/one"
+    child = tmp_path / "child.py"
+    child.write_text(
+        "import sys\nsys.path.append('tasks')\nfrom dog import TASK as DOG, DogCfg\n\n\n"
+        "class ChildCfg(DogCfg):\n    pass\n\n\nTASK = DOG._replace(cfg=ChildCfg)\n"
+    )
     folder.mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    example = str(ROOT / "examples/go1_stand.py")
+    link = tmp_path / "go1_stand.py"
+    link.symlink_to(example)
     for stored, found in (
         ("go1_flat", "go1_flat"),
-        (str(file), str(file)),
-        ("tasks/dog.py", str(file)),
-        ("home/tasks/dog.py", str(file)),
-        ("../else/tasks/dog.py", None),
+        ("examples/go1_stand.py", example),
+        (example, example),
+        ("go1_stand.py", example),  # the link: what it leads to is the project's
+        (str(file), ""),
+        ("tasks/dog.py", ""),
+        ("../examples/go1_stand.py", ""),
+        ("configs/none.py", ""),
     ):
         save_yaml(folder / "config.yaml", {"task": stored})
-        if found is None:
-            places = ", ".join(map(str, (tmp_path, home / "logs/dog", home / "logs", home)))  # each once
-            text = f"home/logs/dog/one is of task '../else/tasks/dog.py', which is not there from {places}; say --task FILE"
-            with pytest.raises(ConfigError, match=f"^{re.escape(text)}$"):
-                task_of(folder)
+        if found:
+            assert task_of(folder) == found
         else:
-            assert Path(task_of(folder)).resolve() == Path(found).resolve() or task_of(folder) == found
-    (home / "dog.py").write_text(DOG)
-    assert task_of(folder) == str(home / "dog.py")
+            with pytest.raises(ConfigError, match=re.escape(f"logs/dog/one is of task '{stored}', somebody's code")):
+                task_of(folder)
+    save_yaml(folder / "config.yaml", {"task": "elsewhere/dog.py"})
+    for mine in (file, child):
+        assert task_of(folder, load_task(str(mine))) == str(file)
+    with pytest.raises(ConfigError, match="--task elsewhere/dog.py, or a task that extends its config$"):
+        task_of(folder, load_task("go1_flat"))
     save_yaml(folder / "config.yaml", {"seed": 1})
-    with pytest.raises(ConfigError, match=r"^home/logs/dog/one/config\.yaml does not say of which task it is; say --task$"):
+    with pytest.raises(ConfigError, match=r"^logs/dog/one/config\.yaml does not say of which task it is; say --task$"):
         task_of(folder)
     line = refused(tmp_path, "play", "--device", "cpu", "--load_run", "one")
     assert "--task is missing, and --load_run is no path of a run that would say it; tasks: " in line

@@ -127,7 +127,7 @@ def test_compiling_says_so(tmp_path: Path) -> None:
     assert len(said) == 1
 
 
-def small_task(name: str) -> LoadedTask:
+def small_task(name: str, **_: Any) -> LoadedTask:
     task = load_task(name)
     few = {"envs_per_core": 4, "num_steps_per_env": 4, "hidden_dims": [16]}
     task.update({"cpu": few, "terrain": {"mesh_type": "plane"}} if name != "go1_rough" else {"cpu": few}, where="test")

@@ -42,7 +42,7 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     args = parse()
-    cfg, file = load_task(args.task).cfg, Path(args.file)
+    cfg, file = load_task(args.task, say=True).cfg, Path(args.file)
     robot = load_robot(cfg, "servo", "mujoco", None, [], {})
     clip = convert(read_motion(file, robot, args.fps), args)
     print(page(robot, clip, feet_of(robot)))

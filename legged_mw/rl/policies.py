@@ -55,8 +55,11 @@ class Trained(NamedTuple):
     task: LoadedTask
 
 
-def find_trained(asked: str, experiment: Path, flag: str) -> Trained:
-    """The policy that a flag names: a file, a run of this or any ``experiment``, an export, a task, or a run of it as TASK/RUN."""
+def find_trained(asked: str, experiment: Path, flag: str, learner: LoadedTask | None = None) -> Trained:
+    """The policy that a flag names: a file, a run of this or any ``experiment``, an export, a task, or a run of it as TASK/RUN.
+
+    Its task is the project's, or in a file that the task of the ``learner`` is or extends.
+    """
     path, (task, _, run) = typed(asked), asked.partition("/")
     try:
         if path.is_file():
@@ -65,7 +68,7 @@ def find_trained(asked: str, experiment: Path, flag: str) -> Trained:
             source = find_policy(load_task(task), run or None)
         else:
             source = _run_or_export(experiment, asked)
-        return Trained(source, load_trained(task_of(source.folder), source))
+        return Trained(source, load_trained(task_of(source.folder, learner), source))
     except ConfigError as error:
         raise ConfigError(
             f"{flag} {asked}: {error}; name a run by its path or as TASK/RUN, or a task for its last or shipped policy"

@@ -16,7 +16,7 @@ from legged_mw.rl.checkpoint import EARLIER, check_content, damage, sealed
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import shown, unknown
 from legged_mw.utils.files import check_folder, check_name, typed
-from legged_mw.utils.task import LoadedTask
+from legged_mw.utils.task import LoadedTask, of_project, somebodys
 
 CONFIG_FILE = "config.yaml"
 
@@ -85,33 +85,19 @@ def find_checkpoint(run: Path, iteration: int) -> Path:
     return found[iteration]
 
 
-def task_of(run: Path) -> str:
-    """What ``--task`` is for the run in the folder ``run``: a name in configs/, or the path of its config file as it lies today.
+def task_of(run: Path, named: LoadedTask | None = None) -> str:
+    """What ``--task`` is for the run in the folder ``run``: the project's task that its config names, or a file that ``named`` has run.
 
-    A relative path is looked for from the current folder and from those above the run, then its bare name. Raises ConfigError.
+    No other file, since a file is code, and a run may be a stranger's. Raises ConfigError with what to type.
     """
     stored = load_yaml(run / CONFIG_FILE).get("task", "")
     if not isinstance(stored, str) or not stored:
         raise ConfigError(f"{shown(run / CONFIG_FILE)} does not say of which task it is; say --task")
-    if Path(stored).suffix != ".py":
-        return stored
-    folders = [*dict.fromkeys([Path.cwd(), *run.resolve().parents[:4]])]  # experiment, logs, what holds logs; of an export one more
-    for file in (folder / name for name in (stored, Path(stored).name) for folder in folders):
-        with suppress(OSError, ValueError):  # a name that no file can have
-            if file.is_file():
-                return _not_brought(file, run)
-    raise ConfigError(f"{shown(run)} is of task '{stored}', which is not there from {', '.join(map(str, folders))}; say --task FILE")
-
-
-def _not_brought(file: Path, run: Path) -> str:
-    """The task file of a run, which will be run as code: it is a task, and did not come with the run. Raises ConfigError."""
-    home, really = run.resolve(), file.resolve()
-    logs = next((above for above in home.parents if above.name == "logs"), home)
-    if really.is_relative_to(home) or really.is_relative_to(logs):
-        raise ConfigError(f"{shown(run)} is of task {shown(file)}, which came with it and is code: read it, then say --task {shown(file)}")
-    if not re.search(rb"^TASK\b", really.read_bytes(), re.MULTILINE):
-        raise ConfigError(f"{shown(run)} is of task {shown(file)}, which is no task: it has no line TASK = Task(...); say --task FILE")
-    return str(file)
+    if found := of_project(stored) or (named and named.file_called(Path(stored).name)):
+        return str(found)
+    raise ConfigError(
+        f"{shown(run)} is of task {stored[:200]!r}, {somebodys(stored)}{', or a task that extends its config' if named else ''}"
+    )
 
 
 def task_at(path: str) -> str:

@@ -28,7 +28,7 @@ from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
 from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import MAX_RATE, GraphedPPO
-from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stuck, quiet, rank_device, this_rank
+from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stuck, rank_device, this_rank
 from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
@@ -66,7 +66,6 @@ class Start(NamedTuple):
 
 def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     """Give ``task`` its final config: the resumed run's, the user's, a CPU's. Returns what to begin with and the device."""
-    quiet(this_rank())  # from here on only the first of several processes prints
     if not torch.cuda.is_available():
         torch.set_num_threads(1)  # hundreds of small operations a step stall on a second thread
     start = _resume(task, args) if args.resume else None
@@ -113,9 +112,9 @@ def _find_others(task: LoadedTask, start: Start) -> Start:
     asked, begin = task.train.distillation.teacher, task.train.warm_start.policy
     if asked:
         asked = str(start.run / TEACHER) if start.run else asked
-        start = start._replace(teacher=find_trained(asked, start.experiment, "--teacher"))
+        start = start._replace(teacher=find_trained(asked, start.experiment, "--teacher", task))
     if begin and not start.run:
-        start = start._replace(policy=find_trained(begin, start.experiment, "--init"))
+        start = start._replace(policy=find_trained(begin, start.experiment, "--init", task))
     return start
 
 

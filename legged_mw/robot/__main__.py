@@ -42,7 +42,7 @@ def main() -> None:
     torch.set_num_threads(1)
     file, image = Path(args.file), Path(args.picture) if args.picture else None
     if file.suffix not in ROBOT_FILES:
-        show_task(load_task(args.file), image)
+        show_task(load_task(args.file, say=True), image)
         return
     if args.new:
         new.targets(args.new, writable(args.out, "--out", folder=True), args.force)  # refused before the page, not after it

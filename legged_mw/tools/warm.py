@@ -43,7 +43,7 @@ def main() -> None:
 
 def warm(name: str, device: str) -> None:
     """Train a task for an iteration, and step its exam: all kernels that its training launches."""
-    task = load_task(name)
+    task = load_task(name, say=True)
     if device == "cpu":
         task.fit_cpu(usable_cores())
         torch.set_num_threads(1)  # as train.py does

@@ -177,5 +177,10 @@ def digest(file: Path) -> str:
     return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
+def file_of(cls: type) -> Path | None:
+    """The file with the body of ``cls``, if it is a config's."""
+    return _FILES.get(cls)
+
+
 def _folder(cls: type) -> Path | None:
     return _FILES[cls].parent if cls in _FILES else None

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from legged_mw import ROOT
 from legged_mw.utils.config import Config, ConfigError
 from legged_mw.utils.errors import UserError, in_short, shown, unknown, users_fault
-from legged_mw.utils.files import find_file, typed
+from legged_mw.utils.files import file_of, find_file, typed
 from legged_mw.utils.renamed import with_new_names
 from legged_mw.utils.task_module import import_task
 
@@ -68,7 +70,8 @@ class LoadedTask:
         saved = self._with_own_file(with_new_names(saved))
         theirs = str(saved.get("task", self.name))
         if Path(theirs).stem != self.name:
-            raise ConfigError(f"{where} is of task '{theirs}', not '{self.name}'; say --task {theirs}")
+            what = f"say --task {theirs}" if of_project(theirs) else f"that is {somebodys(theirs)}"
+            raise ConfigError(f"{where} is of task {theirs[:200]!r}, not '{self.name}'; {what}")
         base = next(kind for kind in reversed(type(self.train).__mro__) if issubclass(kind, Config) and kind is not Config)()
         older = {name: value for name, value in base.to_dict().items() if name not in saved and isinstance(value, dict)}
         self.update({**saved, **older}, where)
@@ -112,6 +115,11 @@ class LoadedTask:
             name = Path(os.path.relpath(file, here)).as_posix() if together else file.name
         return {"task": name, **self.cfg.to_dict(), **self.train.to_dict()}
 
+    def file_called(self, name: str) -> Path | None:
+        """The file of that ``name`` among the task's own and those of the configs that it extends: they have been run."""
+        kinds = (*type(self.cfg).__mro__, *type(self.train).__mro__)
+        return next((file for file in (self.path, *map(file_of, kinds)) if file and file.name == name), None)
+
     @property
     def ships(self) -> bool:
         """Whether the file is in configs/, so that ``--task`` knows its bare name."""
@@ -124,6 +132,26 @@ class LoadedTask:
         return sections[section]
 
 
+def of_project(stored: str) -> str:
+    """``--task`` for the task that a run's config names, if it is this project's; "" for any other file, which no run may start.
+
+    The project's are the names in configs/, and files that really lie in configs/ or examples/ of ``ROOT``, the package or the clone.
+    """
+    if Path(stored).suffix != ".py":
+        return stored  # a name; there is none outside of configs/
+    folders = [(ROOT / name).resolve() for name in ("configs", "examples")]
+    with suppress(OSError, ValueError, RuntimeError):  # a name that no file can have, a link to itself
+        for file in ((place / stored).resolve() for place in (Path.cwd(), ROOT)):
+            if file.is_file() and file.parent in folders:
+                return str(file)
+    return ""
+
+
+def somebodys(stored: str) -> str:
+    """What a task's file that is not ``of_project`` is, and the flag that runs it."""
+    return f"somebody's code, which no run starts by itself: read it, then say --task {shlex.quote(stored[:200])}"
+
+
 def task_names() -> list[str]:
     """Names that ``--task`` knows without a path."""
     return sorted(path.stem for path in (ROOT / "configs").glob("*.py") if not path.stem.startswith("_"))
@@ -134,8 +162,8 @@ def list_tasks() -> str:
     return "\n".join(f"{name:<16} {load_task(name).about}" for name in task_names())
 
 
-def load_task(name: str) -> LoadedTask:
-    """The task called ``name`` in ``configs/``, or that of the config file at that path.
+def load_task(name: str, say: bool = False) -> LoadedTask:
+    """The task called ``name`` in ``configs/``, or that of the config file at that path, which is printed before it runs if ``say``.
 
     The file may import its neighbours. A relative ``asset.file`` is looked for beside the file that wrote it, then in the repository.
     """
@@ -149,6 +177,8 @@ def load_task(name: str) -> LoadedTask:
         path = ROOT / "configs" / f"{name}.py"
     if not path.is_file():
         raise ConfigError(f"no config file at {path.absolute()}")
+    if say and path.resolve().parent != (ROOT / "configs").resolve():
+        print(f"task: {shown(path)}", flush=True)
     try:
         module = import_task(path)
     except UserError:

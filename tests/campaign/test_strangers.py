@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import shlex
 import shutil
 import socket
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from attack import Case, attack, program
+from program import run
 
 from legged_mw import ROOT
 from legged_mw.utils.files import check_folder
@@ -19,7 +21,7 @@ from legged_mw.utils.files import check_folder
 RUN = "gift/logs/go1_flat/run"  # what was given to us
 PLAIN = "it must be a plain name such as wide_net, of 100 bytes at most"
 NAME = "cannot be the name of a folder below logs: "
-CODE = "import pathlib\npathlib.Path('pwned').touch()\nTASK = 1\n"
+CODE = "import pathlib\npathlib.Path('pwned').touch()\nfrom configs.go1_flat import TASK\nTASK = TASK\n"
 CLEAR = "\x1b[2J\x1b]0;owned\x07"  # what a terminal would obey
 play, resume, check = (lambda *flags: program("play", *flags)), (lambda *f: program("train", "--resume", *f)), ("train", "--check")
 Given = Callable[[Path], object]
@@ -186,23 +188,8 @@ CASES = [
          given=text(f"{RUN}/model_9.pt", pickle.dumps(_Code()))),
     Case("pickle: an older checkpoint", program("play", "--load_run", RUN, "--checkpoint", "2"), "cannot be read as a checkpoint",
          given=text(f"{RUN}/model_2.pt", pickle.dumps({"actor_state_dict": _Code()}))),
-    # a task that comes with the run is code
-    Case("task: in the run", BARE, "came with it and is code", given=both(text(f"{RUN}/evil.py", CODE), config(task="run/evil.py"))),
-    Case("task: beside the run", BARE, "came with it and is code",
-         given=both(text("gift/logs/go1_flat/evil.py", CODE), config(task="evil.py"))),
-    Case("task: in logs", BARE, "came with it and is code", given=both(text("gift/logs/evil.py", CODE), config(task="evil.py"))),
-    Case("task: from here into the run", BARE, "came with it and is code",
-         given=both(text(f"{RUN}/evil.py", CODE), config(task=f"{RUN}/evil.py"))),
-    Case("task: by a link", BARE, "came with it and is code",
-         given=both(text(f"{RUN}/evil.txt", CODE), link("gift/evil.py", "logs/go1_flat/run/evil.txt"), config(task="evil.py"))),
-    Case("task: in an export", program("play", "--load_run", f"{RUN}/export", "--task", ""), "came with it and is code",
-         given=both(text(f"{RUN}/export/evil.py", CODE), text(f"{RUN}/export/config.yaml", "task: export/evil.py\n"))),
-    Case("task: of a teacher", program(*check, "--teacher", RUN), "came with it and is code",
-         given=both(text(f"{RUN}/evil.py", CODE), config(task="run/evil.py"))),
-    Case("task: a program of the user's", BARE, "which is no task: it has no line TASK",
-         given=both(text("wipe.py", "open('pwned', 'w')\n"), config(task="wipe.py"))),
     Case("task: an escape", BARE, "", given=config(task=r'"\e[2J\e]0;x\a.py"')),
-    Case("task: a name of 5000", BARE, "which is not there", given=config(task="x" * 5000 + ".py")),
+    Case("task: a name of 5000", BARE, "somebody's code", given=config(task="x" * 5000 + ".py")),
     Case("task: another user's home", BARE, "", given=config(task="~nobody_here/x.py")),
     # names that are printed
     Case("escape: the folder of a run", play("--load_run", "no_such"), r"there are: \x1b[2J\x1b]0;owned\x07",
@@ -216,12 +203,12 @@ CASES = [
 ]  # fmt: skip
 
 
-def given_run(root: Path) -> None:
+def given_run(root: Path, run: str = RUN) -> None:
     """A run as it may be given to us; its checkpoint is none, since nobody comes to read it."""
-    export = root / RUN / "export"
+    export = root / run / "export"
     shutil.copytree(ROOT / "resources/policies/go1_flat", export)
-    shutil.copy(export / "config.yaml", root / RUN)
-    (root / RUN / "model_2.pt").touch()
+    shutil.copy(export / "config.yaml", root / run)
+    (root / run / "model_2.pt").touch()
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.id.encode("unicode_escape").decode()[:60])
@@ -230,6 +217,60 @@ def test_strangers(case: Case, tmp_path: Path) -> None:
     says = tuple(each.replace("ROOT", str(tmp_path)) for each in ([case.says] if isinstance(case.says, str) else case.says))
     line = attack(case._replace(says=says), tmp_path)
     assert line[:-1].isprintable() and not list(tmp_path.rglob("pwned"))
+
+
+BEST, UNPACKED = "walker/best", "logs/walker/logs/go1_flat/run"  # an archive without logs; one that lies in our own logs
+WAYS = {  # what a run's config may name -> (the run, where the code lies, what the config says; the program, if not play)
+    "beside the run": (BEST, "walker/code.py", "code.py"),
+    "exported": (BEST, "walker/code.py", "code.py", "play", "--export", "ROOT/out", "--load_run"),
+    "graded": (BEST, "walker/code.py", "code.py", "play", "--eval", "--load_run"),
+    "resumed": (BEST, "walker/code.py", "code.py", "train", "--resume", "--load_run"),
+    "a start of a task that is named": (BEST, "walker/code.py", "code.py", "train", "--check", "--task", "go1_flat", "--init"),
+    "a teacher of a task that is named": (BEST, "walker/code.py", "code.py", "train", "--check", "--task", "go1_flat", "--teacher"),
+    "an absolute path": (BEST, "walker/code.py", "ROOT/walker/code.py"),
+    "upwards": (BEST, "walker/code.py", "../../../../../../../../../../../..ROOT/walker/code.py"),
+    "beside the logs": (RUN, "gift/code.py", "code.py"),
+    "in a sister folder": (RUN, "gift/tasks/code.py", "tasks/code.py"),
+    "below our own logs": (UNPACKED, "logs/walker/code.py", "code.py"),
+    "in the current folder": (RUN, "code.py", "code.py"),
+    "in the run": (RUN, f"{RUN}/code.py", "run/code.py"),
+    "in its logs": (RUN, "gift/logs/code.py", "code.py"),
+    "in an export": (f"{RUN}/export", f"{RUN}/export/code.py", "export/code.py"),
+    "a link": (RUN, f"{RUN}/code.txt", "code.py"),
+    "a link that is called examples": (RUN, f"{RUN}/code.py", "examples/code.py"),
+    "a module": (BEST, "walker/code.py", "walker.code"),
+    "a path without .py": (BEST, "walker/code.py", "../walker/code"),
+    "a shell's command": (BEST, "walker/code.py; touch pwned #.py", "code.py; touch pwned #.py"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_run_decides_no_code(way: str, tmp_path: Path) -> None:
+    """Which Python is run is what --task names, or the project's own; the line to type is as a shell may be given it."""
+    folder, place, stored, *flags = (each.replace("ROOT", str(tmp_path)) for each in WAYS[way])
+    given_run(tmp_path, folder.removesuffix("/export"))
+    (tmp_path / place).parent.mkdir(exist_ok=True)
+    (tmp_path / place).write_text(CODE)
+    (tmp_path / "examples").symlink_to(tmp_path / RUN)
+    if way == "a link":
+        (tmp_path / "gift/code.py").symlink_to(tmp_path / place)
+    file = tmp_path / folder / "config.yaml"
+    file.write_text(file.read_text().replace("task: go1_flat\n", f"task: '{stored}'\n"))
+    name, *flags = flags or ["play", "--load_run"]
+    task = [] if "--task" in flags else ["--task", ""]
+    is_file = stored.endswith(".py")
+    line = attack(Case(way, program(name, *task, *flags, folder), "somebody's code" if is_file else "no task"), tmp_path)
+    assert not is_file or f"--task {shlex.quote(stored)}" in line
+    assert not list(tmp_path.rglob("pwned"))
+
+
+def test_a_file_that_is_named_runs_and_is_printed_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The trap works: by --task the same file runs."""
+    (tmp_path / "code.py").write_text("print('runs')\n" + CODE)
+    monkeypatch.chdir(tmp_path)
+    done = run("train", tmp_path, "--task", "code.py", "--check", "--eager", "--num_envs", "1", "--device", "cpu")
+    assert done.code == 0 and done.out.splitlines()[:2] == ["task: code.py", "runs"] and (tmp_path / "pwned").exists(), done
+    assert done.out.count("task: ") == 1
 
 
 def test_links_that_stay_in_a_run_are_its_own(tmp_path: Path) -> None:
