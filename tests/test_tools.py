@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -22,6 +23,7 @@ from legged_mw.rl.runner import Runner
 from legged_mw.rl.runs import load_tensors, save_whole
 from legged_mw.sim.device import DeviceFacts, device_facts
 from legged_mw.tools import alongside, chart, completion, doctor, sweep, warm
+from legged_mw.tools.curves import read_run
 from legged_mw.utils import renderer
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.machine import usable_cores
@@ -271,7 +273,7 @@ def test_a_sweep_trains_every_combination_and_ends_with_a_table(tmp_path: Path) 
             return 2, "", "train.py: wrong"
         return 0, str(write_run(tmp_path / f"{len(asked)}", reward=len(asked))), ""
 
-    found = sweep.train_all(cells, ["--task", "go1_flat"], start)
+    found = sweep.train_all(cells, ["--task", "go1_flat"], start, sweep.Stop())
     assert asked[0] == [*["--task", "go1_flat", "--set", "a.b=1", "--set"], "c.d=[3, 4]", *["--set", "seed=1", "--run_name", "b=1_seed=1"]]
     lines = [line.split() for line in sweep.table(found).splitlines()]
     assert lines[0] == ["b", "seed", "iterations", "M", "steps", "minutes", "steps/s", "reward", "falls"]
@@ -288,7 +290,77 @@ def test_a_sweep_ends_where_a_signal_stops_it(tmp_path: Path) -> None:
         code, said = (sweep.STOPPED, "stopped: SIGINT; go on with") if len(flags) == 2 else (0, "")
         return code, str(write_run(tmp_path / f"{len(flags)}")), said
 
-    assert len(sweep.train_all(cells, [], start)) == len(flags) == 2
+    assert len(sweep.train_all(cells, [], start, sweep.Stop())) == len(flags) == 2
+
+
+FAKE = """
+import os, signal, sys
+told = os.open(sys.argv[1], os.O_WRONLY)
+def ask(number, _):
+    os.write(told, signal.Signals(number).name.encode())
+    sys.exit(3)
+if sys.argv[2] == "trains":
+    signal.signal(signal.SIGTERM, ask)
+signal.signal(signal.SIGALRM, lambda *_: os.write(told, b"nobody asked") and sys.exit(1))
+signal.alarm(120)
+os.write(told, b"begins\\n")
+while True:
+    signal.pause()
+"""  # what a training is to a sweep
+
+
+@pytest.mark.parametrize("state", ["starts", "trains"])
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP", "SIGKILL"])
+def test_no_training_outlives_its_sweep(name: str, state: str, tmp_path: Path) -> None:
+    """And no other begins; one that has not yet begun to train is not there to save."""
+    (tmp_path / "fake.py").write_text(FAKE)
+    os.mkfifo(tmp_path / "told")
+    fake = [sys.executable, "fake.py", "told", state]
+    code = f"from legged_mw.tools import sweep\nsweep.TRAIN, sweep.check = {fake}, lambda *_: None\nsweep.main()\n"
+    command = [sys.executable, "-c", code, "--task", "go1_flat", "--seeds", "1,2"]
+    with subprocess.Popen(command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=-1, text=True) as ours:
+        with open(tmp_path / "told") as told:
+            assert told.readline() == "begins\n"
+            ours.send_signal(signal.Signals[name])
+            assert told.read() == ("SIGTERM" if state == "trains" else "")  # to its end, when nobody holds it open
+        assert ours.stdout and "2/2" not in ours.stdout.read()
+    assert ours.returncode == (-signal.SIGKILL if name == "SIGKILL" else 1)
+
+
+def test_a_signal_between_two_trainings_ends_a_sweep(tmp_path: Path) -> None:
+    stop, started = sweep.Stop(), []
+
+    def start(asked: list[str]) -> tuple[int, str, str]:
+        started.append(asked)
+        stop()
+        return 0, str(write_run(tmp_path / "one")), ""
+
+    assert len(sweep.train_all(sweep.make_cells([], ["1", "2"]), [], start, stop)) == len(started) == 1
+
+
+@pytest.mark.parametrize(
+    ("flags", "said"),
+    [
+        (["--set", "algorithm.gamma=0.9,5"], "algorithm.gamma"),
+        (["--set", "algorithm.gama=0.9"], "gama"),
+        (["--num_envs", "none"], "--num_envs"),
+        (["--nonsense"], "--nonsense"),
+    ],
+)
+def test_a_wrong_value_is_found_before_the_first_training(
+    flags: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sweep, "start", lambda *_, **__: pytest.fail("it began"))
+    with pytest.raises(SystemExit, match="2"):
+        program("sweep", "--task", "go1_flat", "--seeds", "1,2", *flags, monkeypatch=monkeypatch)
+    err = capsys.readouterr().err
+    assert said in err and err.count("\n") == 1
+
+
+def test_means_are_of_numbers_not_of_what_is_printed(tmp_path: Path) -> None:
+    cells = sweep.make_cells([], ["1", "2", "3"])
+    found = [(cell, read_run(write_run(tmp_path / cell.name, reward=0.0023 + 5e-5 * i), "")) for i, cell in enumerate(cells)]
+    assert "0.02350 ± 0.00050" in sweep.table(found).splitlines()[-1]
 
 
 def test_values_stand_apart_by_commas() -> None:
@@ -309,11 +381,8 @@ def test_a_sweep_refuses_what_is_of_one_training(monkeypatch: pytest.MonkeyPatch
 def test_a_training_of_a_sweep_says_where_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fake = "import sys\nprint('writing to logs/x')\nprint('Learning iteration 1/2: ...')\nprint('stopped: SIGINT; go on with')\n"
     (tmp_path / "fake").write_text(fake + "print('bad\\nlast', file=sys.stderr)")
-    monkeypatch.setattr(sys, "executable", shutil.which("sh"))
-    real = subprocess.Popen
-    python = [os.path.realpath("/proc/self/exe"), str(tmp_path / "fake")]
-    monkeypatch.setattr(sweep.subprocess, "Popen", lambda command, **rest: real(python, **rest))
-    assert sweep.start([]) == (0, "logs/x", "stopped: SIGINT; go on with")
+    monkeypatch.setattr(sweep, "TRAIN", [sys.executable, str(tmp_path / "fake")])
+    assert sweep.start([], sweep.Stop()) == (0, "logs/x", "stopped: SIGINT; go on with")
 
 
 # ---- completion

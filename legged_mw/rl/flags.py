@@ -10,8 +10,8 @@ from legged_mw.utils.files import writable
 from legged_mw.utils.task import task_names
 
 
-def parse(description: str | None) -> argparse.Namespace:
-    """The flags of training."""
+def parse(description: str | None, argv: list[str] | None = None) -> argparse.Namespace:
+    """The flags of training: those that this program got, or ``argv``."""
     parser = make_parser(description)
     parser.add_argument("--max_iterations", type=positive, metavar="N", help="train until this iteration, resumed or not")
     parser.add_argument("--run_name", metavar="NAME", help="appended to the run folder's name")
@@ -25,7 +25,7 @@ def parse(description: str | None) -> argparse.Namespace:
     parser.add_argument("--list", action="store_true", help="show the tasks and exit")
     parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")
     parser.add_argument("--picture", metavar="PNG", help="with --check: the robot's health page too, and a picture of the robot")
-    args = parser.parse_args()
+    args = parser.parse_args(argv)
     if args.picture is not None:
         writable(args.picture, "--picture")
         if not args.check:

@@ -74,18 +74,24 @@ def steps_an_iteration(run: Run) -> float:
     return total / run.iterations if total and run.iterations else math.nan
 
 
-def rows(runs: Sequence[Run]) -> list[list[str]]:
-    """A row a run: what it is, how long it trained, and its last figures."""
+def figures(runs: Sequence[Run]) -> dict[str, tuple[str, list[float | None]]]:
+    """How long each of ``runs`` trained, and its last figures: name -> (how it is written, a value a run)."""
     exams = list(dict.fromkeys(name for run in runs for name in run.curves if name.startswith("Exam/")))
-    heads = ["run", "iterations", "M steps", "minutes", "steps/s", "reward", *(name.removeprefix("Exam/") for name in exams)]
-    lines = [heads]
-    for run in runs:
-        minutes = run.seconds.get(run.iterations, 0.0) / 60
-        said = [f"{run.iterations}", f"{run.iterations * steps_an_iteration(run) / 1e6:.1f}", f"{minutes:.1f}"]
-        figures = [("Perf/total_fps", ",.0f"), ("Train/mean_reward", ".2f"), *((name, ".3f") for name in exams)]
-        values = [(run.last(name), digits) for name, digits in figures]
-        lines.append([run.name, *said, *("-" if value is None else f"{value:{digits}}" for value, digits in values)])
-    return lines
+    last = {"steps/s": ("Perf/total_fps", ",.0f"), "reward": ("Train/mean_reward", ".2f")}
+    last |= {name.removeprefix("Exam/"): (name, ".3f") for name in exams}
+    return {
+        "iterations": ("d", [run.iterations for run in runs]),
+        "M steps": (".1f", [run.iterations * steps_an_iteration(run) / 1e6 for run in runs]),
+        "minutes": (".1f", [run.seconds.get(run.iterations, 0.0) / 60 for run in runs]),
+        **{head: (digits, [run.last(name) for run in runs]) for head, (name, digits) in last.items()},
+    }
+
+
+def rows(runs: Sequence[Run]) -> list[list[str]]:
+    """A row a run: what it is, and its ``figures``."""
+    found = figures(runs)
+    columns = [["-" if value is None else f"{value:{digits}}" for value in values] for digits, values in found.values()]
+    return [["run", *found], *([run.name, *line] for run, *line in zip(runs, *columns, strict=True))]
 
 
 def text_table(lines: Sequence[Sequence[str]]) -> str:

@@ -7,22 +7,31 @@ commas: --set actor.hidden_dims=[64,64],[128,128]. All other flags are those of 
 from __future__ import annotations
 
 import argparse
+import ctypes
+import math
+import os
 import re
+import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from datetime import datetime
+from functools import partial
 from itertools import product
 from statistics import mean, stdev
 from typing import NamedTuple
 
-from legged_mw.tools.compare import MOST, rows, text_table, write
+from legged_mw.rl import flags
+from legged_mw.tools.compare import MOST, figures, rows, text_table, write
 from legged_mw.tools.curves import Run, find_runs
-from legged_mw.utils.cli import Parser
+from legged_mw.utils.cli import Parser, apply_overrides
 from legged_mw.utils.errors import shown
+from legged_mw.utils.task import load_task
 
 STOPPED = 3  # exit code of a training that a signal ended: rl/training.py's
+TRAIN = [sys.executable, "-m", "legged_mw.programs", "train"]
+_PDEATHSIG = 1  # of Linux's prctl
 Start = Callable[[list[str]], tuple[int, str, str]]  # flags of train -> exit code, run folder or "", last line
 
 
@@ -35,6 +44,26 @@ class Cell(NamedTuple):
     @property
     def name(self) -> str:
         return " ".join(f"{path.rpartition('.')[2]}={value}" for path, value in self.varied.items())
+
+
+class Stop:
+    """Whether a signal has asked the sweep to end; the training that runs is asked to save, with SIGTERM."""
+
+    def __init__(self) -> None:
+        self.asked = False
+        self.training: subprocess.Popen[str] | None = None
+
+    def listen(self) -> None:
+        """For Ctrl-C, SIGTERM and a hang-up, but for those that are ignored: nohup has it so."""
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            number = getattr(signal, name, None)  # no SIGHUP on Windows
+            if number and signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, self)
+
+    def __call__(self, *_: object) -> None:
+        self.asked = True
+        if self.training:
+            self.training.terminate()
 
 
 def parse() -> tuple[argparse.Namespace, list[str]]:
@@ -55,8 +84,11 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
 def main() -> None:
     args, rest = parse()
     cells = make_cells(args.set, values(args.seeds))
+    check(cells, ["--task", args.task, *rest])
     print(f"{len(cells)} trainings of {args.task}: {'; '.join(cell.name or 'as it is' for cell in cells)}", flush=True)
-    found = train_all(cells, ["--task", args.task, *rest], start)
+    stop = Stop()
+    stop.listen()
+    found = train_all(cells, ["--task", args.task, *rest], partial(start, stop=stop), stop)
     if found:
         print(f"\n{table(found)}")
         if 1 < len(found) <= MOST:
@@ -92,10 +124,19 @@ def make_cells(settings: Sequence[str], seeds: Sequence[str]) -> list[Cell]:
     return cells
 
 
-def train_all(cells: Sequence[Cell], common: list[str], start: Start) -> list[tuple[Cell, Run]]:
-    """Train each; one that fails is said and left out, and Ctrl-C ends the sweep after the training that it stops."""
+def check(cells: Sequence[Cell], common: list[str]) -> None:
+    """Read the flags and every value once, as train would; raises UserError, or ends the program, for a wrong one."""
+    args = flags.parse(None, common)
+    args.set += dict.fromkeys(text for cell in cells for text in cell.flags if text != "--set")
+    apply_overrides(load_task(args.task, say=True), args)
+
+
+def train_all(cells: Sequence[Cell], common: list[str], start: Start, stop: Stop) -> list[tuple[Cell, Run]]:
+    """Train each; one that fails is said and left out, and a signal ends the sweep after the training that it stops."""
     found = []
     for number, cell in enumerate(cells, 1):
+        if stop.asked:
+            break
         label = re.sub(r"[^\w.=-]+", "_", cell.name).strip("_")
         code, folder, said = start([*common, *cell.flags, *(["--run_name", label] if label else [])])
         ended = bool(folder) and code in (0, STOPPED)
@@ -107,49 +148,71 @@ def train_all(cells: Sequence[Cell], common: list[str], start: Start) -> list[tu
     return found
 
 
-def start(flags: list[str]) -> tuple[int, str, str]:
-    """``legged-mw train`` in a process of its own; in a terminal its last line is shown meanwhile."""
-    command = [sys.executable, "-m", "legged_mw.programs", "train", *flags]
-    folder, said, line, live = "", "", "", sys.stdout.isatty()
+def start(flags: list[str], stop: Stop) -> tuple[int, str, str]:
+    """``legged-mw train`` in a process of its own, which ends with this one; in a terminal its last line is shown meanwhile."""
+    folder, said, live = "", "", sys.stdout.isatty()
     with (
         tempfile.TemporaryFile("w+") as errors,
-        subprocess.Popen(command, stdout=-1, stderr=errors, text=True, errors="replace") as process,
+        subprocess.Popen(
+            [*TRAIN, *flags], stdout=-1, stderr=errors, text=True, errors="replace", preexec_fn=_end_with(os.getpid())
+        ) as process,
     ):
+        stop.training = process
+        if stop.asked:  # meanwhile
+            process.terminate()
         assert process.stdout is not None
-        while process.poll() is None or line:
-            try:
-                line = process.stdout.readline()
-            except KeyboardInterrupt:  # the training got it too, and saves
-                continue
+        for line in process.stdout:
             folder = line.removeprefix("writing to ").strip() if line.startswith("writing to ") else folder
             said = line.strip() if line.startswith("stopped: ") else said
             if live and line.startswith("Learning iteration"):
                 print(f"\r\x1b[K{line.strip()[:100]}", end="", flush=True)
+        process.wait()
+        stop.training = None
         errors.seek(0)
         last = (errors.read().strip().splitlines() or [""])[-1]
     print("\r\x1b[K" if live else "", end="")
     return process.returncode, folder, said or last
 
 
+def _end_with(parent: int) -> Callable[[], object] | None:
+    """What a child runs first, so that SIGTERM comes to it when ``parent`` is gone, however that ended. On Linux alone."""
+    if sys.platform != "linux":
+        return None
+    prctl = ctypes.CDLL(None).prctl
+
+    def first() -> None:
+        prctl(_PDEATHSIG, int(signal.SIGTERM))
+        if os.getppid() != parent:  # it went before
+            os._exit(1)
+
+    return first
+
+
 def table(found: Sequence[tuple[Cell, Run]]) -> str:
     """A line a training; where seeds were varied, below them the mean of each setting, and its standard deviation."""
     fields = list(dict.fromkeys(path for cell, _ in found for path in cell.varied))
-    (_, *heads), *lines = rows([run for _, run in found])
+    (_, *heads), *lines = rows(runs := [run for _, run in found])
     short = [path.rpartition(".")[2] for path in fields]
-    cells = [[*(cell.varied.get(path, "") for path in fields), *line] for (cell, _), (_, *line) in zip(found, lines, strict=True)]
+    settings = [[cell.varied.get(path, "") for path in fields] for cell, _ in found]
+    cells = [[*setting, *line] for setting, (_, *line) in zip(settings, lines, strict=True)]
     means = []
     if "seed" in fields:
-        groups: dict[tuple[str, ...], list[list[str]]] = {}
-        for line in cells:
-            groups.setdefault(tuple(line[: len(fields) - 1]), []).append(line[len(fields) :])
-        means = [[*group, f"mean of {len(of)}", *map(_mean, zip(*of, strict=True))] for group, of in groups.items() if len(of) > 1]
+        groups: dict[tuple[str, ...], list[int]] = {}
+        for i, setting in enumerate(settings):
+            groups.setdefault(tuple(setting[:-1]), []).append(i)
+        columns = figures(runs).values()
+        for group, of in groups.items():
+            if len(of) > 1:
+                means.append([*group, f"mean of {len(of)}", *(_mean(digits, [values[i] for i in of]) for digits, values in columns)])
     return text_table([[*short, *heads], *cells, *means])
 
 
-def _mean(texts: Sequence[str]) -> str:
-    try:
-        numbers = [float(text.replace(",", "")) for text in texts]
-    except ValueError:  # "-": not all have it
+def _mean(digits: str, values: Sequence[float | None]) -> str:
+    """Mean and standard deviation, with the figure's ``digits``, or as many as two of the deviation need; "-" if not all have it."""
+    numbers = [value for value in values if value is not None and math.isfinite(value)]
+    if len(numbers) < len(values):
         return "-"
-    digits = max(len(text.partition(".")[2]) for text in texts)
-    return f"{mean(numbers):.{digits}f} ± {stdev(numbers):.{digits}f}"
+    spread = stdev(numbers)
+    needed = 1 - math.floor(math.log10(spread)) if spread > 0 else 0
+    places = max(int(digits.strip(",.df") or 0), min(needed, 6))
+    return f"{mean(numbers):.{places}f} ± {spread:.{places}f}"
