@@ -91,8 +91,8 @@ class Checker:
             if re.search(r"(\._var|\._std|\.count)$", key) and bool((value < 0).any()):
                 raise self.fail(f"{name}: {key} is negative")
 
-    def memory(self, content: Mapping[str, Any], name: str, optimizer: torch.optim.Optimizer) -> None:
-        """An optimizer's state: that of ``optimizer``, whose parameters are counted group by group."""
+    def memory(self, content: Mapping[str, Any], name: str, optimizer: torch.optim.Optimizer, done: int) -> None:
+        """An optimizer's state after ``done`` iterations: that of ``optimizer``, whose parameters are counted group by group."""
         saved, parameters = self.take(content, name, dict), list[Tensor]()
         groups, own = saved.get("param_groups"), optimizer.param_groups
         if not isinstance(groups, list) or len(groups) != len(own):
@@ -103,7 +103,9 @@ class Checker:
             if not isinstance(group.get("params"), list) or [*map(_short, group["params"])] != [*map(_short, count)]:
                 raise self.fail(f"{name}: params must count the parameters, from {count.start} to {count.stop - 1}")
             parameters += mine["params"]
-        for index, held in self.take(saved, "state", dict, f"{name}: ").items():
+        if not (state := self.take(saved, "state", dict, f"{name}: ")) and done:
+            raise self.fail(f"{name}: state is empty after {done} iterations")
+        for index, held in state.items():
             if type(index) is not int or not 0 <= index < len(parameters) or not isinstance(held, Mapping):
                 raise self.fail(f"{name}: state {_short(index)} is of no parameter")
             if "betas" in own[0] and not {*_ADAM} <= held.keys():
@@ -172,7 +174,7 @@ def check_resume(content: Mapping[str, Any], path: Path, optimizer: torch.optim.
     done = check.take(content, "iter", int)
     if (named := re.fullmatch(r"model_(\d+)\.pt", path.name)) and int(named[1]) != done:
         raise check.fail(f"its name says {int(named[1])} iterations, and it has done {done}: call it model_{done}.pt")
-    check.memory(content, "optimizer_state_dict", optimizer)
+    check.memory(content, "optimizer_state_dict", optimizer, done)
     check.task(content.get("infos") or {}, task)
 
 

@@ -104,13 +104,15 @@ class Keeper:
     def _sweep(self) -> None:
         """Worlds of checkpoints before the newest, and the checkpoints that are too many.
 
-        Another rank than the first may come here before the newest is written: then the worlds of the one before stay.
+        Another rank than the first may come here before the newest is written: then the worlds of the one before stay. The first
+        sweeps those of another number of processes, too, which trained here before.
         """
         there = checkpoints(self.folder)
-        newest, suffix = max(there, default=0), suffix_of(self._rank)
-        for old in self.folder.glob(f"worlds_*{suffix}.pt"):
-            named = re.fullmatch(rf"worlds_(\d+){suffix}\.pt", old.name)
-            if named and int(named[1]) < newest:
+        newest, rank = max(there, default=0), self._rank
+        for old in self.folder.glob("worlds_*.pt"):
+            named = re.fullmatch(r"worlds_(\d+)((?:_\d+of(\d+))?)\.pt", old.name)
+            mine = named and (named[2] == suffix_of(rank) or (rank.leads and int(named[3] or 1) != rank.count))
+            if named and mine and int(named[1]) < newest:
                 old.unlink(missing_ok=True)
         if self._keep and self._rank.leads:
             for old in list(there.values())[: -self._keep]:

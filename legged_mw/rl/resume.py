@@ -14,11 +14,12 @@ import torch
 from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.worlds import put_worlds, worlds_state
+from legged_mw.envs.worlds import everything, put_worlds, worlds_state
 from legged_mw.rl.checkpoint import damage
 from legged_mw.rl.ranks import Rank
 from legged_mw.rl.recurrent import HiddenStates
 
+_MOST = 1e10  # what MuJoCo calls a state that has blown up: mjMAXVAL
 _FREE = ("rewards", "noise", "viewer", "exam", "termination")  # sections that may have changed: the worlds are the same
 
 
@@ -58,6 +59,8 @@ def take_worlds(runner: Any, checkpoint: Path, rank: Rank, random: dict[str, Ten
     own = _memories(runner, copy=False)
     if own.keys() != memories.keys() or any(own[key].shape != memories[key].shape for key in own):
         return "the networks' memories are of another shape"
+    if name := beyond(worlds, everything(runner.env)) or beyond(memories, own):
+        return f"{file.name}: {name} is not finite, or beyond {_MOST:.0e}"
     if reason := put_worlds(runner.env, worlds):
         return reason
     with torch.inference_mode():
@@ -66,6 +69,15 @@ def take_worlds(runner: Any, checkpoint: Path, rank: Rank, random: dict[str, Ten
     if not rank.leads:
         set_random_state(state, runner.device)
     return ""
+
+
+def beyond(saved: dict[str, Tensor], own: dict[str, Tensor]) -> str:
+    """The first name whose numbers are finite and no larger than ``_MOST`` in ``own``, but not as they were saved; ''."""
+    return next((name for name, value in saved.items() if name in own and _sane(own[name]) and not _sane(value)), "")
+
+
+def _sane(value: Tensor) -> bool:
+    return not value.is_floating_point() or bool((value.abs() <= _MOST).all())
 
 
 def random_state(device: str) -> dict[str, Tensor]:

@@ -215,8 +215,8 @@ def train(
     fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)  # last: it takes seconds
     runner.examine, runner.console.verbose, runner.deadline = examine, verbose, deadline
     with ExitStack() as held:
+        left = _load(runner, task, start)  # before the lock: where it is refused, nothing was written
         lock = held.enter_context(_lock(start)) if start.goes_on and rank.leads else None
-        left = _load(runner, task, start)
         _stop_on_signals(runner)
         leave_when_stuck(rank)
         folder = _open_run(runner, task, start, rank, held, lock)

@@ -217,6 +217,20 @@ def test_worlds_of_a_rank_stay_until_the_first_one_has_written_the_checkpoint(tm
     assert write(follower, 3) == {"worlds_2_0of2.pt", "worlds_2_1of2.pt", "worlds_3_1of2.pt"}
 
 
+def test_worlds_of_another_number_of_processes_go(tmp_path: Path) -> None:
+    """Once a checkpoint after them is whole, which the first process alone knows."""
+    for name in ("worlds_1.pt", "worlds_2_0of3.pt", "worlds_2_11of12.pt", "worlds_9_0of3.pt", "worlds_of_mine.pt"):
+        (tmp_path / name).touch()
+    follower, first, alone = (Keeper(tmp_path, 0, Rank(*rank)) for rank in ((1, 1, 2), (0, 0, 2), (0, 0, 1)))
+    for keeper, iteration, stay in (
+        (follower, 3, {"worlds_1.pt", "worlds_2_0of3.pt", "worlds_2_11of12.pt", "worlds_3_1of2.pt"}),
+        (first, 3, {"worlds_3_0of2.pt", "worlds_3_1of2.pt"}),
+        (alone, 4, {"worlds_4.pt"}),
+    ):
+        assert keeper.write(iteration, dict, dict)
+        assert {path.name for path in tmp_path.glob("worlds_*")} == {*stay, "worlds_9_0of3.pt", "worlds_of_mine.pt"}
+
+
 def test_logs_that_cannot_be_written_are_refused_before_training(tmp_path: Path) -> None:
     (tmp_path / "logs").write_text("a file")
     result = train(tmp_path, 2)

@@ -124,6 +124,7 @@ CONTENTS: list[tuple[str, Change, str]] = [
     ("no second moments", lambda content: content[ADAM]["state"][0].pop("exp_avg_sq"), "state of parameter 0 must have step, exp_avg, exp"),
     ("a rate of many numbers", set_at(f"{ADAM}|param_groups|0|lr", torch.ones(3)), "lr is (3,) float32; that is none"),
     ("Adam backwards", set_at(f"{ADAM}|param_groups|0|maximize", True), "maximize is True; that is none"),
+    ("no state", set_at(f"{ADAM}|state", {}), "optimizer_state_dict: state is empty"),
     ("state of no parameter", lambda content: content[ADAM]["state"].update({99: {}}), "state 99 is of no parameter"),
     ("rate below 0", set_at(f"{ADAM}|param_groups|0|lr", -1e-3), "lr is -0.001; that is none"),
     ("rate is NaN", set_at(f"{ADAM}|param_groups|0|lr", float("nan")), "lr is nan; that is none"),

@@ -9,11 +9,12 @@ from typing import Any
 
 import pytest
 import torch
-from program import SMALL, Result, assert_equal, load, run
+from program import SMALL, Result, assert_equal, load, refused, run, trained
 
 from legged_mw.rl.checkpoint import Checker
 from legged_mw.rl.keeping import Keeper
-from legged_mw.rl.runs import checkpoints
+from legged_mw.rl.resume import beyond
+from legged_mw.rl.runs import checkpoints, save_whole
 
 EXACTLY = "exactly: worlds and generators go on where they were"
 THREE = ["--set", "runner.save_interval=1", "--max_iterations", "3", "--seed", "3", "--set", "cpu.update_threads=1", "--eager"]
@@ -85,3 +86,35 @@ def test_a_resumed_training_is_the_uninterrupted_one(name: str, tmp_path: Path) 
 def test_a_number_of_a_users_task_may_be_below_zero() -> None:
     best = {"best_reward": torch.tensor([-3.0])}
     Checker(Path("model_1.pt")).task({"env": best}, best)
+
+
+@pytest.mark.parametrize("value", [torch.nan, -torch.inf, 1e30])
+@pytest.mark.parametrize("what", ["everything", "sim.qpos", "actions"])
+def test_worlds_of_wild_numbers_begin_anew(what: str, value: float, tmp_path: Path) -> None:
+    """Whoever wrote them: else the run would end some iterations later, and blame the task."""
+    folder = trained(tmp_path, "--max_iterations", "1", "--eager")
+    content = load(folder / "worlds_1.pt")
+    for name, saved in content["worlds"].items():
+        if saved.is_floating_point() and what in ("everything", name):
+            saved.view(-1)[0 if what != "everything" else slice(None)] = value
+    save_whole(content, folder / "worlds_1.pt")
+    result = resume(tmp_path, folder, "--max_iterations", "2")
+    assert result.code == 0 and "worlds begin anew (worlds_1.pt: " in result.out and EXACTLY not in result.out, result
+
+
+def test_numbers_that_are_infinite_in_a_new_environment_too_may_be(tmp_path: Path) -> None:
+    own = {"best": torch.tensor([-torch.inf, 3.0]), "level": torch.tensor([1, 2])}
+    assert beyond({"best": torch.tensor([2.0, -torch.inf]), "level": torch.tensor([1, 2])}, own) == ""
+    assert beyond({"best": torch.tensor([2.0, torch.nan])}, {"best": torch.zeros(2)}) == "best"
+
+
+def test_a_resume_that_is_refused_leaves_nothing(tmp_path: Path) -> None:
+    """Not even a lock, in a run that has none, as a stranger's."""
+    folder = trained(tmp_path, "--max_iterations", "1")
+    (folder / ".lock").unlink()
+    asked = ["--task", "go1_flat", "--device", "cpu", "--eager", "--resume", "--load_run", folder.name]
+    assert "raise --max_iterations" in refused(tmp_path, "train", *asked)
+    content = load(folder / "model_1.pt")
+    content["optimizer_state_dict"]["state"][0]["exp_avg"][...] = torch.nan
+    save_whole(content, folder / "model_1.pt")
+    assert "not finite" in refused(tmp_path, "train", *asked, "--max_iterations", "2")
