@@ -15,12 +15,12 @@ from pathlib import Path
 from typing import Any
 
 from legged_mw.utils import quick_start
-from legged_mw.utils.cli import fail, one_line_errors
+from legged_mw.utils.cli import FEWER_WORLDS, fail, one_line_errors
 from legged_mw.utils.console import patient_console
 from legged_mw.utils.task import LoadedTask, list_tasks, load_task
 
 
-@one_line_errors()
+@one_line_errors(fewer=FEWER_WORLDS)
 def train() -> None:
     """Train a task. On 8 GPUs: torchrun --nproc_per_node=8 train.py --task go1_flat"""
     from legged_mw.rl import flags
@@ -71,7 +71,7 @@ def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.N
         raise SystemExit(training.STOPPED)
 
 
-@one_line_errors()
+@one_line_errors(fewer=FEWER_WORLDS)
 def play() -> None:
     """Watch, grade or export a policy."""
     quick_start.begin()
@@ -108,7 +108,7 @@ def deploy() -> None:
     """Run an exported policy without torch."""
     from legged_mw.deploy.__main__ import main
 
-    with one_line_errors():
+    with one_line_errors(fewer=FEWER_WORLDS):
         main()
 
 

@@ -212,6 +212,15 @@ def complaint(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str
     return capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("name", "said"), [("walker.mjz", "unzip it"), ("walker.stl", ".urdf")])
+def test_a_file_that_is_neither_robot_nor_task(
+    name: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / name).touch()
+    line = complaint(monkeypatch, capsys, tmp_path / name)
+    assert f"{name} is neither" in line and said in line and "no task" not in line
+
+
 def png_size(path: Path) -> tuple[int, int]:
     head = path.read_bytes()[:24]
     assert head[:8] == b"\x89PNG\r\n\x1a\n"

@@ -13,7 +13,7 @@ from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.deploy.switch import SwitchStage
 from legged_mw.eval import rules
-from legged_mw.utils.cli import Parser, duration, one_line_errors, positive
+from legged_mw.utils.cli import FEWER_WORLDS, Parser, duration, one_line_errors, positive
 from legged_mw.utils.errors import UserError, shown, unknown
 from legged_mw.utils.files import check_folder, typed, writable
 from legged_mw.view import launch
@@ -133,5 +133,5 @@ def examine(folder: Path, path: Path, common: bool = False, contact: str | None 
 
 
 if __name__ == "__main__":
-    with one_line_errors("legged_mw.deploy"):
+    with one_line_errors("legged_mw.deploy", FEWER_WORLDS):
         main()

@@ -17,6 +17,8 @@ from legged_mw.utils.config import ConfigError, fit, load_yaml
 from legged_mw.utils.errors import UserError, in_short, out_of_memory, printable, users_fault
 from legged_mw.utils.task import LoadedTask
 
+FEWER_WORLDS = "; fewer worlds need less: try half with --num_envs"  # of the programs that have the flag
+
 
 class Parser(argparse.ArgumentParser):
     """argparse, but a mistake is one line and exit code 2; every program has --verbose."""
@@ -124,10 +126,10 @@ def duration(text: str) -> float:
 
 
 @contextmanager
-def one_line_errors(program: str = "") -> Iterator[None]:
+def one_line_errors(program: str = "", fewer: str = "") -> Iterator[None]:
     """Turn mistakes of the user, in what was asked or in code of their own, into one line and exit code 2; with --verbose all of it.
 
-    Memory that runs out becomes advice, Ctrl-C a word and code 130. A mistake of ours stays a traceback.
+    Memory that runs out becomes that, with the advice ``fewer``, Ctrl-C a word and code 130. A mistake of ours stays a traceback.
     """
     program = program or Path(sys.argv[0]).name
     try:
@@ -147,10 +149,7 @@ def one_line_errors(program: str = "") -> Iterator[None]:
         if not out_of_memory(first) and not out_of_memory(error):
             _blame_user(program, error)
             raise
-        fail(
-            program,
-            f"out of memory ({(str(first) or 'memory').splitlines()[0]}); fewer worlds need less: try half with --num_envs",
-        )
+        fail(program, f"out of memory ({(str(first) or 'memory').splitlines()[0]}){fewer}")
     except Exception as error:
         _blame_user(program, error)
         raise

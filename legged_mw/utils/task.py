@@ -172,6 +172,11 @@ def load_task(name: str, say: bool = False) -> LoadedTask:
         raise ConfigError(f"{name} is a robot, not a task; make a task for it: python -m legged_mw.robot {name} --new NAME")
     if path.suffix != ".py":
         known = task_names()
+        if name not in known and path.is_file():
+            raise ConfigError(
+                f"{name} is neither a task's config file (.py) nor a robot ({', '.join(ROBOT_FILES)})"
+                + ("; unzip it, and name the .xml that is in it" if path.suffix in (".mjz", ".zip") else "")
+            )
         if name not in known:
             raise ConfigError(f"{unknown('task', name, known, 'configs/')}; or give the path of a config file (.py)")
         path = ROOT / "configs" / f"{name}.py"
