@@ -399,6 +399,24 @@ def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Ca
     assert all(error < 0.12 for error in saved["error"]) and 0.5 < saved["cost_of_transport"] < 1.2
 
 
+@pytest.mark.parametrize("of", ["a name", "a path", "a folder of mine"])
+def test_results_of_a_shipped_policy_go_to_the_logs(
+    of: str, export: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The package may be another user's."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(program, "run_exam", lambda *_, **__: {})
+    monkeypatch.setattr(rules, "table", lambda _: "the table")
+    shown = []
+    monkeypatch.setattr(program.launch, "watch", lambda stage, args, folder, **_: shown.append(folder.absolute()))
+    before = sorted(path.name for path in SHIPPED.iterdir())
+    name = {"a name": "go1_flat", "a path": SHIPPED, "a folder of mine": export}[of]
+    where = export if of == "a folder of mine" else tmp_path / "logs/go1_flat/shipped"
+    assert main(capsys, name, "--eval")[0] == main(capsys, name)[0] == 0
+    assert (where / "exam.json").is_file() and shown == [where]
+    assert sorted(path.name for path in SHIPPED.iterdir()) == before
+
+
 def test_the_common_range_of_published_policies(capsys: pytest.CaptureFixture[str]) -> None:
     """Asked of a robot that has none, and without an exam."""
     code, _, err = main(capsys, SHIPPED, "--eval", "--ranges", "common")

@@ -19,6 +19,7 @@ from legged_mw.utils.files import check_folder, typed, writable
 from legged_mw.view import launch
 
 RESULT_FILE = "exam.json"
+SHIPPED = ROOT / "resources" / "policies"
 
 
 def parse() -> argparse.Namespace:
@@ -27,8 +28,8 @@ def parse() -> argparse.Namespace:
     parser.add_argument("folder", metavar="DIR", nargs="?", help=f"an export: {made}")
     parser.add_argument("second", metavar="DIR2", nargs="?", help="with --switch: the policy that takes over, of the same robot")
     parser.add_argument("--switch", choices=("fall",), help="fall: DIR until the robot falls, then DIR2 until it stands (simulated)")
-    parser.add_argument("--eval", action="store_true", help=f"the task's exam; prints its table and writes DIR/{RESULT_FILE}")
-    parser.add_argument("--out", metavar="FILE", help=f"where --eval writes (default: DIR/{RESULT_FILE})")
+    parser.add_argument("--eval", action="store_true", help=f"the task's exam; prints its table and writes {RESULT_FILE}")
+    parser.add_argument("--out", metavar="FILE", help=f"where --eval writes (default: DIR/{RESULT_FILE}; of a shipped one in logs)")
     common = "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
     parser.add_argument("--command", metavar="VALUES", help="fixed command: 0.5,0,0 in the contract's order, or base_height=0.3 by name")
@@ -73,7 +74,7 @@ def main() -> None:
     contact = options.contact(args, contract)
     if args.switch:
         stage = SwitchStage(folder, find(args.second), args.num_envs, command)
-        launch.watch(stage, args, folder, title=f"{contract.task}, {args.second}")
+        launch.watch(stage, args, results(folder), title=f"{contract.task}, {args.second}")
     elif args.serve:
         options.serve(folder, contract, args)
     elif args.robot != "simulated":
@@ -84,20 +85,26 @@ def main() -> None:
         robot = MujocoRobot(folder, contract, scene_file, whole=True, hoisted=drive.hoisted(args, contract), lift=drive.lift(args))
         drive.drive(robot, folder, contract, args, command, args.robot, contact)
     elif args.eval:
-        examine(folder, Path(args.out) if args.out else folder / RESULT_FILE, args.ranges == "common", contact)
+        examine(folder, Path(args.out) if args.out else results(folder) / RESULT_FILE, args.ranges == "common", contact)
     else:
-        launch.watch(DeployStage(folder, args.num_envs, command, scene_file=scene_file, contact=contact), args, folder, title=contract.task)
+        launch.watch(
+            DeployStage(folder, args.num_envs, command, scene_file=scene_file, contact=contact), args, results(folder), title=contract.task
+        )
 
 
 def find(name: str) -> Path:
     """The folder of an export, or of the shipped policy of this name. Raises UserError if it is neither."""
-    shipped = ROOT / "resources" / "policies"
     if (folder := typed(name)).exists():
         return check_folder(folder)
-    if not (shipped / name).is_dir():
-        there = sorted(path.parent.name for path in shipped.glob(f"*/{CONTRACT_FILE}"))
+    if not (SHIPPED / name).is_dir():
+        there = sorted(path.parent.name for path in SHIPPED.glob(f"*/{CONTRACT_FILE}"))
         raise UserError(f"no folder {name}, and {unknown('policy', name, there, 'resources/policies')}")
-    return shipped / name
+    return SHIPPED / name
+
+
+def results(folder: Path) -> Path:
+    """Where what is made of an export goes: beside it; of a shipped one, which is the package's, into logs as play.py's does."""
+    return Path("logs", folder.name, "shipped") if folder.resolve().parent == SHIPPED.resolve() else folder
 
 
 def show_log(path: Path, folder: Path | None) -> None:
