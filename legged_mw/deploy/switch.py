@@ -25,10 +25,10 @@ class SwitchStage(DeployStage):
     None is put back, but those that MuJoCo cannot step.
     """
 
-    def __init__(self, first: Path, second: Path, num_worlds: int = 1, command: Any = None) -> None:
-        """Raises UserError for policies of two robots, ContractError for broken ones."""
-        super().__init__(first, num_worlds, command, ends=Ends(max_tilt=FELL), whole=True)  # its body touches the ground, too
-        other = read_contract(second)
+    def __init__(self, first: Path, second: Path, num_worlds: int = 1, command: Any = None, edited: bool = False) -> None:
+        """``edited``: see read_contract. Raises UserError for policies of two robots, ContractError for broken ones."""
+        super().__init__(first, num_worlds, command, ends=Ends(max_tilt=FELL), whole=True, edited=edited)  # its body touches the ground
+        other = read_contract(second, edited)
         check_same(self.contract, other)
         self.rescuer = Controller(second, other, num_worlds)
         self.rescued = np.zeros(num_worlds, dtype=bool)  # (N,) robots that follow the second policy
