@@ -134,7 +134,7 @@ def threads() -> int:
 
 def measure(folder: Path, seconds: float, path: Path) -> str:
     """Drive for so long, with a log at ``path``; what was found, in lines."""
-    contract, before = read_contract(folder), threads()
+    contract, before = read_contract(folder, edited=True), threads()  # by at_rate
     controller = Controller(folder, contract)
     started, robot = threads() - before, TimedRobot(folder, contract, seconds)
     said: list[str] = []

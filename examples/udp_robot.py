@@ -223,7 +223,7 @@ class UdpServer:
             self.dropped["late or sent twice"] += 1
             return False
         self._count = packet.count
-        self._robot.write(targets)
+        self._robot.write(self._contract.action.held(targets))
         return True
 
     def _hear(self, seconds: float | None) -> tuple[bytes, tuple[str, int]]:

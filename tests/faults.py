@@ -116,7 +116,9 @@ class Rig:
                 self.begin()
                 case.policy(self)
             self.sleep(self.work)
-            return self.change(measured, self.act(measured, commands))
+            self.act(measured, commands)
+            self.controller.last_targets = self.change(measured, self.controller.last_targets)
+            return self.controller.last_targets
 
         def read() -> Measurement:
             if self.states.armed:

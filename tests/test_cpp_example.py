@@ -23,7 +23,7 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from legged_mw import ROOT
-from legged_mw.deploy.contract import FORMATS
+from legged_mw.deploy.contract import checksum
 from legged_mw.utils.config import load_yaml, save_yaml
 
 FOLDER, POLICIES = ROOT / "examples/cpp", ROOT / "resources/policies"
@@ -58,7 +58,6 @@ def remembers(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("export")
     shutil.copy(POLICIES / "g1_flat/scene.xml", folder)
     said = load_yaml(POLICIES / "g1_flat/policy.yaml")
-    said.pop("checksum", None)
     rows = {row["name"]: row for row in said["observation"]}
     rows["dof_pos"]["history"], rows["gait_clock"]["history"], rows["base_ang_vel"]["scale"] = 3, 2, [0.25, 0.5, 1.0]
     said["action"] |= {"origin": "targets", "scale": [0.01 * (i % 5) for i in range(29)], "clip": 0.5}
@@ -81,7 +80,7 @@ def remembers(tmp_path_factory: pytest.TempPathFactory) -> Path:
     said["network"]["sha256"] = hashlib.sha256((folder / "policy.onnx").read_bytes()).hexdigest()
     said["network"]["memory"] = {"input": "state_in", "output": "state_out", "shape": [1, 8]}
     said["estimate"] = [{"name": "base_lin_vel", "size": 3, "unit": "m/s", "frame": "body"}]
-    save_yaml(folder / "policy.yaml", said | {"format": 3})
+    save_yaml(folder / "policy.yaml", said | {"checksum": checksum(said)})
     return folder
 
 
@@ -94,6 +93,8 @@ def test_it_does_what_pythons_controller_does(name: str, check: Check, tmp_path:
     assert done.stdout.endswith("as Python's controller\n") and ("was not found" in done.stdout) != NETWORK
     lines = record.read_text().splitlines()
     head = lines[0].split()
+    wanted, targets = np.split(np.loadtxt(record, skiprows=1)[:, -2 * int(head[-1]) :], 2, axis=1)
+    assert name != "g1_flat" or (wanted != targets).any(), "its ankles ask for more than their range"
     at = sum(map(int, head[1 : head.index("observation") : 2]))  # the first value of the observation
     row = lines[101].split(" ")
     for value in (f"{float(row[at]) + 1e-3}", "nan"):
@@ -117,7 +118,14 @@ def test_it_runs_the_network_itself(check: Check, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "error"),
     [
-        ("format: 2", "format: 4", "policy.yaml, line 1: format 4 is not one that this program reads ({} and {})".format(*FORMATS)),
+        ("format: 5", "format: 6", "policy.yaml, line 1: format 6 is not one that this program reads (5)"),
+        (
+            "format: 5",
+            "format: 3",
+            "policy.yaml, line 1: format 3 does not say within which range targets are held: export the policy again",
+        ),
+        ("  lowest:\n", "  least:\n", "'lowest' is missing"),
+        ("exam:", "motion:", "the policy follows a motion, which this program cannot"),
         ("period: 0.02\n", "", "'period' is missing"),
         ("period: 0.02", "period: fast", "policy.yaml, line 8: 'fast' is no number"),
         ("origin: default", "origin: pose", "no origin 'pose'; there are: default, joints, targets, torque"),

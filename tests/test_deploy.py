@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -22,22 +23,25 @@ from recorder import Recorder
 
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as program
-from legged_mw.deploy.contract import Contract, ContractError, ContractRow, Ends, checksum, read_contract
+from legged_mw.deploy.contract import Contract, ContractError, ContractRow, Ends, read_contract
 from legged_mw.deploy.exam import contract_rules, run_exam
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Measurement, RobotError
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits, Safety
+from legged_mw.deploy.seal import checksum, sealed
 from legged_mw.deploy.simulated import Fleet, MujocoRobot, read_scene
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.eval import exam, rules
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.config import load_yaml
+from legged_mw.utils.files import digest
 from legged_mw.utils.task import load_task
 
 SHIPPED = ROOT / "resources/policies/go1_flat"
 FILES = ("policy.yaml", "policy.onnx", "scene.xml")
+PER_JOINT = ("joints", "default_pose", "stiffness", "damping")
 AHEAD = np.array([0.8, 0.0, 0.0])
 
 
@@ -60,7 +64,7 @@ def rewrite(folder: Path, change: Callable[[Any], Any]) -> None:
     """Change what policy.yaml says."""
     said = load_yaml(folder / "policy.yaml")
     change(said)
-    (folder / "policy.yaml").write_text(yaml.safe_dump(said | {"checksum": checksum(said)}, sort_keys=False))
+    (folder / "policy.yaml").write_text(yaml.safe_dump(sealed(said), sort_keys=False))
 
 
 def main(capsys: pytest.CaptureFixture[str], *args: str | Path) -> tuple[int, str, str]:
@@ -116,7 +120,10 @@ WRONG = [
     (put("joints.4", "FL_thihg_joint"), "no joint 'FL_thihg_joint' in scene.xml; did you mean 'FL_thigh_joint'?"),
     (put("joints.4", "FL_hip_joint"), "policy.yaml: 'joints' is ["),
     (
-        lambda said: [said[name].pop() for name in ("joints", "default_pose", "stiffness", "damping")],
+        lambda said: [
+            part[name].pop()
+            for part, name in ((said["action"], "lowest"), (said["action"], "highest"), *((said, name) for name in PER_JOINT))
+        ],
         "has size 12; joint_offset has 11 values",
     ),
     (
@@ -128,7 +135,7 @@ WRONG = [
     (put("default_pose.2", "bent"), "it must be 12 numbers, one a joint"),
     (put("stiffness.0", 20.0), "stiffness is [20., 35., 35.,"),
     (put("robot.mass", 20.0), "robot: mass is 20., but scene.xml has 12.743"),
-    (put("format", 1), "'format' is 1; it must be one of 2, 3, 4, which this version reads; export the policy again"),
+    (put("format", 1), "'format' is 1; it must be one of 2, 3, 4, 5, which this version reads; export the policy again"),
     (
         put("network.memory", {"input": "state_in", "output": "state_out", "shape": [1, 0]}),
         "policy.yaml: network: memory: 'shape' is [1, 0]; it must be two whole numbers from 1: states and the size of each",
@@ -137,7 +144,11 @@ WRONG = [
         put("network.memory", {"input": "state_in", "output": "state_out", "shape": [1, 8]}),
         "its input is 'obs' ['batch', 48], the contract's is 'obs' [1, 48], 'state_in' [1, 1, 8] (the rows",
     ),
-    (without("format"), "policy.yaml: 'format' is missing; it must be one of 2, 3, 4, which"),
+    (without("format"), "policy.yaml: 'format' is missing; it must be one of 2, 3, 4, 5, which"),
+    (without("action.lowest"), "policy.yaml: action: 'lowest' is missing; it must be 12 numbers, one a joint"),
+    (put("action.highest.0", -1.0), "policy.yaml: action: 'highest' is [-1.0, "),
+    (put("action.highest.0", 0.5), "policy.yaml: action: highest is [ 0.5 ,"),
+    (without("physics.sha256"), "policy.yaml: physics: 'sha256' is missing"),
     (without("action.scale"), "policy.yaml: action: 'scale' is missing; it must be a number, or 12 numbers, one a joint"),
     (put("action.scale", [0.5] * 11), "it must be a number, or 12 numbers, one a joint"),
     (put("action.origin", "pose"), "policy.yaml: action: 'origin' is 'pose'; it must be one of default, joints, targets, torque"),
@@ -167,6 +178,118 @@ def test_a_wrong_contract(change: Callable[[Any], Any], said: str, export: Path,
     code, out, err = main(capsys, export)
     assert (code, out) == (2, "") and err.startswith("legged_mw.deploy: ") and err.count("\n") == 1
     assert said in err
+
+
+def edit(folder: Path, change: Callable[[Any], Any]) -> None:
+    """Change what policy.yaml says, as an editor does."""
+    said = load_yaml(folder / "policy.yaml")
+    change(said)
+    (folder / "policy.yaml").write_text(yaml.safe_dump(said, sort_keys=False))
+
+
+SHOWS = ("--viewer", "none", "--time", "0.1s")
+UNKNOWN = "what was exported is unknown: its line `exported` is missing, or was changed too"
+EDITS = [
+    (put("action.scale", -0.5), "action.scale: -0.5, exported 0.5"),
+    (put("observation.3.scale", 0.0), "observation[3].scale: 0.0, exported 1.0"),
+    (put("default_pose.1", 0.95), "default_pose[1]: 0.95, exported 0.9"),
+    (put("observation.0.measured", "ang_vel"), "observation[0].measured: 'ang_vel', exported 'lin_vel'"),
+    (
+        lambda said: said["observation"].insert(0, said["observation"].pop(1)),
+        "observation[0].name: 'base_ang_vel', exported 'base_lin_vel'",
+    ),
+    (without("physics.terrain"), "physics.terrain.file: nothing, exported 'terrain.mjz'"),
+    (put("format", 2), "format: 2, exported 5"),
+    (without("exported"), UNKNOWN),
+    (lambda said: (said.pop("checksum"), put("exported", "eJyrVkrKT1KyUjCoBQARPgL6")(said)), "bob: nothing, exported 0"),
+    (lambda said: (said.pop("checksum"), put("exported", "eJyrVkrKT1KyUjCo")(said)), UNKNOWN),
+    (without("checksum"), ""),
+]
+
+
+@pytest.mark.parametrize(("change", "line"), EDITS, ids=[line for _, line in EDITS])
+def test_an_edited_contract(change: Callable[[Any], Any], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is refused unless the user says that it was edited; then each value stands beside the exported one."""
+    folder = shutil.copytree(ROOT / "resources/policies/go1_rough", tmp_path / "export")
+    edit(folder, change)
+    code, out, err = main(capsys, folder, *SHOWS)
+    assert (code, out) == (2, "") and "checksum" in err and "--edited" in err and err.count("\n") == 1
+    code, out, err = main(capsys, folder, *SHOWS, "--edited")
+    assert code == 0 and (f"policy.yaml: {line}\n" in out if line else "export: nothing was changed" in out), err
+
+
+def test_a_copy_that_was_changed_with_the_contract(export: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The checksum is of the copy, too."""
+    said = load_yaml(export / "policy.yaml")
+    other = said | {"exported": sealed(said | {"action": said["action"] | {"scale": 0.4}})["exported"], "imu": "b"}
+    (export / "policy.yaml").write_text(yaml.safe_dump(other, sort_keys=False))
+    code, out, _ = main(capsys, export, *SHOWS, "--edited")
+    assert code == 0 and UNKNOWN in out
+
+
+@pytest.mark.parametrize("file", ["scene.xml", "terrain.mjz"])
+def test_a_scene_is_bound_to_the_contract(file: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = shutil.copytree(ROOT / "resources/policies/go1_rough", tmp_path / "export")
+    if file == "scene.xml":
+        (folder / file).write_text((folder / file).read_text().replace("0.213", "0.214", 1))
+    else:
+        shutil.copy(ROOT / "resources/policies/go2_rough/terrain.mjz", folder)
+    code, out, err = main(capsys, folder, *SHOWS)
+    assert (code, out) == (2, "") and f"{file} is not the file that policy.yaml was written for" in err and "--edited" in err
+    code, out, err = main(capsys, folder, *SHOWS, "--edited")
+    assert code == 0 and f"{file}: another file than the exported one" in out, err
+
+
+def test_a_terrain_that_the_contract_does_not_name(export: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copy(ROOT / "resources/policies/go1_rough/terrain.mjz", export)
+    code, _, err = main(capsys, export, "--terrain", "--viewer", "none")
+    assert code == 2 and "no terrain.mjz in " in err
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (put("default_pose.0", 10.0), "default_pose of FR_hip_joint is 10 rad, beyond the range of its targets, -0.863 to 0.863 rad"),
+        (put("ends.falls_on.0", "x"), "ends: falls_on: no geom 'x' in sensors: fall_contact; there are: "),
+        (put("action.scale", 0.0), "'scale' is 0.0; it must be other than 0"),
+    ],
+)
+def test_nonsense_stays_refused(change: Callable[[Any], Any], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = shutil.copytree(ROOT / "resources/policies/go1_footstand", tmp_path / "export")
+    edit(folder, change)
+    code, _, err = main(capsys, folder, *SHOWS, "--edited")
+    assert code == 2 and said in err and err.count("\n") == 1
+
+
+KEYFRAME = '<key name="home"'
+
+
+@pytest.mark.parametrize("key", ["", f"{KEYFRAME}/>"])
+def test_a_scene_without_its_keyframe(key: str, export: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """MuJoCo makes one of straight legs where only `size nkey` is left, or no pose."""
+    file = export / "scene.xml"
+    file.write_text(re.sub(KEYFRAME + "[^>]*/>", key, file.read_text()))
+    code, _, err = main(capsys, export, *SHOWS, "--edited")
+    assert code == 2 and "it has no keyframe" in err
+
+
+def older(folder: Path, version: int = 2) -> None:
+    """As an earlier version wrote it."""
+    said = load_yaml(folder / "policy.yaml") | {"format": version}
+    for path in ("action.lowest", "action.highest", "physics.sha256", "exported"):
+        without(path)(said)
+    (folder / "policy.yaml").write_text(yaml.safe_dump(said | {"checksum": checksum(said)}, sort_keys=False))
+
+
+def test_an_older_format(export: Path, contract: Contract, capsys: pytest.CaptureFixture[str]) -> None:
+    """Its targets are held within the range that the scene has; without the scene it is refused."""
+    older(export)
+    read = read_contract(export)
+    np.testing.assert_array_equal([read.action.lowest, read.action.highest], [contract.action.lowest, contract.action.highest])
+    assert main(capsys, export, *SHOWS)[0] == 0
+    (export / "scene.xml").unlink()
+    code, _, err = main(capsys, export)
+    assert code == 2 and "leaves the range of the targets to scene.xml" in err and "export the policy again" in err
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "text", "other"])
@@ -202,6 +325,7 @@ def test_a_missing_file(name: str, export: Path, capsys: pytest.CaptureFixture[s
 
 def test_broken_texts(export: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (export / "scene.xml").write_text("<mujoco><worldbody>")
+    rewrite(export, put("physics.sha256", digest(export / "scene.xml")))
     code, _, err = main(capsys, export)
     assert code == 2 and "scene.xml is not a valid MJCF: " in err and err.count("\n") == 1
     (export / "policy.yaml").write_text("!!python/object/apply:os.system ['touch evil']")
@@ -311,8 +435,8 @@ def test_joints_may_stand_in_another_order(export: Path, contract: Contract) -> 
     order = np.roll(np.arange(12), 3)
 
     def reorder(said: Any) -> None:
-        for name in ("joints", "default_pose", "stiffness", "damping"):
-            said[name] = [said[name][i] for i in order]
+        for part, name in ((said["action"], "lowest"), (said["action"], "highest"), *((said, name) for name in PER_JOINT)):
+            part[name] = [part[name][i] for i in order]
         for name in ("joint_pos", "joint_vel", "joint_torque"):
             said["sensors"][name] = [said["sensors"][name][i] for i in order]
 
@@ -397,6 +521,24 @@ def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Ca
     assert saved["pushes"]["1"] == saved["pushes"]["2"] == 1.0 and saved["pushes"]["6"] < 1.0
     assert list(saved["pushes"]) == ["1", "2", "3", "4", "5", "6"] and "beats the peer: " in out
     assert all(error < 0.12 for error in saved["error"]) and 0.5 < saved["cost_of_transport"] < 1.2
+
+
+@pytest.mark.parametrize("of", ["a name", "a path", "a folder of mine"])
+def test_results_of_a_shipped_policy_go_to_the_logs(
+    of: str, export: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The package may be another user's."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(program, "run_exam", lambda *_, **__: {})
+    monkeypatch.setattr(rules, "table", lambda _: "the table")
+    shown = []
+    monkeypatch.setattr(program.launch, "watch", lambda stage, args, folder, **_: shown.append(folder.absolute()))
+    before = sorted(path.name for path in SHIPPED.iterdir())
+    name = {"a name": "go1_flat", "a path": SHIPPED, "a folder of mine": export}[of]
+    where = export if of == "a folder of mine" else tmp_path / "logs/go1_flat/shipped"
+    assert main(capsys, name, "--eval")[0] == main(capsys, name)[0] == 0
+    assert (where / "exam.json").is_file() and shown == [where]
+    assert sorted(path.name for path in SHIPPED.iterdir()) == before
 
 
 def test_the_common_range_of_published_policies(capsys: pytest.CaptureFixture[str]) -> None:
@@ -518,12 +660,13 @@ def test_where_a_target_starts_from(origin: str, contract: Contract) -> None:
     scale = np.linspace(0.1, 1.2, 12)
     controller, _ = controller_of(contract, action=contract.action._replace(origin=origin, scale=scale, clip=0.25))
     pose, commands = contract.default_pose, np.zeros((2, 3))
-    targets = [controller.act(measured_at(angle, contract), commands)[0] for angle in (0.5, 0.6, 0.7)]
+    acts = lambda angle: (controller.act(measured_at(angle, contract), commands), controller.last_targets.copy())[1]  # noqa: E731
+    targets = [acts(angle)[0] for angle in (0.5, 0.6, 0.7)]
     starts = {"default": [pose] * 3, "joints": [0.5, 0.6, 0.7], "targets": [pose, pose + 0.1 * scale, pose + 0.3 * scale]}[origin]
     for got, start, action in zip(targets, starts, (0.1, 0.2, 0.25), strict=True):  # the third is clipped
         np.testing.assert_allclose(got, start + action * scale, atol=1e-7)
     controller.reset([1])
-    after = controller.act(measured_at(0.5, contract), commands)
+    after = acts(0.5)
     start = {"default": pose, "joints": 0.5, "targets": pose}[origin]
     np.testing.assert_allclose(after[1], start + 0.25 * scale, atol=1e-7)
     before = {"default": pose, "joints": 0.5, "targets": pose + 0.55 * scale}[origin]

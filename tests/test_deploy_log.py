@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import resource
 import shutil
 import sys
 import threading
 import time
 import tracemalloc
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -65,6 +67,7 @@ def test_a_log_holds_the_run(logged: tuple[Path, Watched], contract: Contract) -
     limits = Limits.of(GO2, contract)
     wanted = np.clip(contract.default_pose + 0.25 * rows["action"][states == 2], limits.low, limits.high)
     np.testing.assert_allclose(rows["target"][states == 2], wanted, atol=1e-6)
+    np.testing.assert_allclose(rows["wanted"][states == 2], contract.default_pose + 0.25 * rows["action"][states == 2], atol=1e-6)
     assert np.isnan(rows["target"][(states == 0) | (states == 3)]).all() and np.isnan(rows["action"][states == 1]).all()
     assert (rows["stiffness"][states == 2] == 20.0).all() and rows["stiffness"][6, 0] < 3.0
     assert np.isnan(rows["voltage"]).all() and rows["age"][0, 0] == np.float32(0.004) and rows["temperature"][240, 3] == 90.0
@@ -138,6 +141,42 @@ def test_a_disk_that_hangs_costs_steps_of_the_log_alone(contract: Contract, tmp_
     assert len(found.rows["time"]) in (200, 300) and found.events[-1][1].endswith(" steps were not logged: the disk is too slow")
 
 
+@contextmanager
+def disk_of(size: int) -> Iterator[None]:
+    """No file gets longer: a disk that is full."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_full_disk_ends_the_log_and_not_the_walk(
+    logged: tuple[Path, Watched], contract: Contract, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It is said once, when it happens; what was written before is read."""
+    whole = logged[0].read_bytes()
+    first = 8 + int.from_bytes(whole[:8], "little")
+    with disk_of(first + 8 + int.from_bytes(whole[first : first + 8], "little") + 1000):  # the export, a block, and a bit
+        robot = walk(tmp_path / "full.lmwlog", contract)
+    assert len(robot.joints) == 250
+    assert capsys.readouterr().out == f"the log {tmp_path}/full.lmwlog ends after 100 steps: File too large\n"
+    assert len(read_log(tmp_path / "full.lmwlog").rows["time"]) == 100
+
+
+def test_the_program_does_not_say_that_it_logged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "full.lmwlog"
+    monkeypatch.setattr(sys, "argv", ["deploy", str(GO2), "--drive", "--time", "0.2", "--log", str(path)])
+    with disk_of(1000):
+        program.main()
+    out = capsys.readouterr().out
+    why = f"the log {path} ends after 0 steps: File too large"
+    assert out.count(f"\n{why}\n") == 1 and f"the joints are damped; {why}\n" in out and "logged to" not in out
+
+
 # ---- replay
 
 
@@ -185,6 +224,15 @@ def test_a_log_needs_nothing_beside_it(logged: tuple[Path, Watched], tmp_path: P
     elsewhere = replace(elsewhere, files={})
     with pytest.raises(ContractError, match=f"no policy.yaml in {tmp_path}"):
         replay(logged[0])
+
+
+def test_the_log_of_a_motion_needs_nothing_beside_it(tmp_path: Path) -> None:
+    folder = ROOT / "resources/policies/g1_track"
+    contract = read_contract(folder)
+    log = Log(tmp_path / "dance.lmwlog", contract, folder, "the test's")
+    run(Watched(folder, contract), Controller(folder, contract), lambda _: np.zeros(0), 2.0, live=False, log=log)
+    assert read_log(log.path).files["motion.npz"] == (folder / "motion.npz").read_bytes()
+    assert len(replay(log.path).simulated["target"]) == 100
 
 
 def test_replay_of_another_network(logged: tuple[Path, Watched], tmp_path: Path, contract: Contract) -> None:

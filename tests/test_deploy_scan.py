@@ -15,14 +15,16 @@ import torch
 from worlds import QUIET, make_env
 
 from legged_mw import ROOT
-from legged_mw.deploy.contract import TERRAIN_FILE, ContractError, read_contract
+from legged_mw.deploy.contract import TERRAIN_FILE, Contract, ContractError, read_contract
 from legged_mw.deploy.policy import Controller
+from legged_mw.deploy.seal import sealed
 from legged_mw.deploy.simulated import Fleet, MujocoRobot
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.rl.export_scene import among_steps
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import make_terrain
 from legged_mw.utils.config import load_yaml, save_yaml
+from legged_mw.utils.files import digest
 from legged_mw.utils.mjcf import MOST_BYTES, check_files, write_archive
 
 SHIPPED = ROOT / "resources/policies/go1_rough_scan"
@@ -31,9 +33,18 @@ SHIPPED = ROOT / "resources/policies/go1_rough_scan"
 @pytest.fixture
 def export(tmp_path: Path) -> Path:
     """A copy to be changed."""
-    for name in ("policy.yaml", "policy.onnx", "scene.xml"):
+    for name in ("policy.yaml", "policy.onnx", "scene.xml", TERRAIN_FILE):
         shutil.copy(SHIPPED / name, tmp_path)
     return tmp_path
+
+
+def seal(folder: Path) -> Contract:
+    """The contract of a copy whose scenes were changed, as an export of those."""
+    said = load_yaml(folder / "policy.yaml")
+    said["physics"] |= {"sha256": digest(folder / "scene.xml")}
+    said["physics"]["terrain"]["sha256"] = digest(folder / TERRAIN_FILE)
+    save_yaml(folder / "policy.yaml", sealed(said))
+    return read_contract(folder)
 
 
 def test_the_contract_says_where_the_scan_looks() -> None:
@@ -77,7 +88,7 @@ def test_the_scan_is_the_environments(export: Path) -> None:
     spec = mujoco.MjSpec.from_file(str(export / "scene.xml"))
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.5, 0.25, 0.05], pos=[0.6, 0.25, 0.05])
     (export / "scene.xml").write_text(spec.to_xml())
-    block = Fleet(export, read_contract(export), 1)
+    block = Fleet(export, seal(export), 1)
     block.qpos[0, :3] = [0.0, 0.0, 0.278]
     scan = block.read().others["height_scan"].reshape(17, 11)
     assert np.allclose(scan[9:, 6:], -0.1) and np.allclose(scan[:9], 0.0) and np.allclose(scan[:, :5], 0.0), "ahead and to the left"
@@ -87,7 +98,7 @@ def test_where_there_is_no_ground_it_is_deep(export: Path) -> None:
     spec = mujoco.MjSpec.from_file(str(export / "scene.xml"))
     spec.geom("floor").size = [0.3, 0.3, 0.05]
     (export / "scene.xml").write_text(spec.to_xml())
-    scan = Fleet(export, read_contract(export), 1).read().others["height_scan"].reshape(17, 11)
+    scan = Fleet(export, seal(export), 1).read().others["height_scan"].reshape(17, 11)
     assert np.allclose(scan[8, 5], 0.0, atol=1e-6) and np.allclose(scan[0], 1.0) and np.allclose(scan[:, 0], 1.0)
 
 
@@ -134,6 +145,7 @@ def test_too_many_steps_for_an_export_are_said() -> None:
 
 
 def test_an_export_of_flat_ground_has_no_steps(export: Path) -> None:
+    (export / TERRAIN_FILE).unlink()
     with pytest.raises(
         ContractError, match=r"no terrain.mjz in .*; an export has one if its task had steps or blocks; export an older one again"
     ):
@@ -152,6 +164,7 @@ def test_what_is_wrong_with_terrain_is_not_said_of_the_scene(right: str, wrong: 
     text = check_files(SHIPPED / TERRAIN_FILE)
     assert right in text
     write_archive(export / TERRAIN_FILE, text.replace(right, wrong))
+    seal(export)
     with pytest.raises(ContractError, match=message) as raised:
         DeployStage(export, 1, scene_file=TERRAIN_FILE)
     assert "scene.xml" not in str(raised.value)

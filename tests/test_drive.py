@@ -183,6 +183,7 @@ def test_a_script_drives_in_its_time(tmp_path: Path) -> None:
             "commands: [{time: 0, command: [1, 0, 0, 0]}]",
             "entry 1 of commands: command: write a list of vx [m/s], vy [m/s], yaw rate [rad/s], or {name: value}, not [1, 0, 0, 0]",
         ),
+        ("commands: [{time: 0, command: [0, 0]}]", "entry 1 of commands: command: write a list of vx [m/s], vy [m/s], yaw rate [rad/s]"),
         ("commands: [{time: 0, command: []}]", "entry 1 of commands: command: write a list of vx [m/s], vy [m/s]"),
         ("commands: [{time: 0, command: [1, 0, .nan]}]", "entry 1 of commands: command: write a list of vx [m/s], vy [m/s]"),
         ("commands: [{time: 0, command: {lin_vel_x: fast}}]", "command: lin_vel_x: write a number, not 'fast'"),

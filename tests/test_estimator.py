@@ -312,7 +312,7 @@ def test_training_goes_on_from_an_exported_estimate(policy: EstimatingModel, run
 
 def test_the_contract_names_the_rows(run_folder: Path) -> None:
     said = load_yaml(run_folder / "export/policy.yaml")
-    assert said["format"] == 3 and said["estimate"] == [
+    assert said["format"] == 5 and said["estimate"] == [
         {"name": "foot_height", "size": 4, "unit": "m", "frame": "site above the ground under it"},
         {"name": "base_lin_vel", "size": 3, "unit": "m/s", "frame": "body, at the IMU"},
     ]

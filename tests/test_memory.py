@@ -124,7 +124,7 @@ def test_the_documented_task_trains_resumes_and_exports(tmp_path: Path) -> None:
     assert again.code == 0 and "not exported" not in again.out, again.out + again.err
     [folder] = tmp_path.glob("logs/*/*/export")
     contract, stage = read_contract(folder), DeployStage(folder, 2)
-    assert contract.memory and contract.memory.shape == (1, 8) and contract.to_dict()["format"] == 3
+    assert contract.memory and contract.memory.shape == (1, 8) and contract.to_dict()["format"] == 5
     for _ in range(3):
         stage.step(None)
     assert stage.controller.memory is not None and stage.controller.memory.all() and np.isfinite(stage.qpos()).all()
@@ -312,5 +312,5 @@ def test_a_memory_of_another_size_is_refused(tmp_path: Path) -> None:
 
 def test_a_contract_without_a_memory_stays_of_the_older_format() -> None:
     contract = read_contract(ROOT / "resources/policies/go1_flat")
-    assert contract.memory is None and contract.to_dict()["format"] == 2 and "memory" not in contract.to_dict()["network"]
-    assert (ROOT / "resources/policies/go1_flat" / CONTRACT_FILE).read_text().startswith("format: 2\n")
+    assert contract.memory is None and contract.to_dict()["format"] == 5 and "memory" not in contract.to_dict()["network"]
+    assert (ROOT / "resources/policies/go1_flat" / CONTRACT_FILE).read_text().startswith("format: 5\n")

@@ -119,7 +119,7 @@ def test_what_is_not_finite_is_handed_on_and_forgotten() -> None:
 def test_the_exam_says_how_far_the_estimate_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     rules = replace(contract_rules(read_contract(GO1)), push_speeds=(2.0,))
     monkeypatch.setattr("legged_mw.eval.rules.SECONDS", 3.0)
-    monkeypatch.setattr(program, "run_exam", lambda folder, common, contact: run_exam(folder, rules, contact=contact))
+    monkeypatch.setattr(program, "run_exam", lambda folder, contact, **_: run_exam(folder, rules, contact=contact))
     monkeypatch.setattr(sys, "argv", ["deploy", str(GO1), "--eval", "--velocity", "odometry", "--out", str(tmp_path / "exam.json")])
     program.main()
     assert "estimate of vx, rms [m/s]            0.0" in capsys.readouterr().out
@@ -127,7 +127,7 @@ def test_the_exam_says_how_far_the_estimate_is(tmp_path: Path, monkeypatch: pyte
 
 
 def test_other_exams_have_no_odometry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(program, "read_contract", lambda folder: replace(read_contract(folder), exam={"kind": "getup"}))
+    monkeypatch.setattr(program, "read_contract", lambda folder, _: replace(read_contract(folder), exam={"kind": "getup"}))
     with pytest.raises(UserError, match="--velocity odometry is of robots that walk, and this exam is another: leave it out"):
         program.examine(GO1, tmp_path / "exam.json", contact="torque")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,9 @@ from rsl_rl.models import MLPModel
 from legged_mw import ROOT
 from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.exam import contract_skill, perform
+from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.simulated import read_scene
+from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.eval import exam, rules
 from legged_mw.rl.export import FILES
@@ -76,6 +79,33 @@ def check_formats(folder: Path, task: LoadedTask, env: RobotTask) -> MLPModel:
     contract = read_contract(folder)
     assert contract.digest == digest(folder / "policy.onnx") and read_scene(folder, contract).model.nu == env.num_actions
     return policy
+
+
+def test_the_contract_and_the_network_alone_have_the_targets_that_servos_obey(tmp_path: Path) -> None:
+    """Of g1_flat, whose policy asks its ankles for more than their range in every step; the scene is not there."""
+    folder, task = ROOT / "resources/policies/g1_flat", load_task("g1_flat")
+    task.update_from_run(load_yaml(folder / "config.yaml"), where="config.yaml")
+    exam.prepare(task)
+    task.cfg.env.num_envs = 2
+    env, stage = task.env_class(task.cfg, "cpu"), DeployStage(folder, 2)
+    policy, alone = load_policy(folder / "policy.onnx", env, task.train, "cpu"), tmp_path / "alone"
+    alone.mkdir()
+    for name in ("policy.yaml", "policy.onnx"):
+        shutil.copy(folder / name, alone)
+    contract = read_contract(alone)
+    controller, obs = Controller(alone, contract, 2), env.get_observations()
+    stage.fleet.qpos[:], stage.fleet.qvel[:] = env.sim.qpos.numpy(), env.sim.qvel.numpy()
+    stage.fleet.refresh()
+    stage.measured = stage.fleet.read()
+    ankles = [i for i, name in enumerate(contract.joints) if "ankle" in name]
+    for _ in range(10):
+        commands = env.commands.numpy().copy()
+        obs, *_ = env.step(act(policy, obs))
+        targets, asked = controller.act(stage.measured, commands), env.actuators.targets.numpy()
+        stage.step(commands)
+        np.testing.assert_allclose(controller.last_targets, asked, atol=1e-3)
+        np.testing.assert_allclose(targets, np.clip(asked, *env.robot.physics.actuator_ctrlrange.T), atol=1e-3)
+        assert (np.abs(targets - asked)[:, ankles] > 0.01).any()
 
 
 def test_play_takes_the_shipped_policy_where_nothing_is_trained(tmp_path: Path) -> None:

@@ -261,6 +261,14 @@ def check_switch(rescuer: Path) -> None:
     stage._stood = lambda measured: np.array([False, True])  # type: ignore[method-assign]
     stage.step()
     assert not stage.rescued[1]
+    stage.rescued[1] = True
+    for world in (0, 1):  # the walker's, and one that is getting up
+        stage.fleet.qvel[world] = math.nan
+        stage.step()
+        assert stage.fell().tolist() == [world == 0, world == 1] and not stage.rescued[world]
+        assert np.isfinite(stage.qpos()).all() and stage.qpos()[world, 2] == stage.fleet.model.key_qpos[0, 2]
+    stage.step()
+    assert not stage.fell().any() and stage.controller.last_actions.any(axis=1).all()
     with pytest.raises(UserError, match="--switch: joints of go1_flat and g1_flat differ, so they cannot drive one robot"):
         SwitchStage(POLICIES / "go1_flat", POLICIES / "g1_flat")
     line = "--switch: rows with sensors of their own of go1_flat and go1_rough_scan differ, .* one robot: \\[\\] and \\['height_scan'\\]"

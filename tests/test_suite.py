@@ -24,6 +24,7 @@ from legged_mw import ROOT
 from legged_mw.check.guard import check_recordable
 from legged_mw.check.recordable import recordable
 from legged_mw.deploy.contract import read_contract
+from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.rl import export as exporting
 from legged_mw.rl.export import Exported, export
@@ -281,8 +282,11 @@ def test_export_states_what_the_policy_sees(made: Made, env: Any) -> None:
     assert tuple(contract.feet) == tuple(getattr(env, "foot_names", ()))
 
 
-def test_deployed_it_acts_and_moves_as_in_its_environment(name: str, made: Made) -> None:
-    """From the same state, each in its own physics: the same observations, joint targets and motion, to float32's rounding."""
+def test_deployed_it_acts_and_moves_as_in_its_environment(name: str, made: Made, tmp_path: Path) -> None:
+    """From the same state, each in its own physics: the same observations, joint targets and motion, to float32's rounding.
+
+    The contract and the network alone, without the scene, know the targets that the servos obey: those are held within their range.
+    """
     task = small(name, NOMINAL, worlds=4)
     torch.manual_seed(6)  # so that no part of a G1 hits another, where the convex collider makes much of rounding
     env = task.env_class(task.cfg, "cpu")
@@ -290,12 +294,18 @@ def test_deployed_it_acts_and_moves_as_in_its_environment(name: str, made: Made)
     stage.fleet.qpos[:], stage.fleet.qvel[:] = env.sim.qpos.numpy(), env.sim.qvel.numpy()
     stage.fleet.refresh()
     stage.measured, obs = stage.fleet.read(), env.get_observations()
+    for file in ("policy.yaml", "policy.onnx") + ("scene.xml", "motion.npz") * (stage.contract.motion is not None):
+        shutil.copy(made.folder / file, tmp_path)
+    alone, physics = Controller(tmp_path, read_contract(tmp_path), 4), env.robot.physics
+    obeyed = np.where(physics.actuator_ctrllimited[:, None] > 0, physics.actuator_ctrlrange, [-np.inf, np.inf]).T
     for _ in range(8):
         commands = env.commands.numpy().copy() if env.command_table else np.zeros((4, 0))
         seen = np.concatenate([obs[group].numpy() for group in task.train.obs_groups.actor], axis=1)
         np.testing.assert_allclose(stage.controller.observe(stage.measured, commands), seen, atol=1e-3)
         obs, _, dones, _ = env.step(act(policy, obs))
+        targets = alone.act(stage.measured, commands)
         stage.step(commands)
+        np.testing.assert_allclose(targets, np.clip(env.actuators.targets.numpy(), *obeyed), atol=1e-4)
         assert not dones.any() and not stage.fell().any()
         np.testing.assert_allclose(stage.controller.last_targets, env.actuators.targets.numpy(), atol=1e-4)
         np.testing.assert_allclose(stage.qpos(), env.sim.qpos.numpy(), atol=1e-4)

@@ -236,7 +236,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_an_export_follows_and_is_graded(exported: Path) -> None:
     stage = DeployStage(exported, 1)
     follower = stage.controller.follower
-    assert follower and stage.contract.motion and stage.contract.to_dict()["format"] == 4
+    assert follower and stage.contract.motion and stage.contract.to_dict()["format"] == 5
     np.testing.assert_allclose(stage.qpos()[0], follower.clip.qpos()[0], atol=1e-5)  # it starts where the clip does
     for step in range(3):
         assert follower.frame.tolist() == [1 + step]

@@ -126,6 +126,17 @@ def test_bad_targets_move_nothing(served: Any, contract: Contract) -> None:
     assert robot.fleet.qpos[0, 2] == 0.278
 
 
+def test_the_server_holds_targets_within_the_contracts_range(served: Any, contract: Contract) -> None:
+    """Whoever the client is."""
+    server, robot, _ = served
+    written: list[Any] = []
+    robot.write = lambda targets, **_: written.append(targets)
+    client = udp.UdpRobot(contract, server.address, timeout=5.0)
+    client.write(contract.default_pose + 5.0)
+    client.close()
+    np.testing.assert_array_equal(written, [contract.action.highest])
+
+
 def test_another_scan_is_another_contract() -> None:
     seen, blind = (read_contract(ROOT / "resources/policies" / name) for name in ("go1_rough_scan", "go1_rough"))
     assert udp.contract_digest(seen) != udp.contract_digest(blind)

@@ -67,6 +67,7 @@ int check(const std::string& folder, const std::string& path) {
     times.push_back(std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - began).count());
     compare("observation", controller.observation, row.at("observation"), worst);
     compare("action", controller.actions, row.at("action"), worst);
+    compare("wanted", controller.wanted, row.at("wanted"), worst);
     compare("target", controller.targets, row.at("target"), worst);
   }
   if (times.empty()) throw std::runtime_error(path + " holds no step");

@@ -36,8 +36,11 @@ struct Command {
 struct Contract {
   explicit Contract(const std::string& folder) : Contract(YamlReader(folder + "/policy.yaml").read()) {}
   explicit Contract(const Yaml& top) {
-    if (const int format = static_cast<int>(top["format"].number()); format < 2 || format > 3)
-      top["format"].fail("format " + std::to_string(format) + " is not one that this program reads (2 and 3)");
+    const int format = static_cast<int>(top["format"].number());
+    if (format >= 2 && format < 5)
+      top["format"].fail("format " + std::to_string(format) + " does not say within which range targets are held: export the policy again");
+    if (format != 5) top["format"].fail("format " + std::to_string(format) + " is not one that this program reads (5)");
+    if (const Yaml* motion = top.find("motion")) motion->fail("the policy follows a motion, which this program cannot");
     task = top["task"].text, period = top["period"].number();
     const Yaml &network = top["network"], &action = top["action"];
     file = network["file"].text, input = network["input"].text, output = network["output"].text;
@@ -46,6 +49,7 @@ struct Contract {
       for (double size : (*memory)["shape"].numbers()) memory_shape.push_back(static_cast<int64_t>(size));
     }
     for (const Yaml& joint : top["joints"].items()) joints.push_back(joint.text);
+    lowest = values(action, "lowest"), highest = values(action, "highest");
     default_pose = values(top, "default_pose"), stiffness = values(top, "stiffness"), damping = values(top, "damping");
     origin = action["origin"].text, action_scale = spread(action["scale"], joints.size()), clip = action["clip"].number();
     if (origin != "default" && origin != "joints" && origin != "targets" && origin != "torque")
@@ -73,6 +77,7 @@ struct Contract {
   double period = 0, clip = 0, gait_period = 0, min_command = 0;  // [s], [-], [s], norm of (vx, vy, yaw rate)
   std::vector<std::string> joints;
   std::vector<double> default_pose, stiffness, damping, action_scale, gait_offsets;  // [rad], [N m/rad], [N m s/rad], ...
+  std::vector<double> lowest, highest;  // [rad] of what a servo is told; +-1e6: anything
   std::vector<Command> commands;
   std::vector<Row> rows;
 
@@ -109,9 +114,10 @@ class Controller {
     network_.reset();
     fresh_ = true, running_ = false, phase_ = 0;
     actions.assign(contract_.joints.size(), 0.0f);
-    targets = contract_.default_pose;
+    wanted = targets = contract_.default_pose;
   }
-  // Joint targets [rad], or torques [N m] where the origin is "torque", for the next period. Commands are in the contract's order.
+  // Joint targets [rad], or torques [N m] where the origin is "torque", for the next period, within the contract's range. Commands are
+  // in the contract's order.
   const std::vector<double>& act(const Measurement& measured, const std::vector<double>& command) {
     observe(measured, command);
     const std::vector<float>& raw = network_.act(observation);
@@ -120,16 +126,17 @@ class Controller {
       actions[i] = std::isfinite(raw.at(i)) ? std::clamp(raw[i], -clip, clip) : NAN;  // not finite: a fault to stop at, not a wish
       const double origin = contract_.origin == "default"  ? contract_.default_pose[i]
                             : contract_.origin == "joints" ? measured.at("joint_pos")[i]
-                            : contract_.origin == "targets" ? targets[i]
+                            : contract_.origin == "targets" ? wanted[i]
                                                             : 0.0;
-      targets[i] = origin + contract_.action_scale[i] * static_cast<double>(actions[i]);
+      wanted[i] = origin + contract_.action_scale[i] * static_cast<double>(actions[i]);
+      targets[i] = std::min(std::max(wanted[i], contract_.lowest[i]), contract_.highest[i]);  // NaN stays
     }
     fresh_ = false;
     return targets;
   }
 
   std::vector<float> observation, actions;  // of the last step; actions are clipped
-  std::vector<double> targets;              // likewise
+  std::vector<double> wanted, targets;      // likewise: the policy's own, to be judged and logged; as held within the range
 
  private:
   void observe(const Measurement& measured, const std::vector<double>& command) {

@@ -31,7 +31,8 @@ def record(folder: Path, path: Path, steps: int) -> None:
     robot, controller, script = MujocoRobot(folder, contract), Controller(folder, contract), commands(contract)
     parts = layout(contract)
     joints = len(contract.joints)
-    sizes = {"fresh": 1, **parts, "command": len(contract.commands), "observation": contract.size, "action": joints, "target": joints}
+    sizes = {"fresh": 1, **parts, "command": len(contract.commands), "observation": contract.size}
+    sizes |= dict.fromkeys(("action", "wanted", "target"), joints)
     with path.open("w") as file:
         file.write(" ".join(f"{name} {size}" for name, size in sizes.items()) + "\n")
         for step in range(steps):
@@ -42,7 +43,7 @@ def record(folder: Path, path: Path, steps: int) -> None:
             command, measured = script[step // HELD % len(script)], robot.read()
             targets = controller.act(measured, command)[0]
             values = [np.array([fresh]), *(part(measured, name) for name in parts), command]
-            values += [controller.last_observation[0], controller.last_actions[0], targets]
+            values += [controller.last_observation[0], controller.last_actions[0], controller.last_targets[0], targets]
             file.write(" ".join(f"{value:.17g}" for value in np.concatenate(values)) + "\n")
             robot.write(targets)
 

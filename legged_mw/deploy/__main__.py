@@ -7,7 +7,7 @@ from pathlib import Path
 
 from legged_mw import ROOT
 from legged_mw.deploy import drive, options, replay
-from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, read_contract
+from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, TERRAIN_FILE, edits, read_contract
 from legged_mw.deploy.exam import contract_skill, run_exam, run_skill
 from legged_mw.deploy.simulated import MujocoRobot
 from legged_mw.deploy.stage import DeployStage
@@ -19,6 +19,7 @@ from legged_mw.utils.files import check_folder, typed, writable
 from legged_mw.view import launch
 
 RESULT_FILE = "exam.json"
+SHIPPED = ROOT / "resources" / "policies"
 
 
 def parse() -> argparse.Namespace:
@@ -27,14 +28,15 @@ def parse() -> argparse.Namespace:
     parser.add_argument("folder", metavar="DIR", nargs="?", help=f"an export: {made}")
     parser.add_argument("second", metavar="DIR2", nargs="?", help="with --switch: the policy that takes over, of the same robot")
     parser.add_argument("--switch", choices=("fall",), help="fall: DIR until the robot falls, then DIR2 until it stands (simulated)")
-    parser.add_argument("--eval", action="store_true", help=f"the task's exam; prints its table and writes DIR/{RESULT_FILE}")
-    parser.add_argument("--out", metavar="FILE", help=f"where --eval writes (default: DIR/{RESULT_FILE})")
+    parser.add_argument("--eval", action="store_true", help=f"the task's exam; prints its table and writes {RESULT_FILE}")
+    parser.add_argument("--out", metavar="FILE", help=f"where --eval writes (default: DIR/{RESULT_FILE}; of a shipped one in logs)")
     common = "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
     parser.add_argument("--command", metavar="VALUES", help="fixed command: 0.5,0,0 in the contract's order, or base_height=0.3 by name")
     parser.add_argument("--num_envs", type=positive, default=1, metavar="N", help="robots side by side")
     parser.add_argument("--time", type=duration, metavar="T", help="how long (default: until closed; 10s of a recording)")
     parser.add_argument("--terrain", action="store_true", help=f"among the steps and blocks of {TERRAIN_FILE}, if the export has it")
+    parser.add_argument("--edited", action="store_true", help="you changed what is exported: each number is shown beside the exported one")
     launch.add_flags(parser)
     options.add_flags(parser)
     drive.add_flags(parser)
@@ -63,17 +65,19 @@ def parse() -> argparse.Namespace:
 def main() -> None:
     args = parse()
     if args.replay:
-        show_log(args.replay, find(args.folder) if args.folder else None)
+        show_log(args.replay, find(args.folder) if args.folder else None, args.edited)
         return
     folder = find(args.folder)
-    contract, scene_file = read_contract(folder), TERRAIN_FILE if args.terrain else SCENE_FILE
+    contract, scene_file = read_contract(folder, args.edited), TERRAIN_FILE if args.terrain else SCENE_FILE
+    for each in (folder, *([find(args.second)] if args.second else [])) if args.edited else ():
+        print("\n".join(edits(each)) or f"{shown(each)}: nothing was changed in what the network was trained with")
     command = launch.check_drive(args, contract.commands, advice=f"the ranges are in {folder / CONTRACT_FILE}")
     if contract.ends.not_covered:
         print(f"not judged here: {', '.join(contract.ends.not_covered)}, which ended episodes in training")
     contact = options.contact(args, contract)
     if args.switch:
-        stage = SwitchStage(folder, find(args.second), args.num_envs, command)
-        launch.watch(stage, args, folder, title=f"{contract.task}, {args.second}")
+        stage = SwitchStage(folder, find(args.second), args.num_envs, command, args.edited)
+        launch.watch(stage, args, results(folder), title=f"{contract.task}, {args.second}")
     elif args.serve:
         options.serve(folder, contract, args)
     elif args.robot != "simulated":
@@ -84,33 +88,38 @@ def main() -> None:
         robot = MujocoRobot(folder, contract, scene_file, whole=True, hoisted=drive.hoisted(args, contract), lift=drive.lift(args))
         drive.drive(robot, folder, contract, args, command, args.robot, contact)
     elif args.eval:
-        examine(folder, Path(args.out) if args.out else folder / RESULT_FILE, args.ranges == "common", contact)
+        examine(folder, Path(args.out) if args.out else results(folder) / RESULT_FILE, args.ranges == "common", contact, args.edited)
     else:
-        launch.watch(DeployStage(folder, args.num_envs, command, scene_file=scene_file, contact=contact), args, folder, title=contract.task)
+        stage = DeployStage(folder, args.num_envs, command, scene_file=scene_file, contact=contact, edited=args.edited)
+        launch.watch(stage, args, results(folder), title=contract.task)
 
 
 def find(name: str) -> Path:
     """The folder of an export, or of the shipped policy of this name. Raises UserError if it is neither."""
-    shipped = ROOT / "resources" / "policies"
     if (folder := typed(name)).exists():
         return check_folder(folder)
-    if not (shipped / name).is_dir():
-        there = sorted(path.parent.name for path in shipped.glob(f"*/{CONTRACT_FILE}"))
+    if not (SHIPPED / name).is_dir():
+        there = sorted(path.parent.name for path in SHIPPED.glob(f"*/{CONTRACT_FILE}"))
         raise UserError(f"no folder {name}, and {unknown('policy', name, there, 'resources/policies')}")
-    return shipped / name
+    return SHIPPED / name
 
 
-def show_log(path: Path, folder: Path | None) -> None:
+def results(folder: Path) -> Path:
+    """Where what is made of an export goes: beside it; of a shipped one, which is the package's, into logs as play.py's does."""
+    return Path("logs", folder.name, "shipped") if folder.resolve().parent == SHIPPED.resolve() else folder
+
+
+def show_log(path: Path, folder: Path | None, edited: bool = False) -> None:
     """A log beside its simulation: the table, and a picture beside the log."""
-    replayed = replay.replay(path, folder)
+    replayed = replay.replay(path, folder, edited)
     print(replay.table(replayed))
     replay.draw(replayed, path.with_suffix(".png"))
     print(f"written to {shown(path.with_suffix('.png'))}")
 
 
-def examine(folder: Path, path: Path, common: bool = False, contact: str | None = None) -> None:
-    """The exam: its table, and a JSON file at ``path``. ``contact``: see DeployStage."""
-    contract = read_contract(folder)
+def examine(folder: Path, path: Path, common: bool = False, contact: str | None = None, edited: bool = False) -> None:
+    """The exam: its table, and a JSON file at ``path``. ``contact`` and ``edited``: see DeployStage."""
+    contract = read_contract(folder, edited)
     writable(str(path), "--out")
     if contract.exam and "kind" in contract.exam:
         if common:
@@ -118,10 +127,10 @@ def examine(folder: Path, path: Path, common: bool = False, contact: str | None 
         if contact:
             raise UserError("--velocity odometry is of robots that walk, and this exam is another: leave it out")
         skill = contract_skill(contract)
-        result = run_skill(folder, skill)
+        result = run_skill(folder, skill, edited=edited)
         print(skill.table(result))
     else:
-        result = run_exam(folder, common=common, contact=contact)
+        result = run_exam(folder, common=common, contact=contact, edited=edited)
         print(rules.table(result))
     said = {"policy": shown(folder / "policy.onnx"), "engine": "mujoco (deploy)"}
     said |= {"velocity": f"odometry, contact by {contact}"} if contact else {}

@@ -5,8 +5,6 @@ The export writes it from here and ``legged_mw.deploy`` reads it with this. Noth
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,18 +13,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from legged_mw.deploy.action import Action, check_pose, read_action, short
 from legged_mw.deploy.estimate import ESTIMATE, Estimated, read_estimated
 from legged_mw.deploy.memory import MEMORY, Memory, read_memory
 from legged_mw.deploy.motion import JOINT_POS, JOINT_VEL, MOTION, PLACE, REFERENCE, TURN, Motion, read_motion
 from legged_mw.deploy.motors import MOTORS, SERVOS, Motors, read_motors
 from legged_mw.deploy.reader import MOST_VALUES, Reader, is_list, is_number
 from legged_mw.deploy.reader import ContractError as ContractError
+from legged_mw.deploy.seal import CHECKSUM, FREE, changes, sealed
+from legged_mw.deploy.seal import checksum as checksum
 from legged_mw.utils.commands import VELOCITY, Command
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.files import digest, finish_moving
 
-FORMATS = (2, 3, 4)  # 3: a memory, an estimate, motors; 4: a motion. A file has the lowest that suffices: old readers read what they can
+FORMATS = (2, 3, 4, 5)  # 5: the range of targets, and checksums of the scenes; older ones take the range from the scene
 CONTRACT_FILE, NETWORK_FILE, SCENE_FILE = "policy.yaml", "policy.onnx", "scene.xml"
 TERRAIN_FILE = "terrain.mjz"  # the same robot among steps and blocks; only of policies that were trained on such ground
 
@@ -71,11 +72,7 @@ SENSORS = "sensors"  # ContractRow.measured of a row that names sensors of the s
 SCAN = "height_scan"  # ContractRow.measured of the height scan
 CLOCK = "gait_clock"  # ContractRow.measured of the gait clock
 OWN = (SENSORS, SCAN, "")  # rows that come whole, in Measurement.others, by their names
-ORIGINS = ("default", "joints", "targets", "torque", "speed")
-CHECKSUM = "checksum"  # of what the network's numbers mean, which may not change without the network
-_FREE = ("format", "task", "ends", "exam", "safety", CHECKSUM)  # what may: how the policy is judged and watched
 _FARTHEST = 100.0  # [rad] or [m] of a joint's default, either way
-_LARGEST_ACTION = 1000.0  # [L] clips at 100
 
 
 @dataclass(frozen=True)
@@ -91,14 +88,6 @@ class ContractRow:
     sensors: tuple[str, ...] = ()
     scale: tuple[float, ...] = (1.0,)  # one a value, or one for all: the network sees scale * value
     history: int = 1  # after a reset all frames are the first one
-
-
-class Action(NamedTuple):
-    """What an action means: joint target = origin + scale * action [rad], or torque [N m] or speed [rad/s] = scale * action."""
-
-    origin: str  # "default": the default pose; "joints": the measured angles; "targets": the last targets; "torque", "speed": none
-    scale: np.ndarray  # (D,) [rad], [N m] or [rad/s]
-    clip: float  # |action| at most [-]
 
 
 class Ends(NamedTuple):
@@ -163,6 +152,8 @@ class Contract:
     estimate: tuple[Estimated, ...] = ()  # the network's second output, row by row
     motors: Motors = SERVOS
     motion: Motion | None = None  # that the policy follows
+    scene: str = ""  # SHA-256 of the scene's file; none in a format before 5
+    terrain: str = ""  # that of the scene among steps, if there is one
 
     @property
     def size(self) -> int:
@@ -178,20 +169,23 @@ class Contract:
         ends = {name: list(value) if isinstance(value, tuple) else value for name, value in self.ends._asdict().items() if value}
         network = {"file": NETWORK_FILE, "sha256": self.digest, "input": self.input, "output": self.output}
         said = {
-            "format": FORMATS[2 if self.motion else 1 if self.memory or self.estimate or self.motors != SERVOS else 0],
+            "format": FORMATS[-1],
             "task": self.task,
             "network": network | ({MEMORY: self.memory.to_dict()} if self.memory else {}),
             "period": self.period,
             "joints": list(self.joints),
             "default_pose": self.default_pose.tolist(),
-            "action": {"origin": self.action.origin, "scale": _short(self.action.scale.tolist()), "clip": self.action.clip},
+            "action": self.action.to_dict(),
             "stiffness": self.stiffness.tolist(),
             "damping": self.damping.tolist(),
             "commands": [{"name": c.name, "unit": c.unit, "lowest": c.low, "highest": c.high, "default": c.default} for c in self.commands],
             "observation": [_row_to_dict(row) for row in self.rows],
             "ends": ends,
             "robot": {"mass": self.mass, "feet": {foot: list(names) for foot, names in self.feet.items()}, "imu": self.imu},
-            "physics": {"file": SCENE_FILE, "timestep": self.timestep, "decimation": self.decimation},
+            "physics": {
+                **{"file": SCENE_FILE, "sha256": self.scene, "timestep": self.timestep, "decimation": self.decimation},
+                **({"terrain": {"file": TERRAIN_FILE, "sha256": self.terrain}} if self.terrain else {}),
+            },
             "sensors": {name: list(names) for name, names in self.sensors.items()},
             **({SCAN: {"x": list(self.scan.x), "y": list(self.scan.y), "standing": self.scan.standing}} if self.scan else {}),
             **({"gait": {**self.gait._asdict(), "offsets": list(self.gait.offsets)}} if self.gait else {}),
@@ -200,59 +194,74 @@ class Contract:
             **self.motors.to_dict(),
             **({MOTION: self.motion.to_dict()} if self.motion else {}),
         }
-        return {**said, CHECKSUM: checksum(said)}
+        return sealed(said)
 
 
 def _row_to_dict(row: ContractRow) -> dict[str, Any]:
     entry = {name: getattr(row, name) for name in ("name", "size", "unit", "frame", "noise", "measured")}
-    entry |= {"scale": _short(row.scale), **({"sensors": list(row.sensors)} if row.sensors else {})}
+    entry |= {"scale": short(row.scale), **({"sensors": list(row.sensors)} if row.sensors else {})}
     return entry | ({"history": row.history} if row.history > 1 else {})
-
-
-def _short(values: Sequence[float]) -> float | list[float]:
-    """One number where all are the same."""
-    return values[0] if len(set(values)) == 1 else list(values)
-
-
-def checksum(said: Mapping[str, Any]) -> str:
-    """SHA-256 of all in a contract that the network was trained with: joints, rows, scales and the rest, in their order."""
-    bound = {name: value for name, value in said.items() if name not in _FREE}
-    return hashlib.sha256(json.dumps(bound, default=str).encode()).hexdigest()
 
 
 # ---- reading -------------------------------------------------------------------------------------------------------
 
 
-def read_contract(folder: Path) -> Contract:
-    """The contract in ``folder``: complete, typed, and of the network that lies beside it.
+def read_contract(folder: Path, edited: bool = False) -> Contract:
+    """The contract in ``folder``: complete, typed, of the network that lies beside it, and of the scenes, if there are any.
 
+    ``edited``: it may have been changed in what the network was trained with; see ``edits``.
     Raises ContractError (or ConfigError, if the YAML is broken) with one line.
     """
     finish_moving(folder)
-    path = folder / CONTRACT_FILE
-    for file in (path, folder / NETWORK_FILE, folder / SCENE_FILE):
-        if not file.is_file():
-            raise ContractError(f"no {file.name} in {folder}; make an export with: python play.py --task <task> --export {folder}")
-    contract = _read(Reader(said := load_yaml(path), CONTRACT_FILE))
+    contract = _read(Reader(said := load_yaml(part(folder, CONTRACT_FILE)), CONTRACT_FILE), folder)
     _check_rows(contract)
+    part(folder, NETWORK_FILE)
     if digest(folder / NETWORK_FILE) != contract.digest:
         raise ContractError(
             f"{NETWORK_FILE} is not the file that {CONTRACT_FILE} was written for (its SHA-256 differs): "
             "it is damaged, or of another export; export the policy again"
         )
-    if CHECKSUM in said and checksum(said) != said[CHECKSUM]:  # older exports have none
+    if edited:
+        check_pose(contract.action, contract.joints, contract.default_pose)
+        return contract
+    what_to_do = "undo the change, export the policy again, or say --edited, which shows each number beside the exported one"
+    if CHECKSUM not in said:
+        raise ContractError(f"{CONTRACT_FILE} has no line `{CHECKSUM}`, which says that it is as it was exported: {what_to_do}")
+    if checksum(said) != said[CHECKSUM]:
         raise ContractError(
-            f"{CONTRACT_FILE} was changed in what the network was trained with (its {CHECKSUM} differs); only {', '.join(_FREE[1:-1])} "
-            "may be: undo the change, or export the policy again"
+            f"{CONTRACT_FILE} was changed in what the network was trained with (its {CHECKSUM} differs); only {', '.join(FREE)} may be: "
+            f"{what_to_do}"
         )
+    for name in _changed_files(folder, contract):
+        raise ContractError(f"{name} is not the file that {CONTRACT_FILE} was written for (its SHA-256 differs): {what_to_do}")
     return contract
 
 
-def _read(top: Reader) -> Contract:
-    top.take("format", f"one of {', '.join(map(str, FORMATS))}, which this version reads; export the policy again", lambda v: v in FORMATS)
+def part(folder: Path, name: str) -> Path:
+    """A file of the export in ``folder``. Raises ContractError if it is not there."""
+    if not (folder / name).is_file():
+        raise ContractError(f"no {name} in {folder}; make an export with: python play.py --task <task> --export {folder}")
+    return folder / name
+
+
+def edits(folder: Path) -> list[str]:
+    """A line for each number of the export in ``folder`` that was changed since, beside the exported one, and for each other file."""
+    lines = changes(load_yaml(part(folder, CONTRACT_FILE)))
+    files = _changed_files(folder, read_contract(folder, edited=True))
+    return [f"{CONTRACT_FILE}: {line}" for line in lines] + [f"{name}: another file than the exported one" for name in files]
+
+
+def _changed_files(folder: Path, contract: Contract) -> list[str]:
+    stated = {SCENE_FILE: contract.scene, TERRAIN_FILE: contract.terrain}
+    return [name for name, wanted in stated.items() if wanted and (folder / name).is_file() and digest(folder / name) != wanted]
+
+
+def _read(top: Reader, folder: Path) -> Contract:
+    version = top.take(
+        "format", f"one of {', '.join(map(str, FORMATS))}, which this version reads; export the policy again", lambda v: v in FORMATS
+    )
     network, action, robot, physics, measured = (top.section(name) for name in ("network", "action", "robot", "physics", "sensors"))
     network.file("file", NETWORK_FILE)
-    physics.file("file", SCENE_FILE)
     joints, feet = top.texts("joints"), robot.section("feet")
     top.take("joints", "names, each once", lambda names: len(set(names)) == len(names))
     count, timestep, decimation = len(joints), physics.above_zero("timestep"), physics.count("decimation", 10_000)
@@ -262,7 +271,7 @@ def _read(top: Reader) -> Contract:
         task=top.text("task"),
         joints=joints,
         default_pose=top.numbers("default_pose", count, "joint", -_FARTHEST, _FARTHEST),
-        action=_read_action(action, count),
+        action=read_action(action, joints, None if version >= 5 else folder / SCENE_FILE),
         stiffness=top.numbers("stiffness", count, "joint", 0.0),
         damping=top.numbers("damping", count, "joint", 0.0),
         period=top.above_zero("period", 10.0),
@@ -285,14 +294,19 @@ def _read(top: Reader) -> Contract:
         estimate=read_estimated(top.sections(ESTIMATE)) if ESTIMATE in top.values else (),
         motors=read_motors(top.section(MOTORS), count) if MOTORS in top.values else SERVOS,
         motion=read_motion(top.section(MOTION)) if MOTION in top.values else None,
+        **_read_scenes(physics, version),
     )
 
 
-def _read_action(action: Reader, joints: int) -> Action:
-    origin = action.take("origin", f"one of {', '.join(ORIGINS)}", lambda v: v in ORIGINS)
-    scale = action.scale(joints, "joint")
-    action.take("scale", "other than 0, which moves nothing", lambda _: bool(scale.any()))
-    return Action(origin, scale, action.above_zero("clip", _LARGEST_ACTION))
+def _read_scenes(physics: Reader, version: int) -> dict[str, Any]:
+    """Their checksums."""
+    physics.file("file", SCENE_FILE)
+    if version < 5:
+        return {}
+    if "terrain" not in physics.values:
+        return {"scene": physics.text("sha256")}
+    (terrain := physics.section("terrain")).file("file", TERRAIN_FILE)
+    return {"scene": physics.text("sha256"), "terrain": terrain.text("sha256")}
 
 
 def _read_command(command: Reader) -> Command:
@@ -359,7 +373,11 @@ def quantity_size(contract: Contract, name: str) -> int:
 
 
 def _check_rows(contract: Contract) -> None:
-    """Every row is one that can be measured, of the right size."""
+    """Every row is one that can be measured, of the right size, and what ends a walk by falling on it is felt."""
+    felt = [name.removeprefix("contact/") for name in contract.sensors.get(FALL, ())]
+    for name in contract.ends.falls_on if felt else ():
+        if name not in felt:
+            raise ContractError(f"{CONTRACT_FILE}: ends: falls_on: {unknown('geom', name, felt, f'sensors: {FALL}')}")
     measurable = {quantity.measured for quantity in ROWS.values()}
     for row in contract.rows:
         where = f"{CONTRACT_FILE}: observation row '{row.name}'"

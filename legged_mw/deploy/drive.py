@@ -105,8 +105,8 @@ def drive(
         mirror = stack.enter_context(closing(Mirror(folder, contract, args))) if args.viewer in LIVE else None
         safety = Safety(contract, Limits.of(folder, contract, robot.limits, parse_limits(args.limit)))
         path = None if args.log == "off" else log_path(contract) if args.log is None else writable(args.log, "--log")
-        log = Log(path, contract, folder, kind) if path else None
         console = stack.enter_context(Console(contract))
+        log = Log(path, contract, folder, kind, console.say) if path else None
         controller, command = Controller(folder, contract), _commands(contract, args, fixed, console.say)
         sources = [*_sources(contract, args, console.say), *([mirror] if mirror else [])]
         checked = JointCheck(controller, sources, console.say, robot, safety.limits) if args.check_joints else None
@@ -123,7 +123,8 @@ def drive(
                 mirror.show(now, measured, states)
 
         done = run(robot, controller, command, seconds, watch=show, safety=safety, states=states, log=log, odometry=odometry)
-        console.say(f"{done.timing}\nthe joints are damped{f'; logged to {shown(path)}' if path else ''}{states.report}")
+        logged = f"; {log.broken or f'logged to {shown(log.path)}'}" if log else ""
+        console.say(f"{done.timing}\nthe joints are damped{logged}{states.report}")
     if not states.right:
         raise SystemExit(1)
 

@@ -25,19 +25,20 @@ from legged_mw.utils.config import ConfigError
 
 
 def run_exam(
-    folder: Path, exam: ExamRules | None = None, threads: int = 0, common: bool = False, contact: str | None = None
+    folder: Path, exam: ExamRules | None = None, threads: int = 0, common: bool = False, contact: str | None = None, edited: bool = False
 ) -> dict[str, Any]:
     """Grade the export in ``folder`` by the rules ``exam``, else by those of its contract. Raises ContractError, ConfigError.
 
-    ``common``: the contract's, but in the one range that all published policies of the robot were asked. ``contact``: see DeployStage.
+    ``common``: the contract's, but in the one range that all published policies of the robot were asked. ``contact`` and
+    ``edited``: see DeployStage.
     """
-    contract = read_contract(folder)
+    contract = read_contract(folder, edited)
     exam, names = exam or contract_rules(contract, common), [command.name for command in contract.commands]
     wanted = np.tile([command.default for command in contract.commands], (exam.worlds(), 1))
     pushed = [(exam.push_vx, 0.0, 0.0)] * (exam.worlds() - len(exam.held()))
     wanted[:, [names.index(name) for name in VELOCITY]] = [*exam.held(), *pushed]
     ends = Ends(max_tilt=90.0, falls_on=contract.ends.falls_on)  # what counts as a fall in legged_mw.eval.exam
-    stage = DeployStage(folder, len(wanted), threads=threads, ends=ends, contact=contact)
+    stage = DeployStage(folder, len(wanted), threads=threads, ends=ends, contact=contact, edited=edited)
     fell_at = np.full(len(wanted), math.inf)
     sampled: dict[str, list[Any]] = {"velocity": [], "position": [], "power": [], "joint_speed": [], "estimate": []}
     for step in range(round(rules.SECONDS / stage.dt)):
@@ -54,10 +55,10 @@ def run_exam(
     return exam.grade(signals, last_position=stage.qpos()[:, :2], fell_at=fell_at, mass=stage.contract.mass, dt=stage.dt)
 
 
-def run_skill(folder: Path, skill: Skill | None = None, threads: int = 0) -> dict[str, Any]:
-    """Grade the export in ``folder`` by ``skill``, else by what its contract names."""
-    skill = skill or contract_skill(read_contract(folder))
-    return skill.result({name: skill.judge(*perform(folder, skill, ground, threads)) for name, ground in skill.grounds.items()})
+def run_skill(folder: Path, skill: Skill | None = None, threads: int = 0, edited: bool = False) -> dict[str, Any]:
+    """Grade the export in ``folder`` by ``skill``, else by what its contract names. ``edited``: see DeployStage."""
+    skill = skill or contract_skill(read_contract(folder, edited))
+    return skill.result({name: skill.judge(*perform(folder, skill, ground, threads, edited)) for name, ground in skill.grounds.items()})
 
 
 def contract_skill(contract: Contract) -> Skill:
@@ -69,9 +70,9 @@ def contract_skill(contract: Contract) -> Skill:
         raise ContractError(f"{CONTRACT_FILE}: {error}") from error
 
 
-def perform(folder: Path, skill: Skill, ground: Ground, threads: int = 0) -> tuple[Robot, Recording]:
+def perform(folder: Path, skill: Skill, ground: Ground, threads: int = 0, edited: bool = False) -> tuple[Robot, Recording]:
     """Put robots into their starts on ``ground`` and let the policy act."""
-    stage = DeployStage(folder, skill.robots, threads=threads, change=lambda model: put_on(model, ground))
+    stage = DeployStage(folder, skill.robots, threads=threads, change=lambda model: put_on(model, ground), edited=edited)
     said, follower = stage.contract.motion, stage.controller.follower
     motion = Motion(follower.clip.qpos(), said.bodies, said.anchor) if said and follower else None
     robot = Robot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)

@@ -15,28 +15,30 @@ import threading
 import time
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from legged_mw.deploy.contract import CONTRACT_FILE, NETWORK_FILE, SCENE_FILE, Contract
+from legged_mw.deploy.contract import CONTRACT_FILE, NETWORK_FILE, SCENE_FILE, TERRAIN_FILE, Contract
 from legged_mw.deploy.estimate import ESTIMATE
 from legged_mw.deploy.loop import Loop
+from legged_mw.deploy.motion import MOTION_FILE
 from legged_mw.deploy.motors import MOTORS_FILE
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement, layout
 from legged_mw.deploy.states import POLICY, STATES, Order
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import check_name
 
 FORMAT = 1
 CHUNK = 100  # steps a block
 BACKLOG = 60  # blocks that wait to be written: a slow disk must not fill the memory
 SUFFIX = ".lmwlog"
-EXPORT = (CONTRACT_FILE, NETWORK_FILE, SCENE_FILE, MOTORS_FILE)  # files of an export that a log holds, if they are there
+# files of an export that a log holds, if they are there
+EXPORT = (CONTRACT_FILE, NETWORK_FILE, SCENE_FILE, MOTORS_FILE, MOTION_FILE, TERRAIN_FILE)
 _LENGTH = struct.Struct("<Q")
 
 
@@ -55,7 +57,7 @@ def _columns(contract: Contract) -> dict[str, int]:
     return {
         **dict.fromkeys(("time", "behind", "work", "age", "state", "voltage"), 1),
         **{"command": len(contract.commands), "observation": contract.size},
-        **dict.fromkeys(("action", "target", "stiffness", "damping", "temperature"), joints),
+        **dict.fromkeys(("action", "wanted", "target", "stiffness", "damping", "temperature"), joints),
         **({ESTIMATE: sum(row.size for row in contract.estimate)} if contract.estimate else {}),
         **layout(contract),
     }
@@ -64,9 +66,10 @@ def _columns(contract: Contract) -> dict[str, int]:
 class Log:
     """Writes a run's log; a thread of its own compresses and writes, so a step only copies numbers."""
 
-    def __init__(self, path: Path, contract: Contract, folder: Path, robot: str) -> None:
-        """Begin the file. Raises LogError if it cannot be written."""
-        self.path, self.contract = path, contract
+    def __init__(self, path: Path, contract: Contract, folder: Path, robot: str, say: Callable[[str], None] = print) -> None:
+        """Begin the file. Raises LogError if it cannot be written. ``say`` is told, once, if that ends later."""
+        self.path, self.contract, self._say = path, contract, say
+        self.broken = ""  # why nothing more can be written
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("xb")
@@ -93,7 +96,8 @@ class Log:
             **{"time": loop.now, "behind": loop.behind, "work": loop.work, "state": STATES.index(order.state)},
             **{"age": _or_nan(health.age_s), "voltage": _or_nan(health.voltage), "temperature": _or_nan(health.temperatures)},
             **{"command": command, "observation": controller.last_observation[0] if acts else nothing},
-            **{"action": controller.last_actions[0] if acts else nothing, "target": order.targets if targets else nothing},
+            **{"action": controller.last_actions[0] if acts else nothing, "wanted": controller.last_targets[0] if acts else nothing},
+            "target": order.targets if targets else nothing,  # as the servos got it
             **{"stiffness": stiffness if targets else nothing, "damping": damping if targets else nothing},
             ESTIMATE: _believed(controller) if acts else nothing,
         }
@@ -127,7 +131,7 @@ class Log:
         return self._blocks.qsize()
 
     def _hand_over(self, last: bool = False) -> None:
-        if not last and self.backlog() >= BACKLOG:
+        if self.broken or (not last and self.backlog() >= BACKLOG):
             self._lost, self._count = self._lost + self._count, 0
             return
         if self._lost:
@@ -139,12 +143,18 @@ class Log:
             self._begin()
 
     def _write(self) -> None:
-        with self._file:
-            while (block := self._blocks.get()) is not None:
-                buffer = io.BytesIO()
-                np.savez_compressed(buffer, **block)
-                self._file.write(_LENGTH.pack(buffer.tell()) + buffer.getvalue())
-                self._file.flush()
+        steps = 0
+        try:
+            with self._file:
+                while (block := self._blocks.get()) is not None:
+                    buffer = io.BytesIO()
+                    np.savez_compressed(buffer, **block)
+                    self._file.write(_LENGTH.pack(buffer.tell()) + buffer.getvalue())
+                    self._file.flush()
+                    steps += len(block.get("time", ()))
+        except OSError as error:  # a full disk; the robot walks on
+            self.broken = f"the log {shown(self.path)} ends after {steps} steps: {error.strerror or error}"
+            self._say(self.broken)
 
 
 def _believed(controller: Controller) -> Any:

@@ -127,7 +127,7 @@ class MirroredStage:
     num_worlds, dt = 1, 1.0 / RATE
 
     def __init__(self, folder: Path, channel: socket.socket) -> None:
-        self.contract = read_contract(folder)
+        self.contract = read_contract(folder, edited=True)  # the robot's program has looked at it
         scene = read_scene(folder, self.contract, whole=True)  # it may lie on the ground
         self.spec, self._model, self._data, self._channel = scene.spec, scene.model, mujoco.MjData(scene.model), channel
         mujoco.mj_resetDataKeyframe(self._model, self._data, 0)

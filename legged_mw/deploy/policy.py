@@ -101,7 +101,7 @@ class Controller:
         self.folder, self.contract, self._network = folder, contract, network or Network(folder, contract)
         self.last_observation = np.zeros((count, contract.size), dtype=np.float32)
         self.last_actions = np.zeros((count, len(contract.joints)), dtype=np.float32)
-        self.last_targets = np.tile(contract.default_pose, (count, 1))  # (N, D) [rad]
+        self.last_targets = np.tile(contract.default_pose, (count, 1))  # (N, D) [rad] the policy's own
         self._frames = [np.zeros((count, row.history, row.size), dtype=np.float32) for row in contract.rows]  # as last observed
         self._fresh = np.ones(count, dtype=bool)  # robots that have observed nothing since their reset
         self.clock = GaitClock(contract, count) if contract.gait else None
@@ -113,7 +113,10 @@ class Controller:
         return _side_by_side(self._look(measurement, commands))
 
     def act(self, measurement: Measurement, commands: Floats) -> NDArray[np.float64]:
-        """Joint targets (N, D) [rad], or torques [N m], for the next period; ``commands`` (N, C) in the contract's order."""
+        """Joint targets (N, D) [rad], or torques [N m], for the next period; ``commands`` (N, C) in the contract's order.
+
+        They are within the range that servos obey; what the policy asked for itself is in ``last_targets``.
+        """
         action = self.contract.action
         self._frames = self._look(measurement, commands)
         if self.clock:
@@ -130,7 +133,7 @@ class Controller:
         self.last_actions = np.clip(actions, -action.clip, action.clip)
         origins = {"default": self.contract.default_pose, "joints": np.atleast_2d(measurement.joint_pos), "targets": self.last_targets}
         self.last_targets = origins.get(action.origin, 0.0) + action.scale * self.last_actions.astype(np.float64)
-        return self.last_targets.copy()
+        return action.held(self.last_targets)
 
     def estimate(self, row: str) -> NDArray[np.float64] | None:
         """What the policy believed of ``row`` when it acted last (N, size), in the contract's unit; None if it does not estimate that."""

@@ -47,17 +47,20 @@ class Replay(NamedTuple):
     simulated: Rows
 
 
-def replay(path: Path, folder: Path | None = None) -> Replay:
-    """Simulate the longest walk in a log with the export in ``folder`` (None: the one in the log). Raises LogError, ContractError."""
+def replay(path: Path, folder: Path | None = None, edited: bool = False) -> Replay:
+    """Simulate the longest walk in a log with the export in ``folder`` (None: the one in the log). Raises LogError, ContractError.
+
+    ``edited``: see read_contract.
+    """
     recording = read_log(path)
     with tempfile.TemporaryDirectory() as own:
         for name, content in recording.files.items():
             (Path(own) / name).write_bytes(content)
-        return _replay(path, recording, folder or (Path(own) if recording.files else Path(recording.header["export"])))
+        return _replay(path, recording, folder or (Path(own) if recording.files else Path(recording.header["export"])), edited)
 
 
-def _replay(path: Path, recording: Recording, folder: Path) -> Replay:
-    contract = read_contract(folder)
+def _replay(path: Path, recording: Recording, folder: Path, edited: bool) -> Replay:
+    contract = read_contract(folder, edited)
     if contract.digest != recording.header["network"]:
         raise LogError(f"{shown(path)} is of another network than the one in {shown(folder)} ({recording.header['task']}); name its export")
     walked = _longest(recording.rows["state"][:, 0] == STATES.index(POLICY))

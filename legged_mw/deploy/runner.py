@@ -162,7 +162,8 @@ class _Step:
 
     def _decide(self, measured: Measurement, now: float) -> Order:
         if self.states is None:
-            return Order(POLICY, self.controller.act(measured, self._command(now))[0])
+            self.controller.act(measured, self._command(now))
+            return Order(POLICY, self.controller.last_targets[0].copy())
         before, order = self.states.armed, self.states.step(measured, now)
         if self.odometry and not self.states.armed:
             self.odometry.reset()  # it may lie, or hang

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, Contract
+from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, Contract, part
 from legged_mw.deploy.loop import LATE
 from legged_mw.deploy.robot import Floats, Health, Measurement, RobotError
 from legged_mw.utils.errors import UserError, unknown
@@ -58,7 +58,7 @@ class Limits:
     low: Floats  # (D,) [rad] the joints' range
     high: Floats  # (D,) [rad]
     motor: Floats  # (D,) [N m] what the motors can give
-    lowest: Floats  # (D,) [rad] the servos' range: targets are held within it, as in training; no drive does it
+    lowest: Floats  # (D,) [rad] the contract's range: targets are held within it, as in training; no drive does it
     highest: Floats  # (D,) [rad]
     position: float = 0.25  # [rad] of a measured angle beyond the range [0.15: simulated end stops give]
     target: float = 0.9  # [rad] of a target beyond the range [0.62]
@@ -116,7 +116,7 @@ def _value(name: str, value: Any, where: str) -> float:
 def _of_scene(folder: Path, contract: Contract) -> Limits:
     import mujoco
 
-    return limits_of(mujoco.MjSpec.from_file(str(folder / SCENE_FILE)).compile(), contract)
+    return limits_of(mujoco.MjSpec.from_file(str(part(folder, SCENE_FILE))).compile(), contract)
 
 
 def limits_of(model: Any, contract: Contract) -> Limits:
@@ -126,8 +126,7 @@ def limits_of(model: Any, contract: Contract) -> Limits:
     low, high = np.where(model.jnt_limited[joints, None] > 0, model.jnt_range[joints], [-OFF, OFF]).T
     servo = np.where(model.actuator_forcelimited[servos] > 0, model.actuator_forcerange[servos, 1], OFF)
     joint = np.where(model.jnt_actfrclimited[joints] > 0, model.jnt_actfrcrange[joints, 1], OFF)
-    lowest, highest = np.where(model.actuator_ctrllimited[servos, None] > 0, model.actuator_ctrlrange[servos], [-OFF, OFF]).T
-    return Limits(low, high, np.minimum(servo, joint), lowest, highest)
+    return Limits(low, high, np.minimum(servo, joint), contract.action.lowest, contract.action.highest)
 
 
 class Safety:

@@ -19,7 +19,19 @@ import numpy as np
 from mujoco.batch import Batch, SimulationError
 from numpy.typing import ArrayLike, NDArray
 
-from legged_mw.deploy.contract import CONTRACT_FILE, FALL, SCAN, SCENE_FILE, SENSED, Contract, ContractError, quantity_size
+from legged_mw.deploy.action import target_range
+from legged_mw.deploy.contract import (
+    CONTRACT_FILE,
+    FALL,
+    SCAN,
+    SCENE_FILE,
+    SENSED,
+    TERRAIN_FILE,
+    Contract,
+    ContractError,
+    part,
+    quantity_size,
+)
 from legged_mw.deploy.motion import ATTITUDE, POSITION
 from legged_mw.deploy.motors import make_network
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, damped, layout
@@ -267,8 +279,9 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
     ``whole``: every body with collision shapes (group 3) touches the ground, and the solver is one for a robot that lies there.
     Training leaves most bodies out and stops after the first iterations. Bodies that were on the ground stay as they were: feet.
     """
-    if not (folder / file).is_file():
+    if file == TERRAIN_FILE and not ((folder / file).is_file() and (contract.terrain or not contract.scene)):
         raise ContractError(f"no {file} in {folder}; an export has one if its task had steps or blocks; export an older one again")
+    part(folder, file)
     try:
         text = check_files(folder / file, alone=True)
         spec = mujoco.MjSpec.from_string(text) if file.endswith(ARCHIVE) else mujoco.MjSpec.from_file(str(folder / file))
@@ -278,14 +291,13 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
                 geom.conaffinity = 1
         model = spec.compile()
         check_model(model)
-        _check_start(model)
+        _check_start(spec, model)
         if whole:
             model.opt.iterations, model.opt.ls_iterations = 100, 50  # MuJoCo's own
     except ValueError as error:
         raise ContractError(f"{file} is not a valid MJCF: {' '.join(str(error).split())}") from None
     joints = [_index(model, file, "joint", name, "joint") for name in contract.joints]
     actuators = [_index(model, file, "actuator", name, "servo") for name in contract.joints]
-    _check_machine(model, file, contract, joints, actuators)
     needed = [*SENSED, *([FALL] if contract.ends.falls_on else [])]
     if missing := [name for name in needed if name not in contract.sensors]:
         raise ContractError(f"{CONTRACT_FILE}: sensors: '{missing[0]}' is missing; name the sensors of {file} that measure it")
@@ -298,12 +310,13 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
             raise ContractError(f"{file}: the sensors of '{name}' ({', '.join(sensors)}) have {len(places[name])} values, not {size}")
     feet = [_places(model, file, names, foot) for foot, names in contract.feet.items()]
     _check_order(model, contract)
+    _check_machine(model, file, contract, joints, actuators)
     return Scene(spec, model, np.array(actuators), model.jnt_dofadr[joints], places, feet)
 
 
-def _check_start(model: mujoco.MjModel) -> None:
+def _check_start(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     """Raises ValueError where the first keyframe is no place to start from."""
-    if model.nkey < 1:
+    if not spec.keys or not len(spec.keys[0].qpos):  # the model has one by `size nkey` alone, with straight legs
         raise ValueError("it has no keyframe; the first one says where the robot starts")
     if not np.any(model.opt.gravity):
         raise ValueError("it has no gravity, so no direction is down")
@@ -354,15 +367,18 @@ def _check_order(model: mujoco.MjModel, contract: Contract) -> None:
 
 
 def _check_machine(model: mujoco.MjModel, file: str, contract: Contract, joints: Sequence[int], actuators: Sequence[int]) -> None:
-    """Joints, gains, mass and step are those that the contract names."""
+    """Joints, gains, ranges, mass and step are those that the contract names."""
     if model.nq != 7 + len(joints) or model.nu != len(joints):
         have = [name for name in _names(model, "joint") if name not in contract.joints]
         raise ContractError(f"{file} has joints that {CONTRACT_FILE} does not: {', '.join(have[1:]) or f'{model.nu} servos'}")
     dofs, motors = model.jnt_dofadr[list(joints)], contract.motors
     stated = {"stiffness": contract.stiffness, "damping": contract.damping}
     stated |= {"motors: stall_torque": motors.stall_torque, "motors: no_load_speed": motors.no_load_speed}
+    lowest, highest = target_range(model, actuators)
     checks = {
         **{name: (stated[name], found) for name, found in contract.motors.gains(model, list(actuators), dofs).items()},
+        "action: lowest": (contract.action.lowest, lowest),
+        "action: highest": (contract.action.highest, highest),
         "robot: mass": (contract.mass, model.body_subtreemass[0]),
         "physics: timestep": (contract.timestep, model.opt.timestep),
     }

@@ -38,14 +38,15 @@ class DeployStage:
         contact: str | None = None,
         change: Change | None = None,
         whole: bool = False,
+        edited: bool = False,
     ) -> None:
         """Load the export in ``folder``.
 
         ``command`` (C,) is what robots follow where ``step`` gets none; ``ends`` are other rules for a fall than the contract's;
-        ``change`` is made to the model first. ``whole``: see Fleet.
+        ``change`` is made to the model first. ``whole``: see Fleet. ``edited``: see read_contract.
         ``contact``: the policy sees the velocity of leg odometry, which finds feet on the ground so; None: the true one.
         """
-        contract = read_contract(folder)
+        contract = read_contract(folder, edited)
         self.contract = replace(contract, ends=ends or contract.ends)
         self.fleet = Fleet(folder, self.contract, num_worlds, threads, scene_file, whole, change)
         self.controller = Controller(folder, self.contract, num_worlds)

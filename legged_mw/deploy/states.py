@@ -29,7 +29,7 @@ class Order(NamedTuple):
     """What the servos do in the next period."""
 
     state: str
-    targets: Floats | None = None  # (D,) [rad]; None: limp in ZERO, damped in DAMPING
+    targets: Floats | None = None  # (D,) [rad] as asked for, which limits judge and hold; None: limp in ZERO, damped in DAMPING
     stiffness: Floats | None = None  # (D,); None: the contract's
     damping: Floats | None = None  # (D,); None: the contract's
 
@@ -80,7 +80,8 @@ class States:
         if self.state == STAND:
             return self._stand(measured, now)
         if self.state == POLICY:
-            return Order(POLICY, self.controller.act(measured, self.command)[0])
+            self.controller.act(measured, self.command)
+            return Order(POLICY, self.controller.last_targets[0].copy())
         return Order(self.state)
 
     def trip(self, trip: Trip, now: float) -> Order:

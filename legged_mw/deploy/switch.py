@@ -20,12 +20,15 @@ HOLD = 0.5  # [s] for so long
 
 
 class SwitchStage(DeployStage):
-    """Robots that follow the policy in ``first``; one that falls follows that in ``second`` until it stands. None is put back."""
+    """Robots that follow the policy in ``first``; one that falls follows that in ``second`` until it stands.
 
-    def __init__(self, first: Path, second: Path, num_worlds: int = 1, command: Any = None) -> None:
-        """Raises UserError for policies of two robots, ContractError for broken ones."""
-        super().__init__(first, num_worlds, command, ends=Ends(max_tilt=FELL), whole=True)  # its body touches the ground, too
-        other = read_contract(second)
+    None is put back, but those that MuJoCo cannot step.
+    """
+
+    def __init__(self, first: Path, second: Path, num_worlds: int = 1, command: Any = None, edited: bool = False) -> None:
+        """``edited``: see read_contract. Raises UserError for policies of two robots, ContractError for broken ones."""
+        super().__init__(first, num_worlds, command, ends=Ends(max_tilt=FELL), whole=True, edited=edited)  # its body touches the ground
+        other = read_contract(second, edited)
         check_same(self.contract, other)
         self.rescuer = Controller(second, other, num_worlds)
         self.rescued = np.zeros(num_worlds, dtype=bool)  # (N,) robots that follow the second policy
@@ -38,12 +41,16 @@ class SwitchStage(DeployStage):
         targets = self.controller.act(self._seen, self._commands), self.rescuer.act(self._seen, self._none)
         self.fleet.write(np.where(rescued, targets[1], targets[0]))
         self.measured = self.fleet.read()
+        broken = self.fleet.broken | ~np.isfinite(self.fleet.qvel).all(axis=1)
+        for world in np.flatnonzero(broken):  # nothing is left of it that could stand up
+            self.reset(int(world))
         tilted = self.contract.ends.tilted(self.measured.gravity)
         self._fell, stood = tilted & ~self.rescued, self._stood(self.measured)
         back = self.rescued & stood
         self.rescued = (self.rescued | self._fell) & ~back
         self.controller.reset(self.rescued | back)  # it begins anew when it takes over, and remembers nothing until then
         self.rescuer.reset(~self.rescued | self._fell)
+        self._fell |= broken
 
     def _stood(self, measured: Measurement) -> np.ndarray:
         """(N,) Upright, near the first policy's default pose and slow, for HOLD."""

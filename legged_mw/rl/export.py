@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from rsl_rl.models import MLPModel, RNNModel
 
+from legged_mw.deploy.action import Action, target_range
 from legged_mw.deploy.contract import (
     CLOCK,
     CONTRACT_FILE,
@@ -28,7 +29,6 @@ from legged_mw.deploy.contract import (
     SCENE_FILE,
     SENSORS,
     TERRAIN_FILE,
-    Action,
     Contract,
     ContractRow,
     Ends,
@@ -137,6 +137,8 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
         _write_network(policy, clip, new / NETWORK_FILE, half)
         memory = Memory(MEMORY_INPUT, MEMORY_OUTPUT, states_of(policy)) if isinstance(policy, RNNModel) else None
         contract = dataclasses.replace(make_contract(env, task, new, noise), memory=memory)
+        no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
+        contract = dataclasses.replace(contract, terrain=digest(new / TERRAIN_FILE) if (new / TERRAIN_FILE).is_file() else "")
         save_yaml(new / CONTRACT_FILE, contract.to_dict())
         steps = record(env, policy, groups, contract, new)
         observations, actions = (np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions"))
@@ -148,7 +150,6 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
         if half:
             gap = _gap(acted, _run(exact, clip, observations, remembered)[0])
         replay(env, contract, steps, new)
-        no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
         if all(row.measured for row in contract.rows):
             read_contract(new)  # as every reader will
         files = (*FILES, *(name for name in SOMETIMES if (new / name).exists()))
@@ -242,7 +243,8 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
     scene = _write_scene(env, folder)
     ends = _ends(env)
     origin = "torque" if env.actuators.law == "torque" else cfg.control.action_origin
-    action = Action(origin, np.array(robot.tables["control.action_scale"]), cfg.normalization.clip_actions)
+    scale, held = np.array(robot.tables["control.action_scale"]), target_range(robot.physics, range(len(robot.joint_names)))
+    action = Action(origin, scale, cfg.normalization.clip_actions, *held)
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))
     ground, scanned = cfg.terrain, any(row.measured == SCAN for row in rows)
     feet = {foot: tuple(f"contact/{geom}" for geom in geoms) for foot, geoms in getattr(env, "foot_geoms", {}).items()}
@@ -273,6 +275,7 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         motors=_motors(env, folder),
         motion=_motion(env, folder),
         estimate=_estimated(env, task),
+        scene=digest(folder / SCENE_FILE),
     )
 
 

@@ -130,8 +130,8 @@ def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) 
         if controller.memory is not None:
             flat = step.memory.reshape(env.num_envs, -1)
             _compare(env, number, "memory", range(flat.shape[1]), flat, controller.memory.reshape(flat.shape))
-        targets = controller.act(step.measured, step.commands)
-        _compare(env, number, "joint target", contract.joints, step.targets[~step.ended], targets[~step.ended])
+        controller.act(step.measured, step.commands)
+        _compare(env, number, "joint target", contract.joints, step.targets[~step.ended], controller.last_targets[~step.ended])
         controller.reset(step.ended)
 
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from legged_mw.utils.commands import Command, outside, with_units
+from legged_mw.utils.commands import VELOCITY, Command, outside, with_units
 from legged_mw.utils.config import ConfigError, load_yaml
 from legged_mw.utils.errors import unknown
 from legged_mw.view.drive import NO_COMMANDS, PUSH_MAX, Pilot
@@ -98,7 +98,10 @@ def _entry(item: Any, where: str, table: Sequence[Command]) -> Entry:
 
 
 def _command(value: Any, where: str, table: Sequence[Command]) -> list[float]:
-    """Values (C,) from a list in the order of the table or a mapping by name; what is missing takes its default."""
+    """Values (C,) from a list in the order of the table or a mapping by name; what is missing takes its default.
+
+    A list has all, or vx, vy and yaw rate.
+    """
     if not table:
         raise ConfigError(f"{where}: {NO_COMMANDS}")
     command, names = [each.default for each in table], [each.name for each in table]
@@ -108,7 +111,8 @@ def _command(value: Any, where: str, table: Sequence[Command]) -> list[float]:
                 raise ConfigError(f"{where}: {unknown('command', str(name), names, 'this task')}")
             [command[names.index(name)]] = _numbers(number, [1], f"{where}: {name}", "a number")
     else:
-        values = _numbers(value, range(1, len(table) + 1), where, f"a list of {with_units(table)}, or {{name: value}}")
+        whole = [len(table), *([len(VELOCITY)] if tuple(names[: len(VELOCITY)]) == VELOCITY else [])]  # a robot's own may be left out
+        values = _numbers(value, whole, where, f"a list of {with_units(table)}, or {{name: value}}")
         command[: len(values)] = values
     if wrong := outside(command, table):
         raise ConfigError(f"{where}: {wrong}")

@@ -28,7 +28,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from legged_mw import ROOT
-from legged_mw.deploy.contract import checksum, read_contract
+from legged_mw.deploy.contract import checksum, edits, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.rl.runner import Runner, make_runner
@@ -123,7 +123,8 @@ def contracts(root: Path, policy: str) -> Callable[[], None]:
     good.pop("checksum", None)
 
     def walk() -> None:
-        contract = read_contract(folder)
+        contract = read_contract(folder, edited=True)
+        edits(folder)
         fleet, controller = Fleet(folder, contract, 1, threads=1), Controller(folder, contract, 1)
         for _ in range(3):
             fleet.write(controller.act(fleet.read(), np.array([[command.default for command in contract.commands]])))

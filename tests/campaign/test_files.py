@@ -313,6 +313,11 @@ CONTRACTS: list[tuple[str, Change, str, bool]] = [
     ("another clip", set_at("action|clip", 3.0), CHANGED, False),
     ("commands in another order", swap("commands"), CHANGED, False),
     ("a checksum of text", set_at("checksum", "none"), CHANGED, False),
+    ("no checksum", lambda said: said.pop("checksum"), "policy.yaml has no line `checksum`", False),
+    ("today's format as an older one", set_at("format", 4), CHANGED, False),
+    ("targets without an end", set_at("action|highest|0", 1e9), "action: 'highest' is [1000000000.0, ", True),
+    ("targets that end before they begin", set_at("action|highest|0", -9.0), "it must be at least `lowest`", True),
+    ("a terrain elsewhere", set_at("physics|terrain", {"file": "../x.mjz", "sha256": ""}), "it must be terrain.mjz, which lies", True),
 ]
 
 
@@ -322,13 +327,13 @@ def test_contracts(change: Change, says: str, stamped: bool, tmp_path: Path) -> 
 
 
 def test_joints_of_an_export_without_checksum(tmp_path: Path) -> None:
-    """As it was: the scene beside it tells."""
+    """That the user edited: the scene beside it tells."""
     said = load_yaml(export(tmp_path) / "policy.yaml")
     said.pop("checksum", None)
     swap("joints")(said)
     save_yaml(tmp_path / "out/policy.yaml", said)
     says = "joints are in another order than sensors"
-    attack(Case("", lambda root: read_scene(root / "out", read_contract(root / "out")), says), tmp_path)
+    attack(Case("", lambda root: read_scene(root / "out", read_contract(root / "out", edited=True)), says), tmp_path)
 
 
 def test_what_may_be_changed(tmp_path: Path) -> None:
@@ -412,7 +417,7 @@ SCENES: list[tuple[str, str, str, str]] = [
 
 @pytest.mark.parametrize(("old", "new", "says"), [entry[1:] for entry in SCENES], ids=[entry[0] for entry in SCENES])
 def test_scenes(old: str, new: str, says: str, tmp_path: Path) -> None:
-    run = lambda root: read_scene(root / "out", read_contract(root / "out"))  # noqa: E731
+    run = lambda root: read_scene(root / "out", read_contract(root / "out", edited=True))  # noqa: E731
     attack(Case("", run, ("scene.xml", says), given=in_scene(old, new)), tmp_path)
 
 

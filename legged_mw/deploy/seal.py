@@ -1,0 +1,62 @@
+"""What of a contract the network was trained with: its checksum, and what was changed since, beside what was exported.
+
+The contract carries a copy of what was exported, since nothing else in an export has all of it.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import zlib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from legged_mw.utils.errors import brief
+
+CHECKSUM = "checksum"  # of what the network's numbers mean, which may not change without the network
+EXPORTED = "exported"  # the same as it was exported: base64 of zlib of JSON
+FREE = ("task", "ends", "exam", "safety")  # what may change: how the policy is judged and watched
+_MOST_TEXT = 1 << 22  # bytes that `exported` may unpack to; a G1's has a four-hundredth
+
+
+def checksum(said: Mapping[str, Any]) -> str:
+    """SHA-256 of all in a contract that the network was trained with: joints, rows, scales and the rest, in their order."""
+    return hashlib.sha256(_bound(said).encode()).hexdigest()
+
+
+def sealed(said: Mapping[str, Any]) -> dict[str, Any]:
+    """A contract with both lines."""
+    said = {**said, EXPORTED: ""}
+    return {**said, EXPORTED: base64.b64encode(zlib.compress(_bound(said).encode(), 9)).decode(), CHECKSUM: checksum(said)}
+
+
+def changes(said: Mapping[str, Any]) -> list[str]:
+    """A line for each value that is not as it was exported, beside the exported one."""
+    try:
+        packed = base64.b64decode(str(said[EXPORTED]), validate=True)
+        text = zlib.decompressobj().decompress(packed, _MOST_TEXT)
+        if hashlib.sha256(text).hexdigest() != said.get(CHECKSUM, hashlib.sha256(text).hexdigest()):
+            raise ValueError("the copy was changed, too")
+        was, now = dict(_values(json.loads(text))), dict(_values(json.loads(_bound(said))))
+    except (KeyError, ValueError, zlib.error, RecursionError):
+        return [f"what was exported is unknown: its line `{EXPORTED}` is missing, or was changed too"]
+    both = [(place, *(brief(of[place]) if place in of else "nothing" for of in (now, was))) for place in {**was, **now}]
+    return [f"{place}: {new}, exported {old}" for place, new, old in both if new != old]
+
+
+def _bound(said: Mapping[str, Any]) -> str:
+    free = (*FREE, EXPORTED, CHECKSUM, *([] if EXPORTED in said else ["format"]))  # formats before 5 have no copy, and left it free
+    return json.dumps({name: value for name, value in said.items() if name not in free}, default=str, skipkeys=True)
+
+
+def _values(tree: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    """Each value in mappings and lists, and where it stands: observation[3].scale."""
+    if isinstance(tree, dict) and tree:
+        for name, value in tree.items():
+            yield from _values(value, f"{place}.{name}" if place else str(name))
+    elif isinstance(tree, list) and tree:
+        for i, value in enumerate(tree):
+            yield from _values(value, f"{place}[{i}]")
+    else:
+        yield place, tree
