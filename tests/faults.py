@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
+import signal
 import socket
 import tempfile
+import threading
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
@@ -21,6 +24,7 @@ from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.states import States
 from legged_mw.deploy.unitree.client import UnitreeRobot
+from legged_mw.deploy.unitree.codec import Message
 from legged_mw.deploy.unitree.faults import Faults, parse_faults
 from legged_mw.deploy.unitree.guard import Board, Guard, Guarded
 from legged_mw.deploy.unitree.link import RobotEnd, Wire
@@ -48,15 +52,15 @@ class Killed(BaseException):
 class Side:
     """The robot's side: its remote stands it up and starts the policy; then comes the fault."""
 
-    def __init__(self, sim: SimulatedUnitree, case: Case, other: Wire | None = None, end: RobotEnd | None = None) -> None:
-        """``other``, ``end``: another commander's and another robot's ends of the wire."""
-        self.sim, self.case, self.other, self.end = sim, case, other, end
+    def __init__(self, sim: SimulatedUnitree, case: Case, other: Wire | None = None, second: Callable[[], RobotEnd] | None = None) -> None:
+        """``other``: another commander's end of the wire; ``second`` switches another robot on."""
+        self.sim, self.case, self.other, self.second, self.end = sim, case, other, second, None
         self.walking: float | None = None  # [s] when the policy began
         self.held: tuple[str, ...] | None = None  # buttons, from the fault on
         self.injected: float | None = None  # [s] when the fault began
+        self.still: Message | None = None  # what another robot sends
         self.tilted: float | None = None  # [s] when it was tilted by more than 60 degrees
         self._begun: float | None = None  # [s] of the first command
-        self.first, self.gone = sim._state.body, False
 
     def before(self) -> None:
         """Before each step of the robot."""
@@ -155,9 +159,12 @@ class Rig:
     def kill(self) -> None:
         os.kill(os.getpid(), 9)
 
-    def end_guard(self) -> None:
+    def signal_guard(self, number: int, seconds: float = 0.0) -> None:
+        """One that is stopped goes on after ``seconds``."""
         process = self.robot._owner.process  # type: ignore[attr-defined]
-        process.terminate()
+        process.send_signal(number)
+        if number == signal.SIGSTOP:
+            threading.Timer(seconds, process.send_signal, [signal.SIGCONT]).start()
 
     def computer_sleeps(self, seconds: float) -> None:
         raise NotImplementedError
@@ -194,9 +201,9 @@ class Lockstep(Rig):
         while (state := wire.receive()) is None:
             self.sim.step()
         self.now = self._due = self.sim.time
-        self.guard.board.put(state.body, self.now)
+        self.guard.board.put(self.now, state.body, self.now)
         self.guard.tell({"ready": True})
-        owner = Stepped(here, board)
+        owner, self._turns = Stepped(here, board, wire, clock=self.late_clock), 0.0
         owner.guard = self.guard
         super().__init__(UnitreeRobot(contract, owner, owner.first, clock=self.late_clock), folder, self.read_clock, self.pass_, 0.001)
 
@@ -216,7 +223,8 @@ class Lockstep(Rig):
         while self._due <= end + 1e-9:
             self.now = self._due
             self.side.before()
-            self.guard.turn()
+            if self.now >= self._turns:
+                self.guard.turn()
             self.sim.step()
             self._due += STEP
         self.now = end
@@ -225,8 +233,13 @@ class Lockstep(Rig):
         self.robot._owner._channel.close()  # type: ignore[attr-defined]
         raise Killed
 
-    def end_guard(self) -> None:
-        self.guard.stop()
+    def signal_guard(self, number: int, seconds: float = 0.0) -> None:
+        if number not in (signal.SIGKILL, signal.SIGSTOP):
+            self.guard.stop(number)
+            return
+        self._turns = self.now + seconds if number == signal.SIGSTOP else np.inf  # [s] when the guard turns again
+        if number == signal.SIGKILL:
+            self.guard.channel.close()
 
     def computer_sleeps(self, seconds: float) -> None:
         self.asleep = seconds
@@ -248,6 +261,9 @@ def lockstep(case: Case, sim: SimulatedUnitree, wire: Wire, folder: Path, patch:
         rig.run(case, 0.3 + WALK + case.known_after + SOON + 0.1)
     rig.pass_(0.1)
     patch.undo()
+    if rig.side.end:
+        rig.side.end = None
+        gc.collect()  # another robot's publisher leaves
     if rig.injected is None:
         rig.injected = rig.side.injected
     return rig
@@ -319,16 +335,39 @@ def pauses(side: Side, since: float) -> None:
     side.sim.faults.silent = since < 0.06
 
 
-def answers_too(side: Side, since: float) -> None:
-    """Another robot, switched on later, sends its states, too."""
-    if side.end:
-        side.end.send(side.first)
+def answers_too(ahead: float = 0.0) -> Callable[[Side, float], None]:
+    """Another robot is switched on. It stands still, with its clock so far ahead [s]."""
+
+    def fault(side: Side, since: float) -> None:
+        if side.end is None and side.second:
+            side.end, side.still = side.second(), Message(side.sim._state.layout, side.sim._state.body)
+        if side.end and side.still:
+            side.still["tick"] = max(1, round(1000 * (side.sim.time + ahead)))
+            side.end.send(side.still.seal())
+
+    return fault
+
+
+def ends_guard(number: int, seconds: float = 0.0) -> Callable[[Rig], None]:
+    return lambda rig: rig.signal_guard(number, seconds)
+
+
+def all_stop(seconds: float) -> Callable[[Rig], None]:
+    """Guard and policy."""
+
+    def fault(rig: Rig) -> None:
+        rig.signal_guard(signal.SIGSTOP, seconds)
+        rig.sleep(seconds)
+
+    return fault
 
 
 def interrupts(rig: Rig) -> None:
     raise KeyboardInterrupt
 
 
+TWO = "two robots answer: 2 programs publish rt/lowstate in domain [0-9]+ on lo"
+SILENT = r"the guard of the wire was silent for [0-9]+ ms; this process damps|nothing was sent for [0-9]+ ms: the guard stood still"
 OLD = r"the newest measurement is [0-9]+ ms old, more than 40"
 CASES: dict[str, Case] = {
     # the limits of the safety layer
@@ -343,6 +382,18 @@ CASES: dict[str, Case] = {
     "low battery": Case("the battery has 20.0 V, less than 24", "low_battery=20"),
     "states that stay away for 60 ms": Case(OLD, pauses),
     "frozen state": Case("4 measurements in a row are the same", "frozen"),
+    "frozen joints": Case("joint_(pos|vel) is the same in 4 measurements in a row", "stuck=q,stuck=dq"),
+    "frozen angles": Case("joint_pos is the same in 4 measurements in a row", "stuck=q"),
+    "frozen speeds": Case("joint_vel is the same in 4 measurements in a row", "stuck=dq"),
+    "frozen IMU": Case("(ang_vel|gravity) is the same in 4 measurements in a row", "stuck=gyroscope,stuck=quaternion"),
+    "frozen gyro": Case("ang_vel is the same in 4 measurements in a row", "stuck=gyroscope"),
+    "frozen orientation": Case("gravity is the same in 4 measurements in a row", "stuck=quaternion"),
+    "stuck encoder": Case(
+        "the angle of FL_calf_joint is the same in 6 measurements in a row",
+        "stuck=FL_calf_joint",
+        known=lambda rig: rig.read_at,
+        known_after=0.5,
+    ),
     "slow policy": Case("5 steps within a second began late", policy=takes(0.035), known=lambda rig: rig.read_at, known_after=0.5),
     "remote lost": Case("the remote was not heard for 3.0 s", "no_remote", known_after=3.0, known=lambda rig: (rig.injected or 0.0) + 2.98),
     "NaN from the policy": Case("the target of FL_hip_joint is not finite: nan", policy=acts(np.nan)),
@@ -366,7 +417,10 @@ CASES: dict[str, Case] = {
     "90 % of messages lost": Case(OLD, "loss=90", known=lambda rig: rig.read_at, known_after=1.0),
     "wrong checksums": Case("[0-9]+ states in a row have a wrong checksum: the newest good one is [0-9]+ ms old", "bad_crc"),
     "robot started again": Case("the robot's clock went back by 1.0 s: it was started again, or two robots answer", "clock_jump=-1"),
-    "two robots": Case("the robot's clock went back by .* s: it was started again, or two robots answer", answers_too),
+    "two robots": Case(TWO, answers_too(-10.0)),
+    "two robots with one clock": Case(TWO, answers_too()),
+    "two robots, one 20 ms ahead": Case(TWO, answers_too(0.02)),
+    "two robots, one 50 ms behind": Case(TWO, answers_too(-0.05)),
     "another body": Case("mode_machine was 5 and is 4: the robot has another body, or two robots answer", "mode_machine=4", task="g1_flat"),
     "dead motor of a G1": Case("the motor of left_knee_joint reports a fault: error 0x1", "motor_fault=left_knee_joint", task="g1_flat"),
     "second commander": Case("another program sends commands to this robot, too", commands_too),
@@ -376,7 +430,17 @@ CASES: dict[str, Case] = {
     "policy killed": Case("the policy's process ended", policy=lambda rig: rig.kill()),
     "policy hangs": Case("no targets for 6[0-9] ms: the policy's process hangs or is late", policy=lambda rig: rig.sleep(0.5)),
     "policy late": Case("no targets for 6[0-9] ms: the policy's process hangs or is late", policy=takes(0.07)),
-    "guard told to end": Case(r"the guard was stopped \(SIGTERM\)", policy=lambda rig: rig.end_guard()),
+    "guard told to end": Case(r"the guard was stopped \(SIGTERM\)", policy=ends_guard(signal.SIGTERM)),
+    **{
+        f"guard that gets {name}": Case(rf"the guard was stopped \({name}\)", policy=ends_guard(getattr(signal, name)))
+        for name in ("SIGHUP", "SIGUSR1", "SIGUSR2", "SIGABRT", "SIGQUIT")
+    },
+    "guard killed": Case("the guard of the wire is gone; this process damps the joints in its place", policy=ends_guard(signal.SIGKILL)),
+    "guard stopped for 200 ms": Case(SILENT, policy=ends_guard(signal.SIGSTOP, 0.2), known_after=0.2),
+    "guard stopped for 2000 ms": Case(SILENT, policy=ends_guard(signal.SIGSTOP, 2.0), known_after=2.0),
+    "guard and policy stopped for 200 ms": Case(
+        SILENT, policy=all_stop(0.2), known=lambda rig: (rig.injected or 0.0) + 0.2, known_after=0.2
+    ),
     "clock ahead": Case("the newest measurement is 100[0-9][0-9] ms old", policy=lambda rig: rig.clock_jumps(10.0)),
     "clock back": Case("the newest measurement comes from .* ms ahead: a clock went back", policy=lambda rig: rig.clock_jumps(-10.0)),
     "computer that slept": Case(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -182,6 +182,64 @@ def test_measurements_that_are_frozen(contract: Contract, limits: Limits) -> Non
     assert trip == Trip("frozen", "4 measurements in a row are the same")
     safety.reset()
     assert safety.sensed(at_rest(contract), health, 0.0) is None
+
+
+def walk(contract: Contract, step: int, stuck: Sequence[str] = (), quantum: float = 0.0) -> Measurement:
+    """A measurement of joints that swing by 0.3 rad and of a body that rolls by 0.05, twice a second; parts and joints that are stuck."""
+    phase, ones = 4.0 * math.pi * step * contract.period, np.ones(12)
+    quick, roll = 4.0 * math.pi, 0.05 * math.sin(phase)
+    parts = {
+        "joint_pos": contract.default_pose + 0.3 * math.sin(phase) * ones,
+        "joint_vel": 0.3 * quick * math.cos(phase) * ones,
+        "ang_vel": np.array([0.05 * quick * math.cos(phase), 0.0, 0.0]),
+        "gravity": np.array([0.0, -math.sin(roll), -math.cos(roll)]),
+    }
+    if step and stuck:
+        before = walk(contract, 0)
+        parts |= {name: getattr(before, name) for name in stuck if name in parts}
+        for joint in (contract.joints.index(name) for name in stuck if name not in parts):
+            parts["joint_pos"][joint], parts["joint_vel"][joint] = before.joint_pos[joint], 0.0
+    return at_rest(contract, **{name: np.round(values / quantum) * quantum if quantum else values for name, values in parts.items()})
+
+
+@pytest.mark.parametrize(
+    ("stuck", "named"),
+    [
+        (["joint_pos"], "joint_pos"),
+        (["joint_vel"], "joint_vel"),
+        (["joint_pos", "joint_vel"], "joint_pos"),
+        (["ang_vel"], "ang_vel"),
+        (["gravity"], "gravity"),
+        (["ang_vel", "gravity"], "ang_vel"),
+        (["RL_calf_joint"], "RL_calf_joint"),
+    ],
+)
+def test_a_part_that_is_frozen(stuck: list[str], named: str, contract: Contract, limits: Limits) -> None:
+    """It is named, soon; without it nothing trips."""
+    for parts in ([], stuck):
+        safety, trips = Safety(contract, limits.but({"remote": "off"}, "test")), list[tuple[int, Trip]]()
+        for step in range(-25, 25):
+            measured = walk(contract, step, parts) if step >= 0 else walk(contract, step)
+            if trip := safety.sensed(measured, Health(), step * contract.period):
+                trips.append((step, trip))
+            safety.asked(measured, walk(contract, step + 1).joint_pos)
+        assert bool(trips) == bool(parts)
+    (step, trip), *_ = trips
+    assert trip.limit == "frozen" and named in trip.text and 3 <= step <= 12
+
+
+@pytest.mark.parametrize("quantum", [1e-4, 1e-3])
+def test_a_robot_that_stands_still_is_not_frozen(quantum: float, contract: Contract, limits: Limits) -> None:
+    """Its encoders have steps; its gyro has noise. A gyro and speeds that are not measured stay zero, also while it walks."""
+    noise, safety = np.random.default_rng(0), Safety(contract, limits)
+    for step in range(200):
+        measured = at_rest(contract, ang_vel=0.02 * noise.standard_normal(3), joint_pos=np.round(contract.default_pose / quantum) * quantum)
+        assert safety.sensed(measured, Health(), step * contract.period) is None
+        assert safety.asked(measured, contract.default_pose + 0.02 * noise.standard_normal(12)) is None
+    safety.reset()
+    for step in range(200):
+        measured = replace(walk(contract, step, quantum=quantum), ang_vel=np.zeros(3), joint_vel=np.zeros(12))
+        assert safety.sensed(measured, Health(), step * contract.period) is None
 
 
 def test_a_clock_that_went_back(contract: Contract, limits: Limits) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import pytest
@@ -18,12 +19,12 @@ from tests.wires import POLICIES, locked_domain
 
 
 class Ends(NamedTuple):
-    """A simulated robot, the policy's end of its wire, and the ends of another commander and of another robot."""
+    """A simulated robot, the policy's end of its wire, that of another commander, and what switches another robot on."""
 
     sim: SimulatedUnitree
     wire: Wire
     other: Wire
-    end: RobotEnd
+    second: Callable[[], RobotEnd]
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,7 @@ def ends() -> Iterator[dict[str, Ends]]:
             sim = SimulatedUnitree(POLICIES / task, contract, RobotEnd(package, "lo", domain))
             wires = [Wire(package, "lo", domain, wait=sim.step, clock=lambda sim=sim: sim.time) for _ in range(2)]
             wires[0].prepare(listen=0.1)
-            made[task] = Ends(sim, *wires, RobotEnd(package, "lo", domain))
+            made[task] = Ends(sim, *wires, partial(RobotEnd, package, "lo", domain))
         yield made
         made.clear()
 
@@ -45,8 +46,8 @@ def ends() -> Iterator[dict[str, Ends]]:
 def test_a_fault_damps(name: str, ends: dict[str, Ends], monkeypatch: pytest.MonkeyPatch) -> None:
     """Within 100 ms of when it can be known, for good, and no joint is moved beyond its limits."""
     case = CASES[name]
-    sim, wire, other, end = ends[case.task]
-    rig = lockstep(case, sim, wire, POLICIES / case.task, monkeypatch, other=other, end=end)
+    sim, wire, other, second = ends[case.task]
+    rig = lockstep(case, sim, wire, POLICIES / case.task, monkeypatch, other=other, second=second)
     lines = [*rig.said, rig.guard.tripped]
     assert any(line.startswith("policy: ") for line in lines), lines
     assert rig.injected is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import replace
 from typing import Any
@@ -151,14 +152,26 @@ def test_a_robot_without_good_states_is_none(fault: str, said: str, domain: int)
         both.robot.read()
 
 
-def test_states_without_a_checksum_are_taken(domain: int) -> None:
-    """unitree_mujoco's simulator in Python sends none."""
-    both = pair("go2_flat", domain)
-    both.steps(0.1)
-    message = Message(LAYOUTS["unitree_go", "LowState_"], both.sim._state.body)
-    message["crc"], message["motor_state.q"] = 0, 0.7
-    both.robot._owner = Once(message.body, both.sim.time)
-    assert np.allclose(both.robot.read().joint_pos, 0.7)
+@pytest.mark.parametrize("simulated", [True, False])
+def test_states_without_a_checksum(simulated: bool) -> None:
+    """unitree_mujoco's simulator in Python sends none, and no voltage. No robot may, nor a simulator that sent one."""
+    contract, state = read_contract(POLICIES / "go2_flat"), Message(LAYOUTS["unitree_go", "LowState_"])
+    state["power_v"], state["imu_state.quaternion"] = 30.0, [1.0, 0.0, 0.0, 0.0]
+    sealed, state["crc"] = state.seal(), 0
+    later = Message(state.layout, state.body)
+    later["motor_state.q"], later["tick"], later["power_v"] = 0.7, 1, 0.0
+    robot = UnitreeRobot(contract, Once(later.body), Received(sealed, 0.0), simulated=simulated, clock=lambda: 0.0)
+    assert not robot.read().joint_pos.any() and robot.dropped == {"with a wrong checksum": 1}
+    robot._owner = Once(later.seal())
+    assert np.allclose(robot.read().joint_pos, 0.7) and robot.health().voltage == 0.0
+    bare, later["crc"], later["tick"] = Message(state.layout), 0, 2
+    bare["imu_state.quaternion"] = state["imu_state.quaternion"]
+    if simulated:
+        robot = UnitreeRobot(contract, Once(later.body), Received(bare.body, 0.0), simulated=True, clock=lambda: 0.0)
+        assert np.allclose(robot.read().joint_pos, 0.7) and robot.health().voltage is None
+    else:
+        with pytest.raises(RobotError, match=r"the robot's states have a wrong checksum \(0x0\)"):
+            UnitreeRobot(contract, Once(b""), Received(bare.body, 0.0), clock=lambda: 0.0)
 
 
 # ---- what is commanded
@@ -294,6 +307,29 @@ def test_more_motors_than_the_contracts_robot_has(domain: int) -> None:
         RobotError, match="motors answer at 12, 13, 14, 15, where a go2 has none: it is not the contract's robot. Known are: go2"
     ):
         UnitreeRobot(both.contract, Once(b""), Received(state.seal(), 0.0))
+
+
+def test_another_robot(domain: int) -> None:
+    """Publishers are counted: one that was killed is waited for, two that send are refused at once."""
+    both = pair("go2_flat", domain)
+    second = RobotEnd("unitree_go", "lo", domain)
+    with pytest.raises(RobotError, match="two robots answer: 2 programs publish rt/lowstate in domain .* on lo"):
+        both.robot.read()
+    both.steps(0.3)  # without a look at it, as while it is silent
+    with pytest.raises(RobotError, match="the robot was started again: another program publishes its rt/lowstate"):
+        both.robot.read()
+    begun, wire = both.sim.time, Wire("unitree_go", "lo", domain, wait=both.sim.step, clock=lambda: both.sim.time)
+    with pytest.raises(RobotError, match="2 programs publish rt/lowstate in domain .* end all but one robot"):
+        wire.prepare(listen=0.1)
+    assert both.sim.time - begun > 10.0
+    begun = both.sim.time
+
+    turns = itertools.cycle([both.sim.step, lambda: second.send(both.sim._state.body)])
+
+    wire._wait = lambda: next(turns)()
+    with pytest.raises(RobotError, match="2 programs publish rt/lowstate in domain .* end all but one robot"):
+        wire.prepare(listen=0.1)
+    assert both.sim.time - begun < 1.0
 
 
 def test_another_commander(domain: int) -> None:

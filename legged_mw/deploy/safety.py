@@ -25,6 +25,12 @@ TORQUE = "torque"  # an action's origin: its targets are torques
 OFF = math.inf  # a limit that is never passed
 # What no joint and no gyro measures; ours: wheels turn far, and gyros end at 35 rad/s. Also NaN and infinity are beyond it.
 _ABSURD = {"joint_pos": (1e5, "rad"), "joint_vel": (1e4, "rad/s"), "ang_vel": (1e3, "rad/s")}
+# A part of a measurement that stands still to the last bit is frozen if meanwhile, within Limits.frozen measurements, another part
+# moved so far; ours: an encoder's or a gyro's smallest step is a hundredth of it, and a robot that stands moves less.
+_MOVED = 0.03  # [rad] of a joint by its speed, of the body by gyro or gravity
+_SWUNG = 0.05  # [rad] of a joint, from which no gyro and no gravity stays the same
+_ASKED = 0.2  # [rad] of a joint's target, from which no encoder does
+_LONGER = 1.5  # so many times longer is looked at one encoder: a joint that carries weight follows late
 _UNIT = 0.1  # by which the length of gravity may differ from 1; ours: a unit quaternion in float32 gives 1e-6
 
 
@@ -129,6 +135,16 @@ def limits_of(model: Any, contract: Contract) -> Limits:
     return Limits(low, high, np.minimum(servo, joint), contract.action.lowest, contract.action.highest)
 
 
+class _Seen(NamedTuple):
+    """What one measurement says of motion, and what the servos were told before it; of several, (N, ...) each."""
+
+    joint_pos: Floats
+    joint_vel: Floats
+    ang_vel: Floats
+    gravity: Floats
+    target: Floats
+
+
 class Safety:
     """Checks one robot. Its memory is of the last steps only; ``reset`` forgets it when a person starts the robot again."""
 
@@ -141,7 +157,9 @@ class Safety:
     def reset(self) -> None:
         """As if nothing had been measured, asked or missed."""
         self._last: Floats | None = None  # targets (D,) of the step before
-        self._seen, self._same = b"", 0
+        self._held: Floats | None = None  # what the servos were told then
+        self._seen = deque[_Seen](maxlen=round(_LONGER * self.limits.frozen) if self.limits.frozen < OFF else 1)
+        self._lived = set[str]()  # parts that changed: what is not measured never does
         self._late: deque[float] = deque()  # [s] of steps that began late, within the last second
         self._remote: float | None = None  # [s] when the remote was last there
 
@@ -181,7 +199,7 @@ class Safety:
             )
             or self._most("torque", strong, torque, limits.torque * limits.motor)
         )
-        self._last = np.array(targets)
+        self._last, self._held = np.array(targets), self.held(targets)
         return trip
 
     # ---- each limit. A comparison is such that NaN is beyond the limit.
@@ -203,10 +221,40 @@ class Safety:
             return Trip("age", f"the newest measurement comes from {-1e3 * age:.0f} ms ahead: a clock went back")
         if age is not None and not age <= most:
             return Trip("age", f"the newest measurement is {1e3 * age:.0f} ms old, more than {1e3 * most:.0f}")
-        seen = measured.joint_pos.tobytes() + measured.joint_vel.tobytes() + measured.ang_vel.tobytes()
-        self._same, self._seen = self._same + 1 if seen == self._seen else 1, seen
-        if self._same >= self.limits.frozen:
-            return Trip("frozen", f"{self._same} measurements in a row are the same")
+        return self._alive(measured)
+
+    def _alive(self, measured: Measurement) -> Trip | None:
+        """Whether one part of the measurement stands still while others say that it cannot."""
+        still = measured.joint_pos if self._held is None else self._held
+        parts = measured.joint_pos, measured.joint_vel, measured.ang_vel, measured.gravity, still
+        self._seen.append(_Seen(*map(np.array, parts)))  # copies: a robot may measure into the same arrays
+        if len(self._seen) < self.limits.frozen:
+            return None
+        long = _Seen(*map(np.array, zip(*self._seen, strict=True)))
+        seen = _Seen(*(values[-int(self.limits.frozen) :] for values in long))
+        count, period = len(seen.joint_pos), self.contract.period
+        same = {name: bool((values == values[0]).all()) for name, values in seen._asdict().items()}
+        if same["joint_pos"] and same["joint_vel"] and same["ang_vel"]:
+            return Trip("frozen", f"{count} measurements in a row are the same")
+        moved, went = _most_of(seen.joint_pos[-1] - seen.joint_pos[0]), _most_of(period * seen.joint_vel[1:].sum(axis=0))
+        leant, turns = _most_of(seen.gravity[-1] - seen.gravity[0]), np.cross(seen.ang_vel, seen.gravity)
+        turned = _most_of(period * turns[1:].sum(axis=0))
+        drives, swings = _most_of(np.ptp(seen.target, axis=0)) > _ASKED or max(leant, turned) > _MOVED, moved > _SWUNG
+        moves = {
+            "joint_pos": drives or went > _MOVED,
+            "joint_vel": drives or moved > _MOVED,
+            "ang_vel": swings or leant > _MOVED,
+            "gravity": swings or turned > _MOVED,
+        }
+        for name in moves:
+            if same[name] and moves[name] and name in {*self._lived, "joint_pos"}:
+                return Trip("frozen", f"{name} is the same in {count} measurements in a row, though the robot moves")
+        self._lived |= {name for name in moves if not same[name]}
+        far = (np.abs(period * long.joint_vel[1:].sum(axis=0)) > _MOVED) | (np.ptp(long.target, axis=0) > _ASKED)
+        stuck = far & (long.joint_pos == long.joint_pos[0]).all(axis=0)
+        if len(self._seen) == self._seen.maxlen and stuck.any():
+            joint = self.contract.joints[_first(stuck)]
+            return Trip("frozen", f"the angle of {joint} is the same in {len(self._seen)} measurements in a row, though it is driven")
         return None
 
     def _on_time(self, now: float, behind: float) -> Trip | None:
@@ -265,6 +313,11 @@ class Safety:
         name, ends = self.contract.joints[joint], f"{low[joint]:.2f} to {high[joint]:.2f}"
         beyond = max(low[joint] - values[joint], values[joint] - high[joint])
         return Trip(limit, f"{name} {words} {values[joint]:.2f} rad, {beyond:.2f} beyond its range {ends}; {margin:.2f} is the most")
+
+
+def _most_of(values: Floats) -> float:
+    """The largest, without signs; 0 of none."""
+    return float(np.abs(values).max(initial=0.0))
 
 
 def _first(wrong: Any) -> int:

@@ -55,6 +55,8 @@ class Direct:
     def receive(self) -> Any:
         if self.wire.other_commander():
             raise RobotError("another program sends commands to this robot, too")
+        if why := self.wire.another_robot():
+            raise RobotError(why)
         return self.wire.receive()
 
     def arm(self, damping: bytes) -> None: ...
@@ -82,22 +84,29 @@ class UnitreeRobot(Robot):
         owner: Owner,
         first: Any,
         *,
-        echo: bool = False,
+        simulated: bool = False,
         odometry: bool = False,
         clock: Callable[[], float] = clock,
     ) -> None:
-        """``first``: the state that the robot sent last. ``echo``: commands name the state that they answer, for a simulated robot.
-        ``odometry``: the velocity is estimated from what it measures.
+        """``first``: the state that the robot sent last. ``odometry``: the velocity is estimated from what it measures.
+
+        ``simulated``: commands name the state that they answer. If its first state has no checksum, or no voltage, the others need none.
 
         Raises RobotError if this is not the contract's robot, or cannot measure what the policy observes.
         """
-        self.contract, self._owner, self._clock, self._echo = contract, owner, clock, echo
+        self.contract, self._owner, self._clock, self._simulated = contract, owner, clock, simulated
         self.machine = machine_of(contract.joints)
         self.limits, self.motors = self.machine.limits, self.machine.motors
         check_rows(contract, self.machine, odometry)
         self._slots = order(self.machine, contract.joints)
         self._state, self._stamp, self._open = self._decoded(first.body), first.stamp, True
         self.report = ""  # after `close`: latencies of the wire
+        self._sealed = not simulated or self._state["crc"] != 0
+        self._metered = not simulated or self._voltage != 0.0
+        if self._sealed and not self._state.intact():
+            raise RobotError(
+                f"the robot's states have a wrong checksum ({self._state['crc']:#x}): the cable, or another version of its messages"
+            )
         check_body(self.machine, self._mode_machine)
         self._body = self._mode_machine
         check_slots(self.machine, (self._state["motor_state.q"] != 0.0) & (self._state["motor_state.mode"] != 0))
@@ -110,6 +119,12 @@ class UnitreeRobot(Robot):
     @property
     def _mode_machine(self) -> int:
         return int(self._state["mode_machine"]) if self.machine.package == "unitree_hg" else 0
+
+    @property
+    def _voltage(self) -> float:
+        """[V] of the battery."""
+        each = self.machine.package == "unitree_hg"  # each motor says it
+        return float(np.median(self._state["motor_state.vol"][self._slots])) if each else float(self._state["power_v"])
 
     def _decoded(self, body: bytes) -> Message:
         return Message(LAYOUTS[self.machine.package, "LowState_"], body)
@@ -162,28 +177,27 @@ class UnitreeRobot(Robot):
         self._listen()
         state, slots = self._state, self._slots
         if self.machine.package == "unitree_go":
-            temperatures, voltage = state["motor_state.temperature"][slots], float(state["power_v"])
+            temperatures = state["motor_state.temperature"][slots]
             before, self._lost = self._lost, state["motor_state.lost"].astype(int)
             wrong = {i: f"it lost {n} messages in a period" for i, n in enumerate(self._lost - before) if n > LOST}
         else:
             temperatures = state["motor_state.temperature"].reshape(-1, 2)[slots].max(axis=1)
-            voltage = float(np.median(state["motor_state.vol"][slots]))
             wrong = {i: f"error {state['motor_state.motorstate'][i]:#x}" for i in slots if state["motor_state.motorstate"][i]}
         faults = {name: wrong[i] for name, i in zip(self.contract.joints, slots, strict=True) if i in wrong}
         return Health(
             age_s=self._clock() - self._stamp,
             temperatures=temperatures.astype(float),
-            voltage=voltage or None,
+            voltage=self._voltage if self._metered else None,
             remote=decode(state["wireless_remote"].tobytes()),
             motor_faults=faults,
         )
 
     def _listen(self) -> None:
-        """Take the newest state, if it is whole, and of the same robot. Simulators that set no checksum, or no tick, send 0 there."""
+        """Take the newest state, if it is whole, and of the same robot. A simulator that sets no tick sends 0 there."""
         if not (received := self._owner.receive()):
             return
         state = self._decoded(received.body)
-        if state["crc"] != 0 and not state.intact():
+        if self._sealed and not state.intact():
             self._left_out += 1
             self.dropped["with a wrong checksum"] += 1
             return
@@ -210,7 +224,7 @@ class UnitreeRobot(Robot):
             command["head"], command["level_flag"] = (0xFE, 0xEF), 0xFF  # low level
         else:
             command["mode_pr"], command["mode_machine"] = 0, self._mode_machine  # ankles and waist by pitch and roll
-        if self._echo:
+        if self._simulated:
             command["reserve"] = self._state["tick"]
         return command.seal()
 
@@ -246,7 +260,7 @@ def connect(folder: Path, contract: Contract, interface: str, domain: int | None
     late = max(LATE, 1.5 * contract.period)  # a policy may be slow
     owner = Guarded.start(machine.package, interface, domain, lies_down=machine.lies_down, late=late)
     try:
-        return UnitreeRobot(contract, owner, owner.first, echo=interface in LOOPBACK, odometry=odometry)
+        return UnitreeRobot(contract, owner, owner.first, simulated=interface in LOOPBACK, odometry=odometry)
     except BaseException:
         owner.close(b"")
         raise

@@ -26,6 +26,7 @@ class Faults:
     loss: float = 0.0  # share of messages that are lost
     bad_crc: bool = False  # states with a wrong checksum
     frozen: bool = False  # the same state again and again
+    stuck: set[str] = field(default_factory=set)  # parts of the state, by their names in NAN, and joints whose encoders stay the same
     silent: bool = False  # no states
     no_remote: bool = False  # the remote is off: 40 zeros
     clock_jump: float = 0.0  # [s] by which the robot's clock is ahead
@@ -63,6 +64,7 @@ KINDS = {
     "joint_order": Kind("joint_order", 1, -40, 40, "places"),
     "joint_sign": Kind("turned_joints", None),
     "motor_fault": Kind("dead_motors", None),
+    "stuck": Kind("stuck", None),
     "joint_bias": Kind("joint_bias", 2.0, unit="rad"),
     "joint_speed": Kind("joint_speed", 100.0, unit="rad/s"),
     "gyro_bias": Kind("gyro_bias", 0.5, unit="rad/s"),
@@ -106,7 +108,7 @@ def _parse(text: str, joints: Sequence[str]) -> Fault:
 
 
 def _value(name: str, kind: Kind, value: str | None, joints: Sequence[str], where: str) -> Any:
-    known = NAN if name == "nan" else joints if kind.value is None else None
+    known = NAN if name == "nan" else [*joints, *NAN] if name == "stuck" else joints if kind.value is None else None
     if known is not None and value is not None:
         if value not in known:
             raise UserError(f"{where}: {unknown('value', value, known, name)}")

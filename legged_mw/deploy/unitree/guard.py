@@ -3,7 +3,8 @@
 The policy's process gives it finished commands and gets states back as they came. The guard repeats the newest command at the
 robot's own rate. Once it has damped, it refuses every command: nothing resumes without a person.
 
-A guard that is killed itself can damp nothing. Then the robot holds its last command, perhaps for ever.
+Every signal that would end the guard has it damp first. One that is killed or stopped can damp nothing: then the policy's process,
+which hears of each of its turns, sends damping itself.
 """
 
 from __future__ import annotations
@@ -19,9 +20,11 @@ import struct
 import subprocess
 import sys
 import tempfile
+import time
+import zlib
 from collections import deque
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 from legged_mw.deploy.loop import Spread, real_time
 from legged_mw.deploy.robot import RobotError
@@ -29,56 +32,83 @@ from legged_mw.deploy.unitree import clock
 from legged_mw.deploy.unitree.codec import LAYOUTS
 
 LATE = 0.06  # [s] ours: three periods at 50 Hz without a command; docs/faults.md has what the joints then take to be damped
-STILL = 0.1  # [s] ours, between two looks at the wire: this computer slept, or the guard was stopped
+STILL = 0.04  # [s] ours, between two turns of the guard: it was stopped, or this computer slept, and the policy's process damps
 REPEAT = 0.002  # [s] between two messages to the robot [unitree_sdk2's examples]
 AFTER = 1.0  # [s] ours: how long damping is sent before the wire is let go
 START = 60.0  # [s] for a guard to find the robot
 PRIORITY = 30  # ours, of a real-time process: before the policy's, which it must outlive
-GONE = "the guard of the wire is gone: the robot may hold its last command. Press its emergency stop"
+GONE = "the guard of the wire is gone"
+INSTEAD = "this process damps the joints in its place"
 _TURN = 0.001  # [s] at most between two looks at the wire
-_BOARD = struct.Struct("<QdI512s")  # changes of the board (odd: one is going on), stamp of the state, bytes of the text, text
+_BOARD = struct.Struct("<IddI512s")  # checksum of what follows, time of the guard's turn, stamp of the state, bytes of the text, text
+_SUM = 4  # bytes of the checksum
+_LOOKS = 10  # at a board that is being written, before what it last said counts
 _FRAME = struct.Struct("<Bd")  # kind, stamp of the state that a command answers
 # Kinds of command: another must follow in time; may be repeated for ever; the last one; stored for a trip, not sent now.
 MOVE, SAFE, CLOSE, ARM = 1, 2, 3, 4
 
 
+class Posted(NamedTuple):
+    """What the board says."""
+
+    body: bytes  # of the newest state
+    stamp: float  # [s] when it came
+    text: str  # why the guard damped; "" if it did not
+    turn: float  # [s] when the guard last looked at both sides
+
+
 class Board:
-    """Memory of two processes: the guard writes states and a text, the policy's process reads the newest."""
+    """Memory of two processes: the guard writes, the policy's process reads the newest.
+
+    What is read counts if its checksum is right, so that the order in which a processor's writes are seen does not matter.
+    """
 
     def __init__(self, file: int, size: int) -> None:
-        self._map, self._size, self._seen = mmap.mmap(file, _BOARD.size + size), size, 0
-        self._changes, self._stamp, self._text, self._body = 0, 0.0, b"", bytes(size)
+        self._map, self._whole = mmap.mmap(file, _BOARD.size + size), bytearray(_BOARD.size + size)
+        self._stamp, self._text, self._posted = 0.0, b"", Posted(bytes(size), 0.0, "", 0.0)
 
-    def put(self, body: bytes | None = None, stamp: float = 0.0, text: str = "") -> None:
+    def put(self, turn: float, body: bytes | None = None, stamp: float = 0.0, text: str = "") -> None:
+        """A state and a text stay until the next ones."""
         if body is not None:
-            self._body, self._stamp = body, stamp
+            self._whole[_BOARD.size :], self._stamp = body, stamp
         self._text = text.encode()[:512] if text else self._text
-        struct.pack_into("<Q", self._map, 0, self._changes + 1)
-        self._map[_BOARD.size :] = self._body
-        struct.pack_into("<dI512s", self._map, 8, self._stamp, len(self._text), self._text)
-        self._changes += 2
-        struct.pack_into("<Q", self._map, 0, self._changes)
+        _BOARD.pack_into(self._whole, 0, 0, turn, self._stamp, len(self._text), self._text)
+        struct.pack_into("<I", self._whole, 0, zlib.crc32(memoryview(self._whole)[_SUM:]))
+        self._map[:] = self._whole
 
-    def get(self) -> tuple[bytes, float, str]:
-        """State, stamp, text. What is being written meanwhile is read again. Raises RobotError if that does not end."""
-        end = clock() + STILL
-        while clock() < end:
-            before, stamp, length, text = _BOARD.unpack_from(self._map)
-            body = self._map[_BOARD.size :]
-            if before % 2 == 0 and struct.unpack_from("<Q", self._map)[0] == before:
-                return body, stamp, text[:length].decode(errors="replace")
-        raise RobotError(GONE)
+    def get(self) -> Posted:
+        """What the guard wrote last; if that is not whole, what it said before: it may have been stopped or killed meanwhile."""
+        for _ in range(_LOOKS):
+            whole = self._map[:]
+            right, turn, stamp, length, text = _BOARD.unpack_from(whole)
+            if zlib.crc32(memoryview(whole)[_SUM:]) == right:
+                self._posted = Posted(whole[_BOARD.size :], stamp, text[:length].decode(errors="replace"), turn)
+                break
+        return self._posted
 
 
 # ---- the policy's side ---------------------------------------------------------------------------------------------
 
 
 class Guarded:
-    """The wire as the policy's process sees it, through a guard (see ``client.Owner``)."""
+    """The wire as the policy's process sees it, through a guard (see ``client.Owner``).
 
-    def __init__(self, channel: socket.socket, board: Board, process: subprocess.Popen[bytes] | None = None) -> None:
-        """Of a guard at the other end of ``channel``; raises RobotError with its error if it does not take the robot over."""
-        self._channel, self._board, self.process = channel, board, process
+    If the guard is gone, or is silent while the robot moves, this process sends damping in its place, for good.
+    """
+
+    def __init__(
+        self,
+        channel: socket.socket,
+        board: Board,
+        commander: Any,
+        process: subprocess.Popen[bytes] | None = None,
+        clock: Callable[[], float] = clock,
+    ) -> None:
+        """Of a guard at the other end of ``channel``; ``commander`` sends in its place (``link.Commander``).
+
+        Raises RobotError with the guard's error if it does not take the robot over.
+        """
+        self._channel, self._board, self._commander, self.process, self._clock = channel, board, commander, process, clock
         self._channel.settimeout(START)
         said = self._answer()
         if "error" in said or not said:
@@ -86,7 +116,8 @@ class Guarded:
             why = f"the guard of the wire did not start: it ended, or took longer than {START:g} s; no command was sent"
             raise RobotError(said.get("error", why))
         self._channel.settimeout(0.5)
-        self._last = 0.0
+        self._last, self._damping, self._moving = 0.0, b"", False
+        self._instead = ""  # why this process damps in the guard's place
         self.first = self.receive()
 
     @classmethod
@@ -95,7 +126,9 @@ class Guarded:
 
         ``find``: [s] to wait for the robot's first state. Raises RobotError with the guard's error.
         """
-        size = LAYOUTS[package, "LowState_"].size
+        from legged_mw.deploy.unitree.link import Commander
+
+        size, commander = LAYOUTS[package, "LowState_"].size, Commander(package, interface, domain)
         with tempfile.TemporaryFile() as file:
             file.truncate(_BOARD.size + size)
             board, (channel, theirs) = Board(file.fileno(), size), socket.socketpair()
@@ -108,47 +141,77 @@ class Guarded:
                     pass_fds=(theirs.fileno(), file.fileno()),
                     start_new_session=True,  # a Ctrl-C in the terminal is not for the guard
                 )
-        return cls(channel, board, process)
+        owner = cls(channel, board, commander, process)
+        try:
+            commander.wait(2, find)  # the robot, and the guard that listens for others
+        except RobotError:
+            owner.close(b"")
+            raise
+        return owner
 
     def receive(self) -> Any:
         from legged_mw.deploy.unitree.link import Received
 
-        body, stamp, text = self._board.get()
-        if text:
-            raise RobotError(text)
+        body, stamp, text, turn = self._board.get()
+        silent = self._clock() - turn
+        if self._ended():
+            self._damp_instead(GONE)
+        elif self._moving and silent > STILL:
+            self._damp_instead(f"the guard of the wire was silent for {1000 * silent:.0f} ms")
+        if text or self._instead:
+            raise RobotError(text or self._instead)
         if stamp == self._last:
             return None
         self._last = stamp
         return Received(body, stamp)
 
     def arm(self, damping: bytes) -> None:
+        self._damping = damping
         self._put(ARM, 0.0, damping)
 
     def send(self, body: bytes, stamp: float, safe: bool) -> None:
-        self._put(SAFE if safe else MOVE, stamp, body)
+        if not self._instead:
+            self._moving = not safe
+            self._put(SAFE if safe else MOVE, stamp, body)
+        else:
+            self._commander.send(self._damping)
 
     def close(self, last: bytes) -> str:
         """Returns the latency of measurements, as the guard saw it."""
         said: dict[str, Any] = {}
-        if self._channel.fileno() >= 0:
-            with contextlib.suppress(RobotError):
-                if last:
-                    self._put(CLOSE, 0.0, last)
-                    self._channel.settimeout(AFTER + 2.0)
-                    said = self._answer()
-            self._channel.close()
+        if last and not self._instead and self._channel.fileno() >= 0:
+            self._put(CLOSE, 0.0, last)
+            self._channel.settimeout(AFTER + 2.0)
+            said = self._answer()
+        self._channel.close()
+        end = self._clock() + AFTER
+        while self._instead and self._clock() < end:
+            self._commander.send(self._damping)
+            time.sleep(REPEAT)
         if self.process:
             with contextlib.suppress(subprocess.TimeoutExpired):
-                self.process.wait(AFTER + 2.0)
+                self.process.wait(0.0 if self._instead else AFTER + 2.0)
         return said.get("report", "")
+
+    def _ended(self) -> bool:
+        """Whether the guard's end of the channel is closed."""
+        if self._channel.fileno() < 0:
+            return True
+        with contextlib.suppress(OSError):
+            return bool(select.select([self._channel], [], [], 0.0)[0]) and not self._channel.recv(1, socket.MSG_PEEK)
+        return True
+
+    def _damp_instead(self, why: str) -> None:
+        """From now on this process sends what it armed the guard with: damping. A guard that goes on damps, too (see ``Guard.turn``)."""
+        if self._damping and not self._instead:
+            self._instead = f"{why}; {INSTEAD}"
+            self._commander.send(self._damping)
 
     def _put(self, kind: int, stamp: float, body: bytes) -> None:
         try:
             self._channel.sendall(_FRAME.pack(kind, stamp) + body)
         except OSError:
-            if text := self._board.get()[2]:
-                raise RobotError(text) from None
-            raise RobotError(GONE) from None
+            self._damp_instead(GONE)
 
     def _answer(self) -> dict[str, Any]:
         """A line of JSON from the guard; empty if none comes."""
@@ -179,13 +242,13 @@ class Guard:
         self._size = _FRAME.size + LAYOUTS[package, "LowCmd_"].size
         self._buffer, self._latencies = b"", deque[float](maxlen=1 << 16)
         self._command, self._damping = b"", b""  # the command that is repeated; the one that replaces it after a trip
-        self._moving, self._heard, self._until, self._due, self._looked = False, 0.0, float("inf"), 0.0, float("inf")
-        self.tripped, self._stopped = "", False
+        self._moving, self._heard, self._until, self._due, self._looked = False, 0.0, float("inf"), 0.0, clock()
+        self.tripped, self._stopped = "", 0
         channel.setblocking(False)
 
-    def stop(self, *_: object) -> None:
+    def stop(self, number: int = signal.SIGTERM, *_: object) -> None:
         """Damp, and end; a signal's handler."""
-        self._stopped = True
+        self._stopped = number
 
     def run(self) -> None:
         """Run until AFTER [s] from the last command, from the end of the policy's process, or from `stop`."""
@@ -194,24 +257,29 @@ class Guard:
             self.turn()
 
     def turn(self) -> None:
-        """One look at both sides."""
+        """One look at both sides. A command is obeyed last: it may have waited while the guard stood still."""
         now = self.clock()
         still, self._looked = now - self._looked, now
+        if still < 0.0:  # what was to happen at a time happens as much earlier
+            self._heard, self._until, self._due = (each + still for each in (self._heard, self._until, self._due))
+        if self._moving and still < 0.0:
+            self.trip(f"this computer's clock went back by {-still:.1f} s")
         if self._moving and still > self.still:
             self.trip(f"nothing was sent for {1000 * still:.0f} ms: the guard stood still, or this computer slept")
-        self._hear(now)
-        if state := self.wire.receive():
-            self.board.put(state.body, state.stamp)
-        if self._moving and now - self._heard > self.late:
-            self.trip(f"no targets for {1000 * (now - self._heard):.0f} ms: the policy's process hangs or is late")
         if self._command and self.wire.other_commander():
             self.trip("another program sends commands to this robot, too")
+        if why := self.wire.another_robot():
+            self.trip(why)
+        self._hear(now)
+        if self._moving and now - self._heard > self.late:
+            self.trip(f"no targets for {1000 * (now - self._heard):.0f} ms: the policy's process hangs or is late")
         if self._stopped:
-            self.trip("the guard was stopped (SIGTERM)")
+            self.trip(f"the guard was stopped ({_name(self._stopped)})")
             self._until = min(self._until, now + AFTER)
         if self._command and now >= self._due:
-            self.wire.send(self._command)
+            self._send()
             self._due = now + REPEAT
+        self.board.put(now, *(self.wire.receive() or ()))
 
     def _hear(self, now: float) -> None:
         """Take what the policy's process sent; the newest command counts."""
@@ -243,9 +311,14 @@ class Guard:
             self.tell({"report": self._report()})
         elif not self.tripped:
             self._command, self._moving, self._heard = body, kind == MOVE, now
-            self.wire.send(body)
+            self._send()
             if kind == MOVE:
                 self._latencies.append(self.clock() - stamp)
+
+    def _send(self) -> None:
+        """The command, unless the guard was stopped since this turn began: then the next one damps."""
+        if self.clock() - self._looked <= self.still:
+            self.wire.send(self._command)
 
     def trip(self, why: str) -> None:
         """Damp from now on, and say why; the first reason counts."""
@@ -255,8 +328,9 @@ class Guard:
         if not self.tripped:
             self.tripped, self._moving = why, False
             done = f"{why}; the joints are damped" if self._command else why
-            self.board.put(text=done)
-            print(f"guard: {done}", file=sys.stderr, flush=True)
+            self.board.put(self._looked, text=done)
+            with contextlib.suppress(OSError):  # a terminal that is gone
+                print(f"guard: {done}", file=sys.stderr, flush=True)
 
     def _report(self) -> str:
         lines = [f"{self.wire.dropped} states of another size dropped"] if getattr(self.wire, "dropped", 0) else []
@@ -267,6 +341,15 @@ class Guard:
     def tell(self, what: dict[str, Any]) -> None:
         with contextlib.suppress(OSError):
             self.channel.sendall(json.dumps(what).encode() + b"\n")
+
+
+# Signals that do not end the guard: which nobody can catch, which end nothing, and those of its own errors, to which a handler would
+# return for ever.
+KEPT = {getattr(signal, f"SIG{name}") for name in ("KILL", "STOP", "CHLD", "CONT", "URG", "WINCH", "PIPE", "SEGV", "BUS", "FPE", "ILL")}
+
+
+def _name(number: int) -> str:
+    return signal.Signals(number).name if number in set(signal.Signals) else f"signal {number}"
 
 
 def main() -> None:
@@ -283,10 +366,10 @@ def main() -> None:
         channel.sendall(json.dumps({"error": str(error)}).encode() + b"\n")
         return
     board = Board(settings["board"], len(first.body))
-    board.put(first.body, first.stamp)
+    board.put(first.stamp, first.body, first.stamp)
     guard = Guard(wire, channel, board, settings["package"], settings["late"], still=settings["still"])
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, guard.stop)
+    for number in signal.valid_signals() - KEPT:
+        signal.signal(number, guard.stop)
     guard.tell({"ready": True})
     gc.freeze()
     gc.disable()

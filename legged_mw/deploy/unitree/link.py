@@ -31,6 +31,8 @@ SPORT = "rt/api/sport/request"
 CHECK_MODE, RELEASE_MODE = 1001, 1003  # of the motion service
 STAND_DOWN = 1005  # of the sport service [unitree_sdk2]
 LOOPBACK = ("lo", "lo0")
+AGAIN = 0.1  # [s] ours: a robot that was heard within it was not started again
+LEASE = 11.0  # [s] for a program that was killed to be forgotten: DDS's 10, and a margin
 _INTERFACE = "<General><Interfaces><NetworkInterface name='{name}' {multicast}/></Interfaces>{more}</General>"
 # Loopback interfaces know no multicast, so the processes look for each other at 127.0.0.1, one port after the other.
 _LOCAL = "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>"
@@ -132,7 +134,28 @@ class Received(NamedTuple):
     stamp: float  # [s] of `unitree.clock`
 
 
-class Wire:
+class Commander:
+    """The right to send commands, and nothing else: what a policy's process has in case its guard is gone."""
+
+    def __init__(self, package: str, interface: str, domain: int) -> None:
+        self.package, self._where = package, f"domain {domain} on {interface}"
+        self._participant = join(interface, domain)
+        self._sample = RAW[package, "LowCmd_"]
+        self._out = _writer(self._participant, COMMANDS, self._sample)
+
+    def send(self, body: bytes) -> None:
+        self._out.write(self._sample(body))
+
+    def wait(self, readers: int, seconds: float) -> None:
+        """Until so many programs read commands, so that the first one is not lost. Raises RobotError if they do not."""
+        end = clock() + seconds
+        while len(self._out.get_matched_subscriptions()) < readers:
+            if clock() > end:
+                raise RobotError(f"no robot reads {COMMANDS} in {self._where}: nothing was sent")
+            time.sleep(0.001)
+
+
+class Wire(Commander):
     """The program's end: states come in, commands go out. Nothing is sent before ``send``."""
 
     _sent = "nothing was sent"  # so far, for errors
@@ -146,34 +169,58 @@ class Wire:
         clock: Callable[[], float] = clock,
     ) -> None:
         """``wait`` passes a moment while nothing comes. In one process with a simulated robot, that moves on there, by its own clock."""
-        self.package, self._wait, self.clock = package, wait, clock
-        self._where = f"domain {domain} on {interface}"
-        self._participant = join(interface, domain)
+        super().__init__(package, interface, domain)
+        self._wait, self.clock = wait, clock
         self._size = LAYOUTS[package, "LowState_"].size
-        command = RAW[package, "LowCmd_"]
-        self._sample = command
-        self._out = _writer(self._participant, COMMANDS, command)
-        self._others = _reader(self._participant, COMMANDS, command, foreign=True)
+        self._others = _reader(self._participant, COMMANDS, self._sample, foreign=True)
         self._states = _reader(self._participant, STATES, RAW[package, "LowState_"])
         self._requests = _writer(self._participant, MOTION[0], TYPES["unitree_api", "Request_"])
         self._answers = _reader(self._participant, MOTION[1], TYPES["unitree_api", "Response_"], depth=10)
         self._sport = _writer(self._participant, SPORT, TYPES["unitree_api", "Request_"])
         self.dropped = 0  # states of another size or encoding
+        self._robot, self._heard = 0, dict[int, float]()  # publisher of the robot's states; when each was heard last [s]
 
     def receive(self) -> Received | None:
         """The newest state since the last call, with the moment of this call: ask often."""
         for sample in _taken(self._states):
             if len(sample.body) == self._size:
-                return Received(sample.body, self.clock())
+                now = self.clock()
+                self._heard[sample.sample_info.publication_handle] = now
+                return Received(sample.body, now)
             self.dropped += 1
         return None
-
-    def send(self, body: bytes) -> None:
-        self._out.write(self._sample(body))
 
     def other_commander(self) -> bool:
         """Whether somebody else sent a command since the last call."""
         return bool(_taken(self._others))
+
+    def another_robot(self) -> str:
+        """Why states may come from another robot than the one that was prepared; "" if they do not.
+
+        Publishers are counted: what they say, and when, may be the same. One whose robot was heard just now is not that one again.
+        """
+        others = self._publishers() - {self._robot}
+        if not self._robot or not others:
+            return ""
+        if self.clock() - self._heard[self._robot] < AGAIN:
+            return f"two robots answer: {len(others) + 1} programs publish {STATES} in {self._where}"
+        return f"the robot was started again: another program publishes its {STATES}"
+
+    def _publishers(self) -> set[int]:
+        """Of states, as samples name them: without a sign."""
+        return {handle % 2**64 for handle in self._states.get_matched_publications()}
+
+    def _one_robot(self, seconds: float) -> None:
+        """Refuse two; a program that was killed is counted until its lease is over, so it is waited for. Raises RobotError."""
+
+        def known() -> bool:
+            self.receive()
+            return len(self._heard) > 1 or self._publishers() == set(self._heard)
+
+        self._until(known, seconds)
+        if (count := len(self._publishers() | set(self._heard))) != 1:
+            raise RobotError(f"{count} programs publish {STATES} in {self._where}: end all but one robot; {self._sent}")
+        self._robot = next(iter(self._heard))
 
     def prepare(self, seconds: float = 5.0, listen: float = 0.5, lies_down: bool = False) -> Received:
         """Wait for the robot, take it from its own motion service, and listen for other commanders; returns its state.
@@ -186,6 +233,7 @@ class Wire:
         self._release(lies_down)
         if self._until(self.other_commander, listen):
             raise RobotError(taken(self._where))
+        self._one_robot(LEASE)
         return self._until(self.receive, 0.1) or state
 
     def _until(self, found: Callable[[], Any], seconds: float) -> Any:

@@ -81,7 +81,7 @@ def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf, faul
     gc.freeze()
     gc.disable()
     began = start = time.monotonic()
-    steps = begun = 0
+    steps = begun = said = 0
     try:
         while sim.time < seconds - 1e-9:
             sim.remote = handset.state(sim.time)
@@ -91,6 +91,9 @@ def run(sim: SimulatedUnitree, handset: Handset, seconds: float = math.inf, faul
                 begun += 1
             sim.step()
             latency.watch(sim)
+            for why in list(sim.record.why.values())[said:]:
+                print(f"refused: {why}; more of its kind are counted", flush=True)
+            said = len(sim.record.why)
             if sim.acted["kp"].any():
                 upright = min(upright, sim.upright)
             steps += 1

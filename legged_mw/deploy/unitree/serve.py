@@ -49,6 +49,7 @@ class Record:
 
     commands: int = 0
     refused: int = 0  # commands of another size, with a wrong checksum, head or mode_machine, or that are not finite
+    why: dict[str, str] = field(default_factory=dict)  # what was wrong with the first command of each kind that was refused
     watchdog: int = 0  # times that it damped by itself
     changes: deque[tuple[float, str]] = field(default_factory=lambda: deque([(0.0, LIMP)], maxlen=1000))  # [s], from when on they do what
     beyond: float = 0.0  # [rad] by which a joint was outside its range at most
@@ -183,17 +184,29 @@ class SimulatedUnitree:
         if len(body) == layout.size:
             self._take(Message(layout, body))
         else:
-            self.record.refused += 1
+            self._refuse("size", f"a command of {len(body)} bytes, not {layout.size}")
+
+    def _refuse(self, kind: str, why: str) -> None:
+        self.record.refused += 1
+        self.record.why.setdefault(kind, why)
 
     def _take(self, command: Message) -> None:
         """Obey a command from now on, if it is one."""
         if self.machine.package == "unitree_go":
-            fits = (*command["head"], command["level_flag"]) == LOW_LEVEL
+            kind, said, wanted = "head and level_flag", (*map(int, command["head"]), int(command["level_flag"])), LOW_LEVEL
         else:
-            fits = command["mode_machine"] == self._state["mode_machine"]
-        if not fits or not command.intact() or not all((np.abs(command[f"motor_cmd.{name}"]) < _MOST).all() for name in _PARTS):
-            self.record.refused += 1
-            return
+            kind, said, wanted = "mode_machine", int(command["mode_machine"]), int(self._state["mode_machine"])
+        wrong = [name for name in _PARTS if not (np.abs(command[f"motor_cmd.{name}"]) < _MOST).all()]
+        if said != wanted:
+            self._refuse(kind, f"a command with {kind} {said}, not {wanted}")
+        elif not command.intact():
+            self._refuse("checksum", f"a command with checksum {command['crc']:#x}, not {command.checksum():#x}")
+        elif wrong:
+            self._refuse("values", f"a command whose {wrong[0]} is not finite, or beyond {_MOST:g}")
+        else:
+            self._accept(command)
+
+    def _accept(self, command: Message) -> None:
         slots, signs = self._plugs()
         on, signs = command["motor_cmd.mode"][slots] != 0, {"q": signs, "dq": signs, "tau": signs}
         acted = {name: np.where(on, command[f"motor_cmd.{name}"][slots] * signs.get(name, 1.0), 0.0) for name in _PARTS}
@@ -248,6 +261,7 @@ class SimulatedUnitree:
         """The state message of this moment."""
         state, data, faults = self._state, self.data, self.faults
         orientation, roll = np.zeros(4), math.radians(faults.imu_tilt) / 2
+        before = {part: state[NAN[part]] for part in NAN} if faults.stuck else {}
         mujoco.mju_mat2Quat(orientation, data.site(self.contract.imu).xmat)
         mujoco.mju_mulQuat(orientation, orientation.copy(), np.array([math.cos(roll), math.sin(roll), 0.0, 0.0]))
         state["imu_state.quaternion"] = orientation
@@ -262,12 +276,23 @@ class SimulatedUnitree:
         state["motor_state.temperature"] = int(faults.temperature)
         state["wireless_remote"] = 0 if faults.no_remote else list(self.remote)
         state["tick"] = max(1, round((data.time + faults.clock_jump) * 1000))
+        if faults.stuck:
+            self._stick(before)
         if faults.nan:
             state[NAN[faults.nan]] = math.nan
         self._fill_own()
         state.seal()
         if faults.bad_crc:
             state["crc"] = int(state["crc"]) ^ 1
+
+    def _stick(self, before: dict[str, Floats]) -> None:
+        """Parts that are stuck are as they were ``before``; the encoder of a joint measures no speed either."""
+        state, stuck = self._state, self.faults.stuck
+        for part in stuck & NAN.keys():
+            state[NAN[part]] = before[part]
+        joints = self._in_slots([name in stuck for name in self.contract.joints]) > 0.0
+        for part, values in (("q", before["q"]), ("dq", 0.0)):
+            state[NAN[part]] = np.where(joints, values, state[NAN[part]])
 
     def _fill_own(self) -> None:
         """What only this package's robots tell."""
