@@ -176,11 +176,24 @@ def test_guard_ends_with_its_block() -> None:
 # ---- a task of one's own: each mistake is one line of text ------------------------------------------------------------------
 
 HEAD = """
+import random
+from collections import deque
+
+import numpy as np
 import torch
 from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.utils.task import Task
+
+RNG = np.random.default_rng(1)
+
+
+class Slots:
+    __slots__ = ("one",)
+
+    def __init__(self, n):
+        self.one = torch.zeros(n)
 
 
 class Buffers:
@@ -193,7 +206,8 @@ class Mine(LeggedRobot):
         super()._init_buffers()
         self.foot, self.rows, self.count = torch.tensor(1), torch.tensor([0, 2]), 0
         self.past, self.parts, self.list = torch.zeros(self.num_envs), Buffers(self.num_envs), [torch.zeros(self.num_envs)]
-        self.view = self.dof_pos[:, :3]
+        self.view, self.slots = self.dof_pos[:, :3], Slots(self.num_envs)
+        self.frames = deque([self.past, self.parts.kept["past"]])
 
 """
 REWARD = """
@@ -205,6 +219,27 @@ END_STEP = """
     def _end_step(self):
         super()._end_step()
         {}  # here
+"""
+ANNEAL = """
+    def anneal(self, done):
+        super().anneal(done)
+        {}  # here
+"""
+LOAD = """
+    def load_training_state(self, state):
+        super().load_training_state(state)
+        {}  # here
+"""
+REDRAW = """
+    def _init_ranges(self):
+        super()._init_ranges()
+        redraw = self.domain_rand.redraw
+
+        def drawn():
+            redraw()
+            {}  # here
+
+        self.domain_rand.redraw = drawn
 """
 TABLE = """
     def observation_rows(self):  # here
@@ -220,7 +255,9 @@ CONDITION = "a tensor as a condition (if, and, not, in) is read to the host; wri
 SCALAR = "a tensor without dimensions as an index is read to the host; write x.index_select(dim, index.view(1)), or use a Python int"
 MASK_INDEX = "a mask as an index has a shape that depends on data; write torch.where(mask, a, b), or assign(x, mask, value)"
 MADE_ONCE = "becomes another tensor; make it once, in __init__, and write in place"
+PAST = f"self.past {MADE_ONCE}: self.past.copy_(...)"
 NUMBER = "self.count is a Python number and changes, but a replay repeats what was recorded; make it a tensor"
+DRAWS = "draws Python's or numpy's random numbers, but a replay repeats what was recorded; write torch.rand(..., device=self.device)"
 BREACHES: dict[str, tuple[str, str, str]] = {
     "column by a scalar tensor": (REWARD, "self.foot_height[:, self.foot].clone()", f"Mine._reward_pose: {SCALAR}"),
     "item": (
@@ -263,6 +300,28 @@ BREACHES: dict[str, tuple[str, str, str]] = {
         f"Mine._end_step: self.list[2] {MADE_ONCE}: self.list[2].copy_(...)",
     ),
     "number": (END_STEP, "self.count += 1", f"Mine._end_step: {NUMBER}"),
+    "number that a training changes": (ANNEAL, "self.count = 2.0 * done", f"Mine.anneal: {NUMBER}"),
+    "number of the config that a training changes": (
+        ANNEAL,
+        "self.cfg.rewards.base_height_target = 0.3 * done",
+        f"Mine.anneal: {NUMBER.replace('self.count', 'self.cfg.rewards.base_height_target')}",
+    ),
+    "rebound by a training": (ANNEAL, "self.past = self.past + done", f"Mine.anneal: {PAST}"),
+    "number that a redraw changes": (REDRAW, "self.count += 1", f"drawn: {NUMBER}"),
+    "rebound by a checkpoint": (
+        LOAD,
+        "self.past = self.past.clone()",
+        f"Mine.load_training_state: {PAST}",
+    ),
+    "rebound in a deque": (END_STEP, "self.frames.rotate()", f"Mine._end_step: self.frames[0] {MADE_ONCE}: self.frames[0].copy_(...)"),
+    "rebound in slots": (
+        END_STEP,
+        "self.slots.one = self.past * 2",
+        f"Mine._end_step: self.slots.one {MADE_ONCE}: self.slots.one.copy_(...)",
+    ),
+    "Python's random numbers": (REWARD, "self.dt * random.random()", f"Mine._reward_pose: {DRAWS}"),
+    "numpy's random numbers": (END_STEP, "self.past += np.random.rand()", f"Mine._end_step: {DRAWS}"),
+    "a generator of numpy's": (END_STEP, "self.past += RNG.normal()", f"Mine._end_step: {DRAWS}"),
     "writes": (
         REWARD,
         "self.past += 1.0",
@@ -336,6 +395,8 @@ ORDINARY = {
     "in place": (END_STEP, "self.past += 1.0; self.view = self.dof_pos[:, :3]; self.parts.kept['past'].copy_(self.past)"),
     "made in the first step": (END_STEP, "self.half = getattr(self, 'half', None) or [torch.tensor(0.5)]"),
     "a number that stays": (END_STEP, "self.unknown = float('nan')"),
+    "in place by a training": (ANNEAL, "self.past.fill_(done); self.slots.one.copy_(self.past)"),
+    "random numbers between steps": (ANNEAL, "self.past.fill_(random.random() + RNG.normal())"),
     "row of a buffer": (TABLE, "Row('past', self.past[:, None])"),
 }
 
