@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legged_mw.check.recordable import Guard, recordable
+from legged_mw.check.recordable import Births, Guard, recordable
 from legged_mw.envs.own_code import check_term, place_of
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
@@ -45,7 +45,14 @@ def check_recordable(task: LoadedTask) -> None:
     for a method that raises, or returns NaN or the wrong shape. Random numbers go on as if it had not been called.
     """
     guard = Guard()
-    with _nothing_changed():
+    for kind in _own_kinds(task.env_class):
+        for name, value in (_of_file(kind) | dict(vars(kind))).items():
+            if isinstance(value, Tensor):
+                what = (
+                    f"{name} is made where its file is read, on the host, and the step reads it; make it in _init_buffers, on self.device"
+                )
+                guard.on_host[value.untyped_storage().data_ptr()] = value, what, kind.__name__
+    with _nothing_changed(), Births(guard):
         try:
             env = _watched(task.env_class, guard)(_tiny(task.cfg), "cpu", True)
             for name in ("step", "reset", "refresh"):  # the engine of a CPU may ask the host
@@ -89,6 +96,11 @@ def _own_methods(env_class: type) -> list[str]:
 def _own_kinds(env_class: type) -> list[type]:
     """The classes of an environment that are the user's."""
     return [kind for kind in env_class.__mro__ if not kind.__module__.startswith("legged_mw.") and kind is not object]
+
+
+def _of_file(kind: type) -> dict[str, Any]:
+    """What the file of a class holds beside it."""
+    return vars(sys.modules[kind.__module__]) if kind.__module__ in sys.modules else {}
 
 
 def _watched(env_class: type[RobotTask], guard: Guard) -> type[Any]:
@@ -161,8 +173,8 @@ def _check_rows(env: RobotTask) -> None:
 
 def _check_steps(env: RobotTask, guard: Guard) -> None:
     def step(watch: bool = True) -> None:
-        env.episode_length_buf = torch.arange(_WORLDS) % 2 * env.max_episode_length  # every second episode ends
-        actions = torch.rand(_WORLDS, env.num_actions).mul_(2.0).sub_(1.0)
+        env.episode_length_buf = torch.arange(_WORLDS, device=env.device) % 2 * env.max_episode_length  # every second episode ends
+        actions = torch.rand(_WORLDS, env.num_actions, device=env.device).mul_(2.0).sub_(1.0)
         with recordable(guard) if watch else nullcontext():
             env.step(actions)
 
@@ -207,8 +219,8 @@ def _check_kept(env: RobotTask, before: dict[Path, Any], step: Callable[[], None
 
 def _draws(env: RobotTask) -> Callable[[], list[object]]:
     """What tells the states of Python's and numpy's generators: the global ones, those that ``env`` holds, those of the user's files."""
-    files = [getattr(sys.modules.get(kind.__module__), "__dict__", {}) for kind in _own_kinds(type(env))]
-    values = [*(value for file in files for value in file.values()), *(value for _, value in _held(env))]
+    files = [value for kind in _own_kinds(type(env)) for value in _of_file(kind).values()]
+    values = [*files, *(value for _, value in _held(env))]
     python = [value for value in values if isinstance(value, random.Random)]
     numpy = [getattr(value, "bit_generator", value) for value in values if isinstance(value, np.random.Generator)]
     return lambda: [
