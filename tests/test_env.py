@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -10,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
+from tensordict import TensorDict
 from torch import Tensor
 from worlds import QUIET, changed, layout, make_env, same, snapshot, tensors
 
@@ -18,6 +20,7 @@ from legged_mw.check.recordable import recordable
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
+from legged_mw.envs.worlds import everything, put_worlds, worlds_state
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import NotRecordable, StepError
@@ -51,6 +54,53 @@ def run_a_while(env: LeggedRobot, steps: int = 20, seed: int = 1) -> None:
     env.reset()
     for _ in range(steps):
         env.step(act(env, 0.5))
+
+
+# ---- what its worlds remember
+
+
+class _Slots:
+    __slots__ = ("kept",)
+
+    def __init__(self, kept: Tensor) -> None:
+        self.kept = kept
+
+
+class _Holds(LeggedRobot):
+    """A task whose buffers lie where attributes, dicts and lists are not all."""
+
+    def _init_buffers(self) -> None:
+        super()._init_buffers()
+        self.frames = deque([self._zeros(3)], maxlen=1)
+        self.slots, self.table = _Slots(self._zeros(3)), TensorDict({"robot": self._zeros(3)})
+        self.net = torch.nn.Sequential(torch.nn.BatchNorm1d(3)).requires_grad_(False)
+
+    def own(self) -> dict[str, Tensor]:
+        return {"frames.0": self.frames[0], "slots.kept": self.slots.kept, "table.robot": self.table["robot"]} | {
+            "net._modules.0._buffers.running_mean": self.net[0].running_mean
+        }
+
+    def _end_step(self) -> None:
+        super()._end_step()
+        for value in self.own().values():
+            value.add_(1.0)
+
+
+def test_worlds_go_on_where_they_were_wherever_a_task_holds_its_buffers() -> None:
+    one, two = (make_env(N, QUIET, env_class=_Holds) for _ in range(2))
+    one.step(act(one))
+    assert put_worlds(two, worlds_state(one)) == ""
+    for name, value in one.own().items():
+        assert (value == 1.0).all() and torch.equal(two.own()[name], value), name
+        assert torch.equal(everything(one)[name], value.flatten()), name
+
+
+def test_worlds_do_not_go_on_where_a_task_holds_what_cannot_be_kept(quiet: LeggedRobot) -> None:
+    other, state = make_env(N, QUIET), worlds_state(quiet)
+    assert put_worlds(other, state) == ""
+    for held in ({torch.zeros(N)}, torch.Generator(), np.random.default_rng(1), np.array([None])):
+        vars(other)["mine"] = held
+        assert "mine" in put_worlds(other, state)
 
 
 # ---- the recorded step

@@ -159,13 +159,56 @@ def test_a_term_that_is_on_has_what_it_reads_sensed() -> None:
     assert CONTACT_FORCE not in off.robot.sensors and off.feet.forces is None and not off._sensed
 
 
+def test_a_term_may_read_it_by_a_helper_or_its_parents_term() -> None:
+    class Mine(LeggedRobot):
+        @property
+        def heaviest(self) -> Tensor:
+            return self._loads().amax(dim=1)
+
+        def _loads(self) -> Tensor:
+            return torch.stack([(lambda foot: self.contact_forces[:, foot, 2])(foot) for foot in range(4)], dim=1)
+
+        def _reward_mine(self) -> Tensor:
+            return self.heaviest
+
+        def _reward_stumble(self) -> Tensor:
+            return super()._reward_stumble().clone()
+
+    for name in ("mine", "stumble"):
+        assert CONTACT_FORCE in make_env(1, {**QUIET, f"rewards.scales.{name}": 1.0}, env_class=Mine).robot.sensors
+    assert CONTACT_FORCE not in make_env(1, QUIET, env_class=Mine).robot.sensors
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_a_sensor_of_the_file_is_kept_where_it_is_asked_for(engine: str, tmp_path: Path) -> None:
+    class Mine(LeggedRobot):
+        def _init_buffers(self) -> None:
+            super()._init_buffers()
+            self.shank = self.sensor("shank_gyro")
+
+    sensors = '<sensor><gyro name="shank_gyro" site="FR"/><velocimeter name="unused" site="FR"/></sensor></mujoco>'
+    text = (ROOT / "resources/robots/go1/go1.xml").read_text().replace("</mujoco>", sensors)
+    (tmp_path / "go1.xml").write_text(text)
+    more = {**QUIET, "asset.file": str(tmp_path / "go1.xml"), "sim.engine": engine}
+    env = make_env(2, {**more, "asset.sense": ["shank_gyro"]}, env_class=Mine)
+    env.step(torch.ones(2, 12))
+    assert env.shank.shape == (2, 3) and env.shank.abs().amax() > 0.1
+    assert env.robot.spec.sensor("shank_gyro") and not env.robot.spec.sensor("unused")
+    with pytest.raises(ConfigError, match="sensor 'unused' of the robot's file was dropped; write asset.sense"):
+        env.sensor("unused")
+    with pytest.raises(ConfigError, match="'shank_gyro' .* asset.sense"):
+        make_env(1, more, env_class=Mine)
+    with pytest.raises(ConfigError, match="asset.sense: no value or sensor 'shank' .* did you mean 'shank_gyro'"):
+        make_env(1, {**more, "asset.sense": ["shank"]})
+
+
 @pytest.mark.parametrize("name", ["contact_forces", "self_contacts", "angular_momentum"])
 def test_what_is_not_sensed_says_how_to_get_it(name: str) -> None:
     class Fallen(LeggedRobot):
         def _fallen(self) -> Tensor:
             return super()._fallen() | (getattr(self, name).flatten(1).abs().amax(dim=1) > 1e6)
 
-    error = f"{name} is not sensed, for no reward term that is on reads it; write asset.sense = ['{name}'] in the config"
+    error = f"{name} is not sensed, for no reward term that is on names it; write asset.sense = ['{name}'] in the config"
     with pytest.raises(ConfigError) as raised:
         make_env(1, QUIET, env_class=Fallen).step(torch.zeros(1, 12))
     assert str(raised.value) == error
@@ -305,7 +348,11 @@ def test_sensed_motion_and_self_contacts() -> None:
             "rewards.mirror_joints is [['FR']]; it must be pairs: lists of two names or patterns each",
         ),
         ("dof_vel_limits", {"asset.joint_speed_limits": {}}, "no joint has a highest speed; write asset.joint_speed_limits"),
-        ("stumble", {"asset.sense": ["forces"]}, "asset.sense: no value 'forces' in LeggedRobot"),
+        (
+            "stumble",
+            {"asset.sense": ["forces"]},
+            "asset.sense: no value or sensor 'forces' in LeggedRobot and its file; did you mean 'contact_forces'",
+        ),
         ("feet_contact_forces", {"rewards.max_contact_force": -1.0}, "rewards.max_contact_force is -1.0; it must be 0 or more"),
     ],
 )

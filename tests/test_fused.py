@@ -295,6 +295,52 @@ def test_a_task_is_fused_into_few_kernels_and_does_what_it_did(robot: RobotTask,
     assert ended >= 32
 
 
+def crowded(monkeypatch: pytest.MonkeyPatch) -> RobotTask:
+    """More contacts than there is room for; as on a GPU, chance decides which worlds lose theirs."""
+    task, chance = load_task("go1_flat"), torch.Generator().manual_seed(1)
+    for field, value in {"env.num_envs": 32, "sim.engine": "mujoco_warp", "sim.nconmax": 1}.items():
+        task.set(field, value)
+    env = task.env_class(task.cfg, "cpu")
+    for action in torch.randn(20, 32, 12):
+        env.step(action)
+    assert env.sim.overflowed_worlds() == 32
+    step = env.sim.step
+
+    @not_traced
+    def by_chance(*args: object) -> None:
+        step(*args)  # type: ignore[arg-type]
+        lost = torch.rand(32, generator=chance) < 0.5
+        env.sim.memory()["overflow"].bitwise_xor_(lost.int() * 4)
+        env.sim.qvel[:, 6:].add_(lost[:, None] * 0.1)
+
+    monkeypatch.setattr(env.sim, "step", by_chance)
+    return env
+
+
+def test_which_contacts_do_not_fit_does_not_decide_whether_a_step_is_fused(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert isinstance(fused_step(crowded(monkeypatch)), Fused)
+    assert "not fused" not in capsys.readouterr().out
+
+
+def test_the_users_own_values_that_differ_are_named_first(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What torch does not see is found before and after the simulator's calls, whatever is different by chance."""
+    env = crowded(monkeypatch)
+    as_it_is, mine = env.actuators.apply, torch.zeros(32)
+    numbers, speeds = mine.numpy(), env.sim.qvel.numpy()
+    vars(env)["mine"] = mine
+
+    def apply(actions: Tensor) -> None:
+        as_it_is(actions)
+        numbers[:] += 1.0
+        speeds[:, 0] += 1.0
+
+    monkeypatch.setattr(env.actuators, "apply", apply)
+    fused_step(env)
+    assert "not fused: mine, sim.qvel " in capsys.readouterr().out
+
+
 def test_fusing_moves_no_world_and_no_draw(robot: RobotTask) -> None:
     before, draws = {name: value.clone() for name, value in everything(robot).items()}, torch.get_rng_state()
     assert isinstance(fused_step(robot), Fused)

@@ -176,24 +176,39 @@ def test_guard_ends_with_its_block() -> None:
 # ---- a task of one's own: each mistake is one line of text ------------------------------------------------------------------
 
 HEAD = """
+import random
+from collections import deque
+
+import numpy as np
 import torch
 from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.utils.task import Task
 
+RNG, AT_IMPORT = np.random.default_rng(1), torch.ones(4)
+
+
+class Slots:
+    __slots__ = ("one",)
+
+    def __init__(self, like):
+        self.one = torch.zeros_like(like)
+
 
 class Buffers:
-    def __init__(self, n):
-        self.kept = {"past": torch.zeros(n)}
+    def __init__(self, like):
+        self.kept = {"past": torch.zeros_like(like)}
 
 
 class Mine(LeggedRobot):
     def _init_buffers(self):
         super()._init_buffers()
-        self.foot, self.rows, self.count = torch.tensor(1), torch.tensor([0, 2]), 0
-        self.past, self.parts, self.list = torch.zeros(self.num_envs), Buffers(self.num_envs), [torch.zeros(self.num_envs)]
-        self.view = self.dof_pos[:, :3]
+        self.foot, self.rows = (torch.tensor(i, device=self.device) for i in (1, [0, 2]))
+        self.past, self.list, self.count = self._zeros(), [self._zeros()], 0
+        self.parts, self.slots, self.view = Buffers(self.past), Slots(self.past), self.dof_pos[:, :3]
+        self.frames = deque([self.past, self.parts.kept["past"]])
+        self.moved, self.net = torch.zeros(self.num_envs).to(self.device), torch.nn.Linear(1, 1).to(self.device).requires_grad_(False)
 
 """
 REWARD = """
@@ -205,6 +220,36 @@ END_STEP = """
     def _end_step(self):
         super()._end_step()
         {}  # here
+"""
+ANNEAL = """
+    def anneal(self, done):
+        super().anneal(done)
+        {}  # here
+"""
+LOAD = """
+    def load_training_state(self, state):
+        super().load_training_state(state)
+        {}  # here
+"""
+REDRAW = """
+    def _init_ranges(self):
+        super()._init_ranges()
+        redraw = self.domain_rand.redraw
+
+        def drawn():
+            redraw()
+            {}  # here
+
+        self.domain_rand.redraw = drawn
+"""
+INIT = """
+    def _init_ranges(self):
+        super()._init_ranges()
+        {}  # here
+
+    def _end_step(self):
+        super()._end_step()
+        self.past.add_(self.own.sum())
 """
 TABLE = """
     def observation_rows(self):  # here
@@ -220,7 +265,10 @@ CONDITION = "a tensor as a condition (if, and, not, in) is read to the host; wri
 SCALAR = "a tensor without dimensions as an index is read to the host; write x.index_select(dim, index.view(1)), or use a Python int"
 MASK_INDEX = "a mask as an index has a shape that depends on data; write torch.where(mask, a, b), or assign(x, mask, value)"
 MADE_ONCE = "becomes another tensor; make it once, in __init__, and write in place"
+PAST = f"self.past {MADE_ONCE}: self.past.copy_(...)"
 NUMBER = "self.count is a Python number and changes, but a replay repeats what was recorded; make it a tensor"
+ON_HOST = "without a device makes a tensor on the host, which the step reads; add device=self.device"
+DRAWS = "draws Python's or numpy's random numbers, but a replay repeats what was recorded; write torch.rand(..., device=self.device)"
 BREACHES: dict[str, tuple[str, str, str]] = {
     "column by a scalar tensor": (REWARD, "self.foot_height[:, self.foot].clone()", f"Mine._reward_pose: {SCALAR}"),
     "item": (
@@ -263,6 +311,36 @@ BREACHES: dict[str, tuple[str, str, str]] = {
         f"Mine._end_step: self.list[2] {MADE_ONCE}: self.list[2].copy_(...)",
     ),
     "number": (END_STEP, "self.count += 1", f"Mine._end_step: {NUMBER}"),
+    "number that a training changes": (ANNEAL, "self.count = 2.0 * done", f"Mine.anneal: {NUMBER}"),
+    "number of the config that a training changes": (
+        ANNEAL,
+        "self.cfg.rewards.base_height_target = 0.3 * done",
+        f"Mine.anneal: {NUMBER.replace('self.count', 'self.cfg.rewards.base_height_target')}",
+    ),
+    "rebound by a training": (ANNEAL, "self.past = self.past + done", f"Mine.anneal: {PAST}"),
+    "number that a redraw changes": (REDRAW, "self.count += 1", f"drawn: {NUMBER}"),
+    "rebound by a checkpoint": (
+        LOAD,
+        "self.past = self.past.clone()",
+        f"Mine.load_training_state: {PAST}",
+    ),
+    "rebound in a deque": (END_STEP, "self.frames.rotate()", f"Mine._end_step: self.frames[0] {MADE_ONCE}: self.frames[0].copy_(...)"),
+    "rebound in slots": (
+        END_STEP,
+        "self.slots.one = self.past * 2",
+        f"Mine._end_step: self.slots.one {MADE_ONCE}: self.slots.one.copy_(...)",
+    ),
+    "Python's random numbers": (REWARD, "self.dt * random.random()", f"Mine._reward_pose: {DRAWS}"),
+    "numpy's random numbers": (END_STEP, "self.past += np.random.rand()", f"Mine._end_step: {DRAWS}"),
+    "a generator of numpy's": (END_STEP, "self.past += RNG.normal()", f"Mine._end_step: {DRAWS}"),
+    "a buffer without a device": (INIT, "self.own = torch.zeros(self.num_envs)", f"Mine._init_ranges: zeros() {ON_HOST}"),
+    "a number without a device": (INIT, "self.own = torch.tensor(0.5)", f"Mine._init_ranges: tensor() {ON_HOST}"),
+    "computed without a device": (
+        INIT,
+        "self.own = {'a': torch.arange(3)[None] / 2.0 + 1.0}['a']",
+        f"Mine._init_ranges: arange() {ON_HOST}",
+    ),
+    "a network without a device": (INIT, "self.own = torch.nn.Linear(1, 1).weight.detach()", f"Mine._init_ranges: empty() {ON_HOST}"),
     "writes": (
         REWARD,
         "self.past += 1.0",
@@ -330,12 +408,21 @@ def test_a_mistake_is_named_by_line(tmp_path: Path, body: str, line: str, text: 
     assert not isinstance(raised.value, NotRecordable)
 
 
+def test_a_tensor_that_a_file_holds_is_named(tmp_path: Path) -> None:
+    with pytest.raises(NotRecordable, match="^mine: Mine: AT_IMPORT is made where its file is read, on the host"):
+        check_recordable(_task(tmp_path, REWARD, "self.past + AT_IMPORT")[0])
+    check_recordable(_task(tmp_path, INIT, "self.own = AT_IMPORT.to(self.device)")[0])
+
+
 ORDINARY = {
     "reads": (REWARD, "self.foot_height.index_select(1, self.rows).sum(dim=1) * self.foot"),
     "own tensors": (REWARD, "(self.past + 1.0).mul_(2.0).masked_fill_(self.fell, 0.0)"),
     "in place": (END_STEP, "self.past += 1.0; self.view = self.dof_pos[:, :3]; self.parts.kept['past'].copy_(self.past)"),
     "made in the first step": (END_STEP, "self.half = getattr(self, 'half', None) or [torch.tensor(0.5)]"),
     "a number that stays": (END_STEP, "self.unknown = float('nan')"),
+    "on the device": (END_STEP, "self.past.add_(self.moved + self.net(self.past[:, None])[:, 0])"),
+    "in place by a training": (ANNEAL, "self.past.fill_(done); self.slots.one.copy_(self.past)"),
+    "random numbers between steps": (ANNEAL, "self.past.fill_(random.random() + RNG.normal())"),
     "row of a buffer": (TABLE, "Row('past', self.past[:, None])"),
 }
 

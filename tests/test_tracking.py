@@ -17,6 +17,7 @@ from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.motion_reference import angle_between
 from legged_mw.envs.motion_tracking import MotionTracking
+from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
 from legged_mw.eval.perform import machine
 from legged_mw.eval.skill import PUSH_EVERY, Ground, Recording
 from legged_mw.eval.skills import make_skill
@@ -59,6 +60,12 @@ def test_worlds_begin_on_the_reference(device: str) -> None:
     tracking = [i for i, name in enumerate(env.reward_names) if name.startswith("tracking")]
     share = (env.episode_sums / env.reward_scales)[:, tracking]
     assert len(tracking) == 6 and (share > 0.9).all() and (share < 1.0).all()
+
+
+def test_what_an_episode_that_begins_in_a_clip_does_not_read_is_refused() -> None:
+    with pytest.raises(ConfigError, match="init_state: yaw_range, dof_vel_range: .* motion: start_turn, start_joints$"):
+        make(**{"init_state.yaw_range": 0.0, "init_state.dof_vel_range": 0.1})
+    make(**{"init_state.yaw_range": MotionTrackingCfg.init_state.yaw_range})
 
 
 def test_errors_are_taken_at_the_anchor() -> None:

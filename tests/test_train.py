@@ -26,12 +26,13 @@ from program import SMALL, assert_equal, load, refused, run, trained
 from rsl_rl.runners import OnPolicyRunner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensordict import TensorDict
+from worlds import make_env
 
 from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl.network import save_onnx
 from legged_mw.rl.policies import act, load_policy
-from legged_mw.rl.report import console_rows
+from legged_mw.rl.report import console_rows, curves
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.rl.runs import checkpoints, find_checkpoint, find_run, new_run, runs
 from legged_mw.rl.settings import rsl_rl_config
@@ -545,3 +546,21 @@ def test_before_an_episode_has_ended_its_means_are_dashes() -> None:
     assert [rows[name] for name in means] == ["-"] * 4 and rows["Value loss"] == "nan"
     rows = console_rows({**numbers, **dict.fromkeys(unknown, 2.0)}, {}, 9.0, 1.0, 1.0)
     assert [rows[name] for name in means] == ["2.00", "2.0", "2.0000", "2.00"]
+
+
+def test_what_a_task_counts_is_shown_and_drawn() -> None:
+    """Its own live statistics, and how far the kicks' curriculum has come; what has a line of its own is there once."""
+
+    class Counts(LeggedRobot):
+        def _live_statistics(self) -> dict[str, torch.Tensor]:
+            return super()._live_statistics() | {"my_figure": torch.tensor([14.0, 2.0])}
+
+    env = make_env(2, {"perturbation.kick": True, "perturbation.curriculum": True}, env_class=Counts)
+    env.perturbation.kick_level.copy_(torch.tensor([0.25, 0.5]))
+    numbers = {**env.read_statistics(), "learning_rate": 1e-3, "action_std": 0.5}
+    rows, drawn = console_rows(numbers, {}, 9.0, 1.0, 1.0), curves(numbers, {}, 9.0, 1.0, 1.0, 1)
+    assert (rows["My figure"], rows["Kick level"]) == ("7.00", "0.38")
+    assert {name: value for name, value in drawn.items() if name.startswith("Curriculum/")} == {
+        "Curriculum/my_figure": 7.0,
+        "Curriculum/kick_level": 0.375,
+    }

@@ -1,7 +1,8 @@
 """Checks a task before it is trained: on a CPU, in a second, that its step can be recorded; the line that breaks a law is named.
 
 A recorded step is replayed as it was. It may not ask the host for a value, copy from it, or have a shape that depends on
-data (``check/recordable.py``). Every tensor stays where it was, Python numbers stay what they were, and rewards only read.
+data (``check/recordable.py``). Every tensor stays where it was, Python numbers stay what they were, also between steps where a
+training changes what the step reads, nothing draws from Python's or numpy's random numbers, and rewards only read.
 """
 
 from __future__ import annotations
@@ -11,8 +12,9 @@ import functools
 import inspect
 import random
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
+from operator import delitem, setitem
 from types import FrameType
 from typing import Any
 
@@ -20,16 +22,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legged_mw.check.recordable import Guard, recordable
+from legged_mw.check.recordable import Births, Guard, recordable
 from legged_mw.envs.own_code import check_term, place_of
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.suspects import BOUND
-from legged_mw.utils.config import Config
+from legged_mw.envs.worlds import CONTAINERS, parts
 from legged_mw.utils.errors import NotRecordable, StepError, UserError, in_short, is_library, line_of, line_to_blame
 from legged_mw.utils.task import LoadedTask
 
 _WORLDS, _STEPS = 4, 3
+
+_DRAWN = "draws Python's or numpy's random numbers, but a replay repeats what was recorded; write torch.rand(..., device=self.device)"
 
 Path = tuple[str | int, ...]  # attributes, keys and places that lead from the environment to what it holds
 
@@ -41,7 +45,14 @@ def check_recordable(task: LoadedTask) -> None:
     for a method that raises, or returns NaN or the wrong shape. Random numbers go on as if it had not been called.
     """
     guard = Guard()
-    with _nothing_changed():
+    for kind in _own_kinds(task.env_class):
+        for name, value in (_of_file(kind) | dict(vars(kind))).items():
+            if isinstance(value, Tensor):
+                what = (
+                    f"{name} is made where its file is read, on the host, and the step reads it; make it in _init_buffers, on self.device"
+                )
+                guard.on_host[value.untyped_storage().data_ptr()] = value, what, kind.__name__
+    with _nothing_changed(), Births(guard):
         try:
             env = _watched(task.env_class, guard)(_tiny(task.cfg), "cpu", True)
             for name in ("step", "reset", "refresh"):  # the engine of a CPU may ask the host
@@ -75,11 +86,21 @@ def _tiny(cfg: RobotTaskCfg) -> RobotTaskCfg:
 
 def _own_methods(env_class: type) -> list[str]:
     """What the user's classes have in the place of ours, each with its line: where our code fails, one of these is not what it expects."""
-    own, found = [kind for kind in env_class.__mro__ if not kind.__module__.startswith("legged_mw.") and kind is not object], []
-    for kind in own:
+    found = []
+    for kind in _own_kinds(env_class):
         names = [name for name in vars(kind) if name == "__init__" or not name.startswith(("__", "_abc"))]
         found += [(kind, name, vars(kind)[name]) for name in names if hasattr(kind.__mro__[1], name) or name.startswith("_reward_")]
     return [place_of(value) if inspect.isroutine(value) else f"{kind.__name__}.{name} = {value!r:.40}" for kind, name, value in found]
+
+
+def _own_kinds(env_class: type) -> list[type]:
+    """The classes of an environment that are the user's."""
+    return [kind for kind in env_class.__mro__ if not kind.__module__.startswith("legged_mw.") and kind is not object]
+
+
+def _of_file(kind: type) -> dict[str, Any]:
+    """What the file of a class holds beside it."""
+    return vars(sys.modules[kind.__module__]) if kind.__module__ in sys.modules else {}
 
 
 def _watched(env_class: type[RobotTask], guard: Guard) -> type[Any]:
@@ -152,20 +173,32 @@ def _check_rows(env: RobotTask) -> None:
 
 def _check_steps(env: RobotTask, guard: Guard) -> None:
     def step(watch: bool = True) -> None:
-        env.episode_length_buf = torch.arange(_WORLDS) % 2 * env.max_episode_length  # every second episode ends
-        actions = torch.rand(_WORLDS, env.num_actions).mul_(2.0).sub_(1.0)
+        env.episode_length_buf = torch.arange(_WORLDS, device=env.device) % 2 * env.max_episode_length  # every second episode ends
+        actions = torch.rand(_WORLDS, env.num_actions, device=env.device).mul_(2.0).sub_(1.0)
         with recordable(guard) if watch else nullcontext():
             env.step(actions)
 
+    def first() -> None:
+        env.anneal(0.0)
+        step(watch=False)
+
     # on a GPU the first steps are not recorded: what is made once, may be made there; what __init__ made must stay
-    _check_kept(env, {path: value for path, value in _held(env) if isinstance(value, Tensor)}, lambda: step(watch=False), alone=True)
+    _check_kept(env, {path: value for path, value in _held(env) if isinstance(value, Tensor)}, first, alone=True)
+    state = env.training_state()
+    states = _draws(env)
     for _ in range(_STEPS):
+        drawn = states()
         _check_kept(env, dict(_held(env)), step)
+        if states() != drawn:
+            raise NotRecordable(_DRAWN, _line_that_changes(step, states, type(env).__name__))
         for group, rows in env.observations.groups.items():
             for row in rows:
                 bad = ~(row.value.float().abs() <= BOUND) & ~env.broken[:, None]  # what the step puts 0 for
                 if not row.group and bool(bad.any()):
                     raise StepError(f"row '{row.name}' of '{group}' is not finite, or beyond {BOUND:g}", place_of(env.observation_rows))
+    # what a training calls between steps that are recorded by then
+    for call in (lambda: env.anneal(0.5), env.domain_rand.redraw, lambda: env.load_training_state(state)):
+        _check_kept(env, dict(_held(env)), call)
 
 
 def _check_kept(env: RobotTask, before: dict[Path, Any], step: Callable[[], None], alone: bool = False) -> None:
@@ -173,12 +206,28 @@ def _check_kept(env: RobotTask, before: dict[Path, Any], step: Callable[[], None
     places = {path: _place(value) for path, value in before.items()}
     step()
     after = {path: _place(value) for path, value in _held(env)}
-    for path in places if alone else [*places, *after]:
-        if places.get(path) != after.get(path):
-            what = f"{_shown(path)} becomes another tensor; make it once, in __init__, and write in place: {_shown(path)}.copy_(...)"
-            if isinstance(before.get(path), int | float):
-                what = f"{_shown(path)} is a Python number and changes, but a replay repeats what was recorded; make it a tensor"
-            raise NotRecordable(what, _line_that_changes(step, env, path, before))
+    other = [path for path in (places if alone else places | after) if places.get(path) != after.get(path)]
+    if other:
+        path, now = other[0], _at(env, other[0])
+        what = f"{_shown(path)} becomes another tensor; make it once, in __init__, and write in place: {_shown(path)}.copy_(...)"
+        if isinstance(before.get(path, now), int | float):
+            what = f"{_shown(path)} is a Python number and changes, but a replay repeats what was recorded; make it a tensor"
+        for each in reversed(other):
+            _put_back(env, each, before)
+        raise NotRecordable(what, _line_that_changes(step, lambda: _place(_at(env, path)), type(env).__name__))
+
+
+def _draws(env: RobotTask) -> Callable[[], list[object]]:
+    """What tells the states of Python's and numpy's generators: the global ones, those that ``env`` holds, those of the user's files."""
+    files = [value for kind in _own_kinds(type(env)) for value in _of_file(kind).values()]
+    values = [*files, *(value for _, value in _held(env))]
+    python = [value for value in values if isinstance(value, random.Random)]
+    numpy = [getattr(value, "bit_generator", value) for value in values if isinstance(value, np.random.Generator)]
+    return lambda: [
+        random.getstate(),
+        *(each.getstate() for each in python),
+        *(str(each.state) for each in [np.random.get_bit_generator(), *numpy]),
+    ]
 
 
 @contextmanager
@@ -199,27 +248,21 @@ def _nothing_changed() -> Iterator[None]:
 
 
 def _held(owner: Any, path: Path = (), seen: set[int] | None = None) -> Iterator[tuple[Path, Any]]:
-    """Tensors and numbers that ``owner`` and its parts hold, also inside dicts and lists; of the simulation the tensors alone."""
+    """Tensors, numbers and generators that ``owner`` and its parts hold, also inside containers; of the simulation the tensors alone."""
     seen = set() if seen is None else seen
-    for key, value in _entries(owner).items():
-        if isinstance(value, Tensor) or (isinstance(value, int | float) and path[:1] != ("sim",)):
+    for key, value in parts(owner).items():
+        if isinstance(value, Tensor) or (isinstance(value, int | float | random.Random | np.random.Generator) and path[:1] != ("sim",)):
             yield (*path, key), value
-        elif (isinstance(value, dict | list | tuple) or _is_part(value)) and id(value) not in seen:
+        elif _is_part(value) and id(value) not in seen:
             seen.add(id(value))
             yield from _held(value, (*path, key), seen)
 
 
-def _entries(owner: Any) -> dict[Any, Any]:
-    if isinstance(owner, list | tuple):
-        return dict(enumerate(owner))
-    return dict(owner if isinstance(owner, dict) else vars(owner))
-
-
 def _is_part(value: Any) -> bool:
-    """Whether it is an object of a class of legged_mw's or of the user's, and no config."""
+    """Whether it is a container, or an object of a class of legged_mw's or of the user's."""
     module = type(value).__module__
     file = getattr(sys.modules.get(module), "__file__", None) or "<built in>"
-    return hasattr(value, "__dict__") and not isinstance(value, Config) and not is_library(module, file)
+    return isinstance(value, CONTAINERS) or not is_library(module, file)
 
 
 def _place(value: Any) -> object:
@@ -229,7 +272,7 @@ def _place(value: Any) -> object:
 
 def _at(owner: Any, path: Path) -> Any:
     for key in path:
-        owner = None if owner is None else _entries(owner).get(key)
+        owner = None if owner is None else parts(owner).get(key)
     return owner
 
 
@@ -238,26 +281,31 @@ def _shown(path: Path) -> str:
 
 
 def _put_back(owner: Any, path: Path, before: dict[Path, Any]) -> None:
-    holder: Any = _at(owner, path[:-1])
-    holder = holder if isinstance(holder, dict | list | tuple) else vars(holder)
-    if path in before and not isinstance(holder, tuple):
-        holder[path[-1]] = before[path]
-    elif not isinstance(holder, tuple):
-        del holder[path[-1]]
+    holder, key = _at(owner, path[:-1]), path[-1]
+    put, remove = (setattr, delattr) if isinstance(key, str) and not isinstance(holder, Mapping) else (setitem, delitem)
+    with suppress(TypeError):  # of a tuple
+        put(holder, key, before[path]) if path in before else remove(holder, key)
 
 
-def _line_that_changes(step: Callable[[], None], env: RobotTask, path: Path, before: dict[Path, Any]) -> str:
-    """Put back what was ``before`` and make another step; watch line by line for the one that changes what is at ``path``."""
-    _put_back(env, path, before)
-    place = _place(_at(env, path))
-    last, found = type(env).__name__, ""
+def _line_that_changes(step: Callable[[], None], look: Callable[[], object], otherwise: str) -> str:
+    """Make another step; watch line by line for the one, of the user's if it is called from there, that changes what ``look`` returns."""
+    place, last, found, own = look(), otherwise, "", sys._getframe()
+
+    def users(frame: FrameType) -> FrameType:
+        each: FrameType | None = frame
+        while each and each is not own:
+            if not _library(each) and not each.f_globals.get("__name__", "").startswith("legged_mw."):
+                return each
+            each = each.f_back
+        return frame
 
     def trace(frame: FrameType, event: str, arg: object) -> Any:
         nonlocal last, found
-        if not found and _place(_at(env, path)) != place:
+        if not found and look() != place:
             found = last
         at = frame.f_back if event == "return" else frame
         if at and not _library(at):
+            at = users(at)
             last = line_of(at.f_code, at.f_lineno)
         return None if _library(frame) else trace
 
@@ -267,7 +315,7 @@ def _line_that_changes(step: Callable[[], None], env: RobotTask, path: Path, bef
         step()
     finally:
         sys.settrace(debugger)
-    return found or type(env).__name__
+    return found or otherwise
 
 
 def _library(frame: FrameType) -> bool:

@@ -1,19 +1,24 @@
-"""What a recorded step may not do, caught on a CPU where it is done: ask the host, copy from it, or depend on data for a shape."""
+"""What a recorded step may not do, caught on a CPU where it is done: ask the host, copy from it, or depend on data for a shape.
+
+On a CPU all tensors are on the same device. So those that the user's code makes without naming one are noted (``Births``).
+"""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import FrameType
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 from legged_mw.utils import math
-from legged_mw.utils.errors import NotRecordable
+from legged_mw.utils.errors import NotRecordable, is_library, line_of
 
 # Seen by name, because on a CPU some of them reach no kernel at all.
 _CONDITIONS = {"__bool__", "is_nonzero", "__contains__"}
@@ -30,10 +35,14 @@ _INDEXED = {"index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_ind
 
 
 class Guard:
-    """What is watched at the moment: calls while ``on``, and then ``on_write`` is called with each tensor that is written to."""
+    """What is watched at the moment: calls while ``on``, and then ``on_write`` is called with each tensor that is written to.
+
+    ``on_host``: address -> a tensor that would be on the host, kept so that its place stays its own; what is wrong with it; where.
+    """
 
     def __init__(self) -> None:
         self.on = False
+        self.on_host: dict[int, tuple[Tensor, str, str]] = {}
         self.on_write: Callable[[Tensor], None] | None = None
 
     @contextmanager
@@ -45,6 +54,29 @@ class Guard:
             yield
         finally:
             vars(self).update(before)
+
+
+class Births(TorchFunctionMode):
+    """Notes what the user's code makes without a device, and what is computed from nothing else."""
+
+    def __init__(self, guard: Guard) -> None:
+        super().__init__()
+        self._known = guard.on_host
+
+    def __torch_function__(self, func: Callable[..., Any], types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+        kwargs = kwargs or {}
+        result, name = func(*args, **kwargs), getattr(func, "__name__", "")
+        if name == "to" and _moves(args[1:], kwargs):  # which is nothing on a CPU
+            return result.clone() if _address(result) in self._known else result
+        made = [value for value in (result if isinstance(result, tuple | list) else [result]) if isinstance(value, Tensor)]
+        fresh = [value for value in made if _address(value) not in self._known] if kwargs.get("device") is None else []
+        given = [self._known.get(_address(value)) for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)] if fresh else []
+        source = given[0] if given and all(given) else None
+        if not given and name in _FACTORIES | _HOST_WRITES and func is getattr(torch, name, None) and (where := _users_line()):
+            source = None, f"{name}() without a device makes a tensor on the host, which the step reads; add device=self.device", where
+        if source:
+            self._known.update({_address(value): (value, *source[1:]) for value in fresh if value.numel()})
+        return result
 
 
 class _FunctionGuard(TorchFunctionMode):
@@ -72,6 +104,10 @@ class _DispatchGuard(TorchDispatchMode):
         kwargs = kwargs or {}
         if self.guard.on and (found := _breach_of_kernel(func, args)):
             raise NotRecordable(found)
+        if self.guard.on and self.guard.on_host:
+            for value in tree_leaves((args, kwargs)):
+                if isinstance(value, Tensor) and (known := self.guard.on_host.get(_address(value))):
+                    raise NotRecordable(*known[1:])
         if self.guard.on and self.guard.on_write:
             for i, argument in enumerate(func._schema.arguments):
                 if argument.alias_info is not None and argument.alias_info.is_write:
@@ -121,6 +157,18 @@ def _breach_of_kernel(func: Any, args: tuple) -> str:
     if name in _INDEXED and any(index is not None and index.dtype in (torch.bool, torch.uint8) for index in args[1]):
         return "a mask as an index has a shape that depends on data; write torch.where(mask, a, b), or assign(x, mask, value)"
     return ""
+
+
+def _address(tensor: Tensor) -> int:
+    return tensor.untyped_storage().data_ptr()
+
+
+def _users_line() -> str:
+    """The line of the user's that is running, unless code of legged_mw's does that it calls; ""."""
+    frame: FrameType | None = sys._getframe()
+    while frame and is_library(frame.f_globals.get("__name__", ""), frame.f_code.co_filename):
+        frame = frame.f_back
+    return "" if not frame or frame.f_globals.get("__name__", "").startswith("legged_mw.") else line_of(frame.f_code, frame.f_lineno)
 
 
 def _is_scalar_index(index: object) -> bool:

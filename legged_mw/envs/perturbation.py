@@ -53,6 +53,11 @@ class Perturbation:
         """
         assign(self.kick_level, mask & (survived >= 0.0), torch.lerp(self.kick_level, survived, self.cfg.curriculum_rate))
 
+    def statistics(self) -> dict[str, Tensor]:
+        """The mean level of the kicks, where a curriculum raises it: (2,) a sum and what to divide it by."""
+        level = self.kick_level
+        return {"kick_level": torch.stack([level.sum(), torch.full_like(level[0], len(level))])} if self.cfg.curriculum else {}
+
     def reset(self, mask: Tensor) -> None:
         """An episode begins where ``mask`` (N,) is true."""
         if self.cfg.kick:

@@ -10,9 +10,10 @@ Sources: [P] MuJoCo Playground; [L] legged_gym; [U] unitree_rl_gym, which is leg
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
-from typing import ClassVar
+from types import CodeType
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -72,19 +73,30 @@ class RobotRewards:
         return {name: float(scale) for name, scale in self.cfg.to_dict()["rewards"]["scales"].items() if scale}
 
     def _sensed_on_demand(self) -> list[str]:
-        """Sensors of ``ON_DEMAND`` whose values a term that is on reads, or that ``asset.sense`` names."""
-        asked = self.cfg.asset.sense
-        for name in asked:
-            if name not in self.ON_DEMAND:
-                raise ConfigError(f"asset.sense: {unknown('value', name, self.ON_DEMAND, type(self).__name__)}")
-        terms = [inspect.unwrap(getattr(type(self), f"_reward_{name}", need)) for name in self._active_scales()]
-        read = {word for term in terms for word in getattr(term, "__code__", need.__code__).co_names}
-        return [sensor for name, sensor in self.ON_DEMAND.items() if name in read or name in asked]
+        """Sensors of ``ON_DEMAND`` whose values a term that is on reads, and all that ``asset.sense`` names, of the file too."""
+        asked, read = self.cfg.asset.sense, self._names_in_terms()
+        values = [sensor for name, sensor in self.ON_DEMAND.items() if name in read or name in asked]
+        return [*values, *(name for name in asked if name not in self.ON_DEMAND)]
+
+    def _names_in_terms(self) -> set[str]:
+        """Names that the terms that are on read, and the methods that they name, also those of a parent, which ``super()`` calls."""
+        found, ahead = set[str](), [f"_reward_{name}" for name in self._active_scales()]
+        while ahead:
+            if (name := ahead.pop()) not in found:
+                found.add(name)
+                ahead += [word for kind in type(self).__mro__ for word in _names_in(vars(kind).get(name))]
+        return found
 
     def _sensed_value(self, name: str) -> Tensor:
         if name not in self._sensed:
-            raise ConfigError(f"{name} is not sensed, for no reward term that is on reads it; write asset.sense = ['{name}'] in the config")
+            raise ConfigError(f"{name} is not sensed, for no reward term that is on names it; write asset.sense = ['{name}'] in the config")
         return self._sensed[name]
+
+    def sensor(self, name: str) -> Tensor:
+        """(N, size) What the sensor called so in the robot's file measured in the last substep: a view, whose place is fixed."""
+        if name in self.robot.file_sensors and not self.robot.spec.sensor(name):
+            raise ConfigError(f"sensor '{name}' of the robot's file was dropped; write asset.sense = ['{name}'] in the config")
+        return self.sim.sensordata[:, self.robot.columns(name)]
 
     @property
     def self_contacts(self) -> Tensor:
@@ -99,6 +111,10 @@ class RobotRewards:
     def _init_robot_rewards(self) -> None:
         """What terms need beside the state, where they are on."""
         on, rewards, robot = self._active_scales(), self.cfg.rewards, self.robot
+        known = [*self.ON_DEMAND, *robot.file_sensors]
+        for name in self.cfg.asset.sense:
+            if name not in known:
+                raise ConfigError(f"asset.sense: {unknown('value or sensor', name, known, f'{type(self).__name__} and its file')}")
         spans = {name: robot.sensors.get(sensor) for name, sensor in self.ON_DEMAND.items()}
         self._sensed = {name: self.sim.sensordata[:, span] for name, span in spans.items() if span}
         if "dof_acc" in on:
@@ -262,6 +278,16 @@ class RobotRewards:
         """How many contacts the robot has with itself. [M; its G1 -1]"""
         need(self.cfg.asset.self_collisions, "self_collision", "asset.self_collisions is False, so that parts pass through one another")
         return self.self_contacts[:, 0].clone()
+
+
+def _names_in(method: Any) -> Iterator[str]:
+    """Names in the code of a method or a property, and in what is written inside of it."""
+    method = getattr(method, "fget", None) or getattr(method, "func", method)
+    codes = [getattr(inspect.unwrap(getattr(method, "__func__", method)), "__code__", None)]
+    for code in codes:
+        if code:
+            yield from code.co_names
+            codes += [each for each in code.co_consts if isinstance(each, CodeType)]
 
 
 def need(given: bool, term: str, what: str) -> None:

@@ -291,7 +291,8 @@ class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
 
     def _live_statistics(self) -> dict[str, Tensor]:
         """Values as they stand: () a sum, or (2,) a sum and what to divide it by, so that ranks can add theirs."""
-        return {"overflowed": self.sim.overflowed_worlds(), **self.divergence.statistics()}  # worlds, so far
+        worlds = {"overflowed": self.sim.overflowed_worlds(), **self.divergence.statistics()}  # so far
+        return worlds | self.perturbation.statistics()
 
     def take_statistics(self) -> Tensor:
         """Sums since the last call and values as they stand (S,), on the device."""

@@ -71,7 +71,8 @@ class RobotTaskCfg(Config):
         self_collisions: bool = False  # among the colliders
         penalize_contacts_on: list[str] = []  # likewise, colliders: `collision` counts their bodies on the ground [L]
         terminate_after_contacts_on: list[str] = []  # likewise: to touch the ground with one of these is a fall [L]
-        sense: list[str] = []  # of contact_forces, self_contacts, angular_momentum, what code of yours reads outside of reward terms
+        # what code of yours reads outside of reward terms: contact_forces, self_contacts, angular_momentum, sensors of the file by name
+        sense: list[str] = []
         held_joints: list[str] = []  # names or patterns: welded at their default angle, so that they are no joints any more
         # tables a joint that need not name every joint; the others keep the file's
         effort: dict[str, Positive] = {}  # highest force of the servo, both ways [N m]

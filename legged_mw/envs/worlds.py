@@ -5,13 +5,16 @@ Found, not listed, so that a task's own buffers are there too: whatever is writt
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from enum import Enum
-from types import FunctionType, MethodType, ModuleType
+from pathlib import PurePath
+from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
 from typing import Any
 
 import numpy as np
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from legged_mw.envs.robot_task import RobotTask
@@ -20,10 +23,13 @@ from legged_mw.sim.graph import StepGraph
 from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
 from legged_mw.utils.config import Config
 
-_OTHERS = (str, bytes, int, float, type, Enum, Config, nn.Module, ModuleType, FunctionType, MethodType, Simulation, StepGraph)
+CONTAINERS = (dict, list, tuple, deque, TensorDictBase, nn.Module)
+_PLAIN = (str, bytes, int, float, complex, slice, range, type, Enum, PurePath, torch.device, torch.dtype, np.generic, np.dtype)
+_OTHERS = (*_PLAIN, Config, ModuleType, FunctionType, BuiltinFunctionType, MethodType, Simulation, StepGraph)
 _LIBRARIES = ("torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl")
 _WORTH_FUSING = 5_000  # control steps: kernels take a CPU seconds to compile, once a machine
 _FACTS = ("robot", "terrain", "clips")  # of the task, which no step changes
+_MODELS = ("MjModel", "MjSpec")  # nor these
 
 
 def worlds_state(env: RobotTask) -> dict[str, Tensor]:
@@ -35,6 +41,9 @@ def worlds_state(env: RobotTask) -> dict[str, Tensor]:
 def put_worlds(env: RobotTask, state: dict[str, Tensor]) -> str:
     """Put back what ``worlds_state`` returned. Returns why that cannot be, and then nothing has changed; '' if it is done."""
     own = everything(env)
+    for name, thing, _ in _reach(env, "", set()):
+        if not isinstance(thing, Tensor):
+            return f"what {name} remembers, a {type(thing).__name__}, is not kept"
     for name, value in state.items():
         if name not in own or own[name].shape != value.shape or own[name].dtype != value.dtype:
             return f"{name} is {_words(value)} there and {_words(own.get(name))} here"
@@ -85,6 +94,8 @@ def _memory(env: RobotTask) -> dict[str, tuple[Tensor, bool]]:
     seen = {value.untyped_storage().data_ptr() for value in env.sim.memory().values()}
     found: dict[str, tuple[Tensor, bool]] = {}
     for name, value, written in _reach(env, "", set()):
+        if not isinstance(value, Tensor):
+            continue
         storage = value.untyped_storage()
         if storage.nbytes() and storage.data_ptr() not in seen:
             seen.add(storage.data_ptr())
@@ -92,24 +103,37 @@ def _memory(env: RobotTask) -> dict[str, tuple[Tensor, bool]]:
     return found
 
 
-def _reach(thing: Any, path: str, done: set[int]) -> Iterator[tuple[str, Tensor, bool]]:
-    """(dotted name, tensor, whether it was ever written) of all tensors and arrays of numbers that ``thing`` holds."""
+def _reach(thing: Any, path: str, done: set[int]) -> Iterator[tuple[str, Any, bool]]:
+    """(dotted name, tensor, whether it was ever written) of all tensors and arrays of numbers that ``thing`` holds.
+
+    In the place of a tensor stands what may remember something and is not looked into.
+    """
     if isinstance(thing, Tensor):
         yield path, thing, thing.is_inference() or thing._version > 0
+    elif thing is None or isinstance(thing, _OTHERS) or id(thing) in done or type(thing).__name__ in _MODELS:
+        return
     elif isinstance(thing, np.ndarray):
-        if thing.flags.writeable and thing.flags.c_contiguous and thing.dtype.kind in "fib":
-            yield path, torch.from_numpy(thing), True
-    elif thing is not None and not isinstance(thing, _OTHERS) and id(thing) not in done:
+        if thing.flags.writeable:
+            known = thing.flags.c_contiguous and thing.dtype.kind in "fib"
+            yield path, torch.from_numpy(thing) if known else thing, True
+    else:
         done.add(id(thing))
-        for name, value in _parts(thing):
-            yield from _reach(value, f"{path}.{name}" if path else name, done)
+        held = parts(thing)
+        library = type(thing).__module__.partition(".")[0] in _LIBRARIES
+        empty = isinstance(thing, set | frozenset) and all(isinstance(each, _OTHERS) for each in thing)
+        if not isinstance(thing, CONTAINERS) and not empty and (library or not (held or hasattr(thing, "__dict__"))):
+            yield path, thing, True
+            return
+        for name, value in held.items():
+            if name not in _FACTS or isinstance(thing, CONTAINERS):
+                yield from _reach(value, f"{path}.{name}" if path else str(name), done)
 
 
-def _parts(thing: Any) -> list[tuple[str, Any]]:
-    if isinstance(thing, dict):
-        return [(str(key), value) for key, value in thing.items()]
-    if isinstance(thing, list | tuple):
-        return [(str(i), value) for i, value in enumerate(thing)]
-    if type(thing).__module__.partition(".")[0] in _LIBRARIES:
-        return []
-    return [(name, value) for name, value in getattr(thing, "__dict__", {}).items() if name not in _FACTS]
+def parts(thing: Any) -> dict[Any, Any]:
+    """What ``thing`` holds, by key, place or name: a container, or an object with attributes or slots."""
+    if isinstance(thing, dict | TensorDictBase):
+        return dict(thing.items())
+    if isinstance(thing, list | tuple | deque):
+        return dict(enumerate(thing))
+    state = object.__getstate__(thing)  # attributes; or those, and slots
+    return {name: value for held in (state if isinstance(state, tuple) else [state]) for name, value in (held or {}).items()}

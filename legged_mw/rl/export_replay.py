@@ -85,10 +85,7 @@ def _measure(env: RobotTask, fleet: Fleet) -> Measurement:
     now, contract = fleet.read(), fleet.contract
 
     def sensed(names: Sequence[str]) -> np.ndarray:
-        model, parts = env.robot.physics, []
-        for index in (env.robot.id("sensor", name) for name in names):
-            start = model.sensor_adr[index]
-            parts.append(env.sim.sensordata[:, start : start + model.sensor_dim[index]])
+        parts = [env.sim.sensordata[:, env.robot.columns(name)] for name in names]
         return torch.cat(parts, dim=1).numpy().copy()
 
     own = {row.name: sensed(row.sensors) for row in contract.rows if row.sensors}

@@ -11,7 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-CURRICULA = ("terrain_level", "command_share", "body_error", "pull")  # what such statistics, and others of the moment, begin with
+_KNOWN = ("reward", "episode_length", "episodes", "fell", "broken", "overflowed", "learning_rate", "action_std")
+_APART = ("rew_", "broken_by")  # shown by other lines, or where a training ends
 
 Mark = torch.cuda.Event | float
 
@@ -103,7 +104,7 @@ def console_rows(numbers: dict[str, float], losses: dict[str, float], speed: flo
         "Mean reward": mean("reward", 2),
         "Mean episode length": mean("episode_length", 1),
         **{name: mean(name, 4) for name in numbers if name.startswith("rew_")},
-        **{name.replace("_", " ").replace("/", ", ").capitalize(): mean(name, 2) for name in numbers if name.startswith(CURRICULA)},
+        **{name.replace("_", " ").replace("/", ", ").capitalize(): mean(name, 2) for name in _of_the_task(numbers)},
         "Episodes ended": f"{numbers['episodes']:.0f} ({numbers['fell']:.0f} falls, {numbers['broken']:.0f} not finite)",
     }
 
@@ -120,5 +121,10 @@ def curves(
         **{f"Episode/{name}": value for name, value in numbers.items() if name.startswith("rew_")},
         **{"Episode/fell": numbers["fell"], "Episode/broken": numbers["broken"], "Train/total_steps": total_steps},
         "Sim/overflowed_worlds": numbers["overflowed"],  # so far
-        **{f"Curriculum/{name}": value for name, value in numbers.items() if name.startswith(CURRICULA)},
+        **{f"Curriculum/{name}": numbers[name] for name in _of_the_task(numbers)},
     }
+
+
+def _of_the_task(numbers: dict[str, float]) -> list[str]:
+    """Names of the task's own statistics of the moment: levels of curricula, and whatever its ``_live_statistics`` adds."""
+    return [name for name in numbers if name not in _KNOWN and not name.startswith(_APART)]

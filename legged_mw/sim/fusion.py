@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from legged_mw.utils.math import alike
-from legged_mw.utils.trace import Trace
+from legged_mw.utils.trace import Call, Trace
 
 _CLOSE, _STRAYS = 1e-3, 0.01  # of all that a step writes: rounding goes through physics, and may turn a comparison
 
@@ -37,7 +38,7 @@ def _fused(
 ) -> Callable[[], None]:
     from legged_mw.sim.fused import Fused  # it needs warp
 
-    with Trace(watched) as trace:
+    with _Recorder(memory, watched) as trace:
         fn()
     expected = {name: value.clone() for name, value in memory.items()}
     put_back()
@@ -48,11 +49,48 @@ def _fused(
     put_back()
     for block in trace.made:  # each is written anew
         trace.blocks[block].fill_(float("nan") if trace.blocks[block].is_floating_point() else 1)
-    program()
-    for name, value in memory.items():
-        if not alike(expected[name], value, _CLOSE, _STRAYS):
-            raise RuntimeError(f"{name} is another than by the step as it is written; does it do something that torch does not see?")
+    other, calls = set[str](), iter(trace.calls)
+
+    def compare(wanted: Mapping[str, Tensor]) -> None:
+        other.update(name for name, value in wanted.items() if not alike(value, memory[name], _CLOSE, _STRAYS))
+
+    for part in program.parts:
+        if not isinstance(part, Call):
+            part()
+            continue
+        before, after = next(calls)
+        compare(before)
+        part.run()
+        for name, value in after.items():
+            memory[name].copy_(value)
+    compare(expected)
+    if other:
+        names = sorted(other, key=lambda name: (name.startswith("sim."), name))  # the task's own first
+        shown, are = ", ".join(names[:5]) + ", ..." * (len(names) > 5), "is another" if len(names) == 1 else "are others"
+        raise RuntimeError(f"{shown} {are} than by the step as it is written; does it do something that torch does not see?")
     return program
+
+
+class _Recorder(Trace):
+    """A trace that also keeps what of ``memory`` each call of the simulator changed, before and after it.
+
+    A simulator need not do the same twice: on a GPU chance orders contacts, and decides which are lost where there is no room.
+    So a fused step is compared between its calls, and goes on from what they did the first time.
+    """
+
+    def __init__(self, memory: Mapping[str, Tensor], watched: Iterable[Tensor]) -> None:
+        super().__init__(watched)
+        self._memory, self.calls = memory, list[tuple[dict[str, Tensor], dict[str, Tensor]]]()
+
+    def call(self, run: Callable[[], object], given: Iterable[Tensor] = ()) -> Any:
+        self._paused = True
+        before = {name: value.clone() for name, value in self._memory.items()}
+        result = super().call(run, given)
+        self._paused = True
+        after = {name: value.clone() for name, value in self._memory.items() if not torch.equal(value, before[name])}
+        self._paused = False
+        self.calls.append(({name: before[name] for name in after}, after))
+        return result
 
 
 def remember(memory: Mapping[str, Tensor]) -> Callable[[], None]:

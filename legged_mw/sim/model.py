@@ -65,6 +65,7 @@ class RobotModel:
     speed_limits: tuple[float, ...] = ()  # (D,) of the motors, unknown to the physics [rad/s]; infinite where nothing states one
     tables: dict[str, list[float]] = field(default_factory=dict)  # (D,) each, of the tables that were given
     keyframe: Keyframe | None = None  # the file's
+    file_sensors: tuple[str, ...] = ()  # names of its sensors, of which ``more_sensors`` are kept, and those that feel contact
 
     @property
     def joint_range(self) -> np.ndarray:
@@ -83,8 +84,14 @@ class RobotModel:
         first = names.index(GROUND)
         return slice(first, first + sum(name == GROUND or name.startswith(f"{GROUND}/") for name in names))
 
+    def columns(self, sensor: str) -> slice:
+        """Of sensordata, those of the sensor called so."""
+        index = self.id("sensor", sensor)
+        start = int(self.physics.sensor_adr[index])
+        return slice(start, start + int(self.physics.sensor_dim[index]))
+
     def id(self, kind: str, name: str) -> int:
-        """Index of the ``kind`` ("body", "geom", "site") called ``name``."""
+        """Index of the ``kind`` ("body", "geom", "site", "sensor") called ``name``."""
         obj = getattr(mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
         index = mujoco.mj_name2id(self.physics, obj, name)
         if index < 0:
@@ -111,11 +118,11 @@ def build_model(
     tables: Mapping[str, Mapping[str, float]] = {},  # what -> a table, as for per_joint: for ``RobotModel.tables``
     held_joints: Sequence[str] = (),  # names or patterns: welded at the pose
     partial: Mapping[str, Mapping[str, float]] | None = None,  # of PARTIAL, as for some_joints: what the caller knows better than the file
-    more_sensors: Collection[str] = (),  # names of sensors.py: what else is sensed
+    more_sensors: Collection[str] = (),  # what else is sensed: names of sensors.py, or of the file's own sensors
     drive: Drive = "angle",  # what `ctrl` means; with joints.CURVE in `tables` motors have torque-speed curves
 ) -> RobotModel:
     """Compile the MJCF or URDF at ``file`` for stepping."""
-    robot = read_robot(file)
+    robot = read_robot(file, more_sensors)
     spec, notes = robot.spec, robot.notes
     with naming(file):
         posed = pose_joints(robot, {"`stiffness`": stiffness, "`damping`": damping, **tables}, pose, held_joints)
@@ -168,6 +175,7 @@ def _compile(
         speed_limits=speeds,
         tables=posed.tables,
         keyframe=robot.keyframe,
+        file_sensors=robot.sensors,
     )
 
 

@@ -8,7 +8,7 @@ Whatever is dropped, added or renamed is a line of ``Loaded.notes``. Host only; 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,7 +46,7 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class Loaded:
-    """A robot alone: one root with a free joint, named joints, no actuators, sensors of its own only where they feel contact."""
+    """A robot alone: one root with a free joint, named joints, no actuators, of its own sensors those that feel contact or are wanted."""
 
     spec: mujoco.MjSpec
     model: mujoco.MjModel  # the same, compiled
@@ -55,6 +55,7 @@ class Loaded:
     limits: dict[str, Range]  # joint -> force [N m], of those that the file limits
     speeds: dict[str, float]  # joint -> highest speed [rad/s], likewise
     keyframe: Keyframe | None  # "home", or the only one
+    sensors: tuple[str, ...]  # names of the file's, kept or dropped
 
     @property
     def root(self) -> str:
@@ -67,8 +68,8 @@ class Loaded:
         return list(self.spec.joints)[1:]
 
 
-def read_robot(file: Path) -> Loaded:
-    """Read an MJCF or URDF. Raises ModelError for what is none, and for what cannot be a robot alone."""
+def read_robot(file: Path, wanted: Collection[str] = ()) -> Loaded:
+    """Read an MJCF or URDF; keep its sensors called as ``wanted``. Raises ModelError for what is none, or cannot be a robot alone."""
     if not file.is_file():
         raise ModelError(f"no {_kind(file)} at {file}")
     where, notes = file.name, []
@@ -81,7 +82,8 @@ def read_robot(file: Path) -> Loaded:
         _infer_inertias(spec)
         limits = take_limits(spec, notes)
         keyframe = _take_keyframe(spec, notes)
-        _drop_sensors(spec, notes)
+        sensors = tuple(sensor.name for sensor in spec.sensors if sensor.name)
+        _drop_sensors(spec, wanted, notes)
         _drop_world(spec, where, notes)
         _forget_defaults(spec)
         _free_root(spec, where, notes)
@@ -92,7 +94,7 @@ def read_robot(file: Path) -> Loaded:
         check_model(model)
         notes += [f"warning: {' '.join(str(each.message).split())}" for each in said]
     _check_joints(spec, where)
-    return Loaded(spec, model, where, notes, limits, speeds, keyframe)
+    return Loaded(spec, model, where, notes, limits, speeds, keyframe, sensors)
 
 
 @contextmanager
@@ -155,10 +157,10 @@ def tilt(quat: Sequence[float] | np.ndarray) -> float:
     return float(np.degrees(np.arccos(np.clip(w * w - x * x - y * y + z * z, -1.0, 1.0))))
 
 
-def _drop_sensors(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """What the state tells needs no sensor. Those that feel contact stay."""
+def _drop_sensors(spec: mujoco.MjSpec, wanted: Collection[str], notes: list[str]) -> None:
+    """What the state tells needs no sensor. Those that feel contact stay, and those that are wanted."""
     kept = {getattr(mujoco.mjtSensor, f"mjSENS_{name}", None) for name in _KEPT_SENSORS}
-    if dropped := [sensor for sensor in spec.sensors if sensor.type not in kept]:
+    if dropped := [sensor for sensor in spec.sensors if sensor.type not in kept and sensor.name not in wanted]:
         notes.append(f"sensors dropped, as nothing reads them: {', '.join(sensor.name or 'one without a name' for sensor in dropped)}")
     for sensor in dropped:
         spec.delete(sensor)
