@@ -69,7 +69,8 @@ class Source:
         """What MuJoCo makes of ``root``."""
         if self.file.suffix == ARCHIVE:  # which names nothing
             return mujoco.MjSpec.from_string(self.text)
-        return mujoco.MjSpec.from_file(str(self.file), include={self.file.name: self.text.encode(), **self._texts})
+        name = f"{self.file}.xml"  # MuJoCo goes by the ending, and warns on a line of its own where it knows none
+        return mujoco.MjSpec.from_file(name, include={os.path.basename(name): self.text.encode(), **self._texts})
 
     def take(self, name: str, path: str, folder: str) -> str:
         """Read what is included or attached, and return where MuJoCo finds it: in the same folder, by a name that nothing else has."""
@@ -81,7 +82,7 @@ class Source:
         if real not in self._parts:
             self._parts[real] = ""
             text = tostring(self._read(Path(path), folder), encoding="unicode")
-            self._parts[real] = place = f"{path}.{len(self._texts)} of {self.file.name}"
+            self._parts[real] = place = f"{path}.{len(self._texts)} of {self.file.name}.xml"
             self._texts[os.path.basename(place)] = text.encode()
         if not self._parts[real]:
             raise ValueError(f"it includes {name}, which is already included")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import mujoco
 import pytest
-from attack import Case, attack, program
+from attack import Case, attack, captured, program
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import read_contract
@@ -305,6 +305,13 @@ def test_what_vendors_write_is_read(text: bytes, tmp_path: Path) -> None:
     assert read_robot(tmp_path / "robot.xml").model.nv == 7
 
 
+def test_a_robot_needs_no_ending(tmp_path: Path) -> None:
+    given(GO1, "robot")(tmp_path)
+    with captured() as said:
+        assert read_robot(tmp_path / "robot").model.nv == 18
+    assert said == [""]
+
+
 def test_parts_are_found_as_mujoco_finds_them_and_read_once(tmp_path: Path) -> None:
     """Includes from the model's folder or their own, attached models by one name in two folders; files that change later do not count."""
     files = {
@@ -318,7 +325,7 @@ def test_parts_are_found_as_mujoco_finds_them_and_read_once(tmp_path: Path) -> N
     for name, text in files.items():
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text(text)
-    theirs = mujoco.MjSpec.from_file(str(tmp_path / "robot.xml"))
+    theirs = mujoco.MjSpec.from_file(str(tmp_path / "robot.xml"))  # pyright: ignore[reportAttributeAccessIssue]
     source = Source(tmp_path / "robot.xml")
     for name in files:
         (tmp_path / name).write_text("<mujoco/>")
