@@ -25,7 +25,7 @@ from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import make_terrain
 from legged_mw.utils.config import load_yaml, save_yaml
 from legged_mw.utils.files import digest
-from legged_mw.utils.mjcf import MOST_BYTES, check_files, write_archive
+from legged_mw.utils.mjcf import MOST_BYTES, Source, write_archive
 
 SHIPPED = ROOT / "resources/policies/go1_rough_scan"
 
@@ -161,7 +161,7 @@ def test_an_export_of_flat_ground_has_no_steps(export: Path) -> None:
     ],
 )
 def test_what_is_wrong_with_terrain_is_not_said_of_the_scene(right: str, wrong: str, message: str, export: Path) -> None:
-    text = check_files(SHIPPED / TERRAIN_FILE)
+    text = Source(SHIPPED / TERRAIN_FILE).text
     assert right in text
     write_archive(export / TERRAIN_FILE, text.replace(right, wrong))
     seal(export)
@@ -176,13 +176,13 @@ def test_an_archive_holds_one_model_that_stands_alone(tmp_path: Path, monkeypatc
     write_archive(file, "<mujoco/>")
     first = file.read_bytes()
     write_archive(file, "<mujoco/>")
-    assert file.read_bytes() == first and check_files(file, alone=True) == "<mujoco/>"
+    assert file.read_bytes() == first and Source(file, alone=True).text == "<mujoco />"
     monkeypatch.chdir(tmp_path)  # where a model of a text would look for what it names
     (tmp_path / "other.xml").write_text("<mujoco/>")
     for text in ('<mujoco><include file="other.xml"/></mujoco>', '<mujoco><asset><mesh file="m.obj"/></asset></mujoco>'):
         write_archive(file, text)
         with pytest.raises(ValueError, match=r"it names (other.xml|m.obj); the model of an archive stands alone"):
-            check_files(file)
+            Source(file)
 
 
 def _zipped(file: Path, method: int, *names: str, text: str = "<mujoco/>") -> bytes:
@@ -203,11 +203,11 @@ def test_a_broken_archive_is_one_line(tmp_path: Path) -> None:
     for content in broken:
         file.write_bytes(content)
         with suppress(ValueError):  # a byte of a date is no harm
-            assert check_files(file) == "<mujoco/>"
+            assert Source(file).text == "<mujoco />"
     for content in broken[:5]:
         file.write_bytes(content)
         with pytest.raises(ValueError, match="no zip file that can be read: "):
-            check_files(file)
+            Source(file)
 
 
 @pytest.mark.parametrize(
@@ -225,11 +225,11 @@ def test_another_archive_is_refused(method: int, names: tuple[str, ...], tmp_pat
     with pytest.raises(
         ValueError, match=f"it holds {', '.join(names) or 'nothing'}; an export's holds model.xml alone, deflated and of 64 MiB"
     ):
-        check_files(tmp_path / "terrain.mjz")
+        Source(tmp_path / "terrain.mjz")
 
 
 def test_an_archive_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None:
     _zipped(tmp_path / "terrain.mjz", zipfile.ZIP_DEFLATED, "model.xml", text=" " * (MOST_BYTES + 1))
     assert (tmp_path / "terrain.mjz").stat().st_size < 100_000
     with pytest.raises(ValueError, match="it holds model.xml; .* of 64 MiB at most"):
-        check_files(tmp_path / "terrain.mjz")
+        Source(tmp_path / "terrain.mjz")

@@ -1,6 +1,7 @@
 """Clips as files: read, resampled, checked; those of others; those that ship; and kinematics in torch beside MuJoCo's."""
 
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -70,6 +71,13 @@ def test_unitrees_csv(g1: RobotModel, tmp_path: Path) -> None:
         np.testing.assert_allclose(read.qpos(), clip.qpos(), atol=1e-7)
     with pytest.raises(ClipError, match="no frame rate"):
         read_motion(tmp_path / "plain.csv", g1, 0.0)
+    for name, text in (("text.csv", "abc\n"), ("comment.csv", "# abc\n"), ("empty.csv", "")):
+        (tmp_path / name).write_text(text)
+        with (
+            warnings.catch_warnings(action="error"),
+            pytest.raises(ClipError, match=f"{name} cannot be read as a CSV of numbers: it"),
+        ):
+            read_motion(tmp_path / name, g1)
     np.savetxt(tmp_path / "legs.csv", table[:, :19], delimiter=",")
     with pytest.raises(ClipError, match="legs.csv has 19 columns; of this robot it must have 36: root x y z, quaternion x y z w"):
         read_motion(tmp_path / "legs.csv", g1)

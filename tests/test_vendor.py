@@ -612,7 +612,7 @@ def test_two_meshes_of_one_name_are_two(tmp_path: Path) -> None:
 
 def test_a_urdf_that_is_none(tmp_path: Path) -> None:
     (tmp_path / "mini.urdf").write_text("<robot><link></robot>")
-    with pytest.raises(ModelError, match=r"^mini.urdf is not a valid URDF: mismatched tag"):
+    with pytest.raises(ModelError, match=r"^mini.urdf is not a valid URDF: it is no XML: mismatched tag"):
         build(tmp_path / "mini.urdf")
     (tmp_path / "mini.urdf").write_text('<robot xmlns:xacro="x"><xacro:leg/></robot>')
     with pytest.raises(ModelError, match=r"^mini.urdf holds xacro macros; write them out first: xacro mini.urdf > robot.urdf$"):

@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 import mujoco
 import numpy as np
 
-from legged_mw.deploy.reader import MOST, ContractError, Reader
+from legged_mw.deploy.reader import MOST, ContractError, Reader, compile_scene
 from legged_mw.utils.errors import unknown
-from legged_mw.utils.mjcf import check_files
 
 ORIGINS = ("default", "joints", "targets", "torque", "speed")
 _LARGEST = 1000.0  # [L] clips at 100
@@ -72,11 +71,7 @@ def _range_of_scene(scene: Path, joints: Sequence[str]) -> tuple[np.ndarray, np.
             f"policy.yaml is of a format that leaves the range of the targets to {scene.name}, which is not beside it: put it there, "
             "or export the policy again"
         )
-    try:
-        check_files(scene, alone=True)
-        model = mujoco.MjSpec.from_file(str(scene)).compile()
-    except ValueError as error:
-        raise ContractError(f"{scene.name} is not a valid MJCF: {' '.join(str(error).split())}") from None
+    model = compile_scene(scene)
     names = [model.actuator(i).name for i in range(model.nu)]
     if missing := [name for name in joints if name not in names]:
         raise ContractError(f"policy.yaml: joints: {unknown('servo', missing[0], names, scene.name)}")

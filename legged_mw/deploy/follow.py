@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from legged_mw.deploy.contract import SCENE_FILE, Contract, digest, part
 from legged_mw.deploy.motion import ATTITUDE, JOINT_POS, JOINT_VEL, MOTION_FILE, PLACE, POSITION, TURN
-from legged_mw.deploy.reader import ContractError
+from legged_mw.deploy.reader import ContractError, compile_scene
 from legged_mw.deploy.robot import Measurement
 from legged_mw.utils.clip import Clip, Floats, conjugate, heading, multiply, read_clip
 
@@ -31,7 +31,7 @@ class Follower:
         if not file.is_file() or digest(file) != contract.motion.digest:
             raise ContractError(f"{file} is missing, or not the motion that the policy was exported with; export the policy again")
         self.clip: Clip = read_clip(file).at(1.0 / contract.period).of(contract.joints, MOTION_FILE)
-        self._model = mujoco.MjModel.from_xml_path(str(part(folder, SCENE_FILE)))
+        self._model = compile_scene(part(folder, SCENE_FILE))
         self._data, self._anchor = mujoco.MjData(self._model), self._model.body(contract.motion.anchor).id
         self._angles = [int(self._model.joint(name).qposadr[0]) for name in contract.joints]
         speed = np.concatenate([self.clip.qvel()[:, 6:], np.zeros((1, len(contract.joints)))])  # the last frame is held at rest

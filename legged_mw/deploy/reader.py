@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -72,6 +73,18 @@ class Reader:
         value = self.take("scale", wanted, lambda v: is_number(v) or (is_list(v, is_number) and len(v) == count))
         self.take("scale", f"of {MOST:g} at most", lambda v: np.max(np.abs(v)) <= MOST)
         return np.full(count, value, dtype=float) if is_number(value) else np.array(value, dtype=float)
+
+
+def compile_scene(file: Path) -> Any:
+    """The model in an export's scene. Raises ContractError."""
+    from legged_mw.utils.mjcf import Source, check_model  # which bring MuJoCo
+
+    try:
+        model = Source(file, alone=True).spec().compile()
+        check_model(model)
+    except (ValueError, OSError) as error:
+        raise ContractError(f"{file.name} is not a valid MJCF: {' '.join(str(error).split())}") from None
+    return model
 
 
 def is_number(value: object) -> bool:

@@ -18,6 +18,7 @@ import numpy as np
 
 from legged_mw.deploy.contract import CONTRACT_FILE, SCENE_FILE, Contract, part
 from legged_mw.deploy.loop import LATE
+from legged_mw.deploy.reader import compile_scene
 from legged_mw.deploy.robot import Floats, Health, Measurement, RobotError
 from legged_mw.utils.errors import UserError, unknown
 
@@ -84,7 +85,9 @@ class Limits:
         """Those of the export in ``folder``: the machine's from its scene, then the contract's section ``safety``, then those that
         the robot's class states, then what the command line asks."""
         falls = OFF if contract.ends.max_tilt is None else contract.ends.max_tilt
-        limits = replace(_of_scene(folder, contract), tilt=falls if falls > 90.0 else min(Limits.tilt, falls))
+        limits = replace(
+            limits_of(compile_scene(part(folder, SCENE_FILE)), contract), tilt=falls if falls > 90.0 else min(Limits.tilt, falls)
+        )
         for values, where in ((contract.safety, f"{CONTRACT_FILE}: safety"), (robot, "Robot.limits"), (asked, "--limit")):
             limits = limits.but(values or {}, where)
         return limits
@@ -117,12 +120,6 @@ def _value(name: str, value: Any, where: str) -> float:
     if isinstance(value, bool) or not number >= 0.0:
         raise LimitError(f"{where}: {name} is {value!r}; it must be a number from 0, or off")
     return number
-
-
-def _of_scene(folder: Path, contract: Contract) -> Limits:
-    import mujoco
-
-    return limits_of(mujoco.MjSpec.from_file(str(part(folder, SCENE_FILE))).compile(), contract)
 
 
 def limits_of(model: Any, contract: Contract) -> Limits:

@@ -37,7 +37,7 @@ from legged_mw.deploy.motors import make_network
 from legged_mw.deploy.robot import QUANTITIES, Floats, Measurement, Robot, damped, layout
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import require_memory, usable_cores
-from legged_mw.utils.mjcf import ARCHIVE, check_files, check_model
+from legged_mw.utils.mjcf import Source, check_model
 
 Change = Callable[[mujoco.MjModel], None]
 _NOW = int(mujoco.mjtStage.mjSTAGE_VEL.value)  # sensors of position and velocity describe the new state
@@ -283,8 +283,7 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
         raise ContractError(f"no {file} in {folder}; an export has one if its task had steps or blocks; export an older one again")
     part(folder, file)
     try:
-        text = check_files(folder / file, alone=True)
-        spec = mujoco.MjSpec.from_string(text) if file.endswith(ARCHIVE) else mujoco.MjSpec.from_file(str(folder / file))
+        spec = Source(folder / file, alone=True).spec()
         for body in spec.bodies[1:] if whole else ():
             shapes = [geom for geom in body.geoms if geom.group == _SHAPES]
             for geom in shapes if not any(geom.conaffinity for geom in shapes) else ():

@@ -41,9 +41,10 @@ def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None, law: s
 
 
 def _check_walking(cfg: LeggedRobotCfg) -> None:
-    if not cfg.asset.foot_names or "*" in "".join(cfg.asset.foot_names):
-        wanted = "a list of at least one name, one for each foot (patterns are for foot_geoms)"
-        raise ConfigError(f"asset.foot_names is {cfg.asset.foot_names!r}; it must be {wanted}")
+    feet = cfg.asset.foot_names
+    if not feet or "*" in "".join(feet) or len({*feet}) < len(feet):
+        wanted = "a list of at least one name, one for each foot and each once (patterns are for foot_geoms)"
+        raise ConfigError(f"asset.foot_names is {feet!r}; it must be {wanted}")
     for name, span in vars(cfg.commands.ranges).items():  # a task may have declared its own
         fit(span, Range, f"commands.ranges.{name}")
     names = [name for name in vars(cfg.commands.ranges) if name != HEADING]

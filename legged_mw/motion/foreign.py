@@ -38,9 +38,12 @@ def read_motion(path: Path, robot: RobotModel, fps: float | None = None) -> Clip
 def _read_csv(path: Path, robot: RobotModel, fps: float) -> Clip:
     """A line a frame: root x, y, z [m], quaternion x, y, z, w, then the joints [rad] in the order of the robot's file."""
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-        skip = int(bool(lines) and not _is_number(lines[0].split(",")[0]))  # a line of names
-        table = np.loadtxt(lines, delimiter=",", skiprows=skip, ndmin=2)
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.partition("#")[0].strip()]
+        if lines and not _is_number(lines[0].split(",")[0]):  # names
+            del lines[0]
+        if not lines:
+            raise ValueError("it holds none")
+        table = np.loadtxt(lines, delimiter=",", ndmin=2)
     except (OSError, ValueError) as error:
         raise ClipError(f"{path} cannot be read as a CSV of numbers: {error}") from None
     count = 7 + len(robot.joint_names)

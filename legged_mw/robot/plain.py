@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 import os
-import re
+from collections.abc import Iterable
 from pathlib import Path
 from xml.sax.saxutils import escape
 
@@ -13,14 +13,13 @@ import mujoco
 
 from legged_mw.sim.meshes import path_of
 from legged_mw.sim.vendor import naming, read_robot
+from legged_mw.utils.mjcf import Source
 
 
 def stands_alone(file: Path) -> bool:
     """Whether ``file`` is an MJCF that needs no other file: then a copy of it is the robot."""
-    text = file.read_text(errors="replace")
-    return bool(re.search(r"<mujoco[\s>]", text)) and not re.search(
-        r"<robot[\s>]|<include\s|\sfile\s*=|\sfile(right|left|up|down|front|back)\s*=", text
-    )
+    source = Source(file)
+    return source.root.tag == "mujoco" and not source.named
 
 
 def as_mjcf(name: str, file: Path, folder: Path) -> str:
@@ -34,29 +33,20 @@ def as_mjcf(name: str, file: Path, folder: Path) -> str:
     spec.comment = f"\n    {name}: facts of the machine, from {file.name}. Ground, servos and sensors are added where it is loaded.\n  "
     with naming(file):
         spec.compile()
-        paths = _name_files(spec, _attached(file))
+        paths = _name_files(spec, Source(file).folders)
         text = spec.to_xml()
     for path in paths:
         text = text.replace(f'"{escape(str(path))}"', f'"{escape(os.path.relpath(path, folder.resolve()))}"')
     return text
 
 
-def _attached(file: Path) -> list[Path]:
-    """Folders of the models that the MJCF in ``file`` attaches, and of those that they attach."""
-    if not file.is_file():
-        return []
-    named = re.findall(r"<model\s[^>]*?file\s*=\s*[\"']([^\"']+)", file.read_text(errors="replace"))
-    models = [file.parent / name for name in named]
-    return [folder for model in models for folder in (model.parent, *_attached(model))]
-
-
-def _name_files(spec: mujoco.MjSpec, attached: list[Path]) -> set[Path]:
+def _name_files(spec: mujoco.MjSpec, folders: Iterable[str]) -> set[Path]:
     """Give meshes and pictures absolute paths, and return these; what is not there is left as it was written."""
     found: set[Path] = set()
 
     def named(item: mujoco.MjsMesh | mujoco.MjsTexture, file: str) -> str:
         own = item.compiler.meshdir if isinstance(item, mujoco.MjsMesh) else item.compiler.texturedir
-        places = [path_of(spec, item, file), *(folder / own / file for folder in attached)]
+        places = [path_of(spec, item, file), *(Path(folder) / own / file for folder in folders)]
         path = next((place.resolve() for place in places if file and place.is_file()), None)
         found.update([path] if path else [])
         return str(path) if path else file

@@ -28,9 +28,6 @@ def compile_readable(spec: mujoco.MjSpec, where: str, notes: list[str]) -> mujoc
 
     Raises ModelError for a mesh that collides or gives a body its mass, ValueError for what else is wrong.
     """
-    for item in (*spec.meshes, *spec.textures, *spec.skins, *spec.hfields):
-        if item.file and (path := path_of(spec, item)).exists() and not path.is_file():
-            raise ValueError(f"{path} is no file")  # a device has no end
     try:
         return _compile(spec)
     except ValueError:  # only then files are looked at: those of an attached model are not where the others are

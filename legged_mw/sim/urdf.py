@@ -4,7 +4,6 @@
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-import re
 from contextlib import suppress
 from pathlib import Path
 from xml.etree import ElementTree
@@ -14,33 +13,21 @@ import mujoco
 
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.meshes import READABLE, why_unreadable
+from legged_mw.utils.mjcf import Source
 
 _KNOWN = ("link", "joint", "material", "mujoco")  # what the reader needs; the rest is for other programs
 _COMPILER = {"fusestatic": "false", "discardvisual": "false", "strippath": "false"}
 SHAPES = "give the <collision> a <box>, <cylinder> or <sphere>"
 
 
-def is_urdf(text: str) -> bool:
-    """Whether the first element is a <robot>."""
-    first = re.search(r"<\s*([A-Za-z_]\w*)", _without_comments(text))
-    return bool(first and first[1] == "robot")
-
-
-def _without_comments(text: str) -> str:
-    return re.sub(r"<!--.*?-->", "", text, flags=re.DOTALL)
-
-
-def read_urdf(file: Path, text: str, notes: list[str]) -> tuple[mujoco.MjSpec, dict[str, float]]:
+def read_urdf(source: Source, notes: list[str]) -> tuple[mujoco.MjSpec, dict[str, float]]:
     """The spec, every link a body of its own, and joint -> speed limit [rad/s].
 
-    Raises ValueError for what is no URDF, ModelError for a mesh that collides and cannot be read.
+    Its tree is changed for that. Raises ValueError for what is no URDF, ModelError for a mesh that collides and cannot be read.
     """
-    if "<xacro:" in _without_comments(text):
+    file, robot = source.file, source.root
+    if any(element.tag.startswith("xacro:") for element in robot.iter()):
         raise ModelError(f"{file.name} holds xacro macros; write them out first: xacro {file.name} > robot.urdf")
-    try:
-        robot = ElementTree.fromstring(text)
-    except ElementTree.ParseError as error:
-        raise ValueError(str(error)) from None
     for other in [child for child in robot if child.tag not in _KNOWN]:
         robot.remove(other)
     _drop_places(robot, notes)
@@ -55,7 +42,7 @@ def read_urdf(file: Path, text: str, notes: list[str]) -> tuple[mujoco.MjSpec, d
     compiler = ElementTree.SubElement(extension, "compiler") if compiler is None else compiler
     compiler.attrib |= _COMPILER
     compiler.attrib.pop("meshdir", None)
-    spec = mujoco.MjSpec.from_string(ElementTree.tostring(robot, encoding="unicode"))
+    spec = source.spec()
     for mesh in spec.meshes:
         mesh.file = str(files[mesh.file])
     _set_looks(spec)

@@ -20,8 +20,8 @@ from legged_mw.sim.errors import ModelError
 from legged_mw.sim.meshes import compile_readable
 from legged_mw.sim.names import give_way
 from legged_mw.sim.servos import Range, take_limits
-from legged_mw.sim.urdf import is_urdf, read_urdf
-from legged_mw.utils.mjcf import check_files, check_model
+from legged_mw.sim.urdf import read_urdf
+from legged_mw.utils.mjcf import Source, check_model
 
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
 _FREE = mujoco.mjtJoint.mjJNT_FREE
@@ -74,11 +74,8 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> Loaded:
         raise ModelError(f"no {_kind(file)} at {file}")
     where, notes = file.name, []
     with naming(file):
-        text, speeds = check_files(file), {}
-        if is_urdf(text):
-            spec, speeds = read_urdf(file, text, notes)
-        else:
-            spec = mujoco.MjSpec.from_file(str(file))
+        source = Source(file)
+        spec, speeds = read_urdf(source, notes) if source.root.tag == "robot" else (source.spec(), {})
         _infer_inertias(spec)
         limits = take_limits(spec, notes)
         keyframe = _take_keyframe(spec, notes)

@@ -1,57 +1,169 @@
-"""What an MJCF or URDF may hold, looked at before MuJoCo builds something of it, and once more in what it has built.
+"""The XML of a robot: parsed once, looked at as attributes, and handed to MuJoCo as what was looked at.
 
-All that is refused is a ValueError in one line, without the file's name.
+MuJoCo reads neither the file nor what that includes or attaches, but their trees, written anew: no reference, comment, encoding or
+mistake of form means one thing here and another there. What is refused is a ValueError in one line, without the file's name.
 """
 
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
 from __future__ import annotations
 
 import io
 import math
+import os
 import re
+import stat
 import zipfile
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element, TreeBuilder, tostring
+from xml.parsers import expat
 
+import mujoco
 import numpy as np
 
 ARCHIVE = ".mjz"  # MuJoCo's name for a zipped model
 _INSIDE = "model.xml"
 MOST_BYTES = 64 << 20  # of one file: the largest known robots, meshes inside, have a tenth
 HEAVIEST, WIDEST, FASTEST = 1e5, 1e6, 1e3  # of a body [kg]; of any length [m] or inertia [kg m^2]; gravity [m/s^2]: a file in cm has 981
-_COPIES = 1e5  # of what a file repeats, all its counts multiplied
+_ELEMENTS, _CELLS, _DEEPEST = 20_000, 1e8, 200  # with all copies; of height fields and pictures; in each other
+_TOO_MUCH = f"makes more than {_ELEMENTS} elements, all copies counted, or {_CELLS:g} cells of height fields and pictures"
+_PLACES = 100_000  # files that it names, times folders where these may lie
+_PIECE, _LONGEST = 1 << 20, 16 << 20  # [byte] that the parser gets at a time; of one element and its attributes
 _MOST = {"count": 1e4, "nrow": 2e4, "ncol": 2e4, "width": 16384, "height": 16384, "nkey": 1e4}  # attribute -> the most that makes sense
 _MOST |= {f"nuser_{kind}": 1e3 for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")} | {"nuserdata": 1e6}
 _MOST |= {"mass": HEAVIEST, "density": 1e6, "armature": WIDEST, "frictionloss": WIDEST, "diaginertia": WIDEST}
 _SIZES = ("mass", "inertia", "pos", "ipos", "size", "armature", "damping", "frictionloss", "stiffness")  # of the model's arrays
-_NAMES = ("name", "class", "childclass", "model", "file", "dir", "meshdir", "texturedir", "assetdir")
-_ATTRIBUTE = re.compile(r"""([\w.:]+)\s*=\s*(?:"([^"]*)"|'([^']*)')""")
-_TAG = re.compile(r"""<(include|model)\b((?:[^>"']|"[^"]*"|'[^']*')*)>""")
+_DIRS = ("meshdir", "texturedir", "assetdir")
+_NAMES = ("name", "class", "childclass", "model", "file", "dir", *_DIRS)
 
 
-def check_files(file: Path, alone: bool = False) -> str:
-    """The text of ``file``, once it and what it includes hold no bomb, no NaN and no range that ends before it begins.
+class Source:
+    """A robot's file with what it includes and attaches. Raises ValueError for what no robot needs and a reader may choke on.
 
     ``alone``: it names no file outside of its own folder, meshes and textures too; a vendor's meshes may lie beside that folder.
     """
-    folder, left, seen, first = file.resolve().parent, [file], set[Path](), ""
-    while left:
-        part = left.pop()
-        text = _text(part)
-        first, seen = first or text, seen | {part.resolve()}
-        text = _checked(text, "" if part == file else f"{part.name}: ")
-        if file.suffix == ARCHIVE and (named := list(_named(text))):
-            raise ValueError(f"it names {named[0][:200]}; the model of an archive stands alone")
-        if alone and (far := [name for name in _named(text) if not (folder / name).resolve().is_relative_to(folder)]):
-            raise ValueError(f"it names {far[0][:200]}, which lies outside of its own folder; an export stands alone")
-        for name in _included(text):
-            path = (folder / name).resolve()
-            if not path.is_relative_to(folder):
-                raise ValueError(f"it includes {name}, which lies outside of its own folder; put that file beside it")
-            if path.is_file() and path not in seen:
-                left.append(path)
-    return first
+
+    def __init__(self, file: Path, alone: bool = False) -> None:
+        self.file, self.alone = file.absolute(), alone
+        self.home = os.path.realpath(self.file.parent)
+        self.named: dict[str, str] = {}  # file -> the line that names it
+        self.folders: dict[str, None] = {}  # in which those may lie, in order
+        self._parts = {os.path.realpath(file): ""}  # included or attached -> its name for MuJoCo; "": being read
+        self._texts: dict[str, bytes] = {}  # the same without the folder -> what is handed over
+        self.elements, self._largest = 0, 0.0  # that are written; of the largest part, with its copies
+        self.root = self._read(self.file, str(self.file.parent))
+        if len(self.named) * len(self.folders) > _PLACES:
+            raise ValueError(f"it names {len(self.named)} files, which may lie in {len(self.folders)} folders; no robot has so many")
+        for name, where in self.named.items():
+            for place in (os.path.join(folder, path) for folder in self.folders for path in (name, os.path.basename(name))):  # as strippath
+                _check_regular(place, where)
+
+    @property
+    def text(self) -> str:
+        """What MuJoCo is handed of the file itself: its elements, each in the line that it had."""
+        return tostring(self.root, encoding="unicode")
+
+    def spec(self) -> mujoco.MjSpec:
+        """What MuJoCo makes of ``root``."""
+        if self.file.suffix == ARCHIVE:  # which names nothing
+            return mujoco.MjSpec.from_string(self.text)
+        name = f"{self.file}.xml"  # MuJoCo goes by the ending, and warns on a line of its own where it knows none
+        return mujoco.MjSpec.from_file(name, include={os.path.basename(name): self.text.encode(), **self._texts})
+
+    def take(self, name: str, path: str, folder: str) -> str:
+        """Read what is included or attached, and return where MuJoCo finds it: in the same folder, by a name that nothing else has."""
+        real = os.path.realpath(path)
+        if not Path(real).is_relative_to(self.home):
+            raise ValueError(f"it includes {name[:200]}, which lies outside of its own folder; put that file beside it")
+        if not os.path.isfile(real):
+            raise ValueError(f"it includes {name[:200]}, which is no file here")
+        if real not in self._parts:
+            self._parts[real] = ""
+            text = tostring(self._read(Path(path), folder), encoding="unicode")
+            self._parts[real] = place = f"{path}.{len(self._texts)} of {self.file.name}.xml"
+            self._texts[os.path.basename(place)] = text.encode()
+        if not self._parts[real]:
+            raise ValueError(f"it includes {name}, which is already included")
+        return self._parts[real]
+
+    def _read(self, path: Path, folder: str) -> Element:
+        root = _Reader(self, path, folder).root
+        self._largest = max(self._largest, self._size(root))
+        if self._largest > _ELEMENTS:
+            raise ValueError(f"{path.name} {_TOO_MUCH}")
+        return root
+
+    def _size(self, element: Element) -> float:
+        """How much it makes [elements]."""
+        size = 1.0 + (self._largest if element.tag in ("include", "attach") else 0.0)
+        for sides in (("nrow", "ncol"), ("width", "height")):
+            size += math.prod(max(_numbers(element.get(side, "")), default=0.0) for side in sides) * _ELEMENTS / _CELLS
+        return math.prod(max(1.0, number) for number in _numbers(element.get("count", ""))) * (size + sum(map(self._size, element)))
+
+
+class _Reader:
+    """Grows the tree of one file, without comments and text. Raises ValueError, with the line."""
+
+    def __init__(self, source: Source, path: Path, folder: str) -> None:
+        self.source, self.path, self.folder = source, path, folder  # the last: of the model that it is or belongs to
+        self.file = "" if path == source.file else f"{path.name}: "
+        self.builder, self.parser, self.line, self.depth = TreeBuilder(), expat.ParserCreate("utf-8"), 1, 0
+        self.parser.StartElementHandler, self.parser.EndElementHandler = self._start, self._end
+        self.parser.StartDoctypeDeclHandler = self._refuse_doctype
+        source.folders |= dict.fromkeys((folder, str(path.parent)))
+        content = _text(path).encode()
+        try:
+            for start in range(0, len(content), _PIECE):
+                self.parser.Parse(content[start : start + _PIECE])
+                if start - self.parser.CurrentByteIndex > _LONGEST:  # an element is looked at from its beginning with each piece
+                    raise ValueError(f"{self.where}an element has more than {_LONGEST >> 20} MiB")
+            self.parser.Parse(b"", True)
+        except expat.ExpatError as error:
+            raise ValueError(f"{self.file}it is no XML: {error}") from None
+        self.root = self.builder.close()
+
+    @property
+    def where(self) -> str:
+        return f"{self.file}line {self.parser.CurrentLineNumber}: "
+
+    def _refuse_doctype(self, *_: object) -> None:
+        raise ValueError(f"{self.where}it has a DOCTYPE, which may define entities; leave it out")
+
+    def _start(self, tag: str, attributes: dict[str, str]) -> None:
+        self.depth, self.source.elements = self.depth + 1, self.source.elements + 1
+        if self.depth > _DEEPEST or len(attributes) > _DEEPEST:  # for whose number MuJoCo's reader takes squared time
+            raise ValueError(f"{self.where}it is nested too deeply, or has more than {_DEEPEST} attributes")
+        if self.source.elements > _ELEMENTS:
+            raise ValueError(f"{self.where}it {_TOO_MUCH}")
+        for name, value in attributes.items():
+            if wrong := "" if name in _NAMES else _wrong(name, value):
+                raise ValueError(f'{self.where}{name}="{value[:60]}" {wrong}')
+            if value and (name.startswith("file") or name in _DIRS):
+                self._note(name, value)
+        if tag in ("include", "model") and (name := attributes.get("file")):
+            here, home = (os.path.join(folder, name) for folder in (self.path.parent, self.folder))
+            path = here if tag == "model" or not os.path.lexists(home) else home  # as MuJoCo looks
+            attributes["file"] = self.source.take(name, path, os.path.dirname(path) if tag == "model" else self.folder)
+        self.builder.data("\n" * (self.parser.CurrentLineNumber - self.line))
+        self.line = self.parser.CurrentLineNumber
+        self.builder.start(tag, attributes)
+
+    def _end(self, tag: str) -> None:
+        self.depth -= 1
+        self.builder.end(tag)
+
+    def _note(self, attribute: str, name: str) -> None:
+        """A file or folder that is named."""
+        if self.source.file.suffix == ARCHIVE:
+            raise ValueError(f"{self.where}it names {name[:200]}; the model of an archive stands alone")
+        if self.source.alone and not Path(os.path.realpath(os.path.join(self.source.home, name))).is_relative_to(self.source.home):
+            raise ValueError(f"{self.where}it names {name[:200]}, which lies outside of its own folder; an export stands alone")
+        if attribute in _DIRS:
+            self.source.folders[os.path.join(self.folder, name)] = None
+        else:
+            self.source.named.setdefault(name, self.where)
 
 
 def write_archive(file: Path, text: str) -> None:
@@ -64,14 +176,14 @@ def _text(file: Path) -> str:
     """What an MJCF or URDF says, or the one in an MJZ. Raises ValueError for too large a file, and for an MJZ with more in it."""
     _check_size(file.name, file.stat().st_size)
     if file.suffix != ARCHIVE:
-        return file.read_text(encoding="utf-8", errors="replace")
+        return _without_comments(file.read_text(encoding="utf-8", errors="replace"))
     held = io.BytesIO(file.read_bytes())
     try:
         with zipfile.ZipFile(held) as archive:
             inside = archive.infolist()
             known = [(entry.filename, entry.compress_type) for entry in inside] == [(_INSIDE, zipfile.ZIP_DEFLATED)]
             if known and inside[0].file_size <= MOST_BYTES:
-                return archive.read(_INSIDE).decode(errors="replace")
+                return _without_comments(archive.read(_INSIDE).decode(errors="replace"))
     except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError) as error:
         raise ValueError(f"no zip file that can be read: {error}") from None  # RuntimeError: it is encrypted
     names = ", ".join(entry.filename for entry in inside)[:200] or "nothing"
@@ -83,54 +195,43 @@ def _check_size(name: str, size: int) -> None:
         raise ValueError(f"{name} has {size >> 20} MiB; a robot's file has {MOST_BYTES >> 20} at most")
 
 
-def _checked(text: str, where: str) -> str:
-    """``text`` with its comments blank. Raises ValueError with the line for what no robot needs and a reader may choke on."""
-    if "<!ENTITY" in text:
-        raise ValueError(f"{where}line {_line(text, text.index('<!ENTITY'))}: it defines entities; write out what they stand for")
-    text = re.sub(r"<!--.*?-->", lambda match: re.sub(r"[^\n]", " ", match[0]), text, flags=re.DOTALL)
-    copies = 1.0
-    for match in _ATTRIBUTE.finditer(text):
-        name, value = match[1], match[2] if match[2] is not None else match[3]
-        wrong = "" if name in _NAMES else _wrong(name, value)
-        if name == "count" and not wrong:
-            copies *= math.prod(float(part) or 1.0 for part in value.split() if part.isdecimal())
-            wrong = f"makes more than {_COPIES:g} copies, with the others" if copies > _COPIES else ""
-        if wrong:
-            raise ValueError(f'{where}line {_line(text, match.start())}: {name}="{value[:60]}" {wrong}')
-    return text
+def _without_comments(text: str) -> str:
+    """``text`` in as many lines: many comments hold --, and <?xml ?> stands behind one, which a parser refuses and MuJoCo does not."""
+    if text.count("<!--") + text.count("<?xml") > _ELEMENTS:
+        raise ValueError(f"it has more than {_ELEMENTS} comments")
+    found = r"<!--.*?(?:-->|\Z)|<\?xml\s[^<>]*>"
+    return re.sub(found, lambda match: "<!--" + "\n" * match[0].count("\n") + "-->", text, flags=re.DOTALL)
+
+
+def _check_regular(path: str, where: str) -> None:
+    """Raises ValueError for what is there and no file, such as a device, which has no end."""
+    try:
+        regular = stat.S_ISREG(os.stat(path).st_mode)
+    except (FileNotFoundError, NotADirectoryError):
+        return
+    except OSError as error:
+        raise ValueError(f"{where}{path[:200]} can be no file: {error.strerror}") from None
+    if not regular:
+        raise ValueError(f"{where}{path} is no file")
+
+
+def _numbers(value: str) -> list[float]:
+    """Those that an attribute holds; none if it holds something else."""
+    try:
+        return [float(part) for part in value.split(None, 9)]  # no such attribute has more
+    except ValueError:
+        return []
 
 
 def _wrong(name: str, value: str) -> str:
     """What is wrong with the numbers of an attribute; "" if nothing is, or if they are none."""
     if "nan" in value.lower() and any(part.lower().strip("+-") == "nan" for part in value.split()):
         return "is not a number"
-    if name.endswith("range") or name in _MOST:
-        try:
-            numbers = [float(part) for part in value.split()]
-        except ValueError:
-            return ""
-        if name in _MOST and not all(0.0 <= number <= _MOST[name] for number in numbers):
-            return f"must be from 0 to {_MOST[name]:g}"
-        if len(numbers) == 2 and name.endswith("range") and numbers[0] > numbers[1]:
-            return "ends before it begins"
+    if name.endswith("range") and len(numbers := _numbers(value)) == 2 and numbers[0] > numbers[1]:
+        return "ends before it begins"
+    if name in _MOST and value.strip() and not all(0.0 <= number <= _MOST[name] for number in _numbers(value) or [-1.0]):
+        return f"must be from 0 to {_MOST[name]:g}"
     return ""
-
-
-def _line(text: str, place: int) -> int:
-    return text.count("\n", 0, place) + 1
-
-
-def _included(text: str) -> Iterator[str]:
-    """Names of other MJCF files that the text takes in."""
-    for tag in _TAG.finditer(text):
-        yield from (match[2] or match[3] or "" for match in _ATTRIBUTE.finditer(tag[2]) if match[1] == "file")
-
-
-def _named(text: str) -> Iterator[str]:
-    """Files and folders that the text names, whatever for."""
-    for match in _ATTRIBUTE.finditer(text):
-        if match[1].startswith("file") or match[1] in ("meshdir", "texturedir", "assetdir"):
-            yield match[2] or match[3] or ""
 
 
 def check_model(model: Any) -> None:

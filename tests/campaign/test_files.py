@@ -395,7 +395,7 @@ SCENES: list[tuple[str, str, str, str]] = [
     ("keyframe is infinite", KEY, 'qpos="inf 0 0.278', "key_qpos has values that are not finite"),
     ("keyframe far away", KEY, 'qpos="1e9 0 0.278', "its first keyframe is no pose"),
     ("negative timestep", 'timestep="0.004"', 'timestep="-0.004"', "timestep is -0.004 s"),
-    ("entities", "<mujoco", '<!DOCTYPE m [<!ENTITY a "b">]><mujoco', "it defines entities"),
+    ("entities", "<mujoco", '<!DOCTYPE m [<!ENTITY a "b">]><mujoco', "it has a DOCTYPE"),
     ("include", "</worldbody>", '</worldbody><include file="../../etc/passwd"/>', "it names ../../etc/passwd, which lies outside"),
     (
         "a mesh",
