@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
+from program import run
 from worlds import make_env
 
-from legged_mw.envs.checks import check_values
+from legged_mw import ROOT
+from legged_mw.envs.checks import PAYS, WITHOUT, check_class, check_values
 from legged_mw.sim.errors import ModelError
 from legged_mw.utils.bounds import bare, bounds_text
 from legged_mw.utils.config import ConfigError, field_types
+from legged_mw.utils.errors import StepError, in_short
+from legged_mw.utils.renamed import LEGGED_GYM_METHODS, LEGGED_GYM_TENSORS
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 
@@ -154,3 +160,140 @@ def test_fewer_samples_than_minibatches_are_named() -> None:
     text = r"an iteration has 3 samples \(1 worlds x 3 steps\), fewer than algorithm.num_mini_batches = 4; raise"
     with pytest.raises(ConfigError, match=text):
         check_values(task.cfg, task.train)
+
+
+# ---- methods of a user's class ----
+
+MINE = """import torch
+from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.utils.task import Task
+
+
+class Mine({parent}):
+    {method}
+
+
+TASK = Task(Mine, Go1FlatCfg, Go1FlatCfgPPO)
+"""
+PLACE = "mine.py:9, Mine."
+
+
+def mine(folder: Path, method: str, parent: str = "LeggedRobot") -> LoadedTask:
+    """A task whose class has one ``method`` of its own."""
+    (folder / "mine.py").write_text(MINE.format(parent=parent, method=method.replace("\n", "\n    ")))
+    return load_task(str(folder / "mine.py"))
+
+
+def lines_on(task: LoadedTask) -> list[str]:
+    return check_class(task.env_class, task.cfg.to_dict()["rewards"]["scales"])
+
+
+@pytest.mark.parametrize(
+    ("method", "call"),
+    [
+        ("def _init_buffers(self):\n    self.mine = torch.zeros(3)", "super()._init_buffers()"),
+        ("def _update_state(self):\n    self.mine = 1", "super()._update_state()"),
+        ("def _end_step(self):\n    pass", "super()._end_step()"),
+        ("def reset_envs(self, mask):\n    self.mine = mask", "super().reset_envs(mask)"),
+        ("def _reset_robots(self, mask):\n    self.mine = mask", "super()._reset_robots(mask)"),
+        ("def _reset_task(self, mask):\n    self.mine = mask", "super()._reset_task(mask)"),
+        ("@torch.no_grad()\ndef _end_step(self):\n    pass", "super()._end_step()"),
+    ],
+)
+def test_a_hook_without_super_is_named(method: str, call: str, tmp_path: Path) -> None:
+    task = mine(tmp_path, method)
+    with pytest.raises(StepError) as error:
+        lines_on(task)
+    assert PLACE in error.value.where and call in error.value.what and WITHOUT in error.value.what
+
+
+@pytest.mark.parametrize(
+    ("method", "parent"),
+    [
+        ("def _end_step(self):\n    super()._end_step()", "LeggedRobot"),
+        ("def _end_step(self):\n    LeggedRobot._end_step(self)", "LeggedRobot"),
+        ("def _end_step(self):  # without super: nothing is remembered\n    pass", "LeggedRobot"),
+        ("def _reset_task(self, mask):\n    self.mine = mask", "RobotTask"),  # whose own does nothing
+        ("def _resample_commands(self, mask):\n    self._reset_commands(mask)", "LeggedRobot"),  # may be replaced
+        ("def _fallen(self):\n    return self.reset_buf", "LeggedRobot"),
+    ],
+)
+def test_what_calls_its_parent_or_may_replace_it_passes(method: str, parent: str, tmp_path: Path) -> None:
+    assert lines_on(mine(tmp_path, method, parent)) == []
+
+
+@pytest.mark.parametrize("how", [[], ["--check"], ["--eager"]], ids=["training", "check", "eager"])
+def test_a_hook_without_super_ends_a_training_before_it_begins(how: list[str], tmp_path: Path) -> None:
+    task = mine(tmp_path, "def reset_envs(self, mask):\n    pass")
+    result = run("train", tmp_path, "--task", str(task.path), "--device", "cpu", *how)
+    assert result.code == 2 and PLACE in result.err and not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize("name", LEGGED_GYM_METHODS)
+def test_a_hook_of_legged_gyms_is_named_with_ours(name: str, tmp_path: Path) -> None:
+    [line] = lines_on(mine(tmp_path, f"def {name}(self, env_ids):\n    super().{name}(env_ids)"))
+    assert PLACE in line and LEGGED_GYM_METHODS[name] in line
+
+
+def test_a_method_of_that_name_which_the_users_own_code_calls_passes(tmp_path: Path) -> None:
+    methods = "def _get_heights(self):\n    return 0\n\ndef _update_state(self):\n    super()._update_state()\n    self._get_heights()"
+    assert lines_on(mine(tmp_path, methods)) == []
+
+
+def test_what_legged_gym_calls_differently_stands_in_the_table() -> None:
+    """And what is named instead is there."""
+    page = (ROOT / "docs" / "from_legged_gym.md").read_text()
+    for old, here in {**LEGGED_GYM_METHODS, **LEGGED_GYM_TENSORS}.items():
+        assert re.search(rf"\b{old}\b", page), old
+        assert all(word in page for word in re.findall(r"\w+", here.partition("(")[0]) if "_" in word), here
+
+
+def test_a_reward_with_a_letter_too_many_is_named(tmp_path: Path) -> None:
+    [line] = lines_on(mine(tmp_path, "def _rewards_crouch(self):\n    return self.base_height"))
+    assert PLACE + "_rewards_crouch" in line and "_reward_" in line
+
+
+def test_a_reward_of_a_users_own_without_a_scale_is_off(tmp_path: Path) -> None:
+    """The check says so."""
+    task = mine(tmp_path, "def _reward_crouch(self):\n    return self.base_height")
+    small = ("--task", str(task.path), "--device", "cpu", "--num_envs", "4", "--check")
+    off = [line.split() for line in run("train", tmp_path, *small).out.splitlines() if " off: rewards" in line]
+    assert off == [["crouch", "off:", "rewards.scales.crouch", "is", "missing"]]
+    assert " off: rewards" not in run("train", tmp_path, *small, "--set", "rewards.scales.crouch=1").out
+
+
+@pytest.mark.parametrize(("name", "scale"), [("tracking_lin_vel", -1.0), ("action_rate", 0.01), ("alive", -1.0), ("feet_slip", 1.0)])
+def test_a_scale_of_the_unusual_sign_is_named(name: str, scale: float) -> None:
+    task = load_task("go1_flat")
+    task.set(f"rewards.scales.{name}", scale)
+    [line] = lines_on(task)
+    assert f"rewards.scales.{name} is {scale:g}" in line
+
+
+def test_a_term_of_a_users_own_has_any_sign(tmp_path: Path) -> None:
+    task = mine(tmp_path, "def _reward_torques(self):\n    return -self.torques.square().sum(dim=1)")
+    task.set("rewards.scales.torques", 1.0)
+    assert lines_on(task) == []
+
+
+@pytest.mark.parametrize("name", [*task_names(), *(f"examples/{path.name}" for path in sorted((ROOT / "examples").glob("*.py")))])
+def test_no_task_of_ours_is_warned_of(name: str) -> None:
+    if name.startswith("examples/") and "TASK = " not in (ROOT / name).read_text():
+        return
+    task = load_task(name if not name.startswith("examples/") else str(ROOT / name))
+    assert lines_on(task) == []
+
+
+def test_usual_signs_are_those_of_the_page() -> None:
+    rows = re.findall(r"^\| (`\w+`(?:, `\w+`)*) \|.*\| (above|below) 0 \|$", (ROOT / "docs" / "tasks.md").read_text(), re.MULTILINE)
+    signs = {term: side == "above" for terms, side in rows for term in re.findall(r"\w+", terms)}
+    assert len(signs) >= 25 and all((term in PAYS) == above for term, above in signs.items())
+
+
+@pytest.mark.parametrize(("name", "here"), [("root_states", "root_pos"), ("foot_speeds", "'foot_speed'")])
+def test_a_tensor_that_is_not_there_is_answered_with_what_is(name: str, here: str) -> None:
+    with pytest.raises(AttributeError) as error:
+        getattr(make_env(1), name)
+    assert here in in_short(error.value)
