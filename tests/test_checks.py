@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from program import run
+import torch
+from program import SMALL, run
 from worlds import make_env
 
 from legged_mw import ROOT
 from legged_mw.envs.checks import PAYS, WITHOUT, check_class, check_values
+from legged_mw.robot.__main__ import doubts
 from legged_mw.sim.errors import ModelError
 from legged_mw.utils.bounds import bare, bounds_text
 from legged_mw.utils.config import ConfigError, field_types
@@ -283,7 +285,9 @@ def test_no_task_of_ours_is_warned_of(name: str) -> None:
     if name.startswith("examples/") and "TASK = " not in (ROOT / name).read_text():
         return
     task = load_task(name if not name.startswith("examples/") else str(ROOT / name))
-    assert lines_on(task) == []
+    wrong, odd = doubts(task)
+    assert lines_on(task) == wrong == []
+    assert bool(odd) == ("g1_" in name), "on two legs it tilts, and its lightest joints ring"
 
 
 def test_usual_signs_are_those_of_the_page() -> None:
@@ -297,3 +301,58 @@ def test_a_tensor_that_is_not_there_is_answered_with_what_is(name: str, here: st
     with pytest.raises(AttributeError) as error:
         getattr(make_env(1), name)
     assert here in in_short(error.value)
+
+
+# ---- what a robot cannot learn with ----
+
+AT_ONCE = {
+    "termination.min_base_height": "5",
+    "env.episode_length_s": "0.01",
+    "asset.terminate_after_contacts_on": "[FR, FL, RR, RL]",
+}
+
+
+@pytest.mark.parametrize("field", AT_ONCE)
+def test_the_rule_that_ends_every_episode_at_once_is_named(field: str) -> None:
+    task = load_task("go1_flat")
+    task.set(field, AT_ONCE[field])
+    [line] = doubts(task)[0]
+    assert [each for each in AT_ONCE if each in line] == [field]
+
+
+def test_a_fall_of_a_users_own_that_ends_every_episode_is_named(tmp_path: Path) -> None:
+    [line] = doubts(mine(tmp_path, "def _fallen(self):\n    return self.base_height > 0"))[0]
+    assert PLACE + "_fallen" in line
+
+
+@pytest.mark.parametrize("task", ["go1_flat", "g1_getup"])
+def test_doubts_draw_no_number(task: str) -> None:
+    """A training is the same with them."""
+    before = torch.get_rng_state()
+    doubts(load_task(task))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_episodes_of_one_step_are_said_when_training_begins_and_after_two_iterations(tmp_path: Path) -> None:
+    field = "termination.min_base_height"
+    result = run("train", tmp_path, *SMALL, "--max_iterations", "3", "--set", f"{field}=5")
+    warned = [line for line in result.out.splitlines() if line.lower().startswith("warning")]
+    assert result.code == 0 and [field in line for line in warned] == [True, False]
+    assert "iteration 2: episodes last 1.0 steps" in warned[1] and " fell" in warned[1] and "timed out" not in warned[1]
+
+
+@pytest.mark.parametrize(("kp", "what"), [("0", "sags"), ("25000", "unstable")])
+@pytest.mark.parametrize("how", [["--check"], ["--max_iterations", "1"]], ids=["check", "training"])
+def test_gains_that_no_robot_stands_on_are_said(kp: str, what: str, how: list[str], tmp_path: Path) -> None:
+    """As the picture's page says it."""
+    out = run("train", tmp_path, *SMALL, "--set", f"control.stiffness={{'': {kp}}}", *how).out
+    [line] = [line for line in out.splitlines() if what in line]
+    assert line.startswith("  - " if how == ["--check"] else "warning: ") and "FR_calf_joint" in line
+
+
+@pytest.mark.parametrize("law", ["torque", "dc_motor"])
+def test_other_motors_are_looked_at_as_far_as_they_have_gains(law: str) -> None:
+    task = load_task("go1_flat")
+    task.update({"control": {"actuator": law, "stall_torque": {"": 30.0}, "no_load_speed": {"": 30.0}, "stiffness": {"": 0.0}}}, "test")
+    wrong, _ = doubts(task)
+    assert bool(wrong) == (law == "dc_motor")
