@@ -35,7 +35,7 @@ def test_tasks_as_they_ship_pass(name: str) -> None:
         ("env.num_envs", 0, "1 or more"),
         ("sim.dt", -0.004, "from 0.0001 to 0.1 s"),
         ("control.decimation", 0, "from 1 to 1000"),
-        ("env.episode_length_s", math.inf, "finite"),
+        ("env.episode_length_s", math.inf, "finite, and 10^9 at most"),
         ("terrain.friction", -1.0, "0 or more"),
         ("terrain.seed", -1, "0 or more"),
         ("terrain.horizontal_scale", 0.3, "above 0 and at most 0.25 m, or a cell would be wider than a step of stairs"),
@@ -52,6 +52,13 @@ def test_tasks_as_they_ship_pass(name: str) -> None:
         ("actor.hidden_dims", [], "a list of at least one; each 1 or more"),
         ("algorithm.num_mini_batches", -1, "1 or more"),
         ("algorithm.gamma", 5.0, "from 0 to 1"),
+        ("env.episode_length_s", 3e38, "finite, and 10^9 at most"),
+        ("algorithm.clip_param", 3e38, "finite, and 10^9 at most"),
+        ("rewards.tracking_sigma", 3e38, "finite, and 10^9 at most"),
+        ("warm_start.critic_warmup", 10**18, "from 0 to 1,000,000"),
+        ("termination.min_base_height", 30.0, "from 0 to 10 m"),
+        ("rewards.base_height_target", 27.0, "from 0 to 10 m"),
+        ("rewards.swing_height", 27.0, "above 0 and at most 10 m"),
         ("runner.run_name", "a/b", "a plain name such as wide_net, of 100 bytes at most"),
     ],
 )
@@ -86,6 +93,15 @@ def test_mistake_is_named(path: str, value: Any, wanted: str) -> None:
             {"dof_armature": [2.0, 1.0]},
             "domain_rand.model_factors['dof_armature'] is [2.0, 1.0]; it must be two",
         ),
+        (
+            "init_state.default_joint_angles",
+            {"thigh": 51.0},
+            "init_state.default_joint_angles['thigh'] is 51.0; it must be from -2 pi to 2 pi",
+        ),
+        ("control.action_scale", 1e5, "control.action_scale is 100000.0; it must be another number than 0, and 10,000 at most"),
+        ("domain_rand.base_com", [100.0, 100.0], "domain_rand.base_com[0] is 100.0; it must be from -10 to 10 m"),
+        ("domain_rand.contact_time", [1e-9, 1e-9], "domain_rand.contact_time[0] is 1e-09; it must be from 0.0001 to 10 s"),
+        ("env.episode_length_s", 1e-9, "env.episode_length_s is 1e-09, shorter than a control step of 0.02 s"),
         ("commands.mirror", {"lin_vel_x": 0.5}, "commands.mirror['lin_vel_x'] is 0.5; it must be 1 or -1"),
         ("terrain.condim", 2, "terrain.condim must be Literal[1, 3, 4, 6], not 2 (int)"),
         ("terrain.terrain_proportions", {"stairs_up": math.inf}, "terrain.terrain_proportions['stairs_up'] is inf; it must be finite"),
@@ -103,6 +119,13 @@ def test_where_in_a_table_or_list_is_named(path: str, value: Any, text: str) -> 
         task.set(path, value)
         check_values(task.cfg, task.train)
     assert text in str(error.value)
+
+
+@pytest.mark.parametrize("field", ["nosuch", "opt"])
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_a_factor_on_a_field_that_is_none_is_refused_whatever_it_is(field: str, factor: float) -> None:
+    with pytest.raises(ModelError, match=field):
+        make_env(1, {"domain_rand.enable": True, "domain_rand.model_factors": {field: [factor, factor]}})
 
 
 def test_a_command_of_a_users_own_has_a_range() -> None:
@@ -307,7 +330,7 @@ def test_a_tensor_that_is_not_there_is_answered_with_what_is(name: str, here: st
 
 AT_ONCE = {
     "termination.min_base_height": "5",
-    "env.episode_length_s": "0.01",
+    "env.episode_length_s": "0.02",
     "asset.terminate_after_contacts_on": "[FR, FL, RR, RL]",
 }
 

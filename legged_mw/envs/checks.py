@@ -36,6 +36,9 @@ def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None, law: s
     """Raise ConfigError at the first value that cannot work; ``law`` of the motors is ``control.actuator``, unless said otherwise."""
     _check_redraws(cfg, law)
     _check_motors(cfg)
+    step = cfg.sim.dt * cfg.control.decimation
+    if cfg.env.episode_length_s < step:
+        raise ConfigError(f"env.episode_length_s is {cfg.env.episode_length_s:g}, shorter than a control step of {step:g} s")
     if isinstance(cfg, LeggedRobotCfg):
         _check_walking(cfg)
     if isinstance(cfg, MotionTrackingCfg):
