@@ -51,16 +51,18 @@ def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.N
     from legged_mw.check.guard import check_recordable
     from legged_mw.eval.exams import make_exam
     from legged_mw.rl import training
+    from legged_mw.robot.__main__ import doubts, show_task
 
     env = training.build(task, start, device, args.eager, check_recordable)
+    wrong, odd = doubts(task)
     if args.check:
         training.make_learner(task, env, start)  # what it refuses is found now
         print(describe(env, task) + ("" if args.eager else "\nthe step can be recorded as a CUDA graph"))
+        print("".join(["what to look at\n", *(f"  - {line}\n" for line in [*wrong, *odd])]) if wrong or odd else "", end="")
         if args.picture:
-            from legged_mw.robot.__main__ import show_task
-
             show_task(task, Path(args.picture))
         return
+    print("".join(f"warning: {line}\n" for line in wrong), end="", flush=True)
     examine = make_exam(task, env, args.eager) if training.wants_exam(task) else None
     begun = None
     if args.play:

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import math
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from program import SMALL, run
 from worlds import make_env
 
-from legged_mw.envs.checks import check_values
+from legged_mw import ROOT
+from legged_mw.envs.checks import PAYS, WITHOUT, check_class, check_values
+from legged_mw.robot.__main__ import doubts
 from legged_mw.sim.errors import ModelError
 from legged_mw.utils.bounds import bare, bounds_text
 from legged_mw.utils.config import ConfigError, field_types
+from legged_mw.utils.errors import StepError, in_short
+from legged_mw.utils.renamed import LEGGED_GYM_METHODS, LEGGED_GYM_TENSORS
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 
@@ -27,7 +35,7 @@ def test_tasks_as_they_ship_pass(name: str) -> None:
         ("env.num_envs", 0, "1 or more"),
         ("sim.dt", -0.004, "from 0.0001 to 0.1 s"),
         ("control.decimation", 0, "from 1 to 1000"),
-        ("env.episode_length_s", math.inf, "finite"),
+        ("env.episode_length_s", math.inf, "finite, and 10^9 at most"),
         ("terrain.friction", -1.0, "0 or more"),
         ("terrain.seed", -1, "0 or more"),
         ("terrain.horizontal_scale", 0.3, "above 0 and at most 0.25 m, or a cell would be wider than a step of stairs"),
@@ -44,6 +52,13 @@ def test_tasks_as_they_ship_pass(name: str) -> None:
         ("actor.hidden_dims", [], "a list of at least one; each 1 or more"),
         ("algorithm.num_mini_batches", -1, "1 or more"),
         ("algorithm.gamma", 5.0, "from 0 to 1"),
+        ("env.episode_length_s", 3e38, "finite, and 10^9 at most"),
+        ("algorithm.clip_param", 3e38, "finite, and 10^9 at most"),
+        ("rewards.tracking_sigma", 3e38, "finite, and 10^9 at most"),
+        ("warm_start.critic_warmup", 10**18, "from 0 to 1,000,000"),
+        ("termination.min_base_height", 30.0, "from 0 to 10 m"),
+        ("rewards.base_height_target", 27.0, "from 0 to 10 m"),
+        ("rewards.swing_height", 27.0, "above 0 and at most 10 m"),
         ("runner.run_name", "a/b", "a plain name such as wide_net, of 100 bytes at most"),
     ],
 )
@@ -83,6 +98,15 @@ def test_mistake_is_named(path: str, value: Any, wanted: str) -> None:
             {"dof_armature": [2.0, 1.0]},
             "domain_rand.model_factors['dof_armature'] is [2.0, 1.0]; it must be two",
         ),
+        (
+            "init_state.default_joint_angles",
+            {"thigh": 51.0},
+            "init_state.default_joint_angles['thigh'] is 51.0; it must be from -2 pi to 2 pi",
+        ),
+        ("control.action_scale", 1e5, "control.action_scale is 100000.0; it must be another number than 0, and 10,000 at most"),
+        ("domain_rand.base_com", [100.0, 100.0], "domain_rand.base_com[0] is 100.0; it must be from -10 to 10 m"),
+        ("domain_rand.contact_time", [1e-9, 1e-9], "domain_rand.contact_time[0] is 1e-09; it must be from 0.0001 to 10 s"),
+        ("env.episode_length_s", 1e-9, "env.episode_length_s is 1e-09, shorter than a control step of 0.02 s"),
         ("commands.mirror", {"lin_vel_x": 0.5}, "commands.mirror['lin_vel_x'] is 0.5; it must be 1 or -1"),
         ("terrain.condim", 2, "terrain.condim must be Literal[1, 3, 4, 6], not 2 (int)"),
         ("terrain.terrain_proportions", {"stairs_up": math.inf}, "terrain.terrain_proportions['stairs_up'] is inf; it must be finite"),
@@ -100,6 +124,13 @@ def test_where_in_a_table_or_list_is_named(path: str, value: Any, text: str) -> 
         task.set(path, value)
         check_values(task.cfg, task.train)
     assert text in str(error.value)
+
+
+@pytest.mark.parametrize("field", ["nosuch", "opt"])
+@pytest.mark.parametrize("factor", [1.0, 2.0])
+def test_a_factor_on_a_field_that_is_none_is_refused_whatever_it_is(field: str, factor: float) -> None:
+    with pytest.raises(ModelError, match=field):
+        make_env(1, {"domain_rand.enable": True, "domain_rand.model_factors": {field: [factor, factor]}})
 
 
 def test_a_command_of_a_users_own_has_a_range() -> None:
@@ -159,3 +190,197 @@ def test_fewer_samples_than_minibatches_are_named() -> None:
     text = r"an iteration has 3 samples \(1 worlds x 3 steps\), fewer than algorithm.num_mini_batches = 4; raise"
     with pytest.raises(ConfigError, match=text):
         check_values(task.cfg, task.train)
+
+
+# ---- methods of a user's class ----
+
+MINE = """import torch
+from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.utils.task import Task
+
+
+class Mine({parent}):
+    {method}
+
+
+TASK = Task(Mine, Go1FlatCfg, Go1FlatCfgPPO)
+"""
+PLACE = "mine.py:9, Mine."
+
+
+def mine(folder: Path, method: str, parent: str = "LeggedRobot") -> LoadedTask:
+    """A task whose class has one ``method`` of its own."""
+    (folder / "mine.py").write_text(MINE.format(parent=parent, method=method.replace("\n", "\n    ")))
+    return load_task(str(folder / "mine.py"))
+
+
+def lines_on(task: LoadedTask) -> list[str]:
+    return check_class(task.env_class, task.cfg.to_dict()["rewards"]["scales"])
+
+
+@pytest.mark.parametrize(
+    ("method", "call"),
+    [
+        ("def _init_buffers(self):\n    self.mine = torch.zeros(3)", "super()._init_buffers()"),
+        ("def _update_state(self):\n    self.mine = 1", "super()._update_state()"),
+        ("def _end_step(self):\n    pass", "super()._end_step()"),
+        ("def reset_envs(self, mask):\n    self.mine = mask", "super().reset_envs(mask)"),
+        ("def _reset_robots(self, mask):\n    self.mine = mask", "super()._reset_robots(mask)"),
+        ("def _reset_task(self, mask):\n    self.mine = mask", "super()._reset_task(mask)"),
+        ("@torch.no_grad()\ndef _end_step(self):\n    pass", "super()._end_step()"),
+    ],
+)
+def test_a_hook_without_super_is_named(method: str, call: str, tmp_path: Path) -> None:
+    task = mine(tmp_path, method)
+    with pytest.raises(StepError) as error:
+        lines_on(task)
+    assert PLACE in error.value.where and call in error.value.what and WITHOUT in error.value.what
+
+
+@pytest.mark.parametrize(
+    ("method", "parent"),
+    [
+        ("def _end_step(self):\n    super()._end_step()", "LeggedRobot"),
+        ("def _end_step(self):\n    LeggedRobot._end_step(self)", "LeggedRobot"),
+        ("def _end_step(self):  # without super: nothing is remembered\n    pass", "LeggedRobot"),
+        ("def _reset_task(self, mask):\n    self.mine = mask", "RobotTask"),  # whose own does nothing
+        ("def _resample_commands(self, mask):\n    self._reset_commands(mask)", "LeggedRobot"),  # may be replaced
+        ("def _fallen(self):\n    return self.reset_buf", "LeggedRobot"),
+    ],
+)
+def test_what_calls_its_parent_or_may_replace_it_passes(method: str, parent: str, tmp_path: Path) -> None:
+    assert lines_on(mine(tmp_path, method, parent)) == []
+
+
+@pytest.mark.parametrize("how", [[], ["--check"], ["--eager"]], ids=["training", "check", "eager"])
+def test_a_hook_without_super_ends_a_training_before_it_begins(how: list[str], tmp_path: Path) -> None:
+    task = mine(tmp_path, "def reset_envs(self, mask):\n    pass")
+    result = run("train", tmp_path, "--task", str(task.path), "--device", "cpu", *how)
+    assert result.code == 2 and PLACE in result.err and not (tmp_path / "logs").exists()
+
+
+@pytest.mark.parametrize("name", LEGGED_GYM_METHODS)
+def test_a_hook_of_legged_gyms_is_named_with_ours(name: str, tmp_path: Path) -> None:
+    [line] = lines_on(mine(tmp_path, f"def {name}(self, env_ids):\n    super().{name}(env_ids)"))
+    assert PLACE in line and LEGGED_GYM_METHODS[name] in line
+
+
+def test_a_method_of_that_name_which_the_users_own_code_calls_passes(tmp_path: Path) -> None:
+    methods = "def _get_heights(self):\n    return 0\n\ndef _update_state(self):\n    super()._update_state()\n    self._get_heights()"
+    assert lines_on(mine(tmp_path, methods)) == []
+
+
+def test_what_legged_gym_calls_differently_stands_in_the_table() -> None:
+    """And what is named instead is there."""
+    page = (ROOT / "docs" / "from_legged_gym.md").read_text()
+    for old, here in {**LEGGED_GYM_METHODS, **LEGGED_GYM_TENSORS}.items():
+        assert re.search(rf"\b{old}\b", page), old
+        assert all(word in page for word in re.findall(r"\w+", here.partition("(")[0]) if "_" in word), here
+
+
+def test_a_reward_with_a_letter_too_many_is_named(tmp_path: Path) -> None:
+    [line] = lines_on(mine(tmp_path, "def _rewards_crouch(self):\n    return self.base_height"))
+    assert PLACE + "_rewards_crouch" in line and "_reward_" in line
+
+
+def test_a_reward_of_a_users_own_without_a_scale_is_off(tmp_path: Path) -> None:
+    """The check says so."""
+    task = mine(tmp_path, "def _reward_crouch(self):\n    return self.base_height")
+    small = ("--task", str(task.path), "--device", "cpu", "--num_envs", "4", "--check")
+    off = [line.split() for line in run("train", tmp_path, *small).out.splitlines() if " off: rewards" in line]
+    assert off == [["crouch", "off:", "rewards.scales.crouch", "is", "missing"]]
+    assert " off: rewards" not in run("train", tmp_path, *small, "--set", "rewards.scales.crouch=1").out
+
+
+@pytest.mark.parametrize(("name", "scale"), [("tracking_lin_vel", -1.0), ("action_rate", 0.01), ("alive", -1.0), ("feet_slip", 1.0)])
+def test_a_scale_of_the_unusual_sign_is_named(name: str, scale: float) -> None:
+    task = load_task("go1_flat")
+    task.set(f"rewards.scales.{name}", scale)
+    [line] = lines_on(task)
+    assert f"rewards.scales.{name} is {scale:g}" in line
+
+
+def test_a_term_of_a_users_own_has_any_sign(tmp_path: Path) -> None:
+    task = mine(tmp_path, "def _reward_torques(self):\n    return -self.torques.square().sum(dim=1)")
+    task.set("rewards.scales.torques", 1.0)
+    assert lines_on(task) == []
+
+
+@pytest.mark.parametrize("name", [*task_names(), *(f"examples/{path.name}" for path in sorted((ROOT / "examples").glob("*.py")))])
+def test_no_task_of_ours_is_warned_of(name: str) -> None:
+    if name.startswith("examples/") and "TASK = " not in (ROOT / name).read_text():
+        return
+    task = load_task(name if not name.startswith("examples/") else str(ROOT / name))
+    wrong, odd = doubts(task)
+    assert lines_on(task) == wrong == []
+    assert bool(odd) == ("g1_" in name), "on two legs it tilts, and its lightest joints ring"
+
+
+def test_usual_signs_are_those_of_the_page() -> None:
+    rows = re.findall(r"^\| (`\w+`(?:, `\w+`)*) \|.*\| (above|below) 0 \|$", (ROOT / "docs" / "tasks.md").read_text(), re.MULTILINE)
+    signs = {term: side == "above" for terms, side in rows for term in re.findall(r"\w+", terms)}
+    assert len(signs) >= 25 and all((term in PAYS) == above for term, above in signs.items())
+
+
+@pytest.mark.parametrize(("name", "here"), [("root_states", "root_pos"), ("foot_speeds", "'foot_speed'")])
+def test_a_tensor_that_is_not_there_is_answered_with_what_is(name: str, here: str) -> None:
+    with pytest.raises(AttributeError) as error:
+        getattr(make_env(1), name)
+    assert here in in_short(error.value)
+
+
+# ---- what a robot cannot learn with ----
+
+AT_ONCE = {
+    "termination.min_base_height": "5",
+    "env.episode_length_s": "0.02",
+    "asset.terminate_after_contacts_on": "[FR, FL, RR, RL]",
+}
+
+
+@pytest.mark.parametrize("field", AT_ONCE)
+def test_the_rule_that_ends_every_episode_at_once_is_named(field: str) -> None:
+    task = load_task("go1_flat")
+    task.set(field, AT_ONCE[field])
+    [line] = doubts(task)[0]
+    assert [each for each in AT_ONCE if each in line] == [field]
+
+
+def test_a_fall_of_a_users_own_that_ends_every_episode_is_named(tmp_path: Path) -> None:
+    [line] = doubts(mine(tmp_path, "def _fallen(self):\n    return self.base_height > 0"))[0]
+    assert PLACE + "_fallen" in line
+
+
+@pytest.mark.parametrize("task", ["go1_flat", "g1_getup"])
+def test_doubts_draw_no_number(task: str) -> None:
+    """A training is the same with them."""
+    before = torch.get_rng_state()
+    doubts(load_task(task))
+    assert torch.equal(torch.get_rng_state(), before)
+
+
+def test_episodes_of_one_step_are_said_when_training_begins_and_after_two_iterations(tmp_path: Path) -> None:
+    field = "termination.min_base_height"
+    result = run("train", tmp_path, *SMALL, "--max_iterations", "3", "--set", f"{field}=5")
+    warned = [line for line in result.out.splitlines() if line.lower().startswith("warning")]
+    assert result.code == 0 and [field in line for line in warned] == [True, False]
+    assert "iteration 2: episodes last 1.0 steps" in warned[1] and " fell" in warned[1] and "timed out" not in warned[1]
+
+
+@pytest.mark.parametrize(("kp", "what"), [("0", "sags"), ("25000", "unstable")])
+@pytest.mark.parametrize("how", [["--check"], ["--max_iterations", "1"]], ids=["check", "training"])
+def test_gains_that_no_robot_stands_on_are_said(kp: str, what: str, how: list[str], tmp_path: Path) -> None:
+    """As the picture's page says it."""
+    out = run("train", tmp_path, *SMALL, "--set", f"control.stiffness={{'': {kp}}}", *how).out
+    [line] = [line for line in out.splitlines() if what in line]
+    assert line.startswith("  - " if how == ["--check"] else "warning: ") and "FR_calf_joint" in line
+
+
+@pytest.mark.parametrize("law", ["torque", "dc_motor"])
+def test_other_motors_are_looked_at_as_far_as_they_have_gains(law: str) -> None:
+    task = load_task("go1_flat")
+    task.update({"control": {"actuator": law, "stall_torque": {"": 30.0}, "no_load_speed": {"": 30.0}, "stiffness": {"": 0.0}}}, "test")
+    wrong, _ = doubts(task)
+    assert bool(wrong) == (law == "dc_motor")

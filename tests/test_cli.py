@@ -86,7 +86,7 @@ def first(root: Path) -> Path:
         (["--task", "dog/dog.py"], ("no config file at ", "dog/dog.py")),
         (
             [*TASK, "--num_env", "4"],
-            ("unrecognized arguments: --num_env 4", "--help"),
+            ("unrecognized arguments: --num_env 4; did you mean --num_envs?", "--help"),
         ),  # no abbreviations: they would change meaning one day
         ([*TASK, "--num_envs", "0"], ("argument --num_envs: 0 is not a positive number",)),
         ([*TASK, "--num_envs", "many"], ("argument --num_envs: invalid positive value: 'many'",)),

@@ -673,6 +673,7 @@ def test_the_page_is_served_on_this_machine_alone_and_says_no_to_a_bad_host(monk
     import asyncio
     import urllib.request
 
+    from mujoco.studio import web_viewer
     from mujoco.studio.web import web_server
 
     from legged_mw.view.web import WebViewer
@@ -699,6 +700,9 @@ def test_the_page_is_served_on_this_machine_alone_and_says_no_to_a_bad_host(monk
     assert not page.is_running()
     with pytest.raises(ViewError, match=r"--host 203.0.113.7: this machine has no such address"):
         WebViewer(SPEC, pilot, host="203.0.113.7")
+    with pytest.raises(ViewError, match="--host"):  # which a socket takes for every interface
+        WebViewer(SPEC, pilot, host="")
+    assert not hasattr(web_viewer, "print"), "Studio's own words are its own again"
 
 
 # ---- the environment as a stage

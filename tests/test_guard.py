@@ -364,7 +364,11 @@ MISTAKES: dict[str, tuple[str, str, str]] = {
         "self.past.add_(self.dof_pos)",
         "Mine._end_step: RuntimeError: The size of tensor a (4) must match the size of tensor b (12) at non-singleton dimension 1",
     ),
-    "unknown name": (REWARD, "self.speed", "Mine._reward_pose: AttributeError: 'Mine' object has no attribute 'speed'"),
+    "unknown name": (
+        REWARD,
+        "self.speed",
+        "Mine._reward_pose: AttributeError: 'Mine' object has no attribute 'speed'; did you mean 'foot_speed'?",
+    ),
     "shape": (
         "\n    def _reward_pose(self):  # here\n        return {}\n",
         "self.dof_pos.square()",

@@ -31,6 +31,8 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
     lines.append("reward terms (scale)")
     scales = task.cfg.to_dict()["rewards"]["scales"]
     lines += [f"  {name:<20} {scales[name]:g}" for name in env.reward_names]
+    off = [name for name in _own_terms(env) if not scales.get(name)]
+    lines += [f"  {name:<20} off: rewards.scales.{name} is {scales.get(name, 'missing')}" for name in off]
     lines.append("joints: default, range [rad], force limit [N m]")
     width = max(map(len, env.robot.joint_names))
     for name, default, (low, high), (_, limit) in zip(
@@ -41,6 +43,12 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
     lines.append(f"what was dropped, added or changed in {task.cfg.asset.file}")
     lines += [f"  {line}" for line in env.robot.overrides]
     return "\n".join(lines)
+
+
+def _own_terms(env: RobotTask) -> list[str]:
+    """Reward terms that the user's classes write."""
+    own = [kind for kind in type(env).__mro__ if not kind.__module__.startswith("legged_mw.")]
+    return sorted({name.removeprefix("_reward_") for kind in own for name in vars(kind) if name.startswith("_reward_")})
 
 
 def _memories(task: LoadedTask) -> list[str]:

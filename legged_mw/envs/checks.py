@@ -1,21 +1,44 @@
-"""Config values that fit their fields, but not each other. What a field alone may hold stands in its annotation."""
+"""Config values that fit their fields, but not each other, and methods of a user's class that do not fit ours.
+
+What a field alone may hold stands in its annotation.
+"""
 
 from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
 
 from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, active
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
+from legged_mw.envs.own_code import place_of
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
 from legged_mw.utils.bounds import Range
 from legged_mw.utils.commands import HEADING
 from legged_mw.utils.config import ConfigError, fit
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import StepError, unknown
+from legged_mw.utils.renamed import LEGGED_GYM_METHODS
+
+HOOKS = (  # whose parents do what every step or reset needs; a command's hooks may be replaced
+    *("_init_buffers", "_episode_columns", "_update_state", "_end_step", "compute_observations"),
+    *("reset_envs", "_reset_robots", "_reset_task", "_update_curricula"),
+)
+WITHOUT = "# without super"  # a comment in the method: it is so on purpose
+PAYS = (  # terms of envs/robot_rewards.py and legged_rewards.py whose usual scale is above 0, as that of every skill's own; others cost
+    *("alive", "pose", "tracking_lin_vel", "tracking_ang_vel", "feet_air_time", "feet_contact_without_cmd"),
+    *("single_stance", "no_fly", "feet_phase", "contact_phase"),
+)
 
 
 def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None, law: str = "") -> None:
     """Raise ConfigError at the first value that cannot work; ``law`` of the motors is ``control.actuator``, unless said otherwise."""
     _check_redraws(cfg, law)
     _check_motors(cfg)
+    step = cfg.sim.dt * cfg.control.decimation
+    if cfg.env.episode_length_s < step:
+        raise ConfigError(f"env.episode_length_s is {cfg.env.episode_length_s:g}, shorter than a control step of {step:g} s")
     if isinstance(cfg, LeggedRobotCfg):
         _check_walking(cfg)
     if isinstance(cfg, MotionTrackingCfg):
@@ -108,3 +131,65 @@ def _check_redraws(cfg: RobotTaskCfg, law: str) -> None:
         writers = [kind for kind, (what, *_) in active(cfg, law).items() if kind != name and name in what.fields]
         if writers:
             raise ConfigError(f"domain_rand.model_factors.{name}: domain_rand.{writers[0]} writes that field; leave one of them out ([])")
+
+
+# ---- methods of a user's class ----
+
+
+def check_class(env_class: type, scales: Mapping[str, float]) -> list[str]:
+    """Warnings on methods that nothing calls, and on ``scales`` of our terms. Raises StepError at a hook that never calls its parent's."""
+    for kind, name, method in _own(env_class):
+        source = _source(method)
+        if name not in HOOKS or re.search(rf"\.{name}\b", source) or WITHOUT in source or not source:
+            continue
+        if _does_something(env_class.__mro__[env_class.__mro__.index(kind) + 1 :], name):
+            arguments = ", ".join([*inspect.signature(method).parameters][1:])
+            call = f"super().{name}({arguments})"
+            what = f"never calls {call}, which every robot needs: call it first; if it is so on purpose, say {WITHOUT} in a comment there"
+            raise StepError(what, place_of(method))
+    lines = []
+    for kind, name, method in _own(env_class):
+        misspelt = re.fullmatch(r"_?rewards?_\w+", name) and not name.startswith("_reward_")
+        if hasattr(kind.__mro__[1], name) or not (misspelt or name in LEGGED_GYM_METHODS) or _is_called(env_class, name):
+            continue
+        instead = "a reward's name begins with _reward_" if misspelt else f"{LEGGED_GYM_METHODS[name]} is what there is"
+        lines.append(f"warning: {place_of(method)}: nothing calls {name}; {instead}")
+    return [*lines, *_unusual_signs(env_class, scales)]
+
+
+def _unusual_signs(env_class: type, scales: Mapping[str, float]) -> Iterator[str]:
+    """Of terms that are ours."""
+    for name, scale in scales.items():
+        method = getattr(env_class, f"_reward_{name}", None)
+        if method is None or not method.__module__.startswith("legged_mw."):
+            continue
+        pays = name in PAYS or method.__qualname__.partition(".")[0] not in ("RobotRewards", "LeggedRewards")
+        if scale and pays != (scale > 0.0):
+            usual = "above 0: it is what the robot should do" if pays else "below 0: it is what the robot should avoid"
+            yield f"warning: rewards.scales.{name} is {scale:g}; its usual sign is {usual} (docs/tasks.md)"
+
+
+def _own(env_class: type) -> Iterator[tuple[type, str, Callable[..., Any]]]:
+    """(class, name, method) of all methods that the user's classes write."""
+    for kind in env_class.__mro__:
+        if not kind.__module__.startswith("legged_mw.") and kind is not object:
+            yield from ((kind, name, value) for name, value in vars(kind).items() if inspect.isfunction(value))
+
+
+def _does_something(parents: tuple[type, ...], name: str) -> bool:
+    """Whether what the parents have under ``name`` is more than a docstring."""
+    method = next((vars(kind)[name] for kind in parents if name in vars(kind)), None)
+    return method is not None and bool(re.search(r"self\.|return", _source(method)))
+
+
+def _is_called(env_class: type, name: str) -> bool:
+    """Whether another method of the user's names it."""
+    return any(re.search(rf"\.{name}\b", _source(method)) for _, other, method in _own(env_class) if other != name)
+
+
+def _source(method: Any) -> str:
+    """What is written there; '' of what was typed at a prompt."""
+    try:
+        return inspect.getsource(inspect.unwrap(method))
+    except (OSError, TypeError):
+        return ""

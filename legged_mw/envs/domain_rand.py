@@ -79,8 +79,9 @@ def active(cfg: RobotTaskCfg, law: str = "") -> dict[str, tuple[Kind, float, flo
 
 
 def world_fields(cfg: RobotTaskCfg, law: str = "") -> list[str]:
-    """Model fields that need a value per world."""
-    return list(dict.fromkeys(field for kind, _, _ in active(cfg, law).values() for field in kind.fields))
+    """Model fields that need a value per world; and those of factors that change nothing, so that a field that is none is refused."""
+    factors = cfg.domain_rand.model_factors if cfg.domain_rand.enable else {}
+    return list(dict.fromkeys([*(field for kind, _, _ in active(cfg, law).values() for field in kind.fields), *factors]))
 
 
 class DomainRand:

@@ -12,6 +12,7 @@ from legged_mw.utils.bounds import (
     THREE,
     Bound,
     Count,
+    Height,
     NonNegative,
     Part,
     Points,
@@ -21,6 +22,7 @@ from legged_mw.utils.bounds import (
     ShareRange,
     Sign,
     Span,
+    Swing,
     Whole,
     or_empty,
 )
@@ -77,10 +79,10 @@ class LeggedRobotCfg(RobotTaskCfg):
     class rewards(RobotTaskCfg.rewards):
         tracking_sigma: Positive = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
         tracking_sigma_end: NonNegative = 0.0  # where it goes in a straight line over max_iterations; 0: it stays [ours]
-        swing_height: Positive = 0.1  # wanted height of a swinging foot [m] [P]
+        swing_height: Swing = 0.1  # wanted height of a swinging foot [m] [P]
         min_air_time: NonNegative = 0.1  # a step that lasts less is penalised [s] [P]
         min_command: NonNegative = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]
-        min_feet_distance: NonNegative = 0.2  # sideways between left and right feet, of `feet_distance` [m] [P: T1, G1]
+        min_feet_distance: Height = 0.2  # sideways between left and right feet, of `feet_distance` [m] [P: T1, G1]
         max_contact_force: NonNegative = 100.0  # on a foot, above which `feet_contact_forces` counts [N] [L]
         max_single_stance: Positive = 0.4  # on one foot, from where `single_stance` grows no more [s] [Isaac Lab: G1]
 

@@ -12,6 +12,7 @@ places and velocities of sites, accelerometer, joint torque) is one simulation s
 from __future__ import annotations
 
 import math
+from functools import reduce
 
 import torch
 from tensordict import TensorDict
@@ -134,12 +135,15 @@ class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
 
     def _fallen(self) -> Tensor:
         """(N,) The robot failed: too tilted, too low, or on the ground with what must not touch it."""
-        down = self.projected_gravity[:, 2] > 1e-5 - math.cos(math.radians(self.cfg.termination.max_tilt))  # at 180 degrees never
+        return reduce(torch.logical_or, self.fall_rules().values())
+
+    def fall_rules(self) -> dict[str, Tensor]:
+        """(N,) each, by the field that it comes from."""
+        tilt, low = math.cos(math.radians(self.cfg.termination.max_tilt)), self.cfg.termination.min_base_height
+        rules = {"termination.max_tilt": self.projected_gravity[:, 2] > 1e-5 - tilt}  # at 180 degrees never
         if len(self.contacts.terminating):
-            down |= self.contact_count[:, self.contacts.terminating].amax(dim=1) > 0.0
-        if self.cfg.termination.min_base_height:
-            down |= self.base_height < self.cfg.termination.min_base_height
-        return down
+            rules["asset.terminate_after_contacts_on"] = self.contact_count[:, self.contacts.terminating].amax(dim=1) > 0.0
+        return {**rules, "termination.min_base_height": self.base_height < low} if low else rules
 
     def _timed_out(self) -> Tensor:
         """(N,) The episode ends, but not by a failure."""

@@ -11,20 +11,25 @@ from typing import Annotated, Any, Literal
 from legged_mw.utils.bounds import (
     PAIR,
     THREE,
+    Angle,
     Bound,
+    ContactTimes,
     Count,
     Delays,
     Factors,
     Few,
     Gain,
+    Height,
+    Iterations,
     Names,
     NonNegative,
-    NonZero,
     Offsets,
     Part,
+    Places,
     Positive,
     PositiveRange,
     Range,
+    Scale,
     Seconds,
     Seed,
     Share,
@@ -82,7 +87,7 @@ class RobotTaskCfg(Config):
 
     class init_state:
         pos: Place = []  # root at reset [m]; empty: feet as high as in the keyframe "home" or the only one, or on the ground
-        default_joint_angles: dict[str, float] = {}  # table a joint [rad]: the pose of action 0; joints without a key: that keyframe's
+        default_joint_angles: dict[str, Angle] = {}  # table a joint [rad]: the pose of action 0; joints without a key: that keyframe's
         dof_pos_range: Range = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
         dof_pos_offset: Range = [0.0, 0.0]  # added to each joint at reset, U(low, high), within its range [rad]
         dof_vel_range: Speed = 0.0  # each joint's velocity at reset, U(-range, range) [rad/s]
@@ -104,7 +109,7 @@ class RobotTaskCfg(Config):
         gear: dict[str, Positive] = {"": 1.0}  # turns of the motor a turn of the joint; 1: the two tables are the joint's own
         network: str = ""  # of `network`: an .npz, as `python -m legged_mw.robot.actuator_net` writes it
         network_digest: dict[str, str] = {}  # written by train.py: that name -> SHA-256 of the file; a changed file is refused
-        action_scale: NonZero | dict[str, NonZero] = 0.5  # target = origin + scale * action [rad, rad/s]; a number, or a table a joint [P]
+        action_scale: Scale | dict[str, Scale] = 0.5  # target = origin + scale * action [rad, rad/s]; a number, or a table a joint [P]
         # the default pose, the measured angles or the last targets [P]; "speed": none, a dc_motor gives damping (scale action - speed)
         action_origin: Literal["default", "joints", "targets", "speed"] = "default"
         decimation: Few = 5  # simulation steps a control step [P]
@@ -115,7 +120,7 @@ class RobotTaskCfg(Config):
 
     class termination:
         max_tilt: Tilt = 90.0  # [deg] between the root's z axis and the vertical; beyond it, it fell [P]
-        min_base_height: NonNegative = 0.0  # [m] of the root above the ground under it; lower, it fell; 0: anything [ours]
+        min_base_height: Height = 0.0  # [m] of the root above the ground under it; lower, it fell; 0: anything [ours]
         max_speed: Positive = 1.0e4  # [m/s, rad/s] of any degree of freedom; beyond it the state counts as not finite [ours]
 
     class rewards:
@@ -124,7 +129,7 @@ class RobotTaskCfg(Config):
         max_reward: Positive = 10000.0  # upper clip of the sum, a step [P]
         soft_dof_pos_limit: Part = 0.95  # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
         pose_weights: dict[str, NonNegative] = {"": 1.0}  # table a joint: weight in `pose` [-]
-        base_height_target: NonNegative = 0.0  # of `base_height`: of the root above the ground under it [m]
+        base_height_target: Height = 0.0  # of `base_height`: of the root above the ground under it [m]
         hip_joints: list[str] = []  # of `hip_pos`: joints' names, patterns, or parts of names
         mirror_joints: Pairs = []  # of `joint_mirror`: pairs of joints, likewise: [["FR_", "RL_"], ["FL_", "RR_"]]
         deviation_weights: dict[str, NonNegative] = {"": 1.0}  # table a joint: weight in `joint_deviation` [-]
@@ -175,10 +180,10 @@ class RobotTaskCfg(Config):
         enable: bool = False  # [P]
         link_mass: Factors = [0.9, 1.1]  # factor on each link's mass, its inertia with it [P; inertia ours]
         base_mass: Offsets = [-1.0, 1.0]  # added to the root's [kg], its inertia in proportion [P; inertia ours]
-        base_com: Offsets = [-0.05, 0.05]  # added to the place of the root's centre of mass, each axis [m] [P]
+        base_com: Places = [-0.05, 0.05]  # added to the place of the root's centre of mass, each axis [m] [P]
         armature: Factors = [1.0, 1.05]  # factor on each joint's [P]
         friction: Factors = [0.4, 1.0]  # sliding friction of the ground [-] [P]
-        contact_time: Factors = []  # time constant of the ground's contacts (solref) [s]: longer is softer, 0.02 is MuJoCo's
+        contact_time: ContactTimes = []  # time constant of the ground's contacts (solref) [s]: longer is softer, 0.02 is MuJoCo's
         frictionloss: Factors = [0.9, 1.1]  # factor on each joint's dry friction [P]
         stiffness: Factors = []  # factor on each servo's position gain
         damping: Factors = []  # factor on each joint's damping
@@ -326,7 +331,7 @@ class RobotTaskCfgPPO(Config):
 
         policy: str = ""  # the run, checkpoint or export, or a task for its last or shipped policy
         init_std: Positive = 0.2  # of exploration at the start [ours: less than from nothing, as it can walk]
-        critic_warmup: Whole = 20  # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
+        critic_warmup: Iterations = 20  # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
 
     class anneal:
         """What a number of `algorithm` goes to, in a straight line over max_iterations or --max_time; 0: it stays [ours]."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from legged_mw.envs.divergence import SHARE
 from legged_mw.envs.suspects import BOUND
@@ -40,6 +40,17 @@ class Health:
             share = f"{found[worst]:.0f} of {steps} steps of a world, for {IN_A_ROW} iterations"
             return warnings, f"{worst} is not finite, or beyond {BOUND:g}, in {share}; look at how it is computed"
         return warnings, ""
+
+    def lengths(self, iteration: int, numbers: Mapping[str, float]) -> list[str]:
+        """A line after two iterations in which episodes lasted a step: how they end."""
+        if iteration != 2 or not numbers["episodes"] or numbers["episode_length"] > 1.5:
+            return []
+        fell, broken = numbers["fell"], numbers["broken"]
+        ends = {"fell": fell, "had a state that is not finite": broken, "timed out": numbers["episodes"] - fell - broken}
+        said = ", ".join(f"{count:.0f} {end}" for end, count in ends.items() if count)
+        return [
+            f"episodes last {numbers['episode_length']:.1f} steps ({said}): nothing can be learned; --check names the rule that ends them"
+        ]
 
     def _by_name(self, counts: Sequence[float]) -> dict[str, float]:
         """Those that were found: of a row with several columns the worst one's count."""

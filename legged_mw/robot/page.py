@@ -20,7 +20,7 @@ def page(health: Health, title: str, guessed: Sequence[str] = (), changed: Seque
     lines += ["joints", *_table(health, gains), *_LEGEND]
     if changed:
         lines += ["what was dropped, added or changed in the file", *(f"  {line}" for line in changed)]
-    found = remarks(health, gains)
+    found = [*faults(health), *doubtful(health, gains)]
     return "\n".join([*lines, "what to look at", *(f"  - {line}" for line in found or ["nothing: all numbers are within bounds"])])
 
 
@@ -92,36 +92,41 @@ def _row(joint: Joint, gain: Gains, health: Health) -> tuple[str, ...]:
     )
 
 
-def remarks(health: Health, gains: Sequence[Gains]) -> list[str]:
-    """What should be looked at, a line each: what is wrong, where, and the field that mends it."""
-    dt, joints = health.dt, health.joints
+def _those(which: Sequence[Joint]) -> str:
+    return ", ".join(joint.name for joint in which)
 
-    def those(which: Sequence[Joint]) -> str:
-        return ", ".join(joint.name for joint in which)
 
-    lines = []
+def faults(health: Health) -> list[str]:
+    """What should be looked at, a line each: what is wrong, where, and the field that mends it. Here what no training makes up for."""
+    dt, joints, lines = health.dt, health.joints, []
     if bad := [joint for joint in joints if joint.verdict(dt, health.implicit) == "unstable"]:
         lines.append(
-            f"unstable servos: {those(bad)}: lower control.damping or control.stiffness, or give them armature (asset.armature), "
+            f"unstable servos: {_those(bad)}: lower control.damping or control.stiffness, or give them armature (asset.armature), "
             "or lower sim.dt, or set sim.integrator to implicitfast"
         )
+    elif health.mode.growth > 1.0 + _GROWS:
+        lines.append(f"no servo is unstable alone, but all together are ({', '.join(health.mode.joints)}): lower sim.dt or the gains")
+    if weak := [joint for joint in joints if abs(joint.torque) > joint.effort]:
+        lines.append(f"to rest in this pose takes more than the effort of {_those(weak)}: choose another init_state.default_joint_angles")
+    if soft := [joint for joint in joints if joint.sag() > _TIP]:
+        lines.append(f"sags by more than {_TIP:g} rad at rest: {_those(soft)}: raise control.stiffness, or choose another pose")
+    return lines
+
+
+def doubtful(health: Health, gains: Sequence[Gains]) -> list[str]:
+    """Likewise what some robots live with."""
+    dt, joints, lines = health.dt, health.joints, []
     if rings := [joint for joint in joints if joint.verdict(dt, health.implicit) == "rings"]:
         lines.append(
-            f"damping turns the velocity's sign in every substep: {those(rings)}: lower control.damping or sim.dt, or give them armature"
+            f"damping turns the velocity's sign in every substep: {_those(rings)}: lower control.damping or sim.dt, or give them armature"
         )
-    if health.mode.growth > 1.0 + _GROWS and not bad:
-        lines.append(f"no servo is unstable alone, but all together are ({', '.join(health.mode.joints)}): lower sim.dt or the gains")
     if bare := [joint for joint, gain in zip(joints, gains, strict=True) if not joint.armature and gain.cut]:
         lines.append(
-            f"no armature, which limits the gains that the step bears: {those(bare)}: a geared motor adds its rotor's inertia times "
+            f"no armature, which limits the gains that the step bears: {_those(bare)}: a geared motor adds its rotor's inertia times "
             "the gear ratio squared; write that into asset.armature"
         )
     if endless := [joint for joint in joints if not math.isfinite(joint.effort)]:
-        lines.append(f"no force limit: {those(endless)}: say asset.effort, or they are trained with torques that no motor has")
-    if weak := [joint for joint in joints if abs(joint.torque) > joint.effort]:
-        lines.append(f"to rest in this pose takes more than the effort of {those(weak)}: choose another init_state.default_joint_angles")
-    if soft := [joint for joint in joints if joint.sag() > _TIP]:
-        lines.append(f"sags by more than {_TIP:g} rad at rest: {those(soft)}: raise control.stiffness, or choose another pose")
+        lines.append(f"no force limit: {_those(endless)}: say asset.effort, or they are trained with torques that no motor has")
     if health.rest.toppled or health.margin < 0.0:
         lines.append("the centre of mass is not over the feet: choose another init_state.default_joint_angles")
     if health.stand.end != "stands":

@@ -39,7 +39,7 @@ def above(low: float, most: float = math.inf, unit: str = "") -> Bound:
 
 _NOT_TEXT = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 _ALWAYS = {
-    float: Bound("finite", lambda value: abs(value) <= 3.4e38),  # what is larger is infinite to float32, so to every tensor
+    float: Bound("finite, and 10^9 at most", lambda value: abs(value) <= 1e9),  # no unit of a config needs more
     int: Bound("below 10^24", lambda value: abs(value) < 10**24),  # more than any machine counts, and few enough digits to print
     str: Bound("text without control characters", lambda value: not _NOT_TEXT.search(value)),  # which rule a terminal, or no file takes
 }
@@ -55,18 +55,22 @@ SOME = Bound("a list of at least one", lambda value: len(value) > 0)
 
 Positive = Annotated[float, above(0)]
 NonNegative = Annotated[float, at_least(0)]
-NonZero = Annotated[float, Bound("another number than 0", lambda value: value != 0)]
+Scale = Annotated[float, Bound("another number than 0, and 10,000 at most", lambda value: 0 < abs(value) <= 1e4)]
 Share = Annotated[float, at_least(0, 1)]
 Part = Annotated[float, above(0, 1)]  # a share that is not 0
 Seconds = Annotated[float, above(0, 1e6, "s")]  # a million: what counts steps never overflows
 Span = Annotated[float, at_least(0, 1e6, "s")]  # such a time, or none
 Speed = Annotated[float, at_least(0, 1000)]  # [m/s, rad/s]: no machine is as fast
+Height = Annotated[float, at_least(0, 10, "m")]  # of a robot or of its feet
+Swing = Annotated[float, above(0, 10, "m")]  # such a height, that is not 0
+Angle = Annotated[float, Bound("from -2 pi to 2 pi rad, no degrees", lambda value: abs(value) <= 2 * math.pi)]
 Gain = Annotated[float, at_least(0, 1e6)]  # in SI units, of a joint or motor: no robot has more
 Sign = Annotated[float, Bound("1 or -1", lambda value: value in (1, -1))]
 
 Count = Annotated[int, at_least(1)]
 Whole = Annotated[int, at_least(0)]
 Few = Annotated[int, at_least(1, 1000)]  # of what is repeated in a loop, where more would never end
+Iterations = Annotated[int, at_least(0, 1_000_000)]
 Seed = Annotated[int, Bound("a whole number below 2^63", lambda value: abs(value) < 2**63)]
 
 Names = Annotated[list[str], SOME]
@@ -80,6 +84,8 @@ ShareRange = Annotated[list[Share], PAIR]
 
 # Of a range that nothing needs to be drawn from: empty, it is left out
 Factors = Annotated[list[Annotated[float, above(0, 1000)]], or_empty(PAIR)]
+Places = Annotated[list[Annotated[float, at_least(-10, 10, "m")]], or_empty(PAIR)]
+ContactTimes = Annotated[list[Annotated[float, at_least(1e-4, 10, "s")]], or_empty(PAIR)]
 Offsets = Annotated[list[float], or_empty(PAIR)]
 Shares = Annotated[list[Share], or_empty(PAIR)]
 Delays = Annotated[list[NonNegative], or_empty(PAIR)]

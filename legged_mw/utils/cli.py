@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import random
 import re
 import sys
@@ -28,6 +29,16 @@ class Parser(argparse.ArgumentParser):
         self.add_argument(
             "--verbose", action="store_true", help="say more: the whole traceback of an error; all numbers of an iteration while training"
         )
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As argparse's, but a flag that does not exist is answered with the nearest one."""
+        found, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            flags = [word.partition("=")[0] for word in unknown if word.startswith("-")]
+            near = [close[0] for flag in flags if (close := difflib.get_close_matches(flag, self._option_string_actions, n=1))]
+            hint = f"; did you mean {', '.join(near)}?" if near else ""
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+        return found
 
     def error(self, message: str) -> NoReturn:
         fail(self.prog, f"{message if len(message) <= 500 else f'{message[:500]}...'} (--help lists the flags)")

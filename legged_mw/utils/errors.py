@@ -11,6 +11,8 @@ from collections.abc import Iterable
 from pathlib import Path
 from types import CodeType
 
+from legged_mw.utils.renamed import LEGGED_GYM_TENSORS
+
 _LIBRARIES = {"torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl", "legged_mw.check"}
 _STANDARD = sysconfig.get_paths()["stdlib"]
 
@@ -81,9 +83,19 @@ def users_fault(error: BaseException) -> str:
 
 
 def in_short(error: BaseException) -> str:
-    """An error in one line: its type and what it says, without end."""
+    """An error in one line: its type and what it says, without end; of an attribute that does not exist what does."""
     text = " ".join(f"{error}".split())
-    return f"{type(error).__name__}: {text[:400]}" if text else type(error).__name__
+    return f"{type(error).__name__}: {text[:400]}{_instead(error)}" if text else type(error).__name__
+
+
+def _instead(error: BaseException) -> str:
+    """What stands for an attribute of legged_gym's here, or the nearest name; ''."""
+    if not isinstance(error, AttributeError) or not error.name or error.obj is None:
+        return ""
+    if hasattr(type(error.obj), "observation_rows") and (here := LEGGED_GYM_TENSORS.get(error.name)):
+        return f"; here that is {here} (docs/from_legged_gym.md)"
+    close = difflib.get_close_matches(error.name, dir(error.obj), n=1)
+    return f"; did you mean '{close[0]}'?" if close else ""
 
 
 def brief(value: object, most: int = 200) -> str:

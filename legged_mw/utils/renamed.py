@@ -1,4 +1,4 @@
-"""Fields that had another name once: what an error suggests for the old name, and how an old run's config.yaml still loads."""
+"""Names that were others once: fields of ours, whose old runs still load; and what legged_gym calls differently."""
 
 from __future__ import annotations
 
@@ -11,6 +11,33 @@ RENAMED: dict[str, tuple[str, ...]] = {
     "perturbation.enable": ("perturbation", "kick"),
     "cpu.keep_probability": ("cpu", "overrides", "commands.keep_probability"),
     "cpu.kick_curriculum": ("cpu", "overrides", "perturbation.curriculum"),
+}
+
+# What a class ported from legged_gym may define, which nothing here calls, or read, which is not here -> what is. docs/from_legged_gym.md
+LEGGED_GYM_METHODS: dict[str, str] = {
+    "post_physics_step": "_step()",
+    "_post_physics_step_callback": "_update_state() and _end_step()",
+    "_get_noise_scale_vec": "observation_rows()",
+    "reset_idx": "reset_envs(mask)",
+    "_reset_dofs": "_reset_robots(mask)",
+    "_reset_root_states": "_reset_robots(mask)",
+    "update_command_curriculum": "_update_command_curriculum(mask)",
+    "_get_heights": "_scan_heights()",
+    "_push_robots": "perturbation.push of the config",
+    **dict.fromkeys(("create_sim", "_create_envs"), "_load_robot()"),
+    **dict.fromkeys(("_process_rigid_shape_props", "_process_dof_props", "_process_rigid_body_props"), "_load_robot()"),
+}
+LEGGED_GYM_TENSORS: dict[str, str] = {
+    "root_states": "root_pos, root_quat (w, x, y, z), root_lin_vel, base_ang_vel",
+    "base_quat": "root_quat (w, x, y, z)",
+    "measured_heights": "height_scan",
+    "rigid_body_states": "foot_pos, foot_height, foot_vel",
+    **dict.fromkeys(("foot_force", "foot_forces"), "contact_forces"),
+    "feet_indices": "foot_contact, contact_forces, foot_vel: of the feet alone",
+    "dof_pos_limits": "soft_lower, soft_upper",
+    "torque_limits": "robot.effort_range",
+    "last_contacts": "first_contact",
+    "extras": "take_statistics()",
 }
 
 

@@ -192,7 +192,8 @@ def load_task(name: str, say: bool = False) -> LoadedTask:
         line = f":{error.lineno}" if error.lineno else ""
         raise ConfigError(f"{shown(Path(error.filename or path))}{line}: {error.msg}: {(error.text or '').strip()[:100]}") from error
     except (Exception, SystemExit) as error:
-        raise ConfigError(f"{users_fault(error) or shown(path)}: {in_short(error)}; {shown(path)} {_ENDS}") from error
+        ends = "" if isinstance(error, ImportError) else f"; {shown(path)} {_ENDS}"
+        raise ConfigError(f"{users_fault(error) or shown(path)}: {in_short(error)}{ends}") from error
     task = getattr(module, "TASK", None)
     if not isinstance(task, Task):
         raise ConfigError(f"{path} {_ENDS}; its TASK is {task!r:.100}")

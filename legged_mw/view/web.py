@@ -127,6 +127,7 @@ def _bound_to(host: str, gate: Gate) -> Iterator[None]:
     try:
         yield
     finally:
+        del web_viewer.print
         web_server.bind_public_socket, web_server.bind_loopback_socket, web_server.serve = bind, inner, serve
 
 
@@ -162,6 +163,8 @@ def _guarded(settings: dict[str, Any], gate: Gate) -> dict[str, Any]:
 
 def free_port(host: str, port: int = 0) -> int:
     """`port` if it is free; for 0 the first free one from FIRST_PORT on. Raises ViewError."""
+    if not host:  # to a socket that is every interface
+        raise ViewError(f"--host is empty; leave it out for {LOCAL}, this machine alone, or name an interface (0.0.0.0: all)")
     candidates = [port] if port else range(FIRST_PORT, FIRST_PORT + PORTS)
     for candidate in candidates:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:

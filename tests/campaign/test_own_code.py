@@ -44,8 +44,8 @@ FILES: list[tuple[str, str, tuple[str, ...]]] = [
     ("a tab among spaces", "if 1:\n    x = 1\n\ty = 2", (f"mine.py:{FIRST + 2}: ",)),
     ("a zero byte", "x = '\0'", ("mine.py", "null bytes")),
     ("not UTF-8", "x = '\udcff'", ("mine.py", "utf-8")),
-    ("an import that is not there", "import nosuch", (f"mine.py:{FIRST}: ModuleNotFoundError: No module named 'nosuch'", WANTED)),
-    ("a name that is not in there", "from legged_mw.envs import legged_robots", (f"mine.py:{FIRST}: ImportError: ", WANTED)),
+    ("an import that is not there", "import nosuch", (f"mine.py:{FIRST}: ModuleNotFoundError: No module named 'nosuch'",)),
+    ("a name that is not in there", "from legged_mw.envs import legged_robots", (f"mine.py:{FIRST}: ImportError: ",)),
     ("a name that is none", "TASK = Task(Dog, Cfg, CfgPPO)", (f"mine.py:{FIRST}: NameError: name 'Dog' is not defined",)),
     (
         "an error as it is imported",
