@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import pty
 import select
@@ -12,6 +13,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,8 +25,8 @@ from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.inputs import Gamepad, Keys, RobotRemote, StopFile, Wish, from_sticks
 from legged_mw.deploy.log import read_log
 from legged_mw.deploy.policy import Controller
-from legged_mw.deploy.robot import Health, Remote, RobotError
-from legged_mw.deploy.states import STANDS, States
+from legged_mw.deploy.robot import Health, Measurement, Remote, RobotError
+from legged_mw.deploy.states import STANDS, States, wrong_imu
 from legged_mw.utils.cli import one_line_errors
 
 POLICIES = ROOT / "resources/policies"
@@ -299,3 +301,36 @@ def test_wrong_flags(args: list[str], said: str, monkeypatch: pytest.MonkeyPatch
         program.main()
     error = capsys.readouterr().err
     assert said in error and error.count("\n") == 1
+
+
+def swapped(one: int, other: int) -> Any:
+    order = [0, 1, 2]
+    order[one], order[other] = other, one
+    return order
+
+
+@pytest.mark.parametrize(
+    ("parts", "order", "sign", "word"),
+    [
+        ([], [0, 1, 2], 1.0, ""),
+        (["ang_vel"], [0, 1, 2], -1.0, "gyro"),
+        (["ang_vel"], swapped(0, 1), 1.0, "gyro"),
+        (["ang_vel"], swapped(1, 2), 1.0, "gyro"),
+        (["ang_vel"], swapped(0, 2), 1.0, ""),  # it pitches alone: roll and yaw cannot be told apart
+        (["ang_vel", "gravity"], swapped(0, 1), 1.0, "gyro"),
+        (["acceleration"], swapped(0, 2), 1.0, "accelerometer"),
+        (["acceleration"], swapped(1, 2), 1.0, "accelerometer"),
+    ],
+)
+def test_an_imu_with_wrong_axes(parts: list[str], order: list[int], sign: float, word: str) -> None:
+    """As a Go2 that stands up pitches: gravity must turn as the gyro says, and at rest be what the accelerometer feels."""
+    seen, period = [], 0.02
+    for step in range(120):
+        pitch, quick = 0.05 * math.sin(2.0 * step * period), 0.1 * math.cos(2.0 * step * period)
+        down = np.array([math.sin(pitch), 0.0, -math.cos(pitch)])
+        values = {"ang_vel": np.array([0.001, quick, 0.001]), "gravity": down, "acceleration": -9.81 * down}
+        values |= {name: sign * values[name][order] for name in parts}
+        rest = {name: np.zeros(3) for name in ("lin_vel", "joint_pos", "joint_vel", "joint_torque", "foot_contact")}
+        seen.append(Measurement(**rest, **values))
+    said = wrong_imu(seen, period)
+    assert bool(said) == bool(word) and word in said, said

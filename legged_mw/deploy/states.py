@@ -5,7 +5,9 @@ A person moves it on, by a remote, a gamepad or keys; only damping comes by itse
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +24,36 @@ SOFT = 0.1  # [share of the stiffness] that standing up begins with
 NEAR = 0.15  # [rad] ours: a joint that is farther from the pose after RISE carries weight, and gets stiffer
 STIFFEST = 3.0  # [share of the stiffness] at most; unitree_rl_lab stands a Go2 with 60 N m/rad, three times what go2_flat walks with
 STIFFEN = 1.0  # [share of the stiffness a second]
+# Ours, of an IMU while the robot stands up: shipped Go1 and Go2 tilt by 0.07 rad in all, and their gyro misses 0.04 of that
+TILTS, MISSED = 0.03, 0.6  # [rad] of tilt from which the gyro is judged; share of it that may not be the gyro's
+TURN = 5  # measurements between two gravities that are compared: their times are not exact
+PLUMB, PULL = 30.0, (8.0, 12.0)  # [deg] between gravity and what the accelerometer feels; [m/s^2] of a robot at rest
 STANDS = 0.3  # [rad] from the pose, at most, where a policy may begin; ours: the shipped policies walk off from there
+
+
+_IMU, _KEPT = ("ang_vel", "gravity", "acceleration"), 1000  # what is kept of a measurement while the robot stands up, and of how many
+
+
+def wrong_imu(seen: Sequence[Measurement], period: float) -> str:
+    """What is wrong with the axes of an IMU that was carried so, one measurement a period; "" if nothing is, or too little moved to tell.
+
+    Gravity turns as the gyro says, and at rest is what the accelerometer feels. An IMU whose parts are all turned in the same way, or
+    read in the same wrong order about an axis along which nothing tilts, is right by both.
+    """
+    if len(seen) <= TURN:
+        return ""
+    gyro, gravity, felt = (np.array([getattr(each, name) for each in seen]) for name in _IMU)
+    count = (len(seen) - 1) // TURN * TURN
+    turned = -period * np.cross(gyro[1:] + gyro[:-1], gravity[1:] + gravity[:-1])[:count].reshape(-1, TURN, 3).sum(axis=1) / 4
+    tilted = np.diff(gravity[: count + 1 : TURN], axis=0)
+    by_gyro, by_gravity, missed = (float(np.linalg.norm(each)) for each in (turned, tilted, turned - tilted))
+    if max(by_gyro, by_gravity) > TILTS and missed > MISSED * max(by_gyro, by_gravity):
+        return f"while it stood up gravity tilted by {by_gravity:.2f} rad, by the gyro by {by_gyro:.2f}, and {missed:.2f} do not agree"
+    pull = felt[-round(1.0 / period) :].mean(axis=0)
+    if not PULL[0] < (size := float(np.linalg.norm(pull))) < PULL[1]:
+        return ""
+    angle = math.degrees(math.acos(np.clip(-(pull @ gravity[-1]) / size, -1.0, 1.0)))
+    return f"gravity is {angle:.0f} degrees from what the accelerometer feels" if angle > PLUMB else ""
 
 
 class Order(NamedTuple):
@@ -52,6 +83,7 @@ class States:
         self.note = f"{START}: {self.first}"
         self._from: Floats = controller.contract.default_pose  # (D,) [rad] where standing up began
         self._stiffer = 1.0
+        self._rise = list[Measurement]()  # since standing up began
         self._pressed = frozenset[str]()
 
     @property
@@ -105,7 +137,7 @@ class States:
         elif START in pressed and self.state == DAMPING:
             self._enter(ZERO, now, f"{START}: {self.first}")
         elif START in pressed and self.state == ZERO:
-            self._from, self._stiffer = measured.joint_pos.copy(), 1.0
+            self._from, self._stiffer, self._rise = measured.joint_pos.copy(), 1.0, []
             self._enter(STAND, now, f"{RISE:g} s to the default pose; then {WALK}: policy")
         elif WALK in pressed and self.state == STAND:
             self._begin(measured, now)
@@ -120,12 +152,17 @@ class States:
                 f"{WALK} has to wait until the robot stands: {joint} is {off.max():.2f} rad from its pose after {now - self.since:.1f} s"
             )
             return
+        if why := wrong_imu(self._rise, contract.period):
+            self._tell(f"{WALK} is refused: {why}; look at how the IMU's axes are mounted and read")
+            return
         self.controller.reset()
         self._enter(POLICY, now, f"{END}: damping")
 
     def _stand(self, measured: Measurement, now: float) -> Order:
         """A straight line to the default pose with gains that rise; where that does not carry the robot, they rise further."""
         contract = self.controller.contract
+        if len(self._rise) < _KEPT:
+            self._rise.append(replace(measured, **{name: np.array(getattr(measured, name)) for name in _IMU}))
         share = min(1.0, (now - self.since) / RISE)
         targets = self._from + share * (contract.default_pose - self._from)
         if share == 1.0 and np.abs(measured.joint_pos - targets).max() > NEAR:
