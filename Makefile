@@ -1,5 +1,6 @@
 # make train, make test: each does all set-up on a fresh machine, in a virtual environment of its own.
 #   make train ARGS="--max_iterations 5"     make test ARGS="tests/test_env.py -k reset"
+# make net A B compares what two commits or checkouts do:     make net main HEAD ARGS="--only recordings"
 TASK ?= go1_flat
 ARGS ?=
 WORKERS ?= 2
@@ -12,7 +13,7 @@ PYTHON ?= $(shell for p in python3.12 python3.11 python3.13 python3 python; do \
 # a process that may not keep what it compiled of torch compiles all of it again: four seconds each, and tests start many
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: train play test lint dist docs clean
+.PHONY: train play test net lint dist docs clean
 train: $(VENV)/ready
 	$(BIN)/python train.py --task $(TASK) $(ARGS)
 
@@ -21,6 +22,15 @@ play: $(VENV)/ready
 
 test: $(VENV)/ready
 	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+
+# the two words after `net` are no targets
+ifeq ($(firstword $(MAKECMDGOALS)),net)
+SIDES := $(wordlist 2,3,$(MAKECMDGOALS))
+.PHONY: $(SIDES)
+$(SIDES): ; @:
+endif
+net: $(VENV)/ready
+	$(BIN)/python tests/net/compare.py $(SIDES) $(ARGS)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check .

@@ -49,7 +49,7 @@ def check(tmp_path_factory: pytest.TempPathFactory) -> Check:
     library = [f"ORT_INCLUDE={HEADERS}", f"ORT_LIB={LIBRARY}"] if NETWORK else []
     built = subprocess.run(["make", "-C", FOLDER, f"OUT={out}", "CXXFLAGS=-O0 -Wall -Wextra", *library], capture_output=True, text=True)
     assert built.returncode == 0 and not built.stderr, built.stderr
-    return lambda export, record: subprocess.run([out / "check", export, record], capture_output=True, text=True, timeout=60)
+    return lambda export, record: subprocess.run([out / "check", export, record], capture_output=True, text=True, timeout=300)
 
 
 @pytest.fixture(scope="module")

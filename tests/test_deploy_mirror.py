@@ -160,7 +160,7 @@ def test_the_viewer_is_a_process_of_its_own(contract: Contract) -> None:
     args = argparse.Namespace(viewer="web", camera="follow", host="127.0.0.1", port=port)
     with closing(Mirror(GO2, contract, args)) as mirror:
         mirror.show(0.0, measurement(contract), state("stand", ""))
-        with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=10) as page:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/", timeout=60) as page:
             assert page.status == 200 and b"<html" in page.read().lower()
         with pytest.raises(ViewError, match=f"--port {port} is in use on 127.0.0.1"):
             Mirror(GO2, contract, args)

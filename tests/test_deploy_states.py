@@ -235,7 +235,7 @@ def in_terminal(args: list[str], presses: list[tuple[str, bytes]]) -> tuple[int,
     if process == 0:
         os.chdir(ROOT)
         os.execv(sys.executable, [sys.executable, "-m", "legged_mw.deploy", *args])
-    shown, seen, until = "", 0, time.monotonic() + 60
+    shown, seen, until = "", 0, time.monotonic() + 300
     while time.monotonic() < until:
         if not select.select([terminal], [], [], 0.1)[0]:
             continue

@@ -691,7 +691,7 @@ def test_the_page_is_served_on_this_machine_alone_and_says_no_to_a_bad_host(monk
         now = np.zeros((2, 3))
         for _ in range(3):
             page.show(Moment(0.0, stage.qpos(), now, now, now, np.ones((2, 4), dtype=bool)))
-        with urllib.request.urlopen(f"http://127.0.0.1:{page.port}/", timeout=10) as answer:
+        with urllib.request.urlopen(f"http://127.0.0.1:{page.port}/", timeout=60) as answer:
             assert b"canvas" in answer.read()
         with pytest.raises(OSError):  # any other address of this machine
             urllib.request.urlopen(f"http://[::1]:{page.port}/", timeout=2)

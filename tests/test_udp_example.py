@@ -45,27 +45,27 @@ def served(contract: Contract) -> Iterator[tuple[Any, MujocoRobot, list[str]]]:
     """A server on a thread, and what it said."""
     said: list[str] = []
     robot = MujocoRobot(SHIPPED, contract)
-    server = udp.UdpServer(robot, contract, ("127.0.0.1", 0), timeout=5.0)
+    server = udp.UdpServer(robot, contract, ("127.0.0.1", 0), timeout=60.0)
     thread = threading.Thread(target=server.serve, args=(said.append,), daemon=True)
     thread.start()
     yield server, robot, said
     with contextlib.suppress(RobotError):  # a test's own client may have closed it, and it may be about to end
-        udp.UdpRobot(contract, server.address).close()
-    thread.join(timeout=20)
+        udp.UdpRobot(contract, server.address, timeout=60.0).close()
+    thread.join(timeout=120)
     assert not thread.is_alive()
 
 
 def test_the_walk_is_the_same_over_udp(served: Any, contract: Contract) -> None:
     server, _, said = served
     runs = []
-    for robot in (MujocoRobot(SHIPPED, contract), udp.UdpRobot(contract, server.address, timeout=5.0)):
+    for robot in (MujocoRobot(SHIPPED, contract), udp.UdpRobot(contract, server.address, timeout=60.0)):
         recorder = Recorder(robot)
         run(recorder, Controller(SHIPPED, contract), lambda _: AHEAD, 1.0, live=False)
         runs.append(recorder)
     here, there = runs
     np.testing.assert_array_equal(here.targets, there.targets)  # bit for bit
     np.testing.assert_array_equal([m.joint_torque for m in here.measured], [m.joint_torque for m in there.measured])
-    for _ in range(200):
+    for _ in range(3000):
         if len(said) == 2:
             break
         threading.Event().wait(0.02)
@@ -74,13 +74,13 @@ def test_the_walk_is_the_same_over_udp(served: Any, contract: Contract) -> None:
 
 def test_after_a_silent_client_the_servos_are_off(contract: Contract) -> None:
     robot, said = MujocoRobot(SHIPPED, contract), []
-    server = udp.UdpServer(robot, contract, ("127.0.0.1", 0), timeout=0.2)
+    server = udp.UdpServer(robot, contract, ("127.0.0.1", 0), timeout=2.0)
     thread = threading.Thread(target=server.serve, args=(said.append,), daemon=True)
     thread.start()
-    client = udp.UdpRobot(contract, server.address)
+    client = udp.UdpRobot(contract, server.address, timeout=60.0)
     client.write(contract.default_pose)
-    thread.join(timeout=20)
-    assert said[-1].endswith("fell silent for 0.2 s; the joints are damped, no longer servoed")
+    thread.join(timeout=120)
+    assert said[-1].endswith("fell silent for 2 s; the joints are damped, no longer servoed")
     robot.write(contract.default_pose)
     assert not robot.read().joint_torque.any()
     with pytest.raises(RobotError, match=r"robot at 127.0.0.1:\d+: .*; stopped \(start one with"):
@@ -103,9 +103,9 @@ def test_a_client_of_another_contract_is_refused(served: Any, contract: Contract
     other = replace(contract, joints=contract.joints[::-1])
     assert udp.contract_digest(other) != udp.contract_digest(contract)
     with pytest.raises(RobotError, match="its export has other joints, measurements or another period; use one export at both ends"):
-        udp.UdpRobot(other, server.address, timeout=5.0)
+        udp.UdpRobot(other, server.address, timeout=60.0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as raw:
-        raw.settimeout(5.0)
+        raw.settimeout(60.0)
         raw.sendto(b"hello?", server.address)  # not a packet of the link: no answer
         packet = bytearray(udp.pack(udp.HELLO, udp.contract_digest(contract), 0))
         packet[4] = 9
@@ -120,7 +120,7 @@ def test_a_client_of_another_contract_is_refused(served: Any, contract: Contract
 
 def test_bad_targets_move_nothing(served: Any, contract: Contract) -> None:
     server, robot, _ = served
-    client = udp.UdpRobot(contract, server.address, timeout=5.0)
+    client = udp.UdpRobot(contract, server.address, timeout=60.0)
     with pytest.raises(RobotError, match="targets must be 12 finite numbers, one a joint"):
         client.write(np.full(12, np.nan))
     assert robot.fleet.qpos[0, 2] == 0.278
@@ -142,19 +142,29 @@ def test_another_scan_is_another_contract() -> None:
     assert udp.contract_digest(seen) != udp.contract_digest(blind)
 
 
+# The program on a computer that may be busy: what silence leads to is tested above.
+PATIENT = f"""
+import runpy, sys
+program = runpy.run_path({str(PROGRAM)!r})
+for end in ("UdpRobot", "UdpServer"):
+    program[end].__init__.__defaults__ = (60.0,)  # its only default: timeout [s]
+program["one_line_errors"]("udp_robot.py")(program["main"])()
+"""
+
+
 def test_the_program() -> None:
     """A server and a client, each a process of its own; and an address that is none."""
-    serve = [sys.executable, str(PROGRAM), str(SHIPPED), "--serve", "127.0.0.1:0"]
+    serve = [sys.executable, "-c", PATIENT, str(SHIPPED), "--serve", "127.0.0.1:0"]
     here: dict[str, Any] = {"cwd": ROOT, "env": {**os.environ, "PYTHONPATH": str(ROOT)}, "text": True}
-    wrong = subprocess.run([*serve[:-1], "robot"], **here, capture_output=True, timeout=60)
+    wrong = subprocess.run([sys.executable, str(PROGRAM), *serve[3:-1], "robot"], **here, capture_output=True, timeout=300)
     assert (wrong.returncode, wrong.stderr) == (2, "udp_robot.py: 'robot' is no address; write HOST:PORT, e.g. 127.0.0.1:9870\n")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     with subprocess.Popen([*serve[:-1], address], **here, stdout=subprocess.PIPE) as server:
         assert server.stdout and server.stdout.readline() == f"a simulated robot for go1_flat at {address}; Ctrl-C ends it\n"
-        drive = [*serve[:3], "--drive", address, "--command", "0.8,0,0", "--time", "2"]
-        done = subprocess.run(drive, **here, capture_output=True, timeout=60)
+        drive = [*serve[:4], "--drive", address, "--command", "0.8,0,0", "--time", "2"]
+        done = subprocess.run(drive, **here, capture_output=True, timeout=300)
         assert done.returncode == 0, done.stderr
-        assert server.stdout.read().endswith("closed the link; the joints are damped, no longer servoed\n") and server.wait(20) == 0
+        assert server.stdout.read().endswith("closed the link; the joints are damped, no longer servoed\n") and server.wait(300) == 0
     assert " steps of 0.02 s" in done.stdout and "commanded 0.80, 0.00, 0.00 (vx [m/s], vy [m/s], yaw rate [rad/s])" in done.stdout

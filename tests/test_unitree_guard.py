@@ -73,7 +73,7 @@ class Bench:
     def send(self, kind: int, body: bytes, stamp: float = 0.0) -> None:
         self.here.sendall(guard._FRAME.pack(kind, stamp) + body)
 
-    def ended(self, seconds: float = 5.0) -> bool:
+    def ended(self, seconds: float = 60.0) -> bool:
         self._thread.join(seconds)
         return not self._thread.is_alive()
 
@@ -84,7 +84,7 @@ class Bench:
         self._file.close()
 
 
-def until(true: Any, seconds: float = 5.0) -> bool:
+def until(true: Any, seconds: float = 60.0) -> bool:
     end = time.monotonic() + seconds
     while not true() and time.monotonic() < end:
         time.sleep(0.001)
@@ -255,7 +255,7 @@ def served(domain: int) -> SimulatedUnitree:
     return SimulatedUnitree(folder, read_contract(folder), RobotEnd("unitree_go", "lo", domain))
 
 
-def live(sim: SimulatedUnitree, until: Any, seconds: float = 90.0) -> float:
+def live(sim: SimulatedUnitree, until: Any, seconds: float = 300.0) -> float:
     """Step in real time until something is true; returns how long it took [s]."""
     start = due = time.monotonic()
     while not until():
@@ -408,12 +408,12 @@ def test_the_programs(domain: int, tmp_path: Path) -> None:
                 break
         time.sleep(2.0)  # it walks
         policy.send_signal(signal.SIGINT)
-        rest, errors = policy.communicate(timeout=60)
+        rest, errors = policy.communicate(timeout=300)
         assert policy.returncode == 0, errors
         assert "go2 at lo: 12 joints, 32.8 V" in said and "from a measurement to its target: median " in rest, said + rest + errors
         assert "zero torque: " in said and "stand: " in said and "policy: select: damping" in said, said
         robot.send_signal(signal.SIGINT)
-        said, errors = robot.communicate(timeout=60)
+        said, errors = robot.communicate(timeout=300)
         assert "from a state to the first command that answers it: median " in said and "0 refused" in said, errors
         assert "degrees from upright" in said
 

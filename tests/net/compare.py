@@ -1,228 +1,404 @@
-"""Records what a checkout's environments do, and compares two recordings bit for bit.
+"""Compares what two commits or checkouts do, on one machine: make net A B
 
-python tests/net/compare.py record --root CHECKOUT --out FILE.npz [--only go1_flat/mujoco] [--steps 20]
-python tests/net/compare.py keep --root CHECKOUT --out tests/net/first_steps.npz     what tests/test_net.py compares with
-python tests/net/compare.py diff A B [--tolerance 0] [--tolerance reward=1e-5]     A, B: a recording, or a checkout to record now
+python tests/net/compare.py A B [--only recordings] [--tolerance reward=1e-5]     exit code 1: they differ
+python tests/net/compare.py --keep tests/net/first_steps.npz                      what tests/test_net.py compares with, of this checkout
 
-The same seed, actions and episode ages for both; what differs is the code. Only public names of the environment are used,
-so that the recorder runs on older and newer checkouts alike.
+recordings  environments' steps on both engines, bit for bit (tests/net/recordings.py)
+exams       exam.json of each policy that ships, value by value
+exports     files of an export of each task, byte by byte
+trainings   tensors of the checkpoint after two iterations of each task, and of each kind of learner
+
+Each part is a process of its own with the sources of that checkout; what was found of a commit stays in logs/net/ and is not found again.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import hashlib
+import io
+import json
 import os
+import platform
+import resource
+import runpy
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-ENGINES = ("mujoco", "mujoco_warp")
-TASKS = ("go1_flat", "go1_flat_dr", "go1_rough", "examples/go1_legged_gym.py")
-# Episodes end, commands change, and robots are kicked and pushed many times within a recording. An entry with several paths: the
-# first that this checkout has.
-OFTEN: dict[str | tuple[str, ...], Any] = {
-    "env.episode_length_s": 1.2,
-    "commands.resampling_time": 0.5,
-    ("perturbation.kick", "perturbation.enable"): True,
-    "perturbation.interval": [0.05, 0.4],
-    "perturbation.push": True,
-    "perturbation.push_interval_s": 0.5,
-    "sim.threads": 1,
+sys.path[:0] = [str(Path(__file__).parent)]
+from recordings import ENGINES, RECORDINGS, first_steps, rollout  # noqa: E402
+
+Found = dict[str, dict[str, np.ndarray]]  # run -> quantity -> value; columns/QUANTITY and steps/QUANTITY name its last and first axis
+NO_STEP, NAMES = -9, ("columns/", "steps/")
+HERE = Path(__file__).resolve()
+REPOSITORY = HERE.parents[2]
+DECIDES = ("numpy", "torch", "mujoco", "mujoco-warp", "warp-lang", "rsl-rl-lib", "tensordict", "onnx", "onnxscript", "onnxruntime")
+
+# ---- what is found of a checkout, in a process whose sources are that checkout's -----------------------------------------------------
+
+
+def recordings(_: Path) -> Found:
+    return {f"{name} {engine}": _or_error(lambda n=name, e=engine: rollout(n, e)) for engine in ENGINES for name in RECORDINGS}
+
+
+def kept(_: Path) -> Found:
+    """Without names: they are known again."""
+    found = {f"{name} {engine}": first_steps(name, engine) for engine in ENGINES for name in RECORDINGS}
+    return {run: {name: v for name, v in values.items() if not name.startswith(NAMES)} for run, values in found.items()}
+
+
+def exams(root: Path) -> Found:
+    """As ``python -m legged_mw.deploy NAME --eval`` writes them."""
+    found: Found = {}
+    for policy in sorted(root.glob("resources/policies/*/policy.onnx")):
+        found[policy.parent.name] = _or_error(lambda folder=policy.parent: _exam(folder))
+    return found
+
+
+def _exam(folder: Path) -> dict[str, np.ndarray]:
+    with tempfile.TemporaryDirectory() as scratch:
+        out = Path(scratch) / "exam.json"
+        _run(lambda: runpy.run_module("legged_mw.deploy", run_name="__main__", alter_sys=True), str(folder), "--eval", "--out", str(out))
+        return {path: np.array(value) for path, value in _leaves(json.loads(out.read_text()))}
+
+
+# Few worlds, so that an iteration takes a second, and short episodes, so that some end in each; one thread, so that sums have one order.
+SMALL = [
+    *("--device", "cpu", "--num_envs", "16", "--max_iterations", "2", "--set", "runner.num_steps_per_env=8"),
+    *("--set", "env.episode_length_s=0.3", "--set", "domain_rand.redraw_iterations=1", "--set", "perturbation.push_interval_s=0.2"),
+    *(
+        "--set",
+        "sim.threads=1",
+        "--set",
+        "cpu.update_threads=1",
+        "--set",
+        "actor.hidden_dims=[32, 16]",
+        "--set",
+        "critic.hidden_dims=[32, 16]",
+    ),
+]
+NO_EXPORT = ["--set", "runner.export=false"]
+AS_SHIPPED = ["--set", "actor.hidden_dims=[512, 256, 128]"]
+# run -> task and flags: the kinds of learners that no task has by itself
+LEARNERS: dict[str, list[str]] = {
+    "go1_legged_gym": ["examples/go1_legged_gym.py"],
+    "g1_unitree_rl_gym": ["examples/g1_unitree_rl_gym.py"],  # an LSTM
+    "a GRU": ["go1_flat_blind", "--set", "actor.class_name=RNNModel", "--set", "actor.rnn_hidden_dim=16"],
+    "an estimator": ["go1_flat_blind", "--set", "actor.estimator.targets=[base_lin_vel]"],
+    "a teacher beside": ["go1_rough_student", "--set", "actor.concurrent.groups=[privileged_state]"],
+    "a student": ["go1_rough_student", "--teacher", "{root}/resources/policies/go1_rough_scan"],
+    "a warm start": ["go2_flat", "--init", "{root}/resources/policies/go2_flat", "--set", "warm_start.critic_warmup=1", *AS_SHIPPED],
+    "a mirror loss": ["go1_flat", "--set", "symmetry.use_mirror_loss=true", "--set", "symmetry.mirror_loss_coeff=1.0"],
+    "bfloat16": ["go1_flat_fast"],
+    "rsl-rl's PPO": ["go1_flat_dr", "--set", "algorithm.class_name=PPO"],
 }
-EXTRA: dict[str, dict[str, Any]] = {
-    "go1_flat": {"rewards.only_positive_rewards": False},  # random actions earn less than 0: the clip would hide most of it
-    "go1_flat_dr": {"domain_rand.observation_delay": [0, 2], "commands.curriculum": True},
-    "go1_rough": {
-        **{"terrain.num_rows": 3, "terrain.num_cols": 8, "terrain.tile_size": 4.0},
-        **{"terrain.border_size": 1.0, "terrain.horizontal_scale": 0.1},
-        "init_state.pos_xy_range": 2.2,  # some begin beyond half a tile, go up a level, or leave the terrain
-    },
-}
 
 
-# As built, after a reset, after each step: the file stays small, and a difference lasts. What the critic sees begins with `state`.
-KEPT_STEPS = {"state": [0, 2, 5, 13, 21], "privileged_state": [1, 9, 17]}
+def trainings(root: Path) -> Found:
+    """What train.py leaves behind after two iterations."""
+    runs = {path.stem: [path.stem] for path in _tasks(root)} | LEARNERS
+    return {name: _or_error(lambda flags=flags: _training(root, flags)) for name, flags in runs.items()}
 
 
-def make_env(task: str, engine: str, worlds: int) -> Any:
-    """The task's environment on a CPU, with all that may happen happening often."""
+def _training(root: Path, flags: Sequence[str]) -> dict[str, np.ndarray]:
     import torch
 
-    from legged_mw import ROOT
-    from legged_mw.utils.config import ConfigError
-    from legged_mw.utils.task import load_task
-
-    loaded = load_task(str(ROOT / task) if task.endswith(".py") else task)
-    for paths, value in {**OFTEN, **EXTRA.get(task, {}), "sim.engine": engine, "env.num_envs": worlds}.items():
-        paths = (paths,) if isinstance(paths, str) else paths
-        for path in paths:
-            try:
-                loaded.set(path, value)
-                break
-            except ConfigError:
-                if path == paths[-1]:
-                    raise
-    torch.manual_seed(1)
-    return loaded.env_class(loaded.cfg, "cpu")
+    with _trained(root, [*flags, *NO_EXPORT]) as run:
+        [*_, last] = sorted(run.glob("model_*.pt"), key=lambda path: int(path.stem.partition("_")[2]))
+        leaves = dict(_leaves(torch.load(last, weights_only=True)))
+        found = {f"config.yaml/{name}": value for name, value in _text(run / "config.yaml").items()}
+    for name, value in leaves.items():
+        if isinstance(value, torch.Tensor):
+            shape = f"{str(value.dtype).removeprefix('torch.')}{[*value.shape]}"
+            value = f"{shape} {hashlib.sha256(value.contiguous().view(-1).view(torch.uint8).numpy().tobytes()).hexdigest()[:16]}"
+        found[name] = np.array(value)
+    return found
 
 
-def rollout(task: str, engine: str, worlds: int = 32, steps: int = 150) -> dict[str, np.ndarray]:
-    """Seeded random actions: ``obs/<group>`` (steps + 2, N, C): as built, after a reset, after each step; and all else by name."""
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)  # the order of a sum depends on it
-    env = make_env(task, engine, worlds)
-    own = torch.Generator().manual_seed(2)
-    observed, stepped = [env.get_observations(), env.reset()], []
-    env.episode_length_buf = torch.randint(0, int(env.max_episode_length), (worlds,), generator=own)
-    for _ in range(steps):
-        obs, reward, done, extras = env.step(0.5 * torch.randn(worlds, env.num_actions, generator=own))
-        observed.append(obs)
-        stepped.append((reward, done, extras["time_outs"], env.episode_length_buf.clone()))
-    taken = {f"obs/{group}": torch.stack([obs[group] for obs in observed]) for group in list(observed[0].keys())}
-    for name, values in zip(("reward", "done", "time_out", "episode_length"), zip(*stepped, strict=True), strict=True):
-        taken[name] = torch.stack(values)
-    for name, value in env.name_statistics(env.take_statistics().tolist()).items():
-        taken[f"statistic/{name}"] = torch.tensor(value, dtype=torch.double)
-    taken |= {f"training_state/{name}": torch.as_tensor(value) for name, value in env.training_state().items()}
-    torch.set_num_threads(threads)
-    return {name: value.numpy() for name, value in taken.items()} | _columns(env)
+def exports(root: Path) -> Found:
+    """Files that ``play.py --export`` writes of the policies that ship, and of the other tasks those that a training ends with."""
+    found: Found = {}
+    for path in _tasks(root):
+        ships = (root / "resources/policies" / path.stem / "policy.onnx").exists()
+        found[path.stem] = _or_error(lambda task=path.stem, ships=ships: _shipped_export(root, task) if ships else _new_export(root, task))
+    return found
 
 
-def _columns(env: Any) -> dict[str, np.ndarray]:
-    """``columns/<group>``: the row that each column is of, where the environment says so."""
-    if hasattr(env, "observation_table"):  # group -> (name, size, noise)
-        table = {group: [(name, size) for name, size, *_ in rows] for group, rows in env.observation_table.items()}
-    elif hasattr(env, "observations"):
-        groups = env.observations.groups
-        table = {group: [(r.name, r.value.shape[1] * getattr(r, "history", 1)) for r in rows] for group, rows in groups.items()}
+def _shipped_export(root: Path, task: str) -> dict[str, np.ndarray]:
+    with _empty_folder() as folder:
+        _program(root, "play", "--task", task, "--device", "cpu", "--export", str(folder / "out"))
+        return _files(folder / "out")
+
+
+def _new_export(root: Path, task: str) -> dict[str, np.ndarray]:
+    with _trained(root, [task]) as run:
+        return _files(run / "export")
+
+
+def _files(folder: Path) -> dict[str, np.ndarray]:
+    found: dict[str, np.ndarray] = {}
+    for file in sorted(path for path in folder.rglob("*") if path.is_file()):
+        name, data = str(file.relative_to(folder)), file.read_bytes()
+        if file.suffix in (".yaml", ".xml"):
+            found |= {f"{name}/{part}": value for part, value in _text(file).items()}
+        else:
+            found[name] = np.array(f"{len(data)} bytes {hashlib.sha256(data).hexdigest()[:16]}")
+    return found
+
+
+def _text(file: Path) -> dict[str, np.ndarray]:
+    """Lines, and all bytes in short: lines hide how they end."""
+    data = file.read_bytes()
+    return {"lines": np.array(data.decode().splitlines()), "bytes": np.array(hashlib.sha256(data).hexdigest()[:16])}
+
+
+def _tasks(root: Path) -> list[Path]:
+    return [path for path in sorted((root / "configs").glob("*.py")) if "TASK = " in path.read_text()]
+
+
+@contextlib.contextmanager
+def _trained(root: Path, flags: Sequence[str]) -> Iterator[Path]:
+    """The folder of a small run."""
+    task, *more = [flag.format(root=root) for flag in flags]
+    with _empty_folder() as folder:
+        _program(root, "train", "--task", str(root / task) if task.endswith(".py") else task, *SMALL, *more)
+        [run] = folder.glob("logs/*/*/config.yaml")
+        yield run.parent
+
+
+@contextlib.contextmanager
+def _empty_folder() -> Iterator[Path]:
+    """The current folder, meanwhile: a folder without logs/."""
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        yield Path(folder)
+
+
+def _program(root: Path, name: str, *flags: str) -> None:
+    _run(lambda: runpy.run_path(str(root / f"{name}.py"), run_name="__main__"), *flags)
+
+
+def _run(work: Callable[[], object], *flags: str) -> None:
+    """A program in this process, where torch is imported already. Raises what it says if it fails."""
+    said, argv = io.StringIO(), sys.argv
+    sys.argv = ["program", *flags]
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said):
+            work()
+    except SystemExit as end:
+        if end.code:
+            raise RuntimeError(said.getvalue().strip().rpartition("\n")[2] or f"exit code {end.code}") from None
+    finally:
+        sys.argv = argv
+
+
+def _or_error(work: Callable[[], dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """What ``work`` finds; its error, if it fails: the others are worth comparing all the same."""
+    try:
+        return work()
+    except Exception as error:
+        print(traceback.format_exc(), file=sys.stderr, flush=True)
+        return {"error": np.array(f"{type(error).__name__}: {error}")}
+
+
+def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    if isinstance(value, Mapping | list | tuple) and value:
+        for key, inner in value.items() if isinstance(value, Mapping) else enumerate(value):
+            yield from _leaves(inner, f"{path}.{key}" if path else str(key))
     else:
-        table = {}
-    return {f"columns/{group}": np.array([f"{name}[{i}]" for name, size in rows for i in range(size)]) for group, rows in table.items()}
+        yield path, str(value) if value is None or isinstance(value, Mapping | list | tuple) else value
 
 
-def first_steps(task: str, engine: str) -> dict[str, np.ndarray]:
-    """What ``tests/test_net.py`` compares: 20 steps of 8 worlds.
+PARTS: dict[str, Callable[[Path], Found]] = {
+    "recordings": recordings,
+    "exams": exams,
+    "exports": exports,
+    "trainings": trainings,
+    "kept": kept,
+}
 
-    Of observations a few steps, which a line about them counts, and every other world.
+# ---- the comparison ------------------------------------------------------------------------------------------------------------------
+
+
+def differences(a: Found, b: Found, tolerances: Mapping[str, float], most: int = 8) -> tuple[list[str], bool]:
+    """A line a run, below it what differs, the first step first; and whether any of it is more than its tolerance.
+
+    NaN equals NaN, and -0.0 equals 0.0. ``tolerances``: by quantity, or the part of its name before a slash; "" is for all others.
     """
-    taken = rollout(task, engine, worlds=8, steps=20)
-    kept = {name: value for name, value in taken.items() if not name.startswith(("statistic/", "training_state/"))}
-    for group, steps in KEPT_STEPS.items():
-        if f"obs/{group}" in kept:
-            kept[f"obs/{group}"] = kept[f"obs/{group}"][steps, ::2]
-    return kept
-
-
-def record(only: Iterable[str] = (), steps: int = 150, keep: bool = False) -> dict[str, np.ndarray]:
-    """All tasks on all engines, by ``<task>/<engine>/<quantity>``; a task that fails leaves its error."""
-    recorded: dict[str, np.ndarray] = {}
-    for engine in ENGINES:
-        for task in TASKS:
-            run = f"{Path(task).stem}/{engine}"
-            if only and run not in only and engine not in only and Path(task).stem not in only:
-                continue
-            try:
-                taken = first_steps(task, engine) if keep else rollout(task, engine, steps=steps)
-            except Exception as error:  # the other tasks are worth comparing all the same
-                taken = {"error": np.array(f"{type(error).__name__}: {error}")}
-                print(f"{run}: {taken['error']}", file=sys.stderr, flush=True)
-            recorded |= {f"{run}/{name}": value for name, value in taken.items()}
-    return recorded
-
-
-def in_checkout(root: Path, program: str, out: Path, *options: str) -> None:
-    """Record the checkout at ``root`` in a process of its own, whose sources are that checkout's."""
-    command = [sys.executable, str(Path(__file__).resolve()), program, "--inside", "--out", str(out.resolve()), *options]
-    subprocess.run(command, cwd=root, env={**os.environ, "PYTHONPATH": str(root.resolve())}, check=True)
-
-
-def differences(a: Mapping[str, np.ndarray], b: Mapping[str, np.ndarray], tolerances: Mapping[str, float]) -> tuple[list[str], bool]:
-    """Lines that say what differs, and whether any of it is more than its tolerance. NaN equals NaN, and -0.0 equals 0.0."""
     lines, failed = [], False
-    for run in dict.fromkeys("/".join(name.split("/")[:2]) for name in [*a, *b]):
-        ours, theirs = ({n.removeprefix(f"{run}/"): v for n, v in part.items() if n.startswith(f"{run}/")} for part in (a, b))
-        names = [name for name in dict.fromkeys([*ours, *theirs]) if not name.startswith("columns/")]
-        equal = 0
-        for name in names:
-            if name not in ours or name not in theirs:
-                lines.append(f"{run:24} {name:30} only in {'A' if name in ours else 'B'}")
-                failed |= not name.startswith(("statistic/", "training_state/"))
-                continue
-            text, largest = _difference(ours[name], theirs[name], (theirs | ours).get(f"columns/{name.removeprefix('obs/')}"))
-            allowed = tolerances.get(name, tolerances.get(name.split("/")[0], tolerances[""]))
-            equal += largest == 0
-            if largest != 0:
-                lines.append(f"{run:24} {name:30} {text}{'' if largest <= allowed else '  <-- more than ' + format(allowed, 'g')}")
-            failed |= not largest <= allowed
-        lines.append(f"{run:24} {equal} of {len(names)} equal")
+    for run in dict.fromkeys([*a, *b]):
+        if run not in a or run not in b:
+            lines.append(f"{run:28} only in {'A' if run in a else 'B'}  <--")
+            failed = True
+            continue
+        names = [name for name in dict.fromkeys([*a[run], *b[run]]) if not name.startswith(NAMES)]
+        found = [(*_difference(name, a[run], b[run]), name) for name in names]
+        more = [gap > tolerances.get(name, tolerances.get(name.split("/")[0], tolerances.get("", 0.0))) for _, gap, _, name in found]
+        broken = "error" in a[run] or "error" in b[run]
+        failed |= any(more) or broken
+        different = sorted((step, not over, text, name) for (step, gap, text, name), over in zip(found, more, strict=True) if gap)
+        lines.append(f"{run:28} {len(names) - len(different)} of {len(names)} equal{'  <--' if any(more) or broken else ''}")
+        lines += [f"    {name:30} {text}{'  (within its tolerance)' if within else ''}" for _, within, text, name in different[:most]]
+        lines += [f"    and {len(different) - most} more"] if len(different) > most else []
+        lines += [f"    {a[run]['error']}"] if "error" in a[run] and not different else []
     return lines, failed
 
 
-def _difference(a: np.ndarray, b: np.ndarray, columns: np.ndarray | None) -> tuple[str, float]:
-    """What differs most, where first and in which columns; and by how much, infinity where the two cannot be compared."""
-    if a.shape != b.shape:
-        return f"shape {a.shape} and {b.shape}", np.inf
-    if a.dtype.kind in "US" or b.dtype.kind in "US":
-        return f"{a} and {b}", 0.0 if a == b and "error" not in str(a).lower() else np.inf
-    if a.dtype != b.dtype:
-        return f"dtype {a.dtype} and {b.dtype}", np.inf
+def _difference(name: str, ours: Mapping[str, np.ndarray], theirs: Mapping[str, np.ndarray]) -> tuple[int, float, str]:
+    """At which step ``name`` differs first, by how much (infinity where the two cannot be compared), and both in words."""
+    if name not in ours or name not in theirs:
+        return NO_STEP, np.inf, f"only in {'A' if name in ours else 'B'}"
+    a, b = ours[name], theirs[name]
+    if a.dtype.kind in "US" and b.dtype.kind in "US":
+        rows = [(x, y) for x, y in zip(np.atleast_1d(a), np.atleast_1d(b), strict=False) if x != y]
+        if not rows and a.shape == b.shape:
+            return NO_STEP, 0.0, "equal"
+        x, y = rows[0] if rows else (f"{len(a)} lines", f"{len(b)} lines")
+        return NO_STEP, np.inf, f"{str(x).strip()[:80]!r} and {str(y).strip()[:80]!r}"
+    if a.shape != b.shape or a.dtype != b.dtype:
+        return NO_STEP, np.inf, f"{a.dtype}{[*a.shape]} and {b.dtype}{[*b.shape]}"
     x, y = a.astype(np.float64), b.astype(np.float64)
     with np.errstate(invalid="ignore"):
         gap = np.where((x == y) | (np.isnan(x) & np.isnan(y)), 0.0, np.abs(x - y))
-    gap = np.where(np.isnan(gap), np.inf, gap)
-    where = np.argwhere(gap)
+    where = np.argwhere(np.nan_to_num(gap, nan=np.inf))
     if not len(where):
-        return "equal", 0.0
-    first = f" first at step {where[0, 0] - 2 if a.ndim == 3 else where[0, 0]}" if a.ndim > 1 else f" {x} and {y}" if a.ndim == 0 else ""
-    if a.ndim == 3:  # observations: step -2 is as built, -1 after the reset
-        which = sorted(set(where[where[:, 0] == where[0, 0]][:, 2].tolist()))
-        names = [str(columns[i]) if columns is not None and i < len(columns) else str(i) for i in which]
-        first += f" in {', '.join(names[:6])}{f' and {len(names) - 6} more' if len(names) > 6 else ''}"
-    return f"{gap.max():.3g}{first}", float(gap.max())
+        return NO_STEP, 0.0, "equal"
+    largest = float(np.nan_to_num(gap, nan=np.inf).max())
+    if a.ndim == 0:
+        return NO_STEP, largest, f"{a} and {b}"
+    columns, steps = ((theirs | ours).get(f"{of}/{name}") for of in ("columns", "steps"))
+    step = NO_STEP if steps is None else int(steps[where[0, 0]])
+    text = f"{largest:.3g}" if steps is None else f"{largest:.3g} first at step {step}"
+    if columns is not None:
+        first = where if steps is None else where[where[:, 0] == where[0, 0]]
+        named = [str(columns[i]) for i in sorted({int(row[-1]) for row in first})]
+        text += f" in {', '.join(named[:6])}" + (f" and {len(named) - 6} more" if len(named) > 6 else "")
+    return step, largest, text
 
 
-def load(path: Path) -> dict[str, np.ndarray]:
-    """A recording from its file; a folder is a checkout, which is recorded now."""
-    if path.is_dir():
-        with tempfile.TemporaryDirectory() as folder:
-            in_checkout(path, "record", Path(folder) / "now.npz")
-            return load(Path(folder) / "now.npz")
-    with np.load(path) as file:
-        return dict(file)
+# ---- two sides -----------------------------------------------------------------------------------------------------------------------
+
+
+def save(file: Path, found: Found, **more: Any) -> None:
+    """Whole or not at all."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    arrays = {f"{run}|{name}": value for run, values in found.items() for name, value in values.items()}
+    with tempfile.NamedTemporaryFile(dir=file.parent, suffix=".npz", delete=False) as part:
+        np.savez_compressed(part, **arrays, **more)
+    os.replace(part.name, file)
+
+
+def load(file: Path) -> Found:
+    found: Found = {}
+    with np.load(file) as arrays:
+        for key in arrays:
+            run, bar, name = key.partition("|")
+            if bar:
+                found.setdefault(run, {})[name] = arrays[key]
+    return found
+
+
+class Side:
+    """A commit or a checkout, and what was found of it."""
+
+    def __init__(self, name: str, stack: contextlib.ExitStack) -> None:
+        self.name, self._stack = name, stack
+        self._folder = Path(name).resolve() if Path(name).is_dir() else None
+        self.commit = "" if self._folder else _git("rev-parse", "--verify", f"{name}^{{commit}}")
+        self.cpu_seconds = 0.0
+
+    def find(self, part: str) -> Found:
+        """Of a commit, what was found before with the same net, libraries and machine."""
+        file = REPOSITORY / "logs" / "net" / f"{self.commit[:12]}-{_machine()}" / f"{part}.npz"
+        if self.commit and file.exists():
+            return load(file)
+        print(f"{self.name}: {part} ...", file=sys.stderr, flush=True)
+        scratch = Path(self._stack.enter_context(tempfile.TemporaryDirectory()))
+        before = _cpu_of_children()
+        in_checkout(self._root(), part, scratch / "found.npz", scratch)
+        self.cpu_seconds += _cpu_of_children() - before
+        found = load(scratch / "found.npz")
+        if self.commit:
+            save(file, found)
+        return found
+
+    def _root(self) -> Path:
+        if self._folder is None:
+            self._folder = Path(self._stack.enter_context(tempfile.TemporaryDirectory())) / "checkout"
+            _git("worktree", "add", "--detach", str(self._folder), self.commit)
+            self._stack.callback(_git, "worktree", "remove", "--force", str(self._folder))
+        return self._folder
+
+
+def in_checkout(root: Path, part: str, out: Path, folder: Path) -> None:
+    """A part of the checkout at ``root``, in a process of its own that stands in ``folder``."""
+    command = [sys.executable, str(HERE), "--part", part, "--root", str(root), "--out", str(out)]
+    subprocess.run(command, cwd=folder, env={**os.environ, "PYTHONPATH": str(root), "OMP_NUM_THREADS": "1"}, check=True)
+
+
+def _machine() -> str:
+    """What decides numbers beside the checkout, in short."""
+    versions = [f"{name} {metadata.version(name)}" for name in DECIDES]
+    sources = [(HERE.parent / name).read_text() for name in ("compare.py", "recordings.py")]
+    cpu = Path("/proc/cpuinfo").read_text().partition("model name")[2].partition("\n")[0] if Path("/proc/cpuinfo").exists() else ""
+    return hashlib.sha256("\n".join([*versions, *sources, cpu, platform.platform(), sys.version]).encode()).hexdigest()[:12]
+
+
+def _git(*words: str) -> str:
+    done = subprocess.run(["git", "-C", str(REPOSITORY), *words], capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(f"git {' '.join(words)}: {done.stderr.strip()}")
+    return done.stdout.strip()
+
+
+def _cpu_of_children() -> float:
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
+
+
+def compare(a: str, b: str, parts: Sequence[str], tolerances: Mapping[str, float]) -> bool:
+    """Print one table; whether they differ."""
+    differ = []
+    with contextlib.ExitStack() as stack:
+        sides = Side(a, stack), Side(b, stack)
+        for part in parts:
+            lines, failed = differences(*(side.find(part) for side in sides), tolerances)
+            print(f"{part}\n" + "\n".join(f"  {line}" for line in lines), flush=True)
+            differ += [part] if failed else []
+        for letter, side in zip("AB", sides, strict=True):
+            print(f"{letter}: {side.name}{f' ({side.commit[:12]})' if side.commit else ''}, {side.cpu_seconds / 60:.1f} minutes of CPU")
+    print(f"A and B differ: {', '.join(differ)}" if differ else "A and B are alike")
+    return bool(differ)
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    programs = parser.add_subparsers(dest="program", required=True)
-    for name in ("record", "keep"):
-        program = programs.add_parser(name)
-        program.add_argument("--root", type=Path, default=Path("."), help="the checkout")
-        program.add_argument("--out", type=Path, required=True)
-        program.add_argument("--only", action="append", default=[], help="a task, an engine or <task>/<engine>; may be repeated")
-        program.add_argument("--steps", type=int, default=150)
-        program.add_argument("--inside", action="store_true", help=argparse.SUPPRESS)
-    program = programs.add_parser("diff")
-    program.add_argument("a", type=Path)
-    program.add_argument("b", type=Path)
-    program.add_argument("--tolerance", action="append", default=[], help="a number, or <quantity>=<number>; may be repeated")
+    parser.add_argument("sides", nargs="*", metavar="A B", help="a commit, a branch, or the folder of a checkout")
+    named = [part for part in PARTS if part != "kept"]
+    parser.add_argument("--only", action="append", choices=named, help="a part; may be repeated")
+    parser.add_argument("--tolerance", action="append", default=[], help="a number, or QUANTITY=NUMBER; may be repeated")
+    parser.add_argument("--keep", metavar="FILE", type=Path)
+    parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
+    parser.add_argument("--root", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--out", type=Path, help=argparse.SUPPRESS)
     args = parser.parse_args()
-    if args.program == "diff":
-        given = [text.rpartition("=") for text in args.tolerance]
-        lines, failed = differences(load(args.a), load(args.b), {"": 0.0} | {name: float(number) for name, _, number in given})
-        print("\n".join(lines))
-        return int(failed)
-    if args.inside:
-        np.savez_compressed(args.out, **record(args.only, args.steps, keep=args.program == "keep"))  # pyright: ignore[reportArgumentType]
-    else:
-        in_checkout(args.root, args.program, args.out, f"--steps={args.steps}", *(f"--only={run}" for run in args.only))
-    return 0
+    if args.part:
+        save(args.out, PARTS[args.part](args.root))
+        return 0
+    if args.keep:
+        in_checkout(REPOSITORY, "kept", args.keep.resolve(), Path.cwd())
+        return 0
+    if len(args.sides) != 2:
+        parser.error("two sides: make net A B")
+    given = [text.rpartition("=") for text in args.tolerance]
+    return int(compare(*args.sides, args.only or named, {"": 0.0} | {name: float(number) for name, _, number in given}))
 
 
 if __name__ == "__main__":
