@@ -98,7 +98,9 @@ REMOTES = {
 FAULTS = [
     "nosuch",
     "delay=10@x",
-    "frozen_joint",
+    "joint_sign",
+    "motor_fault=x",
+    "bad_crc=1",
     "encoder",
     "low_battery=x",
     "nan=x",

@@ -9,6 +9,8 @@ import pytest
 
 from golden.table import Table
 from legged_mw import ROOT, programs
+from legged_mw.robot import new
+from legged_mw.tools import compare
 
 GO1, WAVE = ROOT / "resources/robots/go1/go1.xml", ROOT / "resources/motions/g1_wave.npz"
 ROBOT = [
@@ -54,4 +56,6 @@ def table() -> Table:
         made.programs(name, lines)
     made.programs("doctor", ["--x"])
     made.calls({"no program": legged_mw, "no such program": lambda: legged_mw("trian")})
+    made.add("compare to a folder", lambda root: compare.write([], root / "folder"))
+    made.add("robot to a folder that is a file", lambda root: new.write(None, GO1, "a", root / "there.xml", True, False))  # type: ignore[arg-type]
     return made

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 import test_files as campaign
 from test_files import in_scene, says_else, set_at
 
-from golden.table import Run, Table
+from golden.table import Run, Table, patched
 from legged_mw import ROOT
 from legged_mw.deploy.contract import CHECKSUM, checksum, read_contract
 from legged_mw.deploy.exam import contract_rules, contract_skill
@@ -21,8 +22,11 @@ from legged_mw.deploy.policy import Controller, Network
 from legged_mw.deploy.robot import QUANTITIES, Measurement
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.simulated import read_scene
+from legged_mw.utils import mjcf
 from legged_mw.utils.config import load_yaml, save_yaml
+from legged_mw.utils.mjcf import write_archive
 
+PER_JOINT = ("joints", "default_pose", "stiffness", "damping")
 POLICIES = ROOT / "resources/policies"
 
 
@@ -107,6 +111,12 @@ def theirs(name: str, change: Any = lambda said: None, folder: str = "out") -> R
     return given
 
 
+def zipped(file: Path, *names: str) -> None:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in names:
+            archive.writestr(name, "<mujoco/>")
+
+
 def reads(root: Path) -> None:
     read_contract(root / "out")
 
@@ -177,4 +187,17 @@ def table() -> Table:
         theirs("go1_flat", set_at("action|origin", "speed")),
     )
     made.add("a row of others", acts, theirs("go1_flat", lambda said: said["observation"][0].update(measured="sensors", sensors=["x"])))
+    for name, write in {
+        "of text": lambda file: file.write_bytes(b"PK"),
+        "of two files": lambda file: zipped(file, "model.xml", "terrain.xml"),
+        "that names another": lambda file: write_archive(file, '<mujoco><include file="other.xml"/></mujoco>'),
+    }.items():
+        made.add(
+            f"terrain {name}",
+            lambda root: read_scene(root / "out", read_contract(root / "out"), "terrain.mjz"),
+            lambda root, write=write: (theirs("go1_flat")(root), write(root / "out/terrain.mjz")),
+        )
+    small = patched(in_scene_too, mjcf, MOST_BYTES=1000)
+    made.add("scene: large", small, theirs("go1_flat"))
+    made.add("scene: a joint more", in_scene_too, theirs("go1_flat", lambda said: [said[name].pop() for name in PER_JOINT]))
     return made

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 import socket
@@ -213,6 +214,12 @@ def log(root: Path, seconds: float) -> Path:
     return path
 
 
+def other_format(root: Path) -> None:
+    with (root / "a").open("wb") as file:
+        np.savez(block := io.BytesIO(), header=json.dumps({"format": 99}))
+        file.write(len(block.getvalue()).to_bytes(8, "little") + block.getvalue())
+
+
 def given_log(seconds: float) -> Run:
     return lambda root: log(root, seconds)
 
@@ -301,4 +308,5 @@ def table() -> Table:
     made.add(
         "replay: another network", lambda root: replay.replay(Path("walk.lmwlog"), ROOT / "resources/policies/go1_flat"), given_log(3.0)
     )
+    made.add("log: another format", lambda root: read_log(Path("a")), other_format)
     return made

@@ -7,6 +7,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+import mujoco
 from test_sim import SOLES, Solver, build_toy, go1, toy
 from test_symmetry import GO1, WAIST, load_robot, replaced
 
@@ -16,6 +17,8 @@ from legged_mw.sim.engines import make_simulation, pick_engine
 from legged_mw.sim.kinematics import Kinematics
 from legged_mw.sim.mirror import find_partners
 from legged_mw.sim.model import RobotModel
+from legged_mw.sim.rigid import match_joints
+from legged_mw.sim.shapes import spheres_on
 from legged_mw.sim.tables import per_joint
 
 CHOICES: dict[str, dict[str, Any]] = {  # of the Go1
@@ -62,6 +65,8 @@ SHAPES = {
     "a robot that touches nothing": '<geom size="0.05" pos="0 0 -0.2" mass="1" contype="0" conaffinity="0"/>',
     "a robot whose legs point up": '<geom size="0.05" pos="0 0 0.3" mass="1"/>',
 }
+HILLS = """<mujoco><asset><hfield name="h" nrow="2" ncol="2" size="1 1 1 1"/></asset>
+<worldbody><geom name="hills" type="hfield" hfield="h"/></worldbody></mujoco>"""
 MIRRORS: dict[str, tuple[str, str]] = {
     "an axis": ('name="waist_roll" axis="1 0 0"', 'name="waist_roll" axis="1 0.1 0"'),
     "a kind": ('name="left_hand" type="slide"', 'name="left_hand"'),
@@ -115,4 +120,6 @@ def table() -> Table:
         )
     for name, leg in SHAPES.items():
         made.add(f"draft of {name}", lambda root: draft(Path("a.xml")), lambda root, leg=leg: (root / "a.xml").write_text(BARE.format(leg)))
+    made.add("shapes: a height field", lambda root: spheres_on(mujoco.MjModel.from_xml_string(HILLS), 0, 0.1))
+    made.add("joints: a pattern of none", lambda root: match_joints(["hip"], ["neck"], "held"))
     return made

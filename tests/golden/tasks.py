@@ -15,16 +15,19 @@ from test_tracking import make as tracking
 from worlds import QUIET, make_env, only_scales
 
 from golden.table import Table
+from legged_mw import ROOT
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.mirror import Mirror
+from legged_mw.eval.crossing import make_room
 from legged_mw.eval.exams import find_exam, require_exam
 from legged_mw.eval.rules import ExamRules, in_common
-from legged_mw.rl.policies import Source, Trained
+from legged_mw.rl.policies import Source, Trained, find_rival
 from legged_mw.rl.ranks import Rank, rank_device
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.symmetry import mirror
 from legged_mw.rl.transfer import check_start
+from legged_mw.utils.commands import Command, parse_command
 from legged_mw.utils.task import LoadedTask, Task, load_task
 
 FIELDS: dict[str, dict[str, Any]] = {
@@ -188,4 +191,15 @@ def table() -> Table:
             "no exam": lambda: require_exam(exam("")),
         }
     )
+    for name, (task, fields) in {
+        "a pull on another body": ("go1_getup", {"falls.pull_on": "nose"}),
+        "a pull at the root": ("go1_getup", {"falls.pull": 0.5, "falls.pull_on": "", "perturbation.kick": True}),
+        "hands that are not there": ("go1_handstand", {"exam.hands": ["nose"]}),
+        "a command outside": ("go1_flat", {"commands.default": {"lin_vel_x": 9.0}}),
+    }.items():
+        made.add(f"{task} with {name}", lambda root, task=task, fields=fields: make_env(1, fields, task=task))
+    made.add("rooms of no ground", lambda root: make_room(set_all(load_task("go1_rough"), {"terrain.terrain_proportions": {"flat": 0.0}})))
+    made.add("a rival of another task", lambda root: find_rival(load_task("go1_flat"), str(ROOT / "resources/policies/go2_flat")))
+    made.add("speeds of none", lambda root: ExamRules.from_mapping({"push_speeds": [], "ranges": {}}))
+    made.add("a command outside of its range", lambda root: parse_command("9", [Command("lin_vel_x", -1.0, 1.0, "m/s")]))
     return made
