@@ -38,7 +38,7 @@ CHECKED = [  # what shows only when robot, environment or learner is built
     *("asset.file=dog.xml", "asset.file=", "asset.file=/far/dog.xml", "asset.foot_names=[FR, FL, RR, RLL]", "asset.foot_names=[F*]"),
     *("control.stiffness={hip: 30}", "init_state.default_joint_angles={joint: 0, wheel: 1}", "rewards.scales.torqes=-1"),
     *("algorithm.optimizer=adom", "obs_groups.actor=[stat]", "actor.class_name=os:system", "asset.imu_site=nose", "runner.logger=wandb"),
-    *("commands.keep_probability=[1]", "commands.default={lin_vel_z: 1}"),
+    *("commands.keep_probability=[1]", "commands.units={hight: m}", "commands.default={lin_vel_z: 1}"),
     *("commands.default={lin_vel_x: 9}", "observations.leave_out={nosuch: [a]}", "observations.leave_out={state: [a]}"),
     *("observations.history={nosuch: 2}", "observations.history={state.nosuch: 2}"),
     *("asset.penalize_contacts_on=[nose]", "asset.colliders=[]", "asset.sense=[nosuch]"),

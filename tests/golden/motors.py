@@ -7,13 +7,24 @@ from typing import Any
 
 import numpy as np
 import torch
-from test_motors import DC, Rates, Springs, changed_arrays, mlp
-from torch import nn
+from test_motors import DC, Anydrive, Springs, mlp
+from torch import Tensor, nn
 from worlds import make_env
 
 from golden.table import Run, Table
 from legged_mw.robot import actuator_net
 from legged_mw.utils.motor_network import read_network
+
+
+class Rates(Anydrive):
+    def forward(self, x: Tensor, memory: tuple[Tensor, Tensor]) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        return x[:, 0, :1] ** 2, memory
+
+
+def changed_arrays(**changes: Any) -> dict[str, Any]:
+    arrays = mlp()[1].to_arrays() | changes
+    return {name: value for name, value in arrays.items() if value is not None}
+
 
 ARRAYS = {
     "frames less": lambda: changed_arrays(frames=np.array([0, 1])),

@@ -139,9 +139,9 @@ def table() -> Table:
         )
     for kind in (None, "fot", "privileged_state", "polar"):
         made.add(f"mirror of a row: {kind}", lambda root, kind=kind: mirrored(kind))
-    for name, (change, value, _) in CHANGES.items():
+    for name, (change, value) in CHANGES.items():
         made.add(f"teacher of another {name}", lambda root, change=change, value=value: other(change, value, test_teacher.seat_teacher))
-    made.add("beginning of another pose", lambda root: other(*CHANGES["pose"][:2], begins))
+    made.add("beginning of another pose", lambda root: other(*CHANGES["pose"], begins))
     made.add("beginning of another history", lambda root: other("observations.history", {"state.dof_pos": 2}, begins))
     for path, fields in LEARNERS.items():
         made.add(
