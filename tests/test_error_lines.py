@@ -8,6 +8,7 @@ from importlib import import_module
 from pathlib import Path
 
 import pytest
+import torch
 from golden import table
 from golden.areas import AREAS
 
@@ -21,6 +22,7 @@ def stored(area: str) -> list[str]:
 @pytest.mark.parametrize("area", AREAS)
 def test_every_line(area: str, made: Path, tmp_path: Path, request: pytest.FixtureRequest) -> None:
     table.made_run[:] = [made.parent]
+    torch.manual_seed(0)
     found = sorted(table.lines(area, import_module(f"golden.{area}").table(), tmp_path))
     if request.config.getoption("--rewrite"):
         with GOLDEN.open("r+") as file:

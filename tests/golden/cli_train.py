@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
+from attack import program as started
 
-from golden.table import Run, Table, given_run
+from golden.table import Run, Table, given_run, without
 
 BOTH = [
     ["--task", ""],
@@ -37,7 +38,7 @@ SMALL = [*("--num_envs", "16", "--set", "actor.hidden_dims=[16, 16]", "--set", "
 CHECKED = [  # what shows only when robot, environment or learner is built
     *("asset.file=dog.xml", "asset.file=", "asset.file=/far/dog.xml", "asset.foot_names=[FR, FL, RR, RLL]", "asset.foot_names=[F*]"),
     *("control.stiffness={hip: 30}", "init_state.default_joint_angles={joint: 0, wheel: 1}", "rewards.scales.torqes=-1"),
-    *("algorithm.optimizer=adom", "obs_groups.actor=[stat]", "actor.class_name=os:system", "asset.imu_site=nose", "runner.logger=wandb"),
+    *("algorithm.optimizer=adom", "obs_groups.actor=[stat]", "actor.class_name=os:system", "asset.imu_site=nose"),
     *("commands.keep_probability=[1]", "commands.units={hight: m}", "commands.default={lin_vel_z: 1}"),
     *("commands.default={lin_vel_x: 9}", "observations.leave_out={nosuch: [a]}", "observations.leave_out={state: [a]}"),
     *("observations.history={nosuch: 2}", "observations.history={state.nosuch: 2}"),
@@ -145,6 +146,7 @@ def table() -> Table:
         made.programs(program, BOTH)
     for items in [*([item] for item in CHECKED), *TWO]:
         made.programs("train", [["--check", *SMALL, *sets(items)]], name=f"check {' '.join(items)}")
+    made.add("check runner.logger=wandb", without("wandb", started("train", "--check", *SMALL, "--set", "runner.logger=wandb")))
     made.programs("train", TRAIN, with_run())
     made.programs("play", PLAY, with_run())
     more = ["--resume", "--load_run", "run", "--max_iterations", "3"]

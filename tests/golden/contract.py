@@ -13,9 +13,10 @@ from test_files import in_scene, says_else, set_at
 
 from golden.table import Run, Table, patched
 from legged_mw import ROOT
-from legged_mw.deploy.contract import CHECKSUM, checksum, read_contract
+from legged_mw.deploy.contract import CHECKSUM, CLOCK, checksum, read_contract
 from legged_mw.deploy.exam import contract_rules, contract_skill
 from legged_mw.deploy.follow import Follower
+from legged_mw.deploy.motion import JOINT_POS
 from legged_mw.deploy.motors import Motors, make_network
 from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.policy import Controller, Network
@@ -26,7 +27,6 @@ from legged_mw.utils import mjcf
 from legged_mw.utils.config import load_yaml, save_yaml
 from legged_mw.utils.mjcf import write_archive
 
-PER_JOINT = ("joints", "default_pose", "stiffness", "damping")
 POLICIES = ROOT / "resources/policies"
 
 
@@ -48,7 +48,7 @@ CHANGES: dict[str, Any] = {
     "a row of another size": set_at("observation|3|size", 11),
     "another quantity": set_at("observation|3|measured", "joint_ofset"),
     "nothing measures it": set_at("observation|0|measured", ""),
-    "of a motion": lambda said: said["observation"][0].update(measured="motion_joint_pos"),
+    "of a motion": lambda said: said["observation"][0].update(measured=JOINT_POS),
     "a joint less": pops("joints", "default_pose", "stiffness", "damping"),
     "scales of a row": set_at("observation|4|scale", [1.0, 2.0]),
     "a pose less": set_at("default_pose", [0.0] * 11),
@@ -65,8 +65,9 @@ CHANGES: dict[str, Any] = {
     "another rule": set_at("ends", {"max_tlit": 3}),
     "a tilt of 200": set_at("ends", {"max_tilt": 200}),
     "a clock without its commands": lambda said: (
-        said["observation"].append({**said["observation"][0], "measured": "gait_clock"}),
         said["commands"].pop(),
+        said.update(gait={}),
+        said["observation"][0].update(measured=CLOCK),
     ),
     "no network section": drops("network"),
     "a section of text": set_at("robot", "go1"),
@@ -199,5 +200,5 @@ def table() -> Table:
         )
     small = patched(in_scene_too, mjcf, MOST_BYTES=1000)
     made.add("scene: large", small, theirs("go1_flat"))
-    made.add("scene: a joint more", in_scene_too, theirs("go1_flat", lambda said: [said[name].pop() for name in PER_JOINT]))
+    made.add("scene: a joint more", in_scene_too, in_scene("</worldbody>", '<body><joint name="tail"/><geom size="1"/></body></worldbody>'))
     return made

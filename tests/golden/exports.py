@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from test_export import OtherAngles, OtherMemory, OtherScale, OtherTargets, OtherVelocity
 from test_motors import Springs
-from test_terrain import terrain
 from worlds import make_env
 
 from golden.table import Run, Table, given_run, made_run, patched
@@ -23,6 +22,7 @@ from legged_mw.rl.export import export
 from legged_mw.rl.export_scene import among_steps, standalone
 from legged_mw.rl.keeping import RunLock
 from legged_mw.rl.transfer import begin_with
+from legged_mw.sim.terrain import make_terrain
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.task import load_task
 
@@ -61,8 +61,9 @@ def scene(**changes: Any) -> None:
 
 
 def slopes() -> None:
+    many: Any = {"levels": 1, "columns": 1, "tile": 24.0, "cell": 0.05, "border": 1.0, "difficulty": (1.0, 1.0), "seed": 1}
     xml = (ROOT / "resources/policies/go1_flat/scene.xml").read_text()
-    among_steps(xml, terrain(proportions={"slope_up": 1.0}, columns=1, levels=1), [0.0, 0.0, 0.3])
+    among_steps(xml, make_terrain(proportions={"stepping_stones": 1.0}, **many), [0.0, 0.0, 0.3])
 
 
 def locked(root: Path) -> None:
@@ -85,8 +86,7 @@ def table() -> Table:
         made.add(f"{kind.__name__}", exports(kind))
     made.calls({"a picture of heights": lambda: scene(hfield=True), "slopes": slopes, "another IMU": lambda: scene(imu="nose")})
     made.add("a run that is trained", locked, lock)
-    made.add(
-        "a student alone",
-        lambda root: begin_with(torch.nn.Linear(1, 1), SimpleNamespace(source=SimpleNamespace(checkpoint=Path("policy.onnx")))),  # type: ignore[arg-type]
-    )
+    alone: Any = SimpleNamespace(source=SimpleNamespace(checkpoint=Path("policy.onnx")))
+    student: Any = torch.nn.ModuleDict({"teacher": torch.nn.Linear(1, 1)})
+    made.add("a student alone", lambda root: begin_with(student, alone))
     return made

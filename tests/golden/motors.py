@@ -78,6 +78,13 @@ def table() -> Table:
         "two values": (nn.Linear(2, 2), ()),
     }.items():
         made.add(f"torchscript of {name}", lambda root, flags=flags: actuator_net.main(["net.pt", "net.npz", *flags]), scripted(module))
+    made.add(
+        "another network than in training",
+        lambda root: make_env(
+            1, {"control.actuator": "network", "control.network": "net.npz", "control.network_digest": {"net.npz": "0" * 64}}
+        ),
+        saved(lambda: mlp()[1].to_arrays()),
+    )
     for name, fields in FIELDS.items():
         made.add(f"go1_flat with {name}", lambda root, fields=fields: make_env(2, {**DC, **fields}))
     made.add("two laws", lambda root: make_env(2, DC, env_class=Springs))

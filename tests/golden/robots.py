@@ -8,6 +8,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import mujoco
+from test_robot_page import WHEEL
 from test_sim import SOLES, Solver, build_toy, go1, toy
 from test_symmetry import GO1, WAIST, load_robot, replaced
 
@@ -56,7 +57,7 @@ TOYS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
     ),
     "two joints of a body, one held": (
         {"inside": '<body name="arm"><joint name="a"/><joint name="b" axis="1 0 0"/><geom size="0.1"/></body>'},
-        {"held_joints": {"b": 0.0}},
+        {"held_joints": ["b"], "stiffness": {"": 1.0}, "damping": {"": 1.0}},
     ),
 }
 BARE = """<mujoco><worldbody><body name="base" pos="0 0 1"><freejoint/><geom size="0.1" mass="3" contype="0" conaffinity="0"/>
@@ -118,6 +119,8 @@ def table() -> Table:
             f"fields: {field}",
             lambda root, field=field: make_simulation(dog().physics, 1, "cpu", engine="mujoco", nconmax=8, njmax=40, world_fields=[field]),
         )
+    wheel = WHEEL.format(half=0.2, offset=0.0, more="")
+    made.add("draft of a robot without feet", lambda root: draft(Path("a.xml")), lambda root: (root / "a.xml").write_text(wheel))
     for name, leg in SHAPES.items():
         made.add(f"draft of {name}", lambda root: draft(Path("a.xml")), lambda root, leg=leg: (root / "a.xml").write_text(BARE.format(leg)))
     made.add("shapes: a height field", lambda root: spheres_on(mujoco.MjModel.from_xml_string(HILLS), 0, 0.1))

@@ -24,6 +24,13 @@ from legged_mw.utils.errors import UserError, printable
 Run = Callable[[Path], object]
 PACKAGE = Path(legged_mw.__file__).parent
 made_run: list[Path] = []  # the folder of a finished training
+VARIES = {  # in a line, by machine or moment
+    r"0x[0-9a-f]{8,}": "<address>",
+    r"\b[0-9a-f]{8}\.\.\.": "<digest>...",
+    r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d": "<now>",
+    r"is \S+ in the environment and \S+ by": "is <x> in the environment and <y> by",
+    r"(up to|by|turns at|bodies are) -?\d+\.[\d.e-]+( apart|%| rad/s, more| m from)": r"\1 <x>\2",
+}
 reached: set[tuple[str, int]] = set()  # (file, line) of the package on the way to an error, of all cases so far
 
 
@@ -154,8 +161,8 @@ def plain(text: str, root: Path) -> str:
     """A line without what differs by machine or moment."""
     for place, name in ((root.resolve(), "<tmp>"), (root, "<tmp>"), (root.parent, "<tmp>/.."), (ROOT, "<root>")):
         text = text.replace(str(place), name)
-    text = re.sub(r"0x[0-9a-f]{8,}", "<address>", text)
-    text = re.sub(r"\d{4}-\d\d-\d\d_\d\d-\d\d-\d\d", "<now>", text)
+    for pattern, name in VARIES.items():
+        text = re.sub(pattern, name, text)
     text = re.sub(r"(<root>/(?:legged_mw|tests)/[\w/]+\.py):\d+", r"\1:<line>", text)
     text = re.sub(r" \(choose from .*\)", " (choose from ...)", text)  # as Python's versions say otherwise
     return text.strip()

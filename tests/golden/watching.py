@@ -94,7 +94,8 @@ def table() -> Table:
         patched(patched(lambda root: VideoWriter(root / "a.mp4", 320, 240, fps=50), av, codecs_available={"gif"}), av, __version__="0.0"),
     )
     made.add("no PyAV", without("av", lambda root: VideoWriter(root / "a.mp4", 320, 240, fps=50)))
-    made.add("no OpenGL", patched(lambda root: RobotRenderer(spec(), 64, 48), mujoco, Renderer=no_opengl))
+    egl = {**os.environ, "MUJOCO_GL": "egl"}
+    made.add("no OpenGL", patched(patched(lambda root: RobotRenderer(spec(), 64, 48), mujoco, Renderer=no_opengl), os, environ=egl))
     made.calls(
         {
             "a window without a display": lambda: window(False),
