@@ -1,11 +1,10 @@
-"""A robot that is driven: its wire, its guard, its log, and who else may stop it; nothing here opens a network."""
+"""A robot that is driven: its wire, its log, and who else may stop it; nothing here opens a network."""
 
 from __future__ import annotations
 
 import io
 import json
 import shutil
-import socket
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -29,10 +28,9 @@ from legged_mw.deploy.robot import Robot
 from legged_mw.deploy.runner import run
 from legged_mw.deploy.safety import Limits
 from legged_mw.deploy.simulated import MujocoRobot
-from legged_mw.deploy.unitree import guard, link, need_dds
+from legged_mw.deploy.unitree import link, need_dds
 from legged_mw.deploy.unitree.client import Direct, UnitreeRobot, check_rows
 from legged_mw.deploy.unitree.codec import LAYOUTS, Message
-from legged_mw.deploy.unitree.guard import Board, Guarded
 from legged_mw.deploy.unitree.link import Received, Wire
 from legged_mw.deploy.unitree.robots import G1, GO2, check_body, machine_of
 
@@ -131,40 +129,6 @@ def busy() -> None:
         raise link.DDSException(-1)
 
     join("lo", 3, Domain=lambda *_: None, DomainParticipant=refuse, _joined={})
-
-
-# ---- the guard
-
-
-def guarded(said: dict[str, Any] | None, text: str = "", ends: bool = False) -> None:
-    """A guard that answers ``said``, then writes ``text`` on its board, then ``ends``."""
-    import tempfile
-
-    mine, theirs = socket.socketpair()
-    with mine, theirs, tempfile.TemporaryFile() as file:
-        file.truncate(guard._BOARD.size + STATE.size)
-        board = Board(file.fileno(), STATE.size)
-        if said is not None:
-            theirs.sendall(json.dumps(said).encode() + b"\n")
-        if said is None or ends:
-            theirs.close() if said is None else None
-        made = Guarded(mine, board)
-        if text:
-            board.put(b"\0" * STATE.size, 1.0, text)
-        if ends:
-            theirs.close()
-            made.send(b"x" * 100_000, 0.0, True)
-        made.receive()
-
-
-def endless_board() -> None:
-    import tempfile
-
-    with tempfile.TemporaryFile() as file:
-        file.truncate(guard._BOARD.size + 8)
-        board = Board(file.fileno(), 8)
-        board._map[0] = 1  # being written
-        board.get()
 
 
 # ---- the run
@@ -276,12 +240,6 @@ def table() -> Table:
             "join: another interface before": lambda: join("lo", 1, _joined={1: ("eth0", None)}),
             "join: wrong types": lambda: join("eth0", 0, wrong_hash=lambda: "unitree_go LowCmd_ as 00, not 52", version=lambda _: "0.0"),
             "join: DDS says no": busy,
-            "guard: it did not start": lambda: guarded(None),
-            "guard: its error": lambda: guarded({"error": "no robot"}),
-            "guard: its text": lambda: guarded({"ok": 1}, text="the robot is silent"),
-            "guard: gone": lambda: guarded({"ok": 1}, ends=True),
-            "guard: gone with a text": lambda: guarded({"ok": 1}, text="it was killed", ends=True),
-            "guard: a board that is written for ever": endless_board,
             "no cyclonedds": lambda: patched(lambda root: need_dds(), sys.modules[need_dds.__module__], find_spec=lambda _: None)(Path()),
             "no onnxruntime": lambda: without("onnxruntime", lambda root: Network(GO2_FLAT, CONTRACT))(Path()),
             "no gamepad": lambda: Gamepad(Path("js9"), CONTRACT.commands),
