@@ -21,6 +21,17 @@ from legged_mw.view.native import has_display
 onnxscript_for_torch.get_torchlib_ops = cache(onnxscript_for_torch.get_torchlib_ops)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--rewrite", action="store_true", help="write tests/golden/errors.txt anew; prints the raises that no case reaches")
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    if config.getoption("--rewrite"):
+        from golden.table import unreached
+
+        terminalreporter.write_line("\n".join(["raises that no case reaches:", *unreached()]))
+
+
 def pytest_collection_finish(session: pytest.Session) -> None:
     quick_start.settle()  # what is imported by now stays
 

@@ -1,13 +1,13 @@
-"""The command line of train.py and play.py: every mistake is one line, exit code 2, and leaves nothing behind."""
+"""The command line of train.py and play.py; tests/golden/cli_train.py has the mistakes: each is one line, and leaves nothing behind."""
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+from argparse import ArgumentTypeError
 from ctypes import ArgumentError
 from pathlib import Path
 
@@ -70,197 +70,11 @@ def first(root: Path) -> Path:
     return folder
 
 
-# ---- mistakes that both programs know
-
-
-@pytest.mark.parametrize("program", ["train", "play"])
-@pytest.mark.parametrize(
-    ("args", "parts"),
-    [
-        ([], ("--task is missing", "go1_flat, go1_flat_blind")),
-        (
-            ["--task", "go1_falt"],
-            ("no task 'go1_falt' in configs/; did you mean 'go1_flat'?", "go1_flat, go1_flat_blind", "or give the path of a config file"),
-        ),
-        (["--task", "dog.urdf"], ("dog.urdf is a robot, not a task; make a task for it: python -m legged_mw.robot dog.urdf --new NAME",)),
-        (["--task", "dog/dog.py"], ("no config file at ", "dog/dog.py")),
-        (
-            [*TASK, "--num_env", "4"],
-            ("unrecognized arguments: --num_env 4; did you mean --num_envs?", "--help"),
-        ),  # no abbreviations: they would change meaning one day
-        ([*TASK, "--num_envs", "0"], ("argument --num_envs: 0 is not a positive number",)),
-        ([*TASK, "--num_envs", "many"], ("argument --num_envs: invalid positive value: 'many'",)),
-        ([*TASK, "--seed", "x"], ("argument --seed: invalid int value: 'x'",)),
-        ([*TASK, "--set", "env.num_envs"], ("--set env.num_envs: write it as path=value, e.g. rewards.scales.torques=-1e-4",)),
-        ([*TASK, "--set", "env.num_env=4"], ("--set env.num_env=4: env.num_env does not exist; did you mean 'num_envs'?",)),
-        ([*TASK, "--set", "env.num_envs=many"], ("--set env.num_envs=many: env.num_envs must be int, not 'many'",)),
-        (
-            [*TASK, "--set", "reward.scales.pose=1"],
-            ("no config section 'reward' in this task; did you mean 'rewards'?", "there are: env, asset, "),
-        ),
-        ([*TASK, "--set", "env=4"], ("--set env=4: env is a section, not a field; set one of its fields: num_envs",)),
-        ([*TASK, "--set", "env.num_envs.x=4"], ("env.num_envs is a field (int), not a section",)),
-        ([*TASK, "--set", "terrain.mesh_type=plain"], ("terrain.mesh_type must be", "did you mean 'plane'?")),
-        ([*TASK, "--override", "none.yaml"], ("none.yaml: cannot read this config file: No such file",)),
-        ([*TASK, "--device", "gpu"], ("--device gpu: say cpu, cuda, or cuda:<index>",)),
-        ([*TASK, "--device", "cuda:99"], ("--device cuda:99: this machine has ", " CUDA devices; use --device cpu")),
-        ([*TASK, "--checkpoint", "last"], ("argument --checkpoint: invalid int value: 'last'",)),
-    ],
-)
-def test_mistakes(root: Path, program: str, args: list[str], parts: tuple[str, ...]) -> None:
-    line = refused(root, program, *args)
-    for part in parts:
-        assert part in line
-
-
-@pytest.mark.parametrize("program", ["train", "play"])
-@pytest.mark.parametrize(
-    ("text", "parts"),
-    [
-        ("env: {num_env: 4}", ("env.num_env does not exist; did you mean 'num_envs'?",)),
-        ("envs: {num_envs: 4}", ("no config section 'envs' in this task; did you mean 'env'?",)),
-        ("runner: {max_iterations: soon}", ("runner.max_iterations must be int, not 'soon'",)),
-        ("env: 4", ("env is a section and needs a mapping of its fields, not 4",)),
-        ("- env", ("holds list, not a mapping of sections and fields",)),
-        ("env: {num_envs: 4", ("not valid YAML",)),
-        ("seed: 1\nseed: 2", ("'seed' is written twice",)),
-    ],
-)
-def test_override_file_mistakes(root: Path, tmp_path: Path, program: str, text: str, parts: tuple[str, ...]) -> None:
-    file = tmp_path / "mine.yaml"
-    file.write_text(text)
-    line = refused(root, program, *TASK, "--override", str(file))
-    assert "mine.yaml" in line
-    for part in parts:
-        assert part in line
-
-
-def test_no_gpu(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
-    for program in ("train", "play"):
-        assert "--device cuda:0: this machine has 0 CUDA devices; use --device cpu" in refused(root, program, *TASK, "--device", "cuda:0")
-
-
-@pytest.mark.parametrize("program", ["train", "play"])
-def test_config_file_without_a_task(root: Path, tmp_path: Path, program: str) -> None:
-    file = tmp_path / "empty.py"
-    file.write_text("TASKS = 1\n")
-    assert "empty.py must end with TASK = Task(Env, Cfg, CfgPPO); its TASK is None" in refused(root, program, "--task", str(file))
-
-
-def test_config_file_with_a_mistake(root: Path, tmp_path: Path) -> None:
-    file = tmp_path / "wrong.py"
-    file.write_text(DOG.replace('file = "robot/dog.xml"', 'fiel = "robot/dog.xml"'))
-    line = refused(root, "train", "--task", str(file))
-    assert "wrong.py:15: DogCfg.asset.fiel overrides nothing; did you mean 'file'?" in line
-
-
-# ---- mistakes that show only when the robot is built
-
-
-@pytest.mark.parametrize(
-    ("item", "parts"),
-    [
-        ("asset.file=dog.xml", ("asset.file: no file 'dog.xml' in ", "configs, ")),
-        ("asset.file=", ("asset.file is empty; name the robot's MJCF or URDF",)),
-        ("asset.foot_names=[FR, FL, RR, RLL]", ("no geom or body 'RLL' in go1.xml; did you mean 'RL'?",)),
-        ("control.stiffness={hip: 30}", ("control.stiffness: no value for FR_thigh_joint, ",)),
-        ("init_state.default_joint_angles={joint: 0, wheel: 1}", ("init_state.default_joint_angles: no joint 'wheel'",)),
-        ("rewards.scales.torqes=-1", ("rewards.scales.torqes = -1: no reward term 'torqes'", "did you mean 'torques'?")),
-        ("algorithm.optimizer=adom", ("the learner's config does not fit rsl-rl: ", "'adom'", "'adam'")),
-        ("obs_groups.actor=[stat]", ("the learner's config does not fit rsl-rl: ", "'stat'", "'state'")),
-    ],
-)
-def test_config_that_does_not_fit_the_robot_or_the_learner(root: Path, item: str, parts: tuple[str, ...]) -> None:
-    line = refused(root, "train", *SMALL, "--set", item)
-    for part in parts:
-        assert part in line
-
-
-# ---- finding a run
-
-
-@pytest.mark.parametrize("program", ["train", "play"])
-def test_unknown_run_and_checkpoint(root: Path, first: Path, program: str) -> None:
-    more = ["--resume"] if program == "train" else []
-    line = refused(root, program, *TASK, *more, "--load_run", first.name.replace("first", "frist"))
-    assert f"did you mean '{first.name}'? there are: {first.name}" in line and "no run with a checkpoint '" in line
-    line = refused(root, program, *TASK, *more, "--checkpoint", "7")
-    assert f"no checkpoint 7 in {first}; there are: 1" in line
-    line = refused(root, program, *TASK, *more, "--experiment_name", "elsewhere", "--load_run", "-1")
-    assert "no run with a checkpoint in " in line and "elsewhere; train first" in line
-
-
-def test_load_run_without_resume(root: Path, first: Path) -> None:
-    for flag in (["--load_run", first.name], ["--checkpoint", "1"]):
-        assert "--load_run and --checkpoint say what to go on with: add --resume" in refused(root, "train", *TASK, *flag)
-
-
-def test_nothing_to_play(tmp_path: Path) -> None:
-    line = refused(tmp_path, "play", *TASK)
-    assert "nothing to play: no run in " in line and "so train first; no policy ships with go1_flat; those that ship: none" in line
-
-
-def test_run_without_its_config(root: Path, first: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "logs/go1_flat/bare"
-    folder.mkdir(parents=True)
-    shutil.copy(first / "model_1.pt", folder)
-    assert "config.yaml: cannot read this config file: No such file" in refused(tmp_path, "play", *TASK)
-    assert "config.yaml: cannot read this config file: No such file" in refused(tmp_path, "train", *TASK, "--resume")
-
-
-# ---- checkpoints that do not fit
-
-
-@pytest.mark.parametrize("program", ["train", "play"])
-def test_checkpoint_of_other_networks(root: Path, program: str) -> None:
-    more = ["--resume", "--max_iterations", "2"] if program == "train" else []
-    line = refused(root, program, *TASK, "--device", "cpu", *more, "--set", "actor.hidden_dims=[8, 16]")
-    assert "model_1.pt does not fit this task: actor mlp.0.weight is (16, 48) there and (8, 48) here" in line
-
-
-def test_critic_of_other_networks(root: Path) -> None:
-    line = refused(root, "train", *TASK, "--device", "cpu", "--resume", "--max_iterations", "2", "--set", "critic.hidden_dims=[16]")
-    assert "model_1.pt does not fit this task: critic mlp.2.weight is (16, 16) there and (1, 16) here" in line
-
-
-class Evil:
-    """Unpickling it runs code: it makes a folder."""
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-
-    def __reduce__(self) -> tuple:
-        return (os.mkdir, (str(self.folder),))
-
-
-@pytest.mark.parametrize("program", ["train", "play"])
-@pytest.mark.parametrize("damage", ["cut", "empty", "text", "code", "keyless", "other"])
-def test_damaged_checkpoint(first: Path, tmp_path: Path, program: str, damage: str) -> None:
-    folder = tmp_path / "logs/go1_flat/run"
-    shutil.copytree(first, folder)
-    file, whole = folder / "model_1.pt", (first / "model_1.pt").read_bytes()
-    contents = {"code": {"actor_state_dict": Evil(tmp_path / "evil")}, "keyless": {"actor_state_dict": {}}, "other": {"weights": 3}}
-    if damage in contents:
-        torch.save(contents[damage], file)
-    else:
-        file.write_bytes({"cut": whole[: len(whole) // 2], "empty": b"", "text": b"not a model\n"}[damage])
-    more = ["--resume", "--max_iterations", "2"] if program == "train" else []
-    line = refused(tmp_path, program, *TASK, "--device", "cpu", *more)
-    said = {"other": "is not a checkpoint of this project: it has no actor_state_dict", "keyless": "does not fit this task: actor "}
-    said["code"] = "cannot be read as a checkpoint: it is damaged, or holds more than tensors and numbers"
-    assert f"model_1.pt {said.get(damage, 'cannot be read as a checkpoint: it is damaged: File is not a zip file')}" in line
-    assert ("is missing there and " in line) == (damage == "keyless")
-    assert not (tmp_path / "evil").exists()
-
-
-def test_actor_alone_plays_but_does_not_resume(first: Path, tmp_path: Path) -> None:
+def test_an_actor_alone_plays(first: Path, tmp_path: Path) -> None:
     folder = tmp_path / "logs/go1_flat/run"
     shutil.copytree(first, folder)
     content = torch.load(folder / "model_1.pt", weights_only=True)
     torch.save({"actor_state_dict": content["actor_state_dict"], "infos": {}}, folder / "model_1.pt")
-    line = refused(tmp_path, "train", *TASK, "--device", "cpu", "--resume", "--max_iterations", "2")
-    assert "model_1.pt holds an actor only; it can be played, but not resumed" in line
     result = run("play", tmp_path, *TASK, "--device", "cpu", "--export", str(tmp_path / "out"))
     assert result.code == 0 and (tmp_path / "out/policy.onnx").is_file()
 
@@ -268,42 +82,11 @@ def test_actor_alone_plays_but_does_not_resume(first: Path, tmp_path: Path) -> N
 # ---- durations and commands
 
 
-@pytest.mark.parametrize(("program", "flag"), [("train", "--max_time"), ("play", "--time")])
-@pytest.mark.parametrize("text", ["soon", "0", "0s", "-5", "5d", "1h30", "5 m", "nan", ""])
-def test_no_duration(root: Path, program: str, flag: str, text: str) -> None:
-    assert f"argument {flag}: '{text}' is no duration; write 90s, 5m or 1.5h" in refused(root, program, *TASK, f"{flag}={text}")
-
-
 def test_durations() -> None:
     assert [duration(text) for text in ("90", "90s", "5m", "1.5h", "0.5s")] == [90, 90, 300, 5400, 0.5]
-
-
-@pytest.mark.parametrize("text", ["", "fast", "1;2;3", "0.5,,0", "nan,0,0", "0,inf,0", "1,x"])
-def test_no_command(root: Path, text: str) -> None:
-    line = refused(root, "play", *TASK, f"--command={text}")
-    assert f"--command {text}: '" in line and "' is no number; write --command=0,0,0 (vx [m/s], vy [m/s], yaw rate [rad/s])" in line
-
-
-def test_a_command_too_many_or_of_no_such_name(root: Path) -> None:
-    line = refused(root, "play", *TASK, "--command=1,0,0,0")
-    assert "--command 1,0,0,0: 4 numbers, but this task has 3 commands: vx [m/s], vy [m/s], yaw rate [rad/s]" in line
-    line = refused(root, "play", *TASK, "--command=ang_vel_jaw=1")
-    assert "--command ang_vel_jaw=1: no command 'ang_vel_jaw' in this task; did you mean 'ang_vel_yaw'?" in line
-
-
-@pytest.mark.parametrize(
-    ("args", "part"),
-    [
-        (["--command=9,0,0"], "--command 9,0,0: vx = 9 m/s is outside of what was trained, [-1.5, 1.5] m/s"),
-        (["--commands", "none.yaml"], "none.yaml: cannot read this config file: No such file"),
-        (["--commands", "a.yaml", "--command=0,0,0"], "it goes with neither --command nor --eval nor --export"),
-        (["--viewer", "wbe"], "argument --viewer: invalid choice: 'wbe'"),
-        (["--viewer", "web", "--video", "a.mp4"], "--video records and --viewer web does not: leave one of them out"),
-        (["--video", "a.avi"], "Cannot write 'a.avi': the supported extensions are .mp4 (H.264) and .gif."),
-    ],
-)
-def test_what_cannot_be_watched_is_refused_before_anything_runs(root: Path, args: list[str], part: str) -> None:
-    assert part in refused(root, "play", *TASK, "--device", "cpu", *args)
+    for text in ("soon", "0", "0s", "-5", "5d", "1h30", "5 m", "nan", ""):
+        with pytest.raises(ArgumentTypeError):
+            duration(text)
 
 
 def test_a_wider_range_lets_a_command_pass(root: Path, tmp_path: Path) -> None:
@@ -440,17 +223,6 @@ def test_worlds_grow_with_the_cores_up_to_the_tasks_own_number() -> None:
         assert task.cfg.env.num_envs == worlds
 
 
-@pytest.mark.parametrize(
-    ("words", "line"),
-    [
-        (["--engine", "physx"], "--engine: sim.engine must be Literal['auto', 'mujoco_warp', 'mujoco'], not 'physx' (str)"),
-        (["--set", "sim.threads=-1"], "sim.threads is -1; it must be from 0 to 1024"),
-    ],
-)
-def test_engine_that_cannot_be(tmp_path: Path, words: list[str], line: str) -> None:
-    assert line in refused(tmp_path, "train", *TASK, "--device", "cpu", *words)
-
-
 def test_experiment_name_by_flag_and_by_field(tmp_path: Path) -> None:
     """Both name the folder below logs/, and what is printed finds the run again."""
     for name, flags in (("flag", ["--experiment_name", "flag"]), ("field", ["--set", "runner.experiment_name=field"])):
@@ -528,27 +300,12 @@ def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path) -> None:
 
 
 def test_export_is_the_policy_as_trained(root: Path, tmp_path: Path) -> None:
-    """Twice the same; what would play it otherwise is refused, since it would reach neither the config nor the network's clamp."""
+    """Twice the same."""
     files = []
     for out in (tmp_path / "one", tmp_path / "two"):
         assert run("play", root, *TASK, "--device", "cpu", "--export", str(out)).code == 0
         files.append([(out / name).read_bytes() for name in ("config.yaml", "policy.onnx", "policy.yaml", "scene.xml")])
     assert files[0] == files[1]
-    line = refused(root, "play", *TASK, "--export", str(tmp_path / "three"), "--set", "normalization.clip_actions=0.001")
-    assert "--export writes the policy as it was trained: leave --set, --override and --command out" in line
-
-
-def test_a_run_of_another_task_is_refused(first: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "logs/go1_flat/other"
-    copy.mkdir(parents=True)
-    for name in ("config.yaml", "model_1.pt"):
-        (copy / name).write_bytes((first / name).read_bytes())
-    text = (copy / "config.yaml").read_text()
-    assert "task: go1_flat" in text
-    (copy / "config.yaml").write_text(text.replace("task: go1_flat", "task: /far/away/dog.py"))
-    for program, more in (("play", []), ("train", ["--resume", "--max_iterations", "2"])):
-        line = refused(tmp_path, program, *TASK, "--device", "cpu", "--load_run", "other", *more)
-        assert "is of task '/far/away/dog.py', not 'go1_flat'; that is somebody's code" in line and "--task /far/away/dog.py" in line
 
 
 @pytest.mark.parametrize("text", ["CUDA out of memory. Tried to allocate 2 GiB", "Failed to allocate 4096 bytes on device 'cuda:0'"])

@@ -10,7 +10,6 @@ import torch
 from worlds import QUIET, layout, make_env
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.utils.commands import Command, command_table, outside, parse_command, with_units
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
@@ -110,45 +109,13 @@ def test_the_yaw_rate_steers_to_a_heading() -> None:
     assert caller.commands[:, 2].tolist() == pytest.approx([0.7] * 3), "where nothing is drawn the commands are the caller's"
 
 
-class NamelessCfg(HeightCfg):
-    class commands(HeightCfg.commands):
-        mirror = {}
-
-
-def test_a_command_without_a_mirror_sign_is_named() -> None:
-    cfg = NamelessCfg()
-    cfg.env.num_envs = 1
-    with pytest.raises(ConfigError, match=r"commands.ranges.base_height: nothing says what a mirror does to it; write commands.mirror"):
-        _ = LeggedRobot(cfg, "cpu").mirror
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "message"),
-    [
-        ("commands.units", {"hight": "m"}, "commands.units: no command 'hight' in commands.ranges; there are: lin_vel_x, lin_vel_y"),
-        ("commands.default", {"lin_vel_x": 2.0}, r"commands.default: lin_vel_x is 2; commands.ranges.lin_vel_x is \[-1.5, 1.5\]"),
-    ],
-)
-def test_wrong_tables_are_named(path: str, value: Any, message: str) -> None:
-    cfg: LeggedRobotCfg = Go1FlatCfg()
-    cfg.set(path, value)
-    with pytest.raises(ConfigError, match=message):
-        command_table(cfg)
-
-
 def test_typed_commands() -> None:
     assert parse_command("0.5,0,-0.2", TABLE) == [0.5, 0.0, -0.2, 0.28]
     assert parse_command("0.5,0,0,0.3", TABLE) == [0.5, 0.0, 0.0, 0.3]
     assert parse_command("base_height=0.25", TABLE) == [0.0, 0.0, 0.0, 0.25]
     assert outside([0.0, 0.0, 0.0, 0.32], TABLE) == ""
-    for text, message in {
-        "2,0,0": r"--command 2,0,0: vx = 2 m/s is outside of what was trained, \[-1.5, 1.5\] m/s",
-        "hight=1": "--command hight=1: no command 'hight' in this task; did you mean 'base_height'",
-        "1,2,3,4,5": r"5 numbers, but this task has 4 commands: vx \[m/s\]",
-        "1,x,0": r"'x' is no number; write --command=0,0,0,0.28 \(vx \[m/s\]",
-        "nan": "'nan' is no number",
-    }.items():
-        with pytest.raises(ConfigError, match=message):
+    for text in ("2,0,0", "hight=1", "1,2,3,4,5", "1,x,0", "nan"):
+        with pytest.raises(ConfigError, match=f"--command {text}: "):
             parse_command(text, TABLE)
-    with pytest.raises(ConfigError, match="1 numbers, but this task has 0 commands: none"):
+    with pytest.raises(ConfigError, match="0 commands"):
         parse_command("1", ())

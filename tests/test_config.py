@@ -1,4 +1,4 @@
-"""Class-based configuration: what a class may declare, what its instances accept, and what every error says."""
+"""Class-based configuration: what a class may declare and what its instances accept; tests/golden/config_classes.py has what errors say."""
 
 import copy
 import importlib
@@ -69,12 +69,6 @@ def says(*parts: str) -> Any:
     return pytest.raises(ConfigError, match="(?s)" + ".*".join(re.escape(part) for part in parts))
 
 
-def line_of(text: str) -> str:
-    """`file:line` of the last line of this file that has `text`."""
-    lines = Path(__file__).read_text().splitlines()
-    return f"{Path(__file__).name}:{max(i for i, line in enumerate(lines, 1) if line.strip().startswith(text))}:"
-
-
 def load_module(tmp_path: Path, source: str, name: str) -> Any:
     path = tmp_path / f"{name}.py"
     path.write_text(source)
@@ -129,7 +123,7 @@ def test_open_section_keeps_its_methods() -> None:
             def total(self) -> float:
                 return 0.0
 
-    with says("scales.total does not exist"):
+    with pytest.raises(ConfigError):
         Methods().set("scales.total", 1)
 
 
@@ -152,15 +146,6 @@ def test_an_open_section_may_start_empty() -> None:
     cfg = Empty()
     cfg.set("rewards.scales.lin_vel_z", "-4")
     assert cfg.to_dict()["rewards"]["scales"]["lin_vel_z"] == -4.0
-
-
-def test_only_an_open_section_may_start_empty() -> None:
-    with says(line_of("_only = True  # here"), "Wrong.env is not an open table of numbers: leave `_only` out of it"):
-
-        class Wrong(Base):
-            class env(Base.env):
-                _only = True  # here
-                num_envs = 2
 
 
 def test_same_declaration_again_is_fine() -> None:
@@ -197,7 +182,7 @@ def test_two_parents() -> None:
             pass
 
     assert (Both().env.num_envs, Both().env.run_name) == (8192, "wide")
-    with says("Neither.env extends Go1.env", "drops the fields of ", "Wide.env", "write `class env(Go1.env, Wide.env):`"):
+    with pytest.raises(ConfigError):
 
         class Neither(Go1, Wide):
             class env(Go1.env):
@@ -229,182 +214,32 @@ def test_methods_and_private_names_are_not_fields() -> None:
     assert cfg.to_dict() == Base().to_dict()
 
 
-# ---- Class statements that are wrong --------------------------------------------------------------------------------
-
-
-def test_misspelt_field() -> None:
-    with says(line_of("num_env = "), "Typo.env.num_env overrides nothing", "did you mean 'num_envs'?", "Base.env has: num_envs, episode_"):
-
-        class Typo(Base):
-            class env(Base.env):
-                run_name = "x"
-                num_env = 3
-
-
-def test_misspelt_field_suggests_the_declaration_of_a_new_one() -> None:
-    with says("New.env.zzz overrides nothing", "declare it with a type: `zzz: float = 0.5`") as caught:
-
-        class New(Base):
-            class env(Base.env):
-                zzz = 0.5
-
-    assert "did you mean" not in str(caught.value)
-
-
-def test_field_in_the_wrong_section() -> None:
-    with says("Outside.num_envs overrides nothing", "did you mean 'env.num_envs'?"):
-
-        class Outside(Base):
-            num_envs = 3
-
-
-def test_bare_name_in_a_new_section() -> None:
-    with says("Fresh.sim.dt overrides nothing; if the field is new", "`dt: float = 0.1`"):
-
-        class Fresh(Config):
-            class sim:
-                dt = 0.1
-
-
-@pytest.mark.parametrize("depth", [1, 2])
-def test_section_without_parent(depth: int) -> None:
-    if depth == 1:
-        with says(
-            "Orphan.env extends no section", "drops the fields of Go1.env (num_envs, episode_length_s,", "write `class env(Go1.env):`"
-        ):
-
-            class Orphan(Go1):
-                class env:
-                    num_envs: int = 3
-    else:
-        expected = ("Deep.rewards.scales extends no section", "Base.rewards.scales (torques,", "`class scales(Base.rewards.scales):`")
-        with says(line_of("class scales:  # orphan"), *expected):
-
-            class Deep(Base):
-                class rewards(Base.rewards):
-                    class scales:  # orphan
-                        torques: float = 1.0
-
-
-def test_section_with_the_wrong_parent() -> None:
-    with says("Wrong.env extends Base.control and so drops the fields of Base.env", "write `class env(Base.env):`"):
-
-        class Wrong(Base):
-            class env(Base.control):
-                pass
-
-
-def test_section_that_skips_a_generation() -> None:
-    with says("Skips.env extends Base.env and so drops the fields of Go1.env", "write `class env(Go1.env):`"):
-
-        class Skips(Go1):
-            class env(Base.env):
-                pass
-
-
-def test_nested_misspelt_field() -> None:
-    with says("Nested.commands.ranges.lin_vel_X overrides nothing; did you mean 'lin_vel_x'?"):
-
-        class Nested(Base):
-            class commands(Base.commands):
-                class ranges(Base.commands.ranges):
-                    lin_vel_X = [0.0, 1.0]
-
-
-def test_value_for_a_section_and_section_for_a_field() -> None:
-    with says(line_of("env = 3"), "Flat.env is a section, not a field; write `class env(Base.env):`"):
-
-        class Flat(Base):
-            env = 3  # type: ignore[assignment]
-
-    with says("Flatter.env is a section, not a field"):
-
-        class Flatter(Base):
-            env: int = 3
-
-    with says("Steep.env.num_envs is a field (int), not a section; write `num_envs = ...`"):
-
-        class Steep(Base):
-            class env(Base.env):
-                class num_envs:
-                    pass
-
-
-def test_declared_again_with_another_type() -> None:
-    with says("Other.env.num_envs is a int in Go1.env, not a float; to override it write `num_envs = ...`"):
-
-        class Other(Go1):
-            class env(Go1.env):
-                num_envs: float = 3.0
-
-
-def test_declared_without_value() -> None:
-    with says(line_of("gravity: list"), "Void.gravity has a type but no value; write `gravity: list[float] = ...`"):
-
-        class Void(Config):
-            gravity: list[float]
-
-    with says("Void2.env.num_envs has a type but no value"):
-
-        class Void2(Base):
-            class env(Base.env):
-                num_envs: int
-
-
-def test_unsupported_type() -> None:
-    with says("Odd.path: type Path is not supported; there are int, float"):
-
-        class Odd(Config):
-            path: Path = Path()
-
-    with says("Odder.path: type list[complex] is not supported"):
-
-        class Odder(Config):
-            path: list[complex] = []
-
-    with says("Odd2.path: type tuple[int, int] is not supported"):
-
-        class Odd2(Config):
-            path: tuple[int, int] = (0, 0)
-
-    with says("Oddest.path: type dict[int, str] is not supported"):
-
-        class Oddest(Config):
-            path: dict[int, str] = {}
-
-
-def test_name_of_a_method() -> None:
-    with says("Hides.update would hide the method 'update' of Config"):
-
-        class Hides(Config):
-            update: int = 3
-
-
 @pytest.mark.parametrize(
-    ("path", "value", "text"),
+    ("path", "value"),
     [
-        ("env.num_envs", 3.0, "must be int, not 3.0 (float)"),
-        ("env.num_envs", True, "must be int, not True (bool)"),
-        ("env.episode_length_s", True, "must be float, not True (bool)"),
-        ("env.is_flat", 1, "must be bool, not 1 (int)"),
-        ("env.run_name", None, "must be str, not None (NoneType)"),
-        ("env.note", 3, "must be str | None, not 3 (int)"),
-        ("control.control_type", "v", "must be Literal['P', 'V', 'T'], not 'v' (str)"),
-        ("control.stiffness", {"hip": None}, "['hip'] must be float, not None (NoneType)"),
-        ("control.stiffness", {3: 1.0}, ": key must be str, not 3 (int)"),
-        ("control.stiffness", 35, "must be dict[str, float], not 35 (int); write {NAME: 35}, or in a table a joint {'': 35} for all"),
-        ("control.stiffness", [1.0], "must be dict[str, float], not [1.0] (list)"),
-        ("control.limits", 0.5, "must be int | list[float], not 0.5 (float)"),
-        ("control.anything", {1, 2}, "must be None | bool | int | float | str | list | dict, not {1, 2} (set)"),
-        ("commands.ranges.lin_vel_x", [0.0, "1"], "[1] must be float, not '1' (str)"),
-        ("commands.ranges.path", [1, 2.5], "[1] must be int, not 2.5 (float)"),
-        ("rewards.scales.torques", "big", "must be float, not 'big' (str)"),
-        ("rewards.scales.brand_new", True, "must be float, not True (bool)"),
-        ("rewards.scales.brand_new", "1", "must be float, not '1' (str)"),
-        ("rewards.scales.brand_new", None, "must be float, not None (NoneType)"),
+        ("env.num_envs", 3.0),
+        ("env.num_envs", True),
+        ("env.episode_length_s", True),
+        ("env.is_flat", 1),
+        ("env.run_name", None),
+        ("env.note", 3),
+        ("control.control_type", "v"),
+        ("control.stiffness", {"hip": None}),
+        ("control.stiffness", {3: 1.0}),
+        ("control.stiffness", 35),
+        ("control.stiffness", [1.0]),
+        ("control.limits", 0.5),
+        ("control.anything", {1, 2}),
+        ("commands.ranges.lin_vel_x", [0.0, "1"]),
+        ("commands.ranges.path", [1, 2.5]),
+        ("rewards.scales.torques", "big"),
+        ("rewards.scales.brand_new", True),
+        ("rewards.scales.brand_new", "1"),
+        ("rewards.scales.brand_new", None),
     ],
 )
-def test_wrong_type_of_value(path: str, value: Any, text: str) -> None:
+def test_wrong_type_of_value(path: str, value: Any) -> None:
+    """In the class statement, in an update, in an assignment."""
     *sections, name = path.split(".")
     bodies: list[Any] = [Base]
     for section in sections:
@@ -414,15 +249,15 @@ def test_wrong_type_of_value(path: str, value: Any, text: str) -> None:
     for parent in reversed(bodies[1:]):
         qualname = qualname.rpartition(".")[0]
         body = {parent.__name__: type(parent.__name__, (parent,), {**body, "__qualname__": qualname})}
-    with says(f"Bad.{path}{text if text.startswith(('[', ':')) else ' ' + text}"):  # in the class statement
+    with says(f"Bad.{path}"):
         type("Bad", (Base,), body)
     section_path = ".".join(sections)
-    with says(f"a.yaml: {path}", text):  # in an update
+    with says(f"a.yaml: {path}"):
         Base().update(nest(path, value), "a.yaml")
     node: Any = Base()
     for section in sections:
         node = getattr(node, section)
-    with says(f"Base.{section_path}.{name}", text):  # in an assignment
+    with says(f"Base.{section_path}.{name}"):
         setattr(node, name, value)
 
 
@@ -430,14 +265,6 @@ def nest(path: str, value: Any) -> Any:
     for name in reversed(path.split(".")):
         value = {name: value}
     return value
-
-
-def test_misspelt_choice() -> None:
-    class Choice(Config):
-        ground: Literal["plane", "terrain"] = "plane"
-
-    with says("--set: ground must be", "not 'plan' (str); did you mean 'plane'?"):
-        Choice().set("ground", "plan")
 
 
 # ---- String annotations ---------------------------------------------------------------------------------------------
@@ -463,26 +290,26 @@ def test_string_annotations(tmp_path: Path) -> None:
             num_envs: int = 2
 
     assert Child().to_dict() == {"env": {"num_envs": 2, "mode": "b", "int": [1.0]}}
-    with says("env.mode must be Literal['a', 'b'] | float, not 'c' (str)"):
+    with says("env.mode"):
         Child().set("env.mode", "c")
 
 
 @pytest.mark.parametrize("annotation", ["Tensor", "list[Tensor]", "list['Tensor']", "math.nope", "int |"])
 def test_unresolvable_annotation(tmp_path: Path, annotation: str) -> None:
     source = PARENT + f"        third: {annotation!r} = 3\n"
-    with says("cfg_bad.py:10: Cfg.env.third: its type", "cannot be resolved (", "at the top level of module cfg_bad"):
+    with says("cfg_bad.py:10: Cfg.env.third: "):
         load_module(tmp_path, "import math\n" + source.replace("from __future__ import annotations\n", ""), "cfg_bad")
 
 
 def test_error_names_file_and_line(tmp_path: Path) -> None:
     source = PARENT + "\nclass Go1(Cfg):\n    class env(Cfg.env):\n        '''Doc.'''\n        num_env = 3\n"
-    with says(f"{tmp_path / 'cfg_line.py'}:14: Go1.env.num_env overrides nothing"):
+    with says(f"{tmp_path / 'cfg_line.py'}:14: Go1.env.num_env"):
         load_module(tmp_path, source, "cfg_line")
 
 
 def test_error_without_source_names_the_module() -> None:
     code = "from legged_mw.utils.config import Config\nclass A(Config):\n    x = 1\n"
-    with says("module prompt: A.x overrides nothing"):
+    with says("module prompt: A.x"):
         exec(code, {"__name__": "prompt"})
 
 
@@ -512,13 +339,13 @@ def test_a_default_is_not_the_list_it_was_written_with() -> None:
 
 def test_assignment_is_checked() -> None:
     cfg = Go1()
-    with says("Go1.env.num_env does not exist; did you mean 'num_envs'?", "Go1.env has: num_envs, episode_length_s"):
+    with pytest.raises(ConfigError):
         cfg.env.num_env = 3  # type: ignore[attr-defined]
-    with says("Base.commands.ranges.path2 does not exist; did you mean 'path'?"):
+    with pytest.raises(ConfigError):
         cfg.commands.ranges.path2 = 3  # type: ignore[attr-defined]
-    with says("Go1.env is a section, not a field; set one of its fields: num_envs"):
+    with pytest.raises(ConfigError):
         cfg.env = 3  # type: ignore[assignment]
-    with says("Go1.sede does not exist; did you mean 'seed'?"):
+    with pytest.raises(ConfigError):
         cfg.sede = 3  # type: ignore[attr-defined]
     assert cfg.to_dict() == Go1().to_dict()
     cfg.env.episode_length_s = 3
@@ -541,7 +368,7 @@ def test_deepcopy_and_pickle() -> None:
     for twin in twins:
         assert twin.to_dict() == cfg.to_dict()
         twin.env.num_envs = 4
-        with says("Go1.env.num_env does not exist"):
+        with pytest.raises(ConfigError):
             twin.env.num_env = 4
         assert isinstance(twin.env, Go1.env)
     assert cfg.env.num_envs == 3
@@ -612,32 +439,31 @@ def test_set(path: str, text: Any, expected: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("path", "value", "parts"),
+    ("path", "value"),
     [
-        ("env.num_env", "3", ("env.num_env does not exist; did you mean 'num_envs'?", "env has: num_envs, episode")),
-        ("rewards.scale.torques", "3", ("rewards.scale does not exist; did you mean 'scales'?",)),
-        ("num_envs", "3", ("num_envs does not exist; did you mean 'env.num_envs'?", "Base has: seed, env, control")),
-        ("env", "3", ("env is a section, not a field; set one of its fields: num_envs",)),
-        ("env.num_envs.x", "3", ("env.num_envs.x does not exist: env.num_envs is a field (int), not a section",)),
-        ("control.stiffness.hip", "3", ("a field (dict[str, float]), not a section; set it whole: control.stiffness={hip: ...}",)),
-        ("env.num_envs", "3.5", ("env.num_envs must be int, not 3.5 (float)",)),
-        ("env.num_envs", "many", ("env.num_envs must be int, not 'many' (str)",)),
-        ("env.is_flat", "1", ("env.is_flat must be bool, not 1 (int)",)),
-        ("commands.ranges.lin_vel_x", "[1, a]", ("commands.ranges.lin_vel_x[1] must be float, not 'a' (str)",)),
-        ("commands.ranges.lin_vel_x", "[1, 2", ("commands.ranges.lin_vel_x must be list[float], not '[1, 2' (str)",)),
-        ("rewards.scales.new", "abc", ("rewards.scales.new must be float, not 'abc' (str)",)),
-        ("rewards.scales._open", "0", ("rewards.scales._open does not exist",)),
-        ("rewards.scales.a-b", "0", ("rewards.scales.a-b does not exist",)),
-        ("rewards.total", "0", ("rewards.total does not exist",)),
-        ("", "0", (" does not exist; Base has: seed",)),
-        ("env.", "0", ("env. does not exist; env has: num_envs",)),
+        ("env.num_env", "3"),
+        ("rewards.scale.torques", "3"),
+        ("num_envs", "3"),
+        ("env", "3"),
+        ("env.num_envs.x", "3"),
+        ("control.stiffness.hip", "3"),
+        ("env.num_envs", "3.5"),
+        ("env.num_envs", "many"),
+        ("env.is_flat", "1"),
+        ("commands.ranges.lin_vel_x", "[1, a]"),
+        ("commands.ranges.lin_vel_x", "[1, 2"),
+        ("rewards.scales.new", "abc"),
+        ("rewards.scales._open", "0"),
+        ("rewards.scales.a-b", "0"),
+        ("rewards.total", "0"),
+        ("", "0"),
+        ("env.", "0"),
     ],
 )
-def test_set_errors(path: str, value: Any, parts: tuple[str, ...]) -> None:
+def test_set_errors(path: str, value: Any) -> None:
     cfg = Base()
-    with says("--set: ", *parts) as caught:
+    with pytest.raises(ConfigError, match=f"^--set: {re.escape(path.partition('.')[0])}"):
         cfg.set(path, value)
-    assert str(caught.value).startswith("--set: ")
     assert cfg.diff(Base()) == []
     with says("elsewhere: "):
         cfg.set(path, value, where="elsewhere")
@@ -659,23 +485,23 @@ def test_update() -> None:
 
 
 @pytest.mark.parametrize(
-    ("wrong", "parts"),
+    "wrong",
     [
-        ({"env": {"num_env": 3}}, ("env.num_env does not exist; did you mean 'num_envs'?",)),
-        ({"rewords": {}}, ("rewords does not exist; did you mean 'rewards'?",)),
-        ({"rewards": 3}, ("rewards is a section and needs a mapping of its fields, not 3",)),
-        ({"rewards": {"scales": None}}, ("rewards.scales is a section and needs a mapping", "not None")),
-        ({"env": {"num_envs": "3"}}, ("env.num_envs must be int, not '3' (str)",)),
-        ({"env": {"num_envs": {"a": 1}}}, ("env.num_envs must be int, not {'a': 1} (dict)",)),
-        ({"env": {3: 1}}, ("env.3 does not exist",)),
-        ({"rewards": {"scales": {True: 1}}}, ("rewards.scales.True does not exist",)),
-        ([1], ("Base is a section and needs a mapping of its fields, not [1]",)),
+        {"env": {"num_env": 3}},
+        {"rewords": {}},
+        {"rewards": 3},
+        {"rewards": {"scales": None}},
+        {"env": {"num_envs": "3"}},
+        {"env": {"num_envs": {"a": 1}}},
+        {"env": {3: 1}},
+        {"rewards": {"scales": {True: 1}}},
+        [1],
     ],
 )
-def test_update_is_all_or_nothing(wrong: Any, parts: tuple[str, ...]) -> None:
+def test_update_is_all_or_nothing(wrong: Any) -> None:
     cfg = Base()
     values = {"seed": 99, "env": {"episode_length_s": 1.0, **wrong.pop("env", {})}, **wrong} if isinstance(wrong, dict) else wrong
-    with says("over.yaml: ", *parts):
+    with says("over.yaml: "):
         cfg.update(values, "over.yaml")
     assert cfg.diff(Base()) == []
 
@@ -762,35 +588,6 @@ def test_save_replaces_whole_files_only(tmp_path: Path, monkeypatch: pytest.Monk
     assert os.listdir(tmp_path) == ["config.yaml"]
 
 
-@pytest.mark.parametrize(
-    ("text", "problem"),
-    [
-        ("a: 1\nb: [1, 2\nc: 3\n", ":3: not valid YAML: "),
-        ("a: 1\n\tb: 2\n", ":2: not valid YAML: "),
-        ("env:\n  a: 1\nenv:\n  b: 2\n", ":3: not valid YAML: 'env' is written twice"),
-        ("env:\n  a: 1\n  a: 2\n", ":3: not valid YAML: 'a' is written twice"),
-        ("a: !!python/object/apply:os.getcwd []\n", ":1: not valid YAML: "),
-        ("[1, 2]\n", ": holds list, not a mapping"),
-        ("", ": holds NoneType, not a mapping"),
-    ],
-)
-def test_bad_yaml(tmp_path: Path, text: str, problem: str) -> None:
-    path = tmp_path / "over.yaml"
-    path.write_text(text)
-    with says(f"{path}{problem}"):
-        load_yaml(path)
-
-
-def test_unreadable_yaml(tmp_path: Path) -> None:
-    with says("none.yaml: cannot read this config file: No such file"):
-        load_yaml(tmp_path / "none.yaml")
-    with says("cannot read this config file: Is a directory"):
-        load_yaml(tmp_path)
-    (tmp_path / "latin.yaml").write_bytes(b"a: \xff\xfe\n")
-    with says("latin.yaml: not valid YAML"):
-        load_yaml(tmp_path / "latin.yaml")
-
-
 def test_a_run_older_than_a_section_keeps_what_was_so_then() -> None:
     """Not what the task says today: a resumed run must not change its learner on the way."""
     task = load_task("go1_flat")
@@ -830,7 +627,7 @@ def test_every_shipped_policys_config_loads() -> None:
 
 def test_a_wrong_section_of_an_old_run_is_named() -> None:
     saved = {**load_task("go1_flat").to_dict(), "cpu": {"kick_curriculum": False, "overrides": 3}}
-    with says("config.yaml: cpu.overrides must be dict[str, Any], not 3 (int)"):
+    with says("config.yaml: cpu.overrides"):
         load_task("go1_flat").update_from_run(saved, where="config.yaml")
 
 
@@ -845,14 +642,14 @@ OLD_NAMES = {
 def test_an_old_name_gets_the_new_one(old: str) -> None:
     (section, name), (value, new) = old.split("."), OLD_NAMES[old]
     assert set(OLD_NAMES) == set(RENAMED)
-    with says(f"--set: {old} does not exist; it is called {new} now; {section} has: "):
+    with says(f"--set: {old}", new):
         load_task("go1_flat").set(old, str(value))
-    with says(f"mine.yaml: {old} does not exist; it is called {new} now"):
+    with says(f"mine.yaml: {old}", new):
         load_task("go1_flat").update({section: {name: value}}, where="mine.yaml")
     task = load_task("go1_flat")
     parent = type(task.train) if section in task.train.to_dict() else type(task.cfg)
     body = type(section, (getattr(parent, section),), {name: value, "__qualname__": f"Dog.{section}"})
-    with says(f"Dog.{old} overrides nothing; it is called {new} now"):
+    with says(f"Dog.{old}", new):
         type("Dog", (parent,), {section: body, "__qualname__": "Dog"})
 
 
@@ -865,21 +662,6 @@ def test_a_cpus_overrides_name_fields_of_either_config() -> None:
     task.fit_cpu(cores=1)
     assert task.cfg.commands.resampling_time == 3.0 and task.train.algorithm.gamma == 0.5
     assert task.cfg.terrain.mesh_type == "heightfield" and task.cfg.commands.keep_probability == [0.9, 0.25, 0.5]
-
-
-@pytest.mark.parametrize(
-    ("path", "value", "text"),
-    [
-        ("commands.keep_probabilty", [1.0], "cpu.overrides: commands.keep_probabilty does not exist; did you mean 'keep_probability'?"),
-        ("comands.resampling_time", 3.0, "cpu.overrides: no config section 'comands' in this task; did you mean 'commands'?"),
-        ("commands.resampling_time", [3.0], "cpu.overrides: commands.resampling_time must be float, not [3.0] (list)"),
-    ],
-)
-def test_a_wrong_override_of_a_cpu_is_named(path: str, value: Any, text: str) -> None:
-    task = load_task("go1_flat")
-    task.set("cpu.overrides", {path: value})
-    with says(text):
-        task.fit_cpu(cores=1)
 
 
 @pytest.mark.parametrize("name", ["go1_flat_dr", "go1_flat_fast", "go1_rough", "examples/go1_playground.py", "examples/go1_mjlab.py"])

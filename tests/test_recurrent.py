@@ -194,15 +194,9 @@ def test_symmetric_samples_teach_a_recurrent_policy_symmetry(coefficient: float)
 @pytest.mark.parametrize(
     ("settings", "text"),
     [
-        (
-            {"num_mini_batches": 33},
-            "algorithm.num_mini_batches is 33, but a recurrent network learns from whole worlds, and env.num_envs is 32",
-        ),
-        (
-            {"symmetry_cfg": IMAGES | {"use_data_augmentation": False, "use_mirror_loss": True}},
-            "needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, ",
-        ),
-        ({"symmetry_cfg": IMAGES, "optimizer": "sgd"}, "and for both this project.s recorded update; switch the former on, or both off"),
+        ({"num_mini_batches": 33}, "num_mini_batches"),
+        ({"symmetry_cfg": IMAGES | {"use_data_augmentation": False, "use_mirror_loss": True}}, "use_data_augmentation"),
+        ({"symmetry_cfg": IMAGES, "optimizer": "sgd"}, "switch"),
     ],
 )
 def test_what_does_not_go_with_a_memory(settings: dict[str, Any], text: str) -> None:

@@ -238,22 +238,6 @@ def test_compare_writes_one_page_that_needs_nothing_else(
     assert "http" not in page and "<script" not in page and "mean reward" in page and "total steps" not in page
 
 
-@pytest.mark.parametrize(
-    ("args", "said"),
-    [
-        (["nothing"], "no run with curves at nothing or in logs/nothing; name it by its path, as TASK/RUN, or by its task"),
-        (["a"] * 9, "9 runs cannot be told apart in one picture: name at most 8"),
-    ],
-)
-def test_compare_refuses_in_a_line(
-    args: list[str], said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match="2"):
-        program("compare", *args, monkeypatch=monkeypatch)
-    assert said in capsys.readouterr().err
-
-
 def test_axes_have_round_numbers() -> None:
     assert chart.ticks(0.0, 9.7, 5) == [0, 2, 4, 6, 8, 10] and chart.ticks(-0.3, 0.4, 4) == pytest.approx([-0.4, -0.2, 0, 0.2, 0.4])
     assert chart.ticks(5.0, 5.0, 4)[0] < 5.0 < chart.ticks(5.0, 5.0, 4)[-1]
@@ -366,16 +350,6 @@ def test_means_are_of_numbers_not_of_what_is_printed(tmp_path: Path) -> None:
 def test_values_stand_apart_by_commas() -> None:
     assert sweep.values("1,2") == ["1", "2"] and sweep.values("[1,2],[3]") == ["[1,2]", "[3]"] and sweep.values("") == []
     assert sweep.values("{a: [1,2]},'x,y'") == ["{a: [1,2]}", "'x,y'"]
-
-
-def test_a_sweep_refuses_what_is_of_one_training(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    for args, said in (
-        (["--resume"], "--resume is of one training: leave it out"),
-        (["--seeds", "a"], "--seeds a: write whole numbers apart by commas: --seeds 1,2,3"),
-    ):
-        with pytest.raises(SystemExit, match="2"):
-            program("sweep", "--task", "go1_flat", *args, monkeypatch=monkeypatch)
-        assert said in capsys.readouterr().err
 
 
 def test_a_training_of_a_sweep_says_where_it_writes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

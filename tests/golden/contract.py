@@ -1,0 +1,204 @@
+"""policy.yaml, scene.xml and what lies beside them: the tables of tests/campaign/test_files.py, and more."""
+
+from __future__ import annotations
+
+import shutil
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import test_files as campaign
+from test_files import in_scene, says_else, set_at
+
+from golden.table import Run, Table, patched
+from legged_mw import ROOT
+from legged_mw.deploy.contract import CHECKSUM, CLOCK, checksum, read_contract
+from legged_mw.deploy.exam import contract_rules, contract_skill
+from legged_mw.deploy.follow import Follower
+from legged_mw.deploy.motion import JOINT_POS
+from legged_mw.deploy.motors import Motors, make_network
+from legged_mw.deploy.odometry import Odometry
+from legged_mw.deploy.policy import Controller, Network
+from legged_mw.deploy.robot import QUANTITIES, Measurement
+from legged_mw.deploy.safety import Limits, Safety
+from legged_mw.deploy.simulated import read_scene
+from legged_mw.utils import mjcf
+from legged_mw.utils.config import load_yaml, save_yaml
+from legged_mw.utils.mjcf import write_archive
+
+POLICIES = ROOT / "resources/policies"
+
+
+def pops(*names: str) -> Any:
+    return lambda said: [said[name].pop() for name in names]
+
+
+def drops(path: str) -> Any:
+    def change(said: Any) -> None:
+        *outer, last = path.split("|")
+        for key in outer:
+            said = said[key]
+        del said[last]
+
+    return change
+
+
+CHANGES: dict[str, Any] = {
+    "a row of another size": set_at("observation|3|size", 11),
+    "another quantity": set_at("observation|3|measured", "joint_ofset"),
+    "nothing measures it": set_at("observation|0|measured", ""),
+    "of a motion": lambda said: said["observation"][0].update(measured=JOINT_POS),
+    "a joint less": pops("joints", "default_pose", "stiffness", "damping"),
+    "scales of a row": set_at("observation|4|scale", [1.0, 2.0]),
+    "a pose less": set_at("default_pose", [0.0] * 11),
+    "a pose of words": set_at("default_pose|2", "bent"),
+    "another format": set_at("format", 1),
+    "no format": drops("format"),
+    "memory of no size": set_at("network|memory", {"input": "a", "output": "b", "shape": [1, 0]}),
+    "no scale": drops("action|scale"),
+    "another origin": set_at("action|origin", "pose"),
+    "no commands": drops("commands"),
+    "a default beyond": set_at("commands|1|default", 0.9),
+    "a history of none": set_at("observation|3|history", 0),
+    "no ends": drops("ends"),
+    "another rule": set_at("ends", {"max_tlit": 3}),
+    "a tilt of 200": set_at("ends", {"max_tilt": 200}),
+    "a clock without its commands": lambda said: (
+        said["commands"].pop(),
+        said.update(gait={}),
+        said["observation"][0].update(measured=CLOCK),
+    ),
+    "no network section": drops("network"),
+    "a section of text": set_at("robot", "go1"),
+    "another law": set_at("motors", {"law": "magic"}),
+    "a task of numbers": set_at("task", 3),
+}
+SCENES: dict[str, Any] = {  # what the contract says, that scene.xml does not
+    "another joint": set_at("joints|4", "FL_thihg_joint"),
+    "another stiffness": set_at("stiffness|0", 20.0),
+    "another mass": set_at("robot|mass", 20.0),
+    "no sensor of falls": set_at("ends|falls_on", ["trunk_box"]),
+    "another sensor": lambda said: said["sensors"]["joint_pos"].__setitem__(0, "FR_hip_jont"),
+    "a sensor less": lambda said: said["sensors"]["joint_pos"].pop(),
+    "sensors in another order": lambda said: said["sensors"]["joint_pos"].reverse(),
+}
+NETWORKS: dict[str, Any] = {
+    "a row less": pops("observation"),
+    "a history more": set_at("observation|3|history", 3),
+    "a memory more": set_at("network|memory", {"input": "state_in", "output": "state_out", "shape": [1, 8]}),
+}
+EXAMS: dict[str, Any] = {
+    "a number": set_at("exam", {"ranges": 3}),
+    "a mark that is no speed": set_at("exam", {"push_mark": 9.0}),
+    "a range of a command that is not there": set_at("exam", {"ranges": {"height": [0, 1]}}),
+    "a range backwards": set_at("exam", {"ranges": {"lin_vel_x": [1, 0]}}),
+    "two marks": set_at("exam", {"marks": [1.0, 2.0]}),
+    "another robot": set_at("exam", {"peer": "dog"}),
+}
+IN_SCENE = {
+    "another name of a joint": ('name="FR_hip_joint"', 'name="FR_hip"'),
+}
+
+
+def theirs(name: str, change: Any = lambda said: None, folder: str = "out") -> Run:
+    def given(root: Path) -> None:
+        shutil.copytree(POLICIES / name, root / folder)
+        said = load_yaml(root / folder / "policy.yaml")
+        change(said)
+        said.pop(CHECKSUM, None)
+        save_yaml(root / folder / "policy.yaml", said | {CHECKSUM: checksum(said)})
+
+    return given
+
+
+def zipped(file: Path, *names: str) -> None:
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name in names:
+            archive.writestr(name, "<mujoco/>")
+
+
+def reads(root: Path) -> None:
+    read_contract(root / "out")
+
+
+def in_scene_too(root: Path) -> None:
+    read_scene(root / "out", read_contract(root / "out"))
+
+
+def rules(root: Path) -> None:
+    contract_rules(read_contract(root / "out"))
+
+
+def acts(root: Path) -> None:
+    zeros = Measurement(*(np.zeros(12 if name.startswith("joint") else 3) for name in QUANTITIES))
+    Controller(root / "out", read_contract(root / "out"), 1).act(zeros, np.zeros((1, 3)))
+
+
+def limits(root: Path, **asked: Any) -> Limits:
+    return Limits.of(root / "out", read_contract(root / "out"), asked)
+
+
+def table() -> Table:
+    made = Table()
+    for name, change, _, stamped in campaign.CONTRACTS:
+        made.add(f"contract, {name}", reads, says_else(change, stamped))
+    for name, change in CHANGES.items():
+        made.add(f"contract: {name}", reads, theirs("go1_flat", change))
+    for name, old, new, *_ in campaign.SCENES:
+        made.add(f"scene, {name}", in_scene_too, in_scene(old, new))
+    for name, change in SCENES.items():
+        made.add(f"scene: {name}", in_scene_too, theirs("go1_flat", change))
+    for name, (old, new) in IN_SCENE.items():
+        made.add(f"scene: {name}", in_scene_too, in_scene(old, new))
+    for name, change in NETWORKS.items():
+        made.add(f"network: {name}", lambda root: Network(root / "out", read_contract(root / "out")), theirs("go1_flat", change))
+    for name, change in EXAMS.items():
+        made.add(f"exam: {name}", rules, theirs("go1_flat", change))
+    made.add("exam: no velocity", rules, theirs("go1_handstand"))
+    made.add(
+        "exam: common, of another robot",
+        lambda root: contract_rules(read_contract(root / "out"), common=True),
+        theirs("go2_flat", set_at("exam", {"peer": ""})),
+    )
+    for name, section in {"no such exam": {"kind": "jump"}, "no such field": {"kind": "handstand", "x": 3}}.items():
+        made.add(
+            f"skill: {name}", lambda root: contract_skill(read_contract(root / "out")), theirs("go1_handstand", set_at("exam", section))
+        )
+    made.add("no export", reads)
+    made.add("another network", reads, lambda root: (theirs("go1_flat")(root), (root / "out/policy.onnx").write_bytes(b"no")))
+    made.add(
+        "another motion",
+        lambda root: Follower(root / "out", read_contract(root / "out"), 1),
+        lambda root: (theirs("g1_track")(root), [file.write_bytes(b"no") for file in (root / "out").glob("*.npz")]),
+    )
+    for name, given in {"no motors": lambda root: None, "other motors": lambda root: (root / "motors.npz").write_bytes(b"no")}.items():
+        made.add(name, lambda root: make_network(root, Motors("network", digest="x"), 1, 12), given)
+    made.add("no terrain", lambda root: read_scene(root / "out", read_contract(root / "out"), "terrain.mjz"), theirs("go1_flat"))
+    made.add(
+        "no feet for odometry",
+        lambda root: Odometry(root / "out", read_contract(root / "out")),
+        theirs("go1_flat", set_at("robot|feet", {})),
+    )
+    made.add("a limit that is none", lambda root: limits(root), theirs("go1_flat", set_at("safety", {"tlit": 3})))
+    made.add("a limit of words", lambda root: limits(root, tilt="x"), theirs("go1_flat"))
+    made.add(
+        "a policy of speeds",
+        lambda root: Safety(read_contract(root / "out"), limits(root)),
+        theirs("go1_flat", set_at("action|origin", "speed")),
+    )
+    made.add("a row of others", acts, theirs("go1_flat", lambda said: said["observation"][0].update(measured="sensors", sensors=["x"])))
+    for name, write in {
+        "of text": lambda file: file.write_bytes(b"PK"),
+        "of two files": lambda file: zipped(file, "model.xml", "terrain.xml"),
+        "that names another": lambda file: write_archive(file, '<mujoco><include file="other.xml"/></mujoco>'),
+    }.items():
+        made.add(
+            f"terrain {name}",
+            lambda root: read_scene(root / "out", read_contract(root / "out"), "terrain.mjz"),
+            lambda root, write=write: (theirs("go1_flat")(root), write(root / "out/terrain.mjz")),
+        )
+    small = patched(in_scene_too, mjcf, MOST_BYTES=1000)
+    made.add("scene: large", small, theirs("go1_flat"))
+    made.add("scene: a joint more", in_scene_too, in_scene("</worldbody>", '<body><joint name="tail"/><geom size="1"/></body></worldbody>'))
+    return made
