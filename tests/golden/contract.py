@@ -123,7 +123,8 @@ def reads(root: Path) -> None:
 
 
 def in_scene_too(root: Path) -> None:
-    read_scene(root / "out", read_contract(root / "out"))
+    """As by --edited: the scene's checksum would answer first."""
+    read_scene(root / "out", read_contract(root / "out", edited=True))
 
 
 def rules(root: Path) -> None:
@@ -166,6 +167,7 @@ def table() -> Table:
             f"skill: {name}", lambda root: contract_skill(read_contract(root / "out")), theirs("go1_handstand", set_at("exam", section))
         )
     made.add("no export", reads)
+    made.add("another scene", reads, in_scene("<mujoco", "<!-- mine --><mujoco"))
     made.add("another network", reads, lambda root: (theirs("go1_flat")(root), (root / "out/policy.onnx").write_bytes(b"no")))
     made.add(
         "another motion",
@@ -195,8 +197,8 @@ def table() -> Table:
     }.items():
         made.add(
             f"terrain {name}",
-            lambda root: read_scene(root / "out", read_contract(root / "out"), "terrain.mjz"),
-            lambda root, write=write: (theirs("go1_flat")(root), write(root / "out/terrain.mjz")),
+            lambda root: read_scene(root / "out", read_contract(root / "out", edited=True), "terrain.mjz"),
+            lambda root, write=write: (theirs("go1_rough")(root), write(root / "out/terrain.mjz")),
         )
     small = patched(in_scene_too, mjcf, MOST_BYTES=1000)
     made.add("scene: large", small, theirs("go1_flat"))
