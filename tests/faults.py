@@ -54,7 +54,8 @@ class Side:
 
     def __init__(self, sim: SimulatedUnitree, case: Case, other: Wire | None = None, second: Callable[[], RobotEnd] | None = None) -> None:
         """``other``: another commander's end of the wire; ``second`` switches another robot on."""
-        self.sim, self.case, self.other, self.second, self.end = sim, case, other, second, None
+        self.sim, self.case, self.other, self.second = sim, case, other, second
+        self.end: RobotEnd | None = None  # the other robot's
         self.walking: float | None = None  # [s] when the policy began
         self.held: tuple[str, ...] | None = None  # buttons, from the fault on
         self.injected: float | None = None  # [s] when the fault began

@@ -51,6 +51,18 @@ def test_a_late_step_moves_no_deadline(monkeypatch: pytest.MonkeyPatch) -> None:
     assert str(timing).startswith("9 steps, 2 late, 1 periods left out; begin late by median 0.00, p99 ")
 
 
+def test_a_clock_that_goes_back_stops_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step follows a step within a period, though by that clock it has an hour."""
+    clock, slept = Clock(monkeypatch), list[float]()
+    monkeypatch.setattr("time.sleep", slept.append)
+    with Loop(0.02) as loop:
+        ticks = loop.ticks()
+        next(ticks)
+        clock.now -= 3600.0
+        next(ticks)
+    assert len(slept) == 1 and slept[0] <= 0.02
+
+
 def test_real_time_priority_is_given_back_as_a_user_may(monkeypatch: pytest.MonkeyPatch) -> None:
     """Linux lets only root take back the flag that threads do not inherit the priority."""
     asked: list[int] = []

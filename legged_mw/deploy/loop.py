@@ -164,4 +164,4 @@ class Loop:
         due = self._start + self.now
         if due - ended > _SPARE:
             gc.collect()
-        time.sleep(max(0.0, due - time.perf_counter()))
+        time.sleep(min(self.period, max(0.0, due - time.perf_counter())))  # no more, should the clock go back
