@@ -222,11 +222,12 @@ def _draws(env: RobotTask) -> Callable[[], list[object]]:
     files = [value for kind in _own_kinds(type(env)) for value in _of_file(kind).values()]
     values = [*files, *(value for _, value in _held(env))]
     python = [value for value in values if isinstance(value, random.Random)]
-    numpy = [getattr(value, "bit_generator", value) for value in values if isinstance(value, np.random.Generator)]
+    numpy = [value.bit_generator for value in values if isinstance(value, np.random.Generator)]
     return lambda: [
         random.getstate(),
+        str(np.random.get_state()),
         *(each.getstate() for each in python),
-        *(str(each.state) for each in [np.random.get_bit_generator(), *numpy]),
+        *(str(each.state) for each in numpy),
     ]
 
 
@@ -282,6 +283,8 @@ def _shown(path: Path) -> str:
 
 def _put_back(owner: Any, path: Path, before: dict[Path, Any]) -> None:
     holder, key = _at(owner, path[:-1]), path[-1]
+    put: Callable[..., Any]
+    remove: Callable[..., Any]
     put, remove = (setattr, delattr) if isinstance(key, str) and not isinstance(holder, Mapping) else (setitem, delitem)
     with suppress(TypeError):  # of a tuple
         put(holder, key, before[path]) if path in before else remove(holder, key)

@@ -135,5 +135,5 @@ def parts(thing: Any) -> dict[Any, Any]:
         return dict(thing.items())
     if isinstance(thing, list | tuple | deque):
         return dict(enumerate(thing))
-    state = object.__getstate__(thing)  # attributes; or those, and slots
+    state: Any = object.__getstate__(thing)  # attributes; or those, and slots
     return {name: value for held in (state if isinstance(state, tuple) else [state]) for name, value in (held or {}).items()}

@@ -38,7 +38,7 @@ def _fused(
 ) -> Callable[[], None]:
     from legged_mw.sim.fused import Fused  # it needs warp
 
-    with _Recorder(memory, watched) as trace:
+    with (trace := _Recorder(memory, watched)):
         fn()
     expected = {name: value.clone() for name, value in memory.items()}
     put_back()
