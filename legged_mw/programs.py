@@ -51,7 +51,7 @@ def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.N
     from legged_mw.check.guard import check_recordable
     from legged_mw.eval.exams import make_exam
     from legged_mw.rl import training
-    from legged_mw.robot.__main__ import doubts, show_task
+    from legged_mw.robot.page import doubts
 
     env = training.build(task, start, device, args.eager, check_recordable)
     wrong, odd = doubts(task)
@@ -60,6 +60,8 @@ def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.N
         print(describe(env, task) + ("" if args.eager else "\nthe step can be recorded as a CUDA graph"))
         print("".join(["what to look at\n", *(f"  - {line}\n" for line in [*wrong, *odd])]) if wrong or odd else "", end="")
         if args.picture:
+            from legged_mw.robot.__main__ import show_task
+
             show_task(task, Path(args.picture))
         return
     print("".join(f"warning: {line}\n" for line in wrong), end="", flush=True)

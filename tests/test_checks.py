@@ -14,7 +14,7 @@ from worlds import make_env
 
 from legged_mw import ROOT
 from legged_mw.envs.checks import PAYS, WITHOUT, check_class, check_values
-from legged_mw.robot.__main__ import doubts
+from legged_mw.robot.page import doubts
 from legged_mw.sim.errors import ModelError
 from legged_mw.utils.bounds import bare, bounds_text
 from legged_mw.utils.config import ConfigError, field_types

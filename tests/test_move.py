@@ -263,7 +263,7 @@ def test_a_neighbour_that_fails_leaves_nothing_behind(tmp_path: Path, monkeypatc
     (tmp_path / "my_base.py").write_text("from nowhere_at_all import thing\n")
     (tmp_path / "dog.py").write_text(DOG)
     path = [*sys.path]
-    said = rf"^{tmp_path}/my_base\.py:1, called from {tmp_path}/dog\.py:5: ModuleNotFoundError: No module named 'nowhere_at_all'; "
+    said = rf"^{tmp_path}/my_base\.py:1, called from {tmp_path}/dog\.py:5: ModuleNotFoundError: No module named 'nowhere_at_all'$"
     with pytest.raises(ConfigError, match=said):
         load_task(str(tmp_path / "dog.py"))
     assert sys.path == path and "my_base" not in sys.modules

@@ -484,7 +484,7 @@ def test_training_with_play_starts_a_viewer_and_feeds_it(tmp_path: Path, monkeyp
 NOT_TO_TRAIN = [
     *("matplotlib", "onnxscript", "onnxruntime", "warp", "mujoco_warp", "PIL", "mujoco.studio", "mujoco.viewer", "av", "cyclonedds"),
     *("wandb", "scipy", "pandas", "sympy", "onnx", "torch._dynamo.eval_frame", "torch._inductor", "legged_mw.motion"),
-    *("legged_mw.view", "legged_mw.deploy", "legged_mw.robot", "legged_mw.drawing", "legged_mw.rl.export", "legged_mw.tools"),
+    *("legged_mw.view", "legged_mw.deploy", "legged_mw.robot.picture", "legged_mw.drawing", "legged_mw.rl.export", "legged_mw.tools"),
 ]
 WHAT_IS_THERE = """
 import os, sys

@@ -27,7 +27,6 @@ from legged_mw.sim.model import RobotModel
 from legged_mw.sim.pose import posed
 from legged_mw.sim.room import Room, count_room
 from legged_mw.sim.vendor import tilt
-from legged_mw.view.posed_robot import boxes
 
 FloatArray = NDArray[np.float64]
 
@@ -205,8 +204,10 @@ def _highest(robot: RobotModel, qpos: FloatArray) -> float:
     """[m] of the robot's geoms, looks included."""
     model = robot.spec.copy().compile()
     data = posed(model, qpos[7:], qpos[:7])
-    centres, halves = boxes(model, data, np.flatnonzero(model.body_weldid[model.geom_bodyid]))
-    return float((centres + halves)[:, 2].max(initial=0.0))
+    geoms = np.flatnonzero(model.body_weldid[model.geom_bodyid])
+    upwards, box = data.geom_xmat[geoms, 6:], model.geom_aabb[geoms]
+    tops = data.geom_xpos[geoms, 2] + (upwards * box[:, :3]).sum(axis=1) + (np.abs(upwards) * box[:, 3:]).sum(axis=1)
+    return float(tops.max(initial=0.0))
 
 
 # ---- servos ----

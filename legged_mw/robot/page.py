@@ -1,12 +1,18 @@
-"""The health page as text: numbers of ``measure``, gains of ``suggest``, and what should be looked at."""
+"""The health page as text: numbers of ``measure``, gains of ``suggest``, and what should be looked at, also of a task."""
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Sequence
 
-from legged_mw.robot.measure import STAND_SECONDS, STAND_TILT, Health, Joint, Stand
+import torch
+
+from legged_mw.envs.own_code import place_of
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.robot.measure import STAND_SECONDS, STAND_TILT, Health, Joint, Stand, measure
 from legged_mw.robot.suggest import Gains, suggest
+from legged_mw.utils.task import LoadedTask
 
 _GROWS = 1e-6  # more than 1 by so much, a mode grows; less is rounding of the root's
 _TIP = 0.3  # [rad] a joint that sags more than this does not stand as its default pose says
@@ -132,3 +138,60 @@ def doubtful(health: Health, gains: Sequence[Gains]) -> list[str]:
     if health.stand.end != "stands":
         lines.append(f"with action zero it {standing(health.stand)}: a biped may, others should stand")
     return lines
+
+
+def doubts(task: LoadedTask) -> tuple[list[str], list[str]]:
+    """What keeps robots of a task from learning: a rule that ends every episode at once, gains that no training makes up for; and what may.
+
+    Random numbers go on as if it had not been called.
+    """
+    control = task.cfg.control
+    gains = control.actuator in ("servo", "dc_motor") and control.action_origin != "speed"
+    with torch.random.fork_rng(devices=[]):
+        env, _ = few_robots(task, 4, gains)
+        ends, wrong, odd = first_step(env), list[str](), list[str]()
+        if gains:
+            health = measure(env.robot, env.robot.pose, env.start_place, control.decimation)
+            wrong, odd = faults(health), doubtful(health, suggest(health.joints, health.dt))
+    return [*([ends] if ends else []), *wrong], odd
+
+
+@torch.inference_mode()
+def first_step(env: RobotTask) -> str:
+    """Which rule ends every episode of ``env`` within a step of action zero, in words; '' if none does. Its worlds move on."""
+    for _ in range(3):  # of worlds that begin anywhere, all may end by chance
+        env._reset_all()
+        env.actions.zero_()
+        env._apply_actions()
+        env.sim.step(env.cfg.control.decimation, env.actuators.before)
+        env._update_state()
+        env.check_termination()
+        if not bool(env.reset_buf.all()):
+            return ""
+    rules = [f"{field} = {_field(env, field)}" for field, down in env.fall_rules().items() if bool(down.any())]
+    if bool(env.fell.any()) and type(env)._fallen is not RobotTask._fallen:
+        rules.append(place_of(type(env)._fallen))
+    if bool(env.time_out_buf.any()):
+        rules.append(f"env.episode_length_s = {env.cfg.env.episode_length_s:g}, with control steps of {env.dt:g} s")
+    if bool(env.broken.any()):
+        rules.append("a state that is not finite, or faster than termination.max_speed")
+    return f"every episode ends at its first step: by {' and '.join(rules) or type(env).__name__}"
+
+
+def _field(env: RobotTask, path: str) -> object:
+    section, _, field = path.partition(".")
+    return getattr(getattr(env.cfg, section), field)
+
+
+def few_robots(task: LoadedTask, worlds: int = 1, servos: bool = True) -> tuple[RobotTask, bool]:
+    """Robots of the task on a plane, on a CPU, on ``servos`` or on their own motors; and whether the task's own ground is another."""
+    few = copy.deepcopy(task)
+    kind: type[RobotTask] = task.env_class
+    few.set("env.num_envs", worlds)
+    few.set("sim.engine", "mujoco")
+    if servos:
+        few.set("control.actuator", "servo")  # what the page is about: gains, and what a simulation step makes of them
+        kind = type(kind.__name__, (kind,), {"_compute_torques": RobotTask._compute_torques})
+    if rough := few.cfg.to_dict()["terrain"].get("mesh_type", "plane") != "plane":
+        few.set("terrain.mesh_type", "plane")
+    return kind(few.cfg, "cpu"), rough

@@ -37,7 +37,7 @@ _RUNS = "$(ls -d logs/*/*/ 2>/dev/null | sed 's:/$::')"
 _FILES = "$(ls *.py 2>/dev/null)"
 
 
-class _Caught(Exception):
+class _Caught(BaseException):
     """A program's parser, caught where it would read the command line."""
 
     def __init__(self, parser: argparse.ArgumentParser) -> None:

@@ -266,11 +266,14 @@ def scene(model: str) -> Callable[[Path], object]:
 
 
 FAR = '<asset><mesh name="z" file="..&#47;x.obj"/></asset>'
-OF_SCENES = {"read": lambda root: read_scene(root / "out", read_contract(root / "out")), "limits": lambda root: limits(root / "out")}
+OF_SCENES = {
+    "read": lambda root: read_scene(root / "out", read_contract(root / "out", edited=True)),
+    "limits": lambda root: limits(root / "out"),
+}
 
 
 def limits(folder: Path) -> Limits:
-    return Limits.of(folder, read_contract(folder))
+    return Limits.of(folder, read_contract(folder, edited=True))
 
 
 @pytest.mark.parametrize("reader", OF_SCENES)

@@ -538,11 +538,11 @@ class FakeReader:
         body = self.bodies.popleft()
         if body == b"broken":
             raise IndexError("bytes that end too early")
-        return [SimpleNamespace(body=body, sample_info=SimpleNamespace(valid_data=body != b"gone"))]
+        return [SimpleNamespace(body=body, sample_info=SimpleNamespace(valid_data=body != b"gone", publication_handle=1))]
 
 
 def test_messages_of_another_size_are_counted() -> None:
     wire: Any = object.__new__(Wire)
-    wire._size, wire.dropped, wire.clock = 64, 0, time.monotonic
+    wire._size, wire.dropped, wire.clock, wire._heard = 64, 0, time.monotonic, {}
     wire._states = FakeReader(b"", b"gone", b"broken", bytes(63), bytes(65), bytes(64))
     assert [wire.receive() is None for _ in range(6)] == [True] * 5 + [False] and wire.dropped == 3

@@ -161,6 +161,7 @@ def plain(text: str, root: Path) -> str:
     """A line without what differs by machine or moment."""
     for place, name in ((root.resolve(), "<tmp>"), (root, "<tmp>"), (root.parent, "<tmp>/.."), (ROOT, "<root>")):
         text = text.replace(str(place), name)
+    text = re.sub(r"'[^']*pytest-of-[^']*'", "'<tmp>...'", text)  # a path that an error cuts short
     for pattern, name in VARIES.items():
         text = re.sub(pattern, name, text)
     text = re.sub(r"(<root>/(?:legged_mw|tests)/[\w/]+\.py):\d+", r"\1:<line>", text)
