@@ -287,6 +287,8 @@ def test_an_older_format(export: Path, contract: Contract, capsys: pytest.Captur
     read = read_contract(export)
     np.testing.assert_array_equal([read.action.lowest, read.action.highest], [contract.action.lowest, contract.action.highest])
     assert main(capsys, export, *SHOWS)[0] == 0
+    code, out, _ = main(capsys, export, *SHOWS, "--edited")
+    assert code == 0 and UNKNOWN not in out
     (export / "scene.xml").unlink()
     code, _, err = main(capsys, export)
     assert code == 2 and "leaves the range of the targets to scene.xml" in err and "export the policy again" in err

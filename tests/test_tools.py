@@ -311,6 +311,15 @@ def test_no_training_outlives_its_sweep(name: str, state: str, tmp_path: Path) -
     assert ours.returncode == (-signal.SIGKILL if name == "SIGKILL" else 1)
 
 
+def test_a_terminal_that_hangs_up_twice_stops_a_training_once() -> None:
+    """A training takes a second SIGTERM as: at once, without saving."""
+    stop, asked = sweep.Stop(), []
+    stop.training = SimpleNamespace(terminate=lambda: asked.append(1))  # type: ignore[assignment]
+    stop()
+    stop()
+    assert asked == [1]
+
+
 def test_a_signal_between_two_trainings_ends_a_sweep(tmp_path: Path) -> None:
     stop, started = sweep.Stop(), []
 

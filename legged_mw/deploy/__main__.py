@@ -64,13 +64,13 @@ def parse() -> argparse.Namespace:
 
 def main() -> None:
     args = parse()
+    for each in map(find, filter(None, (args.folder, args.second))) if args.edited else ():
+        print("\n".join(edits(each)) or f"{shown(each)}: nothing was changed in what the network was trained with")
     if args.replay:
         show_log(args.replay, find(args.folder) if args.folder else None, args.edited)
         return
     folder = find(args.folder)
     contract, scene_file = read_contract(folder, args.edited), TERRAIN_FILE if args.terrain else SCENE_FILE
-    for each in (folder, *([find(args.second)] if args.second else [])) if args.edited else ():
-        print("\n".join(edits(each)) or f"{shown(each)}: nothing was changed in what the network was trained with")
     command = launch.check_drive(args, contract.commands, advice=f"the ranges are in {folder / CONTRACT_FILE}")
     if contract.ends.not_covered:
         print(f"not judged here: {', '.join(contract.ends.not_covered)}, which ended episodes in training")

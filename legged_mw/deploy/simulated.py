@@ -384,4 +384,4 @@ def _check_machine(model: mujoco.MjModel, file: str, contract: Contract, joints:
     for name, values in checks.items():
         if not np.allclose(*values, rtol=1e-4, atol=1e-6):
             said, found = (np.array2string(np.asarray(x), precision=6, separator=", ", max_line_width=10_000) for x in values)
-            raise ContractError(f"{CONTRACT_FILE}: {name} is {said}, but {file} has {found}; export the policy again")
+            raise ContractError(f"{CONTRACT_FILE}: {name} is {said}, but {file} has {found}; change both, or export the policy again")

@@ -21,12 +21,12 @@ from legged_mw.utils.config import ConfigError, fit
 from legged_mw.utils.errors import StepError, unknown
 from legged_mw.utils.renamed import LEGGED_GYM_METHODS
 
-HOOKS = (  # whose parents do what every step or reset needs; a command's hooks may be replaced
+HOOKS = (  # every step or reset needs what their parents do; hooks of commands may be replaced
     *("_init_buffers", "_episode_columns", "_update_state", "_end_step", "compute_observations"),
     *("reset_envs", "_reset_robots", "_reset_task", "_update_curricula"),
 )
 WITHOUT = "# without super"  # a comment in the method: it is so on purpose
-PAYS = (  # terms of envs/robot_rewards.py and legged_rewards.py whose usual scale is above 0, as that of every skill's own; others cost
+PAYS = (  # terms of robot_rewards.py and legged_rewards.py with a usual scale above 0, as all of a skill's own have; others cost
     *("alive", "pose", "tracking_lin_vel", "tracking_ang_vel", "feet_air_time", "feet_contact_without_cmd"),
     *("single_stance", "no_fly", "feet_phase", "contact_phase"),
 )

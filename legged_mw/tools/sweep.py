@@ -61,8 +61,8 @@ class Stop:
                 signal.signal(number, self)
 
     def __call__(self, *_: object) -> None:
-        self.asked = True
-        if self.training:
+        first, self.asked = not self.asked, True
+        if first and self.training:  # a closing terminal hangs up twice, and a training takes a second SIGTERM as: at once
             self.training.terminate()
 
 

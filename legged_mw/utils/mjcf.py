@@ -36,6 +36,7 @@ _MOST |= {f"nuser_{kind}": 1e3 for kind in ("body", "jnt", "geom", "site", "cam"
 _MOST |= {"mass": HEAVIEST, "density": 1e6, "armature": WIDEST, "frictionloss": WIDEST, "diaginertia": WIDEST}
 _SIZES = ("mass", "inertia", "pos", "ipos", "size", "armature", "damping", "frictionloss", "stiffness")  # of the model's arrays
 _DIRS = ("meshdir", "texturedir", "assetdir")
+_OF_URDF = ("mesh", "texture", "compiler")  # which name files that MuJoCo reads
 _NAMES = ("name", "class", "childclass", "model", "file", "dir", *_DIRS)
 
 
@@ -109,7 +110,7 @@ class _Reader:
     def __init__(self, source: Source, path: Path, folder: str) -> None:
         self.source, self.path, self.folder = source, path, folder  # the last: of the model that it is or belongs to
         self.file = "" if path == source.file else f"{path.name}: "
-        self.builder, self.parser, self.line, self.depth = TreeBuilder(), expat.ParserCreate("utf-8"), 1, 0
+        self.builder, self.parser, self.line, self.depth, self.urdf = TreeBuilder(), expat.ParserCreate("utf-8"), 1, 0, False
         self.parser.StartElementHandler, self.parser.EndElementHandler = self._start, self._end
         self.parser.StartDoctypeDeclHandler = self._refuse_doctype
         source.folders |= dict.fromkeys((folder, str(path.parent)))
@@ -133,14 +134,16 @@ class _Reader:
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         self.depth, self.source.elements = self.depth + 1, self.source.elements + 1
-        if self.depth > _DEEPEST or len(attributes) > _DEEPEST:  # for whose number MuJoCo's reader takes squared time
+        if self.depth > _DEEPEST or len(attributes) > _DEEPEST:  # MuJoCo's reader is quadratic in attributes
             raise ValueError(f"{self.where}it is nested too deeply, or has more than {_DEEPEST} attributes")
         if self.source.elements > _ELEMENTS:
             raise ValueError(f"{self.where}it {_TOO_MUCH}")
+        self.urdf = self.urdf or (tag == "robot" and self.depth == 1)
+        unread = self.urdf and tag not in _OF_URDF  # of a URDF, such as a simulator's plugins
         for name, value in attributes.items():
             if wrong := "" if name in _NAMES else _wrong(name, value):
                 raise ValueError(f'{self.where}{name}="{value[:60]}" {wrong}')
-            if value and (name.startswith("file") or name in _DIRS):
+            if value and not unread and (name.startswith("file") or name in _DIRS):
                 self._note(name, value)
         if tag in ("include", "model") and (name := attributes.get("file")):
             here, home = (os.path.join(folder, name) for folder in (self.path.parent, self.folder))

@@ -177,6 +177,11 @@ URDFS: list[tuple[str, str, str]] = [
 ]
 
 
+def test_what_a_simulators_plugin_names_is_not_read(tmp_path: Path) -> None:
+    (tmp_path / "robot.urdf").write_text(PLAIN.replace("</robot>", '<gazebo><plugin filename="/dev/null"/></gazebo></robot>'))
+    assert Source(tmp_path / "robot.urdf").spec().compile().nbody > 1
+
+
 @pytest.mark.parametrize(("text", "says"), [entry[1:] for entry in URDFS], ids=[entry[0] for entry in URDFS])
 def test_urdf(text: str, says: str, tmp_path: Path) -> None:
     attack(Case("", reads("robot.urdf"), ("robot.urdf", says), given=given(text, "robot.urdf")), tmp_path)
