@@ -13,12 +13,13 @@ from legged_mw.envs.contacts import FootContacts
 from legged_mw.envs.gait import GaitClock
 from legged_mw.envs.legged_rewards import LeggedRewards
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
-from legged_mw.envs.mirror import Block, command_block, foot_blocks, scan_block
+from legged_mw.envs.mirror import NO_MIRROR, Block, command_block, foot_blocks, scan_block
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.terrain import Tiles, build_terrain
+from legged_mw.sim.errors import ModelError
 from legged_mw.sim.height_map import make_height_map
-from legged_mw.sim.mirror import Partners, find_partners
+from legged_mw.sim.mirror import Partners, find_partners, opposites
 from legged_mw.sim.terrain import PLATFORM, Terrain
 from legged_mw.utils.commands import VELOCITY, Command, command_table
 from legged_mw.utils.config import ConfigError
@@ -271,7 +272,15 @@ class LeggedRobot(LeggedRewards, RobotTask):
         return blocks
 
     def _partners(self) -> Partners:
-        return find_partners(self.robot, self.foot_names)
+        feet = self.foot_names
+        try:
+            return find_partners(self.robot, feet)
+        except ModelError:
+            for foot in feet:
+                if (others := opposites(self.robot, foot)) and not {*others} & {*feet}:
+                    what = f"asset.foot_names has {len(feet)} feet; {others[0]} is missing, on the other side of {foot}"
+                    raise ConfigError(f"{what}: name it too, or {NO_MIRROR}") from None
+            raise
 
     # ---- statistics, checkpoint -----------------------------------------------------------------------------------------
 

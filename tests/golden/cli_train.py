@@ -36,7 +36,8 @@ TASKS = {
 }
 SMALL = [*("--num_envs", "16", "--set", "actor.hidden_dims=[16, 16]", "--set", "critic.hidden_dims=[16, 16]")]
 CHECKED = [  # what shows only when robot, environment or learner is built
-    *("asset.file=dog.xml", "asset.file=", "asset.file=/far/dog.xml", "asset.foot_names=[FR, FL, RR, RLL]", "asset.foot_names=[F*]"),
+    *("asset.file=dog.xml", "asset.file=", "asset.file=/far/dog.xml"),
+    *("asset.foot_names=[FR, FL, RR, RLL]", "asset.foot_names=[FR, FL, RR]", "asset.foot_names=[F*]"),
     *("control.stiffness={hip: 30}", "init_state.default_joint_angles={joint: 0, wheel: 1}", "rewards.scales.torqes=-1"),
     *("algorithm.optimizer=adom", "obs_groups.actor=[stat]", "actor.class_name=os:system", "asset.imu_site=nose"),
     *("commands.keep_probability=[1]", "commands.units={hight: m}", "commands.default={lin_vel_z: 1}"),
