@@ -213,7 +213,13 @@ def fit(value: Any, kind: Any, path: str) -> Any:
     if _is_section(kind):
         raise ConfigError(f"{path} is a section, not a field; set one of its fields: {', '.join(_schema(kind))}")
     if origin is Annotated:
-        return _within(fit(value, args[0], path), kind, path)
+        try:
+            fitted = fit(value, args[0], path)
+        except OutOfBounds:
+            if args[0] in (int, float):
+                _within(value, kind, path)  # what the field takes says more than what every number must be
+            raise
+        return _within(fitted, kind, path)
     if kind is Any or origin in (Union, UnionType):
         return _fit_one_of(value, _PLAIN if kind is Any else kind, path)
     if origin is Literal and any(type(value) is type(choice) and value == choice for choice in args):

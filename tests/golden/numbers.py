@@ -43,6 +43,7 @@ SETS = [
     "control.decimation=1000000000",
     "sim.dt=1e-300",
     "sim.dt=.inf",
+    "sim.dt=1e30",
     "sim.iterations=100000000",
     "sim.threads=100000",
     "init_state.pos=[.nan, 0, 0]",
