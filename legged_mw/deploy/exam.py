@@ -8,6 +8,7 @@ The order of a step is that of the environment's exams, so that both give one re
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from legged_mw.eval.skill import Ground, Motion, Recording, Robot, Skill
 from legged_mw.eval.skills import make_skill
 from legged_mw.utils.commands import VELOCITY
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
 
 
 def run_exam(
@@ -110,8 +112,11 @@ def contract_rules(contract: Contract, common: bool = False) -> ExamRules:
     trained = {command.name: (command.low, command.high) for command in contract.commands}
     if missing := [name for name in VELOCITY if name not in trained]:
         raise ContractError(f"{CONTRACT_FILE}: the walking exam needs the commands {', '.join(VELOCITY)}; missing: {', '.join(missing)}")
+    section, known = dict(contract.exam or {}), [field.name for field in fields(ExamRules)]
+    for name in section:
+        if name not in known:
+            raise ContractError(f"{CONTRACT_FILE}: exam: {unknown('field', name, known, 'the walking exam')}")
     try:
-        section = dict(contract.exam or {})
         return ExamRules.from_mapping(section | (in_common(section.get("peer", "")) if common else {}), trained, len(contract.feet))
     except (AttributeError, TypeError, ValueError) as error:
         raise ContractError(f"{CONTRACT_FILE}: exam: {error}") from error

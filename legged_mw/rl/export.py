@@ -42,6 +42,7 @@ from legged_mw.deploy.motion import MOTION_FILE, Motion
 from legged_mw.deploy.motors import MOTORS_FILE, Motors
 from legged_mw.envs.actuators import OWN as OWN_LAW
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.loading import motor_drive
 from legged_mw.envs.motion_tracking import MotionTracking
 from legged_mw.envs.robot_task import RobotTask
@@ -282,7 +283,9 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
 def _exam(task: LoadedTask) -> dict[str, Any] | None:
     """What grades an export: the section ``exam``, and its kind where that is not the walking exam."""
     section = task.cfg.to_dict().get("exam", {})
-    return section if task.exam == "walking" else {"kind": task.exam, **section} if task.exam else None
+    if task.exam == "walking":  # a task's own fields are no part of it
+        return {name: section[name] for name in LeggedRobotCfg().to_dict()["exam"] if name in section}
+    return {"kind": task.exam, **section} if task.exam else None
 
 
 def _estimated(env: RobotTask, task: LoadedTask) -> tuple[Estimated, ...]:

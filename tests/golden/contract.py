@@ -95,6 +95,7 @@ EXAMS: dict[str, Any] = {
     "a range backwards": set_at("exam", {"ranges": {"lin_vel_x": [1, 0]}}),
     "two marks": set_at("exam", {"marks": [1.0, 2.0]}),
     "another robot": set_at("exam", {"peer": "dog"}),
+    "no such field": set_at("exam", {"pushes": 3}),
 }
 IN_SCENE = {
     "another name of a joint": ('name="FR_hip_joint"', 'name="FR_hip"'),
