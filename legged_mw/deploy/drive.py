@@ -106,7 +106,6 @@ def drive(
         safety = Safety(contract, Limits.of(folder, contract, robot.limits, parse_limits(args.limit)))
         path = None if args.log == "off" else log_path(contract) if args.log is None else writable(args.log, "--log")
         console = stack.enter_context(Console(contract))
-        log = Log(path, contract, folder, kind, console.say) if path else None
         controller, command = Controller(folder, contract), _commands(contract, args, fixed, console.say)
         sources = [*_sources(contract, args, console.say), *([mirror] if mirror else [])]
         checked = JointCheck(controller, sources, console.say, robot, safety.limits) if args.check_joints else None
@@ -116,6 +115,7 @@ def drive(
         stack.enter_context(_ended_by_signals())
         seconds = args.time or math.inf
         odometry = Odometry(folder, contract, 1, contact) if contact else None
+        log = Log(path, contract, folder, kind, console.say) if path else None  # last: what is refused leaves none
 
         def show(now: float, measured: Measurement | None) -> None:
             console.show(now, states)

@@ -34,6 +34,8 @@ go1_flat --limit tilt=4
 go1_flat --limit tilt --drive
 go1_flat --limit tlit=4 --drive
 go1_flat --limit tilt=x --drive
+go1_flat --drive --gamepad none
+go1_flat --drive --stop_fd 9999
 go1_flat --domain 1
 go1_flat --interface lo
 go1_flat --remote a
