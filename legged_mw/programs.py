@@ -16,7 +16,6 @@ from typing import Any
 
 from legged_mw.utils import quick_start
 from legged_mw.utils.cli import FEWER_WORLDS, fail, one_line_errors
-from legged_mw.utils.console import patient_console
 from legged_mw.utils.task import LoadedTask, list_tasks, load_task
 
 
@@ -30,11 +29,6 @@ def train() -> None:
     if args.list:
         print(list_tasks())
         return
-    with patient_console():
-        _train(args)
-
-
-def _train(args: argparse.Namespace) -> None:
     from legged_mw.eval.exams import find_exam
     from legged_mw.rl import training
     from legged_mw.rl.ranks import quiet, this_rank
@@ -128,7 +122,7 @@ def _tool(name: str) -> Callable[[], None]:
     """A program whose ``main`` does all."""
 
     def start() -> None:
-        with one_line_errors(), patient_console():
+        with one_line_errors():
             import_module(name).main()
 
     return start

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import shutil
@@ -323,6 +324,18 @@ def test_memory_that_runs_out_gives_advice(text: str, capsys: pytest.CaptureFixt
         assert capsys.readouterr().err == f"train.py: out of memory ({text}){fewer}\n"
     with pytest.raises(RuntimeError, match="something else"), one_line_errors("train.py"):
         raise RuntimeError("something else")
+
+
+def test_a_reader_that_left_ends_nothing() -> None:
+    """As in ``legged-mw play ... | head``, which closes the pipe; the robot whose command is refused comes to its line all the same."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    try:
+        said = ["-m", "legged_mw.programs", "deploy", "go1_flat", "--edited", "--command=9,0,0"]
+        done = subprocess.run([sys.executable, *said], cwd=ROOT, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+    finally:
+        os.close(writer)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1 and "--command 9,0,0" in done.stderr
 
 
 def test_ctrl_c_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:

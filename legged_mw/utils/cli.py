@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from legged_mw.utils.config import ConfigError, fit, load_yaml
+from legged_mw.utils.console import patient_console
 from legged_mw.utils.errors import UserError, in_short, out_of_memory, printable, users_fault
 from legged_mw.utils.task import LoadedTask
 
@@ -141,10 +142,12 @@ def one_line_errors(program: str = "", fewer: str = "") -> Iterator[None]:
     """Turn mistakes of the user, in what was asked or in code of their own, into one line and exit code 2; with --verbose all of it.
 
     Memory that runs out becomes that, with the advice ``fewer``, Ctrl-C a word and code 130. A mistake of ours stays a traceback.
+    What is printed inside may find no reader, as in ``| head``, and ends nothing.
     """
     program = program or Path(sys.argv[0]).name
     try:
-        yield
+        with patient_console():
+            yield
     except UserError as error:
         _show_all()
         fail(program, str(error))
