@@ -92,7 +92,7 @@ def test_mistake_is_named(path: str, value: Any, wanted: str) -> None:
         ),
         ("asset.foot_names", ["*_foot"], "asset.foot_names is ['*_foot']; it must be a list of at least one name"),
         ("control.stiffness", {"": 35.0, "hip": -35.0}, "control.stiffness['hip'] is -35.0; it must be from 0 to 1,000,000"),
-        ("domain_rand.friction", [0.0, 1.0], "domain_rand.friction[0] is 0.0; it must be above 0"),
+        ("domain_rand.friction", [0.0, 1.0], "domain_rand.friction[0] is 0.0; it must be from 1e-05"),
         (
             "domain_rand.model_factors",
             {"dof_armature": [2.0, 1.0]},

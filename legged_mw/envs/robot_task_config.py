@@ -18,6 +18,7 @@ from legged_mw.utils.bounds import (
     Delays,
     Factors,
     Few,
+    Frictions,
     Gain,
     Height,
     Iterations,
@@ -182,7 +183,7 @@ class RobotTaskCfg(Config):
         base_mass: Offsets = [-1.0, 1.0]  # added to the root's [kg], its inertia in proportion [P; inertia ours]
         base_com: Places = [-0.05, 0.05]  # added to the place of the root's centre of mass, each axis [m] [P]
         armature: Factors = [1.0, 1.05]  # factor on each joint's [P]
-        friction: Factors = [0.4, 1.0]  # sliding friction of the ground [-] [P]
+        friction: Frictions = [0.4, 1.0]  # sliding friction of the ground [-] [P]
         contact_time: ContactTimes = []  # time constant of the ground's contacts (solref) [s]: longer is softer, 0.02 is MuJoCo's
         frictionloss: Factors = [0.9, 1.1]  # factor on each joint's dry friction [P]
         stiffness: Factors = []  # factor on each servo's position gain

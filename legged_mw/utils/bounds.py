@@ -84,6 +84,10 @@ ShareRange = Annotated[list[Share], PAIR]
 
 # Of a range that nothing needs to be drawn from: empty, it is left out
 Factors = Annotated[list[Annotated[float, above(0, 1000)]], or_empty(PAIR)]
+Frictions = Annotated[
+    list[Annotated[float, Bound("from 1e-05, as which MuJoCo takes all below it, to 1000", lambda value: 1e-5 <= value <= 1000)]],
+    or_empty(PAIR),
+]
 Places = Annotated[list[Annotated[float, at_least(-10, 10, "m")]], or_empty(PAIR)]
 ContactTimes = Annotated[list[Annotated[float, at_least(1e-4, 10, "s")]], or_empty(PAIR)]
 Offsets = Annotated[list[float], or_empty(PAIR)]

@@ -65,6 +65,7 @@ SETS = [
     "noise.scales.dof_vel=.nan",
     "normalization.clip_actions=-2",
     "domain_rand.friction=[-1, 1]",
+    "domain_rand.friction=[1e-30, 1]",
     "domain_rand.link_mass=[1e30, 1e38]",
     "perturbation.velocity=[0, 1e38]",
     "terrain.measured_points_x=[1e38]",
