@@ -39,7 +39,7 @@ def above(low: float, most: float = math.inf, unit: str = "") -> Bound:
 
 _NOT_TEXT = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 _ALWAYS = {
-    float: Bound("finite, and 10^9 at most", lambda value: abs(value) <= 1e9),  # no unit of a config needs more
+    float: Bound("finite, and 10^12 at most", lambda value: abs(value) <= 1e12),  # no unit of a config needs more
     int: Bound("below 10^24", lambda value: abs(value) < 10**24),  # more than any machine counts, and few enough digits to print
     str: Bound("text without control characters", lambda value: not _NOT_TEXT.search(value)),  # which rule a terminal, or no file takes
 }
