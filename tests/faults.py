@@ -73,7 +73,8 @@ class Side:
         since = now - self._begun if self._begun is not None else -1.0
         button = "start" if 0.0 < since < 0.05 else "A" if since > 0.1 and since % 0.08 < 0.04 else ""
         sim.remote = encode(([button] if button else []) if self.held is None else self.held)
-        if self.case.robot and self.injected is None and self.walking is not None and now > self.walking + WALK:
+        begins = self.case.from_start or (self.walking is not None and now > self.walking + WALK)
+        if self.case.robot and self.injected is None and begins:
             self.injected = now
             if isinstance(self.case.robot, str):
                 for fault in parse_faults([self.case.robot], sim.contract.joints):
@@ -248,7 +249,7 @@ class Lockstep(Rig):
 
 def lockstep(case: Case, sim: SimulatedUnitree, wire: Wire, folder: Path, patch: Any, **others: Any) -> Lockstep:
     """Run one fault; the robot's record and what was said are in what comes back. ``patch``: pytest's monkeypatch."""
-    for name, value in (("RISE", RISE), ("STANDS", 1.0)):
+    for name, value in () if case.from_start else (("RISE", RISE), ("STANDS", 1.0)):
         patch.setattr(f"legged_mw.deploy.states.{name}", value)
     sim.faults, sim.record, sim.remote, sim._rng = Faults(), Record(), encode(), np.random.default_rng(0)
     sim.reset(after=1.0)
@@ -284,6 +285,7 @@ class Case(NamedTuple):
     limits: Mapping[str, float] = {}  # of the safety layer, other than the defaults
     task: str = "go2_flat"
     misplaced: bool = False  # the fault itself brings right commands to wrong joints
+    from_start: bool = False  # the fault is there before it stands up, as it does in life: slowly
     in_lockstep: bool = False  # nothing that a real process could do here
 
 
@@ -449,4 +451,14 @@ CASES: dict[str, Case] = {
         policy=lambda rig: rig.computer_sleeps(60.0),
         in_lockstep=True,
     ),
+}
+# it stands up and does not walk
+REFUSED: dict[str, Case] = {
+    f"IMU with {axes[0]} and {axes[1]} swapped": Case(
+        f"A is refused: while it stood up it {moved} by .* rad by its legs, by gravity .* do not agree",
+        f"imu_swap={axes}",
+        from_start=True,
+        known_after=4.0,
+    )
+    for axes, moved in (("xy", "(pitched|rolled)"), ("xz", "rolled"), ("yz", "pitched"))
 }

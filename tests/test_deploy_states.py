@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import os
 import pty
+import re
 import select
 import signal
 import struct
@@ -26,7 +27,7 @@ from legged_mw.deploy.inputs import Gamepad, Keys, RobotRemote, StopFile, Wish, 
 from legged_mw.deploy.log import read_log
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Health, Measurement, Remote, RobotError
-from legged_mw.deploy.states import STANDS, States, wrong_imu
+from legged_mw.deploy.states import STANDS, STEEP, States, at_odds, wrong_imu
 from legged_mw.utils.cli import one_line_errors
 
 POLICIES = ROOT / "resources/policies"
@@ -334,3 +335,59 @@ def test_an_imu_with_wrong_axes(parts: list[str], order: list[int], sign: float,
         seen.append(Measurement(**rest, **values))
     said = wrong_imu(seen, period)
     assert bool(said) == bool(word) and word in said, said
+
+
+@pytest.fixture(scope="module", params=["go1_flat", "go2_flat"])
+def stood(request: pytest.FixtureRequest) -> tuple[np.ndarray, np.ndarray]:
+    """What the legs of a robot that stood up say of gravity (N, 3), and what its IMU does."""
+    contract, seen = read_contract(POLICIES / request.param), []
+    robot, controller = Watched(POLICIES / request.param, contract, whole=True), Controller(POLICIES / request.param, contract)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("legged_mw.deploy.states.at_odds", lambda *both: seen.append(both) or at_odds(*both))
+        passed = driven(robot, controller, Script({40: "start", 180: "A"}), 4.0)[1]
+    assert passed[-1] == "policy"
+    return seen[0]
+
+
+def about(axis: int, degrees: float) -> np.ndarray:
+    """Turns row vectors about an axis."""
+    turn, (one, other) = np.eye(3), [each for each in range(3) if each != axis]
+    turn[one, one] = turn[other, other] = math.cos(math.radians(degrees))
+    turn[one, other] = -math.sin(math.radians(degrees))
+    turn[other, one] = -turn[one, other]
+    return turn
+
+
+@pytest.mark.parametrize(
+    ("wrong", "word"),
+    [
+        (np.eye(3), ""),
+        (about(0, 10.0), ""),  # a slope
+        (about(1, 10.0), ""),
+        (about(2, 15.0), ""),
+        (about(0, STEEP + 5.0), "degrees from where"),
+        (np.eye(3)[swapped(0, 1)], "pitched"),
+        (np.eye(3)[swapped(1, 2)], "pitched|rolled"),
+        (np.eye(3)[swapped(0, 2)], "pitched|rolled"),
+        (about(2, 90.0), "pitched"),
+        (about(2, -90.0), "pitched"),
+        (about(2, 180.0), "pitched"),
+        (np.diag([-1.0, 1.0, 1.0]), "pitched"),
+        (np.diag([1.0, -1.0, 1.0]), "rolled"),
+        (np.diag([1.0, 0.0, 1.0]), "rolled"),  # a quaternion's x and z swapped: heading is read as roll
+        (np.diag([1.0, 1.0, -1.0]), "degrees from where"),
+    ],
+)
+def test_gravity_that_is_not_that_of_the_legs(stood: tuple[np.ndarray, np.ndarray], wrong: np.ndarray, word: str) -> None:
+    """The whole IMU has wrong axes, and agrees with itself: pitch and roll of the legs tell, of which it rolls by a sway."""
+    legs, gravity = stood
+    rng = np.random.default_rng(0)
+    said = at_odds(legs, gravity @ wrong + 0.005 * rng.standard_normal(gravity.shape))
+    assert bool(said) == bool(word) and re.search(word, said), said
+    assert at_odds(np.full_like(legs, np.nan), gravity @ wrong) == ""
+
+
+def test_a_robot_that_hangs_is_not_judged_by_its_legs(contract: Contract) -> None:
+    robot, controller = Watched(GO1, contract, hoisted=True, lift=0.3), Controller(GO1, contract)
+    robot.changed = lambda _, measured: replace(measured, **{name: getattr(measured, name)[[1, 0, 2]] for name in ("gravity", "ang_vel")})
+    assert driven(robot, controller, Script({5: "start", 130: "A"}), 2.7)[1][-1] == "policy"

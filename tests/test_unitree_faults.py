@@ -14,7 +14,7 @@ from legged_mw.deploy.contract import read_contract
 from legged_mw.deploy.unitree.link import RobotEnd, Wire
 from legged_mw.deploy.unitree.robots import machine_of
 from legged_mw.deploy.unitree.serve import SimulatedUnitree
-from tests.faults import CASES, SOON, limits_of, lockstep
+from tests.faults import CASES, REFUSED, SOON, Case, limits_of, lockstep
 from tests.wires import POLICIES, locked_domain
 
 
@@ -63,7 +63,17 @@ def test_a_fault_damps(name: str, ends: dict[str, Ends], monkeypatch: pytest.Mon
         assert sim.record.asked < limits.torque and sim.record.outside < 1e-6
 
 
+@pytest.mark.parametrize("name", [*REFUSED, ""])
+def test_a_fault_from_the_start_keeps_it_from_walking(name: str, ends: dict[str, Ends], monkeypatch: pytest.MonkeyPatch) -> None:
+    """It stands up and stays there, however often A is pressed; without a fault it walks."""
+    case = REFUSED.get(name, Case("policy: ", from_start=True, known_after=4.0))
+    sim, wire, other, second = ends[case.task]
+    rig = lockstep(case, sim, wire, POLICIES / case.task, monkeypatch, other=other, second=second)
+    assert (rig.side.walking is None) == (name in REFUSED), rig.said
+    assert any(re.search(case.said, line) for line in rig.said), rig.said
+
+
 def test_the_page_has_them_all() -> None:
     page = (ROOT / "docs/faults.md").read_text()
-    assert [name for name in CASES if f"| {name} |" not in page] == []
+    assert [name for name in [*CASES, *REFUSED] if f"| {name} |" not in page] == []
     assert f"[{len(CASES)} faults](docs/faults.md)" in (ROOT / "README.md").read_text()

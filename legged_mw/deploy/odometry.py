@@ -30,6 +30,7 @@ STANDING = 0.2  # [m/s] noise of the velocity of a foot that stands
 DOUBT = {"measured": 0.5, "torque": 0.3, "height": 0.3}  # [m/s] from which a foot that moves counts half, by how sure its contact is
 CONTACTS = tuple(DOUBT)  # how a foot on the ground is found
 LOADED = 0.1  # [weights] of a foot's force from which it stands, by its joints' torques
+CARRIES = 0.6  # [weights] of all feet together from which a robot stands by itself: on no belly, on no rope
 LEVEL = 0.01  # [m] above the lowest foot, within which others stand too, by their height
 FLAT = 0.05  # [-] sine of a foot's tilt up to which it touches between its ends, not at one of them
 
@@ -98,8 +99,32 @@ class Odometry:
         parts = (measured.joint_pos, measured.joint_vel, measured.joint_torque, measured.ang_vel, measured.gravity)
         return Legs(*map(np.array, zip(*map(self._legs, *map(np.atleast_2d, parts)), strict=True)))
 
+    def down(self, measured: Measurement) -> Floats:
+        """(3,) what the legs say of gravity: across the plane of the feet, so down on level ground. NaN unless three feet or more carry it.
+
+        Of one robot; nothing of its IMU is looked at.
+        """
+        legs = self.legs(replace(measured, gravity=np.array([0.0, 0.0, -1.0]), ang_vel=np.zeros(3)))
+        weight = self.contract.mass * self._gravity
+        place = legs.place[0, legs.force[0] > LOADED * weight]
+        if len(place) < 3 or legs.force.sum() < CARRIES * weight:
+            return np.full(3, np.nan)
+        across = np.linalg.svd(place - place.mean(axis=0))[2][2]
+        return across * np.sign(across @ place.mean(axis=0))
+
+    def leaning(self, angles: Floats, axis: Floats) -> Floats:
+        """(D,) how far each joint turns while the body turns by 1 rad about ``axis`` (3,) over feet that stay."""
+        place, slopes = self._feet_of(angles, np.array([0.0, 0.0, -1.0]))
+        return np.linalg.lstsq(slopes.reshape(-1, slopes.shape[2]), np.cross(place, axis).ravel(), rcond=0.01)[0]
+
     def _legs(self, angles: Floats, speeds: Floats, torques: Floats, gyro: Floats, gravity: Floats) -> tuple[Floats, Floats, Floats]:
-        """Of one robot, without the leading axis. Its root stays where the model has it: only what is relative counts."""
+        """Of one robot, without the leading axis."""
+        place, slopes = self._feet_of(angles, gravity)
+        wrench = np.linalg.solve(slopes @ slopes.transpose(0, 2, 1) + 1e-4 * np.eye(3), (slopes @ torques)[..., None])[..., 0]
+        return place, -(np.cross(gyro, place) + slopes @ speeds), wrench @ gravity
+
+    def _feet_of(self, angles: Floats, gravity: Floats) -> tuple[Floats, Floats]:
+        """Where feet are (F, 3), and how far they move by each joint (F, 3, D). The root stays where the model has it."""
         model, data = self.model, self._data
         data.qpos[self._angles] = angles
         mujoco.mj_kinematics(model, data)
@@ -110,10 +135,7 @@ class Odometry:
         place = np.array([foot.lowest(data, down) for foot in self._feet])
         for jacobian, foot, point in zip(moved, self._feet, place, strict=True):
             mujoco.mj_jac(model, data, jacobian, None, point, foot.body)
-        slopes = turn.T @ (moved - own)[:, :, self._dofs]  # (F, 3, D) how far a foot moves, by each joint
-        place = (place - origin) @ turn
-        wrench = np.linalg.solve(slopes @ slopes.transpose(0, 2, 1) + 1e-4 * np.eye(3), (slopes @ torques)[..., None])[..., 0]
-        return place, -(np.cross(gyro, place) + slopes @ speeds), wrench @ gravity
+        return (place - origin) @ turn, turn.T @ (moved - own)[:, :, self._dofs]
 
 
 class _Foot:

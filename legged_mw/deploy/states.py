@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from legged_mw.deploy.inputs import END, START, WALK, Source
+from legged_mw.deploy.odometry import Odometry
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Floats, Health, Measurement
 from legged_mw.deploy.safety import Trip
@@ -24,9 +25,11 @@ SOFT = 0.1  # [share of the stiffness] that standing up begins with
 NEAR = 0.15  # [rad] ours: a joint that is farther from the pose after RISE carries weight, and gets stiffer
 STIFFEST = 3.0  # [share of the stiffness] at most; unitree_rl_lab stands a Go2 with 60 N m/rad, three times what go2_flat walks with
 STIFFEN = 1.0  # [share of the stiffness a second]
-# Ours, of an IMU while the robot stands up: shipped Go1 and Go2 tilt by 0.07 rad in all, and their gyro misses 0.04 of that
-TILTS, MISSED = 0.03, 0.6  # [rad] of tilt from which the gyro is judged; share of it that may not be the gyro's
-TURN = 5  # measurements between two gravities that are compared: their times are not exact
+# Ours, of an IMU while the robot stands up: shipped Go1 and Go2 tilt by 0.1 rad in all; gyro and legs miss 0.05 of it, wrong axes 0.7
+TILTS, MISSED = 0.03, 0.6  # [rad] of tilt from which gyro and legs are judged; share of it that they may miss
+TURN = 5  # measurements whose mean is compared: they have noise, and their times are not exact
+SWAY, BEND = 0.06, 0.15  # [rad] by which a robot with three feet or more rolls to each side as it stands up; by which a joint may, for that
+STEEP = 25.0  # [deg] between gravity and what the legs say of it: the steepest ground to start on, with what encoders are off
 PLUMB, PULL = 30.0, (8.0, 12.0)  # [deg] between gravity and what the accelerometer feels; [m/s^2] of a robot at rest
 STANDS = 0.3  # [rad] from the pose, at most, where a policy may begin; ours: the shipped policies walk off from there
 
@@ -34,18 +37,22 @@ STANDS = 0.3  # [rad] from the pose, at most, where a policy may begin; ours: th
 _IMU, _KEPT = ("ang_vel", "gravity", "acceleration"), 1000  # what is kept of a measurement while the robot stands up, and of how many
 
 
+def _in_turns(values: Floats) -> Floats:
+    """Means (N // TURN, 3) of TURN values (N, 3) each: less noise, and times that are not exact count less."""
+    return values[: len(values) // TURN * TURN].reshape(-1, TURN, 3).mean(axis=1)
+
+
 def wrong_imu(seen: Sequence[Measurement], period: float) -> str:
     """What is wrong with the axes of an IMU that was carried so, one measurement a period; "" if nothing is, or too little moved to tell.
 
     Gravity turns as the gyro says, and at rest is what the accelerometer feels. An IMU whose parts are all turned in the same way, or
-    read in the same wrong order about an axis along which nothing tilts, is right by both.
+    read in the same wrong order about an axis along which nothing tilts, is right by both: ``at_odds`` finds it.
     """
     if len(seen) <= TURN:
         return ""
     gyro, gravity, felt = (np.array([getattr(each, name) for each in seen]) for name in _IMU)
-    count = (len(seen) - 1) // TURN * TURN
-    turned = -period * np.cross(gyro[1:] + gyro[:-1], gravity[1:] + gravity[:-1])[:count].reshape(-1, TURN, 3).sum(axis=1) / 4
-    tilted = np.diff(gravity[: count + 1 : TURN], axis=0)
+    turns = -period * np.cross(gyro[1:] + gyro[:-1], gravity[1:] + gravity[:-1]) / 4
+    turned, tilted = (np.diff(_in_turns(each), axis=0) for each in (np.cumsum(turns, axis=0), gravity[1:]))
     by_gyro, by_gravity, missed = (float(np.linalg.norm(each)) for each in (turned, tilted, turned - tilted))
     if max(by_gyro, by_gravity) > TILTS and missed > MISSED * max(by_gyro, by_gravity):
         return f"while it stood up gravity tilted by {by_gravity:.2f} rad, by the gyro by {by_gyro:.2f}, and {missed:.2f} do not agree"
@@ -54,6 +61,26 @@ def wrong_imu(seen: Sequence[Measurement], period: float) -> str:
         return ""
     angle = math.degrees(math.acos(np.clip(-(pull @ gravity[-1]) / size, -1.0, 1.0)))
     return f"gravity is {angle:.0f} degrees from what the accelerometer feels" if angle > PLUMB else ""
+
+
+def at_odds(legs: Floats, gravity: Floats) -> str:
+    """Where measured ``gravity`` (N, 3), one a period, is not what the ``legs`` (N, 3) say of it; "" if nowhere, or too little is known.
+
+    A slope is between them all the time, so pitch and roll must change alike, and be no farther apart than a slope may be steep.
+    """
+    known = np.isfinite(legs).all(axis=1)
+    if known.sum() < TURN:
+        return ""
+    legs, gravity = (_in_turns(each[known]) for each in (legs, gravity))
+    for name, axis in (("pitched", 0), ("rolled", 1)):
+        by_legs, by_gravity, missed = (float(np.ptp(each[:, axis])) for each in (legs, gravity, legs - gravity))
+        if max(by_legs, by_gravity) > TILTS and missed > MISSED * max(by_legs, by_gravity):
+            return (
+                f"while it stood up it {name} by {by_legs:.2f} rad by its legs, by gravity {by_gravity:.2f}, and {missed:.2f} do not agree"
+            )
+    cosine = legs[-1] @ gravity[-1] / np.linalg.norm(legs[-1]) / np.linalg.norm(gravity[-1])
+    angle = math.degrees(math.acos(np.clip(cosine, -1.0, 1.0)))
+    return f"gravity is {angle:.0f} degrees from where the legs have the ground" if angle > STEEP else ""
 
 
 class Order(NamedTuple):
@@ -83,7 +110,12 @@ class States:
         self.note = f"{START}: {self.first}"
         self._from: Floats = controller.contract.default_pose  # (D,) [rad] where standing up began
         self._stiffer = 1.0
-        self._rise = list[Measurement]()  # since standing up began
+        self._rise, self._down = list[Measurement](), list[Floats]()  # since standing up began; what the legs said of gravity then
+        self._legs, self._sway = None, np.zeros(len(self._from))  # (D,) [rad] of the sway at its end
+        if len(controller.contract.feet) > 2:
+            self._legs = Odometry(controller.folder, controller.contract)
+            leaning = self._legs.leaning(self._from, np.array([1.0, 0.0, 0.0]))
+            self._sway = leaning * min(SWAY, BEND / max(1e-9, float(np.abs(leaning).max())))
         self._pressed = frozenset[str]()
 
     @property
@@ -137,7 +169,7 @@ class States:
         elif START in pressed and self.state == DAMPING:
             self._enter(ZERO, now, f"{START}: {self.first}")
         elif START in pressed and self.state == ZERO:
-            self._from, self._stiffer, self._rise = measured.joint_pos.copy(), 1.0, []
+            self._from, self._stiffer, self._rise, self._down = measured.joint_pos.copy(), 1.0, [], []
             self._enter(STAND, now, f"{RISE:g} s to the default pose; then {WALK}: policy")
         elif WALK in pressed and self.state == STAND:
             self._begin(measured, now)
@@ -152,19 +184,27 @@ class States:
                 f"{WALK} has to wait until the robot stands: {joint} is {off.max():.2f} rad from its pose after {now - self.since:.1f} s"
             )
             return
-        if why := wrong_imu(self._rise, contract.period):
+        gravity = np.array([each.gravity for each in self._rise])
+        if why := wrong_imu(self._rise, contract.period) or (at_odds(np.array(self._down), gravity) if self._legs else ""):
             self._tell(f"{WALK} is refused: {why}; look at how the IMU's axes are mounted and read")
             return
         self.controller.reset()
         self._enter(POLICY, now, f"{END}: damping")
 
     def _stand(self, measured: Measurement, now: float) -> Order:
-        """A straight line to the default pose with gains that rise; where that does not carry the robot, they rise further."""
+        """A straight line to the default pose with gains that rise; where that does not carry the robot, they rise further.
+
+        In the second half of it a robot with three feet or more sways to both sides, so that its IMU is seen to roll.
+        """
         contract = self.controller.contract
         if len(self._rise) < _KEPT:
             self._rise.append(replace(measured, **{name: np.array(getattr(measured, name)) for name in _IMU}))
+            if self._legs:
+                self._down.append(self._legs.down(measured))
         share = min(1.0, (now - self.since) / RISE)
         targets = self._from + share * (contract.default_pose - self._from)
+        if 0.5 < share < 1.0:
+            targets = targets + math.sin(4.0 * math.pi * share) * self._sway
         if share == 1.0 and np.abs(measured.joint_pos - targets).max() > NEAR:
             self._stiffer = min(STIFFEST, self._stiffer + STIFFEN * contract.period)
         gain = self._stiffer * (SOFT + (1.0 - SOFT) * share)

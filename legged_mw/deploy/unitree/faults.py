@@ -38,6 +38,7 @@ class Faults:
     joint_speed: Floats | float = 0.0  # (D,) [rad/s] added to measured speeds
     gyro_bias: Floats | float = 0.0  # (3,) [rad/s]
     imu_tilt: float = 0.0  # [deg] by which the measured orientation is rolled
+    imu_swap: str = ""  # axes of the IMU, of SWAPS, that are read one for the other: of quaternion and gyro
     nan: str = ""  # part of the state that is not a number
     temperature: float = 35.0  # [deg C] of every motor
     voltage: float | None = None  # [V]; None: of a full battery
@@ -54,6 +55,7 @@ class Kind(NamedTuple):
 
 
 NAN = {"q": "motor_state.q", "dq": "motor_state.dq", "gyroscope": "imu_state.gyroscope", "quaternion": "imu_state.quaternion"}
+SWAPS = {"xy": [1, 0, 2], "xz": [2, 1, 0], "yz": [0, 2, 1]}
 KINDS = {
     "delay": Kind("delay_ms", 200.0, 0, 1000, "ms"),
     "jitter": Kind("jitter_ms", 20.0, 0, 1000, "ms"),
@@ -69,6 +71,7 @@ KINDS = {
     "joint_speed": Kind("joint_speed", 100.0, unit="rad/s"),
     "gyro_bias": Kind("gyro_bias", 0.5, unit="rad/s"),
     "imu_tilt": Kind("imu_tilt", 180.0, unit="deg"),
+    "imu_swap": Kind("imu_swap", "xz"),
     "nan": Kind("nan", "q"),
     "hot_motor": Kind("temperature", 95.0, 0, 127, "deg C"),
     "low_battery": Kind("voltage", 20.0, 0, unit="V"),
@@ -108,11 +111,12 @@ def _parse(text: str, joints: Sequence[str]) -> Fault:
 
 
 def _value(name: str, kind: Kind, value: str | None, joints: Sequence[str], where: str) -> Any:
-    known = NAN if name == "nan" else [*joints, *NAN] if name == "stuck" else joints if kind.value is None else None
+    words = {"nan": NAN, "imu_swap": SWAPS}
+    known = words.get(name, [*joints, *NAN] if name == "stuck" else joints if kind.value is None else None)
     if known is not None and value is not None:
         if value not in known:
             raise UserError(f"{where}: {unknown('value', value, known, name)}")
-        return value if name == "nan" else {value}
+        return value if name in words else {value}
     if value is None:
         if kind.value is None:
             raise UserError(f"{where}: say of which joint, e.g. {name}={joints[0]}")

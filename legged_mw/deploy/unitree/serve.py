@@ -23,7 +23,7 @@ from legged_mw.deploy.robot import Floats, damped
 from legged_mw.deploy.safety import limits_of
 from legged_mw.deploy.simulated import read_scene
 from legged_mw.deploy.unitree.codec import LAYOUTS, Message
-from legged_mw.deploy.unitree.faults import NAN, Faults, Line
+from legged_mw.deploy.unitree.faults import NAN, SWAPS, Faults, Line
 from legged_mw.deploy.unitree.remote import encode
 from legged_mw.deploy.unitree.robots import Machine, machine_of, order
 
@@ -267,6 +267,11 @@ class SimulatedUnitree:
         state["imu_state.quaternion"] = orientation
         state["imu_state.gyroscope"] = self._sensor("ang_vel") + faults.gyro_bias
         state["imu_state.accelerometer"] = self._sensor("acceleration")
+        if faults.imu_swap:
+            order = SWAPS[faults.imu_swap]
+            orientation[1:] = orientation[1:][order]
+            state["imu_state.quaternion"] = orientation
+            state["imu_state.gyroscope"] = state["imu_state.gyroscope"][order]
         state["imu_state.rpy"] = _roll_pitch_yaw(orientation)
         _, signs = self._plugs()
         state["motor_state.mode"] = self._in_slots(1.0)
