@@ -27,7 +27,7 @@ from legged_mw.deploy.inputs import Gamepad, Keys, RobotRemote, StopFile, Wish, 
 from legged_mw.deploy.log import read_log
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Health, Measurement, Remote, RobotError
-from legged_mw.deploy.states import STANDS, STEEP, States, at_odds, wrong_imu
+from legged_mw.deploy.states import KEPT, STANDS, STEEP, States, at_odds, wrong_imu
 from legged_mw.utils.cli import one_line_errors
 
 POLICIES = ROOT / "resources/policies"
@@ -335,6 +335,14 @@ def test_an_imu_with_wrong_axes(parts: list[str], order: list[int], sign: float,
         seen.append(Measurement(**rest, **values))
     said = wrong_imu(seen, period)
     assert bool(said) == bool(word) and word in said, said
+
+
+def test_the_bias_of_a_gyro_does_not_add_up(contract: Contract) -> None:
+    """0.03 rad/s on a robot that waits for a person for 20 s."""
+    assert KEPT * contract.period < 3.0
+    rest = {name: np.zeros(3) for name in ("lin_vel", "joint_pos", "joint_vel", "joint_torque", "foot_contact")}
+    still = Measurement(**rest, ang_vel=np.full(3, 0.03), gravity=np.array([0.0, 0.0, -1.0]), acceleration=np.array([0.0, 0.0, 9.81]))
+    assert wrong_imu([still] * KEPT, contract.period) == ""
 
 
 @pytest.fixture(scope="module", params=["go1_flat", "go2_flat"])

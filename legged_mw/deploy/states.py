@@ -34,7 +34,8 @@ PLUMB, PULL = 30.0, (8.0, 12.0)  # [deg] between gravity and what the accelerome
 STANDS = 0.3  # [rad] from the pose, at most, where a policy may begin; ours: the shipped policies walk off from there
 
 
-_IMU, _KEPT = ("ang_vel", "gravity", "acceleration"), 1000  # what is kept of a measurement while the robot stands up, and of how many
+_IMU = ("ang_vel", "gravity", "acceleration")
+KEPT = 125  # measurements that are kept while the robot stands up: 2.5 s, as the bias of a gyro adds up
 
 
 def _in_turns(values: Floats) -> Floats:
@@ -197,7 +198,7 @@ class States:
         In the second half of it a robot with three feet or more sways to both sides, so that its IMU is seen to roll.
         """
         contract = self.controller.contract
-        if len(self._rise) < _KEPT:
+        if len(self._rise) < KEPT:
             self._rise.append(replace(measured, **{name: np.array(getattr(measured, name)) for name in _IMU}))
             if self._legs:
                 self._down.append(self._legs.down(measured))
