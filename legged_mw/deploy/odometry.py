@@ -115,7 +115,8 @@ class Odometry:
     def leaning(self, angles: Floats, axis: Floats) -> Floats:
         """(D,) how far each joint turns while the body turns by 1 rad about ``axis`` (3,) over feet that stay."""
         place, slopes = self._feet_of(angles, np.array([0.0, 0.0, -1.0]))
-        return np.linalg.lstsq(slopes.reshape(-1, slopes.shape[2]), np.cross(place, axis).ravel(), rcond=0.01)[0]
+        found = np.linalg.lstsq(slopes.reshape(-1, slopes.shape[2]), np.cross(place, axis).ravel(), rcond=0.01)[0]
+        return np.array(found, dtype=float)
 
     def _legs(self, angles: Floats, speeds: Floats, torques: Floats, gyro: Floats, gravity: Floats) -> tuple[Floats, Floats, Floats]:
         """Of one robot, without the leading axis."""
