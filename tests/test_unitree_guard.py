@@ -207,6 +207,50 @@ def test_the_end(bench: Bench) -> None:
     assert bench.ended() and bench.wire.sent[-1] == DAMPING and bench.guard.tripped == ""
 
 
+class FakeCommander:
+    """Keeps what the policy's process sends."""
+
+    def __init__(self) -> None:
+        self.sent = list[bytes]()
+
+    def send(self, body: bytes) -> None:
+        self.sent.append(body)
+
+
+@pytest.fixture
+def ends(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Guarded, FakeCommander, socket.socket]]:
+    """The policy's side while the robot moves, and the guard's end of its channel, which nobody serves."""
+    monkeypatch.setattr(guard, "AFTER", 0.1)
+    with tempfile.TemporaryFile() as file:
+        file.truncate(4096)
+        here, there = socket.socketpair()
+        there.sendall(b'{"ready": true}\n')
+        owner = Guarded(here, Board(file.fileno(), 64), commander := FakeCommander())
+        owner.arm(DAMPING)
+        owner.send(MOVING, 0.0, False)
+        with here, there:
+            yield owner, commander, there
+
+
+@pytest.mark.parametrize("ending", ["stopped", "killed before", "killed meanwhile"])
+def test_a_guard_that_cannot_end_the_run_is_replaced(ending: str, ends: tuple[Guarded, FakeCommander, socket.socket]) -> None:
+    owner, commander, there = ends
+    served = 3 * (guard._FRAME.size + SIZE) if ending == "killed meanwhile" else 0
+
+    def take(left: int) -> None:
+        while left > 0:
+            left -= len(there.recv(left))
+        there.close()
+
+    thread = threading.Thread(target=take, args=(served,))
+    if ending != "stopped":
+        thread.start()
+    if ending == "killed before":
+        thread.join()
+    assert guard.INSTEAD in owner.close(DAMPING)
+    assert len(commander.sent) > 1 and set(commander.sent) == {DAMPING}
+
+
 # ---- processes
 
 POLICY = """

@@ -35,6 +35,7 @@ LATE = 0.06  # [s] ours: three periods at 50 Hz without a command; docs/faults.m
 STILL = 0.04  # [s] ours, between two turns of the guard: it was stopped, or this computer slept, and the policy's process damps
 REPEAT = 0.002  # [s] between two messages to the robot [unitree_sdk2's examples]
 AFTER = 1.0  # [s] ours: how long damping is sent before the wire is let go
+SIGN = 0.1  # [s] ours, for the guard to answer the last command; then the policy's process damps, too
 START = 60.0  # [s] for a guard to find the robot
 PRIORITY = 30  # ours, of a real-time process: before the policy's, which it must outlive
 GONE = "the guard of the wire is gone"
@@ -177,21 +178,24 @@ class Guarded:
             self._commander.send(self._damping)
 
     def close(self, last: bytes) -> str:
-        """Returns the latency of measurements, as the guard saw it."""
+        """Returns the latency of measurements, as the guard saw it; of a guard that does not answer, why this process damped."""
         said: dict[str, Any] = {}
-        if last and not self._instead and self._channel.fileno() >= 0:
+        if asked := bool(last) and not self._instead and self._channel.fileno() >= 0:
             self._put(CLOSE, 0.0, last)
-            self._channel.settimeout(AFTER + 2.0)
-            said = self._answer()
-        self._channel.close()
+            self._channel.settimeout(SIGN)
+            if not (said := self._answer()):
+                self._damp_instead(GONE)
         end = self._clock() + AFTER
         while self._instead and self._clock() < end:
             self._commander.send(self._damping)
             time.sleep(REPEAT)
+        if asked and not said:
+            said = self._answer()  # of one that was only slow
+        self._channel.close()
         if self.process:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(0.0 if self._instead else AFTER + 2.0)
-        return said.get("report", "")
+        return said.get("report", self._instead if asked else "")
 
     def _ended(self) -> bool:
         """Whether the guard's end of the channel is closed."""
