@@ -247,8 +247,32 @@ def test_a_guard_that_cannot_end_the_run_is_replaced(ending: str, ends: tuple[Gu
         thread.start()
     if ending == "killed before":
         thread.join()
-    assert guard.INSTEAD in owner.close(DAMPING)
+    why = guard.DEAF if ending == "stopped" else guard.GONE
+    assert owner.close(DAMPING) == f"{why}; {guard.INSTEAD}"
     assert len(commander.sent) > 1 and set(commander.sent) == {DAMPING}
+
+
+def test_a_guard_that_takes_nothing_more_is_not_gone(ends: tuple[Guarded, FakeCommander, socket.socket]) -> None:
+    owner, commander, _ = ends
+    owner._channel.settimeout(0.01)
+    while not commander.sent:
+        owner.send(MOVING, 0.0, False)
+    with pytest.raises(RobotError, match=guard.DEAF):
+        owner.receive()
+
+
+def test_a_pause_of_the_policy_is_not_the_guards(ends: tuple[Guarded, FakeCommander, socket.socket]) -> None:
+    """Between its look at the board and at the clock, either way round."""
+    owner, commander, _ = ends
+    now, get = [100.0], owner._board.get
+
+    def pauses() -> guard.Posted:
+        posted = get()._replace(turn=now[0])
+        now[0] += 2.0 * guard.STILL
+        return posted
+
+    owner._clock, owner._board.get = lambda: now[0], pauses  # type: ignore[method-assign]
+    assert owner.receive() is None and not commander.sent
 
 
 # ---- processes

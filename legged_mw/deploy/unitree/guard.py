@@ -39,6 +39,7 @@ SIGN = 0.1  # [s] ours, for the guard to answer the last command; then the polic
 START = 60.0  # [s] for a guard to find the robot
 PRIORITY = 30  # ours, of a real-time process: before the policy's, which it must outlive
 GONE = "the guard of the wire is gone"
+DEAF = "the guard of the wire does not listen"
 INSTEAD = "this process damps the joints in its place"
 _TURN = 0.001  # [s] at most between two looks at the wire
 _BOARD = struct.Struct("<IddI512s")  # checksum of what follows, time of the guard's turn, stamp of the state, bytes of the text, text
@@ -153,8 +154,9 @@ class Guarded:
     def receive(self) -> Any:
         from legged_mw.deploy.unitree.link import Received
 
+        now = self._clock()  # before the board: a pause between the two is not the guard's
         body, stamp, text, turn = self._board.get()
-        silent = self._clock() - turn
+        silent = now - turn
         if self._ended():
             self._damp_instead(GONE)
         elif self._moving and silent > STILL:
@@ -184,7 +186,7 @@ class Guarded:
             self._put(CLOSE, 0.0, last)
             self._channel.settimeout(SIGN)
             if not (said := self._answer()):
-                self._damp_instead(GONE)
+                self._damp_instead(GONE if self._ended() else DEAF)
         end = self._clock() + AFTER
         while self._instead and self._clock() < end:
             self._commander.send(self._damping)
@@ -214,6 +216,8 @@ class Guarded:
     def _put(self, kind: int, stamp: float, body: bytes) -> None:
         try:
             self._channel.sendall(_FRAME.pack(kind, stamp) + body)
+        except TimeoutError:
+            self._damp_instead(DEAF)
         except OSError:
             self._damp_instead(GONE)
 
