@@ -204,6 +204,7 @@ def test_the_end(bench: Bench) -> None:
     bench.send(guard.MOVE, MOVING, stamp=clock())
     bench.send(guard.CLOSE, DAMPING)
     assert b"from a measurement to its target: median " in bench.here.recv(4096)
+    assert DAMPING in bench.wire.sent  # the answer says that it is sent
     assert bench.ended() and bench.wire.sent[-1] == DAMPING and bench.guard.tripped == ""
 
 

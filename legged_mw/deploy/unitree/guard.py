@@ -316,6 +316,7 @@ class Guard:
             self._damping = body
         elif kind == CLOSE:
             self._command, self._moving, self._until = body, False, now + AFTER
+            self.wire.send(body)  # before the answer: from then on nobody else sends it
             self.tell({"report": self._report()})
         elif not self.tripped:
             self._command, self._moving, self._heard = body, kind == MOVE, now
