@@ -31,6 +31,7 @@ from legged_mw.deploy.unitree.link import RobotEnd, Wire
 from legged_mw.deploy.unitree.remote import encode
 from legged_mw.deploy.unitree.serve import STEP, Record, SimulatedUnitree
 
+ALONE = 0.22  # [s] of 12 measurements, in which a part that is frozen alone can be known
 SOON = 0.1  # [s] within which joints must be damped
 RISE, WALK = 0.1, 0.2  # [s] in lockstep: to stand up, as it stands at first, and to walk before the fault
 
@@ -369,6 +370,10 @@ def interrupts(rig: Rig) -> None:
     raise KeyboardInterrupt
 
 
+def frozen_alone(rig: Rig) -> float:
+    return (rig.injected or 0.0) + ALONE
+
+
 TWO = "two robots answer: 2 programs publish rt/lowstate in domain [0-9]+ on lo"
 SILENT = r"the guard of the wire was silent for [0-9]+ ms; this process damps|nothing was sent for [0-9]+ ms: the guard stood still"
 OLD = r"the newest measurement is [0-9]+ ms old, more than 40"
@@ -385,14 +390,23 @@ CASES: dict[str, Case] = {
     "low battery": Case("the battery has 20.0 V, less than 24", "low_battery=20"),
     "states that stay away for 60 ms": Case(OLD, pauses),
     "frozen state": Case("4 measurements in a row are the same", "frozen"),
-    "frozen joints": Case("joint_(pos|vel) is the same in 4 measurements in a row", "stuck=q,stuck=dq"),
-    "frozen angles": Case("joint_pos is the same in 4 measurements in a row", "stuck=q"),
-    "frozen speeds": Case("joint_vel is the same in 4 measurements in a row", "stuck=dq"),
-    "frozen IMU": Case("(ang_vel|gravity) is the same in 4 measurements in a row", "stuck=gyroscope,stuck=quaternion"),
-    "frozen gyro": Case("ang_vel is the same in 4 measurements in a row", "stuck=gyroscope"),
-    "frozen orientation": Case("gravity is the same in 4 measurements in a row", "stuck=quaternion"),
+    "frozen joints": Case(
+        "joint_(pos|vel) is the same in 12 measurements in a row", "stuck=q,stuck=dq", known=frozen_alone, known_after=ALONE
+    ),
+    "frozen angles": Case("joint_pos is the same in 12 measurements in a row", "stuck=q", known=frozen_alone, known_after=ALONE),
+    "frozen speeds": Case("joint_vel is the same in 12 measurements in a row", "stuck=dq", known=frozen_alone, known_after=ALONE),
+    "frozen IMU": Case(
+        "(ang_vel|gravity) is the same in 12 measurements in a row",
+        "stuck=gyroscope,stuck=quaternion",
+        known=frozen_alone,
+        known_after=ALONE,
+    ),
+    "frozen gyro": Case("ang_vel is the same in 12 measurements in a row", "stuck=gyroscope", known=frozen_alone, known_after=ALONE),
+    "frozen orientation": Case(
+        "gravity is the same in 12 measurements in a row", "stuck=quaternion", known=frozen_alone, known_after=ALONE
+    ),
     "stuck encoder": Case(
-        "the angle of FL_calf_joint is the same in 6 measurements in a row",
+        "the angle of FL_calf_joint is the same in 12 measurements in a row",
         "stuck=FL_calf_joint",
         known=lambda rig: rig.read_at,
         known_after=0.5,

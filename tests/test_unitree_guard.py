@@ -204,7 +204,76 @@ def test_the_end(bench: Bench) -> None:
     bench.send(guard.MOVE, MOVING, stamp=clock())
     bench.send(guard.CLOSE, DAMPING)
     assert b"from a measurement to its target: median " in bench.here.recv(4096)
+    assert DAMPING in bench.wire.sent  # the answer says that it is sent
     assert bench.ended() and bench.wire.sent[-1] == DAMPING and bench.guard.tripped == ""
+
+
+class FakeCommander:
+    """Keeps what the policy's process sends."""
+
+    def __init__(self) -> None:
+        self.sent = list[bytes]()
+
+    def send(self, body: bytes) -> None:
+        self.sent.append(body)
+
+
+@pytest.fixture
+def ends(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Guarded, FakeCommander, socket.socket]]:
+    """The policy's side while the robot moves, and the guard's end of its channel, which nobody serves."""
+    monkeypatch.setattr(guard, "AFTER", 0.1)
+    with tempfile.TemporaryFile() as file:
+        file.truncate(4096)
+        here, there = socket.socketpair()
+        there.sendall(b'{"ready": true}\n')
+        owner = Guarded(here, Board(file.fileno(), 64), commander := FakeCommander())
+        owner.arm(DAMPING)
+        owner.send(MOVING, 0.0, False)
+        with here, there:
+            yield owner, commander, there
+
+
+@pytest.mark.parametrize("ending", ["stopped", "killed before", "killed meanwhile"])
+def test_a_guard_that_cannot_end_the_run_is_replaced(ending: str, ends: tuple[Guarded, FakeCommander, socket.socket]) -> None:
+    owner, commander, there = ends
+    served = 3 * (guard._FRAME.size + SIZE) if ending == "killed meanwhile" else 0
+
+    def take(left: int) -> None:
+        while left > 0:
+            left -= len(there.recv(left))
+        there.close()
+
+    thread = threading.Thread(target=take, args=(served,))
+    if ending != "stopped":
+        thread.start()
+    if ending == "killed before":
+        thread.join()
+    why = guard.DEAF if ending == "stopped" else guard.GONE
+    assert owner.close(DAMPING) == f"{why}; {guard.INSTEAD}"
+    assert len(commander.sent) > 1 and set(commander.sent) == {DAMPING}
+
+
+def test_a_guard_that_takes_nothing_more_is_not_gone(ends: tuple[Guarded, FakeCommander, socket.socket]) -> None:
+    owner, commander, _ = ends
+    owner._channel.settimeout(0.01)
+    while not commander.sent:
+        owner.send(MOVING, 0.0, False)
+    with pytest.raises(RobotError, match=guard.DEAF):
+        owner.receive()
+
+
+def test_a_pause_of_the_policy_is_not_the_guards(ends: tuple[Guarded, FakeCommander, socket.socket]) -> None:
+    """Between its look at the board and at the clock, either way round."""
+    owner, commander, _ = ends
+    now, get = [100.0], owner._board.get
+
+    def pauses() -> guard.Posted:
+        posted = get()._replace(turn=now[0])
+        now[0] += 2.0 * guard.STILL
+        return posted
+
+    owner._clock, owner._board.get = lambda: now[0], pauses  # type: ignore[method-assign]
+    assert owner.receive() is None and not commander.sent
 
 
 # ---- processes

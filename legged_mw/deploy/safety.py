@@ -26,12 +26,12 @@ TORQUE = "torque"  # an action's origin: its targets are torques
 OFF = math.inf  # a limit that is never passed
 # What no joint and no gyro measures; ours: wheels turn far, and gyros end at 35 rad/s. Also NaN and infinity are beyond it.
 _ABSURD = {"joint_pos": (1e5, "rad"), "joint_vel": (1e4, "rad/s"), "ang_vel": (1e3, "rad/s")}
-# A part of a measurement that stands still to the last bit is frozen if meanwhile, within Limits.frozen measurements, another part
-# moved so far; ours: an encoder's or a gyro's smallest step is a hundredth of it, and a robot that stands moves less.
-_MOVED = 0.03  # [rad] of a joint by its speed, of the body by gyro or gravity
-_SWUNG = 0.05  # [rad] of a joint, from which no gyro and no gravity stays the same
+# A part of a measurement that stands still to the last bit is frozen if meanwhile, within _ALONE * Limits.frozen measurements, another
+# part moved so far; ours: an encoder's or a gyro's smallest step is a hundredth of it, and a robot that stands moves less.
+_ALONE = 3.0  # 0.24 s at 50 Hz: a part with coarse steps may repeat for a while, the whole measurement may not
+_MOVED = 0.05  # [rad] of a joint by its speed, of the body by gyro or gravity, of a target while the body moves
+_SWUNG = 0.1  # [rad] of a joint, from which no gyro and no gravity stays the same
 _ASKED = 0.2  # [rad] of a joint's target, from which no encoder does
-_LONGER = 1.5  # so many times longer is looked at one encoder: a joint that carries weight follows late
 _UNIT = 0.1  # by which the length of gravity may differ from 1; ours: a unit quaternion in float32 gives 1e-6
 
 
@@ -155,8 +155,10 @@ class Safety:
         """As if nothing had been measured, asked or missed."""
         self._last: Floats | None = None  # targets (D,) of the step before
         self._held: Floats | None = None  # what the servos were told then
-        self._seen = deque[_Seen](maxlen=round(_LONGER * self.limits.frozen) if self.limits.frozen < OFF else 1)
-        self._lived = set[str]()  # parts that changed: what is not measured never does
+        self._seen = deque[_Seen](maxlen=max(1, math.ceil(_ALONE * self.limits.frozen)) if self.limits.frozen < OFF else 1)
+        self._same = dict.fromkeys(_Seen._fields[:4], 0)  # measurements in a row in which a part is the same
+        self._stuck = np.zeros(len(self.contract.joints), int)  # (D,) the same of one angle
+        self._lived = set[str]()  # parts but joint_pos that changed: what is not measured never does
         self._late: deque[float] = deque()  # [s] of steps that began late, within the last second
         self._remote: float | None = None  # [s] when the remote was last there
 
@@ -221,37 +223,46 @@ class Safety:
         return self._alive(measured)
 
     def _alive(self, measured: Measurement) -> Trip | None:
-        """Whether one part of the measurement stands still while others say that it cannot."""
+        """Whether the measurement stands still, or one part of it while others say that it cannot."""
         still = measured.joint_pos if self._held is None else self._held
         parts = measured.joint_pos, measured.joint_vel, measured.ang_vel, measured.gravity, still
-        self._seen.append(_Seen(*map(np.array, parts)))  # copies: a robot may measure into the same arrays
-        if len(self._seen) < self.limits.frozen:
-            return None
-        long = _Seen(*map(np.array, zip(*self._seen, strict=True)))
-        seen = _Seen(*(values[-int(self.limits.frozen) :] for values in long))
-        count, period = len(seen.joint_pos), self.contract.period
-        same = {name: bool((values == values[0]).all()) for name, values in seen._asdict().items()}
-        if same["joint_pos"] and same["joint_vel"] and same["ang_vel"]:
+        seen = _Seen(*map(np.array, parts))  # copies: a robot may measure into the same arrays
+        before = self._seen[-1] if self._seen else seen
+        self._seen.append(seen)
+        self._stuck = np.where(seen.joint_pos == before.joint_pos, self._stuck + 1, 1)
+        self._same["joint_pos"] = int(self._stuck.min())
+        for i, name in enumerate(_Seen._fields[1:4], start=1):
+            self._same[name] = self._same[name] + 1 if seen[i].tobytes() == before[i].tobytes() else 1
+            if seen is not before and self._same[name] == 1:
+                self._lived.add(name)
+        if (count := min(self._same[name] for name in ("joint_pos", "joint_vel", "ang_vel"))) >= self.limits.frozen:
             return Trip("frozen", f"{count} measurements in a row are the same")
-        moved, went = _most_of(seen.joint_pos[-1] - seen.joint_pos[0]), _most_of(period * seen.joint_vel[1:].sum(axis=0))
-        leant, turns = _most_of(seen.gravity[-1] - seen.gravity[0]), np.cross(seen.ang_vel, seen.gravity)
-        turned = _most_of(period * turns[1:].sum(axis=0))
-        drives, swings = _most_of(np.ptp(seen.target, axis=0)) > _ASKED or max(leant, turned) > _MOVED, moved > _SWUNG
+        stuck = self._stuck >= _ALONE * self.limits.frozen
+        frozen = [name for name in ("joint_pos", *sorted(self._lived)) if self._same[name] >= _ALONE * self.limits.frozen]
+        return self._contradicted(frozen, stuck) if frozen or stuck.any() else None
+
+    def _contradicted(self, frozen: list[str], stuck: Any) -> Trip | None:
+        """The first of the parts that are ``frozen`` and the joints that are ``stuck`` (D,) of which others say that it must move."""
+        seen = _Seen(*map(np.array, zip(*self._seen, strict=True)))
+        count, period = len(seen.joint_pos), self.contract.period
+        told = np.ptp(seen.target[: count - count // 3], axis=0)  # what is told just now needs time to move a joint
+        went = np.ptp(period * np.cumsum(seen.joint_vel, axis=0), axis=0)
+        moved, leant = float(np.ptp(seen.joint_pos, axis=0).max()), float(np.ptp(seen.gravity, axis=0).max())
+        turned = float(np.ptp(period * np.cumsum(np.cross(seen.ang_vel, seen.gravity), axis=0), axis=0).max())
+        # A body that is carried or pushed may keep its joints' angles.
+        drives = told.max() > _ASKED or (told.max() > _MOVED and max(leant, turned) > _MOVED)
         moves = {
-            "joint_pos": drives or went > _MOVED,
+            "joint_pos": drives or went.max() > _MOVED,
             "joint_vel": drives or moved > _MOVED,
-            "ang_vel": swings or leant > _MOVED,
-            "gravity": swings or turned > _MOVED,
+            "ang_vel": moved > _SWUNG or leant > _MOVED,
+            "gravity": moved > _SWUNG or turned > _MOVED,
         }
-        for name in moves:
-            if same[name] and moves[name] and name in {*self._lived, "joint_pos"}:
+        for name in frozen:
+            if moves[name]:
                 return Trip("frozen", f"{name} is the same in {count} measurements in a row, though the robot moves")
-        self._lived |= {name for name in moves if not same[name]}
-        far = (np.abs(period * long.joint_vel[1:].sum(axis=0)) > _MOVED) | (np.ptp(long.target, axis=0) > _ASKED)
-        stuck = far & (long.joint_pos == long.joint_pos[0]).all(axis=0)
-        if len(self._seen) == self._seen.maxlen and stuck.any():
-            joint = self.contract.joints[_first(stuck)]
-            return Trip("frozen", f"the angle of {joint} is the same in {len(self._seen)} measurements in a row, though it is driven")
+        if (wrong := stuck & ((went > _MOVED) | (told > _ASKED))).any():
+            joint = self.contract.joints[_first(wrong)]
+            return Trip("frozen", f"the angle of {joint} is the same in {count} measurements in a row, though it is driven")
         return None
 
     def _on_time(self, now: float, behind: float) -> Trip | None:
@@ -310,11 +321,6 @@ class Safety:
         name, ends = self.contract.joints[joint], f"{low[joint]:.2f} to {high[joint]:.2f}"
         beyond = max(low[joint] - values[joint], values[joint] - high[joint])
         return Trip(limit, f"{name} {words} {values[joint]:.2f} rad, {beyond:.2f} beyond its range {ends}; {margin:.2f} is the most")
-
-
-def _most_of(values: Floats) -> float:
-    """The largest, without signs; 0 of none."""
-    return float(np.abs(values).max(initial=0.0))
 
 
 def _first(wrong: Any) -> int:

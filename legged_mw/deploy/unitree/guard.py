@@ -35,9 +35,11 @@ LATE = 0.06  # [s] ours: three periods at 50 Hz without a command; docs/faults.m
 STILL = 0.04  # [s] ours, between two turns of the guard: it was stopped, or this computer slept, and the policy's process damps
 REPEAT = 0.002  # [s] between two messages to the robot [unitree_sdk2's examples]
 AFTER = 1.0  # [s] ours: how long damping is sent before the wire is let go
+SIGN = 0.1  # [s] ours, for the guard to answer the last command; then the policy's process damps, too
 START = 60.0  # [s] for a guard to find the robot
 PRIORITY = 30  # ours, of a real-time process: before the policy's, which it must outlive
 GONE = "the guard of the wire is gone"
+DEAF = "the guard of the wire does not listen"
 INSTEAD = "this process damps the joints in its place"
 _TURN = 0.001  # [s] at most between two looks at the wire
 _BOARD = struct.Struct("<IddI512s")  # checksum of what follows, time of the guard's turn, stamp of the state, bytes of the text, text
@@ -152,8 +154,9 @@ class Guarded:
     def receive(self) -> Any:
         from legged_mw.deploy.unitree.link import Received
 
+        now = self._clock()  # before the board: a pause between the two is not the guard's
         body, stamp, text, turn = self._board.get()
-        silent = self._clock() - turn
+        silent = now - turn
         if self._ended():
             self._damp_instead(GONE)
         elif self._moving and silent > STILL:
@@ -177,21 +180,24 @@ class Guarded:
             self._commander.send(self._damping)
 
     def close(self, last: bytes) -> str:
-        """Returns the latency of measurements, as the guard saw it."""
+        """Returns the latency of measurements, as the guard saw it; of a guard that does not answer, why this process damped."""
         said: dict[str, Any] = {}
-        if last and not self._instead and self._channel.fileno() >= 0:
+        if asked := bool(last) and not self._instead and self._channel.fileno() >= 0:
             self._put(CLOSE, 0.0, last)
-            self._channel.settimeout(AFTER + 2.0)
-            said = self._answer()
-        self._channel.close()
+            self._channel.settimeout(SIGN)
+            if not (said := self._answer()):
+                self._damp_instead(GONE if self._ended() else DEAF)
         end = self._clock() + AFTER
         while self._instead and self._clock() < end:
             self._commander.send(self._damping)
             time.sleep(REPEAT)
+        if asked and not said:
+            said = self._answer()  # of one that was only slow
+        self._channel.close()
         if self.process:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self.process.wait(0.0 if self._instead else AFTER + 2.0)
-        return said.get("report", "")
+        return said.get("report", self._instead if asked else "")
 
     def _ended(self) -> bool:
         """Whether the guard's end of the channel is closed."""
@@ -210,6 +216,8 @@ class Guarded:
     def _put(self, kind: int, stamp: float, body: bytes) -> None:
         try:
             self._channel.sendall(_FRAME.pack(kind, stamp) + body)
+        except TimeoutError:
+            self._damp_instead(DEAF)
         except OSError:
             self._damp_instead(GONE)
 
@@ -308,6 +316,7 @@ class Guard:
             self._damping = body
         elif kind == CLOSE:
             self._command, self._moving, self._until = body, False, now + AFTER
+            self.wire.send(body)  # before the answer: from then on nobody else sends it
             self.tell({"report": self._report()})
         elif not self.tripped:
             self._command, self._moving, self._heard = body, kind == MOVE, now

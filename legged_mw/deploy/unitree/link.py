@@ -139,6 +139,7 @@ class Commander:
 
     def __init__(self, package: str, interface: str, domain: int) -> None:
         self.package, self._where = package, f"domain {domain} on {interface}"
+        self._wait, self.clock = lambda: time.sleep(0.001), clock
         self._participant = join(interface, domain)
         self._sample = RAW[package, "LowCmd_"]
         self._out = _writer(self._participant, COMMANDS, self._sample)
@@ -148,11 +149,15 @@ class Commander:
 
     def wait(self, readers: int, seconds: float) -> None:
         """Until so many programs read commands, so that the first one is not lost. Raises RobotError if they do not."""
-        end = clock() + seconds
-        while len(self._out.get_matched_subscriptions()) < readers:
-            if clock() > end:
-                raise RobotError(f"no robot reads {COMMANDS} in {self._where}: nothing was sent")
-            time.sleep(0.001)
+        if not self._until(lambda: len(self._out.get_matched_subscriptions()) >= readers, seconds):
+            raise RobotError(f"no robot reads {COMMANDS} in {self._where}: nothing was sent")
+
+    def _until(self, found: Callable[[], Any], seconds: float) -> Any:
+        """The first result of ``found`` that is true; after so many seconds its last one."""
+        end = self.clock() + seconds
+        while not (result := found()) and self.clock() < end:
+            self._wait()
+        return result
 
 
 class Wire(Commander):
@@ -197,7 +202,8 @@ class Wire(Commander):
     def another_robot(self) -> str:
         """Why states may come from another robot than the one that was prepared; "" if they do not.
 
-        Publishers are counted: what they say, and when, may be the same. One whose robot was heard just now is not that one again.
+        Publishers are counted: what they say, and when, may be the same. If the prepared robot was heard within AGAIN [s], a new publisher
+        is another robot; else it may be the same robot, started again.
         """
         others = self._publishers() - {self._robot}
         if not self._robot or not others:
@@ -235,12 +241,6 @@ class Wire(Commander):
             raise RobotError(taken(self._where))
         self._one_robot(LEASE)
         return self._until(self.receive, 0.1) or state
-
-    def _until(self, found: Callable[[], Any], seconds: float) -> Any:
-        end = self.clock() + seconds
-        while not (result := found()) and self.clock() < end:
-            self._wait()
-        return result
 
     def _nobody(self, seconds: float) -> str:
         """Why no state came."""
