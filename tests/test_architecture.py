@@ -41,7 +41,7 @@ ONLY_IN = {
         "legged_mw/programs.py",
     ],
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/studio.py"],  # young, and not on every platform
-    "legged_mw.check": ["legged_mw/check/*", "legged_mw/programs.py"],
+    "legged_mw.check": ["legged_mw/check/*", "legged_mw/robot/page.py", "legged_mw/programs.py"],
     "legged_mw.robot": ["legged_mw/robot/*", "legged_mw/programs.py"],
     "legged_mw.drawing": [
         "legged_mw/drawing/*",

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import math
+import random
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from program import SMALL, run
@@ -14,6 +17,7 @@ from worlds import make_env
 
 from legged_mw import ROOT
 from legged_mw.envs.checks import PAYS, WITHOUT, check_class, check_values
+from legged_mw.rl.health import Health
 from legged_mw.robot.page import doubts
 from legged_mw.sim.errors import ModelError
 from legged_mw.utils.bounds import bare, bounds_text
@@ -353,12 +357,34 @@ def test_a_fall_of_a_users_own_that_ends_every_episode_is_named(tmp_path: Path) 
     assert PLACE + "_fallen" in line
 
 
-@pytest.mark.parametrize("task", ["go1_flat", "g1_getup"])
-def test_doubts_draw_no_number(task: str) -> None:
-    """A training is the same with them."""
-    before = torch.get_rng_state()
-    doubts(load_task(task))
-    assert torch.equal(torch.get_rng_state(), before)
+@pytest.mark.parametrize("name", ["go1_flat", "g1_getup"])
+def test_doubts_draw_no_number(name: str, tmp_path: Path) -> None:
+    """A training is the same with them, also of a task that draws from Python's generator and numpy's."""
+    task = load_task(name)
+    if name == "go1_flat":
+        task = mine(tmp_path, "def _init_buffers(self):\n    super()._init_buffers()\n    random.random(), np.random.rand()")
+        vars(sys.modules[task.env_class.__module__]).update(random=random, np=np)
+    before = torch.get_rng_state(), random.getstate(), str(np.random.get_state())
+    doubts(task)
+    assert torch.equal(torch.get_rng_state(), before[0]) and (random.getstate(), str(np.random.get_state())) == before[1:]
+
+
+def test_doubts_keep_the_ground_of_a_task_and_never_fail(tmp_path: Path) -> None:
+    """Also where its class fails on a plane, or where so few robots fail."""
+    own = "def _init_buffers(self):\n    super()._init_buffers()\n    self.mine = {}"
+    task = mine(tmp_path, own.format("self.tiles.levels.clone()"))
+    [line] = doubts(task)[1]
+    assert "AttributeError" in line and doubts(task)[0] == []
+    task.set("terrain.mesh_type", "heightfield")
+    assert doubts(task) == ([], [])
+
+
+def test_only_the_first_rank_looks_at_few_robots(monkeypatch: pytest.MonkeyPatch) -> None:
+    task = load_task("go1_flat")
+    task.set("termination.min_base_height", "5")
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.setenv("RANK", "1")
+    assert doubts(task) == ([], [])
 
 
 def test_episodes_of_one_step_are_said_when_training_begins_and_after_two_iterations(tmp_path: Path) -> None:
@@ -367,6 +393,12 @@ def test_episodes_of_one_step_are_said_when_training_begins_and_after_two_iterat
     warned = [line for line in result.out.splitlines() if line.lower().startswith("warning")]
     assert result.code == 0 and [field in line for line in warned] == [True, False]
     assert "iteration 2: episodes last 1.0 steps" in warned[1] and " fell" in warned[1] and "timed out" not in warned[1]
+
+
+def test_episodes_of_one_step_are_said_once_after_a_resume_too() -> None:
+    numbers = {"episodes": 8.0, "episode_length": 1.0, "fell": 8.0, "broken": 0.0}
+    health = Health([], [])
+    assert [len(health.lengths(numbers)) for _ in range(3)] == [0, 1, 0]  # whatever the number of the iteration is
 
 
 @pytest.mark.parametrize(("kp", "what"), [("0", "sags"), ("25000", "unstable")])

@@ -334,7 +334,11 @@ BREACHES: dict[str, tuple[str, str, str]] = {
     "numpy's random numbers": (END_STEP, "self.past += np.random.rand()", f"Mine._end_step: {DRAWS}"),
     "a generator of numpy's": (END_STEP, "self.past += RNG.normal()", f"Mine._end_step: {DRAWS}"),
     "a buffer without a device": (INIT, "self.own = torch.zeros(self.num_envs)", f"Mine._init_ranges: zeros() {ON_HOST}"),
-    "a number without a device": (INIT, "self.own = torch.tensor(0.5)", f"Mine._init_ranges: tensor() {ON_HOST}"),
+    "computed from a number without a device": (
+        INIT,
+        "self.own = torch.tensor(0.5).expand(4)",
+        f"Mine._init_ranges: tensor() {ON_HOST}",
+    ),
     "computed without a device": (
         INIT,
         "self.own = {'a': torch.arange(3)[None] / 2.0 + 1.0}['a']",
@@ -427,6 +431,9 @@ ORDINARY = {
     "on the device": (END_STEP, "self.past.add_(self.moved + self.net(self.past[:, None])[:, 0])"),
     "in place by a training": (ANNEAL, "self.past.fill_(done); self.slots.one.copy_(self.past)"),
     "random numbers between steps": (ANNEAL, "self.past.fill_(random.random() + RNG.normal())"),
+    "a number without a device": (INIT, "self.own = torch.tensor(0.5)"),
+    "a file's, moved by a call": (INIT, "self.own = torch.as_tensor(AT_IMPORT, device=self.device)"),
+    "fresh, moved by a call": (INIT, "self.own = torch.asarray(torch.tensor([1.0]), device=self.device)"),
     "row of a buffer": (TABLE, "Row('past', self.past[:, None])"),
 }
 

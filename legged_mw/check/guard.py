@@ -52,9 +52,9 @@ def check_recordable(task: LoadedTask) -> None:
                     f"{name} is made where its file is read, on the host, and the step reads it; make it in _init_buffers, on self.device"
                 )
                 guard.on_host[value.untyped_storage().data_ptr()] = value, what, kind.__name__
-    with _nothing_changed(), Births(guard):
+    with nothing_changed(), Births(guard):
         try:
-            env = _watched(task.env_class, guard)(_tiny(task.cfg), "cpu", True)
+            env = _watched(task.env_class, guard)(tiny_cfg(task.cfg), "cpu", True)
             for name in ("step", "reset", "refresh"):  # the engine of a CPU may ask the host
                 if method := getattr(env.sim, name, None):
                     setattr(env.sim, name, _unwatched(method, guard))
@@ -74,7 +74,7 @@ def check_recordable(task: LoadedTask) -> None:
             raise StepError(what, f"{task.name}: {where}".removesuffix(": ")) from error
 
 
-def _tiny(cfg: RobotTaskCfg) -> RobotTaskCfg:
+def tiny_cfg(cfg: RobotTaskCfg) -> RobotTaskCfg:
     """The same task in a few worlds, on a terrain of two tiles if it has one."""
     tiny = copy.deepcopy(cfg)
     tiny.env.num_envs, tiny.sim.engine, tiny.sim.threads = _WORLDS, "mujoco", 1
@@ -232,7 +232,7 @@ def _draws(env: RobotTask) -> Callable[[], list[object]]:
 
 
 @contextmanager
-def _nothing_changed() -> Iterator[None]:
+def nothing_changed() -> Iterator[None]:
     """Random numbers and threads are afterwards as they were; inside torch has one thread."""
     threads, python, numpy = torch.get_num_threads(), random.getstate(), np.random.get_state()
     torch.set_num_threads(1)

@@ -66,7 +66,8 @@ class Births(TorchFunctionMode):
     def __torch_function__(self, func: Callable[..., Any], types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
         kwargs = kwargs or {}
         result, name = func(*args, **kwargs), getattr(func, "__name__", "")
-        if name == "to" and _moves(args[1:], kwargs):  # which is nothing on a CPU
+        given_one = name in _HOST_WRITES and kwargs.get("device") is not None  # as_tensor(x, device=...)
+        if given_one or (name == "to" and _moves(args[1:], kwargs)):  # which is nothing on a CPU
             return result.clone() if _address(result) in self._known else result
         made = [value for value in (result if isinstance(result, tuple | list) else [result]) if isinstance(value, Tensor)]
         fresh = [value for value in made if _address(value) not in self._known] if kwargs.get("device") is None else []
@@ -106,7 +107,11 @@ class _DispatchGuard(TorchDispatchMode):
             raise NotRecordable(found)
         if self.guard.on and self.guard.on_host:
             for value in tree_leaves((args, kwargs)):
-                if isinstance(value, Tensor) and (known := self.guard.on_host.get(_address(value))):
+                # a number without dimensions is an argument of a kernel, also on the host; but it is not copied from, nor written
+                kernel = func.overloadpacket.__name__
+                held = kernel == "copy_" or (kernel.endswith("_") and value is args[0])
+                number = isinstance(value, Tensor) and value.dim() == 0 and not held
+                if isinstance(value, Tensor) and not number and (known := self.guard.on_host.get(_address(value))):
                     raise NotRecordable(*known[1:])
         if self.guard.on and self.guard.on_write:
             for i, argument in enumerate(func._schema.arguments):

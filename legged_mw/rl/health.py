@@ -18,6 +18,7 @@ class Health:
         self._names, self._stored = names, stored
         self.undone = 0  # updates, in all
         self._row, self._sick = 0, 0  # updates undone, and iterations with too many suspects, one after the other
+        self._heard = 0  # iterations of this process
         self._said: dict[str, float] = {}  # name -> count when it was said last
 
     def judge(self, counts: Sequence[float], steps: int, undone: bool, wrong: Sequence[float]) -> tuple[list[str], str]:
@@ -41,16 +42,16 @@ class Health:
             return warnings, f"{worst} is not finite, or beyond {BOUND:g}, in {share}; look at how it is computed"
         return warnings, ""
 
-    def lengths(self, iteration: int, numbers: Mapping[str, float]) -> list[str]:
-        """A line after two iterations in which episodes lasted a step: how they end."""
-        if iteration != 2 or not numbers["episodes"] or numbers["episode_length"] > 1.5:
+    def lengths(self, numbers: Mapping[str, float]) -> list[str]:
+        """A line after the second iteration of this process, if episodes lasted a step: how they end."""
+        self._heard += 1
+        if self._heard != 2 or not numbers["episodes"] or numbers["episode_length"] > 1.5:
             return []
         fell, broken = numbers["fell"], numbers["broken"]
         ends = {"fell": fell, "had a state that is not finite": broken, "timed out": numbers["episodes"] - fell - broken}
         said = ", ".join(f"{count:.0f} {end}" for end, count in ends.items() if count)
-        return [
-            f"episodes last {numbers['episode_length']:.1f} steps ({said}): nothing can be learned; --check names the rule that ends them"
-        ]
+        lasted = f"episodes last {numbers['episode_length']:.1f} steps ({said})"
+        return [f"{lasted}: unless that is meant, nothing can be learned; --check names the rule that ends them"]
 
     def _by_name(self, counts: Sequence[float]) -> dict[str, float]:
         """Those that were found: of a row with several columns the worst one's count."""

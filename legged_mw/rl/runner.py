@@ -253,7 +253,7 @@ class Runner(OnPolicyRunner):
         rows = {**console_rows(numbers, losses, speed, collect, learn), "Total steps": f"{report.total_steps}"}
         self.console.iteration(report.iteration, self.plan.last, self._next_exam(report.iteration), numbers, rows, speed)
         warnings, verdict = self._health.judge(suspects, report.steps, undone > 0, wrong)
-        warnings += self._health.lengths(report.iteration, numbers)
+        warnings += self._health.lengths(numbers)
         print("".join(f"WARNING: iteration {report.iteration}: {line}\n" for line in warnings), end="", flush=True)
         if verdict:
             self.diverged, self.stop = self.diverged or verdict, self.stop or "learning has died"
