@@ -155,7 +155,11 @@ def test_an_export_of_flat_ground_has_no_steps(export: Path) -> None:
 @pytest.mark.parametrize(
     ("right", "wrong", "message"),
     [
-        ('gainprm="35"', 'gainprm="36"', r"policy.yaml: stiffness is \[35\..*, but terrain.mjz has \[36\..*; export the policy again"),
+        (
+            'gainprm="35"',
+            'gainprm="36"',
+            r"policy.yaml: stiffness is \[35\..*, but terrain.mjz has \[36\..*; change both, or export the policy again",
+        ),
         ('name="gyro/imu"', 'name="gyro"', "no sensor 'gyro/imu' in terrain.mjz; "),
         ('<gyro site="imu" ', '<framequat objtype="site" objname="imu" ', r"terrain.mjz: the sensors of 'ang_vel' .* have 4 values, not 3"),
     ],

@@ -88,7 +88,7 @@ def test_outputs(case: Case, tmp_path: Path) -> None:
         (["--out", "/proc/nosuch/x.npz"], "--out /proc/nosuch/x.npz: cannot be written"),
         (["--out", ""], "--out is empty: name the file to write"),
         (["--out", "folder.npz"], "that is a folder; name a file"),
-        (["--rate", "nan"], "argument --rate: the value is nan; it must be finite"),
+        (["--rate", "nan"], "argument --rate: the value is nan; it must be above 0"),
         (["--rate", "0"], "argument --rate: the value is 0.0; it must be above 0"),
         (["--fps", "inf"], "argument --fps: the value is inf; it must be finite"),
         (["--lift", "nan"], "argument --lift: the value is nan; it must be finite"),
