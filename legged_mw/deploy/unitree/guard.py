@@ -156,13 +156,13 @@ class Guarded:
 
         now = self._clock()  # before the board: a pause between the two is not the guard's
         body, stamp, text, turn = self._board.get()
-        silent = now - turn
+        silent, known = now - turn, self._instead
         if self._ended():
             self._damp_instead(GONE)
         elif self._moving and silent > STILL:
             self._damp_instead(f"the guard of the wire was silent for {1000 * silent:.0f} ms")
         if text or self._instead:
-            raise RobotError(text or self._instead)
+            raise RobotError(known or text or self._instead)  # a guard that goes on takes this process for another program
         if stamp == self._last:
             return None
         self._last = stamp
