@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from legged_mw.envs.domain_rand import active
+from legged_mw.envs.own_code import own_classes
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.estimator import find_targets
 from legged_mw.sim.room import count_room
@@ -47,7 +48,7 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
 
 def _own_terms(env: RobotTask) -> list[str]:
     """Reward terms that the user's classes write."""
-    own = [kind for kind in type(env).__mro__ if not kind.__module__.startswith("legged_mw.")]
+    own = own_classes(type(env))
     return sorted({name.removeprefix("_reward_") for kind in own for name in vars(kind) if name.startswith("_reward_")})
 
 

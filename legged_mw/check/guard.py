@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from legged_mw.check.recordable import Births, Guard, recordable
-from legged_mw.envs.own_code import check_term, place_of
+from legged_mw.envs.own_code import check_term, own_classes, place_of
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.suspects import BOUND
@@ -45,7 +45,7 @@ def check_recordable(task: LoadedTask) -> None:
     for a method that raises, or returns NaN or the wrong shape. Random numbers go on as if it had not been called.
     """
     guard = Guard()
-    for kind in _own_kinds(task.env_class):
+    for kind in own_classes(task.env_class):
         for name, value in (_of_file(kind) | dict(vars(kind))).items():
             if isinstance(value, Tensor):
                 what = (
@@ -87,15 +87,10 @@ def tiny_cfg(cfg: RobotTaskCfg) -> RobotTaskCfg:
 def _own_methods(env_class: type) -> list[str]:
     """What the user's classes have in the place of ours, each with its line: where our code fails, one of these is not what it expects."""
     found = []
-    for kind in _own_kinds(env_class):
+    for kind in own_classes(env_class):
         names = [name for name in vars(kind) if name == "__init__" or not name.startswith(("__", "_abc"))]
         found += [(kind, name, vars(kind)[name]) for name in names if hasattr(kind.__mro__[1], name) or name.startswith("_reward_")]
     return [place_of(value) if inspect.isroutine(value) else f"{kind.__name__}.{name} = {value!r:.40}" for kind, name, value in found]
-
-
-def _own_kinds(env_class: type) -> list[type]:
-    """The classes of an environment that are the user's."""
-    return [kind for kind in env_class.__mro__ if not kind.__module__.startswith("legged_mw.") and kind is not object]
 
 
 def _of_file(kind: type) -> dict[str, Any]:
@@ -219,7 +214,7 @@ def _check_kept(env: RobotTask, before: dict[Path, Any], step: Callable[[], None
 
 def _draws(env: RobotTask) -> Callable[[], list[object]]:
     """What tells the states of Python's and numpy's generators: the global ones, those that ``env`` holds, those of the user's files."""
-    files = [value for kind in _own_kinds(type(env)) for value in _of_file(kind).values()]
+    files = [value for kind in own_classes(type(env)) for value in _of_file(kind).values()]
     values = [*files, *(value for _, value in _held(env))]
     python = [value for value in values if isinstance(value, random.Random)]
     numpy = [value.bit_generator for value in values if isinstance(value, np.random.Generator)]

@@ -27,8 +27,8 @@ def checksum(said: Mapping[str, Any]) -> str:
 
 def sealed(said: Mapping[str, Any]) -> dict[str, Any]:
     """A contract with both lines."""
-    said = {**said, EXPORTED: ""}
-    return {**said, EXPORTED: base64.b64encode(zlib.compress(_bound(said).encode(), 9)).decode(), CHECKSUM: checksum(said)}
+    text = _bound({**said, EXPORTED: ""}).encode()
+    return {**said, EXPORTED: base64.b64encode(zlib.compress(text, 9)).decode(), CHECKSUM: hashlib.sha256(text).hexdigest()}
 
 
 def changes(said: Mapping[str, Any]) -> list[str]:

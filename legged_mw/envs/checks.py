@@ -13,7 +13,7 @@ from typing import Any
 from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, active
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
-from legged_mw.envs.own_code import place_of
+from legged_mw.envs.own_code import own_classes, place_of
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
 from legged_mw.utils.bounds import Range
 from legged_mw.utils.commands import HEADING
@@ -171,9 +171,8 @@ def _unusual_signs(env_class: type, scales: Mapping[str, float]) -> Iterator[str
 
 def _own(env_class: type) -> Iterator[tuple[type, str, Callable[..., Any]]]:
     """(class, name, method) of all methods that the user's classes write."""
-    for kind in env_class.__mro__:
-        if not kind.__module__.startswith("legged_mw.") and kind is not object:
-            yield from ((kind, name, value) for name, value in vars(kind).items() if inspect.isfunction(value))
+    for kind in own_classes(env_class):
+        yield from ((kind, name, value) for name, value in vars(kind).items() if inspect.isfunction(value))
 
 
 def _does_something(parents: tuple[type, ...], name: str) -> bool:

@@ -1,4 +1,4 @@
-"""What the methods of a task's class must return, and where they are written: for errors that name the line."""
+"""The user's classes of a task, what their methods must return, and where they are written: for errors that name the line."""
 
 from __future__ import annotations
 
@@ -34,6 +34,11 @@ def checked_rows(env: Any) -> Mapping[str, Any]:
             got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
             raise StepError(f"row '{row.name}' of '{group}' is {got}; it must be a tensor ({count}, size), a row a world", where)
     return table
+
+
+def own_classes(env_class: type) -> list[type]:
+    """The classes of an environment that are the user's, the child first."""
+    return [kind for kind in env_class.__mro__ if not kind.__module__.startswith("legged_mw.") and kind is not object]
 
 
 def place_of(method: Any) -> str:

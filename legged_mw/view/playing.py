@@ -29,6 +29,7 @@ NOMINAL = {  # what playing changes in the trained config
     "perturbation.push": False,
     "domain_rand.enable": False,
     "commands.curriculum": False,
+    "gait.random_start": False,
     "motion.random_start": False,  # from a clip's start to its end
     "falls.pull": 0.0,
     "falls.share": 1.0,  # of a task that gets up: a reset is another fall
