@@ -33,7 +33,8 @@ from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.motor_network import MotorNetwork
 from legged_mw.utils.task import load_task
 
-NOTHING: dict[str, Any] = {"domain_rand.enable": True, **{f"domain_rand.{name}": [] for name in KINDS}}  # is drawn but what is added
+# is drawn but what is added
+NOTHING: dict[str, Any] = {"domain_rand.enable": True, **{f"domain_rand.{name}": [] for name in KINDS}}
 SMALL = 0.02  # what goes into a softsign that should let it through
 
 
@@ -91,7 +92,15 @@ def make_env(task_name: str, law: str, num_envs: int, device: str, engine: str, 
     return env
 
 
-LAWS = ("servo", "servo, 0 to 20 ms late", "dc_motor", "torque", "network, 32-32 MLP", "network, 2 x 8 LSTM", "_compute_torques")
+LAWS = (
+    "servo",
+    "servo, 0 to 20 ms late",
+    "dc_motor",
+    "torque",
+    "network, 32-32 MLP",
+    "network, 2 x 8 LSTM",
+    "_compute_torques",
+)
 
 
 def timed(env: RobotTask, actions: list[Tensor]) -> float:
@@ -123,7 +132,10 @@ def main() -> None:
     name = torch.cuda.get_device_name(device) if device != "cpu" else f"CPU, {usable_cores()} cores"
     print(f"{args.task}, {worlds} worlds on {name}, engine {pick_engine(args.engine, device)}")
     with tempfile.TemporaryDirectory() as folder:
-        envs = {law: make_env(args.task, law, worlds, device, args.engine, Path(folder), args.calls * args.rounds) for law in LAWS}
+        envs = {
+            law: make_env(args.task, law, worlds, device, args.engine, Path(folder), args.calls * args.rounds)
+            for law in LAWS
+        }
     joints = next(iter(envs.values())).num_actions
     actions = [0.3 * torch.randn(worlds, joints, device=device) for _ in range(args.calls)]
     with torch.inference_mode():  # as in training

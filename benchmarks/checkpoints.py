@@ -46,20 +46,30 @@ def line(result: dict[str, Any]) -> str:
     if "kinds" in result:
         return f"{start}\n{crossing.table(result)}"
     if "walks" not in result:
-        return f"{start}  " + "  ".join(f"{name} {value:.3f}" for name, value in result.items() if name not in ("iteration", "seconds"))
+        return f"{start}  " + "  ".join(
+            f"{name} {value:.3f}" for name, value in result.items() if name not in ("iteration", "seconds")
+        )
     figures = [f"{name} {', '.join(f'{value:.3f}' for value in result[name])}" for name in ("error", "offset", "worst")]
-    drift, cost = (f"{result[name]:.3f}" if result[name] is not None else "-" for name in ("drift", "cost_of_transport"))
+    drift, cost = (
+        f"{result[name]:.3f}" if result[name] is not None else "-" for name in ("drift", "cost_of_transport")
+    )
     pushes = ", ".join(f"{share:g}" for share in result["pushes"].values())
     walks = "beats" if result.get("beats_peer") and result["walks"] else "walks" if result["walks"] else "-----"
-    return f"{start}  {walks}  falls {result['falls']}  {'  '.join(figures)}  drift {drift}  pushes {pushes}  cost {cost}"
+    return (
+        f"{start}  {walks}  falls {result['falls']}  {'  '.join(figures)}  drift {drift}  pushes {pushes}  cost {cost}"
+    )
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, help="a run folder")
     parser.add_argument("--task", help="its task, where that is a file outside of the clone")
-    parser.add_argument("--every", type=int, default=1, help="iterations between graded checkpoints; the last one is always graded")
-    parser.add_argument("--until", type=int, default=10**9, help="the last iteration to grade; then the newest checkpoint is not")
+    parser.add_argument(
+        "--every", type=int, default=1, help="iterations between graded checkpoints; the last one is always graded"
+    )
+    parser.add_argument(
+        "--until", type=int, default=10**9, help="the last iteration to grade; then the newest checkpoint is not"
+    )
     parser.add_argument("--ranges", choices=["trained", "common"], default="trained")
     parser.add_argument("--crossing", action="store_true", help="the exam's rough part instead")
     parser.add_argument("--device")
@@ -72,7 +82,9 @@ def main() -> None:
     require_exam(task)
     if task.exam != "walking":
         perform.prepare(task)
-        grade: Callable[[Any, Any], dict[str, Any]] = partial(perform.first_part, skill=perform.skill_of(task.cfg, task.exam))
+        grade: Callable[[Any, Any], dict[str, Any]] = partial(
+            perform.first_part, skill=perform.skill_of(task.cfg, task.exam)
+        )
     else:
         (crossing if args.crossing else exam).prepare(task)
         grade = crossing.run_crossing if args.crossing else exam.run_exam

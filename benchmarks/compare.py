@@ -107,7 +107,10 @@ def child(order: Order) -> None:
             reply: dict[str, Any] = {"missing": True}
         else:
             measured = MEASURE[order.framework](order)
-            versions = {"python": platform.python_version(), **{name: importlib.metadata.version(name) for name in framework.versions}}
+            versions = {
+                "python": platform.python_version(),
+                **{name: importlib.metadata.version(name) for name in framework.versions},
+            }
             reply = {"measured": measured._asdict(), "versions": versions}
     except Exception as error:
         traceback.print_exc()
@@ -137,7 +140,9 @@ def measure_legged_mw(order: Order) -> Measured:
     sizes = {role: sum(env.obs_buf[group].shape[1] for group in groups) for role, groups in cfg["obs_groups"].items()}
     facts = {**physics_facts(env.robot.physics, task.cfg.control.decimation), "rewards": f"{len(env.reward_names)}"}
     mirrored = "it learns from the mirror image of every sample too: twice the minibatch shown"
-    return measure_runner(runner, cfg, sizes, order, facts, [mirrored] if task.train.symmetry.use_data_augmentation else [])
+    return measure_runner(
+        runner, cfg, sizes, order, facts, [mirrored] if task.train.symmetry.use_data_augmentation else []
+    )
 
 
 def measure_mjlab(order: Order) -> Measured:
@@ -156,15 +161,19 @@ def measure_mjlab(order: Order) -> Measured:
     configure_torch_backends()
     env = ManagerBasedRlEnv(cfg=env_cfg, device=order.device)
     notes = ["no log is written, so rsl-rl's statistics, which read the device every step, are off"]
-    if int(importlib.metadata.version("mujoco-warp").partition(".")[0]) >= 4:  # which it does not ask for, but runs with
-        env.sim.wp_model.opt.warn_overflow = 0  # else each world that needs all solver iterations prints a line from its kernel
+    # which it does not ask for, but runs with
+    if int(importlib.metadata.version("mujoco-warp").partition(".")[0]) >= 4:
+        # else each world that needs all solver iterations prints a line from its kernel
+        env.sim.wp_model.opt.warn_overflow = 0
         env.sim.create_graph()
         notes.append(QUIET)
     wrapped = RslRlVecEnvWrapper(env, clip_actions=learner.clip_actions)
     runner = (load_runner_cls(task) or MjlabOnPolicyRunner)(wrapped, asdict(learner), None, order.device)
     sizes = {role: value.shape[1] for role, value in wrapped.get_observations().items()}
     rewards = {"rewards": f"{len(env.reward_manager.active_terms)}"}
-    return measure_runner(runner, asdict(learner), sizes, order, {**physics_facts(env.sim.mj_model, env_cfg.decimation), **rewards}, notes)
+    return measure_runner(
+        runner, asdict(learner), sizes, order, {**physics_facts(env.sim.mj_model, env_cfg.decimation), **rewards}, notes
+    )
 
 
 def measure_runner(
@@ -205,7 +214,8 @@ def measure_playground(order: Order) -> Measured:
     from mujoco_playground.config import locomotion_params
 
     task = FRAMEWORKS["playground"].tasks[order.ground]
-    machine = jax.devices()[0].device_kind if order.device != "cpu" else cpu_name()  # fails here without a GPU build of jax
+    # fails here without a GPU build of jax
+    machine = jax.devices()[0].device_kind if order.device != "cpu" else cpu_name()
     env, rewards, changed = load_playground(task, order)
     params = locomotion_params.brax_ppo_config(task, order.impl).to_dict()
     layers = params.pop("network_factory")
@@ -252,13 +262,21 @@ def time_brax(env: Any, params: dict[str, Any], layers: dict[str, Any], order: O
     from mujoco_playground import wrapper
 
     if not hasattr(jax, "device_put_replicated"):  # jax 0.10 dropped it, brax 0.14.2 calls it once, at the start
-        jax.device_put_replicated = lambda tree, devices: jax.tree.map(lambda x: jax.numpy.stack([x] * len(devices)), tree)
+        jax.device_put_replicated = lambda tree, devices: jax.tree.map(
+            lambda x: jax.numpy.stack([x] * len(devices)), tree
+        )
     rollouts = order.num_envs * max(1, params["batch_size"] * params["num_minibatches"] // order.num_envs)
     if rollouts % params["num_minibatches"]:
-        raise ValueError(f"{rollouts} rollouts are not {params['num_minibatches']} minibatches; take a power of two for --num_envs")
+        raise ValueError(
+            f"{rollouts} rollouts are not {params['num_minibatches']} minibatches; take a power of two for --num_envs"
+        )
     steps = rollouts * params["unroll_length"]
     marks: list[float] = []  # ends of epochs: the first two compile, each further one is a round
-    asked = {"num_envs": order.num_envs, "num_evals": 3 + ROUNDS, "num_timesteps": (2 + ROUNDS) * order.iterations * steps}
+    asked = {
+        "num_envs": order.num_envs,
+        "num_evals": 3 + ROUNDS,
+        "num_timesteps": (2 + ROUNDS) * order.iterations * steps,
+    }
     ppo.train(
         env,
         **{**params, **asked, "batch_size": rollouts // params["num_minibatches"], "num_resets_per_eval": 0},
@@ -321,7 +339,9 @@ def ask(python: str, order: Order, env: dict[str, str], timeout: float, verbose:
     print(f"measuring {order.framework} at {order.num_envs} worlds ...", file=sys.stderr, flush=True)
     errors = None if verbose else subprocess.PIPE
     try:
-        ended = subprocess.run(command, env=env, timeout=timeout, text=True, errors="replace", stdout=subprocess.PIPE, stderr=errors)
+        ended = subprocess.run(
+            command, env=env, timeout=timeout, text=True, errors="replace", stdout=subprocess.PIPE, stderr=errors
+        )
     except OSError as error:
         return failed(failure=f"failed: no interpreter {python} ({error.strerror})")
     except subprocess.TimeoutExpired:
@@ -368,13 +388,22 @@ def results(rows: list[Row]) -> str:
 def conditions(rows: list[Row], ground: str) -> str:
     """What was measured under which conditions, a column a framework; then versions and what else differs."""
     last = {row.framework: row for row in rows if row.measured and row.versions}
-    facts = {name: {"task": FRAMEWORKS[name].tasks[ground], **row.measured.facts} for name, row in last.items() if row.measured}
+    facts = {
+        name: {"task": FRAMEWORKS[name].tasks[ground], **row.measured.facts}
+        for name, row in last.items()
+        if row.measured
+    }
     keys = dict.fromkeys(key for column in facts.values() for key in column)
     lines = [f"{'':<20}" + "".join(f"{name:<34}" for name in facts)]
     lines += [f"{key:<20}" + "".join(f"{column.get(key, ''):<34}" for column in facts.values()) for key in keys]
-    lines += ["", "Each task and learner is the framework's own default; only the number of worlds is set. Logging is off."]
+    lines += [
+        "",
+        "Each task and learner is the framework's own default; only the number of worlds is set. Logging is off.",
+    ]
     for name, row in last.items():
-        lines.append(f"{name}: " + ", ".join(f"{package} {version}" for package, version in (row.versions or {}).items()))
+        lines.append(
+            f"{name}: " + ", ".join(f"{package} {version}" for package, version in (row.versions or {}).items())
+        )
         lines += [f"  - {note}" for note in (row.measured.notes if row.measured else [])]
     return "\n".join(line.rstrip() for line in lines)
 
@@ -383,15 +412,29 @@ def parse() -> argparse.Namespace:
     from legged_mw.utils.cli import Parser, positive
 
     parser = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
-    parser.add_argument("--num_envs", type=positive, nargs="+", metavar="N", help="worlds (default: 4096 16384; on a CPU 16)")
+    parser.add_argument(
+        "--num_envs", type=positive, nargs="+", metavar="N", help="worlds (default: 4096 16384; on a CPU 16)"
+    )
     parser.add_argument("--device", metavar="D", help="cuda:0, cpu, ... (default: the GPU if there is one)")
-    parser.add_argument("--ground", choices=("flat", "rough"), default="flat", help="which of each framework's tasks (default: flat)")
-    parser.add_argument("--iterations", type=positive, metavar="N", help=f"in each of {ROUNDS} rounds (default: 10; on a CPU 1)")
-    parser.add_argument("--only", nargs="+", choices=tuple(FRAMEWORKS), default=list(FRAMEWORKS), help="frameworks to measure")
+    parser.add_argument(
+        "--ground", choices=("flat", "rough"), default="flat", help="which of each framework's tasks (default: flat)"
+    )
+    parser.add_argument(
+        "--iterations", type=positive, metavar="N", help=f"in each of {ROUNDS} rounds (default: 10; on a CPU 1)"
+    )
+    parser.add_argument(
+        "--only", nargs="+", choices=tuple(FRAMEWORKS), default=list(FRAMEWORKS), help="frameworks to measure"
+    )
     for peer in ("mjlab", "playground"):
-        parser.add_argument(f"--python-{peer}", default=sys.executable, metavar="PATH", help=f"interpreter of {peer}'s environment")
-    parser.add_argument("--playground-impl", choices=("warp", "jax"), help="its physics (default: warp; on a CPU jax, the faster one)")
-    parser.add_argument("--timeout", type=float, default=1800, metavar="S", help="seconds that one measurement may take")
+        parser.add_argument(
+            f"--python-{peer}", default=sys.executable, metavar="PATH", help=f"interpreter of {peer}'s environment"
+        )
+    parser.add_argument(
+        "--playground-impl", choices=("warp", "jax"), help="its physics (default: warp; on a CPU jax, the faster one)"
+    )
+    parser.add_argument(
+        "--timeout", type=float, default=1800, metavar="S", help="seconds that one measurement may take"
+    )
     return parser.parse_args()
 
 
@@ -411,7 +454,9 @@ def main() -> None:
             order = Order(name, num_envs, iterations, "cpu" if cpu else "cuda:0", impl, args.ground)
             rows.append(ask(pythons[name], order, environment, args.timeout, args.verbose))
     machines = ", ".join(dict.fromkeys(row.measured.machine for row in rows if row.measured)) or device
-    print(f"Go1 on {args.ground} ground, training on {machines}: median of {ROUNDS} rounds of {iterations} iterations after a warm-up\n")
+    print(
+        f"Go1 on {args.ground} ground, training on {machines}: median of {ROUNDS} rounds of {iterations} iterations after a warm-up\n"
+    )
     print(results(rows), end="\n\n")
     if any(row.measured for row in rows):
         print(conditions(rows, args.ground))

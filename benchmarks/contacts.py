@@ -64,7 +64,10 @@ def main() -> None:
     name = torch.cuda.get_device_name(device) if device != "cpu" else "CPU"
     print(f"{args.task}, {num_envs} worlds on {name}, engine {pick_engine(args.engine, device)}")
     engine, steps = {"sim.engine": args.engine}, args.calls * args.rounds
-    envs = {what: make_env(args.task, num_envs, device, engine | more, steps) for what, more in variants(args.colliders).items()}
+    envs = {
+        what: make_env(args.task, num_envs, device, engine | more, steps)
+        for what, more in variants(args.colliders).items()
+    }
     times: dict[str, list[float]] = {what: [] for what in envs}
     with torch.inference_mode():
         actions = 0.3 * torch.randn(num_envs, next(iter(envs.values())).num_actions, device=device)

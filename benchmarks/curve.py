@@ -37,7 +37,11 @@ def read(run: Path) -> dict[str, dict[int, float]]:
     events = EventAccumulator(str(run), size_guidance={"scalars": 0})
     events.Reload()
     tags = events.Tags()["scalars"]
-    curve = {column: {event.step: event.value for event in events.Scalars(tag)} for column, tag in COLUMNS.items() if tag in tags}
+    curve = {
+        column: {event.step: event.value for event in events.Scalars(tag)}
+        for column, tag in COLUMNS.items()
+        if tag in tags
+    }
     rewards = events.Scalars(COLUMNS["reward"])
     took = [0.0, *(after.wall_time - before.wall_time for before, after in pairwise(rewards))]
     seconds = accumulate(spent if spent < PAUSE else 0.0 for spent in took)
@@ -67,13 +71,24 @@ def draw(curve: dict[str, dict[int, float]], path: Path) -> None:
     if right is not left:
         for column, unit in (("error_vx", "m/s"), ("error_vy", "m/s"), ("error_yaw", "rad/s")):
             values = curve[column]
-            right.plot([seconds[step] for step in values], [*values.values()], marker="o", ms=3, lw=1, label=f"{column} [{unit}]")
+            right.plot(
+                [seconds[step] for step in values],
+                [*values.values()],
+                marker="o",
+                ms=3,
+                lw=1,
+                label=f"{column} [{unit}]",
+            )
         right.set(xlabel="seconds of training", ylabel="small exam, mean error", ylim=(0, 0.5))
         right.legend(frameon=False)
         right.grid(alpha=0.3)
     buffer = io.BytesIO()
     figure.savefig(buffer, dpi=100)
-    small = Image.open(buffer).convert("RGB").quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE)
+    small = (
+        Image.open(buffer)
+        .convert("RGB")
+        .quantize(256, method=Image.Quantize.MAXCOVERAGE, kmeans=3, dither=Image.Dither.NONE)
+    )
     small.convert("RGB").save(path, lossless=True, quality=100, method=6)
 
 
@@ -87,7 +102,9 @@ def main() -> None:
     write_csv(curve, args.out / "curve.csv", args.every)
     draw(curve, args.out / "curve.webp")
     last = max(curve["seconds"])
-    print(f"{args.run}: {last} iterations, {curve['steps'][last] / 1e6:.0f} M steps, {curve['seconds'][last]:.0f} s of training")
+    print(
+        f"{args.run}: {last} iterations, {curve['steps'][last] / 1e6:.0f} M steps, {curve['seconds'][last]:.0f} s of training"
+    )
 
 
 if __name__ == "__main__":

@@ -32,7 +32,28 @@ PATHS = sorted({path for task in TASKS for cfg in (task.cfg, task.train) for pat
 FOLDER = Path(tempfile.mkdtemp())
 SEEDS = ["a: &a [*a]", "seed: 1:30", "env: {num_envs: 0x_}", "? [a]\n: 1", "!!int x", "%YAML 1.99\n---\na: 1"]
 SEEDS += ['"\\ud800"', "<<: *a", "- - - -"]
-PIECES = ["&a ", "*a", "!!int ", "{", "[", "]", "}", ": ", "- ", "\n", "\t", "'", '"', "#", "|", "?", "\x00", "\ud7ff", "0x", "1:30"]
+PIECES = [
+    "&a ",
+    "*a",
+    "!!int ",
+    "{",
+    "[",
+    "]",
+    "}",
+    ": ",
+    "- ",
+    "\n",
+    "\t",
+    "'",
+    '"',
+    "#",
+    "|",
+    "?",
+    "\x00",
+    "\ud7ff",
+    "0x",
+    "1:30",
+]
 counts: Counter[str] = Counter()
 
 
@@ -45,7 +66,13 @@ SECTIONS = [section for task in TASKS for section in re.split(r"\n(?=\w)", writt
 
 numbers = st.one_of(st.integers(), st.floats(), st.sampled_from([10**20, 10**400, -1, 0, 1e39, 5e-324]))
 values = st.recursive(
-    st.one_of(st.none(), st.booleans(), numbers, st.text(), st.sampled_from(["mujoco", "*", "state", "hip", ".nan", "1e400", "elu"])),
+    st.one_of(
+        st.none(),
+        st.booleans(),
+        numbers,
+        st.text(),
+        st.sampled_from(["mujoco", "*", "state", "hip", ".nan", "1e400", "elu"]),
+    ),
     lambda inner: st.one_of(st.lists(inner, max_size=4), st.dictionaries(st.text(max_size=8), inner, max_size=4)),
     max_leaves=8,
 )
@@ -60,7 +87,12 @@ def mutated(draw: Any) -> str:
         at, kind = generator.randrange(len(text) + 1), generator.randrange(4)
         piece = generator.choice(PIECES)
         end = min(len(text), at + generator.randrange(1, 12))
-        text = (text[:at] + piece + text[at:], text[:at] + text[end:], text[:end] + text[at:], text[:at] + piece + text[end:])[kind]
+        text = (
+            text[:at] + piece + text[at:],
+            text[:at] + text[end:],
+            text[:end] + text[at:],
+            text[:at] + piece + text[end:],
+        )[kind]
     return text
 
 
@@ -93,7 +125,9 @@ def watched(work: Any) -> None:
 
 
 PHASES = (Phase.generate, Phase.shrink)
-ENDLESS = settings(max_examples=500, deadline=None, database=None, suppress_health_check=list(HealthCheck), phases=PHASES)
+ENDLESS = settings(
+    max_examples=500, deadline=None, database=None, suppress_health_check=list(HealthCheck), phases=PHASES
+)
 
 
 @ENDLESS

@@ -18,7 +18,9 @@ from legged_mw.sim.terrain import MEASURES, measure
 from legged_mw.utils.cli import one_line_errors, pick_device, seed_everything
 
 
-def shares(asked: str, kind: str, low: float, high: float, repeats: int, engine: str, device: str) -> tuple[list[float], list[float]]:
+def shares(
+    asked: str, kind: str, low: float, high: float, repeats: int, engine: str, device: str
+) -> tuple[list[float], list[float]]:
     """What a policy is asked at ten heights, from ``low`` to ``high`` in the kind's unit, and the share of robots that cross."""
     trained = find_trained(asked, ROOT / "logs", "policy")
     task, (first, last) = trained.task, (measure(kind, difficulty)[1] for difficulty in (0.0, 1.0))
@@ -39,7 +41,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("policy", help="a run folder, a checkpoint or an export")
     parser.add_argument("--kind", choices=[*MEASURES], default="stairs_up")
-    parser.add_argument("--heights", type=float, nargs=2, default=[15.0, 19.5], metavar=("LOW", "HIGH"), help="in the kind's unit")
+    parser.add_argument(
+        "--heights", type=float, nargs=2, default=[15.0, 19.5], metavar=("LOW", "HIGH"), help="in the kind's unit"
+    )
     parser.add_argument("--robots", type=int, default=100, help="at each of ten heights; an even number")
     parser.add_argument("--engine", choices=["auto", "mujoco", "mujoco_warp"], default="auto")
     parser.add_argument("--device")

@@ -140,7 +140,10 @@ def measure(folder: Path, seconds: float, path: Path) -> str:
     said: list[str] = []
     states = States(controller, [Walker(contract)], lambda _: np.zeros(len(contract.commands)), said.append)
     count, memory = Collections(), [0, 0]  # [kB] after MINUTE, and now
-    safety, log = Safety(contract, Limits.of(folder, contract, asked={"late": "off"})), Log(path, contract, folder, "simulated")
+    safety, log = (
+        Safety(contract, Limits.of(folder, contract, asked={"late": "off"})),
+        Log(path, contract, folder, "simulated"),
+    )
 
     def watch(now: float, _: Measurement) -> None:
         if now % 1.0 < contract.period:
@@ -149,7 +152,9 @@ def measure(folder: Path, seconds: float, path: Path) -> str:
     taken = stolen()
     gc.callbacks.append(count)
     try:
-        done = run(robot, controller, lambda _: np.zeros(0), seconds, watch=watch, safety=safety, states=states, log=log)
+        done = run(
+            robot, controller, lambda _: np.zeros(0), seconds, watch=watch, safety=safety, states=states, log=log
+        )
     finally:
         gc.callbacks.remove(count)
     rows = read_log(path).rows

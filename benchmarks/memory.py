@@ -89,7 +89,11 @@ def child(task: str, worlds: Sequence[int], device: str, iterations: int, others
     for count in worlds:
         row: dict[str, Any] = {"task": task, "worlds": count}
         try:
-            row |= cpu_row(task, count, iterations) if device == "cpu" else gpu_row(task, count, device, iterations, others)
+            row |= (
+                cpu_row(task, count, iterations)
+                if device == "cpu"
+                else gpu_row(task, count, device, iterations, others)
+            )
         except Exception as error:
             if not out_of_memory(error) and "of memory" not in str(error):
                 raise
@@ -127,7 +131,18 @@ def gpu_row(task: str, worlds: int, device: str, iterations: int, others: int) -
 def rows(args: argparse.Namespace, task: str, worlds: Sequence[int], device: str) -> Iterator[dict[str, Any]]:
     """What a process of its own says of a task, row by row."""
     others = 0 if device == "cpu" else Peak(device).read()
-    options = ["--child", task, "--device", device, "--iterations", args.iterations, "--others", others, "--worlds", *worlds]
+    options = [
+        "--child",
+        task,
+        "--device",
+        device,
+        "--iterations",
+        args.iterations,
+        "--others",
+        others,
+        "--worlds",
+        *worlds,
+    ]
     command = [sys.executable, __file__, *map(str, options)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT)
     assert process.stdout and process.stderr
@@ -141,7 +156,11 @@ def rows(args: argparse.Namespace, task: str, worlds: Sequence[int], device: str
     if process.wait():
         text = "".join(said)
         last = (text.strip().splitlines() or ["it was killed"])[-1][:200]
-        yield {"task": task, "worlds": worlds[-1], "error": "out of memory" if out_of_memory(RuntimeError(text)) else last}
+        yield {
+            "task": task,
+            "worlds": worlds[-1],
+            "error": "out of memory" if out_of_memory(RuntimeError(text)) else last,
+        }
 
 
 class Ballast:
@@ -176,7 +195,11 @@ def smallest(args: argparse.Namespace, task: str, worlds: int, device: str, ball
         else:
             return row["error"]
     ballast.leave(1e9)
-    fits = f"fits {sizes[high]:g} GiB" if high < len(sizes) else f"fits none of {', '.join(f'{size:g}' for size in sizes)} GiB"
+    fits = (
+        f"fits {sizes[high]:g} GiB"
+        if high < len(sizes)
+        else f"fits none of {', '.join(f'{size:g}' for size in sizes)} GiB"
+    )
     return fits + (f"; out of memory with {', '.join(f'{size:g}' for size in sorted(failed))}" if failed else "")
 
 
@@ -187,7 +210,9 @@ def main() -> None:
     parser.add_argument("--worlds", type=int, nargs="+", default=[1024, 2048, 4096, 8192])
     parser.add_argument("--iterations", type=int, default=ITERATIONS)
     parser.add_argument("--fit", action="store_true", help="find the smallest of --sizes instead")
-    parser.add_argument("--sizes", type=float, nargs="+", default=[2, 3, 4, 6, 8, 12, 16, 24], help="of a GPU's memory [GiB]")
+    parser.add_argument(
+        "--sizes", type=float, nargs="+", default=[2, 3, 4, 6, 8, 12, 16, 24], help="of a GPU's memory [GiB]"
+    )
     parser.add_argument("--child", help=argparse.SUPPRESS)
     parser.add_argument("--others", type=int, default=0, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -198,15 +223,25 @@ def main() -> None:
     name = torch.cuda.get_device_name(device) if device != "cpu" else "CPU"
     print(f"{name}; torch {torch.__version__}; [GiB]")
     ballast = Ballast(device) if args.fit and device != "cpu" else None
-    print(f"{'task':>12}{'worlds':>8}" + ("" if ballast else f"{'whole':>8}{'torch':>8}{'held':>8}{'warp':>8}{'seconds':>9}"))
+    print(
+        f"{'task':>12}{'worlds':>8}"
+        + ("" if ballast else f"{'whole':>8}{'torch':>8}{'held':>8}{'warp':>8}{'seconds':>9}")
+    )
     for task in args.tasks:
         began = time.perf_counter()
         if ballast:
-            print(f"{task:>12}{args.worlds[-1]:>8}  {smallest(args, task, args.worlds[-1], device, ballast)}", flush=True)
+            print(
+                f"{task:>12}{args.worlds[-1]:>8}  {smallest(args, task, args.worlds[-1], device, ballast)}", flush=True
+            )
             continue
         for row in rows(args, task, args.worlds, device):
-            figures = "".join(f"{row[key]:>8.2f}" if key in row else f"{'-':>8}" for key in ("whole", "torch", "held", "warp"))
-            print(f"{task:>12}{row['worlds']:>8}{figures}{time.perf_counter() - began:>9.1f}  {row.get('error', '')}", flush=True)
+            figures = "".join(
+                f"{row[key]:>8.2f}" if key in row else f"{'-':>8}" for key in ("whole", "torch", "held", "warp")
+            )
+            print(
+                f"{task:>12}{row['worlds']:>8}{figures}{time.perf_counter() - began:>9.1f}  {row.get('error', '')}",
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

@@ -47,7 +47,9 @@ class Noisy(Odometry):
         rng, felt = self._rng, measured.acceleration
         noise = {row.measured: row.noise for row in self.contract.rows if row.noise}
         noise["joint_pos"] = noise.pop("joint_offset", 0.0)
-        values: dict[str, Any] = {n: getattr(measured, n) + rng.uniform(-a, a, getattr(measured, n).shape) for n, a in noise.items()}
+        values: dict[str, Any] = {
+            n: getattr(measured, n) + rng.uniform(-a, a, getattr(measured, n).shape) for n, a in noise.items()
+        }
         values["acceleration"] = felt + self._biases[0] + rng.normal(0.0, ACCELERATION, felt.shape)
         values["ang_vel"] = values.get("ang_vel", measured.ang_vel) + self._biases[1]
         values["foot_contact"] = np.abs(measured.foot_contact - (rng.random(measured.foot_contact.shape) < FLIP))
@@ -99,7 +101,15 @@ def stairs(folder: Path, contract: Contract, contact: str | None) -> str:
     standing = centre[2] - ground(model, centre[:2])
     for i in range(count):
         (x, y), angle = middles[i // HEADINGS], 2.0 * math.pi * (i % HEADINGS) / HEADINGS
-        walk.fleet.qpos[i, :7] = [x, y, ground(model, (x, y)) + standing, math.cos(angle / 2.0), 0.0, 0.0, math.sin(angle / 2.0)]
+        walk.fleet.qpos[i, :7] = [
+            x,
+            y,
+            ground(model, (x, y)) + standing,
+            math.cos(angle / 2.0),
+            0.0,
+            0.0,
+            math.sin(angle / 2.0),
+        ]
     walk.fleet.refresh()
     walk.measured = walk.fleet.read()
     fell, missed, true = np.zeros(count, dtype=bool), [], []
@@ -109,7 +119,9 @@ def stairs(folder: Path, contract: Contract, contact: str | None) -> str:
         fell |= walk.fell()
         if step * walk.dt >= 1.0:
             estimate = walk.believed_velocity()
-            missed.append(np.where(fell[:, None], np.nan, velocity - velocity if estimate is None else estimate - velocity))
+            missed.append(
+                np.where(fell[:, None], np.nan, velocity - velocity if estimate is None else estimate - velocity)
+            )
             true.append(np.where(fell, np.nan, velocity[:, 0]))
     by_kind = np.array(missed).reshape(len(missed), len(middles), HEADINGS, 2)
     rms = [f"{np.sqrt(np.nanmean(by_kind[:, i] ** 2)):.3f}" for i in range(len(middles))]
@@ -119,7 +131,9 @@ def stairs(folder: Path, contract: Contract, contact: str | None) -> str:
 
 def squares(model: Any) -> list[tuple[float, float]]:
     """Middles of the squares of terrain.mjz, which are 8 m wide."""
-    boxes = [i for i in range(model.ngeom) if model.geom_bodyid[i] == 0 and model.geom_type[i] == mujoco.mjtGeom.mjGEOM_BOX]
+    boxes = [
+        i for i in range(model.ngeom) if model.geom_bodyid[i] == 0 and model.geom_type[i] == mujoco.mjtGeom.mjGEOM_BOX
+    ]
     inside = [place for place in model.geom_pos[boxes, :2] if np.abs(place).max() < 12.0]
     return sorted({(8.0 * round(float(x) / 8.0), 8.0 * round(float(y) / 8.0)) for x, y in inside})
 
@@ -129,7 +143,9 @@ def ground(model: Any, place: Any) -> float:
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     hit = np.zeros(1, dtype=np.int32)
-    return 5.0 - mujoco.mj_ray(model, data, np.array([*place, 5.0]), np.array([0.0, 0.0, -1.0]), [1, 0, 0, 0, 0, 0], 1, -1, hit)
+    return 5.0 - mujoco.mj_ray(
+        model, data, np.array([*place, 5.0]), np.array([0.0, 0.0, -1.0]), [1, 0, 0, 0, 0, 0], 1, -1, hit
+    )
 
 
 def main() -> None:

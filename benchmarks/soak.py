@@ -71,7 +71,9 @@ class Held(NamedTuple):
 
 def who_ask() -> list[Any]:
     """Modules of environments that ask on a CPU whether there is a world to draw for."""
-    return [each for name, each in sys.modules.items() if name.startswith("legged_mw.envs") and hasattr(each, "maybe_any")]
+    return [
+        each for name, each in sys.modules.items() if name.startswith("legged_mw.envs") and hasattr(each, "maybe_any")
+    ]
 
 
 class Soak:
@@ -103,7 +105,9 @@ class Soak:
         seen, reward, ended, _ = env.step(actions)
         parts = [*seen.values(), reward[:, None], ended[:, None].float()]
         bits = torch.cat(parts, dim=1).contiguous().view(torch.int32).long()
-        self.digest.mul_(6364136223846793005).add_((bits * torch.arange(1, 2 * bits.shape[1], 2, device=self.device)).sum(dim=1))
+        self.digest.mul_(6364136223846793005).add_(
+            (bits * torch.arange(1, 2 * bits.shape[1], 2, device=self.device)).sum(dim=1)
+        )
         self.reward += reward
         wild = (~torch.cat(parts, dim=1).isfinite()).sum()
         self.totals += torch.stack([ended.sum(), env.broken.sum(), env.fell.sum(), env.time_out_buf.sum(), wild])
@@ -131,7 +135,10 @@ class Soak:
             if part * 10 >= said + 1:
                 said = int(part * 10)
                 held, rate = Held.now(self.device), self.done * self.count / (time.monotonic() - start)
-                print(f"  {self.done * self.count:,} world-steps, {rate:,.0f} a second, {self.broke} breaks, {held}", flush=True)
+                print(
+                    f"  {self.done * self.count:,} world-steps, {rate:,.0f} a second, {self.broke} breaks, {held}",
+                    flush=True,
+                )
                 before = before or (held if part >= 0.2 else None)
         gc.collect()
         end = Held.now(self.device)
@@ -176,7 +183,9 @@ def main() -> None:
     spread = math.sqrt(sum(float(mean.var()) / len(mean) for mean in means)) or math.inf
     away = abs(float(means[0].mean() - means[1].mean())) / spread
     if args.device == "cpu" and not bool(same.all()):
-        wrong.append(f"{int((~same).sum())} of {len(same)} worlds that never broke are not what they were without breaks")
+        wrong.append(
+            f"{int((~same).sum())} of {len(same)} worlds that never broke are not what they were without breaks"
+        )
     if not away < 5.0:
         wrong.append(f"the mean reward of worlds that never broke is {away:.1f} standard errors away")
     figures: dict[str, Any] = {"world_steps": broken.done * args.num_envs, "rate": round(rate), "breaks": broken.broke}
@@ -185,7 +194,11 @@ def main() -> None:
         "after a fifth": before._asdict(),
         "end": end._asdict(),
     }
-    figures |= {"other worlds bit-equal": f"{int(same.sum())} of {len(same)}", "standard errors": round(away, 3), "wrong": wrong}
+    figures |= {
+        "other worlds bit-equal": f"{int(same.sum())} of {len(same)}",
+        "standard errors": round(away, 3),
+        "wrong": wrong,
+    }
     print(json.dumps(figures, indent=1))
     raise SystemExit(bool(wrong))
 

@@ -45,7 +45,8 @@ from legged_mw.utils.cli import apply_overrides, make_parser, one_line_errors, p
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
 
-SETTINGS = ((1, 5), (3, 10), (5, 10), (10, 20), (50, 50))  # Newton, line search; the last is what the others are held against
+# Newton, line search; the last is what the others are held against
+SETTINGS = ((1, 5), (3, 10), (5, 10), (10, 20), (50, 50))
 ROUNDS, CALLS = 5, 20  # of timing
 SETTLED = 0.5  # [s] since a reset; a robot that was just put down says nothing of the solver
 
@@ -147,7 +148,9 @@ def walk(env: RobotTask, actions: Actions, steps: int) -> Walk:
     seconds = statistics.median(timed(env, actions(env)) for _ in range(ROUNDS))
     falls = float(fell) / env.num_envs / (steps * env.dt / 60)
     option = env.robot.physics.opt
-    return Walk(after, depth, slip, falls, seconds, (option.iterations, option.ls_iterations), env.sim.overflow_report())
+    return Walk(
+        after, depth, slip, falls, seconds, (option.iterations, option.ls_iterations), env.sim.overflow_report()
+    )
 
 
 def timed(env: RobotTask, actions: Tensor) -> float:
@@ -168,7 +171,14 @@ def step_ahead(env: RobotTask, setting: tuple[int, int], state: State) -> Tensor
     model.opt.iterations, model.opt.ls_iterations = setting
     cfg = env.cfg.sim
     sim = make_simulation(
-        model, env.num_envs, env.device, engine=cfg.engine, nconmax=cfg.nconmax, njmax=cfg.njmax, threads=cfg.threads, terrain=env.terrain
+        model,
+        env.num_envs,
+        env.device,
+        engine=cfg.engine,
+        nconmax=cfg.nconmax,
+        njmax=cfg.njmax,
+        threads=cfg.threads,
+        terrain=env.terrain,
     )
     guess_of(sim).copy_(state.guess)
     for name in ("qpos", "qvel", "ctrl"):
@@ -207,7 +217,9 @@ def setting(text: str) -> tuple[int, int]:
 def main() -> None:
     parser = make_parser(__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.add_argument("--settings", type=setting, nargs="+", default=SETTINGS, metavar="N/L", help="Newton / line search, best last")
+    parser.add_argument(
+        "--settings", type=setting, nargs="+", default=SETTINGS, metavar="N/L", help="Newton / line search, best last"
+    )
     parser.add_argument("--steps", type=int, default=200, help="control steps of a walk")
     args = parser.parse_args()
     args.task, device = args.task or "go1_flat", pick_device(args.device)
@@ -224,7 +236,9 @@ def main() -> None:
     )
     state = walks[args.settings[-1]].state
     best = step_ahead(env, args.settings[-1], state)
-    print("| Newton | line search | penetration mean, worst [mm] | slip [mm/s] | joint error [mrad] | falls [1/min] | step [ms] |")
+    print(
+        "| Newton | line search | penetration mean, worst [mm] | slip [mm/s] | joint error [mrad] | falls [1/min] | step [ms] |"
+    )
     print("| ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
     for pair, result in walks.items():
         error = (step_ahead(env, result.used, state) - best).double()
@@ -236,7 +250,9 @@ def main() -> None:
         )
     for pair, result in walks.items():
         if result.used != pair:
-            print(f"{pair[0]} / {pair[1]}: stepped with {result.used[0]} / {result.used[1]}, which this engine needs on this ground")
+            print(
+                f"{pair[0]} / {pair[1]}: stepped with {result.used[0]} / {result.used[1]}, which this engine needs on this ground"
+            )
         if result.note:
             print(f"{pair[0]} / {pair[1]}: {result.note}")
 

@@ -66,7 +66,10 @@ class Importers:
     def find_spec(self, name: str, path: object, target: object = None) -> None:
         package = package_of(name)
         if package not in self._by:
-            calls = [f"{Path(f.filename).parent.name}/{Path(f.filename).name}:{f.lineno}" for f in traceback.extract_stack()[:-1]]
+            calls = [
+                f"{Path(f.filename).parent.name}/{Path(f.filename).name}:{f.lineno}"
+                for f in traceback.extract_stack()[:-1]
+            ]
             self._by[package] = " < ".join([call for call in reversed(calls) if "importlib" not in call][:4])
 
     def show(self) -> None:
@@ -122,7 +125,10 @@ def import_libraries(clock: Clock, device: str | None) -> bool:
 
 def look_into_training(clock: Clock) -> Any:
     """Import legged_mw, and time what a training does before its first step. Returns the class of its runner."""
-    modules = {name: import_module(f"legged_mw.{name}") for name in ("rl.training", "check.guard", "check.describe", "eval.exams")}
+    modules = {
+        name: import_module(f"legged_mw.{name}")
+        for name in ("rl.training", "check.guard", "check.describe", "eval.exams")
+    }
     clock.done("import legged_mw")
     clock.after(modules["rl.training"], "configure", "task, config, open the device")
     clock.after(modules["check.guard"], "check_recordable", "check that the step can be recorded")
@@ -205,7 +211,9 @@ def main() -> None:
     for _ in range(2):
         command = [sys.executable, __file__, *sys.argv[1:], "--started", str(time.time())]
         with tempfile.TemporaryDirectory() as folder:  # for logs/
-            out = subprocess.run(command, cwd=folder, env=environment, check=True, stdout=subprocess.PIPE, text=True).stdout
+            out = subprocess.run(
+                command, cwd=folder, env=environment, check=True, stdout=subprocess.PIPE, text=True
+            ).stdout
         others.clear()
         for line in out.splitlines():
             if found := re.fullmatch(r"(\d+\.\d{3}) (\d+) (.+)", line):

@@ -133,7 +133,11 @@ def measure(task_name: str, engine: str, num_envs: int, device: str, calls: int,
             for name, value in env.sim.memory().items():  # as own physics found it: nobody stands up again there
                 value.copy_(state[name])
             begin_bare()
-            own_time, bare_time, step = timed(own, calls, device), timed(bare, calls, device), timed(env._graph, calls, device)
+            own_time, bare_time, step = (
+                timed(own, calls, device),
+                timed(bare, calls, device),
+                timed(env._graph, calls, device),
+            )
             rows.append((own_time, bare_time, step, timed(lambda: env.step(actions), calls, device)))
     return Times(*map(statistics.median, zip(*rows, strict=True)))
 
@@ -144,15 +148,29 @@ def main() -> None:
     parser.add_argument("--num_envs", type=int, nargs="+", default=None)
     parser.add_argument("--device", default=None)
     parser.add_argument("--engine", choices=ENGINES, default="auto")
-    parser.add_argument("--calls", type=int, default=40, help="calls a round; short, so that bare physics does not fall over")
+    parser.add_argument(
+        "--calls", type=int, default=40, help="calls a round; short, so that bare physics does not fall over"
+    )
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--eager", action="store_true", help="time the step without its recording")
     args = parser.parse_args()
     device = pick_device(args.device)
     name = torch.cuda.get_device_name(device) if device != "cpu" else f"CPU, {usable_cores()} cores"
     torch.set_num_threads(1 if device == "cpu" else torch.get_num_threads())  # as train.py does
-    print(f"{args.task} on {name}, engine {pick_engine(args.engine, device)}; torch {torch.__version__}, mujoco {mujoco.__version__}")
-    heads = ("worlds", "own physics", "step", "env.step [ms]", "own/step", "own/env.step", "bare [ms]", "bare/step", "env steps/s")
+    print(
+        f"{args.task} on {name}, engine {pick_engine(args.engine, device)}; torch {torch.__version__}, mujoco {mujoco.__version__}"
+    )
+    heads = (
+        "worlds",
+        "own physics",
+        "step",
+        "env.step [ms]",
+        "own/step",
+        "own/env.step",
+        "bare [ms]",
+        "bare/step",
+        "env steps/s",
+    )
     print("".join(f"{head:>14}" for head in heads))
     for num_envs in args.num_envs or ([256, 1024] if device == "cpu" else [1024, 4096, 16384]):
         own, bare, step, whole = measure(args.task, args.engine, num_envs, device, args.calls, args.rounds, args.eager)

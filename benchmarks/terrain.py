@@ -106,7 +106,9 @@ def with_boxes(env: LeggedRobot, count: int) -> mujoco.MjModel:
     floor = spec.geom("floor")
     floor.type, floor.size, floor.pos, floor.hfieldname = mujoco.mjtGeom.mjGEOM_PLANE, [0, 0, 0.05], [0, 0, 0], ""
     for x, y in rng.uniform(-40.0, 40.0, (count, 2)):
-        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.5, 0.5, 0.05], pos=[x, y, 0], contype=1, conaffinity=0, priority=1)
+        spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_BOX, size=[0.5, 0.5, 0.05], pos=[x, y, 0], contype=1, conaffinity=0, priority=1
+        )
     for extra in [*spec.lights, *spec.cameras]:
         spec.delete(extra)
     spec.compiler.discardvisual = True
@@ -168,7 +170,9 @@ def main() -> None:
             variant.reset()
             times[name].append(timed(variant.call, args.calls, device))
     plane = statistics.median(times["plane"])
-    print(f"{'ground':<18}{'step [ms]':>10}{'/ plane':>9}{'contacts':>10}{'rows':>7}{'most':>6}{'first [s]':>11}{'memory [MiB]':>14}")
+    print(
+        f"{'ground':<18}{'step [ms]':>10}{'/ plane':>9}{'contacts':>10}{'rows':>7}{'most':>6}{'first [s]':>11}{'memory [MiB]':>14}"
+    )
     for name, variant in variants.items():
         step = statistics.median(times[name])
         print(

@@ -32,11 +32,13 @@ from legged_mw.view.video import Frame, save_png
 
 PROGRAM = "benchmarks/terrain_picture.py"
 WIDTH, FINER = 1280, 2  # [px] of the picture; it is drawn that much larger and made smaller, which smooths it
-WIDEST, HIGHEST = 2560, 1280  # [px] with many levels it is wider, so that names have room; with few it is no higher, and less wide
+# [px] with many levels it is wider, so that names have room; with few it is no higher, and less wide
+WIDEST, HIGHEST = 2560, 1280
 ELEVATION = 40.0  # [deg] of the camera, which looks along y, so that levels go to the right; without perspective
 LIGHT = (-0.7, -0.45, -0.75)  # direction: low, from the upper right, so that slopes stand out
 BRIGHTER = 2.0  # so low a light leaves level ground dark
-MARGIN, LINE = 0.22, 0.027  # of WIDTH, left of the tiles: room for their names; between two lines of text, on the ground
+# of WIDTH, left of the tiles: room for their names; between two lines of text, on the ground
+MARGIN, LINE = 0.22, 0.027
 NUMBER = 0.0375  # of WIDTH, from one level's number to the next
 
 
@@ -45,13 +47,19 @@ def picture(terrain: Terrain) -> Frame:
     model = ground_model(terrain)
     length, depth = terrain.levels * terrain.tile, len(terrain.kinds) * terrain.tile  # [m] to the right, away
     scale = _scale(terrain)
-    line, wide = LINE * WIDTH / scale, length * 1.02 + MARGIN * WIDTH / scale  # [m] between two lines of text; what is seen
+    # [m] between two lines of text; what is seen
+    line, wide = LINE * WIDTH / scale, length * 1.02 + MARGIN * WIDTH / scale
     high = (depth + 3.0 * line) * math.sin(math.radians(ELEVATION))
     width, height = round(wide * scale) * FINER, round(high * scale) * FINER
     vis = model.vis
     vis.global_.offwidth, vis.global_.offheight, vis.global_.fovy = width, height, high
     vis.map.zfar = 10 * max(length, depth)
-    model.light_dir0[:], model.light_castshadow[:], vis.headlight.diffuse[:], vis.headlight.ambient[:] = LIGHT, False, 0.0, 0.3
+    model.light_dir0[:], model.light_castshadow[:], vis.headlight.diffuse[:], vis.headlight.ambient[:] = (
+        LIGHT,
+        False,
+        0.0,
+        0.3,
+    )
     camera = mujoco.MjvCamera()
     camera.orthographic = 1
     camera.azimuth, camera.elevation, camera.distance = 90.0, -ELEVATION, 2 * max(length, depth)
@@ -104,7 +112,9 @@ def spaced(count: int, room: float) -> list[int]:
 def _write(scene: mujoco.MjvScene, text: str, place: tuple[float, float]) -> None:
     """A geom that is nothing but its label, which begins at ``place`` [m]."""
     geom, sphere = scene.geoms[scene.ngeom], mujoco.mjtGeom.mjGEOM_SPHERE
-    mujoco.mjv_initGeom(geom, sphere, np.full(3, 1e-3), np.array([*place, 0.0]), np.eye(3).ravel(), np.zeros(4, np.float32))
+    mujoco.mjv_initGeom(
+        geom, sphere, np.full(3, 1e-3), np.array([*place, 0.0]), np.eye(3).ravel(), np.zeros(4, np.float32)
+    )
     geom.label = text
     scene.ngeom += 1
 
@@ -113,7 +123,9 @@ def ground(task: LoadedTask, everything: bool) -> Terrain:
     """The tiles of ``task``, a column a kind, the first of them farthest away; ``everything``: of every kind there is."""
     terrain = task.cfg.terrain
     if terrain.mesh_type == "plane":
-        raise ConfigError(f"{task.name} is on a plane; to see its section terrain all the same add --set terrain.mesh_type=heightfield")
+        raise ConfigError(
+            f"{task.name} is on a plane; to see its section terrain all the same add --set terrain.mesh_type=heightfield"
+        )
     kinds = list(KINDS) if everything else [kind for kind, share in terrain.terrain_proportions.items() if share > 0]
     terrain.terrain_proportions = dict.fromkeys(reversed(kinds), 1.0)
     terrain.num_cols, terrain.border_size = len(kinds), 1.0
@@ -125,11 +137,19 @@ def ground(task: LoadedTask, everything: bool) -> Terrain:
 
 def main() -> None:
     parser = Parser(prog=PROGRAM, description="A picture of a task's rough ground from above.", allow_abbrev=False)
-    parser.add_argument("file", nargs="?", default="terrain.png", help="where to write it, a PNG (default: terrain.png)")
-    parser.add_argument("--task", metavar="NAME", default="go1_rough", help="whose ground: a task's name, or the path of a config file")
+    parser.add_argument(
+        "file", nargs="?", default="terrain.png", help="where to write it, a PNG (default: terrain.png)"
+    )
+    parser.add_argument(
+        "--task", metavar="NAME", default="go1_rough", help="whose ground: a task's name, or the path of a config file"
+    )
     parser.add_argument("--all", action="store_true", help="every kind of ground there is, in place of the task's")
-    parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="override a config field: terrain.num_rows=5")
-    parser.add_argument("--override", action="append", default=[], metavar="FILE", help="override config fields from a YAML file")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="PATH=VALUE", help="override a config field: terrain.num_rows=5"
+    )
+    parser.add_argument(
+        "--override", action="append", default=[], metavar="FILE", help="override config fields from a YAML file"
+    )
     args = parser.parse_args()
     task = load_task(args.task)
     apply_overrides(task, args)

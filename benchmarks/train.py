@@ -76,7 +76,9 @@ def measure(runner: Runner, iterations: int, rounds: int, eager: bool) -> Times:
     steps = runner.cfg["num_steps_per_env"]
     with contextlib.redirect_stdout(io.StringIO()):
         runner.learn(5)
-        whole = statistics.median(seconds(lambda: runner.learn(iterations, False), device) / iterations for _ in range(rounds))
+        whole = statistics.median(
+            seconds(lambda: runner.learn(iterations, False), device) / iterations for _ in range(rounds)
+        )
     parts: dict[str, list[float]] = {"step": [], "policy": [], "update": []}
     obs = env.get_observations()
     for _ in range(rounds):
@@ -127,7 +129,9 @@ def main() -> None:
     parser = make_parser(__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     parser.set_defaults(task="go1_flat")
-    parser.add_argument("--worlds", type=int, nargs="+", help="worlds to measure, one after the other (default: the task's)")
+    parser.add_argument(
+        "--worlds", type=int, nargs="+", help="worlds to measure, one after the other (default: the task's)"
+    )
     parser.add_argument("--iterations", type=int, default=10, help="in one call of learn")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--beside_rsl_rl", action="store_true", help="measure with rsl-rl's own PPO too")
@@ -144,8 +148,16 @@ def main() -> None:
         ours = run(args, device, worlds)
         if args.beside_rsl_rl:
             theirs = run(args, device, worlds, "PPO")
-            ratios = theirs.whole / ours.whole, (theirs.policy + theirs.update) / (ours.policy + ours.update), theirs.update / ours.update
-            print("rsl-rl's own PPO, above, takes {:.2f} times as long an iteration; its learner {:.2f}, its update {:.2f}".format(*ratios))
+            ratios = (
+                theirs.whole / ours.whole,
+                (theirs.policy + theirs.update) / (ours.policy + ours.update),
+                theirs.update / ours.update,
+            )
+            print(
+                "rsl-rl's own PPO, above, takes {:.2f} times as long an iteration; its learner {:.2f}, its update {:.2f}".format(
+                    *ratios
+                )
+            )
 
 
 if __name__ == "__main__":

@@ -59,7 +59,12 @@ def examine(folder: Path, contract: Contract, exam: ExamRules, domain: int, faul
         one, fell = defaultdict(list), math.inf
         for step in range(round(rules.SECONDS / contract.period)):
             velocity = [*sim._sensor("lin_vel")[:2], sim._sensor("ang_vel")[2]]
-            values = velocity, sim.data.qpos[:2].copy(), np.abs(sim.torque * sim.joint_vel).sum(), np.abs(sim.joint_vel).mean()
+            values = (
+                velocity,
+                sim.data.qpos[:2].copy(),
+                np.abs(sim.torque * sim.joint_vel).sum(),
+                np.abs(sim.joint_vel).mean(),
+            )
             for name, value in zip(("velocity", "position", "power", "joint_speed"), values, strict=True):
                 one[name].append(value)
             if direction >= 0 and step == round(rules.PUSH_AT / contract.period) + direction:
@@ -75,7 +80,9 @@ def examine(folder: Path, contract: Contract, exam: ExamRules, domain: int, faul
         fell_at.append(fell)
         last.append(sim.data.qpos[:2].copy())
     stacked = {name: np.swapaxes(np.array(values), 0, 1) for name, values in signals.items()}
-    return exam.grade(stacked, last_position=np.array(last), fell_at=np.array(fell_at), mass=contract.mass, dt=contract.period)
+    return exam.grade(
+        stacked, last_position=np.array(last), fell_at=np.array(fell_at), mass=contract.mass, dt=contract.period
+    )
 
 
 def main() -> None:

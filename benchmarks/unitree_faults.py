@@ -154,7 +154,15 @@ def in_lockstep(name: str, domain: int) -> float:
     sim = SimulatedUnitree(POLICIES / case.task, contract, RobotEnd(package, "lo", domain))
     wire, other = (Wire(package, "lo", domain, wait=sim.step, clock=lambda: sim.time) for _ in range(2))
     wire.prepare(listen=0.1)
-    rig = lockstep(case, sim, wire, POLICIES / case.task, MonkeyPatch(), other=other, second=partial(RobotEnd, package, "lo", domain))
+    rig = lockstep(
+        case,
+        sim,
+        wire,
+        POLICIES / case.task,
+        MonkeyPatch(),
+        other=other,
+        second=partial(RobotEnd, package, "lo", domain),
+    )
     after = sim.record.damped_after(case.known(rig) if case.known else rig.injected or 0.0)
     return float("nan") if after is None else 1000 * after
 
@@ -176,7 +184,9 @@ def main() -> None:
         policy(args.policy, args.domain)
         return
     real_time(PRIORITY, heirs=True)
-    print("| fault | `--fault` | the line | in lockstep | live: median | worst |\n| --- | --- | --- | --- | --- | --- |")
+    print(
+        "| fault | `--fault` | the line | in lockstep | live: median | worst |\n| --- | --- | --- | --- | --- | --- |"
+    )
     for name in args.faults or CASES:
         print(row(name, args.runs), flush=True)
 

@@ -60,7 +60,10 @@ def jobs(args: argparse.Namespace) -> list[Job]:
     seeds = [seed for seed in args.seeds.split(",") if seed] or [""]
     named = [(name.strip(), shlex.split(more)) for name, _, more in parts]
     return [
-        Job(f"{name}{' ' * bool(name and seed)}{'s' * bool(seed)}{seed}" or "default", [*flags, *(["--seed", seed] if seed else [])])
+        Job(
+            f"{name}{' ' * bool(name and seed)}{'s' * bool(seed)}{seed}" or "default",
+            [*flags, *(["--seed", seed] if seed else [])],
+        )
         for name, flags in named
         for seed in seeds
     ]
@@ -86,7 +89,13 @@ def train(job: Job, args: argparse.Namespace, env: dict[str, str], cores: set[in
         "--set",
         f"runner.save_interval={args.save}",
     ]
-    command += [*([] if args.by_exam else ["--set", "runner.exam_interval=0"]), "--experiment_name", args.experiment, "--run_name", name]
+    command += [
+        *([] if args.by_exam else ["--set", "runner.exam_interval=0"]),
+        "--experiment_name",
+        args.experiment,
+        "--run_name",
+        name,
+    ]
     command += [*(["--device", "cpu"] if args.device == "cpu" else []), *args.flags, *job.flags]
     job.begun, tail, paces = time.time(), [""] * 5, list[float]()
     with begin(command, env, cores, subprocess.STDOUT) as process:
@@ -110,14 +119,26 @@ def train(job: Job, args: argparse.Namespace, env: dict[str, str], cores: set[in
 def grade(job: Job, args: argparse.Namespace, env: dict[str, str], cores: set[int], out: Path) -> None:
     """Every checkpoint's exam, seconds from the command."""
     file = out / f"{Path(job.folder).name}.json"
-    command = [sys.executable, "benchmarks/checkpoints.py", job.folder, "--every", str(args.every), "--device", "cpu", "--out", str(file)]
+    command = [
+        sys.executable,
+        "benchmarks/checkpoints.py",
+        job.folder,
+        "--every",
+        str(args.every),
+        "--device",
+        "cpu",
+        "--out",
+        str(file),
+    ]
     with begin(command, env, cores, subprocess.PIPE) as process:
         said, errors = process.communicate()
     if process.returncode:
         print(f"not graded: {job.name}: {errors.strip()[-300:]}", flush=True)
         return
     start = (ROOT / job.folder / "config.yaml").stat().st_mtime - job.begun
-    job.results = [{**result, "seconds": result["seconds"] + start} for result in json.loads(file.read_text(encoding="utf-8"))]
+    job.results = [
+        {**result, "seconds": result["seconds"] + start} for result in json.loads(file.read_text(encoding="utf-8"))
+    ]
     file.write_text(json.dumps({"name": job.name, "flags": job.flags, "results": job.results}) + "\n", encoding="utf-8")
     print(f"graded: {' | '.join(row(job, args.task))}\n{said}", end="", flush=True)
 
@@ -127,7 +148,11 @@ def walks(result: dict[str, Any], marks: list[float]) -> bool:
     if "walks" in result:
         return bool(result["walks"])
     errors = [result["error_vx"], result["error_vy"], result["error_yaw"]]
-    return not result["falls"] and result["pushes_survived"] == 1.0 and all(a <= b for a, b in zip(errors, marks, strict=True))
+    return (
+        not result["falls"]
+        and result["pushes_survived"] == 1.0
+        and all(a <= b for a, b in zip(errors, marks, strict=True))
+    )
 
 
 def row(job: Job, task: str) -> list[str]:
@@ -140,7 +165,11 @@ def row(job: Job, task: str) -> list[str]:
         cells += [*first, f"{len(good)} of {len(job.results)}"]
     last = job.results[-1] if job.results else {}
     error = last.get("error") or [last[name] for name in ("error_vx", "error_vy", "error_yaw") if name in last]
-    more = f"; drift {last['drift'] or 0:.4f}, cost {last['cost_of_transport']:.3f}" if last.get("cost_of_transport") else ""
+    more = (
+        f"; drift {last['drift'] or 0:.4f}, cost {last['cost_of_transport']:.3f}"
+        if last.get("cost_of_transport")
+        else ""
+    )
     told = f"{', '.join(f'{value:.3f}' for value in error)}; falls {last.get('falls', '-')}{more}"
     return [*cells, f"{job.seconds:.1f}", str(last.get("iteration", "-")), f"{job.pace:,.0f}", told]
 
@@ -177,8 +206,12 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     cores, todo, trained = sorted(os.sched_getaffinity(0)), jobs(args), queue.SimpleQueue[Job | None]()
     base = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])])}
-    gpus = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each] or [str(i) for i in range(args.gpus)]
-    places: list[tuple[dict[str, str], set[int]]] = [({**base, "CUDA_VISIBLE_DEVICES": gpu}, set(cores)) for gpu in gpus[: args.gpus]]
+    gpus = [each for each in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if each] or [
+        str(i) for i in range(args.gpus)
+    ]
+    places: list[tuple[dict[str, str], set[int]]] = [
+        ({**base, "CUDA_VISIBLE_DEVICES": gpu}, set(cores)) for gpu in gpus[: args.gpus]
+    ]
     if args.device == "cpu":
         places = [(base, set(cores[i : i + args.cores])) for i in range(0, len(cores) - args.cores + 1, args.cores)]
     waiting = queue.SimpleQueue[Job | None]()

@@ -5,7 +5,8 @@ from legged_mw.envs.sim_to_real_config import BipedCfg, BipedCfgPPO
 from legged_mw.utils.task import Task
 
 
-class G1FlatCfg(BipedCfg):  # sources: as BipedCfg's; [M]'s gains are from each rotor's inertia, at 10 Hz and a damping ratio of 2
+# sources: as BipedCfg's; [M]'s gains are from each rotor's inertia, at 10 Hz and a damping ratio of 2
+class G1FlatCfg(BipedCfg):
     class asset(BipedCfg.asset):
         file = "resources/robots/g1/g1.xml"
         imu_site = "imu_in_pelvis"
@@ -27,7 +28,16 @@ class G1FlatCfg(BipedCfg):  # sources: as BipedCfg's; [M]'s gains are from each 
         decimation = 4
 
     class rewards(BipedCfg.rewards):
-        pose_weights = {"": 0.3, "hip_pitch": 0.02, "knee": 0.02, "ankle": 0.05, "hip_roll": 0.5, "hip_yaw": 0.5, "waist": 1.0}  # [ours]
+        # [ours]
+        pose_weights = {
+            "": 0.3,
+            "hip_pitch": 0.02,
+            "knee": 0.02,
+            "ankle": 0.05,
+            "hip_roll": 0.5,
+            "hip_yaw": 0.5,
+            "waist": 1.0,
+        }
 
     class exam(BipedCfg.exam):
         peer = "g1"

@@ -26,7 +26,8 @@ class G1GetupCfg(GetupCfg):
     class control(GetupCfg.control):
         stiffness, damping = G1FlatCfg.control.stiffness, G1FlatCfg.control.damping
         action_origin = "default"  # [ours: its servos alone stand it up in the pull; docs/skills.md]
-        action_scale, decimation = G1FlatCfg.control.action_scale, G1FlatCfg.control.decimation  # 4 of it: the motors' whole torque [M]
+        # 4 of it: the motors' whole torque [M]
+        action_scale, decimation = G1FlatCfg.control.action_scale, G1FlatCfg.control.decimation
 
     class normalization(GetupCfg.normalization):
         clip_actions = 8.0  # [ours: folded knees are 2.6 rad away]

@@ -34,7 +34,8 @@ class G1TrackCfg(MotionTrackingCfg):
             *["right_shoulder_roll_link", "right_elbow_link", "right_wrist_yaw_link"],
         ]
         anchor = "torso_link"  # [B]
-        end_bodies = ["left_ankle_roll_link", "right_ankle_roll_link", "left_wrist_yaw_link", "right_wrist_yaw_link"]  # [B]
+        # [B]
+        end_bodies = ["left_ankle_roll_link", "right_ankle_roll_link", "left_wrist_yaw_link", "right_wrist_yaw_link"]
 
     class observations(MotionTrackingCfg.observations):
         leave_out = {"state": ["anchor_pos", "base_lin_vel"]}  # no sensor gives them [B, without state estimation]
@@ -67,7 +68,8 @@ class G1TrackCfgPPO(RobotTaskCfgPPO):
         hidden_dims = [224, 128, 64]  # [ours: one clip is learned by less than B's 512, 256, 128]
 
         class distribution_cfg(RobotTaskCfgPPO.actor.distribution_cfg):
-            init_std = 0.4  # [ours: with the 1.0 of B action_rate outweighs all of tracking at first, and it learns to fall soon]
+            # [ours: with the 1.0 of B action_rate outweighs all of tracking at first, and it learns to fall soon]
+            init_std = 0.4
 
 
 TASK = Task(MotionTracking, G1TrackCfg, G1TrackCfgPPO)

@@ -5,7 +5,8 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.utils.task import Task
 
 
-class Go1FlatFastCfg(Go1FlatCfg):  # all [ours]: four of five seeds beat the peer after 54 to 74 s, one at its end; docs/lab.md
+# all [ours]: four of five seeds beat the peer after 54 to 74 s, one at its end; docs/lab.md
+class Go1FlatFastCfg(Go1FlatCfg):
     class commands(Go1FlatCfg.commands):
         keep_probability = [0.7, 0.25, 0.5]  # to stand and to turn on the spot are asked for more often
 

@@ -14,7 +14,15 @@ class Go2FlatCfg(SimToRealCfg):  # [U] Unitree's own training configs for this r
 
     class init_state(SimToRealCfg.init_state):
         pos = [0.0, 0.0, 0.33]  # [m]
-        default_joint_angles = {"R_hip": -0.1, "L_hip": 0.1, "thigh": 0.8, "RR_thigh": 1.0, "RL_thigh": 1.0, "calf": -1.5}  # [rad] [U]
+        # [rad] [U]
+        default_joint_angles = {
+            "R_hip": -0.1,
+            "L_hip": 0.1,
+            "thigh": 0.8,
+            "RR_thigh": 1.0,
+            "RL_thigh": 1.0,
+            "calf": -1.5,
+        }
 
     class control(SimToRealCfg.control):
         stiffness = {"": 20.0}  # [N m/rad] [U]

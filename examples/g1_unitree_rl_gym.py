@@ -19,9 +19,15 @@ class UnitreeG1(LeggedGymRobot):
     def observation_rows(self) -> dict[str, list[Row | str]]:
         """Its 47 rows; the clock has a sine and a cosine a foot here, so 49. The critic sees them without noise, and the velocity."""
         rows = {row.name: row for row in super().observation_rows()["state"] if isinstance(row, Row)}
-        velocity, clock = rows.pop("base_lin_vel"), Row("gait_clock", self.gait.row if self.gait else self.actions, mirror="foot")
+        velocity, clock = (
+            rows.pop("base_lin_vel"),
+            Row("gait_clock", self.gait.row if self.gait else self.actions, mirror="foot"),
+        )
         seen = [*rows.values(), clock]
-        return {"state": [*seen], "privileged_state": [row._replace(noise=0.0, measured=False) for row in (velocity, *seen)]}
+        return {
+            "state": [*seen],
+            "privileged_state": [row._replace(noise=0.0, measured=False) for row in (velocity, *seen)],
+        }
 
     def _reward_contact(self) -> Tensor:
         """How many feet stand or swing as the clock wants."""

@@ -43,8 +43,17 @@ class LeggedGymRobot(LeggedRobot):
         velocities = (scale.lin_vel, scale.lin_vel, scale.ang_vel)
         return {
             "state": [
-                Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", scale=scale.lin_vel, measured=True),
-                Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", scale=scale.ang_vel, measured=True),
+                Row(
+                    "base_lin_vel",
+                    self.base_lin_vel,
+                    noise.lin_vel,
+                    mirror="imu_velocity",
+                    scale=scale.lin_vel,
+                    measured=True,
+                ),
+                Row(
+                    "base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", scale=scale.ang_vel, measured=True
+                ),
                 Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar", measured=True),
                 Row("commands", self.commands, mirror="command", scale=velocities),
                 Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", scale=scale.dof_pos, measured=True),

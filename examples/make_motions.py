@@ -22,7 +22,16 @@ import numpy as np
 
 from configs.g1_flat import G1FlatCfg
 from legged_mw import ROOT
-from legged_mw.utils.clip import Clip, Floats, checked, conjugate, from_rotation_vector, multiply, rotation_vector, save_clip
+from legged_mw.utils.clip import (
+    Clip,
+    Floats,
+    checked,
+    conjugate,
+    from_rotation_vector,
+    multiply,
+    rotation_vector,
+    save_clip,
+)
 from legged_mw.utils.task import load_task
 
 RATE, GRAVITY = 50.0, 9.81  # [1/s], [m/s^2]
@@ -39,11 +48,13 @@ class Plan:
     """What a clip asks for over T frames; ``keyed`` makes such rows from a few numbers."""
 
     seconds: float
-    feet: list[Floats] = field(default_factory=list)  # of each side (T, 4): the ankle's place [m], the foot's heading [rad]
+    # of each side (T, 4): the ankle's place [m], the foot's heading [rad]
+    feet: list[Floats] = field(default_factory=list)
     push: Floats = field(default_factory=lambda: np.zeros(0))  # (T, 2) where the ground pushes [m]
     height: Floats = field(default_factory=lambda: np.zeros(0))  # (T,) of the pelvis [m]
     tilt: Floats = field(default_factory=lambda: np.zeros(0))  # (T, 3) roll, pitch, heading of the pelvis [rad]
-    joints: dict[str, Floats] = field(default_factory=dict)  # of waist and arms (T,) [rad]; others as in the default pose
+    # of waist and arms (T,) [rad]; others as in the default pose
+    joints: dict[str, Floats] = field(default_factory=dict)
     raised: Floats | None = None  # (T,) how far the right leg is by `leg`, not by its foot, from 0 to 1
     leg: dict[str, Floats] = field(default_factory=dict)  # of the right leg (T,) [rad]
 
@@ -148,7 +159,11 @@ def _between(q: Floats, wanted: Sequence[float] | Floats) -> Floats:
 def swayed(push: Floats, height: float) -> Floats:
     """Places (T, 2) of the centre of mass of a pendulum that is pushed at ``push``; at rest at both ends."""
     count, stiff = len(push), height / GRAVITY * RATE**2
-    matrix = np.diag(np.full(count, 1.0 + 2.0 * stiff)) + np.diag(np.full(count - 1, -stiff), 1) + np.diag(np.full(count - 1, -stiff), -1)
+    matrix = (
+        np.diag(np.full(count, 1.0 + 2.0 * stiff))
+        + np.diag(np.full(count - 1, -stiff), 1)
+        + np.diag(np.full(count - 1, -stiff), -1)
+    )
     matrix[0, 0] = matrix[-1, -1] = 1.0 + stiff
     return np.asarray(np.linalg.solve(matrix, push), dtype=np.float64)
 
@@ -193,7 +208,8 @@ def step(plan: Plan, body: Body, start: float, headings: Sequence[float], first:
     middle = np.mean([_sole(body, side, heading[side]) for side in (0, 1)], axis=0)
     pushes[end + DOUBLE * STEP] = pushes[plan.seconds] = middle
     plan.push = keyed(plan.seconds, pushes)
-    plan.height = body.standing - keyed(plan.seconds, {0.0: 0.0, start: 0.03, end: 0.03, plan.seconds: 0.0})  # else a leg is too short
+    # else a leg is too short
+    plan.height = body.standing - keyed(plan.seconds, {0.0: 0.0, start: 0.03, end: 0.03, plan.seconds: 0.0})
     plan.tilt[:, 2] = keyed(plan.seconds, {0.0: 0.0, start: 0.0, end: heading[0], plan.seconds: heading[0]})
 
 
@@ -221,7 +237,10 @@ def wave(body: Body) -> Plan:
 def kick(body: Body) -> Plan:
     """The weight goes to the left foot; the right leg is drawn up, kicks to the side, is held there, and comes back."""
     plan, left = stand(body, 7.0), body.stance[0]
-    plan.push = keyed(7.0, {0.0: (SOLE, 0.0), 0.5: (SOLE, 0.0), 1.4: (SOLE, left), 5.4: (SOLE, left), 6.3: (SOLE, 0.0), 7.0: (SOLE, 0.0)})
+    plan.push = keyed(
+        7.0,
+        {0.0: (SOLE, 0.0), 0.5: (SOLE, 0.0), 1.4: (SOLE, left), 5.4: (SOLE, left), 6.3: (SOLE, 0.0), 7.0: (SOLE, 0.0)},
+    )
     out = keyed(7.0, {2.4: 0.0, 3.0: 1.0, 4.0: 1.0, 4.6: 0.0, 7.0: 0.0})
     plan.raised = keyed(7.0, {1.5: 0.0, 2.3: 1.0, 4.6: 1.0, 5.4: 0.0, 7.0: 0.0})
     plan.height = body.standing - keyed(7.0, {0.4: 0.0, 1.4: 0.02, 5.4: 0.02, 6.4: 0.0, 7.0: 0.0})
@@ -251,7 +270,8 @@ def turn(body: Body) -> Plan:
     swing = going * np.sin(np.pi / STEP * (np.arange(len(plan.push)) / RATE - 0.6))
     for side, sign in zip(SIDES, (1.0, -1.0), strict=True):
         plan.joints[f"{side}_shoulder_pitch_joint"] = ARMS["shoulder_pitch"] + sign * 0.2 * swing
-        plan.joints[f"{side}_shoulder_roll_joint"] = sign * (ARMS["shoulder_roll"] + 0.15 * going)  # hands clear of the thighs
+        # hands clear of the thighs
+        plan.joints[f"{side}_shoulder_roll_joint"] = sign * (ARMS["shoulder_roll"] + 0.15 * going)
     return plan
 
 

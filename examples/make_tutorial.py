@@ -21,8 +21,14 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 ROOT = Path(__file__).resolve().parent.parent
-PAGES = {ROOT / "docs/tutorial.md": "joystick_explained.ipynb", ROOT / "docs/zh/tutorial.md": "joystick_explained.zh.ipynb"}
-CELL = re.compile(r"```python\n(.*?)```\n(?:\n```text\n(.*?)```\n)?(?:\n!\[[^\]]*\]\((?:\.\./)?(images/tutorial/[^)]*)\)\n)?", re.DOTALL)
+PAGES = {
+    ROOT / "docs/tutorial.md": "joystick_explained.ipynb",
+    ROOT / "docs/zh/tutorial.md": "joystick_explained.zh.ipynb",
+}
+CELL = re.compile(
+    r"```python\n(.*?)```\n(?:\n```text\n(.*?)```\n)?(?:\n!\[[^\]]*\]\((?:\.\./)?(images/tutorial/[^)]*)\)\n)?",
+    re.DOTALL,
+)
 COLORS, QUALITY = 16, 75  # of a plot; of a photo
 
 
@@ -34,17 +40,26 @@ def notebook(page: str) -> dict[str, Any]:
         end = cell.end()
     cells = [cell for cell in [*cells, _markdown(page[end:])] if cell["source"]]
     named = [{"id": f"cell{i}", **cell} for i, cell in enumerate(cells)]
-    kernel = {"kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"}, "language_info": {"name": "python"}}
+    kernel = {
+        "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
+        "language_info": {"name": "python"},
+    }
     return {"cells": named, "metadata": kernel, "nbformat": 4, "nbformat_minor": 5}
 
 
 def _markdown(text: str) -> dict[str, Any]:
     """A cell of text; links to other pages lead out of examples/."""
-    return _cell("markdown", re.sub(r"\]\((?:\.\./)*([\w/.]+\.(?:md|ipynb))", lambda link: f"]({_from_examples(link[1])}", text))
+    return _cell(
+        "markdown", re.sub(r"\]\((?:\.\./)*([\w/.]+\.(?:md|ipynb))", lambda link: f"]({_from_examples(link[1])}", text)
+    )
 
 
 def _from_examples(path: str) -> str:
-    return path.removeprefix("examples/") if path.startswith("examples/") else f"../{'' if (ROOT / path).exists() else 'docs/'}{path}"
+    return (
+        path.removeprefix("examples/")
+        if path.startswith("examples/")
+        else f"../{'' if (ROOT / path).exists() else 'docs/'}{path}"
+    )
 
 
 def _cell(kind: str, text: str) -> dict[str, Any]:
@@ -67,7 +82,9 @@ def translated(page: str, original: str) -> str:
 def _written(cell: re.Match[str], code: str, printed: str) -> str:
     """The cell as it stands in a page, with new code and output; its picture's line stays."""
     picture = re.search(r"\n!\[.*\n", cell[0])
-    return f"```python\n{code}```\n" + (f"\n```text\n{printed}```\n" if printed else "") + (picture[0] if picture else "")
+    return (
+        f"```python\n{code}```\n" + (f"\n```text\n{printed}```\n" if printed else "") + (picture[0] if picture else "")
+    )
 
 
 def run(cells: dict[str, Any], folder: Path = ROOT / "examples") -> list[dict[str, Any]]:
@@ -77,7 +94,8 @@ def run(cells: dict[str, Any], folder: Path = ROOT / "examples") -> list[dict[st
 
     node = nbformat.reads(as_json(cells), as_version=4)
     with TemporaryDirectory() as path:
-        (Path(path) / "legged_mw").symlink_to(ROOT / "legged_mw")  # this checkout's, and not configs/, which a reader's kernel lacks too
+        # this checkout's, and not configs/, which a reader's kernel lacks too
+        (Path(path) / "legged_mw").symlink_to(ROOT / "legged_mw")
         kernel = {**os.environ, "PYTHONPATH": path, "PYDEVD_DISABLE_FILE_VALIDATION": "1"}
         NotebookClient(node, timeout=3600, resources={"metadata": {"path": str(folder)}}).execute(env=kernel)
     return [cell for cell in node["cells"] if cell["cell_type"] == "code"]
@@ -85,7 +103,9 @@ def run(cells: dict[str, Any], folder: Path = ROOT / "examples") -> list[dict[st
 
 def printed(cell: dict[str, Any]) -> str:
     """What a cell printed."""
-    return "".join(output["text"] for output in cell["outputs"] if output["output_type"] == "stream" and output["name"] == "stdout")
+    return "".join(
+        output["text"] for output in cell["outputs"] if output["output_type"] == "stream" and output["name"] == "stdout"
+    )
 
 
 def _with_outputs(page: str, ran: list[dict[str, Any]], quick: bool) -> str:
@@ -122,7 +142,9 @@ def _save(png: bytes, path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--run", action="store_true", help="run the code; write its outputs and pictures")
-    parser.add_argument("--quick", action="store_true", help="likewise, with two iterations of training, whose outputs stay as they are")
+    parser.add_argument(
+        "--quick", action="store_true", help="likewise, with two iterations of training, whose outputs stay as they are"
+    )
     args = parser.parse_args()
     english, *others = PAGES
     text = english.read_text(encoding="utf-8")

@@ -36,7 +36,8 @@ from legged_mw.utils.errors import UserError, printable
 
 VERSION = 1
 HELLO, MEASURED, TARGETS, CLOSE, REFUSED = range(1, 6)  # kinds of packet
-_HEADER = struct.Struct("<4sBB8sI")  # "LMWR", version, kind, digest of the contract's layout, count of TARGETS sent so far
+# "LMWR", version, kind, digest of the contract's layout, count of TARGETS sent so far
+_HEADER = struct.Struct("<4sBB8sI")
 _MAGIC, _MOST = b"LMWR", 65507  # bytes that fit into one packet
 _FAR = 1e4  # [rad] or [N m]: a target beyond it is none
 
@@ -78,7 +79,11 @@ def numbers(body: bytes, count: int) -> Floats | None:
 
 def counted(dropped: Counter[str]) -> str:
     """What was dropped, in words to end a line with; nothing if nothing was."""
-    return f" ({sum(dropped.values())} packets dropped: {', '.join(f'{n} {why}' for why, n in dropped.items())})" if dropped else ""
+    return (
+        f" ({sum(dropped.values())} packets dropped: {', '.join(f'{n} {why}' for why, n in dropped.items())})"
+        if dropped
+        else ""
+    )
 
 
 def parse_address(text: str) -> tuple[str, int]:
@@ -94,7 +99,11 @@ class UdpRobot(Robot):
 
     def __init__(self, contract: Contract, address: tuple[str, int], timeout: float = 0.5) -> None:
         """Send a hello and take the first measurement; raises RobotError if no answer comes within ``timeout`` [s]."""
-        self._layout, self._digest, self._name = layout(contract), contract_digest(contract), f"{address[0]}:{address[1]}"
+        self._layout, self._digest, self._name = (
+            layout(contract),
+            contract_digest(contract),
+            f"{address[0]}:{address[1]}",
+        )
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._count, self._timeout, self._open = 0, timeout, True
         self.dropped: Counter[str] = Counter()  # packets that were no answer, by why
@@ -148,12 +157,17 @@ class UdpRobot(Robot):
 
     def _lost(self, why: str) -> RobotError:
         self.close()
-        return RobotError(f"robot at {self._name}: {why}; stopped (start one with: python examples/udp_robot.py DIR --serve {self._name})")
+        return RobotError(
+            f"robot at {self._name}: {why}; stopped (start one with: python examples/udp_robot.py DIR --serve {self._name})"
+        )
 
     def _measurement(self, body: bytes) -> Measurement:
-        values = np.frombuffer(body, dtype="<f8").astype(float)  # what is not finite, or cannot be, is for the limits of ``safety``
+        # what is not finite, or cannot be, is for the limits of ``safety``
+        values = np.frombuffer(body, dtype="<f8").astype(float)
         parts = dict(zip(self._layout, np.split(values, np.cumsum(list(self._layout.values()))[:-1]), strict=True))
-        return Measurement(**{n: parts[n] for n in QUANTITIES}, others={n: v for n, v in parts.items() if n not in QUANTITIES})
+        return Measurement(
+            **{n: parts[n] for n in QUANTITIES}, others={n: v for n, v in parts.items() if n not in QUANTITIES}
+        )
 
 
 class UdpServer:
@@ -217,7 +231,9 @@ class UdpServer:
         """Whether these targets are new and were written."""
         targets = numbers(packet.body, len(self._contract.joints))
         if targets is None or not (np.abs(targets) < _FAR).all():
-            self._drop("without targets", client, f"targets must be {len(self._contract.joints)} finite numbers, one a joint")
+            self._drop(
+                "without targets", client, f"targets must be {len(self._contract.joints)} finite numbers, one a joint"
+            )
             return False
         if packet.count <= self._count:
             self.dropped["late or sent twice"] += 1
@@ -286,25 +302,38 @@ def drive(folder: Path, contract: Contract, address: tuple[str, int], command: F
     if done.velocity is not None:
         wanted, got = (", ".join(f"{v:.2f}" for v in vector) for vector in (command, done.velocity))
         print(f"{done.steps} steps of {period:g} s, {done.late} of them late")
-        print(f"commanded {wanted} ({with_units(contract.commands)}); vx, vy [m/s], yaw rate [rad/s] over the second half: {got}")
+        print(
+            f"commanded {wanted} ({with_units(contract.commands)}); vx, vy [m/s], yaw rate [rad/s] over the second half: {got}"
+        )
 
 
 def main() -> None:
-    parser = Parser(prog="udp_robot.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, allow_abbrev=False)
+    parser = Parser(
+        prog="udp_robot.py",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
     parser.add_argument("folder", metavar="DIR", type=Path, help="an export: the same at both ends")
     what = parser.add_mutually_exclusive_group(required=True)
     what.add_argument("--serve", metavar="HOST:PORT", help="be a simulated robot that listens there")
     what.add_argument("--drive", metavar="HOST:PORT", help="drive the robot that listens there")
-    parser.add_argument("--command", metavar="C", help="of --drive: e.g. 0.8,0,0 in the order of the contract's commands")
+    parser.add_argument(
+        "--command", metavar="C", help="of --drive: e.g. 0.8,0,0 in the order of the contract's commands"
+    )
     parser.add_argument("--time", type=duration, default=10.0, metavar="T", help="of --drive: how long (default: 10s)")
     args = parser.parse_args()
     contract, address = read_contract(args.folder), parse_address(args.serve or args.drive)
     if args.drive:
-        command = idle_command(contract) if args.command is None else np.array(parse_command(args.command, contract.commands))
+        command = (
+            idle_command(contract) if args.command is None else np.array(parse_command(args.command, contract.commands))
+        )
         drive(args.folder, contract, address, command, args.time)
         return
     server = UdpServer(MujocoRobot(args.folder, contract), contract, address)
-    print(f"a simulated robot for {contract.task} at {server.address[0]}:{server.address[1]}; Ctrl-C ends it", flush=True)
+    print(
+        f"a simulated robot for {contract.task} at {server.address[0]}:{server.address[1]}; Ctrl-C ends it", flush=True
+    )
     with contextlib.suppress(KeyboardInterrupt):
         server.serve(lambda line: print(line, flush=True))
 

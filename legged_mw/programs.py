@@ -52,7 +52,10 @@ def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.N
     if args.check:
         training.make_learner(task, env, start)  # what it refuses is found now
         print(describe(env, task) + ("" if args.eager else "\nthe step can be recorded as a CUDA graph"))
-        print("".join(["what to look at\n", *(f"  - {line}\n" for line in [*wrong, *odd])]) if wrong or odd else "", end="")
+        print(
+            "".join(["what to look at\n", *(f"  - {line}\n" for line in [*wrong, *odd])]) if wrong or odd else "",
+            end="",
+        )
         if args.picture:
             from legged_mw.robot.__main__ import show_task
 

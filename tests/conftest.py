@@ -22,7 +22,11 @@ onnxscript_for_torch.get_torchlib_ops = cache(onnxscript_for_torch.get_torchlib_
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--rewrite", action="store_true", help="write tests/golden/errors.txt anew; prints the raises that no case reaches")
+    parser.addoption(
+        "--rewrite",
+        action="store_true",
+        help="write tests/golden/errors.txt anew; prints the raises that no case reaches",
+    )
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
@@ -38,7 +42,8 @@ def pytest_collection_finish(session: pytest.Session) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     torch.set_num_threads(1)  # hundreds of small operations a step stall on a second thread
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # `make test &` ignores it, and so would programs that tests end
+    # `make test &` ignores it, and so would programs that tests end
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # likewise `nohup make test`
 
 

@@ -83,7 +83,9 @@ def driven(
 ) -> tuple[Summary, list[str]]:
     """Run with states as fast as possible; the summary, and the states one after another."""
     contract = controller.contract
-    states = States(controller, [source], lambda _: np.zeros(len(contract.commands)), (said if said is not None else []).append)
+    states = States(
+        controller, [source], lambda _: np.zeros(len(contract.commands)), (said if said is not None else []).append
+    )
     passed: list[str] = []
 
     def watch(_now: float, _measured: Measurement) -> None:

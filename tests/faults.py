@@ -53,7 +53,9 @@ class Killed(BaseException):
 class Side:
     """The robot's side: its remote stands it up and starts the policy; then comes the fault."""
 
-    def __init__(self, sim: SimulatedUnitree, case: Case, other: Wire | None = None, second: Callable[[], RobotEnd] | None = None) -> None:
+    def __init__(
+        self, sim: SimulatedUnitree, case: Case, other: Wire | None = None, second: Callable[[], RobotEnd] | None = None
+    ) -> None:
         """``other``: another commander's end of the wire; ``second`` switches another robot on."""
         self.sim, self.case, self.other, self.second = sim, case, other, second
         self.end: RobotEnd | None = None  # the other robot's
@@ -89,7 +91,9 @@ class Side:
 class Rig:
     """The policy's side: its sources, states and limits, and what may go wrong there."""
 
-    def __init__(self, robot: UnitreeRobot, folder: Path, clock: Callable[[], float], sleep: Callable[[float], None], work: float) -> None:
+    def __init__(
+        self, robot: UnitreeRobot, folder: Path, clock: Callable[[], float], sleep: Callable[[float], None], work: float
+    ) -> None:
         """``work``: [s] that a step of the policy takes."""
         self.robot, self.clock, self.sleep, self.work = robot, clock, sleep, work
         self.contract, self.said, self.read_at = robot.contract, list[str](), 0.0
@@ -199,7 +203,9 @@ class Lockstep(Rig):
             file.truncate(8192)
             here, there = socket.socketpair()
             board = Board(file.fileno(), len(self.sim._state.body))
-            self.guard = Guard(wire, there, Board(file.fileno(), len(self.sim._state.body)), package, clock=self.late_clock)
+            self.guard = Guard(
+                wire, there, Board(file.fileno(), len(self.sim._state.body)), package, clock=self.late_clock
+            )
         self.sim.step()
         while (state := wire.receive()) is None:
             self.sim.step()
@@ -208,7 +214,13 @@ class Lockstep(Rig):
         self.guard.tell({"ready": True})
         owner, self._turns = Stepped(here, board, wire, clock=self.late_clock), 0.0
         owner.guard = self.guard
-        super().__init__(UnitreeRobot(contract, owner, owner.first, clock=self.late_clock), folder, self.read_clock, self.pass_, 0.001)
+        super().__init__(
+            UnitreeRobot(contract, owner, owner.first, clock=self.late_clock),
+            folder,
+            self.read_clock,
+            self.pass_,
+            0.001,
+        )
 
     def walks(self) -> None:
         self.side.walking = self.now
@@ -279,7 +291,8 @@ class Case(NamedTuple):
     """One fault."""
 
     said: str  # a pattern of the line
-    robot: str | Callable[[Side, float], None] = ""  # at the robot's side: a text of --fault, or what is done in each step since
+    # at the robot's side: a text of --fault, or what is done in each step since
+    robot: str | Callable[[Side, float], None] = ""
     policy: Callable[[Any], None] | None = None  # at the policy's side
     known: Callable[[Lockstep], float] | None = None  # [s] when it can be known; None: when it begins
     known_after: float = 0.0  # [s] after it begins, at most
@@ -380,28 +393,45 @@ OLD = r"the newest measurement is [0-9]+ ms old, more than 40"
 CASES: dict[str, Case] = {
     # the limits of the safety layer
     "angle beyond its range": Case("FL_hip_joint is at .* rad, .* beyond its range", "joint_bias=2"),
-    "target beyond the range": Case("FL_calf_joint is told to go to 0.20 rad, 1.04 beyond its range", policy=puts(2, 0.2)),
-    "targets that jump": Case("FL_thigh_joint is told to step by .* rad from one target to the next", policy=puts(1, 3.6)),
-    "more torque than there is": Case("FL_thigh_joint is asked for .* N m, more than 23.7", policy=puts(1, 2.6), limits={"torque": 1.0}),
+    "target beyond the range": Case(
+        "FL_calf_joint is told to go to 0.20 rad, 1.04 beyond its range", policy=puts(2, 0.2)
+    ),
+    "targets that jump": Case(
+        "FL_thigh_joint is told to step by .* rad from one target to the next", policy=puts(1, 3.6)
+    ),
+    "more torque than there is": Case(
+        "FL_thigh_joint is asked for .* N m, more than 23.7", policy=puts(1, 2.6), limits={"torque": 1.0}
+    ),
     "encoder that counts wrong": Case("FL_hip_joint turns at .* rad/s, more than 60.0", "joint_speed=100"),
-    "pushed over": Case("the body is tilted by [0-9]+ degrees, more than 60", rolls, known=lambda rig: rig.side.tilted or 0.0),
+    "pushed over": Case(
+        "the body is tilted by [0-9]+ degrees, more than 60", rolls, known=lambda rig: rig.side.tilted or 0.0
+    ),
     "IMU upside down": Case("the body is tilted by 1[0-9]+ degrees, more than 60", "imu_tilt=180"),
     "hot motor": Case("FL_hip_joint has a motor of 95 deg C, more than 85", "hot_motor=95"),
     "low battery": Case("the battery has 20.0 V, less than 24", "low_battery=20"),
     "states that stay away for 60 ms": Case(OLD, pauses),
     "frozen state": Case("4 measurements in a row are the same", "frozen"),
     "frozen joints": Case(
-        "joint_(pos|vel) is the same in 12 measurements in a row", "stuck=q,stuck=dq", known=frozen_alone, known_after=ALONE
+        "joint_(pos|vel) is the same in 12 measurements in a row",
+        "stuck=q,stuck=dq",
+        known=frozen_alone,
+        known_after=ALONE,
     ),
-    "frozen angles": Case("joint_pos is the same in 12 measurements in a row", "stuck=q", known=frozen_alone, known_after=ALONE),
-    "frozen speeds": Case("joint_vel is the same in 12 measurements in a row", "stuck=dq", known=frozen_alone, known_after=ALONE),
+    "frozen angles": Case(
+        "joint_pos is the same in 12 measurements in a row", "stuck=q", known=frozen_alone, known_after=ALONE
+    ),
+    "frozen speeds": Case(
+        "joint_vel is the same in 12 measurements in a row", "stuck=dq", known=frozen_alone, known_after=ALONE
+    ),
     "frozen IMU": Case(
         "(ang_vel|gravity) is the same in 12 measurements in a row",
         "stuck=gyroscope,stuck=quaternion",
         known=frozen_alone,
         known_after=ALONE,
     ),
-    "frozen gyro": Case("ang_vel is the same in 12 measurements in a row", "stuck=gyroscope", known=frozen_alone, known_after=ALONE),
+    "frozen gyro": Case(
+        "ang_vel is the same in 12 measurements in a row", "stuck=gyroscope", known=frozen_alone, known_after=ALONE
+    ),
     "frozen orientation": Case(
         "gravity is the same in 12 measurements in a row", "stuck=quaternion", known=frozen_alone, known_after=ALONE
     ),
@@ -411,15 +441,24 @@ CASES: dict[str, Case] = {
         known=lambda rig: rig.read_at,
         known_after=0.5,
     ),
-    "slow policy": Case("5 steps within a second began late", policy=takes(0.035), known=lambda rig: rig.read_at, known_after=0.5),
-    "remote lost": Case("the remote was not heard for 3.0 s", "no_remote", known_after=3.0, known=lambda rig: (rig.injected or 0.0) + 2.98),
+    "slow policy": Case(
+        "5 steps within a second began late", policy=takes(0.035), known=lambda rig: rig.read_at, known_after=0.5
+    ),
+    "remote lost": Case(
+        "the remote was not heard for 3.0 s",
+        "no_remote",
+        known_after=3.0,
+        known=lambda rig: (rig.injected or 0.0) + 2.98,
+    ),
     "NaN from the policy": Case("the target of FL_hip_joint is not finite: nan", policy=acts(np.nan)),
     "infinity from the policy": Case("the target of FL_hip_joint is not finite: nan", policy=acts(np.inf)),
     "NaN from an encoder": Case("what is measured is not finite: joint_pos", "nan=q"),
     "NaN of a speed": Case("what is measured is not finite: joint_vel", "nan=dq"),
     "NaN from the gyro": Case("what is measured is not finite: ang_vel", "nan=gyroscope"),
     "NaN of the orientation": Case("what is measured is not finite: gravity", "nan=quaternion"),
-    "dead motor": Case("the motor of FL_calf_joint reports a fault: it lost [0-9]+ messages in a period", "motor_fault=FL_calf_joint"),
+    "dead motor": Case(
+        "the motor of FL_calf_joint reports a fault: it lost [0-9]+ messages in a period", "motor_fault=FL_calf_joint"
+    ),
     # a person
     "emergency stop of the remote": Case(r"the remote's emergency stop \(L2 \+ B\)", holds("L2", "B")),
     "select": Case("select was pressed", holds("select")),
@@ -432,34 +471,52 @@ CASES: dict[str, Case] = {
     # the wire
     "silent robot": Case(OLD, "silent"),
     "90 % of messages lost": Case(OLD, "loss=90", known=lambda rig: rig.read_at, known_after=1.0),
-    "wrong checksums": Case("[0-9]+ states in a row have a wrong checksum: the newest good one is [0-9]+ ms old", "bad_crc"),
-    "robot started again": Case("the robot's clock went back by 1.0 s: it was started again, or two robots answer", "clock_jump=-1"),
+    "wrong checksums": Case(
+        "[0-9]+ states in a row have a wrong checksum: the newest good one is [0-9]+ ms old", "bad_crc"
+    ),
+    "robot started again": Case(
+        "the robot's clock went back by 1.0 s: it was started again, or two robots answer", "clock_jump=-1"
+    ),
     "two robots": Case(TWO, answers_too(-10.0)),
     "two robots with one clock": Case(TWO, answers_too()),
     "two robots, one 20 ms ahead": Case(TWO, answers_too(0.02)),
     "two robots, one 50 ms behind": Case(TWO, answers_too(-0.05)),
-    "another body": Case("mode_machine was 5 and is 4: the robot has another body, or two robots answer", "mode_machine=4", task="g1_flat"),
-    "dead motor of a G1": Case("the motor of left_knee_joint reports a fault: error 0x1", "motor_fault=left_knee_joint", task="g1_flat"),
+    "another body": Case(
+        "mode_machine was 5 and is 4: the robot has another body, or two robots answer",
+        "mode_machine=4",
+        task="g1_flat",
+    ),
+    "dead motor of a G1": Case(
+        "the motor of left_knee_joint reports a fault: error 0x1", "motor_fault=left_knee_joint", task="g1_flat"
+    ),
     "second commander": Case("another program sends commands to this robot, too", commands_too),
     "motors in another order": Case("F._.*_joint is at .* rad, .* beyond its range", "joint_order=1", misplaced=True),
-    "motor that turns the other way": Case("FL_calf_joint is at .* rad, .* beyond its range", "joint_sign=FL_calf_joint", misplaced=True),
+    "motor that turns the other way": Case(
+        "FL_calf_joint is at .* rad, .* beyond its range", "joint_sign=FL_calf_joint", misplaced=True
+    ),
     # processes and clocks
     "policy killed": Case("the policy's process ended", policy=lambda rig: rig.kill()),
-    "policy hangs": Case("no targets for 6[0-9] ms: the policy's process hangs or is late", policy=lambda rig: rig.sleep(0.5)),
+    "policy hangs": Case(
+        "no targets for 6[0-9] ms: the policy's process hangs or is late", policy=lambda rig: rig.sleep(0.5)
+    ),
     "policy late": Case("no targets for 6[0-9] ms: the policy's process hangs or is late", policy=takes(0.07)),
     "guard told to end": Case(r"the guard was stopped \(SIGTERM\)", policy=ends_guard(signal.SIGTERM)),
     **{
         f"guard that gets {name}": Case(rf"the guard was stopped \({name}\)", policy=ends_guard(getattr(signal, name)))
         for name in ("SIGHUP", "SIGUSR1", "SIGUSR2", "SIGABRT", "SIGQUIT")
     },
-    "guard killed": Case("the guard of the wire is gone; this process damps the joints in its place", policy=ends_guard(signal.SIGKILL)),
+    "guard killed": Case(
+        "the guard of the wire is gone; this process damps the joints in its place", policy=ends_guard(signal.SIGKILL)
+    ),
     "guard stopped for 200 ms": Case(SILENT, policy=ends_guard(signal.SIGSTOP, 0.2), known_after=0.2),
     "guard stopped for 2000 ms": Case(SILENT, policy=ends_guard(signal.SIGSTOP, 2.0), known_after=2.0),
     "guard and policy stopped for 200 ms": Case(
         SILENT, policy=all_stop(0.2), known=lambda rig: (rig.injected or 0.0) + 0.2, known_after=0.2
     ),
     "clock ahead": Case("the newest measurement is 100[0-9][0-9] ms old", policy=lambda rig: rig.clock_jumps(10.0)),
-    "clock back": Case("the newest measurement comes from .* ms ahead: a clock went back", policy=lambda rig: rig.clock_jumps(-10.0)),
+    "clock back": Case(
+        "the newest measurement comes from .* ms ahead: a clock went back", policy=lambda rig: rig.clock_jumps(-10.0)
+    ),
     "computer that slept": Case(
         "nothing was sent for 600[0-9][0-9] ms: the guard stood still, or this computer slept",
         policy=lambda rig: rig.computer_sleeps(60.0),

@@ -28,9 +28,13 @@ class Env:
     num_envs, num_actions = WORLDS, ACTIONS
 
 
-def turned(env: object, obs: TensorDict | None, actions: torch.Tensor | None) -> tuple[TensorDict | None, torch.Tensor | None]:
+def turned(
+    env: object, obs: TensorDict | None, actions: torch.Tensor | None
+) -> tuple[TensorDict | None, torch.Tensor | None]:
     """A stand-in for a mirror: everything changes sign."""
-    both = None if obs is None else TensorDict({k: torch.cat([obs[k], -obs[k]]) for k in list(obs.keys())}, [2 * len(obs)])
+    both = (
+        None if obs is None else TensorDict({k: torch.cat([obs[k], -obs[k]]) for k in list(obs.keys())}, [2 * len(obs)])
+    )
     return both, None if actions is None else torch.cat([actions, -actions])
 
 
@@ -110,12 +114,16 @@ def share_experience(source: PPO, target: PPO) -> None:
 
 def parameters(alg: PPO) -> dict[str, torch.Tensor]:
     """All that a checkpoint holds of the networks."""
-    return {f"{which}.{k}": v.clone() for which in ("actor", "critic") for k, v in getattr(alg, which).state_dict().items()}
+    return {
+        f"{which}.{k}": v.clone() for which in ("actor", "critic") for k, v in getattr(alg, which).state_dict().items()
+    }
 
 
 def difference(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> float:
     """Largest difference of any parameter, as a share of the parameter's own largest value."""
-    return max(float((a[k].double() - b[k].double()).abs().max() / a[k].double().abs().max().clamp(min=1e-3)) for k in a)
+    return max(
+        float((a[k].double() - b[k].double()).abs().max() / a[k].double().abs().max().clamp(min=1e-3)) for k in a
+    )
 
 
 def apart(before: dict[str, torch.Tensor], a: PPO, b: PPO) -> float:
@@ -128,7 +136,9 @@ def apart(before: dict[str, torch.Tensor], a: PPO, b: PPO) -> float:
 def take_over(target: PPO, source: PPO) -> None:
     """``target`` gets the networks, Adam's memory and the rate of ``source``, in place: what is recorded stays recorded."""
     for which in ("actor", "critic"):
-        for mine, other in zip(getattr(target, which).state_dict().values(), getattr(source, which).state_dict().values(), strict=True):
+        for mine, other in zip(
+            getattr(target, which).state_dict().values(), getattr(source, which).state_dict().values(), strict=True
+        ):
             mine.copy_(other)
         for mine, other in zip(getattr(target, which).parameters(), getattr(source, which).parameters(), strict=True):
             for name, memory in target.optimizer.state[mine].items():

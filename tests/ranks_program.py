@@ -64,7 +64,12 @@ end = {
     "obs": env.get_observations()["state"].cpu(),
     "means": runner._last_means,
 }
-end |= {"iteration": runner.current_learning_iteration, "steps": runner.total_steps, "stop": runner.stop, "rate": runner.alg.learning_rate}
+end |= {
+    "iteration": runner.current_learning_iteration,
+    "steps": runner.total_steps,
+    "stop": runner.stop,
+    "rate": runner.alg.learning_rate,
+}
 end["done"] = done[::12]
 runner.alg.release()
 torch.save(end, folder / f"rank{rank.index}.pt")

@@ -35,9 +35,18 @@ for number in range(6 if on_gpus else 2):  # on GPUs the last three are replayed
     for alg in (stock, ours):
         torch.manual_seed(rank.index)  # each draws the order of its samples first
         alg.update()
-    found.append({"difference": difference(parameters(stock), parameters(ours)), "rates": (stock.learning_rate, ours.learning_rate)})
+    found.append(
+        {
+            "difference": difference(parameters(stock), parameters(ours)),
+            "rates": (stock.learning_rate, ours.learning_rate),
+        }
+    )
 assert ours._update_graph.recorded == on_gpus
-end = {"updates": found, "parameters": {k: v.cpu() for k, v in parameters(ours).items()}, "obs": ours.storage.observations["state"].cpu()}
+end = {
+    "updates": found,
+    "parameters": {k: v.cpu() for k, v in parameters(ours).items()},
+    "obs": ours.storage.observations["state"].cpu(),
+}
 torch.save(end, folder / f"rank{rank.index}.pt")
 ours.release()
 leave_together(rank)

@@ -13,7 +13,9 @@ import pytest
 from legged_mw import ROOT
 
 FILES = sorted(
-    str(p.relative_to(ROOT)) for pattern in ("legged_mw/**/*.py", "configs/*.py", "examples/*.py", "*.py") for p in ROOT.glob(pattern)
+    str(p.relative_to(ROOT))
+    for pattern in ("legged_mw/**/*.py", "configs/*.py", "examples/*.py", "*.py")
+    for p in ROOT.glob(pattern)
 )
 MAX_FUNCTION = 60  # lines of one that reads as one story; a file is as long as its concept
 
@@ -34,9 +36,16 @@ ONLY_IN = {
     "mujoco_warp": ["legged_mw/sim/*"],
     "rsl_rl": ["legged_mw/rl/*"],
     "rsl_rl.env": ["legged_mw/rl/*", "legged_mw/envs/base_task.py"],
-    "matplotlib": ["legged_mw/eval/plots.py", "legged_mw/deploy/replay.py"],  # a second to import, and only for a report
+    # a second to import, and only for a report
+    "matplotlib": ["legged_mw/eval/plots.py", "legged_mw/deploy/replay.py"],
     "legged_mw.view": [
-        *("legged_mw/view/*", "legged_mw/deploy/*", "legged_mw/robot/*", "legged_mw/motion/*", "legged_mw/eval/strip.py"),
+        *(
+            "legged_mw/view/*",
+            "legged_mw/deploy/*",
+            "legged_mw/robot/*",
+            "legged_mw/motion/*",
+            "legged_mw/eval/strip.py",
+        ),
         "legged_mw/tools/*",
         "legged_mw/programs.py",
     ],
@@ -70,7 +79,8 @@ NEVER_IN = {
     "legged_mw/envs/*": ["mujoco"],
     "legged_mw/sim/*": ["legged_mw.utils.config", "legged_mw.utils.task"],
     "legged_mw/rl/flags.py": ["torch"],
-    "legged_mw/eval/rules.py": ["torch", "mujoco"],  # numbers in, numbers out: of use to whoever drives the robot otherwise
+    # numbers in, numbers out: of use to whoever drives the robot otherwise
+    "legged_mw/eval/rules.py": ["torch", "mujoco"],
     "legged_mw/eval/figures.py": ["torch", "mujoco"],
     "legged_mw/eval/skill*.py": ["torch", "legged_mw.envs", "legged_mw.rl", "legged_mw.eval.perform"],
     "legged_mw/view/*": [
@@ -102,14 +112,22 @@ DEPLOY_MAY = [
         "legged_mw.eval.skill",
         "legged_mw.eval.skills",
     ),
-    *("legged_mw.utils.cli", "legged_mw.utils.config", "legged_mw.utils.errors", "legged_mw.utils.machine", "legged_mw.utils.commands"),
+    *(
+        "legged_mw.utils.cli",
+        "legged_mw.utils.config",
+        "legged_mw.utils.errors",
+        "legged_mw.utils.machine",
+        "legged_mw.utils.commands",
+    ),
     *("legged_mw.utils.motor_network", "legged_mw.utils.files", "legged_mw.utils.clip", "legged_mw.utils.mjcf"),
     *sys.stdlib_module_names,
 ]
 
 
 # A factory arm could be stepped with sim/: it names no field of a config, no flag, nothing of walking or learning.
-FIELD_OR_FLAG = r"--[a-z]|(?<![\w./])(?:asset|terrain|sim|control|rewards|commands|init_state|domain_rand|env|viewer|cfg)\.[a-z]"
+FIELD_OR_FLAG = (
+    r"--[a-z]|(?<![\w./])(?:asset|terrain|sim|control|rewards|commands|init_state|domain_rand|env|viewer|cfg)\.[a-z]"
+)
 OF_A_CONFIG = r"\b(?:config\w*|section)\b"
 OF_A_TASK = r"\b(?:foot|feet|command\w*|reward\w*|policy|policies|observation\w*|episode\w*)\b"
 
@@ -133,7 +151,9 @@ def within(name: str, package: str) -> bool:
 def layer(name: str) -> int:
     """Place of a module of the core in ``LAYERS``; -1 for all others. Exports are a tool."""
     head, _, rest = name.removeprefix("legged_mw.").partition(".")
-    return LAYERS.index(head) if name.startswith("legged_mw.") and head in LAYERS and not rest.startswith("export") else -1
+    return (
+        LAYERS.index(head) if name.startswith("legged_mw.") and head in LAYERS and not rest.startswith("export") else -1
+    )
 
 
 def against_the_layers(path: str, name: str) -> bool:
@@ -147,9 +167,14 @@ def violations(path: str, source: str) -> list[str]:
     """Imports that ``path`` may not make."""
     wrong = []
     for name in sorted(imports(source)):
-        rule = max((package for package in ONLY_IN if within(name, package)), key=len, default=None)  # the most specific
+        # the most specific
+        rule = max((package for package in ONLY_IN if within(name, package)), key=len, default=None)
         outside = rule is not None and not any(fnmatch(path, where) for where in ONLY_IN[rule])
-        never = any(fnmatch(path, where) and within(name, package) for where, packages in NEVER_IN.items() for package in packages)
+        never = any(
+            fnmatch(path, where) and within(name, package)
+            for where, packages in NEVER_IN.items()
+            for package in packages
+        )
         if path in MAY_ALL_THE_SAME:
             never = False
         if path.startswith("configs/"):
@@ -165,7 +190,9 @@ def circles(sources: Mapping[str, str]) -> list[tuple[str, ...]]:
     """Modules (dotted name -> source) that import each other, directly or not: each group once."""
     graph = {name: _imported(source, sources) - {name} for name, source in sources.items()}
     reach = {name: _reached(graph, name) for name in graph}
-    return sorted({tuple(sorted(other for other in reach[name] if name in reach[other])) for name in graph if name in reach[name]})
+    return sorted(
+        {tuple(sorted(other for other in reach[name] if name in reach[other])) for name in graph if name in reach[name]}
+    )
 
 
 def _imported(source: str, modules: Iterable[str]) -> set[str]:
@@ -185,7 +212,9 @@ def _reached(graph: Mapping[str, set[str]], start: str) -> set[str]:
 
 def too_long(source: str) -> list[str]:
     """Functions of more lines than one can survey."""
-    functions = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)]
+    functions = [
+        node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
+    ]
     lines = [(f.name, (f.end_lineno or 0) - f.lineno + 1) for f in functions]
     return [f"{name}: {length} lines" for name, length in lines if length > MAX_FUNCTION]
 
@@ -290,7 +319,13 @@ def test_no_two_modules_import_each_other() -> None:
     ],
 )
 def test_circles_are_found(back: str) -> None:
-    straight = {"a": "", "a.one": "import a.two\nimport numpy", "a.two": "from a.three import x", "a.three": "", "b": "import a.one"}
+    straight = {
+        "a": "",
+        "a.one": "import a.two\nimport numpy",
+        "a.two": "from a.three import x",
+        "a.three": "",
+        "b": "import a.one",
+    }
     assert circles(straight) == []
     assert circles({**straight, "a.three": back}) == [("a.one", "a.three", "a.two")]
     assert circles({**straight, "a.two": back}) == [("a.one", "a.two")]
@@ -306,7 +341,9 @@ def test_functions_stay_readable(path: str) -> None:
 @pytest.mark.parametrize("task", ["go2_flat", "g1_flat", "g1_12dof_flat", "go2_rough", "go2_rough_scan", "g1_rough"])
 def test_a_robot_is_a_short_config(task: str) -> None:
     """40 lines for its first task, 20 for a further one; go1_flat and go1_rough spell out each number."""
-    assert len((ROOT / f"configs/{task}.py").read_text().splitlines()) <= (40 if task in ("go2_flat", "g1_flat") else 20)
+    assert len((ROOT / f"configs/{task}.py").read_text().splitlines()) <= (
+        40 if task in ("go2_flat", "g1_flat") else 20
+    )
 
 
 def test_what_is_too_long_is_found() -> None:
@@ -340,6 +377,12 @@ def test_words_that_sim_may_not_say_are_found(source: str, found: list[str]) -> 
 
 
 def test_all_files_were_looked_at() -> None:
-    assert {"legged_mw/envs/legged_robot.py", "legged_mw/sim/simulation.py", "configs/go1_flat.py", "train.py", "play.py"} <= set(FILES)
+    assert {
+        "legged_mw/envs/legged_robot.py",
+        "legged_mw/sim/simulation.py",
+        "configs/go1_flat.py",
+        "train.py",
+        "play.py",
+    } <= set(FILES)
     vague = {"helpers", "managers", "core", "common", "wrappers", "helper", "misc"}
     assert [path for path in FILES if vague & set(path.removesuffix(".py").split("/"))] == []

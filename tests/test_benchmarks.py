@@ -42,7 +42,9 @@ def test_the_smallest_memory_is_found(need: float, said: str, monkeypatch: pytes
 def test_another_failure_is_not_taken_for_want_of_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(memory, "rows", lambda *_: iter([{"error": "no task 'go9' in configs/"}]))
     gpu: Any = argparse.Namespace(leave=lambda size: None)
-    assert memory.smallest(argparse.Namespace(sizes=[2.0, 4.0]), "go9", 1024, "cuda:0", gpu) == "no task 'go9' in configs/"
+    assert (
+        memory.smallest(argparse.Namespace(sizes=[2.0, 4.0]), "go9", 1024, "cuda:0", gpu) == "no task 'go9' in configs/"
+    )
 
 
 def test_as_many_robots_as_asked_stand_before_each_height() -> None:

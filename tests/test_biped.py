@@ -51,7 +51,9 @@ def term(env: LeggedRobot, name: str) -> list[float]:
 
 def touch(env: LeggedRobot, *feet: tuple[float, float]) -> None:
     """Contacts of the left and the right foot in each world, on one of each foot's two boxes."""
-    env.sim.sensordata[:, env.robot.sensors["contact"]] = torch.tensor([[left, 0.0, 0.0, right] for left, right in feet])
+    env.sim.sensordata[:, env.robot.sensors["contact"]] = torch.tensor(
+        [[left, 0.0, 0.0, right] for left, right in feet]
+    )
 
 
 def test_every_term_has_a_figure() -> None:
@@ -66,7 +68,9 @@ def test_base_and_joints() -> None:
     env = biped()
     env.sim.qpos[:, 2] = torch.tensor([0.6, 0.47])
     env.sim.qvel[:, 6:] = torch.tensor([[1.0, -2.0, 0.0, 0.0, 0.0, 3.0], [0.5] * 6])
-    env.sim.qpos[:, 7:] = env.default_dof_pos + torch.tensor([[0.3, 9.0, 9.0, -0.4, 9.0, 9.0], [0.0, 9.0, 9.0, 0.1, 9.0, 9.0]])
+    env.sim.qpos[:, 7:] = env.default_dof_pos + torch.tensor(
+        [[0.3, 9.0, 9.0, -0.4, 9.0, 9.0], [0.0, 9.0, 9.0, 0.1, 9.0, 9.0]]
+    )
     env._update_state()
     assert env.robot.joint_names[0] == "left_hip" and env.robot.joint_names[3] == "right_hip"
     assert term(env, "alive") == [1.0, 1.0]
@@ -132,10 +136,15 @@ def test_feet_distance() -> None:
 
 
 def test_feet_distance_of_four_feet_is_of_mirrored_pairs() -> None:
-    env = make_env(1, {**QUIET, "rewards.scales.feet_distance": -1.0, "rewards.min_feet_distance": 0.3, "init_state.yaw_range": 0.0})
+    env = make_env(
+        1,
+        {**QUIET, "rewards.scales.feet_distance": -1.0, "rewards.min_feet_distance": 0.3, "init_state.yaw_range": 0.0},
+    )
     sites = [env.robot.id("site", name) for name in ("FR", "FL", "RR", "RL")]
     assert env.neighbours.tolist() == [[1, 3], [0, 2]]  # left, right
-    env.sim.site_xpos[0, sites] = torch.tensor([[0.2, -0.1, 0.0], [0.2, 0.1, 0.0], [-0.2, -0.1, 0.0], [-0.2, 0.14, 0.0]])
+    env.sim.site_xpos[0, sites] = torch.tensor(
+        [[0.2, -0.1, 0.0], [0.2, 0.1, 0.0], [-0.2, -0.1, 0.0], [-0.2, 0.14, 0.0]]
+    )
     env._update_state()
     assert term(env, "feet_distance") == pytest.approx([0.1 + 0.06], rel=1e-4)
 
@@ -144,7 +153,11 @@ def test_feet_orientation() -> None:
     """A foot rolled by 30 degrees: sin^2 = 0.25; turned about the vertical: nothing."""
     env = biped(worlds=3)
     bodies = [env.robot.id("body", name) for name in ("left_foot", "right_foot")]
-    flat, rolled, turned = [1.0, 0.0, 0.0, 0.0], [math.cos(math.pi / 12), math.sin(math.pi / 12), 0.0, 0.0], [0.6, 0.0, 0.0, 0.8]
+    flat, rolled, turned = (
+        [1.0, 0.0, 0.0, 0.0],
+        [math.cos(math.pi / 12), math.sin(math.pi / 12), 0.0, 0.0],
+        [0.6, 0.0, 0.0, 0.8],
+    )
     env.sim.xquat[:, bodies] = torch.tensor([[flat, flat], [rolled, turned], [rolled, rolled]])
     assert term(env, "feet_orientation") == pytest.approx([0.0, 0.25, 0.5], abs=1e-6)
 
@@ -188,7 +201,9 @@ def test_single_stance() -> None:
         env._update_state()
         got.append(term(env, "single_stance"))
         env._end_step()
-    assert [moving for moving, _ in got] == pytest.approx(wanted) and [stands for _, stands in got] == [0.0] * len(story)
+    assert [moving for moving, _ in got] == pytest.approx(wanted) and [stands for _, stands in got] == [0.0] * len(
+        story
+    )
     assert env.feet_contact_time.tolist() == [[0.0, 0.0]] * 2
 
 
@@ -276,7 +291,10 @@ def test_what_the_clock_wants_of_feet(share: float, left: float, right: float, s
     clock.running[:] = True
     clock.phase[:] = share
     clock.observe(torch.tensor([True, False]))
-    assert clock.swing()[0].tolist() == pytest.approx([left, right], abs=1e-6) and clock.swing()[1].tolist() == [0.0, 0.0]
+    assert clock.swing()[0].tolist() == pytest.approx([left, right], abs=1e-6) and clock.swing()[1].tolist() == [
+        0.0,
+        0.0,
+    ]
     assert clock.wants_contact().tolist() == [[*stands], [True, True]]
     rise = {0.0: 0.0, 0.25: 0.5, 0.5: 1.0}  # 3 r^2 - 2 r^3 with r = 1 - |2 s - 1|
     wanted = [0.08 * rise[left], 0.08 * rise[right]]
@@ -336,8 +354,16 @@ CLOCK = "there is no gait clock; set gait.period \\[s\\]$"
 @pytest.mark.parametrize(
     ("task", "settings", "text"),
     [
-        (BIPED, {"gait.period": 0.0, "rewards.scales.contact_phase": 0.0}, rf"^rewards.scales.feet_phase is on, but {CLOCK}"),
-        (BIPED, {"gait.period": 0.0, "rewards.scales.feet_phase": 0.0}, rf"^rewards.scales.contact_phase is on, but {CLOCK}"),
+        (
+            BIPED,
+            {"gait.period": 0.0, "rewards.scales.contact_phase": 0.0},
+            rf"^rewards.scales.feet_phase is on, but {CLOCK}",
+        ),
+        (
+            BIPED,
+            {"gait.period": 0.0, "rewards.scales.feet_phase": 0.0},
+            rf"^rewards.scales.contact_phase is on, but {CLOCK}",
+        ),
         (
             BIPED,
             {"rewards.base_height_target": 0.0},
@@ -349,7 +375,11 @@ CLOCK = "there is no gait clock; set gait.period \\[s\\]$"
             "^rewards.scales.hip_pos is on, but rewards.hip_joints is empty; write names of joints, parts of them or patterns$",
         ),
         (BIPED, {"rewards.hip_joints": ["hipp"]}, r"^rewards.hip_joints: no joint 'hipp' in the robot; .*left_hip"),
-        (BIPED, {"gait.offsets": [0.0]}, r"^gait.offsets has 1 numbers; write one share of the period a foot \(left, right\)$"),
+        (
+            BIPED,
+            {"gait.offsets": [0.0]},
+            r"^gait.offsets has 1 numbers; write one share of the period a foot \(left, right\)$",
+        ),
         (BIPED, {"gait.offsets": [0.0, 1.5]}, r"gait.offsets\[1\] is 1.5; it must be from 0 to 1$"),
         (BIPED, {"gait.stance": 1.0}, r"gait.stance is 1.0; it must be above 0 and below 1$"),
         (
@@ -368,7 +398,11 @@ CLOCK = "there is no gait clock; set gait.period \\[s\\]$"
             {"rewards.scales.single_stance": 1.0},
             "^rewards.scales.single_stance is on, but it is for robots with two feet; asset.foot_names has 4$",
         ),
-        (BIPED, {"init_state.dof_pos_offset": [0.1]}, r"init_state.dof_pos_offset is \[0.1\]; it must be two numbers, the lower first$"),
+        (
+            BIPED,
+            {"init_state.dof_pos_offset": [0.1]},
+            r"init_state.dof_pos_offset is \[0.1\]; it must be two numbers, the lower first$",
+        ),
         (BIPED, {"init_state.dof_vel_range": -1.0}, r"init_state.dof_vel_range is -1.0; it must be from 0 to 1000$"),
     ],
 )
@@ -389,7 +423,10 @@ def test_one_foot_has_no_neighbour() -> None:
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An untrained biped's export; commands changed and episodes ended while it was tried."""
-    folder, often = tmp_path_factory.mktemp("biped"), {"commands.resampling_time": 0.2, "env.episode_length_s": 0.4, "gait.period": 0.5}
+    folder, often = (
+        tmp_path_factory.mktemp("biped"),
+        {"commands.resampling_time": 0.2, "env.episode_length_s": 0.4, "gait.period": 0.5},
+    )
     task, checkpoint = untrained(ROOT / BIPED, folder, {**ON, **often})
     export(task, checkpoint, folder / "out")
     return folder
@@ -399,7 +436,9 @@ def test_the_contract_states_the_clock(exported: Path) -> None:
     contract = read_contract(exported / "out")
     assert contract.gait == Gait(0.5, (0.0, 0.5), 0.01)
     [clock] = [row for row in contract.rows if row.name == "gait_clock"]
-    assert (clock.size, clock.unit, clock.measured) == (4, "1", "gait_clock") and clock.frame.startswith("sine of each foot's phase")
+    assert (clock.size, clock.unit, clock.measured) == (4, "1", "gait_clock") and clock.frame.startswith(
+        "sine of each foot's phase"
+    )
 
 
 def test_deploy_keeps_the_clock_of_the_environment(exported: Path) -> None:
@@ -434,7 +473,9 @@ def test_a_clock_that_runs_otherwise_is_not_exported(exported: Path, monkeypatch
         self.phase.add_(self.running, alpha=0.01).remainder_(1.0)
 
     monkeypatch.setattr(GaitClock, "tick", late)
-    monkeypatch.setattr(exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(exported / "out/policy.onnx", path))
+    monkeypatch.setattr(
+        exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(exported / "out/policy.onnx", path)
+    )
     text = "^legged_mw.deploy would act otherwise than the environment: observation row 'gait_clock' "
     trained = load_task(str(ROOT / BIPED))
     trained.update_from_run(load_yaml(exported / "out/config.yaml"), where="config.yaml")
@@ -457,7 +498,9 @@ def test_a_clock_that_runs_otherwise_is_not_exported(exported: Path, monkeypatch
         ),
     ],
 )
-def test_a_contract_whose_clock_is_not_whole(exported: Path, tmp_path: Path, change: Callable[[Any], Any], text: str) -> None:
+def test_a_contract_whose_clock_is_not_whole(
+    exported: Path, tmp_path: Path, change: Callable[[Any], Any], text: str
+) -> None:
     shutil.copytree(exported / "out", tmp_path / "out")
     said = load_yaml(tmp_path / "out/policy.yaml")
     change(said)

@@ -17,7 +17,10 @@ from website import gallery, pictures, reference
 from website.formula import formula
 
 DOCS = ROOT / "docs"
-TWINS = [(ROOT / "README.md", ROOT / "README.zh-CN.md"), *((DOCS / path.name, path) for path in sorted((DOCS / "zh").glob("*.md")))]
+TWINS = [
+    (ROOT / "README.md", ROOT / "README.zh-CN.md"),
+    *((DOCS / path.name, path) for path in sorted((DOCS / "zh").glob("*.md"))),
+]
 FORMULAS = {  # by hand from the code
     "lin_vel_z": "(Σ (base_lin_vel · projected_gravity))²",
     "action_rate": "Σ (actions - last_actions)²",
@@ -101,7 +104,9 @@ def test_every_term_says_what_it_is_and_whose() -> None:
 
 def test_every_field_says_its_bounds() -> None:
     lines = {
-        line.split(" | ")[0]: line for line in reference.config_fields().splitlines() if line.startswith("| `") and "overridden" not in line
+        line.split(" | ")[0]: line
+        for line in reference.config_fields().splitlines()
+        if line.startswith("| `") and "overridden" not in line
     }
     for name, told in (
         ("num_envs", "`int`: 1 or more"),
@@ -131,7 +136,11 @@ def shape(page: Path) -> dict[str, Any]:
     text = page.read_text()
     prose = re.sub(r"^```.*?^```", "", text, flags=re.MULTILINE | re.DOTALL)
     rows = [line for line in prose.splitlines() if line.startswith("|")]
-    known = {link.rpartition("/")[2].replace(".zh.", ".") for link in re.findall(r"\]\(([^)#\s]+)", text) if not link.startswith("http")}
+    known = {
+        link.rpartition("/")[2].replace(".zh.", ".")
+        for link in re.findall(r"\]\(([^)#\s]+)", text)
+        if not link.startswith("http")
+    }
     return {
         "headings": [len(mark) for mark in re.findall(r"^(#+) ", prose, re.MULTILINE)],
         "commands": blocks(text),
@@ -173,4 +182,6 @@ def test_the_gallery_has_every_policy(site: Path) -> None:
     assert gallery.PAGE.read_text() == gallery.page(), "python -m website.gallery"
     assert [name for name in gallery.policies() if "| --- |" not in gallery.chapter(name)] == [], "an exam's table"
     page = (site / "gallery.html").read_text()
-    assert page.count("falls in 22 commands") >= 6 and page.count("curve.webp") == len(list(gallery.POLICIES.glob("*/curve.webp")))
+    assert page.count("falls in 22 commands") >= 6 and page.count("curve.webp") == len(
+        list(gallery.POLICIES.glob("*/curve.webp"))
+    )

@@ -47,7 +47,11 @@ def test_tasks_as_they_ship_pass(name: str) -> None:
         ("commands.ranges.lin_vel_y", [0.5], "two numbers, the lower first"),
         ("commands.keep_probability", [0.9, 0.25], "three numbers, and more for further commands; each from 0 to 1"),
         ("perturbation.duration", [0.2, 0.1], "two numbers, the lower first; each above 0"),
-        ("domain_rand.link_mass", [0.9], "two numbers, the lower first, or an empty list; each above 0 and at most 1000"),
+        (
+            "domain_rand.link_mass",
+            [0.9],
+            "two numbers, the lower first, or an empty list; each above 0 and at most 1000",
+        ),
         ("rewards.mirror_joints", [["FR_", "RL_"], ["FL_"]], "pairs: lists of two names or patterns each"),
         ("termination.max_tilt", 0.0, "above 0 and at most 180 degrees"),
         ("init_state.pos", [0.0, 0.3], "three numbers, or an empty list; each from -1000 to 1000 m"),
@@ -79,7 +83,11 @@ def test_mistake_is_named(path: str, value: Any, wanted: str) -> None:
     for section in sections:
         parents.append(getattr(parents[-1], section))
     for parent in parents[:0:-1]:
-        body = {parent.__name__: type(parent.__name__, (parent,), {**body, "__qualname__": f"Bad.{path}".rpartition(".")[0]})}
+        body = {
+            parent.__name__: type(
+                parent.__name__, (parent,), {**body, "__qualname__": f"Bad.{path}".rpartition(".")[0]}
+            )
+        }
     with pytest.raises(ConfigError) as error:
         type("Bad", (owner,), body)
     assert f"{name} is {value!r}; it must be {wanted}" in str(error.value)
@@ -95,7 +103,11 @@ def test_mistake_is_named(path: str, value: Any, wanted: str) -> None:
             "asset.foot_names is ['FR', 'FR']; it must be a list of at least one name, one for each foot and each once",
         ),
         ("asset.foot_names", ["*_foot"], "asset.foot_names is ['*_foot']; it must be a list of at least one name"),
-        ("control.stiffness", {"": 35.0, "hip": -35.0}, "control.stiffness['hip'] is -35.0; it must be from 0 to 1,000,000"),
+        (
+            "control.stiffness",
+            {"": 35.0, "hip": -35.0},
+            "control.stiffness['hip'] is -35.0; it must be from 0 to 1,000,000",
+        ),
         ("domain_rand.friction", [0.0, 1.0], "domain_rand.friction[0] is 0.0; it must be from 1e-05"),
         (
             "domain_rand.model_factors",
@@ -107,13 +119,25 @@ def test_mistake_is_named(path: str, value: Any, wanted: str) -> None:
             {"thigh": 51.0},
             "init_state.default_joint_angles['thigh'] is 51.0; it must be from -2 pi to 2 pi",
         ),
-        ("control.action_scale", 1e5, "control.action_scale is 100000.0; it must be another number than 0, and 10,000 at most"),
+        (
+            "control.action_scale",
+            1e5,
+            "control.action_scale is 100000.0; it must be another number than 0, and 10,000 at most",
+        ),
         ("domain_rand.base_com", [100.0, 100.0], "domain_rand.base_com[0] is 100.0; it must be from -10 to 10 m"),
-        ("domain_rand.contact_time", [1e-9, 1e-9], "domain_rand.contact_time[0] is 1e-09; it must be from 0.0001 to 10 s"),
+        (
+            "domain_rand.contact_time",
+            [1e-9, 1e-9],
+            "domain_rand.contact_time[0] is 1e-09; it must be from 0.0001 to 10 s",
+        ),
         ("env.episode_length_s", 1e-9, "env.episode_length_s is 1e-09, shorter than a control step of 0.02 s"),
         ("commands.mirror", {"lin_vel_x": 0.5}, "commands.mirror['lin_vel_x'] is 0.5; it must be 1 or -1"),
         ("terrain.condim", 2, "terrain.condim must be Literal[1, 3, 4, 6], not 2 (int)"),
-        ("terrain.terrain_proportions", {"stairs_up": math.inf}, "terrain.terrain_proportions['stairs_up'] is inf; it must be finite"),
+        (
+            "terrain.terrain_proportions",
+            {"stairs_up": math.inf},
+            "terrain.terrain_proportions['stairs_up'] is inf; it must be finite",
+        ),
         ("terrain.measured_points_y", [math.nan], "terrain.measured_points_y[0] is nan; it must be from -100 to 100 m"),
         ("control.action_scale", {"": 0.0}, "control.action_scale[''] is 0.0; it must be another number than 0"),
         ("control.action_scale", 0.0, "control.action_scale is 0.0; it must be another number than 0"),
@@ -140,7 +164,9 @@ def test_a_factor_on_a_field_that_is_none_is_refused_whatever_it_is(field: str, 
 def test_a_command_of_a_users_own_has_a_range() -> None:
     task = load_task("go1_flat")
     vars(task.cfg.commands.ranges)["height"] = [0.3, 0.2]
-    with pytest.raises(ConfigError, match=r"^commands.ranges.height is \[0.3, 0.2\]; it must be two numbers, the lower first$"):
+    with pytest.raises(
+        ConfigError, match=r"^commands.ranges.height is \[0.3, 0.2\]; it must be two numbers, the lower first$"
+    ):
         check_values(task.cfg)
 
 
@@ -150,10 +176,17 @@ def fields() -> list[tuple[LoadedTask, str, Any]]:
     return [(task, *field) for task in tasks for cfg in (task.cfg, task.train) for field in field_types(type(cfg))]
 
 
-@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf, 1e39, 10**5000], ids=["nan", "inf", "-inf", "1e39", "5000 digits"])
+@pytest.mark.parametrize(
+    "number", [math.nan, math.inf, -math.inf, 1e39, 10**5000], ids=["nan", "inf", "-inf", "1e39", "5000 digits"]
+)
 def test_no_field_takes_a_number_that_is_not_finite(number: float) -> None:
     """Nor one that is infinite in float32, wherever a number may stand: alone, in a list, in a table."""
-    whole = {float: number, list[float]: [number] * 3, dict[str, float]: {"": number}, dict[str, list[float]]: {"": [number]}}
+    whole = {
+        float: number,
+        list[float]: [number] * 3,
+        dict[str, float]: {"": number},
+        dict[str, list[float]]: {"": [number]},
+    }
     found = [(task, path, whole[bare(kind)]) for task, path, kind in fields() if bare(kind) in whole]
     assert len(found) > 1000
     for task, path, value in found:
@@ -174,16 +207,25 @@ def test_no_number_is_cut_off_in_silence() -> None:
         check_values(task.cfg)
 
 
-@pytest.mark.parametrize("name", ["stiffness", "damping", "action_scale", "pose_weights", "default_joint_angles", "joint_speed_limits"])
+@pytest.mark.parametrize(
+    "name", ["stiffness", "damping", "action_scale", "pose_weights", "default_joint_angles", "joint_speed_limits"]
+)
 def test_a_table_of_joints_is_checked_when_the_environment_is_made(name: str) -> None:
     """Not where it is read, which may be at the end of an exam; all joints are named."""
-    section = {"pose_weights": "rewards", "default_joint_angles": "init_state", "joint_speed_limits": "asset"}.get(name, "control")
+    section = {"pose_weights": "rewards", "default_joint_angles": "init_state", "joint_speed_limits": "asset"}.get(
+        name, "control"
+    )
     legs = [f"{leg}_{joint}_joint" for leg in ("FR", "FL", "RR", "RL") for joint in ("hip", "thigh", "calf")]
-    with pytest.raises(ModelError, match=rf"^{section}\.{name}: no joint 'wheel' in the MJCF; there are: {', '.join(legs)} "):
+    with pytest.raises(
+        ModelError, match=rf"^{section}\.{name}: no joint 'wheel' in the MJCF; there are: {', '.join(legs)} "
+    ):
         make_env(1, {f"{section}.{name}": {"": 1.0, "wheel": 2.0}})
     if name in ("stiffness", "damping", "action_scale", "pose_weights"):  # the other tables may be silent
         thighs = ", ".join(joint for joint in legs if "thigh" in joint)
-        with pytest.raises(ModelError, match=rf"^{section}\.{name}: no value for {thighs}: none of \['hip', 'calf'\] is a part of these"):
+        with pytest.raises(
+            ModelError,
+            match=rf"^{section}\.{name}: no value for {thighs}: none of \['hip', 'calf'\] is a part of these",
+        ):
             make_env(1, {f"{section}.{name}": {"hip": 1.0, "calf": 1.0}})
 
 
@@ -298,7 +340,9 @@ def test_a_reward_of_a_users_own_without_a_scale_is_off(tmp_path: Path) -> None:
     assert " off: rewards" not in run("train", tmp_path, *small, "--set", "rewards.scales.crouch=1").out
 
 
-@pytest.mark.parametrize(("name", "scale"), [("tracking_lin_vel", -1.0), ("action_rate", 0.01), ("alive", -1.0), ("feet_slip", 1.0)])
+@pytest.mark.parametrize(
+    ("name", "scale"), [("tracking_lin_vel", -1.0), ("action_rate", 0.01), ("alive", -1.0), ("feet_slip", 1.0)]
+)
 def test_a_scale_of_the_unusual_sign_is_named(name: str, scale: float) -> None:
     task = load_task("go1_flat")
     task.set(f"rewards.scales.{name}", scale)
@@ -312,7 +356,9 @@ def test_a_term_of_a_users_own_has_any_sign(tmp_path: Path) -> None:
     assert lines_on(task) == []
 
 
-@pytest.mark.parametrize("name", [*task_names(), *(f"examples/{path.name}" for path in sorted((ROOT / "examples").glob("*.py")))])
+@pytest.mark.parametrize(
+    "name", [*task_names(), *(f"examples/{path.name}" for path in sorted((ROOT / "examples").glob("*.py")))]
+)
 def test_no_task_of_ours_is_warned_of(name: str) -> None:
     if name.startswith("examples/") and "TASK = " not in (ROOT / name).read_text():
         return
@@ -323,7 +369,9 @@ def test_no_task_of_ours_is_warned_of(name: str) -> None:
 
 
 def test_usual_signs_are_those_of_the_page() -> None:
-    rows = re.findall(r"^\| (`\w+`(?:, `\w+`)*) \|.*\| (above|below) 0 \|$", (ROOT / "docs" / "tasks.md").read_text(), re.MULTILINE)
+    rows = re.findall(
+        r"^\| (`\w+`(?:, `\w+`)*) \|.*\| (above|below) 0 \|$", (ROOT / "docs" / "tasks.md").read_text(), re.MULTILINE
+    )
     signs = {term: side == "above" for terms, side in rows for term in re.findall(r"\w+", terms)}
     assert len(signs) >= 25 and all((term in PAYS) == above for term, above in signs.items())
 
@@ -362,11 +410,15 @@ def test_doubts_draw_no_number(name: str, tmp_path: Path) -> None:
     """A training is the same with them, also of a task that draws from Python's generator and numpy's."""
     task = load_task(name)
     if name == "go1_flat":
-        task = mine(tmp_path, "def _init_buffers(self):\n    super()._init_buffers()\n    random.random(), np.random.rand()")
+        task = mine(
+            tmp_path, "def _init_buffers(self):\n    super()._init_buffers()\n    random.random(), np.random.rand()"
+        )
         vars(sys.modules[task.env_class.__module__]).update(random=random, np=np)
     before = torch.get_rng_state(), random.getstate(), str(np.random.get_state())
     doubts(task)
-    assert torch.equal(torch.get_rng_state(), before[0]) and (random.getstate(), str(np.random.get_state())) == before[1:]
+    assert (
+        torch.equal(torch.get_rng_state(), before[0]) and (random.getstate(), str(np.random.get_state())) == before[1:]
+    )
 
 
 def test_doubts_keep_the_ground_of_a_task_and_never_fail(tmp_path: Path) -> None:
@@ -413,6 +465,9 @@ def test_gains_that_no_robot_stands_on_are_said(kp: str, what: str, how: list[st
 @pytest.mark.parametrize("law", ["torque", "dc_motor"])
 def test_other_motors_are_looked_at_as_far_as_they_have_gains(law: str) -> None:
     task = load_task("go1_flat")
-    task.update({"control": {"actuator": law, "stall_torque": {"": 30.0}, "no_load_speed": {"": 30.0}, "stiffness": {"": 0.0}}}, "test")
+    task.update(
+        {"control": {"actuator": law, "stall_torque": {"": 30.0}, "no_load_speed": {"": 30.0}, "stiffness": {"": 0.0}}},
+        "test",
+    )
     wrong, _ = doubts(task)
     assert bool(wrong) == (law == "dc_motor")

@@ -113,7 +113,14 @@ def test_list(tmp_path: Path) -> None:
 
 def test_check(tmp_path: Path) -> None:
     """What the task is made of, with overrides, and nothing is written."""
-    scales = ["--set", "rewards.scales.pose=0", "--set", "rewards.scales.lin_vel_z=-0.7", "--set", "control.stiffness={joint: 20}"]
+    scales = [
+        "--set",
+        "rewards.scales.pose=0",
+        "--set",
+        "rewards.scales.lin_vel_z=-0.7",
+        "--set",
+        "control.stiffness={joint: 20}",
+    ]
     result = run("train", tmp_path, *SMALL, "--check", *scales, "--set", "noise.level=2")
     assert result.code == 0 and not files(tmp_path)
     lines = [" ".join(line.split()) for line in result.out.splitlines()]
@@ -149,17 +156,26 @@ def test_check_refuses_a_learner_that_training_refuses(wrong: list[str], said: s
 
 
 def test_check_says_what_remembers_and_that_nothing_is_drawn(tmp_path: Path) -> None:
-    result = run("train", tmp_path, *SMALL, "--check", "--set", "actor.class_name=RNNModel", "--set", "actor.rnn_type=lstm")
-    assert "the actor remembers: lstm, 64 units, layers: 1\n" in result.out and "domain_rand.enable is False: none" in result.out
+    result = run(
+        "train", tmp_path, *SMALL, "--check", "--set", "actor.class_name=RNNModel", "--set", "actor.rnn_type=lstm"
+    )
+    assert (
+        "the actor remembers: lstm, 64 units, layers: 1\n" in result.out
+        and "domain_rand.enable is False: none" in result.out
+    )
 
 
 @pytest.mark.parametrize("more", [["--check"], ["--max_iterations", "1"]])
 def test_a_reward_that_asks_the_host_is_named_before_training(tmp_path: Path, more: list[str]) -> None:
     """A CPU would run it, a recorded step cannot; --eager records nothing."""
-    source = DOG.replace("return self.dof_vel.abs().sum(dim=1)", "return self.dof_vel[:, 0] * self.dof_vel.max().item()")
+    source = DOG.replace(
+        "return self.dof_vel.abs().sum(dim=1)", "return self.dof_vel[:, 0] * self.dof_vel.max().item()"
+    )
     (tmp_path / "dog.py").write_text(source.replace('"robot/dog.xml"', '"resources/robots/go1/go1.xml"'))
     line = refused(tmp_path, "train", "--task", str(tmp_path / "dog.py"), *SMALL[2:], *more)
-    assert "dog.py:10, Dog._reward_calm: item() reads a tensor to the host; keep it a tensor and compute with that" in line
+    assert (
+        "dog.py:10, Dog._reward_calm: item() reads a tensor to the host; keep it a tensor and compute with that" in line
+    )
     if more == ["--check"]:
         assert run("train", tmp_path, "--task", str(tmp_path / "dog.py"), *SMALL[2:], *more, "--eager").code == 0
 
@@ -180,10 +196,32 @@ def test_help_lists_every_flag(tmp_path: Path) -> None:
 
 def test_the_more_specific_wins(tmp_path: Path) -> None:
     one, two = tmp_path / "one.yaml", tmp_path / "two.yaml"
-    one.write_text("env: {num_envs: 3, episode_length_s: 1e+0}\nrewards: {scales: {pose: 0.1, torques: -1e-3}}\nseed: 5\n")
-    two.write_text("env: {num_envs: 4}\nrewards: {scales: {pose: 0.2}}\nrunner: {num_steps_per_env: 4, max_iterations: 9}\n")
-    overrides = ["--set", "rewards.scales.pose=0.3", "--override", str(one), "--override", str(two), "--set", "env.num_envs=6"]
-    overrides += ["--set", "env.num_envs=5", "--set", "algorithm.num_mini_batches=1", "--max_iterations", "1", "--seed", "7"]
+    one.write_text(
+        "env: {num_envs: 3, episode_length_s: 1e+0}\nrewards: {scales: {pose: 0.1, torques: -1e-3}}\nseed: 5\n"
+    )
+    two.write_text(
+        "env: {num_envs: 4}\nrewards: {scales: {pose: 0.2}}\nrunner: {num_steps_per_env: 4, max_iterations: 9}\n"
+    )
+    overrides = [
+        "--set",
+        "rewards.scales.pose=0.3",
+        "--override",
+        str(one),
+        "--override",
+        str(two),
+        "--set",
+        "env.num_envs=6",
+    ]
+    overrides += [
+        "--set",
+        "env.num_envs=5",
+        "--set",
+        "algorithm.num_mini_batches=1",
+        "--max_iterations",
+        "1",
+        "--seed",
+        "7",
+    ]
     result = run("train", tmp_path, *TASK, "--device", "cpu", *overrides)
     assert result.code == 0, result.err
     [saved] = (tmp_path / "logs/go1_flat").glob("*/config.yaml")
@@ -191,18 +229,31 @@ def test_the_more_specific_wins(tmp_path: Path) -> None:
     assert config["env"] == {"num_envs": 5, "episode_length_s": 1.0}  # the last --set; the file that alone names it
     assert config["rewards"]["scales"]["pose"] == 0.3  # a field wins over files, wherever it stands
     assert config["rewards"]["scales"]["torques"] == -1e-3
-    assert config["runner"]["num_steps_per_env"] == 4 and config["runner"]["max_iterations"] == 1  # a flag wins over all
+    # a flag wins over all
+    assert config["runner"]["num_steps_per_env"] == 4 and config["runner"]["max_iterations"] == 1
     assert config["seed"] == 7 and config["task"] == "go1_flat"
     assert "go1_flat: 5 worlds on cpu" in result.out
 
 
 def test_a_cpu_takes_its_own_section_and_what_the_user_says_wins(tmp_path: Path) -> None:
-    asked = ["--num_envs", "5", "--max_iterations", "1", "--set", "runner.num_steps_per_env=4", "--set", "algorithm.num_mini_batches=1"]
+    asked = [
+        "--num_envs",
+        "5",
+        "--max_iterations",
+        "1",
+        "--set",
+        "runner.num_steps_per_env=4",
+        "--set",
+        "algorithm.num_mini_batches=1",
+    ]
     asked += ["--set", "algorithm.desired_kl=0.015"]
     result = run("train", tmp_path, *TASK, "--device", "cpu", *asked)
     assert result.code == 0, result.err
     assert "go1_flat: 5 worlds on cpu, engine mujoco\n" in result.out
-    assert "sets worlds, networks, learner, commands.keep_probability, " in result.out and "algorithm.entropy_coef; flags win" in result.out
+    assert (
+        "sets worlds, networks, learner, commands.keep_probability, " in result.out
+        and "algorithm.entropy_coef; flags win" in result.out
+    )
     assert re.search(r"^\d+ cores: 1 iterations, 0.0 M steps, about 0 min$", result.out, re.MULTILINE)
     [saved] = (tmp_path / "logs/go1_flat").glob("*/config.yaml")
     config, few = load_yaml(saved), load_task("go1_flat").train.cpu
@@ -240,7 +291,9 @@ def test_experiment_name_by_flag_and_by_field(tmp_path: Path) -> None:
 def test_play_says_what_it_changes(root: Path, first: Path, tmp_path: Path) -> None:
     out, was = tmp_path / "out", load_yaml(first / "config.yaml")
     shown = ("--viewer", "none", "--time", "0.02s")
-    result = run("play", root, *TASK, "--device", "cpu", "--command=-0.5,0,0.25", "--set", "sim.ls_iterations=7", *shown)
+    result = run(
+        "play", root, *TASK, "--device", "cpu", "--command=-0.5,0,0.25", "--set", "sim.ls_iterations=7", *shown
+    )
     assert result.code == 0, result.err
     lines = [line.strip() for line in result.out.splitlines()]
     changes = {line.split(": ")[0]: line.split(": ")[1] for line in lines if " -> " in line}
@@ -268,14 +321,19 @@ def test_play_says_what_it_changes(root: Path, first: Path, tmp_path: Path) -> N
 
 def start(program: str, folder: Path, *args: str) -> Result:
     """``program`` started in ``folder``, as a user away from the repository does."""
-    done = subprocess.run([sys.executable, str(ROOT / f"{program}.py"), *args], cwd=folder, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, str(ROOT / f"{program}.py"), *args], cwd=folder, capture_output=True, text=True, timeout=300
+    )
     return Result(done.returncode, done.stdout, done.stderr)
 
 
 def test_a_mistake_in_a_real_process(tmp_path: Path) -> None:
     result = start("train", tmp_path, "--task", "go1_falt")
     assert (result.code, result.out) == (2, "") and not files(tmp_path)
-    assert result.err.startswith("train.py: no task 'go1_falt' in configs/; did you mean 'go1_flat'?") and result.err.count("\n") == 1
+    assert (
+        result.err.startswith("train.py: no task 'go1_falt' in configs/; did you mean 'go1_flat'?")
+        and result.err.count("\n") == 1
+    )
 
 
 def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path) -> None:
@@ -287,7 +345,9 @@ def test_a_task_outside_the_repository_trains_and_plays(tmp_path: Path) -> None:
     assert 'mass="5.204"' in mjcf
     (home / "robot/dog.xml").write_text(mjcf.replace('mass="5.204"', 'mass="4.5"'))
     common = ["--device", "cpu", "--experiment_name", "my dogs"]
-    result = start("train", tmp_path, "--task", "my dog/dog.py", *common, "--num_envs", "8", "--max_iterations", "1", "--verbose")
+    result = start(
+        "train", tmp_path, "--task", "my dog/dog.py", *common, "--num_envs", "8", "--max_iterations", "1", "--verbose"
+    )
     assert result.code == 0, result.err
     assert "Learning iteration 1/1" in result.out and "rew_calm" in result.out
     [folder] = (tmp_path / "logs/my dogs").iterdir()
@@ -309,7 +369,9 @@ def test_export_is_the_policy_as_trained(root: Path, tmp_path: Path) -> None:
     assert files[0] == files[1]
 
 
-@pytest.mark.parametrize("text", ["CUDA out of memory. Tried to allocate 2 GiB", "Failed to allocate 4096 bytes on device 'cuda:0'"])
+@pytest.mark.parametrize(
+    "text", ["CUDA out of memory. Tried to allocate 2 GiB", "Failed to allocate 4096 bytes on device 'cuda:0'"]
+)
 def test_memory_that_runs_out_gives_advice(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     def capture_ends() -> None:
         try:
@@ -332,7 +394,9 @@ def test_a_reader_that_left_ends_nothing() -> None:
     os.close(reader)
     try:
         said = ["-m", "legged_mw.programs", "deploy", "go1_flat", "--edited", "--command=9,0,0"]
-        done = subprocess.run([sys.executable, *said], cwd=ROOT, stdout=writer, stderr=subprocess.PIPE, text=True, check=False)
+        done = subprocess.run(
+            [sys.executable, *said], cwd=ROOT, stdout=writer, stderr=subprocess.PIPE, text=True, check=False
+        )
     finally:
         os.close(writer)
     assert done.returncode == 2 and done.stderr.count("\n") == 1 and "--command 9,0,0" in done.stderr

@@ -102,11 +102,14 @@ def test_the_yaw_rate_steers_to_a_heading() -> None:
     env.sim.qpos[:, 3:7] = torch.stack([half.cos(), 0 * half, 0 * half, half.sin()], dim=1)
     env.heading.copy_(torch.tensor([1.0, -3.0, 3.1]))
     env._end_step()
-    assert env.commands[:, 2].tolist() == pytest.approx([0.5, 0.5 * (2 * math.pi - 6.0), 1.2], abs=1e-5)  # the last at its range's end
+    # the last at its range's end
+    assert env.commands[:, 2].tolist() == pytest.approx([0.5, 0.5 * (2 * math.pi - 6.0), 1.2], abs=1e-5)
     caller = make_env(3, {**QUIET, "commands.heading_command": True})
     caller.commands[:, 2] = 0.7
     caller._end_step()
-    assert caller.commands[:, 2].tolist() == pytest.approx([0.7] * 3), "where nothing is drawn the commands are the caller's"
+    assert caller.commands[:, 2].tolist() == pytest.approx([0.7] * 3), (
+        "where nothing is drawn the commands are the caller's"
+    )
 
 
 def test_typed_commands() -> None:

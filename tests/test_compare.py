@@ -33,7 +33,9 @@ def broken(tmp_path_factory: pytest.TempPathFactory) -> str:
     """An environment in which mjlab is installed, but cannot be imported."""
     folder = tmp_path_factory.mktemp("broken")
     (folder / "mjlab").mkdir()
-    (folder / "mjlab" / "__init__.py").write_text("print('mjlab says hello')\nraise RuntimeError('no driver\\nsee the manual')\n")
+    (folder / "mjlab" / "__init__.py").write_text(
+        "print('mjlab says hello')\nraise RuntimeError('no driver\\nsee the manual')\n"
+    )
     return interpreter(folder / "python", f"PYTHONPATH='{folder}' exec '{sys.executable}' \"$@\"")
 
 
@@ -52,7 +54,14 @@ def test_our_figure_beside_a_broken_and_a_missing_peer(broken: str, bare: str) -
     assert speed == pytest.approx(8 * 16 / seconds, rel=0.01)
     assert "       8  mjlab         failed: RuntimeError: no driver\n" in result.stdout
     assert '       8  playground    not installed: pip install playground "jax[cuda12]' in result.stdout
-    for condition in ("16 steps a world", "5 epochs x 4 minibatches", "48 512 256 128", "123 512 256 128", "5 x 4 ms", "mujoco-warp 4."):
+    for condition in (
+        "16 steps a world",
+        "5 epochs x 4 minibatches",
+        "48 512 256 128",
+        "123 512 256 128",
+        "5 x 4 ms",
+        "mujoco-warp 4.",
+    ):
         assert condition in result.stdout
     assert "hello" not in result.stdout
 
@@ -73,7 +82,9 @@ def test_only_what_was_asked_for_and_status_0_when_a_peer_alone_is_missing(bare:
     ],
 )
 def test_how_a_child_ends_is_reported(tmp_path: Path, script: str, timeout: str, reason: str) -> None:
-    result = compare("--only", "mjlab", "--timeout", timeout, "--python-mjlab", interpreter(tmp_path / "python", script))
+    result = compare(
+        "--only", "mjlab", "--timeout", timeout, "--python-mjlab", interpreter(tmp_path / "python", script)
+    )
     assert result.returncode == 0, result.stderr
     assert reason in result.stdout
 
@@ -91,5 +102,7 @@ def test_our_own_failure_is_status_1() -> None:
 
 def test_a_child_needs_no_package_to_say_what_is_missing(bare: str) -> None:
     order = json.dumps(["mjlab", 8, 1, "cpu", "jax"])
-    result = subprocess.run([bare, str(PROGRAM), "--child", order], capture_output=True, text=True, check=True, env=dict(os.environ))
+    result = subprocess.run(
+        [bare, str(PROGRAM), "--child", order], capture_output=True, text=True, check=True, env=dict(os.environ)
+    )
     assert json.loads(result.stdout) == {"missing": True}

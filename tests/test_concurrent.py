@@ -61,7 +61,11 @@ class Joined(MLPModel):
     def __init__(self, *args: Any, concurrent: dict[str, Any], **more: Any) -> None:
         super().__init__(*args, **more)
         self.whole = ConcurrentModel(*args, concurrent=concurrent, **more)
-        self.mlp, self.obs_normalizer, self.distribution = self.whole.mlp, self.whole.obs_normalizer, self.whole.distribution
+        self.mlp, self.obs_normalizer, self.distribution = (
+            self.whole.mlp,
+            self.whole.obs_normalizer,
+            self.whole.distribution,
+        )
 
     def get_latent(self, obs: TensorDict, masks: Tensor | None = None, hidden_state: Any = None) -> Tensor:
         seen, encoded = self.obs_normalizer(obs["state"]), self.whole.teacher(obs["privileged_state"])
@@ -73,7 +77,9 @@ class Joined(MLPModel):
 
 
 @pytest.mark.parametrize("symmetry", [None, SYMMETRY], ids=["plain", "mirrored"])
-def test_where_all_are_taught_it_is_rsl_rls_own_ppo(symmetry: Any, double: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_where_all_are_taught_it_is_rsl_rls_own_ppo(
+    symmetry: Any, double: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Three updates: the gradient goes through the teacher's encoder, and the student's changes nothing of it."""
     ours = make(GraphedPPO, concurrent={"teacher_share": 1.0}, symmetry_cfg=symmetry)
     monkeypatch.setattr("learner.ConcurrentModel", Joined)
@@ -86,7 +92,9 @@ def test_where_all_are_taught_it_is_rsl_rls_own_ppo(symmetry: Any, double: None,
         expected, got = update(stock), update(ours)
         assert got.pop("student") > 0.0 and got == pytest.approx(expected, rel=1e-4)
     theirs = {f"actor.{name}": value for name, value in stock.actor.whole.state_dict().items()}
-    learned = {name: value for name, value in parameters(ours).items() if not name.startswith(("actor.estimator.", "critic."))}
+    learned = {
+        name: value for name, value in parameters(ours).items() if not name.startswith(("actor.estimator.", "critic."))
+    }
     assert difference(learned, theirs) < 1e-5 and len(learned) > 10
 
 
@@ -100,7 +108,11 @@ def test_no_gradient_goes_astray() -> None:
     def reached(loss: Tensor) -> set[str]:
         actor.zero_grad()
         loss.backward()
-        return {name.partition(".")[0] for name, each in actor.named_parameters() if each.grad is not None and each.grad.any()}
+        return {
+            name.partition(".")[0]
+            for name, each in actor.named_parameters()
+            if each.grad is not None and each.grad.any()
+        }
 
     taught = actor.taught[:, 0]
     assert reached(actor.learn(latent, actor.lesson(obs, worlds))[1]) == {"estimator"}
@@ -140,7 +152,9 @@ def test_worlds_act_by_the_latent_that_is_theirs() -> None:
     assert torch.equal(moved[~taught], latent[~taught]) and (moved[taught] != latent[taught]).any(dim=1).all()
 
 
-@pytest.mark.parametrize("settings", [{}, {"symmetry_cfg": SYMMETRY}, {"memory": {"critic": GRU}}], ids=["plain", "mirrored", "memory"])
+@pytest.mark.parametrize(
+    "settings", [{}, {"symmetry_cfg": SYMMETRY}, {"memory": {"critic": GRU}}], ids=["plain", "mirrored", "memory"]
+)
 def test_samples_are_learned_from_as_they_were_acted(settings: dict[str, Any]) -> None:
     """Of a sample's world, its mirror image's too, and where a critic with a memory learns from whole worlds."""
     alg = make(GraphedPPO, concurrent={}, **settings)
@@ -171,7 +185,8 @@ def test_the_update_asks_the_host_nothing(monkeypatch: pytest.MonkeyPatch) -> No
         collect(alg)
         update(alg)
     collect(alg)
-    monkeypatch.setattr(nn.utils, "clip_grad_norm_", lambda *_: None)  # torch's own: they move tensors to where they are
+    # torch's own: they move tensors to where they are
+    monkeypatch.setattr(nn.utils, "clip_grad_norm_", lambda *_: None)
     monkeypatch.setattr(alg.optimizer, "step", lambda: None)
     with recordable():
         alg._act()
@@ -181,7 +196,9 @@ def test_the_update_asks_the_host_nothing(monkeypatch: pytest.MonkeyPatch) -> No
 def test_a_checkpoint_goes_on_bit_for_bit(tmp_path: Path) -> None:
     task = task_with(cpu__update_threads=1)  # else how long an update takes decides how it is rounded
     resumed, _ = assert_resumes_exactly(task, tmp_path / "model_2.pt")
-    assert {"teacher.0._mean", "teacher.1.0.weight", "estimator.0.weight"} <= load(tmp_path / "model_2.pt")["actor_state_dict"].keys()
+    assert {"teacher.0._mean", "teacher.1.0.weight", "estimator.0.weight"} <= load(tmp_path / "model_2.pt")[
+        "actor_state_dict"
+    ].keys()
     assert resumed.alg.get_policy().get_buffer("taught").sum() == 13
 
 
@@ -192,13 +209,19 @@ def test_a_checkpoint_goes_on_bit_for_bit(tmp_path: Path) -> None:
     ("changes", "said"),
     [
         ({"groups": ["privileged"]}, "groups: no observation group 'privileged' .* did you mean 'privileged_state'"),
-        ({"groups": ["state"]}, "groups: the actor reads 'state' itself; the teacher's encoder is for what a robot does not measure"),
+        (
+            {"groups": ["state"]},
+            "groups: the actor reads 'state' itself; the teacher's encoder is for what a robot does not measure",
+        ),
         ({"actor.class_name": "RNNModel"}, "groups: that goes with actor.class_name 'MLPModel', not 'RNNModel'"),
         (
             {"algorithm.class_name": "PPO"},
             "groups: only GraphedPPO's recorded update trains that, and rsl-rl's own is used here: set it to",
         ),
-        ({"actor.estimator.targets": ["base_lin_vel"]}, "groups are both set: the actor reads an estimate or a latent; empty one"),
+        (
+            {"actor.estimator.targets": ["base_lin_vel"]},
+            "groups are both set: the actor reads an estimate or a latent; empty one",
+        ),
     ],
     ids=lambda value: "" if isinstance(value, str) else "".join(value),
 )
@@ -271,14 +294,18 @@ def test_training_begins_with_a_checkpoint_and_not_with_an_export(run_folder: Pa
     begin_with(model, find_trained(str(run_folder), run_folder.parent, "--init"))
     saved = load(run_folder / "model_3.pt")["actor_state_dict"]
     assert torch.equal(model.teacher[1][0].weight, saved["teacher.1.0.weight"])
-    with pytest.raises(ConfigError, match="policy.onnx holds the student alone, not the teacher's encoder .*; name a checkpoint"):
+    with pytest.raises(
+        ConfigError, match="policy.onnx holds the student alone, not the teacher's encoder .*; name a checkpoint"
+    ):
         begin_with(model, find_trained(str(run_folder / "export"), run_folder.parent, "--init"))
 
 
 @pytest.mark.parametrize("frames", [1, 5])
 def test_it_teaches_a_student_that_reads_other_frames(frames: int, policy: ConcurrentModel, run_folder: Path) -> None:
     """Its newest frames are looked for among its own rows, not among those that the student's group of the same name has."""
-    task = task_with(**{"observations.history": {"state": frames}, "observations.leave_out": {}, "actor.concurrent.groups": []})
+    task = task_with(
+        **{"observations.history": {"state": frames}, "observations.leave_out": {}, "actor.concurrent.groups": []}
+    )
     env, teacher = LeggedRobot(task.cfg, "cpu"), find_trained(str(run_folder), run_folder.parent, "--teacher")
     seat_teacher(env, teacher)
     runner: Any = make_runner(env, task.train, None, "cpu", teacher.task.train)
@@ -302,6 +329,12 @@ def test_it_can_teach_a_student_that_is_distilled(run_folder: Path, tmp_path: Pa
     distil = ["--teacher", str(run_folder), "--max_iterations", "1"]
     result = run("train", tmp_path, *SMALL, *FLAGS[:4], *distil)
     assert result.code == 0, result.err
-    assert "symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it" in result.out
+    assert (
+        "symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it"
+        in result.out
+    )
     line = refused(tmp_path, "train", *SMALL, *FLAGS, *distil)
-    assert "actor.concurrent.groups: only GraphedPPO's recorded update trains that, and a student learns nothing but to act" in line
+    assert (
+        "actor.concurrent.groups: only GraphedPPO's recorded update trains that, and a student learns nothing but to act"
+        in line
+    )

@@ -140,8 +140,18 @@ def test_an_open_section_may_start_empty() -> None:
             class scales(Empty.rewards.scales):
                 termination = -3
 
-    assert Empty().to_dict()["rewards"]["scales"] == {"torques": -1.0, "termination": 0.0, "lin_vel_z": 0.0, "fresh": 2.0}
-    assert Child().to_dict()["rewards"]["scales"] == {"torques": -1.0, "termination": -3.0, "lin_vel_z": 0.0, "fresh": 2.0}
+    assert Empty().to_dict()["rewards"]["scales"] == {
+        "torques": -1.0,
+        "termination": 0.0,
+        "lin_vel_z": 0.0,
+        "fresh": 2.0,
+    }
+    assert Child().to_dict()["rewards"]["scales"] == {
+        "torques": -1.0,
+        "termination": -3.0,
+        "lin_vel_z": 0.0,
+        "fresh": 2.0,
+    }
     assert Go1().to_dict()["rewards"]["scales"] == {"torques": -2e-4, "termination": 0.0, "lin_vel_z": -2.0}
     cfg = Empty()
     cfg.set("rewards.scales.lin_vel_z", "-4")
@@ -418,7 +428,8 @@ def test_numpy_numbers_become_plain() -> None:
         ("control.limits", "[1e-4, 2]", [1e-4, 2.0]),
         ("control.limits", "5", 5),
         ("control.stiffness", "{knee: 1e1, hip: 2}", {"knee": 10.0, "hip": 2.0}),
-        ("control.stiffness", "{knee:1e1,hip: 2}", {"knee": 10.0, "hip": 2.0}),  # which to YAML is a key 'knee:1e1' without a value
+        # which to YAML is a key 'knee:1e1' without a value
+        ("control.stiffness", "{knee:1e1,hip: 2}", {"knee": 10.0, "hip": 2.0}),
         ("control.stiffness", "{hip:2}", {"hip": 2.0}),  # in place of the default, not beside it
         ("control.anything", "{a: [1, 1e-4, x]}", {"a": [1, 1e-4, "x"]}),
         ("commands.ranges.lin_vel_x", "[-1, 1e-1]", [-1.0, 0.1]),
@@ -500,7 +511,11 @@ def test_update() -> None:
 )
 def test_update_is_all_or_nothing(wrong: Any) -> None:
     cfg = Base()
-    values = {"seed": 99, "env": {"episode_length_s": 1.0, **wrong.pop("env", {})}, **wrong} if isinstance(wrong, dict) else wrong
+    values = (
+        {"seed": 99, "env": {"episode_length_s": 1.0, **wrong.pop("env", {})}, **wrong}
+        if isinstance(wrong, dict)
+        else wrong
+    )
     with says("over.yaml: "):
         cfg.update(values, "over.yaml")
     assert cfg.diff(Base()) == []
@@ -658,13 +673,19 @@ def test_an_old_name_gets_the_new_one(old: str) -> None:
 
 def test_a_cpus_overrides_name_fields_of_either_config() -> None:
     task = load_task("go1_flat")
-    task.train.cpu.overrides = {"commands.resampling_time": 3, "algorithm.gamma": 0.5, "terrain.mesh_type": "heightfield"}
+    task.train.cpu.overrides = {
+        "commands.resampling_time": 3,
+        "algorithm.gamma": 0.5,
+        "terrain.mesh_type": "heightfield",
+    }
     task.fit_cpu(cores=1)
     assert task.cfg.commands.resampling_time == 3.0 and task.train.algorithm.gamma == 0.5
     assert task.cfg.terrain.mesh_type == "heightfield" and task.cfg.commands.keep_probability == [0.9, 0.25, 0.5]
 
 
-@pytest.mark.parametrize("name", ["go1_flat_dr", "go1_flat_fast", "go1_rough", "examples/go1_playground.py", "examples/go1_mjlab.py"])
+@pytest.mark.parametrize(
+    "name", ["go1_flat_dr", "go1_flat_fast", "go1_rough", "examples/go1_playground.py", "examples/go1_mjlab.py"]
+)
 def test_on_a_cpu_rewards_stay_those_of_a_task_that_subclasses_another(name: str) -> None:
     task, first = load_task(name), load_task("go1_flat")
     rewards = (task.cfg.to_dict()["rewards"], first.cfg.to_dict()["rewards"])
@@ -728,7 +749,9 @@ def test_a_folder_configs_beside_the_task_wins(no_configs: None, tmp_path: Path,
     assert load_task("go1_flat").cfg.noise.level == 1.0  # by name it is the package's own
 
 
-def test_another_packages_name_configs_is_given_back(no_configs: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_another_packages_name_configs_is_given_back(
+    no_configs: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs/__init__.py").write_text("")
     (tmp_path / "configs/mine.py").write_text("VALUE = 3\n")
@@ -752,5 +775,10 @@ def test_the_exam_is_the_tasks_own_or_its_environments() -> None:
         exam = "walking"
 
     configs = type(load_task("go1_flat").cfg), type(load_task("go1_flat").train)
-    for env, exam, expected in ((Graded, None, "walking"), (Graded, "", ""), (Graded, "getup", "getup"), (Bare, None, "")):
+    for env, exam, expected in (
+        (Graded, None, "walking"),
+        (Graded, "", ""),
+        (Graded, "getup", "getup"),
+        (Bare, None, ""),
+    ):
         assert LoadedTask("dog", Path("dog.py"), Task(env, *configs, exam)).exam == expected

@@ -32,7 +32,9 @@ HEADERS = Path(os.environ.get("ORT_INCLUDE", "/usr/include/onnxruntime"))
 LIBRARY = next((Path(onnxruntime.__file__).parent / "capi").glob("libonnxruntime.so.*"), None)
 NETWORK = (HEADERS / "onnxruntime_cxx_api.h").is_file() and LIBRARY is not None
 
-pytestmark = pytest.mark.skipif(not (shutil.which(COMPILER) and shutil.which("make")), reason=f"needs a C++ compiler ({COMPILER}) and make")
+pytestmark = pytest.mark.skipif(
+    not (shutil.which(COMPILER) and shutil.which("make")), reason=f"needs a C++ compiler ({COMPILER}) and make"
+)
 
 _spec = importlib.util.spec_from_file_location("cpp_record", FOLDER / "record.py")
 assert _spec and _spec.loader
@@ -47,9 +49,13 @@ def check(tmp_path_factory: pytest.TempPathFactory) -> Check:
     """The compiled program."""
     out = tmp_path_factory.mktemp("cpp")
     library = [f"ORT_INCLUDE={HEADERS}", f"ORT_LIB={LIBRARY}"] if NETWORK else []
-    built = subprocess.run(["make", "-C", FOLDER, f"OUT={out}", "CXXFLAGS=-O0 -Wall -Wextra", *library], capture_output=True, text=True)
+    built = subprocess.run(
+        ["make", "-C", FOLDER, f"OUT={out}", "CXXFLAGS=-O0 -Wall -Wextra", *library], capture_output=True, text=True
+    )
     assert built.returncode == 0 and not built.stderr, built.stderr
-    return lambda export, record: subprocess.run([out / "check", export, record], capture_output=True, text=True, timeout=300)
+    return lambda export, record: subprocess.run(
+        [out / "check", export, record], capture_output=True, text=True, timeout=300
+    )
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +69,9 @@ def remembers(tmp_path_factory: pytest.TempPathFactory) -> Path:
     said["action"] |= {"origin": "targets", "scale": [0.01 * (i % 5) for i in range(29)], "clip": 0.5}
     size, rng = sum(row["size"] * row.get("history", 1) for row in said["observation"]), np.random.default_rng(0)
     draw = {"a": (size, 8), "b": (8, 29), "c": (8, 3)}
-    weights = [numpy_helper.from_array(rng.normal(0.0, 0.3, shape).astype(np.float32), name) for name, shape in draw.items()]
+    weights = [
+        numpy_helper.from_array(rng.normal(0.0, 0.3, shape).astype(np.float32), name) for name, shape in draw.items()
+    ]
     weights.append(numpy_helper.from_array(np.array([1, 8]), "flat"))
     nodes = [
         helper.make_node("MatMul", ["obs", "a"], ["mixed"]),
@@ -76,7 +84,9 @@ def remembers(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ports = {"obs": [1, size], "state_in": [1, 1, 8], "actions": [1, 29], "state_out": [1, 1, 8], "estimate": [1, 3]}
     values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, shape) for name, shape in ports.items()]
     graph = helper.make_graph(nodes, "network", values[:2], values[2:], weights)
-    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), folder / "policy.onnx")
+    onnx.save(
+        helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=10), folder / "policy.onnx"
+    )
     said["network"]["sha256"] = hashlib.sha256((folder / "policy.onnx").read_bytes()).hexdigest()
     said["network"]["memory"] = {"input": "state_in", "output": "state_out", "shape": [1, 8]}
     said["estimate"] = [{"name": "base_lin_vel", "size": 3, "unit": "m/s", "frame": "body"}]
@@ -85,7 +95,9 @@ def remembers(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("name", ["go2_flat", "g1_flat", "go1_rough_scan", "remembers"])
-def test_it_does_what_pythons_controller_does(name: str, check: Check, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+def test_it_does_what_pythons_controller_does(
+    name: str, check: Check, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
     folder, record = request.getfixturevalue(name) if name == "remembers" else POLICIES / name, tmp_path / "walk.txt"
     recorder.record(folder, record, steps=130)
     done = check(folder, record)
@@ -109,7 +121,10 @@ def test_it_runs_the_network_itself(check: Check, tmp_path: Path) -> None:
     record = tmp_path / "walk.txt"
     recorder.record(POLICIES / "go2_flat", record, steps=10)
     shutil.copytree(POLICIES / "go2_flat", tmp_path / "export")
-    for other, code, said in (("go2_rough", 1, "NOT as Python's controller"), ("g1_flat", 2, "Got invalid dimensions for input: obs")):
+    for other, code, said in (
+        ("go2_rough", 1, "NOT as Python's controller"),
+        ("g1_flat", 2, "Got invalid dimensions for input: obs"),
+    ):
         shutil.copy(POLICIES / other / "policy.onnx", tmp_path / "export")
         done = check(tmp_path / "export", record)
         assert done.returncode == code and said in done.stdout + done.stderr
@@ -132,7 +147,11 @@ def test_it_runs_the_network_itself(check: Check, tmp_path: Path) -> None:
         ("measured: joint_vel", "measured: ''", "nothing says how row 'dof_vel' is measured, so it cannot be deployed"),
         ("measured: joint_vel", "measured: odometer", "the robot does not measure 'odometer' of row 'dof_vel'"),
         ("- 0.8\n", "", "policy.yaml, line 23: 'default_pose' must have one number a joint"),
-        ("damping:\n", "damping: [1, 2]\nmore:\n", "'[1, 2]' is no list; write one as --export does: '- ' and one value a line"),
+        (
+            "damping:\n",
+            "damping: [1, 2]\nmore:\n",
+            "'[1, 2]' is no list; write one as --export does: '- ' and one value a line",
+        ),
         ("period: 0.02", "period: 0.02\n  -?", "policy.yaml, line 8: '0.02 -?' is no number"),
         ("joints:\n", "joints:\n?\n", "policy.yaml, line 10: '?' is not understood here"),
     ],

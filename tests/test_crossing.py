@@ -46,15 +46,31 @@ def test_prepare_is_the_exam_but_for_ground_place_and_heading() -> None:
     task.set("terrain.tile_size", 12.0)  # whatever it was trained on
     crossing.prepare(task)
     ground = task.cfg.terrain
-    assert (ground.mesh_type, ground.curriculum, ground.tile_size, ground.horizontal_scale) == ("heightfield", False, 8.0, 0.05)
-    assert ground.terrain_proportions == {"stairs_up": 1.0, "flat": 1.0} and (ground.num_rows, ground.num_cols) == (LEVELS, 2 * TILES)
+    assert (ground.mesh_type, ground.curriculum, ground.tile_size, ground.horizontal_scale) == (
+        "heightfield",
+        False,
+        8.0,
+        0.05,
+    )
+    assert ground.terrain_proportions == {"stairs_up": 1.0, "flat": 1.0} and (ground.num_rows, ground.num_cols) == (
+        LEVELS,
+        2 * TILES,
+    )
     assert task.cfg.env.num_envs == 2 * LEVELS * 10
     differs = {path for path, value in exam.OVERRIDES.items() if crossing.OVERRIDES.get(path) != value}
-    assert differs == {"terrain.mesh_type", "init_state.pos_xy_range", "init_state.yaw_range", "termination.min_base_height"}
+    assert differs == {
+        "terrain.mesh_type",
+        "init_state.pos_xy_range",
+        "init_state.yaw_range",
+        "termination.min_base_height",
+    }
 
 
 def test_a_ground_of_nothing_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"terrain.terrain_proportions: no kind of ground has a share above 0; there are: flat, smooth_"):
+    with pytest.raises(
+        ConfigError,
+        match=r"terrain.terrain_proportions: no kind of ground has a share above 0; there are: flat, smooth_",
+    ):
         crossing.prepare(rough({"flat": 0.0}))
 
 
@@ -72,7 +88,8 @@ def test_robots_begin_in_the_middle_of_their_tile_and_walk_ahead(monkeypatch: py
     result = crossing.run_crossing(env, policy)
     assert result["robots"] == 3 * TILES and list(result["kinds"]) == ["stairs_up", "stairs_down"]
     assert env.terrain is not None and env.tiles is not None
-    middles = torch.tensor(env.terrain.origins, dtype=torch.float).transpose(0, 1)[:, :, None]  # columns, levels, robots
+    # columns, levels, robots
+    middles = torch.tensor(env.terrain.origins, dtype=torch.float).transpose(0, 1)[:, :, None]
     assert env.terrain.kinds == ("stairs_up",) * TILES + ("stairs_down",) * TILES
     away = places[0][:, :3].view(2 * TILES, LEVELS, 3, 3) - middles
     assert away[..., :2].abs().max() <= 0.3 and away[..., :2].std() > 0.1
@@ -140,7 +157,16 @@ def test_who_crossed_and_who_fell(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(crossing, "TILES", 1)
     monkeypatch.setattr(crossing, "SECONDS", 0.4)
     script = {
-        3: [(1, move(4.1)), (2, move(-4.1, axis=1)), (3, upset), (4, move(4.1)), (5, move(4.1)), (5, upset), (6, move(3.9)), (7, lose)],
+        3: [
+            (1, move(4.1)),
+            (2, move(-4.1, axis=1)),
+            (3, upset),
+            (4, move(4.1)),
+            (5, move(4.1)),
+            (5, upset),
+            (6, move(3.9)),
+            (7, lose),
+        ],
         9: [(3, move(4.1)), (4, upset), (8, move(500.0)), (7, move(-4.1))],
         15: [(3, upset), (8, move(4.1))],
     }
@@ -163,11 +189,21 @@ def test_shares_are_by_kind_and_level(monkeypatch: pytest.MonkeyPatch) -> None:
     assert kinds["flat"]["crossed"] == [0.75] + [0.0] * 9 and kinds["low_random"]["crossed"] == [0.0] * 9 + [0.25]
     assert kinds["flat"]["fell"] == [0.0] * 5 + [0.25] + [0.0] * 4 and kinds["low_random"]["fell"] == [0.0] * 10
     assert kinds["flat"]["measure"] is None and kinds["flat"]["values"] is None
-    assert kinds["low_random"]["measure"] == "height [cm]" and kinds["low_random"]["values"][::3] == [0.0, 1.67, 3.33, 5.0]
+    assert kinds["low_random"]["measure"] == "height [cm]" and kinds["low_random"]["values"][::3] == [
+        0.0,
+        1.67,
+        3.33,
+        5.0,
+    ]
 
 
 def test_table() -> None:
-    stairs = {"measure": "step [cm]", "values": [6.0 + 1.5 * i for i in range(10)], "crossed": [1.0] * 5 + [0.0] * 5, "fell": [0.2] * 10}
+    stairs = {
+        "measure": "step [cm]",
+        "values": [6.0 + 1.5 * i for i in range(10)],
+        "crossed": [1.0] * 5 + [0.0] * 5,
+        "fell": [0.2] * 10,
+    }
     flat = {"measure": None, "values": None, "crossed": [1.0] * 10, "fell": [0.0] * 10}
     text = crossing.table({"speed": 0.6, "seconds": 15.0, "robots": 20, "kinds": {"flat": flat, "stairs_up": stairs}})
     assert text.splitlines() == [
@@ -190,7 +226,16 @@ KINDS = "terrain.terrain_proportions={stairs_up: 2, flat: 1}"
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A root with a run of an iteration on rough ground."""
     root = tmp_path_factory.mktemp("rough")
-    return root, trained(root, *ROUGH, "--max_iterations", "1", "--set", "terrain.num_rows=2", "--set", "terrain.max_init_terrain_level=1")
+    return root, trained(
+        root,
+        *ROUGH,
+        "--max_iterations",
+        "1",
+        "--set",
+        "terrain.num_rows=2",
+        "--set",
+        "terrain.max_init_terrain_level=1",
+    )
 
 
 def test_eval_of_two_rough_policies(runs: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -204,7 +249,9 @@ def test_eval_of_two_rough_policies(runs: tuple[Path, Path], monkeypatch: pytest
     result = run("play", root, *ROUGH, "--device", "cpu", "--eval", "--compare", folder.name, "--set", KINDS)
     assert result.code == 0, result.err
     walked, crossed = "falls in 22 commands", "share of 10 robots that crossed a tile"
-    assert [line for line in result.out.splitlines() if walked in line or crossed in line][1] == f"{crossed} at 0.6 m/s within 0.1 s"
+    assert [line for line in result.out.splitlines() if walked in line or crossed in line][
+        1
+    ] == f"{crossed} at 0.6 m/s within 0.1 s"
     assert result.out.count(walked) == result.out.count(crossed) == 2
     columns = json.loads((folder / "eval/report.json").read_text())["columns"]
     for column in columns:
@@ -213,7 +260,9 @@ def test_eval_of_two_rough_policies(runs: tuple[Path, Path], monkeypatch: pytest
         assert column["about"]["overrides"]["terrain.terrain_proportions"] == {"stairs_up": 2.0, "flat": 1.0}
     assert (folder / "eval/crossing.png").read_bytes().startswith(b"\x89PNG")
     html = (folder / "eval/report.html").read_text(encoding="utf-8")
-    assert html.index("<h2>Exam</h2>") < html.index("<h2>Rough ground</h2>") < html.index("<h2>Following the command</h2>")
+    assert (
+        html.index("<h2>Exam</h2>") < html.index("<h2>Rough ground</h2>") < html.index("<h2>Following the command</h2>")
+    )
     chapter = html[html.index("<h2>Rough ground</h2>") : html.index("<h2>Following the command</h2>")]
     assert chapter.count("<svg") == 2 and chapter.count("step [cm]") == 2 and ">19.5<" in chapter
     assert f"<th>stairs up, fell, {folder.name}, 1</th>" in chapter
@@ -242,5 +291,7 @@ def test_only_what_was_trained_on_rough_ground_crosses_it() -> None:
 
 
 def test_kinds_that_do_not_exist_are_refused_before_anything_is_graded(runs: tuple[Path, Path]) -> None:
-    line = refused(runs[0], "play", *ROUGH, "--device", "cpu", "--eval", "--set", "terrain.terrain_proportions={stair_up: 1}")
+    line = refused(
+        runs[0], "play", *ROUGH, "--device", "cpu", "--eval", "--set", "terrain.terrain_proportions={stair_up: 1}"
+    )
     assert "no kind of terrain 'stair_up' in terrain.terrain_proportions; did you mean 'stairs_up'" in line

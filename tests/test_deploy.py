@@ -112,7 +112,10 @@ WRONG = [
         "does not fit policy.yaml: its input is 'obs' ['batch', 48], the contract's is 'obs' [1, 36]",
     ),
     (put("observation.3.size", 11), "observation row 'dof_pos' has size 11; joint_offset has 12 values on this robot"),
-    (put("observation.3.measured", "joint_ofset"), "no quantity 'joint_ofset' in what a robot measures; did you mean 'joint_offset'?"),
+    (
+        put("observation.3.measured", "joint_ofset"),
+        "no quantity 'joint_ofset' in what a robot measures; did you mean 'joint_offset'?",
+    ),
     (
         put("observation.0.measured", ""),
         "observation row 'base_lin_vel': nothing says how it is measured, so it cannot be deployed; in the task",
@@ -122,7 +125,11 @@ WRONG = [
     (
         lambda said: [
             part[name].pop()
-            for part, name in ((said["action"], "lowest"), (said["action"], "highest"), *((said, name) for name in PER_JOINT))
+            for part, name in (
+                (said["action"], "lowest"),
+                (said["action"], "highest"),
+                *((said, name) for name in PER_JOINT),
+            )
         ],
         "has size 12; joint_offset has 11 values",
     ),
@@ -130,12 +137,18 @@ WRONG = [
         put("observation.4.scale", [1.0, 2.0]),
         "observation[4]: 'scale' is [1.0, 2.0]; it must be a number, or 12 numbers, one a value of the row",
     ),
-    (put("ends.falls_on", ["trunk_box"]), "sensors: 'fall_contact' is missing; name the sensors of scene.xml that measure it"),
+    (
+        put("ends.falls_on", ["trunk_box"]),
+        "sensors: 'fall_contact' is missing; name the sensors of scene.xml that measure it",
+    ),
     (put("default_pose", [0.0] * 11), "it must be 12 numbers, one a joint"),
     (put("default_pose.2", "bent"), "it must be 12 numbers, one a joint"),
     (put("stiffness.0", 20.0), "stiffness is [20., 35., 35.,"),
     (put("robot.mass", 20.0), "robot: mass is 20., but scene.xml has 12.743"),
-    (put("format", 1), "'format' is 1; it must be one of 2, 3, 4, 5, which this version reads; export the policy again"),
+    (
+        put("format", 1),
+        "'format' is 1; it must be one of 2, 3, 4, 5, which this version reads; export the policy again",
+    ),
     (
         put("network.memory", {"input": "state_in", "output": "state_out", "shape": [1, 0]}),
         "policy.yaml: network: memory: 'shape' is [1, 0]; it must be two whole numbers from 1: states and the size of each",
@@ -149,23 +162,44 @@ WRONG = [
     (put("action.highest.0", -1.0), "policy.yaml: action: 'highest' is [-1.0, "),
     (put("action.highest.0", 0.5), "policy.yaml: action: highest is [ 0.5 ,"),
     (without("physics.sha256"), "policy.yaml: physics: 'sha256' is missing"),
-    (without("action.scale"), "policy.yaml: action: 'scale' is missing; it must be a number, or 12 numbers, one a joint"),
+    (
+        without("action.scale"),
+        "policy.yaml: action: 'scale' is missing; it must be a number, or 12 numbers, one a joint",
+    ),
     (put("action.scale", [0.5] * 11), "it must be a number, or 12 numbers, one a joint"),
-    (put("action.origin", "pose"), "policy.yaml: action: 'origin' is 'pose'; it must be one of default, joints, targets, torque"),
-    (without("action.origin"), "policy.yaml: action: 'origin' is missing; it must be one of default, joints, targets, torque"),
+    (
+        put("action.origin", "pose"),
+        "policy.yaml: action: 'origin' is 'pose'; it must be one of default, joints, targets, torque",
+    ),
+    (
+        without("action.origin"),
+        "policy.yaml: action: 'origin' is missing; it must be one of default, joints, targets, torque",
+    ),
     (without("commands"), "policy.yaml: 'commands' is missing; it must be a list of mappings"),
-    (put("commands.1.default", 0.9), "policy.yaml: commands[1]: 'default' is 0.9; it must be a number from -0.8 to 0.8"),
+    (
+        put("commands.1.default", 0.9),
+        "policy.yaml: commands[1]: 'default' is 0.9; it must be a number from -0.8 to 0.8",
+    ),
     (lambda said: said["commands"].pop(), "observation row 'commands' has size 3; command has 2 values on this robot"),
     (put("observation.3.history", 0), "policy.yaml: observation[3]: 'history' is 0; it must be a whole number from 1"),
     (put("observation.3.history", 3), "its input is 'obs' ['batch', 48], the contract's is 'obs' [1, 72]"),
     (without("ends"), "policy.yaml: 'ends' is missing; it must be a mapping"),
-    (put("ends.max_tlit", 60.0), "policy.yaml: ends: no rule 'max_tlit' in the rules that end a walk; did you mean 'max_tilt'?"),
+    (
+        put("ends.max_tlit", 60.0),
+        "policy.yaml: ends: no rule 'max_tlit' in the rules that end a walk; did you mean 'max_tilt'?",
+    ),
     (put("ends.max_tilt", 200.0), "policy.yaml: ends: 'max_tilt' is 200.0; it must be a number from 0 to 180"),
     (put("action.clip", float("nan")), "policy.yaml: action: 'clip' is nan; it must be a number"),
     (put("period", 0.03), "'period' is 0.03; it must be physics: timestep * decimation = 0.02"),
     (put("network.input", "observations"), "the contract's is 'observations' [1, 48]"),
-    (put("sensors.ang_vel", ["gyro/imuu"]), "sensors of 'ang_vel': no sensor 'gyro/imuu' in scene.xml; did you mean 'gyro/imu'?"),
-    (put("sensors.ang_vel", ["gyro/imu", "up/imu"]), "the sensors of 'ang_vel' (gyro/imu, up/imu) have 6 values, not 3"),
+    (
+        put("sensors.ang_vel", ["gyro/imuu"]),
+        "sensors of 'ang_vel': no sensor 'gyro/imuu' in scene.xml; did you mean 'gyro/imu'?",
+    ),
+    (
+        put("sensors.ang_vel", ["gyro/imu", "up/imu"]),
+        "the sensors of 'ang_vel' (gyro/imu, up/imu) have 6 values, not 3",
+    ),
     (without("sensors.joint_vel"), "sensors: 'joint_vel' is missing; name the sensors of scene.xml that measure it"),
     (put("exam", 3), "policy.yaml: 'exam' is 3; it must be a mapping"),
     (put("observation", {}), "policy.yaml: 'observation' is {}; it must be a list of mappings"),
@@ -173,7 +207,9 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("change", "said"), WRONG, ids=[said[:40] for _, said in WRONG])
-def test_a_wrong_contract(change: Callable[[Any], Any], said: str, export: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_contract(
+    change: Callable[[Any], Any], said: str, export: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     rewrite(export, change)
     code, out, err = main(capsys, export)
     assert (code, out) == (2, "") and err.startswith("legged_mw.deploy: ") and err.count("\n") == 1
@@ -201,14 +237,19 @@ EDITS = [
     (without("physics.terrain"), "physics.terrain.file: nothing, exported 'terrain.mjz'"),
     (put("format", 2), "format: 2, exported 5"),
     (without("exported"), UNKNOWN),
-    (lambda said: (said.pop("checksum"), put("exported", "eJyrVkrKT1KyUjCoBQARPgL6")(said)), "bob: nothing, exported 0"),
+    (
+        lambda said: (said.pop("checksum"), put("exported", "eJyrVkrKT1KyUjCoBQARPgL6")(said)),
+        "bob: nothing, exported 0",
+    ),
     (lambda said: (said.pop("checksum"), put("exported", "eJyrVkrKT1KyUjCo")(said)), UNKNOWN),
     (without("checksum"), ""),
 ]
 
 
 @pytest.mark.parametrize(("change", "line"), EDITS, ids=[line for _, line in EDITS])
-def test_an_edited_contract(change: Callable[[Any], Any], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_edited_contract(
+    change: Callable[[Any], Any], line: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """It is refused unless the user says that it was edited; then each value stands beside the exported one."""
     folder = shutil.copytree(ROOT / "resources/policies/go1_rough", tmp_path / "export")
     edit(folder, change)
@@ -235,7 +276,11 @@ def test_a_scene_is_bound_to_the_contract(file: str, tmp_path: Path, capsys: pyt
     else:
         shutil.copy(ROOT / "resources/policies/go2_rough/terrain.mjz", folder)
     code, out, err = main(capsys, folder, *SHOWS)
-    assert (code, out) == (2, "") and f"{file} is not the file that policy.yaml was written for" in err and "--edited" in err
+    assert (
+        (code, out) == (2, "")
+        and f"{file} is not the file that policy.yaml was written for" in err
+        and "--edited" in err
+    )
     code, out, err = main(capsys, folder, *SHOWS, "--edited")
     assert code == 0 and f"{file}: another file than the exported one" in out, err
 
@@ -249,12 +294,17 @@ def test_a_terrain_that_the_contract_does_not_name(export: Path, capsys: pytest.
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (put("default_pose.0", 10.0), "default_pose of FR_hip_joint is 10 rad, beyond the range of its targets, -0.863 to 0.863 rad"),
+        (
+            put("default_pose.0", 10.0),
+            "default_pose of FR_hip_joint is 10 rad, beyond the range of its targets, -0.863 to 0.863 rad",
+        ),
         (put("ends.falls_on.0", "x"), "ends: falls_on: no geom 'x' in sensors: fall_contact; there are: "),
         (put("action.scale", 0.0), "'scale' is 0.0; it must be other than 0"),
     ],
 )
-def test_nonsense_stays_refused(change: Callable[[Any], Any], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nonsense_stays_refused(
+    change: Callable[[Any], Any], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = shutil.copytree(ROOT / "resources/policies/go1_footstand", tmp_path / "export")
     edit(folder, change)
     code, _, err = main(capsys, folder, *SHOWS, "--edited")
@@ -285,7 +335,9 @@ def test_an_older_format(export: Path, contract: Contract, capsys: pytest.Captur
     """Its targets are held within the range that the scene has; without the scene it is refused."""
     older(export)
     read = read_contract(export)
-    np.testing.assert_array_equal([read.action.lowest, read.action.highest], [contract.action.lowest, contract.action.highest])
+    np.testing.assert_array_equal(
+        [read.action.lowest, read.action.highest], [contract.action.lowest, contract.action.highest]
+    )
     assert main(capsys, export, *SHOWS)[0] == 0
     code, out, _ = main(capsys, export, *SHOWS, "--edited")
     assert code == 0 and UNKNOWN not in out
@@ -307,22 +359,34 @@ def test_a_damaged_network(damage: str, export: Path, capsys: pytest.CaptureFixt
         file.write_bytes({"cut": whole[: len(whole) // 2], "empty": b"", "text": b"not a network\n"}[damage])
     code, _, err = main(capsys, export)
     assert code == 2 and err.count("\n") == 1
-    assert "policy.onnx is not the file that policy.yaml was written for (its SHA-256 differs): it is damaged, or of another export" in err
+    assert (
+        "policy.onnx is not the file that policy.yaml was written for (its SHA-256 differs): it is damaged, or of another export"
+        in err
+    )
     if damage != "other":
         rewrite(export, put("network.sha256", hashlib.sha256(file.read_bytes()).hexdigest()))
         code, _, err = main(capsys, export)
         assert (
-            code == 2 and err == "legged_mw.deploy: policy.onnx cannot be read as an ONNX network: it is damaged; export the policy again\n"
+            code == 2
+            and err
+            == "legged_mw.deploy: policy.onnx cannot be read as an ONNX network: it is damaged; export the policy again\n"
         )
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_a_missing_file(name: str, export: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, err = main(capsys, "go1_flta")
-    assert code == 2 and "no folder go1_flta, and no policy 'go1_flta' in resources/policies; did you mean 'go1_flat'? there are: " in err
+    assert (
+        code == 2
+        and "no folder go1_flta, and no policy 'go1_flta' in resources/policies; did you mean 'go1_flat'? there are: "
+        in err
+    )
     (export / name).unlink()
     code, _, err = main(capsys, export)
-    assert code == 2 and f"no {name} in {export}; make an export with: python play.py --task <task> --export {export}" in err
+    assert (
+        code == 2
+        and f"no {name} in {export}; make an export with: python play.py --task <task> --export {export}" in err
+    )
 
 
 def test_broken_texts(export: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -345,11 +409,17 @@ def test_numbers_as_people_write_them(export: Path) -> None:
 @pytest.mark.parametrize(
     ("args", "said"),
     [
-        (("--eval", "--viewer", "none"), "--eval brings its own commands, is on flat ground and shows nothing: leave --viewer out"),
+        (
+            ("--eval", "--viewer", "none"),
+            "--eval brings its own commands, is on flat ground and shows nothing: leave --viewer out",
+        ),
         (("--eval", "--command", "1,0,0"), "leave --command out"),
         (("--eval", "--terrain"), "leave --terrain out"),
         (("--command", "1,0,0", "--commands", "x.yaml"), "--commands brings its own commands: leave --command out"),
-        (("--command", "fast"), "--command fast: 'fast' is no number; write --command=0,0,0 (vx [m/s], vy [m/s], yaw rate [rad/s])"),
+        (
+            ("--command", "fast"),
+            "--command fast: 'fast' is no number; write --command=0,0,0 (vx [m/s], vy [m/s], yaw rate [rad/s])",
+        ),
         (("--command", "0,0,nan"), "--command 0,0,nan: 'nan' is no number; write --command=0,0,0"),
         (
             ("--command", "0,1,0"),
@@ -385,7 +455,8 @@ def test_walks_as_in_the_environment(contract: Contract) -> None:
     for step in range(150):
         seen = stage.controller.observe(stage.measured, commands)
         if step < 10:
-            np.testing.assert_allclose(seen, obs["state"].numpy(), atol=1e-3)  # joint speeds are the largest, up to 20 rad/s
+            # joint speeds are the largest, up to 20 rad/s
+            np.testing.assert_allclose(seen, obs["state"].numpy(), atol=1e-3)
             np.testing.assert_allclose(stage.qpos(), env.sim.qpos.numpy(), atol=1e-5)
             if step:  # before the first step the environment has sensed nothing
                 np.testing.assert_allclose(stage.measured.joint_torque, env.torques.numpy(), atol=1e-2)
@@ -437,7 +508,11 @@ def test_joints_may_stand_in_another_order(export: Path, contract: Contract) -> 
     order = np.roll(np.arange(12), 3)
 
     def reorder(said: Any) -> None:
-        for part, name in ((said["action"], "lowest"), (said["action"], "highest"), *((said, name) for name in PER_JOINT)):
+        for part, name in (
+            (said["action"], "lowest"),
+            (said["action"], "highest"),
+            *((said, name) for name in PER_JOINT),
+        ):
             part[name] = [part[name][i] for i in order]
         for name in ("joint_pos", "joint_vel", "joint_torque"):
             said["sensors"][name] = [said["sensors"][name][i] for i in order]
@@ -494,7 +569,8 @@ def test_it_is_driven(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     code, out, err = main(capsys, SHIPPED, "--viewer", "none", "--time", "3", "--command", "0.8,0,0", "--num_envs", "2")
     assert code == 0, err
     [leg] = [line.split() for line in out.splitlines() if "+0.80 +0.00 +0.00" in line]
-    assert "3.0 s, 0 falls" in out and abs(float(leg[7]) - 0.8) < 0.08  # from, s, for, s, three commanded, three measured
+    # from, s, for, s, three commanded, three measured
+    assert "3.0 s, 0 falls" in out and abs(float(leg[7]) - 0.8) < 0.08
     (tmp_path / "script.yaml").write_text(
         "commands: [{time: 0, command: [0.5, 0, 0]}, {time: 0.5, command: [0, 0.4, 0]}, {time: 1, reset: true}]"
     )
@@ -519,7 +595,11 @@ def test_exam(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.Ca
     code, out, err = main(capsys, SHIPPED, "--eval", "--out", tmp_path / "exam.json")
     assert code == 0, err
     saved = json.loads((tmp_path / "exam.json").read_text())
-    assert "falls in 22 commands                     0" in out and saved["falls"] == 0 and saved["engine"] == "mujoco (deploy)"
+    assert (
+        "falls in 22 commands                     0" in out
+        and saved["falls"] == 0
+        and saved["engine"] == "mujoco (deploy)"
+    )
     assert saved["pushes"]["1"] == saved["pushes"]["2"] == 1.0 and saved["pushes"]["6"] < 1.0
     assert list(saved["pushes"]) == ["1", "2", "3", "4", "5", "6"] and "beats the peer: " in out
     assert all(error < 0.12 for error in saved["error"]) and 0.5 < saved["cost_of_transport"] < 1.2
@@ -546,7 +626,11 @@ def test_results_of_a_shipped_policy_go_to_the_logs(
 def test_the_common_range_of_published_policies(capsys: pytest.CaptureFixture[str]) -> None:
     """Asked of a robot that has none, and without an exam."""
     code, _, err = main(capsys, SHIPPED, "--eval", "--ranges", "common")
-    assert code == 2 and "exam: --ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2, g1" in err
+    assert (
+        code == 2
+        and "exam: --ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2, g1"
+        in err
+    )
     code, _, err = main(capsys, SHIPPED, "--ranges", "common")
     assert code == 2 and "--ranges says what the exam asks: add --eval" in err
 
@@ -561,16 +645,25 @@ def test_the_contract_brings_the_rules_of_the_exam(export: Path) -> None:
         contract_rules(read_contract(export))
 
 
-def test_a_result_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_result_that_cannot_be_written(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """Refused before the exam; or after it, where the disk changed meanwhile: the table is out by then."""
     monkeypatch.setattr(program, "run_exam", lambda *_, **__: {})
     monkeypatch.setattr(rules, "table", lambda _: "the table")
     (tmp_path / "file").write_text("")
     code, out, err = main(capsys, SHIPPED, "--eval", "--out", tmp_path / "file/exam.json")
-    assert code == 2 and out == "" and f"--out {tmp_path}/file/exam.json: {tmp_path}/file is a file, not a folder" in err
+    assert (
+        code == 2 and out == "" and f"--out {tmp_path}/file/exam.json: {tmp_path}/file is a file, not a folder" in err
+    )
     monkeypatch.setattr(program, "writable", lambda *_, **__: None)
     code, out, err = main(capsys, SHIPPED, "--eval", "--out", tmp_path / "file/exam.json")
-    assert code == 2 and out == "the table\n" and f"cannot write {tmp_path}/file/exam.json: " in err and "say --out FILE" in err
+    assert (
+        code == 2
+        and out == "the table\n"
+        and f"cannot write {tmp_path}/file/exam.json: " in err
+        and "say --out FILE" in err
+    )
 
 
 # ---- the seam
@@ -578,7 +671,9 @@ def test_a_result_that_cannot_be_written(monkeypatch: pytest.MonkeyPatch, tmp_pa
 
 def test_a_robot_walks_behind_the_seam(contract: Contract) -> None:
     robot = Recorder(MujocoRobot(SHIPPED, contract))
-    done = run(robot, Controller(SHIPPED, contract), lambda t: AHEAD if t < 3.0 else np.array([9.0, 0, 0]), 3.0, live=False)
+    done = run(
+        robot, Controller(SHIPPED, contract), lambda t: AHEAD if t < 3.0 else np.array([9.0, 0, 0]), 3.0, live=False
+    )
     assert done.steps == 150 == len(robot.targets) and done.fell is None and robot.closed == 1
     assert done.velocity is not None
     np.testing.assert_allclose(done.velocity, AHEAD, atol=0.08)
@@ -588,7 +683,9 @@ def test_a_robot_walks_behind_the_seam(contract: Contract) -> None:
 
 def test_commands_are_held_within_the_trained_ranges(contract: Contract, monkeypatch: pytest.MonkeyPatch) -> None:
     controller, asked = Controller(SHIPPED, contract), []
-    monkeypatch.setattr(controller, "act", lambda measured, command: (asked.append(command), contract.default_pose[None])[1])
+    monkeypatch.setattr(
+        controller, "act", lambda measured, command: (asked.append(command), contract.default_pose[None])[1]
+    )
     run(MujocoRobot(SHIPPED, contract), controller, lambda _: np.array([9.0, -9.0, 0.3]), 0.04, live=False)
     np.testing.assert_array_equal(asked, [[1.5, -0.8, 0.3]] * 2)
 
@@ -612,7 +709,9 @@ def test_a_fall_ends_the_walk(contract: Contract) -> None:
         ({"min_base_height": 0.18}, [1, 0, 0, 0], 0.15, True),
     ],
 )
-def test_the_contract_states_what_ends_a_walk(ends: dict[str, float], turned: list[float], down: float, falls: bool, export: Path) -> None:
+def test_the_contract_states_what_ends_a_walk(
+    ends: dict[str, float], turned: list[float], down: float, falls: bool, export: Path
+) -> None:
     """For one robot behind the seam, and for the robots of a stage."""
     rewrite(export, put("ends", ends))
     contract = read_contract(export)
@@ -664,7 +763,11 @@ def test_where_a_target_starts_from(origin: str, contract: Contract) -> None:
     pose, commands = contract.default_pose, np.zeros((2, 3))
     acts = lambda angle: (controller.act(measured_at(angle, contract), commands), controller.last_targets.copy())[1]  # noqa: E731
     targets = [acts(angle)[0] for angle in (0.5, 0.6, 0.7)]
-    starts = {"default": [pose] * 3, "joints": [0.5, 0.6, 0.7], "targets": [pose, pose + 0.1 * scale, pose + 0.3 * scale]}[origin]
+    starts = {
+        "default": [pose] * 3,
+        "joints": [0.5, 0.6, 0.7],
+        "targets": [pose, pose + 0.1 * scale, pose + 0.3 * scale],
+    }[origin]
     for got, start, action in zip(targets, starts, (0.1, 0.2, 0.25), strict=True):  # the third is clipped
         np.testing.assert_allclose(got, start + action * scale, atol=1e-7)
     controller.reset([1])
@@ -691,9 +794,15 @@ def test_history_is_oldest_first_and_filled_after_a_reset(contract: Contract) ->
         controller.act(measured_at(angle, contract), commands)
         np.testing.assert_array_equal(before, saw[-1])
     frames = [[*obs[0, [0, 12, 24]], obs[0, 36], *obs[0, [39, 51]]] for obs in saw]
-    expected = [[0.5, 0.5, 0.5, 1, 0, 0], [0.5, 0.5, 1, 2, 0, 0.1], [0.5, 1, 1.5, 3, 0.1, 0.2], [1, 1.5, 2, 4, 0.2, 0.3]]
+    expected = [
+        [0.5, 0.5, 0.5, 1, 0, 0],
+        [0.5, 0.5, 1, 2, 0, 0.1],
+        [0.5, 1, 1.5, 3, 0.1, 0.2],
+        [1, 1.5, 2, 4, 0.2, 0.3],
+    ]
     np.testing.assert_allclose(frames, expected, atol=1e-7)
-    np.testing.assert_allclose(saw[3][1, [0, 12, 24, 36, 39, 51]], [2, 2, 2, 4, 0, 0], atol=1e-7)  # the robot that was reset
+    # the robot that was reset
+    np.testing.assert_allclose(saw[3][1, [0, 12, 24, 36, 39, 51]], [2, 2, 2, 4, 0, 0], atol=1e-7)
 
 
 def test_a_robot_without_feet_and_a_task_without_commands(export: Path) -> None:
@@ -708,7 +817,10 @@ def test_a_robot_without_feet_and_a_task_without_commands(export: Path) -> None:
         model.graph.input.insert(0, onnx.helper.make_tensor_value_info("short", onnx.TensorProto.FLOAT, ["batch", 45]))
         model.graph.input.remove(old)
         onnx.save(model, export / "policy.onnx")
-        entries["network"] |= {"input": "short", "sha256": hashlib.sha256((export / "policy.onnx").read_bytes()).hexdigest()}
+        entries["network"] |= {
+            "input": "short",
+            "sha256": hashlib.sha256((export / "policy.onnx").read_bytes()).hexdigest(),
+        }
 
     rewrite(export, change)
     contract = read_contract(export)
@@ -722,7 +834,8 @@ def test_a_robot_without_feet_and_a_task_without_commands(export: Path) -> None:
     done = run(MujocoRobot(export, contract), Controller(export, contract), lambda _: np.zeros(0), 0.1, live=False)
     assert done.steps == 5 and done.velocity is not None
     with pytest.raises(
-        ContractError, match="the walking exam needs the commands lin_vel_x, lin_vel_y, ang_vel_yaw; missing: lin_vel_x, lin"
+        ContractError,
+        match="the walking exam needs the commands lin_vel_x, lin_vel_y, ang_vel_yaw; missing: lin_vel_x, lin",
     ):
         run_exam(export)
 
@@ -751,8 +864,10 @@ def test_live_keeps_time(contract: Contract, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr("time.sleep", sleep)
     safety = Safety(contract, Limits.of(SHIPPED, contract, {"frozen": "off"}))  # nothing moves this robot
     done = run(Slow(SHIPPED, contract), Controller(SHIPPED, contract), lambda _: AHEAD, 0.2, safety=safety)
-    assert done.steps == 9 and done.late == 1 and done.timing and done.timing.lost == 1  # what was lost is not made up for
-    np.testing.assert_allclose(written[:6], [0, 0.02, 0.04, 0.095, 0.1, 0.12], atol=1e-9)  # and the deadlines stay where they were
+    # what was lost is not made up for
+    assert done.steps == 9 and done.late == 1 and done.timing and done.timing.lost == 1
+    # and the deadlines stay where they were
+    np.testing.assert_allclose(written[:6], [0, 0.02, 0.04, 0.095, 0.1, 0.12], atol=1e-9)
 
 
 # ---- where torch is not installed

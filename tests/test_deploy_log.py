@@ -43,7 +43,9 @@ def walk(path: Path, contract: Contract, seconds: float = 5.0) -> Watched:
     """Hang, stand, walk ahead from 2.2 s on, and trip at 4.8 s."""
     robot, controller = Watched(GO2, contract, hoisted=True), Controller(GO2, contract)
     robot.health_at = lambda step: Health(age_s=0.004, temperatures=np.full(12, 90.0 if step == 240 else 30.0))
-    states = States(controller, [Script({5: "start", 110: "A"}, [0.8, 0.0, 0.0])], lambda _: np.zeros(3), lambda _: None)
+    states = States(
+        controller, [Script({5: "start", 110: "A"}, [0.8, 0.0, 0.0])], lambda _: np.zeros(3), lambda _: None
+    )
     log = Log(path, contract, GO2, "the test's")
     run(robot, controller, lambda _: np.zeros(0), seconds, live=False, states=states, log=log)
     return robot
@@ -67,10 +69,16 @@ def test_a_log_holds_the_run(logged: tuple[Path, Watched], contract: Contract) -
     limits = Limits.of(GO2, contract)
     wanted = np.clip(contract.default_pose + 0.25 * rows["action"][states == 2], limits.low, limits.high)
     np.testing.assert_allclose(rows["target"][states == 2], wanted, atol=1e-6)
-    np.testing.assert_allclose(rows["wanted"][states == 2], contract.default_pose + 0.25 * rows["action"][states == 2], atol=1e-6)
+    np.testing.assert_allclose(
+        rows["wanted"][states == 2], contract.default_pose + 0.25 * rows["action"][states == 2], atol=1e-6
+    )
     assert np.isnan(rows["target"][(states == 0) | (states == 3)]).all() and np.isnan(rows["action"][states == 1]).all()
     assert (rows["stiffness"][states == 2] == 20.0).all() and rows["stiffness"][6, 0] < 3.0
-    assert np.isnan(rows["voltage"]).all() and rows["age"][0, 0] == np.float32(0.004) and rows["temperature"][240, 3] == 90.0
+    assert (
+        np.isnan(rows["voltage"]).all()
+        and rows["age"][0, 0] == np.float32(0.004)
+        and rows["temperature"][240, 3] == 90.0
+    )
     assert log.events == [(4.8, "temperature: FL_hip_joint has a motor of 90 deg C, more than 85")]
 
 
@@ -95,11 +103,20 @@ def test_what_is_no_log(tmp_path: Path, contract: Contract, logged: tuple[Path, 
     wrong = tmp_path / "wrong.lmwlog"
     with pytest.raises(LogError, match="cannot read .*wrong.lmwlog: No such file"):
         read_log(wrong)
-    for content in (b"", b"no log", b"x" * 100, b"\x05" + b"\0" * 7 + b"hello", b"\0" * 8, b"\x05" + b"\0" * 7 + b"PK\x03\x04-"):
+    for content in (
+        b"",
+        b"no log",
+        b"x" * 100,
+        b"\x05" + b"\0" * 7 + b"hello",
+        b"\0" * 8,
+        b"\x05" + b"\0" * 7 + b"PK\x03\x04-",
+    ):
         wrong.write_bytes(content)
         with pytest.raises(LogError, match=r"wrong.lmwlog is no log of legged_mw.deploy"):
             read_log(wrong)
-    with pytest.raises(LogError, match=r"cannot write the log .*walk.lmwlog: File exists; say --log FILE, or --log off"):
+    with pytest.raises(
+        LogError, match=r"cannot write the log .*walk.lmwlog: File exists; say --log FILE, or --log off"
+    ):
         Log(logged[0], contract, GO2, "")
     assert log_path(contract).parent == Path("logs/deploy") and log_path(contract).name.startswith("go2_flat_")
 
@@ -125,7 +142,9 @@ def test_memory_is_flat_while_it_logs(contract: Contract, tmp_path: Path) -> Non
     assert sizes[1] - sizes[0] < 500_000 and len(read_log(log.path).rows["time"]) == 3000
 
 
-def test_a_disk_that_hangs_costs_steps_of_the_log_alone(contract: Contract, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_hangs_costs_steps_of_the_log_alone(
+    contract: Contract, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr("legged_mw.deploy.log.BACKLOG", 2)
     hangs = threading.Event()
     monkeypatch.setattr(np, "savez_compressed", lambda file, **block: (hangs.wait(), np.savez(file, **block)))
@@ -138,7 +157,9 @@ def test_a_disk_that_hangs_costs_steps_of_the_log_alone(contract: Contract, tmp_
     hangs.set()
     log.close()
     found = read_log(log.path)
-    assert len(found.rows["time"]) in (200, 300) and found.events[-1][1].endswith(" steps were not logged: the disk is too slow")
+    assert len(found.rows["time"]) in (200, 300) and found.events[-1][1].endswith(
+        " steps were not logged: the disk is too slow"
+    )
 
 
 @contextmanager
@@ -158,7 +179,8 @@ def test_a_full_disk_ends_the_log_and_not_the_walk(
     """It is said once, when it happens; what was written before is read."""
     whole = logged[0].read_bytes()
     first = 8 + int.from_bytes(whole[:8], "little")
-    with disk_of(first + 8 + int.from_bytes(whole[first : first + 8], "little") + 1000):  # the export, a block, and a bit
+    # the export, a block, and a bit
+    with disk_of(first + 8 + int.from_bytes(whole[first : first + 8], "little") + 1000):
         robot = walk(tmp_path / "full.lmwlog", contract)
     assert len(robot.joints) == 250
     assert capsys.readouterr().out == f"the log {tmp_path}/full.lmwlog ends after 100 steps: File too large\n"
@@ -180,15 +202,19 @@ def test_the_program_does_not_say_that_it_logged(
 # ---- replay
 
 
-def test_the_simulation_of_a_simulated_walk_is_like_it(logged: tuple[Path, Watched], contract: Contract, tmp_path: Path) -> None:
+def test_the_simulation_of_a_simulated_walk_is_like_it(
+    logged: tuple[Path, Watched], contract: Contract, tmp_path: Path
+) -> None:
     found = replay(logged[0])
     assert len(found.robot["time"]) == 130 == len(found.simulated["target"])
     robot, simulated = figures(found.robot, contract), figures(found.simulated, contract)
-    np.testing.assert_allclose(robot["torque"].sum(), simulated["torque"].sum(), rtol=0.25)  # it began 2 cm above the ground
+    # it began 2 cm above the ground
+    np.testing.assert_allclose(robot["torque"].sum(), simulated["torque"].sum(), rtol=0.25)
     np.testing.assert_allclose(robot["velocity"], simulated["velocity"], atol=0.08)
     limits = Limits.of(GO2, contract)
     assert (found.simulated["target"] <= limits.highest).all() and (found.simulated["target"] >= limits.lowest).all()
-    np.testing.assert_allclose([robot["latency"], simulated["latency"]], 20.0, atol=1.0)  # a period, at whose end is measured
+    # a period, at whose end is measured
+    np.testing.assert_allclose([robot["latency"], simulated["latency"]], 20.0, atol=1.0)
     text = table(found)
     assert text.startswith(f"go2_flat, the test's, {found.recording.header['began']}: 2.6 s of the policy\n")
     assert "age of a measurement" in text and "vx [m/s], mean" in text
@@ -205,7 +231,9 @@ def test_latency_is_from_a_target_to_its_torque(contract: Contract) -> None:
     steps = np.cumsum(rng.normal(0.0, 0.05, (12, 400)), axis=1)
     angle, speed = 0.5 * rng.normal(0.0, 0.1, (12, 400)), rng.normal(0.0, 2.0, (12, 400))
     lags = [np.full(400, lag) for lag in (1, 2, 4)] + [3 + rng.integers(0, 2, 400)] * 2
-    wanted = np.stack([steps[i, np.maximum(np.arange(400) - lag, 0)] for i, lag in enumerate(lags)] + [steps[i] for i in range(5, 12)])
+    wanted = np.stack(
+        [steps[i, np.maximum(np.arange(400) - lag, 0)] for i, lag in enumerate(lags)] + [steps[i] for i in range(5, 12)]
+    )
     torque = 20.0 * (wanted - angle) - np.array([0.5, 0.0] * 6)[:, None] * speed
     steps[5] = 0.3  # it rests
     torque[6], torque[7:] = 0.0, rng.normal(0.0, 10.0, (5, 400))  # none is measured; it has another reason
@@ -214,7 +242,9 @@ def test_latency_is_from_a_target_to_its_torque(contract: Contract) -> None:
     np.testing.assert_allclose(found, [20.0, 40.0, 80.0, 70.0, 70.0, *[np.nan] * 7], atol=3.0)
 
 
-def test_a_log_needs_nothing_beside_it(logged: tuple[Path, Watched], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_log_needs_nothing_beside_it(
+    logged: tuple[Path, Watched], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It holds the export. A log from before that names where it was."""
     recording = read_log(logged[0])
     assert recording.files["scene.xml"] == (GO2 / "scene.xml").read_bytes() and len(recording.files) == 3
@@ -236,7 +266,10 @@ def test_the_log_of_a_motion_needs_nothing_beside_it(tmp_path: Path) -> None:
 
 
 def test_replay_of_another_network(logged: tuple[Path, Watched], tmp_path: Path, contract: Contract) -> None:
-    with pytest.raises(LogError, match=r"is of another network than the one in resources/policies/go1_flat \(go2_flat\); name its export"):
+    with pytest.raises(
+        LogError,
+        match=r"is of another network than the one in resources/policies/go1_flat \(go2_flat\); name its export",
+    ):
         replay(logged[0], ROOT / "resources/policies/go1_flat")
     walk(tmp_path / "short.lmwlog", contract, 2.5)
     with pytest.raises(LogError, match="short.lmwlog holds no walk of 50 steps: the policy was not on for so long"):

@@ -75,7 +75,11 @@ def state(name: str, note: str, command: Any = (0.5, 0.0, 0.2)) -> Any:
 
 
 def measurement(contract: Contract, **changed: Any) -> Measurement:
-    level = {"gravity": np.array([0.0, 0.0, -1.0]), "joint_pos": contract.default_pose + 0.1, "foot_contact": np.array([1.0, 0, 0, 1])}
+    level = {
+        "gravity": np.array([0.0, 0.0, -1.0]),
+        "joint_pos": contract.default_pose + 0.1,
+        "foot_contact": np.array([1.0, 0, 0, 1]),
+    }
     return Measurement(**{**vars(MujocoRobot(GO2, contract).read()), **level, **changed})
 
 
@@ -105,7 +109,9 @@ def test_measured_joints_tilt_state_and_why_are_shown(ends: Ends, contract: Cont
 @pytest.mark.parametrize(("gravity", "height"), [((0.0, 0.0, 1.0), 0.057), ((0.0, 1.0, 0.0), 0.195)])
 def test_a_robot_that_lies_is_shown_on_the_ground(ends: Ends, contract: Contract, gravity: Any, height: float) -> None:
     """On its back, on its side: the trunk's shapes and the legs' count, not the feet alone."""
-    ends.mirror.show(0.0, measurement(contract, gravity=np.array(gravity), joint_pos=contract.default_pose), state("damping", ""))
+    ends.mirror.show(
+        0.0, measurement(contract, gravity=np.array(gravity), joint_pos=contract.default_pose), state("damping", "")
+    )
     ends.turn()
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, ends.shown[-1].qpos[0, 3:7])
@@ -122,7 +128,9 @@ def test_it_walks_by_its_velocity_and_a_silent_robot_stays(ends: Ends, contract:
     assert (x, y) == pytest.approx((np.sin(0.5) / 0.5, (1 - np.cos(0.5)) / 0.5), abs=0.03)
     ends.mirror.show(1.0, None, state("damping", "the newest measurement is 120 ms old"))
     lines = ends.turn()
-    assert (lines["state"], lines[""]) == ("damping", "the newest measurement is 120 ms old") and lines["command"] == "-"
+    assert (lines["state"], lines[""]) == ("damping", "the newest measurement is 120 ms old") and lines[
+        "command"
+    ] == "-"
     assert ends.shown[-1].qpos[0, :2] == pytest.approx((x, y))
     broken = measurement(contract, lin_vel=np.full(3, np.nan), joint_pos=np.full(12, np.nan))
     ends.mirror.show(1.1, broken, state("damping", ""))
@@ -172,14 +180,18 @@ def test_the_viewer_is_a_process_of_its_own(contract: Contract) -> None:
 def test_a_viewer_that_ends_at_once_is_not_waited_for(contract: Contract, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.executable", shutil.which("false"))
     args = argparse.Namespace(viewer="web", camera="follow", host="127.0.0.1", port=0)
-    with pytest.raises(ViewError, match="the viewer did not start: it ended, or took longer than 30 s; leave --viewer out"):
+    with pytest.raises(
+        ViewError, match="the viewer did not start: it ended, or took longer than 30 s; leave --viewer out"
+    ):
         Mirror(GO2, contract, args)
 
 
 # ---- who else may drive
 
 
-def test_the_first_gamepad_that_is_there_drives(contract: Contract, tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_first_gamepad_that_is_there_drives(
+    contract: Contract, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(drive, "GAMEPADS", tmp_path)
     assert drive._gamepad(contract, None) is None
     (tmp_path / "js0").symlink_to("nowhere")  # cannot be read

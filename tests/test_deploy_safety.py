@@ -27,7 +27,16 @@ from legged_mw.utils.commands import VELOCITY
 
 POLICIES = ROOT / "resources/policies"
 GO2 = POLICIES / "go2_flat"
-ASKED = {"position": 0.1, "target": 0.3, "step": 0.5, "torque": 1.0, "speed": 20.0, "tilt": 30.0, "temperature": 80.0, "voltage": 24.0}
+ASKED = {
+    "position": 0.1,
+    "target": 0.3,
+    "step": 0.5,
+    "torque": 1.0,
+    "speed": 20.0,
+    "tilt": 30.0,
+    "temperature": 80.0,
+    "voltage": 24.0,
+}
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +52,9 @@ def limits(contract: Contract) -> Limits:
 def at_rest(contract: Contract, **changed: Any) -> Measurement:
     zeros = {name: np.zeros(3) for name in ("lin_vel", "ang_vel", "acceleration")}
     joints = {"joint_pos": contract.default_pose, "joint_vel": np.zeros(12), "joint_torque": np.zeros(12)}
-    return Measurement(**{**zeros, **joints, "gravity": np.array([0.0, 0.0, -1.0]), "foot_contact": np.zeros(4), **changed})
+    return Measurement(
+        **{**zeros, **joints, "gravity": np.array([0.0, 0.0, -1.0]), "foot_contact": np.zeros(4), **changed}
+    )
 
 
 def put(values: Any, joint: int, value: float) -> Any:
@@ -59,7 +70,11 @@ def tilted(degrees: float) -> Any:
 # ---- each limit, at it and beyond it. Of joint 5, FR_calf_joint: -2.7227 to -0.83776 rad, 45.43 N m
 
 SENSED = {
-    "position": (lambda x: {"joint_pos": x}, -0.8378 + 0.1, "FR_calf_joint is at -0.69 rad, 0.15 beyond its range -2.72 to -0.84; 0.10 is"),
+    "position": (
+        lambda x: {"joint_pos": x},
+        -0.8378 + 0.1,
+        "FR_calf_joint is at -0.69 rad, 0.15 beyond its range -2.72 to -0.84; 0.10 is",
+    ),
     "speed": (lambda x: {"joint_vel": x}, 20.0, "FR_calf_joint turns at 20.1 rad/s, more than 20.0"),
     "tilt": (lambda x: {"gravity": tilted(x)}, 30.0, "the body is tilted by 30 degrees, more than 30"),
 }
@@ -87,7 +102,11 @@ HEALTH: dict[str, tuple[Health, Health, str]] = {
     ),
     "voltage": (Health(voltage=24.0), Health(voltage=23.9), "the battery has 23.9 V, less than 24"),
     "age": (Health(age_s=0.04), Health(age_s=0.041), "the newest measurement is 41 ms old, more than 40"),
-    "motor": (Health(), Health(motor_faults={"FL_hip_joint": "error 0x4"}), "the motor of FL_hip_joint reports a fault: error 0x4"),
+    "motor": (
+        Health(),
+        Health(motor_faults={"FL_hip_joint": "error 0x4"}),
+        "the motor of FL_hip_joint reports a fault: error 0x4",
+    ),
 }
 
 
@@ -122,7 +141,9 @@ def test_targets(contract: Contract, limits: Limits) -> None:
     )
     fast = at_rest(contract, joint_vel=put(np.zeros(12), 0, -10.0))  # damping asks for 5 N m more
     assert check(put(pose, 0, 0.1 + 0.93), measured=fast) is None  # 20 * 0.93 + 5 = 23.6 of 23.7 N m
-    assert check(put(pose, 0, 0.1 + 0.94), measured=fast) == Trip("torque", "FL_hip_joint is asked for 23.8 N m, more than 23.7")
+    assert check(put(pose, 0, 0.1 + 0.94), measured=fast) == Trip(
+        "torque", "FL_hip_joint is asked for 23.8 N m, more than 23.7"
+    )
     for value in (math.nan, math.inf):
         assert check(put(pose, 7, value)) == Trip("finite", f"the target of RL_thigh_joint is not finite: {value}")
 
@@ -155,20 +176,30 @@ def test_a_policy_of_torques(contract: Contract, limits: Limits) -> None:
         "torque", "FL_calf_joint is asked for 45.5 N m, more than 45.4"
     )
     controller = Controller(GO2, torques)
-    with pytest.raises(RobotError, match="a policy of torques cannot stand a robot up: its states need servos; run it without states, or"):
+    with pytest.raises(
+        RobotError,
+        match="a policy of torques cannot stand a robot up: its states need servos; run it without states, or",
+    ):
         driven(Watched(GO2, contract), controller, Script({}), 0.1)
 
 
 def test_steps_that_are_late(contract: Contract, limits: Limits) -> None:
     """Five within a second, each by more than half a period; four, or half a period, are fine."""
     off = limits.but({"frozen": "off"}, "test")
-    for count, apart, behind, trips in ((5, 0.2, 0.0101, True), (5, 0.26, 0.0101, False), (4, 0.02, 0.02, False), (9, 0.02, 0.01, False)):
+    for count, apart, behind, trips in (
+        (5, 0.2, 0.0101, True),
+        (5, 0.26, 0.0101, False),
+        (4, 0.02, 0.02, False),
+        (9, 0.02, 0.01, False),
+    ):
         safety = Safety(contract, off)
         found = [safety.sensed(at_rest(contract), Health(), i * apart, behind) for i in range(count)]
         assert not any(found[:-1]) and bool(found[-1]) == trips
     assert Safety(contract, off).sensed(at_rest(contract), Health(), 0.0, 5.0) is None
     many = Safety(contract, off.but({"late": 100}, "test"))
-    assert [bool(many.sensed(at_rest(contract), Health(), i * 0.002, 0.02)) for i in range(100)] == [False] * 99 + [True]
+    assert [bool(many.sensed(at_rest(contract), Health(), i * 0.002, 0.02)) for i in range(100)] == [False] * 99 + [
+        True
+    ]
     safety = Safety(contract, off)
     found = [safety.sensed(at_rest(contract), Health(), i * 0.02, 0.015) for i in range(5)]
     assert found[-1] == Trip("late", "5 steps within a second began late, the last by 15 ms")
@@ -199,7 +230,10 @@ def walk(contract: Contract, step: int, stuck: Sequence[str] = (), quantum: floa
         parts |= {name: getattr(before, name) for name in stuck if name in parts}
         for joint in (contract.joints.index(name) for name in stuck if name not in parts):
             parts["joint_pos"][joint], parts["joint_vel"][joint] = before.joint_pos[joint], 0.0
-    return at_rest(contract, **{name: np.round(values / quantum) * quantum if quantum else values for name, values in parts.items()})
+    return at_rest(
+        contract,
+        **{name: np.round(values / quantum) * quantum if quantum else values for name, values in parts.items()},
+    )
 
 
 @pytest.mark.parametrize(
@@ -233,7 +267,11 @@ def test_a_robot_that_stands_still_is_not_frozen(quantum: float, contract: Contr
     """Its encoders have steps; its gyro has noise. A gyro and speeds that are not measured stay zero, also while it walks."""
     noise, safety = np.random.default_rng(0), Safety(contract, limits)
     for step in range(200):
-        measured = at_rest(contract, ang_vel=0.02 * noise.standard_normal(3), joint_pos=np.round(contract.default_pose / quantum) * quantum)
+        measured = at_rest(
+            contract,
+            ang_vel=0.02 * noise.standard_normal(3),
+            joint_pos=np.round(contract.default_pose / quantum) * quantum,
+        )
         assert safety.sensed(measured, Health(), step * contract.period) is None
         assert safety.asked(measured, contract.default_pose + 0.02 * noise.standard_normal(12)) is None
     safety.reset()
@@ -250,12 +288,17 @@ def test_a_part_with_coarse_steps_is_not_frozen(part: str, steps: int, contract:
     for step in range(200 if carried else begin + steps):
         phase = 0.7 * step * contract.period
         roll = 0.3 * math.sin(phase / 0.3)
-        parts = {"ang_vel": np.array([0.7 * math.cos(phase / 0.3), 0.0, 0.0]), "gravity": np.array([0.0, -math.sin(roll), -math.cos(roll)])}
+        parts = {
+            "ang_vel": np.array([0.7 * math.cos(phase / 0.3), 0.0, 0.0]),
+            "gravity": np.array([0.0, -math.sin(roll), -math.cos(roll)]),
+        }
         measured = at_rest(contract, **parts) if carried else walk(contract, step)
         if step >= begin and not carried:
             measured = replace(measured, **{part: getattr(walk(contract, begin), part)})
         assert safety.sensed(measured, Health(), step * contract.period) is None
-        told = contract.default_pose + 0.002 * noise.standard_normal(12) if carried else walk(contract, step + 1).joint_pos
+        told = (
+            contract.default_pose + 0.002 * noise.standard_normal(12) if carried else walk(contract, step + 1).joint_pos
+        )
         assert safety.asked(measured, told) is None
 
 
@@ -322,7 +365,9 @@ def test_shipped_policies_trip_nothing(name: str) -> None:
     contract = read_contract(folder)
     exam, names = contract_rules(contract), [command.name for command in contract.commands]
     directions = np.arange(rules.PUSH_DIRECTIONS) * 2 * math.pi / rules.PUSH_DIRECTIONS
-    kicks = [speed * np.array([math.cos(a), math.sin(a)]) for speed in exam.push_speeds if speed <= 2.0 for a in directions]
+    kicks = [
+        speed * np.array([math.cos(a), math.sin(a)]) for speed in exam.push_speeds if speed <= 2.0 for a in directions
+    ]
     held = exam.held()
     wanted = np.tile([command.default for command in contract.commands], (len(held) + len(kicks), 1))
     wanted[:, [names.index(each) for each in VELOCITY]] = [*held, *[(exam.push_vx, 0.0, 0.0)] * len(kicks)]
@@ -394,8 +439,16 @@ def ended(robot: Watched, controller: Controller, script: Script) -> None:
 
 
 FAULTS: dict[str, tuple[Fault, int, str]] = {  # fault, periods until it can be known, the line
-    "NaN from the policy": (policy_of(lambda actions: np.nan * actions), 0, "the target of FL_hip_joint is not finite: nan"),
-    "inf from the policy": (policy_of(lambda actions: np.inf * actions), 0, "the target of FL_hip_joint is not finite: nan"),
+    "NaN from the policy": (
+        policy_of(lambda actions: np.nan * actions),
+        0,
+        "the target of FL_hip_joint is not finite: nan",
+    ),
+    "inf from the policy": (
+        policy_of(lambda actions: np.inf * actions),
+        0,
+        "the target of FL_hip_joint is not finite: nan",
+    ),
     "actions a hundred times too large": (policy_of(lambda actions: 100 * actions), 5, "damping: "),
     "NaN from a sensor": (
         measured_as(lambda _, m: replace(m, joint_vel=np.nan * m.joint_vel)),
@@ -407,7 +460,11 @@ FAULTS: dict[str, tuple[Fault, int, str]] = {  # fault, periods until it can be 
         0,
         "FL_hip_joint is at 2.",
     ),
-    "a speed that jumps": (measured_as(lambda _, m: replace(m, joint_vel=m.joint_vel + 100.0)), 0, "FL_hip_joint turns at "),
+    "a speed that jumps": (
+        measured_as(lambda _, m: replace(m, joint_vel=m.joint_vel + 100.0)),
+        0,
+        "FL_hip_joint turns at ",
+    ),
     "joints in another order": (
         measured_as(lambda _, m: replace(m, joint_pos=np.roll(m.joint_pos, 1))),
         0,
@@ -416,9 +473,17 @@ FAULTS: dict[str, tuple[Fault, int, str]] = {  # fault, periods until it can be 
     "a frozen state": (measured_as(frozen), 3, "4 measurements in a row are the same"),
     "a silent robot": (measured_as(silent), 0, "the newest measurement is 100 ms old: the link is down"),
     "a stale measurement": (reports(Health(age_s=0.05)), 0, "the newest measurement is 50 ms old, more than 40"),
-    "a hot motor": (reports(Health(temperatures=np.full(12, 90.0))), 0, "FL_hip_joint has a motor of 90 deg C, more than 85"),
+    "a hot motor": (
+        reports(Health(temperatures=np.full(12, 90.0))),
+        0,
+        "FL_hip_joint has a motor of 90 deg C, more than 85",
+    ),
     "an empty battery": (reports(Health(voltage=20.0)), 0, "the battery has 20.0 V, less than 24"),
-    "a motor's fault": (reports(Health(motor_faults={"FR_calf_joint": "error 0x1"})), 0, "the motor of FR_calf_joint reports a fault"),
+    "a motor's fault": (
+        reports(Health(motor_faults={"FR_calf_joint": "error 0x1"})),
+        0,
+        "the motor of FR_calf_joint reports a fault",
+    ),
     "the remote lost": (reports(Health()), 149, "the remote was not heard for 3.0 s"),
     "an emergency stop": (stopped, 0, "the test"),
     "select": (ended, 0, "select was pressed"),
@@ -447,8 +512,12 @@ def test_a_fault_damps(name: str, contract: Contract) -> None:
 
 def test_a_plain_run_raises_what_tripped(contract: Contract) -> None:
     robot = Watched(GO2, contract)
-    robot.changed = lambda step, measured: replace(measured, joint_vel=measured.joint_vel + (99.0 if step == 20 else 0.0))
-    with pytest.raises(Tripped, match=r"FL_hip_joint turns at .* rad/s, more than 60.0; the joints are damped") as error:
+    robot.changed = lambda step, measured: replace(
+        measured, joint_vel=measured.joint_vel + (99.0 if step == 20 else 0.0)
+    )
+    with pytest.raises(
+        Tripped, match=r"FL_hip_joint turns at .* rad/s, more than 60.0; the joints are damped"
+    ) as error:
         run(robot, Controller(GO2, contract), lambda _: np.zeros(3), 1.0, live=False)
     assert error.value.trip.limit == "speed" and len(robot.done) == 20
     before = robot.fleet.qpos[0, 2]

@@ -60,7 +60,10 @@ def test_the_contract_says_where_the_scan_looks() -> None:
     ("change", "message"),
     [
         (lambda said: said.pop("height_scan"), "policy.yaml: 'height_scan' is missing; it must be a mapping"),
-        (lambda said: said["height_scan"].pop("x"), "policy.yaml: height_scan: 'x' is missing; it must be a list of numbers"),
+        (
+            lambda said: said["height_scan"].pop("x"),
+            "policy.yaml: height_scan: 'x' is missing; it must be a list of numbers",
+        ),
         (
             lambda said: said["height_scan"]["y"].pop(),
             "observation row 'height_scan' has size 187; height_scan has 170 values on this robot",
@@ -91,7 +94,9 @@ def test_the_scan_is_the_environments(export: Path) -> None:
     block = Fleet(export, seal(export), 1)
     block.qpos[0, :3] = [0.0, 0.0, 0.278]
     scan = block.read().others["height_scan"].reshape(17, 11)
-    assert np.allclose(scan[9:, 6:], -0.1) and np.allclose(scan[:9], 0.0) and np.allclose(scan[:, :5], 0.0), "ahead and to the left"
+    assert np.allclose(scan[9:, 6:], -0.1) and np.allclose(scan[:9], 0.0) and np.allclose(scan[:, :5], 0.0), (
+        "ahead and to the left"
+    )
 
 
 def test_where_there_is_no_ground_it_is_deep(export: Path) -> None:
@@ -110,7 +115,10 @@ def test_it_walks_behind_the_seam() -> None:
     contract = read_contract(SHIPPED)
     robot, controller = MujocoRobot(SHIPPED, contract), Controller(SHIPPED, contract)
     measured = robot.read()
-    assert measured.others["height_scan"].shape == (187,) and controller.act(measured, np.zeros((1, 3))).shape == (1, 12)
+    assert measured.others["height_scan"].shape == (187,) and controller.act(measured, np.zeros((1, 3))).shape == (
+        1,
+        12,
+    )
 
 
 def test_among_steps_it_stands_on_boxes_and_sees_them() -> None:
@@ -129,11 +137,22 @@ def test_among_steps_it_stands_on_boxes_and_sees_them() -> None:
 
 @pytest.mark.parametrize("task", ["go1_rough", "go1_rough_scan"])
 def test_around_the_steps_the_ground_goes_on(task: str) -> None:
-    model = mujoco.MjSpec.from_file(str(ROOT / "resources/policies" / task / TERRAIN_FILE)).compile()  # an MJZ, as MuJoCo reads it
+    # an MJZ, as MuJoCo reads it
+    model = mujoco.MjSpec.from_file(str(ROOT / "resources/policies" / task / TERRAIN_FILE)).compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     for x, y in ((15.9, 0.0), (16.1, 3.0), (-500.0, 0.0), (0.0, 900.0), (300.0, -300.0)):
-        hit = mujoco.mj_ray(model, data, np.array([x, y, 5.0]), np.array([0.0, 0.0, -1.0]), None, 1, -1, np.zeros(1, dtype=np.int32), None)
+        hit = mujoco.mj_ray(
+            model,
+            data,
+            np.array([x, y, 5.0]),
+            np.array([0.0, 0.0, -1.0]),
+            None,
+            1,
+            -1,
+            np.zeros(1, dtype=np.int32),
+            None,
+        )
         assert hit == pytest.approx(5.0), (x, y)
 
 
@@ -147,7 +166,8 @@ def test_too_many_steps_for_an_export_are_said() -> None:
 def test_an_export_of_flat_ground_has_no_steps(export: Path) -> None:
     (export / TERRAIN_FILE).unlink()
     with pytest.raises(
-        ContractError, match=r"no terrain.mjz in .*; an export has one if its task had steps or blocks; export an older one again"
+        ContractError,
+        match=r"no terrain.mjz in .*; an export has one if its task had steps or blocks; export an older one again",
     ):
         DeployStage(export, 1, scene_file=TERRAIN_FILE)
 
@@ -161,10 +181,16 @@ def test_an_export_of_flat_ground_has_no_steps(export: Path) -> None:
             r"policy.yaml: stiffness is \[35\..*, but terrain.mjz has \[36\..*; change both, or export the policy again",
         ),
         ('name="gyro/imu"', 'name="gyro"', "no sensor 'gyro/imu' in terrain.mjz; "),
-        ('<gyro site="imu" ', '<framequat objtype="site" objname="imu" ', r"terrain.mjz: the sensors of 'ang_vel' .* have 4 values, not 3"),
+        (
+            '<gyro site="imu" ',
+            '<framequat objtype="site" objname="imu" ',
+            r"terrain.mjz: the sensors of 'ang_vel' .* have 4 values, not 3",
+        ),
     ],
 )
-def test_what_is_wrong_with_terrain_is_not_said_of_the_scene(right: str, wrong: str, message: str, export: Path) -> None:
+def test_what_is_wrong_with_terrain_is_not_said_of_the_scene(
+    right: str, wrong: str, message: str, export: Path
+) -> None:
     text = Source(SHIPPED / TERRAIN_FILE).text
     assert right in text
     write_archive(export / TERRAIN_FILE, text.replace(right, wrong))
@@ -183,7 +209,10 @@ def test_an_archive_holds_one_model_that_stands_alone(tmp_path: Path, monkeypatc
     assert file.read_bytes() == first and Source(file, alone=True).text == "<mujoco />"
     monkeypatch.chdir(tmp_path)  # where a model of a text would look for what it names
     (tmp_path / "other.xml").write_text("<mujoco/>")
-    for text in ('<mujoco><include file="other.xml"/></mujoco>', '<mujoco><asset><mesh file="m.obj"/></asset></mujoco>'):
+    for text in (
+        '<mujoco><include file="other.xml"/></mujoco>',
+        '<mujoco><asset><mesh file="m.obj"/></asset></mujoco>',
+    ):
         write_archive(file, text)
         with pytest.raises(ValueError, match=r"it names (other.xml|m.obj); the model of an archive stands alone"):
             Source(file)
@@ -227,7 +256,8 @@ def test_a_broken_archive_is_one_line(tmp_path: Path) -> None:
 def test_another_archive_is_refused(method: int, names: tuple[str, ...], tmp_path: Path) -> None:
     _zipped(tmp_path / "terrain.mjz", method, *names)
     with pytest.raises(
-        ValueError, match=f"it holds {', '.join(names) or 'nothing'}; an export's holds model.xml alone, deflated and of 64 MiB"
+        ValueError,
+        match=f"it holds {', '.join(names) or 'nothing'}; an export's holds model.xml alone, deflated and of 64 MiB",
     ):
         Source(tmp_path / "terrain.mjz")
 

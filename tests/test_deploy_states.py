@@ -50,7 +50,11 @@ def test_from_lying_to_walking(name: str, lies: float, stands: float) -> None:
     source = Script({60: "start", 300: "A", 450: "select", 500: "A"}, command=[0.6, 0.0, 0.0])
     done, passed = driven(robot, controller, source, 11.0, said)
     assert passed == ["zero torque", "stand", "policy", "damping"] and not done.trips
-    assert said == ["stand: 2 s to the default pose; then A: policy", "policy: select: damping", "damping: select was pressed"]
+    assert said == [
+        "stand: 2 s to the default pose; then A: policy",
+        "policy: select: damping",
+        "damping: select was pressed",
+    ]
     assert robot.done == ["limp"] * 60 + ["write"] * 390 + ["damp"] * 100
     heights, joints = np.array(robot.heights), np.array(robot.joints)
     assert heights[59] < lies and heights[299] > stands and heights[-1] < lies
@@ -63,7 +67,9 @@ def test_limits_judge_the_gains_that_a_robot_has(contract: Contract, monkeypatch
     """One that cannot change them stands up with the contract's, so the torque limit counts with those."""
     robot, judged = Watched(GO1, contract, whole=True), []
     robot.can_change_gains = False
-    monkeypatch.setattr("legged_mw.deploy.safety.Safety.asked", lambda _, measured, targets, *gains: judged.append(gains))
+    monkeypatch.setattr(
+        "legged_mw.deploy.safety.Safety.asked", lambda _, measured, targets, *gains: judged.append(gains)
+    )
     driven(robot, Controller(GO1, contract), Script({2: "start"}), 0.2, [])
     assert len(judged) == 8 and set(judged) == {(None, None)}
 
@@ -87,18 +93,23 @@ def test_standing_begins_where_the_joints_are(contract: Contract) -> None:
     for step in range(101, 400):
         states.listen(Health(), 0.02 * step)
         last = states.step(measured, 0.02 * step)
-    np.testing.assert_allclose(last.stiffness, 3.0 * contract.stiffness)  # the joints did not come: stiffer, but not without end
+    # the joints did not come: stiffer, but not without end
+    np.testing.assert_allclose(last.stiffness, 3.0 * contract.stiffness)
 
 
 def test_buttons_that_come_too_early(contract: Contract) -> None:
     """A at zero torque does nothing, A before it stands has to wait, start while it walks does nothing."""
     said: list[str] = []
     robot, controller = Watched(GO1, contract, hoisted=True), Controller(GO1, contract)
-    source = Script({1: "A", 5: "start", 50: "A", 120: "A", 130: "start", 140: "select", 150: "start", 155: "A", 160: "start"})
+    source = Script(
+        {1: "A", 5: "start", 50: "A", 120: "A", 130: "start", 140: "select", 150: "start", 155: "A", 160: "start"}
+    )
     _, passed = driven(robot, controller, source, 3.4, said)
     assert passed == ["zero torque", "stand", "policy", "damping", "zero torque", "stand"]
     [waits] = [line for line in said if "wait" in line]
-    assert waits.startswith("stand: A has to wait until the robot stands: ") and waits.endswith(" rad from its pose after 0.9 s")
+    assert waits.startswith("stand: A has to wait until the robot stands: ") and waits.endswith(
+        " rad from its pose after 0.9 s"
+    )
 
 
 def test_after_a_trip_a_person_starts_again(contract: Contract) -> None:
@@ -211,7 +222,12 @@ def test_one_who_drives_goes_before_the_others(contract: Contract) -> None:
     """The sticks while they are out of their centre; what the keys had asked for before is forgotten then."""
     read, write = os.pipe()
     robot, controller = Watched(GO1, contract), Controller(GO1, contract)
-    states = States(controller, [RobotRemote(contract.commands), Keys(contract.commands, read)], lambda _: np.full(3, 0.1), lambda _: None)
+    states = States(
+        controller,
+        [RobotRemote(contract.commands), Keys(contract.commands, read)],
+        lambda _: np.full(3, 0.1),
+        lambda _: None,
+    )
     assert robot.read()
 
     def command(remote: Remote | None, keys: str = "") -> list[float]:
@@ -260,7 +276,12 @@ def in_terminal(args: list[str], presses: list[tuple[str, bytes]]) -> tuple[int,
 def test_it_is_driven_from_a_terminal(tmp_path: Path) -> None:
     log, script = tmp_path / "run.lmwlog", tmp_path / "script.yaml"
     script.write_text("commands: [{time: 0, command: [0.1, 0, 0]}, {time: 1, push: [0, 1]}, {time: 2, reset: true}]")
-    presses = [("zero torque: start", b"s"), ("stand: 2 s", b"a"), ("has to wait", b"\x1b[A"), ("+0.30 +0.00 +0.00", b"\x1b")]
+    presses = [
+        ("zero torque: start", b"s"),
+        ("stand: 2 s", b"a"),
+        ("has to wait", b"\x1b[A"),
+        ("+0.30 +0.00 +0.00", b"\x1b"),
+    ]
     presses += [("emergency stop", b"\x03")]
     how = ["--hoist", "yes", "--log", str(log), "--limit", "late=off", "--commands", str(script)]
     code, shown = in_terminal([str(GO1), "--drive", *how], presses)
@@ -296,7 +317,9 @@ def test_a_signal_damps_and_ends(ending: signal.Signals, tmp_path: Path) -> None
         (["--drive", "--log", "/proc/x.lmwlog"], "--log /proc/x.lmwlog: cannot be written: "),
     ],
 )
-def test_wrong_flags(args: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_flags(
+    args: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(sys, "argv", ["deploy", str(GO1), *args])
     with pytest.raises(SystemExit, match="2"), one_line_errors("legged_mw.deploy"):
         program.main()
@@ -341,7 +364,9 @@ def test_the_bias_of_a_gyro_does_not_add_up(contract: Contract) -> None:
     """0.03 rad/s on a robot that waits for a person for 20 s."""
     assert KEPT * contract.period < 3.0
     rest = {name: np.zeros(3) for name in ("lin_vel", "joint_pos", "joint_vel", "joint_torque", "foot_contact")}
-    still = Measurement(**rest, ang_vel=np.full(3, 0.03), gravity=np.array([0.0, 0.0, -1.0]), acceleration=np.array([0.0, 0.0, 9.81]))
+    still = Measurement(
+        **rest, ang_vel=np.full(3, 0.03), gravity=np.array([0.0, 0.0, -1.0]), acceleration=np.array([0.0, 0.0, 9.81])
+    )
     assert wrong_imu([still] * KEPT, contract.period) == ""
 
 
@@ -349,7 +374,10 @@ def test_the_bias_of_a_gyro_does_not_add_up(contract: Contract) -> None:
 def stood(request: pytest.FixtureRequest) -> tuple[np.ndarray, np.ndarray]:
     """What the legs of a robot that stood up say of gravity (N, 3), and what its IMU does."""
     contract, seen = read_contract(POLICIES / request.param), []
-    robot, controller = Watched(POLICIES / request.param, contract, whole=True), Controller(POLICIES / request.param, contract)
+    robot, controller = (
+        Watched(POLICIES / request.param, contract, whole=True),
+        Controller(POLICIES / request.param, contract),
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("legged_mw.deploy.states.at_odds", lambda *both: seen.append(both) or at_odds(*both))
         passed = driven(robot, controller, Script({40: "start", 180: "A"}), 4.0)[1]
@@ -386,7 +414,9 @@ def about(axis: int, degrees: float) -> np.ndarray:
         (np.diag([1.0, 1.0, -1.0]), "degrees from where"),
     ],
 )
-def test_gravity_that_is_not_that_of_the_legs(stood: tuple[np.ndarray, np.ndarray], wrong: np.ndarray, word: str) -> None:
+def test_gravity_that_is_not_that_of_the_legs(
+    stood: tuple[np.ndarray, np.ndarray], wrong: np.ndarray, word: str
+) -> None:
     """The whole IMU has wrong axes, and agrees with itself: pitch and roll of the legs tell, of which it rolls by a sway."""
     legs, gravity = stood
     rng = np.random.default_rng(0)
@@ -397,5 +427,7 @@ def test_gravity_that_is_not_that_of_the_legs(stood: tuple[np.ndarray, np.ndarra
 
 def test_a_robot_that_hangs_is_not_judged_by_its_legs(contract: Contract) -> None:
     robot, controller = Watched(GO1, contract, hoisted=True, lift=0.3), Controller(GO1, contract)
-    robot.changed = lambda _, measured: replace(measured, **{name: getattr(measured, name)[[1, 0, 2]] for name in ("gravity", "ang_vel")})
+    robot.changed = lambda _, measured: replace(
+        measured, **{name: getattr(measured, name)[[1, 0, 2]] for name in ("gravity", "ang_vel")}
+    )
     assert driven(robot, controller, Script({5: "start", 130: "A"}), 2.7)[1][-1] == "policy"

@@ -35,7 +35,9 @@ def make(
 ) -> Any:
     """A learner whose networks come from a fixed seed; the teacher sees more than the student's "state". ``memory``: the student's."""
     torch.manual_seed(1)
-    recurrent = {"class_name": RNNModel, "rnn_type": memory, "rnn_hidden_dim": 12, "rnn_num_layers": 2} if memory else {}
+    recurrent = (
+        {"class_name": RNNModel, "rnn_type": memory, "rnn_hidden_dim": 12, "rnn_num_layers": 2} if memory else {}
+    )
     network = {"class_name": MLPModel, "hidden_dims": [32, 16], "activation": "elu", "obs_normalization": True}
     gaussian = {"class_name": "GaussianDistribution", "init_std": 0.1}
     cfg = {
@@ -90,7 +92,11 @@ def take_over(target: Any, source: Any) -> None:
 
 
 def parameters(alg: Any) -> dict[str, torch.Tensor]:
-    return {f"{which}.{k}": v.clone() for which in ("student", "teacher") for k, v in getattr(alg, which).state_dict().items()}
+    return {
+        f"{which}.{k}": v.clone()
+        for which in ("student", "teacher")
+        for k, v in getattr(alg, which).state_dict().items()
+    }
 
 
 @pytest.mark.parametrize("settings", VARIANTS.values(), ids=VARIANTS.keys())
@@ -106,7 +112,9 @@ def test_same_parameters_as_rsl_rl(settings: dict[str, Any], double: None) -> No
         assert difference(parameters(stock), parameters(ours)) < 1e-9
         assert float(got["behavior"]) == pytest.approx(expected["behavior"], rel=1e-9)
     moved = {k for k, v in parameters(ours).items() if not torch.equal(v, before[k])}
-    assert {k for k in before if k.startswith("student.mlp.")} <= moved and not {k for k in moved if k.startswith("teacher.")}
+    assert {k for k in before if k.startswith("student.mlp.")} <= moved and not {
+        k for k in moved if k.startswith("teacher.")
+    }
     assert "student.obs_normalizer._std" in moved
 
 
@@ -153,16 +161,19 @@ def test_nothing_asks_the_host(memory: str | None) -> None:
         alg._update()
 
 
-@pytest.mark.parametrize("kinds", [(Distillation, GraphedDistillation), (GraphedDistillation, Distillation)], ids=["to ours", "to stock"])
+@pytest.mark.parametrize(
+    "kinds", [(Distillation, GraphedDistillation), (GraphedDistillation, Distillation)], ids=["to ours", "to stock"]
+)
 def test_checkpoints_load_in_both_directions(kinds: tuple[type, type]) -> None:
     writer, other = (make(kind, gradient_length=2) for kind in kinds)
     collect(writer)
     writer.update()
     content = writer.save()
     assert {"student_state_dict", "teacher_state_dict", "optimizer_state_dict"} == content.keys()
-    assert [(type(group["lr"]), group["fused"], group["capturable"]) for group in content["optimizer_state_dict"]["param_groups"]] == [
-        (float, None, False)
-    ]
+    assert [
+        (type(group["lr"]), group["fused"], group["capturable"])
+        for group in content["optimizer_state_dict"]["param_groups"]
+    ] == [(float, None, False)]
     other.load(copy.deepcopy(content), None, True)  # as from a file
     assert difference(parameters(writer), parameters(other)) == 0.0 and other.teacher_loaded
     collect(writer, seed=5)
@@ -183,7 +194,9 @@ def test_checkpoints_load_in_both_directions(kinds: tuple[type, type]) -> None:
     ids=["leftover", "sgd", "mixed precision", "beta"],
 )
 @pytest.mark.filterwarnings("ignore:The product of 'num_learning_epochs'")
-def test_what_cannot_be_recorded_is_left_to_rsl_rl(settings: dict, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_recorded_is_left_to_rsl_rl(
+    settings: dict, reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     alg = make(GraphedDistillation, **settings)
     collect(alg)
     assert not alg.graphed and {*alg.update()} == {"behavior"}

@@ -30,7 +30,8 @@ PAGES = [
     *sorted((ROOT / "resources").rglob("*.md")),
 ]
 ELSEWHERE = {"your_own_robot.md": "tests/test_your_own_robot.py runs its commands, one after the other"}
-WHY_NOT = {  # pattern of a command -> why no test runs it as it stands; those of our programs have their flags read all the same
+# pattern of a command -> why no test runs it as it stands; those of our programs have their flags read all the same
+WHY_NOT = {
     r"^(pip|pipx|uvx|docker|eval|apt|source|make|tensorboard|git|sudo)\b": "sets up a machine; CI itself is make lint and make test",
     r"^legged-mw ": "test_tools.py and test_wheel.py start the programs",
     r"^torchrun ": "several GPUs: test_ranks.py on a CPU, test_gpu.py",
@@ -47,10 +48,13 @@ WHY_NOT = {  # pattern of a command -> why no test runs it as it stands; those o
     r"--num_envs 40": "a grid of all levels takes seconds to build; the same with fewer runs",
 }
 SMALL = "--num_envs 8 --max_iterations 2 --device cpu --set runner.num_steps_per_env=4 --set runner.exam_interval=0"
-SMALL += " --set runner.export=false --set cpu.hidden_dims=[16] --set cpu.num_steps_per_env=4 --set cpu.num_mini_batches=2"
+SMALL += (
+    " --set runner.export=false --set cpu.hidden_dims=[16] --set cpu.num_steps_per_env=4 --set cpu.num_mini_batches=2"
+)
 GROUND = "--set terrain.num_rows=1 --set terrain.num_cols=8 --set terrain.border_size=1"
 OF_TASKS = {"rough": GROUND, "craters": GROUND, "getup": "--set falls.states=8"}
-FILES = {"go1_gentle.py": "index.md", "go1_estimator.py": "tasks.md", "go1_craters.py": "terrain.md"}  # that pages say to save
+# that pages say to save
+FILES = {"go1_gentle.py": "index.md", "go1_estimator.py": "tasks.md", "go1_craters.py": "terrain.md"}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -85,7 +89,8 @@ def same_when_small(command: str) -> str:
 ALL = [(page, command) for page in PAGES for command in commands(page)]
 READ = sorted({command for page, command in ALL if why_not(page, command)})
 _ONCE = {same_when_small(command): command for page, command in reversed(ALL) if not why_not(page, command)}
-RUN = sorted(_ONCE.values(), key=lambda command: ("train.py" not in command, command))  # a run is there when it is played
+# a run is there when it is played
+RUN = sorted(_ONCE.values(), key=lambda command: ("train.py" not in command, command))
 
 
 @pytest.fixture(scope="module")
@@ -114,14 +119,17 @@ def start(words: list[str]) -> str:
     if entry is None:
         entry, flags = {"legged_mw.deploy": deploy, "legged_mw.motion": motion}[flags[0]], flags[1:]
     if program == "train.py" and "--list" not in flags:
-        flags += shlex.split(SMALL) + [flag for name, more in OF_TASKS.items() if name in " ".join(flags) for flag in shlex.split(more)]
+        flags += shlex.split(SMALL) + [
+            flag for name, more in OF_TASKS.items() if name in " ".join(flags) for flag in shlex.split(more)
+        ]
     elif program != "train.py":
         flags += ["--viewer", "none", "--time", "0.1s"]
     out, handlers = io.StringIO(), {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out):
         patch.setattr(sys, "argv", [program, *map(os.path.expanduser, flags)])
         if "--check" not in flags:
-            patch.setattr(guard, "check_recordable", lambda *_, **__: None)  # half a second; other tests try the classes
+            # half a second; other tests try the classes
+            patch.setattr(guard, "check_recordable", lambda *_, **__: None)
         try:
             entry()
         finally:
@@ -142,7 +150,8 @@ def test_every_command_runs(command: str, home: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "command", [command for command in READ if re.match(r"python (train|play)\.py|python -m legged_mw\.deploy", command)]
+    "command",
+    [command for command in READ if re.match(r"python (train|play)\.py|python -m legged_mw\.deploy", command)],
 )
 def test_flags_of_the_others_are_read(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """What a flag is called may change; a page that is not run would not notice."""
@@ -163,7 +172,9 @@ def anchors(page: Path) -> set[str]:
     """Of its headlines, as GitHub makes them, and those that it names."""
     text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.MULTILINE | re.DOTALL)
     heads = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
-    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads} | {*re.findall(r'<a id="([^"]+)">', text)}
+    return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads} | {
+        *re.findall(r'<a id="([^"]+)">', text)
+    }
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

@@ -62,7 +62,9 @@ def walk(env: LeggedRobot, steps: int, seed: int = 0) -> Tensor:
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_neutral_ranges_change_nothing_bit_for_bit(engine: str) -> None:
-    neutral = {f"domain_rand.{name}": [] if kind.neutral is None else [kind.neutral] * 2 for name, kind in KINDS.items()}
+    neutral = {
+        f"domain_rand.{name}": [] if kind.neutral is None else [kind.neutral] * 2 for name, kind in KINDS.items()
+    }
     for name in ("action_delay", "observation_delay"):
         neutral[f"domain_rand.{name}"] = [0, 0]
     plain = make_env(4, {"sim.engine": engine})
@@ -90,7 +92,11 @@ def test_constants_are_left_alone_where_nothing_feeds_them(monkeypatch: pytest.M
 def test_masses_inertias_and_all_that_the_model_derives_from_them(engine: str) -> None:
     env = make(4, engine, link_mass=[0.8, 1.2], base_mass=[-1.0, 1.0], base_com=[-0.05, 0.05], armature=[1.0, 1.5])
     values, model, root = env.domain_rand.values, env.robot.physics, env.root_body
-    assert values["link_mass"].shape == (4, 13) and values["base_com"].shape == (4, 3) and values["armature"].shape == (4, 12)
+    assert (
+        values["link_mass"].shape == (4, 13)
+        and values["base_com"].shape == (4, 3)
+        and values["armature"].shape == (4, 12)
+    )
     for world in range(4):
         mass = model.body_mass.copy()
         mass[1:] *= values["link_mass"][world].numpy()  # Go1: the trunk, then a body a joint, in order
@@ -124,13 +130,19 @@ def test_motors_and_ground(engine: str) -> None:
     ground = env.robot.id("geom", GROUND)
     assert torch.equal(field("geom_friction")[:, ground, 0], values["friction"][:, 0])
     assert torch.equal(field("geom_solref")[:, ground, 0], values["contact_time"][:, 0])
-    torch.testing.assert_close(field("dof_frictionloss")[:, 6:], nominal(env, "dof_frictionloss")[6:] * values["frictionloss"])
+    torch.testing.assert_close(
+        field("dof_frictionloss")[:, 6:], nominal(env, "dof_frictionloss")[6:] * values["frictionloss"]
+    )
     torch.testing.assert_close(field("dof_damping")[:, 6:], nominal(env, "dof_damping")[6:] * values["damping"])
     assert torch.equal(field("dof_damping")[:, :6], nominal(env, "dof_damping")[:6].expand(3, 6))
     torch.testing.assert_close(field("actuator_gainprm")[:, :, 0], 35.0 * values["stiffness"])
     torch.testing.assert_close(field("actuator_biasprm")[:, :, 1], -35.0 * values["stiffness"])
-    torch.testing.assert_close(field("actuator_forcerange"), nominal(env, "actuator_forcerange") * values["strength"][:, :, None])
-    assert all(len(set(value.flatten().tolist())) == value.numel() for value in values.values()), "every world and joint its own"
+    torch.testing.assert_close(
+        field("actuator_forcerange"), nominal(env, "actuator_forcerange") * values["strength"][:, :, None]
+    )
+    assert all(len(set(value.flatten().tolist())) == value.numel() for value in values.values()), (
+        "every world and joint its own"
+    )
     assert all(value.min() >= 0.5 and value.max() <= 1.5 for value in values.values())
 
 
@@ -169,7 +181,9 @@ def test_any_other_field_of_the_model() -> None:
     env = make_env(3, {**NOTHING, "domain_rand.model_factors": {"geom_size": [0.9, 1.1]}})
     factor = env.domain_rand.values["geom_size"]
     torch.testing.assert_close(env.sim.field("geom_size"), nominal(env, "geom_size") * factor[:, :, None])
-    with pytest.raises(ModelError, match="no per-world model field 'geom_sise' in MuJoCo's Model; did you mean 'geom_size'"):
+    with pytest.raises(
+        ModelError, match="no per-world model field 'geom_sise' in MuJoCo's Model; did you mean 'geom_size'"
+    ):
         make_env(2, {**NOTHING, "domain_rand.model_factors": {"geom_sise": [0.9, 1.1]}})
 
 
@@ -192,7 +206,9 @@ def test_a_slide_on_lower_friction_goes_further(engine: str) -> None:
     """A box at 1 m/s on ground of a friction mu a world: v^2 / 2 mu g, by Coulomb's law."""
     box = '<body pos="0 0 .05"><freejoint/><geom type="box" size=".1 .1 .05" mass="1"/></body>'
     floor = '<geom name="floor" type="plane" size="0 0 1" priority="1"/>'
-    model = mujoco.MjModel.from_xml_string(f'<mujoco><option timestep=".002"/><worldbody>{floor}{box}</worldbody></mujoco>')
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><option timestep=".002"/><worldbody>{floor}{box}</worldbody></mujoco>'
+    )
     friction = torch.tensor([0.3, 0.4, 0.6, 1.0])
     sim = make_simulation(model, 4, "cpu", engine=engine, nconmax=8, njmax=64, world_fields=["geom_friction"])
     sim.field("geom_friction")[:, 0, 0] = friction
@@ -235,7 +251,9 @@ def test_late_observations() -> None:
         for world, d in enumerate(late):
             past = true[max(step - d, 0)][world]
             torch.testing.assert_close(seen[step][world, 3:6], past[:3])  # gyro
-            assert torch.equal(seen[step][world, 33:45], env.last_actions[world]) or step < 5, "what it sent itself is not late"
+            assert torch.equal(seen[step][world, 33:45], env.last_actions[world]) or step < 5, (
+                "what it sent itself is not late"
+            )
 
 
 def test_setting_one_world_up_anew_leaves_the_others_observations() -> None:
@@ -260,7 +278,9 @@ def test_encoders_that_are_off() -> None:
     env.step(torch.zeros(3, 12))
     torch.testing.assert_close(env.obs_buf["state"][:, 9:21], env.dof_offset + offset)
     torch.testing.assert_close(env.sim.ctrl, env.default_dof_pos - offset)
-    assert torch.equal(env.joint_reading, env.dof_offset + offset) and not torch.equal(env.joint_reading, env.dof_offset)
+    assert torch.equal(env.joint_reading, env.dof_offset + offset) and not torch.equal(
+        env.joint_reading, env.dof_offset
+    )
 
 
 # ---- when
@@ -306,11 +326,17 @@ def test_the_whole_step_asks_the_host_nothing_with_everything_on() -> None:
 
 def test_what_was_drawn_is_readable() -> None:
     motors = {"control.actuator": "dc_motor", "control.stall_torque": {"": 23.7}, "control.no_load_speed": {"": 30.1}}
-    curves = {"domain_rand.stall_torque": [0.9, 1.1], "domain_rand.no_load_speed": [0.9, 1.1], "domain_rand.delay_ms": [0.0, 20.0]}
+    curves = {
+        "domain_rand.stall_torque": [0.9, 1.1],
+        "domain_rand.no_load_speed": [0.9, 1.1],
+        "domain_rand.delay_ms": [0.0, 20.0],
+    }
     env = make_env(3, {**ALL, **motors, **curves})
     table = layout(env)["privileged_state"]
     assert {name: table[name] for name in KINDS} == {name: env.domain_rand.values[name].shape[1] for name in KINDS}
-    assert env.obs_buf["privileged_state"].shape[1] == 123 + sum(value.shape[1] for value in env.domain_rand.values.values())
+    assert env.obs_buf["privileged_state"].shape[1] == 123 + sum(
+        value.shape[1] for value in env.domain_rand.values.values()
+    )
     friction = env.observations.span("privileged_state", "friction").start
     assert torch.equal(env.obs_buf["privileged_state"][:, friction], env.domain_rand.values["friction"][:, 0])
     twice = env.mirror.observations["privileged_state"]
@@ -319,7 +345,10 @@ def test_what_was_drawn_is_readable() -> None:
 
 
 def test_pushes_set_the_velocity_when_their_clock_says_so() -> None:
-    env = make_env(64, {**QUIET, "perturbation.push": True, "perturbation.push_interval_s": 0.2, "perturbation.max_push_vel_xy": 1.0})
+    env = make_env(
+        64,
+        {**QUIET, "perturbation.push": True, "perturbation.push_interval_s": 0.2, "perturbation.max_push_vel_xy": 1.0},
+    )
     assert len(set(env.perturbation._push_clock.tolist())) > 5, "each world its own clock"
     env.perturbation._push_clock.copy_(torch.arange(64) % 10 + 1.0)
     pushed = torch.zeros(64, dtype=torch.long)
@@ -347,8 +376,16 @@ def test_pushes_set_the_velocity_when_their_clock_says_so() -> None:
         ("redraw_at_reset", ["frictoin"], "no range 'frictoin' in domain_rand; did you mean 'friction'"),
         ("redraw_at_reset", ["base_mass"], "'base_mass', which constants of the model depend on"),
         ("model_factors", {"geom_size": [1.0]}, "domain_rand.model_factors.*geom_size.* two numbers"),
-        ("model_factors", {"dof_armature": [1.0, 2.0]}, "model_factors.dof_armature: domain_rand.armature writes that field"),
-        ("base_mass", [-20.0, 0.0], "domain_rand.base_mass is .* the root 'trunk' has .* kg, which leaves some with none"),
+        (
+            "model_factors",
+            {"dof_armature": [1.0, 2.0]},
+            "model_factors.dof_armature: domain_rand.armature writes that field",
+        ),
+        (
+            "base_mass",
+            [-20.0, 0.0],
+            "domain_rand.base_mass is .* the root 'trunk' has .* kg, which leaves some with none",
+        ),
     ],
 )
 def test_mistakes_are_named(path: str, value: object, message: str) -> None:
@@ -364,9 +401,15 @@ def test_one_field_has_one_writer_under_a_law_in_code_too() -> None:
         def _compute_torques(self, actions: torch.Tensor) -> torch.Tensor:
             return super()._compute_torques(actions)
 
-    curve = {"control.stall_torque": {"": 20.0}, "control.no_load_speed": {"": 25.0}, "domain_rand.stall_torque": [0.9, 1.1]}
+    curve = {
+        "control.stall_torque": {"": 20.0},
+        "control.no_load_speed": {"": 25.0},
+        "domain_rand.stall_torque": [0.9, 1.1],
+    }
     factor = {"domain_rand.enable": True, "domain_rand.model_factors": {"actuator_gainprm": [0.9, 1.1]}}
-    with pytest.raises(ConfigError, match=r"model_factors.actuator_gainprm: domain_rand.stall_torque writes that field"):
+    with pytest.raises(
+        ConfigError, match=r"model_factors.actuator_gainprm: domain_rand.stall_torque writes that field"
+    ):
         make_env(2, {**curve, **factor}, env_class=Springs)
 
 

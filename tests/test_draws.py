@@ -30,7 +30,8 @@ def env() -> LeggedRobot:
 def test_a_new_command_component_by_component(env: LeggedRobot) -> None:
     """Each component changes with probability 0.5, and a changed one is not zero with 0.9, 0.25, 0.5, then uniform."""
     torch.manual_seed(2)
-    everywhere, old = torch.ones(N, dtype=torch.bool), torch.tensor([9.0, 8.0, 7.0])  # outside the ranges, so that a change shows
+    # outside the ranges, so that a change shows
+    everywhere, old = torch.ones(N, dtype=torch.bool), torch.tensor([9.0, 8.0, 7.0])
     draws = []
     for _ in range(400):
         env.commands.copy_(old.expand(N, 3))
@@ -90,7 +91,9 @@ def test_timers_are_exponential_with_a_mean_of_250_steps(env: LeggedRobot) -> No
 
 
 def test_a_command_holds_until_its_timer_ends_bit_for_bit() -> None:
-    env = make_env(N, {"noise.level": 0.0, "commands.change_probability": 1.0, "commands.keep_probability": [1.0, 1.0, 1.0]})
+    env = make_env(
+        N, {"noise.level": 0.0, "commands.change_probability": 1.0, "commands.keep_probability": [1.0, 1.0, 1.0]}
+    )
     env.command_timer.copy_((torch.arange(N) % 4 + 1.0)[:, None])  # 1, 2, 3, 4 steps
     due = torch.arange(N) % 4 + 1
     before = env.commands.clone()
@@ -105,12 +108,17 @@ def test_a_command_holds_until_its_timer_ends_bit_for_bit() -> None:
 
 def test_reward_is_for_the_command_that_the_policy_saw() -> None:
     """The command is redrawn after the reward, and the observation that goes with the next action shows the new one."""
-    env = make_env(8, {"noise.level": 0.0, "commands.change_probability": 1.0, "commands.keep_probability": [1.0, 1.0, 1.0]})
+    env = make_env(
+        8, {"noise.level": 0.0, "commands.change_probability": 1.0, "commands.keep_probability": [1.0, 1.0, 1.0]}
+    )
     seen = env.get_observations()["state"][:, 45:]
     env.command_timer.fill_(1.0)
     rewards = []
     original = env._reward_terms[env.reward_names.index("tracking_lin_vel")]
-    env._reward_terms[env.reward_names.index("tracking_lin_vel")] = lambda: (rewards.append(env.commands.clone()), original())[1]
+    env._reward_terms[env.reward_names.index("tracking_lin_vel")] = lambda: (
+        rewards.append(env.commands.clone()),
+        original(),
+    )[1]
     obs, *_ = env.step(torch.zeros(8, 12))
     assert torch.equal(rewards[0], seen)
     assert torch.equal(obs["state"][:, 45:], env.commands) and (obs["state"][:, 45:] != seen).all()
@@ -171,7 +179,9 @@ def history() -> list[Kick]:
     for _ in range(300):
         env.perturbation._kick_robots()
         applied = env.sim.xfrc_applied
-        assert (applied[:, :body] == 0).all() and (applied[:, body + 1 :] == 0).all() and (applied[:, body, 2:] == 0).all()
+        assert (
+            (applied[:, :body] == 0).all() and (applied[:, body + 1 :] == 0).all() and (applied[:, body, 2:] == 0).all()
+        )
         assert torch.equal(applied[:, body, :3], env.perturbation.kick_force)
         force.append(applied[:, body, :3].clone())
         active.append(env.perturbation.kick_active.clone())
@@ -195,7 +205,8 @@ def test_a_kick_is_half_a_sine_in_one_horizontal_direction(history: list[Kick]) 
         assert torch.allclose(direction, direction[:1].expand_as(direction), atol=1e-3) or dv < 1e-3
         speeds.append(dv)
     speed = torch.tensor(speeds)
-    assert speed.max() <= 3.0001 and speed.max() > 2.95 and speed.min() < 0.05 and abs(speed.mean() - 1.5) < 0.1  # +- 0.025
+    # +- 0.025
+    assert speed.max() <= 3.0001 and speed.max() > 2.95 and speed.min() < 0.05 and abs(speed.mean() - 1.5) < 0.1
 
 
 def test_every_kick_is_drawn_anew(history: list[Kick]) -> None:
@@ -223,13 +234,18 @@ def test_configured_kicks_are_the_tasks() -> None:
         draws.append(env.perturbation._kick.clone())
     pause, steps, angle, dv = torch.cat(draws).unbind(dim=1)
     assert (pause.min(), pause.max()) == (50.0, 150.0) and torch.equal(pause, pause.round())
-    assert steps.min() in (2.0, 3.0) and steps.max() == 10.0 and torch.equal(steps, steps.round())  # 0.05 s is 2.5 steps
+    # 0.05 s is 2.5 steps
+    assert steps.min() in (2.0, 3.0) and steps.max() == 10.0 and torch.equal(steps, steps.round())
     assert angle.abs().max() <= math.pi + 1e-5 and angle.max() > 3.1 and angle.min() < -3.1
     assert dv.min() >= 0.0 and dv.max() <= 8.0 and dv.max() > 7.8
     off = make_env(2)
     for _ in range(5):
         off.step(torch.zeros(2, 12))
-    assert (off.sim.xfrc_applied == 0.0).all() and (off.perturbation.kick_force == 0.0).all() and not off.perturbation.kick_active.any()
+    assert (
+        (off.sim.xfrc_applied == 0.0).all()
+        and (off.perturbation.kick_force == 0.0).all()
+        and not off.perturbation.kick_active.any()
+    )
 
 
 def test_reset_ends_a_kick_and_the_next_one_is_whole() -> None:
@@ -257,7 +273,10 @@ def test_a_kick_moves_the_robot_by_its_impulse() -> None:
     """In free flight the momentum of the whole robot gains the sum of force * dt, and the observation shows the force acting."""
     env = make_env(8, {**KICKS, **QUIET, "init_state.pos": [0.0, 0.0, 30.0], "init_state.ang_vel_range": 0.0})
     env.perturbation._kick.copy_(torch.tensor([2.0, 5.0, 0.0, 0.0]).expand(8, 4))
-    env.perturbation._kick[:, 2], env.perturbation._kick[:, 3] = torch.linspace(-3.0, 3.0, 8), torch.linspace(0.5, 3.0, 8)
+    env.perturbation._kick[:, 2], env.perturbation._kick[:, 3] = (
+        torch.linspace(-3.0, 3.0, 8),
+        torch.linspace(0.5, 3.0, 8),
+    )
     env.perturbation._clock.zero_()
     angle, dv = env.perturbation._kick[:, 2].clone(), env.perturbation._kick[:, 3].clone()
     before, impulse, shown = momentum(env), torch.zeros(8, 3), []
@@ -269,7 +288,9 @@ def test_a_kick_moves_the_robot_by_its_impulse() -> None:
     assert shown == [0.0, 0.0, 1.0, 1.0, 1.0, 1.0, 1.0]
     # sum of 0.5 m dv / T sin(pi i / 5) dt over i = 0 .. 4, T = 5 dt: 0.1 m dv * (2 sin 36 deg + 2 sin 72 deg)
     size = 0.1 * MASS * dv * 2 * (math.sin(math.pi / 5) + math.sin(2 * math.pi / 5))
-    assert torch.allclose(impulse, torch.stack([size * angle.cos(), size * angle.sin(), 0 * size], dim=1), rtol=1e-4, atol=1e-4)
+    assert torch.allclose(
+        impulse, torch.stack([size * angle.cos(), size * angle.sin(), 0 * size], dim=1), rtol=1e-4, atol=1e-4
+    )
     gained = momentum(env) - before
     assert torch.allclose(gained[:, :2], impulse[:, :2], rtol=0.02, atol=0.02)
 
@@ -288,19 +309,27 @@ def momentum(env: LeggedRobot) -> Tensor:
 
 def test_kicks_grow_with_what_a_world_survives() -> None:
     """Halfway, at the end of each episode, to the share of it that was survived; the time-out counts in full."""
-    env = make_env(3, {**QUIET, "perturbation.kick": True, "perturbation.velocity": [2.0, 2.0], "perturbation.curriculum": True})
+    env = make_env(
+        3, {**QUIET, "perturbation.kick": True, "perturbation.velocity": [2.0, 2.0], "perturbation.curriculum": True}
+    )
     assert env.perturbation.kick_level.tolist() == [0.0, 0.0, 0.0] and not env.perturbation._kick[:, 3].any()
     env.episode_steps[:] = torch.tensor([[0.5], [0.25], [0.75]]) * env.max_episode_length
     env.time_out_buf[:] = torch.tensor([True, False, False])
     env.reset_envs(torch.tensor([True, True, False]))
     assert env.perturbation.kick_level.tolist() == [0.5, 0.125, 0.0]
     assert env.perturbation._kick[:, 3].tolist() == [1.0, 0.25, 0.0]  # the pause of the third goes on
-    env.reset_envs(torch.tensor([True, True, True]))  # no step in between: two of them had no episode that says anything
+    # no step in between: two of them had no episode that says anything
+    env.reset_envs(torch.tensor([True, True, True]))
     assert env.perturbation.kick_level.tolist() == [0.5, 0.125, 0.375]
 
 
 def test_kicks_grow_by_a_share_of_the_way() -> None:
-    settings = {**QUIET, "perturbation.kick": True, "perturbation.curriculum": True, "perturbation.curriculum_rate": 0.25}
+    settings = {
+        **QUIET,
+        "perturbation.kick": True,
+        "perturbation.curriculum": True,
+        "perturbation.curriculum_rate": 0.25,
+    }
     env = make_env(2, settings)
     for level in (0.25, 0.4375):  # a quarter of what is left to 1
         env.perturbation.update_level(torch.tensor([True, False]), torch.ones(2))
@@ -317,7 +346,10 @@ def test_kicks_grow_between_two_shares_of_a_training(engine: str) -> None:
         "perturbation.velocity": [2.0, 2.0],
         "perturbation.growth": [0.2, 0.6],
     }
-    env, kicks = make_env(1, {**settings, "perturbation.interval": [0.02, 0.02], "perturbation.duration": [200.0, 200.0]}), []
+    env, kicks = (
+        make_env(1, {**settings, "perturbation.interval": [0.02, 0.02], "perturbation.duration": [200.0, 200.0]}),
+        [],
+    )
     env.perturbation._clock.fill_(5001.0)  # [control steps] in the middle of a kick of 200 s
     for done in (None, 0.0, 0.2, 0.3, 0.6, 1.0):
         if done is not None:

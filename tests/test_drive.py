@@ -76,7 +76,8 @@ def test_who_drives_whom() -> None:
     pilot.follow(own[0])
     done(pilot, "next", "forward")
     commands = pilot.commands(own)
-    assert commands is not None and np.allclose(commands, [[0.1] * 3, [0.4, 0.1, 0.1], [0.1] * 3])  # took over where the robot was
+    # took over where the robot was
+    assert commands is not None and np.allclose(commands, [[0.1] * 3, [0.4, 0.1, 0.1], [0.1] * 3])
     assert np.allclose(own, 0.1)
     commands = done(pilot, "everyone").commands(own)
     assert commands is not None and np.allclose(commands, [[0.4, 0.1, 0.1]] * 3)
@@ -155,7 +156,9 @@ def script(folder: Path, text: str) -> Path:
 
 
 def test_a_script_drives_in_its_time(tmp_path: Path) -> None:
-    text = "commands:\n  - {time: 0, command: [5e-1, 0, 0]}\n  - {time: 2, push: [0, 1.5]}\n  - {time: 2.0, reset: true}\n"
+    text = (
+        "commands:\n  - {time: 0, command: [5e-1, 0, 0]}\n  - {time: 2, push: [0, 1.5]}\n  - {time: 2.0, reset: true}\n"
+    )
     drive, pilot = load_script(script(tmp_path, text), THREE), Pilot(THREE)
     assert drive.seconds == 2 + AFTER
     drive.play(0.0, pilot)
@@ -171,32 +174,56 @@ def test_a_script_drives_in_its_time(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "part"),
     [
-        ("commands: []", "write one list 'commands' with at least one entry, e.g. {time: 0, command: [0.5, 0, 0]}; it has commands"),
+        (
+            "commands: []",
+            "write one list 'commands' with at least one entry, e.g. {time: 0, command: [0.5, 0, 0]}; it has commands",
+        ),
         ("robots: 3", "write one list 'commands' with at least one entry"),
         ("commands: [go]", "entry 1 of commands: write {time: [s], ...} with command, push, reset; it is 'go'"),
         ("commands: [{command: [0, 0, 0]}]", "entry 1 of commands: write {time: [s], ...}"),
-        ("commands: [{time: 0, comand: [0, 0, 0]}]", "entry 1 of commands: there is no 'comand'; there are: time, command, push, reset"),
+        (
+            "commands: [{time: 0, comand: [0, 0, 0]}]",
+            "entry 1 of commands: there is no 'comand'; there are: time, command, push, reset",
+        ),
         ("commands: [{time: 1}]", "entry 1 of commands: nothing happens at 1 s; say command, push or reset"),
-        ("commands: [{time: soon, reset: true}]", "entry 1 of commands: time: write seconds from the start, not 'soon'"),
+        (
+            "commands: [{time: soon, reset: true}]",
+            "entry 1 of commands: time: write seconds from the start, not 'soon'",
+        ),
         ("commands: [{time: -1, reset: true}]", "entry 1 of commands: time = -1 s is before the start"),
         (
             "commands: [{time: 0, command: [1, 0, 0, 0]}]",
             "entry 1 of commands: command: write a list of vx [m/s], vy [m/s], yaw rate [rad/s], or {name: value}, not [1, 0, 0, 0]",
         ),
-        ("commands: [{time: 0, command: [0, 0]}]", "entry 1 of commands: command: write a list of vx [m/s], vy [m/s], yaw rate [rad/s]"),
+        (
+            "commands: [{time: 0, command: [0, 0]}]",
+            "entry 1 of commands: command: write a list of vx [m/s], vy [m/s], yaw rate [rad/s]",
+        ),
         ("commands: [{time: 0, command: []}]", "entry 1 of commands: command: write a list of vx [m/s], vy [m/s]"),
-        ("commands: [{time: 0, command: [1, 0, .nan]}]", "entry 1 of commands: command: write a list of vx [m/s], vy [m/s]"),
+        (
+            "commands: [{time: 0, command: [1, 0, .nan]}]",
+            "entry 1 of commands: command: write a list of vx [m/s], vy [m/s]",
+        ),
         ("commands: [{time: 0, command: {lin_vel_x: fast}}]", "command: lin_vel_x: write a number, not 'fast'"),
         (
             "commands: [{time: 0, command: {lin_vel: 1}}]",
             "entry 1 of commands: command: no command 'lin_vel' in this task; did you mean 'lin_vel_y'? there are: lin_vel_x,",
         ),
-        ("commands: [{time: 0, command: [2, 0, 0]}]", "command: vx = 2 m/s is outside of what was trained, [-1, 1.5] m/s"),
-        ("commands: [{time: 0, command: {ang_vel_yaw: -3}}]", "command: yaw rate = -3 rad/s is outside of what was trained, [-2, 2] rad/s"),
+        (
+            "commands: [{time: 0, command: [2, 0, 0]}]",
+            "command: vx = 2 m/s is outside of what was trained, [-1, 1.5] m/s",
+        ),
+        (
+            "commands: [{time: 0, command: {ang_vel_yaw: -3}}]",
+            "command: yaw rate = -3 rad/s is outside of what was trained, [-2, 2] rad/s",
+        ),
         ("commands: [{time: 0, push: 3}]", "entry 1 of commands: push: write [vx, vy] in m/s, world frame, not 3"),
         ("commands: [{time: 0, push: [30, 0]}]", "entry 1 of commands: a push of 30 m/s; at most 8"),
         ("commands: [{time: 0, reset: later}]", "entry 1 of commands: reset is true or false, not 'later'"),
-        ("commands: [{time: 3, reset: true}, {time: 1, reset: true}]", "entry 2 of commands: its time 1 s is before the one above it, 3 s"),
+        (
+            "commands: [{time: 3, reset: true}, {time: 1, reset: true}]",
+            "entry 2 of commands: its time 1 s is before the one above it, 3 s",
+        ),
         ("commands: [", "not valid YAML"),
     ],
 )
@@ -224,7 +251,9 @@ class FakeStage:
 
     spec, dt = SPEC, 0.02
 
-    def __init__(self, num_worlds: int = 2, falls: dict[int, int] | None = None, table: tuple[Command, ...] = THREE) -> None:
+    def __init__(
+        self, num_worlds: int = 2, falls: dict[int, int] | None = None, table: tuple[Command, ...] = THREE
+    ) -> None:
         self.num_worlds, self.falls, self.command_table = num_worlds, falls or {}, table  # falls: step -> world
         self.steps, self.own = 0, np.full((num_worlds, len(table)), 0.1)
         self.now, self.events = self.own.copy(), []
@@ -240,7 +269,11 @@ class FakeStage:
         return self.now.copy()
 
     def velocity(self) -> Any:
-        return np.resize(self.now, (self.num_worlds, 3)) + 0.01 if len(self.command_table) == 3 else np.full((self.num_worlds, 3), 0.11)
+        return (
+            np.resize(self.now, (self.num_worlds, 3)) + 0.01
+            if len(self.command_table) == 3
+            else np.full((self.num_worlds, 3), 0.11)
+        )
 
     def ghost(self) -> None:
         return None
@@ -292,11 +325,13 @@ def test_a_session_does_what_the_keys_say() -> None:
     outcome = Session(stage, viewer, pilot, real_time=False).run()
     assert isinstance(stage, FakeStage) and stage.steps == 10 and outcome.seconds == pytest.approx(0.2)
     assert stage.given[:2] == [None, None] and stage.given[8:] == [None, None]
-    assert np.allclose(stage.given[2][0], 0) and np.allclose(stage.given[2][1], 0.1)  # the other robot goes on as it was
+    # the other robot goes on as it was
+    assert np.allclose(stage.given[2][0], 0) and np.allclose(stage.given[2][1], 0.1)
     assert np.allclose(stage.given[4][0], [0.3, 0, 0])
     assert stage.events == [(5, "push", 0), (7, "reset", 1)]
     assert [moment.world for moment in viewer.moments] == [0] * 6 + [1] * 4
-    assert [np.allclose(moment.commands[0], 0) for moment in viewer.moments[1:4]] == [False, True, True]  # shown as it will be followed
+    # shown as it will be followed
+    assert [np.allclose(moment.commands[0], 0) for moment in viewer.moments[1:4]] == [False, True, True]
 
 
 def test_a_stage_without_commands_is_watched_pushed_and_reset() -> None:
@@ -366,7 +401,9 @@ def test_the_summary_of_a_script_has_a_row_a_command(tmp_path: Path) -> None:
     pilot = Pilot(THREE)
     pilot.everyone = True
     drive = load_script(script(tmp_path, text), THREE)
-    outcome = Session(FakeStage(2), FakeViewer(pilot), pilot, seconds=drive.seconds, real_time=False, script=drive).run()
+    outcome = Session(
+        FakeStage(2), FakeViewer(pilot), pilot, seconds=drive.seconds, real_time=False, script=drive
+    ).run()
     assert [(round(each.start, 2), round(each.seconds, 2)) for each in outcome.segments] == [(0, 3), (3, 3)]
     title, row = outcome.text().splitlines()[1:3]
     assert title == "    from     for   commanded: vx [m/s], vy [m/s], yaw rate [rad/s]   measured: vx, vy, yaw rate"
@@ -419,7 +456,10 @@ def test_auto_takes_the_best_there_is_and_says_why(
             "--command 2,0,0: vx = 2 m/s is outside of what was trained, [-1, 1.5] m/s; to see what it does there, widen the range: "
             "--set commands.ranges.lin_vel_x=[-1,2]",
         ),
-        (["--command", "1,fast"], "--command 1,fast: 'fast' is no number; write --command=0,0,0 (vx [m/s], vy [m/s], yaw rate [rad/s])"),
+        (
+            ["--command", "1,fast"],
+            "--command 1,fast: 'fast' is no number; write --command=0,0,0 (vx [m/s], vy [m/s], yaw rate [rad/s])",
+        ),
         (["--command", "1,0,0,0"], "--command 1,0,0,0: 4 numbers, but this task has 3 commands"),
     ],
 )
@@ -432,7 +472,9 @@ def test_flags_that_cannot_be(args: list[str], part: str) -> None:
 
 def test_the_range_to_widen_is_that_of_the_command_outside_of_it() -> None:
     table = (*THREE, Command("base_height", 0.18, 0.3, "m"))
-    with pytest.raises(UserError, match=r"base height = 0.1 m is outside .*: --set commands.ranges.base_height=\[0.1,0.3\]$"):
+    with pytest.raises(
+        UserError, match=r"base height = 0.1 m is outside .*: --set commands.ranges.base_height=\[0.1,0.3\]$"
+    ):
         launch.check_drive(flags("--command", "base_height=0.1"), table)
 
 
@@ -444,7 +486,9 @@ def test_watching_without_a_viewer_ends_by_itself(tmp_path: Path, capsys: pytest
     assert "viewer: none (as asked)" in out and "3.0 s, 0 falls" in out and "+0.50 +0.00 +0.00" in out
 
 
-def test_a_batch_job_gets_a_video_and_a_sheet(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_batch_job_gets_a_video_and_a_sheet(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(launch, "has_display", lambda: False)
     picture: Any = {"width": 64, "height": 48, "fps": 25.0}
     launch.watch(FakeStage(), flags("--time", "0.2"), tmp_path, **picture)
@@ -561,7 +605,11 @@ def panel(worlds: int = 2, table: tuple[Command, ...] = THREE) -> tuple[Panel, F
     page = Panel(pilot, "go1", ui, plot)
     page.build()  # nothing to show yet
     now, commands = np.full((worlds, 3), 0.25), np.full((worlds, len(table)), 0.25)
-    page.show(Moment(0.0, np.zeros((worlds, 7)), commands, now, now, np.ones((worlds, 4), dtype=bool), lines=(("falls", "3"),)))
+    page.show(
+        Moment(
+            0.0, np.zeros((worlds, 7)), commands, now, now, np.ones((worlds, 4), dtype=bool), lines=(("falls", "3"),)
+        )
+    )
     return page, ui, plot, pilot
 
 
@@ -580,7 +628,9 @@ def test_each_button_asks_for_its_action(action: str) -> None:
 def test_sliders_have_the_trained_limits_and_drive() -> None:
     page, ui, _, pilot = panel()
     page.build()
-    assert [ui.ranges[name] for name in ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")] == [(each.low, each.high) for each in THREE]
+    assert [ui.ranges[name] for name in ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")] == [
+        (each.low, each.high) for each in THREE
+    ]
     ui.dragged = {"vy [m/s]": -0.3}
     page.build()
     pilot.listen()
@@ -597,7 +647,10 @@ def test_sliders_have_the_trained_limits_and_drive() -> None:
 def test_a_panel_has_a_slider_and_a_curve_for_each_command_of_the_table() -> None:
     page, ui, plot, pilot = panel(1, (HEIGHT, *THREE[:2], Command("gait", 0.0, 3.0)))
     page.build()
-    assert {name: ui.ranges[name] for name in ("base height [m]", "gait")} == {"base height [m]": (0.2, 0.3), "gait": (0.0, 3.0)}
+    assert {name: ui.ranges[name] for name in ("base height [m]", "gait")} == {
+        "base height [m]": (0.2, 0.3),
+        "gait": (0.0, 3.0),
+    }
     assert [(label, len(ys)) for label, _, ys in plot.lines[:4]] == [
         *(("measured##base_height", 0), ("command##base_height", 1)),  # the first colour is for what is measured
         *(("measured##lin_vel_x", 1), ("command##lin_vel_x", 1)),
@@ -656,7 +709,12 @@ def test_curves_are_of_the_last_seconds_and_the_panel_closes_what_it_opens() -> 
     page.build()
     assert len(plot.lines) == 6 and plot.depth == 0
     label, times, values = plot.lines[0]
-    assert label.startswith("measured") and len(times) == 100 and -CURVE_SECONDS < times[0] < -0.95 * CURVE_SECONDS and times[-1] == 0
+    assert (
+        label.startswith("measured")
+        and len(times) == 100
+        and -CURVE_SECONDS < times[0] < -0.95 * CURVE_SECONDS
+        and times[-1] == 0
+    )
     assert values[-1] == pytest.approx(-1.995, abs=0.01)
 
     def broken(*_: Any) -> None:
@@ -722,7 +780,8 @@ def test_the_environment_follows_the_pilot() -> None:
     commands = stage.commands()
     commands[1] = (0.5, -0.2, 0.3)
     stage.step(commands)
-    assert np.allclose(seen[-1][1], (0.5, -0.2, 0.3)) and np.allclose(seen[-1][0], commands[0])  # in the same step, in that world alone
+    # in the same step, in that world alone
+    assert np.allclose(seen[-1][1], (0.5, -0.2, 0.3)) and np.allclose(seen[-1][0], commands[0])
     assert np.allclose(stage.commands(), commands)
     before = stage.velocity()
     stage.push(0, np.array([0.0, 2.0]))
@@ -731,7 +790,11 @@ def test_the_environment_follows_the_pilot() -> None:
     assert np.linalg.norm(after[0, :2] - before[0, :2]) > 1 and np.linalg.norm(after[1, :2] - before[1, :2]) < 1
     stage.reset(1)
     qpos = stage.qpos()
-    assert qpos.shape == (2, stage.spec.compile().nq) and qpos.dtype == np.float64 and np.allclose(qpos[1, 2], env.init_pos[2])
+    assert (
+        qpos.shape == (2, stage.spec.compile().nq)
+        and qpos.dtype == np.float64
+        and np.allclose(qpos[1, 2], env.init_pos[2])
+    )
     assert stage.contacts().shape == (2, 4) and not stage.fell().any()
     kept = stage._obs["state"].clone()  # pyright: ignore[reportAttributeAccessIssue]
     stage.step(commands * 0.5)

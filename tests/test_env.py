@@ -41,7 +41,9 @@ def quiet() -> LeggedRobot:
 @pytest.fixture(scope="module")
 def lively() -> LeggedRobot:
     """Kicks every few steps, new commands often and rewards below zero; no noise, so that observations equal what they observe."""
-    return make_env(N, {**KICKS, "noise.level": 0.0, "commands.resampling_time": 0.1, "rewards.only_positive_rewards": False})
+    return make_env(
+        N, {**KICKS, "noise.level": 0.0, "commands.resampling_time": 0.1, "rewards.only_positive_rewards": False}
+    )
 
 
 def act(env: LeggedRobot, scale: float = 1.0) -> Tensor:
@@ -150,14 +152,20 @@ def test_guard_reaches_every_part_of_the_step(env_class: type[LeggedRobot], mess
 def test_what_a_step_hands_out_is_never_written_again(lively: LeggedRobot) -> None:
     env = lively
     run_a_while(env, 5)
-    env.episode_length_buf = torch.full((N,), env.max_episode_length - 1)  # so that all flags are set now and cleared in the next step
+    # so that all flags are set now and cleared in the next step
+    env.episode_length_buf = torch.full((N,), env.max_episode_length - 1)
     obs, reward, done, extras = env.step(act(env))
     handed = {**dict(obs.items()), "reward": reward, "done": done, "time_outs": extras["time_outs"]}
     kept = {name: value.clone() for name, value in handed.items()}
     assert done.all() and extras["time_outs"].all()
     later_obs, later_reward, later_done, later_extras = env.step(act(env))
     assert [name for name, value in handed.items() if not same(value, kept[name])] == []
-    later = {**dict(later_obs.items()), "reward": later_reward, "done": later_done, "time_outs": later_extras["time_outs"]}
+    later = {
+        **dict(later_obs.items()),
+        "reward": later_reward,
+        "done": later_done,
+        "time_outs": later_extras["time_outs"],
+    }
     assert [name for name, value in later.items() if same(value, kept[name])] == []  # every buffer did change meanwhile
     first = env.reset()
     kept_first = first["state"].clone()
@@ -242,7 +250,12 @@ class _Number(LeggedRobot):
             StepError,
             r"^tests/test_env\.py:\d+, _Column\._reward_pose: must return a tensor \(3,\), one value an environment; it returned \(3, 1\)$",
         ),
-        ({}, _Number, StepError, r"_Number\._reward_pose: must return a tensor \(3,\), one value an environment; it returned float$"),
+        (
+            {},
+            _Number,
+            StepError,
+            r"_Number\._reward_pose: must return a tensor \(3,\), one value an environment; it returned float$",
+        ),
         (
             {"asset.imu_site": "FR"},
             None,
@@ -300,7 +313,9 @@ class _Number(LeggedRobot):
         ),
     ],
 )
-def test_mistakes_are_named(overrides: dict[str, Any], env_class: type[LeggedRobot] | None, error: type[Exception], message: str) -> None:
+def test_mistakes_are_named(
+    overrides: dict[str, Any], env_class: type[LeggedRobot] | None, error: type[Exception], message: str
+) -> None:
     with pytest.raises(error, match=message):
         make_env(3, overrides, env_class=env_class)
 
@@ -321,7 +336,15 @@ def test_a_scale_of_zero_needs_no_method() -> None:
 
 # ---- observations
 
-STATE = {"base_lin_vel": 3, "base_ang_vel": 3, "projected_gravity": 3, "dof_pos": 12, "dof_vel": 12, "last_actions": 12, "commands": 3}
+STATE = {
+    "base_lin_vel": 3,
+    "base_ang_vel": 3,
+    "projected_gravity": 3,
+    "dof_pos": 12,
+    "dof_vel": 12,
+    "last_actions": 12,
+    "commands": 3,
+}
 PRIVILEGED = {
     "state": 48,
     "base_ang_vel": 3,
@@ -375,7 +398,10 @@ def test_sizes_and_noise_of_the_layout() -> None:
     tables = layout(env)
     assert tables == {"state": STATE, "privileged_state": PRIVILEGED}
     assert [list(table) for table in tables.values()] == [list(STATE), list(PRIVILEGED)]  # the order
-    assert {group: tuple(obs.shape) for group, obs in env.obs_buf.items()} == {"state": (2, 48), "privileged_state": (2, 123)}
+    assert {group: tuple(obs.shape) for group, obs in env.obs_buf.items()} == {
+        "state": (2, 48),
+        "privileged_state": (2, 123),
+    }
     noise = [HALF_WIDTH.get(name, 0.0) * 0.5 for name, size in STATE.items() for _ in range(size)]
     vectors = {group: part._noise for group, part in env.observations._parts.items()}
     assert vectors["privileged_state"] is None and vectors["state"].tolist() == pytest.approx(noise)
@@ -425,12 +451,16 @@ def test_a_standing_robot_senses_gravity_and_its_weight(quiet: LeggedRobot) -> N
         obs, _, done, _ = quiet.step(torch.zeros(N, 12))
         assert not done.any()
     row = dict(zip(PRIVILEGED, obs["privileged_state"].split(list(PRIVILEGED.values()), dim=1), strict=True))
-    assert torch.allclose(row["accelerometer"].norm(dim=1), torch.tensor(9.81), atol=0.1) and (row["accelerometer"][:, 2] > 9.5).all()
+    assert (
+        torch.allclose(row["accelerometer"].norm(dim=1), torch.tensor(9.81), atol=0.1)
+        and (row["accelerometer"][:, 2] > 9.5).all()
+    )
     assert (row["foot_contact"] == 1.0).all() and (row["feet_air_time"] == 0.0).all()
     assert (row["foot_lin_vel"].abs() < 0.05).all()
     # servos lag behind their targets under the weight: kp (target - q), and the calves carry most
     assert torch.allclose(row["torques"], -35.0 * row["dof_pos"], atol=0.05) and (row["torques"][:, 2::3] > 1.0).all()
-    assert torch.allclose(quiet.foot_height, torch.tensor(0.02), atol=0.01)  # foot spheres of 0.023 m, a little into the ground
+    # foot spheres of 0.023 m, a little into the ground
+    assert torch.allclose(quiet.foot_height, torch.tensor(0.02), atol=0.01)
 
 
 def test_noise_is_uniform_within_its_half_width_and_new_for_each_number() -> None:
@@ -474,7 +504,9 @@ def test_velocity_and_gravity_at_the_imu_are_mujocos_own(quiet: LeggedRobot) -> 
             for name in ("base_lin_vel", "base_ang_vel", "base_ang_vel_world", "projected_gravity"):
                 assert getattr(env, name)[world].numpy() == pytest.approx(expected[name], abs=1e-5), name
             assert rewards["lin_vel_z"][world].item() == pytest.approx(expected["base_lin_vel_world"][2] ** 2, abs=1e-4)
-            assert rewards["ang_vel_xy"][world].item() == pytest.approx((expected["base_ang_vel_world"][:2] ** 2).sum(), abs=1e-4)
+            assert rewards["ang_vel_xy"][world].item() == pytest.approx(
+                (expected["base_ang_vel_world"][:2] ** 2).sum(), abs=1e-4
+            )
             assert rewards["orientation"][world].item() == pytest.approx((expected["up"][:2] ** 2).sum(), abs=1e-5)
 
 
@@ -498,7 +530,14 @@ def test_reset_touches_the_masked_worlds_only(lively: LeggedRobot) -> None:
         "env.perturbation._kick",
         "env.perturbation._clock",
     }
-    touched |= {"env.commands", "env.command_timer", "env._episode", "env._episode_length_buf", "env.base_lin_vel", "env.foot_contact"}
+    touched |= {
+        "env.commands",
+        "env.command_timer",
+        "env._episode",
+        "env._episode_length_buf",
+        "env.base_lin_vel",
+        "env.foot_contact",
+    }
     assert touched <= set(changed(env, before, worlds=mask))
     nothing = snapshot(env)
     env.reset_envs(torch.zeros(N, dtype=torch.bool))
@@ -517,7 +556,10 @@ def test_reset_forgets_everything(lively: LeggedRobot) -> None:
         for _ in range(5):
             obs, reward, done, _ = env.step(act(env))
             outputs.append(obs)
-        runs.append([o[group] for o in outputs for group in ("state", "privileged_state")] + [reward, done, env.sim.qpos.clone()])
+        runs.append(
+            [o[group] for o in outputs for group in ("state", "privileged_state")]
+            + [reward, done, env.sim.qpos.clone()]
+        )
     assert all(same(a, b) for a, b in zip(*runs, strict=True))
 
 
@@ -527,7 +569,9 @@ def test_state_after_a_reset(lively: LeggedRobot) -> None:
     for seed in range(150):
         run_a_while(env, 15 if seed == 0 else 0, seed)
         if seed == 0:
-            assert (env.sim.qvel[:, 6:] != 0).any() and (env.sim.xfrc_applied != 0).any() and (env.last_actions != 0).all()
+            assert (
+                (env.sim.qvel[:, 6:] != 0).any() and (env.sim.xfrc_applied != 0).any() and (env.last_actions != 0).all()
+            )
             env.reset()
         sim = env.sim
         assert torch.allclose(sim.qpos[:, 7:], torch.tensor(HOME)) and (sim.qpos[:, 2] == 0.278).all()
@@ -561,7 +605,13 @@ def check_uniform(samples: Tensor, half_width: list[float]) -> None:
 
 
 def test_reset_ranges_are_the_configs() -> None:
-    ranges = {"pos_xy_range": 0.0, "yaw_range": 0.1, "lin_vel_range": 0.0, "ang_vel_range": 2.0, "pos": [3.0, -4.0, 0.5]}
+    ranges = {
+        "pos_xy_range": 0.0,
+        "yaw_range": 0.1,
+        "lin_vel_range": 0.0,
+        "ang_vel_range": 2.0,
+        "pos": [3.0, -4.0, 0.5],
+    }
     env = make_env(N, {**QUIET, **{f"init_state.{name}": value for name, value in ranges.items()}})
     assert (env.sim.qpos[:, :3] == torch.tensor([3.0, -4.0, 0.5])).all() and (env.sim.qvel[:, :3] == 0.0).all()
     assert 0.03 < 2 * env.sim.qpos[:, 6].abs().max() <= 0.1
@@ -696,7 +746,10 @@ def test_model_says_what_the_config_changed(quiet: LeggedRobot) -> None:
     notes = "\n".join(quiet.robot.overrides)
     for line in ("option timestep: 0.002 -> 0.004", "option iterations: 100 -> 1", "option ls_iterations: 50 -> 5"):
         assert line in notes
-    assert "ground: plane, friction 0.6, condim 3, priority 1" in notes and "keyframe 'home' read: pose and height of the root" in notes
+    assert (
+        "ground: plane, friction 0.6, condim 3, priority 1" in notes
+        and "keyframe 'home' read: pose and height of the root" in notes
+    )
 
 
 def test_camera_looks_at_the_robot_and_is_not_stepped(quiet: LeggedRobot) -> None:
@@ -737,5 +790,7 @@ def test_a_foot_feels_all_of_its_geoms(foot_geoms: dict[str, list[str]], felt: l
 
 def test_walking_needs_a_config_of_walking() -> None:
     task = load_task(str(ROOT / "examples" / "go1_stand.py"))
-    with pytest.raises(ConfigError, match="^LeggedRobot walks by command: it needs a LeggedRobotCfg, not a Go1StandCfg$"):
+    with pytest.raises(
+        ConfigError, match="^LeggedRobot walks by command: it needs a LeggedRobotCfg, not a Go1StandCfg$"
+    ):
         LeggedRobot(task.cfg, "cpu")

@@ -55,7 +55,9 @@ def part(alg: Any, which: str) -> dict[str, Tensor]:
     """Learned parameters of the actor's policy, of its estimator, or of the critic."""
     found = {name: value for name, value in parameters(alg).items() if "normalizer" not in name}
     ours = {name for name in found if name.startswith("actor.estimator.")}
-    wanted = {"estimator": ours, "policy": {n for n in found if n.startswith("actor.")} - ours}.get(which) or found.keys() - ours
+    wanted = {"estimator": ours, "policy": {n for n in found if n.startswith("actor.")} - ours}.get(
+        which
+    ) or found.keys() - ours
     return {name: found[name] for name in wanted}
 
 
@@ -73,7 +75,9 @@ def learned(estimator: dict[str, Any], good: float, **settings: Any) -> Any:
 # ---- the regression
 
 
-@pytest.mark.parametrize("settings", [{}, {"symmetry_cfg": SYMMETRY}, {"max_grad_norm": 0.02}], ids=["plain", "mirrored", "clipped"])
+@pytest.mark.parametrize(
+    "settings", [{}, {"symmetry_cfg": SYMMETRY}, {"max_grad_norm": 0.02}], ids=["plain", "mirrored", "clipped"]
+)
 def test_neither_gradient_reaches_the_other(settings: dict[str, Any]) -> None:
     """Another reward leaves the estimator as it is, bit for bit, and another estimator's rate the policy and the critic."""
     alg, punished = learned({}, 1.0, **settings), learned({}, -1.0, **settings)
@@ -95,7 +99,9 @@ def test_the_regression_is_plain_torchs(mirrored: bool, double: None) -> None:
     for round_ in range(2):
         collect(alg, seed=round_)
         obs = {name: value.flatten(0, 1).clone() for name, value in alg.storage.observations.items()}
-        target = torch.stack([obs["privileged_state"][:, 2], obs["privileged_state"][:, 3], obs["privileged_state"][:, 6] / 2.0], dim=1)
+        target = torch.stack(
+            [obs["privileged_state"][:, 2], obs["privileged_state"][:, 3], obs["privileged_state"][:, 6] / 2.0], dim=1
+        )
         center, spread = alg.actor.obs_normalizer._mean.clone(), alg.actor.obs_normalizer._std.clone()
         torch.manual_seed(3)
         batches, losses = torch.randperm(WORLDS * STEPS).split(WORLDS * STEPS // 4), []
@@ -112,7 +118,8 @@ def test_the_regression_is_plain_torchs(mirrored: bool, double: None) -> None:
                 losses.append(loss.item())
         assert update(alg)["estimate"] == pytest.approx(sum(losses) / 20, rel=1e-6)
         for got, wanted in zip(alg.actor.estimator.parameters(), network.parameters(), strict=True):
-            torch.testing.assert_close(got, wanted, rtol=1e-5, atol=1e-7)  # our rate is float32, as the fused Adam wants it
+            # our rate is float32, as the fused Adam wants it
+            torch.testing.assert_close(got, wanted, rtol=1e-5, atol=1e-7)
         if round_ == 0:
             mean, std = target.mean(dim=0), target.std(dim=0, unbiased=False)
             torch.testing.assert_close(alg.actor.target_normalizer._mean[0], mean)
@@ -146,7 +153,8 @@ def test_the_update_asks_the_host_nothing(monkeypatch: pytest.MonkeyPatch) -> No
     collect(alg)
     update(alg)
     collect(alg)
-    monkeypatch.setattr(nn.utils, "clip_grad_norm_", lambda *_: None)  # torch's own: they move tensors to where they are
+    # torch's own: they move tensors to where they are
+    monkeypatch.setattr(nn.utils, "clip_grad_norm_", lambda *_: None)
     monkeypatch.setattr(alg.optimizer, "step", lambda: None)
     with recordable():
         alg._update()
@@ -225,7 +233,9 @@ def test_check_says_what_is_estimated() -> None:
 
 
 def test_it_is_one_line_of_the_program(tmp_path: Path) -> None:
-    line = refused(tmp_path, "train", "--task", "go1_flat", "--device", "cpu", "--set", "actor.estimator.targets=[velocity]")
+    line = refused(
+        tmp_path, "train", "--task", "go1_flat", "--device", "cpu", "--set", "actor.estimator.targets=[velocity]"
+    )
     assert line.startswith("train.py: actor.estimator.targets: no observation row 'velocity' in 'privileged_state'; ")
 
 
@@ -280,11 +290,14 @@ def test_both_outputs_of_the_onnx_are_torchs(policy: EstimatingModel, run_folder
     np.testing.assert_allclose(run_onnx(file, obs.numpy()), act(policy, groups).clamp(-2.0, 2.0), atol=1e-5)
     with torch.no_grad():
         np.testing.assert_allclose(run_onnx(file, obs.numpy(), ESTIMATE), policy.estimate(groups), atol=1e-5)
-    assert policy.state_dict()["target_normalizer._mean"].abs().min() > 0.0  # else the normaliser would not have been tried
+    # else the normaliser would not have been tried
+    assert policy.state_dict()["target_normalizer._mean"].abs().min() > 0.0
     task = task_with()
     again = load_policy(file, LeggedRobot(task.cfg, "cpu"), task.train, "cpu")
     assert isinstance(again, EstimatingModel)
-    assert torch.equal(again.estimate(groups), policy.estimate(groups)) and torch.equal(act(again, groups), act(policy, groups))
+    assert torch.equal(again.estimate(groups), policy.estimate(groups)) and torch.equal(
+        act(again, groups), act(policy, groups)
+    )
     actions, estimate = ExportedPolicy(policy, 2.0)(obs)
     assert actions.shape == (40, 12) and estimate.shape == (40, 7)
 
@@ -336,7 +349,9 @@ def test_deploy_believes_what_training_would(policy: EstimatingModel, run_folder
         (lambda said: said["estimate"][1].pop("unit"), "policy.yaml: estimate[1]: 'unit' is missing; it must be text"),
     ],
 )
-def test_a_contract_that_does_not_fit(change: Any, said: str, run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_contract_that_does_not_fit(
+    change: Any, said: str, run_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     for name in ("policy.onnx", "policy.yaml", "scene.xml"):
         (tmp_path / name).write_bytes((run_folder / "export" / name).read_bytes())
     rewrite(tmp_path, change)
@@ -400,7 +415,8 @@ def test_the_exams_root_mean_square_error() -> None:
 
 
 def test_the_exam_during_training_has_it_too(record: Record) -> None:
-    longer = Record(*record[:2], record.commands, record.fell_at, record.last_position, record.signals)._replace(dt=0.2)  # settled after 10
+    # settled after 10
+    longer = Record(*record[:2], record.commands, record.fell_at, record.last_position, record.signals)._replace(dt=0.2)
     found = training_figures(longer, 2)
     assert (found["estimate_vx"], found["estimate_vy"]) == pytest.approx((0.1, 0.2), abs=1e-5)
     del longer.signals["estimate"]
@@ -410,11 +426,19 @@ def test_the_exam_during_training_has_it_too(record: Record) -> None:
 def test_the_report_draws_it_and_compares_it_with_a_policy_that_has_none() -> None:
     rows = np.random.default_rng(0).normal(size=(50, 22, 2))
     fell_at = np.where(np.arange(22) == 3, 10.0, math.inf)
-    both = Record(0.02, 1.0, np.zeros((50, 22, 3)), fell_at, np.zeros((22, 2)), {"velocity": rows, "estimate": rows + 1.0})
+    both = Record(
+        0.02, 1.0, np.zeros((50, 22, 3)), fell_at, np.zeros((22, 2)), {"velocity": rows, "estimate": rows + 1.0}
+    )
     commands = ExamRules.from_config(load_task("go1_flat").cfg).commands()
     found = figures.estimates(both, commands, 0.4)
-    assert found["seconds"] == pytest.approx(0.4) and [len(found[key][0]) for key in ("truth", "estimate")] == [22 * 20] * 2
-    assert found["truth"][1][20] == pytest.approx(rows[30, 1, 1], abs=1e-4) and found["estimate"][0][3 * 20 : 4 * 20] == [None] * 20
+    assert (
+        found["seconds"] == pytest.approx(0.4)
+        and [len(found[key][0]) for key in ("truth", "estimate")] == [22 * 20] * 2
+    )
+    assert (
+        found["truth"][1][20] == pytest.approx(rows[30, 1, 1], abs=1e-4)
+        and found["estimate"][0][3 * 20 : 4 * 20] == [None] * 20
+    )
     panels = plots._estimates([("one", {"estimate": found}), ("other", {})])
     assert len(panels) == 2
     [first, _] = plots.svgs(plots.Section("estimate", "Estimate", panels, across=1))

@@ -57,7 +57,9 @@ def test_commands_are_the_22() -> None:
 
 def test_commands_of_another_range() -> None:
     """Thirds of vx, halves of vy and yaw rate, worked out by hand; a range that is not given is the trained one."""
-    rules = ExamRules.from_mapping({"ranges": {"lin_vel_x": [-0.5, 1.0]}}, {**RANGES, "lin_vel_x": [-9.0, 9.0], "base_height": [0.2, 0.3]})
+    rules = ExamRules.from_mapping(
+        {"ranges": {"lin_vel_x": [-0.5, 1.0]}}, {**RANGES, "lin_vel_x": [-9.0, 9.0], "base_height": [0.2, 0.3]}
+    )
     assert rules.commands() == [
         (0, 0, 0),
         *((0.3333, 0, 0), (0.6667, 0, 0), (1.0, 0, 0), (-0.1667, 0, 0), (-0.3333, 0, 0)),
@@ -78,9 +80,17 @@ def test_a_biped_is_asked_what_a_biped_can_do() -> None:
     assert (biped.marks, biped.marks_of, biped.push_mark) == ((0.06, 0.06, 0.12), "offset", 1.0)
     assert quadruped == ExamRules.from_mapping({}, RANGES) and quadruped.push_mark == 2.0
     silent = {"push_speeds": [], "push_mark": 0.0, "marks_of": "", "marks": []}
-    assert ExamRules.from_mapping(silent, RANGES, 2) == biped and ExamRules.from_mapping(biped.to_mapping(), feet=4) == biped
+    assert (
+        ExamRules.from_mapping(silent, RANGES, 2) == biped
+        and ExamRules.from_mapping(biped.to_mapping(), feet=4) == biped
+    )
     stated = ExamRules.from_mapping({"push_speeds": [2.0, 4.0], "push_mark": 4.0, "marks_of": "error"}, RANGES, 2)
-    assert (stated.push_speeds, stated.push_mark, stated.marks, stated.marks_of) == ((2.0, 4.0), 4.0, (0.06, 0.06, 0.08), "error")
+    assert (stated.push_speeds, stated.push_mark, stated.marks, stated.marks_of) == (
+        (2.0, 4.0),
+        4.0,
+        (0.06, 0.06, 0.08),
+        "error",
+    )
 
 
 def test_rules_know_how_many_feet_a_robot_has() -> None:
@@ -96,8 +106,13 @@ def test_marks_follow_from_the_ranges() -> None:
     def marks(vx: float, yaw: float, **given: Any) -> tuple[float, ...]:
         return ExamRules.from_mapping(given, {**RANGES, "lin_vel_x": [0.0, vx], "ang_vel_yaw": [-yaw, yaw]}).marks
 
-    assert marks(2.0, 2.0) == (0.12, 0.06, 0.2) and marks(0.5, 0.0) == (0.04, 0.06, 0.12)  # vx 0.04 at least; no turning at all
-    assert marks(2.0, 2.0, marks_of="offset") == (0.06, 0.06, 0.12) and marks(2.0, 2.0, marks=[0.1, 0.2, 0.3]) == (0.1, 0.2, 0.3)
+    # vx 0.04 at least; no turning at all
+    assert marks(2.0, 2.0) == (0.12, 0.06, 0.2) and marks(0.5, 0.0) == (0.04, 0.06, 0.12)
+    assert marks(2.0, 2.0, marks_of="offset") == (0.06, 0.06, 0.12) and marks(2.0, 2.0, marks=[0.1, 0.2, 0.3]) == (
+        0.1,
+        0.2,
+        0.3,
+    )
 
 
 def test_rules_survive_being_written() -> None:
@@ -120,7 +135,11 @@ def go2(**given: Any) -> ExamRules:
 
 def test_peers_are_of_the_robot_and_its_range() -> None:
     """Those that were trained for the same range, or all of them in the range that all were asked; a robot has no other's peer."""
-    assert [peer.name for peer in go2().peers] == ["go2_rl_gym, CTS (rough)", "CTS (rough), later", "MoE-CTS (rough, days of training)"]
+    assert [peer.name for peer in go2().peers] == [
+        "go2_rl_gym, CTS (rough)",
+        "CTS (rough), later",
+        "MoE-CTS (rough, days of training)",
+    ]
     assert ExamRules.from_mapping({**GO1.to_mapping(), "peer": "go2"}).peers == []
     g1 = {"lin_vel_x": [-1.0, 1.0], "lin_vel_y": [-0.5, 0.5], "ang_vel_yaw": [-1.0, 1.0]}
     names = [peer.name for peer in ExamRules.from_mapping({"peer": "g1"}, g1, 2).peers]
@@ -135,9 +154,16 @@ def test_peers_are_of_the_robot_and_its_range() -> None:
 def test_the_best_is_figure_by_figure() -> None:
     """Of three Go2 policies, worked out by hand from their lines."""
     best = best_of(go2().peers)
-    assert best["error"] == [0.059, 0.057, 0.042] and best["worst"] == [0.14, 0.13, 0.07] and best["offset"] == [0.054, 0.050, 0.023]
+    assert (
+        best["error"] == [0.059, 0.057, 0.042]
+        and best["worst"] == [0.14, 0.13, 0.07]
+        and best["offset"] == [0.054, 0.050, 0.023]
+    )
     assert best["drift"] == 0.002 and best["cost_of_transport"] == 0.43
-    assert list(best["pushes"].values()) == [1, 1, 1, 1, 1, 15 / 16, 13 / 16, 7 / 16] and next(iter(best["pushes"])) == "0.5"
+    assert (
+        list(best["pushes"].values()) == [1, 1, 1, 1, 1, 15 / 16, 13 / 16, 7 / 16]
+        and next(iter(best["pushes"])) == "0.5"
+    )
     assert best_of([]) == {}
 
 
@@ -149,7 +175,8 @@ def test_beating_several_peers_is_beating_each() -> None:
     assert not rules.beats_peer(worse) and rules.reached(worse) == (18, 20)
     text = rules_table({**worse, "walks": True, "beats_peer": False, "rules": rules.to_mapping()})
     assert (
-        text.startswith("asked: vx -2 to 2 m/s, vy -1 to 1 m/s, yaw rate -2 to 2 rad/s\n") and "best of 3\n" in text.splitlines()[1] + "\n"
+        text.startswith("asked: vx -2 to 2 m/s, vy -1 to 1 m/s, yaw rate -2 to 2 rad/s\n")
+        and "best of 3\n" in text.splitlines()[1] + "\n"
     )
     assert "walks: yes; beats all 3 published policies (at or beyond their best in 18 of 20 figures): no" in text
     assert "half of each policy's own highest vx" not in text and "no policy has them all" in text
@@ -163,7 +190,10 @@ def test_what_the_common_range_did_not_ask_alike_is_said() -> None:
     )
     words = "* Their pushes and cost of transport were taken at half of each policy's own highest vx, not all at 0.5 m/s: compare"
     assert rules.peer_words().startswith("Best of 10: ") and words in rules.peer_words()
-    with pytest.raises(ConfigError, match="--ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2, g1"):
+    with pytest.raises(
+        ConfigError,
+        match="--ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2, g1",
+    ):
         in_common("go1")
 
 
@@ -177,11 +207,15 @@ def test_the_common_range_in_training_and_in_deploy() -> None:
     contract = replace(read_contract(SHIPPED), exam={"peer": "go2", "push_vx": 0.8})
     assert contract_rules(contract, common=True) == go2(**in_common("go2")) and contract_rules(contract).push_vx == 0.8
     flags.set = []
-    with pytest.raises(ConfigError, match="--ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2"):
+    with pytest.raises(
+        ConfigError, match="--ranges common: exam.peer is 'go1'; one range for all published policies is known of: go2"
+    ):
         grading.prepare(Source(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags, common=True)
     rival = grading.prepare(Source(SHIPPED, SHIPPED / "policy.onnx", True), load_task("go1_flat"), flags)
     report.ask_alike([graded.task, rival.task])  # a rival is asked what the first one is, whatever it knows of peers
-    assert ExamRules.from_config(rival.task.cfg) == asked and rival.task.cfg.env.num_envs == graded.task.cfg.env.num_envs
+    assert (
+        ExamRules.from_config(rival.task.cfg) == asked and rival.task.cfg.env.num_envs == graded.task.cfg.env.num_envs
+    )
 
 
 def test_an_older_name_of_the_peer_is_read() -> None:
@@ -191,8 +225,14 @@ def test_an_older_name_of_the_peer_is_read() -> None:
 @pytest.mark.parametrize(
     ("given", "line"),
     [
-        ({"ranges": {"base_height": [0.2, 0.3]}}, "exam.ranges: no command 'base_height' in the walking exam; there are: lin_vel_x, "),
-        ({"ranges": {"lin_vel_x": [1.0, 0.0]}}, "exam.ranges: lin_vel_x is [1.0, 0.0]; it must be two numbers, the lower first"),
+        (
+            {"ranges": {"base_height": [0.2, 0.3]}},
+            "exam.ranges: no command 'base_height' in the walking exam; there are: lin_vel_x, ",
+        ),
+        (
+            {"ranges": {"lin_vel_x": [1.0, 0.0]}},
+            "exam.ranges: lin_vel_x is [1.0, 0.0]; it must be two numbers, the lower first",
+        ),
         ({"push_speeds": [0.0, 2.0]}, "exam.push_speeds is [0.0, 2.0]; it must be one or more numbers above zero"),
         ({"push_speeds": [1.0]}, "exam.push_mark is 2; it must be one of exam.push_speeds, [1.0]"),
         ({"marks": [0.1]}, "exam.marks is [0.1]; it must be three numbers, or an empty list"),
@@ -211,7 +251,8 @@ def test_rules_of_an_export() -> None:
     assert contract_rules(contract) == GO1
     names = [command.name for command in contract.commands]
     with pytest.raises(
-        ContractError, match="policy.yaml: the walking exam needs the commands lin_vel_x, lin_vel_y, ang_vel_yaw; missing: a"
+        ContractError,
+        match="policy.yaml: the walking exam needs the commands lin_vel_x, lin_vel_y, ang_vel_yaw; missing: a",
     ):
         contract_rules(replace(contract, commands=contract.commands[:2]))
     assert names == list(RANGES)
@@ -246,13 +287,18 @@ def test_a_task_without_an_exam() -> None:
     task.exam = Pose.exam  # as the loader does
     assert find_exam(task) is None and make_exam(task, None) is None
     line = f"--eval: no exam grades task 'go1_flat'; there are: {', '.join(EXAMS)}. A task that walks by command has the walking exam, "
-    with pytest.raises(ConfigError, match=re.escape(line + "another one names its own: TASK = Task(Env, Cfg, CfgPPO, exam=...)")):
+    with pytest.raises(
+        ConfigError, match=re.escape(line + "another one names its own: TASK = Task(Env, Cfg, CfgPPO, exam=...)")
+    ):
         require_exam(task)
     task.exam = "walkin"
-    with pytest.raises(ConfigError, match=r"go1_flat.py: no exam 'walkin' in legged_mw/eval/exams.py; did you mean 'walking'\?"):
+    with pytest.raises(
+        ConfigError, match=r"go1_flat.py: no exam 'walkin' in legged_mw/eval/exams.py; did you mean 'walking'\?"
+    ):
         find_exam(task)
     with pytest.raises(
-        ConfigError, match="the walking exam needs a config with the sections commands and exam: a subclass of LeggedRobotCfg"
+        ConfigError,
+        match="the walking exam needs a config with the sections commands and exam: a subclass of LeggedRobotCfg",
     ):
         ExamRules.from_config(RobotTaskCfg())
 
@@ -260,14 +306,26 @@ def test_a_task_without_an_exam() -> None:
 def test_prepare_leaves_nothing_to_chance() -> None:
     """Whatever a task trains with is switched off."""
     task = load_task("go1_flat")
-    for path in ("init_state.pos_xy_range", "init_state.yaw_range", "init_state.lin_vel_range", "init_state.ang_vel_range", "noise.level"):
+    for path in (
+        "init_state.pos_xy_range",
+        "init_state.yaw_range",
+        "init_state.lin_vel_range",
+        "init_state.ang_vel_range",
+        "noise.level",
+    ):
         task.set(path, 3.0)
     task.set("perturbation.kick", True)
     task.set("env.episode_length_s", 1.0)
     exam.prepare(task)
     cfg = task.cfg
     init = cfg.init_state
-    assert (init.pos_xy_range, init.yaw_range, init.lin_vel_range, init.ang_vel_range, cfg.noise.level) == (0, 0, 0, 0, 0)
+    assert (init.pos_xy_range, init.yaw_range, init.lin_vel_range, init.ang_vel_range, cfg.noise.level) == (
+        0,
+        0,
+        0,
+        0,
+        0,
+    )
     assert cfg.perturbation.kick is False and cfg.commands.resampling_time == 0
     assert cfg.env.episode_length_s > rules.SECONDS and cfg.env.num_envs == WORLDS
 
@@ -278,7 +336,9 @@ def test_prepare_leaves_nothing_to_chance() -> None:
 class FakeRobot:
     """Stands in for LeggedRobot: every world does exactly what the script says."""
 
-    def __init__(self, script: Callable[[FakeRobot, int], None], falls: dict[int, list[int]] | None = None, **asked: Any) -> None:
+    def __init__(
+        self, script: Callable[[FakeRobot, int], None], falls: dict[int, list[int]] | None = None, **asked: Any
+    ) -> None:
         task = load_task("go1_flat")
         for name, value in asked.items():
             task.set(f"exam.{name}", value)
@@ -341,7 +401,8 @@ def test_worlds_are_commanded_and_the_policy_sees_it() -> None:
     wanted = torch.tensor([*GO1.commands(), *[(0.8, 0.0, 0.0)] * PUSHED])
     assert torch.equal(env.commands, wanted) and len(seen) == 500
     assert all(torch.equal(obs, wanted) for obs in seen)
-    assert [float(action[0, 0]) for action in env.actions] == [float(i) for i in range(1, 501)]  # each acted upon once, in order
+    # each acted upon once, in order
+    assert [float(action[0, 0]) for action in env.actions] == [float(i) for i in range(1, 501)]
 
 
 def test_pushes() -> None:
@@ -388,7 +449,9 @@ def test_drift_joint_speed_and_cost_of_transport() -> None:
     def script(env: FakeRobot, step: int) -> None:
         follow(env, step)
         env.root_pos[0, :2] = (
-            torch.tensor([7.0, 7.0]) if step < 100 else torch.tensor([1.0, 2.0]) + (step - 100) / 400 * torch.tensor([0.3, 0.4])
+            torch.tensor([7.0, 7.0])
+            if step < 100
+            else torch.tensor([1.0, 2.0]) + (step - 100) / 400 * torch.tensor([0.3, 0.4])
         )
         env.root_pos[2, 0] = 0.9 * 0.02 * step
         env.torques[2], env.dof_vel[2] = 2.0, 3.0 if step % 2 else -3.0  # braking costs too
@@ -411,13 +474,18 @@ def test_cost_of_transport_at_a_command_of_its_own() -> None:
 
     asked = {"transport_vx": 0.75, "push_speeds": [1.0, 2.0]}
     result = grade(FakeRobot(script, {5: [3]}, **asked))
-    assert result["cost_of_transport"] == pytest.approx(12 * 2.0 / (10 * 9.81 * 0.75), rel=1e-4) and "beats_peer" not in result
+    assert (
+        result["cost_of_transport"] == pytest.approx(12 * 2.0 / (10 * 9.81 * 0.75), rel=1e-4)
+        and "beats_peer" not in result
+    )
     assert result["falls"] == 1 and len(result["commands"]) == 22 and result["pushes"] == {"1": 1.0, "2": 1.0}
     text = rules.table(result)
     assert "cost of transport at 0.75 m/s" in text and "peer" not in text and text.endswith("walks: no")
     fallen = grade(FakeRobot(script, {5: [22]}, **asked))
     assert (
-        fallen["falls"] == 0 and fallen["cost_of_transport"] is None and "cost of transport at 0.75 m/s         none" in rules.table(fallen)
+        fallen["falls"] == 0
+        and fallen["cost_of_transport"] is None
+        and "cost of transport at 0.75 m/s         none" in rules.table(fallen)
     )
 
 
@@ -448,7 +516,9 @@ def test_further_commands_stay_at_their_default() -> None:
     env.command_table = (*env.command_table, Command("base_height", 0.2, 0.3, default=0.28))
     env.commands = torch.full((WORLDS, 4), math.nan)
     assert grade(env, policy)["error"] == [0, 0, 0]
-    assert all(torch.equal(obs[:, :3], seen[0][:, :3]) and (obs[:, 3] == 0.28).all() for obs in seen) and len(seen) == 500
+    assert (
+        all(torch.equal(obs[:, :3], seen[0][:, :3]) and (obs[:, 3] == 0.28).all() for obs in seen) and len(seen) == 500
+    )
 
 
 def test_a_task_without_commands_can_be_rolled_out() -> None:
@@ -456,7 +526,9 @@ def test_a_task_without_commands_can_be_rolled_out() -> None:
     env.command_table = ()
     del env.commands
     env.first_observations = env.get_observations
-    record = roll_out(env, lambda obs: torch.zeros(WORLDS, 12), [holding(())] * WORLDS, 5, {"position": lambda env: env.root_pos})
+    record = roll_out(
+        env, lambda obs: torch.zeros(WORLDS, 12), [holding(())] * WORLDS, 5, {"position": lambda env: env.root_pos}
+    )
     assert record.commands.shape == (5, WORLDS, 0) and record.signals["position"].shape == (5, WORLDS, 3)
 
 
@@ -470,7 +542,10 @@ def test_falls() -> None:
     result = grade(FakeRobot(script, {120: [3, 7], 300: [3]}))
     assert result["falls"] == 2 and [i for i, row in enumerate(result["commands"]) if row["fell"]] == [3, 7]
     assert GO1.commands()[3] == (1.5, 0, 0) and GO1.commands()[7] == (0, 0.8, 0)
-    assert result["error"] == result["offset"] == pytest.approx([1.5 / 22, 0.8 / 22, 0], abs=1e-5) and result["walks"] is False
+    assert (
+        result["error"] == result["offset"] == pytest.approx([1.5 / 22, 0.8 / 22, 0], abs=1e-5)
+        and result["walks"] is False
+    )
     assert result["worst"] == [1.5, 0.8, 0] and result["commands"][7]["error"] == [0, 0.8, 0]
     assert grade(FakeRobot(script))["worst"] == pytest.approx([1, 1, 0])
     lying = grade(FakeRobot(follow, {9: list(range(TRACKED))}))
@@ -528,7 +603,14 @@ def test_walks_at_the_threshold() -> None:
 
 @pytest.mark.parametrize(
     ("path", "value"),
-    [("falls", 1), ("error.0", 0.0601), ("error.1", 0.0601), ("error.2", 0.1201), ("pushes.2", 0.9375), ("error.0", math.inf)],
+    [
+        ("falls", 1),
+        ("error.0", 0.0601),
+        ("error.1", 0.0601),
+        ("error.2", 0.1201),
+        ("pushes.2", 0.9375),
+        ("error.0", math.inf),
+    ],
 )
 def test_does_not_walk_past_it(path: str, value: float) -> None:
     assert not GO1.walks(changed(WALKS, path, value))
@@ -542,9 +624,17 @@ def test_beats_the_peer_by_a_little() -> None:
 @pytest.mark.parametrize(
     ("path", "value"),
     [
-        *(("error.0", 0.024), ("error.1", 0.031), ("error.2", 0.084), ("cost_of_transport", 0.86)),  # as good is not better
+        # as good is not better
+        *(("error.0", 0.024), ("error.1", 0.031), ("error.2", 0.084), ("cost_of_transport", 0.86)),
         *(("worst.0", 0.0421), ("worst.1", 0.0631), ("worst.2", 0.3571), ("drift", 0.0051), ("falls", 1)),
-        *(("pushes.1", 0.9375), ("pushes.2", 0.9375), ("pushes.3", 0.9375), ("pushes.4", 0.75), ("pushes.5", 0.375), ("pushes.6", 0.125)),
+        *(
+            ("pushes.1", 0.9375),
+            ("pushes.2", 0.9375),
+            ("pushes.3", 0.9375),
+            ("pushes.4", 0.75),
+            ("pushes.5", 0.375),
+            ("pushes.6", 0.125),
+        ),
     ],
 )
 def test_does_not_beat_the_peer(path: str, value: float) -> None:
@@ -554,7 +644,15 @@ def test_does_not_beat_the_peer(path: str, value: float) -> None:
 def test_table_names_every_figure() -> None:
     result = grade(FakeRobot(follow))
     text = rules.table({**result, "drift": 0.1234, "cost_of_transport": 4.56, "joint_speed": 0.789})
-    for part in ("0.1234", "4.56", "0.789", "survives pushes of 6 m/s", "worst command", "0.0007", "walks: yes; beats the peer: no"):
+    for part in (
+        "0.1234",
+        "4.56",
+        "0.789",
+        "survives pushes of 6 m/s",
+        "worst command",
+        "0.0007",
+        "walks: yes; beats the peer: no",
+    ):
         assert part in text
 
 
@@ -632,7 +730,11 @@ def test_eval_from_the_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         saved["exam"]["error"], abs=0.01
     )
     about, graded = saved["about"], saved["exam"]
-    assert about["policy"].endswith(f"{folder.name}/model_1.pt") and about["engine"] == "mujoco" and about["device"] == "cpu"
+    assert (
+        about["policy"].endswith(f"{folder.name}/model_1.pt")
+        and about["engine"] == "mujoco"
+        and about["device"] == "cpu"
+    )
     assert len(graded["commands"]) == TRACKED and graded["walks"] is False
     assert about["overrides"]["noise.level"] == 0.0 and about["overrides"]["terrain.friction"] == 0.4
     assert folder.name in (folder / "eval/report.html").read_text(encoding="utf-8")
@@ -659,6 +761,8 @@ def test_ranges_from_the_command_line(tmp_path: Path, monkeypatch: pytest.Monkey
     ):
         line = refused(tmp_path, "play", *start, *more)
         assert f"--eval sets {field} itself; an exam with other values would be another exam" in line
-    assert "--ranges says what the exam asks: add --eval" in refused(tmp_path, "play", *start[:-1], "--ranges", "common")
+    assert "--ranges says what the exam asks: add --eval" in refused(
+        tmp_path, "play", *start[:-1], "--ranges", "common"
+    )
     for more in (["--command", "1,0,0"], ["--video", "x.mp4"], ["--export", "x"]):
         assert "one thing each" in refused(tmp_path, "play", *start, *more)

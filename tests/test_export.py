@@ -62,13 +62,27 @@ def test_no_file_says_where_it_was_made(made: Path) -> None:
 
 def test_contract_states_what_was_trained(made: Path) -> None:
     contract, env = read_contract(made), make_env(1)
-    assert contract.joints == env.robot.joint_names and contract.imu == "imu" and list(contract.feet) == ["FR", "FL", "RR", "RL"]
+    assert (
+        contract.joints == env.robot.joint_names
+        and contract.imu == "imu"
+        and list(contract.feet) == ["FR", "FL", "RR", "RL"]
+    )
     np.testing.assert_allclose(contract.default_pose, env.default_dof_pos, atol=1e-7)
     assert (contract.action.origin, set(contract.action.scale), contract.action.clip) == ("default", {0.5}, 2.0)
     assert (contract.period, contract.decimation, contract.ends) == (0.02, 5, Ends(max_tilt=90.0))
-    assert contract.mass == pytest.approx(env.total_mass, abs=1e-5) and set(contract.stiffness) == {35.0} and set(contract.damping) == {0.5}
-    np.testing.assert_allclose([[c.low for c in contract.commands], [c.high for c in contract.commands]], env.command_ranges)
-    assert [(c.name, c.unit) for c in contract.commands] == [("lin_vel_x", "m/s"), ("lin_vel_y", "m/s"), ("ang_vel_yaw", "rad/s")]
+    assert (
+        contract.mass == pytest.approx(env.total_mass, abs=1e-5)
+        and set(contract.stiffness) == {35.0}
+        and set(contract.damping) == {0.5}
+    )
+    np.testing.assert_allclose(
+        [[c.low for c in contract.commands], [c.high for c in contract.commands]], env.command_ranges
+    )
+    assert [(c.name, c.unit) for c in contract.commands] == [
+        ("lin_vel_x", "m/s"),
+        ("lin_vel_y", "m/s"),
+        ("ang_vel_yaw", "rad/s"),
+    ]
     trained_rows = [(row.name, row.size, row.noise) for row in env.observations.groups["state"]]
     assert [(row.name, row.size, row.noise) for row in contract.rows] == trained_rows
     assert all(row.unit and row.frame and row.measured for row in contract.rows) and contract.size == 48
@@ -113,7 +127,9 @@ def test_meshes_from_files_are_written_out(tmp_path: Path) -> None:
         1,
     )
     (tmp_path / "robot.xml").write_text(mjcf)
-    env = make_env(1, {"asset.file": str(tmp_path / "robot.xml"), "asset.colliders": ["FR", "FL", "RR", "RL", "trunk_box"]})
+    env = make_env(
+        1, {"asset.file": str(tmp_path / "robot.xml"), "asset.colliders": ["FR", "FL", "RR", "RL", "trunk_box"]}
+    )
     pose = env.default_dof_pos.tolist()
     scene = standalone(env.robot, imu="imu", qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
     assert "stl" not in scene.xml
@@ -124,7 +140,9 @@ def test_meshes_from_files_are_written_out(tmp_path: Path) -> None:
         np.testing.assert_allclose(getattr(model, name)[index[0]], getattr(whole, name)[index[1]], atol=1e-5)
 
 
-def test_the_export_is_replaced_whole_or_not_at_all(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_export_is_replaced_whole_or_not_at_all(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Foreign files in the folder stay; a failure, early or late, leaves the export that was there."""
     out = tmp_path / "out"
     shutil.copytree(made, out)
@@ -132,16 +150,19 @@ def test_the_export_is_replaced_whole_or_not_at_all(made: Path, tmp_path: Path, 
     monkeypatch.setattr(exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(made / "policy.onnx", path))
     (out / "README.md").write_text("mine")
     before = files(tmp_path)
-    for name, fails in (("run_onnx", lambda path, obs, **_: np.ones((len(obs), 12))), ("make_contract", lambda *_: 1 / 0)):
+    for name, fails in (
+        ("run_onnx", lambda path, obs, **_: np.ones((len(obs), 12))),
+        ("make_contract", lambda *_: 1 / 0),
+    ):
         with monkeypatch.context() as patch:
             patch.setattr(exporting, name, fails)
             with pytest.raises((ExportError, ZeroDivisionError)) as error:
                 export(*arguments(made), out)
         assert files(tmp_path) == before
         if name == "run_onnx":
-            assert "policy.onnx acts otherwise than the trained policy: up to " in str(error.value) and "nothing was written" in str(
+            assert "policy.onnx acts otherwise than the trained policy: up to " in str(
                 error.value
-            )
+            ) and "nothing was written" in str(error.value)
     (out / "policy.yaml").write_text("stale")
     export(*arguments(made), out)
     assert files(tmp_path)["out/policy.yaml"] == before["out/policy.yaml"] and (out / "README.md").read_text() == "mine"
@@ -186,7 +207,8 @@ def test_an_export_that_fails_does_not_end_a_training(tmp_path: Path, monkeypatc
     result = run("train", tmp_path, *SMALL, "--max_iterations", "1", "--set", "runner.export=true")
     assert result.code == 0, result.err
     assert (
-        "done: " in result.out and "not exported: the exporter has a bad day\n  to try again: python play.py --task go1_flat" in result.out
+        "done: " in result.out
+        and "not exported: the exporter has a bad day\n  to try again: python play.py --task go1_flat" in result.out
     )
     [folder] = tmp_path.glob("logs/*/*")
     assert (folder / "model_1.pt").is_file() and not (folder / "export").exists()
@@ -220,7 +242,15 @@ def test_rows_of_ones_own() -> None:
 
 def test_a_group_within_a_group_is_written_out() -> None:
     names = [row.name for row in contract_rows(make_env(1), "privileged_state", 1.0)]
-    assert names[:7] == ["base_lin_vel", "base_ang_vel", "projected_gravity", "dof_pos", "dof_vel", "last_actions", "commands"]
+    assert names[:7] == [
+        "base_lin_vel",
+        "base_ang_vel",
+        "projected_gravity",
+        "dof_pos",
+        "dof_vel",
+        "last_actions",
+        "commands",
+    ]
     assert names[7:9] == ["base_ang_vel", "accelerometer"] and {"torques", "foot_contact"} <= set(names) & set(ROWS)
 
 
@@ -245,7 +275,17 @@ TASK = Task(Dog, DogCfg, Go1FlatCfgPPO)
 
 def test_a_task_with_a_row_of_its_own_is_deployed(tmp_path: Path) -> None:
     (tmp_path / "dog.py").write_text(DOG)
-    result = run("train", tmp_path, "--task", str(tmp_path / "dog.py"), *SMALL[2:], "--max_iterations", "1", "--set", "runner.export=true")
+    result = run(
+        "train",
+        tmp_path,
+        "--task",
+        str(tmp_path / "dog.py"),
+        *SMALL[2:],
+        "--max_iterations",
+        "1",
+        "--set",
+        "runner.export=true",
+    )
     assert result.code == 0, result.err
     [folder] = tmp_path.glob("logs/*/*/export")
     stage = DeployStage(folder, 2)
@@ -259,7 +299,9 @@ def test_a_task_with_a_row_of_its_own_is_deployed(tmp_path: Path) -> None:
     stage.fleet.qpos[1, 2] = 0.04  # with its trunk in the ground
     stage.fleet.write(stage.contract.default_pose + np.zeros((2, 1)))
     assert stage.fleet.fell().tolist() == [False, True]
-    with pytest.raises(ContractError, match=r"the robot does not measure row 'shake': it must be in Measurement.others \(3 values\)"):
+    with pytest.raises(
+        ContractError, match=r"the robot does not measure row 'shake': it must be in Measurement.others \(3 values\)"
+    ):
         stage.controller.observe(dataclasses.replace(stage.measured, others={}), stage.commands())
 
 
@@ -293,7 +335,13 @@ def test_a_further_command_and_history_are_deployed(tmp_path: Path) -> None:
     assert result.code == 0 and "not exported" not in result.out, result.out + result.err
     [folder] = tmp_path.glob("logs/*/*/export")
     contract = read_contract(folder)
-    assert [(c.name, c.unit, c.low, c.high, c.default) for c in contract.commands][3] == ("base_height", "m", 0.2, 0.3, 0.2)
+    assert [(c.name, c.unit, c.low, c.high, c.default) for c in contract.commands][3] == (
+        "base_height",
+        "m",
+        0.2,
+        0.3,
+        0.2,
+    )
     assert [(row.name, row.size, row.history) for row in contract.rows] == [
         ("base_ang_vel", 3, 1),
         ("projected_gravity", 3, 1),
@@ -317,7 +365,11 @@ def test_where_history_stands_in_the_network(tmp_path: Path) -> None:
     """
     columns = [0, 5, 6, 18, 29, 30, 42, 53, 54, 66, 78, 80]
     history = {"state.dof_vel": 3, "state.last_actions": 2}
-    settings = {"observations.history": history, "observations.leave_out": {"state": ["base_lin_vel"]}, "actor.activation": "identity"}
+    settings = {
+        "observations.history": history,
+        "observations.leave_out": {"state": ["base_lin_vel"]},
+        "actor.activation": "identity",
+    }
     task, checkpoint = untrained(ROOT / "configs/go1_flat.py", tmp_path, settings | {"actor.obs_normalization": False})
     saved = torch.load(checkpoint, weights_only=True)
     for layer in (0, 2, 4):
@@ -332,9 +384,18 @@ def test_where_history_stands_in_the_network(tmp_path: Path) -> None:
     controller, acted = Controller(tmp_path / "out", contract), []
     for step in (0.1, 0.2, 0.3):
         speeds = step + 0.001 * np.arange(12)
-        vectors = {"lin_vel": np.zeros(3), "ang_vel": np.full(3, step), "gravity": np.array([0.0, 0.0, -1.0]), "acceleration": np.zeros(3)}
+        vectors = {
+            "lin_vel": np.zeros(3),
+            "ang_vel": np.full(3, step),
+            "gravity": np.array([0.0, 0.0, -1.0]),
+            "acceleration": np.zeros(3),
+        }
         measured = Measurement(
-            **vectors, joint_pos=contract.default_pose + step, joint_vel=speeds, joint_torque=speeds, foot_contact=np.zeros(4)
+            **vectors,
+            joint_pos=contract.default_pose + step,
+            joint_vel=speeds,
+            joint_torque=speeds,
+            foot_contact=np.zeros(4),
         )
         controller.act(measured, np.array([[step, 0.0, -step]]))
         acted.append(controller.last_actions[0].copy())
@@ -347,7 +408,9 @@ def test_where_history_stands_in_the_network(tmp_path: Path) -> None:
 def test_a_row_that_nobody_can_measure_is_said(tmp_path: Path) -> None:
     text = Exported(FILES, 2e-7, 256, ("guess",)).text(tmp_path)
     assert "policy.onnx" in text and "differ from the trained policy's by 2e-07 at most" in text
-    assert "nothing says how to measure guess: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)" in text
+    assert (
+        "nothing says how to measure guess: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)" in text
+    )
 
 
 def test_ends_of_the_tasks_own_are_said(tmp_path: Path) -> None:
@@ -361,7 +424,10 @@ def test_ends_of_the_tasks_own_are_said(tmp_path: Path) -> None:
     assert own_ends(LeggedRobot) == own_ends(RobotTask) == own_ends(OtherPose) == ()
     assert own_ends(Own) == ("Own._fallen", "Own._timed_out", "OtherRewards.check_termination")
     text = Exported(FILES, 0.0, 256, (), not_covered=own_ends(Own)[:2]).text(tmp_path)
-    assert "Own._fallen, Own._timed_out ended episodes in training; a deployed robot walks on (policy.yaml: ends: not_covered)" in text
+    assert (
+        "Own._fallen, Own._timed_out ended episodes in training; a deployed robot walks on (policy.yaml: ends: not_covered)"
+        in text
+    )
 
 
 def test_a_picture_is_left_out_and_a_height_field_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -371,7 +437,9 @@ def test_a_picture_is_left_out_and_a_height_field_refused(monkeypatch: pytest.Mo
     spec.add_hfield(name="hills", file="hills.png")
     pose = env.default_dof_pos.tolist()
     with pytest.raises(ModelError, match="height field 'hills' comes from a file; an export must stand alone"):
-        standalone(type(robot)(**{**vars(robot), "spec": spec}), imu="imu", qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
+        standalone(
+            type(robot)(**{**vars(robot), "spec": spec}), imu="imu", qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose
+        )
 
 
 def untrained(path: Path, folder: Path, settings: dict[str, Any] | None = None) -> tuple[LoadedTask, Path]:
@@ -393,7 +461,12 @@ def untrained(path: Path, folder: Path, settings: dict[str, Any] | None = None) 
 @pytest.mark.parametrize(
     ("name", "commands", "feet", "rows"),
     [
-        ("go1_stand", 0, {}, {"base_lin_vel", "base_ang_vel", "projected_gravity", "dof_pos", "dof_vel", "last_actions"}),
+        (
+            "go1_stand",
+            0,
+            {},
+            {"base_lin_vel", "base_ang_vel", "projected_gravity", "dof_pos", "dof_vel", "last_actions"},
+        ),
         (
             "toy_biped",
             3,
@@ -403,7 +476,9 @@ def untrained(path: Path, folder: Path, settings: dict[str, Any] | None = None) 
         ("go1_base_height", 4, {name: (f"contact/{name}",) for name in ("FR", "FL", "RR", "RL")}, None),
     ],
 )
-def test_other_robots_and_tasks_are_deployed(name: str, commands: int, feet: dict[str, Any], rows: set[str] | None, tmp_path: Path) -> None:
+def test_other_robots_and_tasks_are_deployed(
+    name: str, commands: int, feet: dict[str, Any], rows: set[str] | None, tmp_path: Path
+) -> None:
     """No commands and no feet; feet of two boxes, a scale a joint and no joint angles; a further command."""
     export(*untrained(ROOT / f"examples/{name}.py", tmp_path), tmp_path / "out")
     stage = DeployStage(tmp_path / "out", 2)
@@ -412,7 +487,11 @@ def test_other_robots_and_tasks_are_deployed(name: str, commands: int, feet: dic
     for _ in range(3):
         stage.step()
     geoms = sum(map(len, feet.values()))
-    assert stage.commands().shape == (2, commands) and stage.contacts().shape == (2, geoms) and np.isfinite(stage.qpos()).all()
+    assert (
+        stage.commands().shape == (2, commands)
+        and stage.contacts().shape == (2, geoms)
+        and np.isfinite(stage.qpos()).all()
+    )
     if name == "toy_biped":
         assert stage.contract.action.scale.tolist() == [0.4, 0.4, 0.25] * 2
         np.testing.assert_array_equal(stage.contacts().reshape(2, 2, 2).any(axis=2), stage.measured.foot_contact > 0.0)
@@ -430,7 +509,8 @@ class OtherAngles(LeggedRobot):
     def observation_rows(self) -> dict[str, list[Row | str]]:
         rows = super().observation_rows()
         rows["state"] = [
-            row._replace(value=self.dof_pos) if isinstance(row, Row) and row.name == "dof_pos" else row for row in rows["state"]
+            row._replace(value=self.dof_pos) if isinstance(row, Row) and row.name == "dof_pos" else row
+            for row in rows["state"]
         ]
         return rows
 
@@ -465,7 +545,9 @@ class NoClip(LeggedRobot):
     def _step(self) -> None:
         raw = self.actions.clone()
         super()._step()
-        self.obs_buf["state"][:, self.observations.span("state", "last_actions")] = raw.masked_fill_(self.reset_buf[:, None], 0.0)
+        self.obs_buf["state"][:, self.observations.span("state", "last_actions")] = raw.masked_fill_(
+            self.reset_buf[:, None], 0.0
+        )
 
 
 class OtherRewards(LeggedRobot):
@@ -478,7 +560,9 @@ class OtherRewards(LeggedRobot):
         super().check_termination()
 
 
-def export_of(env_class: type[LeggedRobot], made: Path, out: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any) -> Exported:
+def export_of(
+    env_class: type[LeggedRobot], made: Path, out: Path, monkeypatch: pytest.MonkeyPatch, **changes: Any
+) -> Exported:
     """Export the trained policy as one of another class and other settings, by their dotted paths."""
     monkeypatch.setattr(exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(made / "policy.onnx", path))
     task, checkpoint = arguments(made)
@@ -512,8 +596,11 @@ def test_an_export_that_would_act_otherwise_is_refused(
 def test_a_refusal_states_place_and_both_values(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(ExportError) as error:
         export_of(OtherAngles, made, tmp_path / "out", monkeypatch)
-    found = re.search(r"row 'dof_pos' 0 is (\S+) in the environment and (\S+) by policy.yaml, at step 0\.", str(error.value))
-    assert found and float(found[1]) - float(found[2]) == pytest.approx(0.1, abs=1e-4)  # the default angle of the first joint
+    found = re.search(
+        r"row 'dof_pos' 0 is (\S+) in the environment and (\S+) by policy.yaml, at step 0\.", str(error.value)
+    )
+    # the default angle of the first joint
+    assert found and float(found[1]) - float(found[2]) == pytest.approx(0.1, abs=1e-4)
     with pytest.raises(ExportError) as error:
         export_of(OtherTargets, made, tmp_path / "out", monkeypatch)
     assert "joint target FR_hip_joint is " in str(error.value)
@@ -561,7 +648,9 @@ def test_a_row_that_cannot_be_measured_is_exported_and_the_others_compared(
     assert exported.unknown == ("speeds",) and "nothing says how to measure speeds" in exported.text(tmp_path)
     with pytest.raises(ContractError, match="observation row 'speeds': nothing says how it is measured"):
         read_contract(tmp_path / "out")
-    with pytest.raises(ExportError, match="row 'base_ang_vel' .*UnmeasuredAndOther overrides observation_rows, compute_observations"):
+    with pytest.raises(
+        ExportError, match="row 'base_ang_vel' .*UnmeasuredAndOther overrides observation_rows, compute_observations"
+    ):
         export_of(UnmeasuredAndOther, made, tmp_path / "out", monkeypatch)
 
 

@@ -64,6 +64,8 @@ def test_a_source_without_such_meshes_changes_nothing(written: str) -> None:
         assert shorten(written, source) == written
 
 
-@pytest.mark.parametrize("name", ["go1_flat/scene.xml", "go1_rough/scene.xml", "go1_rough_scan/scene.xml", "go1_rough_scan/terrain.mjz"])
+@pytest.mark.parametrize(
+    "name", ["go1_flat/scene.xml", "go1_rough/scene.xml", "go1_rough_scan/scene.xml", "go1_rough_scan/terrain.mjz"]
+)
 def test_shipped_scenes_are_short(name: str) -> None:
     assert (ROOT / "resources" / "policies" / name).stat().st_size < (60_000 if name.endswith("scene.xml") else 12_000)

@@ -19,7 +19,14 @@ def make(worlds: int = 1, steps: int = 500, fell: dict[int, int] | None = None, 
     fell_at = np.full(worlds, math.inf)
     for world, step in (fell or {}).items():
         fell_at[world] = step
-    return Record(DT, 10.0, np.zeros((steps, worlds, 3)), fell_at, np.zeros((worlds, 2)), {k: np.asarray(v) for k, v in signals.items()})
+    return Record(
+        DT,
+        10.0,
+        np.zeros((steps, worlds, 3)),
+        fell_at,
+        np.zeros((worlds, 2)),
+        {k: np.asarray(v) for k, v in signals.items()},
+    )
 
 
 # ---- following the command
@@ -63,7 +70,11 @@ def test_a_twitch_is_no_response() -> None:
     """One that passes the target and comes back, and one that was not where it should begin."""
     time = np.arange(0.0, 2.0, DT)
     twitch = np.where((time > 0.2) & (time < 0.4), 1.2, 0.0)
-    assert figures.step_response(time, twitch, 0.0, 1.0) == {"rise_time": None, "overshoot": None, "left": pytest.approx(-1.0)}
+    assert figures.step_response(time, twitch, 0.0, 1.0) == {
+        "rise_time": None,
+        "overshoot": None,
+        "left": pytest.approx(-1.0),
+    }
     assert figures.step_response(time, np.zeros(len(time)), -1.0, 0.0)["rise_time"] is None
 
 
@@ -82,7 +93,9 @@ def test_responses_to_each_step() -> None:
     assert (stop["from"], stop["to"], start["from"], start["to"]) == (1.0, 0.0, 0.0, 1.0)
     assert start["rise_time"] == pytest.approx(0.8 * DT / 0.95) and start["left"] == pytest.approx(-0.05)
     assert (
-        figures.responses(make(3, 300, {0: 1, 1: 1, 2: 1}, velocity=moved)._replace(commands=asked), 1, 75)["numbers"][0]["rise_time"]
+        figures.responses(make(3, 300, {0: 1, 1: 1, 2: 1}, velocity=moved)._replace(commands=asked), 1, 75)["numbers"][
+            0
+        ]["rise_time"]
         is None
     )
 
@@ -112,7 +125,9 @@ def test_a_foot_that_chatters_does_not_stride() -> None:
 
 def test_gaits_command_by_command() -> None:
     contact = np.stack([trot(20, 12), trot(25, 10)], axis=1)
-    first, second = figures.gaits(make(2, 400, {1: 30}, contact=contact), 0, [(1.0, 0.0, 0.0), (0.0, 0.8, 0.0)], seconds=0.4)
+    first, second = figures.gaits(
+        make(2, 400, {1: 30}, contact=contact), 0, [(1.0, 0.0, 0.0), (0.0, 0.8, 0.0)], seconds=0.4
+    )
     assert first["command"] == [1.0, 0.0, 0.0] and first["contact"] == contact[-20:, 0].T.astype(int).tolist()
     assert second == {"command": [0.0, 0.8, 0.0], "duty_factor": None, "stride_frequency": None, "contact": None}
 
@@ -131,7 +146,9 @@ def test_share_of_saturation() -> None:
         "dof_vel": (np.array([-np.inf, -3.0]), np.array([np.inf, 3.0])),
     }
     found = figures.joints(make(1, 100, torque=torque, dof_pos=position, dof_vel=np.full((100, 1, 2), 4.0)), 0, limits)
-    assert found["torque"]["saturated"] == pytest.approx([0.3, 0.0]) and found["dof_pos"]["saturated"] == pytest.approx([0.1, 0.0])
+    assert found["torque"]["saturated"] == pytest.approx([0.3, 0.0]) and found["dof_pos"]["saturated"] == pytest.approx(
+        [0.1, 0.0]
+    )
     assert found["dof_vel"]["saturated"] == [None, 1.0] and found["dof_vel"]["low"] == [None, -3.0]
     assert found["dof_pos"]["quantiles"][0] == pytest.approx([0.1, 0.1, 0.1, 0.51, 0.51])
     edges, density = np.array(found["torque"]["edges"][0]), np.array(found["torque"]["density"][0])
@@ -171,7 +188,9 @@ def test_survival_by_strength_and_direction() -> None:
     fell_at = np.full(32, math.inf)
     fell_at[[3, 16, 17]] = 300, 299, 301
     weak, strong = figures.survival(fell_at, 300)
-    assert [k for k, stood in enumerate(weak) if not stood] == [3] and [k for k, stood in enumerate(strong) if not stood] == [0]
+    assert [k for k, stood in enumerate(weak) if not stood] == [3] and [
+        k for k, stood in enumerate(strong) if not stood
+    ] == [0]
 
 
 def test_cost_of_transport() -> None:

@@ -46,13 +46,21 @@ WHOLE_G1 = {
     "asset.foot_geoms": {foot: [f"{foot}?_collision"] for foot in ("left_foot", "right_foot")},
 }
 SCALES = {
-    **dict.fromkeys(("feet_contact_forces", "stumble", "soft_landing", "torque_limits", "dof_vel_limits", "joint_deviation"), -1.0),
-    **dict.fromkeys(("angular_momentum", "self_collision", "joint_mirror", "air_time_variance", "feet_impact_vel"), -1.0),
+    **dict.fromkeys(
+        ("feet_contact_forces", "stumble", "soft_landing", "torque_limits", "dof_vel_limits", "joint_deviation"), -1.0
+    ),
+    **dict.fromkeys(
+        ("angular_momentum", "self_collision", "joint_mirror", "air_time_variance", "feet_impact_vel"), -1.0
+    ),
     **{"action_smoothness": -1.0, "feet_contact_without_cmd": 1.0},
 }
 SETTINGS = {
     **{"asset.self_collisions": True, "rewards.mirror_joints": [["FR_", "RL_"], ["FL_*", "RR_*"]]},
-    **{"rewards.soft_torque_limit": 0.5, "rewards.soft_dof_vel_limit": 0.5, "rewards.deviation_weights": {"": 1.0, "calf": 0.5}},
+    **{
+        "rewards.soft_torque_limit": 0.5,
+        "rewards.soft_dof_vel_limit": 0.5,
+        "rewards.deviation_weights": {"": 1.0, "calf": 0.5},
+    },
 }
 
 
@@ -72,7 +80,9 @@ def go1(more: list[str], **choices: Any) -> RobotModel:
     gains: dict[str, Any] = {"stiffness": {"": 35.0}, "damping": {"": 0.5}, "colliders": FEET, "self_collisions": False}
     gains["pose"] = dict(zip((f"{leg}_{part}" for leg in FEET for part in ("hip", "thigh", "calf")), HOME, strict=True))
     file = ROOT / "resources/robots/go1/go1.xml"
-    return build_model(file, **{"solver": Solver(iterations=50, ls_iterations=50), "ground": Ground(), **gains, **sensed, **choices})
+    return build_model(
+        file, **{"solver": Solver(iterations=50, ls_iterations=50), "ground": Ground(), **gains, **sensed, **choices}
+    )
 
 
 def one_by_one(model: mujoco.MjModel, data: mujoco.MjData, geom: str) -> np.ndarray:
@@ -80,7 +90,8 @@ def one_by_one(model: mujoco.MjModel, data: mujoco.MjData, geom: str) -> np.ndar
     total, wrench = np.zeros(3), np.zeros(6)
     for number, contact in enumerate(data.contact):
         mujoco.mj_contactForce(model, data, number, wrench)
-        sign = {contact.geom[0]: -1.0, contact.geom[1]: 1.0}.get(model.geom(geom).id, 0.0)  # it is the first's force on the second
+        # it is the first's force on the second
+        sign = {contact.geom[0]: -1.0, contact.geom[1]: 1.0}.get(model.geom(geom).id, 0.0)
         total += sign * contact.frame.reshape(3, 3).T @ wrench[:3]
     return total
 
@@ -116,7 +127,8 @@ def test_nothing_more_is_sensed_unless_asked_for() -> None:
     plain, more = go1([]), go1([CONTACT_FORCE, SELF_CONTACT, ANGULAR_MOMENTUM])
     assert plain.physics.nsensordata == 4 and [*plain.sensors] == ["contact", "linvel", "accelerometer"]
     assert more.physics.nsensordata == 16 + 1 + 3 and more.sensors["contact"] == slice(0, 16, 4)
-    assert [sensor.name for sensor in more.spec.sensors] == [sensor.name for sensor in plain.spec.sensors]  # what is exported
+    # what is exported
+    assert [sensor.name for sensor in more.spec.sensors] == [sensor.name for sensor in plain.spec.sensors]
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -208,7 +220,9 @@ def test_what_is_not_sensed_says_how_to_get_it(name: str) -> None:
         def _fallen(self) -> Tensor:
             return super()._fallen() | (getattr(self, name).flatten(1).abs().amax(dim=1) > 1e6)
 
-    error = f"{name} is not sensed, for no reward term that is on names it; write asset.sense = ['{name}'] in the config"
+    error = (
+        f"{name} is not sensed, for no reward term that is on names it; write asset.sense = ['{name}'] in the config"
+    )
     with pytest.raises(ConfigError) as raised:
         make_env(1, QUIET, env_class=Fallen).step(torch.zeros(1, 12))
     assert str(raised.value) == error
@@ -335,25 +349,41 @@ def test_sensed_motion_and_self_contacts() -> None:
             {},
             "rewards.scales.self_collision is on, but asset.self_collisions is False, so that parts pass through one another",
         ),
-        ("joint_mirror", {}, "rewards.mirror_joints is empty; write pairs of names or patterns, [['FR_*', 'RL_*'], ...]"),
+        (
+            "joint_mirror",
+            {},
+            "rewards.mirror_joints is empty; write pairs of names or patterns, [['FR_*', 'RL_*'], ...]",
+        ),
         (
             "joint_mirror",
             {"rewards.mirror_joints": [["FR", "RL_hip"]]},
             "['FR', 'RL_hip'] must be two names or patterns that mean as many joints",
         ),
-        ("joint_mirror", {"rewards.mirror_joints": [["FR", "XX"]]}, "rewards.mirror_joints: no joint 'XX' in the robot"),
+        (
+            "joint_mirror",
+            {"rewards.mirror_joints": [["FR", "XX"]]},
+            "rewards.mirror_joints: no joint 'XX' in the robot",
+        ),
         (
             "joint_mirror",
             {"rewards.mirror_joints": [["FR"]]},
             "rewards.mirror_joints is [['FR']]; it must be pairs: lists of two names or patterns each",
         ),
-        ("dof_vel_limits", {"asset.joint_speed_limits": {}}, "no joint has a highest speed; write asset.joint_speed_limits"),
+        (
+            "dof_vel_limits",
+            {"asset.joint_speed_limits": {}},
+            "no joint has a highest speed; write asset.joint_speed_limits",
+        ),
         (
             "stumble",
             {"asset.sense": ["forces"]},
             "asset.sense: no value or sensor 'forces' in LeggedRobot and its file; did you mean 'contact_forces'",
         ),
-        ("feet_contact_forces", {"rewards.max_contact_force": -1.0}, "rewards.max_contact_force is -1.0; it must be 0 or more"),
+        (
+            "feet_contact_forces",
+            {"rewards.max_contact_force": -1.0},
+            "rewards.max_contact_force is -1.0; it must be 0 or more",
+        ),
     ],
 )
 def test_what_a_term_lacks(name: str, more: dict[str, Any], error: str) -> None:
@@ -366,7 +396,12 @@ def test_what_a_term_lacks(name: str, more: dict[str, Any], error: str) -> None:
 
 
 def whole_g1(engine: str, worlds: int) -> LeggedRobot:
-    still = {"perturbation.push": False, "termination.max_tilt": 180.0, "domain_rand.enable": False, "asset.sense": ["self_contacts"]}
+    still = {
+        "perturbation.push": False,
+        "termination.max_tilt": 180.0,
+        "domain_rand.enable": False,
+        "asset.sense": ["self_contacts"],
+    }
     return make_env(worlds, {**QUIET, **WHOLE_G1, **still, "sim.engine": engine}, task="g1_flat")
 
 
@@ -416,11 +451,16 @@ def test_links_that_overlap_in_the_pose_do_not_collide() -> None:
 def test_the_command_of_the_page(tmp_path: Path) -> None:
     (command,) = re.findall(r"```sh\n(.*?)\n```", (ROOT / "docs/your_own_robot.md").read_text(), re.DOTALL)
     said = run("train", tmp_path, *shlex.split(command)[2:], "--device", "cpu").out
-    assert "sim.nconmax 72, sim.njmax 282, from the model" in said and "self-collisions left out, as they overlap in the pose: 'pel" in said
+    assert (
+        "sim.nconmax 72, sim.njmax 282, from the model" in said
+        and "self-collisions left out, as they overlap in the pose: 'pel" in said
+    )
 
 
 def test_what_is_exported_senses_what_deploy_reads(tmp_path: Path) -> None:
     more = {"asset.sense": ["self_contacts"], "rewards.scales.stumble": -1.0, "observations.contact_forces": True}
     export(*untrained(ROOT / "configs/go1_flat.py", tmp_path, more), tmp_path / "out")
     scene = read_scene(tmp_path / "out", read_contract(tmp_path / "out"))
-    assert [len(columns) for columns in scene.contacts] == [1] * 4 and SELF_CONTACT not in [sensor.name for sensor in scene.spec.sensors]
+    assert [len(columns) for columns in scene.contacts] == [1] * 4 and SELF_CONTACT not in [
+        sensor.name for sensor in scene.spec.sensors
+    ]

@@ -61,7 +61,9 @@ EXPECTED = {
 }
 
 
-def ported(num_envs: int = 4, overrides: dict[str, Any] | None = None, env_class: type[LeggedRobot] | None = None) -> Any:
+def ported(
+    num_envs: int = 4, overrides: dict[str, Any] | None = None, env_class: type[LeggedRobot] | None = None
+) -> Any:
     return make_env(num_envs, {**QUIET, **(overrides or {})}, task=TASK, env_class=env_class)
 
 
@@ -120,8 +122,21 @@ def test_reward_term(env: Any, name: str) -> None:
 
 
 def test_on_rough_ground_heights_are_above_the_ground() -> None:
-    stairs = {"mesh_type": "heightfield", "num_rows": 1, "num_cols": 1, "difficulty": [1.0, 1.0], "terrain_proportions": {"stairs_up": 1}}
-    env = ported(2, {**{f"terrain.{name}": value for name, value in stairs.items()}, "terrain.height_scan": ["state"], "noise.level": 0})
+    stairs = {
+        "mesh_type": "heightfield",
+        "num_rows": 1,
+        "num_cols": 1,
+        "difficulty": [1.0, 1.0],
+        "terrain_proportions": {"stairs_up": 1},
+    }
+    env = ported(
+        2,
+        {
+            **{f"terrain.{name}": value for name, value in stairs.items()},
+            "terrain.height_scan": ["state"],
+            "noise.level": 0,
+        },
+    )
     env.reset()
     deep = -float(env.terrain.origins[0, 0, 2])  # [m] of the pit where episodes begin
     env.sim.qpos[:, :3] = torch.tensor([[0.0, 0.0, 0.35 - deep], [5.0, 0.0, 0.35]])  # in the pit, and beside all tiles
@@ -183,7 +198,10 @@ def test_observation_is_legged_gyms_row_for_row(env: Any) -> None:
 def test_noise_is_in_the_value_s_unit_and_scaled_with_it() -> None:
     env = ported(512, {"noise.level": 1.0})
     env.compute_observations()
-    clean = torch.cat([row.value for row in env.observation_rows()["state"]], dim=1) * env.observations._parts["state"]._scales
+    clean = (
+        torch.cat([row.value for row in env.observation_rows()["state"]], dim=1)
+        * env.observations._parts["state"]._scales
+    )
     error = (env.get_observations()["state"] - clean).abs().amax(dim=0)
     most = [(3, 0.1 * 2.0), (3, 0.2 * 0.25), (3, 0.05), (3, 0.0), (12, 0.01), (12, 1.5 * 0.05), (12, 0.0)]
     wanted = torch.tensor([level for size, level in most for _ in range(size)])
@@ -196,7 +214,9 @@ class _TwoScales(LeggedRobot):
 
 
 def test_scales_that_do_not_fit_their_row_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"^observation row 'commands' has 3 columns and 2 scales; give one, or one a column$"):
+    with pytest.raises(
+        ConfigError, match=r"^observation row 'commands' has 3 columns and 2 scales; give one, or one a column$"
+    ):
         make_env(1, env_class=_TwoScales)
 
 
@@ -272,8 +292,17 @@ def test_joints_are_scattered_at_reset_and_the_exam_starts_without() -> None:
 
 def test_trains_and_is_graded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(exam, "SECONDS", 2.1)
-    small = ["--set", "actor.hidden_dims=[16]", "--set", "critic.hidden_dims=[16]", "--set", "runner.num_steps_per_env=8"]
-    result = run("train", tmp_path, "--task", TASK, "--num_envs", "16", "--device", "cpu", "--max_iterations", "2", *small)
+    small = [
+        "--set",
+        "actor.hidden_dims=[16]",
+        "--set",
+        "critic.hidden_dims=[16]",
+        "--set",
+        "runner.num_steps_per_env=8",
+    ]
+    result = run(
+        "train", tmp_path, "--task", TASK, "--num_envs", "16", "--device", "cpu", "--max_iterations", "2", *small
+    )
     assert result.code == 0, result.err
     assert list((tmp_path / "logs/go1_legged_gym").glob("*/model_2.pt"))
     monkeypatch.setattr(grading, "elsewhere", lambda *_: [])  # the same once more, through an export
@@ -301,7 +330,10 @@ def test_trains_and_is_graded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
             {"asset.penalize_contacts_on": []},
             r"^rewards.scales.collision is on, but asset.penalize_contacts_on names nothing; name what should not touch$",
         ),
-        ({"init_state.dof_pos_range": [1.5, 0.5]}, r"init_state.dof_pos_range is \[1.5, 0.5\]; it must be two numbers, the lower first$"),
+        (
+            {"init_state.dof_pos_range": [1.5, 0.5]},
+            r"init_state.dof_pos_range is \[1.5, 0.5\]; it must be two numbers, the lower first$",
+        ),
     ],
 )
 def test_mistakes_are_one_clear_line(overrides: dict[str, Any], message: str) -> None:
@@ -326,7 +358,9 @@ def test_code_on_the_page_runs(tmp_path: Path) -> None:
     env.step(torch.randn(3, 12))
     with recordable():
         terms = {name: getattr(env, f"_reward_{name}")() for name in ("hip_pos", "action_smoothness")}
-    assert set(terms) <= set(env.reward_names) and all(term.shape == (3,) and bool((term > 0).all()) for term in terms.values())
+    assert set(terms) <= set(env.reward_names) and all(
+        term.shape == (3,) and bool((term > 0).all()) for term in terms.values()
+    )
 
 
 def test_the_page_names_fields_and_methods_that_exist() -> None:
@@ -335,7 +369,12 @@ def test_the_page_names_fields_and_methods_that_exist() -> None:
     both = {**task.cfg.to_dict(), **task.train.to_dict()}
     sections = {name for name, value in both.items() if isinstance(value, dict)}
     rows = [line.split("|")[2] for line in PAGE.read_text(encoding="utf-8").splitlines() if line.startswith("| `")]
-    paths = [path for cell in rows for path in re.findall(r"`([a-z_]+(?:\.[a-z_]+)+)`", cell) if path.split(".")[0] in sections]
+    paths = [
+        path
+        for cell in rows
+        for path in re.findall(r"`([a-z_]+(?:\.[a-z_]+)+)`", cell)
+        if path.split(".")[0] in sections
+    ]
     methods = [name for cell in rows for name in re.findall(r"`(_?[a-z_]+)\(", cell)]
     assert len(paths) > 40 and len(methods) > 10
     for path in paths:
@@ -377,6 +416,10 @@ def test_a_urdf_is_a_robot(tmp_path: Path) -> None:
         imu_site="",
         sites={"FR_foot": ["FR_foot"]},
     )
-    assert robot.root == "base" and robot.joint_names == ("thigh_joint",) and robot.contact_geoms == ("FR_foot_0", "thigh_0")
+    assert (
+        robot.root == "base"
+        and robot.joint_names == ("thigh_joint",)
+        and robot.contact_geoms == ("FR_foot_0", "thigh_0")
+    )
     assert robot.joint_range.tolist() == [[-1.0, 2.0]] and robot.effort_range.tolist() == [[-33.5, 33.5]]
     assert robot.speed_limits == (21.0,) and "fused into 'thigh', to which they are fixed: FR_foot" in robot.overrides

@@ -47,7 +47,13 @@ def fused(fn: Callable[[], None]) -> Fused:
 
 
 def left_to_torch(program: Fused) -> list[str]:
-    return [step.name for part in program.parts if isinstance(part, Region) for step in part.steps if not isinstance(step, Kernel)]
+    return [
+        step.name
+        for part in program.parts
+        if isinstance(part, Region)
+        for step in part.steps
+        if not isinstance(step, Kernel)
+    ]
 
 
 def arithmetic(m: Memory) -> None:
@@ -102,7 +108,9 @@ def test_operations_give_what_torch_gives(name: str) -> None:
         step(torch_s)
         program()
     for i, (own, other) in enumerate(zip(ours.all(), torch_s.all(), strict=True)):
-        torch.testing.assert_close(own, other, rtol=1e-5, atol=1e-5, equal_nan=True, msg=lambda text, i=i: f"{[*vars(ours)][i]}: {text}")
+        torch.testing.assert_close(
+            own, other, rtol=1e-5, atol=1e-5, equal_nan=True, msg=lambda text, i=i: f"{[*vars(ours)][i]}: {text}"
+        )
 
 
 def test_what_does_not_fit_is_left_to_torch() -> None:
@@ -209,7 +217,9 @@ def test_calls_of_the_simulator_stay_where_they_are() -> None:
     assert calls[-1] == 8.0 and memory.out[2, 2].item() == pytest.approx(2.0 * (before + 1.0))
 
 
-def test_a_part_that_gives_other_values_stays_as_it_is(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_part_that_gives_other_values_stays_as_it_is(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     memory = Memory()
     monkeypatch.setattr(Kernel, "__call__", lambda self: memory.out.zero_())
     step = fuse(lambda: [memory.out.copy_(memory.row * 2.0 + memory.b)].clear(), N, {"out": memory.out})
@@ -231,7 +241,9 @@ def test_what_torch_does_not_see_leaves_the_step_as_it_is(capsys: pytest.Capture
     assert capsys.readouterr().out == said
 
 
-def test_a_compiler_that_fails_leaves_the_step_as_it_is(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_compiler_that_fails_leaves_the_step_as_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     memory = Memory()
     monkeypatch.setattr(Fused, "compile", lambda self: 1 / 0)
 
@@ -268,7 +280,9 @@ def robot() -> RobotTask:
     return task.env_class(task.cfg, "cpu")
 
 
-def test_a_task_is_fused_into_few_kernels_and_does_what_it_did(robot: RobotTask, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_task_is_fused_into_few_kernels_and_does_what_it_did(
+    robot: RobotTask, capsys: pytest.CaptureFixture[str]
+) -> None:
     """From the same worlds and draws, over episodes that end: each step as it is, then fused."""
     program = fused_step(robot)
     assert isinstance(program, Fused) and "not fused" not in capsys.readouterr().out
@@ -324,7 +338,9 @@ def test_which_contacts_do_not_fit_does_not_decide_whether_a_step_is_fused(
     assert "not fused" not in capsys.readouterr().out
 
 
-def test_the_users_own_values_that_differ_are_named_first(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_users_own_values_that_differ_are_named_first(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What torch does not see is found before and after the simulator's calls, whatever is different by chance."""
     env = crowded(monkeypatch)
     as_it_is, mine = env.actuators.apply, torch.zeros(32)

@@ -45,7 +45,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.parametrize(("variant", "half"), [*((name, False) for name in VARIANTS), ("plain", True), ("mirror images", True)])
+@pytest.mark.parametrize(
+    ("variant", "half"), [*((name, False) for name in VARIANTS), ("plain", True), ("mirror images", True)]
+)
 def test_fused_update_is_torchs_own(variant: str, half: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two updates of 20 minibatches each, from equal experience: parameters, losses and rate to rounding, of bfloat16 if ``half``."""
     plain, fused = make(GraphedPPO, **VARIANTS[variant]), make(GraphedPPO, **VARIANTS[variant])
@@ -58,7 +60,8 @@ def test_fused_update_is_torchs_own(variant: str, half: bool, monkeypatch: pytes
         expected = update(plain)
         monkeypatch.setattr(layers, "FUSED_ON", ["cpu"])
         got = update(fused)
-        assert difference(parameters(plain), parameters(fused)) < (0.05 if half else 1e-4)  # one bit of bfloat16 is 0.004
+        # one bit of bfloat16 is 0.004
+        assert difference(parameters(plain), parameters(fused)) < (0.05 if half else 1e-4)
         assert got == pytest.approx(expected, rel=0.05 if half else 1e-4, abs=1e-3 if half else 1e-6)
         assert fused.learning_rate == pytest.approx(plain.learning_rate, rel=1e-9)
 
@@ -130,7 +133,9 @@ def test_half_learns_what_float32_does() -> None:
         update(half)
     moved = [flat([p - before[name] for name, p in parameters(alg).items() if "mlp" in name]) for alg in (full, half)]
     assert 0.0 < error(moved[1], moved[0]) < 0.1
-    assert {value.dtype for value in half.save()["actor_state_dict"].values() if value.is_floating_point()} == {torch.float32}
+    assert {value.dtype for value in half.save()["actor_state_dict"].values() if value.is_floating_point()} == {
+        torch.float32
+    }
 
 
 def test_parameters_lie_in_one_tensor_a_part() -> None:

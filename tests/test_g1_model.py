@@ -42,11 +42,15 @@ _ARM = {
     "wrist_pitch": ("y", -1.61443, 1.61443, 0.00425, 5),
     "wrist_yaw": ("z", -1.61443, 1.61443, 0.00425, 5),
 }
-_RIGHT = {"hip_roll": (-2.9671, 0.5236), "shoulder_roll": (-2.2515, 1.5882)}  # the only ranges that are not the left one's
+# the only ranges that are not the left one's
+_RIGHT = {"hip_roll": (-2.9671, 0.5236), "shoulder_roll": (-2.2515, 1.5882)}
 
 
 def _side(side: str, rows: dict[str, tuple]) -> dict[str, tuple]:
-    turned = {name: (row[0], *_RIGHT[name], *row[3:]) if side == "right" and name in _RIGHT else row for name, row in rows.items()}
+    turned = {
+        name: (row[0], *_RIGHT[name], *row[3:]) if side == "right" and name in _RIGHT else row
+        for name, row in rows.items()
+    }
     return {f"{side}_{name}": row for name, row in turned.items()}
 
 
@@ -196,7 +200,13 @@ LINKS = {
 SHAPES = {
     "pelvis_collision": ("pelvis", "sphere", (0.07,), (0.0, 0.0, -0.08), _ONE),
     "left_hip_collision": ("left_hip_roll_link", "capsule", (0.06, 0.04), (0.02, 0.0, -0.04), _ONE),
-    "left_thigh_collision": ("left_hip_yaw_link", "capsule", (0.055, 0.0761577311), (-0.03, 0.0, -0.1), (0.979578, 0.0, 0.201066, 0.0)),
+    "left_thigh_collision": (
+        "left_hip_yaw_link",
+        "capsule",
+        (0.055, 0.0761577311),
+        (-0.03, 0.0, -0.1),
+        (0.979578, 0.0, 0.201066, 0.0),
+    ),
     "left_shin_collision": ("left_knee_link", "capsule", (0.045, 0.075), (0.01, 0.0, -0.075), _ONE),
     "left_linkage_brace_collision": ("left_knee_link", "capsule", (0.03, 0.04), (0.01, 0.0, -0.24), _ONE),
     "left_foot1_collision": (
@@ -206,17 +216,71 @@ SHAPES = {
         (0.075, -0.0265, -0.025),
         (0.707107, -0.0141393, 0.706965, 0.0),
     ),
-    "left_foot2_collision": ("left_ankle_roll_link", "capsule", (0.01, 0.0835), (0.0395, -0.018, -0.025), (0.707107, 0.0, -0.707107, 0.0)),
-    "left_foot3_collision": ("left_ankle_roll_link", "capsule", (0.01, 0.091), (0.039, -0.01, -0.025), (0.707107, 0.0, -0.707107, 0.0)),
-    "left_foot4_collision": ("left_ankle_roll_link", "capsule", (0.01, 0.093), (0.039, 0.0, -0.025), (0.707107, 0.0, -0.707107, 0.0)),
-    "left_foot5_collision": ("left_ankle_roll_link", "capsule", (0.01, 0.091), (0.039, 0.01, -0.025), (0.707107, 0.0, -0.707107, 0.0)),
-    "left_foot6_collision": ("left_ankle_roll_link", "capsule", (0.01, 0.0835), (0.0395, 0.018, -0.025), (0.707107, 0.0, -0.707107, 0.0)),
-    "left_foot7_collision": ("left_ankle_roll_link", "capsule", (0.01, 0.025), (0.075, 0.026, -0.025), (0.707107, 0.0, 0.707107, 0.0)),
+    "left_foot2_collision": (
+        "left_ankle_roll_link",
+        "capsule",
+        (0.01, 0.0835),
+        (0.0395, -0.018, -0.025),
+        (0.707107, 0.0, -0.707107, 0.0),
+    ),
+    "left_foot3_collision": (
+        "left_ankle_roll_link",
+        "capsule",
+        (0.01, 0.091),
+        (0.039, -0.01, -0.025),
+        (0.707107, 0.0, -0.707107, 0.0),
+    ),
+    "left_foot4_collision": (
+        "left_ankle_roll_link",
+        "capsule",
+        (0.01, 0.093),
+        (0.039, 0.0, -0.025),
+        (0.707107, 0.0, -0.707107, 0.0),
+    ),
+    "left_foot5_collision": (
+        "left_ankle_roll_link",
+        "capsule",
+        (0.01, 0.091),
+        (0.039, 0.01, -0.025),
+        (0.707107, 0.0, -0.707107, 0.0),
+    ),
+    "left_foot6_collision": (
+        "left_ankle_roll_link",
+        "capsule",
+        (0.01, 0.0835),
+        (0.0395, 0.018, -0.025),
+        (0.707107, 0.0, -0.707107, 0.0),
+    ),
+    "left_foot7_collision": (
+        "left_ankle_roll_link",
+        "capsule",
+        (0.01, 0.025),
+        (0.075, 0.026, -0.025),
+        (0.707107, 0.0, 0.707107, 0.0),
+    ),
     "torso_collision": ("torso_link", "capsule", (0.09, 0.06), (0.01, 0.0, 0.14), (6.12323e-17, 1.0, 0.0, 0.0)),
     "head_collision": ("torso_link", "sphere", (0.06,), (0.0, 0.0, 0.43), _ONE),
-    "left_shoulder_yaw_collision": ("left_shoulder_yaw_link", "capsule", (0.035, 0.065), (0.0, 0.0, -0.015), (6.12323e-17, 1.0, 0.0, 0.0)),
-    "left_elbow_yaw_collision": ("left_elbow_link", "capsule", (0.035, 0.045), (0.035, 0.0, -0.01), (0.707107, 0.0, -0.707107, 0.0)),
-    "left_wrist_collision": ("left_wrist_pitch_link", "capsule", (0.035, 0.035), (0.025, 0.0, 0.0), (0.707107, 0.0, -0.707107, 0.0)),
+    "left_shoulder_yaw_collision": (
+        "left_shoulder_yaw_link",
+        "capsule",
+        (0.035, 0.065),
+        (0.0, 0.0, -0.015),
+        (6.12323e-17, 1.0, 0.0, 0.0),
+    ),
+    "left_elbow_yaw_collision": (
+        "left_elbow_link",
+        "capsule",
+        (0.035, 0.045),
+        (0.035, 0.0, -0.01),
+        (0.707107, 0.0, -0.707107, 0.0),
+    ),
+    "left_wrist_collision": (
+        "left_wrist_pitch_link",
+        "capsule",
+        (0.035, 0.035),
+        (0.025, 0.0, 0.0),
+        (0.707107, 0.0, -0.707107, 0.0),
+    ),
     "left_hand_collision": (
         "left_wrist_yaw_link",
         "capsule",
@@ -227,13 +291,19 @@ SHAPES = {
 }
 # what is published for the right side and is no mirror image: place; quaternion of the inertia and moments; shape
 RIGHT_PLACE = {"right_shoulder_pitch_link": (0.0039563, -0.10021, 0.24778)}
-RIGHT_INERTIA = {"right_knee_link": ((0.923438887, 0.0345275958, 0.0116332986, -0.382011953), (0.011374, 0.0112843, 0.00146452))}
+RIGHT_INERTIA = {
+    "right_knee_link": ((0.923438887, 0.0345275958, 0.0116332986, -0.382011953), (0.011374, 0.0112843, 0.00146452))
+}
 RIGHT_SHAPE = {"right_foot1_collision": ((0.01, 0.025), (0.075, -0.026, -0.025), (0.707107, 0.0, 0.707107, 0.0))}
 
 
 def sides(name: str) -> list[tuple[str, np.ndarray]]:
     """The names of a link or a shape, each with what turns the typed figures into its own."""
-    return [(name, np.eye(3)), (name.replace("left_", "right_"), MIRROR)] if name.startswith("left_") else [(name, np.eye(3))]
+    return (
+        [(name, np.eye(3)), (name.replace("left_", "right_"), MIRROR)]
+        if name.startswith("left_")
+        else [(name, np.eye(3))]
+    )
 
 
 @pytest.fixture(scope="module")
@@ -298,7 +368,11 @@ def test_joints(model: mujoco.MjModel) -> None:
     assert [model.joint(i).name for i in range(1, model.njnt)] == [f"{name}_joint" for name in JOINTS]
     for name, (axis, low, high, armature, force) in JOINTS.items():
         joint = model.joint(f"{name}_joint")
-        assert joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE and joint.limited[0] == 1 and model.jnt_actfrclimited[joint.id] == 1
+        assert (
+            joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE
+            and joint.limited[0] == 1
+            and model.jnt_actfrclimited[joint.id] == 1
+        )
         np.testing.assert_array_equal(joint.axis, np.eye(3)["xyz".index(axis)], err_msg=name)
         np.testing.assert_array_equal(joint.range, (low, high), err_msg=name)
         np.testing.assert_array_equal(model.jnt_actfrcrange[joint.id], (-force, force), err_msg=name)

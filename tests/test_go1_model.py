@@ -30,7 +30,12 @@ HOME_HIP, HOME_THIGH, HOME_CALF = 0.1, 0.9, -1.8  # hip: + on the right, - on th
 _HIP = (0.000734064, 0.000468438, 0.000398719)
 _THIGH = (0.00478717, 0.00460903, 0.000709268)
 _THIGH_R = (1.009, (-0.00304722, 0.019315, -0.0305004), (0.652429805, -0.0272312919, 0.0775125769, 0.753382775), _THIGH)
-_THIGH_L = (1.009, (-0.00304722, -0.019315, -0.0305004), (0.753382775, 0.0775125769, -0.0272312919, 0.652429805), _THIGH)
+_THIGH_L = (
+    1.009,
+    (-0.00304722, -0.019315, -0.0305004),
+    (0.753382775, 0.0775125769, -0.0272312919, 0.652429805),
+    _THIGH,
+)
 _CALF = (
     0.195862,
     (0.00429862, 0.000976676, -0.146197),
@@ -73,7 +78,11 @@ def shapes(body: str) -> list[tuple[str, tuple, tuple, tuple]]:
     s = 1 if leg[1] == "L" else -1
     if link == "hip":
         rear = [("cylinder", (0.046, 0.02), (0.0, 0.0, 0.0), _Y)] if leg[0] == "R" else []
-        return [("cylinder", (0.046, 0.02), (0.0, s * 0.045, 0.0), _Y), ("cylinder", (0.031, 0.02), (0.0, s * 0.065, 0.0), _Y), *rear]
+        return [
+            ("cylinder", (0.046, 0.02), (0.0, s * 0.045, 0.0), _Y),
+            ("cylinder", (0.031, 0.02), (0.0, s * 0.065, 0.0), _Y),
+            *rear,
+        ]
     if link == "thigh":
         return [
             ("capsule", (0.015, 0.08), (-0.02, 0.0, -0.08), _ONE),
@@ -274,7 +283,16 @@ def test_without_its_looks_it_is_the_same_machine(model: mujoco.MjModel) -> None
     assert {bare.geom(i).name for i in range(bare.ngeom)} == collision
     assert bare.ngeom == sum(len(shapes(name)) for name in INERTIALS) == 37
     assert (bare.nmesh, bare.nmat, bare.ntex) == (0, 0, 0)
-    for field in ("body_mass", "body_ipos", "body_iquat", "body_inertia", "body_invweight0", "dof_invweight0", "site_pos", "key_qpos"):
+    for field in (
+        "body_mass",
+        "body_ipos",
+        "body_iquat",
+        "body_inertia",
+        "body_invweight0",
+        "dof_invweight0",
+        "site_pos",
+        "key_qpos",
+    ):
         np.testing.assert_array_equal(getattr(bare, field), getattr(model, field), err_msg=field)
 
 

@@ -23,7 +23,11 @@ IMU = (-0.02557, 0.0, 0.04232)
 STANCE = {"hip": (0.1, -0.1), "thigh": (0.8, 1.0), "calf": (-1.5, -1.5)}  # hip: left, right; else front, rear
 
 # mass, com, quaternion of the inertia, principal moments
-_HIP, _THIGH, _CALF = (0.00088403, 0.000596003, 0.000479967), (0.00594973, 0.00584149, 0.000878787), (0.0014901, 0.00146356, 5.31397e-05)
+_HIP, _THIGH, _CALF = (
+    (0.00088403, 0.000596003, 0.000479967),
+    (0.00594973, 0.00584149, 0.000878787),
+    (0.0014901, 0.00146356, 5.31397e-05),
+)
 _THIGH_L = (1.152, (-0.00374, -0.0223, -0.0327), (0.829532869, 0.0847634866, -0.0200631968, 0.551622913), _THIGH)
 _THIGH_R = (1.152, (-0.00374, 0.0223, -0.0327), (0.551622913, -0.0200631968, 0.0847634866, 0.829532869), _THIGH)
 _CALF_L = (
@@ -129,7 +133,9 @@ def test_masses(model: mujoco.MjModel) -> None:
         assert model.body(name).mass[0] == mass
         np.testing.assert_array_equal(model.body(name).ipos, com)
         expected = tensor(quat, moments)
-        np.testing.assert_allclose(compiled_tensor(model, name), expected, rtol=0, atol=1e-9 * np.trace(expected), err_msg=name)
+        np.testing.assert_allclose(
+            compiled_tensor(model, name), expected, rtol=0, atol=1e-9 * np.trace(expected), err_msg=name
+        )
 
 
 @pytest.mark.parametrize("name", LINK_NAMES)
@@ -154,7 +160,11 @@ def test_the_free_joint_is_free(model: mujoco.MjModel) -> None:
 def test_what_collides(model: mujoco.MjModel) -> None:
     assert np.count_nonzero(model.geom_contype) == sum(len(shapes(body)) for body in INERTIALS) == 23
     for body in INERTIALS:
-        geoms = [model.geom(i) for i in range(model.ngeom) if model.geom_bodyid[i] == model.body(body).id and model.geom_contype[i]]
+        geoms = [
+            model.geom(i)
+            for i in range(model.ngeom)
+            if model.geom_bodyid[i] == model.body(body).id and model.geom_contype[i]
+        ]
         for geom, (kind, size, pos, quat) in zip(geoms, shapes(body), strict=True):
             assert geom.name and geom.group[0] == 3 and (geom.contype[0], geom.conaffinity[0]) == (1, 1)
             assert geom.type[0] == getattr(mujoco.mjtGeom, f"mjGEOM_{kind.upper()}")
@@ -196,7 +206,15 @@ def test_visual_geoms_weigh_nothing_and_touch_nothing(model: mujoco.MjModel) -> 
     spec.compiler.discardvisual = True
     bare = spec.compile()
     assert (bare.ngeom, bare.nmesh, bare.nmat) == (23, 0, 0)
-    for field in ("body_mass", "body_ipos", "body_iquat", "body_inertia", "body_invweight0", "dof_invweight0", "site_pos"):
+    for field in (
+        "body_mass",
+        "body_ipos",
+        "body_iquat",
+        "body_inertia",
+        "body_invweight0",
+        "dof_invweight0",
+        "site_pos",
+    ):
         np.testing.assert_array_equal(getattr(bare, field), getattr(model, field), err_msg=field)
 
 

@@ -95,7 +95,10 @@ ROUGH: dict[str, object] = {
 
 
 BIPED: dict[str, object] = {
-    **{f"rewards__scales__{name}": 0.1 for name in ("base_height", "dof_vel", "hip_pos", "single_stance", "contact_phase", "no_fly")},
+    **{
+        f"rewards__scales__{name}": 0.1
+        for name in ("base_height", "dof_vel", "hip_pos", "single_stance", "contact_phase", "no_fly")
+    },
     "rewards__base_height_target": 0.78,
     "rewards__hip_joints": ["hip_roll", "hip_yaw"],
     "rewards__torques_as": "squares",
@@ -142,12 +145,21 @@ def test_replay_equals_eager_over_100_steps(task: str, settings: dict[str, objec
     assert recorded._graph.recorded and not eager._graph.recorded
     assert any(done.any() for done in expected[3::5])
     for i, (a, b) in enumerate(zip(expected, got, strict=True)):
-        assert torch.equal(a, b), f"step {i // 5}, output {i % 5}: largest difference {(a.float() - b.float()).abs().max():g}"
+        assert torch.equal(a, b), (
+            f"step {i // 5}, output {i % 5}: largest difference {(a.float() - b.float()).abs().max():g}"
+        )
 
 
 @pytest.mark.parametrize(
     ("task", "settings"),
-    [("go1_flat", {}), ("go1_flat", RANDOMIZED), ("go1_flat", ROUGH), ("g1_flat", BIPED), ("go1_getup", {}), ("g1_track", {})],
+    [
+        ("go1_flat", {}),
+        ("go1_flat", RANDOMIZED),
+        ("go1_flat", ROUGH),
+        ("g1_flat", BIPED),
+        ("go1_getup", {}),
+        ("g1_track", {}),
+    ],
     ids=["nominal", "randomized", "rough", "biped", "falls", "a motion"],
 )
 def test_a_fused_step_is_the_eager_one_to_rounding(
@@ -162,16 +174,25 @@ def test_a_fused_step_is_the_eager_one_to_rounding(
     assert "not fused" not in capsys.readouterr().out
     for i, (a, b) in enumerate(zip(expected, got, strict=True)):
         off = ~torch.isclose(a.float(), b.float(), rtol=1e-3, atol=1e-3)
-        assert off.float().mean() < 0.01, f"step {i // 5}, output {i % 5}: {off.float().mean():.3f} of the values differ"
+        assert off.float().mean() < 0.01, (
+            f"step {i // 5}, output {i % 5}: {off.float().mean():.3f} of the values differ"
+        )
 
 
 @pytest.mark.parametrize("law", ["servo", "dc_motor", "speed", "torque", "network", "own"])
 def test_motors_replay_as_they_run_eager(law: str, tmp_path: Path) -> None:
     """Bit for bit, delayed by 0 to 30 ms, with drawn gains and curves, and episodes that end."""
     net = save(mlp(torque_scale=20.0)[1], tmp_path)
-    drawn = {f"domain_rand.{name}": [0.8, 1.2] for name in ("stiffness", "damping", "strength", "stall_torque", "no_load_speed")}
+    drawn = {
+        f"domain_rand.{name}": [0.8, 1.2]
+        for name in ("stiffness", "damping", "strength", "stall_torque", "no_load_speed")
+    }
     fields: dict[str, object] = {**CURVE, **drawn, "domain_rand.enable": True, "domain_rand.delay_ms": [0.0, 30.0]}
-    fields |= {"control.actuator": "servo" if law == "own" else law, "control.network": net, "env.episode_length_s": 0.5}
+    fields |= {
+        "control.actuator": "servo" if law == "own" else law,
+        "control.network": net,
+        "env.episode_length_s": 0.5,
+    }
     fields |= {"control.action_scale": 5.0} if law in ("torque", "speed") else {}
     if law == "speed":
         law, fields = "dc_motor", fields | {"control.actuator": "dc_motor", "control.action_origin": "speed"}
@@ -186,7 +207,9 @@ def test_motors_replay_as_they_run_eager(law: str, tmp_path: Path) -> None:
         outs.append(roll_out(env, actions))
         assert env._graph.recorded != eager and env.actuators.law == law
     for i, (a, b) in enumerate(zip(*outs, strict=True)):
-        assert torch.equal(a, b), f"step {i // 5}, output {i % 5}: largest difference {(a.float() - b.float()).abs().max():g}"
+        assert torch.equal(a, b), (
+            f"step {i // 5}, output {i % 5}: largest difference {(a.float() - b.float()).abs().max():g}"
+        )
 
 
 def test_rough_ground_trains_without_overflow_and_resumes_on_its_levels(tmp_path: Path) -> None:
@@ -232,12 +255,15 @@ def test_replay_equals_eager_with_contacts() -> None:
 @pytest.mark.parametrize("task", ["go1_flat", "g1_flat"])
 def test_what_physics_leaves_out_is_missed_by_nothing(task: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Recorded, with and without: alike as two runs of the same are."""
-    actions = 0.3 * torch.randn(8, 64, {"go1_flat": 12, "g1_flat": 29}[task], generator=torch.Generator().manual_seed(0)).to(DEVICE)
+    actions = 0.3 * torch.randn(
+        8, 64, {"go1_flat": 12, "g1_flat": 29}[task], generator=torch.Generator().manual_seed(0)
+    ).to(DEVICE)
     short = roll_out(make_env(False, task), actions)
     monkeypatch.setattr(shortcuts, "KNOWN", ())
     monkeypatch.setattr(contact_count, "countable", lambda model: {})
     whole = roll_out(make_env(False, task), actions)
-    for group, (quantile, most) in enumerate([(0.99, 1e-3), (0.98, 1e-2)]):  # the second has an accelerometer and forces
+    # the second has an accelerometer and forces
+    for group, (quantile, most) in enumerate([(0.99, 1e-3), (0.98, 1e-2)]):
         for a, b in zip(short[group::5], whole[group::5], strict=True):
             assert torch.quantile((a - b).abs(), quantile) < most
 
@@ -516,7 +542,9 @@ def test_recorded_distillation_is_rsl_rls_own(settings: dict, monkeypatch: pytes
         distilling.share_experience(stock, ours)
         distilling.take_over(ours, stock)
         expected, got = stock.update(), ours.update()
-        assert difference(distilling.parameters(stock), distilling.parameters(ours)) < (1e-3 if "memory" in settings else 1e-4)
+        assert difference(distilling.parameters(stock), distilling.parameters(ours)) < (
+            1e-3 if "memory" in settings else 1e-4
+        )
         assert float(got["behavior"]) == pytest.approx(expected["behavior"], rel=1e-3)
     assert ours._update_graph.recorded
 
@@ -552,7 +580,9 @@ def test_a_recorded_warm_up_ends(networks: dict) -> None:
     for seed in range(5):
         collect(alg, DEVICE, seed=seed)
         update(alg)
-    assert alg._update_graph.recorded and not torch.equal(parameters(alg)["actor.mlp.0.weight"], warm["actor.mlp.0.weight"])
+    assert alg._update_graph.recorded and not torch.equal(
+        parameters(alg)["actor.mlp.0.weight"], warm["actor.mlp.0.weight"]
+    )
 
 
 def test_a_students_iteration_never_waits_for_the_host() -> None:
@@ -598,6 +628,8 @@ def test_a_run_goes_on_in_the_worlds_that_it_left(tmp_path: Path) -> None:
     again = make_runner(other, task.train, None, DEVICE)
     again.load(str(tmp_path / "model_6.pt"))
     restored = worlds_state(other)
-    assert again.begins_anew == "" and all(torch.equal(restored[name].nan_to_num(), value.nan_to_num()) for name, value in kept.items())
+    assert again.begins_anew == "" and all(
+        torch.equal(restored[name].nan_to_num(), value.nan_to_num()) for name, value in kept.items()
+    )
     again.learn(5, init_at_random_ep_len=False)
     assert again.current_learning_iteration == 11

@@ -18,7 +18,8 @@ from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.sim.warp_engine import WarpSimulation
 
 RADIUS = 0.023  # [m] of a Go1's foot
-BRICK, CORNERS = np.array([0.1, 0.05, 0.02]), np.array(list(itertools.product((-1.0, 1.0), repeat=3)))  # a mesh of half these sizes [m]
+# a mesh of half these sizes [m]
+BRICK, CORNERS = np.array([0.1, 0.05, 0.02]), np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 MESH = {"type": mujoco.mjtGeom.mjGEOM_MESH, "meshname": "brick"}
 
 
@@ -35,7 +36,9 @@ def ball_model(terrain: Terrain | None, shape: dict[str, Any] | None = None) -> 
         low, high = terrain.span()
         rows, columns = terrain.heights.shape
         size = [(columns - 1) * terrain.cell / 2, (rows - 1) * terrain.cell / 2, max(high - low, 1e-3), 1.0]
-        spec.add_hfield(name="g", size=size, nrow=rows, ncol=columns, userdata=((terrain.heights - low) / size[2]).ravel())
+        spec.add_hfield(
+            name="g", size=size, nrow=rows, ncol=columns, userdata=((terrain.heights - low) / size[2]).ravel()
+        )
         floor = {"type": mujoco.mjtGeom.mjGEOM_HFIELD, "hfieldname": "g", "pos": [0, 0, low]}
     spec.worldbody.add_geom(name=GROUND, priority=1, friction=[0.6, 0.005, 0.0001], **floor)
     body = spec.worldbody.add_body(name="ball")
@@ -59,7 +62,10 @@ def nearest(terrain: Terrain, place: np.ndarray) -> tuple[float, np.ndarray]:
     """Signed distance [m] of a point from the triangles around it, and the direction away from the ground; by brute force."""
     column, row = ((place[:2] - terrain.corner) / terrain.cell).astype(int)
     c, r = np.meshgrid(np.arange(column - 3, column + 4), np.arange(row - 3, row + 4))
-    x, y = terrain.corner[0] + np.stack([c, c + 1]) * terrain.cell, terrain.corner[1] + np.stack([r, r + 1]) * terrain.cell
+    x, y = (
+        terrain.corner[0] + np.stack([c, c + 1]) * terrain.cell,
+        terrain.corner[1] + np.stack([r, r + 1]) * terrain.cell,
+    )
     corners = np.array([[x[i], y[j], terrain.heights[r + j, c + i]] for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))])
     triangles = corners[[[0, 1, 2], [0, 2, 3]]].transpose(1, 3, 4, 0, 2).reshape(3, -1, 3)
     each = place - _closest(place, *triangles)
@@ -125,7 +131,8 @@ def test_flat_ground_is_a_plane_with_one_contact_a_ball(device: str) -> None:
 
 def test_a_slope_has_no_edges_inside(device: str) -> None:
     terrain = ground("smooth_slope")
-    places = np.column_stack([np.full(50, 3.3), np.linspace(-0.5, 0.5, 50), np.zeros(50)])  # on one side of the pyramid of level 1
+    # on one side of the pyramid of level 1
+    places = np.column_stack([np.full(50, 3.3), np.linspace(-0.5, 0.5, 50), np.zeros(50)])
     places[:, 2] = [terrain.heights[60, round((3.3 - terrain.corner[0]) / 0.05)] + 0.022] * 50
     world, _, normal = contacts(terrain, places, device)
     assert len(world) == len(set(world)) > 0
@@ -176,7 +183,9 @@ def test_shapes_and_their_probes() -> None:
     assert nearest_probe.max() < 0.1 / np.sqrt(2) + 1e-6, "10 cm apart along either way"
     model = ball_model(None)
     model.geom_type[1] = kinds.mjGEOM_HFIELD
-    with pytest.raises(ModelError, match=r"^geom 'ball' is a hfield: its surface is not known as points, .* or take `engine` = mujoco$"):
+    with pytest.raises(
+        ModelError, match=r"^geom 'ball' is a hfield: its surface is not known as points, .* or take `engine` = mujoco$"
+    ):
         probes(model, 0)
 
 
@@ -196,7 +205,9 @@ def test_a_mesh_is_probed_at_its_corners_and_between_them() -> None:
     places = places @ turn.reshape(3, 3).T + model.mesh_pos[0]
     assert set(geoms) == {1} and not any(radii)
     assert {tuple(corner) for corner in (BRICK * CORNERS).round(6)} <= {tuple(place) for place in places.round(6)}
-    on_surface = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 41), np.linspace(-0.05, 0.05, 21), [-0.02, 0.02]), axis=-1).reshape(-1, 1, 3)
+    on_surface = np.stack(
+        np.meshgrid(np.linspace(-0.1, 0.1, 41), np.linspace(-0.05, 0.05, 21), [-0.02, 0.02]), axis=-1
+    ).reshape(-1, 1, 3)
     assert np.linalg.norm(on_surface - places, axis=-1).min(axis=1).max() < 0.1 / np.sqrt(2) + 1e-6
     assert len(places) < 20, "no more than keeps the surface covered"
 
@@ -236,9 +247,13 @@ def test_a_mesh_rests_as_the_box_of_its_size_does(field: str, device: str) -> No
     slope = 0.4 if field == "smooth_slope" else 0.0  # down along x
     from_middle = place[2] - 0.05 + slope * place[0]  # what the ground's plane has for z + slope * x
     for pose in (rest[0], data.qpos) if field == "flat" else rest:  # MuJoCo's own has tilted contacts on a slope
-        assert (pose[2] + slope * pose[0] - from_middle) / np.hypot(1.0, slope) == pytest.approx(0.02, abs=1e-3), "half its height"
+        assert (pose[2] + slope * pose[0] - from_middle) / np.hypot(1.0, slope) == pytest.approx(0.02, abs=1e-3), (
+            "half its height"
+        )
         w, x, y, z = pose[3:]
-        assert (2 * (x * z + w * y) * slope + 1 - 2 * (x * x + y * y)) / np.hypot(1.0, slope) > 0.999, "it lies on its flat side"
+        assert (2 * (x * z + w * y) * slope + 1 - 2 * (x * x + y * y)) / np.hypot(1.0, slope) > 0.999, (
+            "it lies on its flat side"
+        )
 
 
 @pytest.mark.parametrize(
@@ -264,7 +279,12 @@ def test_what_lies_across_an_edge_does_not_sink_into_it(shape: dict[str, Any], d
 def test_too_little_room_is_seen() -> None:
     terrain = ground("flat")
     sim = WarpSimulation(
-        ball_model(terrain, {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [0.1] * 3}), 3, "cpu", nconmax=1, njmax=24, terrain=terrain
+        ball_model(terrain, {"type": mujoco.mjtGeom.mjGEOM_BOX, "size": [0.1] * 3}),
+        3,
+        "cpu",
+        nconmax=1,
+        njmax=24,
+        terrain=terrain,
     )
     sim.qpos[:, 2] = 0.099
     sim.step()

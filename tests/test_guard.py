@@ -117,7 +117,9 @@ ALLOWED: dict[str, Callable[[], object]] = {
     "slice and None": lambda: X[:, None, :2],
     "len and shape": lambda: (len(X), X.shape, X.dim(), X.numel(), X.data_ptr()),
     "unpack": lambda: [row.sum() for row in X],
-    "random": lambda: torch.rand(2, device="cpu").exponential_().add_(torch.empty_like(ONE, dtype=torch.float).uniform_(-1.0, 1.0)),
+    "random": lambda: (
+        torch.rand(2, device="cpu").exponential_().add_(torch.empty_like(ONE, dtype=torch.float).uniform_(-1.0, 1.0))
+    ),
     "zeros_like": lambda: torch.zeros_like(X),
     "new_zeros": lambda: X.new_zeros(2),
     "zeros on a device": lambda: torch.zeros(2, device="cpu"),
@@ -127,7 +129,13 @@ ALLOWED: dict[str, Callable[[], object]] = {
     "scalar tensor arithmetic": lambda: (X * ONE).clamp_(max=ONE),
     "gather and scatter": lambda: (X.gather(1, ONE.expand(2, 3)), X.index_select(1, PICK), X.index_fill(1, PICK, 0.0)),
     "repeat_interleave by a number": lambda: X.repeat_interleave(2, dim=0),
-    "reduce": lambda: (X.sum(dim=1), X.amax(), MASK.any(), torch.linalg.vector_norm(X, dim=1), torch.linalg.cross(X, X)),
+    "reduce": lambda: (
+        X.sum(dim=1),
+        X.amax(),
+        MASK.any(),
+        torch.linalg.vector_norm(X, dim=1),
+        torch.linalg.cross(X, X),
+    ),
 }
 
 
@@ -141,7 +149,8 @@ def test_host_reads_are_caught(call: Callable[[], object]) -> None:
 def test_host_data_is_caught(call: Callable[[], object]) -> None:
     with (
         pytest.raises(
-            NotRecordable, match="copies data from the host|copies from the host|copies between host and device|makes a tensor on the host"
+            NotRecordable,
+            match="copies data from the host|copies from the host|copies between host and device|makes a tensor on the host",
         ),
         recordable(),
     ):
@@ -168,7 +177,12 @@ def test_ordinary_operations_pass(call: Callable[[], object]) -> None:
 
 
 def test_guard_ends_with_its_block() -> None:
-    with pytest.raises(NotRecordable, match="^item.. reads a tensor to the host; keep it a tensor and compute with that$"), recordable():
+    with (
+        pytest.raises(
+            NotRecordable, match="^item.. reads a tensor to the host; keep it a tensor and compute with that$"
+        ),
+        recordable(),
+    ):
         X[0, 0].item()
     assert X[0, 1].item() == 1.0
 
@@ -263,7 +277,9 @@ TASK = Task(Mine, Go1FlatCfg, Go1FlatCfgPPO)
 """
 CONDITION = "a tensor as a condition (if, and, not, in) is read to the host; write torch.where(condition, a, b)"
 SCALAR = "a tensor without dimensions as an index is read to the host; write x.index_select(dim, index.view(1)), or use a Python int"
-MASK_INDEX = "a mask as an index has a shape that depends on data; write torch.where(mask, a, b), or assign(x, mask, value)"
+MASK_INDEX = (
+    "a mask as an index has a shape that depends on data; write torch.where(mask, a, b), or assign(x, mask, value)"
+)
 MADE_ONCE = "becomes another tensor; make it once, in __init__, and write in place"
 PAST = f"self.past {MADE_ONCE}: self.past.copy_(...)"
 NUMBER = "self.count is a Python number and changes, but a replay repeats what was recorded; make it a tensor"
@@ -293,8 +309,16 @@ BREACHES: dict[str, tuple[str, str, str]] = {
         "self.fell.nonzero()",
         "Mine._end_step: nonzero has a shape that depends on data; keep every row, and write torch.where(mask, a, b)",
     ),
-    "rebound": (END_STEP, "self.past = self.past + 1.0", f"Mine._end_step: self.past {MADE_ONCE}: self.past.copy_(...)"),
-    "rebound view": (END_STEP, "self.view = self.dof_vel[:, :3]", f"Mine._end_step: self.view {MADE_ONCE}: self.view.copy_(...)"),
+    "rebound": (
+        END_STEP,
+        "self.past = self.past + 1.0",
+        f"Mine._end_step: self.past {MADE_ONCE}: self.past.copy_(...)",
+    ),
+    "rebound view": (
+        END_STEP,
+        "self.view = self.dof_vel[:, :3]",
+        f"Mine._end_step: self.view {MADE_ONCE}: self.view.copy_(...)",
+    ),
     "rebound in a part": (
         END_STEP,
         "self.parts.kept['past'] = self.past.abs()",
@@ -324,7 +348,11 @@ BREACHES: dict[str, tuple[str, str, str]] = {
         "self.past = self.past.clone()",
         f"Mine.load_training_state: {PAST}",
     ),
-    "rebound in a deque": (END_STEP, "self.frames.rotate()", f"Mine._end_step: self.frames[0] {MADE_ONCE}: self.frames[0].copy_(...)"),
+    "rebound in a deque": (
+        END_STEP,
+        "self.frames.rotate()",
+        f"Mine._end_step: self.frames[0] {MADE_ONCE}: self.frames[0].copy_(...)",
+    ),
     "rebound in slots": (
         END_STEP,
         "self.slots.one = self.past * 2",
@@ -333,7 +361,11 @@ BREACHES: dict[str, tuple[str, str, str]] = {
     "Python's random numbers": (REWARD, "self.dt * random.random()", f"Mine._reward_pose: {DRAWS}"),
     "numpy's random numbers": (END_STEP, "self.past += np.random.rand()", f"Mine._end_step: {DRAWS}"),
     "a generator of numpy's": (END_STEP, "self.past += RNG.normal()", f"Mine._end_step: {DRAWS}"),
-    "a buffer without a device": (INIT, "self.own = torch.zeros(self.num_envs)", f"Mine._init_ranges: zeros() {ON_HOST}"),
+    "a buffer without a device": (
+        INIT,
+        "self.own = torch.zeros(self.num_envs)",
+        f"Mine._init_ranges: zeros() {ON_HOST}",
+    ),
     "computed from a number without a device": (
         INIT,
         "self.own = torch.tensor(0.5).expand(4)",
@@ -344,7 +376,11 @@ BREACHES: dict[str, tuple[str, str, str]] = {
         "self.own = {'a': torch.arange(3)[None] / 2.0 + 1.0}['a']",
         f"Mine._init_ranges: arange() {ON_HOST}",
     ),
-    "a network without a device": (INIT, "self.own = torch.nn.Linear(1, 1).weight.detach()", f"Mine._init_ranges: empty() {ON_HOST}"),
+    "a network without a device": (
+        INIT,
+        "self.own = torch.nn.Linear(1, 1).weight.detach()",
+        f"Mine._init_ranges: empty() {ON_HOST}",
+    ),
     "writes": (
         REWARD,
         "self.past += 1.0",
@@ -425,7 +461,10 @@ def test_a_tensor_that_a_file_holds_is_named(tmp_path: Path) -> None:
 ORDINARY = {
     "reads": (REWARD, "self.foot_height.index_select(1, self.rows).sum(dim=1) * self.foot"),
     "own tensors": (REWARD, "(self.past + 1.0).mul_(2.0).masked_fill_(self.fell, 0.0)"),
-    "in place": (END_STEP, "self.past += 1.0; self.view = self.dof_pos[:, :3]; self.parts.kept['past'].copy_(self.past)"),
+    "in place": (
+        END_STEP,
+        "self.past += 1.0; self.view = self.dof_pos[:, :3]; self.parts.kept['past'].copy_(self.past)",
+    ),
     "made in the first step": (END_STEP, "self.half = getattr(self, 'half', None) or [torch.tensor(0.5)]"),
     "a number that stays": (END_STEP, "self.unknown = float('nan')"),
     "on the device": (END_STEP, "self.past.add_(self.moved + self.net(self.past[:, None])[:, 0])"),
@@ -502,7 +541,9 @@ def test_a_capture_that_fails_names_the_line(tmp_path: Path, monkeypatch: pytest
     assert raised.value.__suppress_context__  # one traceback, not three
 
 
-@pytest.mark.parametrize("error", [RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"), KeyError("state"), ConfigError("no")])
+@pytest.mark.parametrize(
+    "error", [RuntimeError("CUDA out of memory. Tried to allocate 2 GiB"), KeyError("state"), ConfigError("no")]
+)
 def test_other_failures_stay_what_they_are(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
     def fn() -> None:
         raise error

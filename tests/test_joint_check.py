@@ -40,7 +40,9 @@ class Wired(Watched):
         assert stiffness is not None
         self.pose = self.pose if self.written else targets.copy()
         self.written.append((targets.copy(), stiffness.copy()))
-        super().write(self.wrong(targets.copy(), self.pose) if self.wrong else targets, stiffness=stiffness, damping=damping)
+        super().write(
+            self.wrong(targets.copy(), self.pose) if self.wrong else targets, stiffness=stiffness, damping=damping
+        )
 
 
 def checked(robot: Robot, source: Script | None = None, safety: Safety | None = None) -> tuple[JointCheck, Summary]:
@@ -66,8 +68,12 @@ def test_a_right_robot_is_right() -> None:
     assert np.abs(targets - targets[0]).max() < STEP + 1e-9 and np.abs(np.diff(targets, axis=0)).max() < 0.01
     assert ((np.abs(targets - targets[0]) > 1e-9).sum(axis=1) <= 1).all()  # one joint at a time
     begins = [int(np.argmax(targets[:, joint] != targets[0, joint])) for joint in range(12)]
-    assert all(gains[begin, joint] == pytest.approx(SOFT * CONTRACT.stiffness[joint]) for joint, begin in enumerate(begins))
-    assert all((np.delete(gains[begin] / CONTRACT.stiffness, joint) > 0.999).all() for joint, begin in enumerate(begins))
+    assert all(
+        gains[begin, joint] == pytest.approx(SOFT * CONTRACT.stiffness[joint]) for joint, begin in enumerate(begins)
+    )
+    assert all(
+        (np.delete(gains[begin] / CONTRACT.stiffness, joint) > 0.999).all() for joint, begin in enumerate(begins)
+    )
     assert beyond(robot, LIMITS) < 0.02 and robot.done[-1] == "damp"
     assert np.abs(robot.joints[-1] - robot.joints[105]).max() < 0.05
 
@@ -78,7 +84,9 @@ def test_wrong_joints_are_named() -> None:
     def wrong(targets: Floats, pose: Floats) -> Floats:
         moved = targets - pose
         moved[[FL_HIP, FR_HIP]] = moved[[FR_HIP, FL_HIP]]
-        return pose + moved * np.select([np.arange(12) == each for each in (RL_THIGH, RR_CALF, FR_THIGH)], [-1.0, 0.0, 2.5], 1.0)
+        return pose + moved * np.select(
+            [np.arange(12) == each for each in (RL_THIGH, RR_CALF, FR_THIGH)], [-1.0, 0.0, 2.5], 1.0
+        )
 
     check, _ = checked(Wired(wrong))
     assert verdicts(check) == {
@@ -89,8 +97,13 @@ def test_wrong_joints_are_named() -> None:
         "RR_calf_joint": "STUCK: it did not move",
     }
     lines = check.report.strip().splitlines()
-    assert lines[4].startswith("FR_hip_joint       -  +0.10 ") and lines[4].endswith("  WRONG JOINT: FL_hip_joint moved in its place")
-    assert lines[-1].endswith("wrong: FL_hip_joint, FR_hip_joint, FR_thigh_joint, RL_thigh_joint, RR_calf_joint") and not check.right
+    assert lines[4].startswith("FR_hip_joint       -  +0.10 ") and lines[4].endswith(
+        "  WRONG JOINT: FL_hip_joint moved in its place"
+    )
+    assert (
+        lines[-1].endswith("wrong: FL_hip_joint, FR_hip_joint, FR_thigh_joint, RL_thigh_joint, RR_calf_joint")
+        and not check.right
+    )
 
 
 def test_joints_in_another_order_end_it() -> None:
@@ -118,7 +131,10 @@ def test_a_person_ends_it(source: Script, why: str) -> None:
 @pytest.mark.parametrize(
     ("fault", "found"),
     [
-        ("joint_sign=FL_thigh_joint", {"FL_thigh_joint": "WRONG SIGN OR JOINT: the body did not tilt as this joint tilts it"}),
+        (
+            "joint_sign=FL_thigh_joint",
+            {"FL_thigh_joint": "WRONG SIGN OR JOINT: the body did not tilt as this joint tilts it"},
+        ),
         ("joint_order=1", {}),
     ],
 )
@@ -138,14 +154,17 @@ def test_over_the_wire(fault: str, found: dict[str, str], domain: int) -> None:
     assert verdicts(check) == found and not check.right and not sim.acted["kp"].any() and sim.acted["kd"].all()
     if found:
         assert len(check.rows) == 3 and sim.record.beyond < 0.1
-        assert check.report.strip().splitlines()[3].split()[:3] == ["FL_calf_joint", "5", "-0.10"]  # it hangs at its end: the other way
+        # it hangs at its end: the other way
+        assert check.report.strip().splitlines()[3].split()[:3] == ["FL_calf_joint", "5", "-0.10"]
     else:
         assert done.trips[0].limit == "position" and "beyond its range" in check.report.strip().splitlines()[-1]
 
 
 def test_the_program_ends_with_code_1(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody started it."""
-    monkeypatch.setattr("sys.argv", ["deploy", str(GO2), "--check_joints", "--log", "off", "--time", "0.2s", "--limit", "late=off"])
+    monkeypatch.setattr(
+        "sys.argv", ["deploy", str(GO2), "--check_joints", "--log", "off", "--time", "0.2s", "--limit", "late=off"]
+    )
     with pytest.raises(SystemExit) as ended:
         program.main()
     assert ended.value.code == 1 and "0 of 12 joints checked; ended early: start: joint check" in capfd.readouterr().out
@@ -157,5 +176,7 @@ def test_what_it_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
         program.main()
     robot = Wired()
     robot.can_change_gains = False
-    with pytest.raises(RobotError, match="--check_joints is soft, and Wired cannot change its gains: no joint was moved"):
+    with pytest.raises(
+        RobotError, match="--check_joints is soft, and Wired cannot change its gains: no joint was moved"
+    ):
         checked(robot)

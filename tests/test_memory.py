@@ -59,7 +59,9 @@ def saved(task: LoadedTask, path: Path) -> MLPModel:
     torch.manual_seed(0)
     env = make_env(1)
     actor_class, settings = resolve_class(rsl_rl_config(task.train)["actor"])
-    actor = actor_class(env.get_observations(), task.train.to_dict()["obs_groups"], "actor", env.num_actions, **settings)
+    actor = actor_class(
+        env.get_observations(), task.train.to_dict()["obs_groups"], "actor", env.num_actions, **settings
+    )
     actor.obs_normalizer.update(torch.randn(50, 48) * 2.0 + 0.5)
     torch.save({"actor_state_dict": actor.state_dict()}, path)
     return actor.eval()
@@ -74,7 +76,9 @@ def test_resumed_learning_is_the_uninterrupted_one(tmp_path: Path) -> None:
     torch.manual_seed(0)
     one, two = (LeggedRobot(task.cfg, "cpu") for _ in range(2))
     uninterrupted, resumed = (make_runner(env, task.train, None, "cpu") for env in (one, two))
-    assert isinstance(uninterrupted.alg, GraphedPPO) and isinstance(resumed.alg, GraphedPPO) and uninterrupted.alg.graphed
+    assert (
+        isinstance(uninterrupted.alg, GraphedPPO) and isinstance(resumed.alg, GraphedPPO) and uninterrupted.alg.graphed
+    )
     uninterrupted.learn(1)
     uninterrupted.save(str(tmp_path / "model_1.pt"))
     copy_world(one, two)
@@ -157,7 +161,10 @@ def test_only_a_network_with_a_memory_gets_its_fields() -> None:
     task.set("critic.class_name", "MLPModel")
     learner = rsl_rl_config(task.train)
     assert (learner["actor"]["rnn_type"], learner["actor"]["rnn_num_layers"]) == ("lstm", 2)
-    assert not [name for name in learner["critic"] if name.startswith("rnn_")] and learner["critic"]["hidden_dims"] == [16, 16]
+    assert not [name for name in learner["critic"] if name.startswith("rnn_")] and learner["critic"]["hidden_dims"] == [
+        16,
+        16,
+    ]
 
 
 @pytest.mark.parametrize(
@@ -195,7 +202,9 @@ def test_the_worlds_that_act_alone_do_not_depend_on_the_others(actor: RNNModel) 
     """Each part of a roll-out remembers apart, from nothing on."""
     signals = {"action": lambda env: env.last_actions.clone(), "angle": lambda env: env.dof_pos.clone()}
     cases = [holding((0.1 * i, 0.0, 0.0)) for i in range(5)]
-    few, many = (roll_out(make_env(count, OVERRIDES), actor, cases[:count], 12, signals, alone=2).signals for count in (2, 5))
+    few, many = (
+        roll_out(make_env(count, OVERRIDES), actor, cases[:count], 12, signals, alone=2).signals for count in (2, 5)
+    )
     for name in signals:
         np.testing.assert_array_equal(few[name], many[name][:, :2])
     assert not np.array_equal(few["action"][4], few["action"][11])
@@ -280,12 +289,22 @@ def test_half_precision_rounds_what_remembers_too(tmp_path: Path) -> None:
     task = small_task()
     saved(task, tmp_path / "model.pt")
     exported = export(task, tmp_path / "model.pt", tmp_path / "out", half=True)
-    halves = [each.name for each in onnx.load(tmp_path / "out/policy.onnx").graph.initializer if each.data_type == onnx.TensorProto.FLOAT16]
-    assert "policy.rnn.rnn.weight_hh_l0" in halves and "policy.rnn.rnn.bias_hh_l0" not in halves and 0.0 < exported.gap < 0.01
+    halves = [
+        each.name
+        for each in onnx.load(tmp_path / "out/policy.onnx").graph.initializer
+        if each.data_type == onnx.TensorProto.FLOAT16
+    ]
+    assert (
+        "policy.rnn.rnn.weight_hh_l0" in halves
+        and "policy.rnn.rnn.bias_hh_l0" not in halves
+        and 0.0 < exported.gap < 0.01
+    )
     DeployStage(tmp_path / "out", 2).step(None)
 
 
-def test_an_export_whose_memory_deploy_would_not_forget_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_export_whose_memory_deploy_would_not_forget_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     task = small_task()
     saved(task, tmp_path / "model.pt")
 
@@ -296,7 +315,9 @@ def test_an_export_whose_memory_deploy_would_not_forget_is_refused(tmp_path: Pat
             self.memory = memory
 
     monkeypatch.setattr(export_replay, "Controller", Forgetful)
-    with pytest.raises(ExportError, match=r"deploy would act otherwise than the environment: memory \d is 0 in the environment and "):
+    with pytest.raises(
+        ExportError, match=r"deploy would act otherwise than the environment: memory \d is 0 in the environment and "
+    ):
         export(task, tmp_path / "model.pt", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -304,13 +325,19 @@ def test_an_export_whose_memory_deploy_would_not_forget_is_refused(tmp_path: Pat
 def test_a_memory_of_another_size_is_refused(tmp_path: Path) -> None:
     task = small_task()
     saved(task, tmp_path / "model.pt")
-    with pytest.raises(ConfigError, match=r"does not fit this task: actor mlp.0.weight is \(16, 8\) there and \(16, 9\) here"):
+    with pytest.raises(
+        ConfigError, match=r"does not fit this task: actor mlp.0.weight is \(16, 8\) there and \(16, 9\) here"
+    ):
         load_policy(tmp_path / "model.pt", make_env(1), small_task(settings={"actor.rnn_hidden_dim": 9}).train, "cpu")
-    with pytest.raises(ConfigError, match=r"does not fit this task: actor rnn.rnn.weight_ih_l0 is \(24, 48\) there and \(32, 48\) here"):
+    with pytest.raises(
+        ConfigError, match=r"does not fit this task: actor rnn.rnn.weight_ih_l0 is \(24, 48\) there and \(32, 48\) here"
+    ):
         load_policy(tmp_path / "model.pt", make_env(1), small_task("lstm").train, "cpu")
 
 
 def test_a_contract_without_a_memory_stays_of_the_older_format() -> None:
     contract = read_contract(ROOT / "resources/policies/go1_flat")
-    assert contract.memory is None and contract.to_dict()["format"] == 5 and "memory" not in contract.to_dict()["network"]
+    assert (
+        contract.memory is None and contract.to_dict()["format"] == 5 and "memory" not in contract.to_dict()["network"]
+    )
     assert (ROOT / "resources/policies/go1_flat" / CONTRACT_FILE).read_text().startswith("format: 5\n")

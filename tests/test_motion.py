@@ -36,7 +36,12 @@ def steady(fps: float = 30.0, frames: int = 31) -> Clip:
     """A root that moves at 1 m/s and turns at 2 rad/s, and a joint at 3 rad/s."""
     time = np.arange(frames) / fps
     return checked(
-        Path("clip"), fps, ["knee"], np.outer(time, [1.0, 0.0, 0.0]), from_rotation_vector(np.outer(2 * time, AXIS)), 3 * time[:, None]
+        Path("clip"),
+        fps,
+        ["knee"],
+        np.outer(time, [1.0, 0.0, 0.0]),
+        from_rotation_vector(np.outer(2 * time, AXIS)),
+        3 * time[:, None],
     )
 
 
@@ -45,12 +50,15 @@ def test_a_clip_at_another_rate_is_the_same_motion() -> None:
     assert len(clip.root_pos) == 51 and clip.seconds == pytest.approx(1.0)
     for ours, right in zip(clip[2:], steady(50.0, 51)[2:], strict=True):
         np.testing.assert_allclose(ours, right, atol=1e-9)
-    np.testing.assert_allclose(clip.qvel(), np.tile([1.0, 0, 0, *(2 * AXIS), 3.0], (51, 1)), atol=1e-9)  # turning is in the body's frame
+    # turning is in the body's frame
+    np.testing.assert_allclose(clip.qvel(), np.tile([1.0, 0, 0, *(2 * AXIS), 3.0], (51, 1)), atol=1e-9)
 
 
 @pytest.mark.parametrize("rate", [0.9, 0.0, -50.0])
 def test_a_rate_that_leaves_no_two_frames_is_refused(rate: float) -> None:
-    with pytest.raises(ClipError, match=f"1 s have no two frames at {rate:g} frames a second; take a higher rate or a longer clip"):
+    with pytest.raises(
+        ClipError, match=f"1 s have no two frames at {rate:g} frames a second; take a higher rate or a longer clip"
+    ):
         steady().at(rate)
 
 
@@ -79,7 +87,9 @@ def test_unitrees_csv(g1: RobotModel, tmp_path: Path) -> None:
         ):
             read_motion(tmp_path / name, g1)
     np.savetxt(tmp_path / "legs.csv", table[:, :19], delimiter=",")
-    with pytest.raises(ClipError, match="legs.csv has 19 columns; of this robot it must have 36: root x y z, quaternion x y z w"):
+    with pytest.raises(
+        ClipError, match="legs.csv has 19 columns; of this robot it must have 36: root x y z, quaternion x y z w"
+    ):
         read_motion(tmp_path / "legs.csv", g1)
 
 
@@ -89,10 +99,18 @@ def test_bodies_tell_the_order_of_joints(order: str, g1: RobotModel, tmp_path: P
     whole = read_clip(CLIPS[0]).of(g1.joint_names, "clip")
     clip = Clip(whole.fps, whole.joint_names, *(values[::25] for values in whole[2:]))
     names = breadth_first(g1) if order == "breadth first" else list(g1.joint_names)
-    assert breadth_first(g1)[:4] == ["left_hip_pitch_joint", "right_hip_pitch_joint", "waist_yaw_joint", "left_hip_roll_joint"]
+    assert breadth_first(g1)[:4] == [
+        "left_hip_pitch_joint",
+        "right_hip_pitch_joint",
+        "waist_yaw_joint",
+        "left_hip_roll_joint",
+    ]
     states = [posed(g1.physics, row[7:], row[:7]) for row in clip.qpos()]
     held: dict[str, Any] = {"fps": [50], "joint_pos": clip.of(names, "clip").joint_pos}
-    held |= {"body_pos_w": np.array([data.xpos[1:] for data in states]), "body_quat_w": np.array([data.xquat[1:] for data in states])}
+    held |= {
+        "body_pos_w": np.array([data.xpos[1:] for data in states]),
+        "body_quat_w": np.array([data.xquat[1:] for data in states]),
+    }
     np.savez(tmp_path / "theirs.npz", **held)
     np.testing.assert_allclose(read_motion(tmp_path / "theirs.npz", g1).qpos(), clip.qpos(), atol=1e-6)
     np.savez(tmp_path / "theirs.npz", **{**held, "joint_pos": held["joint_pos"][:, ::-1]})
@@ -114,7 +132,8 @@ def test_a_wrong_clip(change: Callable[[Clip], Clip], said: str, tmp_path: Path)
         read_clip(tmp_path / "clip.npz").of(["knee"], "clip.npz")
     np.savez(tmp_path / "other.npz", joint_pos=[1.0])
     with pytest.raises(
-        ClipError, match="is no clip of legged_mw, for it has no 'fps'; convert it with: python -m legged_mw.motion other.npz"
+        ClipError,
+        match="is no clip of legged_mw, for it has no 'fps'; convert it with: python -m legged_mw.motion other.npz",
     ):
         read_clip(tmp_path / "other.npz")
 
@@ -144,7 +163,9 @@ def test_a_shipped_clip_is_what_the_robot_can_do(file: Path, g1: RobotModel) -> 
     assert "lowest point: 0 mm" in text
 
 
-def test_what_a_robot_cannot_do_is_said(g1: RobotModel, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: Any) -> None:
+def test_what_a_robot_cannot_do_is_said(
+    g1: RobotModel, capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: Any
+) -> None:
     clip = read_clip(CLIPS[0])
     joints = clip.joint_pos.copy()
     joints[10, clip.joint_names.index("left_knee_joint")] = 3.0
@@ -152,7 +173,9 @@ def test_what_a_robot_cannot_do_is_said(g1: RobotModel, capsys: pytest.CaptureFi
     save_clip(tmp_path / "bad.npz", clip._replace(joint_pos=joints, root_pos=moved))
     out = tmp_path / "mended.npz"
     monkeypatch.setattr(
-        sys, "argv", ["motion", str(tmp_path / "bad.npz"), "--lift", "0.05", "--cut", "1", "2", "--rate", "25", "--out", str(out)]
+        sys,
+        "argv",
+        ["motion", str(tmp_path / "bad.npz"), "--lift", "0.05", "--cut", "1", "2", "--rate", "25", "--out", str(out)],
     )
     robot = page(g1, read_clip(tmp_path / "bad.npz"), feet_of(g1))
     assert "warning: left_knee_joint is 0.120 rad beyond its range (-0.09 to 2.88) after 0.20 s" in robot

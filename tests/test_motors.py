@@ -33,7 +33,8 @@ from legged_mw.utils.motor_network import ACTIVATIONS, MotorNetwork, read_networ
 from legged_mw.utils.task import LoadedTask, load_task
 
 ENGINES = ["mujoco", "mujoco_warp"]
-CURVE = {"control.stall_torque": {"": 10.0}, "control.no_load_speed": {"": 50.0}, "control.gear": {"": 2.0}}  # 20 N m, 25 rad/s
+# 20 N m, 25 rad/s
+CURVE = {"control.stall_torque": {"": 10.0}, "control.no_load_speed": {"": 50.0}, "control.gear": {"": 2.0}}
 DC: dict[str, Any] = {**QUIET, **CURVE, "control.actuator": "dc_motor"}
 STILL = {f"init_state.{name}": 0.0 for name in ("lin_vel_range", "ang_vel_range", "yaw_range", "pos_xy_range")}
 
@@ -92,14 +93,18 @@ def test_far_from_its_limits_a_dc_motor_is_a_servo() -> None:
 def test_what_is_drawn_of_a_dc_motor(engine: str) -> None:
     names = ("stiffness", "damping", "strength", "stall_torque", "no_load_speed")
     ranges = {f"domain_rand.{name}": [0.5, 1.5] for name in names}
-    nothing = {f"domain_rand.{name}": [] for name in ("link_mass", "base_mass", "base_com", "armature", "encoder_offset")}
+    nothing = {
+        f"domain_rand.{name}": [] for name in ("link_mass", "base_mass", "base_com", "armature", "encoder_offset")
+    }
     env = make_env(3, {**DC, **nothing, **ranges, "domain_rand.enable": True, "sim.engine": engine})
     drawn, gains = env.domain_rand.values, env.sim.field("actuator_gainprm")
     torch.testing.assert_close(gains[:, :, 1], 1.0 / (25.0 * drawn["no_load_speed"]))
     torch.testing.assert_close(gains[:, :, 1] / gains[:, :, 0], 20.0 * drawn["stall_torque"])
     torch.testing.assert_close(gains[:, :, 4], 35.0 * drawn["stiffness"])
     torch.testing.assert_close(gains[:, :, 6], 0.5 * drawn["damping"])
-    assert env.sim.field("actuator_forcerange")[0, 0, 1].item() == pytest.approx(23.7 * drawn["strength"][0, 0].item(), rel=1e-6)
+    assert env.sim.field("actuator_forcerange")[0, 0, 1].item() == pytest.approx(
+        23.7 * drawn["strength"][0, 0].item(), rel=1e-6
+    )
     before = gains.clone()
     env.reset_envs(torch.tensor([True, False, False]))
     assert (gains != before).any(dim=2).any(dim=1).tolist() == [True, False, False]
@@ -134,7 +139,10 @@ def test_a_delay_of_7_ms_by_hand() -> None:
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("law", ["servo", "dc_motor"])
 def test_physics_hears_a_delay_of_7_ms(engine: str, law: str) -> None:
-    nothing = {f"domain_rand.{name}": [] for name in ("link_mass", "base_mass", "base_com", "armature", "friction", "frictionloss")}
+    nothing = {
+        f"domain_rand.{name}": []
+        for name in ("link_mass", "base_mass", "base_com", "armature", "friction", "frictionloss")
+    }
     late = {**DC, **STILL, **nothing, "control.actuator": law, "domain_rand.enable": True, "sim.engine": engine}
     env = make_env(2, {**late, "domain_rand.encoder_offset": [-0.05, 0.05], "domain_rand.delay_ms": [7.0, 7.0]})
     twin = make_env(2, {**late, "domain_rand.encoder_offset": [], "domain_rand.enable": False})
@@ -169,7 +177,10 @@ def test_check_tells_what_a_delay_is_rounded_to() -> None:
 
 @pytest.mark.parametrize("engine", ENGINES)
 def test_an_action_that_is_a_torque(engine: str) -> None:
-    env = make_env(2, {**QUIET, "control.actuator": "torque", "control.action_scale": {"": 4.0, "calf": 100.0}, "sim.engine": engine})
+    env = make_env(
+        2,
+        {**QUIET, "control.actuator": "torque", "control.action_scale": {"": 4.0, "calf": 100.0}, "sim.engine": engine},
+    )
     env.step(torch.full((2, 12), 0.5))
     assert env.torques[0, :3].tolist() == pytest.approx([2.0, 2.0, 35.55]), "scaled, and held to the force limit"
     assert env.robot.physics.dof_damping[6:].max() == 0.0
@@ -197,7 +208,9 @@ def test_a_law_in_code_runs_in_every_simulation_step(engine: str) -> None:
 
 
 def test_a_law_in_code_has_gains_delays_and_a_curve() -> None:
-    nothing = {f"domain_rand.{name}": [] for name in ("link_mass", "base_mass", "base_com", "armature", "encoder_offset")}
+    nothing = {
+        f"domain_rand.{name}": [] for name in ("link_mass", "base_mass", "base_com", "armature", "encoder_offset")
+    }
     drawn = {"domain_rand.stiffness": [0.5, 1.5], "domain_rand.delay_ms": [8.0, 8.0], "domain_rand.enable": True}
     env = make_env(2, {**DC, **nothing, **drawn, "control.actuator": "servo"}, env_class=Springs)
     assert torch.equal(env.p_gains, 35.0 * env.domain_rand.values["stiffness"]) and env.d_gains.tolist() == [0.5] * 12
@@ -211,13 +224,17 @@ def test_a_law_in_code_has_gains_delays_and_a_curve() -> None:
 # ---- networks
 
 
-def mlp(activation: str = "softsign", frames: tuple[int, ...] = (0, 1, 2), **more: Any) -> tuple[nn.Module, MotorNetwork]:
+def mlp(
+    activation: str = "softsign", frames: tuple[int, ...] = (0, 1, 2), **more: Any
+) -> tuple[nn.Module, MotorNetwork]:
     """A network as torch has it, and as ours."""
     torch.manual_seed(1)
     layers = [nn.Linear(2 * len(frames), 32), nn.Linear(32, 30), nn.Linear(30, 1)]
     kinds = {"elu": nn.ELU, "relu": nn.ReLU, "softsign": nn.Softsign, "tanh": nn.Tanh}
     module = nn.Sequential(layers[0], kinds[activation](), layers[1], kinds[activation](), layers[2])
-    return module, MotorNetwork([], [(x.weight.detach().numpy(), x.bias.detach().numpy()) for x in layers], activation, frames, **more)
+    return module, MotorNetwork(
+        [], [(x.weight.detach().numpy(), x.bias.detach().numpy()) for x in layers], activation, frames, **more
+    )
 
 
 def save(network: MotorNetwork, folder: Path) -> str:
@@ -246,15 +263,21 @@ def tried(file: str, engine: str, steps: int = 6) -> tuple[list[Tensor], list[Te
 
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize(("activation", "in_turns"), [(name, False) for name in ACTIVATIONS] + [("elu", True)])
-def test_a_network_is_what_its_training_library_makes_of_it(activation: str, in_turns: bool, engine: str, tmp_path: Path) -> None:
+def test_a_network_is_what_its_training_library_makes_of_it(
+    activation: str, in_turns: bool, engine: str, tmp_path: Path
+) -> None:
     scales = {"error_scale": -1.0, "speed_scale": 0.2, "torque_scale": 20.0}
     module, network = mlp(activation, (0, 1, 3), in_turns=in_turns, **scales)
     errors, speeds, torques = tried(save(network, tmp_path), engine)
     for step in range(len(torques)):
         for world in (0, 1):
             first = 3 if world == 1 and step > 2 else 0
-            past = [[(x[step - age][world] if step - age >= first else torch.zeros(12)) for age in (0, 1, 3)] for x in (errors, speeds)]
-            rows = torch.stack([torch.stack(past[0], dim=1) * -1.0, torch.stack(past[1], dim=1) * 0.2], dim=2)  # (D, frames, 2)
+            past = [
+                [(x[step - age][world] if step - age >= first else torch.zeros(12)) for age in (0, 1, 3)]
+                for x in (errors, speeds)
+            ]
+            # (D, frames, 2)
+            rows = torch.stack([torch.stack(past[0], dim=1) * -1.0, torch.stack(past[1], dim=1) * 0.2], dim=2)
             wanted = 20.0 * module(rows.reshape(12, 6) if in_turns else rows.transpose(1, 2).reshape(12, 6))[:, 0]
             torch.testing.assert_close(torques[step][world], wanted.detach(), atol=2e-5, rtol=1e-5)
 
@@ -263,9 +286,15 @@ def test_a_network_is_what_its_training_library_makes_of_it(activation: str, in_
 def test_an_lstm_is_what_torch_makes_of_it(engine: str, tmp_path: Path) -> None:
     torch.manual_seed(2)
     lstm, head = nn.LSTM(2, 8, 2), nn.Linear(8, 1)
-    layers = [[getattr(lstm, f"{name}_l{i}").detach().numpy() for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")] for i in (0, 1)]
+    layers = [
+        [getattr(lstm, f"{name}_l{i}").detach().numpy() for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")]
+        for i in (0, 1)
+    ]
     network = MotorNetwork(
-        [(a, b, c, d) for a, b, c, d in layers], [(head.weight.detach().numpy(), head.bias.detach().numpy())], "elu", (0,)
+        [(a, b, c, d) for a, b, c, d in layers],
+        [(head.weight.detach().numpy(), head.bias.detach().numpy())],
+        "elu",
+        (0,),
     )
     errors, speeds, torques = tried(save(network, tmp_path), engine)
     rows = torch.stack([torch.stack(errors), torch.stack(speeds)], dim=-1)  # (T, N, D, 2)
@@ -278,10 +307,25 @@ def test_an_lstm_is_what_torch_makes_of_it(engine: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("engine", ENGINES)
 def test_a_network_in_the_step_hears_delayed_targets_by_its_encoders(engine: str, tmp_path: Path) -> None:
     """A network that is a spring: torque = 35 (target - angle)."""
-    spring = MotorNetwork([], [(np.array([[35.0, -0.5]], dtype=np.float32), np.zeros(1, dtype=np.float32))], "relu", (0,))
-    nothing = {f"domain_rand.{name}": [] for name in ("link_mass", "base_mass", "base_com", "armature", "friction", "frictionloss")}
-    late = {**QUIET, **STILL, **nothing, "domain_rand.enable": True, "domain_rand.delay_ms": [7.0, 7.0], "sim.engine": engine}
-    network, servo = (make_env(3, late | more) for more in ({"control.actuator": "network", "control.network": save(spring, tmp_path)}, {}))
+    spring = MotorNetwork(
+        [], [(np.array([[35.0, -0.5]], dtype=np.float32), np.zeros(1, dtype=np.float32))], "relu", (0,)
+    )
+    nothing = {
+        f"domain_rand.{name}": []
+        for name in ("link_mass", "base_mass", "base_com", "armature", "friction", "frictionloss")
+    }
+    late = {
+        **QUIET,
+        **STILL,
+        **nothing,
+        "domain_rand.enable": True,
+        "domain_rand.delay_ms": [7.0, 7.0],
+        "sim.engine": engine,
+    }
+    network, servo = (
+        make_env(3, late | more)
+        for more in ({"control.actuator": "network", "control.network": save(spring, tmp_path)}, {})
+    )
     assert torch.equal(network.actuators.encoder_offset, servo.actuators.encoder_offset)  # type: ignore[arg-type]
     torch.testing.assert_close(walk(network, 5, guarded=engine == "mujoco_warp"), walk(servo, 5), atol=5e-4, rtol=0)
 
@@ -344,7 +388,9 @@ def small_task(fields: dict[str, Any]) -> LoadedTask:
 @pytest.fixture
 def exported(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[dict[str, Any]], Path]:
     """The same policy, exported with other motors to the folder "out"."""
-    monkeypatch.setattr(exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(made / "out/policy.onnx", path))
+    monkeypatch.setattr(
+        exporting, "save_onnx", lambda _policy, _clip, path: shutil.copy(made / "out/policy.onnx", path)
+    )
 
     def export_with(fields: dict[str, Any]) -> Path:
         export(small_task(fields), made / "model_0.pt", tmp_path / "out")
@@ -354,20 +400,46 @@ def exported(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Cal
 
 
 @pytest.mark.parametrize("law", ["dc_motor", "speed", "torque", "network"])
-def test_deploys_robot_has_the_same_motors(law: str, exported: Callable[[dict[str, Any]], Path], tmp_path: Path) -> None:
+def test_deploys_robot_has_the_same_motors(
+    law: str, exported: Callable[[dict[str, Any]], Path], tmp_path: Path
+) -> None:
     """The same targets move an export's robot as they move the environment's, to float32 and six digits in an MJCF."""
-    fields = {**DC, "asset.effort": {"": 15.0}, "control.actuator": law, "domain_rand.delay_ms": [5.0, 9.0], "domain_rand.enable": True}
+    fields = {
+        **DC,
+        "asset.effort": {"": 15.0},
+        "control.actuator": law,
+        "domain_rand.delay_ms": [5.0, 9.0],
+        "domain_rand.enable": True,
+    }
     origin = "torque" if law == "torque" else "default"
     if law == "speed":
         law, origin = "dc_motor", "speed"
-        fields |= {"control.actuator": law, "control.action_origin": origin, "control.action_scale": 8.0, "control.damping": {"": 1.0}}
+        fields |= {
+            "control.actuator": law,
+            "control.action_origin": origin,
+            "control.action_scale": 8.0,
+            "control.damping": {"": 1.0},
+        }
     elif law != "dc_motor":
-        fields |= {"control.action_scale": 4.0} if law == "torque" else {"control.network": save(mlp(torque_scale=20.0)[1], tmp_path)}
+        fields |= (
+            {"control.action_scale": 4.0}
+            if law == "torque"
+            else {"control.network": save(mlp(torque_scale=20.0)[1], tmp_path)}
+        )
     task, folder = small_task(fields), exported(fields)
     contract = read_contract(folder)
-    assert (contract.motors.law, contract.motors.stall_torque, contract.motors.no_load_speed) == (law, (20.0,) * 12, (25.0,) * 12)
+    assert (contract.motors.law, contract.motors.stall_torque, contract.motors.no_load_speed) == (
+        law,
+        (20.0,) * 12,
+        (25.0,) * 12,
+    )
     assert load_yaml(folder / "policy.yaml")["format"] == 5 and contract.action.origin == origin
-    for path, value in {"domain_rand.enable": False, "sim.engine": "mujoco", **STILL, "perturbation.kick": False}.items():
+    for path, value in {
+        "domain_rand.enable": False,
+        "sim.engine": "mujoco",
+        **STILL,
+        "perturbation.kick": False,
+    }.items():
         task.set(path, value)
     env, fleet = task.env_class(task.cfg, "cpu"), Fleet(folder, contract, 2)
     fleet.qpos[:] = env.sim.qpos
@@ -424,11 +496,17 @@ def test_networks_beside_an_export(exported: Callable[[dict[str, Any]], Path], t
 def test_a_network_that_changed_after_training_is_refused(tmp_path: Path) -> None:
     """Under its name, by --resume, play.py and its export; the config can take it, and another name is another choice."""
     file = save(mlp()[1], tmp_path)
-    folder = trained(tmp_path, "--set", "control.actuator=network", "--set", f"control.network={file}", "--max_iterations", "1")
+    folder = trained(
+        tmp_path, "--set", "control.actuator=network", "--set", f"control.network={file}", "--max_iterations", "1"
+    )
     known = {file: digest(Path(file))}
     assert load_yaml(folder / "config.yaml")["control"]["network_digest"] == known
     np.savez(file, **mlp("elu")[1].to_arrays())
-    for program, flags in (("train", ["--resume"]), ("play", ["--eval"]), ("play", ["--export", str(tmp_path / "out")])):
+    for program, flags in (
+        ("train", ["--resume"]),
+        ("play", ["--eval"]),
+        ("play", ["--export", str(tmp_path / "out")]),
+    ):
         result = run(program, tmp_path, "--task", "go1_flat", "--device", "cpu", *flags)
         assert result.code == 2 and f"control.network: {file} " in result.err
     assert not (tmp_path / "out").exists()

@@ -82,7 +82,19 @@ def test_a_folder_with_task_robot_and_runs_moves(tmp_path: Path, monkeypatch: py
     old.rename(new)
     run_folder = new / "logs/dog" / folder.name
     monkeypatch.chdir(new)
-    result = run("train", new, "--task", "dog.py", "--resume", "--device", "cpu", "--max_iterations", "2", "--set", "runner.export=false")
+    result = run(
+        "train",
+        new,
+        "--task",
+        "dog.py",
+        "--resume",
+        "--device",
+        "cpu",
+        "--max_iterations",
+        "2",
+        "--set",
+        "runner.export=false",
+    )
     assert result.code == 0 and (run_folder / "model_2.pt").exists(), result
     monkeypatch.chdir(tmp_path)
     still = ["--device", "cpu", "--viewer", "none", "--time", "0.1s"]
@@ -94,7 +106,9 @@ def test_a_folder_with_task_robot_and_runs_moves(tmp_path: Path, monkeypatch: py
     result = run("play", tmp_path, "--task", str(other), "--load_run", str(run_folder), *still)
     assert result.code == 0, result
     line = refused(tmp_path, "play", "--load_run", str(run_folder), "--device", "cpu")
-    assert f"{run_folder.relative_to(tmp_path)} is of task 'dog.py', somebody's code" in line and line.endswith("--task dog.py\n")
+    assert f"{run_folder.relative_to(tmp_path)} is of task 'dog.py', somebody's code" in line and line.endswith(
+        "--task dog.py\n"
+    )
 
 
 def test_the_task_of_a_run_is_the_projects_or_the_users(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,7 +184,10 @@ def test_runs_of_before_name_absolute_files(tmp_path: Path) -> None:
     assert loaded(other) == str(other) and loaded(Path("/far/away/cat.xml")) == "/far/away/cat.xml"
     task = load_task(str(file))
     task.set("asset.file", "/far/away/cat.xml")
-    with pytest.raises(UserError, match=r"^asset\.file: no file at /far/away/cat\.xml; an absolute path is of one machine: name the file "):
+    with pytest.raises(
+        UserError,
+        match=r"^asset\.file: no file at /far/away/cat\.xml; an absolute path is of one machine: name the file ",
+    ):
         robot_of(task)
 
 

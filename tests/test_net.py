@@ -76,8 +76,16 @@ def later_actions(loaded: Any) -> None:
         ("go1_flat", other_sign, ["statistics", "reward"]),
         ("go2_flat", other_order, ["obs/state", "obs/privileged_state"]),
         ("go1_rough", later_actions, ["obs/privileged_state", "obs/state", "reward"]),
-        ("g1_flat", lambda loaded: loaded.set("gait.offsets", [0.01, 0.51]), ["obs/state", "obs/privileged_state", "reward"]),
-        ("go1_getup", lambda loaded: loaded.set("perturbation.velocity", [0.0, 3.03]), ["obs/privileged_state", "obs/state", "reward"]),
+        (
+            "g1_flat",
+            lambda loaded: loaded.set("gait.offsets", [0.01, 0.51]),
+            ["obs/state", "obs/privileged_state", "reward"],
+        ),
+        (
+            "go1_getup",
+            lambda loaded: loaded.set("perturbation.velocity", [0.0, 3.03]),
+            ["obs/privileged_state", "obs/state", "reward"],
+        ),
     ],
     ids=["a reward's sign", "the order of rows", "an action's delay", "the phase of a gait", "the force of a kick"],
 )
@@ -91,7 +99,11 @@ def test_a_planted_change_is_found(name: str, change: Change, found: list[str]) 
 def test_a_difference_is_found() -> None:
     a: Found = {
         "task engine": {
-            **{"obs/state": np.zeros((4, 2, 3)), "steps/obs/state": np.arange(-2, 2), "columns/obs/state": np.array(list("xyz"))},
+            **{
+                "obs/state": np.zeros((4, 2, 3)),
+                "steps/obs/state": np.arange(-2, 2),
+                "columns/obs/state": np.array(list("xyz")),
+            },
             **{"reward": np.zeros((2, 2)), "steps/reward": np.arange(2), "flags": np.array(["a", "b"])},
         }
     }
@@ -101,9 +113,14 @@ def test_a_difference_is_found() -> None:
     assert differences(a, a, {}) == (["task engine                  3 of 3 equal"], False)
     lines, failed = differences(a, b, TOLERANCES)
     assert failed
-    assert lines == ["task engine                  2 of 3 equal  <--", "    obs/state                      2e-05 first at step 1 in z"]
+    assert lines == [
+        "task engine                  2 of 3 equal  <--",
+        "    obs/state                      2e-05 first at step 1 in z",
+    ]
     values["reward"][0, 1] = 1e-6
-    assert [line.split()[0] for line in differences(a, b, TOLERANCES)[0]] == ["task", "reward", "obs/state"], "the first step first"
+    assert [line.split()[0] for line in differences(a, b, TOLERANCES)[0]] == ["task", "reward", "obs/state"], (
+        "the first step first"
+    )
     assert not differences(a, b, {"": 1e-4})[1]
     values["flags"][1] = "c"
     assert differences(a, b, {"": 1e-4})[1]
@@ -169,5 +186,7 @@ def test_two_commits_are_compared_and_found_once(
 
 
 def test_what_is_no_commit_is_said() -> None:
-    done = subprocess.run([sys.executable, compare.__file__, "no-such-commit", "HEAD"], capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, compare.__file__, "no-such-commit", "HEAD"], capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 1 and "no-such-commit" in done.stderr and done.stderr.count("\n") == 1

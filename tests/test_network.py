@@ -67,7 +67,11 @@ def test_the_policy_of_an_export_is_the_one_of_the_checkpoint(made: Path) -> Non
     ours, theirs = loaded(made / "policy.onnx", made), loaded(made.parent / "model_2.pt", made)
     mine, other = ours.state_dict(), theirs.state_dict()
     same = [name for name in other if name.startswith("mlp.") or name == "obs_normalizer._mean"]
-    assert len(same) == 7 and all(torch.equal(mine[name], other[name]) for name in same) and mine["obs_normalizer._mean"].any()
+    assert (
+        len(same) == 7
+        and all(torch.equal(mine[name], other[name]) for name in same)
+        and mine["obs_normalizer._mean"].any()
+    )
     torch.testing.assert_close(mine["obs_normalizer._std"], other["obs_normalizer._std"], rtol=1e-6, atol=1e-8)
     assert torch.equal(actions(ours), actions(theirs)) and policies.NETWORK_FILE == contract.NETWORK_FILE
 
@@ -87,17 +91,23 @@ def test_half_precision_halves_the_file_and_acts_alike(exact: Path, half: tuple[
     graph = onnx.load(folder / "policy.onnx").graph
     onnx.checker.check_model(str(folder / "policy.onnx"), full_check=True)
     types = {tensor.name: numpy_helper.to_array(tensor).dtype for tensor in graph.initializer}
-    assert {name for name, dtype in types.items() if dtype == np.float16} == {f"policy.mlp.{layer}.weight" for layer in (0, 2, 4, 6)}
+    assert {name for name, dtype in types.items() if dtype == np.float16} == {
+        f"policy.mlp.{layer}.weight" for layer in (0, 2, 4, 6)
+    }
     whole, rounded = loaded(exact, SHIPPED), loaded(folder / "policy.onnx", folder)
     for name, value in whole.state_dict().items():
         expected = value.half().float() if name.endswith(".weight") else value
         assert name.startswith("distribution.") or torch.equal(rounded.state_dict()[name], expected), name
     wanted, got = actions(whole).clamp(-2.0, 2.0), actions(rounded).clamp(-2.0, 2.0)
-    np.testing.assert_allclose(run_onnx(folder / "policy.onnx", OBS.numpy()), got, atol=1e-5)  # float32 sums in another order
+    # float32 sums in another order
+    np.testing.assert_allclose(run_onnx(folder / "policy.onnx", OBS.numpy()), got, atol=1e-5)
     assert 1e-4 < (got - wanted).abs().max() < 0.02  # of 2; float16 has 11 bits
     assert 1e-5 < exported.gap < 0.01
     text = exported.text(folder)
-    assert f"its weights rounded to half precision; actions differ from the trained policy's by {exported.gap:.0e} at most" in text
+    assert (
+        f"its weights rounded to half precision; actions differ from the trained policy's by {exported.gap:.0e} at most"
+        in text
+    )
 
 
 def test_half_precision_is_deployed(half: tuple[Path, Exported]) -> None:
@@ -125,9 +135,15 @@ def undivided(model: Any) -> None:
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (renamed, r"is no network that this project exported: its weights are called net.mlp.0.weight, .*, not policy.mlp.0.weight \.\.\."),
+        (
+            renamed,
+            r"is no network that this project exported: its weights are called net.mlp.0.weight, .*, not policy.mlp.0.weight \.\.\.",
+        ),
         (undivided, r"is no network that this project exported: it does not begin with \(obs - mean\) / std"),
-        (lambda model: model.graph.initializer.pop(0), r"does not fit this task: actor mlp.0.weight is missing there and \(512, 48\) here"),
+        (
+            lambda model: model.graph.initializer.pop(0),
+            r"does not fit this task: actor mlp.0.weight is missing there and \(512, 48\) here",
+        ),
     ],
 )
 def test_another_network_is_refused(change: Any, text: str, tmp_path: Path) -> None:

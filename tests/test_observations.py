@@ -11,7 +11,15 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.utils.config import ConfigError
 
-SIZES = {"base_lin_vel": 3, "base_ang_vel": 3, "projected_gravity": 3, "dof_pos": 12, "dof_vel": 12, "last_actions": 12, "commands": 3}
+SIZES = {
+    "base_lin_vel": 3,
+    "base_ang_vel": 3,
+    "projected_gravity": 3,
+    "dof_pos": 12,
+    "dof_vel": 12,
+    "last_actions": 12,
+    "commands": 3,
+}
 
 
 def test_rows_left_out_are_gone_from_the_group_and_from_what_contains_it() -> None:
@@ -35,32 +43,46 @@ def test_history_is_oldest_first_within_each_row_and_begins_filled() -> None:
         seen.append(env.dof_vel.clone())
         frames = obs[:, env.observations.span("state", "dof_vel")].unflatten(1, (3, 12))
         for back in range(3):
-            expected = seen[max(step - back, 0)] if step - back >= 0 else torch.zeros_like(seen[0])  # at rest before the first step
+            # at rest before the first step
+            expected = seen[max(step - back, 0)] if step - back >= 0 else torch.zeros_like(seen[0])
             assert torch.equal(frames[[0, 2, 3], 2 - back], expected[[0, 2, 3]]), (step, back)
         if step == 3:
             assert torch.equal(frames[1], seen[-1][1].expand(3, 12)), "after a reset every frame is the first one"
     newest = env.observations.newest("state", "dof_vel")
-    assert newest == slice(env.observations.span("state", "dof_vel").stop - 12, env.observations.span("state", "dof_vel").stop)
+    assert newest == slice(
+        env.observations.span("state", "dof_vel").stop - 12, env.observations.span("state", "dof_vel").stop
+    )
 
 
 def test_history_of_one_row_holds_what_the_policy_saw_noise_and_delay_included() -> None:
     env = make_env(
-        2, {"observations.history": {"state.base_ang_vel": 2}, "domain_rand.enable": True, "domain_rand.observation_delay": [1, 1]}
+        2,
+        {
+            "observations.history": {"state.base_ang_vel": 2},
+            "domain_rand.enable": True,
+            "domain_rand.observation_delay": [1, 1],
+        },
     )
     assert layout(env)["state"] == {**SIZES, "base_ang_vel": 6}
     span, last = env.observations.span("state", "base_ang_vel"), None
     for _ in range(4):
         frames = env.step(torch.randn(2, 12))[0]["state"][:, span].unflatten(1, (2, 3))
-        assert last is None or torch.equal(frames[:, 0], last), "the older frame is the sample of the step before, not a fresh one"
+        assert last is None or torch.equal(frames[:, 0], last), (
+            "the older frame is the sample of the step before, not a fresh one"
+        )
         last = frames[:, 1].clone()
 
 
 def test_mirrored_history_is_the_history_of_the_mirrored() -> None:
     plain, env = make_env(2, QUIET), make_env(2, {**QUIET, "observations.history": {"state": 2}})
     frames = [torch.randn(2, 48) for _ in range(2)]
-    rows = [torch.cat([frame.split(list(SIZES.values()), dim=1)[i] for frame in frames], dim=1) for i in range(len(SIZES))]
+    rows = [
+        torch.cat([frame.split(list(SIZES.values()), dim=1)[i] for frame in frames], dim=1) for i in range(len(SIZES))
+    ]
     images = [plain.mirror.observations["state"](frame) for frame in frames]
-    expected = [torch.cat([image.split(list(SIZES.values()), dim=1)[i] for image in images], dim=1) for i in range(len(SIZES))]
+    expected = [
+        torch.cat([image.split(list(SIZES.values()), dim=1)[i] for image in images], dim=1) for i in range(len(SIZES))
+    ]
     x = torch.cat(rows, dim=1)
     image = env.mirror.observations["state"](x)
     assert torch.allclose(image, torch.cat(expected, dim=1), atol=1e-6)
@@ -68,21 +90,27 @@ def test_mirrored_history_is_the_history_of_the_mirrored() -> None:
 
 
 def test_a_restart_between_steps_leaves_histories_of_other_worlds() -> None:
-    env = make_env(3, {"observations.history": {"state": 4}, "domain_rand.enable": True, "domain_rand.observation_delay": [0, 2]})
+    env = make_env(
+        3, {"observations.history": {"state": 4}, "domain_rand.enable": True, "domain_rand.observation_delay": [0, 2]}
+    )
     for _ in range(5):
         env.step(torch.randn(3, 12))
     before = env.get_observations()
     env.restart(torch.tensor([False, True, False]))
     now = env.get_observations()
     for group in ("state", "privileged_state"):
-        assert torch.equal(now[group][[0, 2]], before[group][[0, 2]]) and not torch.equal(now[group][1], before[group][1])
+        assert torch.equal(now[group][[0, 2]], before[group][[0, 2]]) and not torch.equal(
+            now[group][1], before[group][1]
+        )
     frames = now["state"][1, env.observations.span("state", "dof_vel")].unflatten(0, (4, 12))
     assert torch.equal(frames, frames[-1:].expand(4, 12))
 
 
 def test_a_history_without_the_gyros_has_no_mirror_image() -> None:
     env = make_env(2, {"observations.history": {"state.base_lin_vel": 3}})
-    with pytest.raises(ConfigError, match=r"observations.history: 'state.base_lin_vel' has 3 frames, so 'base_ang_vel' needs as many"):
+    with pytest.raises(
+        ConfigError, match=r"observations.history: 'state.base_lin_vel' has 3 frames, so 'base_ang_vel' needs as many"
+    ):
         _ = env.mirror
 
 
@@ -120,9 +148,17 @@ class _Old(LeggedRobot):
             LeggedRobot,
             "observations.history: no row 'gyro' in 'state'; there are: base_lin_vel",
         ),
-        ({"observations.history": {"states": 2}}, LeggedRobot, "observations.history: no group 'states' in the observation table; did you"),
+        (
+            {"observations.history": {"states": 2}},
+            LeggedRobot,
+            "observations.history: no group 'states' in the observation table; did you",
+        ),
         ({"observations.history": {"state": 0}}, LeggedRobot, r"observations.history\['state'\] is 0; it must be 1"),
-        ({"observations.leave_out": {"state": [*SIZES]}}, LeggedRobot, "observations.leave_out: 'state' has no row left; leave one in"),
+        (
+            {"observations.leave_out": {"state": [*SIZES]}},
+            LeggedRobot,
+            "observations.leave_out: 'state' has no row left; leave one in",
+        ),
         ({}, _Twice, "observation group 'state' has two rows 'dof_vel'"),
         ({}, _Backwards, "observation group 'privileged_state': no group 'state' in the groups that come before it"),
         ({}, _Old, "_Old._observation_rows: the method is now called observation_rows"),

@@ -100,7 +100,15 @@ def test_a_run_sees_the_estimate_and_one_robot_is_as_many() -> None:
         seen.append((measured.lin_vel, robot.fleet.read().lin_vel[0], other(Measurement(**three)).lin_vel))
 
     policy = Controller(GO1, contract)
-    run(robot, policy, lambda _: np.array([0.8, 0, 0]), 1.5, live=False, watch=watch, odometry=Odometry(GO1, contract, 1, "torque"))
+    run(
+        robot,
+        policy,
+        lambda _: np.array([0.8, 0, 0]),
+        1.5,
+        live=False,
+        watch=watch,
+        odometry=Odometry(GO1, contract, 1, "torque"),
+    )
     estimates, _, threefold = (np.array(each) for each in zip(*seen, strict=True))
     assert np.allclose(threefold, estimates[:, None]) and estimates[-20:, 0].mean() == pytest.approx(0.8, abs=0.1)
     assert np.allclose(policy.last_observation[0, :3], estimates[-1], atol=1e-6)
@@ -116,19 +124,27 @@ def test_what_is_not_finite_is_handed_on_and_forgotten() -> None:
         Odometry(GO1, replace(contract, feet={}))
 
 
-def test_the_exam_says_how_far_the_estimate_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_exam_says_how_far_the_estimate_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     rules = replace(contract_rules(read_contract(GO1)), push_speeds=(2.0,))
     monkeypatch.setattr("legged_mw.eval.rules.SECONDS", 3.0)
     monkeypatch.setattr(program, "run_exam", lambda folder, contact, **_: run_exam(folder, rules, contact=contact))
-    monkeypatch.setattr(sys, "argv", ["deploy", str(GO1), "--eval", "--velocity", "odometry", "--out", str(tmp_path / "exam.json")])
+    monkeypatch.setattr(
+        sys, "argv", ["deploy", str(GO1), "--eval", "--velocity", "odometry", "--out", str(tmp_path / "exam.json")]
+    )
     program.main()
     assert "estimate of vx, rms [m/s]            0.0" in capsys.readouterr().out
     assert '"velocity": "odometry, contact by measured"' in (tmp_path / "exam.json").read_text()
 
 
 def test_other_exams_have_no_odometry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(program, "read_contract", lambda folder, _: replace(read_contract(folder), exam={"kind": "getup"}))
-    with pytest.raises(UserError, match="--velocity odometry is of robots that walk, and this exam is another: leave it out"):
+    monkeypatch.setattr(
+        program, "read_contract", lambda folder, _: replace(read_contract(folder), exam={"kind": "getup"})
+    )
+    with pytest.raises(
+        UserError, match="--velocity odometry is of robots that walk, and this exam is another: leave it out"
+    ):
         program.examine(GO1, tmp_path / "exam.json", contact="torque")
 
 
@@ -145,8 +161,16 @@ NO_TRUTH = "no sensor of a real robot gives it; there is --velocity odometry"
             ["--robot", "unitree", *LO, "--velocity", "truth"],
             "no sensor of a real robot gives it; there is --velocity odometry",
         ),
-        ("go2_flat", ["--serve", "unitree", *LO, "--velocity", "odometry"], "--velocity odometry: it is of the program that drives"),
-        ("go2_flat", ["--serve", "unitree", *LO, "--viewer", "web"], "--viewer is of simulated robots in this program: leave it out"),
+        (
+            "go2_flat",
+            ["--serve", "unitree", *LO, "--velocity", "odometry"],
+            "--velocity odometry: it is of the program that drives",
+        ),
+        (
+            "go2_flat",
+            ["--serve", "unitree", *LO, "--viewer", "web"],
+            "--viewer is of simulated robots in this program: leave it out",
+        ),
         (
             "g1_flat",
             ["--robot", "unitree", *LO, "--velocity", "odometry", "--contact", "measured"],
@@ -154,7 +178,9 @@ NO_TRUTH = "no sensor of a real robot gives it; there is --velocity odometry"
         ),
     ],
 )
-def test_wrong_flags(name: str, args: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_flags(
+    name: str, args: list[str], said: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(sys, "argv", ["deploy", name, *args])
     with pytest.raises(SystemExit, match="2"), one_line_errors("legged_mw.deploy"):
         program.main()
@@ -164,7 +190,9 @@ def test_wrong_flags(name: str, args: list[str], said: str, monkeypatch: pytest.
 
 def test_a_robot_that_gives_no_velocity_says_what_to_do() -> None:
     contract = read_contract(GO1)
-    with pytest.raises(RobotError, match="base_lin_vel, which a go2 does not measure; add --velocity odometry, or train one without: "):
+    with pytest.raises(
+        RobotError, match="base_lin_vel, which a go2 does not measure; add --velocity odometry, or train one without: "
+    ):
         check_rows(contract, GO2)
     for machine in (GO2, G1):
         check_rows(contract, machine, odometry=True)

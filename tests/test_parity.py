@@ -51,7 +51,8 @@ class Pair:
         )
         model = self.robot.physics
         self.sim: Any = make_simulation(model, WORLDS, "cpu", engine=engine, nconmax=8, njmax=40)
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # after put_model, which refuses it: else C resets a broken world
+        # after put_model, which refuses it: else C resets a broken world
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self.c = [mujoco.MjData(model) for _ in range(WORLDS)]
         for data in self.c:
             data.qpos[:] = HOME
@@ -155,14 +156,24 @@ def test_a_whole_step_of_the_task_agrees() -> None:
     for step in range(25):
         for name in ("qpos", "qvel", "ctrl"):
             getattr(own.sim, name).copy_(getattr(warp.sim, name))
-        for name in ("commands", "_episode", "foot_contact", "base_ang_vel_world", "base_lin_vel", "projected_gravity", "dof_offset"):
+        for name in (
+            "commands",
+            "_episode",
+            "foot_contact",
+            "base_ang_vel_world",
+            "base_lin_vel",
+            "projected_gravity",
+            "dof_offset",
+        ):
             getattr(own, name).copy_(getattr(warp, name))
         actions = 0.5 * torch.randn(8, 12, generator=dice)
         (obs, reward, done, _), (own_obs, own_reward, own_done, _) = warp.step(actions), own.step(actions)
         assert torch.equal(done, own_done), step
         going = ~done  # a new episode is drawn at random
         landed += int(warp.first_contact.sum())
-        torch.testing.assert_close(own_reward, reward, rtol=1e-4, atol=1e-6, msg=lambda text, step=step: f"reward, step {step}: {text}")
+        torch.testing.assert_close(
+            own_reward, reward, rtol=1e-4, atol=1e-6, msg=lambda text, step=step: f"reward, step {step}: {text}"
+        )
         for group, width in (("state", 48), ("privileged_state", 123)):
             assert obs[group].shape == (8, width) and torch.isfinite(obs[group]).all()
             torch.testing.assert_close(own_obs[group][going], obs[group][going], rtol=1e-3, atol=2e-3)
@@ -200,5 +211,7 @@ def test_spread_of_an_unconverged_solver(warm_start: bool, engine: str, record_p
     figures = {"median": float(np.median(spread)), "largest": float(np.max(spread))}
     for name, value in figures.items():
         record_property(name, value)
-    print(f"one control step at 1 and 5 iterations, qpos: median {figures['median']:.1e}, largest {figures['largest']:.1e}")
+    print(
+        f"one control step at 1 and 5 iterations, qpos: median {figures['median']:.1e}, largest {figures['largest']:.1e}"
+    )
     assert np.isfinite(spread).all() and figures["median"] < 0.02 and figures["largest"] < 0.5

@@ -22,7 +22,15 @@ def row(robot: str, peer: Peer) -> str:
     shares = [figures["pushes"][speed] for speed in PUSHES[robot]]
     pushes = ", ".join(f"{share:.0f}" if share in (0, 1) else f"{share:.2f}" for share in shares)
     ends = ", ".join(f"{high:g}" for _, high in trained)
-    cells = [peer.name, ends, *errors, *offsets, f"{figures['drift']:.4f}", pushes, f"{figures['cost_of_transport']:.2f}"]
+    cells = [
+        peer.name,
+        ends,
+        *errors,
+        *offsets,
+        f"{figures['drift']:.4f}",
+        pushes,
+        f"{figures['cost_of_transport']:.2f}",
+    ]
     return f"| {' | '.join(cells)} |"
 
 
@@ -39,4 +47,6 @@ def test_the_last_line_is_the_policy_that_ships(robot: str) -> None:
     [ours] = re.findall(rf"^\| \*\*`{robot}_flat`.*$", PAGE, re.MULTILINE)
     shown = (ROOT / f"resources/policies/{robot}_flat/README.md").read_text()
     numbers = re.findall(r"\d+\.\d+", ours)
-    assert len(numbers) >= 8 and [number for number in numbers if number not in shown] == [], "of docs/lab.md, not of the policy's page"
+    assert len(numbers) >= 8 and [number for number in numbers if number not in shown] == [], (
+        "of docs/lab.md, not of the policy's page"
+    )

@@ -22,7 +22,9 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def follow(plan: Plan, clock: list[float], seconds: dict[int, float], pace: float, begin: int = 0, late: int = 0) -> list[float]:
+def follow(
+    plan: Plan, clock: list[float], seconds: dict[int, float], pace: float, begin: int = 0, late: int = 0
+) -> list[float]:
     """What is done in each iteration, of ``pace`` seconds or what ``seconds`` says of the n-th; heard of so many iterations ``late``."""
     done, iteration, estimates = [], begin, []
     while iteration < plan.last:
@@ -56,7 +58,9 @@ def test_without_a_deadline_iterations_count(clock: list[float]) -> None:
     ],
     ids=["even", "kernels compile", "recorded", "exams", "slower", "faster"],
 )
-def test_the_last_iteration_that_the_time_has_room_for_is_annealed(clock: list[float], seconds: dict[int, float], late: int) -> None:
+def test_the_last_iteration_that_the_time_has_room_for_is_annealed(
+    clock: list[float], seconds: dict[int, float], late: int
+) -> None:
     plan = Plan(10**6, clock[0] + 60.0)
     done = follow(plan, clock, seconds, 0.1, late=late)
     assert done[0] == 0.0 and done[-1] == 1.0
@@ -68,7 +72,9 @@ def test_the_last_iteration_that_the_time_has_room_for_is_annealed(clock: list[f
 def test_even_iterations_are_even_steps(clock: list[float]) -> None:
     done = follow(Plan(10**6, clock[0] + 10.0), clock, {}, 0.1)
     steps = [after - before for before, after in pairwise(done[1:])]
-    assert len(done) == 100 and steps == pytest.approx([1 / 98] * 98, rel=1e-3), "after the first, whose time says nothing yet"
+    assert len(done) == 100 and steps == pytest.approx([1 / 98] * 98, rel=1e-3), (
+        "after the first, whose time says nothing yet"
+    )
 
 
 def test_a_stall_before_the_end_is_no_jump_back(clock: list[float]) -> None:
@@ -91,7 +97,9 @@ def test_time_before_counts(clock: list[float]) -> None:
     done = follow(Plan(10**6, clock[0] + 30.0, used=30.0), clock, {}, 0.1, begin=300)
     assert done[0] == 0.5 and done[-1] == 1.0 and all(a <= b for a, b in pairwise(done))
     untimed = Plan(1000, used=30.0)
-    assert untimed.begin(300) == pytest.approx(300 / 999) and untimed.seconds >= 30.0, "its iterations are its plan, its time is kept"
+    assert untimed.begin(300) == pytest.approx(300 / 999) and untimed.seconds >= 30.0, (
+        "its iterations are its plan, its time is kept"
+    )
 
 
 # ---- in a runner

@@ -31,7 +31,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "log std": {"distribution": {"std_type": "log", "std_range": (0.2, 1.0)}},
     "a std of each state": {"distribution": {"class_name": "HeteroscedasticGaussianDistribution"}},
     "symmetric samples": {"symmetry_cfg": SYMMETRY},
-    "mirror loss": {"symmetry_cfg": SYMMETRY | {"use_data_augmentation": False, "use_mirror_loss": True, "mirror_loss_coeff": 0.5}},
+    "mirror loss": {
+        "symmetry_cfg": SYMMETRY | {"use_data_augmentation": False, "use_mirror_loss": True, "mirror_loss_coeff": 0.5}
+    },
     "both": {"symmetry_cfg": SYMMETRY | {"use_mirror_loss": True, "mirror_loss_coeff": 0.5}},
 }
 
@@ -71,7 +73,9 @@ def test_same_rollout_as_rsl_rl() -> None:
         torch.testing.assert_close(a, b)
 
 
-@pytest.mark.parametrize("kinds", [(PPO, GraphedPPO), (GraphedPPO, PPO), (GraphedPPO, GraphedPPO)], ids=["to ours", "to stock", "ours"])
+@pytest.mark.parametrize(
+    "kinds", [(PPO, GraphedPPO), (GraphedPPO, PPO), (GraphedPPO, GraphedPPO)], ids=["to ours", "to stock", "ours"]
+)
 def test_checkpoints_load_in_both_directions(kinds: tuple[type[PPO], type[PPO]]) -> None:
     """And learning goes on as if it had not been interrupted: Adam's memory and the adapted rate come along."""
     writer, other = (make(kind) for kind in kinds)
@@ -127,7 +131,9 @@ def test_learning_rate_can_be_set() -> None:
     ],
     ids=["sgd", "beta", "mixed precision"],
 )
-def test_what_cannot_be_recorded_is_left_to_rsl_rl(settings: dict, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_recorded_is_left_to_rsl_rl(
+    settings: dict, reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     alg = make(GraphedPPO, **settings)
     collect(alg)
     assert not alg.graphed and set(update(alg)) == {"value", "surrogate", "entropy"}
@@ -139,16 +145,24 @@ def test_what_cannot_be_recorded_is_left_to_rsl_rl(settings: dict, reason: str, 
 def test_linear_is_torchs_own(rows: int) -> None:
     """Value and all three gradients, also for inputs that are padded with columns of zeros."""
     torch.manual_seed(0)
-    x, weight, bias = torch.randn(rows, 5, requires_grad=True), torch.randn(3, 5, requires_grad=True), torch.randn(3, requires_grad=True)
+    x, weight, bias = (
+        torch.randn(rows, 5, requires_grad=True),
+        torch.randn(3, 5, requires_grad=True),
+        torch.randn(3, requires_grad=True),
+    )
     padded = torch.nn.functional.pad(x.detach(), (0, 3))
     seed = torch.randn(rows, 3)
     expected = torch.nn.functional.linear(x, weight, bias)
     gradients = torch.autograd.grad(expected, (x, weight, bias), seed)
     torch.testing.assert_close(Linear.apply(x, weight, bias), expected)
-    for got, wanted in zip(torch.autograd.grad(Linear.apply(x, weight, bias), (x, weight, bias), seed), gradients, strict=True):  # type: ignore[arg-type]
+    for got, wanted in zip(
+        torch.autograd.grad(Linear.apply(x, weight, bias), (x, weight, bias), seed), gradients, strict=True
+    ):  # type: ignore[arg-type]
         torch.testing.assert_close(got, wanted)
     torch.testing.assert_close(Linear.apply(padded, weight, bias), expected)
-    for got, wanted in zip(torch.autograd.grad(Linear.apply(padded, weight, bias), (weight, bias), seed), gradients[1:], strict=True):  # type: ignore[arg-type]
+    for got, wanted in zip(
+        torch.autograd.grad(Linear.apply(padded, weight, bias), (weight, bias), seed), gradients[1:], strict=True
+    ):  # type: ignore[arg-type]
         torch.testing.assert_close(got, wanted)
 
 
@@ -183,7 +197,10 @@ def test_a_rate_of_a_checkpoint_comes_down_to_the_bound() -> None:
 
 
 def test_a_bound_that_rsl_rl_does_not_know_is_refused() -> None:
-    with pytest.raises(ConfigError, match=r"max_learning_rate is of the recorded update, and this is rsl-rl's own: the optimizer is SGD"):
+    with pytest.raises(
+        ConfigError,
+        match=r"max_learning_rate is of the recorded update, and this is rsl-rl's own: the optimizer is SGD",
+    ):
         make(GraphedPPO, max_learning_rate=2e-3, optimizer="sgd")
     task = load_task("go1_flat")
     task.set("algorithm.max_learning_rate", "0.002")
@@ -192,7 +209,9 @@ def test_a_bound_that_rsl_rl_does_not_know_is_refused() -> None:
         rsl_rl_config(task.train)
     task = load_task("go1_flat")
     task.set("algorithm.max_learning_rate", "0.0005")
-    with pytest.raises(ConfigError, match=r"algorithm.learning_rate is 0\.001, above algorithm.max_learning_rate, 0\.0005; begin"):
+    with pytest.raises(
+        ConfigError, match=r"algorithm.learning_rate is 0\.001, above algorithm.max_learning_rate, 0\.0005; begin"
+    ):
         rsl_rl_config(task.train)
 
 
@@ -213,7 +232,9 @@ class Encoder(MLPModel):
         return super().get_latent(*args, **kwargs)
 
 
-def test_a_network_of_ones_own_is_left_to_rsl_rl(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_network_of_ones_own_is_left_to_rsl_rl(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(learner, "MODEL", Encoder)
     assert not make(GraphedPPO).graphed
     assert "not the recorded one: a network is a Encoder" in capsys.readouterr().out
@@ -228,13 +249,20 @@ def test_a_critics_warm_up() -> None:
         collect(ours, seed=seed)
         assert update(ours).keys() == {"value", "surrogate", "entropy"}
     warm = parameters(ours)
-    assert {name for name in warm if not torch.equal(warm[name], before[name])} == {name for name in warm if name.startswith("critic.")}
-    assert ours.learning_rate == 1e-3 and not any(id(p) in map(id, ours.optimizer.state) for p in ours.actor.parameters())
+    assert {name for name in warm if not torch.equal(warm[name], before[name])} == {
+        name for name in warm if name.startswith("critic.")
+    }
+    assert ours.learning_rate == 1e-3 and not any(
+        id(p) in map(id, ours.optimizer.state) for p in ours.actor.parameters()
+    )
     ours.learn_critic_only(False)
     assert ours.learning_rate == 1e-5
     collect(ours)
     update(ours)
-    assert not torch.equal(parameters(ours)["actor.mlp.0.weight"], warm["actor.mlp.0.weight"]) and ours.learning_rate > 1e-5
+    assert (
+        not torch.equal(parameters(ours)["actor.mlp.0.weight"], warm["actor.mlp.0.weight"])
+        and ours.learning_rate > 1e-5
+    )
     fixed = make(GraphedPPO, schedule="fixed", learning_rate=3e-4)
     for on in (True, False):
         fixed.learn_critic_only(on)

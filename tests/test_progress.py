@@ -46,7 +46,9 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
     return now
 
 
-def test_a_pipe_gets_a_line_an_iteration(tmp_path: Path, capsys: pytest.CaptureFixture[str], clock: list[float]) -> None:
+def test_a_pipe_gets_a_line_an_iteration(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], clock: list[float]
+) -> None:
     console = Console()
     console.open(tmp_path)
     with console:
@@ -71,12 +73,16 @@ def test_the_time_that_is_left_ends_with_the_deadline(capsys: pytest.CaptureFixt
         clock[0] += 10.0
         console.iteration(done, 3 if done == 2 else 1000, None, NUMBERS, {}, 1.0)
     first, second = capsys.readouterr().out.splitlines()
-    assert first.endswith(" 0:00:35 left") and second.endswith(" 0:00:10 left"), "at the latest then, or when the iterations are done"
+    assert first.endswith(" 0:00:35 left") and second.endswith(" 0:00:10 left"), (
+        "at the latest then, or when the iterations are done"
+    )
 
 
 def test_verbose_prints_the_block(capsys: pytest.CaptureFixture[str]) -> None:
     Console(verbose=True).iteration(1, 2, None, NUMBERS, {"rew_pose": "0.1"}, 1.0)
-    assert re.fullmatch(r"#+ Learning iteration 1/2 #+\n +rew_pose: 0.1\n +Time elapsed, left: .*\n", capsys.readouterr().out)
+    assert re.fullmatch(
+        r"#+ Learning iteration 1/2 #+\n +rew_pose: 0.1\n +Time elapsed, left: .*\n", capsys.readouterr().out
+    )
 
 
 def test_a_terminal_keeps_a_bar_below_the_lines(monkeypatch: pytest.MonkeyPatch, clock: list[float]) -> None:
@@ -111,7 +117,9 @@ def test_a_run_has_its_log_and_the_next_exam(tmp_path: Path, monkeypatch: pytest
         monkeypatch.setattr(training, name, seconds)
     result = run("train", tmp_path, *SMALL, "--max_iterations", "3", "--set", "runner.exam_interval=2")
     assert result.code == 0, result.err
-    until = [line.rpartition(", ")[2].partition(" in ")[0] for line in result.out.splitlines() if line.startswith("Learning")]
+    until = [
+        line.rpartition(", ")[2].partition(" in ")[0] for line in result.out.splitlines() if line.startswith("Learning")
+    ]
     assert until == ["exam", "exam", "0:00:00 left"] and result.out.count("Exam after iteration ") == 2
     [log] = tmp_path.glob(f"logs/go1_flat/*/{LOG_FILE}")
     assert [line.strip("# ") for line in log.read_text().splitlines() if line.startswith("#")] == [

@@ -112,8 +112,12 @@ def test_a_program_that_others_call_changes_nothing() -> None:
     assert (sys.modules.get("torch._dynamo"), list(sys.meta_path), gc.get_freeze_count()) == before
 
 
-@pytest.mark.parametrize(("asked", "opened"), [(None, [3]), ("cuda", [0]), ("cuda:2", [2]), ("cpu", []), ("cuda:x", []), ("tpu", [])])
-def test_the_gpu_that_was_asked_for_is_opened(asked: str | None, opened: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("asked", "opened"), [(None, [3]), ("cuda", [0]), ("cuda:2", [2]), ("cpu", []), ("cuda:x", []), ("tpu", [])]
+)
+def test_the_gpu_that_was_asked_for_is_opened(
+    asked: str | None, opened: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     found = list[int]()
     monkeypatch.setenv("LOCAL_RANK", "3")
     monkeypatch.delitem(sys.modules, "torch")

@@ -41,7 +41,8 @@ def ours(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("ranks") / "ours"
     result = learn(folder)
     assert result.returncode == 0, result.stderr
-    written = ["model_1.pt", "model_2.pt", "model_3.pt", "rank0.pt", "rank1.pt", "worlds_3_0of2.pt"]  # the other rank has no folder here
+    # the other rank has no folder here
+    written = ["model_1.pt", "model_2.pt", "model_3.pt", "rank0.pt", "rank1.pt", "worlds_3_0of2.pt"]
     assert sorted(path.name for path in folder.glob("*.pt")) == written
     return folder
 
@@ -87,7 +88,10 @@ def test_one_asked_to_stop_stops_all(tmp_path: Path) -> None:
     assert (one["stop"], other["stop"]) == ("another rank was asked to", "asked")
     assert one["iteration"] == other["iteration"] == 1
     assert difference(one["parameters"], other["parameters"]) == 0.0
-    assert one["parameters"]["actor.target_normalizer.count"] == 2 * 12 * 8 and "actor.estimator.0.weight" in one["parameters"]
+    assert (
+        one["parameters"]["actor.target_normalizer.count"] == 2 * 12 * 8
+        and "actor.estimator.0.weight" in one["parameters"]
+    )
 
 
 def test_train_writes_one_run_folder(tmp_path: Path) -> None:
@@ -120,7 +124,9 @@ def test_a_rank_that_dies_ends_the_run(tmp_path: Path) -> None:
     assert result.returncode != 0
     newest = max(checkpoints(folder))
     assert newest in (1, 2)  # the second is on its way to the disk while the other rank dies
-    saved, beside = (torch.load(folder / f"{name}.pt", weights_only=True) for name in (f"model_{newest}", f"worlds_{newest}_0of2"))
+    saved, beside = (
+        torch.load(folder / f"{name}.pt", weights_only=True) for name in (f"model_{newest}", f"worlds_{newest}_0of2")
+    )
     assert saved["iter"] == newest and torch.equal(saved["infos"]["random_state"]["cpu"], beside["random_state"]["cpu"])
 
 
@@ -134,8 +140,13 @@ leave_when_stuck(Rank(1, 1, int(sys.argv[1])), patience=0.3)
 print("ready", flush=True)
 time.sleep(60.0 if sys.argv[1] == "2" else 3.0)
 """
-    for count, code, said in (("2", 143, "rank 1: still waiting for another rank 0.3 s after SIGTERM; leaving."), ("1", 0, "")):
-        child = subprocess.Popen([sys.executable, "-c", program, count], env=ENVIRONMENT, stdout=-1, stderr=-1, text=True)
+    for count, code, said in (
+        ("2", 143, "rank 1: still waiting for another rank 0.3 s after SIGTERM; leaving."),
+        ("1", 0, ""),
+    ):
+        child = subprocess.Popen(
+            [sys.executable, "-c", program, count], env=ENVIRONMENT, stdout=-1, stderr=-1, text=True
+        )
         assert child.stdout is not None and child.stdout.readline() == "ready\n"
         child.send_signal(signal.SIGTERM)
         _, errors = child.communicate(timeout=300)
@@ -157,7 +168,9 @@ def test_each_rank_gets_its_own_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     assert rank_device(Rank(0, 0, 1), None) is None and rank_device(Rank(0, 0, 1), "cuda:1") == "cuda:1"
     assert rank_device(Rank(3, 1, 4), None) == "cuda:1" and rank_device(Rank(3, 1, 4), "cpu") == "cpu"
-    with pytest.raises(ConfigError, match="--device cuda:0: under torchrun every process takes the GPU of its own number"):
+    with pytest.raises(
+        ConfigError, match="--device cuda:0: under torchrun every process takes the GPU of its own number"
+    ):
         rank_device(Rank(0, 0, 2), "cuda:0")
     with pytest.raises(ConfigError, match="process 2 on a machine with 2 GPUs; use --nproc_per_node=2"):
         rank_device(Rank(2, 2, 3), None)

@@ -7,7 +7,18 @@ from typing import Any
 
 import pytest
 import torch
-from learner import ACTIONS, STEPS, WORLDS, collect, difference, make, observations, parameters, share_experience, turned
+from learner import (
+    ACTIONS,
+    STEPS,
+    WORLDS,
+    collect,
+    difference,
+    make,
+    observations,
+    parameters,
+    share_experience,
+    turned,
+)
 from rsl_rl.algorithms import PPO
 from test_ppo import update
 from torch import Tensor, nn
@@ -34,7 +45,10 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "advantages by minibatch": {"normalize_advantage_per_mini_batch": True},
     "plain value loss, fixed rate": {"use_clipped_value_loss": False, "schedule": "fixed"},
 }
-CASES = [*((memory, {}) for memory in NETWORKS.values()), *((NETWORKS["gru"], settings) for settings in SETTINGS.values())]
+CASES = [
+    *((memory, {}) for memory in NETWORKS.values()),
+    *((NETWORKS["gru"], settings) for settings in SETTINGS.values()),
+]
 IMAGES = {"data_augmentation_func": turned, "use_data_augmentation": True, "env": None}
 
 
@@ -47,13 +61,18 @@ def in_order(monkeypatch: pytest.MonkeyPatch) -> None:
 @torch.inference_mode()
 def share_memory(source: PPO, target: GraphedPPO) -> None:
     """The states with which the stock learner's rollout began, into ours."""
-    for model, saved in ((target.actor, source.storage.saved_hidden_state_a), (target.critic, source.storage.saved_hidden_state_c)):
+    for model, saved in (
+        (target.actor, source.storage.saved_hidden_state_a),
+        (target.critic, source.storage.saved_hidden_state_c),
+    ):
         if saved:
             target._memories[model].start.copy_(torch.cat([states[0] for states in saved])[:, None])
 
 
 @pytest.mark.parametrize(("memory", "settings"), CASES, ids=[*NETWORKS, *SETTINGS])
-def test_same_parameters_as_rsl_rl(memory: dict[str, Any], settings: dict[str, Any], double: None, in_order: None) -> None:
+def test_same_parameters_as_rsl_rl(
+    memory: dict[str, Any], settings: dict[str, Any], double: None, in_order: None
+) -> None:
     """In float64: two updates, each from new experience of the stock learner, whose memory goes on from one to the next."""
     stock, ours = make(PPO, memory=memory, **settings), make(GraphedPPO, memory=memory, **settings)
     assert ours.graphed and difference(parameters(stock), parameters(ours)) == 0.0
@@ -119,7 +138,9 @@ def test_minibatches_are_whole_worlds_of_a_drawn_order() -> None:
     assert minibatch.actor_input.inputs.shape == (1, STEPS, 8, 8) and minibatch.critic_input.keep.shape == (STEPS, 8, 1)
     assert torch.equal(minibatch.batch.actions.view(STEPS, 8, ACTIONS), ours.storage.actions[:, order[8:16]])
     ended = ours.storage.dones[:, order[8:16]]
-    assert torch.equal(minibatch.critic_input.keep[1:], 1.0 - ended[:-1].float()) and bool((minibatch.critic_input.keep[0] == 1.0).all())
+    assert torch.equal(minibatch.critic_input.keep[1:], 1.0 - ended[:-1].float()) and bool(
+        (minibatch.critic_input.keep[0] == 1.0).all()
+    )
 
 
 @pytest.mark.parametrize("kind", [nn.GRU, nn.LSTM])
@@ -180,7 +201,13 @@ def test_mirror_images_are_run_through_the_network(double: None, in_order: None)
 def test_symmetric_samples_teach_a_recurrent_policy_symmetry(coefficient: float) -> None:
     """The distance to the mirror image shrinks, also where it is only reported."""
     images = IMAGES | ({"use_mirror_loss": True, "mirror_loss_coeff": coefficient} if coefficient else {})
-    ours = make(GraphedPPO, memory=NETWORKS["gru"], symmetry_cfg=images, schedule="fixed", learning_rate=1e-2 if coefficient else 3e-3)
+    ours = make(
+        GraphedPPO,
+        memory=NETWORKS["gru"],
+        symmetry_cfg=images,
+        schedule="fixed",
+        learning_rate=1e-2 if coefficient else 3e-3,
+    )
     distances = []
     for seed in range(8):
         collect(ours, seed=seed)
@@ -204,7 +231,9 @@ def test_what_does_not_go_with_a_memory(settings: dict[str, Any], text: str) -> 
         make(GraphedPPO, memory=NETWORKS["actor alone"], **settings)
 
 
-@pytest.mark.parametrize("kinds", [(PPO, GraphedPPO), (GraphedPPO, PPO), (GraphedPPO, GraphedPPO)], ids=["to ours", "to stock", "ours"])
+@pytest.mark.parametrize(
+    "kinds", [(PPO, GraphedPPO), (GraphedPPO, PPO), (GraphedPPO, GraphedPPO)], ids=["to ours", "to stock", "ours"]
+)
 def test_checkpoints_load_in_both_directions(kinds: tuple[type[PPO], type[PPO]]) -> None:
     """Whoever loads one begins every world's episode, and so remembers nothing."""
     writer, other = (make(kind, memory=NETWORKS["lstm"]) for kind in kinds)
@@ -220,7 +249,8 @@ def test_checkpoints_load_in_both_directions(kinds: tuple[type[PPO], type[PPO]])
 @pytest.mark.parametrize("symmetry", [None, IMAGES], ids=["plain", "mirrored"])
 def test_rollout_and_update_can_be_recorded(symmetry: dict[str, Any] | None, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing asks the host; shapes do not depend on where episodes ended; nothing that stays is moved."""
-    monkeypatch.setattr(nn.utils, "clip_grad_norm_", lambda *_: None)  # torch moves the norms to the device where they are
+    # torch moves the norms to the device where they are
+    monkeypatch.setattr(nn.utils, "clip_grad_norm_", lambda *_: None)
     ours = make(GraphedPPO, memory=NETWORKS["two layers"], symmetry_cfg=symmetry)
     collect(ours)
     update(ours)

@@ -34,7 +34,12 @@ KINDS = ("stairs_up", "obstacles", "smooth_slope", "flat")
 
 def terrain(*kinds: str, levels: int = 2, cell: float = 0.1, **more: float) -> Terrain:
     return make_terrain(
-        levels=levels, proportions=dict.fromkeys(kinds, 1.0), columns=len(kinds), tile=8.0, cell=cell, **{"border": 2.0, "seed": 1, **more}
+        levels=levels,
+        proportions=dict.fromkeys(kinds, 1.0),
+        columns=len(kinds),
+        tile=8.0,
+        cell=cell,
+        **{"border": 2.0, "seed": 1, **more},
     )
 
 
@@ -96,7 +101,12 @@ def test_squares_of_half_a_metre_and_lines_around_tiles() -> None:
 def test_the_picture_lies_where_the_heights_are() -> None:
     ground = terrain("obstacles", "obstacles", levels=2, seed=3)
     model = ground_model(ground)
-    model.light_active[:], model.vis.headlight.diffuse[:], model.vis.headlight.ambient[:], model.vis.headlight.specular[:] = 0, 0, 1, 0
+    (
+        model.light_active[:],
+        model.vis.headlight.diffuse[:],
+        model.vis.headlight.ambient[:],
+        model.vis.headlight.specular[:],
+    ) = 0, 0, 1, 0
     model.vis.global_.fovy = 2 * 8.0
     camera, data = mujoco.MjvCamera(), mujoco.MjData(model)
     camera.orthographic, camera.azimuth, camera.elevation, camera.distance = 1, 90, -90, 20.0
@@ -127,11 +137,15 @@ def test_a_plane_is_drawn_as_ever_and_rough_ground_in_tiles(hilly: mujoco.MjMode
 
 @pytest.mark.parametrize(("levels", "columns"), [(2, 2), (26, 1), (100, 3), (1, 40)])
 def test_flat_ground_lies_all_around_as_far_as_a_camera_sees(levels: int, columns: int) -> None:
-    ground = make_terrain(levels=levels, proportions={"flat": 1.0}, columns=columns, tile=8.0, cell=1.0, border=2.0, seed=1)
+    ground = make_terrain(
+        levels=levels, proportions={"flat": 1.0}, columns=columns, tile=8.0, cell=1.0, border=2.0, seed=1
+    )
     model = ground_model(ground)
     pieces = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (model.geom_size[:, 0] > 0)
     x, y = 4.0 * levels, 4.0 * columns
-    grid = np.stack(np.meshgrid(np.arange(0.25 - x - 150, x + 150, 2.5), np.arange(0.25 - y - 150, y + 150, 2.5)), axis=-1)
+    grid = np.stack(
+        np.meshgrid(np.arange(0.25 - x - 150, x + 150, 2.5), np.arange(0.25 - y - 150, y + 150, 2.5)), axis=-1
+    )
     away = np.abs(grid[:, :, None] - model.geom_pos[pieces, :2]) <= model.geom_size[pieces, :2]
     tiles = (np.abs(grid) <= [x, y]).all(axis=-1)
     assert (away.all(axis=-1).sum(axis=-1) == ~tiles).all(), "one piece everywhere beside the tiles, none over them"
@@ -173,7 +187,8 @@ def test_the_camera_looks_over_what_rises_before_it(hilly_spec: mujoco.MjSpec, h
         place = ground.origins[1, column] + (ahead, 0.0, 0.0)
         x, y = np.round((place[:2] - ground.corner) / 0.1).astype(int)
         qpos[:3] = *place[:2], ground.heights[y, x] + 0.3
-        qpos[3:7] = np.cos(np.radians(25)), 0, 0, np.sin(np.radians(25))  # so that the camera is at larger x, up the stairs
+        # so that the camera is at larger x, up the stairs
+        qpos[3:7] = np.cos(np.radians(25)), 0, 0, np.sin(np.radians(25))
         cast.pose(qpos)
         camera = RobotCamera(mujoco.MjvCamera(), cast, by_hand=False).update("follow", 0)
         assert camera.azimuth == pytest.approx(180.0)
@@ -182,7 +197,9 @@ def test_the_camera_looks_over_what_rises_before_it(hilly_spec: mujoco.MjSpec, h
 
 
 def test_boxes_are_places_too() -> None:
-    step = "<worldbody><geom type='box' size='1 1 .1'/><body pos='0 0 1'><freejoint/><geom size='.1'/></body></worldbody>"
+    step = (
+        "<worldbody><geom type='box' size='1 1 .1'/><body pos='0 0 1'><freejoint/><geom size='.1'/></body></worldbody>"
+    )
     assert not PosedRobots(mujoco.MjSpec.from_string(f"<mujoco>{step}</mujoco>"), 3).offsets.any()
 
 
@@ -199,14 +216,21 @@ def played(*args: str) -> tuple[str, Session]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Session, "run", note)
-        result = run("play", ROOT, "--task", "go1_rough", "--load_run", "shipped", "--device", "cpu", "--viewer", "none", *args)
+        result = run(
+            "play", ROOT, "--task", "go1_rough", "--load_run", "shipped", "--device", "cpu", "--viewer", "none", *args
+        )
     assert result.code == 0, result.err
     return result.out, sessions[0]
 
 
 def test_play_has_a_small_grid_with_a_robot_on_each_kind() -> None:
     out, session = played()
-    for line in ("env.num_envs: 8192 -> 8", "terrain.num_rows: 10 -> 3", "terrain.num_cols: 20 -> 8", "terrain.border_size: 5.0 -> 2.0"):
+    for line in (
+        "env.num_envs: 8192 -> 8",
+        "terrain.num_rows: 10 -> 3",
+        "terrain.num_cols: 20 -> 8",
+        "terrain.border_size: 5.0 -> 2.0",
+    ):
         assert f"  {line}\n" in out
     kinds = load_task("go1_rough").cfg.terrain.terrain_proportions
     on = [session.stage.ground(world).split(",")[0] for world in range(8)]
@@ -216,9 +240,20 @@ def test_play_has_a_small_grid_with_a_robot_on_each_kind() -> None:
 
 
 def test_what_is_said_of_the_ground_wins_over_the_small_grid() -> None:
-    stairs = ("--set", "terrain.terrain_proportions={stairs_up: 1}", "--set", "terrain.difficulty=[0.5,0.5]", "--set", "terrain.num_rows=1")
+    stairs = (
+        "--set",
+        "terrain.terrain_proportions={stairs_up: 1}",
+        "--set",
+        "terrain.difficulty=[0.5,0.5]",
+        "--set",
+        "terrain.num_rows=1",
+    )
     out, session = played(*stairs)
-    assert "  terrain.num_cols: 20 -> 1\n" in out and "-> {'stairs_up': 1.0}\n" in out and "  env.num_envs: 8192 -> 1\n" in out
+    assert (
+        "  terrain.num_cols: 20 -> 1\n" in out
+        and "-> {'stairs_up': 1.0}\n" in out
+        and "  env.num_envs: 8192 -> 1\n" in out
+    )
     assert session.stage.ground(0) == "stairs_up, step 12.8 cm"
     out, session = played(*stairs, "--num_envs", "2", "--set", "terrain.num_cols=2", "--set", "terrain.curriculum=true")
     assert "terrain.curriculum" not in out and session.stage.num_worlds == 2
@@ -240,10 +275,21 @@ def draw(monkeypatch: pytest.MonkeyPatch, *args: str) -> None:
         terrain_picture.main()
 
 
-def test_the_picture_of_all_tiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_picture_of_all_tiles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(terrain_picture, "WIDTH", 640)
     kinds = "terrain.terrain_proportions={stairs_up:1, flat:1}"
-    draw(monkeypatch, str(tmp_path / "g.png"), "--set", "terrain.num_rows=3", "--set", kinds, "--set", "terrain.horizontal_scale=0.1")
+    draw(
+        monkeypatch,
+        str(tmp_path / "g.png"),
+        "--set",
+        "terrain.num_rows=3",
+        "--set",
+        kinds,
+        "--set",
+        "terrain.horizontal_scale=0.1",
+    )
     assert capsys.readouterr().out.startswith("written to ")
     with av.open(str(tmp_path / "g.png")) as container:
         frame = next(container.decode(video=0)).to_ndarray(format="rgb24")
@@ -252,7 +298,9 @@ def test_the_picture_of_all_tiles(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     lines = np.flatnonzero(names.any(axis=(1, 2)))
     difficulty, stairs_up, flat_ = (len(block) for block in np.split(lines, np.flatnonzero(np.diff(lines) > 3) + 1))
     assert stairs_up > 1.5 * max(difficulty, flat_), "its name, and under it its measure"
-    stairs, flat = (frame[part, 300:, 1].std() for part in (slice(40, frame.shape[0] // 2), slice(frame.shape[0] // 2 + 30, -20)))
+    stairs, flat = (
+        frame[part, 300:, 1].std() for part in (slice(40, frame.shape[0] // 2), slice(frame.shape[0] // 2 + 30, -20))
+    )
     assert stairs > 2 * flat
 
 
@@ -270,7 +318,9 @@ def blocks(ink: np.ndarray, gap: int) -> int:
         (100, ["stairs_up", "flat"], (96, 2560), 34, 2),  # every third number, and one name
     ],
 )
-def test_names_do_not_run_into_each_other(levels: int, kinds: list[str], size: tuple[int, int], numbers: int, lines: int) -> None:
+def test_names_do_not_run_into_each_other(
+    levels: int, kinds: list[str], size: tuple[int, int], numbers: int, lines: int
+) -> None:
     frame = terrain_picture.picture(terrain(*kinds, levels=levels, cell=1.0))
     assert frame.shape[:2] == pytest.approx(size, abs=8)
     ink = (frame > 230).all(axis=2)
@@ -282,9 +332,15 @@ def test_names_do_not_run_into_each_other(levels: int, kinds: list[str], size: t
     ("args", "message"),
     [
         (["a.jpg"], "a.jpg: the picture is a PNG; give it a name that ends in .png"),
-        (["a.png", "--task", "go1_flat"], "go1_flat is on a plane; to see its section terrain all the same add --set terrain.mesh_type="),
+        (
+            ["a.png", "--task", "go1_flat"],
+            "go1_flat is on a plane; to see its section terrain all the same add --set terrain.mesh_type=",
+        ),
         (["a.png", "--set", "terrain.num_rows=0"], "terrain.num_rows is 0; it must be 1 or more"),
-        (["a.png", "--set", "terrain.terrain_proportions={moon: 1}"], "no kind of terrain 'moon' in terrain.terrain_proportions"),
+        (
+            ["a.png", "--set", "terrain.terrain_proportions={moon: 1}"],
+            "no kind of terrain 'moon' in terrain.terrain_proportions",
+        ),
     ],
 )
 def test_mistakes_are_one_line(

@@ -77,7 +77,9 @@ def test_figures_of_a_policy_that_walks(both: tuple[dict[str, Any], ...]) -> Non
     assert shares == 12
     assert [motor["kind"] for motor in figures["motors"]] == ["hip", "thigh", "calf"]
     assert all(motor["at_limit"] < 0.01 and np.sum(motor["counts"]) == 4 * 22 * 20 for motor in figures["motors"])
-    assert [sum(row) / 16 for row in figures["pushes"]["walking"]] == pytest.approx(list(result["pushes"].values()), abs=1e-4)
+    assert [sum(row) / 16 for row in figures["pushes"]["walking"]] == pytest.approx(
+        list(result["pushes"].values()), abs=1e-4
+    )
     assert figures["steps"]["vx"]["commanded"] == [1.0] * 20 and figures["steps"]["vx"]["fell"] == 0
     assert figures["steps"]["vx"]["mean"] == pytest.approx([1.0] * 20, abs=0.15)
 
@@ -86,11 +88,23 @@ def test_the_plan() -> None:
     """Exam first; grids over the trained ranges; the same steps in each world, later and later."""
     plan = make_plan(shipped().cfg, 0.02)
     assert plan.cases[: GO1.worlds()] == exam.cases(GO1, 0.02)
-    assert [plan.parts[name] for name in ("commands", "transport", "pushes")] == [slice(0, 22), slice(22, 22), slice(22, 118)]
+    assert [plan.parts[name] for name in ("commands", "transport", "pushes")] == [
+        slice(0, 22),
+        slice(22, 22),
+        slice(22, 118),
+    ]
     corner = plan.cases[plan.parts["vx_yaw"]][-1]
-    assert corner == Case(((0, (1.5, 0.0, 1.2)),)) and plan.cases[plan.parts["vx_vy"]][0] == Case(((0, (-1.5, -0.8, 0.0)),))
+    assert corner == Case(((0, (1.5, 0.0, 1.2)),)) and plan.cases[plan.parts["vx_vy"]][0] == Case(
+        ((0, (-1.5, -0.8, 0.0)),)
+    )
     first, second, *_ = plan.cases[plan.parts["step_vy"]]
-    assert first.commands == ((0, (0, 0, 0)), (10, (0, 0.53, 0)), (125, (0, -0.53, 0)), (250, (0, 0, 0)), (375, (0, 0.53, 0)))
+    assert first.commands == (
+        (0, (0, 0, 0)),
+        (10, (0, 0.53, 0)),
+        (125, (0, -0.53, 0)),
+        (250, (0, 0, 0)),
+        (375, (0, 0.53, 0)),
+    )
     assert [step for step, _ in second.commands] == [0, 13, 125, 250, 375]
     assert sum(part.stop - part.start for part in plan.parts.values()) == len(plan.cases)
     narrow = shipped().cfg
@@ -151,7 +165,12 @@ def pages(both: tuple[dict[str, Any], ...], tmp_path_factory: pytest.TempPathFac
         shown |= {"edges": [], "density": [], "quantiles": [], "saturated": []}
     nothing["reward"] = dict.fromkeys(nothing["reward"])
     folder = tmp_path_factory.mktemp("eval")
-    about = {"policy": "go1_flat/a & b/model_7.pt", "engine": "mujoco", "device": "cpu", "overrides": {"noise.level": 0.0}}
+    about = {
+        "policy": "go1_flat/a & b/model_7.pt",
+        "engine": "mujoco",
+        "device": "cpu",
+        "overrides": {"noise.level": 0.0},
+    }
     columns = [report.Column("<first>", about, result, figures), report.Column("rival", about, fallen, nothing)]
     other = {**result, "error": [value + 0.004 for value in result["error"]]}
     report.write(folder, "go1_flat", columns, extras=[("by numpy", other)])
@@ -177,7 +196,10 @@ def test_the_page_shows_columns_gaps_and_verdicts(pages: Path) -> None:
     assert row is not None
     assert row[0].count('class="value pass"') == 2 and row[0].count('class="value fail"') == 1
     assert "<small>+0.004</small>" in row[0] and ">0.568<" in row[0] and ">fell<" in html
-    assert "asked: vx -1.5 to 1.5 m/s, vy -0.8 to 0.8 m/s, yaw rate -1.2 to 1.2 rad/s. A command at which the robot falls counts" in html
+    assert (
+        "asked: vx -1.5 to 1.5 m/s, vy -0.8 to 0.8 m/s, yaw rate -1.2 to 1.2 rad/s. A command at which the robot falls counts"
+        in html
+    )
     assert "Published policies" not in html
     assert "does not walk<" in html and "does not beat the peer" in html
 
@@ -212,14 +234,19 @@ def test_several_peers_are_their_best_and_a_table(
     """The best of each figure beside the policy's, all of them below; what was not asked alike is said."""
     _, result, figures = both
     draw = plots.sections
-    monkeypatch.setattr(plots, "sections", lambda *args: [each for each in draw(*args) if each.name in ("pushes", "energy")])
+    monkeypatch.setattr(
+        plots, "sections", lambda *args: [each for each in draw(*args) if each.name in ("pushes", "energy")]
+    )
     asked = ExamRules.from_mapping({"peer": "go2", **in_common("go2")})
     pushes = dict(zip(("0.5", "1", "1.5", "2", "3", "4", "5", "6"), [1.0] * 8, strict=True))
     figures = copy.deepcopy(figures)
     figures["pushes"] = {"speeds": list(asked.push_speeds), **dict.fromkeys(("walking", "standing"), [[True] * 16] * 8)}
     graded = {**result, "pushes": pushes, "beats_peer": False, "rules": asked.to_mapping()}
     report.write(tmp_path, "go2", [Column("mine", {}, graded, figures)])
-    html, saved = (tmp_path / "report.html").read_text(encoding="utf-8"), json.loads((tmp_path / "report.json").read_text())
+    html, saved = (
+        (tmp_path / "report.html").read_text(encoding="utf-8"),
+        json.loads((tmp_path / "report.json").read_text()),
+    )
     assert (
         "<td>0.30*</td>" in html
         and "<td>0.034</td>" in html
@@ -249,7 +276,9 @@ def test_marks_of_offsets_are_no_marks_of_errors(both: tuple[dict[str, Any], ...
     assert ">0.06</text>" in drawn[1] and ">0.06</text>" not in drawn[0]
     html = page.html("biped", asked, [Column("mine", {}, graded, figures)], [(sections["tracking"], [])])
     assert "The stroke on each scale" not in html and "vx offset" in html and "of the mean velocity" in html
-    assert "The stroke on each scale" in page.html("go1", GO1, [Column("mine", {}, result, figures)], [(sections["tracking"], [])])
+    assert "The stroke on each scale" in page.html(
+        "go1", GO1, [Column("mine", {}, result, figures)], [(sections["tracking"], [])]
+    )
     assert ">2 fell</text>" in "".join(plots.svgs(sections["steps"]._replace(panels=sections["steps"].panels[:1])))
 
 
@@ -274,14 +303,19 @@ def test_two_policies_are_asked_the_same() -> None:
     assert ExamRules.from_config(second.cfg) != GO1
     report.ask_alike([first, second])
     assert ExamRules.from_config(first.cfg) == ExamRules.from_config(second.cfg) == GO1
-    assert first.cfg.exam.ranges == {} and second.cfg.env.num_envs == worlds - 1  # no world more for the cost of transport
+    # no world more for the cost of transport
+    assert first.cfg.exam.ranges == {} and second.cfg.env.num_envs == worlds - 1
 
 
-def test_compare_grades_each_by_its_own_config(two_runs: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compare_grades_each_by_its_own_config(
+    two_runs: tuple[Path, Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     root, first, second = two_runs
     monkeypatch.setattr(exam, "SECONDS", 2.1)
     written: list[Any] = []
-    kind = exams.EXAMS["walking"]._replace(write=lambda folder, task, columns, extras: written.extend([folder, task, *columns]))
+    kind = exams.EXAMS["walking"]._replace(
+        write=lambda folder, task, columns, extras: written.extend([folder, task, *columns])
+    )
     monkeypatch.setitem(exams.EXAMS, "walking", kind)
     monkeypatch.setattr(grading, "elsewhere", lambda *_: [])
     small = ["--load_run", first.name, "--compare", second.name, "--set", "terrain.friction=0.4"]
@@ -289,7 +323,9 @@ def test_compare_grades_each_by_its_own_config(two_runs: tuple[Path, Path, Path]
     assert result.code == 0, result.err
     folder, task, one, other = written
     assert folder == first / "eval" and task == "go1_flat"
-    assert one.about["policy"].endswith(f"{first.name}/model_1.pt") and other.about["policy"].endswith(f"{second.name}/model_1.pt")
+    assert one.about["policy"].endswith(f"{first.name}/model_1.pt") and other.about["policy"].endswith(
+        f"{second.name}/model_1.pt"
+    )
     assert one.about["overrides"]["terrain.friction"] == other.about["overrides"]["terrain.friction"] == 0.4
     assert one.exam != other.exam and one.figures.keys() == other.figures.keys()
     assert result.out.count("falls in 22 commands") == 2
@@ -300,11 +336,19 @@ def test_compare_grades_each_by_its_own_config(two_runs: tuple[Path, Path, Path]
     ("change", "line"),
     [
         ({"task": "go1_flat_fast"}, "is of task 'go1_flat_fast', not 'go1_flat': two policies are graded on one task"),
-        ({"actor": {"hidden_dims": [9]}}, "does not fit this task: actor mlp.0.weight is (8, 48) there and (9, 48) here"),
-        ({"obs_groups": {"actor": ["privileged_state"]}}, "does not fit this task: actor obs_normalizer._mean is (1, 48) there and (1, 12"),
+        (
+            {"actor": {"hidden_dims": [9]}},
+            "does not fit this task: actor mlp.0.weight is (8, 48) there and (9, 48) here",
+        ),
+        (
+            {"obs_groups": {"actor": ["privileged_state"]}},
+            "does not fit this task: actor obs_normalizer._mean is (1, 48) there and (1, 12",
+        ),
     ],
 )
-def test_a_rival_that_does_not_fit_is_refused(two_runs: tuple[Path, Path, Path], change: dict[str, Any], line: str) -> None:
+def test_a_rival_that_does_not_fit_is_refused(
+    two_runs: tuple[Path, Path, Path], change: dict[str, Any], line: str
+) -> None:
     root, first, second = two_runs
     config = second / "config.yaml"
     kept = config.read_text()
@@ -313,7 +357,9 @@ def test_a_rival_that_does_not_fit_is_refused(two_runs: tuple[Path, Path, Path],
         saved[section] = saved[section] | value if isinstance(value, dict) else value
     config.write_text(json.dumps(saved))
     try:
-        text = refused(root, "play", *SMALL[:2], "--device", "cpu", "--eval", "--load_run", first.name, "--compare", second.name)
+        text = refused(
+            root, "play", *SMALL[:2], "--device", "cpu", "--eval", "--load_run", first.name, "--compare", second.name
+        )
     finally:
         config.write_text(kept)
     assert line in text
@@ -324,7 +370,9 @@ def test_compare_mistakes(two_runs: tuple[Path, Path, Path]) -> None:
     start = [*SMALL[:2], "--device", "cpu"]
     assert "add --eval" in refused(root, "play", *start, "--compare", "shipped")
     assert "no run with a checkpoint 'nobody' in " in refused(root, "play", *start, "--eval", "--compare", "nobody")
-    assert "--compare shipped: no policy ships with go1_flat" in refused(root, "play", *start, "--eval", "--compare", "shipped")
+    assert "--compare shipped: no policy ships with go1_flat" in refused(
+        root, "play", *start, "--eval", "--compare", "shipped"
+    )
 
 
 def test_tables_of_two_policies_with_other_ranges() -> None:

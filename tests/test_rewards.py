@@ -174,7 +174,10 @@ def test_settings_reach_the_terms() -> None:
 def test_moving_is_the_norm_of_all_three_commands() -> None:
     env = make_env(6, HAND)
     env.commands.copy_(
-        torch.tensor([[0, 0, 0], [0.0099, 0, 0], [0.0101, 0, 0], [0, -0.0101, 0], [0, 0, -0.0101], [0.006, 0.006, 0.006]])  # norm 0.0104
+        # norm 0.0104
+        torch.tensor(
+            [[0, 0, 0], [0.0099, 0, 0], [0.0101, 0, 0], [0, -0.0101, 0], [0, 0, -0.0101], [0.006, 0.006, 0.006]]
+        )
     )
     env._update_state()
     assert env.moving.tolist() == [False, False, True, True, True, True]
@@ -207,7 +210,11 @@ W, L = 0.2131431, 0.5557057
         ({"max_reward": 0.002, "clip_termination": True}, 0.1, 0.0),
         ({"scales.torques": -0.02}, 0.0, L - 0.1546410 - 1.0),  # W - 0.32 is clipped
         ({"scales.torques": -0.02, "only_positive_rewards": False}, W - 0.32, L - 0.1546410 - 1.0),
-        ({"scales.torques": -0.02, "only_positive_rewards": False, "clip_termination": True}, W - 0.32, L - 0.1546410 - 1.0),
+        (
+            {"scales.torques": -0.02, "only_positive_rewards": False, "clip_termination": True},
+            W - 0.32,
+            L - 0.1546410 - 1.0,
+        ),
     ],
 )
 def test_clip(settings: dict[str, object], walking: float, lying: float) -> None:
@@ -226,7 +233,9 @@ def test_tracking_sigma_goes_to_its_end_over_a_training() -> None:
         assert env._reward_tracking_lin_vel()[0].item() == pytest.approx(math.exp(-squared / sigma), rel=1e-5)
     fixed = make_env(2, HAND)
     fixed.anneal(1.0)
-    assert fixed.tracking_sigma == 0.25 and not isinstance(fixed.tracking_sigma, torch.Tensor), "no operation more than a number takes"
+    assert fixed.tracking_sigma == 0.25 and not isinstance(fixed.tracking_sigma, torch.Tensor), (
+        "no operation more than a number takes"
+    )
 
 
 def test_reward_is_for_a_control_step_of_any_length() -> None:
@@ -240,7 +249,8 @@ def test_reward_is_for_a_control_step_of_any_length() -> None:
 def test_sums_of_the_episode_are_before_the_clip_and_its_return_after() -> None:
     env = make_env(2, {**HAND, **only_scales(torques=-0.02, tracking_lin_vel=1.0, termination=-1.0)})
     paint(env)
-    assert env.reward_names == ["tracking_lin_vel", "torques", "termination"]  # in the config's order, what comes after the clip last
+    # in the config's order, what comes after the clip last
+    assert env.reward_names == ["tracking_lin_vel", "torques", "termination"]
     for _ in range(2):
         env.compute_reward()
     terms = torch.tensor([[0.533143, -0.02 * 32.0, 0.0], [0.710346, -0.02 * 15.464102, -1.0]])
@@ -291,7 +301,8 @@ def test_first_contact_air_time_and_swing_peak() -> None:
     rl = [(0, 0.30), (2, 0.02), (2, 0.02), (0, 0.20), (0, 0.10), (0, 0.25), (1, 0.02)]
     first_fr = [False, False, False, True, False, False, True]
     air_fr = [0.02, 0.02, 0.04, 0.06, 0.02, 0.02, 0.04]  # what the reward sees: with this step, before it is zeroed
-    peak_fr = [0.02, 0.05, 0.09, 0.09, 0.04, 0.01, 0.02]  # the height at touch-down counts, that of the last stance does not
+    # the height at touch-down counts, that of the last stance does not
+    peak_fr = [0.02, 0.05, 0.09, 0.09, 0.04, 0.01, 0.02]
     first_rl = [False, True, False, False, False, False, True]
     air_rl = [0.02, 0.04, 0.02, 0.02, 0.04, 0.06, 0.08]
     peak_rl = [0.30, 0.30, 0.02, 0.20, 0.20, 0.25, 0.25]
@@ -301,14 +312,17 @@ def test_first_contact_air_time_and_swing_peak() -> None:
         assert air.tolist() == pytest.approx([air_fr[t], 0.02, 0.02 * (t + 1), air_rl[t]]), t
         assert peak.tolist() == pytest.approx([peak_fr[t], 0.02, 0.1 + 0.01 * t, peak_rl[t]]), t
         assert env.foot_contact[0].tolist() == [fr[t][0] > 0, True, False, rl[t][0] > 0], t
-    assert env.feet_air_time[0].tolist() == pytest.approx([0.0, 0.0, 0.14, 0.0])  # after the step, zero where in contact
+    # after the step, zero where in contact
+    assert env.feet_air_time[0].tolist() == pytest.approx([0.0, 0.0, 0.14, 0.0])
     assert env.swing_peak[0].tolist() == pytest.approx([0.0, 0.0, 0.16, 0.0])
     assert env.foot_contact[1].tolist() == [False] * 4  # the other world heard nothing of it
 
 
 def test_a_landing_after_a_drop_is_one_first_contact_a_foot() -> None:
     """Through the physics: a robot let fall from 0.4 m lands once, with the air time of the fall."""
-    env = make_env(2, {**HAND, "init_state.lin_vel_range": 0.0, "init_state.ang_vel_range": 0.0, "init_state.pos": [0.0, 0.0, 0.4]})
+    env = make_env(
+        2, {**HAND, "init_state.lin_vel_range": 0.0, "init_state.ang_vel_range": 0.0, "init_state.pos": [0.0, 0.0, 0.4]}
+    )
     landings, times = torch.zeros(2, 4), torch.zeros(2, 4)
     for _ in range(25):
         env.actions.zero_()
@@ -335,7 +349,9 @@ def test_statistics_are_the_sums_of_what_step_returned() -> None:
 
     def add_terms() -> None:
         """The terms of this step by name, straight from the methods, at the moment after the reward."""
-        terms.add_(torch.stack([scale * getattr(env, f"_reward_{name}")() * DT for name, scale in GO1_FLAT.items()], dim=1))
+        terms.add_(
+            torch.stack([scale * getattr(env, f"_reward_{name}")() * DT for name, scale in GO1_FLAT.items()], dim=1)
+        )
         finish()
 
     env._end_step = add_terms  # pyright: ignore[reportAttributeAccessIssue]
@@ -354,7 +370,15 @@ def test_statistics_are_the_sums_of_what_step_returned() -> None:
         expected = sum(row[2][k] for row in rows) / count / 0.3  # the episode length in seconds
         assert stats[f"rew_{name}"] == pytest.approx(expected, rel=1e-3, abs=1e-6), name
     broken_by = {"broken_by_action", *(f"broken_by/{joint}" for joint in env.robot.joint_names)}
-    known = {"reward", "episode_length", "episodes", "fell", "broken", "overflowed", *(f"rew_{name}" for name in GO1_FLAT)}
+    known = {
+        "reward",
+        "episode_length",
+        "episodes",
+        "fell",
+        "broken",
+        "overflowed",
+        *(f"rew_{name}" for name in GO1_FLAT),
+    }
     assert stats.keys() == known | broken_by
     again = env.read_statistics()
     assert again["episodes"] == again["fell"] == 0 and math.isnan(again["episode_length"])  # reading starts anew

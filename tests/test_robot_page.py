@@ -44,11 +44,19 @@ WHEEL = """
 </body></worldbody></mujoco>"""
 
 
-def wheel(folder: Path, *, half: float = 0.2, offset: float = 0.0, more: str = 'actuatorfrcrange="-3 3"', **choices: Any) -> RobotModel:
+def wheel(
+    folder: Path, *, half: float = 0.2, offset: float = 0.0, more: str = 'actuatorfrcrange="-3 3"', **choices: Any
+) -> RobotModel:
     file = folder / "wheel.xml"
     file.write_text(WHEEL.format(half=half, offset=offset, more=more))
     plain = {
-        **{"solver": Solver(DT, 10, 20), "ground": Ground(), "stiffness": {"": KP}, "damping": {"": KD}, "colliders": ["*"]},
+        **{
+            "solver": Solver(DT, 10, 20),
+            "ground": Ground(),
+            "stiffness": {"": KP},
+            "damping": {"": KD},
+            "colliders": ["*"],
+        },
         **{"self_collisions": False, "contact_geoms": ["slab"], "velocity_sites": [], "imu_site": "imu"},
     }
     return build_model(file, **{**plain, **choices})
@@ -78,7 +86,8 @@ def test_a_robot_of_one_joint(tmp_path: Path) -> None:
 
 def test_sag_is_the_torque_at_rest_over_kp(tmp_path: Path) -> None:
     found = health(wheel(tmp_path, offset=0.1))
-    assert found.joints[0].torque == pytest.approx(-1.0 * 9.81 * 0.1, rel=1e-3)  # the weight turns it forwards, about +y
+    # the weight turns it forwards, about +y
+    assert found.joints[0].torque == pytest.approx(-1.0 * 9.81 * 0.1, rel=1e-3)
     assert found.joints[0].sag() == pytest.approx(0.981 / KP, rel=1e-3)
     assert found.margin == pytest.approx(0.2 - 0.1 / 3.0, abs=1e-3)  # 1 kg of 3 is 0.1 m ahead
 
@@ -131,7 +140,10 @@ def test_a_damping_that_the_step_does_not_bear(tmp_path: Path) -> None:
     assert found.stand.end == "diverges" and found.stand.joints[0] == "wheel"
     text = page(found, "it")
     assert "servos in the air: UNSTABLE, a mode of wheel grows 2.20-fold a substep" in text  # d = 3.2: |1 - d|
-    assert "unstable servos: wheel: lower control.damping or control.stiffness, or give them armature (asset.armature)" in text
+    assert (
+        "unstable servos: wheel: lower control.damping or control.stiffness, or give them armature (asset.armature)"
+        in text
+    )
     assert "no force limit: wheel: say asset.effort" in text
     assert "!!3.20" in text and "action zero          diverges after" in text
     calm = health(wheel(tmp_path, damping={"": 40.0}, solver=Solver(DT, 10, 20, "implicitfast")))
@@ -234,18 +246,25 @@ def test_check_prints_the_page_and_draws_the_robot(tmp_path: Path) -> None:
     assert result.out.index("observation state") < result.out.index("health of go1_rough")
     for text in (
         "mass                 12.74 kg",
-        "at rest              4 contacts, 28 constraint rows; room for more (sim.nconmax, sim.njmax): 8, 56",  # of its rough ground
+        # of its rough ground
+        "at rest              4 contacts, 28 constraint rows; room for more (sim.nconmax, sim.njmax): 8, 56",
         "stands on its servos for 5 s",
         "substep              4 ms, euler; servos in the air: stable",
         "nothing: all numbers are within bounds",
     ):
         assert text in result.out, result.out
-    row = next(line for line in result.out.splitlines() if line.startswith("  FL_calf_joint") and "35.55" in line and "20.06" in line)
+    row = next(
+        line
+        for line in result.out.splitlines()
+        if line.startswith("  FL_calf_joint") and "35.55" in line and "20.06" in line
+    )
     assert row.split()[-2:] == ["36", "0.9"]
     assert png_size(picture) == (2 * WIDTH, HEIGHT)
 
 
-def test_a_picture_that_cannot_be_drawn_leaves_the_page(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_picture_that_cannot_be_drawn_leaves_the_page(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """As on a machine without OpenGL."""
 
     def fails(*_: object) -> None:
@@ -255,7 +274,11 @@ def test_a_picture_that_cannot_be_drawn_leaves_the_page(monkeypatch: pytest.Monk
     monkeypatch.setattr(sys, "argv", ["robot", str(TOY), "--picture", "robot.png"])
     with pytest.raises(UserError, match="No OpenGL context"):
         program.main()
-    assert "health of toy_biped.xml" in (out := capsys.readouterr().out) and "what to look at" in out and "picture: " not in out
+    assert (
+        "health of toy_biped.xml" in (out := capsys.readouterr().out)
+        and "what to look at" in out
+        and "picture: " not in out
+    )
 
 
 def test_picture_wants_check_and_a_png(tmp_path: Path) -> None:
@@ -278,8 +301,12 @@ def test_all_joints_without_a_key_at_once(tmp_path: Path) -> None:
         "TASK = Task(LeggedRobot, Cfg, Go1FlatCfgPPO)\n"
     )
     text = refused(tmp_path, "train", "--task", str(task), "--check", "--device", "cpu")
-    hips, thighs, calves = ([f"{leg}_{part}_joint" for leg in ("FR", "FL", "RR", "RL")] for part in ("hip", "thigh", "calf"))
-    both, either = (", ".join(joint for pair in zip(hips, other, strict=True) for joint in pair) for other in (thighs, calves))
+    hips, thighs, calves = (
+        [f"{leg}_{part}_joint" for leg in ("FR", "FL", "RR", "RL")] for part in ("hip", "thigh", "calf")
+    )
+    both, either = (
+        ", ".join(joint for pair in zip(hips, other, strict=True) for joint in pair) for other in (thighs, calves)
+    )
     assert f"control.stiffness: no value for {both}: none of ['calf']" in text
     assert f"control.damping: no value for {', '.join(thighs)}: none of ['hip', 'calf']" in text
     assert f"rewards.pose_weights: no value for {either}: none of ['thigh']" in text
@@ -306,7 +333,9 @@ def test_a_new_task_checks_and_trains(
     assert [*(tmp_path / "logs").glob("*/*/model_2.pt")]
 
 
-def test_a_new_task_overwrites_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_new_task_overwrites_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     mine = tmp_path / "mine_flat.py"
     mine.write_text("of mine")
     text = complaint(monkeypatch, capsys, GO1, "--new", "mine", "--out", tmp_path)
@@ -314,13 +343,17 @@ def test_a_new_task_overwrites_nothing(tmp_path: Path, monkeypatch: pytest.Monke
     assert mine.read_text() == "of mine" and [*tmp_path.iterdir()] == [mine]
     show(monkeypatch, capsys, GO1, "--new", "mine", "--out", tmp_path, "--force")
     assert mine.read_text() != "of mine" and (tmp_path / "mine.xml").read_bytes() == GO1.read_bytes()
-    assert "a b/mine_flat.py' --check" in show(monkeypatch, capsys, GO1, "--new", "mine", "--out", tmp_path / "a b"), "can be pasted"
+    assert "a b/mine_flat.py' --check" in show(monkeypatch, capsys, GO1, "--new", "mine", "--out", tmp_path / "a b"), (
+        "can be pasted"
+    )
     assert "a name begins with a letter" in complaint(monkeypatch, capsys, GO1, "--new", "a/b", "--out", tmp_path)
     assert "go1_flat is a task already" in complaint(monkeypatch, capsys, "go1_flat", "--new", "mine")
 
 
 def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
-    assert draft(GO1).guessed[0] == "pose: the file's keyframe" and draft(GO1).pose[:3] == pytest.approx([0.1, 0.9, -1.8])
+    assert draft(GO1).guessed[0] == "pose: the file's keyframe" and draft(GO1).pose[:3] == pytest.approx(
+        [0.1, 0.9, -1.8]
+    )
     bare = tmp_path / "bare.xml"
     bare.write_text(re.sub(r"<keyframe>.*</keyframe>", "", GO1.read_text(), flags=re.DOTALL))
     found = draft(bare)
@@ -330,15 +363,24 @@ def test_a_draft_says_what_it_guessed(tmp_path: Path) -> None:
     assert found.place[2] == pytest.approx(2 * 0.213 * math.cos(0.8) + 0.023, abs=0.01)
     assert health_of(found, bare).stand.end == "stands"
     text = config_text(found, GO1, "my_go")
-    assert "class MyGoFlatCfg(LeggedRobotCfg):" in text and 'foot_names = ["FR", "FL", "RR", "RL"]  # LOOK: guessed' in text
+    assert (
+        "class MyGoFlatCfg(LeggedRobotCfg):" in text
+        and 'foot_names = ["FR", "FL", "RR", "RL"]  # LOOK: guessed' in text
+    )
     assert "(quadruped, 12 joints; " in text and "effort" not in text
     biped = config_text(draft(TOY), TOY, "toy", mirrors=True)
-    assert "class ToyFlatCfg(BipedCfg):" in biped and "class ToyFlatCfgPPO(BipedCfgPPO):" in biped and "use_data" not in biped
+    assert (
+        "class ToyFlatCfg(BipedCfg):" in biped
+        and "class ToyFlatCfgPPO(BipedCfgPPO):" in biped
+        and "use_data" not in biped
+    )
     assert 'pose_weights = {"": 0.02, "ankle": 0.05}' in biped and "min_feet_distance = 0.12" in biped
     assert "use_data_augmentation = False  # left and right are not alike" in config_text(draft(TOY), TOY, "toy")
     free = tmp_path / "free.xml"
     free.write_text(GO1.read_text().replace("actuatorfrcrange", "user"))
-    assert 'effort = {"": 30.0}  # [N m] LOOK: the file has no force limit for all joints' in config_text(draft(free), free, "free")
+    assert 'effort = {"": 30.0}  # [N m] LOOK: the file has no force limit for all joints' in config_text(
+        draft(free), free, "free"
+    )
 
 
 def test_a_robot_that_would_sink_gets_firmer_servos(tmp_path: Path) -> None:
@@ -347,7 +389,11 @@ def test_a_robot_that_would_sink_gets_firmer_servos(tmp_path: Path) -> None:
     heavy.write_text((ROOT / "tests/data/go2_style.xml").read_text().replace('mass="7"', 'mass="12"'))
     found, light = draft(heavy), draft(ROOT / "tests/data/go2_style.xml")
     assert found.guessed[2] == "gains: 1.5 times what is suggested below, to stand on its servos"
-    assert [gain.kp for gain in found.gains[:3]] == [36.0, 36.0, 68.0] and [gain.kp for gain in light.gains[:3]] == [24.0, 24.0, 45.0]
+    assert [gain.kp for gain in found.gains[:3]] == [36.0, 36.0, 68.0] and [gain.kp for gain in light.gains[:3]] == [
+        24.0,
+        24.0,
+        45.0,
+    ]
     assert health_of(found, heavy).stand.end == "stands" and light.guessed[2] == "gains: as suggested below"
 
 
@@ -374,7 +420,9 @@ def test_feet_and_poses_of_vendors_files(file: Path) -> None:
         assert angle["LF_HFE"] == pytest.approx(-angle["LH_HFE"]) and angle["LF_KFE"] == -angle["LH_KFE"] == -1.6
     if file.stem.startswith("g1"):
         assert angle["left_knee_joint"] == 0.6
-        assert sum(angle[f"left_{part}_joint"] for part in ("hip_pitch", "knee", "ankle_pitch")) == pytest.approx(0.0, abs=1e-6)
+        assert sum(angle[f"left_{part}_joint"] for part in ("hip_pitch", "knee", "ankle_pitch")) == pytest.approx(
+            0.0, abs=1e-6
+        )
 
 
 def test_feet_that_the_pose_lifts_are_feet(tmp_path: Path) -> None:
@@ -385,20 +433,31 @@ def test_feet_that_the_pose_lifts_are_feet(tmp_path: Path) -> None:
     assert found.pose[:6] == [0.0, -1.2, -1.8] * 2 and [foot.name for foot in found.feet] == FEET["go2_style"]
 
 
-def test_what_of_the_file_is_changed_is_on_its_page(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_of_the_file_is_changed_is_on_its_page(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """--new makes an MJCF of a URDF: what was left out of it is said here or nowhere, and its speed limits go into the config."""
     a1, t1 = ROOT / "tests/data/a1_style.urdf", ROOT / "tests/data/t1_style.xml"
     text = show(monkeypatch, capsys, a1)
-    assert "in the file\n  looks left out (MuJoCo reads no .dae, " in text and "\n  free joint added to 'base'\n" in text
+    assert (
+        "in the file\n  looks left out (MuJoCo reads no .dae, " in text and "\n  free joint added to 'base'\n" in text
+    )
     changed = show(monkeypatch, capsys, t1)
     assert "\n  12 actuators replaced\n  keyframe 'stand' read" in changed
-    assert "\n  site 'imu_aligned' made at the place of 'imu' on 'Waist', with the axes of the root 'Trunk'\n" in changed
-    assert "\n  fused into 'Trunk', to which they are fixed: H2, AL, left_hand_link, AR, right_hand_link, Waist\n" in changed
+    assert (
+        "\n  site 'imu_aligned' made at the place of 'imu' on 'Waist', with the axes of the root 'Trunk'\n" in changed
+    )
+    assert (
+        "\n  fused into 'Trunk', to which they are fixed: H2, AL, left_hand_link, AR, right_hand_link, Waist\n"
+        in changed
+    )
     assert 'joint_speed_limits = {"": 28.6, "hip": 52.0}  # [rad/s] the file\'s' in config_text(draft(a1), a1, "mine")
     assert "joint_speed_limits" not in config_text(draft(t1), t1, "mine")
 
 
-def test_a_file_without_feet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_without_feet(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "wheel.xml"
     file.write_text(WHEEL.format(half=0.2, offset=0.0, more=""))
     assert "no part that ends a limb collides, so that no feet can be guessed" in complaint(monkeypatch, capsys, file)
@@ -406,7 +465,9 @@ def test_a_file_without_feet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
         '<mujoco><worldbody><body name="arm"><inertial pos="0 0 0" mass="1" diaginertia="0.01 0.01 0.01"/><body name="hand" pos="0 0 0.4">'
         '<joint name="wrist" axis="0 1 0" range="-1 1" limited="true"/><geom size="0.02"/></body></body></worldbody></mujoco>'
     )
-    text = "'arm', the root, is not above the lowest ends of limbs, hand; the health page is of robots that stand on them"
+    text = (
+        "'arm', the root, is not above the lowest ends of limbs, hand; the health page is of robots that stand on them"
+    )
     assert text in complaint(monkeypatch, capsys, file)
 
 
@@ -415,7 +476,9 @@ def test_names_beside_the_robot_do_not_overlap() -> None:
     rows = _columns(labels)
     for side in (True, False):
         heights = sorted(row for _, _, row, left in rows if left == side)
-        assert len(heights) >= 14 and min(np.diff(heights)) > 20.0 and heights[0] > 40.0 and heights[-1] < HEIGHT - 100.0
+        assert (
+            len(heights) >= 14 and min(np.diff(heights)) > 20.0 and heights[0] > 40.0 and heights[-1] < HEIGHT - 100.0
+        )
 
 
 # ---- physics that diverges stops a training ----
@@ -427,13 +490,18 @@ class FakeSim:
 
 
 def test_what_broke_a_world_is_counted() -> None:
-    sim, actions, broken = FakeSim(torch.zeros(5, 9), torch.zeros(5, 8)), torch.zeros(5, 2), torch.zeros(5, dtype=torch.bool)
+    sim, actions, broken = (
+        FakeSim(torch.zeros(5, 9), torch.zeros(5, 8)),
+        torch.zeros(5, 2),
+        torch.zeros(5, dtype=torch.bool),
+    )
     found = Divergence(sim, actions, ["hip", "knee"], 100.0)  # pyright: ignore[reportArgumentType]
     sim.qvel[:, 6:] = torch.tensor([1.0, 2.0])
     found.find(broken)
     assert not broken.any() and found.counts.tolist() == [0, 0, 0]
     sim.qvel[1, 6], sim.qvel[2] = 101.0, math.nan  # one joint too fast; all is lost, and nobody knows why
-    actions[3, 0], sim.qpos[4, 0] = math.nan, math.inf  # the policy's fault; the root is lost, and the knee is the fastest
+    # the policy's fault; the root is lost, and the knee is the fastest
+    actions[3, 0], sim.qpos[4, 0] = math.nan, math.inf
     found.find(broken)
     assert broken.tolist() == [False, True, True, True, True] and found.counts.tolist() == [1, 1, 1]
     assert {name: float(value) for name, value in found.statistics().items()} == {
@@ -443,8 +511,16 @@ def test_what_broke_a_world_is_counted() -> None:
     assert found.counts.tolist() == [2, 2, 2]
 
 
-def numbers(broken: float, episodes: float = 200.0, hip: float = 0.0, knee: float = 0.0, action: float = 0.0) -> dict[str, float]:
-    return {"broken": broken, "episodes": episodes, "broken_by/hip": hip, "broken_by/knee": knee, "broken_by_action": action}
+def numbers(
+    broken: float, episodes: float = 200.0, hip: float = 0.0, knee: float = 0.0, action: float = 0.0
+) -> dict[str, float]:
+    return {
+        "broken": broken,
+        "episodes": episodes,
+        "broken_by/hip": hip,
+        "broken_by/knee": knee,
+        "broken_by_action": action,
+    }
 
 
 def test_twice_in_a_row_over_one_percent() -> None:
@@ -457,19 +533,40 @@ def test_twice_in_a_row_over_one_percent() -> None:
     assert text.startswith(
         "in the last two iterations 3 of 200 and 5 of 100 episodes ended with a state that is not finite: physics diverges"
     )
-    assert "fastest joint at the break: knee (75%), hip (25%). Lower control.damping or control.stiffness of these joints" in text
-    assert "asset.armature" in text and "sim.dt" in text and "set sim.integrator to implicitfast" in text and "--check --picture" in text
+    assert (
+        "fastest joint at the break: knee (75%), hip (25%). Lower control.damping or control.stiffness of these joints"
+        in text
+    )
+    assert (
+        "asset.armature" in text
+        and "sim.dt" in text
+        and "set sim.integrator to implicitfast" in text
+        and "--check --picture" in text
+    )
     policy = Watch()
     policy.verdict(numbers(9.0, action=9.0))
-    assert "the policy's actions are not finite; lower algorithm.learning_rate" in policy.verdict(numbers(9.0, action=18.0))
+    assert "the policy's actions are not finite; lower algorithm.learning_rate" in policy.verdict(
+        numbers(9.0, action=18.0)
+    )
     assert watch.verdict(numbers(0.0, episodes=0.0)) == ""
 
 
 def test_a_training_whose_physics_diverges_ends_with_the_joints_that_did_it(tmp_path: Path) -> None:
-    run_of = [*SMALL, "--max_iterations", "9", "--set", "control.damping={'': 0.5, 'calf': 14.0}", "--set", "runner.save_interval=1"]
+    run_of = [
+        *SMALL,
+        "--max_iterations",
+        "9",
+        "--set",
+        "control.damping={'': 0.5, 'calf': 14.0}",
+        "--set",
+        "runner.save_interval=1",
+    ]
     result = run("train", tmp_path, *run_of)
     assert result.code == 2 and result.err.count("\n") == 1
-    assert "physics diverges; fastest joint at the break: " in result.err and "_calf_joint (" in result.err.partition("Lower")[0]
+    assert (
+        "physics diverges; fastest joint at the break: " in result.err
+        and "_calf_joint (" in result.err.partition("Lower")[0]
+    )
     assert "Learning iteration 2/9" in result.out and "Learning iteration 3/9" not in result.out
     assert "stopped: what it simulates is not finite" in result.out
     [*_, newest] = sorted((tmp_path / "logs").glob("*/*/model_*.pt"))
@@ -516,14 +613,19 @@ def test_integrator_is_a_field_and_euler_is_as_it_was(tmp_path: Path) -> None:
     assert flags == mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     with pytest.raises(ModelError, match="rk4"):
         wheel(tmp_path, solver=Solver(integrator="rk4"))
-    result = run("train", tmp_path, "--task", "go1_flat", "--device", "cpu", "--check", "--set", "sim.integrator=implicitfast")
+    result = run(
+        "train", tmp_path, "--task", "go1_flat", "--device", "cpu", "--check", "--set", "sim.integrator=implicitfast"
+    )
     assert result.code == 0 and "option integrator: euler -> implicitfast" in result.out
 
 
 # ---- meshes ----
 
-OCTAHEDRON = "".join(f"v {x} {y} {z}\n" for x, y, z in [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]) + "".join(
-    f"f {a} {b} {c}\n" for a, b, c in [(1, 3, 5), (3, 2, 5), (2, 4, 5), (4, 1, 5), (3, 1, 6), (2, 3, 6), (4, 2, 6), (1, 4, 6)]
+OCTAHEDRON = "".join(
+    f"v {x} {y} {z}\n" for x, y, z in [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
+) + "".join(
+    f"f {a} {b} {c}\n"
+    for a, b, c in [(1, 3, 5), (3, 2, 5), (2, 4, 5), (4, 1, 5), (3, 1, 6), (2, 3, 6), (4, 2, 6), (1, 4, 6)]
 )
 
 
@@ -535,7 +637,9 @@ def test_meshes_are_named_relative_to_the_new_file(tmp_path: Path, absolute: boo
     (theirs / "looks" / "hull.obj").write_text(OCTAHEDRON)
     folder = f"{theirs}/looks" if absolute else "looks"
     text = TOY.read_text().replace('<compiler angle="radian"/>', f'<compiler angle="radian" meshdir="{folder}"/>')
-    text = text.replace("<worldbody>", '<asset><mesh name="hull" file="hull.obj" scale="0.1 0.1 0.1"/></asset><worldbody>')
+    text = text.replace(
+        "<worldbody>", '<asset><mesh name="hull" file="hull.obj" scale="0.1 0.1 0.1"/></asset><worldbody>'
+    )
     text = text.replace('<site name="imu"', '<geom class="look" type="mesh" mesh="hull" mass="0"/><site name="imu"')
     (theirs / "toy.xml").write_text(text)
     robot, _ = write(draft(theirs / "toy.xml"), theirs / "toy.xml", "mine", ours)
@@ -561,8 +665,12 @@ def test_meshes_of_an_attached_robot_are_named_relative_too(tmp_path: Path) -> N
     (tmp_path / "theirs/toy.xml").write_text(
         text.replace('<site name="imu"', '<attach model="arm" body="arm" prefix="right_"/><site name="imu"')
     )
-    robot, config = write(draft(tmp_path / "theirs/toy.xml"), tmp_path / "theirs/toy.xml", "mine", tmp_path / "ours/here")
-    assert 'file="../../theirs/arms/left/parts/hull.obj"' in robot.read_text() and str(tmp_path) not in robot.read_text()
+    robot, config = write(
+        draft(tmp_path / "theirs/toy.xml"), tmp_path / "theirs/toy.xml", "mine", tmp_path / "ours/here"
+    )
+    assert (
+        'file="../../theirs/arms/left/parts/hull.obj"' in robot.read_text() and str(tmp_path) not in robot.read_text()
+    )
     assert mujoco.MjModel.from_xml_path(str(robot)).nmesh == 1
     task = load_task(str(config))
     assert task.env_class(task.cfg, "cpu").robot.physics.body_subtreemass[0] == pytest.approx(12.2)

@@ -38,7 +38,11 @@ def walker(foot: str, *, shin: str = "", condim: int = 3, own: bool = False, mor
     return mujoco.MjModel.from_xml_string(xml)
 
 
-BALL, STICK, BRICK = '<geom size="0.02"/>', '<geom type="capsule" size="0.02 0.1"/>', '<geom type="box" size="0.1 0.04 0.02"/>'
+BALL, STICK, BRICK = (
+    '<geom size="0.02"/>',
+    '<geom type="capsule" size="0.02 0.1"/>',
+    '<geom type="box" size="0.1 0.04 0.02"/>',
+)
 
 
 @pytest.mark.parametrize(
@@ -82,12 +86,16 @@ def test_the_go1_gets_what_was_found_by_hand(task: str, counted: tuple[int, int]
 
 
 @pytest.mark.parametrize("own", [False, True])
-@pytest.mark.parametrize("file", [GO1, G1, *sorted((ROOT / "tests/data").glob("*_style.*"))], ids=lambda file: file.stem)
+@pytest.mark.parametrize(
+    "file", [GO1, G1, *sorted((ROOT / "tests/data").glob("*_style.*"))], ids=lambda file: file.stem
+)
 def test_robots_that_thrash_find_room(file: Path, own: bool) -> None:
     """All that collides may touch, and the robot is thrown about: MuJoCo makes no more contacts and rows than were counted."""
     gains: dict[str, Any] = {"stiffness": {"": 30.0}, "damping": {"": 1.0}, "pose": {"": 0.0}}
     nothing: dict[str, Any] = {"contact_geoms": [], "velocity_sites": [], "imu_site": None}
-    robot = build_model(file, solver=Solver(), ground=Ground(), colliders=["*"], self_collisions=own, **gains, **nothing)
+    robot = build_model(
+        file, solver=Solver(), ground=Ground(), colliders=["*"], self_collisions=own, **gains, **nothing
+    )
     model, draw = robot.physics, np.random.default_rng(0)
     data, room, most = mujoco.MjData(model), count_room(model, terrain=False), np.zeros(2)
     ends = np.where(model.jnt_limited[1:, None], model.jnt_range[1:], [-1.0, 1.0]).T
@@ -104,7 +112,11 @@ def test_robots_that_thrash_find_room(file: Path, own: bool) -> None:
 
 def test_an_engine_takes_what_was_counted() -> None:
     model = make_env(1).robot.physics
-    cases: list[tuple[dict[str, Any], tuple[int, int]]] = [({}, (8, 40)), ({"nconmax": 5}, (5, 40)), ({"njmax": 50}, (8, 50))]
+    cases: list[tuple[dict[str, Any], tuple[int, int]]] = [
+        ({}, (8, 40)),
+        ({"nconmax": 5}, (5, 40)),
+        ({"njmax": 50}, (8, 50)),
+    ]
     for asked, got in cases:
         sim: Any = make_simulation(model, 1, "cpu", engine="mujoco_warp", eager=True, **asked)
         assert (sim.nconmax, sim.njmax) == got
@@ -120,7 +132,9 @@ def test_check_says_what_room_there_is(tmp_path: Path) -> None:
 
 
 def test_an_overflow_names_the_fields(tmp_path: Path) -> None:
-    assert config_words("raise `njmax` (now 4) and `nconmax` (now 1)") == "raise sim.njmax (now 4) and sim.nconmax (now 1)"
+    assert (
+        config_words("raise `njmax` (now 4) and `nconmax` (now 1)") == "raise sim.njmax (now 4) and sim.nconmax (now 1)"
+    )
     too_little = ["--engine", "mujoco_warp", "--set", "sim.njmax=12", "--max_iterations", "1"]
     result = run("train", tmp_path, *SMALL, *too_little)
     assert "WARNING: simulator overflow (NEFC) in 16 of 16 worlds; raise sim.njmax (now 12)\n" in result.out

@@ -34,7 +34,9 @@ STAND = torch.zeros(12)
 
 
 def rough(num_envs: int = 16, task: str = "go1_rough", **changes: Any) -> LeggedRobot:
-    return make_env(num_envs, {**SMALL, **QUIET, **{path.replace("__", "."): value for path, value in changes.items()}}, task=task)
+    return make_env(
+        num_envs, {**SMALL, **QUIET, **{path.replace("__", "."): value for path, value in changes.items()}}, task=task
+    )
 
 
 def ground_under(env: LeggedRobot, places: Tensor) -> np.ndarray:
@@ -44,7 +46,9 @@ def ground_under(env: LeggedRobot, places: Tensor) -> np.ndarray:
     data.qpos[2] = 100.0  # the robot out of the way
     mujoco.mj_forward(model, data)
     down = np.array([0.0, 0.0, -1.0])
-    return np.array([10.0 - mujoco.mj_ray(model, data, np.array([x, y, 10.0]), down, None, 1, -1, hit) for x, y in places.tolist()])
+    return np.array(
+        [10.0 - mujoco.mj_ray(model, data, np.array([x, y, 10.0]), down, None, 1, -1, hit) for x, y in places.tolist()]
+    )
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -56,7 +60,9 @@ def test_heights_are_above_the_ground_of_the_compiled_model(engine: str) -> None
     feet = env.sim.site_xpos[:, env.foot_sites]
     below = ground_under(env, feet[..., :2].reshape(-1, 2)).reshape(16, 4)
     np.testing.assert_allclose(env.foot_height, feet[..., 2].numpy() - below, atol=1e-4)
-    np.testing.assert_allclose(env.base_height, env.sim.qpos[:, 2].numpy() - ground_under(env, env.sim.qpos[:, :2]), atol=1e-4)
+    np.testing.assert_allclose(
+        env.base_height, env.sim.qpos[:, 2].numpy() - ground_under(env, env.sim.qpos[:, :2]), atol=1e-4
+    )
     assert np.ptp(below) > 0.05, "the feet stand at different heights"
 
 
@@ -89,7 +95,10 @@ def test_the_scan_is_noisy_for_the_policy_and_true_for_the_critic() -> None:
 def test_the_scan_of_the_policy_is_late_also_in_a_table_of_its_own() -> None:
     class Own(LeggedRobot):
         def observation_rows(self) -> dict[str, list[Row | str]]:
-            return {"state": self._height_rows("state", 0.1), "privileged_state": ["state", *self._height_rows("privileged_state")]}
+            return {
+                "state": self._height_rows("state", 0.1),
+                "privileged_state": ["state", *self._height_rows("privileged_state")],
+            }
 
     overrides = {**SMALL, **QUIET, "terrain.height_scan": ["state", "privileged_state"]}
     rows = make_env(2, overrides, task="go1_rough_scan", env_class=Own).observations.groups
@@ -106,7 +115,8 @@ def test_on_a_plane_the_scan_is_flat() -> None:
 
 def test_the_mirror_image_of_a_scan_is_the_scan_of_the_mirrored_ground() -> None:
     env = rough(2, "go1_rough_scan", noise__level=0.0)
-    scan = torch.stack([env.scan_points[1], env.scan_points[0] + 0.1 * env.scan_points[1] ** 2])  # grows to the left; same on both sides
+    # grows to the left; same on both sides
+    scan = torch.stack([env.scan_points[1], env.scan_points[0] + 0.1 * env.scan_points[1] ** 2])
     state = torch.cat([env.obs_buf["state"][:, :-187], scan], dim=1)
     image = env.mirror.observations["state"](state)[:, -187:]
     torch.testing.assert_close(image[0], -scan[0])
@@ -176,7 +186,14 @@ def test_a_trunk_near_the_ground_is_a_fall() -> None:
 
 
 def episode(
-    env: LeggedRobot, world: int, *, asked: float, progress: float, farthest: float, seconds: float = 20.0, fell: bool = False
+    env: LeggedRobot,
+    world: int,
+    *,
+    asked: float,
+    progress: float,
+    farthest: float,
+    seconds: float = 20.0,
+    fell: bool = False,
 ) -> None:
     """Write into the books that ``world`` had such an episode."""
     env.asked[world], env.progress[world], env.farthest[world], env.asked_speed[world] = asked, progress, farthest, 1.0
@@ -201,7 +218,9 @@ def test_levels_move_by_the_rule() -> None:
     assert env.tiles.levels.tolist() == [2, 1, 0, 1, 0, 1, 1, 1]
     env._update_terrain_curriculum(~mask)
     assert env.tiles.levels[6] == 2
-    torch.testing.assert_close(env.tiles.origins, torch.tensor(env.terrain.origins[env.tiles.levels, env.tiles.columns], dtype=torch.float))
+    torch.testing.assert_close(
+        env.tiles.origins, torch.tensor(env.terrain.origins[env.tiles.levels, env.tiles.columns], dtype=torch.float)
+    )
 
 
 def test_the_lowest_level_holds_and_from_the_last_it_goes_anywhere() -> None:
@@ -264,8 +283,14 @@ def test_levels_are_reported_by_kind() -> None:
 
 def test_ranges_of_commands_grow_when_they_are_tracked() -> None:
     env = rough(10, commands__curriculum=True, commands__curriculum_start=0.5)
-    assert env.command_ranges[1].tolist() == pytest.approx([0.75, 0.4, 0.6]) and (env.commands.abs() <= env.command_ranges[1] + 1e-6).all()
-    column, best = env.reward_names.index("tracking_lin_vel"), float(env.reward_scales[env.reward_names.index("tracking_lin_vel")]) * 100
+    assert (
+        env.command_ranges[1].tolist() == pytest.approx([0.75, 0.4, 0.6])
+        and (env.commands.abs() <= env.command_ranges[1] + 1e-6).all()
+    )
+    column, best = (
+        env.reward_names.index("tracking_lin_vel"),
+        float(env.reward_scales[env.reward_names.index("tracking_lin_vel")]) * 100,
+    )
 
     def ended(worlds: int, share: float) -> float:
         env.episode_steps.fill_(100.0)
@@ -284,15 +309,17 @@ def test_ranges_of_commands_grow_when_they_are_tracked() -> None:
 
 def test_a_range_without_zero_grows_from_its_end_that_is_nearest() -> None:
     env = rough(2, commands__curriculum=True, commands__curriculum_start=0.5, commands__ranges__lin_vel_x=[0.5, 1.5])
-    assert env.command_ranges[:, 0].tolist() == pytest.approx([0.5, 1.0]) and env.command_ranges[:, 1].tolist() == pytest.approx(
-        [-0.4, 0.4]
-    )
+    assert env.command_ranges[:, 0].tolist() == pytest.approx([0.5, 1.0]) and env.command_ranges[
+        :, 1
+    ].tolist() == pytest.approx([-0.4, 0.4])
     with pytest.raises(ConfigError, match=r"commands.curriculum goes by how well tracking_lin_vel is met: give"):
         rough(2, commands__curriculum=True, rewards__scales__tracking_lin_vel=0.0)
 
 
 def test_the_whole_step_asks_the_host_nothing_with_every_curriculum() -> None:
-    env = rough(8, sim__engine="mujoco_warp", commands__curriculum=True, perturbation__kick=True, termination__max_tilt=10.0)
+    env = rough(
+        8, sim__engine="mujoco_warp", commands__curriculum=True, perturbation__kick=True, termination__max_tilt=10.0
+    )
     env._episode_length_buf[:4] = env.max_episode_length
     with recordable():
         env._step()
@@ -323,7 +350,11 @@ def test_curricula_survive_a_resume(tmp_path: Path) -> None:
     runner.save(str(tmp_path / "model_0.pt"))
     other, again = trained(16)
     again.load(str(tmp_path / "model_0.pt"))
-    assert other.tiles and torch.equal(other.tiles.levels, env.tiles.levels) and torch.equal(other.tiles.origins, env.tiles.origins)
+    assert (
+        other.tiles
+        and torch.equal(other.tiles.levels, env.tiles.levels)
+        and torch.equal(other.tiles.origins, env.tiles.origins)
+    )
     assert torch.equal(other.perturbation.kick_level, env.perturbation.kick_level) and torch.equal(
         other.command_curriculum, env.command_curriculum
     )
@@ -333,7 +364,9 @@ def test_curricula_survive_a_resume(tmp_path: Path) -> None:
     again.learn(1)
 
 
-def test_a_resume_with_other_numbers_of_worlds_and_levels_keeps_what_fits(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_resume_with_other_numbers_of_worlds_and_levels_keeps_what_fits(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     env, runner = trained(16)
     assert env.tiles
     env.tiles.put(torch.tensor([0] * 4 + [1] * 4 + [2] * 4 + [3] * 4))  # a level a kind
@@ -354,7 +387,9 @@ def test_a_mistake_is_named() -> None:
     with pytest.raises(ConfigError, match=r"terrain.border_size is 0.5; it must be 1 m or more"):
         rough(2, terrain__border_size=0.5)
     assert max(rough(64, terrain__max_init_terrain_level=50).tiles.levels.tolist()) == 3  # type: ignore[union-attr]
-    with pytest.raises(ConfigError, match=r"terrain.height_scan\[0\] must be Literal\['state', 'privileged_state'\], not 'actor'"):
+    with pytest.raises(
+        ConfigError, match=r"terrain.height_scan\[0\] must be Literal\['state', 'privileged_state'\], not 'actor'"
+    ):
         rough(2, terrain__height_scan=["actor"])
     assert math.isfinite(rough(2).base_height.sum())
 
@@ -370,7 +405,10 @@ def test_a_table_without_the_scan_that_was_asked_for_is_named() -> None:
     task = load_task("go1_rough_scan")
     task.set("env.num_envs", 2)
     task.set("terrain.mesh_type", "plane")
-    with pytest.raises(ConfigError, match=r"terrain.height_scan names 'state', but Own.observation_rows has no row height_scan in 'state'"):
+    with pytest.raises(
+        ConfigError,
+        match=r"terrain.height_scan names 'state', but Own.observation_rows has no row height_scan in 'state'",
+    ):
         Own(task.cfg, "cpu")
 
 
@@ -412,7 +450,13 @@ def test_a_robot_stands_alike_on_both_engines() -> None:
     """On tops of stairs: boxes in one, our contacts in the other."""
     heights = []
     for engine in ENGINES:
-        env = rough(4, sim__engine=engine, terrain__terrain_proportions={"stairs_down": 1.0}, terrain__num_cols=1, sim__iterations=30)
+        env = rough(
+            4,
+            sim__engine=engine,
+            terrain__terrain_proportions={"stairs_down": 1.0},
+            terrain__num_cols=1,
+            sim__iterations=30,
+        )
         env.sim.qvel.zero_()
         env.tiles.put(torch.tensor([0, 1, 2, 3]))  # type: ignore[union-attr]
         env.sim.qpos[:, :3] = env.tiles.origins + torch.tensor([0.0, 0.0, 0.28])  # type: ignore[union-attr]

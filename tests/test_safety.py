@@ -66,7 +66,9 @@ def home(trained_once: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def nothing_ran(home: Path) -> bool:
-    return not list(home.rglob("it_ran")) and not any(name.partition(".")[0] in ("logs", "nets") for name in sys.modules)
+    return not list(home.rglob("it_ran")) and not any(
+        name.partition(".")[0] in ("logs", "nets") for name in sys.modules
+    )
 
 
 def poison(home: Path, path: str, value: str) -> Path:
@@ -110,7 +112,10 @@ def test_no_class_of_a_compared_run_is_imported(home: Path, trained_once: Path) 
     shutil.copytree(trained_once, home / "logs/go1_flat/mine")
     poison(home, "actor.class_name", "logs.go1_flat.some_run.nets:Walker")
     line = refused(home, "play", *TASK, "--load_run", "mine", "--eval", "--compare", "some_run")
-    assert "actor.class_name is 'logs.go1_flat.some_run.nets:Walker': only the task's own Python file" in line and nothing_ran(home)
+    assert (
+        "actor.class_name is 'logs.go1_flat.some_run.nets:Walker': only the task's own Python file" in line
+        and nothing_ran(home)
+    )
 
 
 @pytest.mark.parametrize("name", CLASSES)
@@ -121,8 +126,13 @@ def test_no_class_of_a_flag_or_an_override_file_is_imported(home: Path, name: st
         node = {key: node}
     save_yaml(file, node)
     for flags in (["--set", f"{path}={name}"], ["--override", str(file)]):
-        for program, more in (("play", ["--load_run", "some_run", "--viewer", "none", "--time", "0.02s"]), ("train", [])):
-            assert f"{path} is '{name}': only the task's own Python file" in refused(home, program, *TASK, *more, *flags)
+        for program, more in (
+            ("play", ["--load_run", "some_run", "--viewer", "none", "--time", "0.02s"]),
+            ("train", []),
+        ):
+            assert f"{path} is '{name}': only the task's own Python file" in refused(
+                home, program, *TASK, *more, *flags
+            )
             assert nothing_ran(home)
 
 
@@ -180,7 +190,9 @@ def test_a_distribution_takes_the_fields_of_its_section() -> None:
 
 def test_a_class_of_the_right_kind_may_be_chosen(tmp_path: Path) -> None:
     """By a flag, and then by the run's own config.yaml."""
-    result = run("train", tmp_path, *SMALL, "--max_iterations", "1", "--set", "algorithm.class_name=rsl_rl.algorithms:PPO")
+    result = run(
+        "train", tmp_path, *SMALL, "--max_iterations", "1", "--set", "algorithm.class_name=rsl_rl.algorithms:PPO"
+    )
     assert result.code == 0, result.err
     result = run("train", tmp_path, *TASK, "--resume", "--max_iterations", "2")
     assert result.code == 0 and "Learning iteration 2/2" in result.out, result.err
@@ -235,7 +247,10 @@ def test_a_class_deep_in_a_learners_config_is_checked_too(tmp_path: Path) -> Non
     task = load_task(str(tmp_path / "own.py"))
     check_classes(task.train)
     task.set("algorithm.symmetry_cfg", {"data_augmentation_func": "os:system"})
-    with pytest.raises(ConfigError, match="algorithm.symmetry_cfg.data_augmentation_func is 'os:system': .* may name nothing else there"):
+    with pytest.raises(
+        ConfigError,
+        match="algorithm.symmetry_cfg.data_augmentation_func is 'os:system': .* may name nothing else there",
+    ):
         check_classes(task.train)
     task.set("algorithm.symmetry_cfg", {"many": [{"class_name": "os:system"}]})
     with pytest.raises(ConfigError, match=r"algorithm.symmetry_cfg.many.0.class_name is 'os:system'"):

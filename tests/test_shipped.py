@@ -42,7 +42,9 @@ def trained(folder: Path) -> LoadedTask:
     return task
 
 
-@pytest.mark.parametrize("folder", [folder for folder in POLICIES if folder not in SKILLED], ids=lambda folder: folder.name)
+@pytest.mark.parametrize(
+    "folder", [folder for folder in POLICIES if folder not in SKILLED], ids=lambda folder: folder.name
+)
 def test_walks_and_both_formats_agree(folder: Path) -> None:
     exam.prepare(task := trained(folder))
     env = task.env_class(task.cfg, "cpu")
@@ -71,13 +73,18 @@ def check_formats(folder: Path, task: LoadedTask, env: RobotTask) -> MLPModel:
     with torch.inference_mode():
         expected = ExportedPolicy(policy, task.cfg.normalization.clip_actions)(obs)
     for name in FILES:
-        assert b"site-packages" not in (folder / name).read_bytes() and str(ROOT).encode() not in (folder / name).read_bytes()
+        assert (
+            b"site-packages" not in (folder / name).read_bytes()
+            and str(ROOT).encode() not in (folder / name).read_bytes()
+        )
     session = onnxruntime.InferenceSession(folder / "policy.onnx")
     got = np.concatenate([session.run(["actions"], {"obs": row[None].numpy()})[0] for row in obs])
     np.testing.assert_allclose(got, expected.numpy(), atol=1e-4)  # float32 sums in another order
 
     contract = read_contract(folder)
-    assert contract.digest == digest(folder / "policy.onnx") and read_scene(folder, contract).model.nu == env.num_actions
+    assert (
+        contract.digest == digest(folder / "policy.onnx") and read_scene(folder, contract).model.nu == env.num_actions
+    )
     return policy
 
 
@@ -112,5 +119,8 @@ def test_play_takes_the_shipped_policy_where_nothing_is_trained(tmp_path: Path) 
     (tmp_path / "resources").symlink_to(ROOT / "resources")
     result = run("play", tmp_path, "--task", "go1_flat", "--device", "cpu", "--export", str(tmp_path / "out"))
     assert result.code == 0, result.err
-    assert result.out.startswith("shipped policy: ") and "resources/policies/go1_flat/policy.onnx" in result.out.splitlines()[0]
+    assert (
+        result.out.startswith("shipped policy: ")
+        and "resources/policies/go1_flat/policy.onnx" in result.out.splitlines()[0]
+    )
     assert (tmp_path / "out/policy.onnx").stat().st_size > 100_000

@@ -44,7 +44,9 @@ def walk(task: str, settings: Mapping[str, Any], steps: int = 12) -> tuple[list[
     env.sim.qpos[::2, 2] += 0.5
     for _ in range(steps):
         env.step(0.7 * torch.randn(WORLDS, env.num_actions, generator=dice))
-        held.append({name: value.clone() for name, value in env.sim.memory().items()} | {"contacts": env.contact_count.clone()})
+        held.append(
+            {name: value.clone() for name, value in env.sim.memory().items()} | {"contacts": env.contact_count.clone()}
+        )
     return held, env
 
 
@@ -73,7 +75,10 @@ def launched(sim: WarpSimulation, substeps: int = 2) -> list[str]:
     names, launch, tiled = [], wp.launch, wp.launch_tiled
 
     def note(real: Callable[..., Any]) -> Callable[..., Any]:
-        return lambda kernel, *args, **kwargs: (names.append(kernel.key.partition("__locals__")[0]), real(kernel, *args, **kwargs))[1]
+        return lambda kernel, *args, **kwargs: (
+            names.append(kernel.key.partition("__locals__")[0]),
+            real(kernel, *args, **kwargs),
+        )[1]
 
     wp.launch, wp.launch_tiled = note(launch), note(tiled)
     try:
@@ -94,11 +99,21 @@ def test_what_is_left_out_is_what_the_library_launches(whole: Callable[[], None]
     assert short._idle_unsensed | short._idle_later == once and [names.count(name) for name in once] == [1, 1, 1]
     assert names.count("_update_gradient_cholesky") == names.count("_linesearch_iterative_kernel") == 2
     assert names.count("_update_constraint_efc") == 3  # the last substep's forces are sensed
-    assert not {"_qfrc_constraint_from_grad", "_solve_done", "_tile_cholesky_factorize_solve_block", "_contact_match"} & {*names}
+    assert not {
+        "_qfrc_constraint_from_grad",
+        "_solve_done",
+        "_tile_cholesky_factorize_solve_block",
+        "_contact_match",
+    } & {*names}
     assert wp.launch.__module__.startswith("warp")
     whole()
     names = launched(warp_simulation())
-    assert {*names} >= idle | once | {shortcuts._SEARCH, shortcuts._SOLVED, *shortcuts._FORCES, "_tile_cholesky_factorize_solve_block"}
+    assert {*names} >= idle | once | {
+        shortcuts._SEARCH,
+        shortcuts._SOLVED,
+        *shortcuts._FORCES,
+        "_tile_cholesky_factorize_solve_block",
+    }
     assert names.count("_update_gradient_cholesky") == names.count("_update_constraint_efc") == 4
 
 

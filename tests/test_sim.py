@@ -55,7 +55,9 @@ LEG = """
 </body>"""
 
 
-def toy(folder: Path, *, root: str = "<freejoint/>", inside: str = "", world: str = "", extra: str = "", limit: str = "") -> Path:
+def toy(
+    folder: Path, *, root: str = "<freejoint/>", inside: str = "", world: str = "", extra: str = "", limit: str = ""
+) -> Path:
     """An MJCF of a box with a left and a right leg of one joint each, and whatever a test adds to it."""
     legs = LEG.format("left", 0.1, limit) + LEG.format("right", -0.1, limit)
     file = folder / "toy.xml"
@@ -113,8 +115,12 @@ def test_two_keys_that_fit_equally_well_are_named() -> None:
             {"hip": 1.0, "thigh": 2.0},
             ("no value for FR_calf_joint, FL_calf_joint, RR_calf_joint, RL_calf_joint: none of ['hip'",),
         ),
-        ({}, (f"no value for {', '.join(JOINTS)}: none of [] is a part of these names; add keys, or '' for all others",)),
-        ({"hip": 1.0, "tihgh": 2.0}, ("no joint 'tihgh'", "there are: FR_hip_joint")),  # before what lacks a value for it
+        (
+            {},
+            (f"no value for {', '.join(JOINTS)}: none of [] is a part of these names; add keys, or '' for all others",),
+        ),
+        # before what lacks a value for it
+        ({"hip": 1.0, "tihgh": 2.0}, ("no joint 'tihgh'", "there are: FR_hip_joint")),
         ({"joint": 35.0, "FR_hip_joitn": 20.0}, ("no joint 'FR_hip_joitn'", "did you mean 'FR_hip_joint'?", *JOINTS)),
         ({"joint": 35.0, "wheel": 1.0}, ("no joint 'wheel'", "there are: FR_hip_joint", "RL_calf_joint")),
     ],
@@ -134,7 +140,10 @@ def test_table_that_does_not_fit(field: str, table: dict[str, float], parts: tup
 @pytest.mark.parametrize(
     ("choice", "parts"),
     [
-        ({"colliders": ["FR", "FL", "RR", "RLL"]}, ("no colliding geom or body 'RLL' in go1.xml", "did you mean 'RL'?", "trunk_box")),
+        (
+            {"colliders": ["FR", "FL", "RR", "RLL"]},
+            ("no colliding geom or body 'RLL' in go1.xml", "did you mean 'RL'?", "trunk_box"),
+        ),
         (
             {"colliders": ["foot_*"]},
             ("no colliding geom or body 'foot_*'", "there are: geoms trunk_box", "RL_calf_2", "; bodies trunk, FR_hip"),
@@ -143,7 +152,11 @@ def test_table_that_does_not_fit(field: str, table: dict[str, float], parts: tup
         ({"velocity_sites": ["FR", "FLL"]}, ("no site 'FLL' in go1.xml", "did you mean 'FL'?", "head, imu")),
         (
             {"imu_site": "imuu"},
-            ("no site or body 'imuu' in go1.xml", "did you mean 'imu'?", "there are: head, imu, FR, FL, RR, RL, trunk, FR_hip"),
+            (
+                "no site or body 'imuu' in go1.xml",
+                "did you mean 'imu'?",
+                "there are: head, imu, FR, FL, RR, RL, trunk, FR_hip",
+            ),
         ),
     ],
 )
@@ -158,7 +171,10 @@ def test_unknown_names(choice: dict[str, Any], parts: tuple[str, ...]) -> None:
 def test_ids_by_name() -> None:
     robot = go1()
     assert (robot.root, robot.joint_names) == ("trunk", tuple(JOINTS))
-    assert robot.physics.geom(robot.id("geom", "RL")).name == "RL" and robot.physics.site(robot.id("site", "imu")).name == "imu"
+    assert (
+        robot.physics.geom(robot.id("geom", "RL")).name == "RL"
+        and robot.physics.site(robot.id("site", "imu")).name == "imu"
+    )
     with pytest.raises(ModelError) as error:
         robot.id("body", "FR_hipp")
     assert "no body 'FR_hipp' in the model; did you mean 'FR_hip'?" in one_line(error)
@@ -189,7 +205,9 @@ def test_file_that_is_no_mjcf(tmp_path: Path, text: str, part: str) -> None:
 
 def test_mjcf_that_cannot_be_compiled(tmp_path: Path) -> None:
     """It parses; that a file is missing or a name is used twice comes out later."""
-    mesh = toy(tmp_path, inside='<geom type="mesh" mesh="hull"/>', extra='<asset><mesh name="hull" file="hull.stl"/></asset>')
+    mesh = toy(
+        tmp_path, inside='<geom type="mesh" mesh="hull"/>', extra='<asset><mesh name="hull" file="hull.stl"/></asset>'
+    )
     with pytest.raises(
         ModelError,
         match=r"^toy.xml: a geom of body 'base' collides as the mesh 'hull', and its file hull.stl cannot be read \(no such file; ",
@@ -205,12 +223,18 @@ def test_mjcf_that_cannot_be_compiled(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("parts", "text"),
     [
-        ({"root": '<joint name="rail" type="slide"/>'}, "the first joint must be the root body's free joint; it is rail"),
+        (
+            {"root": '<joint name="rail" type="slide"/>'},
+            "the first joint must be the root body's free joint; it is rail",
+        ),
         (
             {"inside": '<body><joint name="neck" type="ball"/><geom size="0.1"/></body>'},
             "joint 'neck' must be a named hinge or slide joint",
         ),
-        ({"inside": '<body><joint axis="0 0 1"/><geom size="0.1"/></body>'}, "joint '' must be a named hinge or slide joint"),
+        (
+            {"inside": '<body><joint axis="0 0 1"/><geom size="0.1"/></body>'},
+            "joint '' must be a named hinge or slide joint",
+        ),
         (
             {"world": '<body name="cart"><joint name="rail" type="slide"/><geom size="0.1"/></body>'},
             "toy.xml has 2 bodies with joints in its world: cart, base; leave one of them, the robot",
@@ -244,16 +268,27 @@ SOLES = SOLE.format("left", 0.1) + SOLE.format("right", -0.1)
 
 def build_soles(folder: Path, **choices: Any) -> RobotModel:
     """The toy with a heel and a toe on a joint of its own at either side."""
-    gains = {"stiffness": {"": 10.0}, "damping": {"": 0.2}, "velocity_sites": ["left_sole"], "contact_geoms": [], "colliders": ["*_heel"]}
+    gains = {
+        "stiffness": {"": 10.0},
+        "damping": {"": 0.2},
+        "velocity_sites": ["left_sole"],
+        "contact_geoms": [],
+        "colliders": ["*_heel"],
+    }
     choices.setdefault("sites", {"left_sole": ["left_heel", "left_toe"]})
     return build_toy(toy(folder, inside=SOLES), **{**gains, **choices})
 
 
 def test_what_may_touch_has_a_name(tmp_path: Path) -> None:
-    shapes = '<geom size="0.01"/><geom size="0.02" contype="0" conaffinity="0"/><body name="hand"><geom size="0.01"/></body>'
+    shapes = (
+        '<geom size="0.01"/><geom size="0.02" contype="0" conaffinity="0"/><body name="hand"><geom size="0.01"/></body>'
+    )
     robot = build_toy(toy(tmp_path, inside=shapes), colliders=["base_1", "hand_*"], contact_geoms=["hand_0", "base_1"])
     assert robot.contact_geoms == ("hand_0", "base_1") and robot.physics.geom("base_1").conaffinity[0] == 1
-    assert {"geom of 'base' without a name is called 'base_1'", "geom of 'hand' without a name is called 'hand_0'"} <= set(robot.overrides)
+    assert {
+        "geom of 'base' without a name is called 'base_1'",
+        "geom of 'hand' without a name is called 'hand_0'",
+    } <= set(robot.overrides)
     assert len([line for line in robot.overrides if "without a name" in line]) == 2, "what is only looked at needs none"
     taken = toy(tmp_path, inside='<geom size="0.01"/><geom name="base_1" size="0.01"/>')
     assert "geom of 'base' without a name is called 'base_1_'" in build_toy(taken).overrides
@@ -262,8 +297,13 @@ def test_what_may_touch_has_a_name(tmp_path: Path) -> None:
 def test_a_body_means_its_geoms_that_collide(tmp_path: Path) -> None:
     looks = '<geom name="shade" size="0.3" contype="0" conaffinity="0"/><body name="hand"><geom name="palm" size="0.01"/></body>'
     robot = build_toy(toy(tmp_path, inside=looks), colliders=["base", "*_leg"], contact_geoms=["left_leg", "ba*"])
-    assert robot.contact_geoms == ("left_shin", "left_foot", "shell"), "neither what is looked at nor what is on a child"
-    assert robot.names.find(["*"], "") == robot.names.geoms and robot.names.find(["*_foot"], "") == ("left_foot", "right_foot")
+    assert robot.contact_geoms == ("left_shin", "left_foot", "shell"), (
+        "neither what is looked at nor what is on a child"
+    )
+    assert robot.names.find(["*"], "") == robot.names.geoms and robot.names.find(["*_foot"], "") == (
+        "left_foot",
+        "right_foot",
+    )
     assert robot.names.find(["hand"], "") == ("palm",)
     touching = {robot.physics.geom(i).name for i in range(robot.physics.ngeom) if robot.physics.geom_conaffinity[i]}
     assert touching == {"shell", "left_shin", "left_foot", "right_shin", "right_foot"}
@@ -271,10 +311,15 @@ def test_a_body_means_its_geoms_that_collide(tmp_path: Path) -> None:
     assert build_toy(same).names.find(["left_foot"], "") == ("left_foot",), "a geom wins over a body of its name"
     with pytest.raises(ModelError) as error:
         build_toy(
-            toy(tmp_path, inside='<body name="tail"><joint name="tail_hip"/><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/></body>'),
+            toy(
+                tmp_path,
+                inside='<body name="tail"><joint name="tail_hip"/><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/></body>',
+            ),
             contact_geoms=["tail"],
         )
-    text = "`contact_geoms`: body 'tail' of toy.xml has no geom that collides; bodies that have: base, left_leg, right_leg"
+    text = (
+        "`contact_geoms`: body 'tail' of toy.xml has no geom that collides; bodies that have: base, left_leg, right_leg"
+    )
     assert one_line(error) == text
 
 
@@ -285,7 +330,9 @@ def test_a_missing_site_is_made_at_its_geom(tmp_path: Path) -> None:
     np.testing.assert_allclose(robot.physics.site("tail").pos, [-0.2, 0, 0.05], atol=1e-9)
     np.testing.assert_allclose(robot.physics.site("left_foot").pos, [0, 0, -0.2], atol=1e-9)  # the MJCF's own stays
     assert robot.site_geoms == {"tail": ("tail",), "left_foot": ("left_shin",)}
-    assert "site 'tail' made at tail" in robot.overrides and not any("'left_foot' made" in line for line in robot.overrides)
+    assert "site 'tail' made at tail" in robot.overrides and not any(
+        "'left_foot' made" in line for line in robot.overrides
+    )
     data = mujoco.MjData(robot.physics)
     data.qvel[5] = 2.0  # [rad/s] about z
     mujoco.mj_forward(robot.physics, data)
@@ -309,10 +356,15 @@ def test_of_several_geoms_the_lowest_point_is_the_site(tmp_path: Path, angle: fl
 
 
 def test_the_lowest_point_may_be_on_a_fixed_body_and_names_may_be_patterns(tmp_path: Path) -> None:
-    robot = build_soles(tmp_path, pose={"ankle": -3.0, "": 0.0}, sites={"left_sole": ["left_t*", "left_nail"]})  # upside down
+    # upside down
+    robot = build_soles(tmp_path, pose={"ankle": -3.0, "": 0.0}, sites={"left_sole": ["left_t*", "left_nail"]})
     site = robot.physics.site("left_sole")
-    assert robot.site_geoms == {"left_sole": ("left_toe", "left_nail")} and robot.physics.body(site.bodyid[0]).name == "left_ankle"
-    np.testing.assert_allclose(site.pos, [0.1 + 0.01 * math.sin(-3.0), 0, 0.02 - 0.01 * math.cos(-3.0)], atol=1e-6)  # the nail is fused
+    assert (
+        robot.site_geoms == {"left_sole": ("left_toe", "left_nail")}
+        and robot.physics.body(site.bodyid[0]).name == "left_ankle"
+    )
+    # the nail is fused
+    np.testing.assert_allclose(site.pos, [0.1 + 0.01 * math.sin(-3.0), 0, 0.02 - 0.01 * math.cos(-3.0)], atol=1e-6)
 
 
 def test_left_and_right_soles_mirror(tmp_path: Path) -> None:
@@ -356,7 +408,8 @@ def test_servo_parameters() -> None:
     gains, dampings = {"hip": 20.0, "thigh": 30.0, "calf": 40.0}, {"hip": 0.5, "thigh": 0.6, "calf": 0.7}
     robot = go1(stiffness=gains, damping=dampings)
     for model in (robot.physics, visual_model(robot)):
-        assert model.nu == 12 and (model.actuator_trnid[:, 0] == range(1, 13)).all()  # servo i is joint i; joint 0 is free
+        # servo i is joint i; joint 0 is free
+        assert model.nu == 12 and (model.actuator_trnid[:, 0] == range(1, 13)).all()
         kp, kd = [20.0, 30.0, 40.0] * 4, [0.5, 0.6, 0.7] * 4
         assert model.actuator_gainprm[:, 0].tolist() == kp
         assert model.actuator_biasprm[:, :3].tolist() == [[0.0, -k, 0.0] for k in kp]
@@ -367,7 +420,10 @@ def test_servo_parameters() -> None:
         assert model.actuator_ctrllimited.all() and (model.actuator_ctrlrange == model.jnt_range[1:]).all()
         assert not model.jnt_actfrclimited.any()  # the servo clamps, so that actuator_force is what acts
     assert robot.effort_range[:, 1].tolist() == limits and (robot.joint_range == robot.physics.jnt_range[1:]).all()
-    assert "FR_hip_joint servo: kp 20 N m/rad" in robot.overrides and "RL_calf_joint damping: 0.5 -> 0.7 N m s/rad" in robot.overrides
+    assert (
+        "FR_hip_joint servo: kp 20 N m/rad" in robot.overrides
+        and "RL_calf_joint damping: 0.5 -> 0.7 N m s/rad" in robot.overrides
+    )
     assert not any("hip_joint damping" in line for line in robot.overrides)  # 0.5 is what the MJCF has
 
 
@@ -376,7 +432,8 @@ def test_servos_act_as_written() -> None:
     model = go1().physics
     data = mujoco.MjData(model)
     data.qpos[:7], data.qpos[7:], data.qvel[6:] = [0, 0, 1, 1, 0, 0, 0], POSE, 1.0
-    data.ctrl[:] = np.array(POSE) + [0.5, 1.0, 5.0] * 4  # fine; force too large; angle beyond the range, force then fine
+    # fine; force too large; angle beyond the range, force then fine
+    data.ctrl[:] = np.array(POSE) + [0.5, 1.0, 5.0] * 4
     mujoco.mj_forward(model, data)
     np.testing.assert_allclose(data.actuator_force, [17.5, 23.7, 35 * (-0.888 + 1.8)] * 4, rtol=1e-6)
     np.testing.assert_allclose(data.qfrc_passive[6:], -0.5, rtol=1e-6)
@@ -399,7 +456,10 @@ def test_actuators_of_the_mjcf_are_replaced(tmp_path: Path) -> None:
 def test_limit_of_the_joint_wins_over_the_actuators(tmp_path: Path) -> None:
     motors = '<actuator><motor joint="left_hip" forcerange="-7 7"/></actuator>'
     robot = build_toy(toy(tmp_path, extra=motors, limit=' actuatorfrcrange="-5 5"'))
-    assert robot.effort_range[:, 1].tolist() == [5, 5] and robot.physics.actuator_forcerange.tolist() == [[-5, 5], [-5, 5]]
+    assert robot.effort_range[:, 1].tolist() == [5, 5] and robot.physics.actuator_forcerange.tolist() == [
+        [-5, 5],
+        [-5, 5],
+    ]
 
 
 def test_no_limit_stated_is_no_limit(tmp_path: Path) -> None:
@@ -415,9 +475,15 @@ def test_physics_model_is_the_visual_one_without_looks() -> None:
     bare, drawn = robot.physics, visual_model(robot)
     assert (bare.nlight, bare.nmesh) == (0, 0) and drawn.nlight == 1 and drawn.nmesh > 0
     kept = {bare.geom(i).name for i in range(bare.ngeom)}
-    assert all(bare.geom(i).contype or bare.geom(i).conaffinity or bare.geom(i).name == GROUND for i in range(bare.ngeom))
+    assert all(
+        bare.geom(i).contype or bare.geom(i).conaffinity or bare.geom(i).name == GROUND for i in range(bare.ngeom)
+    )
     assert set(FEET) | {GROUND} <= kept and drawn.ngeom > bare.ngeom
-    assert (bare.nq, bare.nv, bare.nu, bare.nsensordata) == (drawn.nq, drawn.nv, drawn.nu, drawn.nsensordata) == (19, 18, 12, 19)
+    assert (
+        (bare.nq, bare.nv, bare.nu, bare.nsensordata)
+        == (drawn.nq, drawn.nv, drawn.nu, drawn.nsensordata)
+        == (19, 18, 12, 19)
+    )
     for field in (
         "body_mass",
         "body_inertia",
@@ -540,7 +606,9 @@ def snapshot(sim: Simulation) -> dict[str, torch.Tensor]:
     return {name: getattr(sim, name).clone() for name in VIEWS}
 
 
-def assert_same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], worlds: Any = slice(None), where: str = "") -> None:
+def assert_same(
+    a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], worlds: Any = slice(None), where: str = ""
+) -> None:
     """Bit for bit."""
     for name in VIEWS:
         assert torch.equal(a[name][worlds], b[name][worlds]), f"{name} {where}"
@@ -548,7 +616,9 @@ def assert_same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], worlds: 
 
 def assert_close(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor], rtol: float = 0.0, atol: float = 0.0) -> None:
     for name in VIEWS:
-        torch.testing.assert_close(a[name], b[name], rtol=rtol, atol=atol, msg=lambda text, name=name: f"{name}: {text}")
+        torch.testing.assert_close(
+            a[name], b[name], rtol=rtol, atol=atol, msg=lambda text, name=name: f"{name}: {text}"
+        )
 
 
 def copy_state(target: Simulation, source: Simulation) -> None:
@@ -567,9 +637,13 @@ def test_shapes(robot: RobotModel, engine: str) -> None:
 def test_which_engine_steps() -> None:
     assert [pick_engine("auto", device) for device in ("cpu", "cuda:1")] == ["mujoco", "mujoco_warp"]
     assert pick_engine("mujoco_warp", "cpu") == "mujoco_warp"
-    with pytest.raises(EngineError, match="steps on a CPU, and the device is cuda:0; take the device cpu, or the engine mujoco_warp$"):
+    with pytest.raises(
+        EngineError, match="steps on a CPU, and the device is cuda:0; take the device cpu, or the engine mujoco_warp$"
+    ):
         pick_engine("mujoco", "cuda:0")
-    with pytest.raises(EngineError, match="no engine 'mujoco-warp' in `engine`; did you mean 'mujoco_warp'. there are: auto, "):
+    with pytest.raises(
+        EngineError, match="no engine 'mujoco-warp' in `engine`; did you mean 'mujoco_warp'. there are: auto, "
+    ):
         pick_engine("mujoco-warp", "cpu")
 
 
@@ -666,7 +740,8 @@ def test_forces_push(robot: RobotModel, engine: str) -> None:
     for _ in range(5):
         sim.step(5)
     mass, momentum = robot.physics.body_subtreemass[0], 10.0 * 25 * robot.physics.opt.timestep
-    assert sim.qvel[1, 0] > 0.5 * momentum / mass and abs(sim.qvel[0, 0]) < 0.1 * momentum / mass  # legs swing, hence the margin
+    # legs swing, hence the margin
+    assert sim.qvel[1, 0] > 0.5 * momentum / mass and abs(sim.qvel[0, 0]) < 0.1 * momentum / mass
 
 
 # ---- per-world fields
@@ -723,7 +798,8 @@ def test_fields_that_do_not_exist(robot: RobotModel, engine: str) -> None:
     assert "no per-world model field 'geom_fricton' in this simulation (declare it in world_fields)" in text
     assert "did you mean 'geom_friction'?" in text and text.endswith("there are: body_mass, geom_friction")
     with pytest.raises(
-        ModelError, match="'dof_armature' in this simulation .declare it in world_fields.*there are: body_mass, geom_friction"
+        ModelError,
+        match="'dof_armature' in this simulation .declare it in world_fields.*there are: body_mass, geom_friction",
     ):
         sim.field("dof_armature")
     for unknown, hint in (
@@ -733,7 +809,9 @@ def test_fields_that_do_not_exist(robot: RobotModel, engine: str) -> None:
         with pytest.raises(ModelError) as error:
             simulate(robot, engine, 2, world_fields=["body_mass", unknown])
         whose = {"mujoco_warp": "mujoco-warp", "mujoco": "MuJoCo"}[engine]
-        assert f"no per-world model field '{unknown}' in {whose}'s Model; " in one_line(error) and hint in str(error.value)
+        assert f"no per-world model field '{unknown}' in {whose}'s Model; " in one_line(error) and hint in str(
+            error.value
+        )
 
 
 # ---- mujoco-warp alone
@@ -809,8 +887,16 @@ def test_what_does_not_fit_is_named(robot: RobotModel, room: dict[str, int], adv
 @pytest.mark.parametrize(
     ("memory", "report", "stands"),
     [
-        ("2K", "simulator overflow in 2 of 2 worlds: contacts or constraints do not fit; raise <size memory=...> in the MJCF", True),
-        ("4K", "MuJoCo could not step 2 of 2 worlds: MuJoCo raised in 2 of 2 simulations (0, 1); simulation 0: ", False),
+        (
+            "2K",
+            "simulator overflow in 2 of 2 worlds: contacts or constraints do not fit; raise <size memory=...> in the MJCF",
+            True,
+        ),
+        (
+            "4K",
+            "MuJoCo could not step 2 of 2 worlds: MuJoCo raised in 2 of 2 simulations (0, 1); simulation 0: ",
+            False,
+        ),
     ],
 )
 def test_what_does_not_fit_is_reported(tmp_path: Path, memory: str, report: str, stands: bool) -> None:

@@ -98,7 +98,9 @@ def test_rewards_of_getup(go1: Getup) -> None:
         "fast_joints": [0.0, 0.0, 0.0, (4.0 * math.pi) ** 2],
     }
     for name, values in expected.items():
-        torch.testing.assert_close(getattr(go1, f"_reward_{name}")(), torch.tensor(values), atol=1e-5, rtol=1e-5, msg=name)
+        torch.testing.assert_close(
+            getattr(go1, f"_reward_{name}")(), torch.tensor(values), atol=1e-5, rtol=1e-5, msg=name
+        )
     assert not go1._fallen().any()
 
 
@@ -119,7 +121,10 @@ def test_pull_lifts_and_fades() -> None:
     other = make("go1_getup", falls__states=4, falls__pull=0.5)
     other.load_training_state(env.training_state())
     assert other.pull.level == env.pull.level
-    with pytest.raises(ConfigError, match="falls.pull lifts the root, which perturbation.kick pushes: name another body in falls.pull_on"):
+    with pytest.raises(
+        ConfigError,
+        match="falls.pull lifts the root, which perturbation.kick pushes: name another body in falls.pull_on",
+    ):
         make("go1_getup", falls__states=4, falls__pull=0.5, perturbation__kick=True)
     with pytest.raises(ConfigError, match="falls.pull_on: no body 'trunck' in .*; did you mean 'trunk'"):
         make("go1_getup", falls__states=4, falls__pull=0.5, falls__pull_on="trunck")
@@ -132,7 +137,9 @@ def recording(robot: Robot, seconds: float, count: int) -> Recording:
     """Robots that stand."""
     steps, joints = round(seconds / robot.dt), robot.model.nv - 6
     qpos = np.tile(robot.home, (steps, count, 1))
-    return Recording(qpos, np.zeros((steps, count, 6 + joints)), np.zeros((steps, count, joints)), np.full(count, np.inf))
+    return Recording(
+        qpos, np.zeros((steps, count, 6 + joints)), np.zeros((steps, count, joints)), np.full(count, np.inf)
+    )
 
 
 def test_what_getup_judges(robot: Robot) -> None:
@@ -152,8 +159,11 @@ def test_what_getup_judges(robot: Robot) -> None:
     assert found["energy"] == pytest.approx(2.0 * 2.0 * 23.7 / 4)  # of four that stood, one spent 2 s at 47 W
     result = skill.result(dict.fromkeys(skill.grounds, found))
     assert not result["passed"] and "share that stands in time              0.667" in skill.table(result)
-    assert skill.result({name: {**found, "stands": 0.98, "stays": 1.0} for name in skill.grounds})["passed"] is False  # 0.99 on the plane
-    assert skill.result({name: {**found, "stands": 1.0 if name == "plane" else 0.98, "stays": 1.0} for name in skill.grounds})["passed"]
+    # 0.99 on the plane
+    assert skill.result({name: {**found, "stands": 0.98, "stays": 1.0} for name in skill.grounds})["passed"] is False
+    assert skill.result(
+        {name: {**found, "stands": 1.0 if name == "plane" else 0.98, "stays": 1.0} for name in skill.grounds}
+    )["passed"]
 
 
 def test_upright_is_by_gravity() -> None:
@@ -186,7 +196,9 @@ def test_handstand_rewards_and_judge() -> None:
     assert found["holds"] == 0.25 and found["up"] == 0.5 and found["drift"] == pytest.approx(0.5, abs=0.01)
     ends = {env.robot.contact_geoms[i] for i in env.contacts.terminating.tolist()}
     parts = ("hip_1", "hip_2", "thigh_1", "thigh_2", "thigh_3", "calf_1", "calf_2")
-    assert ends == {"trunk_box", "trunk_left", "trunk_right"} | {f"{leg}_{part}" for leg in ("FR", "FL") for part in parts}
+    assert ends == {"trunk_box", "trunk_left", "trunk_right"} | {
+        f"{leg}_{part}" for leg in ("FR", "FL") for part in parts
+    }
     assert isinstance(env, Handstand)
 
 
@@ -197,7 +209,9 @@ def test_handstand_rewards_and_judge() -> None:
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """Exams of a few robots and of a second."""
     monkeypatch.setattr(getup.Getup, "robots", 3)
-    monkeypatch.setattr(getup.Getup, "grounds", {"plane": Ground(), "changed": Ground(slope=10.0, friction=0.3, load=2.0)})
+    monkeypatch.setattr(
+        getup.Getup, "grounds", {"plane": Ground(), "changed": Ground(slope=10.0, friction=0.3, load=2.0)}
+    )
     monkeypatch.setattr(getup, "SETTLING", 0.4)
     monkeypatch.setattr(getup, "STAY", 0.2)
     monkeypatch.setattr(strip, "PICTURES", 2)
@@ -226,11 +240,16 @@ def test_getup_from_training_to_deploy(tmp_path: Path, small: None) -> None:
     line = refused(tmp_path, "play", "--task", "go1_getup", "--device", "cpu", "--eval", "--set", "falls.pull=0.1")
     assert "--eval sets falls.pull itself" in line
     leaning = Fleet(folder / "export", contract, 1, threads=1, change=lambda model: put_on(model, Ground(slope=10.0)))
-    np.testing.assert_allclose(leaning.read().gravity[0], [math.sin(math.radians(10.0)), 0.0, -math.cos(math.radians(10.0))], atol=1e-9)
+    np.testing.assert_allclose(
+        leaning.read().gravity[0], [math.sin(math.radians(10.0)), 0.0, -math.cos(math.radians(10.0))], atol=1e-9
+    )
     check_switch(folder / "export")
     for section, words in (
         ({"kind": "getpu"}, "policy.yaml: no exam 'getpu' in legged_mw/eval/skills.py; did you mean 'getup'?"),
-        ({"kind": "getup", "wihtin": 3}, "policy.yaml: exam: no field 'wihtin' in the exam getup; did you mean 'within'?"),
+        (
+            {"kind": "getup", "wihtin": 3},
+            "policy.yaml: exam: no field 'wihtin' in the exam getup; did you mean 'within'?",
+        ),
     ):
         with pytest.raises(ContractError, match=re.escape(words)):
             contract_skill(contract.__class__(**{**vars(contract), "exam": section}))
@@ -269,7 +288,9 @@ def check_switch(rescuer: Path) -> None:
         assert np.isfinite(stage.qpos()).all() and stage.qpos()[world, 2] == stage.fleet.model.key_qpos[0, 2]
     stage.step()
     assert not stage.fell().any() and stage.controller.last_actions.any(axis=1).all()
-    with pytest.raises(UserError, match="--switch: joints of go1_flat and g1_flat differ, so they cannot drive one robot"):
+    with pytest.raises(
+        UserError, match="--switch: joints of go1_flat and g1_flat differ, so they cannot drive one robot"
+    ):
         SwitchStage(POLICIES / "go1_flat", POLICIES / "g1_flat")
     line = "--switch: rows with sensors of their own of go1_flat and go1_rough_scan differ, .* one robot: \\[\\] and \\['height_scan'\\]"
     with pytest.raises(UserError, match=line):
@@ -279,7 +300,10 @@ def check_switch(rescuer: Path) -> None:
 @pytest.mark.parametrize(
     ("args", "line"),
     [
-        (["go1_flat", "go2_flat"], "--switch fall is of two policies: python -m legged_mw.deploy DIR DIR2 --switch fall"),
+        (
+            ["go1_flat", "go2_flat"],
+            "--switch fall is of two policies: python -m legged_mw.deploy DIR DIR2 --switch fall",
+        ),
         (["go1_flat", "--switch", "fall"], "--switch fall is of two policies"),
         (
             ["go1_flat", "go2_flat", "--switch", "fall", "--eval"],
@@ -287,7 +311,9 @@ def check_switch(rescuer: Path) -> None:
         ),
     ],
 )
-def test_switch_flags(args: list[str], line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_switch_flags(
+    args: list[str], line: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr("sys.argv", ["deploy", *args])
     with pytest.raises(SystemExit):
         program.parse()
@@ -313,7 +339,12 @@ def test_variants_step(name: str) -> None:
         ("go1_getup", "terrain.slope", 80.0, "terrain.slope is 80.0; it must be from -60 to 60 degrees"),
         ("go1_handstand", "exam.nose", 0.0, "exam.nose is 0.0; it must be 1 or -1"),
         ("go1_handstand", "exam.hands", [], "exam.hands is []; it must be a list of at least one"),
-        ("go1_handstand", "exam.hands", ["FX"], "exam.hands: no geom 'FX' in resources/robots/go1/go1.xml; there are: floor, "),
+        (
+            "go1_handstand",
+            "exam.hands",
+            ["FX"],
+            "exam.hands: no geom 'FX' in resources/robots/go1/go1.xml; there are: floor, ",
+        ),
     ],
 )
 def test_bad_values(task: str, path: str, value: Any, line: str) -> None:

@@ -35,7 +35,8 @@ from legged_mw.sim.errors import ModelError
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
-VARIANTS = {"go2_getup", "go1_footstand", "go2_handstand", "go2_footstand"}  # the numbers of others: built in test_skills
+# the numbers of others: built in test_skills
+VARIANTS = {"go2_getup", "go1_footstand", "go2_handstand", "go2_footstand"}
 EXAMPLES = [str(path) for path in sorted(ROOT.glob("examples/*.py")) if "TASK = " in path.read_text()]
 N = 10  # no other tensor has as many rows, so that a first dimension of 10 means worlds
 TINY = {  # of a task on rough ground, and of one that begins in falls
@@ -67,7 +68,13 @@ def small(name: str, changes: dict[str, Any] | None = None, worlds: int = N) -> 
     """The task in a few worlds; of ``changes``, by dotted path, those whose field it has."""
     task = load_task(name)
     fields = task.to_dict()
-    for path, value in {"env.num_envs": worlds, "sim.engine": "mujoco", "sim.threads": 1, **TINY, **(changes or {})}.items():
+    for path, value in {
+        "env.num_envs": worlds,
+        "sim.engine": "mujoco",
+        "sim.threads": 1,
+        **TINY,
+        **(changes or {}),
+    }.items():
         section, field = path.split(".")
         if field in fields.get(section, {}):
             task.set(path, value)
@@ -86,7 +93,9 @@ def random_actions(env: Any, scale: float = 1.0) -> Tensor:
 
 
 @pytest.fixture(
-    scope="module", params=[name for name in (*task_names(), *EXAMPLES) if name not in VARIANTS], ids=lambda name: Path(name).stem
+    scope="module",
+    params=[name for name in (*task_names(), *EXAMPLES) if name not in VARIANTS],
+    ids=lambda name: Path(name).stem,
 )
 def name(request: pytest.FixtureRequest) -> str:
     return request.param
@@ -111,10 +120,13 @@ def test_passes_the_guard_and_nothing_is_changed(name: str) -> None:
     assert np.array_equal(np.random.get_state(legacy=False)["state"]["key"], states[2])
 
 
-@pytest.mark.parametrize("changes", [{}, {**KICKS, **STRIPPED}], ids=["as configured", "kicks, no noise, no resampling, no clip"])
+@pytest.mark.parametrize(
+    "changes", [{}, {**KICKS, **STRIPPED}], ids=["as configured", "kicks, no noise, no resampling, no clip"]
+)
 def test_whole_step_asks_the_host_nothing(name: str, changes: dict[str, Any]) -> None:
     """On the engine of a GPU, so that physics is looked at, too."""
-    feet = {"asset.colliders": ["FR", "FL", "RR", "RL"]} if name == "go1_getup" else {}  # all its shapes would compile for a minute
+    # all its shapes would compile for a minute
+    feet = {"asset.colliders": ["FR", "FL", "RR", "RL"]} if name == "go1_getup" else {}
     env = build(name, {**changes, **feet, "sim.engine": "mujoco_warp"}, worlds=4)
     env.sim.qpos[1] = math.nan
     env.episode_length_buf = torch.tensor([0, 0, env.max_episode_length, 0])
@@ -165,7 +177,9 @@ def test_buffers_are_never_rebound(env: Any) -> None:
     after = tensors(env)
     assert after.keys() == before.keys()
     assert [name for name in before if after[name] is not before[name]] == []
-    assert [name for name in before if addresses[name] != (after[name].data_ptr(), after[name].shape, after[name].stride())] == []
+    assert [
+        name for name in before if addresses[name] != (after[name].data_ptr(), after[name].shape, after[name].stride())
+    ] == []
 
 
 # ---- resets
@@ -181,7 +195,15 @@ def test_restart_touches_the_masked_worlds_only(env: Any) -> None:
     env.restart(mask)
     of_all = {"env.command_curriculum"}  # counts the episodes of all worlds
     assert set(changed(env, before, worlds=~mask)) <= of_all
-    touched = {"sim.qpos", "sim.qvel", "sim.ctrl", "sim.sensordata", "env._episode", "env._episode_length_buf", "env.base_lin_vel"}
+    touched = {
+        "sim.qpos",
+        "sim.qvel",
+        "sim.ctrl",
+        "sim.sensordata",
+        "env._episode",
+        "env._episode_length_buf",
+        "env.base_lin_vel",
+    }
     assert touched <= set(changed(env, before, worlds=mask))
     assert {f"env.obs_buf.{group}" for group in env.obs_buf} <= set(changed(env, before, worlds=mask))
 
@@ -215,7 +237,9 @@ def test_mirroring_twice_is_the_identity(name: str, env: Any) -> None:
     try:
         _ = env.mirror
     except (ConfigError, ModelError) as error:
-        assert "symmetry.use_data_augmentation = False" in str(error) or "do without what mirrors the robot" in str(error)
+        assert "symmetry.use_data_augmentation = False" in str(error) or "do without what mirrors the robot" in str(
+            error
+        )
         assert not symmetry.use_data_augmentation and not symmetry.use_mirror_loss
         return
     torch.manual_seed(3)

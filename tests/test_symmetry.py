@@ -102,7 +102,10 @@ WAIST = """
 def test_joints_in_the_middle_are_their_own_partners(tmp_path: Path) -> None:
     robot = load_robot(tmp_path / "waist.xml", WAIST)
     partners = find_partners(robot)
-    found = {name: (robot.joint_names[i], s) for name, i, s in zip(robot.joint_names, partners.joints, partners.signs, strict=True)}
+    found = {
+        name: (robot.joint_names[i], s)
+        for name, i, s in zip(robot.joint_names, partners.joints, partners.signs, strict=True)
+    }
     assert found == {
         "waist_yaw": ("waist_yaw", -1),
         "waist_roll": ("waist_roll", -1),
@@ -159,9 +162,14 @@ def test_a_site_without_partner_is_named(env: LeggedRobot) -> None:
 
 
 def test_joints_that_cannot_be_told_apart(tmp_path: Path) -> None:
-    pitch, two = '<joint name="waist_pitch" axis="0 1 0"/>', [f'<joint name="{name}" axis="0 1 0" armature="1"/>' for name in "ab"]
+    pitch, two = (
+        '<joint name="waist_pitch" axis="0 1 0"/>',
+        [f'<joint name="{name}" axis="0 1 0" armature="1"/>' for name in "ab"],
+    )
     twice = replaced(WAIST, pitch, " ".join(two), 1)
-    with pytest.raises(ModelError, match="^joints 'b' and 'a' have the same mirror partner 'a': .* cannot be told apart"):
+    with pytest.raises(
+        ModelError, match="^joints 'b' and 'a' have the same mirror partner 'a': .* cannot be told apart"
+    ):
         find_partners(load_robot(tmp_path / "twice.xml", twice))
 
 
@@ -219,14 +227,20 @@ def side_by_side(rows: dict[str, Sides]) -> Sides:
 
 def test_one_observation_by_hand(env: LeggedRobot) -> None:
     rows = rows_by_hand()
-    assert {group: list(table) for group, table in layout(env).items()} == {group: list(table) for group, table in rows.items()}
+    assert {group: list(table) for group, table in layout(env).items()} == {
+        group: list(table) for group, table in rows.items()
+    }
     numbers = {group: side_by_side(table) for group, table in rows.items()}
-    seen, image = (TensorDict({group: torch.tensor([both[i]]) for group, both in numbers.items()}, batch_size=[1]) for i in (0, 1))
+    seen, image = (
+        TensorDict({group: torch.tensor([both[i]]) for group, both in numbers.items()}, batch_size=[1]) for i in (0, 1)
+    )
     plain, mirrored = joints_by_hand()
     obs, actions = mirror(env=env, obs=seen, actions=torch.tensor([plain]))  # by keyword, as rsl-rl calls it
     assert obs is not None and actions is not None and obs.batch_size == torch.Size([2])
     for group in numbers:
-        torch.testing.assert_close(obs[group], torch.cat([seen[group], image[group]]), msg=lambda text, group=group: f"{group}: {text}")
+        torch.testing.assert_close(
+            obs[group], torch.cat([seen[group], image[group]]), msg=lambda text, group=group: f"{group}: {text}"
+        )
     assert actions.tolist() == [plain, mirrored]
 
 
@@ -251,7 +265,9 @@ def test_mirroring_asks_the_host_nothing_and_lets_gradients_through() -> None:
     assert both is not None
     (both * torch.arange(8.0)[:, None]).sum().backward()
     sign = torch.tensor([-1.0, 1.0, 1.0] * 4)  # of a joint's number in the mirror
-    assert actions.grad is not None and torch.equal(actions.grad, torch.arange(4.0)[:, None] + torch.arange(4.0, 8.0)[:, None] * sign)
+    assert actions.grad is not None and torch.equal(
+        actions.grad, torch.arange(4.0)[:, None] + torch.arange(4.0, 8.0)[:, None] * sign
+    )
 
 
 def test_the_step_knows_nothing_of_it() -> None:
@@ -271,7 +287,9 @@ def symmetric_go1(folder: Path, imu_y: str) -> str:
     """The Go1 with what is not symmetric about it put right: the trunk's and the calves' mass, and the IMU's place as asked."""
     xml = replaced(GO1, 'name="imu" pos="-0.01592 -0.06659 -0.00617"', f'name="imu" pos="-0.01592 {imu_y} -0.00617"', 1)
     xml = replaced(xml, 'pos="0.0223 0.002 -0.0005"', 'pos="0.0223 0 -0.0005"', 1)
-    xml = replaced(xml, 'quat="-0.00342088047 0.705204098 0.000106698015 0.708996098"', 'quat="0 0.707107 0 0.707107"', 1)
+    xml = replaced(
+        xml, 'quat="-0.00342088047 0.705204098 0.000106698015 0.708996098"', 'quat="0 0.707107 0 0.707107"', 1
+    )
     xml = replaced(xml, 'pos="0.00429862 0.000976676 -0.146197"', 'pos="0.00429862 0 -0.146197"', 4)
     xml = replaced(xml, 'quat="0.6912463 0.00357467155 0.00511118221 0.722592313"', 'quat="0.707107 0 0 0.707107"', 4)
     (folder / "go1.xml").write_text(xml)
@@ -288,7 +306,8 @@ def mirrored_halves(env: LeggedRobot, worlds: int, reach: float) -> None:
     q[here, 7:] += 0.1 * torch.randn(worlds, 12)
     v[here] = 0.5 * torch.randn(worlds, 18)
     env.commands[here] = torch.randn(worlds, 3)
-    env.perturbation._kick[here] = torch.tensor([2.0, 30.0, 0.0, 3.0])  # pause, duration [control steps], direction [rad], dv [m/s]
+    # pause, duration [control steps], direction [rad], dv [m/s]
+    env.perturbation._kick[here] = torch.tensor([2.0, 30.0, 0.0, 3.0])
     env.perturbation._kick[here, 2] = torch.randn(worlds)
     # written out here, joints too, so that nothing is checked against itself
     swap, sign = torch.tensor([3, 4, 5, 0, 1, 2, 9, 10, 11, 6, 7, 8]), torch.tensor([-1.0, 1.0, 1.0] * 4)
@@ -307,8 +326,12 @@ def mirrored_halves(env: LeggedRobot, worlds: int, reach: float) -> None:
 TOLERANCE = {"accelerometer": 5e-3, "dof_vel": 5e-4, "torques": 5e-4}
 
 
-@pytest.mark.parametrize(("imu_y", "reach"), [("0", 0.0), ("-0.06659", REACH)], ids=["IMU in the plane", "IMU beside it, as it is"])
-def test_mirrored_states_and_actions_give_mirrored_observations_and_equal_rewards(imu_y: str, reach: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("imu_y", "reach"), [("0", 0.0), ("-0.06659", REACH)], ids=["IMU in the plane", "IMU beside it, as it is"]
+)
+def test_mirrored_states_and_actions_give_mirrored_observations_and_equal_rewards(
+    imu_y: str, reach: float, tmp_path: Path
+) -> None:
     """A world and its mirror image, stepped with an action and its mirror image, stay mirror images of each other: every row says so.
 
     Beside the plane, an IMU has an acceleration that no formula knows, and rewards read its velocity.
@@ -330,15 +353,24 @@ def test_mirrored_states_and_actions_give_mirrored_observations_and_equal_reward
         assert expected is not None
         for group, table in layout(env).items():
             sizes = list(table.values())
-            rows = zip(table, obs[group][worlds:].split(sizes, dim=1), expected[group][worlds:].split(sizes, dim=1), strict=True)
+            rows = zip(
+                table,
+                obs[group][worlds:].split(sizes, dim=1),
+                expected[group][worlds:].split(sizes, dim=1),
+                strict=True,
+            )
             for name, got, wanted in rows:
                 if name == "accelerometer" and reach:
                     continue
                 error = float((got - wanted)[alive].abs().max())
-                assert error <= TOLERANCE.get(name, 5e-4 if name == "state" else 1e-4), f"step {step}, {group}.{name}: {error:.1e}"
+                assert error <= TOLERANCE.get(name, 5e-4 if name == "state" else 1e-4), (
+                    f"step {step}, {group}.{name}: {error:.1e}"
+                )
                 if group == "privileged_state":
                     seen[name] += float(got[alive].abs().sum())
-        assert reach or torch.allclose(reward[:worlds][alive], reward[worlds:][alive], rtol=0.0, atol=1e-5), f"step {step}"
+        assert reach or torch.allclose(reward[:worlds][alive], reward[worlds:][alive], rtol=0.0, atol=1e-5), (
+            f"step {step}"
+        )
     assert alive.sum() >= worlds // 2 and reward[alive.repeat(2)].abs().max() > 0.01
     assert [name for name, total in seen.items() if total == 0.0] == (
         ["accelerometer"] if reach else []
@@ -371,7 +403,10 @@ class _Extra(LeggedRobot):
             "fot",
             "observation row 'extra' of 'state': no mirror 'fot' in its Row (a group must come before what contains it); did you",
         ),
-        ("privileged_state", "observation row 'extra' of 'state': no mirror 'privileged_state' in its Row (a group must come before"),
+        (
+            "privileged_state",
+            "observation row 'extra' of 'state': no mirror 'privileged_state' in its Row (a group must come before",
+        ),
         ("polar", "observation row 'extra' of 'state' has 4 columns; mirror='polar' takes a multiple of 3"),
     ],
 )
@@ -395,8 +430,14 @@ def test_a_row_of_ones_own_mirrors_as_it_says() -> None:
 def test_a_default_pose_that_leans_is_named() -> None:
     angles = load_task("go1_flat").cfg.init_state.default_joint_angles
     for wrong, message in (
-        ({"FL_hip": 0.1}, "joint 'FR_hip_joint' is at 0.1 rad, the mirror image of 0.1 rad at 'FL_hip_joint' is -0.1; make the default"),
-        ({"FR_hip": 0.0}, "joint 'FR_hip_joint' is at 0 rad, the mirror image of -0.1 rad at 'FL_hip_joint' is 0.1; make the default"),
+        (
+            {"FL_hip": 0.1},
+            "joint 'FR_hip_joint' is at 0.1 rad, the mirror image of 0.1 rad at 'FL_hip_joint' is -0.1; make the default",
+        ),
+        (
+            {"FR_hip": 0.0},
+            "joint 'FR_hip_joint' is at 0 rad, the mirror image of -0.1 rad at 'FL_hip_joint' is 0.1; make the default",
+        ),
     ):
         env = make_env(1, {**QUIET, "init_state.default_joint_angles": {**angles, **wrong}})
         with pytest.raises(ConfigError) as error:
@@ -469,7 +510,12 @@ def test_rsl_rl_reads_what_mirror_returns_as_it_is_meant(env: LeggedRobot) -> No
     obs = TensorDict({group: torch.randn(5, value.shape[1]) for group, value in env.obs_buf.items()}, batch_size=[5])
     numbers = torch.randn(5, 1)
     batch = RolloutStorage.Batch(
-        observations=obs, actions=torch.randn(5, 12), values=numbers, advantages=numbers, returns=numbers, old_actions_log_prob=numbers
+        observations=obs,
+        actions=torch.randn(5, 12),
+        values=numbers,
+        advantages=numbers,
+        returns=numbers,
+        old_actions_log_prob=numbers,
     )
     symmetry.augment_batch(batch, 5)
     assert batch.observations is not None and batch.observations.batch_size == torch.Size([10])
@@ -494,7 +540,9 @@ def test_a_cuda_graph_records_it() -> None:
     env = LeggedRobot(task.cfg, "cuda:0")
     assert env.mirror.actions.sign.device.type == "cuda"
     obs = TensorDict(
-        {group: torch.randn(5, v.shape[1], device="cuda:0") for group, v in env.obs_buf.items()}, batch_size=[5], device="cuda:0"
+        {group: torch.randn(5, v.shape[1], device="cuda:0") for group, v in env.obs_buf.items()},
+        batch_size=[5],
+        device="cuda:0",
     )
     actions = torch.randn(5, 12, device="cuda:0")
     torch.cuda.synchronize()

@@ -31,7 +31,14 @@ from legged_mw.utils.task import LoadedTask, load_task
 # go1_rough_scan and its student, small: one level of one kind of ground.
 ROUGH = [
     *("--num_envs", "16", "--set", "terrain.num_rows=1", "--set", "terrain.num_cols=1", "--set", "terrain.tile_size=4"),
-    *("--set", "terrain.border_size=1", "--set", "terrain.max_init_terrain_level=0", "--set", "terrain.terrain_proportions={waves: 1}"),
+    *(
+        "--set",
+        "terrain.border_size=1",
+        "--set",
+        "terrain.max_init_terrain_level=0",
+        "--set",
+        "terrain.terrain_proportions={waves: 1}",
+    ),
 ]
 WIDE = ["--set", "actor.hidden_dims=[24, 16]"]  # the student's own network: the teacher's is of 16 and 16
 
@@ -50,16 +57,38 @@ def teacher(root: Path) -> Path:
 @pytest.fixture(scope="module")
 def student(root: Path, teacher: Path) -> Path:
     """Distilled from the last run of go1_rough_scan, with an export."""
-    asked = ["--teacher", "go1_rough_scan", "--max_iterations", "3", "--set", "runner.save_interval=2", "--set", "runner.export=true"]
+    asked = [
+        "--teacher",
+        "go1_rough_scan",
+        "--max_iterations",
+        "3",
+        "--set",
+        "runner.save_interval=2",
+        "--set",
+        "runner.export=true",
+    ]
     return trained(root, "--task", "go1_rough_student", *ROUGH, *WIDE, *asked)
 
 
 @pytest.fixture(scope="module")
 def tuned(root: Path, student: Path) -> Path:
     """PPO from that student; the critic learns alone in the first of two iterations. Nothing says how large the actor is."""
-    small = [*SMALL[: SMALL.index("actor.hidden_dims=[16, 16]") - 1], *SMALL[SMALL.index("actor.hidden_dims=[16, 16]") + 1 :]]
+    small = [
+        *SMALL[: SMALL.index("actor.hidden_dims=[16, 16]") - 1],
+        *SMALL[SMALL.index("actor.hidden_dims=[16, 16]") + 1 :],
+    ]
     warm = ["--init", student.name, "--set", "warm_start.critic_warmup=1", "--set", "warm_start.init_std=0.3"]
-    begun = [*small, "--task", "go1_rough_student", *ROUGH, *warm, "--max_iterations", "2", "--set", "runner.save_interval=1"]
+    begun = [
+        *small,
+        "--task",
+        "go1_rough_student",
+        *ROUGH,
+        *warm,
+        "--max_iterations",
+        "2",
+        "--set",
+        "runner.save_interval=1",
+    ]
     result = run("train", root, *begun, "--run_name", "tuned")
     assert result.code == 0, result.err
     assert "the critic learns alone for 1 iterations (warm_start.critic_warmup)" in result.out
@@ -79,7 +108,9 @@ def test_a_students_run(student: Path, teacher: Path) -> None:
     content, config = load(student / "model_3.pt"), load_yaml(student / "config.yaml")
     assert {"student_state_dict", "teacher_state_dict", "optimizer_state_dict", "iter", "infos"} == content.keys()
     assert_equal(dict(content["teacher_state_dict"]), dict(load(teacher / "model_2.pt")["actor_state_dict"]))
-    assert config["distillation"]["teacher"].endswith(f"{teacher.name}/model_2.pt") and config["actor"]["hidden_dims"] == [24, 16]
+    assert config["distillation"]["teacher"].endswith(f"{teacher.name}/model_2.pt") and config["actor"][
+        "hidden_dims"
+    ] == [24, 16]
     assert sorted(path.name for path in (student / TEACHER).iterdir()) == ["config.yaml", "model_2.pt"]
     assert load_yaml(student / TEACHER / "config.yaml") == load_yaml(teacher / "config.yaml")
     first, last = load(student / "model_2.pt")["student_state_dict"], content["student_state_dict"]
@@ -88,12 +119,17 @@ def test_a_students_run(student: Path, teacher: Path) -> None:
     assert last["obs_normalizer.count"] == 3 * 8 * 16
 
 
-def test_a_student_is_exported_and_deployed(student: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_student_is_exported_and_deployed(
+    student: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     contract = read_contract(student / "export")
     assert [(row.name, row.history) for row in contract.rows] == [
         (name, 10) for name in ("base_ang_vel", "projected_gravity", "dof_pos", "dof_vel", "last_actions", "commands")
     ]
-    weights = {each.name: numpy_helper.to_array(each) for each in onnx.load(str(student / "export/policy.onnx")).graph.initializer}
+    weights = {
+        each.name: numpy_helper.to_array(each)
+        for each in onnx.load(str(student / "export/policy.onnx")).graph.initializer
+    }
     saved = load(student / "model_3.pt")["student_state_dict"]
     assert (weights["policy.mlp.0.weight"] == saved["mlp.0.weight"].numpy()).all()
     monkeypatch.setattr("sys.argv", ["deploy", str(student / "export"), "--viewer", "none", "--time", "1s"])
@@ -123,13 +159,20 @@ def test_a_student_resumes_without_its_teachers_run(student: Path, tmp_path: Pat
     saved, [start] = load(folder / "model_3.pt"), starts
     for name in ("student_state_dict", "teacher_state_dict", "optimizer_state_dict"):
         assert_equal(dict(start.alg[name]), dict(saved[name]), name)
-    assert torch.equal(start.random_state, saved["infos"]["random_state"]["cpu"]) and (start.iteration, start.total_steps) == (3, 3 * 128)
+    assert torch.equal(start.random_state, saved["infos"]["random_state"]["cpu"]) and (
+        start.iteration,
+        start.total_steps,
+    ) == (3, 3 * 128)
     assert load(folder / "model_4.pt")["student_state_dict"]["obs_normalizer.count"] == 4 * 128
 
 
 def test_ppo_goes_on_from_the_student(tuned: Path, student: Path) -> None:
     """The critic alone at first, to the bit; then both. The network is the student's, its noise the config's."""
-    begun, first, last = load(student / "model_3.pt")["student_state_dict"], load(tuned / "model_1.pt"), load(tuned / "model_2.pt")
+    begun, first, last = (
+        load(student / "model_3.pt")["student_state_dict"],
+        load(tuned / "model_1.pt"),
+        load(tuned / "model_2.pt"),
+    )
     assert_equal(parts(first["actor_state_dict"], noise=False), parts(begun, noise=False))
     assert first["actor_state_dict"]["distribution.std_param"].unique().tolist() == [pytest.approx(0.3)]
     assert not torch.equal(last["actor_state_dict"]["mlp.0.weight"], begun["mlp.0.weight"])
@@ -137,7 +180,9 @@ def test_ppo_goes_on_from_the_student(tuned: Path, student: Path) -> None:
     assert first["critic_state_dict"]["obs_normalizer.count"] == 128
     config = load_yaml(tuned / "config.yaml")
     assert config["actor"]["hidden_dims"] == [24, 16] and config["critic"]["hidden_dims"] == [16, 16]
-    assert config["warm_start"]["policy"].endswith(f"{student.name}/model_3.pt") and not config["distillation"]["teacher"]
+    assert (
+        config["warm_start"]["policy"].endswith(f"{student.name}/model_3.pt") and not config["distillation"]["teacher"]
+    )
 
 
 def test_a_warm_up_goes_on_when_it_is_resumed(tuned: Path, tmp_path: Path) -> None:
@@ -175,7 +220,9 @@ def test_the_end_of_a_warm_up_is_not_lost_when_it_is_resumed(tuned: Path, env: L
     assert rates == [pytest.approx(1e-5)] and not runner.alg.critic_only
 
 
-@pytest.mark.parametrize(("name", "kept"), [("best.pt", "model_0.pt"), ("walks.onnx", "policy.onnx"), ("model_2.pt", "model_2.pt")])
+@pytest.mark.parametrize(
+    ("name", "kept"), [("best.pt", "model_0.pt"), ("walks.onnx", "policy.onnx"), ("model_2.pt", "model_2.pt")]
+)
 def test_a_resumed_student_finds_a_teacher_of_any_name(name: str, kept: str, teacher: Path, tmp_path: Path) -> None:
     shutil.copy(teacher / "config.yaml", tmp_path)
     shutil.copy(teacher / "model_2.pt", tmp_path / name)
@@ -224,8 +271,19 @@ def test_the_teacher_sees_its_own_rows_exactly() -> None:
         task.set(path, value)
     before = layout(env)
     seen = seated(env, task)
-    order = ["base_lin_vel", "base_ang_vel", "projected_gravity", "dof_pos", "dof_vel", "last_actions", "commands", "height_scan"]
-    assert {row.name: row.size for row in env.observations.groups[TEACHER]} == dict(zip(order, (3, 3, 3, 36, 12, 12, 3, 2), strict=True))
+    order = [
+        "base_lin_vel",
+        "base_ang_vel",
+        "projected_gravity",
+        "dof_pos",
+        "dof_vel",
+        "last_actions",
+        "commands",
+        "height_scan",
+    ]
+    assert {row.name: row.size for row in env.observations.groups[TEACHER]} == dict(
+        zip(order, (3, 3, 3, 36, 12, 12, 3, 2), strict=True)
+    )
     assert {group: rows for group, rows in layout(env).items() if group != TEACHER} == before
     offsets = []
     for _ in range(4):
@@ -305,7 +363,8 @@ def test_what_a_teacher_sees_can_be_recorded() -> None:
     seated(env, task)
     with recordable():
         env.compute_observations()
-    assert "teacher/state" in env.observations._parts and "teacher/privileged_state" not in env.observations._parts  # it reads no more
+    # it reads no more
+    assert "teacher/state" in env.observations._parts and "teacher/privileged_state" not in env.observations._parts
 
 
 # ---- bad input: one line each
@@ -335,7 +394,10 @@ def one_command_more(task: LoadedTask) -> None:
 
 
 CHANGES: dict[str, tuple[str | Callable[[LoadedTask], None], Any]] = {
-    "pose": ("init_state.default_joint_angles", {"FR_hip": 0.1, "FL_hip": -0.1, "RR_hip": 0.1, "RL_hip": -0.1, "thigh": 0.8, "calf": -1.8}),
+    "pose": (
+        "init_state.default_joint_angles",
+        {"FR_hip": 0.1, "FL_hip": -0.1, "RR_hip": 0.1, "RL_hip": -0.1, "thigh": 0.8, "calf": -1.8},
+    ),
     "scale": ("control.action_scale", {"": 0.5, "RL_calf": 0.25}),
     "rate": ("control.decimation", 10),
     "origin": ("control.action_origin", "joints"),
@@ -398,7 +460,8 @@ def test_an_actor_of_other_rows_is_refused(env: LeggedRobot) -> None:
     task.set("observations.history", {"state.dof_pos": 2})
     policy = Trained(Source(Path("run"), Path("run/model_1.pt"), False), task)
     with pytest.raises(
-        ConfigError, match=r"^run/model_1.pt: it reads .* dof_pos 12 x 2 frames, .*; the actor of go1_flat reads .*dof_pos 12,"
+        ConfigError,
+        match=r"^run/model_1.pt: it reads .* dof_pos 12 x 2 frames, .*; the actor of go1_flat reads .*dof_pos 12,",
     ):
         check_start(env, load_task("go1_flat"), policy)
 
@@ -419,11 +482,22 @@ def test_a_warm_up_needs_the_recorded_learner(env: LeggedRobot) -> None:
     with pytest.raises(ConfigError, match="critic_warmup is 20"):
         make_runner(env, task.train, None, "cpu")
     task.set("warm_start.critic_warmup", 0)
-    assert make_runner(env, task.train, None, "cpu").alg.actor.distribution.std_param.mean().item() == pytest.approx(0.2)
+    assert make_runner(env, task.train, None, "cpu").alg.actor.distribution.std_param.mean().item() == pytest.approx(
+        0.2
+    )
 
 
 def test_rsl_rls_own_distillation_trains_too(tmp_path: Path, root: Path, teacher: Path) -> None:
-    small = ["--task", "go1_flat", "--teacher", "go1_flat/first", "--set", "distillation.class_name=Distillation", "--max_iterations", "1"]
+    small = [
+        "--task",
+        "go1_flat",
+        "--teacher",
+        "go1_flat/first",
+        "--set",
+        "distillation.class_name=Distillation",
+        "--max_iterations",
+        "1",
+    ]
     shutil.copytree(trained(root, "--max_iterations", "1"), root / "logs/go1_flat/first")
     assert "student_state_dict" in load(trained(root, *small) / "model_1.pt")
 

@@ -62,7 +62,9 @@ def test_tiles_begin_flat_and_end_at_zero(kind: str) -> None:
         assert np.ptp(middle) == 0.0
         assert not patch[[0, -1]].any() and not patch[:, [0, -1]].any(), "neighbours meet without a step"
         x, y, z = ground.origins[level, ground.kinds.index(kind)]
-        assert z == middle[0, 0] and HeightMap(ground, "cpu")(torch.tensor([x, y], dtype=torch.float)) == pytest.approx(z, abs=1e-6)
+        assert z == middle[0, 0] and HeightMap(ground, "cpu")(torch.tensor([x, y], dtype=torch.float)) == pytest.approx(
+            z, abs=1e-6
+        )
     heights = [np.ptp(tile(ground, level, kind)) for level in (0, 3)]
     assert kind in ("flat", "stepping_stones", "gap") or heights[1] > heights[0], "the last level is the hardest"
 
@@ -102,7 +104,9 @@ def test_a_lookup_is_what_a_ray_hits(cell: float) -> None:
     rows, columns = ground.heights.shape
     spec = mujoco.MjSpec()
     size = [(columns - 1) * cell / 2, (rows - 1) * cell / 2, high - low, 1.0]
-    spec.add_hfield(name="ground", size=size, nrow=rows, ncol=columns, userdata=((ground.heights - low) / (high - low)).ravel())
+    spec.add_hfield(
+        name="ground", size=size, nrow=rows, ncol=columns, userdata=((ground.heights - low) / (high - low)).ravel()
+    )
     spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname="ground", pos=[0, 0, low])
     model = spec.compile()
     data = mujoco.MjData(model)
@@ -145,7 +149,9 @@ def test_a_kind_of_ones_own() -> None:
             return grid.fade(np.full((grid.n + 1, grid.n + 1), -depth * difficulty))
 
     ground = terrain(proportions={"pits": 1.0, "flat": 1.0}, columns=2, levels=3)
-    assert tile(ground, 2, "pits").min() == pytest.approx(-0.1) and tile(ground, 1, "pits").min() == pytest.approx(-0.05)
+    assert tile(ground, 2, "pits").min() == pytest.approx(-0.1) and tile(ground, 1, "pits").min() == pytest.approx(
+        -0.05
+    )
     assert ground.difficulties == (0.0, 0.5, 1.0)
     assert name_tile("pits", 0.5) == "pits, depth 5 cm" and name_tile("stairs_up", 0.5) == "stairs_up, step 12.8 cm"
     assert name_tile("flat", 0.5) == "flat" and name_tile("gap", 0.0) == "gap, width 5 cm"
@@ -194,7 +200,9 @@ def test_a_place_is_on_the_tile_whose_vertices_are_around_it(edge: float) -> Non
 def test_only_level_pieces_become_boxes(cell: float) -> None:
     """A slope of few cells is a heap of steps to who counts rectangles."""
     kinds = [kind for kind in KINDS if kind != "craters"]
-    ground = terrain(levels=2, cell=cell, proportions=dict.fromkeys(kinds, 1.0), columns=len(kinds), difficulty=(0.5, 0.9))
+    ground = terrain(
+        levels=2, cell=cell, proportions=dict.fromkeys(kinds, 1.0), columns=len(kinds), difficulty=(0.5, 0.9)
+    )
     _, heights, _ = as_boxes(ground)
     sunk = set()
     for column, kind in enumerate(ground.kinds):

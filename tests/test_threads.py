@@ -55,7 +55,9 @@ def test_a_machine_that_becomes_busy_and_free_again() -> None:
 
 def test_noise_changes_nothing() -> None:
     choice = ThreadChoice(1, 2)
-    taken = [updates(choice, {1: 0.1 * noise, 2: 0.09 * noise}, 1)[0][0] for noise in (1.0, 1.1, 1.0, 1.9, 0.8, 1.5) * 20]
+    taken = [
+        updates(choice, {1: 0.1 * noise, 2: 0.09 * noise}, 1)[0][0] for noise in (1.0, 1.1, 1.0, 1.9, 0.8, 1.5) * 20
+    ]
     assert set(taken[2:]) == {2}
     choice = ThreadChoice(1, 2)  # one slow update is looked into, and forgotten
     updates(choice, IDLE, 10)
@@ -71,7 +73,9 @@ def test_a_change_must_gain(times: dict[int, float], settled: int, expected: int
     assert better(times, settled) == expected
 
 
-def test_torch_gets_the_threads_and_the_user_the_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_torch_gets_the_threads_and_the_user_the_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A number that is asked for is never tried; what fails is no measurement; torch has its own number back in any case."""
     clock, before = [0.0], torch.get_num_threads()
     monkeypatch.setattr(threads.time, "perf_counter", lambda: clock[0])

@@ -82,7 +82,9 @@ def test_a_renderer_that_does_not_work_is_replaced_in_one_line(
 
 def test_a_wrong_renderer_is_no_traceback() -> None:
     code = "import legged_mw, mujoco"
-    environment = {key: value for key, value in os.environ.items() if "DISPLAY" not in key} | {"MUJOCO_GL": "none of these"}
+    environment = {key: value for key, value in os.environ.items() if "DISPLAY" not in key} | {
+        "MUJOCO_GL": "none of these"
+    }
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, env=environment, capture_output=True, text=True)
     assert done.returncode == 0 and done.stderr.count("\n") == 1, done.stderr
     assert done.stderr.startswith("legged_mw: MUJOCO_GL=none of these does not work here: there are ")
@@ -95,7 +97,9 @@ def test_a_slow_start_has_its_reasons() -> None:
     ready = DeviceFacts("H100", (13, 0), True, Path("cache"), 9, memory=80.0, taken=0.6)
     assert ready.slow() == []
     compiles, shared = ready._replace(compiled=0).slow() + ready._replace(taken=12.3).slow()
-    assert compiles.startswith("some 50 modules of kernels are compiled at this first start, a minute or two; `legged-mw warm`")
+    assert compiles.startswith(
+        "some 50 modules of kernels are compiled at this first start, a minute or two; `legged-mw warm`"
+    )
     assert shared == "another process holds 12 of 80 GiB of this GPU: both run slower (nvidia-smi shows which)"
     pool, driver = ready._replace(pool=False, cuda=(12, 2)).slow()
     assert pool.startswith("this GPU has no memory pool: nothing can be recorded")
@@ -122,7 +126,9 @@ def test_compiling_says_so(tmp_path: Path) -> None:
     assert listen(facts) == []  # compiled before this start
     os.utime(tmp_path / "wp_new/wp_new.sm90.cubin", (4e9, 4e9))
     assert listen(facts._replace(compiled=0)) == []
-    assert listen(facts) == ["kernels that this task needs are being compiled, 1 modules so far; the next start has them"]
+    assert listen(facts) == [
+        "kernels that this task needs are being compiled, 1 modules so far; the next start has them"
+    ]
     with facts.say_compiling(said.append, waits=[60.0]) as thread:
         pass
     thread.join()
@@ -136,7 +142,9 @@ def small_task(name: str, **_: Any) -> LoadedTask:
     return task
 
 
-def test_doctor_says_what_is_there_and_what_mends(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_says_what_is_there_and_what_mends(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(doctor, "draws", lambda name: "EGLError: no device" if name == "egl" else "")
     monkeypatch.setattr(doctor, "gl_fault", lambda name: "")
     monkeypatch.setattr(doctor, "has_display", lambda: False)
@@ -161,23 +169,32 @@ def test_doctor_says_what_is_there_and_what_mends(monkeypatch: pytest.MonkeyPatc
     assert speed.startswith("    go1_flat ") and "iterations in " in speed and "worlds, ready after" in speed
 
 
-def test_doctor_fails_where_nothing_can_train(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_fails_where_nothing_can_train(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     version = doctor._version
     others = {"mujoco-warp": "", "onnxscript": "0.5.4"}
     monkeypatch.setattr(doctor, "_version", lambda name: others.get(name, version(name)))
     monkeypatch.setattr(
-        doctor.metadata, "requires", lambda _: ["mujoco-warp<4.1,>=4.0", "onnxscript>=0.6", "torch", 'av; extra == "video"']
+        doctor.metadata,
+        "requires",
+        lambda _: ["mujoco-warp<4.1,>=4.0", "onnxscript>=0.6", "torch", 'av; extra == "video"'],
     )
     monkeypatch.setattr(doctor, "draws", lambda name: "")
     with pytest.raises(SystemExit, match="1"):
         program("doctor", monkeypatch=monkeypatch)
     said = capsys.readouterr().out
     assert "  mujoco-warp: pip install 'mujoco-warp<4.1,>=4.0'\n" in said and "Speed" not in said
-    assert "  ! onnxscript     0.5.4, which is not >=0.6\n" in said and "  onnxscript: pip install 'onnxscript>=0.6'\n" in said
+    assert (
+        "  ! onnxscript     0.5.4, which is not >=0.6\n" in said
+        and "  onnxscript: pip install 'onnxscript>=0.6'\n" in said
+    )
 
 
 def test_drawing_is_tried_in_another_process() -> None:
-    assert doctor.draws("no such thing") == "RuntimeError: invalid value for environment variable MUJOCO_GL: no such thing"
+    assert (
+        doctor.draws("no such thing") == "RuntimeError: invalid value for environment variable MUJOCO_GL: no such thing"
+    )
 
 
 def test_warm_steps_each_task(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -209,10 +226,16 @@ def write_run(folder: Path, seed: int = 1, gamma: float = 0.99, reward: float = 
     (folder / "config.yaml").write_text(f"task: go1_flat\nalgorithm:\n  gamma: {gamma}\nseed: {seed}\n")
     with SummaryWriter(folder) as writer:
         for i in range(1, 11):
-            curves = {"Train/mean_reward": reward * i, "Train/total_steps": 1e6 * i, "Perf/total_fps": 5000.0, "Loss/value": float("nan")}
+            curves = {
+                "Train/mean_reward": reward * i,
+                "Train/total_steps": 1e6 * i,
+                "Perf/total_fps": 5000.0,
+                "Loss/value": float("nan"),
+            }
             curves |= {"Exam/falls": 1.0} if i == 10 else {}
             for name, value in curves.items():
-                writer.add_scalar(name, value, i, walltime=1000.0 + 2.0 * i + (500.0 if i > 5 else 0.0))  # resumed after a pause
+                # resumed after a pause
+                writer.add_scalar(name, value, i, walltime=1000.0 + 2.0 * i + (500.0 if i > 5 else 0.0))
     return folder
 
 
@@ -220,7 +243,10 @@ def test_compare_writes_one_page_that_needs_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    one, two = write_run(tmp_path / "logs/go1_flat/one"), write_run(tmp_path / "logs/go1_flat/two", gamma=0.97, reward=3.0)
+    one, two = (
+        write_run(tmp_path / "logs/go1_flat/one"),
+        write_run(tmp_path / "logs/go1_flat/two", gamma=0.97, reward=3.0),
+    )
     (two / "eval").mkdir()
     exam = {"falls": 2, "error": [0.01, 0.02, 0.03], "walks": True, "rules": {"x": 1}}
     (two / "eval/report.json").write_text(json.dumps({"columns": [{"exam": exam}]}))
@@ -228,18 +254,23 @@ def test_compare_writes_one_page_that_needs_nothing_else(
     program("compare", str(one), "go1_flat", monkeypatch=monkeypatch)
     head, first, second, written = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert head == ["run", "iterations", "M", "steps", "minutes", "steps/s", "reward", "falls"]
-    assert first == ["one", "10", "10.0", "0.3", "5,000", "10.00", "1.000"] and second[0] == "two" and second[5] == "30.00"
+    assert (
+        first == ["one", "10", "10.0", "0.3", "5,000", "10.00", "1.000"] and second[0] == "two" and second[5] == "30.00"
+    )
     assert written == ["written", "to", "compare.html"]
     page = (tmp_path / "compare.html").read_text()
     assert (
-        "<tr><th>algorithm.gamma</th><td>0.99</td><td>0.97</td></tr>" in page and "<th>error yaw rate</th><td>-</td><td>0.03</td>" in page
+        "<tr><th>algorithm.gamma</th><td>0.99</td><td>0.97</td></tr>" in page
+        and "<th>error yaw rate</th><td>-</td><td>0.03</td>" in page
     )
     assert page.count('style="stroke:var(--run1)"') == 2 and page.count("<circle") == 2  # reward, speed; one exam each
     assert "http" not in page and "<script" not in page and "mean reward" in page and "total steps" not in page
 
 
 def test_axes_have_round_numbers() -> None:
-    assert chart.ticks(0.0, 9.7, 5) == [0, 2, 4, 6, 8, 10] and chart.ticks(-0.3, 0.4, 4) == pytest.approx([-0.4, -0.2, 0, 0.2, 0.4])
+    assert chart.ticks(0.0, 9.7, 5) == [0, 2, 4, 6, 8, 10] and chart.ticks(-0.3, 0.4, 4) == pytest.approx(
+        [-0.4, -0.2, 0, 0.2, 0.4]
+    )
     assert chart.ticks(5.0, 5.0, 4)[0] < 5.0 < chart.ticks(5.0, 5.0, 4)[-1]
     assert chart.chart("x", "y", [("red", [1.0], [float("nan")])]) == ""
     assert [chart.short(value) for value in (0.25, 5000.0, 20000.0, 1.5e6)] == ["0.25", "5000", "20k", "1.5M"]
@@ -258,10 +289,18 @@ def test_a_sweep_trains_every_combination_and_ends_with_a_table(tmp_path: Path) 
         return 0, str(write_run(tmp_path / f"{len(asked)}", reward=len(asked))), ""
 
     found = sweep.train_all(cells, ["--task", "go1_flat"], start, sweep.Stop())
-    assert asked[0] == [*["--task", "go1_flat", "--set", "a.b=1", "--set"], "c.d=[3, 4]", *["--set", "seed=1", "--run_name", "b=1_seed=1"]]
+    assert asked[0] == [
+        *["--task", "go1_flat", "--set", "a.b=1", "--set"],
+        "c.d=[3, 4]",
+        *["--set", "seed=1", "--run_name", "b=1_seed=1"],
+    ]
     lines = [line.split() for line in sweep.table(found).splitlines()]
     assert lines[0] == ["b", "seed", "iterations", "M", "steps", "minutes", "steps/s", "reward", "falls"]
-    assert [(line[0], line[1], line[6]) for line in lines[1:4]] == [("1", "1", "10.00"), ("1", "2", "20.00"), ("2", "1", "30.00")]
+    assert [(line[0], line[1], line[6]) for line in lines[1:4]] == [
+        ("1", "1", "10.00"),
+        ("1", "2", "20.00"),
+        ("2", "1", "30.00"),
+    ]
     assert lines[4][:4] == ["1", "mean", "of", "2"] and "15.00 ± 7.07" in " ".join(lines[4])
 
 
@@ -302,7 +341,9 @@ def test_no_training_outlives_its_sweep(name: str, state: str, tmp_path: Path) -
     fake = [sys.executable, "fake.py", "told", state]
     code = f"from legged_mw.tools import sweep\nsweep.TRAIN, sweep.check = {fake}, lambda *_: None\nsweep.main()\n"
     command = [sys.executable, "-c", code, "--task", "go1_flat", "--seeds", "1,2"]
-    with subprocess.Popen(command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=-1, text=True) as ours:
+    with subprocess.Popen(
+        command, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, stdout=-1, text=True
+    ) as ours:
         with open(tmp_path / "told") as told:
             assert told.readline() == "begins\n"
             ours.send_signal(signal.Signals[name])
@@ -352,12 +393,16 @@ def test_a_wrong_value_is_found_before_the_first_training(
 
 def test_means_are_of_numbers_not_of_what_is_printed(tmp_path: Path) -> None:
     cells = sweep.make_cells([], ["1", "2", "3"])
-    found = [(cell, read_run(write_run(tmp_path / cell.name, reward=0.0023 + 5e-5 * i), "")) for i, cell in enumerate(cells)]
+    found = [
+        (cell, read_run(write_run(tmp_path / cell.name, reward=0.0023 + 5e-5 * i), "")) for i, cell in enumerate(cells)
+    ]
     assert "0.02350 ± 0.00050" in sweep.table(found).splitlines()[-1]
 
 
 def test_values_stand_apart_by_commas() -> None:
-    assert sweep.values("1,2") == ["1", "2"] and sweep.values("[1,2],[3]") == ["[1,2]", "[3]"] and sweep.values("") == []
+    assert (
+        sweep.values("1,2") == ["1", "2"] and sweep.values("[1,2],[3]") == ["[1,2]", "[3]"] and sweep.values("") == []
+    )
     assert sweep.values("{a: [1,2]},'x,y'") == ["{a: [1,2]}", "'x,y'"]
 
 
@@ -380,7 +425,10 @@ def completed(script: str, line: str, folder: Path) -> set[str]:
     """What bash offers at the end of ``line``; words are apart by spaces."""
     words = line.split(" ")
     array = " ".join(f"'{word}'" for word in words)
-    code = f"{script}\nCOMP_WORDS=({array}); COMP_CWORD={len(words) - 1}\n_legged_mw\n" + 'printf "%s\\n" "${COMPREPLY[@]}"'
+    code = (
+        f"{script}\nCOMP_WORDS=({array}); COMP_CWORD={len(words) - 1}\n_legged_mw\n"
+        + 'printf "%s\\n" "${COMPREPLY[@]}"'
+    )
     done = subprocess.run(["bash", "--norc", "-c", code], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     return set(done.stdout.split())
@@ -407,7 +455,10 @@ def test_completion_knows_programs_flags_tasks_fields_and_runs(bash: str, tmp_pa
 
 def test_zsh_reads_the_same_functions(bash: str) -> None:
     zsh = completion.script("zsh", {"warm": programs.PROGRAMS["warm"]})
-    assert zsh.splitlines()[1] == "autoload -U +X bashcompinit && bashcompinit" and "complete -F _legged_mw legged-mw" in zsh
+    assert (
+        zsh.splitlines()[1] == "autoload -U +X bashcompinit && bashcompinit"
+        and "complete -F _legged_mw legged-mw" in zsh
+    )
 
 
 # ---- a viewer beside a training
@@ -434,7 +485,10 @@ def test_play_follows_the_newest_policy(made: Path, tmp_path: Path) -> None:
         result = run("play", tmp_path, *flags)
     assert result.code == 0 and set(said) == {"iteration 7"}, result.err
     refused = run("play", tmp_path, "--task", "go1_flat", "--follow", "--eval")
-    assert refused.code == 2 and "--follow watches the newest policy: leave --eval, --export and --checkpoint out" in refused.err
+    assert (
+        refused.code == 2
+        and "--follow watches the newest policy: leave --eval, --export and --checkpoint out" in refused.err
+    )
 
 
 def test_a_viewer_outlives_a_thinned_checkpoint(tmp_path: Path) -> None:
@@ -491,9 +545,27 @@ def test_training_with_play_starts_a_viewer_and_feeds_it(tmp_path: Path, monkeyp
 
 
 NOT_TO_TRAIN = [
-    *("matplotlib", "onnxscript", "onnxruntime", "warp", "mujoco_warp", "PIL", "mujoco.studio", "mujoco.viewer", "av", "cyclonedds"),
+    *(
+        "matplotlib",
+        "onnxscript",
+        "onnxruntime",
+        "warp",
+        "mujoco_warp",
+        "PIL",
+        "mujoco.studio",
+        "mujoco.viewer",
+        "av",
+        "cyclonedds",
+    ),
     *("wandb", "scipy", "pandas", "sympy", "onnx", "torch._dynamo.eval_frame", "torch._inductor", "legged_mw.motion"),
-    *("legged_mw.view", "legged_mw.deploy", "legged_mw.robot.picture", "legged_mw.drawing", "legged_mw.rl.export", "legged_mw.tools"),
+    *(
+        "legged_mw.view",
+        "legged_mw.deploy",
+        "legged_mw.robot.picture",
+        "legged_mw.drawing",
+        "legged_mw.rl.export",
+        "legged_mw.tools",
+    ),
 ]
 WHAT_IS_THERE = """
 import os, sys
@@ -512,7 +584,12 @@ programs.train()
 
 def test_a_training_on_a_cpu_imports_what_it_needs(tmp_path: Path) -> None:
     """What costs time to import, and only some programs need; a whole iteration, checkpoint included."""
-    command = [sys.executable, "-c", WHAT_IS_THERE, *["--task", "go1_flat", "--device", "cpu", "--num_envs", "8", "--eager"]]
+    command = [
+        sys.executable,
+        "-c",
+        WHAT_IS_THERE,
+        *["--task", "go1_flat", "--device", "cpu", "--num_envs", "8", "--eager"],
+    ]
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "NAMES": " ".join([*NOT_TO_TRAIN, "torch"])}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -531,7 +608,11 @@ def test_what_asks_for_words_imports_no(program: str, without: str) -> None:
 
 
 def test_comparing_runs_needs_no_torch() -> None:
-    subprocess.run([sys.executable, "-c", "import sys, legged_mw.tools.sweep; sys.exit('torch' in sys.modules)"], cwd=ROOT, check=True)
+    subprocess.run(
+        [sys.executable, "-c", "import sys, legged_mw.tools.sweep; sys.exit('torch' in sys.modules)"],
+        cwd=ROOT,
+        check=True,
+    )
 
 
 def test_errors_of_tools_are_one_line(capsys: pytest.CaptureFixture[str]) -> None:

@@ -90,7 +90,13 @@ def test_errors_are_taken_at_the_anchor() -> None:
 
 @pytest.mark.parametrize(
     ("lift", "lean", "bend", "fell"),
-    [(0.0, 0.0, 0.0, False), (0.24, 0.0, 0.0, False), (0.26, 0.0, 0.0, True), (0.0, 1.5, 0.0, True), (0.0, 0.0, 1.2, True)],
+    [
+        (0.0, 0.0, 0.0, False),
+        (0.24, 0.0, 0.0, False),
+        (0.26, 0.0, 0.0, True),
+        (0.0, 1.5, 0.0, True),
+        (0.0, 0.0, 1.2, True),
+    ],
 )
 def test_who_is_far_from_the_reference_fell(lift: float, lean: float, bend: float, fell: bool) -> None:
     """In height, in tilt, and with a foot."""
@@ -129,7 +135,9 @@ def test_starts_are_drawn_by_failures() -> None:
     assert (everywhere > 15).all()
     reference.frame.fill_(301 + 50 + 125)  # of the second clip; after the first one's held frames
     reference.remember_failures(torch.arange(512) < 32, rate=0.5)
-    assert reference.failures.nonzero().tolist() == [[8]] and reference.failures[8].item() == pytest.approx(0.5 * 32 / 512)
+    assert reference.failures.nonzero().tolist() == [[8]] and reference.failures[8].item() == pytest.approx(
+        0.5 * 32 / 512
+    )
     among = torch.bincount(reference._bin_of[reference.draw(0.1)], minlength=14)
     assert 430 < among[8] < 500 and among.gt(0).sum() > 7  # nine tenths, and a fourteenth of the rest
     drawn = reference.draw(1e-9)
@@ -146,8 +154,13 @@ def test_a_mirrored_robot_follows_the_mirrored_motion() -> None:
     partners = env._partners()
 
     def image(qpos: torch.Tensor) -> torch.Tensor:
-        place, attitude = qpos[:, :3] * torch.tensor([1.0, -1.0, 1.0]), qpos[:, 3:7] * torch.tensor([1.0, -1.0, 1.0, -1.0])
-        return torch.cat([place, attitude, qpos[:, 7:36][:, list(partners.joints)] * torch.tensor(partners.signs)], dim=1)
+        place, attitude = (
+            qpos[:, :3] * torch.tensor([1.0, -1.0, 1.0]),
+            qpos[:, 3:7] * torch.tensor([1.0, -1.0, 1.0, -1.0]),
+        )
+        return torch.cat(
+            [place, attitude, qpos[:, 7:36][:, list(partners.joints)] * torch.tensor(partners.signs)], dim=1
+        )
 
     first = env.reference._table[:1, :36]
     env.sim.qpos[1:] = image(env.sim.qpos[:1])
@@ -165,7 +178,9 @@ def test_a_mirrored_robot_follows_the_mirrored_motion() -> None:
         _ = make(worlds=1, **{"motion.bodies": ["torso_link", "left_knee_link"], "motion.end_bodies": []}).mirror
 
 
-@pytest.mark.parametrize(("left_out", "rows"), [({"state": ["anchor_pos", "base_lin_vel"]}, 154), ({}, 160)], ids=["154 rows", "160 rows"])
+@pytest.mark.parametrize(
+    ("left_out", "rows"), [({"state": ["anchor_pos", "base_lin_vel"]}, 154), ({}, 160)], ids=["154 rows", "160 rows"]
+)
 def test_the_step_can_be_recorded(left_out: dict[str, list[str]], rows: int) -> None:
     assert make(worlds=1, **{"observations.leave_out": left_out}).obs_buf["state"].shape == (1, rows)
     task = load_task("g1_track")
@@ -195,7 +210,11 @@ def test_the_exam_judges_places_at_the_anchor() -> None:
     ended = exam.judge(robot, Recording(qpos[:, :2], nothing, nothing, ended_at=np.array([100.0, np.inf])))
     assert ended["worst"] == 0 and ended["finished"] == 0.5 and ended["body_error"] == pytest.approx(0.0, abs=1e-6)
     starts, speeds = exam.starts(robot, 32)
-    assert (np.ptp(starts[:, 7:], axis=0) > 0.05).all() and np.abs(starts - robot.motion.qpos[0])[:, 7:].max() <= 0.05 and speeds.any()
+    assert (
+        (np.ptp(starts[:, 7:], axis=0) > 0.05).all()
+        and np.abs(starts - robot.motion.qpos[0])[:, 7:].max() <= 0.05
+        and speeds.any()
+    )
 
 
 def test_each_robot_is_pushed_once_every_two_seconds() -> None:

@@ -117,7 +117,11 @@ def test_saved_config_is_the_one_that_was_trained(three: Path) -> None:
     task = load_task("go1_flat")
     task.update(saved, where="config.yaml")
     assert task.to_dict() == saved
-    assert saved["env"]["num_envs"] == 16 and saved["env"]["episode_length_s"] == 0.4 and saved["actor"]["hidden_dims"] == [16, 16]
+    assert (
+        saved["env"]["num_envs"] == 16
+        and saved["env"]["episode_length_s"] == 0.4
+        and saved["actor"]["hidden_dims"] == [16, 16]
+    )
     assert saved["runner"]["max_iterations"] == 3 and saved["runner"]["run_name"] == "three" and saved["seed"] == 4
 
 
@@ -125,7 +129,14 @@ def test_curves(three: Path) -> None:
     curves = scalars(three)
     terms = [name for name, scale in load_yaml(three / "config.yaml")["rewards"]["scales"].items() if scale]
     assert {f"Episode/rew_{name}" for name in terms} == {name for name in curves if name.startswith("Episode/rew_")}
-    for name in ("Train/mean_reward", "Train/mean_episode_length", "Loss/value", "Loss/learning_rate", "Policy/mean_std", "Perf/total_fps"):
+    for name in (
+        "Train/mean_reward",
+        "Train/mean_episode_length",
+        "Loss/value",
+        "Loss/learning_rate",
+        "Policy/mean_std",
+        "Perf/total_fps",
+    ):
         assert list(curves[name]) == [1, 2, 3], name
     assert curves["Train/total_steps"] == {i: [i * STEPS] for i in (1, 2, 3)}
     assert all(0 < value[0] <= 20 for value in curves["Train/mean_episode_length"].values())  # 0.4 s are 20 steps
@@ -136,7 +147,9 @@ def test_checkpoint_holds_tensors_and_numbers_only(three: Path) -> None:
     assert {"actor_state_dict", "critic_state_dict", "optimizer_state_dict", "iter", "infos"} == content.keys()
     assert content["iter"] == 3 and content["infos"]["total_steps"] == 3 * STEPS
     assert content["actor_state_dict"]["obs_normalizer.count"] == 3 * STEPS
-    assert not torch.equal(content["actor_state_dict"]["mlp.0.weight"], load(three / "model_2.pt")["actor_state_dict"]["mlp.0.weight"])
+    assert not torch.equal(
+        content["actor_state_dict"]["mlp.0.weight"], load(three / "model_2.pt")["actor_state_dict"]["mlp.0.weight"]
+    )
 
 
 # ---- resuming
@@ -160,7 +173,9 @@ def starts(monkeypatch: pytest.MonkeyPatch) -> list[Start]:
 
     def note_and_learn(self: Runner, *args: Any) -> None:
         alg = copy.deepcopy(self.alg.save())
-        seen.append(Start(alg, self.alg.learning_rate, self.current_learning_iteration, self.total_steps, torch.get_rng_state()))
+        seen.append(
+            Start(alg, self.alg.learning_rate, self.current_learning_iteration, self.total_steps, torch.get_rng_state())
+        )
         learn(self, *args)
         self.logger.writer.flush()  # type: ignore[union-attr]  (a thread writes the curves)
 
@@ -174,9 +189,11 @@ def test_resumed_run_goes_on_where_the_checkpoint_is(copied: Path, tmp_path: Pat
     assert f"resuming {copied}/model_3.pt" in result.out
     assert re.findall(r"Learning iteration (\d+/\d+)", result.out) == ["4/5", "5/5"]
     saved, [start] = load(copied / "model_3.pt"), starts
-    for name in ("actor_state_dict", "critic_state_dict", "optimizer_state_dict"):  # the normalisers are in the first two
+    # the normalisers are in the first two
+    for name in ("actor_state_dict", "critic_state_dict", "optimizer_state_dict"):
         assert_equal(start.alg[name], saved[name], name)
-    assert start.learning_rate == saved["optimizer_state_dict"]["param_groups"][0]["lr"] != 1e-3  # adapted, not the config's
+    # adapted, not the config's
+    assert start.learning_rate == saved["optimizer_state_dict"]["param_groups"][0]["lr"] != 1e-3
     assert torch.equal(start.random_state, saved["infos"]["random_state"]["cpu"])
     assert (start.iteration, start.total_steps) == (3, 3 * STEPS)
     last = load(copied / "model_5.pt")
@@ -190,7 +207,19 @@ def test_resumed_run_goes_on_where_the_checkpoint_is(copied: Path, tmp_path: Pat
 
 
 def test_an_earlier_checkpoint_can_be_resumed(copied: Path, tmp_path: Path, starts: list[Start]) -> None:
-    result = run("train", tmp_path, "--task", "go1_flat", "--device", "cpu", "--resume", "--checkpoint", "2", "--max_iterations", "3")
+    result = run(
+        "train",
+        tmp_path,
+        "--task",
+        "go1_flat",
+        "--device",
+        "cpu",
+        "--resume",
+        "--checkpoint",
+        "2",
+        "--max_iterations",
+        "3",
+    )
     assert result.code == 0, result.err
     assert re.findall(r"Learning iteration (\d+/\d+)", result.out) == ["3/3"]
     assert_equal(starts[0].alg["actor_state_dict"], load(copied / "model_2.pt")["actor_state_dict"])
@@ -200,7 +229,19 @@ def test_an_earlier_checkpoint_begins_a_run_of_its_own(copied: Path, tmp_path: P
     """In the old folder its later checkpoints would stand, of another branch, and -1 would pick them."""
     (copied / "model_7.pt").write_bytes((copied / "model_3.pt").read_bytes())
     before = sorted(path.name for path in copied.iterdir())
-    result = run("train", tmp_path, "--task", "go1_flat", "--device", "cpu", "--resume", "--checkpoint", "3", "--max_iterations", "4")
+    result = run(
+        "train",
+        tmp_path,
+        "--task",
+        "go1_flat",
+        "--device",
+        "cpu",
+        "--resume",
+        "--checkpoint",
+        "3",
+        "--max_iterations",
+        "4",
+    )
     assert result.code == 0, result.err
     assert sorted(path.name for path in copied.iterdir()) == before
     (branch,) = set(copied.parent.iterdir()) - {copied}
@@ -238,7 +279,8 @@ def test_a_fixed_learning_rate_is_the_configs_an_adaptive_one_the_checkpoints(
 def copy_world(source: LeggedRobot, target: LeggedRobot) -> None:
     """All that an environment remembers, the simulator's memory included."""
     for name, value in vars(source).items():
-        if isinstance(value, torch.Tensor) and value.is_contiguous():  # others are constants, or views of what is copied anyway
+        # others are constants, or views of what is copied anyway
+        if isinstance(value, torch.Tensor) and value.is_contiguous():
             getattr(target, name).copy_(value)
     for group, obs in source.obs_buf.items():
         target.obs_buf[group].copy_(obs)
@@ -288,7 +330,11 @@ def test_the_last_run_is_the_one_last_trained(three: Path, tmp_path: Path) -> No
     assert find_run(experiment, "c") == find_run(experiment, str(experiment / "c")) == experiment / "c"
     os.utime(experiment / "b/model_2.pt", (1e9, 1e9))
     common = ["--task", "go1_flat", "--device", "cpu", "--resume", "--max_iterations"]
-    for pick, resumed in ((["4", "--load_run", "c"], "c/model_3.pt"), (["5"], "c/model_4.pt"), (["6", "--load_run", "-1"], "c/model_5.pt")):
+    for pick, resumed in (
+        (["4", "--load_run", "c"], "c/model_3.pt"),
+        (["5"], "c/model_4.pt"),
+        (["6", "--load_run", "-1"], "c/model_5.pt"),
+    ):
         result = run("train", tmp_path, *common, *pick)
         assert result.code == 0, result.err
         assert f"resuming {experiment / resumed}\n" in result.out
@@ -351,16 +397,22 @@ def test_sigterm_saves_and_says_how_to_go_on(tmp_path: Path) -> None:
 
 def test_the_time_that_is_asked_for_is_a_training(tmp_path: Path) -> None:
     """It ends as one that has done all its iterations does; the next one's plan counts its time."""
-    result = run("train", tmp_path, *SMALL, "--max_iterations", "1000", "--max_time", "1s", "--set", "runner.exam_interval=0")
+    result = run(
+        "train", tmp_path, *SMALL, "--max_iterations", "1000", "--max_time", "1s", "--set", "runner.exam_interval=0"
+    )
     assert result.code == 0, result.err
     *_, told, ended, watch = result.out.splitlines()
     done = [int(number) for number in re.findall(r"Learning iteration (\d+)/", result.out)]
     [folder] = (tmp_path / "logs/go1_flat").iterdir()
     assert list(checkpoints(folder)) == [len(done)] and done == list(range(1, len(done) + 1))
-    assert told == f"{len(done)} iterations within --max_time; --resume goes on towards 1000" and ended.startswith("done: ")
+    assert told == f"{len(done)} iterations within --max_time; --resume goes on towards 1000" and ended.startswith(
+        "done: "
+    )
     assert shlex.split(watch) == ["python", "play.py", "--task", "go1_flat", "--load_run", folder.name]
     assert 0.0 < load(folder / f"model_{len(done)}.pt")["infos"]["seconds"] < 60.0
-    assert re.search(r"^\d+ cores: 1000 iterations, .* min; --max_time ends it after 0\.0167 min$", result.out, re.MULTILINE)
+    assert re.search(
+        r"^\d+ cores: 1000 iterations, .* min; --max_time ends it after 0\.0167 min$", result.out, re.MULTILINE
+    )
 
 
 def test_who_is_stopped_is_told_how_much_time_is_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -371,7 +423,9 @@ def test_who_is_stopped_is_told_how_much_time_is_left(tmp_path: Path, monkeypatc
         self.stop = "SIGTERM"
 
     monkeypatch.setattr(Runner, "_log", stop_after)
-    result = run("train", tmp_path, *SMALL, "--max_iterations", "1000", "--max_time", "10h", "--set", "runner.exam_interval=0")
+    result = run(
+        "train", tmp_path, *SMALL, "--max_iterations", "1000", "--max_time", "10h", "--set", "runner.exam_interval=0"
+    )
     assert result.code == 3, result.err
     *_, stopped, hint = result.out.splitlines()
     left = re.fullmatch(r" +python train.py --resume --task go1_flat --load_run \S+ --max_time (\d+)s", hint)
@@ -406,11 +460,14 @@ for attempt in range(12):
 
 def test_kill_while_saving_leaves_whole_checkpoints_only(tmp_path: Path) -> None:
     """SIGKILL at twelve random moments of a process that does nothing but save."""
-    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(
+        [sys.executable, "-c", KILLED, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=300
+    )
     assert done.returncode == 0, done.stderr
     whole, torn = (int(number) for number in done.stdout.split()[-2:])
     assert whole == 3  # it did save
-    assert torn > 0  # and was killed in the middle of it, at least once: such files are left, under a name that nothing reads
+    # and was killed in the middle of it, at least once: such files are left, under a name that nothing reads
+    assert torn > 0
     assert list(checkpoints(tmp_path)) == [0, 1, 2]
 
 
@@ -434,7 +491,11 @@ def test_ours_reads_the_stock_runners(env: LeggedRobot, tmp_path: Path) -> None:
     ours = make_runner(env, small_task().train, None, "cpu")
     ours.load(str(tmp_path / "model_7.pt"))
     assert_equal(ours.alg.save(), stock.alg.save())
-    assert (ours.current_learning_iteration, ours.total_steps, ours.alg.learning_rate) == (7, 0, stock.alg.learning_rate)
+    assert (ours.current_learning_iteration, ours.total_steps, ours.alg.learning_rate) == (
+        7,
+        0,
+        stock.alg.learning_rate,
+    )
 
 
 # ---- the exported policy

@@ -27,15 +27,21 @@ FIGURES = ["error_vx", "error_vy", "error_yaw", "falls", "pushes_survived"]
 def test_figures() -> None:
     """World i is off by 0.01 i, of either sign, once it settled; command 20 fell, and 4 of the 16 that were pushed."""
     steps, worlds = 200, 38
-    off = 0.01 * np.arange(worlds)[None, :, None] * (-1.0) ** np.arange(steps)[:, None, None] * np.array([1.0, 2.0, 3.0])
+    off = (
+        0.01 * np.arange(worlds)[None, :, None] * (-1.0) ** np.arange(steps)[:, None, None] * np.array([1.0, 2.0, 3.0])
+    )
     off[:100] += 9.0
     fell_at = np.full(worlds, math.inf)
     fell_at[[20, 22, 23, 24, 37]] = 150
     commands = np.ones((steps, worlds, 3))
-    found = training_figures(Record(0.02, 10.0, commands, fell_at, np.zeros((worlds, 2)), {"velocity": commands + off}), 22)
+    found = training_figures(
+        Record(0.02, 10.0, commands, fell_at, np.zeros((worlds, 2)), {"velocity": commands + off}), 22
+    )
     means = [(0.01 * n * (sum(range(22)) - 20) + 1.0) / 22 for n in (1, 2, 3)]  # at command 20 it is off by the command
     assert found == pytest.approx(dict(zip(FIGURES, [*means, 1.0, 0.75], strict=True)))
-    all_fell = training_figures(Record(0.02, 10.0, commands, np.zeros(worlds), np.zeros((worlds, 2)), {"velocity": commands + off}), 22)
+    all_fell = training_figures(
+        Record(0.02, 10.0, commands, np.zeros(worlds), np.zeros((worlds, 2)), {"velocity": commands + off}), 22
+    )
     assert all_fell["error_vx"] == 1.0 and all_fell["falls"] == 22 and all_fell["pushes_survived"] == 0.0
 
 
@@ -64,7 +70,10 @@ def test_no_exam_for_an_actor_that_sees_what_the_nominal_world_has_not(capsys: p
     task.set("obs_groups.actor", ["privileged_state"])
     assert make_exam(task, env) is None
     line = capsys.readouterr().out
-    assert line.startswith("no exam during training: the actor's observation group 'privileged_state' has 1") and line.count("\n") == 1
+    assert (
+        line.startswith("no exam during training: the actor's observation group 'privileged_state' has 1")
+        and line.count("\n") == 1
+    )
 
 
 def run_with(root: Path, interval: int) -> tuple[Path, dict[int, Any], dict[str, list[int]]]:
@@ -110,7 +119,9 @@ def test_an_exam_that_fails_costs_the_training_nothing(tmp_path: Path, monkeypat
     assert result.out.count("WARNING: the exam failed, training goes on without: RuntimeError: no room for it") == 1
 
 
-def test_a_short_run_has_no_exam_and_a_negative_interval_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_short_run_has_no_exam_and_a_negative_interval_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def begin(*_: Any, **__: Any) -> None:
         raise AssertionError("nobody asked for an exam")
 

@@ -39,12 +39,16 @@ def test_both_languages_have_the_same_exercises_and_formulas() -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.parent.name)
 def test_scales_are_the_tasks(page: Path) -> None:
     scales = {name: float(scale) for name, scale in TERM.findall(read(page))}
-    assert scales == {name: scale for name, scale in load_task("go1_flat").cfg.to_dict()["rewards"]["scales"].items() if scale}
+    assert scales == {
+        name: scale for name, scale in load_task("go1_flat").cfg.to_dict()["rewards"]["scales"].items() if scale
+    }
 
 
 @pytest.mark.parametrize("name", PAGES.values())
 def test_links_of_notebooks_lead_somewhere(name: str) -> None:
-    text = "".join("".join(cell["source"]) for cell in notebook(read(next(page for page in PAGES if PAGES[page] == name)))["cells"])
+    text = "".join(
+        "".join(cell["source"]) for cell in notebook(read(next(page for page in PAGES if PAGES[page] == name)))["cells"]
+    )
     links = re.findall(r"\]\(([^)#]+)", text)
     assert links and not [link for link in links if not (ROOT / "examples" / link).exists()]
 
@@ -70,8 +74,12 @@ def test_formulas_stand_apart_as_github_wants_them(page: Path) -> None:
 
 
 def test_formulas_become_mathml() -> None:
-    shown = on_page_content(r'<p><span class="arithmatex">\(a &lt; b\)</span></p><div class="arithmatex">\[\sum_k w_k\]</div>')
-    assert shown.count("<math ") == 2 and 'display="block"' in shown and "&#x0003C;" in shown and "arithmatex" not in shown
+    shown = on_page_content(
+        r'<p><span class="arithmatex">\(a &lt; b\)</span></p><div class="arithmatex">\[\sum_k w_k\]</div>'
+    )
+    assert (
+        shown.count("<math ") == 2 and 'display="block"' in shown and "&#x0003C;" in shown and "arithmatex" not in shown
+    )
 
 
 def words(text: str) -> str:

@@ -69,7 +69,9 @@ def test_the_walk_is_the_same_over_udp(served: Any, contract: Contract) -> None:
         if len(said) == 2:
             break
         threading.Event().wait(0.02)
-    assert said[0].endswith("took the robot") and said[1].endswith("closed the link; the joints are damped, no longer servoed")
+    assert said[0].endswith("took the robot") and said[1].endswith(
+        "closed the link; the joints are damped, no longer servoed"
+    )
 
 
 def test_after_a_silent_client_the_servos_are_off(contract: Contract) -> None:
@@ -102,7 +104,9 @@ def test_a_client_of_another_contract_is_refused(served: Any, contract: Contract
     server, robot, _ = served
     other = replace(contract, joints=contract.joints[::-1])
     assert udp.contract_digest(other) != udp.contract_digest(contract)
-    with pytest.raises(RobotError, match="its export has other joints, measurements or another period; use one export at both ends"):
+    with pytest.raises(
+        RobotError, match="its export has other joints, measurements or another period; use one export at both ends"
+    ):
         udp.UdpRobot(other, server.address, timeout=60.0)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as raw:
         raw.settimeout(60.0)
@@ -111,7 +115,11 @@ def test_a_client_of_another_contract_is_refused(served: Any, contract: Contract
         packet[4] = 9
         raw.sendto(packet, server.address)
         answer = udp.unpack(raw.recv(1000))
-        assert answer is not None and answer.kind == udp.REFUSED and b"uses version 9 of the link, this one 1" in answer.body
+        assert (
+            answer is not None
+            and answer.kind == udp.REFUSED
+            and b"uses version 9 of the link, this one 1" in answer.body
+        )
         raw.sendto(udp.pack(udp.TARGETS, udp.contract_digest(contract), 1, bytes(96)), server.address)
         answer = udp.unpack(raw.recv(1000))
         assert answer is not None and answer.kind == udp.REFUSED and answer.body == b"send a hello first"
@@ -156,15 +164,29 @@ def test_the_program() -> None:
     """A server and a client, each a process of its own; and an address that is none."""
     serve = [sys.executable, "-c", PATIENT, str(SHIPPED), "--serve", "127.0.0.1:0"]
     here: dict[str, Any] = {"cwd": ROOT, "env": {**os.environ, "PYTHONPATH": str(ROOT)}, "text": True}
-    wrong = subprocess.run([sys.executable, str(PROGRAM), *serve[3:-1], "robot"], **here, capture_output=True, timeout=300)
-    assert (wrong.returncode, wrong.stderr) == (2, "udp_robot.py: 'robot' is no address; write HOST:PORT, e.g. 127.0.0.1:9870\n")
+    wrong = subprocess.run(
+        [sys.executable, str(PROGRAM), *serve[3:-1], "robot"], **here, capture_output=True, timeout=300
+    )
+    assert (wrong.returncode, wrong.stderr) == (
+        2,
+        "udp_robot.py: 'robot' is no address; write HOST:PORT, e.g. 127.0.0.1:9870\n",
+    )
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{free.getsockname()[1]}"
     with subprocess.Popen([*serve[:-1], address], **here, stdout=subprocess.PIPE) as server:
-        assert server.stdout and server.stdout.readline() == f"a simulated robot for go1_flat at {address}; Ctrl-C ends it\n"
+        assert (
+            server.stdout
+            and server.stdout.readline() == f"a simulated robot for go1_flat at {address}; Ctrl-C ends it\n"
+        )
         drive = [*serve[:4], "--drive", address, "--command", "0.8,0,0", "--time", "2"]
         done = subprocess.run(drive, **here, capture_output=True, timeout=300)
         assert done.returncode == 0, done.stderr
-        assert server.stdout.read().endswith("closed the link; the joints are damped, no longer servoed\n") and server.wait(300) == 0
-    assert " steps of 0.02 s" in done.stdout and "commanded 0.80, 0.00, 0.00 (vx [m/s], vy [m/s], yaw rate [rad/s])" in done.stdout
+        assert (
+            server.stdout.read().endswith("closed the link; the joints are damped, no longer servoed\n")
+            and server.wait(300) == 0
+        )
+    assert (
+        " steps of 0.02 s" in done.stdout
+        and "commanded 0.80, 0.00, 0.00 (vx [m/s], vy [m/s], yaw rate [rad/s])" in done.stdout
+    )

@@ -64,7 +64,9 @@ def test_a_fault_damps(name: str, ends: dict[str, Ends], monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("name", [*REFUSED, ""])
-def test_a_fault_from_the_start_keeps_it_from_walking(name: str, ends: dict[str, Ends], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fault_from_the_start_keeps_it_from_walking(
+    name: str, ends: dict[str, Ends], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It stands up and stays there, however often A is pressed; without a fault it walks."""
     case = REFUSED.get(name, Case("policy: ", from_start=True, known_after=4.0))
     sim, wire, other, second = ends[case.task]

@@ -122,7 +122,9 @@ def test_a_late_policy_is_damped_and_does_not_resume(bench: Bench, capfd: pytest
     count = len(bench.wire.sent)
     assert until(lambda: len(bench.wire.sent) > count + 20) and set(bench.wire.sent[count:]) == {DAMPING}
     text = bench.board.get().text
-    assert text.startswith("no targets for ") and text.endswith(" ms: the policy's process hangs or is late; the joints are damped")
+    assert text.startswith("no targets for ") and text.endswith(
+        " ms: the policy's process hangs or is late; the joints are damped"
+    )
     assert "guard: no targets for" in capfd.readouterr().err
 
 
@@ -234,7 +236,9 @@ def ends(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Guarded, FakeCommand
 
 
 @pytest.mark.parametrize("ending", ["stopped", "killed before", "killed meanwhile"])
-def test_a_guard_that_cannot_end_the_run_is_replaced(ending: str, ends: tuple[Guarded, FakeCommander, socket.socket]) -> None:
+def test_a_guard_that_cannot_end_the_run_is_replaced(
+    ending: str, ends: tuple[Guarded, FakeCommander, socket.socket]
+) -> None:
     owner, commander, there = ends
     served = 3 * (guard._FRAME.size + SIZE) if ending == "killed meanwhile" else 0
 
@@ -366,7 +370,8 @@ def second(domain: int, sim: SimulatedUnitree) -> str:
 
 LATE = "no targets for [0-9]+ ms: the policy's process hangs or is late; the joints are damped"
 STOOD = "nothing was sent for [0-9]+ ms: the guard stood still, or this computer slept; the joints are damped"
-PROCESSES: dict[str, tuple[signal.Signals | None, str]] = {  # a computer that is too busy is late, too, and stands still
+# a computer that is too busy is late, too, and stands still
+PROCESSES: dict[str, tuple[signal.Signals | None, str]] = {
     "dies": (signal.SIGKILL, f"the policy's process ended; the joints are damped|{STOOD}"),
     "hangs": (signal.SIGSTOP, f"{LATE}|{STOOD}"),
     "late": (None, f"{LATE}|{STOOD}"),
@@ -381,7 +386,9 @@ def test_processes_of_a_policy_that_dies_hangs_or_is_late(fault: str, domain: in
     with policy(domain, fault) as process:
         live(sim, lambda: sim.acted["kp"].any())
         if number == signal.SIGKILL:
-            assert re.match("another program sends rt/lowcmd in domain .*: end it first; nothing was sent", second(domain, sim))
+            assert re.match(
+                "another program sends rt/lowcmd in domain .*: end it first; nothing was sent", second(domain, sim)
+            )
         if number:
             os.kill(process.pid, number)
         else:
@@ -410,12 +417,31 @@ def test_a_signal_damps_before_it_ends_the_guard(name: str, domain: int) -> None
 
 def test_what_ends_a_process_ends_the_guard_damped() -> None:
     caught = signal.valid_signals() - guard.KEPT
-    names = ("HUP", "INT", "QUIT", "ABRT", "USR1", "USR2", "ALRM", "TERM", "TSTP", "TTIN", "XCPU", "XFSZ", "VTALRM", "PROF", "SYS", "TRAP")
+    names = (
+        "HUP",
+        "INT",
+        "QUIT",
+        "ABRT",
+        "USR1",
+        "USR2",
+        "ALRM",
+        "TERM",
+        "TSTP",
+        "TTIN",
+        "XCPU",
+        "XFSZ",
+        "VTALRM",
+        "PROF",
+        "SYS",
+        "TRAP",
+    )
     assert {getattr(signal, f"SIG{name}") for name in names} <= caught
     assert {getattr(signal, f"SIG{name}") for name in ("KILL", "STOP", "SEGV", "CHLD")} <= guard.KEPT
 
 
-@pytest.mark.parametrize(("name", "said"), [("SIGKILL", "of the wire is gone; "), ("SIGSTOP", f"of the wire was silent for |{guard.DEAF}")])
+@pytest.mark.parametrize(
+    ("name", "said"), [("SIGKILL", "of the wire is gone; "), ("SIGSTOP", f"of the wire was silent for |{guard.DEAF}")]
+)
 def test_a_guard_that_can_do_nothing_is_replaced(name: str, said: str, domain: int) -> None:
     """The policy's process damps, with a publisher of its own. A guard that goes on damps, too: what waited for it is not obeyed."""
     sim = served(domain)
@@ -440,7 +466,9 @@ def test_one_process_of_a_computer_commands_a_robot(domain: int) -> None:
     begun, first = clock(), link.claim("lo", domain, 0.0)
     if first is None:
         pytest.skip("only Linux has abstract sockets")
-    with pytest.raises(RobotError, match=f"another program sends rt/lowcmd in domain {domain} on lo: end it first; nothing was sent"):
+    with pytest.raises(
+        RobotError, match=f"another program sends rt/lowcmd in domain {domain} on lo: end it first; nothing was sent"
+    ):
         link.claim("lo", domain, 0.2)
     assert clock() - begun >= 0.2
     first.close()
@@ -451,7 +479,9 @@ def test_one_process_of_a_computer_commands_a_robot(domain: int) -> None:
 
 def test_a_guard_that_ends_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.executable", shutil.which("false"))
-    with pytest.raises(RobotError, match="the guard of the wire did not start: it ended, or took longer than 60 s; no command was sent"):
+    with pytest.raises(
+        RobotError, match="the guard of the wire did not start: it ended, or took longer than 60 s; no command was sent"
+    ):
         Guarded.start("unitree_go", "lo", 0)
 
 
@@ -467,8 +497,24 @@ def test_the_programs(domain: int, tmp_path: Path) -> None:
     """Two programs over loopback: the remote of the robot's side stands the robot up, starts the policy, walks and ends it."""
     press = [f"{{time: {0.5 * k}, press: [{button}]}}" for k, button in enumerate(["start", "A"] * 20, start=4)]
     (tmp_path / "remote.yaml").write_text(f"remote: [{{time: 0, ly: 0.4}}, {', '.join(press)}]")
-    command = [sys.executable, "-m", "legged_mw.deploy", "go2_flat", "--interface", "lo", "--domain", str(domain), "--serve", "unitree"]
-    where: dict[str, Any] = {"cwd": POLICIES.parents[1], "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    command = [
+        sys.executable,
+        "-m",
+        "legged_mw.deploy",
+        "go2_flat",
+        "--interface",
+        "lo",
+        "--domain",
+        str(domain),
+        "--serve",
+        "unitree",
+    ]
+    where: dict[str, Any] = {
+        "cwd": POLICIES.parents[1],
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.PIPE,
+        "text": True,
+    }
     with contextlib.ExitStack() as stack:
         robot = subprocess.Popen([*command, "--remote", str(tmp_path / "remote.yaml")], **where)
         stack.callback(robot.kill)
@@ -484,7 +530,9 @@ def test_the_programs(domain: int, tmp_path: Path) -> None:
         policy.send_signal(signal.SIGINT)
         rest, errors = policy.communicate(timeout=300)
         assert policy.returncode == 0, errors
-        assert "go2 at lo: 12 joints, 32.8 V" in said and "from a measurement to its target: median " in rest, said + rest + errors
+        assert "go2 at lo: 12 joints, 32.8 V" in said and "from a measurement to its target: median " in rest, (
+            said + rest + errors
+        )
         assert "zero torque: " in said and "stand: " in said and "policy: select: damping" in said, said
         robot.send_signal(signal.SIGINT)
         said, errors = robot.communicate(timeout=300)
@@ -496,14 +544,21 @@ def test_the_program_with_motors_in_another_order(domain: int) -> None:
     """As soon as it would stand: the angles are not those of the joints."""
     sim = served(domain)
     sim.faults.joint_order = 1
-    where: dict[str, Any] = {"cwd": POLICIES.parents[1], "stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    where: dict[str, Any] = {
+        "cwd": POLICIES.parents[1],
+        "stdout": subprocess.PIPE,
+        "stderr": subprocess.PIPE,
+        "text": True,
+    }
     with subprocess.Popen(deploy(domain, "--time", "1s"), **where) as policy:
         live(sim, lambda: sim.record.commands > 50)
         sim.remote = encode(["start"])
         live(sim, lambda: policy.poll() is not None)
         said, errors = policy.communicate()
     assert policy.returncode == 0, errors
-    assert re.search("\ndamping: F[LR]_.*_joint is (at|told to go to) .* rad, .* beyond its range .*; 0.[0-9]+ is the most\n", said), said
+    assert re.search(
+        "\ndamping: F[LR]_.*_joint is (at|told to go to) .* rad, .* beyond its range .*; 0.[0-9]+ is the most\n", said
+    ), said
     assert sim.record.changes[-1][1] == DAMPED and sim.record.beyond < 0.25
 
 
@@ -530,4 +585,7 @@ def test_a_served_robot_tells_what_its_faults_led_to(domain: int, capsys: pytest
     sim.record.changes.append((0.065, DAMPED))
     done = program.run(sim, Handset(), 0.04, faults)
     assert sim.faults == Faults(temperature=95.0, silent=True) and len(done.faults) == 2
-    assert "hot_motor@0.02: its motors damped 45 ms later, and nothing drove them again\nsilent@0.02: its motors" in done.text()
+    assert (
+        "hot_motor@0.02: its motors damped 45 ms later, and nothing drove them again\nsilent@0.02: its motors"
+        in done.text()
+    )

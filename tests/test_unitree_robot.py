@@ -107,11 +107,23 @@ def test_health_and_faults(domain: int) -> None:
     both.steps(0.02)
     health = robot.health()
     assert health.age_s == 0.0 and health.voltage == pytest.approx(32.8) and not health.motor_faults
-    assert health.remote and not health.remote.buttons and health.temperatures is not None and (health.temperatures == 35).all()
-    sim.faults.temperature, sim.faults.voltage, sim.faults.no_remote, sim.faults.dead_motors = 91.0, 21.5, True, {"RL_calf_joint"}
+    assert (
+        health.remote
+        and not health.remote.buttons
+        and health.temperatures is not None
+        and (health.temperatures == 35).all()
+    )
+    sim.faults.temperature, sim.faults.voltage, sim.faults.no_remote, sim.faults.dead_motors = (
+        91.0,
+        21.5,
+        True,
+        {"RL_calf_joint"},
+    )
     both.steps(0.02)
     health = robot.health()
-    assert health.temperatures is not None and (health.temperatures == 91).all() and health.voltage == pytest.approx(21.5)
+    assert (
+        health.temperatures is not None and (health.temperatures == 91).all() and health.voltage == pytest.approx(21.5)
+    )
     assert health.remote is None and health.motor_faults == {"RL_calf_joint": "it lost 10 messages in a period"}
     assert robot.limits == {"voltage": 24.0}
 
@@ -190,7 +202,9 @@ def test_commands(domain: int) -> None:
     for message in sent:
         assert message.intact() and message["head"].tolist() == [0xFE, 0xEF] and message["level_flag"] == 0xFF
         assert message["motor_cmd.mode"].tolist() == [1] * 12 + [0] * 8 and not message["motor_cmd.dq"].any()
-    assert np.allclose(sent[0]["motor_cmd.q"][slots], targets) and np.allclose(sent[0]["motor_cmd.kp"][slots], both.contract.stiffness)
+    assert np.allclose(sent[0]["motor_cmd.q"][slots], targets) and np.allclose(
+        sent[0]["motor_cmd.kp"][slots], both.contract.stiffness
+    )
     assert np.allclose(sent[1]["motor_cmd.kp"][:12], 7.0) and np.allclose(sent[1]["motor_cmd.kd"][:12], 0.7)
     assert not sent[2]["motor_cmd.kp"].any() and np.allclose(sent[2]["motor_cmd.kd"][slots], damped(both.contract))
     assert not any(sent[3][f"motor_cmd.{part}"].any() for part in ("q", "kp", "kd", "tau"))
@@ -205,10 +219,14 @@ def test_a_contract_in_another_order_sends_the_same(domain: int) -> None:
     named = ("joints", "default_pose", "stiffness", "damping")
     backwards = replace(both.contract, **{name: getattr(both.contract, name)[::-1] for name in named})
     owners, first = [Once(both.sim._state.body) for _ in range(2)], Received(both.sim._state.body, 0.0)
-    robots = [UnitreeRobot(*each, first, clock=lambda: 0.0) for each in zip((both.contract, backwards), owners, strict=True)]
+    robots = [
+        UnitreeRobot(*each, first, clock=lambda: 0.0) for each in zip((both.contract, backwards), owners, strict=True)
+    ]
     robots[0].write(both.contract.default_pose + 0.01 * np.arange(12))
     robots[1].write((both.contract.default_pose + 0.01 * np.arange(12))[::-1])
-    assert owners[0].sent == owners[1].sent and np.array_equal(robots[0].read().joint_pos, robots[1].read().joint_pos[::-1])
+    assert owners[0].sent == owners[1].sent and np.array_equal(
+        robots[0].read().joint_pos, robots[1].read().joint_pos[::-1]
+    )
     said = "joints are in another order than sensors: joint_pos, where jointpos/FL_hip_joint measures FL_hip_joint in the place of RR_calf"
     with pytest.raises(ContractError, match=said):
         read_scene(POLICIES / "go2_flat", backwards)
@@ -245,7 +263,9 @@ def test_the_simulated_robot_obeys_as_a_motor_does(domain: int) -> None:
     """Wrong messages move nothing; a motor's mode 0 and Unitree's stop values give no torque; the last command holds for ever."""
     both = pair("go2_flat", domain)
     sim, robot = both.sim, both.robot
-    command = Message(LAYOUTS["unitree_go", "LowCmd_"], robot._command(q=both.contract.default_pose, kp=both.contract.stiffness))
+    command = Message(
+        LAYOUTS["unitree_go", "LowCmd_"], robot._command(q=both.contract.default_pose, kp=both.contract.stiffness)
+    )
     wrong = Message(command.layout, command.body)
     wrong["motor_cmd.kp"] = 99.0
     low = Message(command.layout, command.body)
@@ -261,7 +281,12 @@ def test_the_simulated_robot_obeys_as_a_motor_does(domain: int) -> None:
     sim._take(command)
     sim.step()
     assert not sim.torque.any()
-    command["motor_cmd.mode"], command["motor_cmd.q"], command["motor_cmd.dq"], command["motor_cmd.kd"] = 1, 2.146e9, 16000.0, 5.0
+    command["motor_cmd.mode"], command["motor_cmd.q"], command["motor_cmd.dq"], command["motor_cmd.kd"] = (
+        1,
+        2.146e9,
+        16000.0,
+        5.0,
+    )
     command.seal()
     sim._take(command)
     sim.step()
@@ -274,7 +299,11 @@ def test_a_watchdog_if_asked_for(domain: int) -> None:
     both.steps(0.09)
     assert both.sim.acted["kp"].any()
     both.steps(0.03)
-    assert not both.sim.acted["kp"].any() and np.allclose(both.sim.acted["kd"], damped(both.contract)) and both.sim.record.watchdog == 1
+    assert (
+        not both.sim.acted["kp"].any()
+        and np.allclose(both.sim.acted["kd"], damped(both.contract))
+        and both.sim.record.watchdog == 1
+    )
 
 
 # ---- before the first command
@@ -282,7 +311,9 @@ def test_a_watchdog_if_asked_for(domain: int) -> None:
 
 def test_no_robot(domain: int) -> None:
     wire = Wire("unitree_go", "lo", domain)
-    with pytest.raises(RobotError, match="no robot: no rt/lowstate of unitree_go in domain .* on lo within 0.1 s; is it on, is this"):
+    with pytest.raises(
+        RobotError, match="no robot: no rt/lowstate of unitree_go in domain .* on lo within 0.1 s; is it on, is this"
+    ):
         wire.prepare(seconds=0.1)
 
 
@@ -293,8 +324,12 @@ def test_the_wrong_robot(domain: int) -> None:
     wire = Wire("unitree_go", "lo", domain, wait=sim.step, clock=lambda: sim.time)
     with pytest.raises(RobotError) as error:
         wire.prepare(seconds=0.5)
-    assert "the robot there speaks unitree_hg: it is not the contract's. There: g1 has left_hip_pitch_joint, " in str(error.value)
-    assert ". Here: go2 has FR_hip_joint, FR_thigh_joint, " in str(error.value) and "; h1 has right_hip_roll_joint, " in str(error.value)
+    assert "the robot there speaks unitree_hg: it is not the contract's. There: g1 has left_hip_pitch_joint, " in str(
+        error.value
+    )
+    assert ". Here: go2 has FR_hip_joint, FR_thigh_joint, " in str(
+        error.value
+    ) and "; h1 has right_hip_roll_joint, " in str(error.value)
     assert sim.record.commands == 0
 
 
@@ -304,7 +339,8 @@ def test_more_motors_than_the_contracts_robot_has(domain: int) -> None:
     state = Message(LAYOUTS["unitree_go", "LowState_"], both.sim._state.body)
     state["motor_state.q"] = state["motor_state.mode"] = np.arange(20) < 16
     with pytest.raises(
-        RobotError, match="motors answer at 12, 13, 14, 15, where a go2 has none: it is not the contract's robot. Known are: go2"
+        RobotError,
+        match="motors answer at 12, 13, 14, 15, where a go2 has none: it is not the contract's robot. Known are: go2",
     ):
         UnitreeRobot(both.contract, Once(b""), Received(state.seal(), 0.0))
 
@@ -366,7 +402,9 @@ ASKED = "no motor command was sent, but its own program may have let go: hold th
         (range(2, 7), "", ASKED),  # the release was heard; whether it did is asked then
     ],
 )
-def test_a_motion_service_whose_answers_are_lost_is_asked_again(domain: int, lost: range, program: str, error: str) -> None:
+def test_a_motion_service_whose_answers_are_lost_is_asked_again(
+    domain: int, lost: range, program: str, error: str
+) -> None:
     """Of its calls, those that are lost: a robot may answer before it has discovered who listens. It is asked five times."""
     folder = POLICIES / "go2_flat"
 
@@ -412,7 +450,9 @@ def test_rows_that_a_robot_does_not_measure() -> None:
     check_rows(replace(contract, rows=(*contract.rows, rows[1])), GO2)
     with pytest.raises(RobotError) as error:
         check_rows(replace(contract, rows=(*contract.rows, *rows)), G1)
-    assert "the policy observes base_lin_vel, touch, which a g1 does not measure; train one without: " in str(error.value)
+    assert "the policy observes base_lin_vel, touch, which a g1 does not measure; train one without: " in str(
+        error.value
+    )
     assert "observations.leave_out = {'state': ['base_lin_vel', 'touch']}" in str(error.value)
 
 
@@ -422,7 +462,9 @@ def test_a_policy_of_torques_or_speeds() -> None:
     for origin in ("torque", "speed"):
         with pytest.raises(RobotError, match=f"the policy commands {origin}s; a go2 is driven by angles here"):
             check_rows(replace(contract, action=contract.action._replace(origin=origin)), GO2)
-    with pytest.raises(RobotError, match="the policy commands speeds, which no limit here judges: grade and watch it in simulation"):
+    with pytest.raises(
+        RobotError, match="the policy commands speeds, which no limit here judges: grade and watch it in simulation"
+    ):
         Safety(replace(contract, action=contract.action._replace(origin="speed")), Limits.of(folder, contract))
 
 

@@ -36,13 +36,17 @@ def test_types_are_announced_as_the_robots_announce_them() -> None:
 def test_a_wrong_type_is_announced_on_this_machine_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link, "wrong_hash", lambda: "unitree_go LowCmd_ as 00, not 52")
     monkeypatch.setattr(link.socket, "if_nameindex", lambda: [(1, "lo"), (2, "eth0")])
-    with pytest.raises(RobotError, match="LowCmd_ as 00, not 52, which crashes the robot's own programs: nothing was sent; install"):
+    with pytest.raises(
+        RobotError, match="LowCmd_ as 00, not 52, which crashes the robot's own programs: nothing was sent; install"
+    ):
         link.join("eth0", 0)
 
 
 def test_a_wrong_interface_or_domain(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link.socket, "if_nameindex", lambda: [(1, "lo"), (2, "eth0")])
-    with pytest.raises(RobotError, match="--interface: no network interface 'eth1' in this machine; did you mean 'eth0'"):
+    with pytest.raises(
+        RobotError, match="--interface: no network interface 'eth1' in this machine; did you mean 'eth0'"
+    ):
         link.join("eth1", 0)
     with pytest.raises(RobotError, match="--domain 233: a domain is a number from 0 to 232"):
         link.join("lo", 233)
@@ -56,7 +60,9 @@ def filled(key: tuple[str, str], rng: np.random.Generator) -> Any:
     """A sample of cyclonedds' own, with a number in every field."""
     package, made = key[0], {}
     for name, kind, count in fields(*key):
-        values = [filled((package, kind), rng) if kind in STRUCTS[package] else _number(kind, rng) for _ in range(count or 1)]
+        values = [
+            filled((package, kind), rng) if kind in STRUCTS[package] else _number(kind, rng) for _ in range(count or 1)
+        ]
         made[name] = values[0] if count is None else values
     return idl.TYPES[key](**made)
 
@@ -74,7 +80,9 @@ def flat(sample: Any) -> list[float]:
     return [x for each in sample for x in flat(each)] if isinstance(sample, list) else [sample]
 
 
-@pytest.mark.parametrize(("key", "size"), [(("unitree_go", "LowCmd_"), 812), (("unitree_hg", "LowState_"), 2092)], ids=str)
+@pytest.mark.parametrize(
+    ("key", "size"), [(("unitree_go", "LowCmd_"), 812), (("unitree_hg", "LowState_"), 2092)], ids=str
+)
 def test_bytes_are_those_of_the_generic_codec(key: tuple[str, str], size: int) -> None:
     """Field by field: what cyclonedds' own codec writes is read by name, and the other way round."""
     sample, layout = filled(key, np.random.default_rng(1)), LAYOUTS[key]
@@ -117,7 +125,9 @@ def test_the_checksum() -> None:
     assert crc32(image) == bitwise(image)
 
 
-@pytest.mark.parametrize(("key", "size"), [(k, s) for k, s in zip(LAYOUTS, (812, 1180, 1004, 2092), strict=True)], ids=str)
+@pytest.mark.parametrize(
+    ("key", "size"), [(k, s) for k, s in zip(LAYOUTS, (812, 1180, 1004, 2092), strict=True)], ids=str
+)
 def test_it_is_taken_of_the_struct_not_of_the_wire(key: tuple[str, str], size: int) -> None:
     """The compiler pads where the wire does not: a field that is set must lie where C++ has it."""
     layout = LAYOUTS[key]
@@ -150,13 +160,18 @@ def test_a_message_of_another_size() -> None:
 
 
 def test_motors_by_name() -> None:
-    assert list(GO2.motors)[:4] == ["FR_hip_joint", "FR_thigh_joint", "FR_calf_joint", "FL_hip_joint"] and len(GO2.motors) == 12
-    assert [G1.motors[f"{name}_joint"] for name in ("left_knee", "right_hip_pitch", "waist_pitch", "left_elbow", "right_wrist_yaw")] == [
-        *(3, 6, 14, 18, 28)
-    ]
-    assert [H1.motors[f"{name}_joint"] for name in ("right_knee", "torso", "left_ankle", "right_shoulder_pitch", "left_elbow")] == [
-        *(2, 6, 10, 12, 19)
-    ]
+    assert (
+        list(GO2.motors)[:4] == ["FR_hip_joint", "FR_thigh_joint", "FR_calf_joint", "FL_hip_joint"]
+        and len(GO2.motors) == 12
+    )
+    assert [
+        G1.motors[f"{name}_joint"]
+        for name in ("left_knee", "right_hip_pitch", "waist_pitch", "left_elbow", "right_wrist_yaw")
+    ] == [*(3, 6, 14, 18, 28)]
+    assert [
+        H1.motors[f"{name}_joint"]
+        for name in ("right_knee", "torso", "left_ankle", "right_shoulder_pitch", "left_elbow")
+    ] == [*(2, 6, 10, 12, 19)]
     assert (9 not in H1.motors.values(), len(H1.motors), len(G1.motors)) == (True, 19, 29)
     for name, machine in (("go2_flat", GO2), ("g1_flat", G1)):
         joints = read_contract(POLICIES / name).joints
@@ -198,7 +213,11 @@ def test_the_remote() -> None:
     assert len(data) == 40 and data[2:4] == (1 << 8 | 1 << 5).to_bytes(2, "little")
     assert np.frombuffer(data, "<f4", offset=4)[[0, 1, 2, 4]].tolist() == [0.25, -1.0, 0.125, 0.5]
     remote = decode(data)
-    assert remote and remote.buttons == {"A", "L2"} and (remote.lx, remote.ly, remote.rx, remote.ry) == (0.25, 0.5, -1.0, 0.125)
+    assert (
+        remote
+        and remote.buttons == {"A", "L2"}
+        and (remote.lx, remote.ly, remote.rx, remote.ry) == (0.25, 0.5, -1.0, 0.125)
+    )
     assert decode(bytes(40)) is None
     for i, name in enumerate(BUTTONS):
         assert encode([name])[2:4] == (1 << i).to_bytes(2, "little")
@@ -223,7 +242,9 @@ def test_a_wrong_script_of_the_remote(text: str, said: str, tmp_path: Path) -> N
 
 
 def test_a_script_of_the_remote(tmp_path: Path) -> None:
-    (tmp_path / "remote.yaml").write_text("remote: [{time: 2, ly: 0.5}, {time: 1, press: start}, {time: 3, lx: -1, hoist: false}]")
+    (tmp_path / "remote.yaml").write_text(
+        "remote: [{time: 2, ly: 0.5}, {time: 1, press: start}, {time: 3, lx: -1, hoist: false}]"
+    )
     hand = handset.Handset(handset.load_remote(tmp_path / "remote.yaml"))
     states = [decode(hand.state(time)) for time in (0.0, 1.0, 1.09, 1.2, 2.5, 3.0)]
     assert [(set(s.buttons), s.ly, s.lx) for s in states if s] == [
@@ -238,7 +259,10 @@ JOINTS = ["FL_hip_joint", "FL_calf_joint"]
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("dealy=3", "no fault 'dealy' in what a served robot can have; did you mean 'delay'? there are: delay, jitter, loss,"),
+        (
+            "dealy=3",
+            "no fault 'dealy' in what a served robot can have; did you mean 'delay'? there are: delay, jitter, loss,",
+        ),
         ("loss=200", "loss is a number from 0 to 100 [%], or off"),
         ("delay=x", "delay is a number from 0 to 1000 [ms], or off"),
         ("clock_jump=1e9", "clock_jump is a number from -1000 to 1000 [s], or off"),
@@ -261,7 +285,9 @@ def test_faults_on_demand() -> None:
     """In the order of their times; "off" ends one."""
     faults, found = (
         Faults(),
-        parse_faults(["silent@2,silent=off@3", "loss=5,joint_order,motor_fault=FL_calf_joint@1.5", "hot_motor=90"], JOINTS),
+        parse_faults(
+            ["silent@2,silent=off@3", "loss=5,joint_order,motor_fault=FL_calf_joint@1.5", "hot_motor=90"], JOINTS
+        ),
     )
     assert [(fault.text, fault.time) for fault in found] == [
         *(
@@ -288,21 +314,29 @@ def test_faults_on_demand() -> None:
     assert [name for name in KINDS if f"`{name}" not in page] == []
 
 
-def test_without_the_extra_one_command_installs_it(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_the_extra_one_command_installs_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     monkeypatch.setattr(unitree, "find_spec", lambda name: None)
     for flag in ("--robot", "--serve"):
         monkeypatch.setattr(sys, "argv", ["legged_mw.deploy", "go2_flat", flag, "unitree", "--interface", "lo"])
         with pytest.raises(SystemExit, match="2"), one_line_errors("legged_mw.deploy"):
             deploy.main()
         error = capsys.readouterr().err
-        assert "Unitree's robots speak DDS, which needs cyclonedds: pip install 'legged_mw[unitree]'\n" in error and error.count("\n") == 1
+        assert (
+            "Unitree's robots speak DDS, which needs cyclonedds: pip install 'legged_mw[unitree]'\n" in error
+            and error.count("\n") == 1
+        )
     assert importlib.util.find_spec("cyclonedds")
 
 
 def test_nothing_of_dds_is_imported_by_the_program() -> None:
     """Only by who asks for such a robot."""
     code = "import sys, legged_mw.deploy.__main__; print([name for name in sys.modules if name.partition('.')[0] == 'cyclonedds'])"
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout == "[]\n"
+    assert (
+        subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+        == "[]\n"
+    )
 
 
 @pytest.mark.parametrize(
@@ -321,8 +355,14 @@ def test_nothing_of_dds_is_imported_by_the_program() -> None:
             ("--serve", "unitree", "--robot", "unitree", "--interface", "lo"),
             "--serve is the robot and --robot drives one: start them as two",
         ),
-        (("--serve", "unitree", "--interface", "lo", "--num_envs", "3"), "--num_envs is of simulated robots in this program: leave it out"),
-        (("--serve", "unitree", "--interface", "lo", "--fault", "hot"), "--fault hot: no fault 'hot' in what a served robot can have"),
+        (
+            ("--serve", "unitree", "--interface", "lo", "--num_envs", "3"),
+            "--num_envs is of simulated robots in this program: leave it out",
+        ),
+        (
+            ("--serve", "unitree", "--interface", "lo", "--fault", "hot"),
+            "--fault hot: no fault 'hot' in what a served robot can have",
+        ),
         (
             ("--serve", "unitree", "--interface", "lo", "--watchdog", "0"),
             "--watchdog 0: a time of more than 0 s; without the flag it never damps by itself",

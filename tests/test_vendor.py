@@ -30,7 +30,12 @@ from legged_mw.utils.config import ConfigError
 from legged_mw.view.video import save_png
 
 EXACT = {"sim.iterations": 100, "sim.ls_iterations": 50}
-STILL = {"init_state.lin_vel_range": 0.0, "init_state.ang_vel_range": 0.0, "init_state.yaw_range": 0.0, "init_state.pos_xy_range": 0.0}
+STILL = {
+    "init_state.lin_vel_range": 0.0,
+    "init_state.ang_vel_range": 0.0,
+    "init_state.yaw_range": 0.0,
+    "init_state.pos_xy_range": 0.0,
+}
 EFFORTS = {
     "go2_style": [24, 24, 45] * 4,
     "g1_29dof_style": [88, 139, 88, 139, 50, 50] * 2 + [88, 50, 50] + [25, 25, 25, 25, 25, 5, 5] * 2,
@@ -144,7 +149,10 @@ SAID = {
         "fused into 'pelvis', to which they are fixed: torso_link, left_arm_link, right_arm_link",
         "site 'imu_aligned' made at the place of 'imu' on 'torso_link', with the axes of the root 'pelvis'",
     ],
-    "t1_style": ["keyframe 'stand' read: pose and height of the root, where nothing else states them", "cameras dropped: track"],
+    "t1_style": [
+        "keyframe 'stand' read: pose and height of the root, where nothing else states them",
+        "cameras dropped: track",
+    ],
     "anymal_c_style": [
         "free joint added to 'base'",
         "fused into 'base', to which they are fixed: base_inertia, face_front, battery, imu_link",
@@ -227,12 +235,17 @@ def test_where_it_starts(name: str, place: list[float] | None) -> None:
 
 
 def test_the_config_wins_over_the_keyframe() -> None:
-    changed = make("go2_style", **{"init_state.pos": [0.0, 0.0, 0.5], "init_state.default_joint_angles": {"hip": 0.1, "FR_calf": -1.7}})
+    changed = make(
+        "go2_style",
+        **{"init_state.pos": [0.0, 0.0, 0.5], "init_state.default_joint_angles": {"hip": 0.1, "FR_calf": -1.7}},
+    )
     assert changed.start_place == [0.0, 0.0, 0.5]
     assert changed.robot.pose == (0.1, 0.9, -1.8, 0.1, 0.9, -1.7, 0.1, 0.9, -1.8, 0.1, 0.9, -1.8)
     legs = [0.213 * math.cos(0.9) + 0.213 * math.cos(0.9 + calf) for calf in (-1.8, -2.4)]
     lower = make("go2_style", **{"init_state.default_joint_angles": {"calf": -2.4}}).start_place
-    assert lower[2] == pytest.approx(0.27 - legs[0] + legs[1], abs=0.01), "feet are as high above the ground as in the keyframe"
+    assert lower[2] == pytest.approx(0.27 - legs[0] + legs[1], abs=0.01), (
+        "feet are as high above the ground as in the keyframe"
+    )
 
 
 def test_a_keyframe_states_a_height_and_no_place(tmp_path: Path) -> None:
@@ -250,7 +263,11 @@ def test_a_keyframes_tilt_is_a_warning(tmp_path: Path) -> None:
 
     said = "warning: keyframe 'sit' tilts the root by 30 degrees; that and its height are not read, the root begins upright: "
     tilted = made("0.9659258 0 0.258819 0")
-    assert said + "state a pose for that by `pose`" in tilted.overrides and tilted.keyframe and tilted.keyframe.height is None
+    assert (
+        said + "state a pose for that by `pose`" in tilted.overrides
+        and tilted.keyframe
+        and tilted.keyframe.height is None
+    )
     for quat in ("0.7 0 0 0.7", "2 0 0 0"):
         level = made(quat)
         assert level.keyframe and level.keyframe.height == 0.4 and not any("tilt" in line for line in level.overrides)
@@ -264,7 +281,9 @@ def test_a_motors_range_is_its_force_limit(tmp_path: Path) -> None:
     motors = """<actuator><motor joint="left_hip" gear="4" ctrlrange="-6 5"/>
       <general joint="right_hip" gainprm="2" ctrlrange="-3 3"/></actuator>"""
     robot = build_toy(toy(tmp_path, extra=motors))
-    assert robot.effort_range.tolist() == [[-24, 20], [-6, 6]] and not any("warning" in line for line in robot.overrides)
+    assert robot.effort_range.tolist() == [[-24, 20], [-6, 6]] and not any(
+        "warning" in line for line in robot.overrides
+    )
     both = motors.replace('gear="4"', 'gear="4" forcerange="-2 2"')
     assert build_toy(toy(tmp_path, extra=both)).effort_range.tolist()[0] == [-8, 8], "forcerange comes first"
     angles = '<actuator><position joint="left_hip" ctrlrange="-1 1"/></actuator>'
@@ -275,12 +294,17 @@ def test_a_motors_range_is_its_force_limit(tmp_path: Path) -> None:
 
 
 def test_an_infinite_servo_is_a_warning_that_names_the_field(tmp_path: Path) -> None:
-    (tmp_path / "bare.xml").write_text((HERE / "g1_12dof_style.xml").read_text().replace('actuatorfrcrange="-139 139"', ""))
+    (tmp_path / "bare.xml").write_text(
+        (HERE / "g1_12dof_style.xml").read_text().replace('actuatorfrcrange="-139 139"', "")
+    )
     text = "warning: nothing limits the force of left_hip_roll_joint, left_knee_joint, right_hip_roll_joint, right_knee_joint: "
     text += "these servos are stronger than any motor; set asset.effort"
     env = make("g1_12dof_style", **{"asset.file": str(tmp_path / "bare.xml")})
     assert text in env.robot.overrides and f"  {text}" in describe(env, vendor_task("g1_12dof_style")).splitlines()
-    mended = make("g1_12dof_style", **{"asset.file": str(tmp_path / "bare.xml"), "asset.effort": {"hip_roll": 120.0, "knee": 130.0}})
+    mended = make(
+        "g1_12dof_style",
+        **{"asset.file": str(tmp_path / "bare.xml"), "asset.effort": {"hip_roll": 120.0, "knee": 130.0}},
+    )
     assert not any("warning" in line for line in mended.robot.overrides)
     assert mended.robot.effort_range[:, 1].tolist() == [88, 120, 88, 130, 50, 50] * 2
 
@@ -291,7 +315,9 @@ def test_tables_that_name_some_joints_win_over_the_file() -> None:
     assert robot.effort_range[:3, 1].tolist() == [20, 24, 45] and robot.speed_limits == (30.0, 30.0, 20.0) * 4
     np.testing.assert_allclose(robot.physics.dof_armature[6:12], [0.01, 0.01, 0.03] * 2)
     fr_hip = robot.joint_names.index("FR_hip_joint")
-    assert robot.physics.dof_frictionloss[6 + fr_hip] == 1.0 and robot.physics.dof_frictionloss[6:].sum() == pytest.approx(1.0 + 11 * 0.2)
+    assert robot.physics.dof_frictionloss[6 + fr_hip] == 1.0 and robot.physics.dof_frictionloss[
+        6:
+    ].sum() == pytest.approx(1.0 + 11 * 0.2)
     assert {"FR_hip_joint force limit: 24 -> 20 N m", "FR_hip_joint frictionloss: 0.2 -> 1 N m"} <= set(robot.overrides)
 
 
@@ -303,7 +329,9 @@ def test_a_urdfs_speed_limits_are_known() -> None:
 
 @pytest.mark.parametrize("field", ["effort", "armature", "frictionloss", "joint_speed_limits"])
 def test_a_table_with_a_wrong_key_or_number(field: str) -> None:
-    with pytest.raises(ModelError, match=rf"^asset\.{field}: no joint 'kneee' in the MJCF; there are: FL_hip_joint, .* a part of"):
+    with pytest.raises(
+        ModelError, match=rf"^asset\.{field}: no joint 'kneee' in the MJCF; there are: FL_hip_joint, .* a part of"
+    ):
         make("go2_style", **{f"asset.{field}": {"kneee": 3.0}})
     wrong, must = (-1.0, "from 0 to 1,000,000") if field in ("armature", "frictionloss") else (0.0, "above 0")
     with pytest.raises(ConfigError, match=rf"^--set: asset\.{field}\['hip'\] is {wrong}; it must be {must}$"):
@@ -314,10 +342,17 @@ def test_all_joints_without_a_number_are_named_at_once() -> None:
     with pytest.raises(ModelError) as error:
         make(
             "a1_style",
-            **{"control.stiffness": {"hip": 1.0}, "control.damping": {"calf": 1.0}, "init_state.default_joint_angles": {"hip": 0.0}},
+            **{
+                "control.stiffness": {"hip": 1.0},
+                "control.damping": {"calf": 1.0},
+                "init_state.default_joint_angles": {"hip": 0.0},
+            },
         )
     text = one_line(error)
-    for field, missing in (("control.stiffness", "FR_thigh_joint, FR_calf_joint"), ("control.damping", "FR_hip_joint, FR_thigh_joint")):
+    for field, missing in (
+        ("control.stiffness", "FR_thigh_joint, FR_calf_joint"),
+        ("control.damping", "FR_hip_joint, FR_thigh_joint"),
+    ):
         assert f"{field}: no value for {missing}" in text
     assert "; init_state.default_joint_angles: no value for FR_thigh_joint, FR_calf_joint, FL_thigh_joint" in text
 
@@ -330,14 +365,20 @@ def test_a_joint_without_limits_is_nowhere_punished() -> None:
     assert env._reward_dof_pos_limits().abs().max() == 0.0
     env.sim.qpos[:, 7] = 0.8  # LF_HAA
     assert env._reward_dof_pos_limits().min() > 0.0
-    assert not env.robot.physics.actuator_ctrllimited[1] and "[-inf, inf]" in describe(env, vendor_task("anymal_c_style"))
+    assert not env.robot.physics.actuator_ctrllimited[1] and "[-inf, inf]" in describe(
+        env, vendor_task("anymal_c_style")
+    )
 
 
 def test_errors_name_bodies_and_geoms() -> None:
     """It said "there are: floor", since a vendor's geoms have no names."""
-    with pytest.raises(ModelError, match=r"^asset\.foot_names or foot_geoms: 'left_foot': no geom or body 'left_foot' in ") as error:
+    with pytest.raises(
+        ModelError, match=r"^asset\.foot_names or foot_geoms: 'left_foot': no geom or body 'left_foot' in "
+    ) as error:
         make("g1_12dof_style", **{"asset.foot_names": ["left_foot", "right_foot"]})
-    assert "geoms pelvis_0, left_hip_roll_link_0" in str(error.value) and "; bodies pelvis, left_hip_pitch_link, " in str(error.value)
+    assert "geoms pelvis_0, left_hip_roll_link_0" in str(
+        error.value
+    ) and "; bodies pelvis, left_hip_pitch_link, " in str(error.value)
     assert "floor" not in str(error.value)
 
 
@@ -345,7 +386,10 @@ def test_a_second_ground_is_dropped(tmp_path: Path) -> None:
     world = '<geom name="floor" type="plane" size="0 0 1"/><body name="table"><geom size="0.1"/></body>'
     robot = build_toy(toy(tmp_path, world=world))
     assert robot.physics.geom(0).name == "floor" and robot.physics.ngeom == 3 and robot.physics.nbody == 4
-    for line in ("world geoms dropped, as the ground is added: floor", "body 'table' of the world dropped: it has no joint"):
+    for line in (
+        "world geoms dropped, as the ground is added: floor",
+        "body 'table' of the world dropped: it has no joint",
+    ):
         assert line in robot.overrides
 
 
@@ -357,7 +401,12 @@ def test_a_geom_of_the_robot_that_is_called_as_the_ground(tmp_path: Path) -> Non
 
 def test_of_keyframes_home_or_the_only_one_is_read(tmp_path: Path) -> None:
     def keys(*names: str, qpos: str = "0 0 0.4 1 0 0 0 0.1 0.2") -> RobotModel:
-        return build_toy(toy(tmp_path, extra=f"<keyframe>{''.join(f'<key name={name!r} qpos={qpos!r}/>' for name in names)}</keyframe>"))
+        return build_toy(
+            toy(
+                tmp_path,
+                extra=f"<keyframe>{''.join(f'<key name={name!r} qpos={qpos!r}/>' for name in names)}</keyframe>",
+            )
+        )
 
     for robot in (keys("sit", "home"), keys("sit")):
         assert robot.pose == (0.1, 0.2) and robot.keyframe is not None and robot.keyframe.height == 0.4
@@ -366,7 +415,9 @@ def test_of_keyframes_home_or_the_only_one_is_read(tmp_path: Path) -> None:
 
 
 def test_what_a_files_defaults_say_is_not_of_what_is_added(tmp_path: Path) -> None:
-    defaults = '<default><geom margin="0.01" solref="0.1 1"/><motor gear="7" ctrlrange="-1 1" forcerange="-1 1"/></default>'
+    defaults = (
+        '<default><geom margin="0.01" solref="0.1 1"/><motor gear="7" ctrlrange="-1 1" forcerange="-1 1"/></default>'
+    )
     robot = build_toy(toy(tmp_path, extra=defaults))
     floor, foot = robot.physics.geom("floor"), robot.physics.geom("left_foot")
     assert (floor.margin[0], floor.solref[0], foot.margin[0]) == (0.0, 0.02, 0.01)
@@ -386,7 +437,11 @@ def test_a_frictionless_flight(tmp_path: Path) -> None:
     robot = build_toy(toy(tmp_path, root='<joint type="free" damping="0.5" armature="0.1" frictionloss="0.2"/>'))
     model = robot.physics
     assert not (model.dof_damping[:6].any() or model.dof_armature[:6].any() or model.dof_frictionloss[:6].any())
-    assert {"free joint damping: 0.5 -> 0", "free joint armature: 0.1 -> 0", "free joint frictionloss: 0.2 -> 0"} <= set(robot.overrides)
+    assert {
+        "free joint damping: 0.5 -> 0",
+        "free joint armature: 0.1 -> 0",
+        "free joint frictionloss: 0.2 -> 0",
+    } <= set(robot.overrides)
 
 
 # ---- held joints
@@ -401,7 +456,12 @@ def test_a_joint_is_held_at_its_default() -> None:
         data = mujoco.MjData(model)
         data.qpos[:] = [0, 0, 1, 1, 0, 0, 0, *robot.pose]
         mujoco.mj_forward(model, data)
-        places.append({name: data.geom(name).xpos.copy() for name in ("head", "left_wrist_yaw_link_0", "right_shoulder_yaw_link_0")})
+        places.append(
+            {
+                name: data.geom(name).xpos.copy()
+                for name in ("head", "left_wrist_yaw_link_0", "right_shoulder_yaw_link_0")
+            }
+        )
     for name, place in places[0].items():
         np.testing.assert_allclose(place, places[1][name], atol=1e-9, err_msg=name)
 
@@ -418,7 +478,13 @@ def test_held_joints_within_frames_and_with_others_on_their_body(tmp_path: Path)
       <joint name="a" axis="1 0 0" pos="0 0 0.1"/><joint name="b" axis="0 1 0"/><geom name="hand" size="0.02" pos="0.1 0.1 0.1"/>
       </body></frame>"""
     file, places = toy(tmp_path, inside=arm), []
-    table = {"stiffness": {"": 1.0}, "damping": {"": 1.0}, "pose": {"": 0.3, "b": 0.7}, "colliders": ["hand"], "contact_geoms": []}
+    table = {
+        "stiffness": {"": 1.0},
+        "damping": {"": 1.0},
+        "pose": {"": 0.3, "b": 0.7},
+        "colliders": ["hand"],
+        "contact_geoms": [],
+    }
     for held in ([], ["a"], ["a", "b"]):
         robot = build_toy(file, held_joints=held, **table)
         data = mujoco.MjData(robot.physics)
@@ -427,7 +493,10 @@ def test_held_joints_within_frames_and_with_others_on_their_body(tmp_path: Path)
         places.append(data.geom("hand").xpos - data.xpos[1])
     np.testing.assert_allclose(places[1], places[0], atol=1e-9)
     np.testing.assert_allclose(places[2], places[0], atol=1e-9)
-    with pytest.raises(ModelError, match="^`held_joints`: joint 'b' moves together with 'a' on body 'arm'; hold both of them, or neither$"):
+    with pytest.raises(
+        ModelError,
+        match="^`held_joints`: joint 'b' moves together with 'a' on body 'arm'; hold both of them, or neither$",
+    ):
         build_toy(file, held_joints=["b"], **table)
 
 
@@ -435,7 +504,9 @@ def test_a_reward_about_held_joints_leaves_them_out() -> None:
     """So that one config serves 29 joints and 12."""
     hips = {"rewards.scales.hip_pos": -1.0, "rewards.hip_joints": ["hip_roll", "waist_*", "wrist"]}
     env, whole = make("g1_held_style", **hips), make("g1_29dof_style", **hips)
-    named = [[robot.joint_names[i] for i in indices] for robot, indices in ((env.robot, env.hips), (whole.robot, whole.hips))]
+    named = [
+        [robot.joint_names[i] for i in indices] for robot, indices in ((env.robot, env.hips), (whole.robot, whole.hips))
+    ]
     assert named[0] == ["left_hip_roll_joint", "right_hip_roll_joint"] and len(named[1]) == 2 + 3 + 6
     said = "rewards.hip_joints: 'waist_*' left out, as waist_yaw_joint, waist_roll_joint, waist_pitch_joint are held"
     assert said in env.robot.overrides and not any("hip_joints" in line for line in whole.robot.overrides)
@@ -445,7 +516,9 @@ def test_a_reward_about_held_joints_leaves_them_out() -> None:
 
 
 def test_held_joints_that_are_none() -> None:
-    with pytest.raises(ModelError, match=r"^asset\.held_joints: no joint 'neck' in the MJCF; there are: FL_hip_joint, "):
+    with pytest.raises(
+        ModelError, match=r"^asset\.held_joints: no joint 'neck' in the MJCF; there are: FL_hip_joint, "
+    ):
         make("go2_style", **{"asset.held_joints": ["neck"]})
 
 
@@ -458,10 +531,13 @@ def test_a_turned_imu_reads_in_the_roots_axes() -> None:
     robot = env.robot
     spec = mujoco.MjSpec.from_file(str(HERE / "g1_12dof_style.xml"))
     for key, kind in (("v", "VELOCIMETER"), ("w", "GYRO"), ("a", "ACCELEROMETER")):
-        spec.add_sensor(name=key, type=getattr(mujoco.mjtSensor, f"mjSENS_{kind}"), objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu")
+        spec.add_sensor(
+            name=key, type=getattr(mujoco.mjtSensor, f"mjSENS_{kind}"), objtype=mujoco.mjtObj.mjOBJ_SITE, objname="imu"
+        )
     file = spec.compile()
     data, ours = mujoco.MjData(file), mujoco.MjData(robot.physics)
-    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # the site's axes in the root's: 90 degrees about z
+    # the site's axes in the root's: 90 degrees about z
+    turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     for each in (data, ours):
         each.qpos[:] = [0, 0, 3, 0.9, 0.1, 0.3, 0.2, *robot.pose]
         each.qpos[3:7] /= np.linalg.norm(each.qpos[3:7])
@@ -535,7 +611,9 @@ def build(file: Path) -> RobotModel:
 
 def test_a_missing_mesh_that_collides_is_named(tmp_path: Path) -> None:
     """It was called "not a valid MJCF"."""
-    mesh = toy(tmp_path, inside='<geom type="mesh" mesh="hull"/>', extra='<asset><mesh name="hull" file="hull.stl"/></asset>')
+    mesh = toy(
+        tmp_path, inside='<geom type="mesh" mesh="hull"/>', extra='<asset><mesh name="hull" file="hull.stl"/></asset>'
+    )
     with pytest.raises(ModelError) as error:
         build_toy(mesh)
     assert one_line(error) == (
@@ -555,7 +633,9 @@ def test_a_missing_mesh_that_collides_is_named(tmp_path: Path) -> None:
 def test_a_mesh_that_gives_a_body_its_mass_is_needed(tmp_path: Path) -> None:
     looks = '<geom type="mesh" mesh="hull" contype="0" conaffinity="0"/>'
     asset = '<asset><mesh name="hull" file="hull.stl"/></asset>'
-    with pytest.raises(ModelError, match=r"^toy.xml: a geom of body 'base' takes its mass from the mesh 'hull', and its file hull.stl "):
+    with pytest.raises(
+        ModelError, match=r"^toy.xml: a geom of body 'base' takes its mass from the mesh 'hull', and its file hull.stl "
+    ):
         build_toy(toy(tmp_path, inside=looks, extra=asset))
     robot = build_toy(toy(tmp_path, inside=looks.replace("/>", ' mass="0"/>'), extra=asset))
     assert "looks left out (no such file): hull.stl" in robot.overrides
@@ -580,7 +660,8 @@ def test_inertias_that_all_come_from_geoms_do(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "place", ["meshes/leg.stl", "../mini_description/meshes/leg.stl", "../../mini_description/meshes/leg.stl", "leg.stl"]
+    "place",
+    ["meshes/leg.stl", "../mini_description/meshes/leg.stl", "../../mini_description/meshes/leg.stl", "leg.stl"],
 )
 def test_package_paths_are_found_near_the_file(tmp_path: Path, place: str) -> None:
     file = tmp_path / "a/b/mini.urdf"
@@ -596,14 +677,19 @@ def test_meshes_of_a_urdf_for_mujoco_are_found_in_its_meshdir_and_may_be_scaled(
     one = part("collision", "leg.stl")
     text = '<mujoco><compiler meshdir="parts" balanceinertia="true"/></mujoco>'
     robot = build(urdf(tmp_path / "mini.urdf", leg=one + one.replace("leg.stl'", "leg.stl' scale='1 -1 2'"), more=text))
-    sizes = [np.ptp(robot.physics.mesh_vert[robot.physics.mesh_vertadr[i] :][:4], axis=0).max() for i in range(robot.physics.nmesh)]
+    sizes = [
+        np.ptp(robot.physics.mesh_vert[robot.physics.mesh_vertadr[i] :][:4], axis=0).max()
+        for i in range(robot.physics.nmesh)
+    ]
     assert robot.physics.nmesh == 2 and max(sizes) > 1.3 * min(sizes)
 
 
 def test_two_meshes_of_one_name_are_two(tmp_path: Path) -> None:
     for folder in ("visual", "collision"):
         brick(tmp_path / folder / "leg.stl")
-    robot = build(urdf(tmp_path / "mini.urdf", leg=part("visual", "visual/leg.stl") + part("collision", "collision/leg.stl")))
+    robot = build(
+        urdf(tmp_path / "mini.urdf", leg=part("visual", "visual/leg.stl") + part("collision", "collision/leg.stl"))
+    )
     assert sorted(Path(mesh.file).parent.name for mesh in robot.spec.meshes) == ["collision", "visual"]
 
 
@@ -615,18 +701,27 @@ def test_a_urdf_that_is_none(tmp_path: Path) -> None:
     with pytest.raises(ModelError, match=r"^mini.urdf is not a valid URDF: it is no XML: mismatched tag"):
         build(tmp_path / "mini.urdf")
     (tmp_path / "mini.urdf").write_text('<robot xmlns:xacro="x"><xacro:leg/></robot>')
-    with pytest.raises(ModelError, match=r"^mini.urdf holds xacro macros; write them out first: xacro mini.urdf > robot.urdf$"):
+    with pytest.raises(
+        ModelError, match=r"^mini.urdf holds xacro macros; write them out first: xacro mini.urdf > robot.urdf$"
+    ):
         build(tmp_path / "mini.urdf")
-    assert build(urdf(tmp_path / "mini.urdf", more="<!-- from <xacro:include/> -->")).root == "base", "a comment is no macro"
+    assert build(urdf(tmp_path / "mini.urdf", more="<!-- from <xacro:include/> -->")).root == "base", (
+        "a comment is no macro"
+    )
 
 
 def test_looks_of_no_size_are_left_out(tmp_path: Path) -> None:
     """MuJoCo spoke of a geom without a name."""
-    point, box = ("<{0}><geometry><" + shape + "/></geometry></{0}>" for shape in ("sphere radius='0.0'", "box size='0.1 0.1 0.2'"))
+    point, box = (
+        "<{0}><geometry><" + shape + "/></geometry></{0}>"
+        for shape in ("sphere radius='0.0'", "box size='0.1 0.1 0.2'")
+    )
     file = urdf(tmp_path / "mini.urdf", leg=point.format("visual") + box.format("visual") + box.format("collision"))
     robot = build(file)
     assert "looks left out (of size 0): those of link 'leg'" in robot.overrides and visual_model(robot).ngeom == 4
-    with pytest.raises(ModelError, match=r"^mini.urdf: link 'base' collides as a shape of size 0; give it a size, or leave it out$"):
+    with pytest.raises(
+        ModelError, match=r"^mini.urdf: link 'base' collides as a shape of size 0; give it a size, or leave it out$"
+    ):
         build(urdf(file, base=point.format("collision")))
 
 
@@ -634,11 +729,14 @@ def test_a_link_world_is_dropped(tmp_path: Path) -> None:
     world = '<link name="world"/><joint name="stand" type="fixed"><parent link="world"/><child link="base"/></joint>'
     robot = build(urdf(tmp_path / "mini.urdf", more=world))
     assert robot.root == "base" and robot.physics.nq == 8
-    assert {"link 'world' and joint 'stand' dropped: the root is free", "free joint added to 'base'"} <= set(robot.overrides)
+    assert {"link 'world' and joint 'stand' dropped: the root is free", "free joint added to 'base'"} <= set(
+        robot.overrides
+    )
 
 
 @pytest.mark.parametrize(
-    ("kind", "origin", "root"), [("floating", "", "base"), ("fixed", '<origin xyz="0 0 0.4"/>', "base"), ("fixed", "", "odom")]
+    ("kind", "origin", "root"),
+    [("floating", "", "base"), ("fixed", '<origin xyz="0 0 0.4"/>', "base"), ("fixed", "", "odom")],
 )
 def test_an_empty_link_that_is_elsewhere_is_dropped(tmp_path: Path, kind: str, origin: str, root: str) -> None:
     """As base_footprint is, on the ground: heights are of the base. A dummy root in the same place stays."""
@@ -668,12 +766,16 @@ def test_a_pose_beyond_a_range_is_a_warning(tmp_path: Path) -> None:
     file = toy(tmp_path)
     file.write_text(file.read_text().replace("<worldbody>", '<compiler angle="radian"/><worldbody>'))
     over = build_toy(file, pose={"": 0.0, "left": 1.5}).overrides
-    assert [line for line in over if "beyond" in line] == ["warning: `pose`: left_hip stands at 1.5 rad, beyond its range from -1 to 1 rad"]
+    assert [line for line in over if "beyond" in line] == [
+        "warning: `pose`: left_hip stands at 1.5 rad, beyond its range from -1 to 1 rad"
+    ]
     assert not any("beyond" in line for line in build_toy(file, pose={"": 1.0001}).overrides)
 
 
 def test_foot_names_are_no_patterns() -> None:
-    with pytest.raises(ConfigError, match=r"^asset.foot_names is \['F\*'\]; it must be a list of at least one name, one for each foot"):
+    with pytest.raises(
+        ConfigError, match=r"^asset.foot_names is \['F\*'\]; it must be a list of at least one name, one for each foot"
+    ):
         make("go2_style", **{"asset.foot_names": ["F*"]})
 
 
@@ -690,7 +792,9 @@ def test_files_of_an_attached_robot_and_of_a_stripped_path_are_found(tmp_path: P
     (tmp_path / "own").mkdir()
     save_png(tmp_path / "own/wood.png", np.full((4, 4, 3), 255, dtype=np.uint8))
     looks = '<geom type="box" size="0.1 0.1 0.1" material="wood" mass="0" contype="0" conaffinity="0"/>'
-    asset = '<asset><texture name="wood" type="2d" file="theirs/wood.png"/><material name="wood" texture="wood"/></asset>'
+    asset = (
+        '<asset><texture name="wood" type="2d" file="theirs/wood.png"/><material name="wood" texture="wood"/></asset>'
+    )
     file = toy(tmp_path, inside=looks, extra='<compiler strippath="true" texturedir="own"/>' + asset)
     robot = build_toy(file)
     assert visual_model(robot).ntex and not any("left out" in line for line in robot.overrides)

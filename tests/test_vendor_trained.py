@@ -15,8 +15,24 @@ from program import run
 from legged_mw.deploy.contract import read_contract
 from legged_mw.utils.config import load_yaml
 
-FEW = ["--num_envs", "8", "--max_iterations", "3", "--set", "runner.num_steps_per_env=8", "--set", "runner.exam_interval=0"]
-FEW += ["--set", "actor.hidden_dims=[16, 16]", "--set", "critic.hidden_dims=[16, 16]", "--set", "algorithm.num_learning_epochs=1"]
+FEW = [
+    "--num_envs",
+    "8",
+    "--max_iterations",
+    "3",
+    "--set",
+    "runner.num_steps_per_env=8",
+    "--set",
+    "runner.exam_interval=0",
+]
+FEW += [
+    "--set",
+    "actor.hidden_dims=[16, 16]",
+    "--set",
+    "critic.hidden_dims=[16, 16]",
+    "--set",
+    "algorithm.num_learning_epochs=1",
+]
 FILES = {path.name for path in HERE.iterdir() if path.suffix in (".xml", ".urdf")}
 
 
@@ -36,7 +52,8 @@ def test_they_are_six_short_files() -> None:
 
 
 @pytest.mark.parametrize(
-    ("engine", "device"), [("mujoco", "cpu"), ("mujoco_warp", "cpu"), pytest.param("mujoco_warp", "cuda:0", marks=pytest.mark.gpu)]
+    ("engine", "device"),
+    [("mujoco", "cpu"), ("mujoco_warp", "cpu"), pytest.param("mujoco_warp", "cuda:0", marks=pytest.mark.gpu)],
 )
 @pytest.mark.parametrize("name", TASKS)
 def test_from_the_file_to_a_deployed_policy(name: str, engine: str, device: str, robots: Path, tmp_path: Path) -> None:

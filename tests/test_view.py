@@ -128,10 +128,14 @@ def test_no_encoder_says_what_to_install(tmp_path: Path, monkeypatch: pytest.Mon
     with monkeypatch.context() as patch:
         patch.setattr(av, "codecs_available", {"gif"})
         VideoWriter(tmp_path / "walk.gif", 320, 240, fps=12.5).abort()
-        with pytest.raises(RuntimeError, match=r"PyAV .* was built without libx264. Install another: pip install --force-reinstall av"):
+        with pytest.raises(
+            RuntimeError, match=r"PyAV .* was built without libx264. Install another: pip install --force-reinstall av"
+        ):
             VideoWriter(tmp_path / "walk.mp4", 320, 240, fps=50)
     monkeypatch.setitem(sys.modules, "av", None)
-    with pytest.raises(RuntimeError, match=r'Videos are written by PyAV \(.*\). Install it: pip install "legged_mw\[video\]"'):
+    with pytest.raises(
+        RuntimeError, match=r'Videos are written by PyAV \(.*\). Install it: pip install "legged_mw\[video\]"'
+    ):
         VideoWriter(tmp_path / "walk.mp4", 320, 240, fps=50)
 
 
@@ -177,7 +181,9 @@ def test_gif_is_an_animation_in_its_own_colours(tmp_path: Path) -> None:
 
 
 def test_a_recorder_writes_a_video_and_a_sheet(tmp_path: Path, model: mujoco.MjModel) -> None:
-    film = Recorder(SPEC, 1, 0.02, 1.2, video=tmp_path / "a.mp4", sheet=tmp_path / "a.png", width=160, height=120, fps=25)
+    film = Recorder(
+        SPEC, 1, 0.02, 1.2, video=tmp_path / "a.mp4", sheet=tmp_path / "a.png", width=160, height=120, fps=25
+    )
     for step in range(60):
         film.show(moment(model, time=step * 0.02))
     film.close()
@@ -224,7 +230,8 @@ def test_both_arrows_are_drawn_and_collision_shapes_are_not(model: mujoco.MjMode
 
 def test_arrow_points_along_the_body_velocity() -> None:
     scene = mujoco.MjvScene(mujoco.MjModel.from_xml_string(ROBOT), 100)
-    draw_velocities(scene, Placement(np.zeros(3), np.pi / 2, 0.4, 0.1), np.array([1.0, 0.0, 0.0]), np.zeros(3))  # heading +y
+    # heading +y
+    draw_velocities(scene, Placement(np.zeros(3), np.pi / 2, 0.4, 0.1), np.array([1.0, 0.0, 0.0]), np.zeros(3))
     [arrow] = scene.geoms[: scene.ngeom]
     assert arrow.type == mujoco.mjtGeom.mjGEOM_ARROW
     assert np.allclose(arrow.mat[:, 2], [0, 1, 0], atol=1e-6)
@@ -277,7 +284,11 @@ def test_what_is_followed_is_a_pale_robot_beside(model: mujoco.MjModel) -> None:
 
 def test_words_are_written_over_the_picture(model: mujoco.MjModel, renderer: RobotRenderer) -> None:
     plain, said = (renderer.frame(moment(model, lines=lines)) for lines in ((), (("falls", "3"),)))
-    assert np.array_equal(plain[120:], said[120:]) and (said[:40, :80] > 200).any() and not np.array_equal(plain[:40, :80], said[:40, :80])
+    assert (
+        np.array_equal(plain[120:], said[120:])
+        and (said[:40, :80] > 200).any()
+        and not np.array_equal(plain[:40, :80], said[:40, :80])
+    )
 
 
 def test_camera_glides_after_the_base_and_cuts_after_a_jump(model: mujoco.MjModel) -> None:
@@ -306,7 +317,9 @@ def test_camera_walks_behind_and_sees_all(model: mujoco.MjModel) -> None:
     assert camera.update("behind", 1).azimuth == pytest.approx(90)  # looks along the robot's x axis
     near = camera.camera.distance
     camera.update("all", 1)
-    assert np.allclose(camera.camera.lookat[:2], robots.offsets[:, :2].mean(axis=0)) and camera.camera.distance > 2 * near
+    assert (
+        np.allclose(camera.camera.lookat[:2], robots.offsets[:, :2].mean(axis=0)) and camera.camera.distance > 2 * near
+    )
 
 
 def test_a_mouse_may_turn_the_camera_that_follows(model: mujoco.MjModel) -> None:
@@ -366,7 +379,8 @@ def test_robots_stand_side_by_side_each_in_its_pose(model: mujoco.MjModel) -> No
     contacts[3, 0] = True  # of the leg that is turned
     [patch] = robots.patches(contacts)
     assert np.allclose(patch.place, alone.data.geom("foot0.1").xpos + robots.offsets[3] - (0, 0, 0.03))
-    assert 0.03 < 0.15 * robots.radius < 0.066 and np.allclose(patch.half, 0.15 * robots.radius)  # 2.2 x 0.03 would be large for it
+    # 2.2 x 0.03 would be large for it
+    assert 0.03 < 0.15 * robots.radius < 0.066 and np.allclose(patch.half, 0.15 * robots.radius)
 
 
 def with_feet(geom: str, pitch: float = 0.0, yaw: float = 0.0) -> PosedRobots:
@@ -388,7 +402,8 @@ def test_the_disc_of_a_flat_foot_is_below_its_sole() -> None:
     [turned] = with_feet(box, yaw=np.pi / 2).patches([[True, False]])
     assert np.allclose(turned.place, [-0.1, 0.18 + 0.05, 0.04]) and np.allclose(turned.turn[:, 0], [0, 1, 0])
     assert np.allclose(turned.half, patch.half)
-    robots = with_feet(box, pitch=0.5)  # on its heel or its toe: the disc lies below that edge, and is no longer than its margin
+    # on its heel or its toe: the disc lies below that edge, and is no longer than its margin
+    robots = with_feet(box, pitch=0.5)
     [edge] = robots.patches([[True, False]])
     corner = robots.data.geom("foot0.1").xpos + robots.data.geom("foot0.1").xmat.reshape(3, 3) @ (0.1, 0.0, -0.01)
     assert np.allclose(edge.place, corner) and np.allclose(edge.half, [0.022, 0.04 + 0.022])
@@ -418,7 +433,9 @@ def test_a_foot_of_several_geoms_has_one_disc() -> None:
     both, toe = robots.patches([[True, True, False, True]])
     sole = 0.62 - 2 * 0.28 - 0.03 - 0.015  # [m] the height of the trunk in its first pose, less its legs and a box
     margin = 2.2 * 0.015
-    assert np.allclose(both.place, [(-0.07 + 0.12) / 2, 0.09, sole]) and np.allclose(both.half, [0.095 + margin, 0.05 + margin])
+    assert np.allclose(both.place, [(-0.07 + 0.12) / 2, 0.09, sole]) and np.allclose(
+        both.half, [0.095 + margin, 0.05 + margin]
+    )
     assert np.allclose(toe.place, [0.07, -0.09, sole]) and np.allclose(toe.half, 0.05 + margin)
     assert robots.patches([[False] * 4]) == [] and robots.patches([[True] * 5]) == []  # more columns than sensors
 
@@ -465,7 +482,12 @@ def test_robots_of_every_height_are_in_the_picture_with_their_arrows(height: flo
     share = {mujoco.mjtGeom.mjGEOM_ARROW: 0.5, mujoco.mjtGeom.mjGEOM_CAPSULE: 1.0}
     ends = [np.array(geom.pos) + np.array(geom.mat)[:, 2] * geom.size[2] * share[geom.type] for geom in drawn]
     assert min(end[2] for end in ends) > height  # above its top
-    corners = [np.array([x, y, z]) for x in (-length / 2, length / 2) for y in (0.1 * height, -0.1 * height) for z in (0.0, height)]
+    corners = [
+        np.array([x, y, z])
+        for x in (-length / 2, length / 2)
+        for y in (0.1 * height, -0.1 * height)
+        for z in (0.0, height)
+    ]
     for place in [*ends, *corners]:
         right, up = in_picture(camera, place)
         assert abs(up) < 1.0 and abs(right) < 16 / 9, (place, right, up)
@@ -474,7 +496,11 @@ def test_robots_of_every_height_are_in_the_picture_with_their_arrows(height: flo
 def test_the_camera_of_a_scene_is_as_far_as_its_robot_is_large() -> None:
     """Go1's is where it always was; who gives a place gets that one."""
     places = []
-    for name, camera in (("go1_flat", []), (str(ROOT / "examples" / "toy_biped.py"), []), ("go1_flat", [1.0, 2.0, 3.0])):
+    for name, camera in (
+        ("go1_flat", []),
+        (str(ROOT / "examples" / "toy_biped.py"), []),
+        ("go1_flat", [1.0, 2.0, 3.0]),
+    ):
         task = load_task(name)
         task.update({"env": {"num_envs": 1}, "viewer": {"camera": camera}}, where="test")
         env = task.env_class(task.cfg, "cpu")
@@ -495,7 +521,9 @@ def test_on_a_terrain_each_robot_stays_where_it_is() -> None:
 def test_many_robots_are_in_one_picture(model: mujoco.MjModel) -> None:
     with closing(RobotRenderer(SPEC, 320, 240, count=4)) as several:
         command = np.tile([1.0, 0.0, 0.0], (4, 1))
-        one = colour_count(several.frame(moment(model, 4, target_velocity=command * [[1], [0], [0], [0]], camera="all")), (255, 130, 0))
+        one = colour_count(
+            several.frame(moment(model, 4, target_velocity=command * [[1], [0], [0], [0]], camera="all")), (255, 130, 0)
+        )
         four = colour_count(several.frame(moment(model, 4, target_velocity=command, camera="all")), (255, 130, 0))
         assert one > 5 and four > 2.5 * one
 
@@ -515,7 +543,9 @@ def test_bad_poses_and_models(model: mujoco.MjModel, renderer: RobotRenderer) ->
 def test_missing_opengl_names_the_remedy_and_the_state() -> None:
     code = "import mujoco\nfrom legged_mw.view.recorder import RobotRenderer\n"
     code += f"RobotRenderer(mujoco.MjSpec.from_string({ROBOT!r}), 64, 48)"
-    environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")} | {"MUJOCO_GL": "glfw"}
+    environment = {key: value for key, value in os.environ.items() if key not in ("DISPLAY", "WAYLAND_DISPLAY")} | {
+        "MUJOCO_GL": "glfw"
+    }
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False)
     assert "ViewError: No OpenGL context for offscreen rendering (MUJOCO_GL='glfw', DISPLAY=None)" in done.stderr
     assert "set MUJOCO_GL=egl" in done.stderr and "MUJOCO_GL=osmesa" in done.stderr
@@ -612,7 +642,8 @@ def test_every_key_of_the_table_reaches_the_pilot_by_its_code() -> None:
 
 def test_our_keys_switch_nothing_of_mujocos_that_is_not_switched_back() -> None:
     rendering = {row[2] for row in mujoco.mjRNDSTRING}
-    assert {chr(code) for code in native.KEY_CODES if code < 128} & rendering <= {"R"}  # reflections: no material of ours has any
+    # reflections: no material of ours has any
+    assert {chr(code) for code in native.KEY_CODES if code < 128} & rendering <= {"R"}
 
 
 def test_window_texts_fit_mujocos_overlay(model: mujoco.MjModel) -> None:

@@ -38,9 +38,8 @@ def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def start(installed: Path, folder: Path, *args: str) -> str:
     """``legged-mw <args>`` in ``folder``, with the package of the wheel and without the clone on the path."""
     libraries = sysconfig.get_path("purelib")
-    program = (
-        "import sys; sys.argv[0] = 'legged-mw'; import legged_mw; print(legged_mw.__file__); from legged_mw.programs import main; main()"
-    )
+    program = "import sys; sys.argv[0] = 'legged-mw'; import legged_mw; print(legged_mw.__file__); "
+    program += "from legged_mw.programs import main; main()"
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(installed), libraries])}
     command = [sys.executable, "-S", "-c", program, *args]  # -S: an editable install of the clone stays out
     done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
@@ -71,14 +70,21 @@ def test_the_sdist_holds_what_the_wheel_is_built_from_and_tested_with(tmp_path: 
 def test_the_image_is_built_from_files_that_are_there_and_from_constraints() -> None:
     lines = (ROOT / "Dockerfile").read_text().splitlines()
     copied = [name for line in lines if line.startswith("COPY ") for name in line.split()[1:-1]]
-    assert {"legged_mw", "configs", "resources", "constraints.txt"} <= set(copied) and all((ROOT / name).exists() for name in copied)
+    assert {"legged_mw", "configs", "resources", "constraints.txt"} <= set(copied) and all(
+        (ROOT / name).exists() for name in copied
+    )
     [install] = [line for line in lines if "pip install" in line]
-    assert "--constraint /src/constraints.txt" in install and not set(copied) & set((ROOT / ".dockerignore").read_text().split())
+    assert "--constraint /src/constraints.txt" in install and not set(copied) & set(
+        (ROOT / ".dockerignore").read_text().split()
+    )
 
 
 def test_the_same_version_everywhere() -> None:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
-    assert f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text() and f"## {version} (" in (ROOT / "CHANGELOG.md").read_text()
+    assert (
+        f"\nversion: {version}\n" in (ROOT / "CITATION.cff").read_text()
+        and f"## {version} (" in (ROOT / "CHANGELOG.md").read_text()
+    )
 
 
 def test_what_is_installed_by_constraints_fits_the_ranges() -> None:
@@ -87,7 +93,9 @@ def test_what_is_installed_by_constraints_fits_the_ranges() -> None:
     for text in tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]:
         requirement = Requirement(text)
         assert requirement.specifier.contains(pinned[requirement.name]), text
-        assert any(spec.operator == ">=" for spec in requirement.specifier), f"{text}: from which version on was it tested?"
+        assert any(spec.operator == ">=" for spec in requirement.specifier), (
+            f"{text}: from which version on was it tested?"
+        )
 
 
 def test_every_package_is_in_the_list() -> None:
@@ -105,10 +113,13 @@ def test_configs_robots_and_policies_are_inside(installed: Path) -> None:
         assert ours and ours == {path.relative_to(inside) for path in inside.rglob("*") if path.is_file()}
     [points] = installed.glob("*.dist-info/entry_points.txt")
     assert "legged-mw = legged_mw.programs:main" in points.read_text()
-    assert {path.name for path in installed.iterdir()} == {"legged_mw", points.parent.name}  # `configs` is nobody's top level
+    # `configs` is nobody's top level
+    assert {path.name for path in installed.iterdir()} == {"legged_mw", points.parent.name}
 
 
-def test_an_installed_package_trains_the_task_of_the_first_page_and_logs_where_it_is_started(installed: Path, tmp_path: Path) -> None:
+def test_an_installed_package_trains_the_task_of_the_first_page_and_logs_where_it_is_started(
+    installed: Path, tmp_path: Path
+) -> None:
     [code] = re.findall(r"```python\n(.*?)```", (ROOT / "docs/index.md").read_text(), re.DOTALL)
     home = tmp_path / "robots"
     home.mkdir()
@@ -145,7 +156,10 @@ def test_an_installed_package_drafts_a_task(installed: Path, tmp_path: Path) -> 
 
 def test_without_a_program_the_programs_are_named(tmp_path: Path) -> None:
     names = "train, play, deploy, robot, motion, doctor, compare, sweep, warm, completion"
-    for words, said in (([], f"there are: {names}"), (["trian"], f"no program 'trian', did you mean 'train'? there are: {names}")):
+    for words, said in (
+        ([], f"there are: {names}"),
+        (["trian"], f"no program 'trian', did you mean 'train'? there are: {names}"),
+    ):
         command = [sys.executable, "-m", "legged_mw.programs", *words]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
         assert (done.returncode, done.stderr) == (2, f"legged-mw: {said}; e.g. legged-mw train --task go1_flat\n")

@@ -48,7 +48,9 @@ def start(words: list[str], folder: Path, capsys: pytest.CaptureFixture[str]) ->
 
 
 @pytest.mark.parametrize("file", ["a1_style.urdf", "g1_12dof_style.xml"])
-def test_every_command_runs(file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_runs(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     robots = tmp_path / "robots"
     robots.mkdir()
     mine = shutil.copyfile(DATA / file, robots / f"robot{Path(file).suffix}")
@@ -79,13 +81,22 @@ def test_every_command_runs(file: str, tmp_path: Path, monkeypatch: pytest.Monke
 
 
 @pytest.mark.parametrize("file", ["a1_style.urdf", "g1_12dof_style.xml"])
-def test_for_a_real_robot(file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_for_a_real_robot(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """As the page says: other parents for four feet, in the import line and everywhere below; for two feet three lines less."""
     monkeypatch.setattr(sys, "argv", ["robot", str(DATA / file), "--new", "mine", "--out", str(tmp_path)])
     robot_program.main()
     config = tmp_path / "mine_flat.py"
-    assert all(words in PAGE.read_text() for words in ("`SimToRealCfg` and `SimToRealCfgPPO`", "`leave_out`, `enable` and `push`"))
-    text = config.read_text().replace("legged_robot_config", "sim_to_real_config").replace("LeggedRobotCfg", "SimToRealCfg")
+    assert all(
+        words in PAGE.read_text()
+        for words in ("`SimToRealCfg` and `SimToRealCfgPPO`", "`leave_out`, `enable` and `push`")
+    )
+    text = (
+        config.read_text()
+        .replace("legged_robot_config", "sim_to_real_config")
+        .replace("LeggedRobotCfg", "SimToRealCfg")
+    )
     text = re.sub(r"    class observations.*\n.*leave_out.*\n", "", text)
     config.write_text(re.sub(r".* (enable|push) = False .*\n", "", text))
     result = run("train", tmp_path, "--task", str(config), "--device", "cpu", *TRAIN, "--set", "runner.export=false")
@@ -102,16 +113,27 @@ def check_rough(folder: Path) -> None:
     heads = "from legged_mw.envs.sim_to_real_config import SimToRealRoughCfg, SimToRealRoughCfgPPO\nfrom mine_flat import MineFlatCfg\n"
     heads += "from legged_mw.envs.legged_robot import LeggedRobot\nfrom legged_mw.utils.task import Task\n\n"
     [body] = re.findall(r"```text\n(class MineRoughCfg.*?)```", PAGE.read_text(), re.DOTALL)
-    (folder / "mine_rough.py").write_text(f"{heads}{body}\nTASK = Task(LeggedRobot, MineRoughCfg, SimToRealRoughCfgPPO)\n")
+    (folder / "mine_rough.py").write_text(
+        f"{heads}{body}\nTASK = Task(LeggedRobot, MineRoughCfg, SimToRealRoughCfgPPO)\n"
+    )
     cfg, flat = load_task(str(folder / "mine_rough.py")).cfg, load_task(str(folder / "mine_flat.py")).cfg
-    assert (cfg.terrain.mesh_type, cfg.termination.min_base_height, cfg.rewards.swing_height) == ("heightfield", 0.15, 0.15)
-    assert (cfg.asset.foot_names, cfg.commands.ranges.lin_vel_x) == (flat.asset.foot_names, flat.commands.ranges.lin_vel_x)
+    assert (cfg.terrain.mesh_type, cfg.termination.min_base_height, cfg.rewards.swing_height) == (
+        "heightfield",
+        0.15,
+        0.15,
+    )
+    assert (cfg.asset.foot_names, cfg.commands.ranges.lin_vel_x) == (
+        flat.asset.foot_names,
+        flat.commands.ranges.lin_vel_x,
+    )
     assert not cfg.commands.curriculum and flat.commands.curriculum
 
 
 def test_the_page_names_fields_that_exist() -> None:
     config = load_task("go1_flat").cfg.to_dict()
-    named = re.findall(r"`((?:asset|init_state|control|rewards|sim|termination|domain_rand|perturbation)\.[a-z_]+)", PAGE.read_text())
+    named = re.findall(
+        r"`((?:asset|init_state|control|rewards|sim|termination|domain_rand|perturbation)\.[a-z_]+)", PAGE.read_text()
+    )
     assert len({*named}) > 25
     assert [name for name in named if name.split(".")[1] not in config[name.split(".")[0]]] == []
 

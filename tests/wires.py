@@ -71,7 +71,9 @@ class Pair(NamedTuple):
         begin, count = self.robot.read().joint_pos, round(seconds / self.contract.period)
         for k in range(1, count + 1):
             share = k / count
-            self.robot.write(begin + share * (self.contract.default_pose - begin), stiffness=3 * share * self.contract.stiffness)
+            self.robot.write(
+                begin + share * (self.contract.default_pose - begin), stiffness=3 * share * self.contract.stiffness
+            )
             self.period()
 
     def walk(self, controller: Any, command: Floats, seconds: float) -> Floats:

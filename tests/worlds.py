@@ -16,7 +16,11 @@ QUIET = {"noise.level": 0.0, "commands.resampling_time": 0.0}  # nothing drawn w
 
 
 def make_env(
-    num_envs: int, overrides: Mapping[str, Any] | None = None, *, task: str = "go1_flat", env_class: type[LeggedRobot] | None = None
+    num_envs: int,
+    overrides: Mapping[str, Any] | None = None,
+    *,
+    task: str = "go1_flat",
+    env_class: type[LeggedRobot] | None = None,
 ) -> LeggedRobot:
     """A task's environment with fields overridden by their dotted path, always from the same seed; no kicks unless asked for."""
     loaded = load_task(task)

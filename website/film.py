@@ -25,7 +25,8 @@ from legged_mw.sim.settle import fallen
 from legged_mw.view.video import Frame
 
 IMAGES = ROOT / "docs/images"
-LEVEL, STEP, EDGE = (1.0, 1.0, 1.0, 1.0), (0.84, 0.87, 0.90, 1.0), (0.66, 0.71, 0.76, 1.0)  # ground; steps; every other one
+# ground; steps; every other one
+LEVEL, STEP, EDGE = (1.0, 1.0, 1.0, 1.0), (0.84, 0.87, 0.90, 1.0), (0.66, 0.71, 0.76, 1.0)
 SKY = (0.95, 0.96, 0.97)
 FPS, FINER = 12.5, 2  # [1/s]; drawn so many times larger and made smaller, which smooths
 
@@ -47,14 +48,26 @@ class Shot(NamedTuple):
 
 
 FILM = [  # of the README, from left to right
-    Shot("go1_rough_scan", (0.6, 0.0, 0.0), begin=3.6, distance=2.3, elevation=-16.0, azimuth=75.0, follow=0.0, rough=True),
+    Shot(
+        "go1_rough_scan",
+        (0.6, 0.0, 0.0),
+        begin=3.6,
+        distance=2.3,
+        elevation=-16.0,
+        azimuth=75.0,
+        follow=0.0,
+        rough=True,
+    ),
     Shot("go2_flat", (0.75, 0.0, 0.0), distance=1.9, elevation=-10.0),
     Shot("g1_flat", (0.7, 0.0, 0.0), distance=2.6, elevation=-6.0, height=-0.1),
     Shot("go1_getup", (), begin=0.0, seconds=3.0, distance=1.45, elevation=-14.0, fall=6),
 ]
 BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
     "go1_flat": Shot("go1_flat", (0.9, 0.0, 0.6), distance=1.8, azimuth=110.0),
-    **{name: FILM[0]._replace(policy=name) for name in ("go1_rough", "go1_rough_scan", "go1_rough_student", "go2_rough", "go2_rough_scan")},
+    **{
+        name: FILM[0]._replace(policy=name)
+        for name in ("go1_rough", "go1_rough_scan", "go1_rough_student", "go2_rough", "go2_rough_scan")
+    },
     "go2_flat": FILM[1],
     "g1_flat": FILM[2],
     "g1_12dof_flat": FILM[2]._replace(policy="g1_12dof_flat"),
@@ -64,13 +77,20 @@ BY_NAME = {  # of the gallery; a policy that is not here walks as the first does
     "go1_handstand": Shot("go1_handstand", (), begin=0.0, distance=1.9, height=0.1),
     "go1_footstand": Shot("go1_footstand", (), begin=0.0, distance=1.9, height=0.1),
     "g1_track": Shot("g1_track", (), begin=2.2, distance=2.6, elevation=-6.0, azimuth=40.0),
-    "g1_rough": Shot("g1_rough", (0.5, 0.0, 0.0), 2.0, distance=2.6, elevation=-14.0, azimuth=75.0, follow=0.0, rough=True),
+    "g1_rough": Shot(
+        "g1_rough", (0.5, 0.0, 0.0), 2.0, distance=2.6, elevation=-14.0, azimuth=75.0, follow=0.0, rough=True
+    ),
 }
 
 
 def record(shot: Shot, width: int, height: int) -> list[Frame]:
     """The frames of ``shot``, (height, width, 3)."""
-    stage = DeployStage(ROOT / "resources/policies" / shot.policy, 1, shot.command, scene_file=TERRAIN_FILE if shot.rough else SCENE_FILE)
+    stage = DeployStage(
+        ROOT / "resources/policies" / shot.policy,
+        1,
+        shot.command,
+        scene_file=TERRAIN_FILE if shot.rough else SCENE_FILE,
+    )
     if shot.fall:
         stage.put(*fallen(stage.fleet.model, 1, shot.fall, seconds=1.0))
     lies = [stage.qpos()[0]] * round(FPS) if shot.fall else []  # a second, before it gets up
@@ -80,7 +100,11 @@ def record(shot: Shot, width: int, height: int) -> list[Frame]:
         if step * stage.dt >= shot.begin and step % every == 0:
             path.append(stage.qpos()[0])
     model = _pale(stage.spec.compile())
-    model.vis.global_.offwidth, model.vis.global_.offheight, model.vis.quality.offsamples = width * FINER, height * FINER, 4
+    model.vis.global_.offwidth, model.vis.global_.offheight, model.vis.quality.offsamples = (
+        width * FINER,
+        height * FINER,
+        4,
+    )
     data, camera = mujoco.MjData(model), mujoco.MjvCamera()
     middle = (np.min(path, axis=0) + np.max(path, axis=0))[:3] / 2
     camera.lookat[:] = middle + [0.0, 0.0, shot.height]
@@ -105,7 +129,10 @@ def _pale(model: mujoco.MjModel) -> mujoco.MjModel:
         model.geom_rgba[geom] = LEVEL if level else EDGE if model.geom_rgba[geom, 0] < 0.9 else STEP
         model.geom_matid[geom] = -1
     for texture in np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX):
-        first, size = model.tex_adr[texture], model.tex_height[texture] * model.tex_width[texture] * model.tex_nchannel[texture]
+        first, size = (
+            model.tex_adr[texture],
+            model.tex_height[texture] * model.tex_width[texture] * model.tex_nchannel[texture],
+        )
         model.tex_data[first : first + size] = np.tile(np.array(SKY) * 255, size // 3).astype(np.uint8)
     model.vis.rgba.haze[:3] = SKY
     return model
@@ -118,7 +145,16 @@ def side_by_side(films: Sequence[Sequence[Frame]]) -> list[Frame]:
 
 def save_webp(path: Path, frames: Sequence[Frame], quality: int = 10) -> None:
     first, *others = map(Image.fromarray, frames)
-    first.save(path, save_all=True, append_images=others, duration=round(1000 / FPS), loop=0, quality=quality, method=6, minimize_size=True)
+    first.save(
+        path,
+        save_all=True,
+        append_images=others,
+        duration=round(1000 / FPS),
+        loop=0,
+        quality=quality,
+        method=6,
+        minimize_size=True,
+    )
 
 
 def main() -> None:

@@ -16,7 +16,8 @@ SIGNS: dict[type, str] = {
     **{ast.BitAnd: " and ", ast.BitOr: " or ", ast.BitXor: " xor ", ast.USub: "-", ast.Invert: "not ", ast.Pow: "^"},
 }
 _SUM, _LOGIC = (ast.Add, ast.Sub), (ast.BitAnd, ast.BitOr)
-LOOSE: dict[type, tuple[tuple[type, ...], tuple[type, ...]]] = {  # what stands in brackets to the left, and to the right
+# what stands in brackets to the left, and to the right
+LOOSE: dict[type, tuple[tuple[type, ...], tuple[type, ...]]] = {
     **{ast.Add: (_LOGIC, _LOGIC), ast.Sub: (_LOGIC, (*_SUM, *_LOGIC)), ast.Mult: ((*_SUM, *_LOGIC), (*_SUM, *_LOGIC))},
     **{ast.Div: ((*_SUM, *_LOGIC), (ast.operator,)), ast.BitAnd: ((), ()), ast.BitOr: ((), ())},
 }
@@ -30,7 +31,10 @@ WORDS = {  # names that say less than words do
         "contacts.penalized": "penalized",
     },
     **{"_is_upright()": "upright", "_is_up()": "up", "PHASE_SIGMA": f"{PHASE_SIGMA:g}", "2 · pi": "2π"},
-    **{"(error / -tracking_sigma)": "(-error / tracking_sigma)", "exp(Σ (foot_height - wanted)² / -": "exp(-Σ (foot_height - wanted)² / "},
+    **{
+        "(error / -tracking_sigma)": "(-error / tracking_sigma)",
+        "exp(Σ (foot_height - wanted)² / -": "exp(-Σ (foot_height - wanted)² / ",
+    },
     "quat_rotate(sim.xquat[foot_bodies], foot_up.expand(len(foot_contact), -1, -1))": "the foot's own vertical in the world's frame",
 }
 WRAPPED = {"abs": "|{}|", "norm": "‖{}‖", "sqrt": "√({})", "square": "({})²"}
@@ -141,4 +145,10 @@ def _clamp(first: str, args: list[ast.expr], given: dict[str | None, ast.expr]) 
         return f"clip({first}, {_tidy(ast.unparse(low.value))})"
     if low is not None and high is not None:
         return f"clip({first}, {_write(low)}, {_write(high)})"
-    return f"max({first}, {_write(low)})" if low is not None else f"min({first}, {_write(high)})" if high is not None else first
+    return (
+        f"max({first}, {_write(low)})"
+        if low is not None
+        else f"min({first}, {_write(high)})"
+        if high is not None
+        else first
+    )

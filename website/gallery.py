@@ -53,7 +53,11 @@ def chapter(name: str) -> str:
     folder = POLICIES / name
     text = _relinked((folder / "README.md").read_text(), folder)
     made = re.findall(r"^```bash\n.*?^```$", text, re.MULTILINE | re.DOTALL)[:1]
-    tables = [part for part in text.split("\n\n") if part.startswith("|") and re.search("falls in|stands within|holds|finishes", part)]
+    tables = [
+        part
+        for part in text.split("\n\n")
+        if part.startswith("|") and re.search("falls in|stands within|holds|finishes", part)
+    ]
     exam = "\n".join(line for line in "\n".join(tables).splitlines() if line.startswith("|"))
     curve = [f"![learning curve](../resources/policies/{name}/curve.webp)"] if (folder / "curve.webp").exists() else []
     return "\n\n".join([text.split("\n\n")[1].replace("\n", " "), *made, exam, *curve])

@@ -27,7 +27,10 @@ def targets(path: Path) -> list[Path]:
     """Files and folders that a page links to, its code left out."""
     parts = FENCE.split(path.read_text())
     links = [link for part in parts[::2] for _, link, _ in LINK.findall(part) if not outside(link)]
-    curves = [f"../resources/policies/{name}/curve.webp" for name in re.findall(r"<!-- made: policy_(\w+) -->", path.read_text())]
+    curves = [
+        f"../resources/policies/{name}/curve.webp"
+        for name in re.findall(r"<!-- made: policy_(\w+) -->", path.read_text())
+    ]
     return [(path.parent / link.partition("#")[0]).resolve() for link in [*links, *curves]]
 
 
@@ -49,7 +52,9 @@ def _shown(path: Path) -> str:
     """A file or folder that is no page, as one."""
     title = f"# {path.relative_to(ROOT)}\n\n"
     if path.is_dir():
-        return title + "\n".join(f"- `{each.name}`" for each in sorted(path.iterdir()) if not each.name.startswith(("_", ".")))
+        return title + "\n".join(
+            f"- `{each.name}`" for each in sorted(path.iterdir()) if not each.name.startswith(("_", "."))
+        )
     return f"{title}```{LANGUAGES.get(path.suffix, 'text')}\n{path.read_text()}\n```\n"
 
 
@@ -63,7 +68,11 @@ def on_files(files: Files, config: Any) -> Files:
                 continue
             seen.add(path)
             text = path.suffix not in PICTURES
-            content = {"content": path.read_text() if path.suffix == ".md" else _shown(path)} if text else {"abs_src_path": str(path)}
+            content = (
+                {"content": path.read_text() if path.suffix == ".md" else _shown(path)}
+                if text
+                else {"abs_src_path": str(path)}
+            )
             files.append(File.generated(config, page_of(path), inclusion=InclusionLevel.NOT_IN_NAV, **content))
             if path.suffix == ".md":
                 todo.append(path)

@@ -13,7 +13,8 @@ from html import escape
 from legged_mw import ROOT
 
 IMAGES = ROOT / "docs/images"
-BLUE, GREEN, ORANGE, GREY, PURPLE = "#3b5ba9", "#2e7d5b", "#b0641a", "#5f6b7a", "#7a4a9e"  # white text stands out on each
+# white text stands out on each
+BLUE, GREEN, ORANGE, GREY, PURPLE = "#3b5ba9", "#2e7d5b", "#b0641a", "#5f6b7a", "#7a4a9e"
 LINE = "#75808e"  # seen on white and on black
 STEP: list[tuple[str, str, str, str]] = [  # colour, method, English, Chinese
     (ORANGE, "perturbation.apply()", "kicks and pushes", "扰动：推力与速度突变"),
@@ -28,7 +29,11 @@ STEP: list[tuple[str, str, str, str]] = [  # colour, method, English, Chinese
     (BLUE, "compute_observations()", "rows: noise, delay, history", "观测行：噪声、延迟、历史"),
 ]
 WORDS = {
-    "en": ("actions (N, D)", "observations, reward, dones: clones", "on a GPU all of this is one recorded CUDA graph, replayed every step"),
+    "en": (
+        "actions (N, D)",
+        "observations, reward, dones: clones",
+        "on a GPU all of this is one recorded CUDA graph, replayed every step",
+    ),
     "zh": ("动作 (N, D)", "观测、奖励、终止：交出副本", "在 GPU 上，这一切是一张录制好的 CUDA graph，每一步只需重放"),
 }
 HOUSE: list[tuple[str, str, str, str]] = [  # of the core, from the top
@@ -50,13 +55,23 @@ HOUSE_WORDS = {
         "tools: import the core, never the other way",
         "configs/*.py: a task is one file; resources/: robots, policies",
     ),
-    "zh": ("核心：import 只能自上而下", "工具：依赖核心，反之不行", "configs/*.py：一个任务一个文件；resources/：机器人与策略"),
+    "zh": (
+        "核心：import 只能自上而下",
+        "工具：依赖核心，反之不行",
+        "configs/*.py：一个任务一个文件；resources/：机器人与策略",
+    ),
 }
 
 
-def text(x: float, y: float, words: str, size: int = 13, fill: str = "#fff", style: str = "", anchor: str = "middle") -> str:
+def text(
+    x: float, y: float, words: str, size: int = 13, fill: str = "#fff", style: str = "", anchor: str = "middle"
+) -> str:
     """``style``: mono, bold, or both."""
-    family = "ui-monospace,Menlo,Consolas,monospace" if "mono" in style else "system-ui,'Noto Sans CJK SC','Microsoft YaHei',sans-serif"
+    family = (
+        "ui-monospace,Menlo,Consolas,monospace"
+        if "mono" in style
+        else "system-ui,'Noto Sans CJK SC','Microsoft YaHei',sans-serif"
+    )
     look = f'font-size="{size}" fill="{fill}" text-anchor="{anchor}" font-family="{family}" font-weight="{600 if "bold" in style else 400}"'
     return f'<text x="{x:g}" y="{y:g}" {look}>{escape(words)}</text>'
 
@@ -64,7 +79,11 @@ def text(x: float, y: float, words: str, size: int = 13, fill: str = "#fff", sty
 def box(x: float, y: float, width: float, height: float, colour: str, name: str, words: str) -> str:
     shape = f'<rect x="{x}" y="{y}" width="{width}" height="{height}" rx="8" fill="{colour}"/>'
     middle = x + width / 2
-    return shape + text(middle, y + height / 2 - 4, name, 13, style="mono bold") + text(middle, y + height / 2 + 15, words, 12)
+    return (
+        shape
+        + text(middle, y + height / 2 - 4, name, 13, style="mono bold")
+        + text(middle, y + height / 2 + 15, words, 12)
+    )
 
 
 def arrow(*points: tuple[float, float]) -> str:
@@ -88,8 +107,14 @@ def step(language: str) -> str:
     """Ten boxes in three rows, read like a page."""
     before, after, note = WORDS[language]
     width, height, left, top, gap_x, gap_y, columns = 212, 58, 30, 66, 26, 34, 4
-    places = [(left + (i % columns) * (width + gap_x), top + (i // columns) * (height + gap_y)) for i in range(len(STEP))]
-    parts = [frame(12, 44, 956, 288), text(490, 352, note, 13, LINE), text(left, 30, before, 14, LINE, style="bold", anchor="start")]
+    places = [
+        (left + (i % columns) * (width + gap_x), top + (i // columns) * (height + gap_y)) for i in range(len(STEP))
+    ]
+    parts = [
+        frame(12, 44, 956, 288),
+        text(490, 352, note, 13, LINE),
+        text(left, 30, before, 14, LINE, style="bold", anchor="start"),
+    ]
     parts.append(arrow((left + 50, 38), (left + 50, top - 2)))
     for (x, y), (colour, name, english, chinese) in zip(places, STEP, strict=True):
         parts.append(box(x, y, width, height, colour, name, english if language == "en" else chinese))
@@ -99,7 +124,12 @@ def step(language: str) -> str:
         else:
             middle = y + height + gap_y / 2
             parts.append(
-                arrow((x + width / 2, y + height), (x + width / 2, middle), (to_x + width / 2, middle), (to_x + width / 2, to_y - 2))
+                arrow(
+                    (x + width / 2, y + height),
+                    (x + width / 2, middle),
+                    (to_x + width / 2, middle),
+                    (to_x + width / 2, to_y - 2),
+                )
             )
     x, y = places[-1]
     parts += [
@@ -114,7 +144,10 @@ def house(language: str) -> str:
     core, tools, below = HOUSE_WORDS[language]
     which = 2 if language == "en" else 3
     width, height, gap = 400, 54, 24
-    parts = [text(30, 28, core, 14, LINE, style="bold", anchor="start"), text(520, 28, tools, 14, LINE, style="bold", anchor="start")]
+    parts = [
+        text(30, 28, core, 14, LINE, style="bold", anchor="start"),
+        text(520, 28, tools, 14, LINE, style="bold", anchor="start"),
+    ]
     for i, row in enumerate(HOUSE):
         y = 44 + i * (height + gap)
         parts.append(box(30, y, width, height, row[0], row[1], row[which]))
@@ -122,7 +155,10 @@ def house(language: str) -> str:
             parts.append(arrow((230, y - gap), (230, y - 2)))
     for i, row in enumerate(TOOLS):
         y = 44 + (i + 0.5) * (height + gap)
-        parts += [box(520, y, width, height, row[0], row[1], row[which]), arrow((520, y + height / 2), (432, y + height / 2))]
+        parts += [
+            box(520, y, width, height, row[0], row[1], row[which]),
+            arrow((520, y + height / 2), (432, y + height / 2)),
+        ]
     parts.append(text(475, 44 + 5 * (height + gap) + 6, below, 13, LINE))
     return svg(950, 454, parts, core)
 

@@ -33,7 +33,12 @@ TERMS: dict[str, str] = {  # a class with terms of its own -> heading; others co
 TASKS = ["go1_flat", "go1_rough", "go2_flat", "go2_rough", "g1_flat", "g1_rough"]
 EVERYTHING = {  # of a walking task: all rows that a flag switches on
     **{"env.num_envs": 1, "observations.foot_height": True, "observations.contact_forces": True, "gait.period": 0.8},
-    **{"gait.offsets": [0.0, 0.5, 0.5, 0.0], "domain_rand.enable": True, "domain_rand.observe": True, "observations.leave_out": {}},
+    **{
+        "gait.offsets": [0.0, 0.5, 0.5, 0.0],
+        "domain_rand.enable": True,
+        "domain_rand.observe": True,
+        "observations.leave_out": {},
+    },
     **{"terrain.num_rows": 1, "terrain.num_cols": 8, "terrain.height_scan": ["state", "privileged_state"]},
 }
 ENVS: list[tuple[str, str, dict[str, Any]]] = [
@@ -101,8 +106,12 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 def classes(headings: Mapping[str, str], wanted: Callable[[type], object]) -> list[tuple[str, Any]]:
     """Heading and class of those in legged_mw/envs that are ``wanted``."""
-    modules = [importlib.import_module(f"legged_mw.envs.{module.name}") for module in pkgutil.iter_modules(envs.__path__)]
-    found = {each.__name__: each for module in modules for each in vars(module).values() if _is_ours(each) and wanted(each)}
+    modules = [
+        importlib.import_module(f"legged_mw.envs.{module.name}") for module in pkgutil.iter_modules(envs.__path__)
+    ]
+    found = {
+        each.__name__: each for module in modules for each in vars(module).values() if _is_ours(each) and wanted(each)
+    }
     order = [*(name for name in headings if name in found), *sorted(found.keys() - headings.keys())]
     return [(headings.get(name, f"`{name}`"), found[name]) for name in order]
 
@@ -126,9 +135,19 @@ def rewards() -> str:
         for name, term in terms_of(owner).items():
             said = read_comment(inspect.getdoc(term) or "")
             rows.append(
-                [code(name), cell(said.words), code(formula(term)), cell(said.unit) or "1", cell(said.source), default_scale(owner, name)]
+                [
+                    code(name),
+                    cell(said.words),
+                    code(formula(term)),
+                    cell(said.unit) or "1",
+                    cell(said.source),
+                    default_scale(owner, name),
+                ]
             )
-        parts += [f"### {heading}", table(["term", "what it measures", "formula", "unit", "source", "default scale"], rows)]
+        parts += [
+            f"### {heading}",
+            table(["term", "what it measures", "formula", "unit", "source", "default scale"], rows),
+        ]
     return "\n\n".join([*parts, "### Scales in the tasks", _scales()])
 
 
@@ -142,7 +161,10 @@ def default_scale(owner: type, name: str) -> str:
 def _scales() -> str:
     configs = [load_task(task).cfg.to_dict()["rewards"]["scales"] for task in TASKS]
     names = sorted({name for scales in configs for name, scale in scales.items() if scale})
-    return table(["term", *map(code, TASKS)], [[code(name), *(f"{s[name]:g}" if s.get(name) else "" for s in configs)] for name in names])
+    return table(
+        ["term", *map(code, TASKS)],
+        [[code(name), *(f"{s[name]:g}" if s.get(name) else "" for s in configs)] for name in names],
+    )
 
 
 # ---- observation rows
@@ -178,7 +200,10 @@ def observations() -> str:
                 noise = f"±{row.noise * env.cfg.noise.level:g}" if row.noise else ""
                 lines.append([code(row.name), str(row.size), cell(words), cell(unit), noise, cell(row.mirror or "")])
             size = sum(row.size for row in rows)
-            parts.append(f"**`{group}`**, {size} columns\n\n" + table(["row", "columns", "what", "unit", "noise", "mirror"], lines))
+            parts.append(
+                f"**`{group}`**, {size} columns\n\n"
+                + table(["row", "columns", "what", "unit", "noise", "mirror"], lines)
+            )
         parts.insert(len(parts) - len(env.observations.groups), f"### {heading}")
     return "\n\n".join(parts)
 
@@ -207,7 +232,9 @@ def fields(config: type) -> dict[str, Field]:
     return dict(_fields(tree, config, "", comments))
 
 
-def _fields(tree: ast.ClassDef, owner: Any, prefix: str, comments: dict[int, tuple[str, bool]]) -> Iterator[tuple[str, Field]]:
+def _fields(
+    tree: ast.ClassDef, owner: Any, prefix: str, comments: dict[int, tuple[str, bool]]
+) -> Iterator[tuple[str, Field]]:
     for line in tree.body:
         if isinstance(line, ast.ClassDef):
             yield from _fields(line, getattr(owner, line.name), f"{prefix}{line.name}.", comments)
@@ -230,7 +257,11 @@ def _fields(tree: ast.ClassDef, owner: Any, prefix: str, comments: dict[int, tup
 def bounds(kind: Any) -> str:
     """The type, and what a value of it must be, in the words that errors use."""
     choices, words = re.fullmatch(r"Literal\[(.*)\]", text := type_text(kind)), bounds_text(kind)
-    return choices.group(1).replace("'", "`").replace('"', "`") if choices else code(text) + (f": {cell(words)}" if words else "")
+    return (
+        choices.group(1).replace("'", "`").replace('"', "`")
+        if choices
+        else code(text) + (f": {cell(words)}" if words else "")
+    )
 
 
 def is_config(each: type) -> bool:
@@ -246,7 +277,11 @@ def config_fields() -> str:
             continue
         changes = not any(field.kind for field in written.values())
         parent = config.__mro__[1].__name__
-        whose = f"`{config.__name__}`" if parent == "Config" else f"`{config.__name__}({parent})`{' changes:' if changes else ''}"
+        whose = (
+            f"`{config.__name__}`"
+            if parent == "Config"
+            else f"`{config.__name__}({parent})`{' changes:' if changes else ''}"
+        )
         parts.append(f"## {heading}\n\n{whose}")
         sections: dict[str, list[list[str]]] = {}
         kinds = dict(field_types(config))
@@ -259,7 +294,11 @@ def config_fields() -> str:
             sections.setdefault(section, []).append([*line, cell(field.said.source)])
         head = ["field", "default", "type, bounds", "unit", "what", "source"]
         if changes:
-            whole = [[code(f"{section}.{row[0].strip('`')}"), row[1], *row[3:]] for section, rows in sections.items() for row in rows]
+            whole = [
+                [code(f"{section}.{row[0].strip('`')}"), row[1], *row[3:]]
+                for section, rows in sections.items()
+                for row in rows
+            ]
             parts.append(table(["field", "default", "unit", "what", "source"], whole))
             continue
         parts += [(f"### `{section}`\n\n" if section else "") + table(head, rows) for section, rows in sections.items()]

@@ -21,7 +21,9 @@ HELD = 30  # steps of a command
 
 def commands(contract: Contract) -> list[Floats]:
     """Rest, half of the highest, rest, half of the lowest: a gait clock stops and starts again."""
-    rest, low, high = (np.array([getattr(each, name) for each in contract.commands]) for name in ("default", "low", "high"))
+    rest, low, high = (
+        np.array([getattr(each, name) for each in contract.commands]) for name in ("default", "low", "high")
+    )
     return [rest, 0.5 * (rest + high), rest, 0.5 * (rest + low)]
 
 

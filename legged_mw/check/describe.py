@@ -21,14 +21,18 @@ def describe(env: RobotTask, task: LoadedTask) -> str:
             line += f"   scale {row.scale}" if row.scale != 1.0 else ""
             lines.append(line + (f"   {row.history} frames" if row.history > 1 else ""))
     if targets := find_targets(task.train.to_dict(), env):
-        lines.append(f"the actor estimates {', '.join(f'{target.name} ({len(target.scale)})' for target, _ in targets)}")
+        lines.append(
+            f"the actor estimates {', '.join(f'{target.name} ({len(target.scale)})' for target, _ in targets)}"
+        )
     if (taught := task.train.actor.concurrent).groups:
         latent = f"a teacher's latent ({taught.latent_dim}) of {', '.join(taught.groups)}"
         lines.append(f"{taught.teacher_share:.0%} of the worlds act by {latent}")
     lines += _memories(task)
     for command in env.command_table:
         lines.append(f"command {command.label:<14} [{command.low:g}, {command.high:g}] {command.unit}")
-    lines.append(f"actions ({env.num_actions}), clipped at +-{task.cfg.normalization.clip_actions:g}, {1 / env.dt:g} Hz")
+    lines.append(
+        f"actions ({env.num_actions}), clipped at +-{task.cfg.normalization.clip_actions:g}, {1 / env.dt:g} Hz"
+    )
     lines.append("reward terms (scale)")
     scales = task.cfg.to_dict()["rewards"]["scales"]
     lines += [f"  {name:<20} {scales[name]:g}" for name in env.reward_names]
@@ -86,5 +90,9 @@ def _room(env: RobotTask) -> str:
     """What mujoco-warp allocates a world, and where the numbers come from."""
     room, sim = count_room(env.robot.physics, env.terrain is not None), env.cfg.sim
     asked, counted = (sim.nconmax or room.contacts, sim.njmax or room.rows), (room.contacts, room.rows)
-    source = f"the model: {room.why}" if asked == counted else f"the config; the model makes {counted[0]} and {counted[1]}: {room.why}"
+    source = (
+        f"the model: {room.why}"
+        if asked == counted
+        else f"the config; the model makes {counted[0]} and {counted[1]}: {room.why}"
+    )
     return f"room of a world on mujoco_warp: sim.nconmax {asked[0]}, sim.njmax {asked[1]}, from {source}"

@@ -48,9 +48,8 @@ def check_recordable(task: LoadedTask) -> None:
     for kind in own_classes(task.env_class):
         for name, value in (_of_file(kind) | dict(vars(kind))).items():
             if isinstance(value, Tensor):
-                what = (
-                    f"{name} is made where its file is read, on the host, and the step reads it; make it in _init_buffers, on self.device"
-                )
+                what = f"{name} is made where its file is read, on the host, and the step reads it; "
+                what += "make it in _init_buffers, on self.device"
                 guard.on_host[value.untyped_storage().data_ptr()] = value, what, kind.__name__
     with nothing_changed(), Births(guard):
         try:
@@ -69,7 +68,9 @@ def check_recordable(task: LoadedTask) -> None:
             own = [] if users else _own_methods(task.env_class)
             if not users and not own:
                 raise
-            doubt = f" ({'this does' if len(own) == 1 else 'one of these does'} not fit: {'; '.join(own)})" if own else ""
+            doubt = (
+                f" ({'this does' if len(own) == 1 else 'one of these does'} not fit: {'; '.join(own)})" if own else ""
+            )
             what = in_short(error) + doubt
             raise StepError(what, f"{task.name}: {where}".removesuffix(": ")) from error
 
@@ -89,8 +90,15 @@ def _own_methods(env_class: type) -> list[str]:
     found = []
     for kind in own_classes(env_class):
         names = [name for name in vars(kind) if name == "__init__" or not name.startswith(("__", "_abc"))]
-        found += [(kind, name, vars(kind)[name]) for name in names if hasattr(kind.__mro__[1], name) or name.startswith("_reward_")]
-    return [place_of(value) if inspect.isroutine(value) else f"{kind.__name__}.{name} = {value!r:.40}" for kind, name, value in found]
+        found += [
+            (kind, name, vars(kind)[name])
+            for name in names
+            if hasattr(kind.__mro__[1], name) or name.startswith("_reward_")
+        ]
+    return [
+        place_of(value) if inspect.isroutine(value) else f"{kind.__name__}.{name} = {value!r:.40}"
+        for kind, name, value in found
+    ]
 
 
 def _of_file(kind: type) -> dict[str, Any]:
@@ -129,7 +137,9 @@ def _watched(env_class: type[RobotTask], guard: Guard) -> type[Any]:
 
         return law
 
-    body: dict[str, Any] = {name: watch(getattr(env_class, name)) for name in dir(env_class) if name.startswith("_reward_")}
+    body: dict[str, Any] = {
+        name: watch(getattr(env_class, name)) for name in dir(env_class) if name.startswith("_reward_")
+    }
     if env_class._compute_torques is not RobotTask._compute_torques:
         body["_compute_torques"] = watch_law(env_class._compute_torques)
     body |= {"__module__": env_class.__module__, "__qualname__": env_class.__qualname__}
@@ -150,7 +160,11 @@ def _unwatched(method: Callable[..., Any], guard: Guard, on: bool = False) -> Ca
 def _check_written(env: RobotTask, tensor: Tensor) -> None:
     """Inside a reward, no tensor may be written to that the environment holds."""
     memory = tensor.untyped_storage().data_ptr()
-    held = [(path, value) for path, value in _held(env) if isinstance(value, Tensor) and value.untyped_storage().data_ptr() == memory]
+    held = [
+        (path, value)
+        for path, value in _held(env)
+        if isinstance(value, Tensor) and value.untyped_storage().data_ptr() == memory
+    ]
     if held and memory:
         path, _ = min(held, key=lambda entry: _place(entry[1]) != _place(tensor))
         raise NotRecordable(f"writes to {_shown(path)}; a reward only reads: write to it in _update_state or _end_step")
@@ -163,12 +177,15 @@ def _check_rows(env: RobotTask) -> None:
         for row, again in zip(tables[0][group], tables[1][group], strict=True):
             if not isinstance(row, str) and not isinstance(again, str) and _place(row.value) != _place(again.value):
                 what = f"row '{row.name}' of '{group}' is computed when the table is made, which is once"
-                raise NotRecordable(f"{what}; give it a buffer, which _update_state writes in place", place_of(env.observation_rows))
+                raise NotRecordable(
+                    f"{what}; give it a buffer, which _update_state writes in place", place_of(env.observation_rows)
+                )
 
 
 def _check_steps(env: RobotTask, guard: Guard) -> None:
     def step(watch: bool = True) -> None:
-        env.episode_length_buf = torch.arange(_WORLDS, device=env.device) % 2 * env.max_episode_length  # every second episode ends
+        # every second episode ends
+        env.episode_length_buf = torch.arange(_WORLDS, device=env.device) % 2 * env.max_episode_length
         actions = torch.rand(_WORLDS, env.num_actions, device=env.device).mul_(2.0).sub_(1.0)
         with recordable(guard) if watch else nullcontext():
             env.step(actions)
@@ -190,7 +207,10 @@ def _check_steps(env: RobotTask, guard: Guard) -> None:
             for row in rows:
                 bad = ~(row.value.float().abs() <= BOUND) & ~env.broken[:, None]  # what the step puts 0 for
                 if not row.group and bool(bad.any()):
-                    raise StepError(f"row '{row.name}' of '{group}' is not finite, or beyond {BOUND:g}", place_of(env.observation_rows))
+                    raise StepError(
+                        f"row '{row.name}' of '{group}' is not finite, or beyond {BOUND:g}",
+                        place_of(env.observation_rows),
+                    )
     # what a training calls between steps that are recorded by then
     for call in (lambda: env.anneal(0.5), env.domain_rand.redraw, lambda: env.load_training_state(state)):
         _check_kept(env, dict(_held(env)), call)
@@ -253,7 +273,9 @@ def _held(owner: Any, path: Path = (), seen: set[int] | None = None) -> Iterator
     """Tensors, numbers and generators that ``owner`` and its parts hold, also inside containers; of the simulation the tensors alone."""
     seen = set() if seen is None else seen
     for key, value in parts(owner).items():
-        if isinstance(value, Tensor) or (isinstance(value, int | float | random.Random | np.random.Generator) and path[:1] != ("sim",)):
+        if isinstance(value, Tensor) or (
+            isinstance(value, int | float | random.Random | np.random.Generator) and path[:1] != ("sim",)
+        ):
             yield (*path, key), value
         elif _is_part(value) and id(value) not in seen:
             seen.add(id(value))
@@ -269,7 +291,8 @@ def _is_part(value: Any) -> bool:
 
 def _place(value: Any) -> object:
     """What must not change: where a tensor is, what a number is."""
-    return (value.data_ptr(), value.shape, value.stride(), value.dtype) if isinstance(value, Tensor) else repr(value)  # NaN is NaN
+    # NaN is NaN
+    return (value.data_ptr(), value.shape, value.stride(), value.dtype) if isinstance(value, Tensor) else repr(value)
 
 
 def _at(owner: Any, path: Path) -> Any:

@@ -23,14 +23,46 @@ from legged_mw.utils.errors import NotRecordable, is_library, line_of
 # Seen by name, because on a CPU some of them reach no kernel at all.
 _CONDITIONS = {"__bool__", "is_nonzero", "__contains__"}
 _PRINTS = {"__repr__", "__str__", "__format__"}
-_HOST_READS = {"item", "tolist", "cpu", "numpy", "__array__", "__dlpack__", "__int__", "__float__", "__complex__", "__index__"}
+_HOST_READS = {
+    "item",
+    "tolist",
+    "cpu",
+    "numpy",
+    "__array__",
+    "__dlpack__",
+    "__int__",
+    "__float__",
+    "__complex__",
+    "__index__",
+}
 _HOST_WRITES = {"tensor", "as_tensor", "asarray", "scalar_tensor", "new_tensor"}
 _MOVES = {"cuda", "pin_memory"}
-_FACTORIES = {"empty", "zeros", "ones", "full", "eye", "arange", "linspace", "rand", "randn", "randint", "randperm", "normal"}
+_FACTORIES = {
+    "empty",
+    "zeros",
+    "ones",
+    "full",
+    "eye",
+    "arange",
+    "linspace",
+    "rand",
+    "randn",
+    "randint",
+    "randperm",
+    "normal",
+}
 # Kernels that read a value to the host, or whose result has as many elements as the data say.
 _READING = {"_local_scalar_dense", "equal", "allclose", "histc", "bincount", "_linalg_check_errors"}
 _READING |= {"_linalg_eigh", "_linalg_svd", "linalg_eig", "linalg_lstsq"}  # only on a GPU
-_DATA_SHAPED = {"nonzero", "masked_select", "_unique", "_unique2", "unique_dim", "unique_consecutive", "unique_dim_consecutive"}
+_DATA_SHAPED = {
+    "nonzero",
+    "masked_select",
+    "_unique",
+    "_unique2",
+    "unique_dim",
+    "unique_consecutive",
+    "unique_dim_consecutive",
+}
 _INDEXED = {"index", "index_put", "index_put_", "_index_put_impl_", "_unsafe_index", "_unsafe_index_put"}
 
 
@@ -63,18 +95,35 @@ class Births(TorchFunctionMode):
         super().__init__()
         self._known = guard.on_host
 
-    def __torch_function__(self, func: Callable[..., Any], types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+    def __torch_function__(
+        self, func: Callable[..., Any], types: Any, args: tuple = (), kwargs: dict | None = None
+    ) -> Any:
         kwargs = kwargs or {}
         result, name = func(*args, **kwargs), getattr(func, "__name__", "")
         given_one = name in _HOST_WRITES and kwargs.get("device") is not None  # as_tensor(x, device=...)
         if given_one or (name == "to" and _moves(args[1:], kwargs)):  # which is nothing on a CPU
             return result.clone() if _address(result) in self._known else result
-        made = [value for value in (result if isinstance(result, tuple | list) else [result]) if isinstance(value, Tensor)]
+        made = [
+            value for value in (result if isinstance(result, tuple | list) else [result]) if isinstance(value, Tensor)
+        ]
         fresh = [value for value in made if _address(value) not in self._known] if kwargs.get("device") is None else []
-        given = [self._known.get(_address(value)) for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)] if fresh else []
+        given = (
+            [self._known.get(_address(value)) for value in tree_leaves((args, kwargs)) if isinstance(value, Tensor)]
+            if fresh
+            else []
+        )
         source = given[0] if given and all(given) else None
-        if not given and name in _FACTORIES | _HOST_WRITES and func is getattr(torch, name, None) and (where := _users_line()):
-            source = None, f"{name}() without a device makes a tensor on the host, which the step reads; add device=self.device", where
+        if (
+            not given
+            and name in _FACTORIES | _HOST_WRITES
+            and func is getattr(torch, name, None)
+            and (where := _users_line())
+        ):
+            source = (
+                None,
+                f"{name}() without a device makes a tensor on the host, which the step reads; add device=self.device",
+                where,
+            )
         if source:
             self._known.update({_address(value): (value, *source[1:]) for value in fresh if value.numel()})
         return result
@@ -87,7 +136,9 @@ class _FunctionGuard(TorchFunctionMode):
         super().__init__()
         self.guard = guard
 
-    def __torch_function__(self, func: Callable[..., Any], types: Any, args: tuple = (), kwargs: dict | None = None) -> Any:
+    def __torch_function__(
+        self, func: Callable[..., Any], types: Any, args: tuple = (), kwargs: dict | None = None
+    ) -> Any:
         kwargs = kwargs or {}
         if self.guard.on and (found := _breach_of_call(func, args, kwargs)):
             raise NotRecordable(found)
@@ -127,7 +178,9 @@ def _breach_of_call(func: Callable[..., Any], args: tuple, kwargs: dict[str, Any
     """What is wrong with a call, and what to write instead; "" if nothing is."""
     name = getattr(func, "__name__", "")
     call = f"{name.strip('_')}()"
-    if name in ("__getitem__", "__setitem__") and any(map(_is_scalar_index, args[1] if isinstance(args[1], tuple) else args[1:2])):
+    if name in ("__getitem__", "__setitem__") and any(
+        map(_is_scalar_index, args[1] if isinstance(args[1], tuple) else args[1:2])
+    ):
         return "a tensor without dimensions as an index is read to the host; write x.index_select(dim, index.view(1)), or use a Python int"
     if name in _CONDITIONS:
         return "a tensor as a condition (if, and, not, in) is read to the host; write torch.where(condition, a, b)"
@@ -173,23 +226,36 @@ def _users_line() -> str:
     frame: FrameType | None = sys._getframe()
     while frame and is_library(frame.f_globals.get("__name__", ""), frame.f_code.co_filename):
         frame = frame.f_back
-    return "" if not frame or frame.f_globals.get("__name__", "").startswith("legged_mw.") else line_of(frame.f_code, frame.f_lineno)
+    return (
+        ""
+        if not frame or frame.f_globals.get("__name__", "").startswith("legged_mw.")
+        else line_of(frame.f_code, frame.f_lineno)
+    )
 
 
 def _is_scalar_index(index: object) -> bool:
-    return isinstance(index, Tensor) and index.dim() == 0 and not index.is_floating_point() and index.dtype not in (torch.bool, torch.uint8)
+    return (
+        isinstance(index, Tensor)
+        and index.dim() == 0
+        and not index.is_floating_point()
+        and index.dtype not in (torch.bool, torch.uint8)
+    )
 
 
 def _moves(args: tuple, kwargs: dict[str, Any]) -> bool:
     """Whether arguments of ``Tensor.to`` name a device, not only a dtype; another tensor names its device."""
-    return any(isinstance(value, str | int | torch.device | Tensor) and not isinstance(value, bool) for value in [*args, *kwargs.values()])
+    return any(
+        isinstance(value, str | int | torch.device | Tensor) and not isinstance(value, bool)
+        for value in [*args, *kwargs.values()]
+    )
 
 
 @contextmanager
 def recordable(guard: Guard | None = None) -> Iterator[None]:
     """Inside, calls that a CUDA graph cannot record raise NotRecordable; what only a CPU asks is not asked."""
     guard = guard or Guard()
-    held = [(module, getattr(module, "__dict__", {})) for module in list(sys.modules.values())]  # getattr would import what is lazy
+    # getattr would import what is lazy
+    held = [(module, getattr(module, "__dict__", {})) for module in list(sys.modules.values())]
     asks = [module for module, names in held if names.get("maybe_any") is math.maybe_any]
     original = math.maybe_any
     try:

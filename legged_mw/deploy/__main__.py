@@ -26,24 +26,46 @@ def parse() -> argparse.Namespace:
     parser = Parser(prog="python -m legged_mw.deploy", description=__doc__, allow_abbrev=False)
     made = "play.py --export DIR makes one, a finished training too, in its run folder; or the name of a shipped policy"
     parser.add_argument("folder", metavar="DIR", nargs="?", help=f"an export: {made}")
-    parser.add_argument("second", metavar="DIR2", nargs="?", help="with --switch: the policy that takes over, of the same robot")
-    parser.add_argument("--switch", choices=("fall",), help="fall: DIR until the robot falls, then DIR2 until it stands (simulated)")
-    parser.add_argument("--eval", action="store_true", help=f"the task's exam; prints its table and writes {RESULT_FILE}")
-    parser.add_argument("--out", metavar="FILE", help=f"where --eval writes (default: DIR/{RESULT_FILE}; of a shipped one in logs)")
-    common = "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
+    parser.add_argument(
+        "second", metavar="DIR2", nargs="?", help="with --switch: the policy that takes over, of the same robot"
+    )
+    parser.add_argument(
+        "--switch", choices=("fall",), help="fall: DIR until the robot falls, then DIR2 until it stands (simulated)"
+    )
+    parser.add_argument(
+        "--eval", action="store_true", help=f"the task's exam; prints its table and writes {RESULT_FILE}"
+    )
+    parser.add_argument(
+        "--out", metavar="FILE", help=f"where --eval writes (default: DIR/{RESULT_FILE}; of a shipped one in logs)"
+    )
+    common = (
+        "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
+    )
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
-    parser.add_argument("--command", metavar="VALUES", help="fixed command: 0.5,0,0 in the contract's order, or base_height=0.3 by name")
+    parser.add_argument(
+        "--command", metavar="VALUES", help="fixed command: 0.5,0,0 in the contract's order, or base_height=0.3 by name"
+    )
     parser.add_argument("--num_envs", type=positive, default=1, metavar="N", help="robots side by side")
-    parser.add_argument("--time", type=duration, metavar="T", help="how long (default: until closed; 10s of a recording)")
-    parser.add_argument("--terrain", action="store_true", help=f"among the steps and blocks of {TERRAIN_FILE}, if the export has it")
-    parser.add_argument("--edited", action="store_true", help="you changed what is exported: each number is shown beside the exported one")
+    parser.add_argument(
+        "--time", type=duration, metavar="T", help="how long (default: until closed; 10s of a recording)"
+    )
+    parser.add_argument(
+        "--terrain", action="store_true", help=f"among the steps and blocks of {TERRAIN_FILE}, if the export has it"
+    )
+    parser.add_argument(
+        "--edited",
+        action="store_true",
+        help="you changed what is exported: each number is shown beside the exported one",
+    )
     launch.add_flags(parser)
     options.add_flags(parser)
     drive.add_flags(parser)
     args = parser.parse_args()
     if args.folder is None and args.replay is None:
         parser.error("the following arguments are required: DIR")
-    if args.eval and (asked := [f"--{name}" for name in ("command", "terrain") if getattr(args, name)] + launch.asked(args)):
+    if args.eval and (
+        asked := [f"--{name}" for name in ("command", "terrain") if getattr(args, name)] + launch.asked(args)
+    ):
         parser.error(f"--eval brings its own commands, is on flat ground and shows nothing: leave {asked[0]} out")
     if (args.second is None) != (args.switch is None):
         parser.error("--switch fall is of two policies: python -m legged_mw.deploy DIR DIR2 --switch fall")
@@ -85,10 +107,18 @@ def main() -> None:
         drive.drive(robot, folder, contract, args, command, args.robot, contact)
         print(robot.report)
     elif args.drive:
-        robot = MujocoRobot(folder, contract, scene_file, whole=True, hoisted=drive.hoisted(args, contract), lift=drive.lift(args))
+        robot = MujocoRobot(
+            folder, contract, scene_file, whole=True, hoisted=drive.hoisted(args, contract), lift=drive.lift(args)
+        )
         drive.drive(robot, folder, contract, args, command, args.robot, contact)
     elif args.eval:
-        examine(folder, Path(args.out) if args.out else results(folder) / RESULT_FILE, args.ranges == "common", contact, args.edited)
+        examine(
+            folder,
+            Path(args.out) if args.out else results(folder) / RESULT_FILE,
+            args.ranges == "common",
+            contact,
+            args.edited,
+        )
     else:
         stage = DeployStage(folder, args.num_envs, command, scene_file=scene_file, contact=contact, edited=args.edited)
         launch.watch(stage, args, results(folder), title=contract.task)

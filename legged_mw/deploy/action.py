@@ -36,7 +36,9 @@ class Action(NamedTuple):
         return np.clip(targets, self.lowest, self.highest)
 
     def to_dict(self) -> dict[str, Any]:
-        values = {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in self._asdict().items()}
+        values = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in self._asdict().items()
+        }
         return values | {"scale": short(values["scale"])}
 
 

@@ -64,7 +64,8 @@ ROWS: dict[str, Quantity] = {
         "the robot stands on level ground, within 1 m; x by x from behind, in each from right to left",
     ),
 }
-COMPUTED = ("joint_offset", "last_action", "command", "gait_clock", *REFERENCE)  # by the controller; a robot measures all others
+# by the controller; a robot measures all others
+COMPUTED = ("joint_offset", "last_action", "command", "gait_clock", *REFERENCE)
 # What the sensors of a scene measure; "up" is the world's z axis in the IMU's frame, opposite to gravity.
 SENSED = ("lin_vel", "ang_vel", "up", "acceleration", "joint_pos", "joint_vel", "joint_torque")
 FALL = "fall_contact"  # contacts of `ends: falls_on` with the ground; only where there are such geoms
@@ -94,7 +95,9 @@ class Ends(NamedTuple):
     """What counts as a fall and ends a walk; nothing does where none of it is set."""
 
     max_tilt: float | None = None  # [deg] between the robot's z axis and the vertical
-    min_base_height: float | None = None  # [m] of the root above the ground; a real robot cannot judge it, a simulated one does
+    min_base_height: float | None = (
+        None  # [m] of the root above the ground; a real robot cannot judge it, a simulated one does
+    )
     falls_on: tuple[str, ...] = ()  # geoms that must not touch the ground; judged in simulation, too
     not_covered: tuple[str, ...] = ()  # methods of the task that ended its episodes, too; nobody judges those here
 
@@ -166,7 +169,11 @@ class Contract:
 
     def to_dict(self) -> dict[str, Any]:
         """What policy.yaml holds."""
-        ends = {name: list(value) if isinstance(value, tuple) else value for name, value in self.ends._asdict().items() if value}
+        ends = {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in self.ends._asdict().items()
+            if value
+        }
         network = {"file": NETWORK_FILE, "sha256": self.digest, "input": self.input, "output": self.output}
         said = {
             "format": FORMATS[-1],
@@ -178,16 +185,27 @@ class Contract:
             "action": self.action.to_dict(),
             "stiffness": self.stiffness.tolist(),
             "damping": self.damping.tolist(),
-            "commands": [{"name": c.name, "unit": c.unit, "lowest": c.low, "highest": c.high, "default": c.default} for c in self.commands],
+            "commands": [
+                {"name": c.name, "unit": c.unit, "lowest": c.low, "highest": c.high, "default": c.default}
+                for c in self.commands
+            ],
             "observation": [_row_to_dict(row) for row in self.rows],
             "ends": ends,
-            "robot": {"mass": self.mass, "feet": {foot: list(names) for foot, names in self.feet.items()}, "imu": self.imu},
+            "robot": {
+                "mass": self.mass,
+                "feet": {foot: list(names) for foot, names in self.feet.items()},
+                "imu": self.imu,
+            },
             "physics": {
                 **{"file": SCENE_FILE, "sha256": self.scene, "timestep": self.timestep, "decimation": self.decimation},
                 **({"terrain": {"file": TERRAIN_FILE, "sha256": self.terrain}} if self.terrain else {}),
             },
             "sensors": {name: list(names) for name, names in self.sensors.items()},
-            **({SCAN: {"x": list(self.scan.x), "y": list(self.scan.y), "standing": self.scan.standing}} if self.scan else {}),
+            **(
+                {SCAN: {"x": list(self.scan.x), "y": list(self.scan.y), "standing": self.scan.standing}}
+                if self.scan
+                else {}
+            ),
             **({"gait": {**self.gait._asdict(), "offsets": list(self.gait.offsets)}} if self.gait else {}),
             **{name: dict(said) for name, said in (("exam", self.exam), ("safety", self.safety)) if said is not None},
             **({ESTIMATE: [row._asdict() for row in self.estimate]} if self.estimate else {}),
@@ -224,23 +242,31 @@ def read_contract(folder: Path, edited: bool = False) -> Contract:
     if edited:
         check_pose(contract.action, contract.joints, contract.default_pose)
         return contract
-    what_to_do = "undo the change, export the policy again, or say --edited, which shows each number beside the exported one"
+    what_to_do = (
+        "undo the change, export the policy again, or say --edited, which shows each number beside the exported one"
+    )
     if CHECKSUM not in said:
-        raise ContractError(f"{CONTRACT_FILE} has no line `{CHECKSUM}`, which says that it is as it was exported: {what_to_do}")
+        raise ContractError(
+            f"{CONTRACT_FILE} has no line `{CHECKSUM}`, which says that it is as it was exported: {what_to_do}"
+        )
     if checksum(said) != said[CHECKSUM]:
         raise ContractError(
             f"{CONTRACT_FILE} was changed in what the network was trained with (its {CHECKSUM} differs); only {', '.join(FREE)} may be: "
             f"{what_to_do}"
         )
     for name in _changed_files(folder, contract):
-        raise ContractError(f"{name} is not the file that {CONTRACT_FILE} was written for (its SHA-256 differs): {what_to_do}")
+        raise ContractError(
+            f"{name} is not the file that {CONTRACT_FILE} was written for (its SHA-256 differs): {what_to_do}"
+        )
     return contract
 
 
 def part(folder: Path, name: str) -> Path:
     """A file of the export in ``folder``. Raises ContractError if it is not there."""
     if not (folder / name).is_file():
-        raise ContractError(f"no {name} in {folder}; make an export with: python play.py --task <task> --export {folder}")
+        raise ContractError(
+            f"no {name} in {folder}; make an export with: python play.py --task <task> --export {folder}"
+        )
     return folder / name
 
 
@@ -248,25 +274,39 @@ def edits(folder: Path) -> list[str]:
     """A line for each number of the export in ``folder`` that was changed since, beside the exported one, and for each other file."""
     lines = changes(load_yaml(part(folder, CONTRACT_FILE)))
     files = _changed_files(folder, read_contract(folder, edited=True))
-    return [f"{CONTRACT_FILE}: {line}" for line in lines] + [f"{name}: another file than the exported one" for name in files]
+    return [f"{CONTRACT_FILE}: {line}" for line in lines] + [
+        f"{name}: another file than the exported one" for name in files
+    ]
 
 
 def _changed_files(folder: Path, contract: Contract) -> list[str]:
     stated = {SCENE_FILE: contract.scene, TERRAIN_FILE: contract.terrain}
-    return [name for name, wanted in stated.items() if wanted and (folder / name).is_file() and digest(folder / name) != wanted]
+    return [
+        name
+        for name, wanted in stated.items()
+        if wanted and (folder / name).is_file() and digest(folder / name) != wanted
+    ]
 
 
 def _read(top: Reader, folder: Path) -> Contract:
     version = top.take(
-        "format", f"one of {', '.join(map(str, FORMATS))}, which this version reads; export the policy again", lambda v: v in FORMATS
+        "format",
+        f"one of {', '.join(map(str, FORMATS))}, which this version reads; export the policy again",
+        lambda v: v in FORMATS,
     )
-    network, action, robot, physics, measured = (top.section(name) for name in ("network", "action", "robot", "physics", "sensors"))
+    network, action, robot, physics, measured = (
+        top.section(name) for name in ("network", "action", "robot", "physics", "sensors")
+    )
     network.file("file", NETWORK_FILE)
     joints, feet = top.texts("joints"), robot.section("feet")
     top.take("joints", "names, each once", lambda names: len(set(names)) == len(names))
     count, timestep, decimation = len(joints), physics.above_zero("timestep"), physics.count("decimation", 10_000)
     step = timestep * decimation
-    top.take("period", f"physics: timestep * decimation = {step:g}", lambda v: is_number(v) and math.isclose(v, step, rel_tol=1e-6))
+    top.take(
+        "period",
+        f"physics: timestep * decimation = {step:g}",
+        lambda v: is_number(v) and math.isclose(v, step, rel_tol=1e-6),
+    )
     return Contract(
         task=top.text("task"),
         joints=joints,
@@ -312,7 +352,9 @@ def _read_scenes(physics: Reader, version: int) -> dict[str, Any]:
 def _read_command(command: Reader) -> Command:
     low = command.number("lowest")
     high = command.number("highest", low)
-    return Command(command.text("name"), low, high, command.text("unit", empty=True), default=command.number("default", low, high))
+    return Command(
+        command.text("name"), low, high, command.text("unit", empty=True), default=command.number("default", low, high)
+    )
 
 
 def _read_row(row: Reader) -> ContractRow:
@@ -337,7 +379,9 @@ def _read_ends(ends: Reader) -> Ends:
             raise ContractError(f"{ends.where}: {unknown('rule', name, Ends._fields, 'the rules that end a walk')}")
     return Ends(
         max_tilt=ends.number("max_tilt", 0.0, 180.0) if "max_tilt" in ends.values else None,
-        min_base_height=ends.number("min_base_height", -_FARTHEST, _FARTHEST) if "min_base_height" in ends.values else None,
+        min_base_height=ends.number("min_base_height", -_FARTHEST, _FARTHEST)
+        if "min_base_height" in ends.values
+        else None,
         falls_on=ends.texts("falls_on") if "falls_on" in ends.values else (),
         not_covered=ends.texts("not_covered") if "not_covered" in ends.values else (),
     )
@@ -358,16 +402,26 @@ def _read_gait(top: Reader) -> Gait | None:
         return None
     gait, names = top.section("gait"), [command.values.get("name") for command in top.sections("commands", empty=True)]
     if missing := [name for name in VELOCITY if name not in names]:
-        raise ContractError(f"{top.where}: {CLOCK} rests by the commands {', '.join(VELOCITY)}; missing: {', '.join(missing)}")
+        raise ContractError(
+            f"{top.where}: {CLOCK} rests by the commands {', '.join(VELOCITY)}; missing: {', '.join(missing)}"
+        )
     feet = len(top.section("robot").section("feet").values)
-    return Gait(gait.above_zero("period"), tuple(gait.numbers("offsets", feet, "foot").tolist()), gait.number("min_command", 0.0))
+    return Gait(
+        gait.above_zero("period"),
+        tuple(gait.numbers("offsets", feet, "foot").tolist()),
+        gait.number("min_command", 0.0),
+    )
 
 
 def quantity_size(contract: Contract, name: str) -> int:
     """Values of a measured or computed quantity."""
     per_joint = ("joint_pos", "joint_offset", "joint_vel", "joint_torque", "last_action", JOINT_POS, JOINT_VEL)
     scan = len(contract.scan.x) * len(contract.scan.y) if contract.scan else 0
-    counts = {**dict.fromkeys(per_joint, len(contract.joints)), "foot_contact": len(contract.feet), "command": len(contract.commands)}
+    counts = {
+        **dict.fromkeys(per_joint, len(contract.joints)),
+        "foot_contact": len(contract.feet),
+        "command": len(contract.commands),
+    }
     clock = 2 * len(contract.gait.offsets) if contract.gait else 0
     return {**counts, FALL: len(contract.ends.falls_on), SCAN: scan, CLOCK: clock, TURN: 6}.get(name, 3)
 
@@ -389,8 +443,12 @@ def _check_rows(contract: Contract) -> None:
                 f"sensors=(...), unit=...) with sensors of the MJCF, or use one of the rows {', '.join(ROWS)}; then export again"
             )
         if row.measured in REFERENCE and not contract.motion:
-            raise ContractError(f"{where} is of a motion, and the contract has no section `{MOTION}`; export the policy again")
+            raise ContractError(
+                f"{where} is of a motion, and the contract has no section `{MOTION}`; export the policy again"
+            )
         if row.measured not in measurable:
-            raise ContractError(f"{where}: {unknown('quantity', row.measured, [*sorted(measurable), SENSORS], 'what a robot measures')}")
+            raise ContractError(
+                f"{where}: {unknown('quantity', row.measured, [*sorted(measurable), SENSORS], 'what a robot measures')}"
+            )
         if row.size != (right := quantity_size(contract, row.measured)):
             raise ContractError(f"{where} has size {row.size}; {row.measured} has {right} values on this robot")

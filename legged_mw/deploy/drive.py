@@ -41,22 +41,36 @@ STATUS = 0.2  # [s] between two status lines
 
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add the flags of driving a robot, and of its log."""
-    parser.add_argument("--drive", action="store_true", help="from the terminal as on a robot: states, safety limits, a log; in real time")
+    parser.add_argument(
+        "--drive",
+        action="store_true",
+        help="from the terminal as on a robot: states, safety limits, a log; in real time",
+    )
     checked = "in place of the policy: each joint goes 0.1 rad and back at a tenth of the stiffness, and what moved is compared"
     parser.add_argument("--check_joints", action="store_true", help=checked)
     hangs = "a simulated robot hangs until the policy starts (default: if it has two feet), high: its feet in the air, as in --check_joints"
     parser.add_argument("--hoist", choices=("yes", "no", "high"), help=hangs)
     limits = "another limit of the safety layer, e.g. tilt=45 or frozen=off (docs/on_the_robot.md has them all)"
     parser.add_argument("--limit", action="append", default=[], metavar="NAME=VALUE", help=limits)
-    parser.add_argument("--gamepad", metavar="FILE", help="a gamepad that drives too (default: the first that is there), or off")
-    parser.add_argument("--stop_fd", type=int, metavar="N", help="damp the robot when this file descriptor can be read or is closed")
-    parser.add_argument("--log", metavar="FILE", help="where the run is logged (default: a new file in logs/deploy), or off")
-    parser.add_argument("--replay", type=Path, metavar="LOG", help="draw a log beside the simulation of the same commands")
+    parser.add_argument(
+        "--gamepad", metavar="FILE", help="a gamepad that drives too (default: the first that is there), or off"
+    )
+    parser.add_argument(
+        "--stop_fd", type=int, metavar="N", help="damp the robot when this file descriptor can be read or is closed"
+    )
+    parser.add_argument(
+        "--log", metavar="FILE", help="where the run is logged (default: a new file in logs/deploy), or off"
+    )
+    parser.add_argument(
+        "--replay", type=Path, metavar="LOG", help="draw a log beside the simulation of the same commands"
+    )
 
 
 def check_flags(args: argparse.Namespace) -> None:
     """Refuse flags that do not go together. Raises FlagError or LimitError."""
-    if args.check_joints and (others := [name for name in ("serve", "eval", "replay", "command", "commands") if getattr(args, name)]):
+    if args.check_joints and (
+        others := [name for name in ("serve", "eval", "replay", "command", "commands") if getattr(args, name)]
+    ):
         raise FlagError(f"--check_joints moves one joint of a robot at a time: leave --{others[0]} out")
     args.drive |= args.check_joints
     several = {"eval": args.eval, "num_envs": args.num_envs != 1, "replay": args.replay}
@@ -122,7 +136,9 @@ def drive(
             if mirror:
                 mirror.show(now, measured, states)
 
-        done = run(robot, controller, command, seconds, watch=show, safety=safety, states=states, log=log, odometry=odometry)
+        done = run(
+            robot, controller, command, seconds, watch=show, safety=safety, states=states, log=log, odometry=odometry
+        )
         logged = f"; {log.broken or f'logged to {shown(log.path)}'}" if log else ""
         console.say(f"{done.timing}\nthe joints are damped{logged}{states.report}")
     if not states.right:
@@ -161,7 +177,9 @@ def _commands(
         return lambda _: rest
     script = load_script(args.commands, contract.commands).entries
     if others := sum((entry.push is not None) + entry.reset for entry in script):
-        say(f"--commands {args.commands}: {others} of its pushes and resets are left out; a robot that is driven has commands alone")
+        say(
+            f"--commands {args.commands}: {others} of its pushes and resets are left out; a robot that is driven has commands alone"
+        )
     entries = [(entry.time, np.array(entry.command)) for entry in script if entry.command]
     return lambda time: next((command for start, command in reversed(entries) if start <= time + 1e-9), rest)
 

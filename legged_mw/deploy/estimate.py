@@ -20,7 +20,8 @@ class Estimated(NamedTuple):
 def read_estimated(rows: Sequence[Any]) -> tuple[Estimated, ...]:
     """The rows from the contract's readers of ``estimate``."""
     return tuple(
-        Estimated(row.text("name"), row.count("size"), row.text("unit", empty=True), row.text("frame", empty=True)) for row in rows
+        Estimated(row.text("name"), row.count("size"), row.text("unit", empty=True), row.text("frame", empty=True))
+        for row in rows
     )
 
 

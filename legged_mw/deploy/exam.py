@@ -27,7 +27,12 @@ from legged_mw.utils.errors import unknown
 
 
 def run_exam(
-    folder: Path, exam: ExamRules | None = None, threads: int = 0, common: bool = False, contact: str | None = None, edited: bool = False
+    folder: Path,
+    exam: ExamRules | None = None,
+    threads: int = 0,
+    common: bool = False,
+    contact: str | None = None,
+    edited: bool = False,
 ) -> dict[str, Any]:
     """Grade the export in ``folder`` by the rules ``exam``, else by those of its contract. Raises ContractError, ConfigError.
 
@@ -54,13 +59,17 @@ def run_exam(
         sampled["estimate"] += [] if estimate is None else [estimate]
         fell_at[stage.fell() & np.isinf(fell_at)] = step
     signals = {name: np.stack(values) for name, values in sampled.items() if values}
-    return exam.grade(signals, last_position=stage.qpos()[:, :2], fell_at=fell_at, mass=stage.contract.mass, dt=stage.dt)
+    return exam.grade(
+        signals, last_position=stage.qpos()[:, :2], fell_at=fell_at, mass=stage.contract.mass, dt=stage.dt
+    )
 
 
 def run_skill(folder: Path, skill: Skill | None = None, threads: int = 0, edited: bool = False) -> dict[str, Any]:
     """Grade the export in ``folder`` by ``skill``, else by what its contract names. ``edited``: see DeployStage."""
     skill = skill or contract_skill(read_contract(folder, edited))
-    return skill.result({name: skill.judge(*perform(folder, skill, ground, threads, edited)) for name, ground in skill.grounds.items()})
+    return skill.result(
+        {name: skill.judge(*perform(folder, skill, ground, threads, edited)) for name, ground in skill.grounds.items()}
+    )
 
 
 def contract_skill(contract: Contract) -> Skill:
@@ -72,9 +81,13 @@ def contract_skill(contract: Contract) -> Skill:
         raise ContractError(f"{CONTRACT_FILE}: {error}") from error
 
 
-def perform(folder: Path, skill: Skill, ground: Ground, threads: int = 0, edited: bool = False) -> tuple[Robot, Recording]:
+def perform(
+    folder: Path, skill: Skill, ground: Ground, threads: int = 0, edited: bool = False
+) -> tuple[Robot, Recording]:
     """Put robots into their starts on ``ground`` and let the policy act."""
-    stage = DeployStage(folder, skill.robots, threads=threads, change=lambda model: put_on(model, ground), edited=edited)
+    stage = DeployStage(
+        folder, skill.robots, threads=threads, change=lambda model: put_on(model, ground), edited=edited
+    )
     said, follower = stage.contract.motion, stage.controller.follower
     motion = Motion(follower.clip.qpos(), said.bodies, said.anchor) if said and follower else None
     robot = Robot(stage.fleet.model, stage.qpos()[0], stage.dt, motion)
@@ -111,13 +124,17 @@ def contract_rules(contract: Contract, common: bool = False) -> ExamRules:
     """The rules for an export: the section ``exam`` of its contract, if it has one, the trained ranges, and how many feet it has."""
     trained = {command.name: (command.low, command.high) for command in contract.commands}
     if missing := [name for name in VELOCITY if name not in trained]:
-        raise ContractError(f"{CONTRACT_FILE}: the walking exam needs the commands {', '.join(VELOCITY)}; missing: {', '.join(missing)}")
+        raise ContractError(
+            f"{CONTRACT_FILE}: the walking exam needs the commands {', '.join(VELOCITY)}; missing: {', '.join(missing)}"
+        )
     section, known = dict(contract.exam or {}), [field.name for field in fields(ExamRules)]
     for name in section:
         if name not in known:
             raise ContractError(f"{CONTRACT_FILE}: exam: {unknown('field', name, known, 'the walking exam')}")
     try:
-        return ExamRules.from_mapping(section | (in_common(section.get("peer", "")) if common else {}), trained, len(contract.feet))
+        return ExamRules.from_mapping(
+            section | (in_common(section.get("peer", "")) if common else {}), trained, len(contract.feet)
+        )
     except (AttributeError, TypeError, ValueError) as error:
         raise ContractError(f"{CONTRACT_FILE}: exam: {error}") from error
 

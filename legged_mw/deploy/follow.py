@@ -29,12 +29,15 @@ class Follower:
         assert contract.motion
         file = folder / MOTION_FILE
         if not file.is_file() or digest(file) != contract.motion.digest:
-            raise ContractError(f"{file} is missing, or not the motion that the policy was exported with; export the policy again")
+            raise ContractError(
+                f"{file} is missing, or not the motion that the policy was exported with; export the policy again"
+            )
         self.clip: Clip = read_clip(file).at(1.0 / contract.period).of(contract.joints, MOTION_FILE)
         self._model = compile_scene(part(folder, SCENE_FILE))
         self._data, self._anchor = mujoco.MjData(self._model), self._model.body(contract.motion.anchor).id
         self._angles = [int(self._model.joint(name).qposadr[0]) for name in contract.joints]
-        speed = np.concatenate([self.clip.qvel()[:, 6:], np.zeros((1, len(contract.joints)))])  # the last frame is held at rest
+        # the last frame is held at rest
+        speed = np.concatenate([self.clip.qvel()[:, 6:], np.zeros((1, len(contract.joints)))])
         self._joints = np.concatenate([self.clip.joint_pos, self.clip.joint_pos[-1:]]), speed
         place, turn = self._anchors(self.clip.root_pos, self.clip.root_quat, self.clip.joint_pos)
         self._place, self._turn = np.concatenate([place, place[-1:]]), np.concatenate([turn, turn[-1:]])
@@ -66,7 +69,10 @@ class Follower:
         frame = np.minimum(self._now(), len(self.clip.root_pos) - 1)
         states = np.zeros((len(frame), self._model.nq))
         states[:, :3] = _rotate(self._heading, self.clip.root_pos[frame]) + self._shift
-        states[:, 3:7], states[:, self._angles] = multiply(self._heading, self.clip.root_quat[frame]), self.clip.joint_pos[frame]
+        states[:, 3:7], states[:, self._angles] = (
+            multiply(self._heading, self.clip.root_quat[frame]),
+            self.clip.joint_pos[frame],
+        )
         return states
 
     def _now(self) -> NDArray[np.int64]:

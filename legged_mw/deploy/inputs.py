@@ -173,7 +173,11 @@ class Keys:
             elif key in self._DRIVE:
                 self._pilot.press(key)
         self._pilot.listen()
-        return Wish(pressed, self._pilot.command if self._pilot.driving else None, stop or ("the terminal is gone" if self._closed else ""))
+        return Wish(
+            pressed,
+            self._pilot.command if self._pilot.driving else None,
+            stop or ("the terminal is gone" if self._closed else ""),
+        )
 
     def let_go(self) -> None:
         self._pilot.driving, self._pilot.command = False, self._pilot.default.copy()

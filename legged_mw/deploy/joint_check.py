@@ -25,7 +25,8 @@ from legged_mw.deploy.states import CHECK, DAMPING, SOFT, ZERO, Order, States
 STEP = 0.1  # [rad] that a joint is asked to move
 SETTLE, RAMP, REST = 2.0, 0.8, 0.6  # [s] ours: until all joints are held; from a pose to the next; after each joint
 SOFTLY, HOLD = 0.4, 1.2  # [s] ours, there: before it gets stiffer; before it is judged
-STIFFEN = 1.5  # [share of the stiffness a second] while nothing moves far enough: friction and weight, which a tenth may not overcome
+# [share of the stiffness a second] while nothing moves far enough: friction and weight, which a tenth may not overcome
+STIFFEN = 1.5
 CLOSE, MOVED, FAR = 0.07, 0.03, 0.3  # [rad] ours: moved far enough; moved at all; so far that the check ends
 LEAN, ALONG = 2e-3, 0.3  # [rad] ours: of tilt that tells; cosine from which a tilt is as the joint tilts the body
 HEAVY = 0.4  # [share of the mass] ours: on one side of a joint from which the tilt does not tell: of a waist
@@ -48,10 +49,19 @@ class JointCheck(States):
 
     first = CHECK
 
-    def __init__(self, controller: Controller, sources: Sequence[Source], say: Callable[[str], None], robot: Robot, limits: Limits) -> None:
+    def __init__(
+        self,
+        controller: Controller,
+        sources: Sequence[Source],
+        say: Callable[[str], None],
+        robot: Robot,
+        limits: Limits,
+    ) -> None:
         """Raises RobotError if this robot cannot be moved softly."""
         if not robot.can_change_gains:
-            raise RobotError(f"--check_joints is soft, and {type(robot).__name__} cannot change its gains: no joint was moved")
+            raise RobotError(
+                f"--check_joints is soft, and {type(robot).__name__} cannot change its gains: no joint was moved"
+            )
         rest, self.rows = np.array([each.default for each in controller.contract.commands]), list[Row]()
         super().__init__(controller, sources, lambda _: rest, say)
         self.joints, self._limits, self._motors, self._moves = controller.contract.joints, limits, robot.motors, None
@@ -70,7 +80,11 @@ class JointCheck(States):
         if self._moves is None:
             if self.state != ZERO or START not in self._pressed or END in self._pressed:
                 return super().step(measured, now)
-            self._enter(CHECK, now, f"each joint goes {STEP} rad and back; {END} if another one moves than the one that is named")
+            self._enter(
+                CHECK,
+                now,
+                f"each joint goes {STEP} rad and back; {END} if another one moves than the one that is named",
+            )
             self.note, self._moves = "all joints are held", self._check(measured)
             return next(self._moves)
         if END in self._pressed:
@@ -96,7 +110,9 @@ class JointCheck(States):
             measured = yield self._order(pose, held * (step + 1) / settle)
             if np.abs(away := measured.joint_pos - pose).max() > FAR:
                 joint = int(np.abs(away).argmax())
-                self._tell(f"{self.joints[joint]} was held where it was and went {away[joint]:+.2f} rad: WRONG JOINT or WRONG SIGN")
+                self._tell(
+                    f"{self.joints[joint]} was held where it was and went {away[joint]:+.2f} rad: WRONG JOINT or WRONG SIGN"
+                )
                 return
         for joint in range(len(self.joints)):
             yield from self._one(joint, pose)
@@ -126,7 +142,9 @@ class JointCheck(States):
             to[joint] = pose[joint] + step * max(0.0, 1.0 - (tick + 1) / ramp)
             gains[joint] += (1.0 - gains[joint]) / max(1, ramp - tick)
             back = yield self._order(to, gains)
-        self.rows.append(Row(joint, step, moved, took, self._verdict(joint, step, moved, self._tilts(joint, before, there, back))))
+        self.rows.append(
+            Row(joint, step, moved, took, self._verdict(joint, step, moved, self._tilts(joint, before, there, back)))
+        )
 
     def _order(self, targets: Floats, share: Floats) -> Order:
         contract = self.controller.contract
@@ -165,7 +183,9 @@ class JointCheck(States):
         tilts = [there.gravity - then.gravity for then in (before, back)]
         sizes = [float(np.linalg.norm(tilt)) for tilt in tilts]
         tells = mass[body] < HEAVY * mass[1] and min(sizes) > LEAN
-        return not tells or any(t @ shift > ALONG * n * np.linalg.norm(shift) for t, n in zip(tilts, sizes, strict=True))
+        return not tells or any(
+            t @ shift > ALONG * n * np.linalg.norm(shift) for t, n in zip(tilts, sizes, strict=True)
+        )
 
     def _motor(self, joint: int, form: str = "{}") -> str:
         return form.format(self._motors[self.joints[joint]]) if self._motors else ""
@@ -181,9 +201,19 @@ class JointCheck(States):
             most = f"{self.joints[other]} {moved[other]:+.3f}" if abs(moved[other]) >= 0.001 else "-"
             own = f"{moved[joint]:+.3f}"
             lines.append(
-                form.format(self.joints[joint], self._motor(joint) or "-", f"{asked:+.2f}", own, f"{stiffness:.0%}", most, verdict)
+                form.format(
+                    self.joints[joint],
+                    self._motor(joint) or "-",
+                    f"{asked:+.2f}",
+                    own,
+                    f"{stiffness:.0%}",
+                    most,
+                    verdict,
+                )
             )
         wrong = [self.joints[row.joint] for row in self.rows if row.verdict != "right"]
-        said = f"{len(self.rows)} of {len(self.joints)} joints checked" + (f"; wrong: {', '.join(wrong)}" if wrong else "")
+        said = f"{len(self.rows)} of {len(self.joints)} joints checked" + (
+            f"; wrong: {', '.join(wrong)}" if wrong else ""
+        )
         early = "" if len(self.rows) == len(self.joints) else f"; ended early: {self.note}"
         return "\n".join(["", *lines, said + (early or ("" if wrong else "; none is wrong"))])

@@ -48,7 +48,9 @@ class LogError(UserError, ValueError):
 
 def log_path(contract: Contract, folder: Path = Path("logs/deploy")) -> Path:
     """Where a run is logged that was not told where."""
-    return folder / f"{check_name(contract.task, f'{CONTRACT_FILE}: task')}_{time.strftime('%Y-%m-%d_%H-%M-%S')}{SUFFIX}"
+    return (
+        folder / f"{check_name(contract.task, f'{CONTRACT_FILE}: task')}_{time.strftime('%Y-%m-%d_%H-%M-%S')}{SUFFIX}"
+    )
 
 
 def _columns(contract: Contract) -> dict[str, int]:
@@ -66,7 +68,9 @@ def _columns(contract: Contract) -> dict[str, int]:
 class Log:
     """Writes a run's log; a thread of its own compresses and writes, so a step only copies numbers."""
 
-    def __init__(self, path: Path, contract: Contract, folder: Path, robot: str, say: Callable[[str], None] = print) -> None:
+    def __init__(
+        self, path: Path, contract: Contract, folder: Path, robot: str, say: Callable[[str], None] = print
+    ) -> None:
         """Begin the file. Raises LogError if it cannot be written. ``say`` is told, once, if that ends later."""
         self.path, self.contract, self._say = path, contract, say
         self.broken = ""  # why nothing more can be written
@@ -75,7 +79,13 @@ class Log:
             self._file = path.open("xb")
         except OSError as error:
             raise LogError(f"cannot write the log {path}: {error.strerror}; say --log FILE, or --log off") from None
-        said = {"format": FORMAT, "task": contract.task, "network": contract.digest, "robot": robot, "export": str(folder.resolve())}
+        said = {
+            "format": FORMAT,
+            "task": contract.task,
+            "network": contract.digest,
+            "robot": robot,
+            "export": str(folder.resolve()),
+        }
         self._blocks: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
         header = json.dumps({**said, "began": time.strftime("%Y-%m-%d %H:%M:%S"), "contract": contract.to_dict()})
         files = {name: np.fromfile(folder / name, np.uint8) for name in EXPORT if (folder / name).is_file()}
@@ -86,7 +96,9 @@ class Log:
         self._thread = threading.Thread(target=self._write, name="log", daemon=True)
         self._thread.start()
 
-    def add(self, loop: Loop, controller: Controller, measured: Measurement, health: Health, order: Order, command: Floats) -> None:
+    def add(
+        self, loop: Loop, controller: Controller, measured: Measurement, health: Health, order: Order, command: Floats
+    ) -> None:
         """One step. What there was none of is NaN."""
         nothing, contract = np.nan, self.contract
         targets, acts = order.targets is not None, order.state == POLICY
@@ -94,9 +106,16 @@ class Log:
         damping = contract.damping if order.damping is None else order.damping
         values = {
             **{"time": loop.now, "behind": loop.behind, "work": loop.work, "state": STATES.index(order.state)},
-            **{"age": _or_nan(health.age_s), "voltage": _or_nan(health.voltage), "temperature": _or_nan(health.temperatures)},
+            **{
+                "age": _or_nan(health.age_s),
+                "voltage": _or_nan(health.voltage),
+                "temperature": _or_nan(health.temperatures),
+            },
             **{"command": command, "observation": controller.last_observation[0] if acts else nothing},
-            **{"action": controller.last_actions[0] if acts else nothing, "wanted": controller.last_targets[0] if acts else nothing},
+            **{
+                "action": controller.last_actions[0] if acts else nothing,
+                "wanted": controller.last_targets[0] if acts else nothing,
+            },
             "target": order.targets if targets else nothing,  # as the servos got it
             **{"stiffness": stiffness if targets else nothing, "damping": damping if targets else nothing},
             ESTIMATE: _believed(controller) if acts else nothing,
@@ -104,7 +123,9 @@ class Log:
         for name, column in self._rows.items():
             value = values.get(name)
             column[self._count] = (
-                (measured.others[name] if name in measured.others else getattr(measured, name)) if value is None else value
+                (measured.others[name] if name in measured.others else getattr(measured, name))
+                if value is None
+                else value
             )
         self._count += 1
         if self._count == CHUNK:
@@ -124,7 +145,9 @@ class Log:
     def _begin(self) -> None:
         self._count, self._events = 0, []
         sizes = _columns(self.contract).items()
-        self._rows = {name: np.empty((CHUNK, size), np.float64 if name == "time" else np.float32) for name, size in sizes}
+        self._rows = {
+            name: np.empty((CHUNK, size), np.float64 if name == "time" else np.float32) for name, size in sizes
+        }
 
     def backlog(self) -> int:
         """Blocks that wait to be written."""
@@ -184,7 +207,11 @@ def read_log(path: Path) -> Recording:
         first, *blocks = _blocks(path)
         header = json.loads(str(first["header"]))
         files = {name: first[name].tobytes() for name in EXPORT if name in first}
-        rows = {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0] if name != "events"} if blocks else {}
+        rows = (
+            {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0] if name != "events"}
+            if blocks
+            else {}
+        )
         events = [(float(now), str(text)) for block in blocks for now, text in json.loads(str(block["events"]))]
         fits = header["format"] == FORMAT
     except OSError as error:

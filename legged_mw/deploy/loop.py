@@ -20,7 +20,8 @@ LATE = 0.5  # [periods] by which a step may begin late before it is counted
 KEPT = 1 << 16  # samples for median and p99: 22 minutes at 50 Hz; the worst is of the whole run
 _PRIORITY = 20  # ours, of 1 to 99: above all that is not real time, below a kernel's own threads
 _YIELD = 5e-4  # [s] for which another thread may keep the interpreter; Python's own 5 ms would be a late step
-_SPARE = 0.003  # [s] of waiting that must be left for a collection: it takes 0.1 ms, as frozen objects are not looked at
+# [s] of waiting that must be left for a collection: it takes 0.1 ms, as frozen objects are not looked at
+_SPARE = 0.003
 
 
 class Spread(NamedTuple):
@@ -120,7 +121,8 @@ class Loop:
                 gc.enable()
             if self._scheduled:
                 policy, parameters = self._scheduled
-                os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, parameters)  # only root may take that flag back
+                # only root may take that flag back
+                os.sched_setscheduler(0, policy | os.SCHED_RESET_ON_FORK, parameters)
 
     def ticks(self, seconds: float = math.inf) -> Iterator[float]:
         """The time [s] of each step for ``seconds``, when it is due, or at once if it is late.

@@ -30,6 +30,8 @@ class Memory(NamedTuple):
 def read_memory(section: Reader) -> Memory:
     """From the contract's reader of the section."""
     wanted = "two whole numbers from 1: states and the size of each"
-    shape = section.take("shape", wanted, lambda v: isinstance(v, list) and len(v) == 2 and all(type(n) is int and n >= 1 for n in v))
+    shape = section.take(
+        "shape", wanted, lambda v: isinstance(v, list) and len(v) == 2 and all(type(n) is int and n >= 1 for n in v)
+    )
     section.take("shape", f"{MOST_VALUES} values at most", lambda v: v[0] * v[1] <= MOST_VALUES)
     return Memory(section.text("input"), section.text("output"), tuple(shape))

@@ -37,7 +37,8 @@ from legged_mw.view.stage import ViewError
 
 RATE = 25.0  # [Hz] of pictures
 START = 30.0  # [s] for a viewer to open
-ACTIONS = {"reset": "Damp", "camera": "", "help": ""}  # the only actions, each with its label; "": the label of BINDINGS
+# the only actions, each with its label; "": the label of BINDINGS
+ACTIONS = {"reset": "Damp", "camera": "", "help": ""}
 DAMP = b"damp"
 _PARTS = ("joint_pos", "gravity", "ang_vel", "lin_vel", "foot_contact")  # of a measurement
 FLAGS = ("viewer", "camera", "host", "port")
@@ -56,7 +57,8 @@ class Mirror:
         with theirs:
             settings["channel"] = theirs.fileno()
             command = [sys.executable, "-c", program, json.dumps(settings)]
-            self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), start_new_session=True)  # Ctrl-C must not end it
+            # Ctrl-C must not end it
+            self._process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), start_new_session=True)
         problem = self._problem()
         self._channel.setblocking(False)
         if problem:
@@ -133,7 +135,12 @@ class MirroredStage:
         mujoco.mj_resetDataKeyframe(self._model, self._data, 0)
         self.command_table, self._parent = self.contract.commands, os.getppid()
         # the foot of each geom of the feet, in the order of the sensors
-        self._foot = [foot for _, foot in sorted((at, foot) for foot, places in enumerate(scene.contacts) for at in set(places.tolist()))]
+        self._foot = [
+            foot
+            for _, foot in sorted(
+                (at, foot) for foot, places in enumerate(scene.contacts) for at in set(places.tolist())
+            )
+        ]
         self.latest: dict[str, Any] = {"command": None, "state": "", "note": "nothing was measured yet"}
 
     def step(self, commands: Floats | None) -> None:
@@ -156,7 +163,9 @@ class MirroredStage:
         return np.array([self.latest["command"] or [each.default for each in self.command_table]])
 
     def velocity(self) -> Floats:
-        return np.nan_to_num(np.array([[*self.latest.get("lin_vel", [0.0, 0.0])[:2], self.latest.get("ang_vel", [0.0])[-1]]]))
+        return np.nan_to_num(
+            np.array([[*self.latest.get("lin_vel", [0.0, 0.0])[:2], self.latest.get("ang_vel", [0.0])[-1]]])
+        )
 
     def believed_velocity(self) -> None:
         return None
@@ -193,8 +202,17 @@ class MirrorSession(Session):
     def _lines(self, command: Floats, velocity: Floats) -> tuple[tuple[str, str], ...]:
         latest = self.stage.latest
         followed = signed(command) if latest["command"] else "-"
-        lines = [("state", latest["state"]), ("", latest["note"]), ("command", followed), ("measured", signed(velocity))]
-        for name, key, form in (("battery", "voltage", "{:.1f} V"), ("hottest", "hottest", "{:.0f} deg C"), ("time", "time", "{:.1f} s")):
+        lines = [
+            ("state", latest["state"]),
+            ("", latest["note"]),
+            ("command", followed),
+            ("measured", signed(velocity)),
+        ]
+        for name, key, form in (
+            ("battery", "voltage", "{:.1f} V"),
+            ("hottest", "hottest", "{:.0f} deg C"),
+            ("time", "time", "{:.1f} s"),
+        ):
             lines += [(name, form.format(latest[key]))] if latest.get(key) is not None else []
         return tuple(lines)
 

@@ -29,7 +29,11 @@ class Motors(NamedTuple):
 
     def to_dict(self) -> dict[str, Any]:
         """The section; nothing for servos."""
-        curve = {"stall_torque": list(self.stall_torque), "no_load_speed": list(self.no_load_speed)} if self.stall_torque else {}
+        curve = (
+            {"stall_torque": list(self.stall_torque), "no_load_speed": list(self.no_load_speed)}
+            if self.stall_torque
+            else {}
+        )
         network = {"file": MOTORS_FILE, "sha256": self.digest} if self.digest else {}
         return {MOTORS: {"law": self.law, **curve, **network}} if self.law != "servo" else {}
 
@@ -75,5 +79,7 @@ def make_network(folder: Path, motors: Motors, count: int, joints: int) -> Netwo
     if not (folder / MOTORS_FILE).is_file():
         raise ContractError(f"no {MOTORS_FILE} in {folder}, the network of its motors; export the policy again")
     if digest(folder / MOTORS_FILE) != motors.digest:
-        raise ContractError(f"{MOTORS_FILE} is not the file that policy.yaml was written for: its SHA-256 differs; export the policy again")
+        raise ContractError(
+            f"{MOTORS_FILE} is not the file that policy.yaml was written for: its SHA-256 differs; export the policy again"
+        )
     return NetworkMotors(read_network(folder / MOTORS_FILE), count, joints)

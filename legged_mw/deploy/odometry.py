@@ -27,7 +27,8 @@ ROW = "lin_vel"  # ContractRow.measured of the velocity
 # slower to notice what no accelerometer feels: a shock between two measurements.
 DRIFT = 4.0  # [m/s^2] noise of the accelerometer over a period
 STANDING = 0.2  # [m/s] noise of the velocity of a foot that stands
-DOUBT = {"measured": 0.5, "torque": 0.3, "height": 0.3}  # [m/s] from which a foot that moves counts half, by how sure its contact is
+# [m/s] from which a foot that moves counts half, by how sure its contact is
+DOUBT = {"measured": 0.5, "torque": 0.3, "height": 0.3}
 CONTACTS = tuple(DOUBT)  # how a foot on the ground is found
 LOADED = 0.1  # [weights] of a foot's force from which it stands, by its joints' torques
 CARRIES = 0.6  # [weights] of all feet together from which a robot stands by itself: on no belly, on no rope
@@ -50,7 +51,12 @@ class Odometry:
         """``contact``: of CONTACTS. Raises ContractError."""
         if not contract.feet:
             raise ContractError(f"{CONTRACT_FILE}: robot: feet is empty; leg odometry needs feet")
-        self.contract, self.contact, self._doubt, scene = contract, contact, DOUBT[contact], read_scene(folder, contract)
+        self.contract, self.contact, self._doubt, scene = (
+            contract,
+            contact,
+            DOUBT[contact],
+            read_scene(folder, contract),
+        )
         self.model, self._dofs = scene.model, scene.dofs
         self._data = mujoco.MjData(self.model)
         self._angles = [int(self.model.joint(name).qposadr[0]) for name in contract.joints]
@@ -68,7 +74,9 @@ class Odometry:
 
     def __call__(self, measured: Measurement) -> Measurement:
         """``measured`` of N robots (or of one, without the leading axis) with the estimate in the place of its velocity."""
-        gyro, gravity, felt = (np.atleast_2d(each) for each in (measured.ang_vel, measured.gravity, measured.acceleration))
+        gyro, gravity, felt = (
+            np.atleast_2d(each) for each in (measured.ang_vel, measured.gravity, measured.acceleration)
+        )
         felt_before = np.where(np.isfinite(self._shock), self._shock, felt)
         self._shock = felt.copy()
         pull = 0.5 * (felt + felt_before) + self._gravity * gravity
@@ -118,10 +126,14 @@ class Odometry:
         found = np.linalg.lstsq(slopes.reshape(-1, slopes.shape[2]), np.cross(place, axis).ravel(), rcond=0.01)[0]
         return np.array(found, dtype=float)
 
-    def _legs(self, angles: Floats, speeds: Floats, torques: Floats, gyro: Floats, gravity: Floats) -> tuple[Floats, Floats, Floats]:
+    def _legs(
+        self, angles: Floats, speeds: Floats, torques: Floats, gyro: Floats, gravity: Floats
+    ) -> tuple[Floats, Floats, Floats]:
         """Of one robot, without the leading axis."""
         place, slopes = self._feet_of(angles, gravity)
-        wrench = np.linalg.solve(slopes @ slopes.transpose(0, 2, 1) + 1e-4 * np.eye(3), (slopes @ torques)[..., None])[..., 0]
+        wrench = np.linalg.solve(slopes @ slopes.transpose(0, 2, 1) + 1e-4 * np.eye(3), (slopes @ torques)[..., None])[
+            ..., 0
+        ]
         return place, -(np.cross(gyro, place) + slopes @ speeds), wrench @ gravity
 
     def _feet_of(self, angles: Floats, gravity: Floats) -> tuple[Floats, Floats]:

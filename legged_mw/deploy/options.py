@@ -25,18 +25,28 @@ _OF_A_ROBOT, _OF_SERVING = ("interface", "domain"), ("remote", "fault", "watchdo
 def add_flags(parser: argparse.ArgumentParser) -> None:
     """Add --robot, --serve and what goes with them."""
     parser.add_argument("--robot", choices=ROBOTS, default="simulated", help="unitree: a Go2 or G1 at --interface")
-    parser.add_argument("--serve", choices=ROBOTS[1:], help="simulate such a robot at --interface, for --robot to drive")
-    parser.add_argument("--interface", metavar="IF", help="network interface of the robot: eth0, or lo for one that is served here")
+    parser.add_argument(
+        "--serve", choices=ROBOTS[1:], help="simulate such a robot at --interface, for --robot to drive"
+    )
+    parser.add_argument(
+        "--interface", metavar="IF", help="network interface of the robot: eth0, or lo for one that is served here"
+    )
     parser.add_argument("--domain", type=int, metavar="N", help="DDS domain (default: 0, as robots have it; on lo 1)")
-    velocity = "where a policy's base_lin_vel is from: truth of a simulated robot (its default), or odometry of legs and IMU"
+    velocity = (
+        "where a policy's base_lin_vel is from: truth of a simulated robot (its default), or odometry of legs and IMU"
+    )
     parser.add_argument("--velocity", choices=(TRUTH, ODOMETRY), help=velocity)
     contact = "how odometry finds feet on the ground (default: measured where the robot does, else torque)"
     parser.add_argument("--contact", choices=CONTACTS, help=contact)
     served = parser.add_argument_group("with --serve")
-    served.add_argument("--remote", metavar="FILE", help="a YAML script of its remote (default: the keys of this terminal)")
+    served.add_argument(
+        "--remote", metavar="FILE", help="a YAML script of its remote (default: the keys of this terminal)"
+    )
     fault = "what goes wrong, and when: delay=10,loss=5 or low_battery@8, again for more (docs/faults.md has them all)"
     served.add_argument("--fault", action="append", metavar="NAME[=VALUE][@S]", help=fault)
-    served.add_argument("--watchdog", type=float, metavar="S", help="it damps after S seconds without a command (default: never)")
+    served.add_argument(
+        "--watchdog", type=float, metavar="S", help="it damps after S seconds without a command (default: never)"
+    )
 
 
 def check_flags(args: argparse.Namespace) -> None:
@@ -49,17 +59,23 @@ def check_flags(args: argparse.Namespace) -> None:
         if not args.serve and getattr(args, name) is not None:
             raise UserError(f"--{name} is of a robot that is simulated for others: add --serve unitree")
     if args.watchdog is not None and not args.watchdog > 0.0:
-        raise UserError(f"--watchdog {args.watchdog:g}: a time of more than 0 s; without the flag it never damps by itself")
+        raise UserError(
+            f"--watchdog {args.watchdog:g}: a time of more than 0 s; without the flag it never damps by itself"
+        )
     if args.contact and args.velocity != ODOMETRY:
         raise UserError(f"--contact is of leg odometry: add --velocity {ODOMETRY}")
     if args.velocity and (args.serve or (args.velocity == TRUTH and wire)):
-        raise UserError(f"--velocity {args.velocity}: " + ("it is of the program that drives" if args.serve else NO_TRUTH))
+        raise UserError(
+            f"--velocity {args.velocity}: " + ("it is of the program that drives" if args.serve else NO_TRUTH)
+        )
     if not wire:
         return
     if args.serve and args.robot != "simulated":
         raise UserError("--serve is the robot and --robot drives one: start them as two programs")
     if args.interface is None:
-        raise UserError("say on which network the robot is: --interface eth0, or --interface lo for one that --serve simulates here")
+        raise UserError(
+            "say on which network the robot is: --interface eth0, or --interface lo for one that --serve simulates here"
+        )
     given = {name: getattr(args, name) for name in ("eval", "terrain", "video", "sheet")}
     given |= {"num_envs": args.num_envs != 1, "viewer": args.serve and args.viewer != "auto"}
     others = [name for name, value in given.items() if value]
@@ -74,7 +90,10 @@ def serve(folder: Path, contract: Contract, args: argparse.Namespace) -> None:
 
     need_dds()
     faults = parse_faults(args.fault or [], contract.joints)
-    script, keys = handset.load_remote(Path(args.remote)) if args.remote else [], args.remote is None and sys.stdin.isatty()
+    script, keys = (
+        handset.load_remote(Path(args.remote)) if args.remote else [],
+        args.remote is None and sys.stdin.isatty(),
+    )
     if keys:
         print(handset.KEYS_HELP)
     with closing(handset.Handset(script, keys)) as hand:
@@ -96,12 +115,17 @@ def contact(args: argparse.Namespace, contract: Contract) -> str | None:
         return None
     feels = args.robot == "simulated" or bool(machine_of(contract.joints).feet)
     if args.contact == CONTACTS[0] and not feels:
-        raise UserError(f"--contact {args.contact}: this robot does not measure it; there are: {', '.join(CONTACTS[1:])}")
+        raise UserError(
+            f"--contact {args.contact}: this robot does not measure it; there are: {', '.join(CONTACTS[1:])}"
+        )
     return args.contact or CONTACTS[not feels]
 
 
 def connect(folder: Path, contract: Contract, args: argparse.Namespace) -> UnitreeRobot:
     """The robot on the wire."""
     robot = client.connect(folder, contract, args.interface, args.domain, odometry=args.velocity == ODOMETRY)
-    print(f"{robot.machine.name} at {args.interface}: {len(contract.joints)} joints, {robot.health().voltage or 0:.1f} V", flush=True)
+    print(
+        f"{robot.machine.name} at {args.interface}: {len(contract.joints)} joints, {robot.health().voltage or 0:.1f} V",
+        flush=True,
+    )
     return robot

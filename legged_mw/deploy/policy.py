@@ -37,9 +37,12 @@ class Network:
         options.intra_op_num_threads = options.inter_op_num_threads = 1  # a network this small loses by a second
         options.log_severity_level = self._run.log_severity_level = 4
         network = (folder / NETWORK_FILE).read_bytes()
-        self._session = self._first(lambda: onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"]), "read")
+        self._session = self._first(
+            lambda: onnxruntime.InferenceSession(network, options, providers=["CPUExecutionProvider"]), "read"
+        )
         memory, guessed = contract.memory, sum(row.size for row in contract.estimate)
-        self._inputs = {contract.input: [contract.size]} | ({memory.input: [*memory.shape]} if memory else {})  # name -> shape
+        # name -> shape
+        self._inputs = {contract.input: [contract.size]} | ({memory.input: [*memory.shape]} if memory else {})
         self._outputs = {contract.output: [len(contract.joints)]} | ({memory.output: [*memory.shape]} if memory else {})
         self._outputs |= {ESTIMATE: [guessed]} if guessed else {}
         self._one_by_one = self._check(contract)
@@ -51,10 +54,14 @@ class Network:
         try:
             return contained(work, _FIRST_SECONDS, _FIRST_ROOM, stop=lambda: setattr(self._run, "terminate", True))
         except TimeoutError:
-            raise ContractError(f"{NETWORK_FILE} cannot be {what}: its first call takes longer than {_FIRST_SECONDS:g} s") from None
+            raise ContractError(
+                f"{NETWORK_FILE} cannot be {what}: its first call takes longer than {_FIRST_SECONDS:g} s"
+            ) from None
         except Exception as error:  # onnxruntime raises a type of its own for each way that a file is broken
             if isinstance(error, MemoryError) or "alloc" in str(error):
-                raise ContractError(f"{NETWORK_FILE} cannot be {what}: it asks for more than {_FIRST_ROOM >> 30} GiB") from None
+                raise ContractError(
+                    f"{NETWORK_FILE} cannot be {what}: it asks for more than {_FIRST_ROOM >> 30} GiB"
+                ) from None
             text = "cannot be read as an ONNX network" if what == "read" else "cannot be run"
             raise ContractError(f"{NETWORK_FILE} {text}: it is damaged; export the policy again") from None
 
@@ -65,7 +72,9 @@ class Network:
         for (name, shape), value in zip(self._outputs.items(), found, strict=True):
             if np.shape(value) != (1, *shape) or not np.isfinite(value).all():
                 got = np.shape(value) if np.shape(value) != (1, *shape) else "what is not finite"
-                raise ContractError(f"{NETWORK_FILE}: its output '{name}' for an observation of zeros is {got}; export the policy again")
+                raise ContractError(
+                    f"{NETWORK_FILE}: its output '{name}' for an observation of zeros is {got}; export the policy again"
+                )
 
     def _check(self, contract: Contract) -> bool:
         """Inputs and outputs of the contract's names and sizes; returns whether the batch is fixed to 1."""
@@ -84,9 +93,16 @@ class Network:
         return self._session.get_inputs()[0].shape[0] == 1
 
     def __call__(self, *inputs: Floats) -> Any:
-        whole = {name: np.ascontiguousarray(value, dtype=np.float32) for name, value in zip(self._inputs, inputs, strict=True)}
+        whole = {
+            name: np.ascontiguousarray(value, dtype=np.float32)
+            for name, value in zip(self._inputs, inputs, strict=True)
+        }
         count = len(inputs[0])
-        batches = [{name: value[i : i + 1] for name, value in whole.items()} for i in range(count)] if self._one_by_one else [whole]
+        batches = (
+            [{name: value[i : i + 1] for name, value in whole.items()} for i in range(count)]
+            if self._one_by_one
+            else [whole]
+        )
         found = [self._session.run([*self._outputs], batch) for batch in batches]
         outputs = dict(zip(self._outputs, (np.concatenate(parts) for parts in zip(*found, strict=True)), strict=True))
         self.estimate = outputs.pop(ESTIMATE, None)
@@ -96,13 +112,16 @@ class Network:
 class Controller:
     """A policy at work on ``count`` robots: observations and joint targets as the contract states them, and the memory they need."""
 
-    def __init__(self, folder: Path, contract: Contract, count: int = 1, network: Callable[..., Any] | None = None) -> None:
+    def __init__(
+        self, folder: Path, contract: Contract, count: int = 1, network: Callable[..., Any] | None = None
+    ) -> None:
         """``network``: what stands for the one in ``folder``; see ``Network``."""
         self.folder, self.contract, self._network = folder, contract, network or Network(folder, contract)
         self.last_observation = np.zeros((count, contract.size), dtype=np.float32)
         self.last_actions = np.zeros((count, len(contract.joints)), dtype=np.float32)
         self.last_targets = np.tile(contract.default_pose, (count, 1))  # (N, D) [rad] the policy's own
-        self._frames = [np.zeros((count, row.history, row.size), dtype=np.float32) for row in contract.rows]  # as last observed
+        # as last observed
+        self._frames = [np.zeros((count, row.history, row.size), dtype=np.float32) for row in contract.rows]
         self._fresh = np.ones(count, dtype=bool)  # robots that have observed nothing since their reset
         self.clock = GaitClock(contract, count) if contract.gait else None
         self.follower = Follower(folder, contract, count) if contract.motion else None
@@ -131,7 +150,11 @@ class Controller:
             actions, self.memory = self._network(seen, self.memory)
         actions = np.where(np.isfinite(actions), actions, np.nan)  # a clipped infinity would look like a wish
         self.last_actions = np.clip(actions, -action.clip, action.clip)
-        origins = {"default": self.contract.default_pose, "joints": np.atleast_2d(measurement.joint_pos), "targets": self.last_targets}
+        origins = {
+            "default": self.contract.default_pose,
+            "joints": np.atleast_2d(measurement.joint_pos),
+            "targets": self.last_targets,
+        }
         self.last_targets = origins.get(action.origin, 0.0) + action.scale * self.last_actions.astype(np.float64)
         return action.held(self.last_targets)
 
@@ -162,7 +185,9 @@ class Controller:
         frames = []
         for row, before in zip(self.contract.rows, self._frames, strict=True):
             if row.measured in OWN and row.name not in measurement.others:
-                raise ContractError(f"the robot does not measure row '{row.name}': it must be in Measurement.others ({row.size} values)")
+                raise ContractError(
+                    f"the robot does not measure row '{row.name}': it must be in Measurement.others ({row.size} values)"
+                )
             value = measurement.others[row.name] if row.measured in OWN else computed.get(row.measured)
             value = np.atleast_2d(getattr(measurement, row.measured) if value is None else value)
             newest = (value * np.array(row.scale)).astype(np.float32)[:, None]

@@ -45,12 +45,16 @@ class Reader:
         return tuple(self.take(key, "a list of names", lambda v: is_list(v, lambda item: isinstance(item, str), empty)))
 
     def count(self, key: str, most: int = MOST_VALUES) -> int:
-        value = self.take(key, "a whole number from 1", lambda v: isinstance(v, int) and not isinstance(v, bool) and v >= 1)
+        value = self.take(
+            key, "a whole number from 1", lambda v: isinstance(v, int) and not isinstance(v, bool) and v >= 1
+        )
         return value if value <= most else self.take(key, f"{most} at most", lambda v: False)
 
     def number(self, key: str, low: float = -MOST, high: float = MOST) -> float:
         beyond = is_number(self.values.get(key)) and abs(self.values[key]) > MOST
-        limits = (f" from {low:g}" if beyond or low > -MOST else "") + (f" to {high:g}" if beyond or high < MOST else "")
+        limits = (f" from {low:g}" if beyond or low > -MOST else "") + (
+            f" to {high:g}" if beyond or high < MOST else ""
+        )
         return float(self.take(key, f"a number{limits}", lambda v: is_number(v) and low <= v <= high))
 
     def above_zero(self, key: str, high: float = MOST) -> float:
@@ -88,7 +92,8 @@ def compile_scene(file: Path) -> Any:
 
 
 def is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300  # a whole number may be no float
+    # a whole number may be no float
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e300
 
 
 def is_list(value: object, fits: Callable[[Any], bool], empty: bool = False) -> bool:

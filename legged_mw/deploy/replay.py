@@ -56,13 +56,17 @@ def replay(path: Path, folder: Path | None = None, edited: bool = False) -> Repl
     with tempfile.TemporaryDirectory() as own:
         for name, content in recording.files.items():
             (Path(own) / name).write_bytes(content)
-        return _replay(path, recording, folder or (Path(own) if recording.files else Path(recording.header["export"])), edited)
+        return _replay(
+            path, recording, folder or (Path(own) if recording.files else Path(recording.header["export"])), edited
+        )
 
 
 def _replay(path: Path, recording: Recording, folder: Path, edited: bool) -> Replay:
     contract = read_contract(folder, edited)
     if contract.digest != recording.header["network"]:
-        raise LogError(f"{shown(path)} is of another network than the one in {shown(folder)} ({recording.header['task']}); name its export")
+        raise LogError(
+            f"{shown(path)} is of another network than the one in {shown(folder)} ({recording.header['task']}); name its export"
+        )
     walked = _longest(recording.rows["state"][:, 0] == STATES.index(POLICY))
     if walked.stop - walked.start < SHORTEST:
         raise LogError(f"{shown(path)} holds no walk of {SHORTEST} steps: the policy was not on for so long")
@@ -79,7 +83,11 @@ def _longest(on: Any) -> slice:
 
 def _simulate(folder: Path, contract: Contract, rows: Rows) -> Rows:
     """The same steps on the simulated robot, until it falls."""
-    robot, controller, safety = MujocoRobot(folder, contract), Controller(folder, contract), Safety(contract, Limits.of(folder, contract))
+    robot, controller, safety = (
+        MujocoRobot(folder, contract),
+        Controller(folder, contract),
+        Safety(contract, Limits.of(folder, contract)),
+    )
     _pose(robot, {name: rows[name][0] for name in ("joint_pos", "joint_vel", "gravity", "lin_vel", "ang_vel")})
     found: dict[str, list[Floats]] = {name: [] for name in (*QUANTITIES, "target")}
     for command in rows["command"]:
@@ -116,7 +124,11 @@ def latency(rows: Rows, contract: Contract) -> Floats:
     torque = stiffness * (target - angle) - damping * speed, with the contract's stiffness; damping is fitted, as not every robot has it
     in its torque. Where no lag explains the torque, or the target hardly moves, it is NaN.
     """
-    columns = zip(*(rows[name].T for name in ("target", "joint_pos", "joint_vel", "joint_torque")), contract.stiffness, strict=True)
+    columns = zip(
+        *(rows[name].T for name in ("target", "joint_pos", "joint_vel", "joint_torque")),
+        contract.stiffness,
+        strict=True,
+    )
     return contract.period * np.array([_lag(*each) for each in columns])
 
 
@@ -181,10 +193,16 @@ def table(replayed: Replay) -> str:
         f"{'robot / simulated':<28}{'torque [N m]':>18}{'error [rad]':>18}{'latency [ms]':>18}",
     ]
     for i, name in enumerate(contract.joints):
-        lines.append(f"{name:<28}" + "".join(pair(key, i, n) for key, n in (("torque", 2), ("error", 3), ("latency", 0))))
+        lines.append(
+            f"{name:<28}" + "".join(pair(key, i, n) for key, n in (("torque", 2), ("error", 3), ("latency", 0)))
+        )
     lines += [f"{axis + ', mean':<28}{pair('velocity', i, 3)}" for i, axis in enumerate(AXES)]
     age = rows["age"][np.isfinite(rows["age"])]
-    for name, values in (("age of a measurement", age), ("work of a step", rows["work"]), ("step began late by", rows["behind"])):
+    for name, values in (
+        ("age of a measurement", age),
+        ("work of a step", rows["work"]),
+        ("step began late by", rows["behind"]),
+    ):
         if len(values):
             lines.append(f"{name:<28}{Spread.of(values)}")
     return "\n".join([*lines, *(f"{now:8.2f} s  {text}" for now, text in replayed.recording.events)])
@@ -202,7 +220,10 @@ def draw(replayed: Replay, path: Path) -> None:
     contract, rows, simulated = replayed.contract, replayed.robot, replayed.simulated
     figure = Figure((13, 11), layout="constrained")
     grid = figure.add_gridspec(4, 3)
-    figure.suptitle("\n".join([_title(replayed), *(f"{now:.2f} s  {text}" for now, text in replayed.recording.events[:4])]), fontsize=9)
+    figure.suptitle(
+        "\n".join([_title(replayed), *(f"{now:.2f} s  {text}" for now, text in replayed.recording.events[:4])]),
+        fontsize=9,
+    )
     time, made = rows["time"][:, 0], len(simulated["target"])
     _velocities([figure.add_subplot(grid[0, i]) for i in range(3)], contract, rows, simulated, time)
     both, where = (figures(rows, contract), figures(simulated, contract)), np.arange(len(contract.joints))
@@ -216,7 +237,9 @@ def draw(replayed: Replay, path: Path) -> None:
         axes.legend(fontsize=6)
     joint = int(np.argmax(np.abs(both[0]["torque"] - both[1]["torque"])))
     for i, (key, unit) in enumerate((("joint_pos", "rad"), ("joint_torque", "N m"))):
-        axes = figure.add_subplot(grid[2 + i, :2], title=f"{contract.joints[joint]} [{unit}]: the joint whose torque differs most")
+        axes = figure.add_subplot(
+            grid[2 + i, :2], title=f"{contract.joints[joint]} [{unit}]: the joint whose torque differs most"
+        )
         if key == "joint_pos":
             axes.plot(time, rows["target"][:, joint], color="0.6", linewidth=0.8, label="target")
         axes.plot(time, rows[key][:, joint], label="robot")

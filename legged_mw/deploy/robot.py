@@ -31,7 +31,9 @@ class Measurement:
     What no observation row of the contract needs may stay zero.
     """
 
-    lin_vel: Floats  # (3,) of the IMU, body frame (x forward, y left, z up) [m/s]; on a real robot from a state estimator
+    lin_vel: (
+        Floats  # (3,) of the IMU, body frame (x forward, y left, z up) [m/s]; on a real robot from a state estimator
+    )
     ang_vel: Floats  # (3,) gyro, body frame [rad/s]
     gravity: Floats  # (3,) direction of gravity, body frame, unit length: standing level it is (0, 0, -1)
     joint_pos: Floats  # (D,) [rad], the angle itself: the contract's default pose is taken off later
@@ -81,7 +83,9 @@ QUANTITIES = tuple(f.name for f in fields(Measurement) if f.name != "others")
 def layout(contract: Contract) -> dict[str, int]:
     """Values of each part of a measurement, the rows with sensors of their own last."""
     own = {row.name: row.size for row in contract.rows if row.measured in OWN and row.measured}
-    own |= ({ATTITUDE: 4} if contract.motion else {}) | ({POSITION: 3} if any(row.measured == PLACE for row in contract.rows) else {})
+    own |= ({ATTITUDE: 4} if contract.motion else {}) | (
+        {POSITION: 3} if any(row.measured == PLACE for row in contract.rows) else {}
+    )
     return {**{name: quantity_size(contract, name) for name in QUANTITIES}, **own}
 
 

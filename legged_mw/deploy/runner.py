@@ -55,7 +55,10 @@ def run(
     ``states``: begin at zero torque and do what they say, with their own commands; a trip or a fall damps and the run goes on.
     """
     safety = safety or Safety(controller.contract, Limits.of(controller.folder, controller.contract, robot.limits))
-    one, velocities = _Step(robot, controller, command, safety, states, log, odometry), _Velocities(controller.contract.period, seconds)
+    one, velocities = (
+        _Step(robot, controller, command, safety, states, log, odometry),
+        _Velocities(controller.contract.period, seconds),
+    )
     with ExitStack() as stack:
         for each in filter(None, (states, log)):
             stack.callback(each.close)
@@ -73,7 +76,9 @@ def run(
                     watch(now, measured)
         if log and live:
             log.event(loop.now, str(loop.timing()))
-    return replace(one.summary, velocity=velocities.mean(one.summary.steps), late=loop.late, timing=loop.timing() if live else None)
+    return replace(
+        one.summary, velocity=velocities.mean(one.summary.steps), late=loop.late, timing=loop.timing() if live else None
+    )
 
 
 class _Velocities:
@@ -103,7 +108,14 @@ class _Step:
         log: Log | None,
         odometry: Odometry | None,
     ) -> None:
-        self.robot, self.controller, self.command, self.safety, self.states, self.log = robot, controller, command, safety, states, log
+        self.robot, self.controller, self.command, self.safety, self.states, self.log = (
+            robot,
+            controller,
+            command,
+            safety,
+            states,
+            log,
+        )
         self.summary, self.odometry = Summary(), odometry
         if states and (type(robot).damp is Robot.damp or type(robot).limp is Robot.limp):
             raise RobotError(f"{type(robot).__name__} has no damp() and limp() of its own, which the states need")
@@ -135,7 +147,14 @@ class _Step:
                 order = self._trip(trip, loop.now) if trip else order._replace(targets=held)
         self._do(order)
         if self.log and measured:
-            self.log.add(loop, self.controller, measured, health, order, self.states.command if self.states else self._command(loop.now))
+            self.log.add(
+                loop,
+                self.controller,
+                measured,
+                health,
+                order,
+                self.states.command if self.states else self._command(loop.now),
+            )
         return measured
 
     def _sense(self, loop: Loop) -> tuple[Measurement | None, Health, Trip | None]:

@@ -72,7 +72,9 @@ class Limits:
     step: float = 2.5  # [rad] between two targets of a joint [1.85]
     torque: float = 2.0  # [share of `motor`] that the servo would ask for [1.52]
     speed: float = 60.0  # [rad/s] of a joint [48]
-    tilt: float = 60.0  # [deg] of the body, where the contract calls one up to 90 a fall; else what it calls a fall [30]
+    tilt: float = (
+        60.0  # [deg] of the body, where the contract calls one up to 90 a fall; else what it calls a fall [30]
+    )
     temperature: float = 85.0  # [deg C] of a motor: below the 90 at which drives switch themselves off
     voltage: float = -OFF  # [V] of the battery, at least; a robot's class states its own
     age: float = 2.0  # [periods] of the newest measurement
@@ -81,14 +83,21 @@ class Limits:
     remote: float = 3.0  # [s] without the remote that was there [unitree_rl_lab]
 
     @staticmethod
-    def of(folder: Path, contract: Contract, robot: Mapping[str, Any] | None = None, asked: Mapping[str, Any] | None = None) -> Limits:
+    def of(
+        folder: Path, contract: Contract, robot: Mapping[str, Any] | None = None, asked: Mapping[str, Any] | None = None
+    ) -> Limits:
         """Those of the export in ``folder``: the machine's from its scene, then the contract's section ``safety``, then those that
         the robot's class states, then what the command line asks."""
         falls = OFF if contract.ends.max_tilt is None else contract.ends.max_tilt
         limits = replace(
-            limits_of(compile_scene(part(folder, SCENE_FILE)), contract), tilt=falls if falls > 90.0 else min(Limits.tilt, falls)
+            limits_of(compile_scene(part(folder, SCENE_FILE)), contract),
+            tilt=falls if falls > 90.0 else min(Limits.tilt, falls),
         )
-        for values, where in ((contract.safety, f"{CONTRACT_FILE}: safety"), (robot, "Robot.limits"), (asked, "--limit")):
+        for values, where in (
+            (contract.safety, f"{CONTRACT_FILE}: safety"),
+            (robot, "Robot.limits"),
+            (asked, "--limit"),
+        ):
             limits = limits.but(values or {}, where)
         return limits
 
@@ -147,7 +156,9 @@ class Safety:
 
     def __init__(self, contract: Contract, limits: Limits) -> None:
         if contract.action.origin == "speed":
-            raise RobotError(f"{CONTRACT_FILE}: the policy commands speeds, which no limit here judges: grade and watch it in simulation")
+            raise RobotError(
+                f"{CONTRACT_FILE}: the policy commands speeds, which no limit here judges: grade and watch it in simulation"
+            )
         self.contract, self.limits = contract, limits
         self.reset()
 
@@ -155,7 +166,9 @@ class Safety:
         """As if nothing had been measured, asked or missed."""
         self._last: Floats | None = None  # targets (D,) of the step before
         self._held: Floats | None = None  # what the servos were told then
-        self._seen = deque[_Seen](maxlen=max(1, math.ceil(_ALONE * self.limits.frozen)) if self.limits.frozen < OFF else 1)
+        self._seen = deque[_Seen](
+            maxlen=max(1, math.ceil(_ALONE * self.limits.frozen)) if self.limits.frozen < OFF else 1
+        )
         self._same = dict.fromkeys(_Seen._fields[:4], 0)  # measurements in a row in which a part is the same
         self._stuck = np.zeros(len(self.contract.joints), int)  # (D,) the same of one angle
         self._lived = set[str]()  # parts but joint_pos that changed: what is not measured never does
@@ -178,7 +191,9 @@ class Safety:
         """``targets`` (D,) within the servos' range; torques within that of the motors, if their actuators have one."""
         return np.clip(targets, self.limits.lowest, self.limits.highest)
 
-    def asked(self, measured: Measurement, targets: Floats, stiffness: Floats | None = None, damping: Floats | None = None) -> Trip | None:
+    def asked(
+        self, measured: Measurement, targets: Floats, stiffness: Floats | None = None, damping: Floats | None = None
+    ) -> Trip | None:
         """The first limit that targets (D,) [rad], or torques [N m], pass, for servos with these gains (D,); None: the contract's."""
         limits, contract = self.limits, self.contract
         strong = "is asked for {value:.1f} N m, more than {most:.1f}"
@@ -194,7 +209,10 @@ class Safety:
         trip = (
             self._range("target", "is told to go to", targets, limits.target)
             or self._most(
-                "step", "is told to step by {value:.2f} rad from one target to the next, more than {most:.2f}", stepped, limits.step
+                "step",
+                "is told to step by {value:.2f} rad from one target to the next, more than {most:.2f}",
+                stepped,
+                limits.step,
             )
             or self._most("torque", strong, torque, limits.torque * limits.motor)
         )
@@ -211,7 +229,9 @@ class Safety:
             if (found := np.abs(getattr(measured, name)).max()) > most:
                 return Trip("finite", f"what is measured cannot be: {name} of {found:.3g} {unit}")
         if abs((length := float(np.linalg.norm(measured.gravity))) - 1.0) > _UNIT:
-            return Trip("finite", f"what is measured cannot be: gravity of length {length:.2f}, not 1: no orientation comes")
+            return Trip(
+                "finite", f"what is measured cannot be: gravity of length {length:.2f}, not 1: no orientation comes"
+            )
         return None
 
     def _fresh(self, measured: Measurement, health: Health) -> Trip | None:
@@ -238,7 +258,9 @@ class Safety:
         if (count := min(self._same[name] for name in ("joint_pos", "joint_vel", "ang_vel"))) >= self.limits.frozen:
             return Trip("frozen", f"{count} measurements in a row are the same")
         stuck = self._stuck >= _ALONE * self.limits.frozen
-        frozen = [name for name in ("joint_pos", *sorted(self._lived)) if self._same[name] >= _ALONE * self.limits.frozen]
+        frozen = [
+            name for name in ("joint_pos", *sorted(self._lived)) if self._same[name] >= _ALONE * self.limits.frozen
+        ]
         return self._contradicted(frozen, stuck) if frozen or stuck.any() else None
 
     def _contradicted(self, frozen: list[str], stuck: Any) -> Trip | None:
@@ -262,7 +284,9 @@ class Safety:
                 return Trip("frozen", f"{name} is the same in {count} measurements in a row, though the robot moves")
         if (wrong := stuck & ((went > _MOVED) | (told > _ASKED))).any():
             joint = self.contract.joints[_first(wrong)]
-            return Trip("frozen", f"the angle of {joint} is the same in {count} measurements in a row, though it is driven")
+            return Trip(
+                "frozen", f"the angle of {joint} is the same in {count} measurements in a row, though it is driven"
+            )
         return None
 
     def _on_time(self, now: float, behind: float) -> Trip | None:
@@ -284,7 +308,9 @@ class Safety:
     def _tilt(self, measured: Measurement) -> Trip | None:
         tilt = math.degrees(math.acos(np.clip(-measured.gravity[2], -1.0, 1.0)))
         return (
-            None if tilt <= self.limits.tilt else Trip("tilt", f"the body is tilted by {tilt:.0f} degrees, more than {self.limits.tilt:g}")
+            None
+            if tilt <= self.limits.tilt
+            else Trip("tilt", f"the body is tilted by {tilt:.0f} degrees, more than {self.limits.tilt:g}")
         )
 
     def _machine(self, health: Health) -> Trip | None:
@@ -320,7 +346,10 @@ class Safety:
         joint = _first(~fine)
         name, ends = self.contract.joints[joint], f"{low[joint]:.2f} to {high[joint]:.2f}"
         beyond = max(low[joint] - values[joint], values[joint] - high[joint])
-        return Trip(limit, f"{name} {words} {values[joint]:.2f} rad, {beyond:.2f} beyond its range {ends}; {margin:.2f} is the most")
+        return Trip(
+            limit,
+            f"{name} {words} {values[joint]:.2f} rad, {beyond:.2f} beyond its range {ends}; {margin:.2f} is the most",
+        )
 
 
 def _first(wrong: Any) -> int:

@@ -28,7 +28,11 @@ def checksum(said: Mapping[str, Any]) -> str:
 def sealed(said: Mapping[str, Any]) -> dict[str, Any]:
     """A contract with both lines."""
     text = _bound({**said, EXPORTED: ""}).encode()
-    return {**said, EXPORTED: base64.b64encode(zlib.compress(text, 9)).decode(), CHECKSUM: hashlib.sha256(text).hexdigest()}
+    return {
+        **said,
+        EXPORTED: base64.b64encode(zlib.compress(text, 9)).decode(),
+        CHECKSUM: hashlib.sha256(text).hexdigest(),
+    }
 
 
 def changes(said: Mapping[str, Any]) -> list[str]:
@@ -48,7 +52,8 @@ def changes(said: Mapping[str, Any]) -> list[str]:
 
 
 def _bound(said: Mapping[str, Any]) -> str:
-    free = (*FREE, EXPORTED, CHECKSUM, *([] if EXPORTED in said else ["format"]))  # formats before 5 have no copy, and left it free
+    # formats before 5 have no copy, and left it free
+    free = (*FREE, EXPORTED, CHECKSUM, *([] if EXPORTED in said else ["format"]))
     return json.dumps({name: value for name, value in said.items() if name not in free}, default=str, skipkeys=True)
 
 

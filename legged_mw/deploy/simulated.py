@@ -69,16 +69,20 @@ class Fleet:
         self.contract, self.count, self.spec, self.model = contract, count, scene.spec, scene.model
         if change:
             change(self.model)
-        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a broken world counts as fallen; nothing is printed
+        # a broken world counts as fallen; nothing is printed
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         _keep_quiet()
-        require_memory(0.2 * mujoco.MjData(self.model).nbuffer * count, "cpu", f"--num_envs {count}", "take fewer")  # as sim/engines.py
+        # as sim/engines.py
+        require_memory(0.2 * mujoco.MjData(self.model).nbuffer * count, "cpu", f"--num_envs {count}", "take fewer")
         self._batch = Batch(self.model, count, threads or min(usable_cores(), count))
         self._sensors, self._layout = self._batch.bind("sensordata"), layout(contract)
-        self.qpos: Floats = self._batch.bind("qpos")  # (N, nq), a view: position [m], quaternion, joints in MuJoCo's order
+        # (N, nq), a view: position [m], quaternion, joints in MuJoCo's order
+        self.qpos: Floats = self._batch.bind("qpos")
         self.qvel: Floats = self._batch.bind("qvel")  # (N, nv), a view: the next step starts from what is written
         self._ctrl, self._actuators, self._dofs = self._batch.bind("ctrl"), scene.actuators, scene.dofs
         self._where, self._contacts = scene.sensordata, scene.contacts
-        self.broken: NDArray[np.bool_] = np.zeros(count, dtype=bool)  # robots that MuJoCo could not step since their reset
+        # robots that MuJoCo could not step since their reset
+        self.broken: NDArray[np.bool_] = np.zeros(count, dtype=bool)
         self._network = make_network(folder, contract.motors, count, len(contract.joints))
         self._angles = [int(self.model.joint(name).qposadr[0]) for name in contract.joints]  # of each joint in qpos
         self.reset()
@@ -86,7 +90,9 @@ class Fleet:
     def read(self) -> Measurement:
         """Measurement of every robot, (N, ...) each, in copies."""
         values = {name: self._value(name) for name in self._layout}
-        return Measurement(**{n: values[n] for n in QUANTITIES}, others={n: v for n, v in values.items() if n not in QUANTITIES})
+        return Measurement(
+            **{n: values[n] for n in QUANTITIES}, others={n: v for n, v in values.items() if n not in QUANTITIES}
+        )
 
     def write(self, targets: Floats) -> None:
         """Step every robot by one period with servo targets (N, D) [rad], or torques where an action is one."""
@@ -95,7 +101,9 @@ class Fleet:
             self._step(self.contract.decimation, _NOW)
             return
         for left in reversed(range(self.contract.decimation)):
-            self._ctrl[:, self._actuators] = self._network.torque(targets - self.qpos[:, self._angles], self.qvel[:, self._dofs])
+            self._ctrl[:, self._actuators] = self._network.torque(
+                targets - self.qpos[:, self._angles], self.qvel[:, self._dofs]
+            )
             self._step(1, 0 if left else _NOW)
 
     def _step(self, count: int, stage: int) -> None:
@@ -162,11 +170,16 @@ class Fleet:
 
     def _gravity(self) -> Floats:
         """Direction of gravity (N, 3), body frame; it may lean towards the world's x axis."""
-        up, (x, _, z) = self._sensors[:, self._where["up"]], self.model.opt.gravity / np.linalg.norm(self.model.opt.gravity)
+        up, (x, _, z) = (
+            self._sensors[:, self._where["up"]],
+            self.model.opt.gravity / np.linalg.norm(self.model.opt.gravity),
+        )
         if not x:
             return -up
         w, i, j, k = self.qpos[:, 3:7].T
-        return z * up + x * np.stack([1.0 - 2.0 * (j * j + k * k), 2.0 * (i * j - w * k), 2.0 * (i * k + w * j)], axis=1)
+        return z * up + x * np.stack(
+            [1.0 - 2.0 * (j * j + k * k), 2.0 * (i * j - w * k), 2.0 * (i * k + w * j)], axis=1
+        )
 
     def _scan(self) -> Floats:
         """The height scan (N, points) [m] of the contract."""
@@ -217,7 +230,10 @@ class MujocoRobot(Robot):
 
     def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
         contract, self.hoisted = self.fleet.contract, self.hoisted and stiffness is not None
-        wanted = (contract.stiffness if stiffness is None else stiffness, contract.damping if damping is None else damping)
+        wanted = (
+            contract.stiffness if stiffness is None else stiffness,
+            contract.damping if damping is None else damping,
+        )
         self._move(np.asarray(targets), *wanted)
 
     def damp(self) -> None:
@@ -280,7 +296,9 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
     Training leaves most bodies out and stops after the first iterations. Bodies that were on the ground stay as they were: feet.
     """
     if file == TERRAIN_FILE and not ((folder / file).is_file() and (contract.terrain or not contract.scene)):
-        raise ContractError(f"no {file} in {folder}; an export has one if its task had steps or blocks; export an older one again")
+        raise ContractError(
+            f"no {file} in {folder}; an export has one if its task had steps or blocks; export an older one again"
+        )
     part(folder, file)
     try:
         spec = Source(folder / file, alone=True).spec()
@@ -299,14 +317,18 @@ def read_scene(folder: Path, contract: Contract, file: str = SCENE_FILE, whole: 
     actuators = [_index(model, file, "actuator", name, "servo") for name in contract.joints]
     needed = [*SENSED, *([FALL] if contract.ends.falls_on else [])]
     if missing := [name for name in needed if name not in contract.sensors]:
-        raise ContractError(f"{CONTRACT_FILE}: sensors: '{missing[0]}' is missing; name the sensors of {file} that measure it")
+        raise ContractError(
+            f"{CONTRACT_FILE}: sensors: '{missing[0]}' is missing; name the sensors of {file} that measure it"
+        )
     own = {row.name: row for row in contract.rows if row.sensors}
     named, places = {**contract.sensors, **{name: row.sensors for name, row in own.items()}}, {}
     for name, sensors in named.items():
         places[name] = _places(model, file, sensors, name)
         size = own[name].size if name in own else quantity_size(contract, name)
         if len(places[name]) != size:
-            raise ContractError(f"{file}: the sensors of '{name}' ({', '.join(sensors)}) have {len(places[name])} values, not {size}")
+            raise ContractError(
+                f"{file}: the sensors of '{name}' ({', '.join(sensors)}) have {len(places[name])} values, not {size}"
+            )
     feet = [_places(model, file, names, foot) for foot, names in contract.feet.items()]
     _check_order(model, contract)
     _check_machine(model, file, contract, joints, actuators)
@@ -322,7 +344,9 @@ def _check_start(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
     data = mujoco.MjData(model)
     mujoco.mj_resetDataKeyframe(model, data, 0)
     if not 0.9 < np.linalg.norm(data.qpos[3:7]) < 1.1 or np.abs(data.qpos).max() > _FAR:
-        raise ValueError("its first keyframe is no pose: the root's quaternion has not length 1, or a value is enormous")
+        raise ValueError(
+            "its first keyframe is no pose: the root's quaternion has not length 1, or a value is enormous"
+        )
     mujoco.mj_forward(model, data)
     deep = [contact.dist for contact in data.contact if 0 in model.body_weldid[model.geom_bodyid[contact.geom]]]
     planes = (model.geom_bodyid == 0) & (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE)
@@ -349,7 +373,9 @@ def _places(model: mujoco.MjModel, file: str, sensors: Sequence[str], what: str)
     for name in sensors:
         index = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_SENSOR, name)
         if index < 0:
-            raise ContractError(f"{CONTRACT_FILE}: sensors of '{what}': {unknown('sensor', name, _names(model, 'sensor'), file)}")
+            raise ContractError(
+                f"{CONTRACT_FILE}: sensors of '{what}': {unknown('sensor', name, _names(model, 'sensor'), file)}"
+            )
         spans.append(np.arange(model.sensor_adr[index], model.sensor_adr[index] + model.sensor_dim[index]))
     return np.concatenate(spans)
 
@@ -365,11 +391,15 @@ def _check_order(model: mujoco.MjModel, contract: Contract) -> None:
                 )
 
 
-def _check_machine(model: mujoco.MjModel, file: str, contract: Contract, joints: Sequence[int], actuators: Sequence[int]) -> None:
+def _check_machine(
+    model: mujoco.MjModel, file: str, contract: Contract, joints: Sequence[int], actuators: Sequence[int]
+) -> None:
     """Joints, gains, ranges, mass and step are those that the contract names."""
     if model.nq != 7 + len(joints) or model.nu != len(joints):
         have = [name for name in _names(model, "joint") if name not in contract.joints]
-        raise ContractError(f"{file} has joints that {CONTRACT_FILE} does not: {', '.join(have[1:]) or f'{model.nu} servos'}")
+        raise ContractError(
+            f"{file} has joints that {CONTRACT_FILE} does not: {', '.join(have[1:]) or f'{model.nu} servos'}"
+        )
     dofs, motors = model.jnt_dofadr[list(joints)], contract.motors
     stated = {"stiffness": contract.stiffness, "damping": contract.damping}
     stated |= {"motors: stall_torque": motors.stall_torque, "motors: no_load_speed": motors.no_load_speed}
@@ -383,5 +413,9 @@ def _check_machine(model: mujoco.MjModel, file: str, contract: Contract, joints:
     }
     for name, values in checks.items():
         if not np.allclose(*values, rtol=1e-4, atol=1e-6):
-            said, found = (np.array2string(np.asarray(x), precision=6, separator=", ", max_line_width=10_000) for x in values)
-            raise ContractError(f"{CONTRACT_FILE}: {name} is {said}, but {file} has {found}; change both, or export the policy again")
+            said, found = (
+                np.array2string(np.asarray(x), precision=6, separator=", ", max_line_width=10_000) for x in values
+            )
+            raise ContractError(
+                f"{CONTRACT_FILE}: {name} is {said}, but {file} has {found}; change both, or export the policy again"
+            )

@@ -61,7 +61,9 @@ class DeployStage:
 
     def step(self, commands: Floats | None = None) -> None:
         """One period with ``commands`` (N, C), or the stage's own. A robot that falls starts again."""
-        self._commands = self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self._own.shape)
+        self._commands = (
+            self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self._own.shape)
+        )
         self._seen = self.odometry(self.measured) if self.odometry else self.measured
         self.fleet.write(self.controller.act(self._seen, self._commands))
         self._fell = self.fleet.fell()

@@ -23,13 +23,16 @@ ARMED = (STAND, POLICY, CHECK)  # states in which limits are watched: in the oth
 RISE = 2.0  # [s] from wherever the joints are to the default pose [unitree_rl_gym]
 SOFT = 0.1  # [share of the stiffness] that standing up begins with
 NEAR = 0.15  # [rad] ours: a joint that is farther from the pose after RISE carries weight, and gets stiffer
-STIFFEST = 3.0  # [share of the stiffness] at most; unitree_rl_lab stands a Go2 with 60 N m/rad, three times what go2_flat walks with
+# [share of the stiffness] at most; unitree_rl_lab stands a Go2 with 60 N m/rad, three times what go2_flat walks with
+STIFFEST = 3.0
 STIFFEN = 1.0  # [share of the stiffness a second]
 # Ours, of an IMU while the robot stands up: shipped Go1 and Go2 tilt by 0.1 rad in all; gyro and legs miss 0.05 of it, wrong axes 0.7
 TILTS, MISSED = 0.03, 0.6  # [rad] of tilt from which gyro and legs are judged; share of it that they may miss
 TURN = 5  # measurements whose mean is compared: they have noise, and their times are not exact
-SWAY, BEND = 0.06, 0.15  # [rad] by which a robot with three feet or more rolls to each side as it stands up; by which a joint may, for that
-STEEP = 25.0  # [deg] between gravity and what the legs say of it: the steepest ground to start on, with what encoders are off
+# [rad] by which a robot with three feet or more rolls to each side as it stands up; by which a joint may, for that
+SWAY, BEND = 0.06, 0.15
+# [deg] between gravity and what the legs say of it: the steepest ground to start on, with what encoders are off
+STEEP = 25.0
 PLUMB, PULL = 30.0, (8.0, 12.0)  # [deg] between gravity and what the accelerometer feels; [m/s^2] of a robot at rest
 STANDS = 0.3  # [rad] from the pose, at most, where a policy may begin; ours: the shipped policies walk off from there
 
@@ -76,9 +79,8 @@ def at_odds(legs: Floats, gravity: Floats) -> str:
     for name, axis in (("pitched", 0), ("rolled", 1)):
         by_legs, by_gravity, missed = (float(np.ptp(each[:, axis])) for each in (legs, gravity, legs - gravity))
         if max(by_legs, by_gravity) > TILTS and missed > MISSED * max(by_legs, by_gravity):
-            return (
-                f"while it stood up it {name} by {by_legs:.2f} rad by its legs, by gravity {by_gravity:.2f}, and {missed:.2f} do not agree"
-            )
+            both = f"{by_legs:.2f} rad by its legs, by gravity {by_gravity:.2f}"
+            return f"while it stood up it {name} by {both}, and {missed:.2f} do not agree"
     cosine = legs[-1] @ gravity[-1] / np.linalg.norm(legs[-1]) / np.linalg.norm(gravity[-1])
     angle = math.degrees(math.acos(np.clip(cosine, -1.0, 1.0)))
     return f"gravity is {angle:.0f} degrees from where the legs have the ground" if angle > STEEP else ""
@@ -88,7 +90,9 @@ class Order(NamedTuple):
     """What the servos do in the next period."""
 
     state: str
-    targets: Floats | None = None  # (D,) [rad] as asked for, which limits judge and hold; None: limp in ZERO, damped in DAMPING
+    targets: Floats | None = (
+        None  # (D,) [rad] as asked for, which limits judge and hold; None: limp in ZERO, damped in DAMPING
+    )
     stiffness: Floats | None = None  # (D,); None: the contract's
     damping: Floats | None = None  # (D,); None: the contract's
 
@@ -103,7 +107,11 @@ class States:
     over, report, right = False, "", True  # whether the run ends now; what is said at its end, and whether that is good
 
     def __init__(
-        self, controller: Controller, sources: Sequence[Source], command: Callable[[float], Floats], say: Callable[[str], None] = print
+        self,
+        controller: Controller,
+        sources: Sequence[Source],
+        command: Callable[[float], Floats],
+        say: Callable[[str], None] = print,
     ) -> None:
         self.controller, self.sources, self._own, self._say = controller, list(sources), command, say
         self.state, self.since = ZERO, 0.0  # [s] since when
@@ -111,7 +119,8 @@ class States:
         self.note = f"{START}: {self.first}"
         self._from: Floats = controller.contract.default_pose  # (D,) [rad] where standing up began
         self._stiffer = 1.0
-        self._rise, self._down = list[Measurement](), list[Floats]()  # since standing up began; what the legs said of gravity then
+        # since standing up began; what the legs said of gravity then
+        self._rise, self._down = list[Measurement](), list[Floats]()
         self._legs, self._sway = None, np.zeros(len(self._from))  # (D,) [rad] of the sway at its end
         if len(controller.contract.feet) > 2:
             self._legs = Odometry(controller.folder, controller.contract)
@@ -186,7 +195,9 @@ class States:
             )
             return
         gravity = np.array([each.gravity for each in self._rise])
-        if why := wrong_imu(self._rise, contract.period) or (at_odds(np.array(self._down), gravity) if self._legs else ""):
+        if why := wrong_imu(self._rise, contract.period) or (
+            at_odds(np.array(self._down), gravity) if self._legs else ""
+        ):
             self._tell(f"{WALK} is refused: {why}; look at how the IMU's axes are mounted and read")
             return
         self.controller.reset()

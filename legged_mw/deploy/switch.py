@@ -13,7 +13,8 @@ from legged_mw.deploy.robot import Floats, Measurement
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.utils.errors import UserError
 
-FELL = 60.0  # [deg] between the robot's z axis and the vertical: the second policy takes over [ours: a walker does not come back]
+# [deg] between the robot's z axis and the vertical: the second policy takes over [ours: a walker does not come back]
+FELL = 60.0
 # It stands again, so that the first takes over, while it is [ours]:
 UP, NEAR, SLOW = 10.0, 0.3, 1.0  # [deg] tilted; [rad] from the first's default pose; [rad/s] of joints; means over them
 HOLD = 0.5  # [s] for so long
@@ -25,9 +26,12 @@ class SwitchStage(DeployStage):
     None is put back, but those that MuJoCo cannot step.
     """
 
-    def __init__(self, first: Path, second: Path, num_worlds: int = 1, command: Any = None, edited: bool = False) -> None:
+    def __init__(
+        self, first: Path, second: Path, num_worlds: int = 1, command: Any = None, edited: bool = False
+    ) -> None:
         """``edited``: see read_contract. Raises UserError for policies of two robots, ContractError for broken ones."""
-        super().__init__(first, num_worlds, command, ends=Ends(max_tilt=FELL), whole=True, edited=edited)  # its body touches the ground
+        # its body touches the ground
+        super().__init__(first, num_worlds, command, ends=Ends(max_tilt=FELL), whole=True, edited=edited)
         other = read_contract(second, edited)
         check_same(self.contract, other)
         self.rescuer = Controller(second, other, num_worlds)
@@ -36,7 +40,9 @@ class SwitchStage(DeployStage):
         self._none = np.array([[each.default for each in other.commands]] * num_worlds).reshape(num_worlds, -1)
 
     def step(self, commands: Floats | None = None) -> None:
-        self._commands = self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self._own.shape)
+        self._commands = (
+            self._own.copy() if commands is None else np.array(commands, dtype=float).reshape(self._own.shape)
+        )
         self._seen, rescued = self.measured, self.rescued[:, None]
         targets = self.controller.act(self._seen, self._commands), self.rescuer.act(self._seen, self._none)
         self.fleet.write(np.where(rescued, targets[1], targets[0]))
@@ -48,7 +54,8 @@ class SwitchStage(DeployStage):
         self._fell, stood = tilted & ~self.rescued, self._stood(self.measured)
         back = self.rescued & stood
         self.rescued = (self.rescued | self._fell) & ~back
-        self.controller.reset(self.rescued | back)  # it begins anew when it takes over, and remembers nothing until then
+        # it begins anew when it takes over, and remembers nothing until then
+        self.controller.reset(self.rescued | back)
         self.rescuer.reset(~self.rescued | self._fell)
         self._fell |= broken
 

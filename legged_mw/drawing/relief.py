@@ -21,13 +21,17 @@ Picture = NDArray[np.uint8]
 Tones = NDArray[np.floating]  # float32: these arrays are large
 
 SQUARE = 0.5  # edge of one checker square [m], a thin line every second one: to judge speed and stride by
-STEEP_LIGHT = (-0.25, 0.35, -1.0)  # of the key light over steps: steeper, so that a riser is darker than a tread wherever it faces
+# of the key light over steps: steeper, so that a riser is darker than a tread wherever it faces
+STEEP_LIGHT = (-0.25, 0.35, -1.0)
 RELIEF, AROUND = "relief", "around"  # materials of the tiles, and of the flat ground around them
 COARSE = 2  # cells of a tile that is far away are so much longer
-COLOUR = np.array([0.30, 0.33, 0.37], dtype=np.float32)  # of level ground; each number below is a share of it, lighter or darker
+# of level ground; each number below is a share of it, lighter or darker
+COLOUR = np.array([0.30, 0.33, 0.37], dtype=np.float32)
 CHECKER, LINE, TILE_LINE = 0.05, 0.15, 0.3  # a square, a line every metre, a line around each tile
-EDGE, EDGE_WIDTH, EDGE_MAX = 2.5, 0.1, 0.4  # what lies higher than its neighbourhood is lighter by [1/m], within [m], at most by
-STEEP, STEEP_FROM, STEEP_TO = 0.3, 0.6, 1.6  # ground as steep as a riser is darker; slopes [-] where that begins and is full
+# what lies higher than its neighbourhood is lighter by [1/m], within [m], at most by
+EDGE, EDGE_WIDTH, EDGE_MAX = 2.5, 0.1, 0.4
+# ground as steep as a riser is darker; slopes [-] where that begins and is full
+STEEP, STEEP_FROM, STEEP_TO = 0.3, 0.6, 1.6
 HILL, HILL_HEIGHT = 0.12, 0.5  # hills are lighter and pits darker, at most by; at about [m]
 REACH = 200.0  # of the flat ground beyond the tiles [m]; a camera sees as far as 150
 
@@ -62,13 +66,19 @@ def _add_tile(spec: mujoco.MjSpec, terrain: Terrain, level: int, column: int, pi
     texture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, width=n, height=n, nchannel=3)
     texture.data = image[::-1].tobytes()  # a texture begins at the largest y
     add_material(spec, name, texuniform=False, texrepeat=[1, 1])
-    x, y = (start + first.start * terrain.cell + half for start, first in zip(terrain.corner, (columns, rows), strict=True))
+    x, y = (
+        start + first.start * terrain.cell + half for start, first in zip(terrain.corner, (columns, rows), strict=True)
+    )
     level_ground = not np.ptp(heights)
     coarse = next(step for step in ((n,) if level_ground else (COARSE, 3, 1)) if n % step == 0)
     for step in (coarse,) if level_ground else (1, coarse):
         some = ((heights[::step, ::step] - low) / span).astype(np.float32)
-        spec.add_hfield(name=f"{name}/{step}", size=[half, half, span, 0.1], nrow=len(some), ncol=len(some), userdata=some.ravel())
-        geom = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=f"{name}/{step}", pos=[x, y, low], material=name)
+        spec.add_hfield(
+            name=f"{name}/{step}", size=[half, half, span, 0.1], nrow=len(some), ncol=len(some), userdata=some.ravel()
+        )
+        geom = spec.worldbody.add_geom(
+            type=mujoco.mjtGeom.mjGEOM_HFIELD, hfieldname=f"{name}/{step}", pos=[x, y, low], material=name
+        )
         geom.contype, geom.conaffinity = 0, 0
         geom.castshadow = False  # a software renderer would draw it once more, and edges show as it is
         if step > 1 and not level_ground:
@@ -119,7 +129,9 @@ def _slopes(heights: Tones) -> Tones:
 
 def add_squares(spec: mujoco.MjSpec, name: str, dark: Colour, light: Colour, line: Colour) -> None:
     """A material of squares, 2 x 2 of them with a line around."""
-    picture = spec.add_texture(name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, rgb1=dark, rgb2=light, markrgb=line, width=512, height=512)
+    picture = spec.add_texture(
+        name=name, type=mujoco.mjtTexture.mjTEXTURE_2D, rgb1=dark, rgb2=light, markrgb=line, width=512, height=512
+    )
     picture.builtin, picture.mark = mujoco.mjtBuiltin.mjBUILTIN_CHECKER, mujoco.mjtMark.mjMARK_EDGE
     # texuniform measures in half-sizes: texrepeat 1 lays the image, 2 x 2 squares with a line around it, over 2 m
     add_material(spec, name, texuniform=True, texrepeat=[1 / SQUARE, 1 / SQUARE])
@@ -137,10 +149,13 @@ def _add_surroundings(spec: mujoco.MjSpec, terrain: Terrain, squares: bool) -> N
     plane = {"type": mujoco.mjtGeom.mjGEOM_PLANE, "contype": 0, "conaffinity": 0, "castshadow": False}
     x, y = 0.5 * terrain.levels * terrain.tile, 0.5 * len(terrain.kinds) * terrain.tile
     reach = max(REACH, 2 * x, 2 * y)  # benchmarks/terrain_picture.py sees as far as the tiles are long
-    wide, deep = (2 * x + reach, reach), (reach, 2 * y + reach)  # [m] along x and y: a side of the tiles and on beyond its end
+    # [m] along x and y: a side of the tiles and on beyond its end
+    wide, deep = (2 * x + reach, reach), (reach, 2 * y + reach)
     vanes = ((-x, y), (1, 1), wide), ((x, y), (1, -1), deep), ((x, -y), (-1, -1), wide), ((-x, -y), (-1, 1), deep)
     for corner, away, edges in vanes:  # each from a corner of the tiles, like the vanes of a wheel
         # a plane's picture begins half a metre from its middle; lines are to lie at whole metres
-        middle = [round(start + side * edge / 2 - 0.5) + 0.5 for start, side, edge in zip(corner, away, edges, strict=True)]
+        middle = [
+            round(start + side * edge / 2 - 0.5) + 0.5 for start, side, edge in zip(corner, away, edges, strict=True)
+        ]
         size = [abs(place - start) for place, start in zip(middle, corner, strict=True)]
         spec.worldbody.add_geom(pos=[*middle, 0.0], size=[*size, 0.05], material=AROUND, **plane)

@@ -17,7 +17,8 @@ from legged_mw.sim.terrain import Terrain
 
 GROUND_MATERIAL = "ground"  # of the floor
 _ZENITH, _HORIZON = (0.22, 0.32, 0.45), (0.56, 0.63, 0.70)
-CAMERA = (1.78, -2.18, 1.19)  # place of the camera "track", from the robot's centre of mass [reach of the robot], where none is given
+# place of the camera "track", from the robot's centre of mass [reach of the robot], where none is given
+CAMERA = (1.78, -2.18, 1.19)
 
 
 def visual_model(robot: RobotModel, camera: Sequence[float] = ()) -> mujoco.MjModel:
@@ -84,7 +85,9 @@ def _add_camera(spec: mujoco.MjSpec, root: str, place: Sequence[float]) -> None:
 def _add_sky(spec: mujoco.MjSpec) -> None:
     # the gradient runs from zenith to nadir, so the horizon is its middle; the haze has that colour, and the ground no edge
     nadir = [2 * h - z for h, z in zip(_HORIZON, _ZENITH, strict=True)]
-    sky = spec.add_texture(name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, rgb1=_ZENITH, rgb2=nadir, width=512, height=3072)
+    sky = spec.add_texture(
+        name="sky", type=mujoco.mjtTexture.mjTEXTURE_SKYBOX, rgb1=_ZENITH, rgb2=nadir, width=512, height=3072
+    )
     sky.builtin = mujoco.mjtBuiltin.mjBUILTIN_GRADIENT
     spec.visual.rgba.haze = [*_HORIZON, 1.0]
 

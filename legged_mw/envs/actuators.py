@@ -93,15 +93,23 @@ class Actuators:
     with "speed" there is none, and targets are speeds [rad/s].
     """
 
-    before: Callable[[int], None] | None = None  # what ``Simulation.step`` calls before each substep; None: nothing changes within a step
+    # what ``Simulation.step`` calls before each substep; None: nothing changes within a step
+    before: Callable[[int], None] | None = None
 
     def __init__(self, task: TorqueLaw, robot: RobotModel, sim: Simulation, rand: DomainRand) -> None:
         cfg = task.cfg
-        self._origin, self._default, self._dof_pos, self._sim = cfg.control.action_origin, task.default_dof_pos, task.dof_pos, sim
+        self._origin, self._default, self._dof_pos, self._sim = (
+            cfg.control.action_origin,
+            task.default_dof_pos,
+            task.dof_pos,
+            sim,
+        )
         self.law, self._rand = task.motor_law, rand
         scale = robot.tables["control.action_scale"]
         self.scale = torch.tensor(scale, device=sim.device)  # (D,) [rad], [rad/s] or [N m]
-        self._gains = {name: torch.tensor(robot.tables[f"`{name}`"], device=sim.device) for name in ("stiffness", "damping")}
+        self._gains = {
+            name: torch.tensor(robot.tables[f"`{name}`"], device=sim.device) for name in ("stiffness", "damping")
+        }
         self._same_scale = scale[0] if len(set(scale)) == 1 else None  # one number takes one operation less
         by_angle = self.law not in ("torque", OWN) and self._origin != "speed"
         self.encoder_offset = rand.values.get("encoder_offset")  # (N, D) [rad], measured minus true angle
@@ -116,7 +124,8 @@ class Actuators:
             self._sent, self.before = torch.zeros_like(sim.ctrl), self._before_substep
         if self.law == "network":
             self._network = make_motor_network(read_network(find_network(cfg)), sim)
-        self.targets = self._sent if self._offset is None else torch.zeros_like(sim.ctrl)  # (N, D) as the policy means them
+        # (N, D) as the policy means them
+        self.targets = self._sent if self._offset is None else torch.zeros_like(sim.ctrl)
 
     def sent(self) -> Tensor:
         """(N, D) what was sent to the motors last, as the policy means it."""

@@ -28,7 +28,8 @@ class BaseTask(VecEnv):
         self.actions = torch.zeros(num_envs, num_actions, device=device)
         self.rew_buf = torch.zeros(num_envs, device=device)
         self.reset_buf = torch.zeros(num_envs, dtype=torch.bool, device=device)  # the episode ended in this step
-        self.time_out_buf = torch.zeros(num_envs, dtype=torch.bool, device=device)  # it ended by the clock, or off the terrain; no fall
+        # it ended by the clock, or off the terrain; no fall
+        self.time_out_buf = torch.zeros(num_envs, dtype=torch.bool, device=device)
         self._episode_length_buf = torch.zeros(num_envs, dtype=torch.long, device=device)  # [control steps]
         self._graph = StepGraph(self._step, device, eager)
 
@@ -43,7 +44,9 @@ class BaseTask(VecEnv):
 
     def get_observations(self) -> TensorDict:
         """Copies of the observation groups, each (N, size)."""
-        return TensorDict({name: obs.clone() for name, obs in self.obs_buf.items()}, batch_size=[self.num_envs], device=self.device)
+        return TensorDict(
+            {name: obs.clone() for name, obs in self.obs_buf.items()}, batch_size=[self.num_envs], device=self.device
+        )
 
     @torch.no_grad()  # actions that carry gradients must not make the fixed buffers carry them
     def step(self, actions: Tensor) -> tuple[TensorDict, Tensor, Tensor, dict[str, Any]]:
@@ -52,7 +55,9 @@ class BaseTask(VecEnv):
         An environment whose episode ended is already reset: its observation is the first of the next episode.
         """
         if actions.shape != self.actions.shape:
-            raise ValueError(f"actions must be {tuple(self.actions.shape)} (environments, joints); got {tuple(actions.shape)}")
+            raise ValueError(
+                f"actions must be {tuple(self.actions.shape)} (environments, joints); got {tuple(actions.shape)}"
+            )
         with torch.inference_mode():  # the fixed buffers stay ordinary tensors; what lives for a moment is cheaper so
             self.actions.copy_(actions)
             self._graph()

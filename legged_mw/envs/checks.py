@@ -26,7 +26,8 @@ HOOKS = (  # every step or reset needs what their parents do; hooks of commands 
     *("reset_envs", "_reset_robots", "_reset_task", "_update_curricula"),
 )
 WITHOUT = "# without super"  # a comment in the method: it is so on purpose
-PAYS = (  # terms of robot_rewards.py and legged_rewards.py with a usual scale above 0, as all of a skill's own have; others cost
+# terms of robot_rewards.py and legged_rewards.py with a usual scale above 0, as all of a skill's own have; others cost
+PAYS = (
     *("alive", "pose", "tracking_lin_vel", "tracking_ang_vel", "feet_air_time", "feet_contact_without_cmd"),
     *("single_stance", "no_fly", "feet_phase", "contact_phase"),
 )
@@ -38,7 +39,9 @@ def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None, law: s
     _check_motors(cfg)
     step = cfg.sim.dt * cfg.control.decimation
     if cfg.env.episode_length_s < step:
-        raise ConfigError(f"env.episode_length_s is {cfg.env.episode_length_s:g}, shorter than a control step of {step:g} s")
+        raise ConfigError(
+            f"env.episode_length_s is {cfg.env.episode_length_s:g}, shorter than a control step of {step:g} s"
+        )
     if isinstance(cfg, LeggedRobotCfg):
         _check_walking(cfg)
     if isinstance(cfg, MotionTrackingCfg):
@@ -72,7 +75,9 @@ def _check_walking(cfg: LeggedRobotCfg) -> None:
         fit(span, Range, f"commands.ranges.{name}")
     names = [name for name in vars(cfg.commands.ranges) if name != HEADING]
     if len(keep := cfg.commands.keep_probability) > len(names):
-        raise ConfigError(f"commands.keep_probability has {len(keep)} numbers, but there are {len(names)} commands: {', '.join(names)}")
+        raise ConfigError(
+            f"commands.keep_probability has {len(keep)} numbers, but there are {len(names)} commands: {', '.join(names)}"
+        )
     for foot in cfg.asset.foot_geoms:
         if foot not in cfg.asset.foot_names:
             raise ConfigError(f"asset.foot_geoms: {unknown('foot', foot, cfg.asset.foot_names, 'asset.foot_names')}")
@@ -91,13 +96,17 @@ def _check_tracking(cfg: MotionTrackingCfg) -> None:
             if name not in motion.bodies:
                 raise ConfigError(f"motion.{field}: {unknown('body', name, motion.bodies, 'motion.bodies')}")
     if not motion.clips:
-        raise ConfigError("motion.clips is empty; name a clip, as python -m legged_mw.motion FILE --out CLIP.npz writes it")
+        raise ConfigError(
+            "motion.clips is empty; name a clip, as python -m legged_mw.motion FILE --out CLIP.npz writes it"
+        )
 
 
 def _check_motors(cfg: RobotTaskCfg) -> None:
     control, curve = cfg.control, cfg.control.stall_torque or cfg.control.no_load_speed
     if control.actuator == "network" and not control.network:
-        raise ConfigError("control.actuator is 'network', but control.network names no file of weights (docs/motors.md)")
+        raise ConfigError(
+            "control.actuator is 'network', but control.network names no file of weights (docs/motors.md)"
+        )
     if control.actuator != "dc_motor" and control.action_origin == "speed":
         raise ConfigError(
             f"control.action_origin is 'speed', but control.actuator is {control.actuator!r}: only a 'dc_motor' is driven by a "
@@ -115,7 +124,9 @@ def _check_motors(cfg: RobotTaskCfg) -> None:
                 "a joint, '' for all (docs/motors.md)"
             )
         if cfg.domain_rand.enable and getattr(cfg.domain_rand, name) not in ([], [1.0, 1.0]) and not curve:
-            raise ConfigError(f"domain_rand.{name} is a factor on control.{name}, which is empty: fill it, or leave the range out ([])")
+            raise ConfigError(
+                f"domain_rand.{name} is a factor on control.{name}, which is empty: fill it, or leave the range out ([])"
+            )
 
 
 def _check_redraws(cfg: RobotTaskCfg, law: str) -> None:
@@ -130,7 +141,9 @@ def _check_redraws(cfg: RobotTaskCfg, law: str) -> None:
     for name in cfg.domain_rand.model_factors:
         writers = [kind for kind, (what, *_) in active(cfg, law).items() if kind != name and name in what.fields]
         if writers:
-            raise ConfigError(f"domain_rand.model_factors.{name}: domain_rand.{writers[0]} writes that field; leave one of them out ([])")
+            raise ConfigError(
+                f"domain_rand.model_factors.{name}: domain_rand.{writers[0]} writes that field; leave one of them out ([])"
+            )
 
 
 # ---- methods of a user's class ----
@@ -150,7 +163,11 @@ def check_class(env_class: type, scales: Mapping[str, float]) -> list[str]:
     lines = []
     for kind, name, method in _own(env_class):
         misspelt = re.fullmatch(r"_?rewards?_\w+", name) and not name.startswith("_reward_")
-        if hasattr(kind.__mro__[1], name) or not (misspelt or name in LEGGED_GYM_METHODS) or _is_called(env_class, name):
+        if (
+            hasattr(kind.__mro__[1], name)
+            or not (misspelt or name in LEGGED_GYM_METHODS)
+            or _is_called(env_class, name)
+        ):
             continue
         instead = "a reward's name begins with _reward_" if misspelt else f"{LEGGED_GYM_METHODS[name]} is what there is"
         lines.append(f"warning: {place_of(method)}: nothing calls {name}; {instead}")

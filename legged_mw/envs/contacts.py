@@ -25,20 +25,25 @@ class GroundContacts:
         fall = self._columns(asset.terminate_after_contacts_on, "terminate_after_contacts_on")
         columns = self._columns(asset.penalize_contacts_on, "penalize_contacts_on")
         if penalty and not columns:
-            raise ConfigError("rewards.scales.collision is on, but asset.penalize_contacts_on names nothing; name what should not touch")
+            raise ConfigError(
+                "rewards.scales.collision is on, but asset.penalize_contacts_on names nothing; name what should not touch"
+            )
         body = {column: int(model.geom_bodyid[robot.id("geom", robot.contact_geoms[column])]) for column in columns}
         bodies = sorted(set(body.values()))
         table = torch.zeros(count.shape[1], len(bodies))
         for column in columns:
             table[column, bodies.index(body[column])] = 1.0
         self.penalized = table.to(count.device)  # (C, B) 1 where a geom is of a body
-        self.terminating = torch.tensor(fall, dtype=torch.long, device=count.device)  # columns of geoms whose contact is a fall
+        # columns of geoms whose contact is a fall
+        self.terminating = torch.tensor(fall, dtype=torch.long, device=count.device)
 
     def _columns(self, patterns: list[str], field: str) -> list[int]:
         meant, model = self._robot.names.find(patterns, f"asset.{field}"), self._robot.physics
         for name in meant:
             if not model.geom_conaffinity[self._robot.id("geom", name)]:
-                raise ConfigError(f"asset.{field}: '{name}' never touches the ground; add it to asset.colliders: {self._asset.colliders}")
+                raise ConfigError(
+                    f"asset.{field}: '{name}' never touches the ground; add it to asset.colliders: {self._asset.colliders}"
+                )
         return [i for i, name in enumerate(self._robot.contact_geoms) if name in meant]
 
 
@@ -55,8 +60,10 @@ class FootContacts:
         self._counts = count[:, : len(geoms)]
         self.count = self._counts if self._foot_of_geom is None else count.new_zeros(len(count), len(feet))  # (N, F)
         if CONTACT_FORCE in robot.sensors:
-            columns = sensed[:, robot.sensors[CONTACT_FORCE]].unflatten(1, (-1, 4))  # (N, C, 4): count, force on the ground
-            self._geom_forces, self._against = columns[:, None, : len(geoms), 1:], -table.T[..., None]  # (N, 1, G, 3), (F, G, 1)
+            # (N, C, 4): count, force on the ground
+            columns = sensed[:, robot.sensors[CONTACT_FORCE]].unflatten(1, (-1, 4))
+            # (N, 1, G, 3), (F, G, 1)
+            self._geom_forces, self._against = columns[:, None, : len(geoms), 1:], -table.T[..., None]
             self.forces = count.new_zeros(len(count), len(feet), 3)
 
     def update(self) -> None:

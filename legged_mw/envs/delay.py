@@ -46,7 +46,10 @@ class SubstepDelay:
     def __init__(self, delay: Tensor, step_ms: float, longest: float, substeps: int, width: int) -> None:
         """``delay`` (N, 1) [ms], whole steps of ``step_ms`` and at most ``longest``, is read at each call."""
         self._delay, self._step_ms = delay, step_ms
-        self._past = torch.zeros(math.ceil(round(longest / step_ms) / substeps) + 1, len(delay), width, device=delay.device)  # newest first
+        # newest first
+        self._past = torch.zeros(
+            math.ceil(round(longest / step_ms) / substeps) + 1, len(delay), width, device=delay.device
+        )
         self._substep = torch.arange(substeps, device=delay.device)[:, None, None]
         self.arriving = torch.zeros(substeps, len(delay), width, device=delay.device)  # in each substep
 
@@ -59,5 +62,6 @@ class SubstepDelay:
         self._past[1:] = self._past[:-1].clone()
         self._past[0] = sent
         steps, count = torch.round(self._delay / self._step_ms).long(), len(self._substep)
-        age = (steps - self._substep + count - 1).clamp_(min=0) // count  # control steps since it was sent, (substeps, N, 1)
+        # control steps since it was sent, (substeps, N, 1)
+        age = (steps - self._substep + count - 1).clamp_(min=0) // count
         torch.gather(self._past, 0, age.expand_as(self.arriving), out=self.arriving)

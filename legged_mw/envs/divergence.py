@@ -14,7 +14,8 @@ from torch import Tensor
 
 from legged_mw.sim.simulation import Simulation
 
-SHARE = 0.01  # of an iteration's finished episodes: more that are not finite, in two iterations one after the other, end a training [ours]
+# of an iteration's finished episodes: more that are not finite, in two iterations one after the other, end a training [ours]
+SHARE = 0.01
 JOINT, ACTION = "broken_by/", "broken_by_action"  # statistics: worlds so far that a joint broke, and that an action did
 
 
@@ -31,7 +32,8 @@ class Divergence:
         speed = self._sim.qvel.abs()
         joints, position = speed[:, 6:], self._sim.qpos.abs().amax(dim=1)
         action = self._actions.abs().amax(dim=1) < math.inf  # a servo swallows NaN, the reward does not
-        torch.logical_not((speed.amax(dim=1) <= self._max_speed) & (position < math.inf) & action, out=broken)  # NaN compares false
+        # NaN compares false
+        torch.logical_not((speed.amax(dim=1) <= self._max_speed) & (position < math.inf) & action, out=broken)
         fastest = (joints == joints.amax(dim=1, keepdim=True)) & (broken & action)[:, None]
         self.counts.add_(torch.cat([fastest, (broken & ~action)[:, None]], dim=1).sum(dim=0))
 
@@ -56,7 +58,9 @@ class Watch:
         if not before:
             return ""
         shares = " and ".join(f"{each['broken']:.0f} of {each['episodes']:.0f}" for each in (before, numbers))
-        counts = {name: numbers[name] - self._good.get(name, 0.0) for name in numbers if name.startswith((JOINT, ACTION))}
+        counts = {
+            name: numbers[name] - self._good.get(name, 0.0) for name in numbers if name.startswith((JOINT, ACTION))
+        }
         return f"in the last two iterations {shares} episodes ended with a state that is not finite: {_because(counts)}"
 
 
@@ -66,7 +70,10 @@ def _because(counts: dict[str, float]) -> str:
     if action > total:
         return "the policy's actions are not finite; lower algorithm.learning_rate, and look for a reward term without a bound"
     worst = sorted((name for name in counts if counts[name]), key=lambda name: -counts[name])[:4]
-    joints = ", ".join(f"{name.removeprefix(JOINT)} ({counts[name] / total:.0%})" for name in worst) or "none, all was lost at once"
+    joints = (
+        ", ".join(f"{name.removeprefix(JOINT)} ({counts[name] / total:.0%})" for name in worst)
+        or "none, all was lost at once"
+    )
     return (
         f"physics diverges; fastest joint at the break: {joints}. Lower control.damping or control.stiffness of these joints, or give them "
         "armature (asset.armature), or lower sim.dt and raise control.decimation, or set sim.integrator to implicitfast; "

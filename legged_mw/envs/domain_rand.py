@@ -29,7 +29,8 @@ class Kind(NamedTuple):
     """What one range of the config means."""
 
     per: str  # how many numbers a world draws: "world" one, "axis" three, "joint" D, "link" 1 + D: the root's, then each joint's
-    neutral: float | None  # that changes nothing; None: the number is itself the first one of the field, in the ground's geoms
+    # that changes nothing; None: the number is itself the first one of the field, in the ground's geoms
+    neutral: float | None
     mirror: str  # its mirror image, a kind of envs/mirror.py
     fields: tuple[str, ...] = ()  # of the model, that it writes
     whole: bool = False  # whole numbers, both ends included
@@ -73,15 +74,25 @@ def active(cfg: RobotTaskCfg, law: str = "") -> dict[str, tuple[Kind, float, flo
     given = {name: (kind, getattr(rand, name)) for name, kind in KINDS.items() if name not in lacks}
     if law not in ("servo", "torque", "network"):
         fields = ("actuator_gainprm",) if law == "dc_motor" else ()  # else a law in code reads them
-        given |= {name: (KINDS[name]._replace(fields=fields), given[name][1]) for name in ("stiffness", "damping") if name in given}
+        given |= {
+            name: (KINDS[name]._replace(fields=fields), given[name][1])
+            for name in ("stiffness", "damping")
+            if name in given
+        }
     given |= {field: (Kind("world", 1.0, "scalar", (field,)), span) for field, span in rand.model_factors.items()}
-    return {name: (kind, span[0], span[1]) for name, (kind, span) in given.items() if span and not span[0] == span[1] == kind.neutral}
+    return {
+        name: (kind, span[0], span[1])
+        for name, (kind, span) in given.items()
+        if span and not span[0] == span[1] == kind.neutral
+    }
 
 
 def world_fields(cfg: RobotTaskCfg, law: str = "") -> list[str]:
     """Model fields that need a value per world; and those of factors that change nothing, so that a field that is none is refused."""
     factors = cfg.domain_rand.model_factors if cfg.domain_rand.enable else {}
-    return list(dict.fromkeys([*(field for kind, _, _ in active(cfg, law).values() for field in kind.fields), *factors]))
+    return list(
+        dict.fromkeys([*(field for kind, _, _ in active(cfg, law).values() for field in kind.fields), *factors])
+    )
 
 
 class DomainRand:
@@ -98,17 +109,24 @@ class DomainRand:
         self.widths = {name: count[kind.per] for name, kind in KINDS.items()}  # of each draw, drawn here or not
         widths = [count[kinds[name][0].per] for name in order]
         self._draws = torch.zeros(sim.num_envs, sum(widths), device=sim.device)
-        self.values: dict[str, Tensor] = dict(zip(order, self._draws.split(widths, dim=1), strict=True)) if order else {}
+        self.values: dict[str, Tensor] = (
+            dict(zip(order, self._draws.split(widths, dim=1), strict=True)) if order else {}
+        )
         self.mirrors = {name: kinds[name][0].mirror for name in order}
         self._first_again = sum(width for name, width in zip(order, widths, strict=True) if name not in again)
         bounds = [list(kinds[name][1:]) for name, width in zip(order, widths, strict=True) for _ in range(width)]
-        self._low, self._high = torch.tensor(bounds or [[0.0, 0.0]], dtype=torch.float, device=sim.device).T.contiguous()
+        self._low, self._high = torch.tensor(
+            bounds or [[0.0, 0.0]], dtype=torch.float, device=sim.device
+        ).T.contiguous()
         self._whole = [name for name in order if kinds[name][0].whole]
         self._nominal = {field: sim.field(field)[:1].clone() for field in world_fields(cfg, law)}
         _check_mass(cfg, robot)
         gravity = robot.physics.opt.gravity
         self._gravity = math.hypot(*gravity) or 1.0  # [m/s^2]
-        self.gravity_dir = torch.tensor(gravity / self._gravity, dtype=torch.float, device=sim.device).repeat(sim.num_envs, 1)  # (N, 3)
+        # (N, 3)
+        self.gravity_dir = torch.tensor(gravity / self._gravity, dtype=torch.float, device=sim.device).repeat(
+            sim.num_envs, 1
+        )
         self._root, self._ground = robot.id("body", robot.root), robot.ground_geoms()
         self._link_of_body = _links(robot).to(sim.device)
         writers = {name: self._writer(name, field) for name in order for field in kinds[name][0].fields[:1]}
@@ -133,7 +151,12 @@ class DomainRand:
 
     def _require_memory(self, name: str, frames: float, width: int) -> None:
         need = 4 * frames * len(self._mask) * width
-        require_memory(need, self._sim.device, f"domain_rand.{name} = {self._ends[name]}", "every step of it keeps a frame of each world")
+        require_memory(
+            need,
+            self._sim.device,
+            f"domain_rand.{name} = {self._ends[name]}",
+            "every step of it keeps a frame of each world",
+        )
 
     def rounded_delay(self, delay: Any) -> Any:
         """[ms], a number or a tensor, to the nearest whole number of simulation steps, a half up."""
@@ -182,12 +205,18 @@ class DomainRand:
         if name in KINDS and field in special:
             return special[field]
         if name in KINDS and KINDS[name].neutral is None:
-            return lambda mask: assign(self._sim.field(field)[:, self._ground, 0], mask, self.values[name])  # of the ground's geoms
-        first = self._nominal[field].shape[1] - self.values[name].shape[1] if name in KINDS else 0  # the free joint's six come first
+            # of the ground's geoms
+            return lambda mask: assign(self._sim.field(field)[:, self._ground, 0], mask, self.values[name])
+        # the free joint's six come first
+        first = self._nominal[field].shape[1] - self.values[name].shape[1] if name in KINDS else 0
 
         def scale(mask: Tensor) -> None:
             nominal, factor = self._nominal[field][:, first:], self.values[name]
-            assign(self._sim.field(field)[:, first:], mask, nominal * factor.view(*factor.shape, *[1] * (nominal.dim() - 2)))
+            assign(
+                self._sim.field(field)[:, first:],
+                mask,
+                nominal * factor.view(*factor.shape, *[1] * (nominal.dim() - 2)),
+            )
 
         return scale
 
@@ -204,15 +233,24 @@ class DomainRand:
         assign(self._sim.field("body_inertia"), mask, self._nominal["body_inertia"] * ratio[:, :, None])
 
     def _write_com(self, mask: Tensor) -> None:
-        assign(self._sim.field("body_ipos")[:, self._root], mask, self._nominal["body_ipos"][:, self._root] + self.values["base_com"])
+        assign(
+            self._sim.field("body_ipos")[:, self._root],
+            mask,
+            self._nominal["body_ipos"][:, self._root] + self.values["base_com"],
+        )
 
     def _write_stiffness(self, mask: Tensor) -> None:
         for field, place in (("actuator_gainprm", 0), ("actuator_biasprm", 1)):
-            assign(self._sim.field(field)[:, :, place], mask, self._nominal[field][:, :, place] * self.values["stiffness"])
+            assign(
+                self._sim.field(field)[:, :, place], mask, self._nominal[field][:, :, place] * self.values["stiffness"]
+            )
 
     def _write_motors(self, mask: Tensor) -> None:
         """Gains and curve of MuJoCo's DC motor: its no-load speed is 1 over its constant, its stall torque constant over resistance."""
-        gains, one = self._nominal["actuator_gainprm"].repeat(self._sim.num_envs, 1, 1), torch.ones((), device=self._draws.device)
+        gains, one = (
+            self._nominal["actuator_gainprm"].repeat(self._sim.num_envs, 1, 1),
+            torch.ones((), device=self._draws.device),
+        )
         speed, stall = (self.values.get(name, one) for name in ("no_load_speed", "stall_torque"))
         gains[:, :, _CONSTANT] /= speed
         gains[:, :, _RESISTANCE] /= speed * stall
@@ -230,10 +268,14 @@ class DomainRand:
 def _check_mass(cfg: RobotTaskCfg, robot: RobotModel) -> None:
     """The lightest root that can be drawn still has a mass."""
     kinds, nominal = active(cfg), float(robot.physics.body_mass[robot.id("body", robot.root)])
-    lightest = nominal * (kinds["link_mass"][1] if "link_mass" in kinds else 1.0) + (kinds["base_mass"][1] if "base_mass" in kinds else 0.0)
+    lightest = nominal * (kinds["link_mass"][1] if "link_mass" in kinds else 1.0) + (
+        kinds["base_mass"][1] if "base_mass" in kinds else 0.0
+    )
     if lightest <= 0.0:
         span = cfg.domain_rand.base_mass
-        raise ConfigError(f"domain_rand.base_mass is {span!r}: the root '{robot.root}' has {nominal:g} kg, which leaves some with none")
+        raise ConfigError(
+            f"domain_rand.base_mass is {span!r}: the root '{robot.root}' has {nominal:g} kg, which leaves some with none"
+        )
 
 
 def _links(robot: RobotModel) -> Tensor:

@@ -41,7 +41,9 @@ class Falls(RobotTask):
         states = fallen(self.robot.physics, min(falls.states, 4 * self.num_envs), falls.seed, falls.seconds)
         self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in states)  # (P, nq), (P, nv)
         self.up = self._zeros(dtype=torch.bool)  # (N,) as high and upright as one that stands
-        self.pull = Pull(self.sim, self._lifted(), self.gravity_dir, falls.pull * 9.81 * self.total_mass, falls.pull_fades)
+        self.pull = Pull(
+            self.sim, self._lifted(), self.gravity_dir, falls.pull * 9.81 * self.total_mass, falls.pull_fades
+        )
 
     def _lifted(self) -> int:
         """The body that ``falls.pull`` lifts."""
@@ -51,7 +53,9 @@ class Falls(RobotTask):
             raise ConfigError(f"falls.pull_on: {unknown('body', falls.pull_on, names, self.cfg.asset.file)}")
         lifted = model.body(falls.pull_on).id if falls.pull_on else self.root_body
         if falls.pull and lifted == self.root_body and self.cfg.perturbation.kick:
-            raise ConfigError("falls.pull lifts the root, which perturbation.kick pushes: name another body in falls.pull_on")
+            raise ConfigError(
+                "falls.pull lifts the root, which perturbation.kick pushes: name another body in falls.pull_on"
+            )
         return lifted
 
     def _reset_robots(self, mask: Tensor) -> None:

@@ -19,7 +19,9 @@ from legged_mw.utils.config import ConfigError
 class GaitClock:
     """The clocks of N worlds with F feet; fixed tensors, written in place, as a recorded step needs them."""
 
-    def __init__(self, cfg: type[LeggedRobotCfg.gait], feet: tuple[str, ...], num_envs: int, dt: float, device: str) -> None:
+    def __init__(
+        self, cfg: type[LeggedRobotCfg.gait], feet: tuple[str, ...], num_envs: int, dt: float, device: str
+    ) -> None:
         """``dt`` [s] is a control step. Raises ConfigError for offsets that are not one a foot."""
         self.offsets = _offsets(cfg, feet)
         self.stance, self._random_start = cfg.stance, cfg.random_start
@@ -28,7 +30,8 @@ class GaitClock:
         self.phase = torch.zeros(num_envs, device=device)  # (N,) share of the period, as last observed
         self.running = torch.zeros(num_envs, dtype=torch.bool, device=device)  # (N,) as last observed: told to move
         self.foot_phase = torch.zeros(num_envs, len(feet), device=device)  # (N, F) from 0 to 1
-        self.row = torch.zeros(num_envs, 2 * len(feet), device=device)  # sine of each foot's phase, then cosine; 0 at rest
+        # sine of each foot's phase, then cosine; 0 at rest
+        self.row = torch.zeros(num_envs, 2 * len(feet), device=device)
 
     def tick(self) -> None:
         """A control step has passed: clocks that run go on."""

@@ -13,7 +13,8 @@ from legged_mw.envs.observations import Row
 from legged_mw.envs.skill_config import SkillCfgPPO
 from legged_mw.utils.bounds import Seconds
 
-UP_TILT, UP_HEIGHT = 0.966, 0.9  # cosine of the tilt (15 degrees), share of the standing height: it is up [ours: servos alone hold 0.92]
+# cosine of the tilt (15 degrees), share of the standing height: it is up [ours: servos alone hold 0.92]
+UP_TILT, UP_HEIGHT = 0.966, 0.9
 
 
 class GetupCfg(FallsCfg):
@@ -24,13 +25,15 @@ class GetupCfg(FallsCfg):
         self_collisions = True  # and all colliders touch the ground [P]
 
     class control(FallsCfg.control):
-        action_origin, action_scale = "joints", 0.5  # [P, H: about the default pose noise turns no robot over; docs/skills.md], [rad] [P]
+        # [P, H: about the default pose noise turns no robot over; docs/skills.md], [rad] [P]
+        action_origin, action_scale = "joints", 0.5
 
     class termination(FallsCfg.termination):
         max_tilt = 180.0  # [deg]: no attitude ends an episode [P, H]
 
     class domain_rand(FallsCfg.domain_rand):
-        base_mass, base_com, friction = [-1.0, 3.0], [-0.03, 0.03], [0.25, 1.2]  # [kg] [H -2 to 5], [m], [-] [H 0.1 to 1]
+        # [kg] [H -2 to 5], [m], [-] [H 0.1 to 1]
+        base_mass, base_com, friction = [-1.0, 3.0], [-0.03, 0.03], [0.25, 1.2]
         stiffness, damping, strength = [0.9, 1.1], [0.9, 1.1], [0.9, 1.1]  # [H 0.85 to 1.15]
         slope = [0.0, 12.0]  # [deg] [ours: the exam asks 10]
 
@@ -38,18 +41,21 @@ class GetupCfg(FallsCfg):
         within: Seconds = 3.0  # [s] in which it must stand
 
     class rewards(FallsCfg.rewards):
-        only_positive_rewards = False  # [ours, P True: nothing ends an episode, and while it thrashes all would be clipped]
+        # [ours, P True: nothing ends an episode, and while it thrashes all would be clipped]
+        only_positive_rewards = False
 
         class scales(FallsCfg.rewards.scales):  # [P], with our terms of the same meaning
             upright, height, posture, stand_still = 1.0, 1.0, 1.0, 1.0
             action_rate, action_smoothness, torques, dof_acc, dof_pos_limits = -0.005, -0.001, -1e-5, -1e-8, -0.1
-            fast_joints = -0.0003  # [ours, P -0.1 and dof_acc -2.5e-7: at first the noise would cost ten times what it gains]
+            # [ours, P -0.1 and dof_acc -2.5e-7: at first the noise would cost ten times what it gains]
+            fast_joints = -0.0003
 
 
 class GetupCfgPPO(SkillCfgPPO):
     class actor(SkillCfgPPO.actor):
         class distribution_cfg(SkillCfgPPO.actor.distribution_cfg):
-            init_std, std_range = 1.0, [0.2, 1e6]  # [ours: those that stand want less noise, before the others have found how to turn over]
+            # [ours: those that stand want less noise, before the others have found how to turn over]
+            init_std, std_range = 1.0, [0.2, 1e6]
 
     class algorithm(SkillCfgPPO.algorithm):
         gamma = 0.98  # [P 0.97]
@@ -70,7 +76,8 @@ class Getup(Falls):
         self.up.copy_((self.upright > UP_TILT) & (self.base_height > UP_HEIGHT * self.up_height))
 
     def _body_rows(self) -> list[Row]:
-        return [*super()._body_rows(), Row("base_height", self.base_height[:, None], mirror="scalar")]  # above the ground [m] [P]
+        # above the ground [m] [P]
+        return [*super()._body_rows(), Row("base_height", self.base_height[:, None], mirror="scalar")]
 
     def _near_upright(self) -> Tensor:
         return torch.exp(-4.0 * (1.0 - self.upright))  # exp(-2 |g + z|^2) of unit vectors [P]

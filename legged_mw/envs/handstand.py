@@ -28,7 +28,8 @@ class HandstandCfg(SkillCfg):
         hands: list[str] = []  # geoms that stand: nothing else may touch the ground
 
     class control(SkillCfg.control):
-        action_scale = 0.5  # [rad] [ours, of the default pose; P 0.3 of the last targets, and no row says where they are]
+        # [rad] [ours, of the default pose; P 0.3 of the last targets, and no row says where they are]
+        action_scale = 0.5
 
     class normalization(SkillCfg.normalization):
         clip_actions = 4.0  # [ours: the thighs turn by 1.6 rad]
@@ -42,10 +43,12 @@ class HandstandCfg(SkillCfg):
     class rewards(SkillCfg.rewards):
         soft_dof_pos_limit = 0.9  # [P]
 
-        class scales(SkillCfg.rewards.scales):  # [P]; what it calls pose and contact is here joint_deviation, of angles, and collision
+        # [P]; what it calls pose and contact is here joint_deviation, of angles, and collision
+        class scales(SkillCfg.rewards.scales):
             stand_height, stand_attitude = 1.0, 1.0
             collision, dof_pos_limits, joint_deviation = -0.1, -0.5, -0.1
-            action_rate, energy, dof_acc = -0.002, -1e-4, -1e-8  # [P in its fine-tuning 0, -0.003, -2.5e-7: as much as it gains, at first]
+            # [P in its fine-tuning 0, -0.003, -2.5e-7: as much as it gains, at first]
+            action_rate, energy, dof_acc = -0.002, -1e-4, -1e-8
 
 
 class HandstandCfgPPO(SkillCfgPPO):

@@ -160,7 +160,9 @@ class LeggedRewards(RobotRewards):
 
     def _reward_feet_orientation(self) -> Tensor:
         """Sum over feet of the squared sine of their tilt; a foot is flat as it is in the default pose. [H -5]"""
-        up = quat_rotate(self.sim.xquat.index_select(1, self.foot_bodies), self.foot_up.expand(len(self.foot_contact), -1, -1))
+        up = quat_rotate(
+            self.sim.xquat.index_select(1, self.foot_bodies), self.foot_up.expand(len(self.foot_contact), -1, -1)
+        )
         return up[..., :2].square().sum(dim=(1, 2))
 
     def _reward_air_time_variance(self) -> Tensor:

@@ -216,7 +216,8 @@ class LeggedRobot(LeggedRewards, RobotTask):
             "state": [
                 *self._measured_rows(),
                 *self._gait_rows(),
-                Row("commands", self.commands, mirror="command"),  # vx, vy [m/s], yaw rate [rad/s], body frame; further ones
+                # vx, vy [m/s], yaw rate [rad/s], body frame; further ones
+                Row("commands", self.commands, mirror="command"),
                 *self._height_rows("state", self.cfg.noise.scales.height_scan),
             ],
             "privileged_state": [
@@ -239,9 +240,20 @@ class LeggedRobot(LeggedRewards, RobotTask):
         """Of each foot, where ``observations`` asks for it: height above the ground under it; the ground's force, in 100 N."""
         rows, asked = [], self.cfg.observations
         if asked.foot_height:
-            rows.append(Row("foot_height", self.foot_height, mirror="foot", unit="m", frame="site above the ground under it"))
+            rows.append(
+                Row("foot_height", self.foot_height, mirror="foot", unit="m", frame="site above the ground under it")
+            )
         if asked.contact_forces:
-            rows.append(Row("contact_forces", self.contact_forces.flatten(1), mirror="foot_polar", scale=0.01, unit="N", frame="world"))
+            rows.append(
+                Row(
+                    "contact_forces",
+                    self.contact_forces.flatten(1),
+                    mirror="foot_polar",
+                    scale=0.01,
+                    unit="N",
+                    frame="world",
+                )
+            )
         return rows
 
     def _height_rows(self, group: str, noise: float = 0.0) -> list[Row]:
@@ -262,7 +274,9 @@ class LeggedRobot(LeggedRewards, RobotTask):
             left_out = "height_scan" in self.cfg.observations.leave_out.get(group, [])
             if not left_out and not any(row.name == "height_scan" for row in self.observations.groups.get(group, [])):
                 here = f"{type(self).__name__}.observation_rows has no row height_scan in '{group}'"
-                raise ConfigError(f"terrain.height_scan names '{group}', but {here}; add *self._height_rows('{group}', noise) to it")
+                raise ConfigError(
+                    f"terrain.height_scan names '{group}', but {here}; add *self._height_rows('{group}', noise) to it"
+                )
 
     def _mirror_blocks(self) -> dict[str, Block]:
         terrain, blocks = self.cfg.terrain, super()._mirror_blocks()
@@ -314,7 +328,10 @@ class LeggedRobot(LeggedRewards, RobotTask):
             self._episode.zero_()  # what was under way counts for nothing
             levels, last = spread(state["terrain_levels"], self.num_envs), self.tiles.num_levels - 1
             if beyond := int((levels > last).sum()):
-                print(f"terrain: {beyond} worlds go on on level {last}, the last one here; the checkpoint has them higher", flush=True)
+                print(
+                    f"terrain: {beyond} worlds go on on level {last}, the last one here; the checkpoint has them higher",
+                    flush=True,
+                )
             self.tiles.put(levels.clamp(max=last))
             self._reset_all()
 
@@ -332,7 +349,9 @@ class LeggedRobot(LeggedRewards, RobotTask):
 
     def _make_terrain(self) -> Terrain | None:
         if not isinstance(self.cfg, LeggedRobotCfg):
-            raise ConfigError(f"{type(self).__name__} walks by command: it needs a LeggedRobotCfg, not a {type(self.cfg).__name__}")
+            raise ConfigError(
+                f"{type(self).__name__} walks by command: it needs a LeggedRobotCfg, not a {type(self.cfg).__name__}"
+            )
         return build_terrain(self.cfg)
 
     def _sensed_geoms(self) -> list[str]:
@@ -345,7 +364,8 @@ class LeggedRobot(LeggedRewards, RobotTask):
     def _init_buffers(self) -> None:
         super()._init_buffers()
         self.num_feet = feet = len(self.foot_names)
-        self.foot_vel = self.sim.sensordata[:, self.robot.sensors["linvel"]].unflatten(1, (feet, 3))  # view, world frame [m/s]
+        # view, world frame [m/s]
+        self.foot_vel = self.sim.sensordata[:, self.robot.sensors["linvel"]].unflatten(1, (feet, 3))
         self.foot_sites = torch.tensor([self.robot.id("site", name) for name in self.foot_names], device=self.device)
         self.foot_pos = self._zeros(feet, 3)  # [m, world]
         self.feet = FootContacts(self.robot, self.foot_geoms.values(), self.sim.sensordata, self.contact_count)
@@ -373,7 +393,9 @@ class LeggedRobot(LeggedRewards, RobotTask):
         # above the ground under each foot and under the root [m]
         self.foot_height = self._zeros(self.num_feet) if terrain else self.foot_pos[..., 2]
         self.base_height = self._zeros() if terrain else self.base_height
-        grid = torch.cartesian_prod(torch.tensor(cfg.measured_points_x), torch.tensor(cfg.measured_points_y)).view(-1, 2)
+        grid = torch.cartesian_prod(torch.tensor(cfg.measured_points_x), torch.tensor(cfg.measured_points_y)).view(
+            -1, 2
+        )
         self.scan_points = grid.to(self.device, torch.float).unbind(dim=1)
         self.height_scan = self._zeros(len(grid) if cfg.height_scan else 0)  # (N, P) [m]
 
@@ -384,10 +406,15 @@ class LeggedRobot(LeggedRewards, RobotTask):
         self.commands, self.command_timer = self._zeros(count), self._zeros(1)  # [unit of each]; [control steps]
         self.velocity_command = self.commands[:, :3]  # view: vx, vy [m/s], yaw rate [rad/s]
         self.heading = self._zeros()  # wanted, of the root's x axis in the world [rad]
-        self.full_command_ranges = self._tensor([[command.low, command.high] for command in self.command_table]).T.contiguous()  # (2, C)
+        # (2, C)
+        self.full_command_ranges = self._tensor(
+            [[command.low, command.high] for command in self.command_table]
+        ).T.contiguous()
         self.command_ranges = self.full_command_ranges.clone()
         self._narrowest = default.expand(2, count)
-        self.rest_command = self._tensor([0.0 if command.name in VELOCITY else command.default for command in self.command_table])
+        self.rest_command = self._tensor(
+            [0.0 if command.name in VELOCITY else command.default for command in self.command_table]
+        )
         self.keep_probability = self._tensor([*cfg.keep_probability, *[1.0] * (count - len(cfg.keep_probability))])
         self.command_curriculum = self._tensor([cfg.curriculum_start if cfg.curriculum else 1.0, 0.0, 0.0])
         if cfg.curriculum:

@@ -29,7 +29,9 @@ from legged_mw.utils.bounds import (
 
 Probabilities = Annotated[list[Share], Bound("three numbers, and more for further commands", lambda v: len(v) >= 3)]
 Stance = Annotated[float, Bound("above 0 and below 1", lambda v: 0 < v < 1)]
-CellSize = Annotated[float, Bound("above 0 and at most 0.25 m, or a cell would be wider than a step of stairs", lambda v: 0 < v <= 0.25)]
+CellSize = Annotated[
+    float, Bound("above 0 and at most 0.25 m, or a cell would be wider than a step of stairs", lambda v: 0 < v <= 0.25)
+]
 Border = Annotated[float, Bound("1 m or more, for a robot that leaves the tiles to turn back", lambda v: v >= 1)]
 Marks = Annotated[list[Positive], or_empty(THREE)]
 
@@ -38,27 +40,37 @@ class LeggedRobotCfg(RobotTaskCfg):
     """Walking by command. Defaults are the joystick task [P]; the robot's own names and numbers are in configs/."""
 
     class asset(RobotTaskCfg.asset):
-        foot_names: list[str] = []  # of sites, and of geoms if foot_geoms says nothing; the order is the order in observations
-        foot_geoms: dict[str, list[str]] = {}  # foot -> its geoms, names or patterns, where a foot is not one geom of its name
+        # of sites, and of geoms if foot_geoms says nothing; the order is the order in observations
+        foot_names: list[str] = []
+        # foot -> its geoms, names or patterns, where a foot is not one geom of its name
+        foot_geoms: dict[str, list[str]] = {}
 
     class observations(RobotTaskCfg.observations):
         foot_height: bool = False  # a row of `privileged_state`: each foot's height above the ground under it [m]
-        contact_forces: bool = False  # a row of `privileged_state`: the ground's force on each foot, world frame [N] [ours: off]
+        contact_forces: bool = (
+            False  # a row of `privileged_state`: the ground's force on each foot, world frame [N] [ours: off]
+        )
 
     class commands:
         resampling_time: Span = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]
         change_probability: Share = 0.5  # that a component changes at all when the timer ends [P]
-        keep_probability: Probabilities = [0.9, 0.25, 0.5]  # of each command: that a changed one is not its default; beyond the list 1 [P]
+        # of each command: that a changed one is not its default; beyond the list 1 [P]
+        keep_probability: Probabilities = [0.9, 0.25, 0.5]
 
-        curriculum: bool = False  # begin with a share of the ranges, and widen it while the velocity is tracked well [L]
+        curriculum: bool = (
+            False  # begin with a share of the ranges, and widen it while the velocity is tracked well [L]
+        )
         curriculum_start: Part = 0.4  # that share [-] [ours]
-        curriculum_step: Part = 0.1  # by which it grows, where worlds' last episodes have 0.8 of the best tracking_lin_vel [L, ours]
+        curriculum_step: Part = (
+            0.1  # by which it grows, where worlds' last episodes have 0.8 of the best tracking_lin_vel [L, ours]
+        )
 
         heading_command: bool = False  # the yaw rate steers to a heading that is drawn in its place [L]
         heading_gain: Positive = 0.5  # yaw rate a heading error, within its range [1/s] [L]
         units: dict[str, str] = {}  # of commands of your own, by name
         mirror: dict[str, Sign] = {}  # likewise: 1.0, or -1.0 where left and right change its sign
-        default: dict[str, float] = {}  # likewise: its value when nothing is asked; else 0, or the nearest to it in the range
+        # likewise: its value when nothing is asked; else 0, or the nearest to it in the range
+        default: dict[str, float] = {}
 
         class ranges:
             """Lowest and highest of each command, in the order that the policy sees them. A task may declare its own after these."""
@@ -72,13 +84,18 @@ class LeggedRobotCfg(RobotTaskCfg):
         """A clock (legged_mw/envs/gait.py): where each foot is in its step, for the policy and the terms feet_phase, contact_phase."""
 
         period: Span = 0.0  # of a step of both legs [s]; 0: no clock [unitree_rl_gym: 0.8]
-        offsets: list[Share] = []  # where each foot is when the clock is at 0, share of the period; empty: of two feet [0.0, 0.5]
+        # where each foot is when the clock is at 0, share of the period; empty: of two feet [0.0, 0.5]
+        offsets: list[Share] = []
         stance: Stance = 0.55  # share of the period that a foot stands, from its phase 0 [unitree_rl_gym]
-        random_start: bool = True  # episodes begin anywhere in the period, so that each leg learns to lead; False: at 0, as deploy does
+        random_start: bool = (
+            True  # episodes begin anywhere in the period, so that each leg learns to lead; False: at 0, as deploy does
+        )
 
     class rewards(RobotTaskCfg.rewards):
         tracking_sigma: Positive = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
-        tracking_sigma_end: NonNegative = 0.0  # where it goes in a straight line over max_iterations; 0: it stays [ours]
+        tracking_sigma_end: NonNegative = (
+            0.0  # where it goes in a straight line over max_iterations; 0: it stays [ours]
+        )
         swing_height: Swing = 0.1  # wanted height of a swinging foot [m] [P]
         min_air_time: NonNegative = 0.1  # a step that lasts less is penalised [s] [P]
         min_command: NonNegative = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]
@@ -116,16 +133,21 @@ class LeggedRobotCfg(RobotTaskCfg):
         num_rows: Count = 10  # levels of difficulty, along x [L]
         num_cols: Count = 20  # tiles side by side along y, each column of one kind [L]
         tile_size: Positive = 8.0  # edge of a tile [m] [L]
-        horizontal_scale: CellSize = 0.05  # between two heights [m] [ours: L 0.1 makes a step of stairs a slope of 50 degrees]
+        horizontal_scale: CellSize = (
+            0.05  # between two heights [m] [ours: L 0.1 makes a step of stairs a slope of 50 degrees]
+        )
         border_size: Border = 5.0  # flat ground around all tiles; a robot that leaves half of it behind starts again, timed out [m] [L 25]
         difficulty: ShareRange = [0.0, 1.0]  # of the first and the last row, from 0 to 1 [L]
-        terrain_proportions: dict[str, NonNegative] = {  # kind (legged_mw/sim/terrain.py) -> share of the columns [ours]
+        # kind (legged_mw/sim/terrain.py) -> share of the columns [ours]
+        terrain_proportions: dict[str, NonNegative] = {
             **{"flat": 0.05, "smooth_slope": 0.1, "rough_slope": 0.15, "stairs_up": 0.25, "stairs_down": 0.15},
             **{"obstacles": 0.15, "waves": 0.05, "low_random": 0.1},
         }
         seed: Whole = 1  # of all that is random in it
         curriculum: bool = True  # levels by what a robot can do; False: a random one at each reset [L]
-        max_init_terrain_level: Whole = 5  # highest level at the start of training; the last one, if there are fewer [L]
+        max_init_terrain_level: Whole = (
+            5  # highest level at the start of training; the last one, if there are fewer [L]
+        )
         measured_points_x: Points = [i / 10 for i in range(-8, 9)]  # of the height scan, ahead of the root [m] [L]
         measured_points_y: Points = [i / 10 for i in range(-5, 6)]  # to its left [m] [L]
         height_scan: list[Literal["state", "privileged_state"]] = []  # groups of observations that get the row
@@ -133,15 +155,21 @@ class LeggedRobotCfg(RobotTaskCfg):
     class exam:
         """The walking exam of --eval and of training (docs/grading.md); all [ours]."""
 
-        ranges: dict[str, Range] = {}  # lowest and highest lin_vel_x, lin_vel_y, ang_vel_yaw asked; not named: commands.ranges
-        push_speeds: list[Positive] = []  # jumps of the base's velocity [m/s]; empty: 0.5, 1, 1.5, 2, 3, and 4, 5, 6 if not on two feet
+        # lowest and highest lin_vel_x, lin_vel_y, ang_vel_yaw asked; not named: commands.ranges
+        ranges: dict[str, Range] = {}
+        # jumps of the base's velocity [m/s]; empty: 0.5, 1, 1.5, 2, 3, and 4, 5, 6 if not on two feet
+        push_speeds: list[Positive] = []
         push_vx: float = 0.0  # vx of a robot that is pushed [m/s]; 0: half of the highest
         transport_vx: float = 0.0  # vx of the cost of transport [m/s]; 0: half of the highest
-        marks: Marks = []  # walks: of vx, vy [m/s], yaw rate [rad/s]; empty: errors 0.06 of the highest, 0.06, 0.1 of the highest
+        # walks: of vx, vy [m/s], yaw rate [rad/s]; empty: errors 0.06 of the highest, 0.06, 0.1 of the highest
+        marks: Marks = []
         # and offsets 0.06, 0.06, 0.12
-        marks_of: Literal["", "error", "offset"] = ""  # offset: of the mean velocity; empty: that on two feet, which sway, else error
+        # offset: of the mean velocity; empty: that on two feet, which sway, else error
+        marks_of: Literal["", "error", "offset"] = ""
         push_mark: NonNegative = 0.0  # walks: all pushes of this speed are survived [m/s]; 0: 1 on two feet, else 2
-        peer: str = ""  # the robot (go1, go2, g1) whose published policies of legged_mw/eval/peers.py stand beside; empty: none
+        peer: str = (
+            ""  # the robot (go1, go2, g1) whose published policies of legged_mw/eval/peers.py stand beside; empty: none
+        )
 
 
 class LeggedRobotCfgPPO(RobotTaskCfgPPO):

@@ -42,7 +42,9 @@ def load_robot(
     robot = build_model(
         find_file(cfg, "asset.file"),
         solver=Solver(cfg.sim.dt, cfg.sim.iterations, cfg.sim.ls_iterations, cfg.sim.integrator),
-        ground=Ground(cfg.terrain.friction, cfg.terrain.condim, terrain, boxes=engine == "mujoco", slope=cfg.terrain.slope),
+        ground=Ground(
+            cfg.terrain.friction, cfg.terrain.condim, terrain, boxes=engine == "mujoco", slope=cfg.terrain.slope
+        ),
         stiffness={"": 0.0} if drive == "speed" else control.stiffness or none,
         damping=control.damping or none,
         colliders=asset.colliders,

@@ -33,7 +33,8 @@ class Block(NamedTuple):
 
     index: list[int]  # column that each is taken from
     sign: list[float]  # +1 or -1, times the ratio of the two columns' scales
-    shifts: list[tuple[int, int, float]] = []  # (to, from, factor): to the mirrored column, add factor * column, not mirrored
+    # (to, from, factor): to the mirrored column, add factor * column, not mirrored
+    shifts: list[tuple[int, int, float]] = []
 
 
 class Columns(NamedTuple):
@@ -70,9 +71,12 @@ def make_mirror(groups: Mapping[str, Sequence[Row]], blocks: dict[str, Block], r
     """
 
     def columns(block: Block) -> Columns:
-        with torch.inference_mode(False):  # whatever mode the first caller is in: mirrored actions of a loss carry gradients
+        # whatever mode the first caller is in: mirrored actions of a loss carry gradients
+        with torch.inference_mode(False):
             target, source, factor = zip(*block.shifts, strict=True) if block.shifts else ((), (), ())
-            places = (torch.tensor(list(where), dtype=torch.long, device=device) for where in (block.index, target, source))
+            places = (
+                torch.tensor(list(where), dtype=torch.long, device=device) for where in (block.index, target, source)
+            )
             numbers = (torch.tensor(list(values), dtype=torch.float, device=device) for values in (block.sign, factor))
             (index, to, origin), (sign, by) = places, numbers
             return Columns(index, sign, to, origin, by)
@@ -90,10 +94,12 @@ def robot_blocks(partners: Partners) -> dict[str, Block]:
         "scalar": Block([0], [1.0]),  # the same on both sides
         "polar": Block([0, 1, 2], [1.0, -1.0, 1.0]),  # x, -y, z: a velocity, a force, a direction
         "axial": Block([0, 1, 2], [-1.0, 1.0, -1.0]),  # -x, y, -z: an angular velocity
-        "imu_velocity": Block([0, 1, 2], [1.0, -1.0, 1.0]),  # of the IMU, body frame; shifted by the row "base_ang_vel" beside it
+        # of the IMU, body frame; shifted by the row "base_ang_vel" beside it
+        "imu_velocity": Block([0, 1, 2], [1.0, -1.0, 1.0]),
         "joint": joints,  # a number a joint
         "joint_factor": Block(joints.index, [1.0] * len(joints.index)),  # one that does not turn with the joint's axis
-        "link": Block([0, *(1 + j for j in joints.index)], [1.0] * (1 + len(joints.index))),  # the root's, then one a joint
+        # the root's, then one a joint
+        "link": Block([0, *(1 + j for j in joints.index)], [1.0] * (1 + len(joints.index))),
     }
 
 
@@ -102,7 +108,8 @@ def foot_blocks(partners: Partners) -> dict[str, Block]:
     feet = list(partners.sites)
     return {
         "foot": Block(feet, [1.0] * len(feet)),  # a number a foot
-        "foot_polar": Block([3 * f + k for f in feet for k in range(3)], [1.0, -1.0, 1.0] * len(feet)),  # a polar vector a foot
+        # a polar vector a foot
+        "foot_polar": Block([3 * f + k for f in feet for k in range(3)], [1.0, -1.0, 1.0] * len(feet)),
     }
 
 
@@ -117,7 +124,9 @@ def body_blocks(robot: RobotModel, partners: Partners, names: Sequence[str]) -> 
     for name, image in zip(names, images, strict=True):
         if image not in bodies:
             other = robot.physics.body(image).name
-            raise ConfigError(f"body '{name}' is compared and its mirror image '{other}' is not: name both, or {NO_MIRROR}")
+            raise ConfigError(
+                f"body '{name}' is compared and its mirror image '{other}' is not: name both, or {NO_MIRROR}"
+            )
     places, polar, turn = [bodies.index(image) for image in images], [1.0, -1.0, 1.0], [1.0, -1.0, -1.0, 1.0, 1.0, -1.0]
     return {
         "turn": Block([*range(6)], turn),
@@ -142,7 +151,9 @@ def command_block(table: Sequence[Command], reach: float) -> Block:
 def scan_block(xs: Sequence[float], ys: Sequence[float]) -> Block:
     """Points (x, y) in the order of the height scan: x stays, y changes its sign. Raises ConfigError for a lopsided grid."""
     if any(abs(left + right) > 1e-6 for left, right in zip(sorted(ys), sorted(ys, reverse=True), strict=True)):
-        raise ConfigError(f"terrain.measured_points_y {list(ys)} is not its own mirror image; make it so, or {NO_MIRROR}")
+        raise ConfigError(
+            f"terrain.measured_points_y {list(ys)} is not its own mirror image; make it so, or {NO_MIRROR}"
+        )
     partner = [min(range(len(ys)), key=lambda j: abs(ys[j] + y)) for y in ys]
     return Block([i * len(ys) + j for i in range(len(xs)) for j in partner], [1.0] * (len(xs) * len(ys)))
 
@@ -165,13 +176,19 @@ def _side_by_side(group: str, rows: Sequence[Row], blocks: Mapping[str, Block], 
     for row in rows:
         where = f"observation row '{row.name}' of '{group}'"
         if row.mirror is None:
-            raise ConfigError(f"{where} does not say what a mirror does to it: give its Row a mirror=...; there are: {', '.join(blocks)}")
+            raise ConfigError(
+                f"{where} does not say what a mirror does to it: give its Row a mirror=...; there are: {', '.join(blocks)}"
+            )
         if row.mirror not in blocks:
-            raise ConfigError(f"{where}: {unknown('mirror', row.mirror, blocks, 'its Row (a group must come before what contains it)')}")
+            raise ConfigError(
+                f"{where}: {unknown('mirror', row.mirror, blocks, 'its Row (a group must come before what contains it)')}"
+            )
         block = blocks[row.mirror]
         times, rest = divmod(row.size, len(block.index))
         if row.value.shape[1] % len(block.index) or rest:
-            raise ConfigError(f"{where} has {row.value.shape[1]} columns; mirror='{row.mirror}' takes a multiple of {len(block.index)}")
+            raise ConfigError(
+                f"{where} has {row.value.shape[1]} columns; mirror='{row.mirror}' takes a multiple of {len(block.index)}"
+            )
         starts[row.name] = len(whole.index)
         for _ in range(times):
             start = len(whole.index)
@@ -184,13 +201,19 @@ def _side_by_side(group: str, rows: Sequence[Row], blocks: Mapping[str, Block], 
     return _scaled(whole, [scale for row in rows for scale in row.column_scales() * row.history])
 
 
-def _imu_shifts(group: str, row: Row, rows: Sequence[Row], starts: Mapping[str, int], reach: float) -> list[tuple[int, int, float]]:
+def _imu_shifts(
+    group: str, row: Row, rows: Sequence[Row], starts: Mapping[str, int], reach: float
+) -> list[tuple[int, int, float]]:
     """What turning adds to each frame of the IMU's velocity ``row``, from the same frame of the row "base_ang_vel"."""
     rates = next((each for each in rows if each.name == "base_ang_vel"), None)
     if rates is None:
-        raise ConfigError(f"observation row '{row.name}' of '{group}' needs the row 'base_ang_vel' beside it, to be mirrored")
+        raise ConfigError(
+            f"observation row '{row.name}' of '{group}' needs the row 'base_ang_vel' beside it, to be mirrored"
+        )
     if rates.history < row.history:
-        raise ConfigError(f"observations.history: '{group}.{row.name}' has {row.history} frames, so 'base_ang_vel' needs as many")
+        raise ConfigError(
+            f"observations.history: '{group}.{row.name}' has {row.history} frames, so 'base_ang_vel' needs as many"
+        )
     shifts = []
     for back in range(1, row.history + 1):  # frames are oldest first, so both are counted from the newest
         velocity = starts[row.name] + 3 * (row.history - back)

@@ -16,7 +16,9 @@ from legged_mw.utils.files import find_file
 class Reference:
     """Clips one after another, each followed by its last frame, held. Every world has a frame that it is to reach in the step to come."""
 
-    def __init__(self, clips: Sequence[Clip], kinematics: Kinematics, num_envs: int, device: str, *, held: int, bin_frames: int) -> None:
+    def __init__(
+        self, clips: Sequence[Clip], kinematics: Kinematics, num_envs: int, device: str, *, held: int, bin_frames: int
+    ) -> None:
         """``held``: frames that a clip's last one is held for. New episodes begin in bins of some ``bin_frames`` frames."""
 
         def places(values: Sequence[int]) -> Tensor:
@@ -25,20 +27,25 @@ class Reference:
         tables, last, bins, bin_of = [], [], [], []
         for clip in clips:
             start, count = len(last), len(clip.root_pos)
-            qpos, qvel = (torch.tensor(values, dtype=torch.float, device=device) for values in (clip.qpos(), clip.qvel()))
+            qpos, qvel = (
+                torch.tensor(values, dtype=torch.float, device=device) for values in (clip.qpos(), clip.qvel())
+            )
             still = torch.cat([qpos[-1:], torch.zeros_like(qvel[-1:])], dim=1).expand(held, -1)
             state = torch.cat([torch.cat([qpos, qvel], dim=1), still])
             bodies = kinematics(*state.split([qpos.shape[1], qvel.shape[1]], dim=1))
             tables.append(torch.cat([state, *(part.flatten(1) for part in bodies)], dim=1))
             parts = max(1, round((count - 1) / bin_frames))
             edges = [start + (count - 1) * i // parts for i in range(parts + 1)]
-            bin_of += [len(bins) + min(i * parts // (count - 1), parts - 1) for i in range(count)] + [len(bins) + parts - 1] * held
+            bin_of += [len(bins) + min(i * parts // (count - 1), parts - 1) for i in range(count)] + [
+                len(bins) + parts - 1
+            ] * held
             bins += [(low, high - low) for low, high in zip(edges, edges[1:], strict=False)]
             last += [start + count - 1 + held] * (count + held)
         self._table = torch.cat(tables)  # (M, W)
         self._last, self._bin_of, self._bins = places(last), places(bin_of), torch.tensor(bins, device=device)
         self.frame = torch.zeros(num_envs, dtype=torch.long, device=device)  # (N,)
-        self.failures = torch.zeros(len(bins), device=device)  # share of the worlds that fall there in a step, as remembered
+        # share of the worlds that fall there in a step, as remembered
+        self.failures = torch.zeros(len(bins), device=device)
         self._row = torch.zeros(num_envs, self._table.shape[1], device=device)
         widths = [qpos.shape[1], qvel.shape[1], *(part[0].numel() for part in bodies)]
         self.qpos, self.qvel, *parts = self._row.split(widths, dim=1)

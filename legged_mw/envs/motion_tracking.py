@@ -55,7 +55,9 @@ class MotionTracking(RobotTask):
         down = super()._fallen()
         down |= (ours.pos[:, self.anchor, 2] - theirs.pos[:, self.anchor, 2]).abs() > end.max_anchor_height
         down |= (ours.rot[:, self.anchor, 2, 2] - theirs.rot[:, self.anchor, 2, 2]).abs() > end.max_anchor_tilt
-        down |= ((ours.pos - self.reference.wanted_pos).index_select(1, self.ends)[..., 2].abs() > end.max_end_height).any(dim=1)
+        down |= (
+            (ours.pos - self.reference.wanted_pos).index_select(1, self.ends)[..., 2].abs() > end.max_end_height
+        ).any(dim=1)
         return down
 
     def _timed_out(self) -> Tensor:
@@ -66,7 +68,12 @@ class MotionTracking(RobotTask):
         """Robots near the reference, at a frame that the failures draw."""
         motion = self.cfg.motion
         qpos, qvel = self.reference.begin(mask, self.reference.draw(motion.uniform) if motion.random_start else None)
-        off = torch.rand(self.num_envs, len(self.start_range), device=self.device).mul_(2.0).sub_(1.0).mul_(self.start_range)
+        off = (
+            torch.rand(self.num_envs, len(self.start_range), device=self.device)
+            .mul_(2.0)
+            .sub_(1.0)
+            .mul_(self.start_range)
+        )
         place, turn, speed, bend = off.split([3, 3, 6, self.num_actions], dim=1)
         attitude = quat_multiply(rotation_quat(turn), qpos[:, 3:7])
         joints = (qpos[:, 7:] + bend).clamp(self.soft_lower, self.soft_upper)
@@ -98,11 +105,18 @@ class MotionTracking(RobotTask):
 
     def observation_rows(self) -> dict[str, list[Row | str]]:
         noise = self.cfg.noise.scales
-        angles = {"reference_joint_pos": self.reference.joint_pos, "reference_joint_vel": self.reference.joint_vel}  # [rad], [rad/s]
+        # [rad], [rad/s]
+        angles = {"reference_joint_pos": self.reference.joint_pos, "reference_joint_vel": self.reference.joint_vel}
         clip = [Row(name, value, mirror="joint") for name, value in angles.items()]
         # the reference's anchor in the robot's: its place [m], two columns of its rotation
-        anchors = [Row("anchor_pos", self.anchor_pos, mirror="polar"), Row("anchor_ori", self.anchor_ori, mirror="turn")]
-        seen = [row._replace(noise=level, measured=True) for row, level in zip(anchors, (noise.anchor_pos, noise.anchor_ori), strict=True)]
+        anchors = [
+            Row("anchor_pos", self.anchor_pos, mirror="polar"),
+            Row("anchor_ori", self.anchor_ori, mirror="turn"),
+        ]
+        seen = [
+            row._replace(noise=level, measured=True)
+            for row, level in zip(anchors, (noise.anchor_pos, noise.anchor_ori), strict=True)
+        ]
         return {
             "state": [*clip, *seen, *(row for row in self._measured_rows() if row.name != "projected_gravity")],
             "privileged_state": [
@@ -137,11 +151,15 @@ class MotionTracking(RobotTask):
 
     def _reward_tracking_body_pos(self) -> Tensor:
         """The bodies' places, at the anchor. [B]"""
-        return self._near((self.body.pos - self.reference.wanted_pos).square().sum(dim=2), self.cfg.rewards.body_pos_sigma)
+        return self._near(
+            (self.body.pos - self.reference.wanted_pos).square().sum(dim=2), self.cfg.rewards.body_pos_sigma
+        )
 
     def _reward_tracking_body_ori(self) -> Tensor:
         """The bodies' attitudes, at the anchor. [B]"""
-        return self._near(angle_between(self.body.rot, self.reference.wanted_rot).square(), self.cfg.rewards.body_ori_sigma)
+        return self._near(
+            angle_between(self.body.rot, self.reference.wanted_rot).square(), self.cfg.rewards.body_ori_sigma
+        )
 
     def _reward_tracking_body_lin_vel(self) -> Tensor:
         """The bodies' velocities, world frame. [B]"""
@@ -156,7 +174,9 @@ class MotionTracking(RobotTask):
     def _live_statistics(self) -> dict[str, Tensor]:
         """Mean distance of the bodies from the reference, at the anchor [mm]."""
         off = ((self.body.pos - self.reference.wanted_pos).norm(dim=2).mean(dim=1) * 1000.0).nan_to_num(0.0, 0.0, 0.0)
-        return super()._live_statistics() | {"body_error_mm": torch.stack([off.sum(), torch.full_like(off[0], len(off))])}
+        return super()._live_statistics() | {
+            "body_error_mm": torch.stack([off.sum(), torch.full_like(off[0], len(off))])
+        }
 
     # ---- checkpoint, buffers ------------------------------------------------------------------------------------------------
 
@@ -174,14 +194,18 @@ class MotionTracking(RobotTask):
         given, default = self.cfg.init_state, MotionTrackingCfg.init_state
         if unread := [name for name in _BEGINNINGS if getattr(given, name) != getattr(default, name)]:
             names, instead = ", ".join(unread), ", ".join(dict.fromkeys(_BEGINNINGS[name] for name in unread))
-            raise ConfigError(f"init_state: {names}: not read here, as episodes begin in a motion; leave out, and write motion: {instead}")
+            raise ConfigError(
+                f"init_state: {names}: not read here, as episodes begin in a motion; leave out, and write motion: {instead}"
+            )
         super()._init_ranges()
 
     def _init_buffers(self) -> None:
         super()._init_buffers()
         motion = self.cfg.motion
         self.anchor = motion.bodies.index(motion.anchor)
-        self.ends = torch.tensor([motion.bodies.index(name) for name in motion.end_bodies], dtype=torch.long, device=self.device)
+        self.ends = torch.tensor(
+            [motion.bodies.index(name) for name in motion.end_bodies], dtype=torch.long, device=self.device
+        )
         bodies = [self.robot.id("body", name) for name in motion.bodies]
         self.kinematics = Kinematics(self.robot.physics, bodies, self.device)
         self.anchor_kinematics = Kinematics(self.robot.physics, [bodies[self.anchor]], self.device)
@@ -191,4 +215,6 @@ class MotionTracking(RobotTask):
         ranges = [*motion.start_pos, *motion.start_turn, *motion.start_lin_vel, *motion.start_ang_vel]
         self.start_range = self._tensor(ranges + [motion.start_joints] * self.num_actions)
         self.body = Bodies(*(torch.zeros_like(part) for part in self.reference.bodies))
-        self.anchor_pos, self.anchor_ori, self.body_pos, self.body_ori = map(self._zeros, (3, 6, 3 * len(bodies), 6 * len(bodies)))
+        self.anchor_pos, self.anchor_ori, self.body_pos, self.body_ori = map(
+            self._zeros, (3, 6, 3 * len(bodies), 6 * len(bodies))
+        )

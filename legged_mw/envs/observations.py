@@ -23,7 +23,9 @@ class Row(NamedTuple):
     name: str
     value: Tensor  # (N, size), a buffer that the step writes in place
     noise: float = 0.0  # half width of the uniform noise added to it, in the value's unit
-    mirror: str | None = None  # its mirror image, left for right: a kind of envs/mirror.py, or a group; None: not stated
+    mirror: str | None = (
+        None  # its mirror image, left for right: a kind of envs/mirror.py, or a group; None: not stated
+    )
     scale: float | tuple[float, ...] = 1.0  # a number, or one a column; the policy sees scale * (value + noise)
     measured: bool = False  # comes from a sensor, so that domain_rand.observation_delay applies to it
     # how a robot measures it, for the exported policy; legged_mw/deploy/contract.py knows the rows of RobotTask by their names
@@ -42,7 +44,9 @@ class Row(NamedTuple):
         """The scale of each column of ``value``; raises ConfigError where there is not one for each."""
         size = self.value.shape[1]
         if isinstance(self.scale, tuple) and len(self.scale) != size:
-            raise ConfigError(f"observation row '{self.name}' has {size} columns and {len(self.scale)} scales; give one, or one a column")
+            raise ConfigError(
+                f"observation row '{self.name}' has {size} columns and {len(self.scale)} scales; give one, or one a column"
+            )
         return list(self.scale) if isinstance(self.scale, tuple) else [float(self.scale)] * size
 
 
@@ -130,7 +134,9 @@ class Observations:
     def _group_row(self, group: str, name: str) -> Row:
         """A group as a row of another: the same noisy sample."""
         if name not in self.buffers:
-            raise ConfigError(f"observation group '{group}': {unknown('group', name, self.buffers, 'the groups that come before it')}")
+            raise ConfigError(
+                f"observation group '{group}': {unknown('group', name, self.buffers, 'the groups that come before it')}"
+            )
         return Row(name, self.buffers[name], mirror=name, group=name)
 
 
@@ -145,18 +151,28 @@ class _Group:
         self._scales = torch.tensor(scales, device=device) if any(scale != 1.0 for scale in scales) else None
         self._measured = torch.tensor([row.measured for row in rows for _ in range(row.value.shape[1])], device=device)
         self.delay: Delay | None = None
-        self.suspects = Suspects([f"observation row '{row.name}' of '{name}'" for row in rows for _ in range(row.value.shape[1])], device)
+        self.suspects = Suspects(
+            [f"observation row '{row.name}' of '{name}'" for row in rows for _ in range(row.value.shape[1])], device
+        )
         self.fresh = torch.ones(num_envs, dtype=torch.bool, device=device)  # no frame of this episode is there yet
         self.frame = torch.zeros(num_envs, len(noise), device=device)  # the newest frame of each row
         self.buffer = self.frame
-        self.histories: list[tuple[Tensor, Tensor]] = []  # frames (N, F, size) in the buffer, newest (N, size) in the frame
+        # frames (N, F, size) in the buffer, newest (N, size) in the frame
+        self.histories: list[tuple[Tensor, Tensor]] = []
         if any(row.history > 1 for row in rows):
             long = max(rows, key=lambda row: row.size)
             what = f"observations.history of '{long.name}' = {long.history}"
-            require_memory(4 * num_envs * sum(row.size for row in rows), device, what, "each frame is kept in each world")
+            require_memory(
+                4 * num_envs * sum(row.size for row in rows), device, what, "each frame is kept in each world"
+            )
             self.buffer = torch.zeros(num_envs, sum(row.size for row in rows), device=device)
-            spans = self.buffer.split([row.size for row in rows], dim=1), self.frame.split([row.value.shape[1] for row in rows], dim=1)
-            self.histories = [(all_.unflatten(1, (row.history, -1)), new) for row, all_, new in zip(rows, *spans, strict=True)]
+            spans = (
+                self.buffer.split([row.size for row in rows], dim=1),
+                self.frame.split([row.value.shape[1] for row in rows], dim=1),
+            )
+            self.histories = [
+                (all_.unflatten(1, (row.history, -1)), new) for row, all_, new in zip(rows, *spans, strict=True)
+            ]
 
     def compute(self) -> None:
         torch.cat(self._values, dim=1, out=self.frame)
@@ -185,7 +201,10 @@ class _Group:
 
 def _check_names(table: Mapping[str, Sequence[Row | str]], cfg: type[RobotTaskCfg.observations]) -> None:
     """Every group and row that the section ``observations`` names is in the table. Raises ConfigError."""
-    names = {group: [entry if isinstance(entry, str) else entry.name for entry in entries] for group, entries in table.items()}
+    names = {
+        group: [entry if isinstance(entry, str) else entry.name for entry in entries]
+        for group, entries in table.items()
+    }
     for group, rows in names.items():
         if twice := [name for name in rows if rows.count(name) > 1]:
             raise ConfigError(f"observation group '{group}' has two rows '{twice[0]}': give each a name of its own")
@@ -204,4 +223,6 @@ def _check_names(table: Mapping[str, Sequence[Row | str]], cfg: type[RobotTaskCf
         if row and (row not in names[group] or row in cfg.leave_out.get(group, [])):
             raise ConfigError(f"observations.history: {unknown('row', row, names[group], repr(group))}")
         if frames < 1:
-            raise ConfigError(f"observations.history['{where}'] is {frames}; it must be 1 (the newest frame alone) or more")
+            raise ConfigError(
+                f"observations.history['{where}'] is {frames}; it must be 1 (the newest frame alone) or more"
+            )

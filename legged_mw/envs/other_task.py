@@ -21,10 +21,19 @@ _SAME_SCAN = ("terrain.measured_points_x", "terrain.measured_points_y")
 
 def class_in(env: RobotTask, kind: type[RobotTask]) -> type[RobotTask] | None:
     """``kind`` among the classes of ``env``; by its name and file, since a task's file may have been imported twice."""
-    return next((each for each in type(env).__mro__ if each.__qualname__ == kind.__qualname__ and getfile(each) == getfile(kind)), None)
+    return next(
+        (
+            each
+            for each in type(env).__mro__
+            if each.__qualname__ == kind.__qualname__ and getfile(each) == getfile(kind)
+        ),
+        None,
+    )
 
 
-def observe_as(env: RobotTask, kind: type[RobotTask], cfg: RobotTaskCfg, groups: Sequence[str], name: str) -> Observations:
+def observe_as(
+    env: RobotTask, kind: type[RobotTask], cfg: RobotTaskCfg, groups: Sequence[str], name: str
+) -> Observations:
     """Observations of ``env`` as a ``kind`` with the config ``cfg`` has them; ``name`` is what a policy reads in ``groups``.
 
     They are exact and not delayed: noise would only blur what is to be learned from the policy. Raises ConfigError for a
@@ -35,27 +44,36 @@ def observe_as(env: RobotTask, kind: type[RobotTask], cfg: RobotTaskCfg, groups:
     for group in groups:
         if group not in table:
             raise ConfigError(unknown("observation group", group, table, kind.__name__))
-    exact = {group: [row if isinstance(row, str) else row._replace(noise=0.0) for row in rows] for group, rows in table.items()}
+    exact = {
+        group: [row if isinstance(row, str) else row._replace(noise=0.0) for row in rows]
+        for group, rows in table.items()
+    }
     return Observations({**exact, name: [*groups]}, cfg.observations, 0.0, env.num_envs, env.device, lambda width: None)
 
 
 def in_words(rows: Iterable[Row]) -> str:
     """``base_ang_vel 3, dof_pos 12 x 5 frames``"""
-    return ", ".join(f"{row.name} {row.value.shape[1]}" + (f" x {row.history} frames" if row.history > 1 else "") for row in rows)
+    return ", ".join(
+        f"{row.name} {row.value.shape[1]}" + (f" x {row.history} frames" if row.history > 1 else "") for row in rows
+    )
 
 
 def differences(env: RobotTask, cfg: RobotTaskCfg, rows: Iterable[Row]) -> list[str]:
     """What keeps a policy of the config ``cfg``, which reads ``rows``, from meaning the same in ``env``: a clause for each."""
     kinds = [_field(each, "control.actuator") for each in (cfg, env.cfg)]
     found = [_differ("control.actuator", *kinds)] if "torque" in kinds else []
-    there, here = (", ".join(command.name for command in table) or "none" for table in (command_table(cfg), env.command_table))
+    there, here = (
+        ", ".join(command.name for command in table) or "none" for table in (command_table(cfg), env.command_table)
+    )
     found.append(_differ("the list of commands", there, here))
     if any(found):
         return [text for text in found if text]
     with _config_of(env, cfg):
         theirs, ours = env._load_robot("mujoco"), env.robot
     if theirs.joint_names != ours.joint_names:
-        return [f"its robot is another one, with the joints {_few(theirs.joint_names)}; here they are {_few(ours.joint_names)}"]
+        return [
+            f"its robot is another one, with the joints {_few(theirs.joint_names)}; here they are {_few(ours.joint_names)}"
+        ]
     found = [_joint("default angle", ours.joint_names, theirs.pose, ours.pose, " rad")]
     there, here = (robot.tables["control.action_scale"] for robot in (theirs, ours))
     found.append(_joint("control.action_scale", ours.joint_names, there, here, ""))
@@ -64,8 +82,12 @@ def differences(env: RobotTask, cfg: RobotTaskCfg, rows: Iterable[Row]) -> list[
     found.append(_differ("asset.imu_site", theirs.imu, ours.imu))
     scan = [row for row in rows if row.name == "height_scan"]
     if scan and not scan[0].value.shape[1]:
-        found.append("it reads the height scan, which is off here: name a group in terrain.height_scan, such as privileged_state")
-    found += [_differ(path, _field(cfg, path), _field(env.cfg, path)) for path in (*_SAME, *(_SAME_SCAN if scan else ()))]
+        found.append(
+            "it reads the height scan, which is off here: name a group in terrain.height_scan, such as privileged_state"
+        )
+    found += [
+        _differ(path, _field(cfg, path), _field(env.cfg, path)) for path in (*_SAME, *(_SAME_SCAN if scan else ()))
+    ]
     return [text for text in found if text]
 
 

@@ -17,7 +17,9 @@ def check_term(method: Callable[[], Any], count: int) -> Tensor:
     value = method()
     if not isinstance(value, Tensor) or value.shape != (count,):
         got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-        raise StepError(f"must return a tensor ({count},), one value an environment; it returned {got}", place_of(method))
+        raise StepError(
+            f"must return a tensor ({count},), one value an environment; it returned {got}", place_of(method)
+        )
     return value
 
 
@@ -28,11 +30,16 @@ def checked_rows(env: Any) -> Mapping[str, Any]:
         raise StepError(f"must return group -> list of rows; it returned {type(table).__name__}", where)
     for group, row in [(group, row) for group, rows in table.items() for row in rows if not isinstance(row, str)]:
         if not isinstance(row, Row):
-            raise StepError(f"group '{group}' holds {type(row).__name__}; write Row(name, value, ...), or the name of a group", where)
+            raise StepError(
+                f"group '{group}' holds {type(row).__name__}; write Row(name, value, ...), or the name of a group",
+                where,
+            )
         value = row.value
         if not isinstance(value, Tensor) or value.dim() != 2 or len(value) != count or not value.numel():
             got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
-            raise StepError(f"row '{row.name}' of '{group}' is {got}; it must be a tensor ({count}, size), a row a world", where)
+            raise StepError(
+                f"row '{row.name}' of '{group}' is {got}; it must be a tensor ({count}, size), a row a world", where
+            )
     return table
 
 

@@ -16,7 +16,9 @@ from legged_mw.utils.math import assign, maybe_any
 class Perturbation:
     """Kicks and pushes of the root in N worlds, as the section ``perturbation`` has them."""
 
-    def __init__(self, cfg: type[RobotTaskCfg.perturbation], sim: Simulation, root_body: int, mass: float, dt: float) -> None:
+    def __init__(
+        self, cfg: type[RobotTaskCfg.perturbation], sim: Simulation, root_body: int, mass: float, dt: float
+    ) -> None:
         """``mass`` [kg] of the robot, ``dt`` [s] of a control step."""
         self.cfg, self._sim, self._root, self._mass, self._dt = cfg, sim, root_body, mass, dt
         device = sim.device
@@ -26,11 +28,14 @@ class Perturbation:
 
         spans = [cfg.interval, cfg.duration, [-math.pi, math.pi], cfg.velocity]
         self._ranges = torch.tensor(spans, dtype=torch.float, device=device).T.contiguous()  # (2, 4)
-        self._kick, self._clock = zeros(4), zeros()  # pause, duration [control steps], direction [rad], dv [m/s]; [control steps]
+        # pause, duration [control steps], direction [rad], dv [m/s]; [control steps]
+        self._kick, self._clock = zeros(4), zeros()
         self.kick_force = zeros(3)  # (N, 3) on the root, world frame [N]
         self.kick_active = zeros(dtype=torch.bool)  # (N,)
-        self.kick_level = zeros().fill_(0.0 if cfg.curriculum else 1.0)  # (N,) share of the range of dv that is drawn from
-        self.growth: Tensor | float = torch.ones((), device=device) if cfg.growth else 1.0  # () share of dv that a training has come to
+        # (N,) share of the range of dv that is drawn from
+        self.kick_level = zeros().fill_(0.0 if cfg.curriculum else 1.0)
+        # () share of dv that a training has come to
+        self.growth: Tensor | float = torch.ones((), device=device) if cfg.growth else 1.0
         interval = cfg.push_interval_s / dt
         self._push_clock = zeros().uniform_(0.0, interval).round_() if cfg.push else zeros()  # [control steps] to go
 
@@ -51,12 +56,18 @@ class Perturbation:
 
         A negative share leaves the level as it is.
         """
-        assign(self.kick_level, mask & (survived >= 0.0), torch.lerp(self.kick_level, survived, self.cfg.curriculum_rate))
+        assign(
+            self.kick_level, mask & (survived >= 0.0), torch.lerp(self.kick_level, survived, self.cfg.curriculum_rate)
+        )
 
     def statistics(self) -> dict[str, Tensor]:
         """The mean level of the kicks, where a curriculum raises it: (2,) a sum and what to divide it by."""
         level = self.kick_level
-        return {"kick_level": torch.stack([level.sum(), torch.full_like(level[0], len(level))])} if self.cfg.curriculum else {}
+        return (
+            {"kick_level": torch.stack([level.sum(), torch.full_like(level[0], len(level))])}
+            if self.cfg.curriculum
+            else {}
+        )
 
     def reset(self, mask: Tensor) -> None:
         """An episode begins where ``mask`` (N,) is true."""

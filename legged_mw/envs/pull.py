@@ -7,7 +7,8 @@ from torch import Tensor
 
 from legged_mw.sim.simulation import Simulation
 
-GIVEN_BACK = 3.0  # times: an episode that ends down raises the level by this much more than one that ends up lowers it [ours]
+# times: an episode that ends down raises the level by this much more than one that ends up lowers it [ours]
+GIVEN_BACK = 3.0
 
 
 class Pull:

@@ -52,10 +52,14 @@ class RobotObservations:
         """What a robot measures or estimates of itself, with noise, and its last action."""
         noise = self.cfg.noise.scales
         return [
-            Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", measured=True),  # at the IMU, body frame [m/s]
-            Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", measured=True),  # gyro, body frame [rad/s]
-            Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar", measured=True),  # direction, body frame
-            Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", measured=True),  # minus the default pose [rad]
+            # at the IMU, body frame [m/s]
+            Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", measured=True),
+            # gyro, body frame [rad/s]
+            Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", measured=True),
+            # direction, body frame
+            Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar", measured=True),
+            # minus the default pose [rad]
+            Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", measured=True),
             Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", measured=True),  # [rad/s]
             Row("last_actions", self.last_actions, mirror="joint"),  # a_t, clipped
         ]
@@ -67,7 +71,8 @@ class RobotObservations:
             Row("accelerometer", self.accelerometer, mirror="polar"),  # proper acceleration at the IMU [m/s^2]
             Row("projected_gravity", self.projected_gravity, mirror="polar"),
             Row("base_lin_vel", self.base_lin_vel, mirror="imu_velocity"),
-            Row("base_ang_vel_world", self.base_ang_vel_world, mirror="axial"),  # [rad/s]; the world mirrors about its own x-z plane
+            # [rad/s]; the world mirrors about its own x-z plane
+            Row("base_ang_vel_world", self.base_ang_vel_world, mirror="axial"),
             Row("dof_pos", self.dof_offset, mirror="joint"),
             Row("dof_vel", self.dof_vel, mirror="joint"),
             Row("torques", self.torques, mirror="joint"),  # [N m]
@@ -76,7 +81,11 @@ class RobotObservations:
     def _disturbance_rows(self) -> list[Row]:
         """Kicks, and with ``domain_rand.observe`` what was drawn, in the config's units."""
         rand = self.domain_rand
-        drawn = [Row(name, value, mirror=rand.mirrors[name]) for name, value in rand.values.items() if self.cfg.domain_rand.observe]
+        drawn = [
+            Row(name, value, mirror=rand.mirrors[name])
+            for name, value in rand.values.items()
+            if self.cfg.domain_rand.observe
+        ]
         return [
             Row("kick_force", self.perturbation.kick_force, mirror="polar"),  # on the root, world frame [N]
             Row("kick_active", self.perturbation.kick_active[:, None], mirror="scalar"),  # 0 or 1

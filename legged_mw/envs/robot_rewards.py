@@ -89,13 +89,17 @@ class RobotRewards:
 
     def _sensed_value(self, name: str) -> Tensor:
         if name not in self._sensed:
-            raise ConfigError(f"{name} is not sensed, for no reward term that is on names it; write asset.sense = ['{name}'] in the config")
+            raise ConfigError(
+                f"{name} is not sensed, for no reward term that is on names it; write asset.sense = ['{name}'] in the config"
+            )
         return self._sensed[name]
 
     def sensor(self, name: str) -> Tensor:
         """(N, size) What the sensor called so in the robot's file measured in the last substep: a view, whose place is fixed."""
         if name in self.robot.file_sensors and not self.robot.spec.sensor(name):
-            raise ConfigError(f"sensor '{name}' of the robot's file was dropped; write asset.sense = ['{name}'] in the config")
+            raise ConfigError(
+                f"sensor '{name}' of the robot's file was dropped; write asset.sense = ['{name}'] in the config"
+            )
         return self.sim.sensordata[:, self.robot.columns(name)]
 
     @property
@@ -114,7 +118,9 @@ class RobotRewards:
         known = [*self.ON_DEMAND, *robot.file_sensors]
         for name in self.cfg.asset.sense:
             if name not in known:
-                raise ConfigError(f"asset.sense: {unknown('value or sensor', name, known, f'{type(self).__name__} and its file')}")
+                raise ConfigError(
+                    f"asset.sense: {unknown('value or sensor', name, known, f'{type(self).__name__} and its file')}"
+                )
         spans = {name: robot.sensors.get(sensor) for name, sensor in self.ON_DEMAND.items()}
         self._sensed = {name: self.sim.sensordata[:, span] for name, span in spans.items() if span}
         if "dof_acc" in on:
@@ -125,12 +131,18 @@ class RobotRewards:
             pairs = [[self._joints_called([word], "mirror_joints") for word in pair] for pair in rewards.mirror_joints]
             for words, pair in zip(rewards.mirror_joints, pairs, strict=True):
                 if [len(joints) for joints in pair] != [len(pair[0])] * 2:
-                    raise ConfigError(f"rewards.mirror_joints: {words} must be two names or patterns that mean as many joints")
+                    raise ConfigError(
+                        f"rewards.mirror_joints: {words} must be two names or patterns that mean as many joints"
+                    )
             self.mirror_pairs = torch.cat([torch.stack(pair) for pair in pairs], dim=1) if pairs else torch.empty(0)
         if "joint_deviation" in on:
             self.deviation_weights = self._row(robot.tables["rewards.deviation_weights"])
         if "torque_limits" in on:
-            need(bool(np.isfinite(robot.effort_range).any()), "torque_limits", "no joint has a force limit; write asset.effort")
+            need(
+                bool(np.isfinite(robot.effort_range).any()),
+                "torque_limits",
+                "no joint has a force limit; write asset.effort",
+            )
             self.soft_effort = self._row(robot.effort_range.T * rewards.soft_torque_limit)
         if "dof_vel_limits" in on:
             needed = "no joint has a highest speed; write asset.joint_speed_limits"
@@ -142,7 +154,9 @@ class RobotRewards:
 
     def _columns_for_rewards(self) -> dict[str, int]:
         """What an episode remembers for terms that are on: name -> width."""
-        return {"last_last_actions": len(self.robot.joint_names)} if "action_smoothness" in self._active_scales() else {}
+        return (
+            {"last_last_actions": len(self.robot.joint_names)} if "action_smoothness" in self._active_scales() else {}
+        )
 
     def _joints_called(self, wanted: list[str], field: str) -> Tensor:
         """Indices of the joints whose name fits one of ``wanted``, patterns or parts of names. Held joints are left out."""
@@ -192,7 +206,11 @@ class RobotRewards:
     def _reward_base_height(self) -> Tensor:
         """Squared distance of the root's height above the ground under it from ``rewards.base_height_target`` [m^2]. [L; U -10]"""
         target = self.cfg.rewards.base_height_target
-        need(target > 0.0, "base_height", "rewards.base_height_target is 0; write the wanted height of the root above the ground [m]")
+        need(
+            target > 0.0,
+            "base_height",
+            "rewards.base_height_target is 0; write the wanted height of the root above the ground [m]",
+        )
         return (self.base_height - target).square()
 
     def _reward_angular_momentum(self) -> Tensor:
@@ -215,7 +233,11 @@ class RobotRewards:
 
     def _reward_hip_pos(self) -> Tensor:
         """Squared distance of the joints that ``rewards.hip_joints`` means from the default pose [rad^2]. [U -1]"""
-        need(bool(self.cfg.rewards.hip_joints), "hip_pos", "rewards.hip_joints is empty; write names of joints, parts of them or patterns")
+        need(
+            bool(self.cfg.rewards.hip_joints),
+            "hip_pos",
+            "rewards.hip_joints is empty; write names of joints, parts of them or patterns",
+        )
         return self.dof_offset.index_select(1, self.hips).square().sum(dim=1)
 
     def _reward_joint_deviation(self) -> Tensor:
@@ -225,9 +247,15 @@ class RobotRewards:
     def _reward_joint_mirror(self) -> Tensor:
         """Squared difference of the angles of two legs' joints, mean over the pairs of ``rewards.mirror_joints`` [rad^2]. [UL]"""
         pairs = self.cfg.rewards.mirror_joints
-        need(bool(pairs), "joint_mirror", "rewards.mirror_joints is empty; write pairs of names or patterns, [['FR_*', 'RL_*'], ...]")
+        need(
+            bool(pairs),
+            "joint_mirror",
+            "rewards.mirror_joints is empty; write pairs of names or patterns, [['FR_*', 'RL_*'], ...]",
+        )
         first, second = self.mirror_pairs
-        return (self.dof_pos.index_select(1, first) - self.dof_pos.index_select(1, second)).square().sum(dim=1) / len(pairs)
+        return (self.dof_pos.index_select(1, first) - self.dof_pos.index_select(1, second)).square().sum(dim=1) / len(
+            pairs
+        )
 
     def _reward_dof_vel(self) -> Tensor:
         """Squared joint velocities [rad^2/s^2]. [L; U -1e-3]"""
@@ -276,7 +304,11 @@ class RobotRewards:
 
     def _reward_self_collision(self) -> Tensor:
         """How many contacts the robot has with itself. [M; its G1 -1]"""
-        need(self.cfg.asset.self_collisions, "self_collision", "asset.self_collisions is False, so that parts pass through one another")
+        need(
+            self.cfg.asset.self_collisions,
+            "self_collision",
+            "asset.self_collisions is False, so that parts pass through one another",
+        )
         return self.self_contacts[:, 0].clone()
 
 

@@ -142,7 +142,9 @@ class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
         tilt, low = math.cos(math.radians(self.cfg.termination.max_tilt)), self.cfg.termination.min_base_height
         rules = {"termination.max_tilt": self.projected_gravity[:, 2] > 1e-5 - tilt}  # at 180 degrees never
         if len(self.contacts.terminating):
-            rules["asset.terminate_after_contacts_on"] = self.contact_count[:, self.contacts.terminating].amax(dim=1) > 0.0
+            rules["asset.terminate_after_contacts_on"] = (
+                self.contact_count[:, self.contacts.terminating].amax(dim=1) > 0.0
+            )
         return {**rules, "termination.min_base_height": self.base_height < low} if low else rules
 
     def _timed_out(self) -> Tensor:
@@ -271,17 +273,24 @@ class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
     def _prepare_reward_function(self) -> None:
         """Match scales to methods by name; every term is tried once, so that a mistake shows before training."""
         scales = self._active_scales()
-        terms = {name.removeprefix("_reward_"): getattr(self, name) for name in dir(self) if name.startswith("_reward_")}
+        terms = {
+            name.removeprefix("_reward_"): getattr(self, name) for name in dir(self) if name.startswith("_reward_")
+        }
         after_clip = [] if self.cfg.rewards.clip_termination else ["termination"]
         self.reward_names = [n for n in scales if n not in after_clip] + [n for n in after_clip if n in scales]
         self._num_clipped = len([n for n in scales if n not in after_clip])
         for name in self.reward_names:
             where = f"{type(self).__name__} (a method _reward_<name>)"
             if name not in terms:
-                raise ConfigError(f"rewards.scales.{name} = {scales[name]:g}: {unknown('reward term', name, terms, where)}")
+                raise ConfigError(
+                    f"rewards.scales.{name} = {scales[name]:g}: {unknown('reward term', name, terms, where)}"
+                )
             check_term(terms[name], self.num_envs)
         self._reward_terms = [terms[name] for name in self.reward_names]
-        self.suspects = [Suspects([f"reward term '{n}'" for n in self.reward_names], self.device), *self.observations.suspects()]
+        self.suspects = [
+            Suspects([f"reward term '{n}'" for n in self.reward_names], self.device),
+            *self.observations.suspects(),
+        ]
         self.reward_scales = torch.tensor([scales[name] for name in self.reward_names], device=self.device) * self.dt
         means = [*(f"rew_{name}" for name in self.reward_names), "reward", "episode_length"]
         self.statistics = Statistics(means, ["episodes", "fell", "broken"], self.device)
@@ -361,15 +370,19 @@ class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
         self.base_height = self.root_pos[:, 2]  # of the root above the ground under it [m]
         self.fell, self.broken = self._zeros(dtype=torch.bool), self._zeros(dtype=torch.bool)
         self.divergence = Divergence(sim, self.actions, self.robot.joint_names, self.cfg.termination.max_speed)
-        self._episode, views = columns(n, device, **self._episode_columns())  # one matrix, so that a reset clears it in one go
+        # one matrix, so that a reset clears it in one go
+        self._episode, views = columns(n, device, **self._episode_columns())
         for name, view in views.items():
             setattr(self, name, view)
         model = self.robot.physics
         self.gravity_dir = self.domain_rand.gravity_dir  # (N, 3) world frame
         self.total_mass = float(model.body_subtreemass[0])  # [kg]
         self.root_body = self.robot.id("body", self.robot.root)
-        self.imu_pos = self._tensor(model.site_pos[self.robot.id("site", self.robot.imu)]).expand(n, 3)  # body frame [m]
-        self.contacts = GroundContacts(self.robot, self.cfg.asset, self.contact_count, "collision" in self._active_scales())
+        # body frame [m]
+        self.imu_pos = self._tensor(model.site_pos[self.robot.id("site", self.robot.imu)]).expand(n, 3)
+        self.contacts = GroundContacts(
+            self.robot, self.cfg.asset, self.contact_count, "collision" in self._active_scales()
+        )
         self._init_robot_rewards()
 
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
@@ -389,7 +402,9 @@ class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
         self.soft_lower, self.soft_upper = soft_limits(self.robot, cfg.rewards.soft_dof_pos_limit, self.device)
         self.start_place = start_place(cfg, self.robot, cfg.asset.colliders)  # of the root at reset [m]
         self.init_pos = self._tensor(self.start_place)
-        self.reset_range = self._tensor([init.pos_xy_range] * 2 + [init.yaw_range] + [init.lin_vel_range] * 3 + [init.ang_vel_range] * 3)
+        self.reset_range = self._tensor(
+            [init.pos_xy_range] * 2 + [init.yaw_range] + [init.lin_vel_range] * 3 + [init.ang_vel_range] * 3
+        )
 
     def _tensor(self, values: object) -> Tensor:
         return torch.tensor(values, dtype=torch.float, device=self.device)

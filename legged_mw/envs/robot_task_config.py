@@ -47,8 +47,12 @@ from legged_mw.utils.config import Config
 from legged_mw.utils.files import MOST_LETTERS, wrong_name
 
 Place = Annotated[list[Annotated[float, at_least(-1000, 1000, "m")]], or_empty(THREE)]
-Camera = Annotated[list[float], or_empty(Bound("three numbers, not straight above or below", lambda v: len(v) == 3 and any(v[:2])))]
-Pairs = Annotated[list[list[str]], Bound("pairs: lists of two names or patterns each", lambda v: all(len(pair) == 2 for pair in v))]
+Camera = Annotated[
+    list[float], or_empty(Bound("three numbers, not straight above or below", lambda v: len(v) == 3 and any(v[:2])))
+]
+Pairs = Annotated[
+    list[list[str]], Bound("pairs: lists of two names or patterns each", lambda v: all(len(pair) == 2 for pair in v))
+]
 Kicks = Annotated[list[Annotated[float, at_least(-1000, 1000, "m/s")]], PAIR]
 Tilt = Annotated[float, above(0, 180, "degrees")]
 Slope = Annotated[float, at_least(-60, 60, "degrees")]
@@ -56,8 +60,13 @@ Slopes = Annotated[list[Slope], or_empty(PAIR)]
 TimeStep = Annotated[float, at_least(1e-4, 0.1, "s")]
 Pixels = Annotated[int, at_least(1, 8192)]
 Threads = Annotated[int, at_least(0, 1024)]
-FolderPart = Annotated[str, Bound(f"a plain name such as wide_net, of {MOST_LETTERS} bytes at most", lambda v: not wrong_name(v))]
-Activation = Literal["elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish", "identity"]  # [R]
+FolderPart = Annotated[
+    str, Bound(f"a plain name such as wide_net, of {MOST_LETTERS} bytes at most", lambda v: not wrong_name(v))
+]
+# [R]
+Activation = Literal[
+    "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish", "identity"
+]
 
 
 class RobotTaskCfg(Config):
@@ -70,8 +79,12 @@ class RobotTaskCfg(Config):
         episode_length_s: Seconds = 20.0  # [s], then the episode times out [P]
 
     class asset:
-        file: str = ""  # MJCF or URDF, as its vendor wrote it; beside the file of the class that says so, or in the repository
-        imu_site: str = ""  # site, or body, that is fixed to the root; empty: "imu" if it is so, or else the root's origin [ours]
+        file: str = (
+            ""  # MJCF or URDF, as its vendor wrote it; beside the file of the class that says so, or in the repository
+        )
+        imu_site: str = (
+            ""  # site, or body, that is fixed to the root; empty: "imu" if it is so, or else the root's origin [ours]
+        )
         # names of geoms; of bodies, which mean their own geoms that collide; or patterns. Geoms that touch the ground:
         colliders: Names = ["*"]  # of those that collide in the file
         self_collisions: bool = False  # among the colliders
@@ -79,16 +92,20 @@ class RobotTaskCfg(Config):
         terminate_after_contacts_on: list[str] = []  # likewise: to touch the ground with one of these is a fall [L]
         # what code of yours reads outside of reward terms: contact_forces, self_contacts, angular_momentum, sensors of the file by name
         sense: list[str] = []
-        held_joints: list[str] = []  # names or patterns: welded at their default angle, so that they are no joints any more
+        # names or patterns: welded at their default angle, so that they are no joints any more
+        held_joints: list[str] = []
         # tables a joint that need not name every joint; the others keep the file's
         effort: dict[str, Positive] = {}  # highest force of the servo, both ways [N m]
         armature: dict[str, Gain] = {}  # inertia of the rotor at the joint [kg m^2]
         frictionloss: dict[str, Gain] = {}  # dry friction [N m]
-        joint_speed_limits: dict[str, Positive] = {}  # the motor's highest speed [rad/s] (a URDF has it); for report and rewards only
+        # the motor's highest speed [rad/s] (a URDF has it); for report and rewards only
+        joint_speed_limits: dict[str, Positive] = {}
 
     class init_state:
-        pos: Place = []  # root at reset [m]; empty: feet as high as in the keyframe "home" or the only one, or on the ground
-        default_joint_angles: dict[str, Angle] = {}  # table a joint [rad]: the pose of action 0; joints without a key: that keyframe's
+        # root at reset [m]; empty: feet as high as in the keyframe "home" or the only one, or on the ground
+        pos: Place = []
+        # table a joint [rad]: the pose of action 0; joints without a key: that keyframe's
+        default_joint_angles: dict[str, Angle] = {}
         dof_pos_range: Range = [1.0, 1.0]  # each joint at reset: default * U(low, high) [-] [P; L 0.5 to 1.5]
         dof_pos_offset: Range = [0.0, 0.0]  # added to each joint at reset, U(low, high), within its range [rad]
         dof_vel_range: Speed = 0.0  # each joint's velocity at reset, U(-range, range) [rad/s]
@@ -102,41 +119,55 @@ class RobotTaskCfg(Config):
         # torque: the action is one, scaled; network: a file's weights make the torque (docs/motors.md)
         actuator: Literal["servo", "dc_motor", "torque", "network"] = "servo"  # [P]
         stiffness: dict[str, Gain] = {}  # table a joint: position gain [N m/rad]
-        damping: dict[str, Gain] = {}  # table a joint: passive damping; of a dc_motor its velocity gain, in its curve [N m s/rad]
+        # table a joint: passive damping; of a dc_motor its velocity gain, in its curve [N m s/rad]
+        damping: dict[str, Gain] = {}
         # tables a joint of a torque-speed curve, which dc_motor needs and torque and network may have: at angular velocity w a motor
         # gives from -stall_torque (1 + w / no_load_speed) to stall_torque (1 - w / no_load_speed), and at most asset.effort
         stall_torque: dict[str, Positive] = {}  # [N m]
         no_load_speed: dict[str, Positive] = {}  # [rad/s]
-        gear: dict[str, Positive] = {"": 1.0}  # turns of the motor a turn of the joint; 1: the two tables are the joint's own
+        # turns of the motor a turn of the joint; 1: the two tables are the joint's own
+        gear: dict[str, Positive] = {"": 1.0}
         network: str = ""  # of `network`: an .npz, as `python -m legged_mw.robot.actuator_net` writes it
-        network_digest: dict[str, str] = {}  # written by train.py: that name -> SHA-256 of the file; a changed file is refused
-        action_scale: Scale | dict[str, Scale] = 0.5  # target = origin + scale * action [rad, rad/s]; a number, or a table a joint [P]
+        # written by train.py: that name -> SHA-256 of the file; a changed file is refused
+        network_digest: dict[str, str] = {}
+        # target = origin + scale * action [rad, rad/s]; a number, or a table a joint [P]
+        action_scale: Scale | dict[str, Scale] = 0.5
         # the default pose, the measured angles or the last targets [P]; "speed": none, a dc_motor gives damping (scale action - speed)
         action_origin: Literal["default", "joints", "targets", "speed"] = "default"
         decimation: Few = 5  # simulation steps a control step [P]
 
     class observations:
-        leave_out: dict[str, list[str]] = {}  # group -> rows of the table that it does without: {"state": ["base_lin_vel"]}
+        # group -> rows of the table that it does without: {"state": ["base_lin_vel"]}
+        leave_out: dict[str, list[str]] = {}
         history: dict[str, Count] = {}  # group, or "group.row" -> frames of each row, oldest first: {"state": 5}
 
     class termination:
         max_tilt: Tilt = 90.0  # [deg] between the root's z axis and the vertical; beyond it, it fell [P]
         min_base_height: Height = 0.0  # [m] of the root above the ground under it; lower, it fell; 0: anything [ours]
-        max_speed: Positive = 1.0e4  # [m/s, rad/s] of any degree of freedom; beyond it the state counts as not finite [ours]
+        max_speed: Positive = (
+            1.0e4  # [m/s, rad/s] of any degree of freedom; beyond it the state counts as not finite [ours]
+        )
 
     class rewards:
         only_positive_rewards: bool = True  # clip the sum at 0: without it the robot learns to stand still [P, L]
-        clip_termination: bool = False  # True: `termination` is inside that clip, where a fall costs nothing [P]; False [L]
+        clip_termination: bool = (
+            False  # True: `termination` is inside that clip, where a fall costs nothing [P]; False [L]
+        )
         max_reward: Positive = 10000.0  # upper clip of the sum, a step [P]
-        soft_dof_pos_limit: Part = 0.95  # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
+        soft_dof_pos_limit: Part = (
+            0.95  # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
+        )
         pose_weights: dict[str, NonNegative] = {"": 1.0}  # table a joint: weight in `pose` [-]
         base_height_target: Height = 0.0  # of `base_height`: of the root above the ground under it [m]
         hip_joints: list[str] = []  # of `hip_pos`: joints' names, patterns, or parts of names
         mirror_joints: Pairs = []  # of `joint_mirror`: pairs of joints, likewise: [["FR_", "RL_"], ["FL_", "RR_"]]
         deviation_weights: dict[str, NonNegative] = {"": 1.0}  # table a joint: weight in `joint_deviation` [-]
-        soft_torque_limit: Positive = 0.9  # share of the servo's force limit, of `torque_limits` [L: Cassie; L 1.0, which none exceeds]
+        soft_torque_limit: Positive = (
+            0.9  # share of the servo's force limit, of `torque_limits` [L: Cassie; L 1.0, which none exceeds]
+        )
         soft_dof_vel_limit: Positive = 0.9  # share of asset.joint_speed_limits, of `dof_vel_limits` [L: Cassie; L 1.0]
-        torques_as: Literal["norms", "squares"] = "norms"  # `torques` is the 2-norm plus the 1-norm [P], or the sum of squares [L]
+        # `torques` is the 2-norm plus the 1-norm [P], or the sum of squares [L]
+        torques_as: Literal["norms", "squares"] = "norms"
 
         class scales:
             """Reward terms by name: each number switches on the method _reward_<name>, 0 switches it off."""
@@ -144,7 +175,9 @@ class RobotTaskCfg(Config):
             _open = True
 
     class normalization:
-        clip_actions: Positive = 2.0  # the clipped action is applied, penalised, observed and exported [ours: P has no bound, and thrashes]
+        clip_actions: Positive = (
+            2.0  # the clipped action is applied, penalised, observed and exported [ours: P has no bound, and thrashes]
+        )
 
     class noise:
         level: NonNegative = 1.0  # multiplies every scale; 0: no noise [P]
@@ -169,8 +202,11 @@ class RobotTaskCfg(Config):
         duration: PositiveRange = [0.05, 0.2]  # [s] [P]
         velocity: Kicks = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
         curriculum: bool = False  # a world's dv grows with the share of an episode that it survives, from 0 [ours]
-        curriculum_rate: Part = 0.5  # by which share of the way it does, at the end of an episode, from above 0 to 1 [ours]
-        growth: Shares = []  # kicks grow from none to all between these shares of a training, [0.2, 0.5]; empty: all at once [ours]
+        curriculum_rate: Part = (
+            0.5  # by which share of the way it does, at the end of an episode, from above 0 to 1 [ours]
+        )
+        # kicks grow from none to all between these shares of a training, [0.2, 0.5]; empty: all at once [ours]
+        growth: Shares = []
         push: bool = False  # the root's horizontal velocity becomes a random one; beside kicks or alone [L]
         push_interval_s: Seconds = 15.0  # between pushes, each world's clock its own [s] [L]
         max_push_vel_xy: Speed = 1.0  # each axis U(-max, max) [m/s] [L]
@@ -184,7 +220,8 @@ class RobotTaskCfg(Config):
         base_com: Places = [-0.05, 0.05]  # added to the place of the root's centre of mass, each axis [m] [P]
         armature: Factors = [1.0, 1.05]  # factor on each joint's [P]
         friction: Frictions = [0.4, 1.0]  # sliding friction of the ground [-] [P]
-        contact_time: ContactTimes = []  # time constant of the ground's contacts (solref) [s]: longer is softer, 0.02 is MuJoCo's
+        # time constant of the ground's contacts (solref) [s]: longer is softer, 0.02 is MuJoCo's
+        contact_time: ContactTimes = []
         frictionloss: Factors = [0.9, 1.1]  # factor on each joint's dry friction [P]
         stiffness: Factors = []  # factor on each servo's position gain
         damping: Factors = []  # factor on each joint's damping
@@ -195,19 +232,34 @@ class RobotTaskCfg(Config):
         action_delay: WholeDelays = []  # control steps from an action to its servo, whole numbers, both ends included
         delay_ms: Delays = []  # from an action to its motor [ms], rounded to the nearest simulation step, a half up
         observation_delay: WholeDelays = []  # control steps that what `state` measures is old
-        slope: Slopes = []  # [deg] of the plane, downhill along x, in place of terrain.slope: with any heading, any direction
-        model_factors: dict[str, Factors] = {}  # any other field of the model that may differ: a factor per world on all of it
+        # [deg] of the plane, downhill along x, in place of terrain.slope: with any heading, any direction
+        slope: Slopes = []
+        # any other field of the model that may differ: a factor per world on all of it
+        model_factors: dict[str, Factors] = {}
         redraw_at_reset: list[str] = [  # drawn at every reset of a world; the others once, at the start
-            *["friction", "contact_time", "frictionloss", "stiffness", "damping", "strength", "stall_torque", "no_load_speed"],
+            *[
+                "friction",
+                "contact_time",
+                "frictionloss",
+                "stiffness",
+                "damping",
+                "strength",
+                "stall_torque",
+                "no_load_speed",
+            ],
             *["encoder_offset", "action_delay", "delay_ms", "observation_delay", "slope"],
         ]
-        redraw_iterations: Whole = 0  # draw everything again every so many iterations of training, and when it is resumed; 0: never
+        redraw_iterations: Whole = (
+            0  # draw everything again every so many iterations of training, and when it is resumed; 0: never
+        )
         observe: bool = False  # rows in `privileged_state` with what was drawn
 
     class terrain:
         friction: NonNegative = 0.6  # sliding friction of the ground, which overrules the robot's [-] [P]
         condim: Literal[1, 3, 4, 6] = 3  # contact dimensions: 3 is sliding without torsion [P]
-        slope: Slope = 0.0  # [deg] of the plane, downhill along x: gravity leans, the plane and heights above it stay as they are
+        slope: Slope = (
+            0.0  # [deg] of the plane, downhill along x: gravity leans, the plane and heights above it stay as they are
+        )
 
     class sim:
         engine: Literal["auto", "mujoco_warp", "mujoco"] = "auto"  # auto: mujoco_warp on a GPU, MuJoCo's own on a CPU
@@ -215,15 +267,19 @@ class RobotTaskCfg(Config):
         dt: TimeStep = 0.004  # simulation step [s] [P]
         iterations: Few = 1  # Newton iterations [P]
         ls_iterations: Few = 5  # line-search iterations [P]
-        integrator: Literal["euler", "implicitfast"] = "euler"  # implicitfast: joint damping is stable however large [P: euler]
+        # implicitfast: joint damping is stable however large [P: euler]
+        integrator: Literal["euler", "implicitfast"] = "euler"
         fuse: bool = True  # a recorded step's small operations go together in few kernels, equal to float32 rounding [ours: docs/lab.md]
         nconmax: Whole = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model, as --check says [ours: sim/room.py]
-        njmax: Whole = 0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
+        njmax: Whole = (
+            0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
+        )
 
     class viewer:
         width: Pixels = 1280  # [pixel]
         height: Pixels = 720  # [pixel]
-        camera: Camera = []  # place of the camera "track", from the robot, world axes [m]; empty: by its size, Go1's is 0.9 -1.1 0.6
+        # place of the camera "track", from the robot, world axes [m]; empty: by its size, Go1's is 0.9 -1.1 0.6
+        camera: Camera = []
         fps: Few = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
 
 
@@ -240,7 +296,9 @@ class RobotTaskCfgPPO(Config):
         max_iterations: Count = 300  # [ours: a robot of one's own shows something by then]
         save_interval: Count = 50  # [iterations] between checkpoints
         keep_checkpoints: Whole = 0  # newest ones that stay; 0: all [ours]
-        exam_interval: Whole = 200  # [iterations] between small exams, and one at the end; 0, or over max_iterations: none [ours]
+        exam_interval: Whole = (
+            200  # [iterations] between small exams, and one at the end; 0, or over max_iterations: none [ours]
+        )
         experiment_name: str = ""  # folder below logs/; empty: the task's name
         run_name: FolderPart = ""  # appended to the run folder's time stamp
         logger: Literal["tensorboard", "wandb"] = "tensorboard"
@@ -259,7 +317,8 @@ class RobotTaskCfgPPO(Config):
         hidden_dims: Sizes = [512, 256, 128]  # [P]
         activation: Activation = "elu"  # [P]
         obs_normalization: bool = True  # [P]
-        rnn_type: Literal["gru", "lstm"] = "gru"  # of RNNModel alone, as the next two [ours: three quarters of an LSTM's work; R lstm]
+        # of RNNModel alone, as the next two [ours: three quarters of an LSTM's work; R lstm]
+        rnn_type: Literal["gru", "lstm"] = "gru"
         rnn_hidden_dim: Count = 256  # values that a layer remembers [R]
         rnn_num_layers: Few = 1  # [R]
 
@@ -272,7 +331,8 @@ class RobotTaskCfgPPO(Config):
         class estimator:
             """A network from what the actor reads to rows that it does not; the actor reads its estimate, too (rl/estimator.py)."""
 
-            targets: list[str] = []  # rows of the critic's groups: ["base_lin_vel", "foot_contact"]; empty: no estimator
+            # rows of the critic's groups: ["base_lin_vel", "foot_contact"]; empty: no estimator
+            targets: list[str] = []
             hidden_dims: Sizes = [256, 128]  # [genesis_lr's explicit estimator of a Go2]
             activation: Activation = "elu"
             learning_rate: Part = 1e-3  # fixed [HIMLoco]
@@ -280,7 +340,8 @@ class RobotTaskCfgPPO(Config):
         class concurrent:
             """The actor reads its newest frame and a latent: a teacher's of ``groups``, or a student's of all frames (rl/concurrent.py)."""
 
-            groups: list[str] = []  # that the teacher's encoder reads: ["privileged_state"]; empty: no teacher [CTS, arXiv 2405.10830]
+            # that the teacher's encoder reads: ["privileged_state"]; empty: no teacher [CTS, arXiv 2405.10830]
+            groups: list[str] = []
             teacher_share: Part = 0.75  # of the worlds, that act by the teacher's latent [CTS]
             latent_dim: Count = 32  # values of a latent, whose length is 1 [go2_rl_gym]
             hidden_dims: Sizes = [512, 256]  # of both encoders [go2_rl_gym]
@@ -317,9 +378,13 @@ class RobotTaskCfgPPO(Config):
     class distillation:
         """Takes the place of `algorithm` where there is a teacher: the actor learns to act like it. After init_std rsl-rl's own keys."""
 
-        teacher: str = ""  # its run, checkpoint or export, or a task for its last or shipped policy (train.py --teacher)
+        teacher: str = (
+            ""  # its run, checkpoint or export, or a task for its last or shipped policy (train.py --teacher)
+        )
         init_std: Positive = 0.1  # of the student's noise while it learns; nothing changes it [Isaac Lab]
-        class_name: str = "legged_mw.rl.distillation:GraphedDistillation"  # or "Distillation": rsl-rl's own, same results, slower
+        class_name: str = (
+            "legged_mw.rl.distillation:GraphedDistillation"  # or "Distillation": rsl-rl's own, same results, slower
+        )
         num_learning_epochs: Few = 5  # [R 1; ours: docs/lab.md]
         gradient_length: Count = 4  # steps a gradient; it divides num_steps_per_env [ours: R 15 leaves 9 of 24 unused]
         learning_rate: Part = 1e-3  # [R]
@@ -332,7 +397,9 @@ class RobotTaskCfgPPO(Config):
 
         policy: str = ""  # the run, checkpoint or export, or a task for its last or shipped policy
         init_std: Positive = 0.2  # of exploration at the start [ours: less than from nothing, as it can walk]
-        critic_warmup: Iterations = 20  # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
+        critic_warmup: Iterations = (
+            20  # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
+        )
 
     class anneal:
         """What a number of `algorithm` goes to, in a straight line over max_iterations or --max_time; 0: it stays [ours]."""
@@ -353,7 +420,9 @@ class RobotTaskCfgPPO(Config):
         rnn_hidden_dim: Count = 64  # likewise
         max_iterations: Count = 2600
         overrides: dict[str, Any] = {}  # any field of the task: dotted path -> value
-        update_threads: Threads = 0  # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one
+        update_threads: Threads = (
+            0  # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one
+        )
 
     class symmetry:
         """Left-right symmetry in the update, as in Mittal et al. 2024. Rows of observations say how they mirror: envs/mirror.py."""

@@ -90,7 +90,8 @@ class SimToRealRoughCfg(SimToRealCfg):
         }
 
     class termination(SimToRealCfg.termination):
-        min_base_height = 0.12  # [m] [ours: the feet alone touch the ground, so that a trunk would sink into a step unpunished]
+        # [m] [ours: the feet alone touch the ground, so that a trunk would sink into a step unpunished]
+        min_base_height = 0.12
 
     class rewards(SimToRealCfg.rewards):
         tracking_sigma, tracking_sigma_end = 0.25, 0.0  # [P]

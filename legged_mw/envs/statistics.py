@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-Live = Mapping[str, Tensor]  # name -> () a sum, or (2,) a sum and what to divide it by, as they stand when they are taken
+# name -> () a sum, or (2,) a sum and what to divide it by, as they stand when they are taken
+Live = Mapping[str, Tensor]
 
 
 class Statistics:

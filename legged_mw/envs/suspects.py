@@ -10,7 +10,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-BOUND = 1e6  # [ours: rewards are about 1 and rows, in their units, below 1e5; a mean or variance over 1e5 samples survives it]
+# [ours: rewards are about 1 and rows, in their units, below 1e5; a mean or variance over 1e5 samples survives it]
+BOUND = 1e6
 
 
 class Suspects:

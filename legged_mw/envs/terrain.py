@@ -42,11 +42,13 @@ class Tiles:
         highest = min(cfg.terrain.max_init_terrain_level, terrain.levels - 1) if self.curriculum else terrain.levels - 1
         self.levels = torch.randint(0, highest + 1, (num_envs,), device=device)  # (N,) row of the tile
         world = torch.arange(num_envs, device=device)
-        self.columns = (2 * world + 1) * len(terrain.kinds) // (2 * num_envs)  # (N,) fixed; few worlds take some of them
+        # (N,) fixed; few worlds take some of them
+        self.columns = (2 * world + 1) * len(terrain.kinds) // (2 * num_envs)
         self._all_origins = torch.tensor(terrain.origins, dtype=torch.float, device=device)  # (levels, columns, 3)
         self.origins = self._all_origins[self.levels, self.columns]  # (N, 3) where an episode begins [m, world]
         tiles = torch.tensor([terrain.levels, len(terrain.kinds)], dtype=torch.float, device=device)
-        self.edge = tiles * terrain.tile / 2 + cfg.terrain.border_size / 2  # x, y [m] beyond which a robot has left the terrain
+        # x, y [m] beyond which a robot has left the terrain
+        self.edge = tiles * terrain.tile / 2 + cfg.terrain.border_size / 2
         self.kinds = tuple(dict.fromkeys(terrain.kinds))
         kind = torch.tensor([self.kinds.index(name) for name in terrain.kinds], device=device)[self.columns]
         self._is_kind = torch.nn.functional.one_hot(kind, len(self.kinds)).float()  # (N, kinds)

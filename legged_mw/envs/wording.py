@@ -26,7 +26,10 @@ FIELDS = {
     "pose": "init_state.default_joint_angles",
     "sites": "asset.foot_names or foot_geoms",
     "contact_geoms": "asset.penalize_contacts_on or terminate_after_contacts_on",
-    **{name: f"asset.{name}" for name in ("imu_site", "held_joints", "effort", "armature", "frictionloss", "joint_speed_limits")},
+    **{
+        name: f"asset.{name}"
+        for name in ("imu_site", "held_joints", "effort", "armature", "frictionloss", "joint_speed_limits")
+    },
 }
 
 

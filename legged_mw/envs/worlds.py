@@ -24,7 +24,22 @@ from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
 from legged_mw.utils.config import Config
 
 CONTAINERS = (dict, list, tuple, deque, TensorDictBase, nn.Module)
-_PLAIN = (str, bytes, int, float, complex, slice, range, type, Enum, PurePath, torch.device, torch.dtype, np.generic, np.dtype)
+_PLAIN = (
+    str,
+    bytes,
+    int,
+    float,
+    complex,
+    slice,
+    range,
+    type,
+    Enum,
+    PurePath,
+    torch.device,
+    torch.dtype,
+    np.generic,
+    np.dtype,
+)
 _OTHERS = (*_PLAIN, Config, ModuleType, FunctionType, BuiltinFunctionType, MethodType, Simulation, StepGraph)
 _LIBRARIES = ("torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl")
 _WORTH_FUSING = 5_000  # control steps: kernels take a CPU seconds to compile, once a machine
@@ -136,4 +151,6 @@ def parts(thing: Any) -> dict[Any, Any]:
     if isinstance(thing, list | tuple | deque):
         return dict(enumerate(thing))
     state: Any = object.__getstate__(thing)  # attributes; or those, and slots
-    return {name: value for held in (state if isinstance(state, tuple) else [state]) for name, value in (held or {}).items()}
+    return {
+        name: value for held in (state if isinstance(state, tuple) else [state]) for name, value in (held or {}).items()
+    }

@@ -22,11 +22,13 @@ from legged_mw.sim.terrain import KINDS, MEASURES, measure
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask
 
-SPEED, SECONDS = 0.6, 15.0  # [m/s] commanded; [s] in which the edge must be reached: 9 m at that speed, and the corner is 5.7 m away
+# [m/s] commanded; [s] in which the edge must be reached: 9 m at that speed, and the corner is 5.7 m away
+SPEED, SECONDS = 0.6, 15.0
 TILES, REPEATS = 2, 5  # tiles of each level, of a slope one goes up and one down; robots on each tile
 
 OVERRIDES: dict[str, Any] = {
-    **{path: value for path, value in exam.OVERRIDES.items() if path != "termination.min_base_height"},  # a trunk in a step is a fall
+    # a trunk in a step is a fall
+    **{path: value for path, value in exam.OVERRIDES.items() if path != "termination.min_base_height"},
     "terrain.mesh_type": "heightfield",
     "terrain.curriculum": False,
     "terrain.num_rows": LEVELS,
@@ -53,7 +55,9 @@ def make_room(task: LoadedTask, repeats: int = REPEATS) -> None:
     ground = task.cfg.terrain
     kinds = [kind for kind, share in ground.terrain_proportions.items() if share > 0]
     if not kinds:
-        raise ConfigError(f"terrain.terrain_proportions: no kind of ground has a share above 0; there are: {', '.join(KINDS)}")
+        raise ConfigError(
+            f"terrain.terrain_proportions: no kind of ground has a share above 0; there are: {', '.join(KINDS)}"
+        )
     ground.terrain_proportions, ground.num_cols = dict.fromkeys(kinds, 1.0), len(kinds) * TILES
     task.cfg.env.num_envs = ground.num_cols * LEVELS * repeats
 
@@ -75,7 +79,9 @@ def run_crossing(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
 
 def _walk(env: LeggedRobot, policy: Policy, edge: float) -> tuple[Tensor, Tensor]:
     """Which worlds came ``edge`` [m] away from the middle along x or y, and which fell before that, each (N,)."""
-    command = torch.tensor([SPEED, 0.0, 0.0, *(further.default for further in env.command_table[3:])], device=env.device)
+    command = torch.tensor(
+        [SPEED, 0.0, 0.0, *(further.default for further in env.command_table[3:])], device=env.device
+    )
     crossed, fell, over = (torch.zeros(env.num_envs, dtype=torch.bool, device=env.device) for _ in range(3))
     env.commands.copy_(command)
     obs = env.first_observations()
@@ -97,13 +103,18 @@ def _measure(kind: str) -> dict[str, Any]:
     """What makes a kind hard and its value at each level; None where nothing does."""
     if kind not in MEASURES:
         return {"measure": None, "values": None}
-    return {"measure": MEASURES[kind][0], "values": [round(measure(kind, i / (LEVELS - 1))[1], 2) for i in range(LEVELS)]}
+    return {
+        "measure": MEASURES[kind][0],
+        "values": [round(measure(kind, i / (LEVELS - 1))[1], 2) for i in range(LEVELS)],
+    }
 
 
 def table(result: dict[str, Any]) -> str:
     """Shares that crossed, a line a kind, a column a level; at the end the means over all levels, of those that fell too."""
     kinds = result["kinds"]
-    lines = [f"share of {result['robots']} robots that crossed a tile at {result['speed']:g} m/s within {result['seconds']:g} s"]
+    lines = [
+        f"share of {result['robots']} robots that crossed a tile at {result['speed']:g} m/s within {result['seconds']:g} s"
+    ]
     lines.append(f"{'level':<16}" + "".join(f"{level:>7}" for level in range(LEVELS)) + f"{'mean':>9}{'fell':>7}")
     for name, kind in kinds.items():
         crossed = "".join(f"{share:>7.2f}" for share in kind["crossed"])

@@ -24,7 +24,9 @@ def draw(estimate: dict[str, Any], k: int, colours: tuple[str, str, str], title:
     for i in range(1, len(commands)):
         ax.axvline(i * seconds, color=faint, linewidth=0.8)
     places = (np.arange(len(commands)) + 0.5) * seconds
-    ax.set_xticks(places, [", ".join(f"{value:.2g}" for value in command) for command in commands], rotation=90, fontsize=5.5)
+    ax.set_xticks(
+        places, [", ".join(f"{value:.2g}" for value in command) for command in commands], rotation=90, fontsize=5.5
+    )
     name, unit = AXES[k]
     ax.set(title=f"{name} [{unit}]{title}", xlabel="command: vx, vy, yaw rate", xlim=(0.0, seconds * len(commands)))
     ax.grid(False, axis="x")

@@ -37,10 +37,12 @@ OVERRIDES: dict[str, Any] = {
     "termination.max_tilt": 90.0,  # [deg], a fall
     "termination.min_base_height": 0.0,  # and nothing else
 }
-SETS = {*OVERRIDES, "env.num_envs"} - {"domain_rand.enable"}  # what the exam decides; another robot than the nominal one may be asked for
+# what the exam decides; another robot than the nominal one may be asked for
+SETS = {*OVERRIDES, "env.num_envs"} - {"domain_rand.enable"}
 
 SIGNALS: dict[str, Signal] = {
-    "velocity": lambda env: torch.cat([env.base_lin_vel[:, :2], env.base_ang_vel[:, 2:]], dim=1),  # at the IMU, body frame
+    # at the IMU, body frame
+    "velocity": lambda env: torch.cat([env.base_lin_vel[:, :2], env.base_ang_vel[:, 2:]], dim=1),
     "position": lambda env: env.root_pos[:, :2],  # [m, world]
     "power": lambda env: (env.torques * env.dof_vel).abs().sum(dim=1),  # [W]
     "joint_speed": lambda env: env.dof_vel.abs().mean(dim=1),  # [rad/s]
@@ -63,7 +65,9 @@ def cases(rules: ExamRules, dt: float, push_at: float | None = None) -> list[Cas
 def pushes(rules: ExamRules, command: Velocity, step: int) -> list[Case]:
     """At ``step`` + k, direction k of every speed."""
     angles = [2 * math.pi * k / PUSH_DIRECTIONS for k in range(PUSH_DIRECTIONS)]
-    return [holding(command, Push(step + k, speed, angle)) for speed in rules.push_speeds for k, angle in enumerate(angles)]
+    return [
+        holding(command, Push(step + k, speed, angle)) for speed in rules.push_speeds for k, angle in enumerate(angles)
+    ]
 
 
 def run_exam(env: LeggedRobot, policy: Policy) -> dict[str, Any]:
@@ -81,4 +85,6 @@ def deployed(folder: Path, task: LoadedTask) -> dict[str, Any]:
 
 def grade(rules: ExamRules, record: Record) -> dict[str, Any]:
     """What ``rules`` makes of a record whose worlds are the exam's."""
-    return rules.grade(record.signals, last_position=record.last_position, fell_at=record.fell_at, mass=record.mass, dt=record.dt)
+    return rules.grade(
+        record.signals, last_position=record.last_position, fell_at=record.fell_at, mass=record.mass, dt=record.dt
+    )

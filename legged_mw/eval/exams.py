@@ -33,8 +33,10 @@ class Exam(NamedTuple):
     prepare: Callable[[LoadedTask], None]  # turn a task into the exam
     make_room: Callable[[LoadedTask], None]  # set the number of worlds once more, after the user's overrides
     ask_alike: Callable[[Sequence[LoadedTask]], None]  # grade prepared tasks by the rules of the first
-    examine: Callable[..., tuple[dict[str, Any], dict[str, Any]]]  # (env, policy, env of the rough part or None) -> result, figures
-    deployed: Callable[[Path, LoadedTask], dict[str, Any]]  # the result of an export in that folder, in MuJoCo's C engine
+    # (env, policy, env of the rough part or None) -> result, figures
+    examine: Callable[..., tuple[dict[str, Any], dict[str, Any]]]
+    # the result of an export in that folder, in MuJoCo's C engine
+    deployed: Callable[[Path, LoadedTask], dict[str, Any]]
     table: Callable[[dict[str, Any]], str]  # the result as text
     write: Callable[..., None]  # the report: see report.write
     in_training: Callable[[LoadedTask, str, bool], Examiner]  # task, device, eager
@@ -98,7 +100,8 @@ def make_exam(task: LoadedTask, env: RobotTask, eager: bool = False) -> Examiner
     examine = kind.in_training(task, env.device, eager)
     here, there = env.get_observations(), examine.env.get_observations()
     for group in task.train.obs_groups.actor:
-        if group in here and here[group].shape[1] != there[group].shape[1]:  # a group that does not exist is the learner's to refuse
+        # a group that does not exist is the learner's to refuse
+        if group in here and here[group].shape[1] != there[group].shape[1]:
             sizes = f"{there[group].shape[1]} values in the exam's nominal world and {here[group].shape[1]} in training"
             print(f"no exam during training: the actor's observation group '{group}' has {sizes}")
             return None

@@ -31,7 +31,8 @@ Array = NDArray[Any]
 
 def tracking_errors(record: Record, settled: int, rows: int) -> list[list[list[float | None]]]:
     """Mean absolute error of vx, vy, yaw rate over a grid of worlds: 3 x rows x columns."""
-    error = np.abs(record.signals["velocity"][settled:] - record.commands[settled:, :, :3]).mean(axis=0, dtype=float)  # (N, 3)
+    # (N, 3)
+    error = np.abs(record.signals["velocity"][settled:] - record.commands[settled:, :, :3]).mean(axis=0, dtype=float)
     error[np.isfinite(record.fell_at)] = np.nan
     return [plain(error[:, k].reshape(rows, -1)) for k in range(3)]
 
@@ -73,7 +74,9 @@ def responses(record: Record, axis: int, begin: int) -> dict[str, Any]:
     commanded, stood = record.commands[begin:, 0, axis], np.isinf(record.fell_at)
     moved = record.signals["velocity"][begin:, stood, axis].astype(float)
     time = np.arange(len(commanded)) * record.dt
-    mean, low, high = (f(moved, axis=1) if stood.any() else np.full(len(time), np.nan) for f in (np.mean, np.min, np.max))
+    mean, low, high = (
+        f(moved, axis=1) if stood.any() else np.full(len(time), np.nan) for f in (np.mean, np.min, np.max)
+    )
     curves = {"time": time.round(4), "commanded": commanded, "mean": mean, "low": low, "high": high}
     numbers = _each_step(time, commanded, mean)
     return {**{name: plain(values) for name, values in curves.items()}, "fell": int((~stood).sum()), "numbers": numbers}
@@ -85,7 +88,13 @@ def _each_step(time: Array, commanded: Array, mean: Array) -> list[dict[str, Any
     found = []
     for begin, end in zip(borders[:-1], borders[1:], strict=True):
         start, target = float(commanded[begin - 1]), float(commanded[begin])
-        found.append({"from": start, "to": target, **step_response(time[begin:end] - time[begin], mean[begin:end], start, target)})
+        found.append(
+            {
+                "from": start,
+                "to": target,
+                **step_response(time[begin:end] - time[begin], mean[begin:end], start, target),
+            }
+        )
     return found
 
 
@@ -128,7 +137,11 @@ def gaits(record: Record, settled: int, commands: Sequence[Sequence[float]], sec
     for world, command in enumerate(commands):
         contact, fell = record.signals["contact"][settled:, world], bool(np.isfinite(record.fell_at[world]))
         last = contact[-round(seconds / record.dt) :].T.astype(int).tolist()
-        gait = {"duty_factor": duty_factor(contact), "stride_frequency": stride_frequency(contact, record.dt), "contact": last}
+        gait = {
+            "duty_factor": duty_factor(contact),
+            "stride_frequency": stride_frequency(contact, record.dt),
+            "contact": last,
+        }
         found.append({"command": list(command), **(dict.fromkeys(gait) if fell else gait)})
     return found
 
@@ -144,7 +157,10 @@ def distribution(values: Array, low: Array, high: Array, margin: float = 1.0) ->
     if not len(values):
         return {"low": [], "high": [], "edges": [], "density": [], "quantiles": [], "saturated": []}
     histograms = [np.histogram(row, BINS, density=True) for row in values.T]
-    outside, limited = ((values < low * margin) | (values > high * margin)).mean(axis=0), np.isfinite(low) & np.isfinite(high)
+    outside, limited = (
+        ((values < low * margin) | (values > high * margin)).mean(axis=0),
+        np.isfinite(low) & np.isfinite(high),
+    )
     return {
         "low": [float(v) if ok else None for v, ok in zip(low, limited, strict=True)],
         "high": [float(v) if ok else None for v, ok in zip(high, limited, strict=True)],

@@ -12,7 +12,8 @@ from legged_mw.sim.settle import fallen
 from legged_mw.utils.clip import rotate
 
 SEED, SETTLING = 20_000, 1.5  # of the falls, [s] from the drop; training has seeds of its own: falls.seed
-HIGH, TILT, SLOW = 0.9, 20.0, 0.5  # share of the standing height, [deg] from the vertical, [rad/s] mean joint speed: ours
+# share of the standing height, [deg] from the vertical, [rad/s] mean joint speed: ours
+HIGH, TILT, SLOW = 0.9, 20.0, 0.5
 HOLD, STAY = 0.5, 5.0  # [s] that it stands before it counts, [s] after that at which it must still
 AT_LIMIT = 0.98  # share of the force limit from which a torque is at it
 
@@ -25,7 +26,12 @@ class Getup(Skill):
 
     kind = "getup"
     asks = "256 falls on each ground: it stands high, upright and with joints at rest in time, and 5 s later still does"
-    grounds: ClassVar = {"plane": Ground(), "slope": Ground(slope=10.0), "slippery": Ground(friction=0.3), "loaded": Ground(load=2.0)}
+    grounds: ClassVar = {
+        "plane": Ground(),
+        "slope": Ground(slope=10.0),
+        "slippery": Ground(friction=0.3),
+        "loaded": Ground(load=2.0),
+    }
     robots = 256
     measures = (
         Measure("stands", "share that stands in time", 3, (0.99, 0.97)),

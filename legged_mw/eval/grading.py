@@ -81,7 +81,9 @@ def override(task: LoadedTask, args: argparse.Namespace, sets: set[str]) -> None
     apply_overrides(task, args)
     check_classes(task.train)
     if touched := sets & task.changes_since(before).keys():
-        raise ConfigError(f"--eval sets {', '.join(sorted(touched))} itself; an exam with other values would be another exam")
+        raise ConfigError(
+            f"--eval sets {', '.join(sorted(touched))} itself; an exam with other values would be another exam"
+        )
 
 
 def build(graded: Graded, args: argparse.Namespace, device: str) -> tuple[Policy, RobotTask, RobotTask | None]:
@@ -102,8 +104,17 @@ def make_column(graded: Graded, policy: Policy, env: RobotTask, rough: RobotTask
     if rough and exam.rough:
         print(f"{exam.rough.table(figures['crossing'])}\n")
     overrides = {path: now for path, (_, now) in graded.task.changes_since(graded.trained).items()}
-    about = {"policy": "/".join(source.checkpoint.parts[-3:]), "engine": env.sim.engine, "device": env.device, "overrides": overrides}
-    about |= {"warning": note} if (note := " ".join(overflow_note(each.sim, "this exam") for each in (env, rough) if each).strip()) else {}
+    about = {
+        "policy": "/".join(source.checkpoint.parts[-3:]),
+        "engine": env.sim.engine,
+        "device": env.device,
+        "overrides": overrides,
+    }
+    about |= (
+        {"warning": note}
+        if (note := " ".join(overflow_note(each.sim, "this exam") for each in (env, rough) if each).strip())
+        else {}
+    )
     return Column(name, about, result, figures)
 
 

@@ -65,7 +65,8 @@ class Handstand(Skill):
             "median": float(np.median(begin[holds]) * robot.dt) if holds.any() else None,
             "drift": float(drift[holds].mean()) if holds.any() else None,
             "power": float(power[up].mean()) if up.any() else None,
-            "worst": int(np.argmax(np.where(holds, drift, np.inf))),  # a robot that did not, or the one that drifted most
+            # a robot that did not, or the one that drifted most
+            "worst": int(np.argmax(np.where(holds, drift, np.inf))),
         }
 
     def _ground_contact(self, robot: Robot, qpos: Floats) -> tuple[np.ndarray, np.ndarray]:

@@ -31,7 +31,9 @@ class Limits(NamedTuple):
     def at(self, speed: Array) -> tuple[Array, Array]:
         """Lowest and highest torque at ``speed`` (..., D)."""
         share = speed / self.no_load_speed
-        return np.maximum(self.low, -self.stall_torque * (1.0 + share)), np.minimum(self.high, self.stall_torque * (1.0 - share))
+        return np.maximum(self.low, -self.stall_torque * (1.0 + share)), np.minimum(
+            self.high, self.stall_torque * (1.0 - share)
+        )
 
     def of(self, joint: int) -> Limits:
         """Of one joint, (1,) each."""
@@ -52,7 +54,10 @@ def envelopes(record: Record, settled: int, kinds: Sequence[str], limits: Limits
     found = []
     for kind in dict.fromkeys(kinds):
         joints = [i for i, name in enumerate(kinds) if name == kind]
-        drawn = {"kind": kind, **_picture(torque[..., joints].ravel(), speed[..., joints].ravel(), limits.of(joints[0]))}
+        drawn = {
+            "kind": kind,
+            **_picture(torque[..., joints].ravel(), speed[..., joints].ravel(), limits.of(joints[0])),
+        }
         known = bool(np.isfinite(most[joints]).all()) and stood.any()
         found.append({**drawn, "at_limit": float(at_limit[..., joints].mean()) if known else None})
     return found
@@ -81,10 +86,20 @@ def draw(motor: dict[str, Any], heat: Any, ink: tuple[str, str], suffix: str, ax
     counts, speeds, torques = (np.array(motor[key], dtype=float) for key in ("counts", "speeds", "torques"))
     rows, columns = np.nonzero(counts)  # a mesh would draw the empty cells, too, and make a page of megabytes
     often = np.log1p(counts[rows, columns]) / np.log1p(counts.max(initial=1.0))
-    ax.bar(speeds[columns], np.diff(torques)[0], np.diff(speeds)[0], torques[rows], align="edge", color=heat(1.0 - often), linewidth=0)
+    ax.bar(
+        speeds[columns],
+        np.diff(torques)[0],
+        np.diff(speeds)[0],
+        torques[rows],
+        align="edge",
+        color=heat(1.0 - often),
+        linewidth=0,
+    )
     if motor["envelope"]:
         for side in ("low", "high"):
             ax.plot(motor["envelope"]["speed"], motor["envelope"][side], color=ink[0], linewidth=1.2)
     share = motor["at_limit"]
     ax.set(title=f"{motor['kind'].replace('_', ' ')}{suffix}", xlabel="speed [rad/s]", ylabel="torque [N m]")
-    ax.set_title("no limit known" if share is None else f"{share:.1%} at the limit", loc="right", color=ink[1], fontsize=7.0)
+    ax.set_title(
+        "no limit known" if share is None else f"{share:.1%} at the limit", loc="right", color=ink[1], fontsize=7.0
+    )

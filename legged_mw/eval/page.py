@@ -58,10 +58,18 @@ class Column(NamedTuple):
 
 def html(task: str, rules: ExamRules, columns: Sequence[Column], drawn: Sequence[tuple[Section, list[str]]]) -> str:
     """The whole page; ``rules`` are those of the first column."""
-    words: dict[str, Any] = {"speeds": " to ".join(f"{end(rules.push_speeds):g}" for end in (min, max)), "vx": rules.push_vx}
+    words: dict[str, Any] = {
+        "speeds": " to ".join(f"{end(rules.push_speeds):g}" for end in (min, max)),
+        "vx": rules.push_vx,
+    }
     words["stroke"] = STROKE if rules.marks_of == "error" else ""
-    chapters = [_chapter(section, panels, TEXTS[section.name].format(**words), _extra(section.name, columns)) for section, panels in drawn]
-    note = EXAM_NOTE.format(pushes=len(rules.push_speeds) * PUSH_DIRECTIONS, asked=rules.asked_words(), peer=escape(rules.peer_words()))
+    chapters = [
+        _chapter(section, panels, TEXTS[section.name].format(**words), _extra(section.name, columns))
+        for section, panels in drawn
+    ]
+    note = EXAM_NOTE.format(
+        pushes=len(rules.push_speeds) * PUSH_DIRECTIONS, asked=rules.asked_words(), peer=escape(rules.peer_words())
+    )
     results = [column.exam for column in columns]
     figures = [rules.figures(result, others=results) for result in results]
     return f"""<!doctype html>
@@ -83,7 +91,9 @@ def _names(columns: Sequence[Column], rules: ExamRules) -> str:
         swatch = f'<i class="swatch c{drawn.index(column.name)}"></i>' if column.figures and len(drawn) > 1 else ""
         engine = escape(str(column.about.get("engine", "")))
         pills = [pill(*_said(words), yes) for words, yes in verdicts(rules, column.exam)]
-        items.append(f"<li>{swatch}<b>{escape(column.name)}</b> <span class='muted'>{engine}</span> {' '.join(pills)}</li>")
+        items.append(
+            f"<li>{swatch}<b>{escape(column.name)}</b> <span class='muted'>{engine}</span> {' '.join(pills)}</li>"
+        )
     return f'<ul class="names">{"".join(items)}</ul>'
 
 
@@ -94,7 +104,9 @@ def _said(words: str) -> tuple[str, str]:
 
 
 def pill(good: str, bad: str, yes: bool) -> str:
-    return f'<span class="pill {"yes" if yes else "no"}">{"&#10003;" if yes else "&#10007;"} {good if yes else bad}</span>'
+    return (
+        f'<span class="pill {"yes" if yes else "no"}">{"&#10003;" if yes else "&#10007;"} {good if yes else bad}</span>'
+    )
 
 
 def _cards(figures: Sequence[Figure]) -> str:
@@ -103,8 +115,14 @@ def _cards(figures: Sequence[Figure]) -> str:
     for figure in figures:
         if figure.card:
             title, unit = figure.card
-            value = f"{figure.value:.0%}" if figure.more_is_better and figure.value is not None else figure.text(figure.value)
-            cards.append(f'<div class="card{_mood(figure)}"><span>{title}</span><b>{value}</b><small>{unit}</small></div>')
+            value = (
+                f"{figure.value:.0%}"
+                if figure.more_is_better and figure.value is not None
+                else figure.text(figure.value)
+            )
+            cards.append(
+                f'<div class="card{_mood(figure)}"><span>{title}</span><b>{value}</b><small>{unit}</small></div>'
+            )
     return f'<div class="cards">{"".join(cards)}</div>'
 
 
@@ -112,7 +130,9 @@ def _mood(figure: Figure) -> str:
     return {True: " pass", False: " fail", None: ""}[figure.passes()]
 
 
-def exam_table(columns: Sequence[Column], figures: Sequence[Sequence[Figure]], peer: str, asks: str = "walks at") -> str:
+def exam_table(
+    columns: Sequence[Column], figures: Sequence[Sequence[Figure]], peer: str, asks: str = "walks at"
+) -> str:
     """A row a figure; from the second column on with the gap to the first."""
     lines = []
     for first, *others in zip(*figures, strict=True):
@@ -120,13 +140,17 @@ def exam_table(columns: Sequence[Column], figures: Sequence[Sequence[Figure]], p
         for other in others:
             gap = "" if other.value is None or first.value is None else f"{other.value - first.value:+.{first.digits}f}"
             gap = gap if gap.strip("+-0.") else ""
-            cells.append(f'<td><span class="value{_mood(other)}">{other.text(other.value)}</span> <small>{gap}</small></td>')
+            cells.append(
+                f'<td><span class="value{_mood(other)}">{other.text(other.value)}</span> <small>{gap}</small></td>'
+            )
         cells.append(f"<td>{first.mark_text()}</td>")
         if peer:
             cells.append(f"<td>{first.peer_text()}</td>")
         sub = ' class="sub"' if first.name.startswith(" ") else ""
         lines.append(f"<tr{sub}><th>{escape(first.name.strip())}</th>{''.join(cells)}</tr>")
-    heads = "".join(f"<th>{escape(name)}</th>" for name in [*(column.name for column in columns), asks, *([peer] if peer else [])])
+    heads = "".join(
+        f"<th>{escape(name)}</th>" for name in [*(column.name for column in columns), asks, *([peer] if peer else [])]
+    )
     head = f"<thead><tr><th></th>{heads}</tr></thead>"
     return f'<div class="scroll"><table class="exam">{head}<tbody>{"".join(lines)}</tbody></table></div>'
 
@@ -156,7 +180,9 @@ def _published(rules: ExamRules, columns: Sequence[Column]) -> str:
         cells.append([name, str(found["falls"]), *triples, drift, cost, shares, vx])
     pushes = ", ".join(f"{speed:g}" for speed in rules.push_speeds)
     lead = f"All were asked the same commands. Cost of transport, and pushes of {pushes} m/s: walking ahead at the last column's vx [m/s]."
-    return f'<section class="peers"><h2>Published policies</h2><p class="lead">{lead}</p>{table(heads, cells)}</section>'
+    return (
+        f'<section class="peers"><h2>Published policies</h2><p class="lead">{lead}</p>{table(heads, cells)}</section>'
+    )
 
 
 def _chapter(section: Section, panels: list[str], lead: str, extra: str) -> str:
@@ -173,13 +199,18 @@ def _extra(name: str, columns: Sequence[Column]) -> str:
     tables = {
         "crossing": (_crossing_rows, ["", *(f"level {i}" for i in range(LEVELS)), "mean"], "Every share"),
         "steps": (_step_rows, ["", "from", "to", "10 to 90 % in [s]", "overshoot", "left at the end"], ""),
-        "gait": (_gait_rows, ["vx, vy, yaw rate", "strides [1/s]", *(f"{foot} down" for foot in figures["foot_names"])], "All commands"),
+        "gait": (
+            _gait_rows,
+            ["vx, vy, yaw rate", "strides [1/s]", *(f"{foot} down" for foot in figures["foot_names"])],
+            "All commands",
+        ),
         "joints": (_joint_rows, ["", "position", "velocity", "torque"], "Share beyond the limit, joint by joint"),
     }
     if name not in tables:
         return ""
     make, heads, folded = tables[name]
-    paired = zip_longest(*(make(column, f", {column.name}" if len(drawn) > 1 else "") for column in drawn))  # ranges may differ
+    # ranges may differ
+    paired = zip_longest(*(make(column, f", {column.name}" if len(drawn) > 1 else "") for column in drawn))
     return table(heads, [row for rows in paired for row in rows if row], folded)
 
 
@@ -224,7 +255,9 @@ def _joint_rows(column: Column, whose: str) -> list[list[str]]:
 def table(heads: list[str], rows: list[list[str]], folded: str = "") -> str:
     """A table; folded away below its title if it has one."""
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
-    body = "".join(f"<tr><th>{escape(row[0])}</th>{''.join(f'<td>{escape(text)}</td>' for text in row[1:])}</tr>" for row in rows)
+    body = "".join(
+        f"<tr><th>{escape(row[0])}</th>{''.join(f'<td>{escape(text)}</td>' for text in row[1:])}</tr>" for row in rows
+    )
     drawn = f'<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
     return f"<details><summary>{folded}</summary>{drawn}</details>" if folded else drawn
 
@@ -235,9 +268,15 @@ def about(columns: Sequence[Column]) -> str:
     for column in columns:
         about: dict[str, Any] = column.about
         changed = about.get("overrides") or {}
-        listed = "".join(f"<li><code>{escape(path)}</code> {escape(str(value))}</li>" for path, value in sorted(changed.items()))
+        listed = "".join(
+            f"<li><code>{escape(path)}</code> {escape(str(value))}</li>" for path, value in sorted(changed.items())
+        )
         where = ", ".join(str(about[key]) for key in ("policy", "engine", "device") if about.get(key))
-        fields = f"<details><summary>Config fields that differ from training</summary><ul>{listed}</ul></details>" if listed else ""
+        fields = (
+            f"<details><summary>Config fields that differ from training</summary><ul>{listed}</ul></details>"
+            if listed
+            else ""
+        )
         warning = f"<p><b>{escape(str(about['warning']))}</b></p>" if about.get("warning") else ""
         parts.append(f"<p><b>{escape(column.name)}</b> {escape(where)}</p>{warning}{fields}")
     return "".join(parts)

@@ -25,7 +25,11 @@ from legged_mw.rl.recurrent import forget
 from legged_mw.utils.errors import UserError
 from legged_mw.utils.task import LoadedTask, load_task
 
-NOMINAL: dict[str, Any] = {**{f"domain_rand.{name}": [] for name in KINDS}, "domain_rand.delay_ms": [], "domain_rand.model_factors": {}}
+NOMINAL: dict[str, Any] = {
+    **{f"domain_rand.{name}": [] for name in KINDS},
+    "domain_rand.delay_ms": [],
+    "domain_rand.model_factors": {},
+}
 
 
 def skill_of(cfg: RobotTaskCfg, kind: str) -> Skill:
@@ -35,7 +39,8 @@ def skill_of(cfg: RobotTaskCfg, kind: str) -> Skill:
 
 def overrides(task: LoadedTask) -> dict[str, Any]:
     """What the exam changes in the task; fields that it does not have are left out."""
-    common = {path: value for path, value in exam.OVERRIDES.items() if not path.startswith("termination.")}  # a task's own ends stay
+    # a task's own ends stay
+    common = {path: value for path, value in exam.OVERRIDES.items() if not path.startswith("termination.")}
     wanted, config = {**common, **skill_of(task.cfg, task.exam).overrides}, task.to_dict()
     return {path: value for path, value in wanted.items() if path.split(".")[1] in config.get(path.split(".")[0], {})}
 
@@ -85,7 +90,11 @@ def on_ground(env: RobotTask, ground: Ground) -> RobotTask:
     """Another environment of the same task, on ``ground``."""
     changes = {"terrain.slope": ground.slope} if ground.slope else {}
     changes |= {"terrain.friction": ground.friction} if ground.friction is not None else {}
-    changes |= {**NOMINAL, "domain_rand.enable": True, "domain_rand.base_mass": [ground.load, ground.load]} if ground.load else {}
+    changes |= (
+        {**NOMINAL, "domain_rand.enable": True, "domain_rand.base_mass": [ground.load, ground.load]}
+        if ground.load
+        else {}
+    )
     cfg = copy.deepcopy(env.cfg)
     for path, value in changes.items():
         cfg.set(path, value, where="exam")
@@ -103,7 +112,13 @@ def motion_of(env: MotionTracking) -> Motion:
     return Motion(env.clips[0].qpos(), tuple(env.cfg.motion.bodies), env.cfg.motion.anchor)
 
 
-def perform(env: RobotTask, policy: Policy, skill: Skill, ground: Ground = Ground(), starts: Starts | None = None) -> Recording:  # noqa: B008
+def perform(
+    env: RobotTask,
+    policy: Policy,
+    skill: Skill,
+    ground: Ground = Ground(),  # noqa: B008
+    starts: Starts | None = None,
+) -> Recording:
     """Put the robots of all worlds into their starts, or into ``starts`` where they are known, and let ``policy`` act."""
     env.reset()
     if starts := starts or skill.starts(machine(env), env.num_envs):
@@ -170,10 +185,14 @@ def table(result: Mapping[str, Any]) -> str:
 
 def of_result(result: Mapping[str, Any]) -> Skill:
     """The exam that gave a result."""
-    return make_skill(result["asked"]["kind"], {name: value for name, value in result["asked"].items() if name != "kind"})
+    return make_skill(
+        result["asked"]["kind"], {name: value for name, value in result["asked"].items() if name != "kind"}
+    )
 
 
-def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()) -> None:
+def write(
+    folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()
+) -> None:
     """Write ``report.json`` and ``report.html``; see ``report.write``."""
     columns = [columns[0], *(Column(name, {}, result) for name, result in extras), *columns[1:]]
     folder.mkdir(parents=True, exist_ok=True)

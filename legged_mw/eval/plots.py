@@ -34,9 +34,23 @@ Columns = list[tuple[str, Figures]]  # (name, figures) of one policy or two
 
 INK, MUTED, FAINT, PAPER = "#1b1f27", "#68707d", "#e3e6eb", "#fdfdfe"
 PAIR, GREEN = ("#0072b2", "#d55e00"), "#009e73"
-VARIABLES = {INK: "ink", MUTED: "muted", FAINT: "faint", PAPER: "paper", PAIR[0]: "first", PAIR[1]: "second", GREEN: "peer"}
+VARIABLES = {
+    INK: "ink",
+    MUTED: "muted",
+    FAINT: "faint",
+    PAPER: "paper",
+    PAIR[0]: "first",
+    PAIR[1]: "second",
+    GREEN: "peer",
+}
 STYLE: dict[Any, Any] = {
-    **{"font.family": "DejaVu Sans", "font.size": 7.5, "svg.fonttype": "none", "text.color": INK, "axes.labelcolor": MUTED},
+    **{
+        "font.family": "DejaVu Sans",
+        "font.size": 7.5,
+        "svg.fonttype": "none",
+        "text.color": INK,
+        "axes.labelcolor": MUTED,
+    },
     **{
         "axes.edgecolor": FAINT,
         "axes.linewidth": 0.8,
@@ -45,9 +59,21 @@ STYLE: dict[Any, Any] = {
         "axes.titlepad": 7.0,
         "axes.labelpad": 2.0,
     },
-    **{"axes.titlecolor": INK, "axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "axes.axisbelow": True},
+    **{
+        "axes.titlecolor": INK,
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.grid": True,
+        "axes.axisbelow": True,
+    },
     **{"grid.color": FAINT, "grid.linewidth": 0.6, "xtick.color": MUTED, "ytick.color": MUTED, "xtick.major.size": 0.0},
-    **{"ytick.major.size": 0.0, "xtick.major.pad": 4.0, "ytick.major.pad": 4.0, "legend.frameon": False, "legend.fontsize": 7.0},
+    **{
+        "ytick.major.size": 0.0,
+        "xtick.major.pad": 4.0,
+        "ytick.major.pad": 4.0,
+        "legend.frameon": False,
+        "legend.fontsize": 7.0,
+    },
     **{"lines.linewidth": 1.4, "figure.facecolor": "none", "axes.facecolor": "none", "savefig.facecolor": "none"},
 }
 HEAT = "viridis"  # perceptually uniform
@@ -204,14 +230,23 @@ def _heat_maps(columns: Columns, rules: ExamRules) -> list[Panel]:
     for grid, across in (("vx_yaw", "yaw"), ("vx_vy", "vy")):
         for name, figures in columns:
             for k, mark in enumerate(marks):
-                every = np.concatenate([_array(f["tracking"][g][k]).ravel() for _, f in columns for g in ("vx_yaw", "vx_vy")])
+                every = np.concatenate(
+                    [_array(f["tracking"][g][k]).ravel() for _, f in columns for g in ("vx_yaw", "vx_vy")]
+                )
                 top = max(1.25 * mark, min(3 * mark, float(np.nanmax(every)) if np.isfinite(every).any() else mark))
                 stroke = mark if strict else None
-                panels.append(Panel(partial(_heat, figures["tracking"], grid, across, k, stroke, top, _of(name, columns)), height=2.45))
+                panels.append(
+                    Panel(
+                        partial(_heat, figures["tracking"], grid, across, k, stroke, top, _of(name, columns)),
+                        height=2.45,
+                    )
+                )
     return panels
 
 
-def _heat(tracking: Figures, grid: str, down: str, k: int, mark: float | None, top: float, suffix: str, ax: Axes) -> None:
+def _heat(
+    tracking: Figures, grid: str, down: str, k: int, mark: float | None, top: float, suffix: str, ax: Axes
+) -> None:
     x, y, values = _array(tracking["axes"]["vx"]), _array(tracking["axes"][down]), _array(tracking[grid][k])
     scale = Normalize(0.0, top)
     ax.pcolormesh(_edges(x), _edges(y), values, cmap=HEAT, norm=scale, edgecolors=PAPER, linewidth=0.8)
@@ -225,9 +260,16 @@ def _heat(tracking: Figures, grid: str, down: str, k: int, mark: float | None, t
     name, unit = AXES[k]
     beside = "yaw rate [rad/s]" if down == "yaw" else "vy [m/s]"
     ax.set(title=f"error of {name} [{unit}]{suffix}", xlabel="commanded vx [m/s]", ylabel=beside)
-    shape: dict[str, Any] = {"aspect": 18, "pad": 0.03, "extend": "max" if (values > top).any() else "neither", "format": "%.2f"}
+    shape: dict[str, Any] = {
+        "aspect": 18,
+        "pad": 0.03,
+        "extend": "max" if (values > top).any() else "neither",
+        "format": "%.2f",
+    }
     ticks = [0.0, *([mark] if mark else []), *([top] if not mark or top > 1.4 * mark else [])]
-    bar = ax.figure.colorbar(ScalarMappable(scale, HEAT), ax=ax, boundaries=np.linspace(0.0, top, 33), ticks=ticks, **shape)
+    bar = ax.figure.colorbar(
+        ScalarMappable(scale, HEAT), ax=ax, boundaries=np.linspace(0.0, top, 33), ticks=ticks, **shape
+    )
     bar.solids.set_edgecolor("face")  # type: ignore[union-attr]
     bar.outline.set_visible(False)  # type: ignore[operator]
     if mark:
@@ -249,7 +291,15 @@ def _response(columns: Columns, k: int, ax: Axes) -> None:
         ax.fill_between(time, low, high, color=PAIR[i], alpha=0.18, linewidth=0)
         ax.plot(time, _array(step["mean"]), color=PAIR[i], label=label if len(columns) > 1 else "measured")
         if i == 0:
-            ax.step(time, _array(step["commanded"]), where="post", color=INK, linestyle=(0, (4, 2)), linewidth=1.0, label="commanded")
+            ax.step(
+                time,
+                _array(step["commanded"]),
+                where="post",
+                color=INK,
+                linestyle=(0, (4, 2)),
+                linewidth=1.0,
+                label="commanded",
+            )
     ax.set(title=f"{name} [{unit}]", xlabel="time [s]")
     if any(fell := [figures["steps"][("vx", "vy", "yaw")[k]]["fell"] for _, figures in columns]):
         ax.set_title(f"{' / '.join(map(str, fell))} fell", loc="right", color=MUTED, fontsize=7.0)
@@ -277,7 +327,8 @@ def _gait(columns: Columns, world: int, ax: Axes) -> None:
     rows, height = [figures["gait"][world] for _, figures in columns], 0.62 / count
     for i, row in enumerate(rows):
         for foot, down in enumerate(row["contact"] or []):
-            edges = np.flatnonzero(np.diff([0, *down, 0])).reshape(-1, 2) * columns[i][1]["dt"]  # begin and end of each stance
+            # begin and end of each stance
+            edges = np.flatnonzero(np.diff([0, *down, 0])).reshape(-1, 2) * columns[i][1]["dt"]
             bars = [(begin, end - begin) for begin, end in edges]
             ax.broken_barh(bars, (foot - 0.31 + i * height, height * 0.94), facecolors=PAIR[i], linewidth=0)
     command = zip(AXES, rows[0]["command"], strict=True)
@@ -316,7 +367,9 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
                     ax.plot([end, end], [joint, joint - 0.72], color=INK, linewidth=1.2)
             if share := found["saturated"][joint]:
                 text = f"{share:.1%}" if share >= 0.001 else "<0.1%"
-                ax.annotate(text, (1.01, joint - 0.1 - 0.4 * i), xycoords=("axes fraction", "data"), color=PAIR[i], fontsize=6.2)
+                ax.annotate(
+                    text, (1.01, joint - 0.1 - 0.4 * i), xycoords=("axes fraction", "data"), color=PAIR[i], fontsize=6.2
+                )
     ax.set_yticks(range(len(names)), names)
     ax.set(title=label, ylim=(len(names) - 0.6, -1.05))
     ax.spines["left"].set_visible(False)
@@ -325,8 +378,14 @@ def _joints(columns: Columns, key: str, label: str, ax: Axes) -> None:
 
 def _motor_panels(columns: Columns) -> list[Panel]:
     """A picture a kind of joint and policy; figures that were saved before there were any have none."""
-    rows = zip_longest(*([(_of(name, columns), motor) for motor in figures.get("motors", [])] for name, figures in columns))
-    return [Panel(partial(draw_motor, motor, colormaps[HEAT], (INK, MUTED), suffix)) for row in rows for suffix, motor in filter(None, row)]
+    rows = zip_longest(
+        *([(_of(name, columns), motor) for motor in figures.get("motors", [])] for name, figures in columns)
+    )
+    return [
+        Panel(partial(draw_motor, motor, colormaps[HEAT], (INK, MUTED), suffix))
+        for row in rows
+        for suffix, motor in filter(None, row)
+    ]
 
 
 # ---- pushes
@@ -336,7 +395,9 @@ def _push_curve(columns: Columns, rules: ExamRules, ax: Axes) -> None:
     speeds = rules.push_speeds
     if rules.peers:
         shares = list(best_of(rules.peers)["pushes"].values())
-        ax.plot(speeds, shares, color=GREEN, marker="D", markersize=3.2, linewidth=1.0, label=f"{rules.peer_label}, walking")
+        ax.plot(
+            speeds, shares, color=GREEN, marker="D", markersize=3.2, linewidth=1.0, label=f"{rules.peer_label}, walking"
+        )
     for i, (name, figures) in enumerate(columns):
         for which, line in (("walking", "-"), ("standing", (0, (2, 1.5)))):
             share, label = np.mean(figures["pushes"][which], axis=1), f"{which}{_of(name, columns)}"
@@ -363,18 +424,38 @@ def _push_wheel(pushes: Figures, which: str, colour: str, title: str, ax: Any) -
 
 def _against_speed(columns: Columns, rules: ExamRules, key: str, ax: Axes) -> None:
     for i, (name, figures) in enumerate(columns):
-        ax.plot(figures["transport"]["vx"], _array(figures["transport"][key]), color=PAIR[i], marker="o", markersize=3.2, label=name)
+        ax.plot(
+            figures["transport"]["vx"],
+            _array(figures["transport"][key]),
+            color=PAIR[i],
+            marker="o",
+            markersize=3.2,
+            label=name,
+        )
     if key == "cost_of_transport" and rules.peers:
         cost = best_of(rules.peers)[key]
-        ax.plot([rules.transport_vx], [cost], color=GREEN, marker="D", markersize=4.5, linestyle="none", label=rules.peer_label)
-    ax.set(title="mean power [W]" if key == "power" else "cost of transport [-]", xlabel="commanded vx [m/s]", ylim=(0.0, None))
+        ax.plot(
+            [rules.transport_vx],
+            [cost],
+            color=GREEN,
+            marker="D",
+            markersize=4.5,
+            linestyle="none",
+            label=rules.peer_label,
+        )
+    ax.set(
+        title="mean power [W]" if key == "power" else "cost of transport [-]",
+        xlabel="commanded vx [m/s]",
+        ylim=(0.0, None),
+    )
     if key == "cost_of_transport" or len(columns) > 1:
         ax.legend(loc="best", handlelength=1.6)
 
 
 def _reward(columns: Columns, ax: Axes) -> None:
     """A bar a term, the largest at the top."""
-    shares = {term: share or 0.0 for _, figures in reversed(columns) for term, share in figures["reward"].items()}  # of either
+    # of either
+    shares = {term: share or 0.0 for _, figures in reversed(columns) for term, share in figures["reward"].items()}
     terms = sorted(shares, key=lambda term: -abs(shares[term]))
     height = 0.7 / len(columns)
     for i, (name, figures) in enumerate(columns):

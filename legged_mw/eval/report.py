@@ -55,7 +55,9 @@ def ask_alike(tasks: Sequence[LoadedTask]) -> None:
             make_room(task)
 
 
-def examine(env: LeggedRobot, policy: Policy, rough: LeggedRobot | None = None) -> tuple[dict[str, Any], dict[str, Any]]:
+def examine(
+    env: LeggedRobot, policy: Policy, rough: LeggedRobot | None = None
+) -> tuple[dict[str, Any], dict[str, Any]]:
     """The exam's result and the report's figures, from one roll-out of an environment made from a prepared task.
 
     With ``rough``, made from a task that ``crossing`` prepared, its result is among the figures.
@@ -86,7 +88,11 @@ def gather(env: LeggedRobot, asked: rules.ExamRules, plan: Plan, record: Record)
         },
         "steps": {name: figures.responses(parts[f"step_{name}"], i, first) for i, name in enumerate(NAMES)},
         "gait": figures.gaits(held, settled, asked.commands(), GAIT_SECONDS),
-        **({"estimate": figures.estimates(held, asked.commands(), ESTIMATE_SECONDS)} if "estimate" in held.signals else {}),
+        **(
+            {"estimate": figures.estimates(held, asked.commands(), ESTIMATE_SECONDS)}
+            if "estimate" in held.signals
+            else {}
+        ),
         "joints": figures.joints(held, settled, joint_limits(env)),
         "motors": motors.envelopes(held, settled, [family(name) for name in env.robot.joint_names], motor_limits(env)),
         "pushes": {
@@ -113,7 +119,9 @@ def motor_limits(env: LeggedRobot) -> motors.Limits:
     return motors.Limits(*env.robot.effort_range.T, *curve)
 
 
-def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()) -> None:
+def write(
+    folder: Path, task: str, columns: Sequence[Column], extras: Sequence[tuple[str, dict[str, Any]]] = ()
+) -> None:
     """Write ``report.json``, a PNG a section and the self-contained ``report.html``.
 
     The other columns are compared with the first, by its rules; at most two have figures. ``extras`` are further results of
@@ -131,7 +139,10 @@ def write(folder: Path, task: str, columns: Sequence[Column], extras: Sequence[t
     sections = plots.sections([(column.name, column.figures) for column in columns if column.figures], asked)
     for section in sections:
         plots.write_png(section, folder / f"{section.name}.png")
-    _write_text(folder / "report.html", page.html(task, asked, columns, [(section, plots.svgs(section)) for section in sections]))
+    _write_text(
+        folder / "report.html",
+        page.html(task, asked, columns, [(section, plots.svgs(section)) for section in sections]),
+    )
 
 
 def _write_text(path: Path, text: str) -> None:

@@ -36,7 +36,8 @@ class Push(NamedTuple):
 class Case(NamedTuple):
     """What one world is asked to do, and how it is pushed."""
 
-    commands: tuple[tuple[int, tuple[float, ...]], ...]  # from that control step on, the first of the task's table; the rest: default
+    # from that control step on, the first of the task's table; the rest: default
+    commands: tuple[tuple[int, tuple[float, ...]], ...]
     push: Push | None = None
 
 
@@ -58,11 +59,18 @@ class Record(NamedTuple):
     def part(self, worlds: slice) -> Record:
         """The record of some of the worlds."""
         signals = {name: values[:, worlds] for name, values in self.signals.items()}
-        return Record(self.dt, self.mass, self.commands[:, worlds], self.fell_at[worlds], self.last_position[worlds], signals)
+        return Record(
+            self.dt, self.mass, self.commands[:, worlds], self.fell_at[worlds], self.last_position[worlds], signals
+        )
 
 
 def roll_out(
-    env: RobotTask, policy: Policy, cases: Sequence[Case], steps: int, signals: Mapping[str, Signal], alone: int | None = None
+    env: RobotTask,
+    policy: Policy,
+    cases: Sequence[Case],
+    steps: int,
+    signals: Mapping[str, Signal],
+    alone: int | None = None,
 ) -> Record:
     """Run each case in a world of its own for ``steps`` control steps.
 
@@ -87,7 +95,8 @@ def roll_out(
         if step in pushes:
             worlds, jumps = pushes[step]
             env.root_lin_vel[worlds, :2] += jumps
-        if step + 1 < steps:  # the observation at the end of this step shows the next command: a second one would be a step of delay
+        # the observation at the end of this step shows the next command: a second one would be a step of delay
+        if step + 1 < steps:
             commands.copy_(asked[step + 1])
         obs, _, dones, _ = env.step(actions)
         actor.forget(dones)
@@ -120,7 +129,9 @@ class _Actor:
     def believed(self, obs: TensorDict) -> dict[str, Tensor]:
         """A further signal, "estimate", of a policy that estimates its velocity: vx, vy (N, 2) [m/s]."""
         with torch.inference_mode():
-            found = [value for policy, worlds in self._parts if (value := believed_velocity(policy, obs[worlds])) is not None]
+            found = [
+                value for policy, worlds in self._parts if (value := believed_velocity(policy, obs[worlds])) is not None
+            ]
         return {"estimate": torch.cat(found)} if found else {}
 
     def forget(self, ended: Tensor) -> None:

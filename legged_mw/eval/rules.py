@@ -29,7 +29,11 @@ EQUAL_DRIFT = 0.005  # [m], below which drifts count as equal
 # Where no config says others: pushes [m/s], the one that is to be survived, what the marks are of, and they [m/s, m/s, rad/s] if fixed.
 # A biped sways, and its step-by-step error holds the sway
 BIPED: dict[str, Any] = {"push_speeds": (0.5, 1.0, 1.5, 2.0, 3.0), "push_mark": 1.0, "marks_of": "offset"}
-OTHERS: dict[str, Any] = {"push_speeds": (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0), "push_mark": 2.0, "marks_of": "error"}
+OTHERS: dict[str, Any] = {
+    "push_speeds": (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 6.0),
+    "push_mark": 2.0,
+    "marks_of": "error",
+}
 OFFSET_MARKS = (0.06, 0.06, 0.12)
 AXES = tuple(zip(LABELS.values(), ("m/s", "m/s", "rad/s"), strict=True))  # vx, vy, yaw rate: name and unit
 
@@ -91,11 +95,15 @@ class ExamRules:
     def from_config(cls, cfg: Any) -> ExamRules:
         """The rules for a task that walks by command. Raises ConfigError."""
         if not hasattr(cfg, "exam"):
-            raise ConfigError("the walking exam needs a config with the sections commands and exam: a subclass of LeggedRobotCfg")
+            raise ConfigError(
+                "the walking exam needs a config with the sections commands and exam: a subclass of LeggedRobotCfg"
+            )
         return cls.from_mapping(vars(cfg.exam), vars(cfg.commands.ranges), len(cfg.asset.foot_names))
 
     @classmethod
-    def from_mapping(cls, given: Mapping[str, Any], trained: Mapping[str, Sequence[float]] | None = None, feet: int = 0) -> ExamRules:
+    def from_mapping(
+        cls, given: Mapping[str, Any], trained: Mapping[str, Sequence[float]] | None = None, feet: int = 0
+    ) -> ExamRules:
         """The rules from the fields of the config section ``exam`` or from what ``to_mapping`` returned; both may lack some.
 
         ``trained``: command -> lowest and highest, where ``given`` has no range. ``feet``: how many the robot has; two make a
@@ -110,7 +118,10 @@ class ExamRules:
         scaled = (round(max(0.06 * vx[1], 0.04), 4), 0.06, round(0.1 * yaw[1], 4) if yaw[1] > 0 else 0.12)
         marks = given.get("marks") or (scaled if given["marks_of"] == "error" else OFFSET_MARKS)
         push_vx, transport_vx = (float(given.get(name) or round(vx[1] / 2, 4)) for name in ("push_vx", "transport_vx"))
-        speeds, kept = tuple(map(float, given["push_speeds"])), {name: given[name] for name in ("marks_of", "push_mark", "peer")}
+        speeds, kept = (
+            tuple(map(float, given["push_speeds"])),
+            {name: given[name] for name in ("marks_of", "push_mark", "peer")},
+        )
         return cls((vx, vy, yaw), speeds, push_vx, transport_vx, tuple(map(float, marks)), **kept)
 
     def to_mapping(self) -> dict[str, Any]:
@@ -130,8 +141,14 @@ class ExamRules:
 
     def asked_words(self) -> str:
         """The ranges that are asked."""
-        spans = [f"{name} {low:g} to {high:g} {unit}" for (name, unit), (low, high) in zip(AXES, self.ranges, strict=True)]
-        common = ", the one range that all published policies of this robot were asked" if COMMON.get(self.peer) == self.ranges else ""
+        spans = [
+            f"{name} {low:g} to {high:g} {unit}" for (name, unit), (low, high) in zip(AXES, self.ranges, strict=True)
+        ]
+        common = (
+            ", the one range that all published policies of this robot were asked"
+            if COMMON.get(self.peer) == self.ranges
+            else ""
+        )
         return f"asked: {', '.join(spans)}{common}"
 
     def peer_words(self) -> str:
@@ -170,7 +187,13 @@ class ExamRules:
         return len(self.held()) + len(self.push_speeds) * PUSH_DIRECTIONS
 
     def grade(
-        self, signals: Mapping[str, NDArray[Any]], *, last_position: NDArray[Any], fell_at: NDArray[Any], mass: float, dt: float
+        self,
+        signals: Mapping[str, NDArray[Any]],
+        *,
+        last_position: NDArray[Any],
+        fell_at: NDArray[Any],
+        mass: float,
+        dt: float,
     ) -> dict[str, Any]:
         """The exam's result from samples of its N worlds before each of T control steps of ``dt`` [s].
 
@@ -179,7 +202,9 @@ class ExamRules:
         ``last_position`` (N, 2) after the last step [m];
         ``fell_at`` (N,): control step of the first fall, or inf; ``mass`` [kg].
         """
-        velocity, position, power, joint_speed = (signals[name] for name in ("velocity", "position", "power", "joint_speed"))
+        velocity, position, power, joint_speed = (
+            signals[name] for name in ("velocity", "position", "power", "joint_speed")
+        )
         commands, held, settled = self.commands(), self.held(), round(SETTLING / dt)
         ahead, stood = held.index((self.transport_vx, 0.0, 0.0)), np.isinf(fell_at)
         distance = ((last_position - position[settled]) ** 2).sum(axis=1) ** 0.5  # a straight line
@@ -190,13 +215,17 @@ class ExamRules:
             **_tracking(velocity[settled:, : len(commands)], commands, stood[: len(commands)]),
             "drift": float(distance[0]) if stood[0] else None,
             "joint_speed": float(joint_speed[-round(1.0 / dt) :, 0].mean()) if stood[0] else None,
-            "pushes": {f"{speed:g}": round(float(share), 4) for speed, share in zip(self.push_speeds, survived, strict=True)},
+            "pushes": {
+                f"{speed:g}": round(float(share), 4) for speed, share in zip(self.push_speeds, survived, strict=True)
+            },
             "cost_of_transport": float(energy / (mass * GRAVITY * distance[ahead])) if moved else None,
             "rules": self.to_mapping(),
         }
         if "estimate" in signals:
             missed = (signals["estimate"] - velocity[..., :2])[settled:, : len(commands)][:, stood[: len(commands)]]
-            result["estimate_rms"] = _plain(np.sqrt((missed.astype(float) ** 2).mean(axis=(0, 1)))) if missed.size else None
+            result["estimate_rms"] = (
+                _plain(np.sqrt((missed.astype(float) ** 2).mean(axis=(0, 1)))) if missed.size else None
+            )
         beats = {"beats_peer": self.beats_peer(result)} if self.peers else {}
         return {"walks": self.walks(result), **beats, **result}
 
@@ -241,12 +270,22 @@ class ExamRules:
             mark, card = (1.0, (f"{speed} m/s pushes", "survived")) if float(speed) == self.push_mark else (None, None)
             listed.append(
                 Figure(
-                    f"survives pushes of {speed} m/s", share, 2, mark, peer.get("pushes", {}).get(speed), True, card=card, peer_mark=apart
+                    f"survives pushes of {speed} m/s",
+                    share,
+                    2,
+                    mark,
+                    peer.get("pushes", {}).get(speed),
+                    True,
+                    card=card,
+                    peer_mark=apart,
                 )
             )
         name, ahead = "cost_of_transport", f"at {self.transport_vx:g} m/s"
         card = ("cost of transport", ahead)
-        return [*listed, Figure(" ".join(card), result[name], 2, None, peer.get(name), without="none", card=card, peer_mark=apart)]
+        return [
+            *listed,
+            Figure(" ".join(card), result[name], 2, None, peer.get(name), without="none", card=card, peer_mark=apart),
+        ]
 
 
 def _tracking(velocity: NDArray[Any], commands: list[Velocity], stood: NDArray[Any]) -> dict[str, Any]:
@@ -264,7 +303,9 @@ def _tracking(velocity: NDArray[Any], commands: list[Velocity], stood: NDArray[A
         "error": _plain(error.mean(axis=0)),
         "worst": _plain(error.max(axis=0)),
         "offset": _plain(offset.mean(axis=0)),
-        "commands": [{"command": list(c), "error": _plain(e), "offset": _plain(o), "fell": not ok} for c, e, o, ok in rows],
+        "commands": [
+            {"command": list(c), "error": _plain(e), "offset": _plain(o), "fell": not ok} for c, e, o, ok in rows
+        ],
     }
 
 
@@ -273,8 +314,12 @@ def _beats(result: Mapping[str, Any], peer: Mapping[str, Any]) -> bool:
     if result["falls"] > peer["falls"]:
         return False
     better = all(a < b for a, b in zip(result["error"], peer["error"], strict=True))
-    better = better and result["cost_of_transport"] is not None and result["cost_of_transport"] < peer["cost_of_transport"]
-    beside = [(a, b) for name in ("worst", "offset") if name in peer for a, b in zip(result[name], peer[name], strict=True)]
+    better = (
+        better and result["cost_of_transport"] is not None and result["cost_of_transport"] < peer["cost_of_transport"]
+    )
+    beside = [
+        (a, b) for name in ("worst", "offset") if name in peer for a, b in zip(result[name], peer[name], strict=True)
+    ]
     pushes = all(result["pushes"][speed] >= share for speed, share in peer["pushes"].items())
     return better and all(a <= b for a, b in beside) and pushes and result["drift"] <= max(EQUAL_DRIFT, peer["drift"])
 
@@ -283,7 +328,9 @@ def _check(given: Mapping[str, Any], ranges: Mapping[str, Sequence[float]]) -> N
     """Raises ConfigError for rules that cannot be applied."""
     for name in given["ranges"]:
         if name not in VELOCITY:
-            raise ConfigError(f"exam.ranges: {unknown('command', name, VELOCITY, 'the walking exam')}; others stay at their default")
+            raise ConfigError(
+                f"exam.ranges: {unknown('command', name, VELOCITY, 'the walking exam')}; others stay at their default"
+            )
     for name in VELOCITY:
         if len(ranges.get(name, ())) != 2 or ranges[name][0] > ranges[name][1]:
             raise ConfigError(f"exam.ranges: {name} is {ranges.get(name)}; it must be two numbers, the lower first")
@@ -302,7 +349,9 @@ def in_common(peer: str) -> dict[str, Any]:
     Raises ConfigError if there is none.
     """
     if (robot := robot_of(peer)) not in COMMON:
-        raise ConfigError(f"--ranges common: exam.peer is '{robot}'; one range for all published policies is known of: {', '.join(COMMON)}")
+        raise ConfigError(
+            f"--ranges common: exam.peer is '{robot}'; one range for all published policies is known of: {', '.join(COMMON)}"
+        )
     ranges = {name: list(ends) for name, ends in zip(VELOCITY, COMMON[robot], strict=True)}
     return {"ranges": ranges, "push_vx": 0.0, "transport_vx": 0.0}
 
@@ -314,10 +363,14 @@ def table(result: Mapping[str, Any]) -> str:
     width = max(8, len(label) + 2) if label else 0
     lines = [rules.asked_words(), f"{'':<30}{'this policy':>12}{'walks at':>10}{label:>{width}}"]
     for figure in rules.figures(result):
-        lines.append(f"{figure.name:<30}{figure.text(figure.value):>12}{figure.mark_text():>10}{figure.peer_text():>{width}}".rstrip())
+        lines.append(
+            f"{figure.name:<30}{figure.text(figure.value):>12}{figure.mark_text():>10}{figure.peer_text():>{width}}".rstrip()
+        )
     if len(rules.peers) > 1:
         lines.append(rules.peer_words())
-    return "\n".join([*lines, "; ".join(f"{words}: {'yes' if yes else 'no'}" for words, yes in verdicts(rules, result))])
+    return "\n".join(
+        [*lines, "; ".join(f"{words}: {'yes' if yes else 'no'}" for words, yes in verdicts(rules, result))]
+    )
 
 
 def verdicts(rules: ExamRules, result: Mapping[str, Any]) -> list[tuple[str, bool]]:

@@ -137,7 +137,11 @@ class Skill(ABC):
         lines = [self.asks, f"{'':<34}" + "".join(f"{name:>{width}}" for name in parts) + f"{'asks':>14}"]
         for row in zip(*columns, strict=True):
             marks = " / ".join(dict.fromkeys(figure.mark_text() for figure in row))
-            lines.append(f"{row[0].name:<34}" + "".join(f"{figure.text(figure.value):>{width}}" for figure in row) + f"{marks:>14}")
+            lines.append(
+                f"{row[0].name:<34}"
+                + "".join(f"{figure.text(figure.value):>{width}}" for figure in row)
+                + f"{marks:>14}"
+            )
         return "\n".join([*(line.rstrip() for line in lines), f"passes: {'yes' if result['passed'] else 'no'}"])
 
 

@@ -24,7 +24,9 @@ def strip(env: RobotTask, qpos: Floats) -> bytes:
     for step in np.linspace(0, len(qpos) - 1, PICTURES).round().astype(int):
         lines = ((f"{step * env.dt:.1f} s", ""),)
         there = np.concatenate([qpos[0, :2], qpos[step, 2:]])  # the camera would be left behind
-        moment = Moment(step * env.dt, there[None], none[:, :0], np.nan * none, none, np.zeros((1, 0), dtype=bool), lines=lines)
+        moment = Moment(
+            step * env.dt, there[None], none[:, :0], np.nan * none, none, np.zeros((1, 0), dtype=bool), lines=lines
+        )
         frames.append(renderer.frame(moment))
     renderer.close()
     with TemporaryDirectory() as folder:

@@ -13,7 +13,8 @@ from legged_mw.eval.skill import Floats, Ground, Measure, Recording, Robot, Skil
 from legged_mw.utils.clip import conjugate, from_rotation_vector, heading, multiply, rotate
 
 JOINTS_OFF, HEADING_OFF, SPEED_OFF = 0.05, 0.1, 0.1  # [rad], [rad], [m/s] of a robot at the start, U(-off, off)
-LOST_HEIGHT, LOST_TILT = 0.25, 0.8  # [BeyondMimic] of the anchor against its reference, beyond which a robot does not follow any more
+# [BeyondMimic] of the anchor against its reference, beyond which a robot does not follow any more
+LOST_HEIGHT, LOST_TILT = 0.25, 0.8
 FAR = 1e9  # of the task's own rules, which the exam does not use: the exports know none of them
 
 
@@ -76,7 +77,8 @@ class Tracking(Skill):
         drift = np.linalg.norm((found - wanted)[-1, last, anchor, :2], axis=1)
         return {
             "finished": float(last.mean()),
-            "worst": int(np.argmax(np.where(last, own, FAR - kept))),  # the robot that was lost first, else the least exact
+            # the robot that was lost first, else the least exact
+            "worst": int(np.argmax(np.where(last, own, FAR - kept))),
             "body_error": float(1000.0 * error[follows].mean()) if follows.any() else None,
             "joint_error": float(joints[follows].mean()) if follows.any() else None,
             "drift": float(drift.mean()) if last.any() else None,

@@ -17,7 +17,8 @@ from legged_mw.eval.rules import PUSH_AT, ExamRules, Velocity
 GRID = (13, 9, 9)  # values of vx, vy, yaw rate
 STEP_SHARE = 2 / 3  # of the range's end, that a step goes to
 STEPS_AT = (2.5, 5.0, 7.5)  # [s]: reverse, stop, start again
-STEP_BEGINS, STEP_REPEATS, STEP_SHIFT = 0.2, 8, 0.06  # [s] when the first of 8 worlds begins to walk, and each later by: the
+# [s] when the first of 8 worlds begins to walk, and each later by: the
+STEP_BEGINS, STEP_REPEATS, STEP_SHIFT = 0.2, 8, 0.06
 # steps meet them in other phases of their gait
 NAMES = ("vx", "vy", "yaw")
 

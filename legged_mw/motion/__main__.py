@@ -24,8 +24,15 @@ def parse() -> argparse.Namespace:
     parser = Parser(prog="python -m legged_mw.motion", description=__doc__, allow_abbrev=False)
     parser.add_argument("file", metavar="FILE", help="Unitree-style CSV, or an .npz of BeyondMimic, mjlab or legged_mw")
     parser.add_argument("--task", default="g1_track", metavar="NAME", help="whose robot moves so (default: g1_track)")
-    parser.add_argument("--fps", type=number(Positive), metavar="F", help=f"frames a second, if the file does not say (a CSV: {CSV_FPS:g})")
-    parser.add_argument("--rate", type=number(Positive), default=50.0, metavar="F", help="frames a second to resample to (default: 50)")
+    parser.add_argument(
+        "--fps",
+        type=number(Positive),
+        metavar="F",
+        help=f"frames a second, if the file does not say (a CSV: {CSV_FPS:g})",
+    )
+    parser.add_argument(
+        "--rate", type=number(Positive), default=50.0, metavar="F", help="frames a second to resample to (default: 50)"
+    )
     parser.add_argument("--cut", type=number(float), nargs=2, metavar=("FROM", "TO"), help="keep these seconds alone")
     parser.add_argument("--lift", type=number(float), default=0.0, metavar="M", help="raise it by so many metres")
     parser.add_argument("--out", metavar="CLIP.npz", help="write the clip that a task can follow")

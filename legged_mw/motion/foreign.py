@@ -25,7 +25,9 @@ def read_motion(path: Path, robot: RobotModel, fps: float | None = None) -> Clip
     if path.suffix.lower() == ".csv":
         return _read_csv(path, robot, CSV_FPS if fps is None else fps)
     if path.suffix.lower() != ".npz":
-        raise ClipError(f"{path} is neither .csv nor .npz: a motion is Unitree's CSV, or an .npz of BeyondMimic, mjlab or legged_mw")
+        raise ClipError(
+            f"{path} is neither .csv nor .npz: a motion is Unitree's CSV, or an .npz of BeyondMimic, mjlab or legged_mw"
+        )
     try:
         held = read_arrays(path)
     except ValueError as error:
@@ -49,7 +51,9 @@ def _read_csv(path: Path, robot: RobotModel, fps: float) -> Clip:
     count = 7 + len(robot.joint_names)
     if table.shape[1:] != (count,):
         got = table.shape[1] if table.ndim > 1 else 0
-        raise ClipError(f"{path} has {got} columns; of this robot it must have {count}: root x y z, quaternion x y z w, then the joints")
+        raise ClipError(
+            f"{path} has {got} columns; of this robot it must have {count}: root x y z, quaternion x y z w, then the joints"
+        )
     return checked(path, fps, robot.joint_names, table[:, :3], table[:, [6, 3, 4, 5]], table[:, 7:])
 
 
@@ -65,15 +69,23 @@ def _read_bodies(path: Path, robot: RobotModel, held: Mapping[str, Any], fps: fl
     """Joints without names, and the places of all bodies: the order of joints is the one that puts the bodies there."""
     for key in ("joint_pos", "body_pos_w", "body_quat_w"):
         if key not in held:
-            raise ClipError(f"{path} has no '{key}'; a motion of BeyondMimic or mjlab has joint_pos, body_pos_w, body_quat_w and fps")
+            raise ClipError(
+                f"{path} has no '{key}'; a motion of BeyondMimic or mjlab has joint_pos, body_pos_w, body_quat_w and fps"
+            )
     rate = float(np.ravel(held["fps"])[0]) if "fps" in held else fps
     if not rate:
         raise ClipError(f"{path} does not say how many frames a second it has; say --fps")
     places, turns = held["body_pos_w"], held["body_quat_w"]
     found = {}
-    for words, names in {"as in the robot's file": list(robot.joint_names), "breadth first": breadth_first(robot)}.items():
+    for words, names in {
+        "as in the robot's file": list(robot.joint_names),
+        "breadth first": breadth_first(robot),
+    }.items():
         clip = checked(path, rate, names, places[:, 0], turns[:, 0], held["joint_pos"]).of(robot.joint_names, str(path))
-        found[words] = max(_apart(robot, clip, places, frame) for frame in np.linspace(0, len(places) - 1, 5).astype(int)), clip
+        found[words] = (
+            max(_apart(robot, clip, places, frame) for frame in np.linspace(0, len(places) - 1, 5).astype(int)),
+            clip,
+        )
     apart, clip = min(found.values(), key=lambda each: each[0])
     if apart > APART:
         raise ClipError(

@@ -25,12 +25,18 @@ def page(robot: RobotModel, clip: Clip, feet: Sequence[str]) -> str:
     """What the clip is, and what of it a robot cannot do. ``feet``: geoms that touch the ground."""
     speed = np.abs(clip.qvel()[:, 6:])
     fastest = int(speed.max(axis=0).argmax())
-    lines = [f"{len(clip.root_pos)} frames, {clip.seconds:.2f} s at {clip.fps:g} frames a second, {len(clip.joint_names)} joints"]
-    lines.append(f"fastest joint: {clip.joint_names[fastest]}, {speed.max():.1f} rad/s after {_when(clip, speed[:, fastest])}")
+    lines = [
+        f"{len(clip.root_pos)} frames, {clip.seconds:.2f} s at {clip.fps:g} frames a second, {len(clip.joint_names)} joints"
+    ]
+    lines.append(
+        f"fastest joint: {clip.joint_names[fastest]}, {speed.max():.1f} rad/s after {_when(clip, speed[:, fastest])}"
+    )
     heights, slides = _feet(robot, clip, feet)
     lowest, now = heights.min(), heights.min(axis=1)
     lines.append(f"lowest point: {round(1000 * lowest)} mm above the ground after {_when(clip, -now)}")
-    lines.append(f"fastest slide of a foot within {1000 * NEAR:.0f} mm of the ground: {slides.max():.2f} m/s after {_when(clip, slides)}")
+    lines.append(
+        f"fastest slide of a foot within {1000 * NEAR:.0f} mm of the ground: {slides.max():.2f} m/s after {_when(clip, slides)}"
+    )
     return "\n".join([*lines, *(f"warning: {text}" for text in wrong(robot, clip, float(lowest), float(slides.max())))])
 
 
@@ -40,7 +46,9 @@ def wrong(robot: RobotModel, clip: Clip, lowest: float, slide: float) -> list[st
     beyond = np.maximum(low - clip.joint_pos, clip.joint_pos - high)
     for joint in np.flatnonzero(beyond.max(axis=0) > BEYOND):
         far, limits = beyond[:, joint].max(), f"{low[joint]:.2f} to {high[joint]:.2f}"
-        found.append(f"{clip.joint_names[joint]} is {far:.3f} rad beyond its range ({limits}) after {_when(clip, beyond[:, joint])}")
+        found.append(
+            f"{clip.joint_names[joint]} is {far:.3f} rad beyond its range ({limits}) after {_when(clip, beyond[:, joint])}"
+        )
     if lowest < -DEEP:
         found.append(f"a foot is {-1000 * lowest:.0f} mm in the ground; --lift {-lowest:.3f} raises the clip")
     if slide > SLIDING:
@@ -56,7 +64,10 @@ def _feet(robot: RobotModel, clip: Clip, feet: Sequence[str]) -> tuple[Floats, F
     """Heights (T, bodies) of the lowest point of each foot [m], and the fastest standing foot (T,) [m/s]."""
     model, data, heights, places = robot.physics, mujoco.MjData(robot.physics), [], []
     geoms = [robot.id("geom", name) for name in feet]
-    bodies, points = sorted({int(model.geom_bodyid[geom]) for geom in geoms}), {geom: spheres_on(model, geom, SPACING) for geom in geoms}
+    bodies, points = (
+        sorted({int(model.geom_bodyid[geom]) for geom in geoms}),
+        {geom: spheres_on(model, geom, SPACING) for geom in geoms},
+    )
     for row in clip.qpos():
         data.qpos[:] = row
         mujoco.mj_kinematics(model, data)

@@ -26,7 +26,9 @@ def plain_state(state: dict[str, Any], rates: Sequence[float]) -> dict[str, Any]
     plain = {"fused": None, "capturable": False}
     return {
         "state": {i: {**memory, "step": memory["step"].cpu().clone()} for i, memory in state["state"].items()},
-        "param_groups": [{**group, "lr": rate, **plain} for group, rate in zip(state["param_groups"], rates, strict=True)],
+        "param_groups": [
+            {**group, "lr": rate, **plain} for group, rate in zip(state["param_groups"], rates, strict=True)
+        ],
     }
 
 
@@ -36,7 +38,9 @@ class FlatAdam:
     The parameters and Adam's memory become views of those tensors; the optimizer has the memory's state as ever.
     """
 
-    def __init__(self, optimizer: torch.optim.Optimizer, group: int, part: Sequence[nn.Parameter], limit: float) -> None:
+    def __init__(
+        self, optimizer: torch.optim.Optimizer, group: int, part: Sequence[nn.Parameter], limit: float
+    ) -> None:
         """``group``: the optimizer's that has the part; ``limit``: of the norm of its gradient."""
         self._optimizer, self._group, self._limit = optimizer, optimizer.param_groups[group], limit
         self._part = [parameter for parameter in part if parameter.requires_grad]
@@ -50,10 +54,14 @@ class FlatAdam:
             parameter.data = value
 
     def _lay(self, tensors: Sequence[Tensor]) -> Tensor:
-        return torch.cat([piece for pair in zip(tensors, self._gaps, strict=True) for piece in (pair[0].flatten(), pair[1])])
+        return torch.cat(
+            [piece for pair in zip(tensors, self._gaps, strict=True) for piece in (pair[0].flatten(), pair[1])]
+        )
 
     def _views(self, flat: Tensor) -> list[Tensor]:
-        sizes = [size for value, gap in zip(self._part, self._gaps, strict=True) for size in (value.numel(), gap.numel())]
+        sizes = [
+            size for value, gap in zip(self._part, self._gaps, strict=True) for size in (value.numel(), gap.numel())
+        ]
         return [piece.view_as(value) for piece, value in zip(flat.split(sizes)[::2], self._part, strict=True)]
 
     def gradient(self) -> Tensor | None:
@@ -82,8 +90,12 @@ class FlatAdam:
         group, (mean, square), norm = self._group, self._memory, torch.linalg.vector_norm(gradient)
         rate, (beta1, beta2), eps, decay = (group[name] for name in ("lr", "betas", "eps", "weight_decay"))
         if kernels := kernels_for(gradient):
-            kernels.launch(kernels.begin_adam, 1, norm, self._limit, rate, beta1, beta2, decay, self._step, self._factors)
-            kernels.launch(kernels.adam, len(gradient), gradient, self._factors, beta1, beta2, eps, self._values, mean, square)
+            kernels.launch(
+                kernels.begin_adam, 1, norm, self._limit, rate, beta1, beta2, decay, self._step, self._factors
+            )
+            kernels.launch(
+                kernels.adam, len(gradient), gradient, self._factors, beta1, beta2, eps, self._values, mean, square
+            )
             return
         self._step += 1
         count = self._step.double()

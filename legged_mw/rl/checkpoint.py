@@ -25,7 +25,8 @@ _SEAL = b"sha256:"
 EARLIER = "an earlier one is named by --checkpoint"
 _ADAM = ("step", "exp_avg", "exp_avg_sq")  # what Adam remembers of a parameter
 _CHOSEN = ("amsgrad", "maximize", "differentiable")  # by the config
-_LEVELS = ("kick_level", "pull_level", "terrain_levels", "command_curriculum", "num_envs", "motion_failures")  # never below 0
+# never below 0
+_LEVELS = ("kick_level", "pull_level", "terrain_levels", "command_curriculum", "num_envs", "motion_failures")
 _KINDS = {int: "a whole number from 0", dict: "a mapping"}
 
 
@@ -79,7 +80,9 @@ class Checker:
         if value.numel() * value.element_size() > value.untyped_storage().nbytes():
             raise self.fail(f"{what} shows {value.numel()} numbers and has fewer")
         if value.is_complex() or not bool(value.isfinite().all()):
-            raise self.fail(f"{what} has values that are not finite" if not value.is_complex() else f"{what} is {_short(value)}")
+            raise self.fail(
+                f"{what} has values that are not finite" if not value.is_complex() else f"{what} is {_short(value)}"
+            )
         return value
 
     def weights(self, content: Mapping[str, Any], name: str) -> None:
@@ -141,7 +144,12 @@ class Checker:
         saved = self.take(infos, "env", dict, "infos: ") if "env" in infos else {}
         for name in saved.keys() & own.keys():
             value, mine, what = self.tensor(saved[name], f"infos: env: {name}"), own[name], f"infos: env: {name}"
-            if value.dtype != mine.dtype or value.shape[1:] != mine.shape[1:] or value.dim() != mine.dim() or not value.numel():
+            if (
+                value.dtype != mine.dtype
+                or value.shape[1:] != mine.shape[1:]
+                or value.dim() != mine.dim()
+                or not value.numel()
+            ):
                 raise self.fail(f"{what} is {_short(value)}, it must be as {_short(mine)}")
             if name in _LEVELS and bool((value < 0).any()):
                 raise self.fail(f"{what} is negative")
@@ -168,7 +176,9 @@ def check_content(content: Any, path: Path) -> dict[str, Any]:
     return content
 
 
-def check_resume(content: Mapping[str, Any], path: Path, optimizer: torch.optim.Optimizer, task: Mapping[str, Tensor]) -> None:
+def check_resume(
+    content: Mapping[str, Any], path: Path, optimizer: torch.optim.Optimizer, task: Mapping[str, Tensor]
+) -> None:
     """What a training goes on from: counters as the file's name has them, ``optimizer``'s state, and the ``task``'s. Raises ConfigError."""
     check = Checker(path)
     done = check.take(content, "iter", int)
@@ -183,7 +193,11 @@ def _is_setting(key: str, value: Any, own: Any) -> bool:
     if own is None or isinstance(own, bool):
         return (value is None or isinstance(value, bool)) and (key not in _CHOSEN or value == own)
     if key == "betas":
-        return isinstance(value, list | tuple) and len(value) == 2 and all(_is_number(beta) and beta < 1.0 for beta in value)
+        return (
+            isinstance(value, list | tuple)
+            and len(value) == 2
+            and all(_is_number(beta) and beta < 1.0 for beta in value)
+        )
     return _is_number(value) and (key != "lr" or value > 0.0)
 
 

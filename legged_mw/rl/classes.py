@@ -61,7 +61,9 @@ def actor_settings(sections: dict[str, Any], env: RobotTask | None, learns: bool
         return actor
     field = estimator.FIELD if estimates else concurrent.FIELD
     if estimates and taught:
-        raise ConfigError(f"{estimator.FIELD} and {concurrent.FIELD} are both set: the actor reads an estimate or a latent; empty one")
+        raise ConfigError(
+            f"{estimator.FIELD} and {concurrent.FIELD} are both set: the actor reads an estimate or a latent; empty one"
+        )
     if actor["class_name"] != "MLPModel":
         raise ConfigError(f"{field}: that goes with actor.class_name 'MLPModel', not '{actor['class_name']}'")
     assert env is not None
@@ -85,7 +87,9 @@ def _check_distribution(section: dict[str, Any] | None, path: str) -> None:
         surplus = sorted((section or {}).keys() - inspect.signature(kind).parameters.keys() - {"class_name"})
         if surplus and name in spellings(kind):
             fit = ", ".join(other.__name__ for other in _DISTRIBUTIONS)
-            raise ConfigError(f"{path}.class_name is {name!r}, which takes no {', '.join(surplus)}, fields of {path}; there fit: {fit}")
+            raise ConfigError(
+                f"{path}.class_name is {name!r}, which takes no {', '.join(surplus)}, fields of {path}; there fit: {fit}"
+            )
 
 
 def spellings(kind: type) -> list[str]:

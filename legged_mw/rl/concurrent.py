@@ -26,7 +26,8 @@ from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
 FIELD = "actor.concurrent.groups"
-_GOLDEN = 0.6180339887498949  # its multiples' fractions fill [0, 1) evenly, out of step with terrain columns and any other period
+# its multiples' fractions fill [0, 1) evenly, out of step with terrain columns and any other period
+_GOLDEN = 0.6180339887498949
 
 
 class ConcurrentModel(RegressingModel):
@@ -35,7 +36,14 @@ class ConcurrentModel(RegressingModel):
     field, regression = FIELD, "student"
 
     def __init__(
-        self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str, output_dim: int, *, concurrent: dict[str, Any], **more: Any
+        self,
+        obs: TensorDict,
+        obs_groups: dict[str, list[str]],
+        obs_set: str,
+        output_dim: int,
+        *,
+        concurrent: dict[str, Any],
+        **more: Any,
     ) -> None:
         """``concurrent``: the config section, and ``newest``, (start, stop) of columns of the observations; the rest is MLPModel's.
 
@@ -48,8 +56,12 @@ class ConcurrentModel(RegressingModel):
         self.estimator = MLP(self.obs_dim, *encoder)
         if self._groups:
             known = sum(obs[group].shape[1] for group in self._groups)
-            self.teacher = nn.Sequential(EmpiricalNormalization(known) if self.obs_normalization else nn.Identity(), MLP(known, *encoder))
-            self.register_buffer("taught", taught_worlds(obs.batch_size[0], concurrent["teacher_share"]), persistent=False)
+            self.teacher = nn.Sequential(
+                EmpiricalNormalization(known) if self.obs_normalization else nn.Identity(), MLP(known, *encoder)
+            )
+            self.register_buffer(
+                "taught", taught_worlds(obs.batch_size[0], concurrent["teacher_share"]), persistent=False
+            )
 
     taught: Tensor  # (N, 1): the worlds that act by the teacher's latent
 
@@ -101,7 +113,9 @@ class _OnnxStudent(nn.Module):
     def __init__(self, model: ConcurrentModel) -> None:
         super().__init__()
         self._newest = model._newest
-        self.obs_normalizer, self.mlp, self.estimator = copy.deepcopy((model.obs_normalizer, model.mlp, model.estimator))
+        self.obs_normalizer, self.mlp, self.estimator = copy.deepcopy(
+            (model.obs_normalizer, model.mlp, model.estimator)
+        )
         assert model.distribution is not None
         self.deterministic_output = model.distribution.as_deterministic_output_module()
 
@@ -134,9 +148,13 @@ def concurrent_settings(sections: dict[str, Any], env: RobotTask, learns: bool) 
     groups = concurrent["groups"] if learns else []
     for group in groups:
         if group not in env.observations.groups:
-            raise ConfigError(f"{FIELD}: {unknown('observation group', group, env.observations.groups, 'the observation table')}")
+            raise ConfigError(
+                f"{FIELD}: {unknown('observation group', group, env.observations.groups, 'the observation table')}"
+            )
         if group in read:
-            raise ConfigError(f"{FIELD}: the actor reads '{group}' itself; the teacher's encoder is for what a robot does not measure")
+            raise ConfigError(
+                f"{FIELD}: the actor reads '{group}' itself; the teacher's encoder is for what a robot does not measure"
+            )
     newest, stop = [], 0
     for row in (row for group in read for row in env.observations.rows(group)):
         stop += row.size

@@ -42,8 +42,11 @@ class GraphedDistillation(Recorded, Distillation):
         self._rates = [self.learning_rate]
         make_recordable(self.optimizer, self._rates, str(self.device))
         seen = storage.observations.select(*student.obs_groups, *teacher.obs_groups)
-        self._obs = TensorDict({name: value[0].clone() for name, value in seen.items()}, [storage.num_envs], device=self.device)
-        storage.observations = storage.observations.select(*student.obs_groups)  # what the teacher sees is not learned from
+        self._obs = TensorDict(
+            {name: value[0].clone() for name, value in seen.items()}, [storage.num_envs], device=self.device
+        )
+        # what the teacher sees is not learned from
+        storage.observations = storage.observations.select(*student.obs_groups)
         self._loss = torch.zeros((), device=self.device)
         self.undo = Undo(self, (self.student,))
         self._begin()
@@ -104,7 +107,12 @@ class GraphedDistillation(Recorded, Distillation):
         with torch.no_grad():
             seen = torch.cat([st.observations[group] for group in self.student.obs_groups], dim=-1).flatten(0, 1)
             inputs = self.student.obs_normalizer(seen).unflatten(0, st.rewards.shape[:2])
-        chunks = [*zip(*(each.split(self.gradient_length) for each in (inputs, st.privileged_actions, st.dones.bool())), strict=True)]
+        chunks = [
+            *zip(
+                *(each.split(self.gradient_length) for each in (inputs, st.privileged_actions, st.dones.bool())),
+                strict=True,
+            )
+        ]
         state = None
         self._loss.zero_()
         for _ in range(self.num_learning_epochs):

@@ -82,7 +82,14 @@ class EstimatingModel(RegressingModel):
     field, regression = FIELD, "estimate"
 
     def __init__(
-        self, obs: TensorDict, obs_groups: dict[str, list[str]], obs_set: str, output_dim: int, *, estimator: dict[str, Any], **more: Any
+        self,
+        obs: TensorDict,
+        obs_groups: dict[str, list[str]],
+        obs_set: str,
+        output_dim: int,
+        *,
+        estimator: dict[str, Any],
+        **more: Any,
     ) -> None:
         """``estimator``: the config section, its ``targets`` as ``Target``s; the rest is MLPModel's."""
         targets = [Target(*target) for target in estimator["targets"]]
@@ -180,13 +187,24 @@ def estimator_settings(sections: dict[str, Any], env: RobotTask, learns: bool) -
 
     ``learns``: False for an actor that only acts, in worlds that may be without what ``domain_rand`` showed the critic.
     """
-    return {**sections["actor"]["estimator"], "targets": [tuple(target) for target, _ in find_targets(sections, env, learns)]}
+    return {
+        **sections["actor"]["estimator"],
+        "targets": [tuple(target) for target, _ in find_targets(sections, env, learns)],
+    }
 
 
 def find_targets(sections: dict[str, Any], env: RobotTask, learns: bool = True) -> list[tuple[Target, Row]]:
     """Each target and its row: of the critic's groups first, then of others, never of one that the actor reads. Raises ConfigError."""
-    names, obs_groups, groups = sections["actor"]["estimator"]["targets"], sections["obs_groups"], env.observations.groups
-    order = [group for group in dict.fromkeys([*obs_groups["critic"], *groups]) if group in groups and group not in obs_groups["actor"]]
+    names, obs_groups, groups = (
+        sections["actor"]["estimator"]["targets"],
+        sections["obs_groups"],
+        env.observations.groups,
+    )
+    order = [
+        group
+        for group in dict.fromkeys([*obs_groups["critic"], *groups])
+        if group in groups and group not in obs_groups["actor"]
+    ]
     rows = {row.name: (group, row) for group in reversed(order) for row in groups[group] if not row.group}
     found = []
     for i, name in enumerate(names):
@@ -194,7 +212,9 @@ def find_targets(sections: dict[str, Any], env: RobotTask, learns: bool = True) 
             found.append((Target(name, "", 0, [1.0] * width), Row(name, torch.zeros(1, width))))
             continue
         if name not in rows:
-            hint = f" (observations.{name} = True adds it)" if getattr(env.cfg.observations, name, None) is False else ""
+            hint = (
+                f" (observations.{name} = True adds it)" if getattr(env.cfg.observations, name, None) is False else ""
+            )
             where = ", ".join(f"'{group}'" for group in order) or "any group that the actor does not read"
             raise ConfigError(f"{FIELD}: {unknown('observation row', name, rows, where)}{hint}")
         if name in names[:i]:

@@ -87,7 +87,8 @@ class Exported(NamedTuple):
     files: tuple[str, ...]
     gap: float  # largest difference of an action to the trained policy's
     observations: int  # that it was tried on
-    unknown: tuple[str, ...]  # observation rows without a statement of how to measure them: the export cannot be deployed
+    # observation rows without a statement of how to measure them: the export cannot be deployed
+    unknown: tuple[str, ...]
     no_terrain: str = ""  # why there is no scene among steps though training had some; else empty
     not_covered: tuple[str, ...] = ()  # methods of the task that ended episodes in training and cannot end a walk
     half: bool = False  # the weights are rounded to float16
@@ -99,10 +100,14 @@ class Exported(NamedTuple):
         lines[0] += f"; actions differ from the trained policy's by {self.gap:.0e} at most"
         if self.unknown:
             names = ", ".join(self.unknown)
-            lines.append(f"nothing says how to measure {names}: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)")
+            lines.append(
+                f"nothing says how to measure {names}: legged_mw.deploy will refuse it (docs/deploy.md, Rows of your own)"
+            )
         if self.not_covered:
             names = ", ".join(self.not_covered)
-            lines.append(f"{names} ended episodes in training; a deployed robot walks on ({CONTRACT_FILE}: ends: not_covered)")
+            lines.append(
+                f"{names} ended episodes in training; a deployed robot walks on ({CONTRACT_FILE}: ends: not_covered)"
+            )
         if self.no_terrain:
             lines.append(f"no {TERRAIN_FILE}: {self.no_terrain}")
         return "\n  ".join(lines)
@@ -139,15 +144,23 @@ def _export(trained: LoadedTask, checkpoint: Path, folder: Path, half: bool) -> 
         memory = Memory(MEMORY_INPUT, MEMORY_OUTPUT, states_of(policy)) if isinstance(policy, RNNModel) else None
         contract = dataclasses.replace(make_contract(env, task, new, noise), memory=memory)
         no_terrain = _write_terrain(env, task, new) if ground != "plane" else ""
-        contract = dataclasses.replace(contract, terrain=digest(new / TERRAIN_FILE) if (new / TERRAIN_FILE).is_file() else "")
+        contract = dataclasses.replace(
+            contract, terrain=digest(new / TERRAIN_FILE) if (new / TERRAIN_FILE).is_file() else ""
+        )
         save_yaml(new / CONTRACT_FILE, contract.to_dict())
         steps = record(env, policy, groups, contract, new)
-        observations, actions = (np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions"))
+        observations, actions = (
+            np.concatenate([getattr(step, name) for step in steps]) for name in ("observation", "actions")
+        )
         remembered = np.concatenate([step.memory for step in steps]) if memory else None
         acted = run_onnx(new / NETWORK_FILE, observations, memory=remembered)
         gap = _compare(acted, np.clip(actions, -clip, clip))
         if isinstance(policy, EstimatingModel):
-            _compare(run_onnx(new / NETWORK_FILE, observations, ESTIMATE), _run(policy, clip, observations)[1], does="estimates")
+            _compare(
+                run_onnx(new / NETWORK_FILE, observations, ESTIMATE),
+                _run(policy, clip, observations)[1],
+                does="estimates",
+            )
         if half:
             gap = _gap(acted, _run(exact, clip, observations, remembered)[0])
         replay(env, contract, steps, new)
@@ -190,7 +203,11 @@ def _run(policy: MLPModel, clip: float, *inputs: np.ndarray | None) -> list[np.n
 
 def _gap(got: np.ndarray, wanted: np.ndarray) -> float:
     """The largest difference, relative above 1."""
-    return float((np.abs(got - wanted) / np.maximum(1.0, np.abs(wanted))).max()) if got.shape == wanted.shape else float("inf")
+    return (
+        float((np.abs(got - wanted) / np.maximum(1.0, np.abs(wanted))).max())
+        if got.shape == wanted.shape
+        else float("inf")
+    )
 
 
 def _compare(got: np.ndarray, wanted: np.ndarray, does: str = "acts") -> float:
@@ -244,7 +261,10 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
     scene = _write_scene(env, folder)
     ends = _ends(env)
     origin = "torque" if env.actuators.law == "torque" else cfg.control.action_origin
-    scale, held = np.array(robot.tables["control.action_scale"]), target_range(robot.physics, range(len(robot.joint_names)))
+    scale, held = (
+        np.array(robot.tables["control.action_scale"]),
+        target_range(robot.physics, range(len(robot.joint_names))),
+    )
     action = Action(origin, scale, cfg.normalization.clip_actions, *held)
     rows = tuple(row for group in task.train.obs_groups.actor for row in contract_rows(env, group, noise))
     ground, scanned = cfg.terrain, any(row.measured == SCAN for row in rows)
@@ -261,7 +281,9 @@ def make_contract(env: RobotTask, task: LoadedTask, folder: Path, noise: float) 
         decimation=cfg.control.decimation,
         commands=env.command_table,
         rows=rows,
-        scan=HeightScan(tuple(ground.measured_points_x), tuple(ground.measured_points_y), env.start_place[2]) if scanned else None,
+        scan=HeightScan(tuple(ground.measured_points_x), tuple(ground.measured_points_y), env.start_place[2])
+        if scanned
+        else None,
         sensors={name: tuple(names) for name, names in scene.sensors.items()}
         | ({FALL: tuple(f"contact/{name}" for name in ends.falls_on)} if ends.falls_on else {}),
         gait=_gait(env) if any(row.measured == CLOCK for row in rows) else None,
@@ -292,7 +314,12 @@ def _estimated(env: RobotTask, task: LoadedTask) -> tuple[Estimated, ...]:
     """The rows of the network's second output."""
     rows = [(row, ROWS.get(row.name)) for _, row in find_targets(task.train.to_dict(), env, learns=False)]
     return tuple(
-        Estimated(row.name, row.value.shape[1], row.unit or (known.unit if known else ""), row.frame or (known.frame if known else ""))
+        Estimated(
+            row.name,
+            row.value.shape[1],
+            row.unit or (known.unit if known else ""),
+            row.frame or (known.frame if known else ""),
+        )
         for row, known in rows
     )
 
@@ -320,7 +347,9 @@ def _motors(env: RobotTask, folder: Path) -> Motors:
     curve = (tuple(env.robot.tables.get(name, ())) for name in CURVE)
     if env.actuators.law == "network":
         shutil.copyfile(find_file(env.cfg, "control.network"), folder / MOTORS_FILE)
-    return Motors(env.actuators.law, *curve, digest=digest(folder / MOTORS_FILE) if env.actuators.law == "network" else "")
+    return Motors(
+        env.actuators.law, *curve, digest=digest(folder / MOTORS_FILE) if env.actuators.law == "network" else ""
+    )
 
 
 def _motion(env: RobotTask, folder: Path) -> Motion | None:
@@ -355,7 +384,8 @@ def contract_rows(env: RobotTask, group: str, noise: float) -> list[ContractRow]
                 )
             rows += contract_rows(env, row.group, noise)
             continue
-        known = ROWS.get(row.name) if row.name != CLOCK or getattr(env, "gait", None) else None  # a clock of the task's own
+        # a clock of the task's own
+        known = ROWS.get(row.name) if row.name != CLOCK or getattr(env, "gait", None) else None
         units = ", ".join(command.unit for command in env.command_table) if row.name == "commands" else ""
         rows.append(
             ContractRow(

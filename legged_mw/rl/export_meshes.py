@@ -34,12 +34,15 @@ def shorten(xml: str, source: str) -> str:
 def built_meshes(source: str) -> dict[str, str]:
     """Mesh -> the attributes that build it, of the MJCF ``source``; none of what is no MJCF."""
     try:
-        meshes = [mesh for mesh in ElementTree.fromstring(source).iter("mesh") if mesh.get("name") and mesh.get("builtin")]
+        meshes = [
+            mesh for mesh in ElementTree.fromstring(source).iter("mesh") if mesh.get("name") and mesh.get("builtin")
+        ]
     except ElementTree.ParseError:
         return {}
     wanted = ("builtin", "params")
     return {
-        mesh.attrib["name"]: " ".join(f"{key}={quoteattr(mesh.attrib[key])}" for key in wanted if key in mesh.attrib) for mesh in meshes
+        mesh.attrib["name"]: " ".join(f"{key}={quoteattr(mesh.attrib[key])}" for key in wanted if key in mesh.attrib)
+        for mesh in meshes
     }
 
 

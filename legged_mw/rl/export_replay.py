@@ -61,7 +61,9 @@ def record(env: RobotTask, policy: MLPModel, groups: Sequence[str], contract: Co
         measured, commands = _measure(env, fleet), np.zeros((env.num_envs, 0))
         gait = getattr(env, "gait", None)
         clock = gait.phase.numpy().copy() if gait else np.zeros(env.num_envs)
-        frame = env.reference.frame.numpy().copy() if isinstance(env, MotionTracking) else np.zeros(env.num_envs, dtype=int)
+        frame = (
+            env.reference.frame.numpy().copy() if isinstance(env, MotionTracking) else np.zeros(env.num_envs, dtype=int)
+        )
         if contract.commands:
             commands = env.commands.numpy().copy()  # type: ignore[attr-defined]
         taken = actions.clone()
@@ -123,12 +125,21 @@ def replay(env: RobotTask, contract: Contract, steps: list[Step], folder: Path) 
         for row in contract.rows:
             columns = slice(start, start := start + row.size * row.history)
             what = f"observation row '{row.name}'"
-            _compare(env, number, what, range(row.size * row.history), step.observation[:, columns], observed[:, columns])
+            _compare(
+                env, number, what, range(row.size * row.history), step.observation[:, columns], observed[:, columns]
+            )
         if controller.memory is not None:
             flat = step.memory.reshape(env.num_envs, -1)
             _compare(env, number, "memory", range(flat.shape[1]), flat, controller.memory.reshape(flat.shape))
         controller.act(step.measured, step.commands)
-        _compare(env, number, "joint target", contract.joints, step.targets[~step.ended], controller.last_targets[~step.ended])
+        _compare(
+            env,
+            number,
+            "joint target",
+            contract.joints,
+            step.targets[~step.ended],
+            controller.last_targets[~step.ended],
+        )
         controller.reset(step.ended)
 
 
@@ -149,11 +160,22 @@ def _compare(env: RobotTask, step: int, what: str, names: Sequence[Any], theirs:
 def own_ends(task: type[RobotTask]) -> tuple[str, ...]:
     """Methods of the task's own classes that may end an episode, which a contract cannot state."""
     own = [kind for kind in task.__mro__ if kind not in LeggedRobot.__mro__]
-    return tuple(f"{kind.__name__}.{name}" for kind in own for name in ("_fallen", "_timed_out", "check_termination") if name in vars(kind))
+    return tuple(
+        f"{kind.__name__}.{name}"
+        for kind in own
+        for name in ("_fallen", "_timed_out", "check_termination")
+        if name in vars(kind)
+    )
 
 
 def overridden(task: type[RobotTask]) -> list[str]:
     """Methods of RobotTask or LeggedRobot that the task has its own of; rewards aside."""
     own = [kind for kind in task.__mro__ if kind not in LeggedRobot.__mro__]
-    names = [name for kind in own for name, value in vars(kind).items() if callable(value) and hasattr(LeggedRobot, name)]
-    return [name for name in dict.fromkeys(names) if not name.startswith("_reward_") and name not in ("__module__", "__doc__")]
+    names = [
+        name for kind in own for name, value in vars(kind).items() if callable(value) and hasattr(LeggedRobot, name)
+    ]
+    return [
+        name
+        for name in dict.fromkeys(names)
+        if not name.startswith("_reward_") and name not in ("__module__", "__doc__")
+    ]

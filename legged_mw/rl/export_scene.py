@@ -33,7 +33,14 @@ _FIELDS = (
     *("jnt_type", "jnt_axis", "jnt_pos", "jnt_range", "jnt_limited", "jnt_stiffness", "jnt_solref", "jnt_solimp"),
     *("dof_armature", "dof_damping", "dof_frictionloss", "dof_solref", "dof_solimp"),
     *("actuator_dyntype", "actuator_gaintype", "actuator_biastype", "actuator_ctrlspec"),
-    *("actuator_gainprm", "actuator_biasprm", "actuator_ctrlrange", "actuator_forcerange", "actuator_gear", "actuator_trnid"),
+    *(
+        "actuator_gainprm",
+        "actuator_biasprm",
+        "actuator_ctrlrange",
+        "actuator_forcerange",
+        "actuator_gear",
+        "actuator_trnid",
+    ),
     *("actuator_ctrllimited", "actuator_forcelimited", "jnt_actfrclimited", "jnt_actfrcrange"),
 )
 _CONTACT = (
@@ -51,7 +58,12 @@ class Scene:
 
 
 def standalone(
-    robot: RobotModel, imu: str, qpos: Sequence[float], ctrl: Sequence[float], camera: Sequence[float] = (), source: str = ""
+    robot: RobotModel,
+    imu: str,
+    qpos: Sequence[float],
+    ctrl: Sequence[float],
+    camera: Sequence[float] = (),
+    source: str = "",
 ) -> Scene:
     """``robot`` as MJCF text, with a sensor for each quantity that a controller may read and ``qpos``, ``ctrl`` as keyframe "home".
 
@@ -60,10 +72,11 @@ def standalone(
     """
     spec = dressed(robot, camera)
     if files := [field.name for field in spec.hfields if field.file]:
-        raise ModelError(f"height field '{files[0]}' comes from a file; an export must stand alone, so build it from numbers")
-    spec.comment = (
-        f"\n    {spec.modelname}: robot, ground, servos, sensors. Self-contained; written by legged_mw from the model that was trained.\n  "
-    )
+        raise ModelError(
+            f"height field '{files[0]}' comes from a file; an export must stand alone, so build it from numbers"
+        )
+    what = "robot, ground, servos, sensors. Self-contained; written by legged_mw from the model that was trained."
+    spec.comment = f"\n    {spec.modelname}: {what}\n  "
     for geom in spec.geoms:  # group 0 is the ground's: a height scan's rays look for it there
         if geom.group == 0 and geom.parent.name != "world":
             geom.group = 1
@@ -77,7 +90,9 @@ def standalone(
     except ValueError as error:
         raise ModelError(f"the robot cannot be written as one MJCF: {' '.join(str(error).split())}") from None
     if wrong := differences(robot.physics, model):
-        raise ModelError(f"the robot written as one MJCF would be another machine: {', '.join(wrong)} differ from the trained model")
+        raise ModelError(
+            f"the robot written as one MJCF would be another machine: {', '.join(wrong)} differ from the trained model"
+        )
     return Scene(xml, sensors)
 
 
@@ -102,7 +117,9 @@ def among_steps(xml: str, terrain: Terrain, start: Sequence[float]) -> str:
     bottom = terrain.span()[0] - 1.0
     pieces = [*boxes, *(Box(low, high, 0.0) for low, high in border)]
     tiles = [terrain.tile_at((low[0] + high[0]) / 2, (low[1] + high[1]) / 2) for low, high, _ in pieces]
-    tops = {tile: sorted({piece.top for piece, where in zip(pieces, tiles, strict=True) if where == tile}) for tile in tiles}
+    tops = {
+        tile: sorted({piece.top for piece, where in zip(pieces, tiles, strict=True) if where == tile}) for tile in tiles
+    }
     for (low, high, top), tile in zip(pieces, tiles, strict=True):
         box = add_ground_box(spec, np.array([*low, bottom]), np.array([*high, top]))
         tone = (1.0, 0.7)[tops[tile].index(top) % 2]  # a step has another tone than the next one
@@ -165,7 +182,8 @@ def _write_out_files(spec: mujoco.MjSpec) -> None:
         if mesh.file:
             view, rotation = model.mesh(mesh.name), np.zeros(9)
             vertices, faces = (
-                slice(start[0], start[0] + count[0]) for start, count in ((view.vertadr, view.vertnum), (view.faceadr, view.facenum))
+                slice(start[0], start[0] + count[0])
+                for start, count in ((view.vertadr, view.vertnum), (view.faceadr, view.facenum))
             )
             mujoco.mju_quat2Mat(rotation, model.mesh_quat[view.id])  # compiled, a mesh lies in its principal axes
             places = model.mesh_vert[vertices] @ rotation.reshape(3, 3).T + model.mesh_pos[view.id]

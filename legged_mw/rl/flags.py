@@ -13,18 +13,30 @@ from legged_mw.utils.task import task_names
 def parse(description: str | None, argv: list[str] | None = None) -> argparse.Namespace:
     """The flags of training: those that this program got, or ``argv``."""
     parser = make_parser(description)
-    parser.add_argument("--max_iterations", type=positive, metavar="N", help="train until this iteration, resumed or not")
+    parser.add_argument(
+        "--max_iterations", type=positive, metavar="N", help="train until this iteration, resumed or not"
+    )
     parser.add_argument("--run_name", metavar="NAME", help="appended to the run folder's name")
     parser.add_argument("--resume", action="store_true", help="go on with the last run, or the one of --load_run")
     source = "its run, checkpoint or export, or a task for its last or shipped policy"
-    parser.add_argument("--teacher", metavar="RUN", help=f"distil: learn to act like a policy that may see more; {source}")
+    parser.add_argument(
+        "--teacher", metavar="RUN", help=f"distil: learn to act like a policy that may see more; {source}"
+    )
     parser.add_argument("--init", metavar="RUN", help="begin with the actor of another policy, named as a teacher is")
-    parser.add_argument("--headless", action="store_true", help="accepted as in legged_gym; training never opens a window")
-    parser.add_argument("--max_time", type=duration, metavar="T", help="be done, annealed, after 90s, 5m, 1.5h ... or --max_iterations")
-    parser.add_argument("--play", action="store_true", help="watch the policy as it trains: a window, or a web page without a screen")
+    parser.add_argument(
+        "--headless", action="store_true", help="accepted as in legged_gym; training never opens a window"
+    )
+    parser.add_argument(
+        "--max_time", type=duration, metavar="T", help="be done, annealed, after 90s, 5m, 1.5h ... or --max_iterations"
+    )
+    parser.add_argument(
+        "--play", action="store_true", help="watch the policy as it trains: a window, or a web page without a screen"
+    )
     parser.add_argument("--list", action="store_true", help="show the tasks and exit")
     parser.add_argument("--check", action="store_true", help="show what the task is made of and exit")
-    parser.add_argument("--picture", metavar="PNG", help="with --check: the robot's health page too, and a picture of the robot")
+    parser.add_argument(
+        "--picture", metavar="PNG", help="with --check: the robot's health page too, and a picture of the robot"
+    )
     args = parser.parse_args(argv)
     if args.picture is not None:
         writable(args.picture, "--picture")
@@ -47,4 +59,6 @@ def require_task(args: argparse.Namespace, parser: argparse.ArgumentParser) -> N
 
         args.task = task_at(args.load_run)
     if not args.task:
-        parser.error(f"--task is missing, and --load_run is no path of a run that would say it; tasks: {', '.join(task_names())}")
+        parser.error(
+            f"--task is missing, and --load_run is no path of a run that would say it; tasks: {', '.join(task_names())}"
+        )

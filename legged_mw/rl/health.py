@@ -31,10 +31,20 @@ class Health:
         if undone:
             self.undone += 1
             brought = list(dict.fromkeys(name for name, bad in zip(self._stored, wrong, strict=True) if bad))
-            cause = f"{' and '.join(brought[:4])} held what is not finite or beyond {BOUND:g}" if brought else "loss or weights"
-            warnings.append(f"the update was not finite ({cause}) and is undone: {self._row} in a row, {self.undone} so far")
+            cause = (
+                f"{' and '.join(brought[:4])} held what is not finite or beyond {BOUND:g}"
+                if brought
+                else "loss or weights"
+            )
+            warnings.append(
+                f"the update was not finite ({cause}) and is undone: {self._row} in a row, {self.undone} so far"
+            )
             if self._row >= IN_A_ROW:
-                advice = "look at how that is computed" if brought else "lower algorithm.learning_rate; look for rewards without a bound"
+                advice = (
+                    "look at how that is computed"
+                    if brought
+                    else "lower algorithm.learning_rate; look for rewards without a bound"
+                )
                 kept = "the networks are those of the last good one"
                 return warnings, f"{IN_A_ROW} updates in a row were not finite ({cause}); {kept}; {advice}"
         if self._sick >= IN_A_ROW:
@@ -48,7 +58,11 @@ class Health:
         if self._heard != 2 or not numbers["episodes"] or numbers["episode_length"] > 1.5:
             return []
         fell, broken = numbers["fell"], numbers["broken"]
-        ends = {"fell": fell, "had a state that is not finite": broken, "timed out": numbers["episodes"] - fell - broken}
+        ends = {
+            "fell": fell,
+            "had a state that is not finite": broken,
+            "timed out": numbers["episodes"] - fell - broken,
+        }
         said = ", ".join(f"{count:.0f} {end}" for end, count in ends.items() if count)
         lasted = f"episodes last {numbers['episode_length']:.1f} steps ({said})"
         return [f"{lasted}: unless that is meant, nothing can be learned; --check names the rule that ends them"]

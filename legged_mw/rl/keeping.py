@@ -38,9 +38,14 @@ class RunLock:
             self._file.seek(0)
             who = self._file.read().strip() or "another process"
             self._file.close()
-            raise ConfigError(f"{shown(folder)} is being trained by {who}; wait for its end, stop it, or name another run") from None
+            raise ConfigError(
+                f"{shown(folder)} is being trained by {who}; wait for its end, stop it, or name another run"
+            ) from None
         except OSError as error:  # a file system without locks
-            print(f"WARNING: {shown(folder)} cannot be locked ({error.strerror}): do not resume it while it trains", flush=True)
+            print(
+                f"WARNING: {shown(folder)} cannot be locked ({error.strerror}): do not resume it while it trains",
+                flush=True,
+            )
 
     def begin(self) -> None:
         """Say who it is, and sweep what a process that was killed left half written."""
@@ -73,7 +78,9 @@ class Keeper:
         self.written: Path | None = None  # the newest one that could
         self.moved = False  # the folder had to be made again
 
-    def write(self, iteration: int, checkpoint: Callable[[], dict[str, Any]], worlds: Callable[[], dict[str, Any]]) -> bool:
+    def write(
+        self, iteration: int, checkpoint: Callable[[], dict[str, Any]], worlds: Callable[[], dict[str, Any]]
+    ) -> bool:
         """Worlds, then the checkpoint, then sweep the ones before; returns whether the checkpoint is there."""
         path = self.folder / f"model_{iteration}.pt"
         try:
@@ -84,10 +91,14 @@ class Keeper:
         except (OSError, MemoryError) as error:  # the file is put together in memory
             self.failed = reason_of(error)
             newest = f"the newest is {shown(self.written)}" if self.written else "none of this training is written"
-            print(f"WARNING: checkpoint {path.name} cannot be written: {self.failed}; {newest}; going on in memory", flush=True)
+            print(
+                f"WARNING: checkpoint {path.name} cannot be written: {self.failed}; {newest}; going on in memory",
+                flush=True,
+            )
             if not path.exists():
                 with contextlib.suppress(OSError):
-                    worlds_file(path, self._rank).unlink(missing_ok=True)  # of use to no checkpoint, and the disk is full
+                    # of use to no checkpoint, and the disk is full
+                    worlds_file(path, self._rank).unlink(missing_ok=True)
             return False
         self.failed, self.written = "", path
         with contextlib.suppress(OSError):
@@ -99,7 +110,10 @@ class Keeper:
         try:
             save_whole(worlds(), file, sync=False)  # one that a power cut tears is found out by its reader
         except (OSError, MemoryError) as error:
-            print(f"WARNING: {file.name} cannot be written: {reason_of(error)}; from {checkpoint.name} worlds begin anew", flush=True)
+            print(
+                f"WARNING: {file.name} cannot be written: {reason_of(error)}; from {checkpoint.name} worlds begin anew",
+                flush=True,
+            )
 
     def _sweep(self) -> None:
         """Worlds of checkpoints before the newest, and the checkpoints that are too many.

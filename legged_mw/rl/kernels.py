@@ -73,7 +73,9 @@ def _unpack(x: wp.int64):
 @wp.func
 def _round(low: float, high: float):
     """The bits of two values in bfloat16, beside each other."""
-    return (wp.uint32(wp.cast(wp.bfloat16(high), wp.uint16)) << wp.uint32(16)) | wp.uint32(wp.cast(wp.bfloat16(low), wp.uint16))
+    return (wp.uint32(wp.cast(wp.bfloat16(high), wp.uint16)) << wp.uint32(16)) | wp.uint32(
+        wp.cast(wp.bfloat16(low), wp.uint16)
+    )
 
 
 @wp.func
@@ -87,7 +89,9 @@ def _pack(x: wp.vec4, like: wp.int64):
 
 
 @wp.kernel(enable_backward=False)
-def _elu_backward(grad: wp.array2d[Any], out: wp.array2d[Any], into: wp.array2d[Any], sums: wp.array2d[wp.vec4], first: int):
+def _elu_backward(
+    grad: wp.array2d[Any], out: wp.array2d[Any], into: wp.array2d[Any], sums: wp.array2d[wp.vec4], first: int
+):
     block, c = wp.tid()
     total = wp.vec4()
     for row in range(block * ROWS, wp.min((block + 1) * ROWS, grad.shape[0]), _AT_ONCE):
@@ -143,7 +147,8 @@ def policy_loss(
     old_std: wp.array2d[float],
     clip: float,
     of_mean: wp.array2d[float],
-    terms: wp.array2d[float],  # (B, A + 2): by which the std's gradient is the sum, the surrogate loss, the KL divergence
+    # (B, A + 2): by which the std's gradient is the sum, the surrogate loss, the KL divergence
+    terms: wp.array2d[float],
 ):
     i = wp.tid()
     width = mean.shape[1]

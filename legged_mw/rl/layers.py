@@ -80,7 +80,11 @@ class EluLayers(torch.autograd.Function):
             weights.append(_float_product(grad.t(), outs[i - 1]))
         weights[-1] = weights[-1][:, : ctx.columns]
         pairs = zip(weights[::-1], [*elu.sums(), *biases], strict=True)
-        return grad @ read[0][0] if ctx.needs_input_grad[0] else None, None, *(value for pair in pairs for value in pair)
+        return (
+            grad @ read[0][0] if ctx.needs_input_grad[0] else None,
+            None,
+            *(value for pair in pairs for value in pair),
+        )
 
 
 class EluBackward:
@@ -98,7 +102,9 @@ class EluBackward:
     def __call__(self, grad: Tensor, i: int) -> Tensor:
         """The gradient (B, size) before ELU ``i``, of its output's type."""
         if self._table is not None:
-            return self._kernels.elu_backward(grad, self._outs[i], self._table, sum(out.shape[1] for out in self._outs[:i]))
+            return self._kernels.elu_backward(
+                grad, self._outs[i], self._table, sum(out.shape[1] for out in self._outs[:i])
+            )
         out = self._outs[i]
         grad = torch.ops.aten.elu_backward(grad.to(out.dtype), 1.0, 1.0, 1.0, True, out)
         self._sums[i] = sum_rows(grad.float() if out.dtype == torch.bfloat16 else grad)
@@ -132,7 +138,9 @@ def run_mlp(layers: nn.Module, x: Tensor, read: Layers | None = None) -> Tensor:
     rest = [*layers]  # type: ignore[misc]
     if linear := elu_layers(layers):
         with torch.no_grad():
-            read = read or [(_padded(layer.weight, x.shape[1] if layer is linear[0] else 0), layer.bias) for layer in linear]
+            read = read or [
+                (_padded(layer.weight, x.shape[1] if layer is linear[0] else 0), layer.bias) for layer in linear
+            ]
         x = EluLayers.apply(x, read, *(value for layer in linear for value in (layer.weight, layer.bias)))  # type: ignore[assignment]
         rest = rest[2 * len(linear) - 1 :]
     for layer in rest:
@@ -154,7 +162,10 @@ class HalfWeights:
         self._own = [value for layer in hidden for value in (layer.weight, layer.bias)]
         first = self._own[0]
         wide = first.new_zeros(len(first), -(-first.shape[1] // self.ALIGNED) * self.ALIGNED, dtype=torch.bfloat16)
-        self._copies = [wide[:, : first.shape[1]], *(torch.empty_like(value, dtype=torch.bfloat16) for value in self._own[1:])]
+        self._copies = [
+            wide[:, : first.shape[1]],
+            *(torch.empty_like(value, dtype=torch.bfloat16) for value in self._own[1:]),
+        ]
         weights = [wide, *self._copies[2::2]]
         self._layers = [*zip(weights, self._copies[1::2], strict=True), (linear[-1].weight, linear[-1].bias)]
 

@@ -40,12 +40,19 @@ def own_std(distribution: GaussianDistribution) -> Tensor:
 
 
 @torch.no_grad()
-def policy_loss(mean: Tensor, std: Tensor, batch: RolloutStorage.Batch, clip: float, entropy_coef: Tensor) -> PolicyLoss:
+def policy_loss(
+    mean: Tensor, std: Tensor, batch: RolloutStorage.Batch, clip: float, entropy_coef: Tensor
+) -> PolicyLoss:
     """PPO's clipped surrogate loss less ``entropy_coef`` times the entropy. Entropy and divergence are not of mirror images."""
     assert batch.old_distribution_params is not None
     kernels, old = kernels_for(mean), batch.old_distribution_params
     if kernels and std.dim() == 1:
-        (rows, width), of_mean, of_std, parts = mean.shape, torch.empty_like(mean), torch.empty_like(std), mean.new_empty(3)
+        (rows, width), of_mean, of_std, parts = (
+            mean.shape,
+            torch.empty_like(mean),
+            torch.empty_like(std),
+            mean.new_empty(3),
+        )
         terms = mean.new_empty(rows, width + 2)
         samples = batch.actions, batch.advantages, batch.old_actions_log_prob, *old
         kernels.launch(kernels.policy_loss, rows, mean, std, *samples, clip, of_mean, terms)
@@ -63,7 +70,9 @@ def policy_loss(mean: Tensor, std: Tensor, batch: RolloutStorage.Batch, clip: fl
     entropy = (own.log() + (0.5 + _HALF_LOG_2PI)).sum() / size
     ratio_of_std, moved = old_std / own, (old_mean - mean[:size]) / own
     kl = (0.5 * (ratio_of_std.square() + moved.square() - 1.0) - ratio_of_std.log()).sum() / size
-    return PolicyLoss(of_mean, of_std if std.dim() == 2 else sum_rows(of_std), torch.max(plain, clipped).mean(), entropy, kl)
+    return PolicyLoss(
+        of_mean, of_std if std.dim() == 2 else sum_rows(of_std), torch.max(plain, clipped).mean(), entropy, kl
+    )
 
 
 @torch.no_grad()
@@ -71,7 +80,9 @@ def value_loss(values: Tensor, batch: RolloutStorage.Batch, clip: float, coef: f
     """The gradient (B, 1) of ``coef`` times the value loss, and the value loss (); clipped, unless ``clip`` is 0."""
     if kernels := kernels_for(values):
         of_values, terms = torch.empty_like(values), torch.empty_like(values)
-        kernels.launch(kernels.value_loss, len(values), values, batch.values, batch.returns, clip, coef, of_values, terms)
+        kernels.launch(
+            kernels.value_loss, len(values), values, batch.values, batch.returns, clip, coef, of_values, terms
+        )
         return of_values, terms.mean()
     error = values - batch.returns  # type: ignore[operator]
     slope, terms = 2.0 * error, error.square()

@@ -25,7 +25,11 @@ PREFIX = "policy."  # of the weights' names in the file: the attribute of Export
 MEAN, STD = "obs_normalizer._mean", "obs_normalizer._std"
 LEARNING_ONLY = "teacher."  # parameters that nothing needs to act
 # neither a mean action nor an estimate needs them
-UNWRITTEN = ("distribution.", LEARNING_ONLY, *(f"{of}_normalizer.{name}" for of in ("obs", "target") for name in ("_var", "count")))
+UNWRITTEN = (
+    "distribution.",
+    LEARNING_ONLY,
+    *(f"{of}_normalizer.{name}" for of in ("obs", "target") for name in ("_var", "count")),
+)
 
 
 class ExportedPolicy(nn.Module):
@@ -59,7 +63,9 @@ class ExportedPolicy(nn.Module):
         return policy.distribution.deterministic_output(policy.mlp(seen)).clamp(-clip, clip), state.transpose(0, 1)
 
 
-def run_onnx(path: Path, observations: np.ndarray, output: str = OUTPUT, memory: np.ndarray | None = None) -> np.ndarray:
+def run_onnx(
+    path: Path, observations: np.ndarray, output: str = OUTPUT, memory: np.ndarray | None = None
+) -> np.ndarray:
     """Actions (B, A), or another output, of the network in an ONNX file, by onnxruntime or where it is not installed onnx's evaluator."""
     inputs = {INPUT: observations} | ({} if memory is None else {MEMORY_INPUT: memory})
     try:
@@ -136,7 +142,9 @@ def halve(policy: MLPModel, path: Path) -> None:
     for each in graph.initializer:
         if each.name in names:
             each.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(each).astype(np.float16), each.name))
-            casts.append(onnx.helper.make_node("Cast", [each.name], [f"{each.name}.float32"], to=onnx.TensorProto.FLOAT))
+            casts.append(
+                onnx.helper.make_node("Cast", [each.name], [f"{each.name}.float32"], to=onnx.TensorProto.FLOAT)
+            )
     whole = {cast.input[0]: cast.output[0] for cast in casts}
     for value in graph.value_info:
         if value.name in whole:
@@ -162,7 +170,9 @@ def read_parameters(path: Path, policy: MLPModel) -> dict[str, Tensor]:
 
     try:
         graph = onnx.load(path, load_external_data=False).graph
-        stored = {each.name: torch.from_numpy(numpy_helper.to_array(each).astype(np.float32)) for each in graph.initializer}
+        stored = {
+            each.name: torch.from_numpy(numpy_helper.to_array(each).astype(np.float32)) for each in graph.initializer
+        }
     except FileNotFoundError:
         raise ConfigError(f"no policy at {path}") from None
     except Exception:  # protobuf's or onnx's, by how the file is broken
@@ -170,7 +180,9 @@ def read_parameters(path: Path, policy: MLPModel) -> dict[str, Tensor]:
     found = {name.removeprefix(PREFIX): value for name, value in stored.items() if name.startswith(PREFIX)}
     if not found:
         names = ", ".join(list(stored)[:3]) or "none"
-        raise ConfigError(f"{path} is no network that this project exported: its weights are called {names}, not {PREFIX}mlp.0.weight ...")
+        raise ConfigError(
+            f"{path} is no network that this project exported: its weights are called {names}, not {PREFIX}mlp.0.weight ..."
+        )
     if MEAN in found and STD not in found:
         found[STD] = _divisor(graph, stored, path) - getattr(policy.obs_normalizer, "eps", 0.0)
     return {name: value for name, value in policy.state_dict().items() if name.startswith(UNWRITTEN)} | found

@@ -17,7 +17,16 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import actor_settings, check_classes, network_section
 from legged_mw.rl.network import LEARNING_ONLY, read_parameters
 from legged_mw.rl.room import check_room
-from legged_mw.rl.runs import CONFIG_FILE, check_fit, experiment_folder, find_checkpoint, find_run, load_tensors, runs, task_of
+from legged_mw.rl.runs import (
+    CONFIG_FILE,
+    check_fit,
+    experiment_folder,
+    find_checkpoint,
+    find_run,
+    load_tensors,
+    runs,
+    task_of,
+)
 from legged_mw.utils.config import Config, ConfigError, load_yaml
 from legged_mw.utils.errors import printable, shown
 from legged_mw.utils.files import check_folder, finish_moving, typed
@@ -38,7 +47,9 @@ class Source(NamedTuple):
         return experiment_folder(task, task.name) / "shipped" if self.shipped else self.folder
 
 
-def find_policy(task: LoadedTask, run: str | None = None, checkpoint: int = -1, experiment: str | None = None) -> Source:
+def find_policy(
+    task: LoadedTask, run: str | None = None, checkpoint: int = -1, experiment: str | None = None
+) -> Source:
     """The run or export asked for, else the last run, else the policy that ships with the task."""
     folder = experiment_folder(task, experiment)
     if run == "shipped":
@@ -82,7 +93,9 @@ def find_rival(task: LoadedTask, run: str, experiment: str | None = None) -> Sou
     rival = _run_or_export(experiment_folder(task, experiment), run)
     theirs = str(load_yaml(rival.folder / CONFIG_FILE).get("task", task.name))
     if Path(theirs).stem != task.name:
-        raise ConfigError(f"--compare {run} is of task '{theirs}', not '{task.name}': two policies are graded on one task")
+        raise ConfigError(
+            f"--compare {run} is of task '{theirs}', not '{task.name}': two policies are graded on one task"
+        )
     return rival
 
 
@@ -126,7 +139,9 @@ def load_policy(path: Path, env: RobotTask, cfg: Config, device: str) -> MLPMode
     or the config names a class that it may not.
     """
     actor_class, actor_cfg = resolve_class(acting(cfg, env))
-    actor = actor_class(env.get_observations(), cfg.to_dict()["obs_groups"], "actor", env.num_actions, **actor_cfg).to(device)
+    actor = actor_class(env.get_observations(), cfg.to_dict()["obs_groups"], "actor", env.num_actions, **actor_cfg).to(
+        device
+    )
     actor.load_state_dict(read_actor(path, actor))
     return actor.eval()
 

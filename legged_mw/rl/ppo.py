@@ -73,7 +73,9 @@ class GraphedPPO(Recorded, PPO):
             self.symmetry = Symmetry(**symmetry) if symmetry else None  # rsl-rl refuses mirror images here
         if reason:
             if self._bound:
-                raise ConfigError(f"algorithm.max_learning_rate is of the recorded update, and this is rsl-rl's own: {reason}")
+                raise ConfigError(
+                    f"algorithm.max_learning_rate is of the recorded update, and this is rsl-rl's own: {reason}"
+                )
             print(f"PPO: rsl-rl's own update is used, not the recorded one: {reason}", flush=True)
             return
         self._adam_rate = torch.tensor(self.learning_rate, dtype=torch.float32, device=self.device)
@@ -84,7 +86,8 @@ class GraphedPPO(Recorded, PPO):
         groups = [{"params": part, "lr": rate} for part, rate in zip(learners, self._rates, strict=True)]
         self.optimizer = type(self.optimizer)(groups)
         make_recordable(self.optimizer, self._rates, str(self.device))
-        flat = [] if self._recurrent else enumerate(self._parts)  # cuDNN wants the weights of its own layers in its own order
+        # cuDNN wants the weights of its own layers in its own order
+        flat = [] if self._recurrent else enumerate(self._parts)
         self._adams = [FlatAdam(self.optimizer, max(0, i - 1), part, self.max_grad_norm) for i, part in flat]
         self.undo = Undo(self, (self.actor, self.critic))
         self._begin()
@@ -103,8 +106,11 @@ class GraphedPPO(Recorded, PPO):
         drawn = st.num_envs if self._recurrent else st.num_envs * st.num_transitions_per_env
         self._share = drawn // self.num_mini_batches  # of a minibatch, in samples or in whole worlds
         self._size = self._share * (st.num_transitions_per_env if self._recurrent else 1)  # in samples
-        self._obs = TensorDict({name: value[0].clone() for name, value in st.observations.items()}, [st.num_envs], device=device)
-        self._worlds = torch.arange(st.num_envs, device=device).expand(st.num_transitions_per_env, -1)  # of each transition
+        self._obs = TensorDict(
+            {name: value[0].clone() for name, value in st.observations.items()}, [st.num_envs], device=device
+        )
+        # of each transition
+        self._worlds = torch.arange(st.num_envs, device=device).expand(st.num_transitions_per_env, -1)
         self._order = torch.zeros(self._share * self.num_mini_batches, dtype=torch.long, device=device)
         self._memories = HiddenStates((self.actor, self.critic), st.num_envs, 2 if self.symmetry else 1, device)
         self._advantages = torch.zeros_like(st.returns)
@@ -112,7 +118,10 @@ class GraphedPPO(Recorded, PPO):
         more += [self.actor.regression] if isinstance(self.actor, RegressingModel) else []
         self._loss_names = ("value", "surrogate", "entropy", *more)
         self._losses = torch.zeros(len(self._loss_names), device=device)
-        self._entropy_coef, self._desired_kl = torch.zeros((), device=device), torch.zeros((), dtype=torch.float64, device=device)
+        self._entropy_coef, self._desired_kl = (
+            torch.zeros((), device=device),
+            torch.zeros((), dtype=torch.float64, device=device),
+        )
         plain = [model for model in (self.actor, self.critic) if self.half and type(model) is MLPModel]
         self._half = {model: HalfWeights(linear) for model in plain if (linear := elu_layers(model.mlp))}
         self._side = torch.cuda.Stream(device) if str(device).startswith("cuda") else None
@@ -200,7 +209,8 @@ class GraphedPPO(Recorded, PPO):
 
     def _compute_returns(self) -> None:
         memory = self._memories.get(self.critic)
-        self.critic.reset(hidden_state=memory.for_rsl_rl() if memory else None)  # rsl-rl looks once more, and so does not change ours
+        # rsl-rl looks once more, and so does not change ours
+        self.critic.reset(hidden_state=memory.for_rsl_rl() if memory else None)
         super().compute_returns(self._obs)
         self.critic.reset()
         self._advantages.copy_(self.storage.advantages)
@@ -235,7 +245,11 @@ class GraphedPPO(Recorded, PPO):
         st = self.storage
 
         def take(stored: Any) -> Tensor:
-            return stored.index_select(1, indices).flatten(0, 1) if self._recurrent else stored.flatten(0, 1).index_select(0, indices)
+            return (
+                stored.index_select(1, indices).flatten(0, 1)
+                if self._recurrent
+                else stored.flatten(0, 1).index_select(0, indices)
+            )
 
         assert st.distribution_params is not None
         batch = RolloutStorage.Batch(
@@ -251,7 +265,9 @@ class GraphedPPO(Recorded, PPO):
             batch.advantages = (batch.advantages - batch.advantages.mean()) / (batch.advantages.std() + 1e-8)  # type: ignore[operator]
         if self.symmetry:
             self.symmetry.augment_batch(batch, self._size)
-        actor_input, critic_input = (self._input(model, batch.observations, indices) for model in (self.actor, self.critic))
+        actor_input, critic_input = (
+            self._input(model, batch.observations, indices) for model in (self.actor, self.critic)
+        )
         if not isinstance(self.actor, RegressingModel):
             return Minibatch(batch, actor_input, critic_input)
         return Minibatch(batch, actor_input, critic_input, self.actor.lesson(batch.observations, take(self._worlds)))
@@ -291,7 +307,9 @@ class GraphedPPO(Recorded, PPO):
         self._step(kl)
         self._losses.add_(torch.stack([value.detach() for value in (of_critic, *parts, *regression)]))
 
-    def _policy_loss(self, batch: Any, output: Tensor) -> tuple[list[tuple[Tensor, Tensor]], list[Tensor], Tensor | None]:
+    def _policy_loss(
+        self, batch: Any, output: Tensor
+    ) -> tuple[list[tuple[Tensor, Tensor]], list[Tensor], Tensor | None]:
         """What of the actor has which gradient, the loss's parts by ``_loss_names``, and the KL divergence (None: fixed rate)."""
         assert self.actor.distribution is not None
         self.actor.distribution.update(output)
@@ -341,7 +359,9 @@ class GraphedPPO(Recorded, PPO):
         assert self._rate is not None
         highest = self._bound or MAX_RATE
         if kernels := kernels_for(kl):
-            kernels.launch(kernels.adapt_rate, 1, kl, self._desired_kl, self._rate, self._adam_rate, _RATE_STEP, _MIN_RATE, highest)
+            kernels.launch(
+                kernels.adapt_rate, 1, kl, self._desired_kl, self._rate, self._adam_rate, _RATE_STEP, _MIN_RATE, highest
+            )
             return
         slower = (self._rate / _RATE_STEP).clamp(min=_MIN_RATE)
         faster = (self._rate * _RATE_STEP).clamp(max=highest)
@@ -363,7 +383,8 @@ class GraphedPPO(Recorded, PPO):
         symmetry, size = self.symmetry, self._size
         assert symmetry is not None
         if not self._recurrent and (symmetry.use_mirror_loss or not symmetry.use_data_augmentation):
-            return symmetry.compute_loss(self.actor, copy.copy(batch), size)  # it puts mirror images into what it is given
+            # it puts mirror images into what it is given
+            return symmetry.compute_loss(self.actor, copy.copy(batch), size)
         means = self.actor.output_mean
         _, mirrored = symmetry.data_augmentation_func(env=symmetry.env, obs=None, actions=means[:size].detach())
         return nn.functional.mse_loss(means[size:], mirrored[size:])

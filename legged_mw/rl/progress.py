@@ -38,7 +38,9 @@ class Console:
         """Write blocks to the log file of this run from now on."""
         self._file = self._try(lambda: open(folder / LOG_FILE, "a", encoding="utf-8"))  # noqa: SIM115 (open until the training ends)
 
-    def iteration(self, done: int, last: int, exam: int | None, numbers: Mapping[str, float], rows: dict[str, str], speed: float) -> None:
+    def iteration(
+        self, done: int, last: int, exam: int | None, numbers: Mapping[str, float], rows: dict[str, str], speed: float
+    ) -> None:
         """An iteration is done. ``exam``: the next iteration that ends with one."""
         self._times.append((done, time.time()))
         if len(self._times) == 1:
@@ -144,7 +146,10 @@ class _Above:
 def summary(numbers: Mapping[str, float]) -> str:
     """What one looks at first, in words; "-" until an episode has ended."""
     shares = {"reward": ".2f", "episode_length": ".1f"}
-    said = [f"{name.replace('_', ' ').removeprefix('episode ')} {_number(numbers[name], digits)}" for name, digits in shares.items()]
+    said = [
+        f"{name.replace('_', ' ').removeprefix('episode ')} {_number(numbers[name], digits)}"
+        for name, digits in shares.items()
+    ]
     return ", ".join([*said, f"episodes {numbers['episodes']:.0f}, falls {numbers['fell']:.0f}"])
 
 

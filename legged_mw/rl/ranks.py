@@ -32,7 +32,9 @@ class Rank(NamedTuple):
 
 def this_rank() -> Rank:
     """From the environment that torchrun sets; alone without it."""
-    index, local, count = (int(os.environ.get(*entry)) for entry in (("RANK", "0"), ("LOCAL_RANK", "0"), ("WORLD_SIZE", "1")))
+    index, local, count = (
+        int(os.environ.get(*entry)) for entry in (("RANK", "0"), ("LOCAL_RANK", "0"), ("WORLD_SIZE", "1"))
+    )
     return Rank(index, local, count) if count > 1 else Rank(0, 0, 1)
 
 
@@ -41,7 +43,9 @@ def rank_device(rank: Rank, asked: str | None) -> str | None:
     if rank.count == 1 or asked == "cpu":
         return asked
     if asked is not None:
-        raise ConfigError(f"--device {asked}: under torchrun every process takes the GPU of its own number; leave --device out")
+        raise ConfigError(
+            f"--device {asked}: under torchrun every process takes the GPU of its own number; leave --device out"
+        )
     if rank.local >= torch.cuda.device_count():
         seen = torch.cuda.device_count()
         advice = f"use --nproc_per_node={seen}" if seen else "say --device cpu to train on the CPU"
@@ -82,7 +86,10 @@ def leave_together(rank: Rank, patience: float = _PATIENCE) -> None:
     sys.stdout.flush()
 
     def leave() -> None:
-        os.write(2, f"rank {rank.index}: the connection to the other ranks does not close; leaving, all is written\n".encode())
+        os.write(
+            2,
+            f"rank {rank.index}: the connection to the other ranks does not close; leaving, all is written\n".encode(),
+        )
         os._exit(0)
 
     timer = threading.Timer(patience, leave)

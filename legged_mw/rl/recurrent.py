@@ -62,14 +62,18 @@ class HiddenState:
         """The rollout of ``worlds`` (B,) from ``inputs`` (S * T * B, size) and where a step ended an episode, ``dones`` (T, N, 1)."""
         ended = dones.index_select(1, worlds).to(inputs.dtype)
         keep = torch.cat([torch.ones_like(ended[:1]), 1.0 - ended[:-1]])
-        return SequenceInput(inputs.view(-1, len(keep), len(worlds), inputs.shape[1]), self.start.index_select(2, worlds), keep)
+        return SequenceInput(
+            inputs.view(-1, len(keep), len(worlds), inputs.shape[1]), self.start.index_select(2, worlds), keep
+        )
 
 
 class HiddenStates(dict[nn.Module, HiddenState]):
     """Those of the recurrent networks among a learner's ``models``."""
 
     def __init__(self, models: Iterable[nn.Module], worlds: int, images: int, device: str) -> None:
-        super().__init__({model: HiddenState(model, worlds, images, device) for model in models if isinstance(model, RNNModel)})
+        super().__init__(
+            {model: HiddenState(model, worlds, images, device) for model in models if isinstance(model, RNNModel)}
+        )
 
     def begin_rollout(self) -> None:
         """Keep the present states as those that the rollout begins with."""
@@ -175,7 +179,9 @@ class GRU(torch.autograd.Function):
         size = weight.shape[1]
         r, z = rz.chunk(2, dim=-1)
         to_new = (1.0 - z) * (1.0 - new.square())
-        into = torch.cat([to_new * onward[..., 2 * size :] * r * (1.0 - r), (before - new) * z * (1.0 - z), to_new * r], dim=-1)
+        into = torch.cat(
+            [to_new * onward[..., 2 * size :] * r * (1.0 - r), (before - new) * z * (1.0 - z), to_new * r], dim=-1
+        )
         of_h = torch.empty_like(before)
         of_h[-1] = grad[:, -1]
         for t in reversed(range(len(keep))):

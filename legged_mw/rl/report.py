@@ -90,7 +90,9 @@ def console_block(title: str, rows: dict[str, str]) -> str:
     return "\n".join([f" {title} ".center(80, "#"), *(f"{name:>32}: {text}" for name, text in rows.items())])
 
 
-def console_rows(numbers: dict[str, float], losses: dict[str, float], speed: float, collect: float, learn: float) -> dict[str, str]:
+def console_rows(
+    numbers: dict[str, float], losses: dict[str, float], speed: float, collect: float, learn: float
+) -> dict[str, str]:
     """What an iteration shows of its numbers: name -> text. A mean over episodes is "-" until one has ended."""
 
     def mean(name: str, digits: int) -> str:

@@ -36,7 +36,12 @@ def suffix_of(rank: Rank) -> str:
 def worlds_content(runner: Any) -> dict[str, Any]:
     """What to write: tensors and plain numbers only."""
     random = random_state(runner.device)
-    return {**_kind(runner.env), "random_state": random, "worlds": worlds_state(runner.env), "memories": _memories(runner)}
+    return {
+        **_kind(runner.env),
+        "random_state": random,
+        "worlds": worlds_state(runner.env),
+        "memories": _memories(runner),
+    }
 
 
 def take_worlds(runner: Any, checkpoint: Path, rank: Rank, random: dict[str, Tensor]) -> str:
@@ -52,7 +57,9 @@ def take_worlds(runner: Any, checkpoint: Path, rank: Rank, random: dict[str, Ten
         state, worlds, memories = (dict(content[key]) for key in ("random_state", "worlds", "memories"))
     except Exception:  # a zip, pickle or tensor error, by how the file is broken
         return f"{file.name} cannot be read"
-    if rank.leads and not (state.keys() == random.keys() and all(torch.equal(state[key], random[key].cpu()) for key in state)):
+    if rank.leads and not (
+        state.keys() == random.keys() and all(torch.equal(state[key], random[key].cpu()) for key in state)
+    ):
         return f"{file.name} is of another checkpoint"
     if different := _first_difference(there, here):
         return different
@@ -112,6 +119,9 @@ def _first_difference(there: Any, here: Any, path: str = "") -> str:
     """``path is A there and B here`` of the first value that differs; ''."""
     if isinstance(there, dict) and isinstance(here, dict):
         names = [*here, *(name for name in there if name not in here)]
-        found = (_first_difference(there.get(name), here.get(name), f"{path}.{name}" if path else str(name)) for name in names)
+        found = (
+            _first_difference(there.get(name), here.get(name), f"{path}.{name}" if path else str(name))
+            for name in names
+        )
         return next((text for text in found if text), "")
     return "" if there == here else f"{path.removeprefix('config.')} was {there} and is {here}"

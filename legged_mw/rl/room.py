@@ -20,17 +20,22 @@ def check_room(sections: dict[str, Any], env: RobotTask, learns: bool = True) ->
     counts = {
         field: count
         for name in (("actor", "critic") if learns else ("actor",))
-        for field, count in _weights(sections, name, sum(sizes.get(group, 0) for group in sections["obs_groups"][name])).items()
+        for field, count in _weights(
+            sections, name, sum(sizes.get(group, 0) for group in sections["obs_groups"][name])
+        ).items()
     }
     field = max(counts, key=lambda field: counts[field])
     value = sections
     for part in field.split("."):
         value = value[part]
     copies = 4 if learns else 1  # beside the weights their gradients, and Adam's two moments
-    require_memory(_FLOAT * copies * sum(counts.values()), device, f"{field} = {value}", "fewer values a layer need less")
+    require_memory(
+        _FLOAT * copies * sum(counts.values()), device, f"{field} = {value}", "fewer values a layer need less"
+    )
     if learns:
         steps, worlds = sections["runner"]["num_steps_per_env"], env.num_envs
-        sample = sum(sizes.values()) + 3 * env.num_actions + 5  # action, mean, deviation; reward, done, value, return, advantage
+        # action, mean, deviation; reward, done, value, return, advantage
+        sample = sum(sizes.values()) + 3 * env.num_actions + 5
         what = f"runner.num_steps_per_env = {steps} with env.num_envs = {worlds}"
         require_memory(_FLOAT * steps * worlds * sample, device, what, "fewer steps or worlds need less")
 
@@ -47,7 +52,9 @@ def _weights(sections: dict[str, Any], name: str, seen: int) -> dict[str, int]:
         counts["actor.estimator.hidden_dims"] = _chain([seen, *section["estimator"]["hidden_dims"], 1])
     if name == "actor" and section["concurrent"]["groups"]:
         counts["actor.concurrent.hidden_dims"] = _chain([seen, *section["concurrent"]["hidden_dims"]])
-        counts["actor.concurrent.latent_dim"] = section["concurrent"]["latent_dim"] * section["concurrent"]["hidden_dims"][-1]
+        counts["actor.concurrent.latent_dim"] = (
+            section["concurrent"]["latent_dim"] * section["concurrent"]["hidden_dims"][-1]
+        )
     return counts
 
 

@@ -52,7 +52,9 @@ class Runner(OnPolicyRunner):
 
     env: RobotTask
 
-    def __init__(self, env: RobotTask, train_cfg: dict[str, Any], log_dir: str | None = None, device: str = "cpu") -> None:
+    def __init__(
+        self, env: RobotTask, train_cfg: dict[str, Any], log_dir: str | None = None, device: str = "cpu"
+    ) -> None:
         super().__init__(env, train_cfg, log_dir, device)
         self.logger.git_status_repos = [str(ROOT)] if (ROOT / ".git").exists() else []
         self.total_steps = 0
@@ -69,7 +71,9 @@ class Runner(OnPolicyRunner):
         self._health = Health([name for each in env.suspects for name in each.names], self._stored_names())
         self.examine: Callable[[Any], dict[str, float]] | None = None
         self.last_exam: tuple[int, dict[str, float]] | None = None  # iteration, figures
-        self.update_threads = UpdateThreads(self.cfg["cpu"]["update_threads"], usable_cores()) if device == "cpu" else nullcontext()
+        self.update_threads = (
+            UpdateThreads(self.cfg["cpu"]["update_threads"], usable_cores()) if device == "cpu" else nullcontext()
+        )
         self.console = Console()
         self._warned_overflow = self._curves_lost = False
         self._last_means: dict[str, float] = {}
@@ -93,7 +97,9 @@ class Runner(OnPolicyRunner):
         On a GPU an iteration is logged while the next one runs, so that the device never waits for the host.
         """
         if init_at_random_ep_len:  # else every world would time out in the same step
-            self.env.episode_length_buf = torch.randint_like(self.env.episode_length_buf, high=self.env.max_episode_length)
+            self.env.episode_length_buf = torch.randint_like(
+                self.env.episode_length_buf, high=self.env.max_episode_length
+            )
         obs = self.env.get_observations()
         self.alg.train_mode()
         if self.is_distributed:
@@ -122,9 +128,13 @@ class Runner(OnPolicyRunner):
             redraw = self.env.cfg.domain_rand.redraw_iterations
             if redraw and self.current_learning_iteration % redraw == 0:
                 self.env.domain_rand.redraw()
-            if self.current_learning_iteration % self.cfg["save_interval"] == 0 and self.current_learning_iteration < self.plan.last:
+            if (
+                self.current_learning_iteration % self.cfg["save_interval"] == 0
+                and self.current_learning_iteration < self.plan.last
+            ):
                 self._save_checkpoint()
-            if self._exam_is_due():  # what waits to be logged still does: ranks must hear of a stop in the same iteration
+            # what waits to be logged still does: ranks must hear of a stop in the same iteration
+            if self._exam_is_due():
                 self._examine()
                 start = clock.mark()
         if waiting:
@@ -187,7 +197,11 @@ class Runner(OnPolicyRunner):
     def _next_exam(self, done: int) -> int | None:
         """The iteration after which the next exam comes, if any does."""
         interval = self.cfg["exam_interval"]
-        return min((done // interval + 1) * interval, self.plan.last) if self.examine is not None and interval > 0 else None
+        return (
+            min((done // interval + 1) * interval, self.plan.last)
+            if self.examine is not None and interval > 0
+            else None
+        )
 
     def _examine(self) -> None:
         """Grade the policy as it is now; of the ranks, only the first has an exam, and the others wait in the next update."""
@@ -218,15 +232,24 @@ class Runner(OnPolicyRunner):
         steps = self.cfg["num_steps_per_env"] * self.env.num_envs * self.gpu_world_size
         self.total_steps += steps
         asks = float(self.stop is not None), self.plan.room() if self.gpu_global_rank == 0 else 0.0
-        taken = [each.take() for each in self.env.suspects], [torch.full((1,), value, device=self.device) for value in asks]
+        taken = (
+            [each.take() for each in self.env.suspects],
+            [torch.full((1,), value, device=self.device) for value in asks],
+        )
         parts = [self.env.take_statistics(), *map(torch.cat, taken)]
         summed, sizes = torch.cat(parts), [len(part) for part in parts]
         if self.is_distributed:
             torch.distributed.all_reduce(summed)
         own = [torch.as_tensor(value, dtype=torch.float, device=self.device) for value in losses.values()]
-        rate = self.alg.rate if isinstance(self.alg, GraphedPPO) else torch.full((), self.alg.learning_rate, device=self.device)
+        rate = (
+            self.alg.rate
+            if isinstance(self.alg, GraphedPPO)
+            else torch.full((), self.alg.learning_rate, device=self.device)
+        )
         own += [rate.to(self.device, torch.float), self._action_std(), self._undo.undone]
-        message = Message(torch.cat([summed, torch.stack(own), self._undo.wrong]), [*sizes, len(losses), 2, 1, len(self._undo.wrong)])
+        message = Message(
+            torch.cat([summed, torch.stack(own), self._undo.wrong]), [*sizes, len(losses), 2, 1, len(self._undo.wrong)]
+        )
         return Report(self.current_learning_iteration, self.total_steps, steps, list(losses), message, marks)
 
     def _action_std(self) -> Tensor:
@@ -251,7 +274,9 @@ class Runner(OnPolicyRunner):
         collect, learn = report.seconds()
         speed = report.steps / (collect + learn)
         rows = {**console_rows(numbers, losses, speed, collect, learn), "Total steps": f"{report.total_steps}"}
-        self.console.iteration(report.iteration, self.plan.last, self._next_exam(report.iteration), numbers, rows, speed)
+        self.console.iteration(
+            report.iteration, self.plan.last, self._next_exam(report.iteration), numbers, rows, speed
+        )
         warnings, verdict = self._health.judge(suspects, report.steps, undone > 0, wrong)
         warnings += self._health.lengths(numbers)
         print("".join(f"WARNING: iteration {report.iteration}: {line}\n" for line in warnings), end="", flush=True)
@@ -260,7 +285,9 @@ class Runner(OnPolicyRunner):
         drawn = curves(numbers, losses, speed, collect, learn, report.total_steps)
         self._draw_curves({**drawn, "Train/undone_updates": float(self._health.undone)}, report.iteration)
         if numbers["overflowed"] and not self._warned_overflow:
-            others = f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks; raise `nconmax` and `njmax`"
+            others = (
+                f"simulator overflow in {numbers['overflowed']:.0f} worlds of other ranks; raise `nconmax` and `njmax`"
+            )
             print(f"WARNING: {config_words(self.env.sim.overflow_report() or others)}", flush=True)
             self._warned_overflow = True
 
@@ -269,7 +296,9 @@ class Runner(OnPolicyRunner):
         table, names = self.env.observations, []
         rows = {group: [row.name for row in table.rows(group) for _ in range(row.size)] for group in table.groups}
         for group, i in self._undo.columns:
-            names.append(f"observation row '{rows[group][i]}' of '{group}'" if group in rows else f"observation group '{group}'")
+            names.append(
+                f"observation row '{rows[group][i]}' of '{group}'" if group in rows else f"observation group '{group}'"
+            )
         return [*names, "the rewards"]
 
     # ---- curves: what they are written to may fail, and training goes on ---------------------------------------------
@@ -314,7 +343,10 @@ class Runner(OnPolicyRunner):
         """Write a checkpoint, unless the networks hold what is not finite: the newest one must be good to go on from."""
         weights = [weight for network in self._networks().values() for weight in network.parameters()]
         if not all(bool(weight.isfinite().all()) for weight in weights):
-            print(f"WARNING: after iteration {self.current_learning_iteration} the networks are not finite; not saved", flush=True)
+            print(
+                f"WARNING: after iteration {self.current_learning_iteration} the networks are not finite; not saved",
+                flush=True,
+            )
             return
         if not self.keeper:
             return
@@ -332,10 +364,17 @@ class Runner(OnPolicyRunner):
     def _content(self, infos: dict | None = None) -> dict[str, Any]:
         """A checkpoint: tensors and plain numbers only."""
         content = self.alg.save()
-        told = {**(infos or {}), "total_steps": self.total_steps, "random_state": random_state(self.device), **self.plan.saved()}
+        told = {
+            **(infos or {}),
+            "total_steps": self.total_steps,
+            "random_state": random_state(self.device),
+            **self.plan.saved(),
+        }
         return content | {"iter": self.current_learning_iteration, "infos": {**told, "env": self.env.training_state()}}
 
-    def load(self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None) -> dict:
+    def load(
+        self, path: str, load_cfg: dict | None = None, strict: bool = True, map_location: str | None = None
+    ) -> dict:
         """Go on from a checkpoint: networks, normalisers, optimizer, learning rate, counters, random state; worlds, where they are kept."""
         content = load_tensors(Path(path), map_location or self.device)
         (first, actor), (second, other) = self._networks().items()
@@ -368,7 +407,9 @@ class Runner(OnPolicyRunner):
         return infos
 
 
-def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, device: str, teacher: RobotTaskCfgPPO | None = None) -> Runner:
+def make_runner(
+    env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, device: str, teacher: RobotTaskCfgPPO | None = None
+) -> Runner:
     """A runner over ``env`` from the learner's config; with that of a ``teacher`` it distils. Without ``log_dir`` it writes nothing."""
     half = cfg.runner.matmul_precision == "bf16"
     torch.set_float32_matmul_precision("high" if half else cfg.runner.matmul_precision)
@@ -386,7 +427,9 @@ def make_runner(env: RobotTask, cfg: RobotTaskCfgPPO, log_dir: Path | None, devi
     if half and isinstance(runner.alg, GraphedPPO):
         runner.alg.learn_in_half()
     if settings["critic_warmup"] and not graphed:
-        raise ConfigError(f"warm_start.critic_warmup is {settings['critic_warmup']}, but only the recorded PPO knows it; set it to 0")
+        raise ConfigError(
+            f"warm_start.critic_warmup is {settings['critic_warmup']}, but only the recorded PPO knows it; set it to 0"
+        )
     if isinstance(policy := runner.alg.get_policy(), RegressingModel) and not graphed:
         who = "a student learns nothing but to act like its teacher" if teacher else "rsl-rl's own is used here"
         raise ConfigError(f"{policy.field}: only GraphedPPO's recorded update trains that, and {who}: set it to []")

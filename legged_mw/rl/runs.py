@@ -28,7 +28,9 @@ def logs_folder() -> Path:
 
 def experiment_folder(task: LoadedTask, name: str | None = None) -> Path:
     """The folder of a task's runs, or of the experiment called ``name``. Raises UserError for a name that is none."""
-    return logs_folder() / check_name(name or task.train.runner.experiment_name or task.name, "the name of the experiment")
+    return logs_folder() / check_name(
+        name or task.train.runner.experiment_name or task.name, "the name of the experiment"
+    )
 
 
 def new_run(experiment: Path, run_name: str) -> Path:
@@ -48,7 +50,8 @@ def runs(experiment: Path) -> list[Path]:
     """Run folders that hold a checkpoint, oldest first by the time of their newest checkpoint. What cannot be read is none."""
     found: dict[Path, int] = {}
     for folder in experiment.glob("*"):
-        with suppress(OSError):  # a link to itself, a folder of another user's, a checkpoint that is thinned out as it is looked at
+        # a link to itself, a folder of another user's, a checkpoint that is thinned out as it is looked at
+        with suppress(OSError):
             if there := checkpoints(folder):
                 found[folder] = max(path.stat().st_mtime_ns for path in there.values())
     return sorted(found, key=lambda folder: found[folder])
@@ -65,7 +68,9 @@ def find_run(experiment: Path, name: str) -> Path:
     found, given = runs(experiment), typed(name)
     if name == "-1":
         if not found:
-            raise ConfigError(f"no run with a checkpoint in {experiment}; train first, or name another --experiment_name")
+            raise ConfigError(
+                f"no run with a checkpoint in {experiment}; train first, or name another --experiment_name"
+            )
         return check_folder(found[-1])
     for folder in (experiment / name, given):
         if folder.is_dir() and checkpoints(folder):
@@ -132,7 +137,9 @@ def load_tensors(path: Path, device: str) -> dict[str, Any]:
     why = damage(written)
     try:
         content = None if why else torch.load(io.BytesIO(written), map_location=device, weights_only=True)
-    except Exception:  # a zip, pickle or tensor error, by how the file is broken; torch's own advice is to load it unsafely
+    except (
+        Exception
+    ):  # a zip, pickle or tensor error, by how the file is broken; torch's own advice is to load it unsafely
         why = "it is damaged, or holds more than tensors and numbers"
     if why:
         raise ConfigError(f"{path} cannot be read as a checkpoint: {why}; {EARLIER}")
@@ -147,7 +154,12 @@ def check_fit(saved: dict[str, torch.Tensor], wanted: dict[str, torch.Tensor], p
         raise ConfigError(f"{path} does not fit this task: the {what} has a memory (RNNModel) {has} and none {lacks}")
     for name in [*wanted, *saved]:
         here, there = wanted.get(name), saved.get(name)
-        if here is None or there is None or here.shape != there.shape or here.is_floating_point() != there.is_floating_point():
+        if (
+            here is None
+            or there is None
+            or here.shape != there.shape
+            or here.is_floating_point() != there.is_floating_point()
+        ):
             shapes = ["missing" if t is None else str(tuple(t.shape)) for t in (there, here)]
             if here is not None and there is not None and here.shape == there.shape:
                 shapes = [str(t.dtype).removeprefix("torch.") for t in (there, here)]

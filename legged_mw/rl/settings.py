@@ -47,11 +47,15 @@ def _check_bound(algorithm: dict[str, Any]) -> None:
         return
     name, rate, bound = (algorithm[key] for key in ("class_name", "learning_rate", "max_learning_rate"))
     if name in spellings(PPO):
-        raise ConfigError(f"algorithm.max_learning_rate: rsl-rl's own {name} goes up to {MAX_RATE:g}; GraphedPPO takes another")
+        raise ConfigError(
+            f"algorithm.max_learning_rate: rsl-rl's own {name} goes up to {MAX_RATE:g}; GraphedPPO takes another"
+        )
     if algorithm["schedule"] == "fixed":
         raise ConfigError(
             f"algorithm.max_learning_rate is {bound:g}, but algorithm.schedule is 'fixed', which has no bound: "
             f"the rate is algorithm.learning_rate throughout. Leave the bound at {MAX_RATE:g}, or take the schedule 'adaptive'"
         )
     if rate > bound:
-        raise ConfigError(f"algorithm.learning_rate is {rate:g}, above algorithm.max_learning_rate, {bound:g}; begin at or below it")
+        raise ConfigError(
+            f"algorithm.learning_rate is {rate:g}, above algorithm.max_learning_rate, {bound:g}; begin at or below it"
+        )

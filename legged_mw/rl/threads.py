@@ -21,7 +21,8 @@ class ThreadChoice:
 
     def __init__(self, few: int, many: int) -> None:
         self.few, self.many = few, many
-        self.settled, self.threads = many, few  # what was chosen; what the next update takes: first the one that cannot be very slow
+        # what was chosen; what the next update takes: first the one that cannot be very slow
+        self.settled, self.threads = many, few
         self._times: dict[int, float] = {}  # threads -> [s] of the last update on as many
         self._warm, self._since, self._patience = False, 0, _PATIENCE
 

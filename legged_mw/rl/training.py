@@ -128,7 +128,9 @@ def _note_others(task: LoadedTask, start: Start) -> None:
             task.update({section: {field: trained.task.name if trained.source.shipped else file}}, where="train")
             print(f"{'teacher' if trained is start.teacher else 'begins with the actor of'}: {file}")
     if start.teacher and (task.train.symmetry.use_data_augmentation or task.train.symmetry.use_mirror_loss):
-        print("symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it again")
+        print(
+            "symmetry is off while a student is distilled, as rsl-rl's distillation has none; PPO from the student has it again"
+        )
 
 
 def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> bool:
@@ -148,16 +150,23 @@ def _announce(task: LoadedTask, device: str, rank: Rank, most: float | None) -> 
     rough = task.to_dict()["terrain"].get("mesh_type", "plane") != "plane"
     slow = "rough ground takes a CPU several times as long as a plane, and wants a GPU"
     plan = (
-        f"{steps:,} steps; {slow}" if rough else f"{runner.max_iterations} iterations, {steps / 1e6:.1f} M steps, about {minutes:.0f} min"
+        f"{steps:,} steps; {slow}"
+        if rough
+        else f"{runner.max_iterations} iterations, {steps / 1e6:.1f} M steps, about {minutes:.0f} min"
     )
-    print(f"{cores} cores: {plan}{f'; --max_time ends it after {most / 60:.3g} min' if most and most < 60 * minutes else ''}", flush=True)
+    print(
+        f"{cores} cores: {plan}{f'; --max_time ends it after {most / 60:.3g} min' if most and most < 60 * minutes else ''}",
+        flush=True,
+    )
     return True
 
 
 def advice_on_rate(task: LoadedTask) -> str:
     """A line where a memory may lose its way on a GPU, as many samples let the adaptive learning rate rise (docs/lab.md, Blind stairs)."""
     algorithm, networks = task.train.algorithm, (task.train.actor, task.train.critic)
-    remembers = any(network.class_name.endswith("RNNModel") for network in networks) and not task.train.distillation.teacher
+    remembers = (
+        any(network.class_name.endswith("RNNModel") for network in networks) and not task.train.distillation.teacher
+    )
     if not remembers or algorithm.schedule == "fixed" or algorithm.max_learning_rate < MAX_RATE:
         return ""
     return "a memory loses its way where the learning rate rises far: --set algorithm.max_learning_rate=1e-3 (docs/training.md, A memory)\n"
@@ -165,7 +174,11 @@ def advice_on_rate(task: LoadedTask) -> str:
 
 def say_compiling(task: LoadedTask, device: str) -> AbstractContextManager[object]:
     """Inside, a line says so if the start waits for kernels."""
-    return device_facts(device).say_compiling() if pick_engine(task.cfg.sim.engine, device) == "mujoco_warp" else nullcontext()
+    return (
+        device_facts(device).say_compiling()
+        if pick_engine(task.cfg.sim.engine, device) == "mujoco_warp"
+        else nullcontext()
+    )
 
 
 def build(task: LoadedTask, start: Start, device: str, eager: bool, check_recordable: Check) -> Any:
@@ -282,15 +295,25 @@ def _lock(start: Start) -> RunLock:
     if (newest := find_checkpoint(start.run, -1)) == start.checkpoint:
         return lock
     lock.release()
-    raise ConfigError(f"{shown(start.run)} has gone on since this began, to {newest.name}: another process trained there; resume it again")
+    raise ConfigError(
+        f"{shown(start.run)} has gone on since this began, to {newest.name}: another process trained there; resume it again"
+    )
 
 
-def _open_run(runner: Runner, task: LoadedTask, start: Start, rank: Rank, held: ExitStack, lock: RunLock | None) -> Path:
+def _open_run(
+    runner: Runner, task: LoadedTask, start: Start, rank: Rank, held: ExitStack, lock: RunLock | None
+) -> Path:
     """The folder that this training writes to, with the config in it; an earlier checkpoint begins a folder of its own.
 
     One for all ranks, made by the first. It has a ``lock`` until ``held`` ends, and is made again if somebody deletes it.
     """
-    folder = [start.run if start.run and lock else new_run(start.experiment, task.train.runner.run_name) if rank.leads else Path()]
+    folder = [
+        start.run
+        if start.run and lock
+        else new_run(start.experiment, task.train.runner.run_name)
+        if rank.leads
+        else Path()
+    ]
 
     def write() -> None:
         nonlocal lock
@@ -342,11 +365,15 @@ def _say_how_it_ended(runner: Runner, task: LoadedTask, folder: Path, rank: Rank
     """Print the last exam and the command that comes next; returns whether the training is finished."""
     if runner.last_exam:
         iteration, figures = runner.last_exam
-        print(f"exam after {iteration} iterations: {', '.join(f'{figure} {value:.3f}' for figure, value in figures.items())}")
+        print(
+            f"exam after {iteration} iterations: {', '.join(f'{figure} {value:.3f}' for figure, value in figures.items())}"
+        )
     flags, plan, done = _flags(task, folder), runner.plan, runner.current_learning_iteration
     if runner.stop and done < plan.last:
         left = f" --max_time {max(1, round(plan.deadline - time.time()))}s" if plan.deadline else ""
-        print(f"stopped: {runner.stop}; go on with\n  {command('train', rank.count)} --resume {flags}{left}", flush=True)
+        print(
+            f"stopped: {runner.stop}; go on with\n  {command('train', rank.count)} --resume {flags}{left}", flush=True
+        )
         return False
     if done < task.train.runner.max_iterations:
         print(f"{done} iterations within --max_time; --resume goes on towards {task.train.runner.max_iterations}")

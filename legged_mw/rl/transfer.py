@@ -21,7 +21,8 @@ from legged_mw.utils.errors import shown
 from legged_mw.utils.task import LoadedTask
 
 TEACHER = "teacher"  # the observation group that it reads, and its folder in a student's run
-_EXPORTED_COUNT = 10**8  # samples that an exported normalizer stands for, as the file does not say [ours: as most have seen]
+# samples that an exported normalizer stands for, as the file does not say [ours: as most have seen]
+_EXPORTED_COUNT = 10**8
 
 
 def adapt(settings: dict[str, Any], cfg: RobotTaskCfgPPO, teacher: dict[str, Any] | None) -> dict[str, Any]:
@@ -34,7 +35,13 @@ def adapt(settings: dict[str, Any], cfg: RobotTaskCfgPPO, teacher: dict[str, Any
     if teacher:
         groups = {"student": settings["obs_groups"]["actor"], "teacher": [TEACHER]}
         algorithm = {name: value for name, value in distillation.items() if name not in ("teacher", "init_std")}
-        settings |= {"student": settings["actor"], "teacher": teacher, "obs_groups": groups, "algorithm": algorithm, "anneal": {}}
+        settings |= {
+            "student": settings["actor"],
+            "teacher": teacher,
+            "obs_groups": groups,
+            "algorithm": algorithm,
+            "anneal": {},
+        }
     return settings
 
 
@@ -68,9 +75,12 @@ def begin_with(model: MLPModel, policy: Trained) -> None:
     """Give ``model`` the actor's parameters; its noise stays its own."""
     path, own = policy.source.checkpoint, model.state_dict()
     if path.suffix == ".onnx" and any(name.startswith(LEARNING_ONLY) for name in own):
-        raise ConfigError(f"{shown(path)} holds the student alone, not the teacher's encoder that it would learn from; name a checkpoint")
+        raise ConfigError(
+            f"{shown(path)} holds the student alone, not the teacher's encoder that it would learn from; name a checkpoint"
+        )
     saved = read_actor(path, model)
-    for name in [name for name in saved if name.endswith("_normalizer._std") and path.suffix == ".onnx"]:  # of observations, of targets
+    # of observations, of targets
+    for name in [name for name in saved if name.endswith("_normalizer._std") and path.suffix == ".onnx"]:
         of = name.removesuffix("_std")
         saved |= {f"{of}_var": saved[name].square(), f"{of}count": torch.full_like(own[f"{of}count"], _EXPORTED_COUNT)}
     model.load_state_dict({**saved, **{name: value for name, value in own.items() if name.startswith("distribution.")}})

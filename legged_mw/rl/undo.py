@@ -23,7 +23,8 @@ class Undo:
         self.columns = [(group, i) for group in stored.keys() for i in range(stored[group][0, 0].numel())]  # noqa: SIM118 (a TensorDict)
         device = learner.storage.rewards.device
         self.undone = torch.zeros((), device=device)  # 1: the last update was
-        self.wrong = torch.zeros(len(self.columns) + 1, device=device)  # 1 where it had such a value: by columns, and last rewards
+        # 1 where it had such a value: by columns, and last rewards
+        self.wrong = torch.zeros(len(self.columns) + 1, device=device)
 
     def _learned(self) -> dict[str, Tensor]:
         """Parameters, normalisers, the optimizer's memory and the learning rates, by name: rsl-rl's own normaliser rebinds its std."""
@@ -52,7 +53,8 @@ class Undo:
         for names, before in self._before:
             kind = [new.pop(name) for name in names]
             states.append((kind, before, _join(kind)))
-        for kind in [list(kind.values()) for kind in _kinds(new)]:  # Adam's memory, of its first step: it begins with zeros
+        # Adam's memory, of its first step: it begins with zeros
+        for kind in [list(kind.values()) for kind in _kinds(new)]:
             states.append((kind, torch.zeros_like(after := _join(kind)), after))
         for _, _, after in states:
             sound = sound & _on(after.isfinite().all(), sound.device)

@@ -43,7 +43,8 @@ def main() -> None:
         show_task(load_task(args.file, say=True), image)
         return
     if args.new:
-        new.targets(args.new, writable(args.out, "--out", folder=True), args.force)  # refused before the page, not after it
+        # refused before the page, not after it
+        new.targets(args.new, writable(args.out, "--out", folder=True), args.force)
     found = draft(file)
     env = as_env(found, file)
     show(env, file.name, image, found)

@@ -37,12 +37,16 @@ def convert(file: Path, frames: Sequence[int] = (), **layout: Any) -> tuple[Moto
         module = torch.jit.load(str(file), map_location="cpu").eval()
     except (RuntimeError, ValueError, OSError) as error:
         reason = str(error).strip().splitlines()[0]
-        raise UserError(f"{file} is no torchscript file, which torch.jit.script(network).save(FILE) writes: {reason}") from None
+        raise UserError(
+            f"{file} is no torchscript file, which torch.jit.script(network).save(FILE) writes: {reason}"
+        ) from None
     found = _layers({name: value.detach().numpy() for name, value in module.state_dict().items()}, file)
     width = (found.recurrent or found.linear)[0][0].shape[1]
     frames = tuple(frames or range(width // 2))
     if width != 2 * len(frames):
-        raise UserError(f"{file.name} takes {width} values a joint, and --frames means {2 * len(frames)}: an error and a speed of each")
+        raise UserError(
+            f"{file.name} takes {width} values a joint, and --frames means {2 * len(frames)}: an error and a speed of each"
+        )
     fed = replace(found, frames=frames, **layout)
     states = _states()
     wanted = _theirs(module, fed, states)
@@ -63,12 +67,18 @@ def _layers(state: dict[str, Any], file: Path) -> MotorNetwork:
     recurrent, linear = [], []
     while ends := [name for name in state if name.endswith(f"weight_ih_l{len(recurrent)}")]:
         prefix, layer = ends[0].removesuffix(f"weight_ih_l{len(recurrent)}"), len(recurrent)
-        recurrent.append(tuple(state[f"{prefix}{name}_l{layer}"] for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh")))
+        recurrent.append(
+            tuple(state[f"{prefix}{name}_l{layer}"] for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"))
+        )
     for name, value in state.items():
         if value.ndim == 2 and "weight_ih_l" not in name and "weight_hh_l" not in name:
-            linear.append((value, state.get(name.removesuffix("weight") + "bias", np.zeros(len(value), dtype=np.float32))))
+            linear.append(
+                (value, state.get(name.removesuffix("weight") + "bias", np.zeros(len(value), dtype=np.float32)))
+            )
     if not linear or len(linear[-1][0]) != 1:
-        raise UserError(f"{file.name} has no last layer of one value, a joint's torque; it has {', '.join(state) or 'no weights'}")
+        raise UserError(
+            f"{file.name} has no last layer of one value, a joint's torque; it has {', '.join(state) or 'no weights'}"
+        )
     return MotorNetwork(recurrent, linear, "elu", (0,))
 
 
@@ -97,7 +107,9 @@ def _fit(network: MotorNetwork, states: Any, wanted: Any) -> tuple[MotorNetwork,
     """``network`` with the scales that a file may have inside of it, too, and what is left as a share of the largest torque."""
 
     def ours(factors: Any) -> tuple[MotorNetwork, Any]:
-        scaled = replace(network, error_scale=network.error_scale * factors[0], speed_scale=network.speed_scale * factors[1])
+        scaled = replace(
+            network, error_scale=network.error_scale * factors[0], speed_scale=network.speed_scale * factors[1]
+        )
         motors = NetworkMotors(scaled, 1, _JOINTS)
         torques = np.array([motors.torque(error[None], speed[None])[0] for error, speed in states])
         return scaled, torques
@@ -112,7 +124,10 @@ def _fit(network: MotorNetwork, states: Any, wanted: Any) -> tuple[MotorNetwork,
     exact = float(np.abs(ours(np.ones(2))[1] - wanted).max()) / largest
     if exact <= _TOLERANCE:
         return network, exact
-    best = min((np.array(logs) for logs in product(np.log([0.03, 0.1, 0.3, 1.0, 3.0, 10.0]), repeat=2)), key=lambda x: _norm(left(x)[1]))
+    best = min(
+        (np.array(logs) for logs in product(np.log([0.03, 0.1, 0.3, 1.0, 3.0, 10.0]), repeat=2)),
+        key=lambda x: _norm(left(x)[1]),
+    )
     for _ in range(30):  # Gauss and Newton, with half a step where a whole one is worse
         here = left(best)[1]
         slopes = np.stack([(left(best + step)[1] - here) / 1e-2 for step in 1e-2 * np.eye(2)], axis=1)
@@ -131,9 +146,15 @@ def main(argv: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path, help="the torchscript file")
     parser.add_argument("out", type=Path, help="the .npz to write")
-    parser.add_argument("--frames", type=int, nargs="+", default=None, help="ages in simulation steps, 0 is now (default: 0 1 2 ...)")
+    parser.add_argument(
+        "--frames", type=int, nargs="+", default=None, help="ages in simulation steps, 0 is now (default: 0 1 2 ...)"
+    )
     parser.add_argument("--in_turns", action="store_true", help="error, speed, error, speed ...; else errors first")
-    for name, what in (("error", "of target - angle [rad]"), ("speed", "of the speed [rad/s]"), ("torque", "of what comes out")):
+    for name, what in (
+        ("error", "of target - angle [rad]"),
+        ("speed", "of the speed [rad/s]"),
+        ("torque", "of what comes out"),
+    ):
         parser.add_argument(f"--{name}_scale", type=number(float), default=1.0, help=f"factor {what}")
     args = parser.parse_args(argv)
     writable(str(args.out), "OUT").parent.mkdir(parents=True, exist_ok=True)

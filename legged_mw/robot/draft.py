@@ -32,7 +32,8 @@ from legged_mw.sim.vendor import read_robot
 from legged_mw.utils.config import ConfigError
 
 LOW = 0.33  # [m] a root that stands lower than this cannot swing its feet as high as others
-FIRMNESS = (1.0, 1.25, 1.5, 2.0)  # times the suggested gains: beyond 2 it is another robot than vendors publish gains for [ours]
+# times the suggested gains: beyond 2 it is another robot than vendors publish gains for [ours]
+FIRMNESS = (1.0, 1.25, 1.5, 2.0)
 CLEARANCE = 0.003  # [m] above the ground at reset, so that nothing begins inside of it
 
 
@@ -63,7 +64,9 @@ def draft(file: Path) -> Draft:
     if bends is not None:
         pose, rest = bends, stand_as_statue(robot, bends, place)
     joints = what_joints_bear(robot, mass_matrices(robot, pose), rest.torque)
-    how = "all joints at 0, or at the nearest end of their range" if bends is None else "knees bent, feet under the hips"
+    how = (
+        "all joints at 0, or at the nearest end of their range" if bends is None else "knees bent, feet under the hips"
+    )
     how = "the file's keyframe" if from_file else how
     pose = (np.round(pose, 4) + 0.0).tolist()  # no -0.0
     height = standing_height(robot, [geom for foot in feet for geom in foot.geoms], pose)
@@ -77,9 +80,12 @@ def draft(file: Path) -> Draft:
     guessed = [
         f"pose: {how}",
         f"feet: {', '.join(foot.name for foot in feet)}, the lowest ends of limbs",
-        "gains: as suggested below" if firmness == 1.0 else f"gains: {firmness:g} times what is suggested below, to stand on its servos",
+        "gains: as suggested below"
+        if firmness == 1.0
+        else f"gains: {firmness:g} times what is suggested below, to stand on its servos",
     ]
-    more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]  # a bare robot's one site is its IMU
+    # a bare robot's one site is its IMU
+    more = [line for line in robot.overrides if line.startswith(("fused into ", "site "))]
     return Draft(robot, pose, place, joints, gains, feet, guessed, how, [*read.notes, *more])
 
 
@@ -94,7 +100,10 @@ def _firm(
         gains = suggest(joints, float(model.opt.timestep), firmness)
         model.actuator_gainprm[:, 0], model.dof_damping[6:] = [gain.kp for gain in gains], [gain.kd for gain in gains]
         model.actuator_biasprm[:, 1] = -model.actuator_gainprm[:, 0]
-        if stand_on_servos(replace(robot, physics=model), np.array(pose), place, RobotTaskCfg.control.decimation).end == "stands":
+        if (
+            stand_on_servos(replace(robot, physics=model), np.array(pose), place, RobotTaskCfg.control.decimation).end
+            == "stands"
+        ):
             return firmness, gains
     return 1.0, suggest(joints, float(model.opt.timestep))
 
@@ -138,7 +147,9 @@ def values(found: Draft) -> dict[str, dict[str, Any]]:
     asset: dict[str, Any] = {"foot_names": [foot.name for foot in found.feet]}
     if parts := {foot.name: list(foot.geoms) for foot in found.feet if not foot.known}:
         asset["foot_geoms"] = parts
-    if said := {name: speed for name, speed in zip(names, found.robot.speed_limits, strict=True) if math.isfinite(speed)}:
+    if said := {
+        name: speed for name, speed in zip(names, found.robot.speed_limits, strict=True) if math.isfinite(speed)
+    }:
         asset["joint_speed_limits"] = table([*said.values()], names) if len(said) == len(names) else said
     asset["colliders"] = [name for foot in found.feet for name in ([foot.name] if foot.known else foot.geoms)]
     chosen: dict[str, dict[str, Any]] = {

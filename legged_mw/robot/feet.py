@@ -16,7 +16,8 @@ from legged_mw.sim.pose import posed
 from legged_mw.sim.shapes import surfaces
 from legged_mw.sim.tables import family
 
-_SAME, _SAME_SHARE = 0.03, 0.08  # [m], and of the robot's height: ends of limbs that are so much higher than the lowest are feet too
+# [m], and of the robot's height: ends of limbs that are so much higher than the lowest are feet too
+_SAME, _SAME_SHARE = 0.03, 0.08
 _SOLE = 0.015  # [m] parts of a foot that are so much higher than its lowest are of its sole
 
 
@@ -38,12 +39,16 @@ def guess_feet(robot: RobotModel, qpos: NDArray[np.float64]) -> list[Foot]:
         geom = model.geom(name)
         of_body.setdefault(int(geom.bodyid[0]), {})[geom.id] = float(points[:, 2].min())
     if not of_body:
-        raise ModelError("no part that ends a limb collides, so that no feet can be guessed; give the feet colliding geoms")
+        raise ModelError(
+            "no part that ends a limb collides, so that no feet can be guessed; give the feet colliding geoms"
+        )
     lowest = min(min(these.values()) for these in of_body.values())
     near = lowest + max(_SAME, _SAME_SHARE * (float(qpos[2]) - lowest))
     soles = {body: _sole(model, these) for body, these in of_body.items() if min(these.values()) <= near}
     for body, these in of_body.items():  # a leg that the pose lifts has the same foot
-        same = [other for other in soles if family(model.body(other).name) == family(model.body(body).name or str(body))]
+        same = [
+            other for other in soles if family(model.body(other).name) == family(model.body(body).name or str(body))
+        ]
         if body not in soles and same and len(of_body[same[0]]) == len(these):
             soles[body] = [geom for geom, like in zip(these, of_body[same[0]], strict=True) if like in soles[same[0]]]
     return [_foot(robot, body, soles[body]) for body in sorted(soles)]
@@ -58,7 +63,8 @@ def _sole(model: mujoco.MjModel, low: dict[int, float]) -> list[int]:
 def _foot(robot: RobotModel, body: int, geoms: list[int]) -> Foot:
     """A name for these geoms of ``body``."""
     names = tuple(robot.physics.geom(geom).name for geom in geoms)
-    parts = [part for part, geoms in robot.names.bodies.items() if {*geoms} == {*names}]  # also such as are fused in what is stepped
+    # also such as are fused in what is stepped
+    parts = [part for part, geoms in robot.names.bodies.items() if {*geoms} == {*names}]
     if parts:
         return Foot(parts[-1], names, True)
     return Foot(names[0], names, True) if len(names) == 1 else Foot(robot.physics.body(body).name, names, False)

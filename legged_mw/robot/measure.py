@@ -122,7 +122,9 @@ class Health:
     room: Room  # for contacts and constraint rows on mujoco-warp
 
 
-def measure(robot: RobotModel, pose: Sequence[float], place: Sequence[float], decimation: int = 5, rough: bool = False) -> Health:
+def measure(
+    robot: RobotModel, pose: Sequence[float], place: Sequence[float], decimation: int = 5, rough: bool = False
+) -> Health:
     """The health of ``robot`` on level ground, in ``pose`` (D,) [rad], with its root at ``place`` (3,) [m], upright.
 
     Room is counted for ``rough`` ground, if so.
@@ -239,7 +241,14 @@ def what_joints_bear(robot: RobotModel, matrices: dict[str, FloatArray], torque:
         low, high = robot.joint_range[i]
         rows.append(
             Joint(
-                *(name, float(low), float(high), float(robot.effort_range[i, 1]), robot.speed_limits[i], float(model.dof_armature[dof])),
+                *(
+                    name,
+                    float(low),
+                    float(high),
+                    float(robot.effort_range[i, 1]),
+                    robot.speed_limits[i],
+                    float(model.dof_armature[dof]),
+                ),
                 *(robot.tables["`stiffness`"][i], robot.tables["`damping`"][i]),
                 *(float(free[pose][dof]), pose, float(matrices["default"][dof, dof]), float(torque[i])),
             )
@@ -260,7 +269,9 @@ def fastest_mode(robot: RobotModel, matrix: FloatArray, implicit: bool) -> Mode:
     worst = int(np.abs(values).argmax())
     share = np.abs(vectors[size + 6 :, worst])
     order = np.argsort(-share)[:2]
-    return Mode(float(abs(values[worst])), tuple(robot.joint_names[i] for i in order if share[i] > 0.3 * share[order[0]]))
+    return Mode(
+        float(abs(values[worst])), tuple(robot.joint_names[i] for i in order if share[i] > 0.3 * share[order[0]])
+    )
 
 
 def stand_on_servos(robot: RobotModel, pose: FloatArray, place: Sequence[float], decimation: int) -> Stand:

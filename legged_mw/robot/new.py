@@ -58,7 +58,9 @@ def targets(name: str, folder: Path, force: bool = False) -> tuple[Path, Path]:
     robot, config = folder / f"{name}.xml", folder / f"{name}_flat.py"
     there = [path for path in (robot, config) if path.exists()]
     if there and not force:
-        raise UserError(f"{' and '.join(shown(path) for path in there)} exists; say --force to overwrite, or another name or --out DIR")
+        raise UserError(
+            f"{' and '.join(shown(path) for path in there)} exists; say --force to overwrite, or another name or --out DIR"
+        )
     return robot, config
 
 
@@ -74,7 +76,9 @@ def write(found: Draft, file: Path, name: str, folder: Path, force: bool = False
             robot.write_text(as_mjcf(name, file, folder))
         config.write_text(config_text(found, file, name, mirrors))
     except OSError as error:
-        raise UserError(f"cannot write to {shown(folder)}: {error.strerror or os.strerror(error.errno or 0)}; say --out DIR") from None
+        raise UserError(
+            f"cannot write to {shown(folder)}: {error.strerror or os.strerror(error.errno or 0)}; say --out DIR"
+        ) from None
     return [robot, config]
 
 
@@ -85,7 +89,9 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
     title = "".join(part.capitalize() for part in name.split("_"))
     base, train = (parent.__name__ for parent in parents(found))
     names = {"module": parents(found)[0].__module__, "cfg": base, "train": train}
-    lines = [_HEAD.format(title=name, joints=len(found.joints), legs=legs, file=file.name, name=title, **names).rstrip("\n")]
+    lines = [
+        _HEAD.format(title=name, joints=len(found.joints), legs=legs, file=file.name, name=title, **names).rstrip("\n")
+    ]
     sections = values(found)
     sections["asset"] = {"file": f"{name}.xml", **sections["asset"]}
     comments = {**_COMMENTS, "default_joint_angles": f"[rad] LOOK: {found.pose_from}"}
@@ -95,7 +101,9 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
             if field in ("ranges", "scales"):
                 lines += [""] * (field != next(iter(fields)))
                 lines += [f"        class {field}({base}.{section}.{field}):"]
-                lines += [line for inner, span in value.items() for line in _field(inner, span, comments.get(inner, ""), 12)]
+                lines += [
+                    line for inner, span in value.items() for line in _field(inner, span, comments.get(inner, ""), 12)
+                ]
             else:
                 lines += _field(field, value, comments.get(field, ""), 8)
         if section == "asset":
@@ -104,11 +112,19 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
     lines += ["", f"class {title}FlatCfgPPO({train}):"]
     lines += [f"    class runner({train}.runner):", "        max_iterations = 1500"]
     if feet == 2:
-        lines += ["", f"    class actor({train}.actor):", f"        class distribution_cfg({train}.actor.distribution_cfg):"]
+        lines += [
+            "",
+            f"    class actor({train}.actor):",
+            f"        class distribution_cfg({train}.actor.distribution_cfg):",
+        ]
         lines += ["            init_std = 0.6  # at 1.0 it does not learn to follow on a few cores [ours: docs/lab.md]"]
     if mirrors != parents(found)[1].symmetry.use_data_augmentation:
         comment = f"left and right are {'alike' if mirrors else 'not alike'}"
-        lines += ["", f"    class symmetry({train}.symmetry):", f"        use_data_augmentation = {mirrors}  # {comment}"]
+        lines += [
+            "",
+            f"    class symmetry({train}.symmetry):",
+            f"        use_data_augmentation = {mirrors}  # {comment}",
+        ]
     lines += ["", ""]
     return "\n".join([*lines, f"TASK = Task(LeggedRobot, {title}FlatCfg, {title}FlatCfgPPO)", ""])
 
@@ -118,18 +134,29 @@ def _force_limits(found: Draft) -> list[str]:
     endless = [joint.name for joint in found.joints if joint.effort == float("inf")]
     if not endless:
         return []
-    some = "all joints" if len(endless) == len(found.joints) else f"{endless[0]} and {len(endless) - 1} more" if endless[1:] else endless[0]
+    some = (
+        "all joints"
+        if len(endless) == len(found.joints)
+        else f"{endless[0]} and {len(endless) - 1} more"
+        if endless[1:]
+        else endless[0]
+    )
     return [f'        # effort = {{"": 30.0}}  # [N m] LOOK: the file has no force limit for {some}; write yours']
 
 
 def _field(name: str, value: Any, comment: str, indent: int) -> list[str]:
     """``name = value  # comment``, in several lines where it is longer than a line may be."""
     space, note = " " * indent, f"  # {comment}" if comment else ""
-    text = str(value) if isinstance(value, bool) else json.dumps(value)  # of the others as Python has them, in ruff's quotes
+    # of the others as Python has them, in ruff's quotes
+    text = str(value) if isinstance(value, bool) else json.dumps(value)
     line = f"{space}{name} = {text}"
     if len(line + note) <= WIDTH:
         return [line + note]
     opening, closing = ("{", "}") if isinstance(value, dict) else ("[", "]")
     parts = json.dumps(value)[1:-1].replace(": ", ":\0") + ","  # a key and its number stay in one line
     lines = textwrap.wrap(parts, WIDTH - indent - 4, break_long_words=False, break_on_hyphens=False)
-    return [f"{space}{name} = {opening}{note}", *(f"{space}    {line}".replace("\0", " ") for line in lines), space + closing]
+    return [
+        f"{space}{name} = {opening}{note}",
+        *(f"{space}    {line}".replace("\0", " ") for line in lines),
+        space + closing,
+    ]

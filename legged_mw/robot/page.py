@@ -19,7 +19,21 @@ from legged_mw.utils.task import LoadedTask
 
 _GROWS = 1e-6  # more than 1 by so much, a mode grows; less is rounding of the root's
 _TIP = 0.3  # [rad] a joint that sags more than this does not stand as its default pose says
-_HEAD = ("joint", "inertia", "pose", "dt kd/I", "dt sqrt(kp/I)", "ratio", "sag", "range [rad]", "effort", "speed", "kp", "kd", "suggested")
+_HEAD = (
+    "joint",
+    "inertia",
+    "pose",
+    "dt kd/I",
+    "dt sqrt(kp/I)",
+    "ratio",
+    "sag",
+    "range [rad]",
+    "effort",
+    "speed",
+    "kp",
+    "kd",
+    "suggested",
+)
 
 
 def page(health: Health, title: str, guessed: Sequence[str] = (), changed: Sequence[str] = ()) -> str:
@@ -30,7 +44,9 @@ def page(health: Health, title: str, guessed: Sequence[str] = (), changed: Seque
     if changed:
         lines += ["what was dropped, added or changed in the file", *(f"  {line}" for line in changed)]
     found = [*faults(health), *doubtful(health, gains)]
-    return "\n".join([*lines, "what to look at", *(f"  - {line}" for line in found or ["nothing: all numbers are within bounds"])])
+    return "\n".join(
+        [*lines, "what to look at", *(f"  - {line}" for line in found or ["nothing: all numbers are within bounds"])]
+    )
 
 
 _LEGEND = (
@@ -83,7 +99,10 @@ def _table(health: Health, gains: Sequence[Gains]) -> list[str]:
     widths = [max(len(row[column]) for row in rows) for column in range(len(_HEAD))]
     return [
         "  "
-        + "  ".join(cell.ljust(width) if i == 0 else cell.rjust(width) for i, (cell, width) in enumerate(zip(row, widths, strict=True)))
+        + "  ".join(
+            cell.ljust(width) if i == 0 else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(row, widths, strict=True))
+        )
         for row in rows
     ]
 
@@ -96,7 +115,10 @@ def _row(joint: Joint, gain: Gains, health: Health) -> tuple[str, ...]:
         *(f"{mark}{joint.damping_step(health.dt):.2f}", f"{joint.stiffness_step(health.dt):.2f}"),
         *(f"{joint.damping_ratio():.2f}", f"{joint.sag():.3f}"),
         f"{joint.low:.2f} {joint.high:.2f}" if math.isfinite(joint.low) else "none",
-        *(f"{joint.effort:g}" if math.isfinite(joint.effort) else "none", f"{joint.speed:g}" if math.isfinite(joint.speed) else "?"),
+        *(
+            f"{joint.effort:g}" if math.isfinite(joint.effort) else "none",
+            f"{joint.speed:g}" if math.isfinite(joint.speed) else "?",
+        ),
         *(f"{joint.kp:g}", f"{joint.kd:g}", f"{gain.kp:g} {gain.kd:g}{' cut' if gain.cut else ''}"),
     )
 
@@ -114,11 +136,17 @@ def faults(health: Health) -> list[str]:
             "or lower sim.dt, or set sim.integrator to implicitfast"
         )
     elif health.mode.growth > 1.0 + _GROWS:
-        lines.append(f"no servo is unstable alone, but all together are ({', '.join(health.mode.joints)}): lower sim.dt or the gains")
+        lines.append(
+            f"no servo is unstable alone, but all together are ({', '.join(health.mode.joints)}): lower sim.dt or the gains"
+        )
     if weak := [joint for joint in joints if abs(joint.torque) > joint.effort]:
-        lines.append(f"to rest in this pose takes more than the effort of {_those(weak)}: choose another init_state.default_joint_angles")
+        lines.append(
+            f"to rest in this pose takes more than the effort of {_those(weak)}: choose another init_state.default_joint_angles"
+        )
     if soft := [joint for joint in joints if joint.sag() > _TIP]:
-        lines.append(f"sags by more than {_TIP:g} rad at rest: {_those(soft)}: raise control.stiffness, or choose another pose")
+        lines.append(
+            f"sags by more than {_TIP:g} rad at rest: {_those(soft)}: raise control.stiffness, or choose another pose"
+        )
     return lines
 
 
@@ -135,7 +163,9 @@ def doubtful(health: Health, gains: Sequence[Gains]) -> list[str]:
             "the gear ratio squared; write that into asset.armature"
         )
     if endless := [joint for joint in joints if not math.isfinite(joint.effort)]:
-        lines.append(f"no force limit: {_those(endless)}: say asset.effort, or they are trained with torques that no motor has")
+        lines.append(
+            f"no force limit: {_those(endless)}: say asset.effort, or they are trained with torques that no motor has"
+        )
     if health.rest.toppled or health.margin < 0.0:
         lines.append("the centre of mass is not over the feet: choose another init_state.default_joint_angles")
     if health.stand.end != "stands":

@@ -55,7 +55,8 @@ class Label(NamedTuple):
     text: str
     place: FloatArray  # (3,) [m, world]
     rgb: Rgb
-    arrows: tuple[tuple[FloatArray, Rgb], ...] = ()  # ends (3,) [m, world]; drawn over the picture, else the robot hides them
+    # ends (3,) [m, world]; drawn over the picture, else the robot hides them
+    arrows: tuple[tuple[FloatArray, Rgb], ...] = ()
 
 
 def draw(path: Path, robot: RobotModel, qpos: FloatArray, feet: Mapping[str, Sequence[str]], title: str) -> None:
@@ -93,7 +94,10 @@ class _Picture:
         """The robot from one side, with the names of the joints that are on the near one (of the first view, on the far one)."""
         camera, model = mujoco.MjvCamera(), self.posed.model
         camera.type, camera.azimuth, camera.elevation = mujoco.mjtCamera.mjCAMERA_FREE, azimuth, elevation
-        camera.lookat[:], camera.distance = self.middle, 0.5 * self.size / math.tan(math.radians(model.vis.global_.fovy) / 2) / FILL
+        camera.lookat[:], camera.distance = (
+            self.middle,
+            0.5 * self.size / math.tan(math.radians(model.vis.global_.fovy) / 2) / FILL,
+        )
         option = mujoco.MjvOption()
         option.geomgroup[:] = 1
         option.sitegroup[:] = 0
@@ -114,7 +118,11 @@ class _Picture:
     def _paint(self) -> None:
         """Colliders orange, all else of the robot half transparent; what is neither is hidden."""
         model = self.posed.model
-        touching = {self.robot.physics.geom(g).name for g in range(self.robot.physics.ngeom) if self.robot.physics.geom_conaffinity[g]}
+        touching = {
+            self.robot.physics.geom(g).name
+            for g in range(self.robot.physics.ngeom)
+            if self.robot.physics.geom_conaffinity[g]
+        }
         for geom in np.flatnonzero(model.body_weldid[model.geom_bodyid]):
             collides = model.geom(geom).name in touching
             if collides:
@@ -194,7 +202,9 @@ class _Picture:
     def _project(self, place: FloatArray, camera: mujoco.MjvCamera) -> tuple[float, float]:
         """Pixel (x from the left, y from the top) of ``place`` (3,) [m]."""
         azimuth, elevation = math.radians(camera.azimuth), math.radians(camera.elevation)
-        forward = np.array([math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)])
+        forward = np.array(
+            [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
+        )
         right = np.array([math.sin(azimuth), -math.cos(azimuth), 0.0])
         away = place - (np.array(camera.lookat) - camera.distance * forward)
         scale = 0.5 * HEIGHT / math.tan(math.radians(self.posed.model.vis.global_.fovy) / 2) / float(away @ forward)
@@ -230,7 +240,9 @@ def _text(context: mujoco.MjrContext, text: str, x: float, y: float, rgb: Rgb) -
         mujoco.mjr_text(mujoco.mjtFont.mjFONT_NORMAL, text, context, (x + shift) / WIDTH, down, *colour)
 
 
-def _line(frame: NDArray[np.uint8], start: tuple[float, float], end: tuple[float, float], rgb: Rgb, wide: int = 1) -> None:
+def _line(
+    frame: NDArray[np.uint8], start: tuple[float, float], end: tuple[float, float], rgb: Rgb, wide: int = 1
+) -> None:
     """A line, half transparent, between two pixels; ``wide`` [px]."""
     steps = max(2, int(np.hypot(end[0] - start[0], end[1] - start[1])))
     x, y = (np.linspace(a, b, steps).round().astype(int) for a, b in zip(start, end, strict=True))

@@ -13,7 +13,8 @@ import torch
 
 GRAPHS_SINCE = (12, 4)  # CUDA of the driver: below, mujoco-warp warns that recording may be unreliable
 _OTHERS = 1.0  # GiB on a GPU: a desktop takes less, a training more
-_WAITS = (6.0, 6.0, 12.0)  # [s] after which compiled kernels are looked for; a start that compiles none is over before the first
+# [s] after which compiled kernels are looked for; a start that compiles none is over before the first
+_WAITS = (6.0, 6.0, 12.0)
 
 
 class DeviceFacts(NamedTuple):
@@ -32,7 +33,9 @@ class DeviceFacts(NamedTuple):
         """A line a reason for which the first minute, or all of the training, is slow here."""
         lines = []
         if not self.compiled:
-            lines.append("some 50 modules of kernels are compiled at this first start, a minute or two; `legged-mw warm` does it ahead")
+            lines.append(
+                "some 50 modules of kernels are compiled at this first start, a minute or two; `legged-mw warm` does it ahead"
+            )
         if self.memory and not self.pool:
             lines.append("this GPU has no memory pool: nothing can be recorded, and a step takes several times as long")
         if self.cuda and self.cuda < GRAPHS_SINCE:
@@ -58,7 +61,9 @@ class DeviceFacts(NamedTuple):
                 if over.wait(seconds):
                     return
                 if count := self.compiled_since(begun):
-                    say(f"kernels that this task needs are being compiled, {count} modules so far; the next start has them")
+                    say(
+                        f"kernels that this task needs are being compiled, {count} modules so far; the next start has them"
+                    )
                     return
 
         thread = Thread(target=watch, daemon=True)

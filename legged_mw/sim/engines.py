@@ -28,7 +28,9 @@ def pick_engine(asked: str, device: str) -> str:
     if asked == "auto":
         return "mujoco" if device == "cpu" else "mujoco_warp"
     if asked == "mujoco" and device != "cpu":
-        raise EngineError(f"`engine` = mujoco steps on a CPU, and the device is {device}; take the device cpu, or the engine mujoco_warp")
+        raise EngineError(
+            f"`engine` = mujoco steps on a CPU, and the device is {device}; take the device cpu, or the engine mujoco_warp"
+        )
     return asked
 
 
@@ -62,7 +64,9 @@ def make_simulation(
         nconmax, njmax = nconmax or counted.contacts, njmax or counted.rows
         world += 4 * (njmax * (model.nv + 10) + nconmax * 30)
         room = f" with `nconmax` = {nconmax}, `njmax` = {njmax}"
-    require_memory(num_envs * world, device, f"`num_envs` = {num_envs}", f"a world takes {in_bytes(world)}{room}; take fewer")
+    require_memory(
+        num_envs * world, device, f"`num_envs` = {num_envs}", f"a world takes {in_bytes(world)}{room}; take fewer"
+    )
     # each engine is imported where it steps: importing warp takes a second
     if kind == "mujoco":
         from legged_mw.sim.mujoco_engine import MujocoSimulation
@@ -70,4 +74,6 @@ def make_simulation(
         return MujocoSimulation(model, num_envs, threads=threads, world_fields=world_fields)
     from legged_mw.sim.warp_engine import WarpSimulation
 
-    return WarpSimulation(model, num_envs, device, nconmax=nconmax, njmax=njmax, world_fields=world_fields, terrain=terrain, eager=eager)
+    return WarpSimulation(
+        model, num_envs, device, nconmax=nconmax, njmax=njmax, world_fields=world_fields, terrain=terrain, eager=eager
+    )

@@ -79,7 +79,9 @@ class Kernel:
         wp.load_module(self._kernel.module, device=self._device, block_dim=BLOCK)
 
     def __call__(self) -> None:
-        wp.launch(self._kernel, dim=self._worlds * self._lanes, inputs=[self._table], device=self._device, block_dim=BLOCK)
+        wp.launch(
+            self._kernel, dim=self._worlds * self._lanes, inputs=[self._table], device=self._device, block_dim=BLOCK
+        )
 
 
 def _body(table: wp.array(dtype=wp.uint64), thread: int) -> None: ...
@@ -243,11 +245,22 @@ def _join_sums(nodes: Sequence[Node]) -> list[Node]:
     joined = list[Node]()
     for node in nodes:
         total = joined[-1] if joined else node
-        if node.name == "add" and total.name == "sum" and node.func._schema.is_mutable and not node.kwargs and len(node.args) == 2:
+        if (
+            node.name == "add"
+            and total.name == "sum"
+            and node.func._schema.is_mutable
+            and not node.kwargs
+            and len(node.args) == 2
+        ):
             rows, dims = total.args[0], [*total.args[1]] if len(total.args) > 1 and total.args[1] else []
             over_worlds = len(total.args) < 3 and (dims == [0] or (not dims and rows.dim() == 1))
             unread = sum(view.block == total.writes[0].block for each in nodes for view in each.reads) == 1
-            if unread and over_worlds and node.args[1] is total.outs[0] and total.writes[0].shape == node.writes[0].shape:
+            if (
+                unread
+                and over_worlds
+                and node.args[1] is total.outs[0]
+                and total.writes[0].shape == node.writes[0].shape
+            ):
                 joined[-1] = Node(ADD_ROWS, (node.args[0], rows), {}, (), (total.reads[0], node.writes[0]), node.writes)
                 continue
         joined.append(node)
@@ -311,7 +324,9 @@ class _Rows:
             self._pitches[block] = {-1}
             self._written.add(block)
             return True
-        if code.write.pitch == 0 and (block in self._pitches or any(access.view.block == block for access in code.reads)):
+        if code.write.pitch == 0 and (
+            block in self._pitches or any(access.view.block == block for access in code.reads)
+        ):
             return False
         reached = {block: {self._row(code.write)}}
         for access in code.reads:
@@ -340,7 +355,9 @@ def _replay(node: Node) -> None:
     """Do again what the node did, to the same memory."""
     if node.func is ADD_ROWS:
         ADD_ROWS(*node.args)
-    elif node.func.overloadpacket in (torch.ops.aten.rand, torch.ops.aten.rand_like) and not node.kwargs.get("generator"):
+    elif node.func.overloadpacket in (torch.ops.aten.rand, torch.ops.aten.rand_like) and not node.kwargs.get(
+        "generator"
+    ):
         node.outs[0].uniform_()
     elif node.name.startswith(("empty", "new_empty")):
         pass

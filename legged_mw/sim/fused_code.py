@@ -57,7 +57,20 @@ _THREE = {
     "lerp": "({c} < 0.5f ? {a} + {c} * ({b} - {a}) : {b} - ({b} - {a}) * (1.0f - {c}))",
 }  # fmt: skip
 _COPIES = {"copy", "clone", "to_copy", "to"}
-_COMPARING = {"eq", "ne", "lt", "le", "gt", "ge", "isnan", "isfinite", "logical_and", "logical_or", "logical_not", "logical_xor"}
+_COMPARING = {
+    "eq",
+    "ne",
+    "lt",
+    "le",
+    "gt",
+    "ge",
+    "isnan",
+    "isfinite",
+    "logical_and",
+    "logical_or",
+    "logical_not",
+    "logical_xor",
+}
 _FLOATS = {name for name, text in {**_ONE, **_TWO, **_THREE}.items() if "f(" in text or "." in text}  # only of float32
 _CONSTANTS = {"zeros_like": 0, "zeros": 0, "zero": 0, "new_zeros": 0, "ones_like": 1, "ones": 1, "new_ones": 1}
 _REDUCTIONS = {  # name -> start, step from the sum so far and a value
@@ -99,7 +112,9 @@ class Writer(Lines):
         index = self._index(source.shape)
         self._reads.append(self._access(source, source.shape))
         value = f"float a = (float){self._at(source, source.strides, index)};"
-        lines = self._loops(source.shape, index, [value, f"if (a != 0) ADD({self._at(out, out.strides, index[1:])}, a);"])
+        lines = self._loops(
+            source.shape, index, [value, f"if (a != 0) ADD({self._at(out, out.strides, index[1:])}, a);"]
+        )
         return Code(["{", *lines, "}", "SYNC"], self._reads, Access(out, -1, 0, 0))
 
     # ---- operations ------------------------------------------------------------------------------------------------------
@@ -171,15 +186,20 @@ class Writer(Lines):
         if isinstance(exponent, Tensor) or self._out.dtype != torch.float32 or not isinstance(x, Tensor):
             raise Unfit
         a = self._value(x, self._out.shape, index := self._index(self._out.shape), torch.float32)
-        return self._store(self._out.shape, index, f"{a} * {a}" if exponent == 2 else f"powf({a}, {float(exponent)!r}f)", [x])
+        return self._store(
+            self._out.shape, index, f"{a} * {a}" if exponent == 2 else f"powf({a}, {float(exponent)!r}f)", [x]
+        )
 
-    def _emit_nan_to_num(self, x: Tensor, nan: Any = None, posinf: Any = None, neginf: Any = None, **more: Any) -> list[str]:
+    def _emit_nan_to_num(
+        self, x: Tensor, nan: Any = None, posinf: Any = None, neginf: Any = None, **more: Any
+    ) -> list[str]:
         shape, index = self._out.shape, self._index(self._out.shape)
         if self._out.dtype != torch.float32:
             raise Unfit
         a, top = self._value(x, shape, index, torch.float32), torch.finfo(torch.float32).max
         most, least = (
-            self._value(v, shape, index, torch.float32) for v in (top if posinf is None else posinf, -top if neginf is None else neginf)
+            self._value(v, shape, index, torch.float32)
+            for v in (top if posinf is None else posinf, -top if neginf is None else neginf)
         )
         zero = self._value(nan or 0.0, shape, index, torch.float32)
         return self._store(shape, index, f"({a} != {a} ? {zero} : FINITE({a}) ? {a} : {a} > 0 ? {most} : {least})", [x])
@@ -203,7 +223,10 @@ class Writer(Lines):
         shift = -sum(b * s for b, s in zip(before, view.strides, strict=True))
         element = self._at(view, view.strides, index, shift)
         return self._store(
-            shape, index, f"(({' && '.join(inside)}) ? {element} : {self._value(value, shape, index, self._out.dtype)})", [x]
+            shape,
+            index,
+            f"(({' && '.join(inside)}) ? {element} : {self._value(value, shape, index, self._out.dtype)})",
+            [x],
         )
 
     def _emit_pad(self, x: Tensor, pad: Sequence[int], mode: str = "constant", value: Any = None) -> list[str]:
@@ -218,7 +241,9 @@ class Writer(Lines):
             raise Unfit
         index = self._index(view.shape)
         self._reads.append(self._access(view, view.shape))
-        return self._loops(view.shape, index, [f"{self._at(self._out, strides, index)} = {self._at(view, view.strides, index)};"])
+        return self._loops(
+            view.shape, index, [f"{self._at(self._out, strides, index)} = {self._at(view, view.strides, index)};"]
+        )
 
     _emit_reshape = _emit_unsafe_view = _emit_flatten
 
@@ -228,7 +253,9 @@ class Writer(Lines):
         dims = args[2 if name == "linalg_vector_norm" else 1]
         dims = range(x.dim()) if dims is None or dims == [] else [dims] if isinstance(dims, int) else dims
         dims = {d % max(x.dim(), 1) for d in dims}
-        if (not self._shared and (0 in dims or x.shape[0] != self._worlds)) or (name == "linalg_vector_norm" and args[1] != 2):
+        if (not self._shared and (0 in dims or x.shape[0] != self._worlds)) or (
+            name == "linalg_vector_norm" and args[1] != 2
+        ):
             raise Unfit
         if (self._shared and math.prod(x.shape) > SMALL) or node.kwargs.get("dtype") not in (None, self._out.dtype):
             raise Unfit
@@ -258,7 +285,9 @@ class Writer(Lines):
             self._reads.append(self._access(view, view.shape))
             index, offset = self._index(view.shape), start * self._out.strides[dim]
             to = self._at(self._out, self._out.strides, index, offset)
-            lines += self._loops(view.shape, index, [f"{to} = ({TYPES[self._out.dtype]}){self._at(view, view.strides, index)};"])
+            lines += self._loops(
+                view.shape, index, [f"{to} = ({TYPES[self._out.dtype]}){self._at(view, view.strides, index)};"]
+            )
             start += view.shape[dim]
         if any(self._view(tensor).block == self._out.block for tensor in tensors if tensor.numel()):
             raise Unfit
@@ -303,7 +332,11 @@ class Writer(Lines):
     def _emit_index(self, x: Tensor, indices: Sequence[Tensor | None]) -> list[str]:
         shape = self._out.shape
         used = [d for d, i in enumerate(indices) if i is not None]
-        if not used or used != list(range(used[0], used[-1] + 1)) or any(i is not None and i.dtype == torch.bool for i in indices):
+        if (
+            not used
+            or used != list(range(used[0], used[-1] + 1))
+            or any(i is not None and i.dtype == torch.bool for i in indices)
+        ):
             raise Unfit
         common = torch.broadcast_shapes(*(indices[d].shape for d in used))  # type: ignore[union-attr]
         at, first = self._index(shape), used[0]
@@ -313,7 +346,9 @@ class Writer(Lines):
             assert tensor is not None
             view = self._view(tensor)
             world = not self._shared and first == 0
-            self._reads.append(self._access(view, common) if world else Access(view, 0, view.offset, view.offset + span_of(view)))
+            self._reads.append(
+                self._access(view, common) if world else Access(view, 0, view.offset, view.offset + span_of(view))
+            )
             j = self._at(view, spread(view, common), inner)
             place.append(f"(int)({j} < 0 ? {j} + {x.shape[d]} : {j})")
         return self._store(shape, at, self._picked(x, [*place, *at[first + len(common) :]]), [x])
@@ -326,7 +361,11 @@ class Writer(Lines):
         self._reads += [self._access(left, left.shape), Access(right, 0, right.offset, right.offset + span_of(right))]
         j = "0" if columns == 1 else "j"
         term = f"s += {self._at(left, left.strides, [WORLD, 'k'])} * {self._at(right, right.strides, ['k', j])};"
-        body = ["float s = 0;", *self._loops([a.shape[1]], ["k"], [term], alone=True), f"{self._write([WORLD, j])} = s;"]
+        body = [
+            "float s = 0;",
+            *self._loops([a.shape[1]], ["k"], [term], alone=True),
+            f"{self._write([WORLD, j])} = s;",
+        ]
         return self._loops([columns], [j], body)
 
     def _emit_linalg_cross(self, a: Tensor, b: Tensor, dim: int = -1, **_: Any) -> list[str]:
@@ -334,6 +373,13 @@ class Writer(Lines):
         if dim % len(shape) != len(shape) - 1:
             raise Unfit
         at = self._index(shape)[:-1]
-        x, y = ([self._read(v, shape, [*at, str(k)]) if k else self._read(v, shape, [*at, "0"]) for k in range(3)] for v in (a, b))
-        values = [f"float c{k} = {x[i]} * {y[j]} - {x[j]} * {y[i]};" for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1)))]
-        return self._loops(shape[:-1], at, [*values, *(f"{self._write([*at, str(k) if k else '0'])} = c{k};" for k in range(3))])
+        x, y = (
+            [self._read(v, shape, [*at, str(k)]) if k else self._read(v, shape, [*at, "0"]) for k in range(3)]
+            for v in (a, b)
+        )
+        values = [
+            f"float c{k} = {x[i]} * {y[j]} - {x[j]} * {y[i]};" for k, (i, j) in enumerate(((1, 2), (2, 0), (0, 1)))
+        ]
+        return self._loops(
+            shape[:-1], at, [*values, *(f"{self._write([*at, str(k) if k else '0'])} = c{k};" for k in range(3))]
+        )

@@ -11,7 +11,13 @@ from torch import Tensor
 
 from legged_mw.utils.trace import View
 
-TYPES = {torch.float32: "float", torch.float64: "double", torch.int64: "long long", torch.int32: "int", torch.bool: "bool"}
+TYPES = {
+    torch.float32: "float",
+    torch.float64: "double",
+    torch.int64: "long long",
+    torch.int32: "int",
+    torch.bool: "bool",
+}
 WORLD = "w"
 
 HELPERS = """
@@ -100,7 +106,11 @@ class Lines:
         loops = [(n, i) for n, i in zip(shape, index, strict=True) if i not in ("0", WORLD)]
         heads = [f"for (int {i} = 0; {i} < {n}; ++{i})" for n, i in loops]
         if not alone:
-            first = f"for (int {loops[0][1]} = lane; {loops[0][1]} < {loops[0][0]}; {loops[0][1]} += LANES)" if loops else "if (lane == 0)"
+            first = (
+                f"for (int {loops[0][1]} = lane; {loops[0][1]} < {loops[0][0]}; {loops[0][1]} += LANES)"
+                if loops
+                else "if (lane == 0)"
+            )
             heads = [first, *heads[1:]]
         return [" ".join(heads) + " {", *body, "}"]
 
@@ -114,7 +124,12 @@ class Lines:
         inner = index if self._shared else index[1:]
         at = " + ".join(f"{math.prod(sizes[d + 1 :])} * {i}" for d, i in enumerate(inner) if i != "0") or "0"
         copied = self._loops(shape, index, [f"copy[{at}] = ({kind})({value});"])
-        return [f"{kind} copy[{math.prod(sizes)}];", *copied, "SYNC", *self._loops(shape, index, [f"{self._write(index)} = copy[{at}];"])]
+        return [
+            f"{kind} copy[{math.prod(sizes)}];",
+            *copied,
+            "SYNC",
+            *self._loops(shape, index, [f"{self._write(index)} = copy[{at}];"]),
+        ]
 
 
 def spread(view: View, shape: Sequence[int]) -> list[int]:

@@ -14,7 +14,9 @@ from legged_mw.utils.trace import Call, Trace
 _CLOSE, _STRAYS = 1e-3, 0.01  # of all that a step writes: rounding goes through physics, and may turn a comparison
 
 
-def fused(fn: Callable[[], None], worlds: int, memory: Mapping[str, Tensor], watched: Iterable[Tensor] = ()) -> Callable[[], None]:
+def fused(
+    fn: Callable[[], None], worlds: int, memory: Mapping[str, Tensor], watched: Iterable[Tensor] = ()
+) -> Callable[[], None]:
     """The step ``fn`` of ``worlds``, fused; or ``fn`` itself, and a line says why. No world has moved when it returns.
 
     ``memory`` is all that ``fn`` writes, by name. Only torch may write to what is ``watched``.
@@ -34,7 +36,11 @@ def fused(fn: Callable[[], None], worlds: int, memory: Mapping[str, Tensor], wat
 
 
 def _fused(
-    fn: Callable[[], None], worlds: int, memory: Mapping[str, Tensor], watched: Iterable[Tensor], put_back: Callable[[], None]
+    fn: Callable[[], None],
+    worlds: int,
+    memory: Mapping[str, Tensor],
+    watched: Iterable[Tensor],
+    put_back: Callable[[], None],
 ) -> Callable[[], None]:
     from legged_mw.sim.fused import Fused  # it needs warp
 
@@ -66,8 +72,13 @@ def _fused(
     compare(expected)
     if other:
         names = sorted(other, key=lambda name: (name.startswith("sim."), name))  # the task's own first
-        shown, are = ", ".join(names[:5]) + ", ..." * (len(names) > 5), "is another" if len(names) == 1 else "are others"
-        raise RuntimeError(f"{shown} {are} than by the step as it is written; does it do something that torch does not see?")
+        shown, are = (
+            ", ".join(names[:5]) + ", ..." * (len(names) > 5),
+            "is another" if len(names) == 1 else "are others",
+        )
+        raise RuntimeError(
+            f"{shown} {are} than by the step as it is written; does it do something that torch does not see?"
+        )
     return program
 
 

@@ -18,7 +18,8 @@ class StepGraph:
     The first calls are real ones: they compile kernels and warm the allocators, and no step is thrown away.
     """
 
-    better: Callable[[], Callable[[], None]] | None = None  # asked once, before recording, for what does the same in fewer kernels
+    # asked once, before recording, for what does the same in fewer kernels
+    better: Callable[[], Callable[[], None]] | None = None
 
     def __init__(self, fn: Callable[[], None], device: str, eager: bool = False, warmup: int = 3) -> None:
         self._fn, self._warmup = fn, warmup

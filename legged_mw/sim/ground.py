@@ -84,7 +84,10 @@ def replace_level_pieces(spec: mujoco.MjSpec, terrain: Terrain, notes: list[str]
 
 def add_ground_box(spec: mujoco.MjSpec, low: np.ndarray, high: np.ndarray) -> mujoco.MjsGeom:
     """A box between two corners (3,) [m] that touches as the ground does."""
-    box, floor = spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=(low + high) / 2, size=(high - low) / 2), spec.geom(GROUND)
+    box, floor = (
+        spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_BOX, pos=(low + high) / 2, size=(high - low) / 2),
+        spec.geom(GROUND),
+    )
     for name in ("contype", "conaffinity", "priority", "condim", "friction", "solref", "solimp"):
         setattr(box, name, getattr(floor, name))
     return box
@@ -123,7 +126,10 @@ def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights, list[str]]:
             left.add(kind)
             continue
         for rows, columns, top in pieces:
-            y, x = (tile.start + np.clip([*span], 0.5, n + 0.5) - 0.5 for tile, span in zip(where, (rows, columns), strict=True))
+            y, x = (
+                tile.start + np.clip([*span], 0.5, n + 0.5) - 0.5
+                for tile, span in zip(where, (rows, columns), strict=True)
+            )
             low, high = zip(terrain.corner[0] + x * terrain.cell, terrain.corner[1] + y * terrain.cell, strict=True)
             boxes.append(Box(low, high, top))
         inside = heights[where][1:-1, 1:-1]

@@ -44,7 +44,10 @@ def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, l
     """
     geoms, places, radii = [], [], []
     for geom in range(model.ngeom):
-        touches = model.geom_contype[ground] & model.geom_conaffinity[geom] or model.geom_contype[geom] & model.geom_conaffinity[ground]
+        touches = (
+            model.geom_contype[ground] & model.geom_conaffinity[geom]
+            or model.geom_contype[geom] & model.geom_conaffinity[ground]
+        )
         if geom != ground and touches:
             found, radius = spheres_on(model, geom, PROBE_SPACING)
             geoms += [geom] * len(found)
@@ -55,7 +58,11 @@ def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, l
 
 def _field(terrain: Terrain) -> Any:
     field = _Field()
-    field.heights, field.corner, field.per_cell = wp.array(terrain.heights, dtype=float), wp.vec2(*terrain.corner), 1.0 / terrain.cell
+    field.heights, field.corner, field.per_cell = (
+        wp.array(terrain.heights, dtype=float),
+        wp.vec2(*terrain.corner),
+        1.0 / terrain.cell,
+    )
     return field
 
 
@@ -73,7 +80,11 @@ class HeightLookup:
         heights = torch.empty(points.shape[:-1], device=points.device)
         places = wp.from_torch(points.reshape(-1, 2), dtype=wp.vec2)
         wp.launch(
-            _look_up, dim=heights.numel(), inputs=[self._field, places], outputs=[wp.from_torch(heights.view(-1))], device=self._device
+            _look_up,
+            dim=heights.numel(),
+            inputs=[self._field, places],
+            outputs=[wp.from_torch(heights.view(-1))],
+            device=self._device,
         )
         return heights
 
@@ -114,7 +125,9 @@ class _Probes:
 def _struct(source: type, names: str) -> Any:
     """Some arrays of a dataclass of mujoco-warp as one argument of a kernel, under its names and with its types."""
     kinds = {field.name: field.type for field in dataclasses.fields(source)}
-    return wp.struct(type(f"_{source.__name__}", (), {"__annotations__": {name: kinds[name] for name in names.split()}}))
+    return wp.struct(
+        type(f"_{source.__name__}", (), {"__annotations__": {name: kinds[name] for name in names.split()}})
+    )
 
 
 _Material = _struct(
@@ -192,7 +205,9 @@ def _nearest_on_triangle(p: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> wp.v
 def _over_triangle(p: wp.vec3, n: wp.vec3, a: wp.vec3, b: wp.vec3, c: wp.vec3) -> bool:
     """Whether p, moved along the normal n, meets the triangle a, b, c (counterclockwise seen from above)."""
     return (
-        wp.dot(wp.cross(b - a, p - a), n) >= 0.0 and wp.dot(wp.cross(c - b, p - b), n) >= 0.0 and wp.dot(wp.cross(a - c, p - c), n) >= 0.0
+        wp.dot(wp.cross(b - a, p - a), n) >= 0.0
+        and wp.dot(wp.cross(c - b, p - b), n) >= 0.0
+        and wp.dot(wp.cross(a - c, p - c), n) >= 0.0
     )
 
 
@@ -312,11 +327,25 @@ def _touch(
     normal = up
     if distance > 1.0e-6:
         away = side * (centre - nearest) / distance
-        if wp.dot(away, up) < 0.9999:  # else it is over a face, whose own normal is more exact than a difference of places
+        # else it is over a face, whose own normal is more exact than a difference of places
+        if wp.dot(away, up) < 0.9999:
             normal = away
-    _write(world, 0, geoms, depth, centre - normal * (radius + 0.5 * depth), normal, material, naconmax, contacts, nacon)
+    _write(
+        world, 0, geoms, depth, centre - normal * (radius + 0.5 * depth), normal, material, naconmax, contacts, nacon
+    )
     if above >= 0.0:  # from under the ground there is one way out
         other, face = _other_face(field, cells, centre, normal)
         depth = other - radius
         if depth < farthest:
-            _write(world, 1, geoms, depth, centre - face * (radius + 0.5 * depth), face, material, naconmax, contacts, nacon)
+            _write(
+                world,
+                1,
+                geoms,
+                depth,
+                centre - face * (radius + 0.5 * depth),
+                face,
+                material,
+                naconmax,
+                contacts,
+                nacon,
+            )

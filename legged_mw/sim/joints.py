@@ -16,7 +16,8 @@ from legged_mw.sim.tables import per_joint_all, some_joints
 from legged_mw.sim.vendor import Loaded
 
 _BEYOND = 1e-3  # [rad] that a pose may be beyond a range by rounding
-CURVE = ("`stall_torque`", "`no_load_speed`")  # tables of motors with a torque-speed curve, before a "`gear`": [N m], [rad/s]
+# tables of motors with a torque-speed curve, before a "`gear`": [N m], [rad/s]
+CURVE = ("`stall_torque`", "`no_load_speed`")
 PARTIAL = ("effort", "armature", "frictionloss", "joint_speed_limits")  # tables that need not name every joint
 
 
@@ -29,10 +30,13 @@ class Posed:
     held: list[str]
     angles: list[float]  # D, the pose [rad]
     ranges: list[Range]  # D [rad]; infinite where there is no limit
-    tables: dict[str, list[float]]  # D each: "`stiffness`" [N m/rad], "`damping`" [N m s/rad], CURVE at the joint, what else was asked
+    # D each: "`stiffness`" [N m/rad], "`damping`" [N m s/rad], CURVE at the joint, what else was asked
+    tables: dict[str, list[float]]
 
 
-def pose_joints(robot: Loaded, tables: Mapping[str, Mapping[str, float]], pose: Mapping[str, float] | None, held: Sequence[str]) -> Posed:
+def pose_joints(
+    robot: Loaded, tables: Mapping[str, Mapping[str, float]], pose: Mapping[str, float] | None, held: Sequence[str]
+) -> Posed:
     """Weld the ``held`` joints, and give the others their numbers from ``tables``, what -> table.
 
     The pose is the caller's, then the keyframe's; where both are silent 0 for a held joint, and for all of them if ``pose`` is None.
@@ -46,7 +50,8 @@ def pose_joints(robot: Loaded, tables: Mapping[str, Mapping[str, float]], pose: 
     known = {**(robot.keyframe.angles if robot.keyframe else {}), **some_joints(pose or {}, every, "`pose`")}
     model = robot.model
     if welded:
-        nearest = {name: float(np.clip(0.0, *span)) for name, span in zip(welded, _ranges(model, welded), strict=True)}  # to 0
+        # to 0
+        nearest = {name: float(np.clip(0.0, *span)) for name, span in zip(welded, _ranges(model, welded), strict=True)}
         hold_joints(robot.spec, model, {name: known.get(name, nearest[name]) for name in welded}, robot.notes)
         model = robot.spec.copy().compile()
     ranges = _ranges(model, moving)
@@ -55,7 +60,9 @@ def pose_joints(robot: Loaded, tables: Mapping[str, Mapping[str, float]], pose: 
     angles = [known.get(name, 0.0) for name in moving]
     for name, angle, (low, high) in zip(moving, angles, ranges, strict=True):
         if pose is not None and not low - _BEYOND <= angle <= high + _BEYOND:
-            robot.notes.append(f"warning: `pose`: {name} stands at {angle:g} rad, beyond its range from {low:g} to {high:g} rad")
+            robot.notes.append(
+                f"warning: `pose`: {name} stands at {angle:g} rad, beyond its range from {low:g} to {high:g} rad"
+            )
     for name, gear in zip(CURVE, (1.0, -1.0), strict=True):  # a motor's torque grows by its gear, its speed shrinks
         if name in values and "`gear`" in values:
             values[name] = [value * ratio**gear for value, ratio in zip(values[name], values["`gear`"], strict=True)]
@@ -67,7 +74,9 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> list[Range]:
     return [(float(j.range[0]), float(j.range[1])) if model.jnt_limited[j.id] else (-np.inf, np.inf) for j in each]
 
 
-def set_machine(robot: Loaded, partial: Mapping[str, Mapping[str, float]], posed: Posed, drive: Drive) -> tuple[float, ...]:
+def set_machine(
+    robot: Loaded, partial: Mapping[str, Mapping[str, float]], posed: Posed, drive: Drive
+) -> tuple[float, ...]:
     """Motors with their force limits, armature and dry friction; what ``partial`` (of PARTIAL) says wins over the file.
 
     Returns the speed limits (D,) [rad/s], infinite where nothing states one.
@@ -77,5 +86,9 @@ def set_machine(robot: Loaded, partial: Mapping[str, Mapping[str, float]], posed
     set_joints(robot.joints, said["armature"], said["frictionloss"], robot.notes)
     motors = map(Motor, *(posed.tables[name] for name in ("`stiffness`", "`damping`", *CURVE) if name in posed.tables))
     add_motors(robot.spec, robot.joints, posed.ranges, list(motors), drive, robot.limits, robot.notes)
-    speeds = robot.speeds | dict(zip(posed.joints, posed.tables.get(CURVE[1], ()), strict=False)) | said["joint_speed_limits"]
+    speeds = (
+        robot.speeds
+        | dict(zip(posed.joints, posed.tables.get(CURVE[1], ()), strict=False))
+        | said["joint_speed_limits"]
+    )
     return tuple(speeds.get(name, np.inf) for name in posed.joints)

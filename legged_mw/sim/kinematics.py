@@ -32,7 +32,9 @@ class Kinematics:
 
     def __init__(self, model: mujoco.MjModel, bodies: Sequence[int], device: str) -> None:
         """``bodies``: which of ``model``, in the order that is returned."""
-        root = next(b for b in range(1, model.nbody) if model.body_jntnum[b] and model.jnt_type[model.body_jntadr[b]] == 0)
+        root = next(
+            b for b in range(1, model.nbody) if model.body_jntnum[b] and model.jnt_type[model.body_jntadr[b]] == 0
+        )
         levels = _levels(model, root, bodies)
         order = [body for level in levels for body in level]
         joints = [_joint(model, body) for body in order[1:]]
@@ -55,12 +57,20 @@ class Kinematics:
 
         self._constant, self._sine, self._cosine, self._above = map(tensor, (constant, sine, cosine, above[..., None]))
         self._products, self._identity = tensor(_matrix_of_products()), tensor(np.eye(3).ravel())
-        self._zero, self._axis, self._anchor = tensor(model.qpos0[7:]), tensor(model.jnt_axis[hinges]), tensor(model.jnt_pos[hinges])
-        self._angle_of = places([model.jnt_qposadr[j] - 7 if j >= 0 else 0 for j in joints])  # a body without a joint: sine is 0
+        self._zero, self._axis, self._anchor = (
+            tensor(model.qpos0[7:]),
+            tensor(model.jnt_axis[hinges]),
+            tensor(model.jnt_pos[hinges]),
+        )
+        # a body without a joint: sine is 0
+        self._angle_of = places([model.jnt_qposadr[j] - 7 if j >= 0 else 0 for j in joints])
         self._speed_of = places([model.jnt_dofadr[j] for j in hinges])
         self._carried = places([order.index(int(model.jnt_bodyid[j])) for j in hinges])
         self._wanted = places([order.index(body) for body in bodies])
-        parents = [[above_.index(int(model.body_parentid[b])) for b in level] for above_, level in zip(levels, levels[1:], strict=False)]
+        parents = [
+            [above_.index(int(model.body_parentid[b])) for b in level]
+            for above_, level in zip(levels, levels[1:], strict=False)
+        ]
         starts = np.cumsum([0, *(len(level) for level in levels[1:])])
         self._levels = [(places(of), slice(starts[i], starts[i + 1])) for i, of in enumerate(parents)]
 
@@ -77,7 +87,8 @@ class Kinematics:
         carried, wanted = every.index_select(1, self._carried), every.index_select(1, self._wanted)
         axis = rotate(carried[..., :3], self._axis) * qvel.index_select(1, self._speed_of)[..., None]
         anchor = rotate(carried[..., :3], self._anchor) + carried[..., 3]
-        twist = torch.cat([axis, torch.linalg.cross(anchor, axis)], dim=2)  # of each hinge: turning, and velocity of what is at the root
+        # of each hinge: turning, and velocity of what is at the root
+        twist = torch.cat([axis, torch.linalg.cross(anchor, axis)], dim=2)
         turning, moving = (self._above * twist[:, None]).sum(dim=2).split(3, dim=2)
         turning = turning + rotate(frames[0][..., :3], qvel[:, None, 3:6])
         place = wanted[..., 3]
@@ -113,7 +124,9 @@ def _levels(model: mujoco.MjModel, root: int, bodies: Sequence[int]) -> list[lis
         chain = [body]
         while chain[-1] not in depth:
             if chain[-1] == 0:
-                raise ModelError(f"body '{model.body(body).name}' is not carried by the robot's root '{model.body(root).name}'")
+                raise ModelError(
+                    f"body '{model.body(body).name}' is not carried by the robot's root '{model.body(root).name}'"
+                )
             chain.append(int(model.body_parentid[chain[-1]]))
         for each in reversed(chain[:-1]):
             depth[each] = depth[int(model.body_parentid[each])] + 1
@@ -124,7 +137,9 @@ def _joint(model: mujoco.MjModel, body: int) -> int:
     """The joint by which ``body`` moves against its parent; -1 for none."""
     count, first = int(model.body_jntnum[body]), int(model.body_jntadr[body])
     if count > 1 or (count and model.jnt_type[first] != mujoco.mjtJoint.mjJNT_HINGE):
-        raise ModelError(f"body '{model.body(body).name}' moves by more than one hinge; kinematics in torch know one hinge a body")
+        raise ModelError(
+            f"body '{model.body(body).name}' moves by more than one hinge; kinematics in torch know one hinge a body"
+        )
     return first if count else -1
 
 

@@ -31,7 +31,11 @@ def compile_readable(spec: mujoco.MjSpec, where: str, notes: list[str]) -> mujoc
     try:
         return _compile(spec)
     except ValueError:  # only then files are looked at: those of an attached model are not where the others are
-        broken = {mesh.name: why_unreadable(path_of(spec, mesh)) or _read_error(spec, mesh) for mesh in spec.meshes if mesh.file}
+        broken = {
+            mesh.name: why_unreadable(path_of(spec, mesh)) or _read_error(spec, mesh)
+            for mesh in spec.meshes
+            if mesh.file
+        }
         if not any(broken.values()) and not _missing_pictures(spec) and not _missing_skins(spec):
             raise
     _drop(spec, broken, where, notes)
@@ -77,8 +81,12 @@ def _read_error(spec: mujoco.MjSpec, mesh: mujoco.MjsMesh) -> str:
     return ""
 
 
-def _refuse_what_matters(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, mesh: mujoco.MjsMesh, reason: str, where: str) -> None:
-    gives_mass = not geom.parent.explicitinertial and geom.mass != 0.0 and (geom.density > 0.0 or not np.isnan(geom.mass))
+def _refuse_what_matters(
+    spec: mujoco.MjSpec, geom: mujoco.MjsGeom, mesh: mujoco.MjsMesh, reason: str, where: str
+) -> None:
+    gives_mass = (
+        not geom.parent.explicitinertial and geom.mass != 0.0 and (geom.density > 0.0 or not np.isnan(geom.mass))
+    )
     if not (geom.contype or geom.conaffinity or gives_mass):
         return
     name = f"geom '{geom.name}'" if geom.name else "a geom"
@@ -91,7 +99,10 @@ def _refuse_what_matters(spec: mujoco.MjSpec, geom: mujoco.MjsGeom, mesh: mujoco
 
 def _missing_pictures(spec: mujoco.MjSpec) -> dict[str, list[str]]:
     """Texture -> those of its files that are not there."""
-    files = {t.name: [file for file in (t.file, *t.cubefiles) if file and not path_of(spec, t, file).is_file()] for t in spec.textures}
+    files = {
+        t.name: [file for file in (t.file, *t.cubefiles) if file and not path_of(spec, t, file).is_file()]
+        for t in spec.textures
+    }
     return {name: gone for name, gone in files.items() if gone}
 
 

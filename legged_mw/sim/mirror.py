@@ -18,7 +18,8 @@ from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.pose import posed
 
-POLAR = np.array([1.0, -1.0, 1.0])  # a place, a velocity, a force; what turns (an axis, an angular velocity) is axial: -POLAR
+# a place, a velocity, a force; what turns (an axis, an angular velocity) is axial: -POLAR
+POLAR = np.array([1.0, -1.0, 1.0])
 TOLERANCE = 0.001  # [m] between a mirrored place and its partner's
 AXIS_TOLERANCE = 0.01  # [rad] between a mirrored axis and its partner's
 
@@ -39,8 +40,12 @@ def find_partners(robot: RobotModel, sites: Sequence[str] = (), tolerance: float
     """
     model = robot.physics
     data = posed(model, np.zeros(len(robot.joint_names)))  # the pose about which q -> sign * q is the mirror image
-    joint_ids, site_ids = [model.joint(name).id for name in robot.joint_names], [robot.id("site", name) for name in sites]
-    anchors, axes, places = data.xanchor[joint_ids], data.xaxis[joint_ids], data.site_xpos[site_ids]  # (., 3) in the root's frame
+    joint_ids, site_ids = (
+        [model.joint(name).id for name in robot.joint_names],
+        [robot.id("site", name) for name in sites],
+    )
+    # (., 3) in the root's frame
+    anchors, axes, places = data.xanchor[joint_ids], data.xaxis[joint_ids], data.site_xpos[site_ids]
     slides = model.jnt_type[joint_ids] == mujoco.mjtJoint.mjJNT_SLIDE
     images = np.where(slides[:, None], axes * POLAR, axes * -POLAR)  # mirrored axes
     signs = np.where(images @ axes.T < 0.0, -1, 1)  # (D, D) of the mirrored joint i along joint j

@@ -30,7 +30,8 @@ from legged_mw.sim.terrain import Terrain
 from legged_mw.sim.vendor import Keyframe, Loaded, naming, read_robot
 from legged_mw.utils.errors import unknown
 
-_CHOICES = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone, "solver": mujoco.mjtSolver}  # option -> its values
+# option -> its values
+_CHOICES = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone, "solver": mujoco.mjtSolver}
 _FLAGS = {"disableflags": mujoco.mjtDisableBit, "enableflags": mujoco.mjtEnableBit}
 _INTEGRATORS = {"euler": mujoco.mjtIntegrator.mjINT_EULER, "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST}
 
@@ -58,14 +59,17 @@ class RobotModel:
     contact_geoms: tuple[str, ...] = ()  # in order of the span "contact"
     site_geoms: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of each site that was asked for with geoms
     terrain: Terrain | None = None  # None: the plane
-    overrides: list[str] = field(default_factory=list)  # what was dropped, added or changed, a line each; "warning: ..." needs the caller
+    # what was dropped, added or changed, a line each; "warning: ..." needs the caller
+    overrides: list[str] = field(default_factory=list)
     imu: str = ""  # site whose accelerometer is sensed, on the root and with its axes
     pose: tuple[float, ...] = ()  # (D,) the caller's, or else the keyframe's [rad]
     held: tuple[str, ...] = ()  # joints of the file that are welded
-    speed_limits: tuple[float, ...] = ()  # (D,) of the motors, unknown to the physics [rad/s]; infinite where nothing states one
+    # (D,) of the motors, unknown to the physics [rad/s]; infinite where nothing states one
+    speed_limits: tuple[float, ...] = ()
     tables: dict[str, list[float]] = field(default_factory=dict)  # (D,) each, of the tables that were given
     keyframe: Keyframe | None = None  # the file's
-    file_sensors: tuple[str, ...] = ()  # names of its sensors, of which ``more_sensors`` are kept, and those that feel contact
+    # names of its sensors, of which ``more_sensors`` are kept, and those that feel contact
+    file_sensors: tuple[str, ...] = ()
 
     @property
     def joint_range(self) -> np.ndarray:
@@ -75,7 +79,9 @@ class RobotModel:
     @property
     def effort_range(self) -> np.ndarray:
         """(D, 2) [N m]; infinite where the MJCF states none."""
-        return np.where(self.physics.actuator_forcelimited[:, None] > 0, self.physics.actuator_forcerange, [-np.inf, np.inf])
+        return np.where(
+            self.physics.actuator_forcelimited[:, None] > 0, self.physics.actuator_forcerange, [-np.inf, np.inf]
+        )
 
     def ground_geoms(self) -> slice:
         """Indices of the geoms that are the ground: MuJoCo counts geoms body by body, and these are the world's."""
@@ -112,12 +118,16 @@ def build_model(
     self_collisions: bool,
     contact_geoms: Sequence[str],  # sensed: number of contacts with the ground; likewise, each geom once
     velocity_sites: Sequence[str],  # sensed: linear velocity, world frame [m/s]
-    imu_site: str | None,  # sensed: proper acceleration in the root's axes [m/s^2]; as for rigid.sensed_site; None: not at all
-    sites: Mapping[str, Sequence[str]] | None = None,  # name -> geoms, likewise; a site that the MJCF lacks is made there
-    pose: Mapping[str, float] | None = None,  # as for per_joint: angles [rad]; where it is silent the keyframe's; None without one: all 0
+    imu_site: str
+    | None,  # sensed: proper acceleration in the root's axes [m/s^2]; as for rigid.sensed_site; None: not at all
+    # name -> geoms, likewise; a site that the MJCF lacks is made there
+    sites: Mapping[str, Sequence[str]] | None = None,
+    # as for per_joint: angles [rad]; where it is silent the keyframe's; None without one: all 0
+    pose: Mapping[str, float] | None = None,
     tables: Mapping[str, Mapping[str, float]] = {},  # what -> a table, as for per_joint: for ``RobotModel.tables``
     held_joints: Sequence[str] = (),  # names or patterns: welded at the pose
-    partial: Mapping[str, Mapping[str, float]] | None = None,  # of PARTIAL, as for some_joints: what the caller knows better than the file
+    # of PARTIAL, as for some_joints: what the caller knows better than the file
+    partial: Mapping[str, Mapping[str, float]] | None = None,
     more_sensors: Collection[str] = (),  # what else is sensed: names of sensors.py, or of the file's own sensors
     drive: Drive = "angle",  # what `ctrl` means; with joints.CURVE in `tables` motors have torque-speed curves
 ) -> RobotModel:
@@ -217,7 +227,11 @@ def _option(name: str, value: float) -> str:
     if name in _CHOICES:
         return _CHOICES[name](value).name.split("_")[1].lower()
     if name in _FLAGS:
-        flags = [text.split("_")[1].lower() for text, flag in _FLAGS[name].__members__.items() if "_" in text and int(value) & flag.value]
+        flags = [
+            text.split("_")[1].lower()
+            for text, flag in _FLAGS[name].__members__.items()
+            if "_" in text and int(value) & flag.value
+        ]
         return " ".join(flags) or "none"
     return f"{value:g}"
 

@@ -36,11 +36,14 @@ class MujocoSimulation(Simulation):
 
     engine, device = "mujoco", "cpu"
 
-    def __init__(self, model: mujoco.MjModel, num_envs: int, *, threads: int = 0, world_fields: Sequence[str] = ()) -> None:
+    def __init__(
+        self, model: mujoco.MjModel, num_envs: int, *, threads: int = 0, world_fields: Sequence[str] = ()
+    ) -> None:
         """Allocate ``num_envs`` worlds, stepped by ``threads`` threads; 0: one a core."""
         self.num_envs = num_envs
         model = copy.copy(model)
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # else it resets a broken world by itself, unasked
+        # else it resets a broken world by itself, unasked
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         _keep_quiet()
         self._batch = Batch(model, num_envs, threads or usable_cores())
         self._start = self._batch.state[0].copy()  # a row of state, as the model has it
@@ -128,7 +131,11 @@ class MujocoSimulation(Simulation):
 
     def _expand(self, name: str) -> Tensor:
         """The engine's rows (N, ...) of a field of the model."""
-        known = sorted(field for field in MODEL_FIELDS if getattr(getattr(self._batch.model, field, None), "dtype", None) == np.float64)
+        known = sorted(
+            field
+            for field in MODEL_FIELDS
+            if getattr(getattr(self._batch.model, field, None), "dtype", None) == np.float64
+        )
         if name not in (*known, GRAVITY):
             raise ModelError(unknown("per-world model field", name, known, "MuJoCo's Model"))
         return _tensor(self._batch.expand(name))

@@ -15,7 +15,9 @@ from legged_mw.sim.errors import ModelError
 from legged_mw.utils.errors import unknown
 
 _SCENE = r"(floor|ground|around|relief|sky)(/.*)?"  # what is added around a robot, by sim.ground and to be looked at
-_SENSED = r"(contact|linvel|accelerometer|velocimeter|gyro|up|jointpos|jointvel|torque)/.*|self_contact|angular_momentum"
+_SENSED = (
+    r"(contact|linvel|accelerometer|velocimeter|gyro|up|jointpos|jointvel|torque)/.*|self_contact|angular_momentum"
+)
 _OURS = {"geoms": _SCENE, "hfields": _SCENE, "materials": _SCENE, "textures": _SCENE, "sensors": _SENSED}
 
 
@@ -26,7 +28,8 @@ class Names:
     where: str  # the file
     geoms: tuple[str, ...]  # all that have a name
     colliding: tuple[str, ...]  # those that may touch
-    bodies: dict[str, tuple[str, ...]]  # body -> its own geoms that may touch; of a body without any, those that are fixed to it
+    # body -> its own geoms that may touch; of a body without any, those that are fixed to it
+    bodies: dict[str, tuple[str, ...]]
 
     def find(self, patterns: Sequence[str], what: str, colliding: bool = False) -> tuple[str, ...]:
         """The geoms that ``patterns`` mean, in their order, each once; ``colliding`` only looks at those that may touch.
@@ -41,11 +44,15 @@ class Names:
             hits += [geom for body in bodies for geom in self.bodies[body]]
             if bodies and not hits:
                 have = ", ".join(name for name, own in self.bodies.items() if own) or "none"
-                raise ModelError(f"{what}: body '{bodies[0]}' of {self.where} has no geom that collides; bodies that have: {have}")
+                raise ModelError(
+                    f"{what}: body '{bodies[0]}' of {self.where} has no geom that collides; bodies that have: {have}"
+                )
             if not hits:
                 kind = "colliding geom or body" if colliding else "geom or body"
                 text = unknown(kind, pattern, [*geoms, *self.bodies], self.where).partition("there are: ")[0]
-                raise ModelError(f"{what}: {text}there are: geoms {', '.join(geoms) or 'none'}; bodies {', '.join(self.bodies)}")
+                raise ModelError(
+                    f"{what}: {text}there are: geoms {', '.join(geoms) or 'none'}; bodies {', '.join(self.bodies)}"
+                )
             found |= dict.fromkeys(hits)
         return tuple(found)
 
@@ -62,7 +69,10 @@ def give_way(spec: mujoco.MjSpec, notes: list[str]) -> None:
             taken.add(name)
             new[thing.name] = thing.name = name
     for kind, names in renamed.items():
-        notes += [f"{kind.removesuffix('s')} '{old}' is called '{new}': the first name is one of ours" for old, new in names.items()]
+        notes += [
+            f"{kind.removesuffix('s')} '{old}' is called '{new}': the first name is one of ours"
+            for old, new in names.items()
+        ]
     for thing in (*spec.geoms, *spec.sites, *spec.meshes, *spec.skins, *spec.tendons):
         thing.material = renamed["materials"].get(thing.material, thing.material)
     for geom in spec.geoms:
@@ -90,8 +100,12 @@ def name_geoms(spec: mujoco.MjSpec, where: str, notes: list[str]) -> Names:
             taken.add(name)
             notes.append(f"geom of '{body.name}' without a name is called '{name}'")
     named = [geom for geom in spec.geoms if geom.name]
-    bodies = {body.name: tuple(_own(body) or _fixed_to(body)) for body in spec.bodies if body.name and body.name != "world"}
-    return Names(where, tuple(geom.name for geom in named), tuple(geom.name for geom in named if _collides(geom)), bodies)
+    bodies = {
+        body.name: tuple(_own(body) or _fixed_to(body)) for body in spec.bodies if body.name and body.name != "world"
+    }
+    return Names(
+        where, tuple(geom.name for geom in named), tuple(geom.name for geom in named if _collides(geom)), bodies
+    )
 
 
 def _collides(geom: mujoco.MjsGeom) -> bool:

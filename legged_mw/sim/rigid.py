@@ -42,7 +42,9 @@ def hold_joints(spec: mujoco.MjSpec, model: mujoco.MjModel, angles: Mapping[str,
         _place(body, *_pose_in_parent(model, data, body.name))
         spec.delete(joint)
         notes.append(f"joint '{name}' held at {angle:g} rad")
-    for tie in [tie for tie in spec.equalities if tie.type == mujoco.mjtEq.mjEQ_JOINT and {tie.name1, tie.name2} & {*angles}]:
+    for tie in [
+        tie for tie in spec.equalities if tie.type == mujoco.mjtEq.mjEQ_JOINT and {tie.name1, tie.name2} & {*angles}
+    ]:
         notes.append(f"equality '{tie.name}' dropped: it couples joints of which one is held")
         spec.delete(tie)
 
@@ -106,7 +108,11 @@ def sensed_site(spec: mujoco.MjSpec, model: mujoco.MjModel, root: str, asked: st
                     "root, or hold that joint by `held_joints`"
                 )
             made, why = f"{name}_root", f"{why}: '{name}' is on {beyond}; `imu_site` may name another"
-        elif is_site and body.name == root and np.allclose(axes @ there.xmat.reshape(3, 3), np.eye(3), rtol=0.0, atol=ALIGNED):
+        elif (
+            is_site
+            and body.name == root
+            and np.allclose(axes @ there.xmat.reshape(3, 3), np.eye(3), rtol=0.0, atol=ALIGNED)
+        ):
             return name
         else:
             made, place = f"{name}_aligned" if is_site else name, axes @ (there.xpos - base.xpos)

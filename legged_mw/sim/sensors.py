@@ -21,7 +21,9 @@ _FOUND, _FORCE = (1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{name}"))
 _NET = 3  # the contact sensor's reduction: all contacts as one, in the world's frame
 
 
-def add_sensors(spec: mujoco.MjSpec, contact_geoms: Sequence[str], velocity_sites: Sequence[str], imu: str, where: str) -> None:
+def add_sensors(
+    spec: mujoco.MjSpec, contact_geoms: Sequence[str], velocity_sites: Sequence[str], imu: str, where: str
+) -> None:
     """In an order that makes each group one span of sensordata."""
     sites = [s.name for s in spec.sites if s.name]
     for name in contact_geoms:
@@ -41,7 +43,9 @@ def add_sensors(spec: mujoco.MjSpec, contact_geoms: Sequence[str], velocity_site
     for name in velocity_sites:
         spec.add_sensor(name=f"linvel/{name}", type=mujoco.mjtSensor.mjSENS_FRAMELINVEL, objtype=site, objname=name)
     if imu:
-        spec.add_sensor(name=f"accelerometer/{imu}", type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=site, objname=imu)
+        spec.add_sensor(
+            name=f"accelerometer/{imu}", type=mujoco.mjtSensor.mjSENS_ACCELEROMETER, objtype=site, objname=imu
+        )
 
 
 def add_more_sensors(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str], more: Collection[str]) -> None:
@@ -58,7 +62,9 @@ def add_more_sensors(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str
         spec.add_sensor(name=ANGULAR_MOMENTUM, type=momentum, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=root)
 
 
-def sensor_spans(mj: mujoco.MjModel, contacts: int, velocities: int, imu: bool, more: Collection[str]) -> dict[str, slice]:
+def sensor_spans(
+    mj: mujoco.MjModel, contacts: int, velocities: int, imu: bool, more: Collection[str]
+) -> dict[str, slice]:
     """Columns of sensordata, by group. The sensors that were added last lie last."""
     wide = 4 if CONTACT_FORCE in more else 1  # columns a contact geom: contacts found, and their force
     sizes = {"contact": wide * contacts, "linvel": 3 * velocities, "accelerometer": 3 if imu else 0}

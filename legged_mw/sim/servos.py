@@ -12,7 +12,8 @@ import mujoco
 import numpy as np
 
 Range = tuple[float, float]
-Drive = Literal["angle", "speed", "torque"]  # what ctrl is: an angle that the motor turns to [rad], a speed [rad/s], or its torque [N m]
+# what ctrl is: an angle that the motor turns to [rad], a speed [rad/s], or its torque [N m]
+Drive = Literal["angle", "speed", "torque"]
 _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _INPUTS = {"angle": 1, "speed": 2, "torque": 4}  # of a DC motor: bits "pos", "vel" and "ff" of its input signature
 _NEVER, _ALWAYS = mujoco.mjtLimited.mjLIMITED_FALSE, mujoco.mjtLimited.mjLIMITED_TRUE
@@ -24,7 +25,9 @@ def take_limits(spec: mujoco.MjSpec, notes: list[str]) -> dict[str, Range]:
     Of what states one, in this order: the joint's actuatorfrcrange (a URDF's effort is read as that), the actuator's forcerange
     through its gear, a motor's ctrlrange through gain and gear.
     """
-    limits = {j.name: (j.actfrcrange[0], j.actfrcrange[1]) for j in spec.joints if _limited(j.actfrclimited, j.actfrcrange)}
+    limits = {
+        j.name: (j.actfrcrange[0], j.actfrcrange[1]) for j in spec.joints if _limited(j.actfrclimited, j.actfrcrange)
+    }
     if actuators := list(spec.actuators):
         notes.append(f"{len(actuators)} actuator{'s' * (len(actuators) > 1)} replaced")
     for actuator in actuators:
@@ -96,7 +99,11 @@ def add_motors(
         joint.damping = np.array([passive, *np.atleast_1d(joint.damping)[1:]]) if np.ndim(joint.damping) else passive
         servo = motor.add_to(spec, joint, drive)
         damped = f"kd {kd:g} N m s/rad"
-        laws = {"angle": f"kp {kp:g} N m/rad" + (f", {damped}" if passive != kd else ""), "speed": damped, "torque": "a torque"}
+        laws = {
+            "angle": f"kp {kp:g} N m/rad" + (f", {damped}" if passive != kd else ""),
+            "speed": damped,
+            "torque": "a torque",
+        }
         curve = f", {stall:g} N m at rest, none at {speed:g} rad/s" if speed else ""
         notes.append(f"{joint.name} {'motor' if speed or drive == 'torque' else 'servo'}: {laws[drive]}{curve}")
         if drive == "angle" and math.isfinite(low) and math.isfinite(high):
@@ -104,13 +111,22 @@ def add_motors(
         if joint.name in limits:  # on the motor and not on the joint, so that actuator_force is the clamped force
             servo.forcelimited, servo.forcerange = True, list(limits[joint.name])
             joint.actfrclimited, joint.actfrcrange = False, [0.0, 0.0]
-    endless = [joint.name for joint, motor in zip(joints, motors, strict=True) if joint.name not in limits and not motor.no_load_speed]
+    endless = [
+        joint.name
+        for joint, motor in zip(joints, motors, strict=True)
+        if joint.name not in limits and not motor.no_load_speed
+    ]
     if endless:
-        notes.append(f"warning: nothing limits the force of {', '.join(endless)}: these servos are stronger than any motor; set `effort`")
+        notes.append(
+            f"warning: nothing limits the force of {', '.join(endless)}: these servos are stronger than any motor; set `effort`"
+        )
 
 
 def set_joints(
-    joints: Sequence[mujoco.MjsJoint], armature: Mapping[str, float], frictionloss: Mapping[str, float], notes: list[str]
+    joints: Sequence[mujoco.MjsJoint],
+    armature: Mapping[str, float],
+    frictionloss: Mapping[str, float],
+    notes: list[str],
 ) -> None:
     """What the caller knows better than the file: joint -> armature [kg m^2] and dry friction [N m]."""
     for what, unit, values in (("armature", "kg m^2", armature), ("frictionloss", "N m", frictionloss)):

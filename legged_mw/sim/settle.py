@@ -15,7 +15,8 @@ from mujoco.batch import Batch
 
 from legged_mw.utils.machine import usable_cores
 
-DAMPING = (0.0, 5.0)  # [N m s/rad] at least, of joints of one half and of the other: limp, and as motors that only brake
+# [N m s/rad] at least, of joints of one half and of the other: limp, and as motors that only brake
+DAMPING = (0.0, 5.0)
 VELOCITY = 0.5  # [m/s, rad/s] of the root when it is dropped: each axis U(-0.5, 0.5) [MuJoCo Playground's getup]
 CLEAR = 0.02  # [m] between the lowest point and the ground when it is dropped
 _CHUNK = 256  # worlds that are stepped together: memory
@@ -28,7 +29,11 @@ def fallen(model: mujoco.MjModel, count: int, seed: int, seconds: float) -> tupl
     """
     model = copy.copy(model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_ACTUATION | mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    model.opt.integrator, model.opt.iterations, model.opt.ls_iterations = mujoco.mjtIntegrator.mjINT_IMPLICITFAST, 50, 50
+    model.opt.integrator, model.opt.iterations, model.opt.ls_iterations = (
+        mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+        50,
+        50,
+    )
     starts = _drops(model, count, np.random.default_rng(seed))
     batch = Batch(model, min(_CHUNK, -(-count // 2)), usable_cores())
     found = [np.empty((count, size)) for size in (model.nq, model.nv)]
@@ -49,7 +54,8 @@ def _drops(model: mujoco.MjModel, count: int, rng: np.random.Generator) -> tuple
     """Any attitude, any joint angles within the ranges (of a joint without: +-pi), just above the ground."""
     data, joints = mujoco.MjData(model), slice(1, model.njnt)
     draw = rng.random((count, 9 + model.nq - 7))  # in one go, so that a state does not depend on how many there are
-    size, turn = np.sqrt([1.0 - draw[:, 6], draw[:, 6]]), 2.0 * np.pi * draw[:, 7:9].T  # [Shoemake 1992: uniform attitudes]
+    # [Shoemake 1992: uniform attitudes]
+    size, turn = np.sqrt([1.0 - draw[:, 6], draw[:, 6]]), 2.0 * np.pi * draw[:, 7:9].T
     low, high = np.where(model.jnt_limited[joints, None] > 0, model.jnt_range[joints], [-np.pi, np.pi]).T
     qpos, qvel = np.zeros((count, model.nq)), np.zeros((count, model.nv))
     qpos[:, 3:7] = np.concatenate([size * np.sin(turn), size * np.cos(turn)]).T

@@ -46,7 +46,9 @@ def _on_box(size: Points, spacing: float) -> list[tuple[float, ...]]:
 
 def _on_cylinder(size: Points, spacing: float) -> list[tuple[float, ...]]:
     inner = np.linspace(0.0, size[0], math.ceil(size[0] / spacing) + 1)[:-1]
-    rings = [(size[0], z) for z in _spaced(size[1], spacing)] + [(radius, z) for z in (-size[1], size[1]) for radius in inner]
+    rings = [(size[0], z) for z in _spaced(size[1], spacing)] + [
+        (radius, z) for z in (-size[1], size[1]) for radius in inner
+    ]
     return [(x, y, z) for radius, z in rings for x, y in _ring(radius, spacing)]
 
 
@@ -55,7 +57,11 @@ def _on_ellipsoid(size: Points, spacing: float) -> list[tuple[float, ...]]:
     largest = float(size.max())
     angles = np.linspace(-0.5 * math.pi, 0.5 * math.pi, 2 * max(3, math.ceil(0.5 * math.pi * largest / spacing)) + 1)
     rings = [(math.cos(angle) if abs(angle) < 1.57 else 0.0, math.sin(angle)) for angle in angles]
-    return [(x / largest * size[0], y / largest * size[1], z * size[2]) for radius, z in rings for x, y in _ring(radius * largest, spacing)]
+    return [
+        (x / largest * size[0], y / largest * size[1], z * size[2])
+        for radius, z in rings
+        for x, y in _ring(radius * largest, spacing)
+    ]
 
 
 def _on_mesh(model: mujoco.MjModel, mesh: int, spacing: float) -> Points:
@@ -63,7 +69,8 @@ def _on_mesh(model: mujoco.MjModel, mesh: int, spacing: float) -> Points:
     first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     vertices, faces = model.mesh_vert[first : first + count].astype(float), model.mesh_face[model.mesh_faceadr[mesh] :]
     faces = faces[: model.mesh_facenum[mesh]]
-    if (start := model.mesh_graphadr[mesh]) >= 0:  # the hull: how many vertices and faces, two lists a vertex, one an edge, then its faces
+    # the hull: how many vertices and faces, two lists a vertex, one an edge, then its faces
+    if (start := model.mesh_graphadr[mesh]) >= 0:
         (count, number), graph = model.mesh_graph[start : start + 2], model.mesh_graph[start + 2 :]
         faces = graph[3 * count + 3 * number :][: 3 * number].reshape(-1, 3)
     corners = vertices[np.unique(faces)]
@@ -83,7 +90,8 @@ def _where_lines_meet(triangles: Points, lines: Points, axis: int, across: list[
     """Points (P, 3) of ``triangles`` (T, 3, 3) on ``lines`` (L, 2) along ``axis``, given by their places along the axes ``across``."""
     a, ab, ac = triangles[:, 0], triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
     (au, av), (bu, bv), (cu, cv) = a[:, across].T, ab[:, across].T, ac[:, across].T
-    area = np.where(np.abs(bu * cv - bv * cu) > 1e-12, bu * cv - bv * cu, np.inf)  # a triangle along the lines is met nowhere
+    # a triangle along the lines is met nowhere
+    area = np.where(np.abs(bu * cv - bv * cu) > 1e-12, bu * cv - bv * cu, np.inf)
     u, v = lines[:, :1] - au, lines[:, 1:] - av
     share_b, share_c = (u * cv - v * cu) / area, (v * bu - u * bv) / area
     met = (share_b >= 0.0) & (share_c >= 0.0) & (share_b + share_c <= 1.0) & np.isfinite(area)
@@ -113,7 +121,9 @@ _POINTS: dict[int, Callable[[Points, float], list[tuple[float, ...]]]] = {
 # ---- sites that an MJCF lacks: at a geom, or at the lowest point of several ----
 
 
-def add_sites(spec: mujoco.MjSpec, sites: Mapping[str, Sequence[str]], angles: Sequence[float], where: str, notes: list[str]) -> None:
+def add_sites(
+    spec: mujoco.MjSpec, sites: Mapping[str, Sequence[str]], angles: Sequence[float], where: str, notes: list[str]
+) -> None:
     """Add each site (name -> geoms) that ``spec`` lacks; which point is the lowest is asked with the joints at ``angles`` (D,) [rad].
 
     One geom has its site in its middle. Several have it at the middle of their lowest points, on the body of the lowest one.

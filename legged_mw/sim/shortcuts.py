@@ -25,8 +25,10 @@ import warp as wp
 
 KNOWN = ("4.0.0",)  # of mujoco-warp
 _ALONE = threading.RLock()  # warp.launch is everybody's
-_SEARCH, _SOLVED = "_linesearch_iterative_kernel", "_qfrc_constraint_from_grad"  # of an iteration, of a solve: the last but for its end
-_FORCES = ("_zero_change_counters", "_update_constraint_efc")  # what follows the search, and sensors read: forces of constraint rows
+# of an iteration, of a solve: the last but for its end
+_SEARCH, _SOLVED = "_linesearch_iterative_kernel", "_qfrc_constraint_from_grad"
+# what follows the search, and sensors read: forces of constraint rows
+_FORCES = ("_zero_change_counters", "_update_constraint_efc")
 
 
 class Shortcuts:
@@ -36,13 +38,22 @@ class Shortcuts:
     and its factors, for a direction that would be the next iteration's.
     """
 
-    def __init__(self, mj: mujoco.MjModel, model: mjw.Model, data: mjw.Data, world_fields: Collection[str] = ()) -> None:
+    def __init__(
+        self, mj: mujoco.MjModel, model: mjw.Model, data: mjw.Data, world_fields: Collection[str] = ()
+    ) -> None:
         option, kinds = model.opt, mujoco.mjtSensor
         known = mjw.__version__ in KNOWN
-        if known:  # a world without constraint rows reaches the same acceleration in its first iteration, to float32 rounding
+        # a world without constraint rows reaches the same acceleration in its first iteration, to float32 rounding
+        if known:
             option.run_qacc_smooth = False
-        plain = option.solver == mjw.SolverType.NEWTON and option.cone == mjw.ConeType.PYRAMIDAL and not option.noslip_iterations
-        plain = plain and not option.enableflags & mjw.EnableBit.SLEEP and option.integrator != mjw.IntegratorType.DISCRETE
+        plain = (
+            option.solver == mjw.SolverType.NEWTON
+            and option.cone == mjw.ConeType.PYRAMIDAL
+            and not option.noslip_iterations
+        )
+        plain = (
+            plain and not option.enableflags & mjw.EnableBit.SLEEP and option.integrator != mjw.IntegratorType.DISCRETE
+        )
         self._iterations = option.iterations if known and plain and not option.graph_conditional else 0
         self._idle, self._idle_unsensed, self._idle_later = set(), set(), set()
         self._zero: set[int] = set()  # addresses of arrays that are zero, and are set to zero in every substep
@@ -61,9 +72,13 @@ class Shortcuts:
             self._idle.add("_next_activation")
         if not {int(kinds.mjSENS_FORCE), int(kinds.mjSENS_TORQUE)} & sensors:
             self._idle.add("_cfrc_world")
-        if not {int(kinds.mjSENS_E_POTENTIAL), int(kinds.mjSENS_E_KINETIC)} & sensors and not option.enableflags & mjw.EnableBit.ENERGY:
+        if (
+            not {int(kinds.mjSENS_E_POTENTIAL), int(kinds.mjSENS_E_KINETIC)} & sensors
+            and not option.enableflags & mjw.EnableBit.ENERGY
+        ):
             self._zero.add(data.energy.ptr)
-        if set(mj.sensor_intprm[mj.sensor_type == kinds.mjSENS_CONTACT, 1]) <= {0, 3}:  # reduced to none, or to the net force
+        # reduced to none, or to the net force
+        if set(mj.sensor_intprm[mj.sensor_type == kinds.mjSENS_CONTACT, 1]) <= {0, 3}:
             self._idle.add("_contact_sort")
         if not mj.ntendon and not mj.neq and joints_alone:
             self._idle_unsensed.add("_site_local_to_global")

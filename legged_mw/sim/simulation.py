@@ -35,7 +35,9 @@ class Simulation(ABC):
     actuator_force: Tensor  # (N, nu) [N m], clamped, of the last substep
     site_xpos: Tensor  # (N, nsite, 3) [m, world], of the last substep
     xquat: Tensor  # (N, nbody, 4) attitude of each body, (w, x, y, z), body to world, of the last substep
-    xfrc_applied: Tensor  # (N, nbody, 6) force [N] and torque [N m], world frame, at the body's centre of mass; persists
+    xfrc_applied: (
+        Tensor  # (N, nbody, 6) force [N] and torque [N m], world frame, at the body's centre of mass; persists
+    )
 
     _fields: dict[str, Tensor]  # of ``world_fields``
 
@@ -63,7 +65,9 @@ class Simulation(ABC):
     def field(self, name: str) -> Tensor:
         """View (N, ...) of a model field that was declared in ``world_fields``; write it in place."""
         if name not in self._fields:
-            raise ModelError(unknown("per-world model field", name, self._fields, "this simulation (declare it in world_fields)"))
+            raise ModelError(
+                unknown("per-world model field", name, self._fields, "this simulation (declare it in world_fields)")
+            )
         return self._fields[name]
 
     @abstractmethod

@@ -11,14 +11,18 @@ _NO_KIND = {"joint", "l", "r", "left", "right", "fl", "fr", "rl", "rr", "lf", "r
 _NO_KIND |= {"front", "rear", "hind", "back"}
 
 
-def some_joints(table: Mapping[str, float], joints: Sequence[str], what: str, spare: Sequence[str] = ()) -> dict[str, float]:
+def some_joints(
+    table: Mapping[str, float], joints: Sequence[str], what: str, spare: Sequence[str] = ()
+) -> dict[str, float]:
     """Joint -> value, of those ``joints`` that a key fits: a key fits if it is the joint's name or a part of it.
 
     Raises ModelError for a key without a joint, and for two keys that fit a joint equally well. A key may fit one in ``spare`` instead.
     """
     for key in table:
         if key and not any(key in joint for joint in (*joints, *spare)):
-            raise ModelError(f"{what}: {unknown('joint', key, joints, 'the MJCF')} (a key may be a part of a joint's name)")
+            raise ModelError(
+                f"{what}: {unknown('joint', key, joints, 'the MJCF')} (a key may be a part of a joint's name)"
+            )
     found = {}
     for joint in joints:
         fitting = sorted((key for key in table if key in joint), key=len)
@@ -26,7 +30,9 @@ def some_joints(table: Mapping[str, float], joints: Sequence[str], what: str, sp
             continue
         *others, best = fitting
         if others and len(others[-1]) == len(best):
-            raise ModelError(f"{what}: '{others[-1]}' and '{best}' fit joint '{joint}' equally well; add the key '{joint}'")
+            raise ModelError(
+                f"{what}: '{others[-1]}' and '{best}' fit joint '{joint}' equally well; add the key '{joint}'"
+            )
         found[joint] = float(table[best])
     return found
 
@@ -41,7 +47,9 @@ def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str, spar
     return list(found.values())
 
 
-def per_joint_all(tables: Mapping[str, Mapping[str, float]], joints: Sequence[str], spare: Sequence[str] = ()) -> dict[str, list[float]]:
+def per_joint_all(
+    tables: Mapping[str, Mapping[str, float]], joints: Sequence[str], spare: Sequence[str] = ()
+) -> dict[str, list[float]]:
     """``per_joint`` of several tables, by what they are; the error is about all of them at once."""
     values, wrong = dict[str, list[float]](), []
     for what, table in tables.items():

@@ -21,7 +21,8 @@ STONE_GAP = (0.05, 0.2)  # [m] between stones [legged_gym: 0.05, 0.1]
 DITCH = (0.05, 0.6)  # [m] of width [legged_gym: 0 to 1]
 SLOPE, WAVE, NOISE = 0.4, 0.3, 0.05  # at difficulty 1: [-], then [m]; a wave from trough to crest
 MOST_HEIGHTS = 1e8  # of a whole ground: 0.8 GB on the host, half of it on the device
-PLATFORM = 1.0  # [m] half the edge of the flat middle of a tile, where robots begin [legged_gym: 3 m in all for most, ours 2]
+# [m] half the edge of the flat middle of a tile, where robots begin [legged_gym: 3 m in all for most, ours 2]
+PLATFORM = 1.0
 
 
 @dataclass(frozen=True)
@@ -45,14 +46,18 @@ class Terrain:
 
     def tile_at(self, x: float, y: float) -> tuple[int, int] | None:
         """Level and column of the tile there [m, world]; None outside of all tiles."""
-        level, column = (int(np.floor(along / self.tile + count / 2)) for along, count in ((x, self.levels), (y, len(self.kinds))))
+        level, column = (
+            int(np.floor(along / self.tile + count / 2)) for along, count in ((x, self.levels), (y, len(self.kinds)))
+        )
         return (level, column) if 0 <= level < self.levels and 0 <= column < len(self.kinds) else None
 
     def vertices(self, level: int, column: int) -> tuple[slice, slice]:
         """Rows and columns of ``heights`` that are a tile's, its rim included."""
         n = round(self.tile / self.cell)
         edge = (self.heights.shape[1] - 1 - self.levels * n) // 2
-        return slice(edge + column * n, edge + (column + 1) * n + 1), slice(edge + level * n, edge + (level + 1) * n + 1)
+        return slice(edge + column * n, edge + (column + 1) * n + 1), slice(
+            edge + level * n, edge + (level + 1) * n + 1
+        )
 
     def span(self) -> tuple[float, float]:
         """Lowest and highest point [m]."""
@@ -76,7 +81,9 @@ def make_terrain(
             raise ModelError(unknown("kind of terrain", kind, KINDS, "`proportions`"))
     n = round(tile / cell)
     if abs(n * cell - tile) > 1e-6 or tile < 4 * PLATFORM:
-        raise ModelError(f"`tile` {tile:g} must be a whole number of cells (`cell`) of {cell:g} m, and at least {4 * PLATFORM:g} m")
+        raise ModelError(
+            f"`tile` {tile:g} must be a whole number of cells (`cell`) of {cell:g} m, and at least {4 * PLATFORM:g} m"
+        )
     kinds, rng = share_columns(proportions, columns), np.random.default_rng(seed)
     edge = round(border / cell)
     if (count := (columns * n + 2 * edge + 1) * (levels * n + 2 * edge + 1)) > MOST_HEIGHTS:
@@ -103,7 +110,9 @@ def _checked(patch: Heights, kind: str, grid: Grid) -> Heights:
     """The heights that the function ``kind`` made, if they are a tile's."""
     patch, n = np.asarray(patch, dtype=float), grid.n
     if patch.shape != (n + 1, n + 1):
-        raise ModelError(f"kind of terrain '{kind}' returned heights of shape {patch.shape}; a tile has {(n + 1, n + 1)}, as grid.zeros()")
+        raise ModelError(
+            f"kind of terrain '{kind}' returned heights of shape {patch.shape}; a tile has {(n + 1, n + 1)}, as grid.zeros()"
+        )
     rim = np.concatenate([patch[[0, -1]].ravel(), patch[:, [0, -1]].ravel()])
     if not np.isfinite(patch).all() or np.abs(rim).max() > 1e-9:
         raise ModelError(
@@ -120,11 +129,17 @@ def share_columns(proportions: Mapping[str, float], columns: int) -> tuple[str, 
     """A kind for each column, in the order given, as near to the shares as whole columns come; each kind at least once."""
     wanted = {kind: share for kind, share in proportions.items() if share > 0}
     if not wanted:
-        raise ModelError(f"`proportions`: no kind has a share above 0, in {dict(proportions)}; there are: {', '.join(KINDS)}")
+        raise ModelError(
+            f"`proportions`: no kind has a share above 0, in {dict(proportions)}; there are: {', '.join(KINDS)}"
+        )
     if len(wanted) > columns:
-        raise ModelError(f"`columns`: {columns} columns cannot hold {len(wanted)} kinds; every kind with a share above 0 needs one")
+        raise ModelError(
+            f"`columns`: {columns} columns cannot hold {len(wanted)} kinds; every kind with a share above 0 needs one"
+        )
     bounds = np.cumsum(list(wanted.values())) / sum(wanted.values())
-    kinds = [list(wanted)[min(int(np.searchsorted(bounds, (i + 0.5) / columns)), len(wanted) - 1)] for i in range(columns)]
+    kinds = [
+        list(wanted)[min(int(np.searchsorted(bounds, (i + 0.5) / columns)), len(wanted) - 1)] for i in range(columns)
+    ]
     for kind in wanted:
         if kind not in kinds:
             most = max(wanted, key=kinds.count)
@@ -164,10 +179,12 @@ class Grid:
         return heights * inside * outside
 
 
-Kind = Callable[[Grid, float, np.random.Generator], Heights]  # of the grid, the difficulty from 0 to 1, and what is to be drawn from
+# of the grid, the difficulty from 0 to 1, and what is to be drawn from
+Kind = Callable[[Grid, float, np.random.Generator], Heights]
 
 KINDS: dict[str, Kind] = {}
-MEASURES: dict[str, tuple[str, float, float]] = {}  # what makes a kind hard: name [unit], its value at difficulty 0 and 1
+# what makes a kind hard: name [unit], its value at difficulty 0 and 1
+MEASURES: dict[str, tuple[str, float, float]] = {}
 LEVEL: set[str] = set()  # kinds that are made of level pieces
 
 
@@ -186,7 +203,9 @@ def add_kind(measure: str = "", low: float = 0.0, high: float = 0.0, *, level: b
     def add(kind: Kind) -> Kind:
         name = kind.__name__
         if name in KINDS and KINDS[name].__module__ == __name__:
-            raise ModelError(f"kind of terrain '{name}' is one of the package's own; give yours another name than {', '.join(KINDS)}")
+            raise ModelError(
+                f"kind of terrain '{name}' is one of the package's own; give yours another name than {', '.join(KINDS)}"
+            )
         KINDS[name] = kind
         MEASURES.pop(name, None)
         LEVEL.discard(name)

@@ -73,7 +73,9 @@ def _leads_elsewhere(joint: Element) -> bool:
     """Whether an empty link above the joint, as base_footprint is on the ground, is not where the robot is."""
     origin = joint.find("origin")
     numbers = [] if origin is None else f"{origin.get('xyz', '')} {origin.get('rpy', '')}".split()
-    return joint.get("type") == "floating" or (joint.get("type") == "fixed" and any(float(number) for number in numbers))
+    return joint.get("type") == "floating" or (
+        joint.get("type") == "fixed" and any(float(number) for number in numbers)
+    )
 
 
 def _drop_points(robot: Element, file: Path, notes: list[str]) -> None:
@@ -82,7 +84,9 @@ def _drop_points(robot: Element, file: Path, notes: list[str]) -> None:
     for link in robot.findall("link"):
         for part in [part for part in [*link.findall("visual"), *link.findall("collision")] if _has_no_size(part)]:
             if part.tag == "collision":
-                raise ModelError(f"{file.name}: link '{link.get('name')}' collides as a shape of size 0; give it a size, or leave it out")
+                raise ModelError(
+                    f"{file.name}: link '{link.get('name')}' collides as a shape of size 0; give it a size, or leave it out"
+                )
             link.remove(part)
             left_out.append(f"'{link.get('name')}'")
     if left_out:
@@ -93,7 +97,9 @@ def _has_no_size(part: Element) -> bool:
     shape = part.find("geometry/*")
     with suppress(ValueError):  # what is no number is MuJoCo's to say
         if shape is not None and shape.tag != "mesh":
-            return any(not float(number) for name in ("radius", "length", "size") for number in shape.get(name, "").split())
+            return any(
+                not float(number) for name in ("radius", "length", "size") for number in shape.get(name, "").split()
+            )
     return False
 
 
@@ -134,7 +140,9 @@ def _resolve(asked: str, file: Path, meshdir: str) -> Path:
     package, _, inside = rest.partition("/") if scheme == "package" else ("", "", rest)
     name = Path(inside).name
     above = [here, *here.parents]
-    places = [folder / inside for folder in above if folder.name == package] + [folder / package / inside for folder in above]
+    places = [folder / inside for folder in above if folder.name == package] + [
+        folder / package / inside for folder in above
+    ]
     places += [folder / inside for folder in above[:3]] + [here / meshdir / inside, here / name, here / "meshes" / name]
     return next((place for place in places if place.is_file()), here / inside)
 

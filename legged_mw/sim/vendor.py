@@ -32,7 +32,19 @@ _ADDED = {  # what a default may say of what is added to the robot
     "actuator": "gaintype gainprm biastype biasprm dyntype dynprm gear ctrllimited ctrlrange forcelimited forcerange actlimited actrange",
 }
 _UPRIGHT = 0.5  # [degrees] of tilt that are rounding
-_KEPT_SENSORS = ("TOUCH", "FORCE", "TORQUE", "RANGEFINDER", "CONTACT", "GEOMDIST", "GEOMNORMAL", "GEOMFROMTO", "USER", "PLUGIN", "TACTILE")
+_KEPT_SENSORS = (
+    "TOUCH",
+    "FORCE",
+    "TORQUE",
+    "RANGEFINDER",
+    "CONTACT",
+    "GEOMDIST",
+    "GEOMNORMAL",
+    "GEOMFROMTO",
+    "USER",
+    "PLUGIN",
+    "TACTILE",
+)
 
 
 @dataclass(frozen=True)
@@ -102,7 +114,11 @@ def naming(file: Path) -> Iterator[None]:
     except ModelError:
         raise
     except (ValueError, RecursionError) as error:  # parsing does not see a name that is used twice, compiling does
-        why = "it is nested too deeply" if isinstance(error, RecursionError) else str(error).partition("The visual elements of the spec")[0]
+        why = (
+            "it is nested too deeply"
+            if isinstance(error, RecursionError)
+            else str(error).partition("The visual elements of the spec")[0]
+        )
         raise ModelError(f"{file.name} is not a valid {_kind(file)}: {' '.join(why.split())}") from None
 
 
@@ -129,7 +145,11 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
     qpos = list(chosen.qpos) if chosen else []
     starts = np.cumsum([0, *(_COLUMNS.get(joint.type, 1) for joint in spec.joints)])
     if chosen and len(qpos) == starts[-1]:
-        angles = {joint.name: qpos[start] for joint, start in zip(spec.joints, starts[:-1], strict=True) if joint.type in _SCALAR_JOINTS}
+        angles = {
+            joint.name: qpos[start]
+            for joint, start in zip(spec.joints, starts[:-1], strict=True)
+            if joint.type in _SCALAR_JOINTS
+        }
         first = next(iter(spec.joints), None)
         free = bool(first and first.type == _FREE)
         lean = tilt(qpos[3:7]) if free else 0.0
@@ -142,7 +162,9 @@ def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
         if key is not chosen:
             notes.append(f"keyframe '{key.name}' dropped")
         elif not taken:
-            notes.append(f"keyframe '{key.name}' dropped: its qpos has {len(qpos)} numbers, the joints of the file have {starts[-1]}")
+            notes.append(
+                f"keyframe '{key.name}' dropped: its qpos has {len(qpos)} numbers, the joints of the file have {starts[-1]}"
+            )
         spec.delete(key)
     spec.nkey = 0
     return taken
@@ -158,7 +180,9 @@ def _drop_sensors(spec: mujoco.MjSpec, wanted: Collection[str], notes: list[str]
     """What the state tells needs no sensor. Those that feel contact stay, and those that are wanted."""
     kept = {getattr(mujoco.mjtSensor, f"mjSENS_{name}", None) for name in _KEPT_SENSORS}
     if dropped := [sensor for sensor in spec.sensors if sensor.type not in kept and sensor.name not in wanted]:
-        notes.append(f"sensors dropped, as nothing reads them: {', '.join(sensor.name or 'one without a name' for sensor in dropped)}")
+        notes.append(
+            f"sensors dropped, as nothing reads them: {', '.join(sensor.name or 'one without a name' for sensor in dropped)}"
+        )
     for sensor in dropped:
         spec.delete(sensor)
 
@@ -171,7 +195,9 @@ def _drop_world(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
     if not spec.worldbody.bodies:
         raise ModelError(f"{where} has no body; it must hold a robot")
     if len(moving := [body.name for body in spec.worldbody.bodies]) > 1:
-        raise ModelError(f"{where} has {len(moving)} bodies with joints in its world: {', '.join(moving)}; leave one of them, the robot")
+        raise ModelError(
+            f"{where} has {len(moving)} bodies with joints in its world: {', '.join(moving)}; leave one of them, the robot"
+        )
     geoms = list(spec.worldbody.geoms)
     skies = [texture for texture in spec.textures if texture.type == mujoco.mjtTexture.mjTEXTURE_SKYBOX]
     dropped = {"world geoms": geoms, "lights": list(spec.lights), "cameras": list(spec.cameras), "skybox": skies}
@@ -238,7 +264,9 @@ def _free_root(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
         notes.append(f"free joint added to '{root.name}'")
     first = root.joints[0]
     if first.type != _FREE:
-        raise ModelError(f"{where}: the first joint must be the root body's free joint; it is {first.name or 'one without a name'}")
+        raise ModelError(
+            f"{where}: the first joint must be the root body's free joint; it is {first.name or 'one without a name'}"
+        )
     for name in ("armature", "frictionloss"):
         if old := getattr(first, name):
             notes.append(f"free joint {name}: {old:g} -> 0")
@@ -262,7 +290,9 @@ def _balance(spec: mujoco.MjSpec, notes: list[str]) -> None:
             spec.compiler.balanceinertia = True
         if short > 1e-9 * moments[2]:
             figures = ", ".join(f"{moment:g}" for moment in moments)
-            notes.append(f"inertia of '{body.name}' balanced: no body has the moments {figures} kg m^2, so each becomes their mean")
+            notes.append(
+                f"inertia of '{body.name}' balanced: no body has the moments {figures} kg m^2, so each becomes their mean"
+            )
 
 
 def _check_joints(spec: mujoco.MjSpec, where: str) -> None:

@@ -32,7 +32,18 @@ wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it
 
 _STATE = ("qpos", "qvel", "ctrl", "sensordata", "actuator_force", "site_xpos", "xquat", "xfrc_applied", "overflow")
 # What else a step leaves to the next one.
-_CARRIED = ("time", "act", "qacc_warmstart", "qfrc_applied", "eq_active", "mocap_pos", "mocap_quat", "history", "plastic", "userdata")
+_CARRIED = (
+    "time",
+    "act",
+    "qacc_warmstart",
+    "qfrc_applied",
+    "eq_active",
+    "mocap_pos",
+    "mocap_quat",
+    "history",
+    "plastic",
+    "userdata",
+)
 # With 1 Newton and 5 line-search iterations these two are always set: they say "not converged", which is the plan.
 _EXPECTED = OverflowType.ITERATIONS | OverflowType.LS_ITERATIONS
 # From this many Newton iterations on, a conditional loop in the graph is worth its launch.
@@ -66,7 +77,8 @@ class WarpSimulation(Simulation):
         self._eager = eager or not self._device.is_cpu
         _check_fields(world_fields)
         with wp.ScopedDevice(self._device):
-            derived = CONSTANTS if {*CONSTANTS_READ} & {*world_fields} else ()  # else every world silently has the first one's
+            # else every world silently has the first one's
+            derived = CONSTANTS if {*CONSTANTS_READ} & {*world_fields} else ()
             batched = [name for name in (*world_fields, *derived) if name != GRAVITY]
             self._model = make_model(model, terrain, dict.fromkeys(batched, num_envs))
             option = self._model.opt
@@ -100,12 +112,21 @@ class WarpSimulation(Simulation):
     def reset(self, mask: Tensor) -> None:
         self._reset_mask.copy_(mask)
         self._run("reset", lambda: mjw.reset_data(self._model, self._data, reset=self._reset_mask_wp))
-        for stale in (self.actuator_force, self.site_xpos, self.xquat):  # reset_data leaves the dead episode's values, even NaN
+        # reset_data leaves the dead episode's values, even NaN
+        for stale in (self.actuator_force, self.site_xpos, self.xquat):
             stale.masked_fill_(mask.view(-1, *[1] * (stale.dim() - 1)), 0.0)
 
     def memory(self) -> dict[str, Tensor]:
-        own = {name: wp.to_torch(getattr(self._data, name)) for name in (*_STATE, *_CARRIED) if getattr(self._data, name).size}
-        return {**own, "overflow_seen": self._overflow_seen, **{f"model.{name}": value for name, value in self._fields.items()}}
+        own = {
+            name: wp.to_torch(getattr(self._data, name))
+            for name in (*_STATE, *_CARRIED)
+            if getattr(self._data, name).size
+        }
+        return {
+            **own,
+            "overflow_seen": self._overflow_seen,
+            **{f"model.{name}": value for name, value in self._fields.items()},
+        }
 
     def set_constants(self) -> None:
         with wp.ScopedDevice(self._device):
@@ -164,7 +185,9 @@ def _check_fields(names: Sequence[str]) -> None:
             raise ModelError(unknown("per-world model field", name, known, "mujoco-warp's Model"))
 
 
-def make_model(model: mujoco.MjModel, terrain: Terrain | None = None, batch_sizes: dict[str, int] | None = None) -> mjw.Model:
+def make_model(
+    model: mujoco.MjModel, terrain: Terrain | None = None, batch_sizes: dict[str, int] | None = None
+) -> mjw.Model:
     """The model on the current device; on ``terrain`` with contacts of our own in place of its height field's."""
     if terrain is None:
         return mjw.put_model(model, batch_sizes=batch_sizes)

@@ -159,7 +159,9 @@ class WarpNetwork:
         with wp.ScopedDevice(sim.device):
             net = _Net()
             net.scales = wp.vec3(network.error_scale, network.speed_scale, network.torque_scale)
-            net.frames, net.units, net.sizes = (wp.array(values, dtype=int) for values in (network.frames, network.hidden, sizes))
+            net.frames, net.units, net.sizes = (
+                wp.array(values, dtype=int) for values in (network.frames, network.hidden, sizes)
+            )
             net.weights = wp.array(_in_fours(network), dtype=wp.vec4)
             net.in_turns, net.activation = int(network.in_turns), list(ACTIVATIONS).index(network.activation)
         self._past = torch.zeros(robots, joints, network.frames[-1] + 1, 2, device=sim.device)

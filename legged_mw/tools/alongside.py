@@ -27,8 +27,24 @@ def watch(task: LoadedTask, runner: Runner, folder: Path) -> None:
         except (OSError, MemoryError) as error:
             print(f"WARNING: no viewer opens: cannot write model_0.pt ({reason_of(error)})", flush=True)
             return
-    flags = ["--task", task.name if task.ships else str(task.path), "--load_run", str(folder), "--follow", "--device", "cpu"]
-    command = [sys.executable, "-m", "legged_mw.programs", "play", *flags, "--viewer", "native" if has_display() else "web"]
+    flags = [
+        "--task",
+        task.name if task.ships else str(task.path),
+        "--load_run",
+        str(folder),
+        "--follow",
+        "--device",
+        "cpu",
+    ]
+    command = [
+        sys.executable,
+        "-m",
+        "legged_mw.programs",
+        "play",
+        *flags,
+        "--viewer",
+        "native" if has_display() else "web",
+    ]
     if hasattr(os, "nice"):
         command = ["nice", "-n", "10", *command]
     # in a session of its own, so that Ctrl-C asks the training alone; it ends us from there

@@ -32,11 +32,19 @@ def chart(title: str, over: str, lines: Sequence[Line]) -> str:
         parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{at:.1f}" y2="{at:.1f}"/>')
         parts.append(f'<text x="{LEFT - 6}" y="{at + 4:.1f}" text-anchor="end">{short(y)}</text>')
     for x in across:
-        parts.append(f'<text x="{place(x, up[0])[0]:.1f}" y="{HEIGHT - BOTTOM + 15}" text-anchor="middle">{short(x)}</text>')
+        parts.append(
+            f'<text x="{place(x, up[0])[0]:.1f}" y="{HEIGHT - BOTTOM + 15}" text-anchor="middle">{short(x)}</text>'
+        )
     parts.append(f'<text x="{WIDTH - RIGHT}" y="{HEIGHT - 2}" text-anchor="end">{escape(over)}</text>')
     for colour, line in thinned:
         path = "L".join("{:.1f} {:.1f}".format(*place(*point)) for point in line)
-        parts.append(f'<path style="stroke:{colour}" d="M{path}"/>' if len(line) > 1 else _dot(colour, place(*line[0])) if line else "")
+        parts.append(
+            f'<path style="stroke:{colour}" d="M{path}"/>'
+            if len(line) > 1
+            else _dot(colour, place(*line[0]))
+            if line
+            else ""
+        )
     return f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">{"".join(parts)}</svg>'
 
 

@@ -44,7 +44,9 @@ UNITS = {"iterations": "iterations", "steps": "million steps", "minutes": "minut
 def parse() -> argparse.Namespace:
     parser = Parser(prog="legged-mw compare", description=__doc__, allow_abbrev=False)
     parser.add_argument("runs", nargs="+", metavar="RUN", help="a run's path, TASK/RUN, or a task for its last run")
-    parser.add_argument("--out", default="compare.html", metavar="FILE", help="the page to write (default: compare.html)")
+    parser.add_argument(
+        "--out", default="compare.html", metavar="FILE", help="the page to write (default: compare.html)"
+    )
     parser.add_argument("--over", choices=ACROSS, default="steps", help="what curves are drawn over (default: steps)")
     args = parser.parse_args()
     if len(args.runs) > MOST:
@@ -109,11 +111,17 @@ def html(runs: Sequence[Run], over: str = "steps") -> str:
         f'<span class="muted">{escape(shown(run.folder))}</span></li>'
         for i, run in enumerate(runs)
     )
-    differ = [[path, *map(_said, values)] for path, values in differences(list(runs)).items() if path != "runner.run_name"]
+    differ = [
+        [path, *map(_said, values)] for path, values in differences(list(runs)).items() if path != "runner.run_name"
+    ]
     graded = list(dict.fromkeys(name for run in runs for name in run.graded))
     exam = [[name, *(f"{run.graded[name]:.3g}" if name in run.graded else "-" for run in runs)] for name in graded]
     columns = ["", *(run.name for run in runs)]
-    settings = table(columns, differ, f"{len(differ)} settings" if len(differ) > 12 else "") if differ else "<p class=lead>None.</p>"
+    settings = (
+        table(columns, differ, f"{len(differ)} settings" if len(differ) > 12 else "")
+        if differ
+        else "<p class=lead>None.</p>"
+    )
     parts = [
         f"<section><h2>At the end</h2>{table(heads, lines)}</section>",
         *_chapters(runs, over),
@@ -138,7 +146,9 @@ def _chapters(runs: Sequence[Run], over: str) -> Iterable[str]:
     """Charts by what their curves are about; the common ones open, the others folded."""
     names = sorted(dict.fromkeys(name for run in runs for name in run.curves if name != TOTAL), key=_order)
     for chapter, group in groupby(names, key=_chapter):
-        drawn = [chart(name.rpartition("/")[2].replace("_", " "), UNITS[over], _lines(runs, name, over)) for name in group]
+        drawn = [
+            chart(name.rpartition("/")[2].replace("_", " "), UNITS[over], _lines(runs, name, over)) for name in group
+        ]
         figures = f'<div class="panels">{"".join(f"<figure>{svg}</figure>" for svg in drawn if svg)}</div>'
         if chapter in ("Exam/", "Train/"):
             yield f"<section><h2>{CHAPTERS[chapter]}</h2>{figures}</section>"

@@ -70,7 +70,9 @@ def script(shell: str, programs: Mapping[str, Callable[[], None]]) -> str:
             if action.choices and action.option_strings:
                 cases.append(f'        *:{name}:{action.option_strings[-1]}) words="{_join(action.choices)}" ;;')
         cases.append(f'        *:{name}:*) words="{places.get(name, "")} {_flags(parser)}" ;;')
-    before = "autoload -U +X bashcompinit && bashcompinit\nautoload -U +X compinit && compinit\n" if shell == "zsh" else ""
+    before = (
+        "autoload -U +X bashcompinit && bashcompinit\nautoload -U +X compinit && compinit\n" if shell == "zsh" else ""
+    )
     return _SCRIPT.format(shell=shell, before=before, programs=" ".join(programs), cases="\n".join(cases))
 
 

@@ -41,7 +41,10 @@ def find_runs(names: list[str]) -> list[Run]:
     folders = [_find(name) for name in names]
     together = [folder.resolve().parent for folder in folders]
     alone = len({folder.name for folder in folders}) == len(folders) and len(set(together)) == 1
-    return [read_run(folder, folder.name if alone else f"{folder.resolve().parent.name}/{folder.name}") for folder in folders]
+    return [
+        read_run(folder, folder.name if alone else f"{folder.resolve().parent.name}/{folder.name}")
+        for folder in folders
+    ]
 
 
 def _find(name: str) -> Path:
@@ -49,9 +52,13 @@ def _find(name: str) -> Path:
     for folder in (path, logs / name):
         if _events(folder):
             return folder
-        if newest := sorted((run for run in folder.glob("*") if _events(run)), key=lambda run: _events(run)[-1].stat().st_mtime_ns):
+        if newest := sorted(
+            (run for run in folder.glob("*") if _events(run)), key=lambda run: _events(run)[-1].stat().st_mtime_ns
+        ):
             return newest[-1]
-    raise ConfigError(f"no run with curves at {shown(path)} or in {shown(logs / name)}; name it by its path, as TASK/RUN, or by its task")
+    raise ConfigError(
+        f"no run with curves at {shown(path)} or in {shown(logs / name)}; name it by its path, as TASK/RUN, or by its task"
+    )
 
 
 def _events(folder: Path) -> list[Path]:
@@ -85,7 +92,12 @@ def _graded(report: Path) -> dict[str, float]:
     except (OSError, ValueError, LookupError, TypeError):
         return {}
     found = dict(_flat({name: each for name, each in exam.items() if name != "rules"}))
-    axes = {f"{path} {axis}": each for path, value in found.items() if path in AXES_OF for axis, each in zip(AXES, value, strict=False)}
+    axes = {
+        f"{path} {axis}": each
+        for path, value in found.items()
+        if path in AXES_OF
+        for axis, each in zip(AXES, value, strict=False)
+    }
     return {path: float(value) for path, value in {**found, **axes}.items() if isinstance(value, int | float)}
 
 

@@ -25,7 +25,8 @@ from legged_mw.utils.renderer import gl_fault, has_display
 from legged_mw.utils.task import load_task, task_names
 
 SPEED_TASKS = ("go1_flat", "g1_flat", "go1_rough")
-_LIBRARIES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "rsl-rl-lib", "tensordict")  # where legged_mw is only on the path
+# where legged_mw is only on the path
+_LIBRARIES = ("mujoco", "mujoco-warp", "warp-lang", "torch", "rsl-rl-lib", "tensordict")
 _CUDA_WHEELS = "pip install --force-reinstall torch --index-url https://download.pytorch.org/whl/cu130"
 _DRAW = "import mujoco\nc = mujoco.GLContext(64, 64)\nc.make_current()\nmujoco.MjrContext(mujoco.MjModel.from_xml_string('<mujoco/>'), 100)"
 
@@ -42,8 +43,12 @@ class Finding(NamedTuple):
 def parse() -> tuple[str | None, float]:
     """The device, and the seconds to spend on speed."""
     parser = Parser(prog="legged-mw doctor", description=__doc__, allow_abbrev=False)
-    parser.add_argument("--device", metavar="D", help="what to measure on: cuda:0, cpu (default: the GPU if there is one)")
-    parser.add_argument("--seconds", type=float, default=30.0, metavar="S", help="how long to train for the speed; 0 leaves it out")
+    parser.add_argument(
+        "--device", metavar="D", help="what to measure on: cuda:0, cpu (default: the GPU if there is one)"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=30.0, metavar="S", help="how long to train for the speed; 0 leaves it out"
+    )
     args = parser.parse_args()
     return args.device, args.seconds
 
@@ -82,11 +87,24 @@ def machine() -> Iterator[Finding]:
     """Python, cores, memory, disk, where the package is."""
     version = platform.python_version()
     fits = (3, 11) <= sys.version_info[:2] <= (3, 13)
-    yield Finding("Python", f"{version}, {sys.executable}", "" if fits else "legged_mw runs on Python 3.11, 3.12 and 3.13", needed=not fits)
+    yield Finding(
+        "Python",
+        f"{version}, {sys.executable}",
+        "" if fits else "legged_mw runs on Python 3.11, 3.12 and 3.13",
+        needed=not fits,
+    )
     yield Finding("system", f"{platform.system()} {platform.release()}, {platform.machine()}")
-    memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB of memory" if hasattr(os, "sysconf") else ""
+    memory = (
+        f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.0f} GiB of memory"
+        if hasattr(os, "sysconf")
+        else ""
+    )
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
-    busy = "others use this machine: what is measured now is slower than it could be" if load > usable_cores() + 0.5 else ""
+    busy = (
+        "others use this machine: what is measured now is slower than it could be"
+        if load > usable_cores() + 0.5
+        else ""
+    )
     yield Finding("cores", f"{usable_cores()} for this process, of {os.cpu_count()}{memory}; load {load:.1f}", busy)
     free = shutil.disk_usage(Path.cwd()).free / 2**30
     mend = "" if free > 1.0 else "a run writes up to a few hundred MB: free some disk, or start elsewhere"
@@ -94,7 +112,8 @@ def machine() -> Iterator[Finding]:
     policies = len(list((ROOT / "resources/policies").glob("*/policy.onnx")))
     kind = "a clone" if (ROOT / "pyproject.toml").exists() else "installed"
     yield Finding(
-        "legged_mw", f"{_version('legged_mw') or 'not installed'}, {kind} at {ROOT}: {len(task_names())} tasks, {policies} policies"
+        "legged_mw",
+        f"{_version('legged_mw') or 'not installed'}, {kind} at {ROOT}: {len(task_names())} tasks, {policies} policies",
     )
 
 
@@ -106,7 +125,12 @@ def training() -> Iterator[Finding]:
             version = _version(needs.name)
             fits = bool(version) and needs.specifier.contains(version, prereleases=True)
             wanted = "" if fits or not version else f", which is not {needs.specifier}"
-            yield Finding(needs.name, f"{version or 'missing'}{wanted}", "" if fits else f"pip install '{needs}'", needed=not version)
+            yield Finding(
+                needs.name,
+                f"{version or 'missing'}{wanted}",
+                "" if fits else f"pip install '{needs}'",
+                needed=not version,
+            )
 
 
 def gpus() -> Iterator[Finding]:
@@ -118,7 +142,9 @@ def gpus() -> Iterator[Finding]:
     if not torch.cuda.is_available():
         has_one = Path("/proc/driver/nvidia/version").exists() or shutil.which("nvidia-smi") is not None
         if has_one and torch.version.cuda is None:
-            yield Finding("none", f"there is an NVIDIA driver, but torch {torch.__version__} is built for CPUs", _CUDA_WHEELS)
+            yield Finding(
+                "none", f"there is an NVIDIA driver, but torch {torch.__version__} is built for CPUs", _CUDA_WHEELS
+            )
         elif has_one:
             mend = "update the driver, or take an older torch; nvidia-smi shows what the driver supports"
             yield Finding("none", f"torch {torch.__version__} for CUDA {torch.version.cuda} finds no usable GPU", mend)
@@ -145,7 +171,11 @@ def pictures() -> Iterator[Finding]:
         fault = gl_fault(name) or (draws(name) if name != "glfw" or has_display() else "no screen")
         works += [name] * (not fault)
         yield Finding(name, fault or "draws")
-    mend = "" if works else "apt install libegl1 libegl-mesa0 (or libosmesa6): without one no video, picture or window; training needs none"
+    mend = (
+        ""
+        if works
+        else "apt install libegl1 libegl-mesa0 (or libosmesa6): without one no video, picture or window; training needs none"
+    )
     yield Finding("MUJOCO_GL", chosen or "not set", mend)
     from legged_mw.view import video, web
 
@@ -158,7 +188,10 @@ def pictures() -> Iterator[Finding]:
 
 def extras() -> Iterator[Finding]:
     """What only some programs need, and nobody has to mend."""
-    for package, extra, what in (("onnxruntime", "deploy", "runs an export"), ("cyclonedds", "unitree", "drives a Go2 or G1")):
+    for package, extra, what in (
+        ("onnxruntime", "deploy", "runs an export"),
+        ("cyclonedds", "unitree", "drives a Go2 or G1"),
+    ):
         version = _version(package) if importlib.util.find_spec(package) else ""
         yield Finding(package, version or f"not installed; it {what}: pip install 'legged_mw[{extra}]'")
     git = shutil.which("git")
@@ -173,7 +206,9 @@ def draws(name: str) -> str:
     environment = {**os.environ, "MUJOCO_GL": name}
     environment.pop("PYOPENGL_PLATFORM", None)
     try:
-        done = subprocess.run([sys.executable, "-c", _DRAW], env=environment, capture_output=True, text=True, timeout=60)
+        done = subprocess.run(
+            [sys.executable, "-c", _DRAW], env=environment, capture_output=True, text=True, timeout=60
+        )
     except subprocess.TimeoutExpired:
         return "does not answer"
     lines = [line for line in done.stderr.strip().splitlines() if "Error" in line] or ["it crashed"]

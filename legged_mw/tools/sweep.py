@@ -62,7 +62,8 @@ class Stop:
 
     def __call__(self, *_: object) -> None:
         first, self.asked = not self.asked, True
-        if first and self.training:  # a closing terminal hangs up twice, and a training takes a second SIGTERM as: at once
+        # a closing terminal hangs up twice, and a training takes a second SIGTERM as: at once
+        if first and self.training:
             self.training.terminate()
 
 
@@ -71,7 +72,9 @@ def parse() -> tuple[argparse.Namespace, list[str]]:
     parser = Parser(prog="legged-mw sweep", description=f"{about} {more}", allow_abbrev=False)
     parser.add_argument("--task", metavar="NAME", required=True, help="a task, or the path of a config file")
     parser.add_argument("--seeds", metavar="N,N,...", default="", help="seeds, each a training")
-    parser.add_argument("--set", action="append", default=[], metavar="PATH=V,V,...", help="a config field and its values")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="PATH=V,V,...", help="a config field and its values"
+    )
     args, rest = parser.parse_known_args()
     for flag in ("--run_name", "--resume", "--load_run", "--list", "--check", "--play"):
         if any(text.partition("=")[0] == flag for text in rest):
@@ -114,11 +117,16 @@ def values(text: str) -> list[str]:
 
 def make_cells(settings: Sequence[str], seeds: Sequence[str]) -> list[Cell]:
     """Every combination; the seeds change fastest."""
-    axes = [[(path, value) for value in values(text) or [""]] for path, _, text in (item.partition("=") for item in settings)]
+    axes = [
+        [(path, value) for value in values(text) or [""]]
+        for path, _, text in (item.partition("=") for item in settings)
+    ]
     axes += [[("seed", seed) for seed in seeds]] if seeds else []
     cells = []
     for choice in product(*axes):
-        varied = {path: value for (path, value), axis in zip(choice, axes, strict=True) if len(axis) > 1 or path == "seed"}
+        varied = {
+            path: value for (path, value), axis in zip(choice, axes, strict=True) if len(axis) > 1 or path == "seed"
+        }
         flags = [text for path, value in choice for text in ("--set", f"{path}={value}")]
         cells.append(Cell(varied, flags))
     return cells
@@ -203,7 +211,13 @@ def table(found: Sequence[tuple[Cell, Run]]) -> str:
         columns = figures(runs).values()
         for group, of in groups.items():
             if len(of) > 1:
-                means.append([*group, f"mean of {len(of)}", *(_mean(digits, [values[i] for i in of]) for digits, values in columns)])
+                means.append(
+                    [
+                        *group,
+                        f"mean of {len(of)}",
+                        *(_mean(digits, [values[i] for i in of]) for digits, values in columns),
+                    ]
+                )
     return text_table([[*short, *heads], *cells, *means])
 
 

@@ -29,7 +29,9 @@ def main() -> None:
     args = parser.parse_args()
     device = pick_device(args.device)
     if device == "cpu":
-        print("on a CPU MuJoCo's own engine trains: few kernels; most of these are for --engine mujoco_warp", flush=True)
+        print(
+            "on a CPU MuJoCo's own engine trains: few kernels; most of these are for --engine mujoco_warp", flush=True
+        )
     before = device_facts(device)
     print(f"kernels of {before.name} go to {before.cache}", flush=True)
     for name in args.tasks or task_names():

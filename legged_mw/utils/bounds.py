@@ -40,8 +40,10 @@ def above(low: float, most: float = math.inf, unit: str = "") -> Bound:
 _NOT_TEXT = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff]")
 _ALWAYS = {
     float: Bound("finite, and 10^12 at most", lambda value: abs(value) <= 1e12),  # no unit of a config needs more
-    int: Bound("below 10^24", lambda value: abs(value) < 10**24),  # more than any machine counts, and few enough digits to print
-    str: Bound("text without control characters", lambda value: not _NOT_TEXT.search(value)),  # which rule a terminal, or no file takes
+    # more than any machine counts, and few enough digits to print
+    int: Bound("below 10^24", lambda value: abs(value) < 10**24),
+    # which rule a terminal, or no file takes
+    str: Bound("text without control characters", lambda value: not _NOT_TEXT.search(value)),
 }
 
 
@@ -85,7 +87,11 @@ ShareRange = Annotated[list[Share], PAIR]
 # Of a range that nothing needs to be drawn from: empty, it is left out
 Factors = Annotated[list[Annotated[float, above(0, 1000)]], or_empty(PAIR)]
 Frictions = Annotated[
-    list[Annotated[float, Bound("from 1e-05, as which MuJoCo takes all below it, to 1000", lambda value: 1e-5 <= value <= 1000)]],
+    list[
+        Annotated[
+            float, Bound("from 1e-05, as which MuJoCo takes all below it, to 1000", lambda value: 1e-5 <= value <= 1000)
+        ]
+    ],
     or_empty(PAIR),
 ]
 Places = Annotated[list[Annotated[float, at_least(-10, 10, "m")]], or_empty(PAIR)]

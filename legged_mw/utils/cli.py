@@ -28,7 +28,9 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.add_argument(
-            "--verbose", action="store_true", help="say more: the whole traceback of an error; all numbers of an iteration while training"
+            "--verbose",
+            action="store_true",
+            help="say more: the whole traceback of an error; all numbers of an iteration while training",
         )
 
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
@@ -36,7 +38,11 @@ class Parser(argparse.ArgumentParser):
         found, unknown = self.parse_known_args(args, namespace)
         if unknown:
             flags = [word.partition("=")[0] for word in unknown if word.startswith("-")]
-            near = [close[0] for flag in flags if (close := difflib.get_close_matches(flag, self._option_string_actions, n=1))]
+            near = [
+                close[0]
+                for flag in flags
+                if (close := difflib.get_close_matches(flag, self._option_string_actions, n=1))
+            ]
             hint = f"; did you mean {', '.join(near)}?" if near else ""
             self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         return found
@@ -55,9 +61,15 @@ def make_parser(description: str | None) -> Parser:
     parser.add_argument("--load_run", metavar="RUN", help="run to load: its name or path; -1 is the one last trained")
     parser.add_argument("--checkpoint", type=int, default=-1, metavar="N", help="iteration to load; -1 is the newest")
     parser.add_argument("--device", metavar="D", help="cuda:0, cpu, ... (default: the GPU if there is one)")
-    parser.add_argument("--engine", metavar="E", help="physics: mujoco (CPU), mujoco_warp (GPU, or slowly CPU) or auto, the default")
-    parser.add_argument("--set", action="append", default=[], metavar="PATH=VALUE", help="override a config field: env.num_envs=64")
-    parser.add_argument("--override", action="append", default=[], metavar="FILE", help="override config fields from a YAML file")
+    parser.add_argument(
+        "--engine", metavar="E", help="physics: mujoco (CPU), mujoco_warp (GPU, or slowly CPU) or auto, the default"
+    )
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="PATH=VALUE", help="override a config field: env.num_envs=64"
+    )
+    parser.add_argument(
+        "--override", action="append", default=[], metavar="FILE", help="override config fields from a YAML file"
+    )
     parser.add_argument("--eager", action="store_true", help="record nothing, launch every kernel: slow, for debugging")
     return parser
 
@@ -92,7 +104,9 @@ def pick_device(asked: str | None) -> str:
         index = int(asked.partition(":")[2] or 0)
         if index < torch.cuda.device_count():
             return f"cuda:{index}"
-        raise ConfigError(f"--device {asked}: this machine has {torch.cuda.device_count()} CUDA devices; use --device cpu")
+        raise ConfigError(
+            f"--device {asked}: this machine has {torch.cuda.device_count()} CUDA devices; use --device cpu"
+        )
     if asked != "cpu":
         raise ConfigError(f"--device {asked}: say cpu, cuda, or cuda:<index>")
     return asked
@@ -192,5 +206,7 @@ def command(program: str, processes: int = 1) -> str:
     """How the user starts ``train`` or ``play``: as the script of a clone, or as ``legged-mw train``."""
     installed = Path(sys.argv[0]).name.startswith("legged-mw")
     if processes > 1:
-        return f"torchrun --nproc_per_node={processes} " + (f"-m legged_mw.programs {program}" if installed else f"{program}.py")
+        return f"torchrun --nproc_per_node={processes} " + (
+            f"-m legged_mw.programs {program}" if installed else f"{program}.py"
+        )
     return f"legged-mw {program}" if installed else f"python {program}.py"

@@ -44,7 +44,8 @@ class Clip(NamedTuple):
 
     def qvel(self) -> Floats:
         """(T, 6 + D) root [m/s, world], its turning [rad/s, body], joints [rad/s]; central differences, at the ends one-sided."""
-        turn = rotation_vector(multiply(conjugate(self.root_quat[:-1]), self.root_quat[1:])) * self.fps  # from frame to frame
+        # from frame to frame
+        turn = rotation_vector(multiply(conjugate(self.root_quat[:-1]), self.root_quat[1:])) * self.fps
         turning = np.concatenate([turn[:1], (turn[:-1] + turn[1:]) / 2, turn[-1:]])
         root, joints = (np.gradient(values, 1.0 / self.fps, axis=0) for values in (self.root_pos, self.joint_pos))
         return np.concatenate([root, turning, joints], axis=1)
@@ -54,13 +55,17 @@ class Clip(NamedTuple):
         if abs(rate - self.fps) < 1e-6:
             return self
         if not self.seconds * rate + 1e-6 >= 1:
-            raise ClipError(f"{self.seconds:g} s have no two frames at {rate:g} frames a second; take a higher rate or a longer clip")
+            raise ClipError(
+                f"{self.seconds:g} s have no two frames at {rate:g} frames a second; take a higher rate or a longer clip"
+            )
         places = np.arange(int(self.seconds * rate + 1e-6) + 1) / rate * self.fps
         first = np.minimum(places.astype(int), len(self.root_pos) - 2)
         share = (places - first)[:, None]
         here, there = self.root_quat[first], self.root_quat[first + 1]
         turned = multiply(here, from_rotation_vector(share * rotation_vector(multiply(conjugate(here), there))))
-        root, joints = ((1 - share) * values[first] + share * values[first + 1] for values in (self.root_pos, self.joint_pos))
+        root, joints = (
+            (1 - share) * values[first] + share * values[first + 1] for values in (self.root_pos, self.joint_pos)
+        )
         return Clip(rate, self.joint_names, root, turned, joints)
 
     def of(self, joints: Sequence[str], where: str) -> Clip:
@@ -68,7 +73,9 @@ class Clip(NamedTuple):
         for name in joints:
             if name not in self.joint_names:
                 raise ClipError(f"{where}: {unknown('joint', name, self.joint_names, 'the clip')}")
-        return self._replace(joint_names=tuple(joints), joint_pos=self.joint_pos[:, [self.joint_names.index(name) for name in joints]])
+        return self._replace(
+            joint_names=tuple(joints), joint_pos=self.joint_pos[:, [self.joint_names.index(name) for name in joints]]
+        )
 
 
 def read_clip(path: Path) -> Clip:
@@ -95,22 +102,35 @@ def clip_of(path: Path, held: Mapping[str, Any]) -> Clip:
     return checked(path, float(arrays["fps"]), names, *(arrays[key] for key in KEYS[2:]))
 
 
-def checked(path: Path, fps: float, names: Sequence[str], root_pos: ArrayLike, root_quat: ArrayLike, joint_pos: ArrayLike) -> Clip:
+def checked(
+    path: Path, fps: float, names: Sequence[str], root_pos: ArrayLike, root_quat: ArrayLike, joint_pos: ArrayLike
+) -> Clip:
     """A clip of these arrays, its quaternions of unit length and without jumps of sign. Raises ClipError."""
     pos, quat, joints = (np.array(values, dtype=np.float64) for values in (root_pos, root_quat, joint_pos))
-    if len(pos) < 2 or pos.shape != (len(pos), 3) or quat.shape != (len(pos), 4) or joints.shape != (len(pos), len(names)):
+    if (
+        len(pos) < 2
+        or pos.shape != (len(pos), 3)
+        or quat.shape != (len(pos), 4)
+        or joints.shape != (len(pos), len(names))
+    ):
         found = f"root_pos {pos.shape}, root_quat {quat.shape}, joint_pos {joints.shape}"
-        raise ClipError(f"{path}: {found} for {len(names)} joints; there must be two frames or more: (T, 3), (T, 4), (T, {len(names)})")
+        raise ClipError(
+            f"{path}: {found} for {len(names)} joints; there must be two frames or more: (T, 3), (T, 4), (T, {len(names)})"
+        )
     length = np.linalg.norm(quat, axis=1, keepdims=True)
     finite = all(np.isfinite(values).all() for values in (pos, quat, joints))
     if not finite or not fps > 0 or (np.abs(length - 1.0) > 0.01).any():
-        raise ClipError(f"{path}: the clip has a value that is not finite, a quaternion that is not of unit length, or no frame rate")
+        raise ClipError(
+            f"{path}: the clip has a value that is not finite, a quaternion that is not of unit length, or no frame rate"
+        )
     if not 0.1 <= fps <= 1e5:
         raise ClipError(f"{path}: {fps:g} frames a second; there must be from 0.1 to 1e+05")
     if max(np.abs(pos).max(), np.abs(joints).max(initial=0.0)) > FARTHEST or len({*names}) < len(names):
         raise ClipError(f"{path}: the clip has a place or an angle beyond {FARTHEST:g} m or rad, or a joint twice")
     flips = np.sign((quat[1:] * quat[:-1]).sum(axis=1))
-    return Clip(fps, tuple(names), pos, quat / length * np.cumprod(np.r_[1.0, np.where(flips < 0, -1.0, 1.0)])[:, None], joints)
+    return Clip(
+        fps, tuple(names), pos, quat / length * np.cumprod(np.r_[1.0, np.where(flips < 0, -1.0, 1.0)])[:, None], joints
+    )
 
 
 def save_clip(path: Path, clip: Clip) -> None:

@@ -73,14 +73,18 @@ def parse_command(text: str, table: Sequence[Command]) -> list[float]:
             raise ConfigError(f"--command {text}: {unknown('command', name.strip(), names, 'this task')}")
         if not equals and place >= len(table):
             known = with_units(table) or "none"
-            raise ConfigError(f"--command {text}: {place + 1} numbers, but this task has {len(table)} commands: {known}")
+            raise ConfigError(
+                f"--command {text}: {place + 1} numbers, but this task has {len(table)} commands: {known}"
+            )
         try:
             value = float(number if equals else item)
         except ValueError:
             value = math.nan
         if not math.isfinite(value):
             example = ",".join(f"{c.default:g}" for c in table)
-            raise ConfigError(f"--command {text}: '{item.strip()}' is no number; write --command={example} ({with_units(table)})")
+            raise ConfigError(
+                f"--command {text}: '{item.strip()}' is no number; write --command={example} ({with_units(table)})"
+            )
         values[names.index(name.strip()) if equals else place] = value
     if wrong := outside(values, table):
         raise ConfigError(f"--command {text}: {wrong}")

@@ -55,10 +55,13 @@ def _schema(cls: type) -> dict[str, Any]:
             fields[name] = kind
         if _is_section(kind):
             _schema(kind)
-            fields[name].__setattr__ = _guarded_setattr  # all that is ever added to a section: it stays the user's plain class
+            # all that is ever added to a section: it stays the user's plain class
+            fields[name].__setattr__ = _guarded_setattr
     if vars(cls).get("_only"):  # what it inherits and does not write itself is 0
         if not getattr(cls, "_open", False):
-            raise ConfigError(f"{_place(cls, '_only')}: {_path(cls)} is not an open table of numbers: leave `_only` out of it")
+            raise ConfigError(
+                f"{_place(cls, '_only')}: {_path(cls)} is not an open table of numbers: leave `_only` out of it"
+            )
         for name in known.keys() - vars(cls).keys():
             setattr(cls, name, 0.0)
     return _SCHEMAS.setdefault(note_file(cls), fields)
@@ -75,7 +78,9 @@ def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
     if inherited is None and not annotated and (inspect.isroutine(value) or isinstance(value, property)):
         return None
     if _is_section(inherited):
-        raise ConfigError(f"{path} is a section, not a field; write `class {name}({_parents(cls, name)}):` and its fields below")
+        raise ConfigError(
+            f"{path} is a section, not a field; write `class {name}({_parents(cls, name)}):` and its fields below"
+        )
     if inherited is None and any(hasattr(base, name) for base in cls.__bases__):
         raise ConfigError(f"{path} would hide the method '{name}' of {_path(cls.__bases__[0])}; choose another name")
     if annotated:
@@ -111,7 +116,9 @@ def _declared_type(cls: type, name: str, inherited: Any) -> Any:
     path, written = f"{_path(cls)}.{name}", inspect.get_annotations(cls)[name]
     module = sys.modules.get(cls.__module__)
     try:
-        kind = get_type_hints(SimpleNamespace(__annotations__={name: written}), vars(module) if module else {}, include_extras=True)[name]
+        kind = get_type_hints(
+            SimpleNamespace(__annotations__={name: written}), vars(module) if module else {}, include_extras=True
+        )[name]
     except (NameError, AttributeError, SyntaxError, TypeError) as error:
         hint = f"import what it names at the top level of module {cls.__module__}"
         raise ConfigError(f"{path}: its type {written!r} cannot be resolved ({error}); {hint}") from None
@@ -124,7 +131,9 @@ def _declared_type(cls: type, name: str, inherited: Any) -> Any:
         return inherited
     if inherited is not None:
         first = next(base for base in cls.__mro__[1:] if name in _schema(base))
-        raise ConfigError(f"{path} is a {_full(inherited)} in {_path(first)}, not a {_full(kind)}; to override it write `{name} = ...`")
+        raise ConfigError(
+            f"{path} is a {_full(inherited)} in {_path(first)}, not a {_full(kind)}; to override it write `{name} = ...`"
+        )
     return kind
 
 
@@ -252,7 +261,11 @@ def _fit_one_of(value: Any, kind: Any, path: str) -> Any:
             continue
     if len(outside) == 1:
         raise outside[0]
-    wrong = f"is {brief(value)}; it must be {bounds_text(kind)}" if outside else f"must be {type_text(kind)}, not {brief(value)}"
+    wrong = (
+        f"is {brief(value)}; it must be {bounds_text(kind)}"
+        if outside
+        else f"must be {type_text(kind)}, not {brief(value)}"
+    )
     raise ConfigError(f"{path} {wrong} ({type(value).__name__})")
 
 
@@ -304,7 +317,9 @@ def _fill(node: Any) -> Any:
     cls = type(node)
     for name, kind in _schema(cls).items():
         default = getattr(cls, name)
-        vars(node)[name] = _fill(object.__new__(kind)) if _is_section(kind) else fit(default, kind, f"{_path(cls)}.{name}")
+        vars(node)[name] = (
+            _fill(object.__new__(kind)) if _is_section(kind) else fit(default, kind, f"{_path(cls)}.{name}")
+        )
     return node
 
 
@@ -327,7 +342,9 @@ def _leaves(node: Any, prefix: str = "") -> Iterator[tuple[str, Any]]:
 def _edits(node: Any, values: Any, path: str = "") -> Iterator[tuple[Any, str, Any]]:
     """(section, name, value) for every field that the nested `values` name, each checked."""
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{path or _path(type(node))} is a section and needs a mapping of its fields, not {brief(values)}")
+        raise ConfigError(
+            f"{path or _path(type(node))} is a section and needs a mapping of its fields, not {brief(values)}"
+        )
     for name, value in values.items():
         here = f"{path}.{name}" if path else str(name)
         kind = _kind(type(node), str(name), here)
@@ -370,7 +387,9 @@ class Config:
                 kind = _kind(type(node), section, here)
                 if not _is_section(kind):
                     whole = f": {here}={{{path.removeprefix(f'{here}.')}: ...}}" if get_origin(kind) is dict else ""
-                    raise ConfigError(f"{path} does not exist: {here} is a field ({type_text(kind)}), not a section; set it whole{whole}")
+                    raise ConfigError(
+                        f"{path} does not exist: {here} is a field ({type_text(kind)}), not a section; set it whole{whole}"
+                    )
                 node = getattr(node, section)
             kind = _kind(type(node), name, path)
             vars(node)[name] = _parse(value, kind, path) if isinstance(value, str) else fit(value, kind, path)
@@ -390,4 +409,8 @@ class Config:
         """(dotted path, mine, theirs) of every field that differs; None stands for a field that one side lacks."""
         mine, theirs = dict(_leaves(self)), dict(_leaves(other))
         both = mine.keys() & theirs.keys()
-        return [(path, mine.get(path), theirs.get(path)) for path in mine | theirs if path not in both or mine[path] != theirs[path]]
+        return [
+            (path, mine.get(path), theirs.get(path))
+            for path in mine | theirs
+            if path not in both or mine[path] != theirs[path]
+        ]

@@ -62,7 +62,10 @@ def line_to_blame(error: BaseException) -> tuple[str, bool]:
 
     It must be below the function that caught the error; where there is none, it is "".
     """
-    every = [(frame.f_code, line, frame.f_globals.get("__name__", "")) for frame, line in traceback.walk_tb(error.__traceback__)]
+    every = [
+        (frame.f_code, line, frame.f_globals.get("__name__", ""))
+        for frame, line in traceback.walk_tb(error.__traceback__)
+    ]
     ours = [entry for entry in every if not is_library(entry[2], entry[0].co_filename)]
     users = [entry for entry in ours if not entry[2].startswith("legged_mw.")]
     for code, line, _ in reversed(users or ours):
@@ -75,7 +78,8 @@ def users_fault(error: BaseException) -> str:
     lines, called = list[str](), False
     for frame, line in traceback.walk_tb(error.__traceback__):
         module, file = frame.f_globals.get("__name__", ""), frame.f_code.co_filename
-        ours = module.startswith("legged_mw.") and module != "legged_mw.utils.cli"  # which catches the error, around all others
+        # which catches the error, around all others
+        ours = module.startswith("legged_mw.") and module != "legged_mw.utils.cli"
         if called and not ours and not is_library(module, file):
             lines.append(line_of(frame.f_code, line).removesuffix(", <module>"))
         called = called or ours
@@ -109,7 +113,10 @@ def brief(value: object, most: int = 200) -> str:
 
 def printable(text: str) -> str:
     """``text`` with what a terminal would obey, not print, written as \\x1b: names come from files, folders and the net."""
-    return "".join(each if each.isprintable() or each == "\n" or unicodedata.category(each) == "Zs" else ascii(each)[1:-1] for each in text)
+    return "".join(
+        each if each.isprintable() or each == "\n" or unicodedata.category(each) == "Zs" else ascii(each)[1:-1]
+        for each in text
+    )
 
 
 def shown(path: Path) -> str:

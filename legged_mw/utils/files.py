@@ -42,13 +42,19 @@ def find_file(cfg: Any, path: str, one: str = "") -> Path:
     author = next(cls for cls in type(owner).__mro__ if name in vars(cls))
     folders = [_folder(author)]
     if getattr(owner, name) != getattr(author, name):
-        folders = [Path.cwd(), Path(getattr(cfg, "_folder", "")), *map(_folder, [*type(owner).__mro__, *type(cfg).__mro__])]
+        folders = [
+            Path.cwd(),
+            Path(getattr(cfg, "_folder", "")),
+            *map(_folder, [*type(owner).__mro__, *type(cfg).__mro__]),
+        ]
     places = list(dict.fromkeys(folder for folder in (*folders, ROOT) if folder and folder.is_absolute()))
     for file in (place / written for place in places):  # an absolute path stays itself
         if file.is_file():
             return file
     if written.is_absolute():
-        raise UserError(f"{path}: no file at {written}; an absolute path is of one machine: name the file relative to the task's")
+        raise UserError(
+            f"{path}: no file at {written}; an absolute path is of one machine: name the file relative to the task's"
+        )
     raise UserError(f"{path}: no file '{written}' in {', '.join(map(str, places))}")
 
 
@@ -64,7 +70,9 @@ def writable(name: str, flag: str, folder: bool = False) -> Path:
         with suppress(FileNotFoundError, NotADirectoryError):
             path.lstat()  # raises for a name that no file can have
         if path.exists() and path.is_dir() != folder:
-            raise UserError(f"{flag} {name}: that is a {'file' if folder else 'folder'}; name a {'folder' if folder else 'file'}")
+            raise UserError(
+                f"{flag} {name}: that is a {'file' if folder else 'folder'}; name a {'folder' if folder else 'file'}"
+            )
         there = next(place for place in (path.absolute(), *path.absolute().parents) if place.is_dir())
         if blocks := [place for place in path.absolute().parents if place.exists() and not place.is_dir()]:
             raise UserError(f"{flag} {name}: {blocks[0]} is a file, not a folder")
@@ -73,14 +81,18 @@ def writable(name: str, flag: str, folder: bool = False) -> Path:
         if path.is_file() and not os.access(path, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
     except (OSError, ValueError) as error:  # a name too long, or with a null character
-        raise UserError(f"{flag} {name[:200]}: cannot be written: {getattr(error, 'strerror', None) or error}") from None
+        raise UserError(
+            f"{flag} {name[:200]}: cannot be written: {getattr(error, 'strerror', None) or error}"
+        ) from None
     return path
 
 
 def check_name(name: str, where: str) -> str:
     """``name`` if a folder may be called so, in any system and terminal, and it leads nowhere else. Raises UserError."""
     if why := wrong_name(name):
-        raise UserError(f"{where}: {name[:60]!r} cannot be the name of a folder below logs: {why}; write a plain name, e.g. go1_fast")
+        raise UserError(
+            f"{where}: {name[:60]!r} cannot be the name of a folder below logs: {why}; write a plain name, e.g. go1_fast"
+        )
     return name
 
 
@@ -100,7 +112,8 @@ def typed(path: str) -> Path:
         found = Path(path).expanduser()
         with suppress(FileNotFoundError, NotADirectoryError, PermissionError):
             found.stat()
-    except (OSError, ValueError, RuntimeError) as error:  # too long, a link to itself; a null character; ~ of an unknown user
+    # too long, a link to itself; a null character; ~ of an unknown user
+    except (OSError, ValueError, RuntimeError) as error:
         raise UserError(f"'{path[:60]}' is no path here: {getattr(error, 'strerror', None) or error}") from None
     return found
 
@@ -119,7 +132,9 @@ def check_folder(folder: Path) -> Path:
             elif not stat.S_ISLNK(kind) and not stat.S_ISREG(kind) and not stat.S_ISDIR(kind):
                 why = "a pipe, a socket or a device"
             if why:
-                raise UserError(f"{shown(folder)}: {path.relative_to(home)} is {why}: delete it; a run or an export holds files alone")
+                raise UserError(
+                    f"{shown(folder)}: {path.relative_to(home)} is {why}: delete it; a run or an export holds files alone"
+                )
     return folder
 
 
@@ -142,7 +157,9 @@ def finish_moving(folder: Path) -> None:
         with suppress(FileNotFoundError):
             staged.rmdir()
     except OSError as error:
-        raise UserError(f"{folder}: a newer export is on its way into it and cannot be finished: {error.strerror or error}") from None
+        raise UserError(
+            f"{folder}: a newer export is on its way into it and cannot be finished: {error.strerror or error}"
+        ) from None
 
 
 def flush(path: Path) -> None:
@@ -159,7 +176,9 @@ def sweep(folder: Path) -> None:
     for path in folder.glob(".*.tmp"):
         name = re.fullmatch(r"\.(export|.+\.(?:pt|yaml))\.(\d{1,9})\.tmp", path.name)
         if name and not _lives(int(name[2])):
-            shutil.rmtree(path, ignore_errors=True) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() and not path.is_symlink() else path.unlink(
+                missing_ok=True
+            )
 
 
 def _lives(process: int) -> bool:

@@ -30,7 +30,8 @@ def free_memory(device: str = "cpu") -> float:
     lines = _read("/proc/meminfo").splitlines()
     free = [1024.0 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
     limit, used = (_read(f"/sys/fs/cgroup/memory.{name}") for name in ("max", "current"))  # of a container
-    cached = re.search(r"^inactive_file (\d+)$", _read("/sys/fs/cgroup/memory.stat"), re.MULTILINE)  # of files; given back when asked for
+    # of files; given back when asked for
+    cached = re.search(r"^inactive_file (\d+)$", _read("/sys/fs/cgroup/memory.stat"), re.MULTILINE)
     if limit.isdigit() and used.isdigit():
         free.append(float(limit) - float(used) + float(cached[1] if cached else 0))
     return min(free, default=math.inf)
@@ -41,7 +42,9 @@ def require_memory(need: float, device: str, what: str, instead: str) -> None:
     free = free_memory(device)
     if need > free:
         where = "this machine" if device == "cpu" else device
-        raise UserError(f"{what} needs {in_bytes(need)} of memory at least, and {where} has {in_bytes(free)} free: {instead}")
+        raise UserError(
+            f"{what} needs {in_bytes(need)} of memory at least, and {where} has {in_bytes(free)} free: {instead}"
+        )
 
 
 def in_bytes(count: float) -> str:

@@ -26,15 +26,22 @@ import numpy as np
 ARCHIVE = ".mjz"  # MuJoCo's name for a zipped model
 _INSIDE = "model.xml"
 MOST_BYTES = 64 << 20  # of one file: the largest known robots, meshes inside, have a tenth
-HEAVIEST, WIDEST, FASTEST = 1e5, 1e6, 1e3  # of a body [kg]; of any length [m] or inertia [kg m^2]; gravity [m/s^2]: a file in cm has 981
+# of a body [kg]; of any length [m] or inertia [kg m^2]; gravity [m/s^2]: a file in cm has 981
+HEAVIEST, WIDEST, FASTEST = 1e5, 1e6, 1e3
 _ELEMENTS, _CELLS, _DEEPEST = 20_000, 1e8, 200  # with all copies; of height fields and pictures; in each other
-_TOO_MUCH = f"makes more than {_ELEMENTS} elements, all copies counted, or {_CELLS:g} cells of height fields and pictures"
+_TOO_MUCH = (
+    f"makes more than {_ELEMENTS} elements, all copies counted, or {_CELLS:g} cells of height fields and pictures"
+)
 _PLACES = 100_000  # files that it names, times folders where these may lie
 _PIECE, _LONGEST = 1 << 20, 16 << 20  # [byte] that the parser gets at a time; of one element and its attributes
-_MOST = {"count": 1e4, "nrow": 2e4, "ncol": 2e4, "width": 16384, "height": 16384, "nkey": 1e4}  # attribute -> the most that makes sense
-_MOST |= {f"nuser_{kind}": 1e3 for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")} | {"nuserdata": 1e6}
+# attribute -> the most that makes sense
+_MOST = {"count": 1e4, "nrow": 2e4, "ncol": 2e4, "width": 16384, "height": 16384, "nkey": 1e4}
+_MOST |= {f"nuser_{kind}": 1e3 for kind in ("body", "jnt", "geom", "site", "cam", "tendon", "actuator", "sensor")} | {
+    "nuserdata": 1e6
+}
 _MOST |= {"mass": HEAVIEST, "density": 1e6, "armature": WIDEST, "frictionloss": WIDEST, "diaginertia": WIDEST}
-_SIZES = ("mass", "inertia", "pos", "ipos", "size", "armature", "damping", "frictionloss", "stiffness")  # of the model's arrays
+# of the model's arrays
+_SIZES = ("mass", "inertia", "pos", "ipos", "size", "armature", "damping", "frictionloss", "stiffness")
 _DIRS = ("meshdir", "texturedir", "assetdir")
 _OF_URDF = ("mesh", "texture", "compiler")  # which name files that MuJoCo reads
 _NAMES = ("name", "class", "childclass", "model", "file", "dir", *_DIRS)
@@ -56,9 +63,14 @@ class Source:
         self.elements, self._largest = 0, 0.0  # that are written; of the largest part, with its copies
         self.root = self._read(self.file, str(self.file.parent))
         if len(self.named) * len(self.folders) > _PLACES:
-            raise ValueError(f"it names {len(self.named)} files, which may lie in {len(self.folders)} folders; no robot has so many")
+            raise ValueError(
+                f"it names {len(self.named)} files, which may lie in {len(self.folders)} folders; no robot has so many"
+            )
         for name, where in self.named.items():
-            for place in (os.path.join(folder, path) for folder in self.folders for path in (name, os.path.basename(name))):  # as strippath
+            # as strippath
+            for place in (
+                os.path.join(folder, path) for folder in self.folders for path in (name, os.path.basename(name))
+            ):
                 _check_regular(place, where)
 
     @property
@@ -101,7 +113,9 @@ class Source:
         size = 1.0 + (self._largest if element.tag in ("include", "attach") else 0.0)
         for sides in (("nrow", "ncol"), ("width", "height")):
             size += math.prod(max(_numbers(element.get(side, "")), default=0.0) for side in sides) * _ELEMENTS / _CELLS
-        return math.prod(max(1.0, number) for number in _numbers(element.get("count", ""))) * (size + sum(map(self._size, element)))
+        return math.prod(max(1.0, number) for number in _numbers(element.get("count", ""))) * (
+            size + sum(map(self._size, element))
+        )
 
 
 class _Reader:
@@ -110,7 +124,13 @@ class _Reader:
     def __init__(self, source: Source, path: Path, folder: str) -> None:
         self.source, self.path, self.folder = source, path, folder  # the last: of the model that it is or belongs to
         self.file = "" if path == source.file else f"{path.name}: "
-        self.builder, self.parser, self.line, self.depth, self.urdf = TreeBuilder(), expat.ParserCreate("utf-8"), 1, 0, False
+        self.builder, self.parser, self.line, self.depth, self.urdf = (
+            TreeBuilder(),
+            expat.ParserCreate("utf-8"),
+            1,
+            0,
+            False,
+        )
         self.parser.StartElementHandler, self.parser.EndElementHandler = self._start, self._end
         self.parser.StartDoctypeDeclHandler = self._refuse_doctype
         source.folders |= dict.fromkeys((folder, str(path.parent)))
@@ -118,7 +138,8 @@ class _Reader:
         try:
             for start in range(0, len(content), _PIECE):
                 self.parser.Parse(content[start : start + _PIECE])
-                if start - self.parser.CurrentByteIndex > _LONGEST:  # an element is looked at from its beginning with each piece
+                # an element is looked at from its beginning with each piece
+                if start - self.parser.CurrentByteIndex > _LONGEST:
                     raise ValueError(f"{self.where}an element has more than {_LONGEST >> 20} MiB")
             self.parser.Parse(b"", True)
         except expat.ExpatError as error:
@@ -161,8 +182,12 @@ class _Reader:
         """A file or folder that is named."""
         if self.source.file.suffix == ARCHIVE:
             raise ValueError(f"{self.where}it names {name[:200]}; the model of an archive stands alone")
-        if self.source.alone and not Path(os.path.realpath(os.path.join(self.source.home, name))).is_relative_to(self.source.home):
-            raise ValueError(f"{self.where}it names {name[:200]}, which lies outside of its own folder; an export stands alone")
+        if self.source.alone and not Path(os.path.realpath(os.path.join(self.source.home, name))).is_relative_to(
+            self.source.home
+        ):
+            raise ValueError(
+                f"{self.where}it names {name[:200]}, which lies outside of its own folder; an export stands alone"
+            )
         if attribute in _DIRS:
             self.source.folders[os.path.join(self.folder, name)] = None
         else:
@@ -190,7 +215,9 @@ def _text(file: Path) -> str:
     except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError) as error:
         raise ValueError(f"no zip file that can be read: {error}") from None  # RuntimeError: it is encrypted
     names = ", ".join(entry.filename for entry in inside)[:200] or "nothing"
-    raise ValueError(f"it holds {names}; an export's holds {_INSIDE} alone, deflated and of {MOST_BYTES >> 20} MiB at most")
+    raise ValueError(
+        f"it holds {names}; an export's holds {_INSIDE} alone, deflated and of {MOST_BYTES >> 20} MiB at most"
+    )
 
 
 def _check_size(name: str, size: int) -> None:
@@ -232,7 +259,11 @@ def _wrong(name: str, value: str) -> str:
         return "is not a number"
     if name.endswith("range") and len(numbers := _numbers(value)) == 2 and numbers[0] > numbers[1]:
         return "ends before it begins"
-    if name in _MOST and value.strip() and not all(0.0 <= number <= _MOST[name] for number in _numbers(value) or [-1.0]):
+    if (
+        name in _MOST
+        and value.strip()
+        and not all(0.0 <= number <= _MOST[name] for number in _numbers(value) or [-1.0])
+    ):
         return f"must be from 0 to {_MOST[name]:g}"
     return ""
 
@@ -244,12 +275,17 @@ def check_model(model: Any) -> None:
         raise ValueError(f"gravity is {' '.join(f'{g:g}' for g in gravity)} m/s^2; it must be {FASTEST:g} at most")
     if not 0.0 < model.opt.timestep <= 1.0:
         raise ValueError(f"timestep is {model.opt.timestep:g} s; it must be above 0 and 1 at most")
-    for kind, what in (("body", "mass"), *((kind, what) for kind in ("body", "geom", "dof", "jnt", "site") for what in _SIZES)):
+    for kind, what in (
+        ("body", "mass"),
+        *((kind, what) for kind in ("body", "geom", "dof", "jnt", "site") for what in _SIZES),
+    ):
         values = getattr(model, f"{kind}_{what}", None)
         most = HEAVIEST if what == "mass" else WIDEST
         if values is not None and (wrong := np.argwhere(~(np.abs(values) <= most))).size:
             value, index = values[tuple(wrong[0])], int(wrong[0][0])
-            whose = f"joint '{model.joint(model.dof_jntid[index]).name}'" if kind == "dof" else _name(model, kind, index)
+            whose = (
+                f"joint '{model.joint(model.dof_jntid[index]).name}'" if kind == "dof" else _name(model, kind, index)
+            )
             raise ValueError(f"{what} of {whose} is {value:g}; it must be {most:g} at most")
     for kind in ("jnt", "actuator", "tendon"):
         for name in ("range", "ctrlrange", "forcerange", "actrange", "actfrcrange"):
@@ -257,7 +293,16 @@ def check_model(model: Any) -> None:
             for index, (low, high) in enumerate(ranges):
                 if not low <= high:
                     raise ValueError(f"{name} of {_name(model, kind, index)} is from {low:g} to {high:g}")
-    for name in ("qpos0", "key_qpos", "key_qvel", "key_ctrl", "actuator_gainprm", "actuator_biasprm", "actuator_gear", "geom_friction"):
+    for name in (
+        "qpos0",
+        "key_qpos",
+        "key_qvel",
+        "key_ctrl",
+        "actuator_gainprm",
+        "actuator_biasprm",
+        "actuator_gear",
+        "geom_friction",
+    ):
         if not np.isfinite(getattr(model, name)).all():
             raise ValueError(f"{name} has values that are not finite")
 

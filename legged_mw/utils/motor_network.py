@@ -35,7 +35,8 @@ class MotorNetwork:
     with ``in_turns``. ``frames`` are ages in simulation steps, 0 is now. Output: torque [N m], times torque_scale.
     """
 
-    recurrent: list[tuple[Floats, Floats, Floats, Floats]]  # a layer: (4 H, in), (4 H, H), (4 H,), (4 H,); gates i, f, g, o
+    # a layer: (4 H, in), (4 H, H), (4 H,), (4 H,); gates i, f, g, o
+    recurrent: list[tuple[Floats, Floats, Floats, Floats]]
     linear: list[tuple[Floats, Floats]]  # a layer: (out, in), (out,)
     activation: str
     frames: tuple[int, ...]
@@ -51,11 +52,21 @@ class MotorNetwork:
 
     def to_arrays(self) -> dict[str, Any]:
         """What the .npz holds."""
-        layers = {f"{name}_l{i}": value for i, layer in enumerate(self.recurrent) for name, value in zip(_RECURRENT, layer, strict=True)}
+        layers = {
+            f"{name}_l{i}": value
+            for i, layer in enumerate(self.recurrent)
+            for name, value in zip(_RECURRENT, layer, strict=True)
+        }
         for i, (weight, bias) in enumerate(self.linear):
             layers |= {f"weight{i}": weight, f"bias{i}": bias}
         scales = {name: getattr(self, name) for name in _SCALES}
-        return {**layers, "activation": self.activation, "frames": np.array(self.frames), "in_turns": self.in_turns, **scales}
+        return {
+            **layers,
+            "activation": self.activation,
+            "frames": np.array(self.frames),
+            "in_turns": self.in_turns,
+            **scales,
+        }
 
 
 def read_network(file: Path) -> MotorNetwork:
@@ -78,7 +89,9 @@ def read_network(file: Path) -> MotorNetwork:
 def _read(arrays: Mapping[str, Any]) -> MotorNetwork:
     frames = tuple(int(age) for age in np.ravel(arrays.get("frames", 0)))
     if not frames or list(frames) != sorted({*frames}) or frames[0] < 0 or frames[-1] > 10_000:
-        raise ValueError(f"frames is {list(frames)[:99]}; they must be ages in simulation steps, the newest first, 10000 at most")
+        raise ValueError(
+            f"frames is {list(frames)[:99]}; they must be ages in simulation steps, the newest first, 10000 at most"
+        )
     activation = str(arrays.get("activation", "elu"))
     if activation not in ACTIVATIONS:
         raise ValueError(unknown("activation", activation, ACTIVATIONS, "motor networks"))
@@ -86,7 +99,12 @@ def _read(arrays: Mapping[str, Any]) -> MotorNetwork:
     while f"weight_ih_l{len(recurrent)}" in arrays:
         units = _take(arrays, f"weight_hh_l{len(recurrent)}", -1, -1).shape[1]
         shapes = ((4 * units, width), (4 * units, units), (4 * units,), (4 * units,))
-        recurrent.append(tuple(_take(arrays, f"{name}_l{len(recurrent)}", *shape) for name, shape in zip(_RECURRENT, shapes, strict=True)))
+        recurrent.append(
+            tuple(
+                _take(arrays, f"{name}_l{len(recurrent)}", *shape)
+                for name, shape in zip(_RECURRENT, shapes, strict=True)
+            )
+        )
         width = units
     while f"weight{len(linear)}" in arrays:
         weight = _take(arrays, f"weight{len(linear)}", -1, width)
@@ -107,7 +125,9 @@ def _take(arrays: Mapping[str, Any], name: str, *shape: int) -> Floats:
     same = value.ndim == len(shape)
     wanted = tuple(own if size < 0 else size for own, size in zip(value.shape, shape, strict=True)) if same else shape
     if value.shape != wanted:
-        raise ValueError(f"array '{name}' has shape {value.shape}, it must be {wanted}: (out, in), in from the layer before or the frames")
+        raise ValueError(
+            f"array '{name}' has shape {value.shape}, it must be {wanted}: (out, in), in from the layer before or the frames"
+        )
     if not np.isfinite(value).all():
         raise ValueError(f"array '{name}' has values that are not finite")
     return value
@@ -118,8 +138,10 @@ class NetworkMotors:
 
     def __init__(self, network: MotorNetwork, robots: int, joints: int) -> None:
         self.network = network
-        self._past = np.zeros((network.frames[-1] + 1, 2, robots, joints), dtype=np.float32)  # newest first; errors, speeds, scaled
-        self._memory = [np.zeros((2, robots, joints, units), dtype=np.float32) for units in network.hidden]  # h and c of each layer
+        # newest first; errors, speeds, scaled
+        self._past = np.zeros((network.frames[-1] + 1, 2, robots, joints), dtype=np.float32)
+        # h and c of each layer
+        self._memory = [np.zeros((2, robots, joints, units), dtype=np.float32) for units in network.hidden]
 
     def reset(self, which: Any = slice(None)) -> None:
         """The robots ``which`` (indices or a mask) begin again: nothing was ever off its target."""

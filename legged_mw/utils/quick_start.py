@@ -24,7 +24,8 @@ from typing import Any
 
 _COMPILER = "torch._dynamo"
 _SHAPES = "torch.fx.experimental.symbolic_shapes"
-_KNOWN = (2, 11), (2, 13)  # the first and last version of torch that this was tried with; others import as they always did
+# the first and last version of torch that this was tried with; others import as they always did
+_KNOWN = (2, 11), (2, 13)
 _DISABLED = "__dynamo_disable"  # where torch/_compile.py keeps what `disable` gave it
 
 Marked = Callable[..., Any]
@@ -76,7 +77,8 @@ def put_off_compiler() -> bool:
     shapes = _Shapes(_SHAPES, "fx/experimental/symbolic_shapes.py")
     sys.modules[_COMPILER], sys.modules[_SHAPES] = _Compiler(_COMPILER, "_dynamo/__init__.py"), shapes
     package, _, name = _SHAPES.rpartition(".")
-    setattr(importlib.import_module(package), name, shapes)  # as an import does; torch itself looks for its compiler in sys.modules
+    # as an import does; torch itself looks for its compiler in sys.modules
+    setattr(importlib.import_module(package), name, shapes)
     sys.meta_path.insert(0, _Found())
     return True
 

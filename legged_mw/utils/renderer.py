@@ -6,7 +6,8 @@ import ctypes
 import os
 import sys
 
-_WITHOUT_SCREEN = {"egl": ("libEGL.so.1", "libegl1"), "osmesa": ("libOSMesa.so.8", "libosmesa6")}  # name -> library, Debian's package
+# name -> library, Debian's package
+_WITHOUT_SCREEN = {"egl": ("libEGL.so.1", "libegl1"), "osmesa": ("libOSMesa.so.8", "libosmesa6")}
 _ON_SCREEN = ("", "enable", "enabled", "on", "true", "1", "glfw", "glx", "cgl", "wgl")
 _OFF = ("disable", "disabled", "off", "false", "0")
 
@@ -46,4 +47,8 @@ def choose_renderer() -> str:
         os.environ["MUJOCO_GL"] = works
     elif fault:
         os.environ["MUJOCO_GL"] = "glfw" if has_display() else "disable"
-    return f"MUJOCO_GL={asked} does not work here: {fault}; going on with MUJOCO_GL={os.environ['MUJOCO_GL']}" if fault else ""
+    return (
+        f"MUJOCO_GL={asked} does not work here: {fault}; going on with MUJOCO_GL={os.environ['MUJOCO_GL']}"
+        if fault
+        else ""
+    )

@@ -72,7 +72,9 @@ class LoadedTask:
         if Path(theirs).stem != self.name:
             what = f"say --task {theirs}" if of_project(theirs) else f"that is {somebodys(theirs)}"
             raise ConfigError(f"{where} is of task {theirs[:200]!r}, not '{self.name}'; {what}")
-        base = next(kind for kind in reversed(type(self.train).__mro__) if issubclass(kind, Config) and kind is not Config)()
+        base = next(
+            kind for kind in reversed(type(self.train).__mro__) if issubclass(kind, Config) and kind is not Config
+        )()
         older = {name: value for name, value in base.to_dict().items() if name not in saved and isinstance(value, dict)}
         self.update({**saved, **older}, where)
         return list(older)
@@ -97,7 +99,10 @@ class LoadedTask:
         train, few = self.train, self.train.cpu
         self.cfg.env.num_envs = min(self.cfg.env.num_envs, few.envs_per_core * cores)
         train.runner.num_steps_per_env, train.runner.max_iterations = few.num_steps_per_env, few.max_iterations
-        train.algorithm.num_learning_epochs, train.algorithm.num_mini_batches = few.num_learning_epochs, few.num_mini_batches
+        train.algorithm.num_learning_epochs, train.algorithm.num_mini_batches = (
+            few.num_learning_epochs,
+            few.num_mini_batches,
+        )
         train.algorithm.desired_kl = few.desired_kl
         train.actor.hidden_dims = train.critic.hidden_dims = few.hidden_dims
         train.actor.rnn_hidden_dim = train.critic.rnn_hidden_dim = few.rnn_hidden_dim
@@ -169,7 +174,9 @@ def load_task(name: str, say: bool = False) -> LoadedTask:
     """
     path = typed(name)
     if path.suffix in ROBOT_FILES:
-        raise ConfigError(f"{name} is a robot, not a task; make a task for it: python -m legged_mw.robot {name} --new NAME")
+        raise ConfigError(
+            f"{name} is a robot, not a task; make a task for it: python -m legged_mw.robot {name} --new NAME"
+        )
     if path.suffix != ".py":
         known = task_names()
         if name not in known and path.is_file():
@@ -190,7 +197,9 @@ def load_task(name: str, say: bool = False) -> LoadedTask:
         raise
     except SyntaxError as error:
         line = f":{error.lineno}" if error.lineno else ""
-        raise ConfigError(f"{shown(Path(error.filename or path))}{line}: {error.msg}: {(error.text or '').strip()[:100]}") from error
+        raise ConfigError(
+            f"{shown(Path(error.filename or path))}{line}: {error.msg}: {(error.text or '').strip()[:100]}"
+        ) from error
     except (Exception, SystemExit) as error:
         ends = "" if isinstance(error, ImportError) else f"; {shown(path)} {_ENDS}"
         raise ConfigError(f"{users_fault(error) or shown(path)}: {in_short(error)}{ends}") from error
@@ -205,8 +214,18 @@ def _check_task(task: Task, path: Path) -> None:
     """Three classes of the kinds that are expected, and an exam's name."""
     for name, kind, wanted, has in (
         ("env", task.env, "an environment, as LeggedRobot is", lambda kind: hasattr(kind, "observation_rows")),
-        ("cfg", task.cfg, "an environment's config, as LeggedRobotCfg is", lambda kind: issubclass(kind, Config) and hasattr(kind, "env")),
-        ("train", task.train, "a learner's, as LeggedRobotCfgPPO is", lambda kind: issubclass(kind, Config) and hasattr(kind, "runner")),
+        (
+            "cfg",
+            task.cfg,
+            "an environment's config, as LeggedRobotCfg is",
+            lambda kind: issubclass(kind, Config) and hasattr(kind, "env"),
+        ),
+        (
+            "train",
+            task.train,
+            "a learner's, as LeggedRobotCfgPPO is",
+            lambda kind: issubclass(kind, Config) and hasattr(kind, "runner"),
+        ),
     ):
         if not isinstance(kind, type) or not has(kind):
             raise ConfigError(f"{path}: TASK: {name} is {kind!r:.100}; it must be a class: {wanted}")

@@ -13,7 +13,8 @@ from types import ModuleType
 
 from legged_mw import ROOT
 
-_loaded: dict[tuple[str, ...], dict[str, ModuleType]] = {}  # folders of `configs` -> its modules, kept while the name is another's
+# folders of `configs` -> its modules, kept while the name is another's
+_loaded: dict[tuple[str, ...], dict[str, ModuleType]] = {}
 _neighbours_of: dict[Path, dict[str, ModuleType]] = {}  # folder of a task -> the modules beside it that were imported
 
 
@@ -42,7 +43,12 @@ def _neighbours(folder: Path) -> Iterator[None]:
     next task wants it, since a config may name a class by its module. Libraries, and what comes from the folder already, stay.
     """
     names = {entry.stem for entry in folder.iterdir() if entry.suffix == ".py" or (entry / "__init__.py").is_file()}
-    hidden = {key: it for name in names & sys.modules.keys() if _may_be_hidden(name, folder) for key, it in _take_out(name).items()}
+    hidden = {
+        key: it
+        for name in names & sys.modules.keys()
+        if _may_be_hidden(name, folder)
+        for key, it in _take_out(name).items()
+    }
     before = {name.partition(".")[0] for name in sys.modules}
     mine = _neighbours_of.setdefault(folder, {})
     sys.modules.update(mine)

@@ -77,9 +77,13 @@ class Trace(TorchDispatchMode):
             self.blocks.append(tensor)
             if made:
                 self.made.add(self._known[address])
-        return View(self._known[address], tensor.dtype, tuple(tensor.shape), tensor.stride(), int(tensor.storage_offset()))
+        return View(
+            self._known[address], tensor.dtype, tuple(tensor.shape), tensor.stride(), int(tensor.storage_offset())
+        )
 
-    def __torch_dispatch__(self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None) -> Any:
+    def __torch_dispatch__(
+        self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
         kwargs = kwargs or {}
         result = func(*args, **kwargs)
         if self._paused:

@@ -62,7 +62,8 @@ class _Loader(yaml.SafeLoader):
 
     def construct_scalar(self, node: Any) -> Any:
         text = super().construct_scalar(node)
-        if bad := [char for char in text if unicodedata.category(char) in ("Cc", "Cs") and char not in "\t\n\r"]:  # a terminal obeys these
+        # a terminal obeys these
+        if bad := [char for char in text if unicodedata.category(char) in ("Cc", "Cs") and char not in "\t\n\r"]:
             raise _error(f"the character {bad[0]!a} is not text", node.start_mark)
         return text
 
@@ -94,7 +95,10 @@ def _error(problem: str, mark: Any) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(None, None, problem, mark)
 
 
-_INT, _FLOAT = r"[-+]?(\d[\d_]*|0x[0-9a-fA-F_]+|0o[0-7_]+)$", rf"[-+]?(\d[\d_]*\.\d*|\.\d+|\.(inf|Inf|INF))$|\.(nan|NaN|NAN)$|{_EXPONENT}"
+_INT, _FLOAT = (
+    r"[-+]?(\d[\d_]*|0x[0-9a-fA-F_]+|0o[0-7_]+)$",
+    rf"[-+]?(\d[\d_]*\.\d*|\.\d+|\.(inf|Inf|INF))$|\.(nan|NaN|NAN)$|{_EXPONENT}",
+)
 for _name, _pattern in (("float", _FLOAT), ("int", _INT)):
     _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_name}", re.compile(_pattern), list("-+.0123456789"))
 _Loader.add_constructor("tag:yaml.org,2002:int", _Loader.construct_yaml_int)
@@ -110,7 +114,8 @@ def parse_yaml(text: str | bytes, where: str) -> Any:
         return loader.get_single_data()
     except yaml.YAMLError as error:
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None) or str(error)
-    except (ValueError, OverflowError, RecursionError) as error:  # what PyYAML lets through: escapes beyond Unicode, %YAML 1.<digits>
+    # what PyYAML lets through: escapes beyond Unicode, %YAML 1.<digits>
+    except (ValueError, OverflowError, RecursionError) as error:
         mark, problem = loader.get_mark() if loader else None, str(error)
     line = f":{mark.line + 1}" if mark else ""
     raise ConfigError(f"{where}{line}: not valid YAML: {' '.join(problem.split())}")
@@ -126,7 +131,9 @@ def load_yaml(path: str | os.PathLike[str]) -> dict[str, Any]:
         with path.open("rb") as file:
             text = file.read(MOST_BYTES + 1)
     except (OSError, ValueError) as error:  # a name with a null character
-        raise ConfigError(f"{path}: cannot read this config file: {getattr(error, 'strerror', None) or error}") from None
+        raise ConfigError(
+            f"{path}: cannot read this config file: {getattr(error, 'strerror', None) or error}"
+        ) from None
     if len(text) > MOST_BYTES:
         raise ConfigError(f"{path}: larger than {MOST_BYTES >> 20} MiB, which no config is")
     loaded = parse_yaml(text, str(path))

@@ -17,12 +17,14 @@ DISTANCE = 2.4  # [robot radius] camera to base, at least
 BEHIND = 1.3 * DISTANCE  # likewise from behind
 ARROWS = 0.45  # [robot radius] above its top: the picture has room for the arrows there
 ROOM = 0.88  # share of the picture's height that robot and arrows take, at most
-FOLLOW_XY, FOLLOW_Z = 0.12, 0.04  # share of the way to the base per frame; slower in z, so that steps do not shake the picture
+# share of the way to the base per frame; slower in z, so that steps do not shake the picture
+FOLLOW_XY, FOLLOW_Z = 0.12, 0.04
 FOLLOW_ALL = 0.04  # the same for all: slow, because robots come into reach and leave it
 REACH = 14.0  # [robot radius] from the followed robot; "all" shows the robots within it
 REACH_HILLS = 24.0  # the same on hills, where each begins on a tile of its own
 TURN = 0.08  # share of the way to the heading per frame
-STEEPEST, CLEARANCE, LOOK_BELOW = -60.0, 0.15, 0.6  # [deg], [robot radius]: on hills it sees the feet, so far below the base, over a rise
+# [deg], [robot radius]: on hills it sees the feet, so far below the base, over a rise
+STEEPEST, CLEARANCE, LOOK_BELOW = -60.0, 0.15, 0.6
 LIFT = 0.06  # share of the way to the elevation that this needs per frame
 JUMP = 3.0  # [robot radius] a base that moved this far at once was reset: the camera cuts to it
 
@@ -55,7 +57,10 @@ class RobotCamera:
         before, self._target = self._target, (mode, world)
         changed = before is None or before[0] != mode
         placement = self.robots.placements[world]
-        jumped = before == self._target and float(np.linalg.norm(placement.position - self._last_position)) > JUMP * placement.radius
+        jumped = (
+            before == self._target
+            and float(np.linalg.norm(placement.position - self._last_position)) > JUMP * placement.radius
+        )
         self._last_position = placement.position
         if mode == "all":
             self._see_all(world, cut=changed or jumped)
@@ -101,7 +106,11 @@ class RobotCamera:
         away = camera.distance * math.cos(math.radians(ELEVATION)) * np.linspace(0.3, 1.0, 8)
         azimuth = math.radians(camera.azimuth)
         places = camera.lookat[:2] - away[:, None] * [math.cos(azimuth), math.sin(azimuth)]
-        rise = np.array([ground.height(place) for place in places]) + CLEARANCE * radius - (camera.lookat[2] - LOOK_BELOW * radius)
+        rise = (
+            np.array([ground.height(place) for place in places])
+            + CLEARANCE * radius
+            - (camera.lookat[2] - LOOK_BELOW * radius)
+        )
         return max(min(ELEVATION, -math.degrees(float(np.arctan2(rise, away).max()))), STEEPEST)
 
     def _share(self, each: float) -> float:
@@ -125,6 +134,8 @@ class RobotCamera:
         share = 1.0 if cut else self._share(FOLLOW_ALL)
         camera.type = mujoco.mjtCamera.mjCAMERA_FREE
         camera.lookat[:] += share * (middle - camera.lookat)
-        camera.distance += share * (max(2.5 * reach, distance(self.robots.placements[world], self._fovy)) - camera.distance)
+        camera.distance += share * (
+            max(2.5 * reach, distance(self.robots.placements[world], self._fovy)) - camera.distance
+        )
         if cut:
             camera.azimuth, camera.elevation = AZIMUTH, ELEVATION_ALL

@@ -74,11 +74,14 @@ _STEP = {  # command, sign
 class Pilot:
     """What the user wants now. `ask`, `press`, `steer` and `push` may be called from any thread; the rest belongs to the session's."""
 
-    def __init__(self, table: Sequence[Command], num_worlds: int = 1, camera: str = "follow", only: Mapping[str, str] = {}) -> None:
+    def __init__(
+        self, table: Sequence[Command], num_worlds: int = 1, camera: str = "follow", only: Mapping[str, str] = {}
+    ) -> None:
         """``only``: the actions that there are, with other words for them or ""; empty: all. Without "own" nothing is driven."""
         self.table, self.num_worlds = tuple(table), num_worlds
         self.low, self.high, self.default = (
-            np.array([getattr(command, end) for command in table], dtype=np.float64) for end in ("low", "high", "default")
+            np.array([getattr(command, end) for command in table], dtype=np.float64)
+            for end in ("low", "high", "default")
         )
         self.command = self.default.copy()
         self.driving = False  # else the stage follows its own commands
@@ -88,7 +91,9 @@ class Pilot:
         self.speed = SPEEDS[0]
         self.push_speed = PUSH_SPEED
         self.message = ""  # why the last action did nothing
-        self.bindings = tuple(b._replace(text=only.get(b.action) or b.text) for b in BINDINGS if not only or b.action in only)
+        self.bindings = tuple(
+            b._replace(text=only.get(b.action) or b.text) for b in BINDINGS if not only or b.action in only
+        )
         self.words, self.can = only, frozenset(binding.action for binding in self.bindings)
         self._asked: queue.SimpleQueue[Callable[[], None]] = queue.SimpleQueue()
         self._pushes: list[tuple[int, FloatArray]] = []
@@ -187,7 +192,9 @@ class Pilot:
         """One press of a key: a fifth of the way from the default to the farther end of the range."""
         columns = [i for i, each in enumerate(self.table) if (each.name == name if name else each.name not in VELOCITY)]
         if self.table and not columns:
-            self.message = f"this task has no command {LABELS[name] if name else 'beyond ' + ', '.join(LABELS.values())}"
+            self.message = (
+                f"this task has no command {LABELS[name] if name else 'beyond ' + ', '.join(LABELS.values())}"
+            )
             return
         command = self.command.copy()
         for i in columns[:1]:

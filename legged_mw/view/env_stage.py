@@ -45,7 +45,9 @@ class EnvStage:
         self._commands: Tensor = env.commands if env.command_table else env.actions[:, :0]
         self._gait = env.gait if isinstance(env, LeggedRobot) else None
         self._command_columns, self._clock_columns = _columns_of(env, "commands"), _columns_of(env, "gait_clock")
-        geoms = len({geom for geoms in env.foot_geoms.values() for geom in geoms}) if isinstance(env, LeggedRobot) else 0
+        geoms = (
+            len({geom for geoms in env.foot_geoms.values() for geom in geoms}) if isinstance(env, LeggedRobot) else 0
+        )
         self._foot_contacts = env.contact_count[:, :geoms]
         self._obs = env.get_observations()
         self._believed: Tensor | None = None  # vx, vy (N, 2) when it acted last
@@ -126,7 +128,10 @@ def _columns_of(env: RobotTask, wanted: str) -> list[tuple[str, slice, Tensor]]:
                 found.append((group, newest, torch.tensor(row.column_scales(), device=env.device)))
             elif row.group:
                 inside = [(columns, scales) for name, columns, scales in found if name == row.group]
-                found += [(group, slice(newest.start + cols.start, newest.start + cols.stop), scales) for cols, scales in inside]
+                found += [
+                    (group, slice(newest.start + cols.start, newest.start + cols.stop), scales)
+                    for cols, scales in inside
+                ]
     return found
 
 

@@ -14,7 +14,8 @@ import numpy as np
 
 from legged_mw.view.stage import FloatArray
 
-MARGIN = 2.2  # [smallest half extent of the foot's geoms] by which a patch is larger than what touches: a ball touches in a point
+# [smallest half extent of the foot's geoms] by which a patch is larger than what touches: a ball touches in a point
+MARGIN = 2.2
 MARGIN_MIN, MARGIN_MAX = 0.045, 0.15  # [robot radius]
 FLAT = 0.5  # [margin] above its lowest point a foot still touches: a sole that is tilted a little is flat
 CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))

@@ -48,7 +48,15 @@ class Gate:
 
     def url(self, host: str) -> str:
         """What the user opens. Of all interfaces (0.0.0.0, ::) it names this machine."""
-        name = "localhost" if host == LOCAL else socket.gethostname() if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+        name = (
+            "localhost"
+            if host == LOCAL
+            else socket.gethostname()
+            if host in ("0.0.0.0", "::")
+            else f"[{host}]"
+            if ":" in host
+            else host
+        )
         return f"http://{name}:{self.port}/" + (f"?token={self.token}" if self.token else "")
 
     def refusal(self, target: str, header: Callable[[str], list[str]]) -> str:
@@ -60,14 +68,20 @@ class Gate:
         host, origin, path = header("Host"), header("Origin"), target.partition("?")[0]
         if len(host) != 1 or not self._known(host[0]):
             return f"this page answers to localhost, to this machine's name and to addresses in numbers: open http://localhost:{self.port}/"
-        if any(one not in (f"http://{host[0]}", f"https://{host[0]}") for one in origin) or (path in SOCKETS and len(origin) != 1):
+        if any(one not in (f"http://{host[0]}", f"https://{host[0]}") for one in origin) or (
+            path in SOCKETS and len(origin) != 1
+        ):
             return "a page of another site may not reach this one"
         opened = header("Sec-Fetch-Mode") == ["navigate"] and not {*header("Sec-Fetch-Dest")} & {*FRAMES}
         if {*header("Sec-Fetch-Site")} & {"cross-site", "same-site"} and not opened:
             return "a page of another site may not show this one or read from it"
         if path == "/drop":
             return "models cannot be dropped on this page"
-        if self.token and not self._shown(self.asked(target)) and not any(map(self._shown, self._kept(header("Cookie")))):
+        if (
+            self.token
+            and not self._shown(self.asked(target))
+            and not any(map(self._shown, self._kept(header("Cookie"))))
+        ):
             return "this page has a token: open the address that the program printed, with ?token="
         return ""
 

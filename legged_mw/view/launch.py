@@ -34,13 +34,23 @@ class FlagError(UserError, ValueError):
 def add_flags(parser: argparse.ArgumentParser, viewer: str = "auto") -> None:
     """Add the flags of watching and driving; the program adds `--command` and `--time` [s] itself."""
     best = " (auto: the best that this machine has)"
-    parser.add_argument("--viewer", choices=VIEWERS, default=viewer, help=f"where to show it, by default {viewer}{best}")
+    parser.add_argument(
+        "--viewer", choices=VIEWERS, default=viewer, help=f"where to show it, by default {viewer}{best}"
+    )
     parser.add_argument("--video", metavar="FILE", help="record an .mp4 or a .gif instead")
-    parser.add_argument("--sheet", metavar="FILE.png", help="write one picture of twelve moments instead, or beside the video")
+    parser.add_argument(
+        "--sheet", metavar="FILE.png", help="write one picture of twelve moments instead, or beside the video"
+    )
     parser.add_argument("--commands", metavar="FILE", help="drive by a YAML script of timed commands")
-    parser.add_argument("--camera", choices=CAMERAS, default="follow", help="follow the robot, walk behind it, or see all")
-    parser.add_argument("--host", default=web.LOCAL, metavar="H", help="interface of the web page (default: this machine only)")
-    parser.add_argument("--port", type=int, default=0, metavar="P", help="port of the web page (default: the first free one from 8080)")
+    parser.add_argument(
+        "--camera", choices=CAMERAS, default="follow", help="follow the robot, walk behind it, or see all"
+    )
+    parser.add_argument(
+        "--host", default=web.LOCAL, metavar="H", help="interface of the web page (default: this machine only)"
+    )
+    parser.add_argument(
+        "--port", type=int, default=0, metavar="P", help="port of the web page (default: the first free one from 8080)"
+    )
 
 
 def check_flags(args: argparse.Namespace) -> None:
@@ -164,21 +174,30 @@ def web_page(stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, tit
     page = web.WebViewer(stage.spec, pilot, pilot.num_worlds, host=args.host, port=args.port, title=title)
     print(f"viewer: a web page ({why}): {page.url}  Ctrl-C ends it")
     if args.host == web.LOCAL and not has_display():
-        print(f"  on another machine paste this into a terminal there, then open the page: {web.tunnel_line(page.port)}")
+        print(
+            f"  on another machine paste this into a terminal there, then open the page: {web.tunnel_line(page.port)}"
+        )
     elif "?token=" in page.url:
-        print(f"  whoever has this address can {'drive' if 'own' in pilot.can else 'damp the robot'}; nothing is encrypted")
+        print(
+            f"  whoever has this address can {'drive' if 'own' in pilot.can else 'damp the robot'}; nothing is encrypted"
+        )
     sys.stdout.flush()
     return page
 
 
-def _recorder(stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, folder: Path, seconds: float, size: Any) -> Viewer:
+def _recorder(
+    stage: Stage, pilot: Pilot, why: str, args: argparse.Namespace, folder: Path, seconds: float, size: Any
+) -> Viewer:
     video, sheet = (Path(name) if name else None for name in (args.video, args.sheet))
     if video is None and sheet is None:
         video, sheet = folder / "play.mp4", folder / "play.png"
         if (reason := no_encoder()) is not None:  # no video was asked for by name
             print(f"no video: {reason}")
             video = None
-    print(f"viewer: {seconds:g} s of {' and '.join(_names(video, sheet))} ({why}); without a GPU for drawing it takes a while", flush=True)
+    print(
+        f"viewer: {seconds:g} s of {' and '.join(_names(video, sheet))} ({why}); without a GPU for drawing it takes a while",
+        flush=True,
+    )
     return Recorder(stage.spec, pilot.num_worlds, stage.dt, seconds, video=video, sheet=sheet, **size)
 
 

@@ -22,7 +22,8 @@ from legged_mw.view.stage import Moment, ViewError
 CLOSE_SECONDS = 5.0
 TEXT_SECONDS = 0.1  # between two changes of text
 _GLFW = {"right": 262, "left": 263, "down": 264, "up": 265, "space": 32, "backspace": 259, "enter": 257}
-KEY_CODES = {_GLFW.get(key, ord(key[0].upper())): key for key in KEY_ACTION}  # GLFW's code of a letter is its capital's ASCII
+# GLFW's code of a letter is its capital's ASCII
+KEY_CODES = {_GLFW.get(key, ord(key[0].upper())): key for key in KEY_ACTION}
 
 
 Text = tuple[int | None, int | None, str, str]  # font, place, left column, right column
@@ -47,7 +48,9 @@ class NativeViewer:
             show_groups(self._handle.opt)
             self._camera = RobotCamera(self._handle.cam, self.robots, by_hand=True)
             ours = {chr(code) for code in KEY_CODES if code < 128}
-            self._own_flags = {i: bool(self._handle.opt.flags[i]) for i, row in enumerate(mujoco.mjVISSTRING) if row[2] in ours}
+            self._own_flags = {
+                i: bool(self._handle.opt.flags[i]) for i, row in enumerate(mujoco.mjVISSTRING) if row[2] in ours
+            }
         self._writer.start()
 
     def show(self, moment: Moment) -> None:
@@ -120,7 +123,9 @@ def _launch(model: mujoco.MjModel, data: mujoco.MjData, on_key: Callable[[int], 
         return mujoco.viewer.launch_passive(model, data, key_callback=on_key, show_left_ui=False, show_right_ui=False)
     except RuntimeError as error:
         if sys.platform == "darwin":
-            raise ViewError("On macOS a window needs the main thread: start with `mjpython` in place of `python`.") from error
+            raise ViewError(
+                "On macOS a window needs the main thread: start with `mjpython` in place of `python`."
+            ) from error
         raise
 
 

@@ -24,7 +24,8 @@ CONTACT_RGBA = (0.00, 0.75, 0.52, 0.9)
 FALL_RGBA = (0.90, 0.20, 0.45, 0.45)
 GHOST_RGBA = (0.55, 0.75, 0.95, 0.3)  # ours: pale blue
 
-ARROW_PER_SPEED = 1.3  # [robot radius per m/s] arrow length; MuJoCo draws half of it: at 1 m/s a little more than from base to nose
+# [robot radius per m/s] arrow length; MuJoCo draws half of it: at 1 m/s a little more than from base to nose
+ARROW_PER_SPEED = 1.3
 ARROW_MAX = 1.95  # [robot radius] of the fastest command: a longer arrow would leave the picture
 LEVELS = (0.36, 0.24)  # [robot radius] above its top: the commanded velocity, the measured one
 ARC_PER_RATE = 1.0  # [rad per rad/s] the turn arrow shows one second of turning, at most ARC_MAX of it
@@ -49,7 +50,12 @@ def draw(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment) -> None:
 
 
 def draw_velocities(
-    scene: mujoco.MjvScene, placement: Placement, target: ArrayLike, velocity: ArrayLike, turn: bool = True, top_speed: float = 1.0
+    scene: mujoco.MjvScene,
+    placement: Placement,
+    target: ArrayLike,
+    velocity: ArrayLike,
+    turn: bool = True,
+    top_speed: float = 1.0,
 ) -> None:
     """Append arrows for the commanded and the measured velocity, each (vx, vy, yaw rate) in the body frame, above the robot's top.
 
@@ -68,7 +74,12 @@ def draw_velocities(
 
 
 def _draw_straight(
-    scene: mujoco.MjvScene, placement: Placement, origin: FloatArray, velocity: FloatArray, per_speed: float, rgba: tuple[float, ...]
+    scene: mujoco.MjvScene,
+    placement: Placement,
+    origin: FloatArray,
+    velocity: FloatArray,
+    per_speed: float,
+    rgba: tuple[float, ...],
 ) -> None:
     """An arrow along (vx, vy), level even when the trunk is not: commands are meant in the plane. `per_speed` [robot radius per m/s]."""
     speed = math.hypot(velocity[0], velocity[1])
@@ -81,7 +92,9 @@ def _draw_straight(
     connect(scene, mujoco.mjtGeom.mjGEOM_ARROW, 0.03 * placement.radius, origin, tip, rgba)
 
 
-def _draw_turn(scene: mujoco.MjvScene, placement: Placement, origin: FloatArray, rate: float, rgba: tuple[float, ...]) -> None:
+def _draw_turn(
+    scene: mujoco.MjvScene, placement: Placement, origin: FloatArray, rate: float, rgba: tuple[float, ...]
+) -> None:
     """A bent arrow around the vertical: it starts in front of the robot and turns with the yaw rate."""
     if abs(rate) < RATE_MIN:
         return
@@ -92,7 +105,9 @@ def _draw_turn(scene: mujoco.MjvScene, placement: Placement, origin: FloatArray,
     for start, end in zip(ring[:-1], ring[1:], strict=True):
         connect(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, width, start, end, rgba)
     tangent = math.copysign(1.0, rate) * np.array([-math.sin(angles[-1]), math.cos(angles[-1]), 0.0])
-    connect(scene, mujoco.mjtGeom.mjGEOM_ARROW, 2.0 * width, ring[-1], ring[-1] + 0.13 * placement.radius * tangent, rgba)
+    connect(
+        scene, mujoco.mjtGeom.mjGEOM_ARROW, 2.0 * width, ring[-1], ring[-1] + 0.13 * placement.radius * tangent, rgba
+    )
 
 
 def _draw_contacts(scene: mujoco.MjvScene, robots: PosedRobots, moment: Moment) -> None:
@@ -125,7 +140,9 @@ def _draw_fall(scene: mujoco.MjvScene, place: FloatArray, radius: float) -> None
     _add(scene, mujoco.mjtGeom.mjGEOM_SPHERE, (0.35 * radius,) * 3, place, FALL_RGBA, "fell")
 
 
-def connect(scene: mujoco.MjvScene, kind: int, width: float, start: FloatArray, end: FloatArray, rgba: tuple[float, ...]) -> None:
+def connect(
+    scene: mujoco.MjvScene, kind: int, width: float, start: FloatArray, end: FloatArray, rgba: tuple[float, ...]
+) -> None:
     """Append a capsule or an arrow from ``start`` to ``end``; of an arrow MuJoCo draws half."""
     geom = _add(scene, kind, (0.0, 0.0, 0.0), start, rgba)
     if geom is not None:
@@ -133,7 +150,12 @@ def connect(scene: mujoco.MjvScene, kind: int, width: float, start: FloatArray, 
 
 
 def _add(
-    scene: mujoco.MjvScene, kind: int, size: tuple[float, ...], place: FloatArray, rgba: tuple[float, ...], label: str = ""
+    scene: mujoco.MjvScene,
+    kind: int,
+    size: tuple[float, ...],
+    place: FloatArray,
+    rgba: tuple[float, ...],
+    label: str = "",
 ) -> mujoco.MjvGeom | None:
     """One geom; None where the scene is full."""
     if scene.ngeom >= scene.maxgeom:

@@ -119,11 +119,17 @@ class Panel:
         ui, pilot = self.ui, self.pilot
         ui.SeparatorText("robot")
         for row in BUTTONS:
-            several = [(action, label) for action, label in row if action in pilot.can and (action != "next" or pilot.num_worlds > 1)]
+            several = [
+                (action, label)
+                for action, label in row
+                if action in pilot.can and (action != "next" or pilot.num_worlds > 1)
+            ]
             for place, (action, label) in enumerate(several):
                 if place:
                     ui.SameLine()
-                if ui.Button(self._label(action, label), ui.Vec2(0.94 * WIDTH / 3 - 6 if len(row) == 3 else 0.47 * WIDTH - 6, 0)):
+                if ui.Button(
+                    self._label(action, label), ui.Vec2(0.94 * WIDTH / 3 - 6 if len(row) == 3 else 0.47 * WIDTH - 6, 0)
+                ):
                     self._click(action)
         ui.SetNextItemWidth(0.62 * WIDTH)
         if "push" in pilot.can:

@@ -41,17 +41,37 @@ def parse(description: str | None) -> argparse.Namespace:
     """The flags of playing."""
     parser = make_parser(description)
     parser.add_argument(
-        "--command", metavar="VX,VY,YAW", help="fixed command [m/s, m/s, rad/s]; --command=-0.5,0,0; others by name: base_height=0.25"
+        "--command",
+        metavar="VX,VY,YAW",
+        help="fixed command [m/s, m/s, rad/s]; --command=-0.5,0,0; others by name: base_height=0.25",
     )
-    parser.add_argument("--time", type=duration, metavar="T", help="how long to play (default: 10s of video, a window until closed)")
+    parser.add_argument(
+        "--time", type=duration, metavar="T", help="how long to play (default: 10s of video, a window until closed)"
+    )
     launch.add_flags(parser)
     parser.add_argument("--follow", action="store_true", help="read the policy again as its run trains on")
-    parser.add_argument("--eval", action="store_true", help="run the task's exam (on rough ground too), print its tables, write a report")
-    parser.add_argument("--compare", metavar="RUN", help="with --eval: grade this run beside it; its name or path, or 'shipped'")
-    common = "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
+    parser.add_argument(
+        "--eval",
+        action="store_true",
+        help="run the task's exam (on rough ground too), print its tables, write a report",
+    )
+    parser.add_argument(
+        "--compare", metavar="RUN", help="with --eval: grade this run beside it; its name or path, or 'shipped'"
+    )
+    common = (
+        "--eval asks the ranges that were trained, or the one range that all published policies of the robot were asked"
+    )
     parser.add_argument("--ranges", choices=("trained", "common"), help=common)
-    parser.add_argument("--export", metavar="DIR", help="write the policy as network, contract and scene there, to deploy (docs/deploy.md)")
-    parser.add_argument("--half", action="store_true", help="with --export: round the weights to float16; the network takes half the space")
+    parser.add_argument(
+        "--export",
+        metavar="DIR",
+        help="write the policy as network, contract and scene there, to deploy (docs/deploy.md)",
+    )
+    parser.add_argument(
+        "--half",
+        action="store_true",
+        help="with --export: round the weights to float16; the network takes half the space",
+    )
     args = parser.parse_args()
     require_task(args, parser)
     asked = [flag for flag in ("eval", "export", "video") if getattr(args, flag) not in (None, False)]

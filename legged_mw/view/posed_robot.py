@@ -16,7 +16,8 @@ from legged_mw.view.stage import FloatArray
 
 GROUPS_SHOWN = 3  # geom groups 0 ground, 1 and 2 visuals; from 3 on collision shapes
 SHADOW_MAX, SHADOW_SIZE = 8.0, 4096  # [extent] half-width of the shadow map, [px] its edge: 4 mm a pixel at the most
-SEVERAL_WITHOUT = ("sensors", "actuators", "equalities", "tendons", "pairs", "excludes")  # each copy of a body would copy them too
+# each copy of a body would copy them too
+SEVERAL_WITHOUT = ("sensors", "actuators", "equalities", "tendons", "pairs", "excludes")
 PLAIN = (0.55, 0.57, 0.60, 1.0)  # colour of a link that has no looks
 SPACING = 3.0  # [robot radius] between robots that stand side by side
 
@@ -43,7 +44,9 @@ class PosedRobots:
         single = spec.compile()
         if single.njnt == 0 or single.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE:
             first = "no joint at all" if single.njnt == 0 else f"{single.joint(0).name!r}, which is not one"
-            raise ValueError(f"A viewer follows the robot's free joint, which must be the model's first joint; found {first}.")
+            raise ValueError(
+                f"A viewer follows the robot's free joint, which must be the model's first joint; found {first}."
+            )
         self.count, self._nq = count, single.nq
         self.model, self._bases, self._feet = many_robots(spec, single, count)
         self.data, self.base = mujoco.MjData(self.model), self._bases[0]
@@ -65,11 +68,16 @@ class PosedRobots:
         """Place all robots by the rows of `qpos` (N, nq), and follow robot `world`."""
         array = np.atleast_2d(np.array(qpos, dtype=np.float64))[: self.count]
         if array.shape[1:] != (self._nq,):
-            raise ValueError(f"qpos has shape {array.shape[1:]}; this model has nq = {self._nq}, so ({self._nq},) is needed.")
+            raise ValueError(
+                f"qpos has shape {array.shape[1:]}; this model has nq = {self._nq}, so ({self._nq},) is needed."
+            )
         if not np.isfinite(array).all():
-            raise ValueError(f"qpos[{int(np.argwhere(~np.isfinite(array))[0, 1])}] is not finite: the simulation diverged.")
+            raise ValueError(
+                f"qpos[{int(np.argwhere(~np.isfinite(array))[0, 1])}] is not finite: the simulation diverged."
+            )
         array[:, :3] += self.offsets
-        self._order = [world, *(index for index in range(self.count) if index != world)]  # robot of each copy in the model
+        # robot of each copy in the model
+        self._order = [world, *(index for index in range(self.count) if index != world)]
         self.data.qpos[:] = array[self._order].ravel()
         self._forward()
         self.placements: list[Placement] = [self._placement(self._order.index(index)) for index in range(self.count)]
@@ -104,7 +112,9 @@ class PosedRobots:
     def _placement(self, copy: int) -> Placement:
         body = self._bases[copy]
         rotation = self.data.xmat[body]
-        return Placement(np.array(self.data.xpos[body]), math.atan2(rotation[3], rotation[0]), self.radius, self.top, self.bottom)
+        return Placement(
+            np.array(self.data.xpos[body]), math.atan2(rotation[3], rotation[0]), self.radius, self.top, self.bottom
+        )
 
     def _measure(self) -> tuple[float, float, float]:
         """Of what is seen of a robot, and its feet: largest distance from its base, height above it and depth below it [m]."""
@@ -125,7 +135,9 @@ def boxes(model: mujoco.MjModel, data: mujoco.MjData, geoms: ArrayLike) -> tuple
     return centres, (np.abs(rotation) @ box[:, 3:, None])[..., 0]
 
 
-def many_robots(spec: mujoco.MjSpec, single: mujoco.MjModel, count: int) -> tuple[mujoco.MjModel, list[int], list[list[int]]]:
+def many_robots(
+    spec: mujoco.MjSpec, single: mujoco.MjModel, count: int
+) -> tuple[mujoco.MjModel, list[int], list[list[int]]]:
     """`count` copies of the robot of `spec` as one model for drawing: nothing collides, and one robot has the lights and cameras.
 
     Returns also the base of each copy, and each copy's geoms with a contact sensor, in the order of the sensors.
@@ -137,11 +149,16 @@ def many_robots(spec: mujoco.MjSpec, single: mujoco.MjModel, count: int) -> tupl
         for element in getattr(spec, kind):
             spec.delete(element)
     for body in spec.bodies[1:]:
-        if all(shape.group >= GROUPS_SHOWN for shape in body.geoms):  # it has no looks: its collision shapes are better than nothing
+        # it has no looks: its collision shapes are better than nothing
+        if all(shape.group >= GROUPS_SHOWN for shape in body.geoms):
             for shape in body.geoms:
                 shape.group, shape.rgba = GROUPS_SHOWN - 1, PLAIN
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    spec.stat.extent, spec.stat.center, spec.stat.meansize = single.stat.extent, single.stat.center, single.stat.meansize
+    spec.stat.extent, spec.stat.center, spec.stat.meansize = (
+        single.stat.extent,
+        single.stat.center,
+        single.stat.meansize,
+    )
     spec.copy_during_attach = True
     bases = [spec.joints[0].parent]
     for index in range(1, count):
@@ -186,7 +203,8 @@ class RoughGround:
             x, y = np.round(data.geom_xpos[geom, :2], 6)
             found.setdefault((x, y), []).append(int(geom))
         self._model = model
-        self.fine, self.coarse = (np.array([same[which] for same in found.values()]) for which in (0, -1))  # (T,), the same if alone
+        # (T,), the same if alone
+        self.fine, self.coarse = (np.array([same[which] for same in found.values()]) for which in (0, -1))
         self.places: FloatArray = np.array(list(found))
         self.halves: FloatArray = np.array([model.hfield_size[model.geom_dataid[geom], :2] for geom in self.fine])
         self._bottoms: FloatArray = np.array(data.geom_xpos[self.fine, 2])

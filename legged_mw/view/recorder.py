@@ -19,9 +19,11 @@ from legged_mw.view.posed_robot import PosedRobots, show_groups
 from legged_mw.view.stage import Moment, ViewError
 from legged_mw.view.video import Frame, VideoWriter, contact_sheet, save_png
 
-SHADOW_MAX = 2048  # ours: edge of the shadow map [px]; 8192, found in many scenes, halves the frame rate of software OpenGL
+# ours: edge of the shadow map [px]; 8192, found in many scenes, halves the frame rate of software OpenGL
+SHADOW_MAX = 2048
 GEOMS_MAX = 20_000
-FINE_REACH = 3.0  # [m] beyond the camera's distance: tiles of rough ground farther from what it looks at are drawn coarsely
+# [m] beyond the camera's distance: tiles of rough ground farther from what it looks at are drawn coarsely
+FINE_REACH = 3.0
 TINY, SMALL = 400, 800  # [px] pictures up to these widths get smaller letters
 SHEET_FRAMES, SHEET_COLUMNS, SHEET_WIDTH = 12, 4, 320  # pictures, pictures in a row, width of a picture at most [px]
 GIF_FPS, GIF_WIDTH = 12.5, 640  # a GIF counts in hundredths of a second, and grows large with more of either
@@ -41,8 +43,16 @@ class RobotRenderer:
         show_groups(self._option)
         try:
             scale = mujoco.mjtFontScale
-            font = scale.mjFONTSCALE_50 if width <= TINY else scale.mjFONTSCALE_100 if width <= SMALL else scale.mjFONTSCALE_150
-            self._renderer = mujoco.Renderer(self.robots.model, height=height, width=width, max_geom=GEOMS_MAX, font_scale=font)
+            font = (
+                scale.mjFONTSCALE_50
+                if width <= TINY
+                else scale.mjFONTSCALE_100
+                if width <= SMALL
+                else scale.mjFONTSCALE_150
+            )
+            self._renderer = mujoco.Renderer(
+                self.robots.model, height=height, width=width, max_geom=GEOMS_MAX, font_scale=font
+            )
         except Exception as error:  # each OpenGL backend fails with a type of its own
             raise ViewError(no_context(error)) from error
 
@@ -119,7 +129,10 @@ class Recorder:
     def show(self, moment: Moment) -> None:
         """Record a frame, if one is due."""
         film = self._writer is not None and self._turn % self._every == 0
-        still = len(self._pictures) < len(self._sheet_times) and moment.time >= self._sheet_times[len(self._pictures)] - 1e-9
+        still = (
+            len(self._pictures) < len(self._sheet_times)
+            and moment.time >= self._sheet_times[len(self._pictures)] - 1e-9
+        )
         self._turn += 1
         if not (film or still):
             return

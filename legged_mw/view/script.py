@@ -73,7 +73,9 @@ def load_script(path: Path | str, table: Sequence[Command]) -> Script:
         where = f"{path}: entry {number} of commands"
         entries.append(_entry(item, where, table))
         if number > 1 and entries[-1].time < entries[-2].time:
-            raise ConfigError(f"{where}: its time {entries[-1].time:g} s is before the one above it, {entries[-2].time:g} s")
+            raise ConfigError(
+                f"{where}: its time {entries[-1].time:g} s is before the one above it, {entries[-2].time:g} s"
+            )
     return Script(entries)
 
 
@@ -111,7 +113,8 @@ def _command(value: Any, where: str, table: Sequence[Command]) -> list[float]:
                 raise ConfigError(f"{where}: {unknown('command', str(name), names, 'this task')}")
             [command[names.index(name)]] = _numbers(number, [1], f"{where}: {name}", "a number")
     else:
-        whole = [len(table), *([len(VELOCITY)] if tuple(names[: len(VELOCITY)]) == VELOCITY else [])]  # a robot's own may be left out
+        # a robot's own may be left out
+        whole = [len(table), *([len(VELOCITY)] if tuple(names[: len(VELOCITY)]) == VELOCITY else [])]
         values = _numbers(value, whole, where, f"a list of {with_units(table)}, or {{name: value}}")
         command[: len(values)] = values
     if wrong := outside(command, table):

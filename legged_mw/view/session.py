@@ -46,7 +46,9 @@ class Outcome(NamedTuple):
         if self.segments:
             lines.append(f"{'from':>8}{'for':>8}   {commanded}   measured: {MEASURED}")
         for each in self.segments[-20:]:
-            lines.append(f"{each.start:>6.1f} s{each.seconds:>6.1f} s   {signed(each.command):<{len(commanded)}}   {signed(each.velocity)}")
+            lines.append(
+                f"{each.start:>6.1f} s{each.seconds:>6.1f} s   {signed(each.command):<{len(commanded)}}   {signed(each.velocity)}"
+            )
         return "\n".join(lines)
 
 

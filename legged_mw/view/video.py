@@ -35,7 +35,9 @@ class VideoWriter:
         check_format(self.path)
         kind = self.path.suffix.lower()
         if kind == ".mp4" and (width < 2 or height < 2 or width % 2 or height % 2):
-            raise ViewError(f"A video of {width} x {height} cannot be encoded: yuv420p needs an even width and an even height.")
+            raise ViewError(
+                f"A video of {width} x {height} cannot be encoded: yuv420p needs an even width and an even height."
+            )
         if not (math.isfinite(fps) and fps > 0):
             raise ValueError(f"fps = {fps}: a video needs a positive number of frames per second.")
         if (reason := no_encoder(kind)) is not None:
@@ -50,7 +52,9 @@ class VideoWriter:
         if self._container is None:
             raise RuntimeError(f"{self.path} is closed: no frame can be added.")
         if frame.shape != (self.height, self.width, 3) or frame.dtype != np.uint8:
-            raise ValueError(f"A frame of this video is uint8 {(self.height, self.width, 3)}; got {frame.dtype} {frame.shape}.")
+            raise ValueError(
+                f"A frame of this video is uint8 {(self.height, self.width, 3)}; got {frame.dtype} {frame.shape}."
+            )
         picture = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(frame), format="rgb24")
         picture.pts, picture.time_base = self.frames, self._time
         self._palette.push(picture) if self._palette else self._write(picture)
@@ -91,9 +95,17 @@ class VideoWriter:
         self._av: Any = av
         self._time = 1 / rate
         gif = kind == ".gif"
-        self._container: Any = av.open(str(self._partial), "w", format=kind[1:], options={} if gif else {"movflags": "+faststart"})
-        self._stream: Any = self._container.add_stream(CODECS[kind], rate=rate, options={} if gif else {"crf": str(CRF)})
-        self._stream.width, self._stream.height, self._stream.pix_fmt = self.width, self.height, "pal8" if gif else "yuv420p"
+        self._container: Any = av.open(
+            str(self._partial), "w", format=kind[1:], options={} if gif else {"movflags": "+faststart"}
+        )
+        self._stream: Any = self._container.add_stream(
+            CODECS[kind], rate=rate, options={} if gif else {"crf": str(CRF)}
+        )
+        self._stream.width, self._stream.height, self._stream.pix_fmt = (
+            self.width,
+            self.height,
+            "pal8" if gif else "yuv420p",
+        )
         self._palette: Any = self._palette_graph() if gif else None
 
     def _palette_graph(self) -> Any:
@@ -101,7 +113,8 @@ class VideoWriter:
         graph = self._av.filter.Graph()
         source = graph.add_buffer(width=self.width, height=self.height, format="rgb24", time_base=self._time)
         split, palette, use, sink = (
-            graph.add(*filter_) for filter_ in (("split",), ("palettegen", "stats_mode=full"), ("paletteuse", DITHER), ("buffersink",))
+            graph.add(*filter_)
+            for filter_ in (("split",), ("palettegen", "stats_mode=full"), ("paletteuse", DITHER), ("buffersink",))
         )
         source.link_to(split)
         split.link_to(palette, 0, 0)
@@ -128,14 +141,18 @@ def no_encoder(kind: str = ".mp4") -> str | None:
     except ImportError as error:
         return f'Videos are written by PyAV ({error}). Install it: pip install "legged_mw[video]"'
     if CODECS[kind] not in av.codecs_available:
-        return f"PyAV {av.__version__} was built without {CODECS[kind]}. Install another: pip install --force-reinstall av"
+        return (
+            f"PyAV {av.__version__} was built without {CODECS[kind]}. Install another: pip install --force-reinstall av"
+        )
     return None
 
 
 def contact_sheet(frames: Sequence[Frame], columns: int) -> Frame:
     """Frames of one shape side by side, row after row; an unfinished last row ends in black."""
     if not frames or columns < 1:
-        raise ValueError(f"A contact sheet needs frames and at least one column; got {len(frames)} frames, {columns} columns.")
+        raise ValueError(
+            f"A contact sheet needs frames and at least one column; got {len(frames)} frames, {columns} columns."
+        )
     height, width = frames[0].shape[:2]
     rows = -(-len(frames) // columns)
     sheet = np.zeros((rows * columns, height, width, 3), dtype=np.uint8)
@@ -153,5 +170,10 @@ def save_png(path: Path | str, frame: Frame) -> None:
     rows = np.hstack([np.zeros((height, 1), dtype=np.uint8), np.ascontiguousarray(frame).reshape(height, width * 3)])
     header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    data = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(rows.tobytes())) + chunk(b"IEND", b"")
+    data = (
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(rows.tobytes()))
+        + chunk(b"IEND", b"")
+    )
     Path(path).write_bytes(data)

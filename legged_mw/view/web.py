@@ -45,7 +45,14 @@ class WebViewer:
     _serving = ""  # the address of the one that is open
 
     def __init__(
-        self, spec: mujoco.MjSpec, pilot: Pilot, count: int = 1, *, host: str = LOCAL, port: int = 0, title: str = "legged_mw"
+        self,
+        spec: mujoco.MjSpec,
+        pilot: Pilot,
+        count: int = 1,
+        *,
+        host: str = LOCAL,
+        port: int = 0,
+        title: str = "legged_mw",
     ) -> None:
         if (reason := missing()) is not None:
             raise ViewError(f"--viewer web: {reason}")
@@ -55,7 +62,8 @@ class WebViewer:
 
         self.robots = PosedRobots(spec, count)
         port = free_port(host, port)
-        if WebViewer._serving:  # Studio's client of NetImgui is a global of C++: a second one never ends its first picture
+        # Studio's client of NetImgui is a global of C++: a second one never ends its first picture
+        if WebViewer._serving:
             raise ViewError(
                 f"--viewer web: this process serves {WebViewer._serving} already, and MuJoCo's web viewer can be there once: close it first"
             )
@@ -94,7 +102,8 @@ class WebViewer:
     def _wait(self, host: str, port: int) -> None:
         """Wait until the page is served, and refuse any interface but the one asked for."""
         until = time.monotonic() + START_SECONDS
-        while not self._listens() and time.monotonic() < until and self._handle.is_running():  # raises what its thread raised
+        # raises what its thread raised
+        while not self._listens() and time.monotonic() < until and self._handle.is_running():
             time.sleep(0.02)
         if not self._listens():
             self.close()
@@ -102,11 +111,16 @@ class WebViewer:
         bound = self._plugin.viewer._http_sock.getsockname()
         if host == LOCAL and bound[0] != LOCAL:
             self.close()
-            raise ViewError(f"--viewer web: the page would be open to the network ({bound[0]}:{port}); this mujoco binds it otherwise")
+            raise ViewError(
+                f"--viewer web: the page would be open to the network ({bound[0]}:{port}); this mujoco binds it otherwise"
+            )
 
     def _listens(self) -> bool:
         """Whether its server listens: one more thread, which starts after the viewer."""
-        return self._plugin.begun.is_set() and self._plugin.viewer._http_sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1
+        return (
+            self._plugin.begun.is_set()
+            and self._plugin.viewer._http_sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN) == 1
+        )
 
 
 @contextmanager
@@ -118,7 +132,9 @@ def _bound_to(host: str, gate: Gate) -> Iterator[None]:
     names = ("bind_public_socket", "bind_loopback_socket", "serve")
     bind, inner, serve = (getattr(web_server, name, None) for name in names)
     if bind is None or inner is None or serve is None:
-        raise ViewError(f"--viewer web: the page of this mujoco ({mujoco.__version__}) cannot be bound to {host} and guarded")
+        raise ViewError(
+            f"--viewer web: the page of this mujoco ({mujoco.__version__}) cannot be bound to {host} and guarded"
+        )
     logging.getLogger("WebServer").setLevel(logging.WARNING)
     web_viewer.print = lambda *_, **__: None  # type: ignore[attr-defined]  # its banner names all interfaces
     web_server.bind_public_socket = lambda _, port=0: bind(host, port)
@@ -164,7 +180,9 @@ def _guarded(settings: dict[str, Any], gate: Gate) -> dict[str, Any]:
 def free_port(host: str, port: int = 0) -> int:
     """`port` if it is free; for 0 the first free one from FIRST_PORT on. Raises ViewError."""
     if not host:  # to a socket that is every interface
-        raise ViewError(f"--host is empty; leave it out for {LOCAL}, this machine alone, or name an interface (0.0.0.0: all)")
+        raise ViewError(
+            f"--host is empty; leave it out for {LOCAL}, this machine alone, or name an interface (0.0.0.0: all)"
+        )
     candidates = [port] if port else range(FIRST_PORT, FIRST_PORT + PORTS)
     for candidate in candidates:
         with socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM) as probe:
@@ -175,18 +193,25 @@ def free_port(host: str, port: int = 0) -> int:
                 if isinstance(error, socket.gaierror) or error.errno == errno.EADDRNOTAVAIL:
                     raise ViewError(f"--host {host}: this machine has no such address ({error.strerror})") from None
                 if isinstance(error, PermissionError):
-                    raise ViewError(f"--port {candidate}: this user may not listen there; ports from 1024 on are free for all") from None
+                    raise ViewError(
+                        f"--port {candidate}: this user may not listen there; ports from 1024 on are free for all"
+                    ) from None
                 continue
             return candidate
     if port:
-        raise ViewError(f"--port {port} is in use on {host}; leave it out and the first free one from {FIRST_PORT} is taken")
-    raise ViewError(f"--viewer web: ports {FIRST_PORT} to {FIRST_PORT + PORTS - 1} are all in use; name another with --port")
+        raise ViewError(
+            f"--port {port} is in use on {host}; leave it out and the first free one from {FIRST_PORT} is taken"
+        )
+    raise ViewError(
+        f"--viewer web: ports {FIRST_PORT} to {FIRST_PORT + PORTS - 1} are all in use; name another with --port"
+    )
 
 
 def tunnel_line(port: int) -> str:
     """The command that brings this machine's page to the user's own machine."""
     user = getpass.getuser()
-    client = os.environ.get("SSH_CONNECTION", "").split()  # client's address and port, then ours as the client knows them
+    # client's address and port, then ours as the client knows them
+    client = os.environ.get("SSH_CONNECTION", "").split()
     if len(client) == 4:
         way = f"-p {client[3]} " if client[3] != "22" else ""
         return f"ssh {way}-L {port}:{LOCAL}:{port} {user}@{client[2]}"

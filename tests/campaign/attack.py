@@ -95,7 +95,9 @@ def attack(case: Case, root: Path, allowed: tuple[Path, ...] = ()) -> str:
     assert "out of memory" not in said[0], "it was tried, not refused"
     for text in (case.says,) if isinstance(case.says, str) else case.says:
         assert text in said[0], said[0]
-    assert not (strange := [path for path in written if not any(path.is_relative_to(place) for place in places)]), strange
+    assert not (strange := [path for path in written if not any(path.is_relative_to(place) for place in places)]), (
+        strange
+    )
     assert files(root) == before
     return said[0]
 
@@ -122,7 +124,10 @@ def captured() -> Iterator[list[str]]:
     with tempfile.TemporaryFile("w+b") as file, contextlib.redirect_stdout(io.StringIO()):
         os.dup2(file.fileno(), 2)
         try:
-            with open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False) as stderr, contextlib.redirect_stderr(stderr):
+            with (
+                open(2, "w", encoding="utf-8", errors="backslashreplace", closefd=False) as stderr,
+                contextlib.redirect_stderr(stderr),
+            ):
                 yield said
         finally:
             os.dup2(kept, 2)

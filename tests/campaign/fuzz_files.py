@@ -41,9 +41,20 @@ from legged_mw.utils.task import load_task
 
 EXAMPLES, SLOW = 50, 2.0  # of a round; [s]
 SHIPPED = ROOT / "resources/policies"
-NUMBERS = st.one_of(st.floats(), st.integers(-(10**40), 10**40), st.integers(-3, 60), st.sampled_from([0, -0.0, 1e9, 1e308, 2**31, 2**63]))
+NUMBERS = st.one_of(
+    st.floats(),
+    st.integers(-(10**40), 10**40),
+    st.integers(-3, 60),
+    st.sampled_from([0, -0.0, 1e9, 1e308, 2**31, 2**63]),
+)
 VALUES = st.recursive(
-    st.one_of(NUMBERS, st.text(max_size=20), st.booleans(), st.none(), st.sampled_from(["../x", "/etc/passwd", "nan", "FR_hip_joint"])),
+    st.one_of(
+        NUMBERS,
+        st.text(max_size=20),
+        st.booleans(),
+        st.none(),
+        st.sampled_from(["../x", "/etc/passwd", "nan", "FR_hip_joint"]),
+    ),
     lambda inner: st.one_of(st.lists(inner, max_size=14), st.dictionaries(st.text(max_size=8), inner, max_size=4)),
     max_leaves=8,
 )
@@ -156,7 +167,12 @@ def contract_bytes(root: Path) -> Callable[[], None]:
 
 def small_runner() -> Runner:
     task = load_task("go1_flat")
-    for path, value in {"env.num_envs": 2, "actor.hidden_dims": [4], "critic.hidden_dims": [4], "perturbation.curriculum": True}.items():
+    for path, value in {
+        "env.num_envs": 2,
+        "actor.hidden_dims": [4],
+        "critic.hidden_dims": [4],
+        "perturbation.curriculum": True,
+    }.items():
         task.set(path, value)
     runner = make_runner(task.env_class(task.cfg, "cpu"), task.train, None, "cpu")
     for parameter in [p for group in runner.alg.optimizer.param_groups for p in group["params"]]:
@@ -171,7 +187,9 @@ TENSORS = st.one_of(
         lambda shape, value, dtype: torch.full(shape, value).to(dtype),
         st.lists(st.integers(0, 6), max_size=3),
         st.sampled_from([0.0, 1.0, -1.0, float("nan"), float("inf"), 1e30]),
-        st.sampled_from([torch.float32, torch.float64, torch.int64, torch.uint8, torch.bool, torch.float16, torch.complex64]),
+        st.sampled_from(
+            [torch.float32, torch.float64, torch.int64, torch.uint8, torch.bool, torch.float16, torch.complex64]
+        ),
     ),
     st.builds(lambda size: torch.zeros(1).expand(size), st.sampled_from([1, 10**6, 10**12])),
 )
@@ -260,7 +278,9 @@ def motors(root: Path) -> Callable[[], None]:
 
 def _round(test: Callable[..., None]) -> Callable[[], None]:
     quick = [Phase.explicit, Phase.generate]  # to shrink what is found takes longer than to find it
-    relaxed = settings(max_examples=EXAMPLES, deadline=None, database=None, phases=quick, suppress_health_check=[*HealthCheck])
+    relaxed = settings(
+        max_examples=EXAMPLES, deadline=None, database=None, phases=quick, suppress_health_check=[*HealthCheck]
+    )
     return relaxed(test)  # type: ignore[return-value]
 
 

@@ -65,7 +65,9 @@ def check_whole(folder: Path) -> None:
         assert not damage(file.read_bytes()), file
     newest = max(checkpoints(folder))
     assert (folder / f"worlds_{newest}.pt").is_file(), sorted(path.name for path in folder.iterdir())
-    assert not (folder / "export").exists() or {"policy.onnx", "policy.yaml"} <= {path.name for path in (folder / "export").iterdir()}
+    assert not (folder / "export").exists() or {"policy.onnx", "policy.yaml"} <= {
+        path.name for path in (folder / "export").iterdir()
+    }
 
 
 def _wait(child: int, home: Path, new: int, pause: float) -> None:
@@ -78,9 +80,14 @@ def _wait(child: int, home: Path, new: int, pause: float) -> None:
     time.sleep(pause)
 
 
-def campaign(root: Path, kills: int, numbers: tuple[int, ...], seed: int = 0, iterations: int = 12, export: bool = True) -> dict[str, int]:
+def campaign(
+    root: Path, kills: int, numbers: tuple[int, ...], seed: int = 0, iterations: int = 12, export: bool = True
+) -> dict[str, int]:
     """``kills`` signals from ``numbers``, each up to 0.4 s after 0 to 4 new checkpoints; counts of what happened."""
-    dice, counts = random.Random(seed), dict[str, int](kills=0, compared=0, **{"resumed exactly": 0, "ended by itself": 0})
+    dice, counts = (
+        random.Random(seed),
+        dict[str, int](kills=0, compared=0, **{"resumed exactly": 0, "ended by itself": 0}),
+    )
     assert waited(train(root / "whole", False, iterations, export)) == 0
     whole = folder_of(root / "whole")
     assert whole

@@ -74,7 +74,9 @@ def never_ends(root: Path) -> None:
         (never_ends, TimeoutError),
     ],
 )
-def test_it_sees(run: Callable[[Path], object], error: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_sees(
+    run: Callable[[Path], object], error: type[Exception], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(harness, "SECONDS", 1 if run is never_ends else 60)
     (tmp_path.parent / "stood").write_text("")
     with pytest.raises(error):

@@ -111,8 +111,12 @@ WAYS = {
 }
 
 
-@pytest.mark.parametrize(("way", "value"), [("reward", math.nan), ("row", 1e20), ("handed out", 1e20), ("handed out", math.nan)])
-def test_once_in_one_world_of_eight_ruins_nothing(way: str, value: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("way", "value"), [("reward", math.nan), ("row", 1e20), ("handed out", 1e20), ("handed out", math.nan)]
+)
+def test_once_in_one_world_of_eight_ruins_nothing(
+    way: str, value: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     spoil, said = WAYS[way]
     spoil(monkeypatch, Spoiler(value, lambda call: call == 20))
     result = train(tmp_path, 6)
@@ -131,10 +135,15 @@ def test_a_reward_that_stays_bad_ends_the_run(tmp_path: Path, monkeypatch: pytes
 def test_a_row_that_stays_bad_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spoil_row(monkeypatch, Spoiler(1e38, lambda call: call > 16))
     result = train(tmp_path, 50)
-    assert result.code == 2 and "train.py: observation row 'commands' of 'state' is not finite, or beyond 1e+06, in " in result.err
+    assert (
+        result.code == 2
+        and "train.py: observation row 'commands' of 'state' is not finite, or beyond 1e+06, in " in result.err
+    )
 
 
-def test_three_dead_updates_in_a_row_end_the_run_at_the_last_good_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_three_dead_updates_in_a_row_end_the_run_at_the_last_good_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     good: dict[str, Any] = {}
     update = Runner._update
 
@@ -147,7 +156,11 @@ def test_three_dead_updates_in_a_row_end_the_run_at_the_last_good_one(tmp_path: 
     spoil_handed_out(monkeypatch, Spoiler(math.nan, lambda call: call > 16))
     result = train(tmp_path, 50)
     text = "train.py: 3 updates in a row were not finite (observation row '"
-    assert result.code == 2 and result.err.startswith(text) and "the networks are those of the last good one; look at" in result.err
+    assert (
+        result.code == 2
+        and result.err.startswith(text)
+        and "the networks are those of the last good one; look at" in result.err
+    )
     end = newest(tmp_path)
     assert end["iter"] == 5 and all(torch.equal(end["actor_state_dict"][name], value) for name, value in good.items())
 

@@ -78,7 +78,9 @@ def test_a_checkpoint_that_cannot_be_written_is_said_and_the_next_one_tried(
     assert result.code == 0, result
     assert worlds == [[], ["worlds_1.pt"], ["worlds_1.pt"], []], "those of a checkpoint that could not be written go"
     assert f"WARNING: checkpoint model_2.pt cannot be written: {os.strerror(code)}; the newest is " in result.out
-    assert f"WARNING: worlds_3.pt cannot be written: {os.strerror(code)}; from model_3.pt worlds begin anew" in result.out
+    assert (
+        f"WARNING: worlds_3.pt cannot be written: {os.strerror(code)}; from model_3.pt worlds begin anew" in result.out
+    )
     assert sound(only_run(tmp_path)) == [1, 3, 4]
     assert sorted(path.name for path in only_run(tmp_path).glob("[.w]*.*")) == ["worlds_4.pt"]  # nothing half written
 
@@ -101,7 +103,11 @@ def test_a_full_disk_keeps_the_newest_that_could_be_written(tmp_path: Path, monk
     assert result.code == 2 and "done: " not in result.out and "stopped: " not in result.out
     folder = only_run(tmp_path)
     said = "the last checkpoint, of iteration 4, cannot be written to"
-    assert said in result.err and "No space left on device; the newest that is written is " in result.err and "model_2.pt" in result.err
+    assert (
+        said in result.err
+        and "No space left on device; the newest that is written is " in result.err
+        and "model_2.pt" in result.err
+    )
     assert result.err.count("\n") == 1, result.err
     assert sound(folder) == [1, 2] and not list(folder.glob(".*.tmp"))
     monkeypatch.undo()
@@ -142,13 +148,19 @@ def test_a_logger_that_does_not_start_ends_nothing(tmp_path: Path, monkeypatch: 
 
     monkeypatch.setattr(SummaryWriter, "__init__", refuse)
     result = train(tmp_path, 2)
-    assert result.code == 0 and result.out.count("they cannot be written: no route") == 3 and sound(only_run(tmp_path)) == [1, 2]
+    assert (
+        result.code == 0
+        and result.out.count("they cannot be written: no route") == 3
+        and sound(only_run(tmp_path)) == [1, 2]
+    )
 
 
 def test_what_nobody_reads_is_lost(tmp_path: Path) -> None:
     """The pipe to a pager that was closed; then even the end of the program finds nothing wrong."""
     program = "import sys\nfrom legged_mw.utils.console import patient_console\nwith patient_console():\n"
-    program += "    for i in range(20000):\n        print('a line', i)\n    open(sys.argv[1], 'w').write('got to its end')"
+    program += (
+        "    for i in range(20000):\n        print('a line', i)\n    open(sys.argv[1], 'w').write('got to its end')"
+    )
     command = [sys.executable, "-c", program, str(tmp_path / "end")]
     child = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert child.stdout and child.stderr and child.stdout.readline() == "a line 0\n"
@@ -176,7 +188,9 @@ def test_a_line_that_does_not_fit_is_lost_and_the_next_one_is_not() -> None:
     assert stream.text == "one\ntwo\n"
 
 
-def test_a_signal_ends_the_run_after_the_iteration_and_resumes_exactly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_signal_ends_the_run_after_the_iteration_and_resumes_exactly(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A hang-up comes twice: from the shell, and from the system."""
     before_iteration(monkeypatch, lambda _, i: i == 2 and [os.kill(os.getpid(), signal.SIGHUP) for _ in range(2)])
     result = train(tmp_path, 4)
@@ -248,7 +262,10 @@ def test_a_run_that_is_being_trained_is_not_resumed(tmp_path: Path) -> None:
     with RunLock(folder) as lock:
         lock.begin()
         line = refused(tmp_path, "train", *go_on)
-        assert f" is being trained by process {os.getpid()} since 20" in line and "; wait for its end, stop it, or name another run" in line
+        assert (
+            f" is being trained by process {os.getpid()} since 20" in line
+            and "; wait for its end, stop it, or name another run" in line
+        )
         other = run("train", tmp_path, *go_on, "--checkpoint", "1")  # begins a run of its own
         assert other.code == 0, other.err
     assert run("train", tmp_path, *go_on, "--load_run", folder.name).code == 0
@@ -258,7 +275,9 @@ def test_a_run_that_is_being_trained_is_not_resumed(tmp_path: Path) -> None:
 def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
     program = "import sys, time\nfrom pathlib import Path\nfrom legged_mw.rl.keeping import RunLock\n"
     program += "lock = RunLock(Path(sys.argv[1]))\nlock.begin()\nprint(1, flush=True)\ntime.sleep(60)"
-    child = subprocess.Popen([sys.executable, "-c", program, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    child = subprocess.Popen(
+        [sys.executable, "-c", program, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE, text=True
+    )
     assert child.stdout and child.stdout.readline() == "1\n"
     with pytest.raises(ConfigError, match=f"is being trained by process {child.pid} since"):
         RunLock(tmp_path)
@@ -268,7 +287,9 @@ def test_a_lock_ends_with_its_process(tmp_path: Path) -> None:
     assert (tmp_path / LOCK_FILE).is_file()
 
 
-def test_a_resume_whose_checkpoint_is_not_the_newest_any_more_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_resume_whose_checkpoint_is_not_the_newest_any_more_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Another process went on and ended while this one made its worlds."""
     assert train(tmp_path, 2).code == 0
     folder = only_run(tmp_path)

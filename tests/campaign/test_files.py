@@ -90,26 +90,58 @@ CONTENTS: list[tuple[str, Change, str]] = [
     ("counter is NaN", set_at("iter", float("nan")), "iter is nan"),
     ("counter is true", set_at("iter", True), "iter is True"),
     ("counter is text", set_at("iter", "5"), "iter is '5'"),
-    ("another counter than the name", set_at("iter", 6), "its name says 5 iterations, and it has done 6: call it model_6.pt"),
+    (
+        "another counter than the name",
+        set_at("iter", 6),
+        "its name says 5 iterations, and it has done 6: call it model_6.pt",
+    ),
     ("steps below 0", set_at("infos|total_steps", -3), "infos: total_steps is -3"),
     ("seconds are NaN", set_at("infos|seconds", float("nan")), "infos: seconds is nan, it must be a number from 0"),
     ("infos is a list", set_at("infos", [1]), "infos is [1], it must be a mapping"),
-    ("NaN in a weight", set_at(f"{ACTOR}|mlp.0.weight", poisoned), "actor_state_dict: mlp.0.weight has values that are not finite"),
-    ("infinite bias", set_at(f"{ACTOR}|mlp.0.bias", partial(poisoned, value=torch.inf)), "mlp.0.bias has values that are not finite"),
-    ("NaN in the critic", set_at("critic_state_dict|mlp.0.weight", poisoned), "critic_state_dict: mlp.0.weight has values"),
+    (
+        "NaN in a weight",
+        set_at(f"{ACTOR}|mlp.0.weight", poisoned),
+        "actor_state_dict: mlp.0.weight has values that are not finite",
+    ),
+    (
+        "infinite bias",
+        set_at(f"{ACTOR}|mlp.0.bias", partial(poisoned, value=torch.inf)),
+        "mlp.0.bias has values that are not finite",
+    ),
+    (
+        "NaN in the critic",
+        set_at("critic_state_dict|mlp.0.weight", poisoned),
+        "critic_state_dict: mlp.0.weight has values",
+    ),
     ("weight of another shape", set_at(f"{ACTOR}|mlp.0.weight", torch.zeros(2, 2)), "mlp.0.weight is (2, 2) there"),
-    ("weight of whole numbers", set_at(f"{ACTOR}|mlp.0.weight", lambda w: w.long()), "mlp.0.weight is int64 there and float32 here"),
+    (
+        "weight of whole numbers",
+        set_at(f"{ACTOR}|mlp.0.weight", lambda w: w.long()),
+        "mlp.0.weight is int64 there and float32 here",
+    ),
     ("weight is a list", set_at(f"{ACTOR}|mlp.0.weight", [1.0]), "mlp.0.weight is [1.0], it must be a tensor"),
-    ("weight is shown wider", set_at(f"{ACTOR}|mlp.0.weight", torch.zeros(1).expand(10**9)), "shows 1000000000 numbers and has fewer"),
+    (
+        "weight is shown wider",
+        set_at(f"{ACTOR}|mlp.0.weight", torch.zeros(1).expand(10**9)),
+        "shows 1000000000 numbers and has fewer",
+    ),
     ("sparse weight", set_at(f"{ACTOR}|mlp.0.weight", lambda w: w.to_sparse()), "it must be a tensor"),
     ("a number as a name", lambda content: content[ACTOR].update({3: torch.zeros(1)}), "has a parameter called 3"),
-    ("a weight too many", lambda content: content[ACTOR].update(more=torch.zeros(1)), "actor more is (1,) there and missing here"),
+    (
+        "a weight too many",
+        lambda content: content[ACTOR].update(more=torch.zeros(1)),
+        "actor more is (1,) there and missing here",
+    ),
     ("negative variance", set_at(f"{ACTOR}|obs_normalizer._var", lambda v: -v), "obs_normalizer._var is negative"),
     ("negative count", set_at(f"{ACTOR}|obs_normalizer.count", lambda c: c - 9), "obs_normalizer.count is negative"),
     ("networks are a list", set_at(ACTOR, []), "actor_state_dict is [], it must be a mapping"),
     ("moments of another shape", set_at(f"{ADAM}|state|0|exp_avg", torch.zeros(3)), "exp_avg of parameter 0 is (3,)"),
     ("moments of one number", set_at(f"{ADAM}|state|0|exp_avg_sq", torch.zeros(())), "exp_avg_sq of parameter 0 is ()"),
-    ("moments are NaN", set_at(f"{ADAM}|state|0|exp_avg", poisoned), "exp_avg of parameter 0 has values that are not finite"),
+    (
+        "moments are NaN",
+        set_at(f"{ADAM}|state|0|exp_avg", poisoned),
+        "exp_avg of parameter 0 has values that are not finite",
+    ),
     (
         "negative second moment",
         set_at(f"{ADAM}|state|0|exp_avg_sq", partial(poisoned, value=-1.0)),
@@ -121,7 +153,11 @@ CONTENTS: list[tuple[str, Change, str]] = [
         set_at(f"{ADAM}|state|0|exp_avg_sq", lambda m: m.to(torch.complex64)),
         "is (12,) complex64",
     ),
-    ("no second moments", lambda content: content[ADAM]["state"][0].pop("exp_avg_sq"), "state of parameter 0 must have step, exp_avg, exp"),
+    (
+        "no second moments",
+        lambda content: content[ADAM]["state"][0].pop("exp_avg_sq"),
+        "state of parameter 0 must have step, exp_avg, exp",
+    ),
     ("a rate of many numbers", set_at(f"{ADAM}|param_groups|0|lr", torch.ones(3)), "lr is (3,) float32; that is none"),
     ("Adam backwards", set_at(f"{ADAM}|param_groups|0|maximize", True), "maximize is True; that is none"),
     ("no state", set_at(f"{ADAM}|state", {}), "optimizer_state_dict: state is empty"),
@@ -136,8 +172,16 @@ CONTENTS: list[tuple[str, Change, str]] = [
         set_at(f"{ADAM}|param_groups|0|params", lambda p: p[::-1]),
         "params must count the parameters, from",
     ),
-    ("random state of floats", set_at("infos|random_state|cpu", torch.zeros(9)), "cpu is no state of torch's generator"),
-    ("random state cut", set_at("infos|random_state|cpu", lambda state: state[:7]), "cpu is no state of torch's generator"),
+    (
+        "random state of floats",
+        set_at("infos|random_state|cpu", torch.zeros(9)),
+        "cpu is no state of torch's generator",
+    ),
+    (
+        "random state cut",
+        set_at("infos|random_state|cpu", lambda state: state[:7]),
+        "cpu is no state of torch's generator",
+    ),
     ("level below 0", set_at(f"{ENV}|kick_level", lambda level: level - 3), "infos: env: kick_level is negative"),
     ("level of two axes", set_at(f"{ENV}|kick_level", lambda level: level[:, None]), "infos: env: kick_level is "),
     ("no levels", set_at(f"{ENV}|kick_level", lambda level: level[:0]), "infos: env: kick_level is "),
@@ -220,14 +264,25 @@ def strange_folders(root: Path) -> Path:
 
 def test_links_in_the_logs(tmp_path: Path) -> None:
     logs = strange_folders(tmp_path)
-    assert runs(logs) == [logs / "good"] and list(checkpoints(logs / "good")) == [3] and find_run(logs, "-1") == logs / "good"
+    assert (
+        runs(logs) == [logs / "good"]
+        and list(checkpoints(logs / "good")) == [3]
+        and find_run(logs, "-1") == logs / "good"
+    )
 
 
 FOLDERS = [
-    Case("a run that links to itself", program("play", "--load_run", "itself"), "no run with a checkpoint 'itself'", given=strange_folders),
+    Case(
+        "a run that links to itself",
+        program("play", "--load_run", "itself"),
+        "no run with a checkpoint 'itself'",
+        given=strange_folders,
+    ),
     Case("a dangling run", program("train", "--resume", "--load_run", "dangling"), "'dangling'", given=strange_folders),
     Case("a dangling checkpoint", program("play", "--checkpoint", "9"), "no checkpoint 9 in ", given=strange_folders),
-    Case("a run without config", program("play", "--load_run", "good"), "config.yaml: cannot read", given=strange_folders),
+    Case(
+        "a run without config", program("play", "--load_run", "good"), "config.yaml: cannot read", given=strange_folders
+    ),
 ]
 
 
@@ -278,17 +333,52 @@ CONTRACTS: list[tuple[str, Change, str, bool]] = [
     ("clip of 10^9", set_at("action|clip", 1e9), "action: 'clip' is 1000000000.0; it must be a number", True),
     ("clip of 0", set_at("action|clip", 0), "action: 'clip' is 0; it must be above zero", True),
     ("scale of 0", set_at("action|scale", 0.0), "action: 'scale' is 0.0; it must be other than 0", True),
-    ("scale of 10^12", set_at("action|scale", 1e12), "action: 'scale' is 1000000000000.0; it must be of 1e+06 at most", True),
+    (
+        "scale of 10^12",
+        set_at("action|scale", 1e12),
+        "action: 'scale' is 1000000000000.0; it must be of 1e+06 at most",
+        True,
+    ),
     ("scale of a row", set_at("observation|0|scale", 1e30), "observation[0]: 'scale' is 1e+30", True),
-    ("highest below lowest", set_at("commands|0|highest", -9.0), "commands[0]: 'highest' is -9.0; it must be a number from -1.5", True),
+    (
+        "highest below lowest",
+        set_at("commands|0|highest", -9.0),
+        "commands[0]: 'highest' is -9.0; it must be a number from -1.5",
+        True,
+    ),
     ("stiffness below 0", set_at("stiffness|3", -35.0), "'stiffness' is [35.0", True),
     ("damping of 10^9", set_at("damping|3", 1e9), "it must be numbers from 0 to 1e+06", True),
-    ("period of a day", lambda said: said.update(period=86400.0, physics={"timestep": 8640.0, "decimation": 10}), "'period' is", True),
-    ("decimation of 10^9", set_at("physics|decimation", 10**9), "'decimation' is 1000000000; it must be 10000 at most", True),
+    (
+        "period of a day",
+        lambda said: said.update(period=86400.0, physics={"timestep": 8640.0, "decimation": 10}),
+        "'period' is",
+        True,
+    ),
+    (
+        "decimation of 10^9",
+        set_at("physics|decimation", 10**9),
+        "'decimation' is 1000000000; it must be 10000 at most",
+        True,
+    ),
     ("timestep of 0", set_at("physics|timestep", 0), "'timestep' is 0; it must be above zero", True),
-    ("a scene elsewhere", set_at("physics|file", "../../etc/passwd"), "physics: 'file' is '../../etc/passwd'; it must be scene.xml", True),
-    ("a network elsewhere", set_at("network|file", "/tmp/policy.onnx"), "network: 'file' is '/tmp/policy.onnx'; it must be", True),
-    ("a row of 10^12 values", set_at("observation|0|size", 10**12), "'size' is 1000000000000; it must be 10000000 at most", True),
+    (
+        "a scene elsewhere",
+        set_at("physics|file", "../../etc/passwd"),
+        "physics: 'file' is '../../etc/passwd'; it must be scene.xml",
+        True,
+    ),
+    (
+        "a network elsewhere",
+        set_at("network|file", "/tmp/policy.onnx"),
+        "network: 'file' is '/tmp/policy.onnx'; it must be",
+        True,
+    ),
+    (
+        "a row of 10^12 values",
+        set_at("observation|0|size", 10**12),
+        "'size' is 1000000000000; it must be 10000000 at most",
+        True,
+    ),
     ("a history of 10^9", set_at("observation|0|history", 10**9), "'history' is 1000000000; it must be ", True),
     ("mass of 10^300", set_at("robot|mass", 1e300), "'mass' is 1e+300; it must be a number", True),
     ("noise below 0", set_at("observation|0|noise", -1.0), "'noise' is -1.0; it must be a number from 0", True),
@@ -317,13 +407,23 @@ CONTRACTS: list[tuple[str, Change, str, bool]] = [
     ("today's format as an older one", set_at("format", 4), CHANGED, False),
     ("targets without an end", set_at("action|highest|0", 1e9), "action: 'highest' is [1000000000.0, ", True),
     ("targets that end before they begin", set_at("action|highest|0", -9.0), "it must be at least `lowest`", True),
-    ("a terrain elsewhere", set_at("physics|terrain", {"file": "../x.mjz", "sha256": ""}), "it must be terrain.mjz, which lies", True),
+    (
+        "a terrain elsewhere",
+        set_at("physics|terrain", {"file": "../x.mjz", "sha256": ""}),
+        "it must be terrain.mjz, which lies",
+        True,
+    ),
 ]
 
 
-@pytest.mark.parametrize(("change", "says", "stamped"), [entry[1:] for entry in CONTRACTS], ids=[entry[0] for entry in CONTRACTS])
+@pytest.mark.parametrize(
+    ("change", "says", "stamped"), [entry[1:] for entry in CONTRACTS], ids=[entry[0] for entry in CONTRACTS]
+)
 def test_contracts(change: Change, says: str, stamped: bool, tmp_path: Path) -> None:
-    attack(Case("", lambda root: read_contract(root / "out"), ("policy.yaml", says), given=says_else(change, stamped)), tmp_path)
+    attack(
+        Case("", lambda root: read_contract(root / "out"), ("policy.yaml", says), given=says_else(change, stamped)),
+        tmp_path,
+    )
 
 
 def test_joints_of_an_export_without_checksum(tmp_path: Path) -> None:
@@ -346,28 +446,53 @@ def test_what_may_be_changed(tmp_path: Path) -> None:
 
 # ---- motions and motors
 
-CLIP = {"fps": 50.0, "joint_names": ["a"], "root_pos": np.zeros((3, 3)), "root_quat": np.eye(4)[[0, 0, 0]], "joint_pos": np.zeros((3, 1))}
+CLIP = {
+    "fps": 50.0,
+    "joint_names": ["a"],
+    "root_pos": np.zeros((3, 3)),
+    "root_quat": np.eye(4)[[0, 0, 0]],
+    "joint_pos": np.zeros((3, 1)),
+}
 MOTOR = {"weight0": np.zeros((1, 2)), "bias0": np.zeros(1)}
 ARRAYS: list[tuple[str, Callable[[Path], Any], dict[str, Any], str]] = [
     ("no rate", read_clip, {"fps": np.nan}, "or no frame rate"),
     ("a rate of 10^30", read_clip, {"fps": 1e30}, "1e+30 frames a second; there must be from 0.1 to 1e+05"),
     ("two rates", read_clip, {"fps": [50.0, 50.0]}, "fps is float64 along 1 axes; it must be numbers along 0 axes"),
-    ("joints are numbers", read_clip, {"joint_names": [1]}, "joint_names is int64 along 1 axes; it must be text along 1 axes"),
+    (
+        "joints are numbers",
+        read_clip,
+        {"joint_names": [1]},
+        "joint_names is int64 along 1 axes; it must be text along 1 axes",
+    ),
     ("complex places", read_clip, {"root_pos": np.zeros((3, 3)) * 1j}, "root_pos is complex128 along 2 axes"),
     ("far away", read_clip, {"root_pos": np.full((3, 3), 1e30)}, "a place or an angle beyond 10000 m or rad"),
     ("a joint twice", read_clip, {"joint_names": ["a", "a"], "joint_pos": np.zeros((3, 2))}, "or a joint twice"),
-    ("more than there may be", read_clip, {"more": np.zeros(70_000, dtype=np.uint8)}, "it unpacks to 0 MiB; 0 are the most"),
+    (
+        "more than there may be",
+        read_clip,
+        {"more": np.zeros(70_000, dtype=np.uint8)},
+        "it unpacks to 0 MiB; 0 are the most",
+    ),
     ("frames of 10^9", read_network, {"frames": [0, 10**9]}, "the newest first, 10000 at most"),
     ("infinite frames", read_network, {"frames": [np.inf]}, "file.npz: cannot convert float infinity"),
 ]
 
 
-@pytest.mark.parametrize(("read", "change", "says"), [entry[1:] for entry in ARRAYS], ids=[entry[0] for entry in ARRAYS])
-def test_arrays(read: Callable[[Path], Any], change: dict[str, Any], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("read", "change", "says"), [entry[1:] for entry in ARRAYS], ids=[entry[0] for entry in ARRAYS]
+)
+def test_arrays(
+    read: Callable[[Path], Any], change: dict[str, Any], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(arrays, "MOST_BYTES", 1 << 16)
     content = (CLIP if read is read_clip else MOTOR) | {name: np.asarray(value) for name, value in change.items()}
     attack(
-        Case("", lambda root: read(root / "file.npz"), says, given=lambda root: np.savez(root / "file.npz", allow_pickle=False, **content)),
+        Case(
+            "",
+            lambda root: read(root / "file.npz"),
+            says,
+            given=lambda root: np.savez(root / "file.npz", allow_pickle=False, **content),
+        ),
         tmp_path,
     )
 
@@ -396,7 +521,12 @@ SCENES: list[tuple[str, str, str, str]] = [
     ("keyframe far away", KEY, 'qpos="1e9 0 0.278', "its first keyframe is no pose"),
     ("negative timestep", 'timestep="0.004"', 'timestep="-0.004"', "timestep is -0.004 s"),
     ("entities", "<mujoco", '<!DOCTYPE m [<!ENTITY a "b">]><mujoco', "it has a DOCTYPE"),
-    ("include", "</worldbody>", '</worldbody><include file="../../etc/passwd"/>', "it names ../../etc/passwd, which lies outside"),
+    (
+        "include",
+        "</worldbody>",
+        '</worldbody><include file="../../etc/passwd"/>',
+        "it names ../../etc/passwd, which lies outside",
+    ),
     (
         "a mesh",
         "</worldbody>",
@@ -429,7 +559,10 @@ def network(*nodes: Any, constants: Sequence[Any] = ()) -> Callable[[Path], None
 
     def given(root: Path) -> None:
         folder = export(root)
-        begin = [helper.make_tensor("from", TensorProto.INT64, [1], [0]), helper.make_tensor("to", TensorProto.INT64, [1], [12])]
+        begin = [
+            helper.make_tensor("from", TensorProto.INT64, [1], [0]),
+            helper.make_tensor("to", TensorProto.INT64, [1], [12]),
+        ]
         ones = [helper.make_tensor("axis", TensorProto.INT64, [1], [1])]
         graph = helper.make_graph(
             [helper.make_node("Slice", ["obs", "from", "to", "axis"], ["short"]), *nodes],
@@ -438,7 +571,9 @@ def network(*nodes: Any, constants: Sequence[Any] = ()) -> Callable[[Path], None
             [helper.make_tensor_value_info("actions", TensorProto.FLOAT, ["batch", 12])],
             [*begin, *ones, *constants],
         )
-        onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9), folder / "policy.onnx")
+        onnx.save(
+            helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9), folder / "policy.onnx"
+        )
         said = load_yaml(folder / "policy.yaml")
         said["network"]["sha256"] = digest(folder / "policy.onnx")
         save_yaml(folder / "policy.yaml", said | {"checksum": checksum(said)})
@@ -448,22 +583,33 @@ def network(*nodes: Any, constants: Sequence[Any] = ()) -> Callable[[Path], None
 
 def endless() -> Callable[[Path], None]:
     """A loop of 10^15 turns."""
-    infos = [helper.make_tensor_value_info(name, kind, []) for name, kind in (("turn", TensorProto.INT64), ("go", TensorProto.BOOL))]
-    held, more = helper.make_tensor_value_info("x", TensorProto.FLOAT, None), helper.make_tensor_value_info("y", TensorProto.FLOAT, None)
+    infos = [
+        helper.make_tensor_value_info(name, kind, [])
+        for name, kind in (("turn", TensorProto.INT64), ("go", TensorProto.BOOL))
+    ]
+    held, more = (
+        helper.make_tensor_value_info("x", TensorProto.FLOAT, None),
+        helper.make_tensor_value_info("y", TensorProto.FLOAT, None),
+    )
     body = helper.make_graph(
         [helper.make_node("Identity", ["go"], ["on"]), helper.make_node("Neg", ["x"], ["y"])],
         "body",
         [*infos, held],
         [helper.make_tensor_value_info("on", TensorProto.BOOL, []), more],
     )
-    constants = [helper.make_tensor("turns", TensorProto.INT64, [], [10**15]), helper.make_tensor("true", TensorProto.BOOL, [], [True])]
+    constants = [
+        helper.make_tensor("turns", TensorProto.INT64, [], [10**15]),
+        helper.make_tensor("true", TensorProto.BOOL, [], [True]),
+    ]
     return network(helper.make_node("Loop", ["turns", "true", "short"], ["actions"], body=body), constants=constants)
 
 
 def vast(count: int) -> Callable[[Path], None]:
     """Adds up ``count`` zeros."""
     nodes = [
-        helper.make_node("ConstantOfShape", ["size"], ["zeros"], value=helper.make_tensor("v", TensorProto.FLOAT, [1], [0.0])),
+        helper.make_node(
+            "ConstantOfShape", ["size"], ["zeros"], value=helper.make_tensor("v", TensorProto.FLOAT, [1], [0.0])
+        ),
         helper.make_node("ReduceSum", ["zeros"], ["sum"], keepdims=0),
         helper.make_node("Add", ["short", "sum"], ["actions"]),
     ]
@@ -482,7 +628,11 @@ NETWORKS: list[tuple[str, Callable[[Path], None], str]] = [
     ("4 GB", vast(10**9), "policy.onnx cannot be run: it asks for more than 2 GiB"),
     ("10^18 numbers", vast(10**18), "policy.onnx cannot be "),
     ("another width", network(helper.make_node("Concat", ["short", "short"], ["actions"], axis=1)), "policy.onnx"),
-    ("another input", network(helper.make_node("Add", ["short", "nosuch"], ["actions"])), "cannot be read as an ONNX network"),
+    (
+        "another input",
+        network(helper.make_node("Add", ["short", "nosuch"], ["actions"])),
+        "cannot be read as an ONNX network",
+    ),
 ]
 
 
@@ -567,7 +717,8 @@ def test_killed_exports(tmp_path: Path, extra: bool) -> None:
         assert _contents(folder).keys() == {*wanted["new"], "README.md"}
         left = [path for path in folder.iterdir() if path.is_dir() and path.name != f".export.{os.getpid()}.tmp"]
         assert not left, last
-    assert seen == sorted(seen, reverse=True) and {*seen} == {"old", "new"}  # first the old one, from one call on the new
+    # first the old one, from one call on the new
+    assert seen == sorted(seen, reverse=True) and {*seen} == {"old", "new"}
 
 
 def test_what_a_killed_export_leaves_is_swept(tmp_path: Path) -> None:

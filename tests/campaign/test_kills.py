@@ -8,7 +8,15 @@ from pathlib import Path
 
 
 def test_five_kills_lose_nothing() -> None:
-    program = [sys.executable, str(Path(__file__).with_name("kills.py")), "--kills", "5", "--iterations", "5", "--no_export"]
+    program = [
+        sys.executable,
+        str(Path(__file__).with_name("kills.py")),
+        "--kills",
+        "5",
+        "--iterations",
+        "5",
+        "--no_export",
+    ]
     done = subprocess.run(program, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr[-3000:]
     assert "'kills': 5" in done.stdout

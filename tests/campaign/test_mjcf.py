@@ -57,23 +57,43 @@ TEXTS: list[tuple[str, str | bytes, str]] = [
     ("NaN mass", first('mass="[^"]*"', 'mass="nan"'), 'mass="nan" is not a number'),
     ("mass of 10^30", first('mass="[^"]*"', 'mass="1e30"'), 'mass="1e30" must be from 0 to 100000'),
     ("infinite mass", first('mass="[^"]*"', 'mass="inf"'), 'mass="inf" must be from 0 to 100000'),
-    ("no mass", first('(<inertial[^>]*)mass="[^"]*"', r'\1mass="0"'), "mass and inertia of moving bodies must be larger"),
-    ("negative inertia", first('diaginertia="[^"]*"', 'diaginertia="-1 -1 -1"'), 'diaginertia="-1 -1 -1" must be from 0 to'),
+    (
+        "no mass",
+        first('(<inertial[^>]*)mass="[^"]*"', r'\1mass="0"'),
+        "mass and inertia of moving bodies must be larger",
+    ),
+    (
+        "negative inertia",
+        first('diaginertia="[^"]*"', 'diaginertia="-1 -1 -1"'),
+        'diaginertia="-1 -1 -1" must be from 0 to',
+    ),
     ("NaN inertia", first('diaginertia="[^"]*"', 'diaginertia="nan 1 1"'), 'diaginertia="nan 1 1" is not a number'),
     ("inertia of 10^30", first('diaginertia="[^"]*"', 'diaginertia="1e30 1e30 1e30"'), "must be from 0 to 1e+06"),
     ("density of 10^30", first("<geom ", '<geom density="1e30" '), 'density="1e30" must be from 0 to'),
-    ("a range that ends first", first(' range="[^"]*"', ' range="1 -1"'), 'line 14: range="1 -1" ends before it begins'),
+    (
+        "a range that ends first",
+        first(' range="[^"]*"', ' range="1 -1"'),
+        'line 14: range="1 -1" ends before it begins',
+    ),
     (
         "a force range that ends first",
         more('<actuator><motor joint="FR_hip_joint" forcerange="5 -5"/></actuator>'),
         "ends before it begins",
     ),
-    ("NaN gravity", first("<compiler", '<option gravity="0 0 nan"/><compiler'), 'line 8: gravity="0 0 nan" is not a number'),
+    (
+        "NaN gravity",
+        first("<compiler", '<option gravity="0 0 nan"/><compiler'),
+        'line 8: gravity="0 0 nan" is not a number',
+    ),
     ("gravity of 10^9", first("<compiler", '<option gravity="0 0 -1e9"/><compiler'), "gravity is 0 0 -1e+09 m/s^2"),
     ("infinite gravity", first("<compiler", '<option gravity="0 0 inf"/><compiler'), "gravity is 0 0 inf m/s^2"),
     ("negative timestep", first("<compiler", '<option timestep="-1"/><compiler'), "timestep is -1 s"),
     ("NaN place", first(' pos="[^"]*"', ' pos="nan 0 0"'), 'pos="nan 0 0" is not a number'),
-    ("infinite place", first('name="FR_hip" pos="[^"]*"', 'name="FR_hip" pos="inf 0 0"'), "pos of body 'FR_hip' is inf"),
+    (
+        "infinite place",
+        first('name="FR_hip" pos="[^"]*"', 'name="FR_hip" pos="inf 0 0"'),
+        "pos of body 'FR_hip' is inf",
+    ),
     ("a turn of no length", first(' quat="[^"]*"', ' quat="0 0 0 0"'), "zero quaternion is not allowed"),
     ("negative size", first(' size="[^"]*"', ' size="-1 -1 -1"'), "must be positive"),
     ("size of 10^30", first(' size="[^"]*"', ' size="1e30 1e30 1e30"'), "size of geom 'trunk_right' is 1e+30"),
@@ -82,41 +102,95 @@ TEXTS: list[tuple[str, str | bytes, str]] = [
     ("NaN damping", first(' damping="[^"]*"', ' damping="nan"'), 'damping="nan" is not a number'),
     ("a name twice", GO1.replace('name="FR_hip_1"', 'name="FR_hip_2"'), "repeated name 'FR_hip_2' in geom"),
     ("entities", '<!DOCTYPE a [<!ENTITY b "c">]>' + GO1, "line 1: it has a DOCTYPE, which may define entities"),
-    ("a bomb of entities", '<!DOCTYPE a [<!ENTITY b "ha"><!ENTITY c "&b;&b;&b;">]><mujoco model="&c;"/>', "it has a DOCTYPE"),
+    (
+        "a bomb of entities",
+        '<!DOCTYPE a [<!ENTITY b "ha"><!ENTITY c "&b;&b;&b;">]><mujoco model="&c;"/>',
+        "it has a DOCTYPE",
+    ),
     ("an entity of a file", '<!DOCTYPE a [<!ENTITY b SYSTEM "file:///etc/passwd">]>' + GO1, "it has a DOCTYPE"),
     ("a definition elsewhere", '<!DOCTYPE a SYSTEM "/etc/passwd">' + GO1, "it has a DOCTYPE"),
-    ("include from above", more('<include file="../x.xml"/>'), "it includes ../x.xml, which lies outside of its own folder"),
-    ("include from anywhere", more('<include file="/etc/passwd"/>'), "it includes /etc/passwd, which lies outside of its own folder"),
-    ("include by a crooked way", more("<include file = 'a/../../x.xml' />"), "it includes a/../../x.xml, which lies outside"),
-    ("a model from above", more('<asset><model name="m" file="../x.xml"/></asset>'), "it includes ../x.xml, which lies outside"),
+    (
+        "include from above",
+        more('<include file="../x.xml"/>'),
+        "it includes ../x.xml, which lies outside of its own folder",
+    ),
+    (
+        "include from anywhere",
+        more('<include file="/etc/passwd"/>'),
+        "it includes /etc/passwd, which lies outside of its own folder",
+    ),
+    (
+        "include by a crooked way",
+        more("<include file = 'a/../../x.xml' />"),
+        "it includes a/../../x.xml, which lies outside",
+    ),
+    (
+        "a model from above",
+        more('<asset><model name="m" file="../x.xml"/></asset>'),
+        "it includes ../x.xml, which lies outside",
+    ),
     ("include of itself", more('<include file="robot.xml"/>'), "it includes robot.xml, which is already included"),
-    ("a model of itself", more('<model name="m" file="robot.xml"/>', "asset"), "it includes robot.xml, which is already included"),
+    (
+        "a model of itself",
+        more('<model name="m" file="robot.xml"/>', "asset"),
+        "it includes robot.xml, which is already included",
+    ),
     ("include of nothing", more('<include file="none.xml"/>'), "it includes none.xml, which is no file here"),
     ("include by reference", more('<include file="..&#47;x.xml"/>'), "it includes ../x.xml, which lies outside"),
     (
         "include between attributes",
-        more('<custom><text name="<!--" data="a"/></custom><include file="/etc/passwd"/><custom><text name="-->" data="a"/></custom>'),
+        more(
+            '<custom><text name="<!--" data="a"/></custom><include file="/etc/passwd"/><custom><text name="-->" data="a"/></custom>'
+        ),
         "it is no XML: not well-formed",
     ),
     ("NaN by reference", first('mass="[^"]*"', 'mass="&#110;a&#x6E;"'), 'line 32: mass="nan" is not a number'),
     ("a number by reference", first('mass="[^"]*"', 'mass="1&#101;30"'), 'mass="1e30" must be from 0'),
-    ("10^9 copies", more('<replicate count="1000000000"><geom size="1"/></replicate>', "worldbody"), 'count="1000000000" must be'),
-    ("copies of copies", more('<replicate count="9000">' * 3 + "</replicate>" * 3, "worldbody"), "makes more than 20000 elements"),
+    (
+        "10^9 copies",
+        more('<replicate count="1000000000"><geom size="1"/></replicate>', "worldbody"),
+        'count="1000000000" must be',
+    ),
+    (
+        "copies of copies",
+        more('<replicate count="9000">' * 3 + "</replicate>" * 3, "worldbody"),
+        "makes more than 20000 elements",
+    ),
     (
         "copies of many things",
         more('<replicate count="300">' * 2 + "<geom size='1'/>" * 20 + "</replicate>" * 2, "worldbody"),
         "makes more than 20000 elements, all copies counted",
     ),
-    ("copies, counted in other words", more('<replicate count="0x2710"><geom size="1"/></replicate>', "worldbody"), 'count="0x2710" must'),
-    ("a height field of 4 10^8", more('<hfield name="h" nrow="20000" ncol="20000" size="1 1 1 1"/>', "asset"), "cells of height fields"),
-    ("height fields of 10^8", more('<hfield nrow="5000" ncol="5000" size="1 1 1 1"/>' * 4, "asset"), "cells of height fields"),
-    ("a picture of 2 10^8", more('<texture builtin="flat" width="16384" height="16384"/>', "asset"), "cells of height fields"),
+    (
+        "copies, counted in other words",
+        more('<replicate count="0x2710"><geom size="1"/></replicate>', "worldbody"),
+        'count="0x2710" must',
+    ),
+    (
+        "a height field of 4 10^8",
+        more('<hfield name="h" nrow="20000" ncol="20000" size="1 1 1 1"/>', "asset"),
+        "cells of height fields",
+    ),
+    (
+        "height fields of 10^8",
+        more('<hfield nrow="5000" ncol="5000" size="1 1 1 1"/>' * 4, "asset"),
+        "cells of height fields",
+    ),
+    (
+        "a picture of 2 10^8",
+        more('<texture builtin="flat" width="16384" height="16384"/>', "asset"),
+        "cells of height fields",
+    ),
     (
         "400 joints in a row",
         "<mujoco><worldbody>" + '<body><joint/><geom size="1"/>' * 400 + "</body>" * 400 + "</worldbody></mujoco>",
         "too deeply",
     ),
-    ("a mesh name of 5000", more(f'<mesh name="z" file="{"x" * 5000}.stl"/>', "asset"), "can be no file: File name too long"),
+    (
+        "a mesh name of 5000",
+        more(f'<mesh name="z" file="{"x" * 5000}.stl"/>', "asset"),
+        "can be no file: File name too long",
+    ),
     ("an include of 5000", more(f'<include file="{"x" * 5000}"/>'), "which is no file here"),
     (
         "files in many folders",
@@ -126,7 +200,11 @@ TEXTS: list[tuple[str, str | bytes, str]] = [
     ("an element of 20 MB", f'<mujoco model="{"x" * (20 << 20)}"/>', "an element has more than 16 MiB"),
     ("200 kB of comments without end", "<mujoco>" + "<!--" * 50_000, "it has more than 20000 comments"),
     ("comments without end", "<mujoco>" + "<!--" * 5000, "it is no XML"),
-    ("many attributes", "<mujoco><option " + " ".join(f"a{i}='1'" for i in range(300)) + "/></mujoco>", "more than 200 attributes"),
+    (
+        "many attributes",
+        "<mujoco><option " + " ".join(f"a{i}='1'" for i in range(300)) + "/></mujoco>",
+        "more than 200 attributes",
+    ),
     ("200 kB of includes without end", "<mujoco>" + "<include " * 22_000, "it is no XML"),
     ("another encoding", GO1.encode("utf-16"), "it is no XML"),
     (
@@ -135,12 +213,20 @@ TEXTS: list[tuple[str, str | bytes, str]] = [
         'nrow="100000" must be',
     ),
     ("room of 400 GB", first("<worldbody>", '<size memory="400G"/><worldbody>'), "Could not allocate memory"),
-    ("10^9 numbers a body", first("<worldbody>", '<size nuser_body="1000000000"/><worldbody>'), 'nuser_body="1000000000" must be from 0'),
+    (
+        "10^9 numbers a body",
+        first("<worldbody>", '<size nuser_body="1000000000"/><worldbody>'),
+        'nuser_body="1000000000" must be from 0',
+    ),
     ("a mesh without end", more('<mesh name="z" file="/dev/zero"/>', "asset"), "/dev/zero is no file"),
     ("nothing", "", "it is no XML: no element found"),
     ("zeros", b"\0" * 99, "robot.xml is not a valid MJCF"),
     ("cut", GO1[:3000], "it is no XML"),
-    ("3000 deep", "<mujoco><worldbody>" + '<body><joint/><geom size="1"/>' * 3000 + "</body>" * 3000 + "</worldbody></mujoco>", "too deep"),
+    (
+        "3000 deep",
+        "<mujoco><worldbody>" + '<body><joint/><geom size="1"/>' * 3000 + "</body>" * 3000 + "</worldbody></mujoco>",
+        "too deep",
+    ),
     ("no robot", "<mujoco/>", "it must hold a robot"),
     ("no XML", "legs: 4", "robot.xml is not a valid MJCF"),
 ]
@@ -168,17 +254,31 @@ URDFS: list[tuple[str, str, str]] = [
     ("speed of words", PLAIN.replace('velocity="9"', 'velocity="fast"'), "'fast'"),
     ("no axis", URDF.format(INERTIA, LIMIT, "0 0 0"), "axis"),
     ("a bomb", '<!DOCTYPE r [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><robot name="&b;"/>', "it has a DOCTYPE"),
-    ("a mesh name of 5000", PLAIN.replace("</link>", MESH.format("x" * 5000) + "</link>", 1), "can be no file: File name too long"),
+    (
+        "a mesh name of 5000",
+        PLAIN.replace("</link>", MESH.format("x" * 5000) + "</link>", 1),
+        "can be no file: File name too long",
+    ),
     ("a mesh without end", PLAIN.replace("</link>", MESH.format("/dev/zero") + "</link>", 1), "/dev/zero is no file"),
-    ("include", PLAIN.replace("</link>", '<include file="/etc/passwd"/></link>', 1), "it includes /etc/passwd, which lies outside"),
-    ("20000 deep", '<robot name="a"><link name="l">' + "<a>" * 20_000 + "</a>" * 20_000 + "</link></robot>", "it is nested too deeply"),
+    (
+        "include",
+        PLAIN.replace("</link>", '<include file="/etc/passwd"/></link>', 1),
+        "it includes /etc/passwd, which lies outside",
+    ),
+    (
+        "20000 deep",
+        '<robot name="a"><link name="l">' + "<a>" * 20_000 + "</a>" * 20_000 + "</link></robot>",
+        "it is nested too deeply",
+    ),
     ("two roots", '<robot name="a"><link name="a"/><link name="b"/></robot>', "robot.urdf"),
     ("a circle", PLAIN.replace('parent link="base"', 'parent link="leg"'), "robot.urdf"),
 ]
 
 
 def test_what_a_simulators_plugin_names_is_not_read(tmp_path: Path) -> None:
-    (tmp_path / "robot.urdf").write_text(PLAIN.replace("</robot>", '<gazebo><plugin filename="/dev/null"/></gazebo></robot>'))
+    (tmp_path / "robot.urdf").write_text(
+        PLAIN.replace("</robot>", '<gazebo><plugin filename="/dev/null"/></gazebo></robot>')
+    )
     assert Source(tmp_path / "robot.urdf").spec().compile().nbody > 1
 
 
@@ -219,7 +319,9 @@ def models_of_models(root: Path) -> None:
         name, last = (f"{i}.xml" if i else "robot.xml"), i == 29
         asset = "" if last else f'<asset><model name="m" file="{i + 1}.xml"/></asset>'
         two = "" if last else "".join(f'<frame><attach model="m" body="b" prefix="{side}_"/></frame>' for side in "ab")
-        (root / name).write_text(f'<mujoco>{asset}<worldbody><body name="b"><joint/><geom size="1"/>{two}</body></worldbody></mujoco>')
+        (root / name).write_text(
+            f'<mujoco>{asset}<worldbody><body name="b"><joint/><geom size="1"/>{two}</body></worldbody></mujoco>'
+        )
 
 
 def includes_in_a_circle(root: Path) -> None:
@@ -230,7 +332,10 @@ def includes_in_a_circle(root: Path) -> None:
 PIPES = {
     "mesh": ('<mesh name="z" file="p/q"/>', "asset"),
     "mesh in a folder": ('<compiler meshdir="p"/><asset><mesh name="z" file="q"/></asset>', "mujoco"),
-    "mesh by its last name": ('<compiler strippath="true" meshdir="p"/><asset><mesh name="z" file="C:/there/q"/></asset>', "mujoco"),
+    "mesh by its last name": (
+        '<compiler strippath="true" meshdir="p"/><asset><mesh name="z" file="C:/there/q"/></asset>',
+        "mujoco",
+    ),
     "picture": ('<texture name="z" type="2d" file="p/q"/>', "asset"),
     "side of a picture": ('<texture name="z" type="cube" fileleft="p/q"/>', "asset"),
     "height field": ('<hfield name="z" size="1 1 1 1" file="p/q"/>', "asset"),
@@ -247,11 +352,22 @@ OTHERS = [
     Case("a folder", reads(), "no MJCF at ", given=lambda root: (root / "robot.xml").mkdir()),
     *(Case(f"a pipe: {name}", reads(), "is no file", given=piped(*where)) for name, where in PIPES.items()),
     Case("models of models", reads(), "makes more than 20000 elements", given=models_of_models),
-    Case("includes in a circle", reads(), "it includes robot.xml, which is already included", given=includes_in_a_circle),
-    Case("what is no robot's file", program("train", "--check", "--set", "asset.file=/etc/passwd"), ("passwd", "it is no XML")),
+    Case(
+        "includes in a circle", reads(), "it includes robot.xml, which is already included", given=includes_in_a_circle
+    ),
+    Case(
+        "what is no robot's file",
+        program("train", "--check", "--set", "asset.file=/etc/passwd"),
+        ("passwd", "it is no XML"),
+    ),
     Case("a mesh that links to a device", reads(), "z.stl is no file", given=endless_mesh),
     Case("the health page of it", program("robot", "ROOT/robot.xml"), "robot.xml", given=BAD),
-    Case("a task of it", program("train", "--check", "--set", "asset.file=ROOT/robot.xml"), 'gravity="0 0 nan" is not a number', given=BAD),
+    Case(
+        "a task of it",
+        program("train", "--check", "--set", "asset.file=ROOT/robot.xml"),
+        'gravity="0 0 nan" is not a number',
+        given=BAD,
+    ),
 ]
 
 
@@ -265,7 +381,9 @@ def scene(model: str) -> Callable[[Path], object]:
 
     def given_scene(root: Path) -> None:
         shutil.copytree(SHIPPED, root / "out")
-        (root / "out/scene.xml").write_text((SHIPPED / "scene.xml").read_text().replace("</worldbody>", f"</worldbody>{model}", 1))
+        (root / "out/scene.xml").write_text(
+            (SHIPPED / "scene.xml").read_text().replace("</worldbody>", f"</worldbody>{model}", 1)
+        )
 
     return given_scene
 
@@ -282,7 +400,9 @@ def limits(folder: Path) -> Limits:
 
 
 @pytest.mark.parametrize("reader", OF_SCENES)
-@pytest.mark.parametrize("model", [FAR, f'<custom><text name="<!--" data="a"/></custom>{FAR}<custom><text name="-->" data="a"/></custom>'])
+@pytest.mark.parametrize(
+    "model", [FAR, f'<custom><text name="<!--" data="a"/></custom>{FAR}<custom><text name="-->" data="a"/></custom>']
+)
 def test_scenes_that_name_other_files(reader: str, model: str, tmp_path: Path) -> None:
     """Whoever reads the scene refuses it, also for the limits of a real robot."""
     says = "it is no XML" if "<!--" in model else "it names ../x.obj, which lies outside"
@@ -351,8 +471,15 @@ def test_mujoco_names_the_line_of_the_file(tmp_path: Path) -> None:
 
 def test_names_that_are_ours(tmp_path: Path) -> None:
     """They are renamed, and what refers to them follows."""
-    text = GO1.replace('name="FR_hip_1"', 'name="floor"').replace('name="trunk_box"', 'name="floor/0"').replace('"rubber"', '"ground"')
-    text = text.replace("</mujoco>", '<sensor><touch name="contact/FR" site="imu"/><rangefinder name="up/x" site="imu"/></sensor></mujoco>')
+    text = (
+        GO1.replace('name="FR_hip_1"', 'name="floor"')
+        .replace('name="trunk_box"', 'name="floor/0"')
+        .replace('"rubber"', '"ground"')
+    )
+    text = text.replace(
+        "</mujoco>",
+        '<sensor><touch name="contact/FR" site="imu"/><rangefinder name="up/x" site="imu"/></sensor></mujoco>',
+    )
     given(text)(tmp_path)
     robot = read_robot(tmp_path / "robot.xml")
     names = {kind: [thing.name for thing in getattr(robot.spec, kind)] for kind in ("geoms", "materials", "sensors")}
@@ -364,7 +491,12 @@ def test_names_that_are_ours(tmp_path: Path) -> None:
 
 def test_a_robot_whose_names_are_ours_trains(tmp_path: Path) -> None:
     """Also the names that an export and a picture add."""
-    text = GO1.replace('"rubber"', '"ground"').replace('"metal"', '"sky"').replace('"dark"', '"around"').replace('"lens"', '"relief"')
+    text = (
+        GO1.replace('"rubber"', '"ground"')
+        .replace('"metal"', '"sky"')
+        .replace('"dark"', '"around"')
+        .replace('"lens"', '"relief"')
+    )
     text = text.replace('name="FR_hip_1"', 'name="floor/3"')
     given(text)(tmp_path)
     task = load_task("go1_flat")

@@ -36,26 +36,73 @@ def report_is_a_file(root: Path) -> None:
 
 
 CASES = [
-    Case("exam into nowhere", program(*DEPLOY, "--eval", "--out", "/proc/nosuch/x.json"), "--out /proc/nosuch/x.json: cannot be written: "),
-    Case("exam below a file", program(*DEPLOY, "--eval", "--out", "file/x.json"), "file is a file, not a folder", given=a_file),
-    Case("exam onto a folder", program(*DEPLOY, "--eval", "--out", "folder.json"), "that is a folder; name a file", given=some_folders),
+    Case(
+        "exam into nowhere",
+        program(*DEPLOY, "--eval", "--out", "/proc/nosuch/x.json"),
+        "--out /proc/nosuch/x.json: cannot be written: ",
+    ),
+    Case(
+        "exam below a file",
+        program(*DEPLOY, "--eval", "--out", "file/x.json"),
+        "file is a file, not a folder",
+        given=a_file,
+    ),
+    Case(
+        "exam onto a folder",
+        program(*DEPLOY, "--eval", "--out", "folder.json"),
+        "that is a folder; name a file",
+        given=some_folders,
+    ),
     Case("exam to no name", program(*DEPLOY, "--eval", "--out", ""), "--out is empty: name the file to write"),
     Case("exam to a blank", program(*DEPLOY, "--eval", "--out", "  "), "--out is empty: name the file to write"),
     Case("exam to a long name", program(*DEPLOY, "--eval", "--out", "x" * 300), "--out xxx"),
     Case("exam to a null", program(*DEPLOY, "--eval", "--out", "a\0b"), "--out a"),
-    Case("film into nowhere", program(*PLAY, "--video", "/proc/nosuch/dir/x.mp4"), "--video /proc/nosuch/dir/x.mp4: cannot be written"),
-    Case("film below a file", program(*PLAY, "--video", "file/dir/x.mp4"), "file is a file, not a folder", given=a_file),
+    Case(
+        "film into nowhere",
+        program(*PLAY, "--video", "/proc/nosuch/dir/x.mp4"),
+        "--video /proc/nosuch/dir/x.mp4: cannot be written",
+    ),
+    Case(
+        "film below a file", program(*PLAY, "--video", "file/dir/x.mp4"), "file is a file, not a folder", given=a_file
+    ),
     Case("film to no name", program(*PLAY, "--video", ""), "--video is empty: name the file to write"),
-    Case("film onto a folder", program(*PLAY, "--video", "folder.mp4"), "that is a folder; name a file", given=some_folders),
+    Case(
+        "film onto a folder",
+        program(*PLAY, "--video", "folder.mp4"),
+        "that is a folder; name a file",
+        given=some_folders,
+    ),
     Case("film of deploy to no name", program(*DEPLOY, "--video", ""), "--video is empty", name="deploy.py"),
-    Case("film of deploy", program(*DEPLOY, "--video", "/proc/nosuch/x.gif"), "--video /proc/nosuch/x.gif: cannot be written"),
-    Case("sheet into nowhere", program(*PLAY, "--sheet", "/proc/nosuch/x.png"), "--sheet /proc/nosuch/x.png: cannot be written"),
+    Case(
+        "film of deploy",
+        program(*DEPLOY, "--video", "/proc/nosuch/x.gif"),
+        "--video /proc/nosuch/x.gif: cannot be written",
+    ),
+    Case(
+        "sheet into nowhere",
+        program(*PLAY, "--sheet", "/proc/nosuch/x.png"),
+        "--sheet /proc/nosuch/x.png: cannot be written",
+    ),
     Case("sheet to no name", program(*PLAY, "--sheet", ""), "--sheet is empty: name the file to write"),
-    Case("sheet onto a folder", program(*PLAY, "--sheet", "folder.png"), "that is a folder; name a file", given=some_folders),
+    Case(
+        "sheet onto a folder",
+        program(*PLAY, "--sheet", "folder.png"),
+        "that is a folder; name a file",
+        given=some_folders,
+    ),
     Case("export to no name", program(*PLAY, "--export", ""), "--export is empty: name the folder to write"),
-    Case("export onto a file", program(*PLAY, "--export", "file"), "--export file: that is a file; name a folder", given=a_file),
+    Case(
+        "export onto a file",
+        program(*PLAY, "--export", "file"),
+        "--export file: that is a file; name a folder",
+        given=a_file,
+    ),
     Case("export below a file", program(*PLAY, "--export", "file/out"), "file is a file, not a folder", given=a_file),
-    Case("export into nowhere", program(*PLAY, "--export", "/proc/nosuch/out"), "--export /proc/nosuch/out: cannot be written"),
+    Case(
+        "export into nowhere",
+        program(*PLAY, "--export", "/proc/nosuch/out"),
+        "--export /proc/nosuch/out: cannot be written",
+    ),
     Case(
         "report onto a file",
         program("play", "--load_run", "ROOT/theirs", "--eval"),
@@ -63,16 +110,46 @@ CASES = [
         given=report_is_a_file,
     ),
     Case("picture to no name", program(*CHECK, "--picture", ""), "--picture is empty: name the file to write"),
-    Case("picture into nowhere", program(*CHECK, "--picture", "/proc/nosuch/x.png"), "--picture /proc/nosuch/x.png: cannot be written"),
-    Case("picture of a robot", program("robot", GO1, "--picture", "/proc/nosuch/x.png"), "--picture /proc/nosuch/x.png: cannot be written"),
     Case(
-        "a new task into nowhere", program("robot", GO1, "--new", "dog", "--out", "/proc/nosuch"), "--out /proc/nosuch: cannot be written"
+        "picture into nowhere",
+        program(*CHECK, "--picture", "/proc/nosuch/x.png"),
+        "--picture /proc/nosuch/x.png: cannot be written",
     ),
-    Case("a new task below a file", program("robot", GO1, "--new", "dog", "--out", "file/x"), "file is a file", given=a_file),
-    Case("a new task onto a file", program("robot", GO1, "--new", "dog", "--out", "file"), "that is a file; name a folder", given=a_file),
-    Case("training below a file", program("train", "--num_envs", "4"), "logs is a file, not a folder", given=logs_is_a_file),
+    Case(
+        "picture of a robot",
+        program("robot", GO1, "--picture", "/proc/nosuch/x.png"),
+        "--picture /proc/nosuch/x.png: cannot be written",
+    ),
+    Case(
+        "a new task into nowhere",
+        program("robot", GO1, "--new", "dog", "--out", "/proc/nosuch"),
+        "--out /proc/nosuch: cannot be written",
+    ),
+    Case(
+        "a new task below a file",
+        program("robot", GO1, "--new", "dog", "--out", "file/x"),
+        "file is a file",
+        given=a_file,
+    ),
+    Case(
+        "a new task onto a file",
+        program("robot", GO1, "--new", "dog", "--out", "file"),
+        "that is a file; name a folder",
+        given=a_file,
+    ),
+    Case(
+        "training below a file",
+        program("train", "--num_envs", "4"),
+        "logs is a file, not a folder",
+        given=logs_is_a_file,
+    ),
     Case("a log into nowhere", program(*DEPLOY, "--drive", "--log", "/proc/nosuch/x.npz"), "cannot be written"),
-    Case("a log onto a folder", program(*DEPLOY, "--drive", "--log", "folder.npz"), "that is a folder; name a file", given=some_folders),
+    Case(
+        "a log onto a folder",
+        program(*DEPLOY, "--drive", "--log", "folder.npz"),
+        "that is a folder; name a file",
+        given=some_folders,
+    ),
     Case("a log to no name", program(*DEPLOY, "--drive", "--log", ""), "--log is empty: name the file to write"),
 ]
 

@@ -23,7 +23,11 @@ NOTE = "is not to be trusted: simulator overflow (NEFC) in 3 of 4 worlds; raise 
 
 @pytest.fixture
 def env(monkeypatch: pytest.MonkeyPatch) -> LeggedRobot:
-    monkeypatch.setattr(MujocoSimulation, "overflow_report", lambda _: "simulator overflow (NEFC) in 3 of 4 worlds; raise `njmax` (now 1)")
+    monkeypatch.setattr(
+        MujocoSimulation,
+        "overflow_report",
+        lambda _: "simulator overflow (NEFC) in 3 of 4 worlds; raise `njmax` (now 1)",
+    )
     task = load_task("go1_flat")
     for item in SMALL[SMALL.index("--set") + 1 :: 2]:
         task.set(*item.split("=", 1))

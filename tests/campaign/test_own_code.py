@@ -44,9 +44,17 @@ FILES: list[tuple[str, str, tuple[str, ...]]] = [
     ("a tab among spaces", "if 1:\n    x = 1\n\ty = 2", (f"mine.py:{FIRST + 2}: ",)),
     ("a zero byte", "x = '\0'", ("mine.py", "null bytes")),
     ("not UTF-8", "x = '\udcff'", ("mine.py", "utf-8")),
-    ("an import that is not there", "import nosuch", (f"mine.py:{FIRST}: ModuleNotFoundError: No module named 'nosuch'",)),
+    (
+        "an import that is not there",
+        "import nosuch",
+        (f"mine.py:{FIRST}: ModuleNotFoundError: No module named 'nosuch'",),
+    ),
     ("a name that is not in there", "from legged_mw.envs import legged_robots", (f"mine.py:{FIRST}: ImportError: ",)),
-    ("a name that is none", "TASK = Task(Dog, Cfg, CfgPPO)", (f"mine.py:{FIRST}: NameError: name 'Dog' is not defined",)),
+    (
+        "a name that is none",
+        "TASK = Task(Dog, Cfg, CfgPPO)",
+        (f"mine.py:{FIRST}: NameError: name 'Dog' is not defined",),
+    ),
     (
         "an error as it is imported",
         "def f():\n    return 1 / 0\n\n\nf()",
@@ -59,15 +67,39 @@ FILES: list[tuple[str, str, tuple[str, ...]]] = [
     ("nothing", "", (WANTED, "its TASK is None")),
     ("a tuple", "TASK = (LeggedRobot, Cfg, CfgPPO)", (WANTED, "its TASK is (<class")),
     ("a name", "TASK = 'go1_flat'", (WANTED, "its TASK is 'go1_flat'")),
-    ("two too few", "TASK = Task(LeggedRobot)", (f"mine.py:{FIRST}: TypeError: ", "missing 2 required positional arguments", WANTED)),
+    (
+        "two too few",
+        "TASK = Task(LeggedRobot)",
+        (f"mine.py:{FIRST}: TypeError: ", "missing 2 required positional arguments", WANTED),
+    ),
     ("two too many", "TASK = Task(LeggedRobot, Cfg, CfgPPO, '', 3)", (f"mine.py:{FIRST}: TypeError: ", WANTED)),
-    ("an argument that is not known", "TASK = Task(LeggedRobot, Cfg, CfgPPO, exams='a')", (f"mine.py:{FIRST}: TypeError: ", "'exams'")),
+    (
+        "an argument that is not known",
+        "TASK = Task(LeggedRobot, Cfg, CfgPPO, exams='a')",
+        (f"mine.py:{FIRST}: TypeError: ", "'exams'"),
+    ),
     ("numbers", "TASK = Task(1, 2, 3)", ("TASK: env is 1; it must be a class: an environment, as LeggedRobot is",)),
-    ("config first", "TASK = Task(Cfg, LeggedRobot, CfgPPO)", ("TASK: env is <class ", "it must be a class: an environment")),
-    ("learner second", "TASK = Task(LeggedRobot, CfgPPO, Cfg)", ("TASK: cfg is <class ", "an environment's config, as LeggedRobotCfg is")),
-    ("the same config twice", "TASK = Task(LeggedRobot, Cfg, Cfg)", ("TASK: train is <class ", "a learner's, as LeggedRobotCfgPPO is")),
+    (
+        "config first",
+        "TASK = Task(Cfg, LeggedRobot, CfgPPO)",
+        ("TASK: env is <class ", "it must be a class: an environment"),
+    ),
+    (
+        "learner second",
+        "TASK = Task(LeggedRobot, CfgPPO, Cfg)",
+        ("TASK: cfg is <class ", "an environment's config, as LeggedRobotCfg is"),
+    ),
+    (
+        "the same config twice",
+        "TASK = Task(LeggedRobot, Cfg, Cfg)",
+        ("TASK: train is <class ", "a learner's, as LeggedRobotCfgPPO is"),
+    ),
     ("an instance", "TASK = Task(LeggedRobot, Cfg(), CfgPPO)", ("TASK: cfg is <", "it must be a class")),
-    ("an exam that is a number", "TASK = Task(LeggedRobot, Cfg, CfgPPO, 3)", ("TASK: exam is 3; it must be the name of an exam, or None",)),
+    (
+        "an exam that is a number",
+        "TASK = Task(LeggedRobot, Cfg, CfgPPO, 3)",
+        ("TASK: exam is 3; it must be the name of an exam, or None",),
+    ),
     (
         "a field that is not there",
         SECTION.format("(Cfg.env)", "num_env"),
@@ -124,12 +156,36 @@ def hook(name: str) -> str:
 
 HERE, ROWS = f"mine: mine.py:{FIRST + 1}, Mine.", f"mine: mine.py:{FIRST + 1}, Mine.observation_rows: "
 ENVIRONMENTS: list[tuple[str, str, str]] = [
-    ("reward is nothing", method("def _reward_pose(self):\n    pass"), HERE + "_reward_pose: must return a tensor (4,), one value an env"),
-    ("reward is a column", method("def _reward_pose(self):\n    return self.dof_pos[:, :1]"), "_reward_pose: must return a tensor (4,)"),
-    ("reward is one number", method("def _reward_pose(self):\n    return self.dof_pos.sum()"), "one value an environment; it returned ()"),
-    ("reward is text", method("def _reward_pose(self):\n    return 'good'"), "_reward_pose: must return a tensor (4,), one value an env"),
-    ("reward divides by 0", method("def _reward_pose(self):\n    return self.rew_buf / (self.rew_buf * 0)"), "a value that is not finite"),
-    ("reward raises", method("def _reward_pose(self):\n    return self.nosuch"), "Mine._reward_pose: AttributeError: 'Mine' object has no"),
+    (
+        "reward is nothing",
+        method("def _reward_pose(self):\n    pass"),
+        HERE + "_reward_pose: must return a tensor (4,), one value an env",
+    ),
+    (
+        "reward is a column",
+        method("def _reward_pose(self):\n    return self.dof_pos[:, :1]"),
+        "_reward_pose: must return a tensor (4,)",
+    ),
+    (
+        "reward is one number",
+        method("def _reward_pose(self):\n    return self.dof_pos.sum()"),
+        "one value an environment; it returned ()",
+    ),
+    (
+        "reward is text",
+        method("def _reward_pose(self):\n    return 'good'"),
+        "_reward_pose: must return a tensor (4,), one value an env",
+    ),
+    (
+        "reward divides by 0",
+        method("def _reward_pose(self):\n    return self.rew_buf / (self.rew_buf * 0)"),
+        "a value that is not finite",
+    ),
+    (
+        "reward raises",
+        method("def _reward_pose(self):\n    return self.nosuch"),
+        "Mine._reward_pose: AttributeError: 'Mine' object has no",
+    ),
     (
         "reward wants more",
         method("def _reward_pose(self, more):\n    return more"),
@@ -137,17 +193,53 @@ ENVIRONMENTS: list[tuple[str, str, str]] = [
     ),
     ("reward is static", method("@staticmethod\ndef _reward_pose():\n    return 1"), "this does not fit: mine.py:"),
     ("reward is a number", method("_reward_pose = 5"), "this does not fit: Mine._reward_pose = 5"),
-    ("no table", method("def observation_rows(self):\n    pass"), ROWS + "must return group -> list of rows; it returned NoneType"),
-    ("table is a list", method("def observation_rows(self):\n    return []"), ROWS + "must return group -> list of rows; it returned list"),
+    (
+        "no table",
+        method("def observation_rows(self):\n    pass"),
+        ROWS + "must return group -> list of rows; it returned NoneType",
+    ),
+    (
+        "table is a list",
+        method("def observation_rows(self):\n    return []"),
+        ROWS + "must return group -> list of rows; it returned list",
+    ),
     ("a group without rows", rows("table['state'] = []"), ROWS + "must return group -> list of rows"),
-    ("row is a number", rows("mine.append(3)"), ROWS + "group 'state' holds int; write Row(name, value, ...), or the name of a group"),
-    ("row is a tensor", rows("mine.append(self.rew_buf)"), ROWS + "group 'state' holds Tensor; write Row(name, value, ...)"),
-    ("value is a number", rows("mine.append(Row('x', 3.0))"), ROWS + "row 'x' of 'state' is float; it must be a tensor (4, size)"),
-    ("value of one axis", rows("mine.append(Row('x', self.rew_buf))"), ROWS + "row 'x' of 'state' is (4,); it must be a tensor (4, size)"),
-    ("value of other worlds", rows("mine.append(Row('x', torch.zeros(5, 2)))"), ROWS + "row 'x' of 'state' is (5, 2); it must be a"),
-    ("value without columns", rows("mine.append(Row('x', torch.zeros(4, 0)))"), ROWS + "row 'x' of 'state' is (4, 0); it must be a"),
+    (
+        "row is a number",
+        rows("mine.append(3)"),
+        ROWS + "group 'state' holds int; write Row(name, value, ...), or the name of a group",
+    ),
+    (
+        "row is a tensor",
+        rows("mine.append(self.rew_buf)"),
+        ROWS + "group 'state' holds Tensor; write Row(name, value, ...)",
+    ),
+    (
+        "value is a number",
+        rows("mine.append(Row('x', 3.0))"),
+        ROWS + "row 'x' of 'state' is float; it must be a tensor (4, size)",
+    ),
+    (
+        "value of one axis",
+        rows("mine.append(Row('x', self.rew_buf))"),
+        ROWS + "row 'x' of 'state' is (4,); it must be a tensor (4, size)",
+    ),
+    (
+        "value of other worlds",
+        rows("mine.append(Row('x', torch.zeros(5, 2)))"),
+        ROWS + "row 'x' of 'state' is (5, 2); it must be a",
+    ),
+    (
+        "value without columns",
+        rows("mine.append(Row('x', torch.zeros(4, 0)))"),
+        ROWS + "row 'x' of 'state' is (4, 0); it must be a",
+    ),
     ("a group that is not there", rows("mine.append('nosuch')"), "group 'state': no group 'nosuch' in the groups"),
-    ("scales that do not fit", rows("mine.append(Row('x', torch.zeros(4, 2), scale=(1.0, 2.0, 3.0)))"), "'x' has 2 columns and 3 scales"),
+    (
+        "scales that do not fit",
+        rows("mine.append(Row('x', torch.zeros(4, 2), scale=(1.0, 2.0, 3.0)))"),
+        "'x' has 2 columns and 3 scales",
+    ),
     (
         "an argument that Row has not",
         rows("mine.append(Row('x', self.dof_pos, noises=1))"),
@@ -163,14 +255,25 @@ ENVIRONMENTS: list[tuple[str, str, str]] = [
     ("nothing is made", method("def __init__(self):\n    pass"), FIT + "__init__"),
     *(
         (f"{name} raises", hook(name), f"mine: mine.py:{FIRST + 2}, Mine.{name}: KeyError: 'mine'")
-        for name in ("_update_state", "check_termination", "_end_step", "reset_envs", "compute_observations", "_resample_commands")
+        for name in (
+            "_update_state",
+            "check_termination",
+            "_end_step",
+            "reset_envs",
+            "compute_observations",
+            "_resample_commands",
+        )
     ),
 ]
 
 
-@pytest.mark.parametrize(("text", "says"), [entry[1:] for entry in ENVIRONMENTS], ids=[entry[0] for entry in ENVIRONMENTS])
+@pytest.mark.parametrize(
+    ("text", "says"), [entry[1:] for entry in ENVIRONMENTS], ids=[entry[0] for entry in ENVIRONMENTS]
+)
 def test_environments(text: str, says: str, tmp_path: Path) -> None:
-    attack(Case("", lambda root: check_recordable(load_task(str(root / "mine.py"))), says, given=written(text)), tmp_path)
+    attack(
+        Case("", lambda root: check_recordable(load_task(str(root / "mine.py"))), says, given=written(text)), tmp_path
+    )
 
 
 # ---- where nobody checked before
@@ -191,10 +294,16 @@ def test_a_hook_that_raises_later(tmp_path: Path) -> None:
     attack(Case("", run, said, given=written(text)), tmp_path)
 
 
-def test_verbose_shows_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_verbose_shows_the_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     written("import nosuch")(tmp_path)
     monkeypatch.setattr(sys, "argv", ["train.py", "--task", str(tmp_path / "mine.py"), "--verbose"])
     with pytest.raises(SystemExit):
         programs.train()
     said = capsys.readouterr().err
-    assert said.startswith("Traceback") and "import_task" in said and said.rstrip().splitlines()[-1].startswith("train.py: ")
+    assert (
+        said.startswith("Traceback")
+        and "import_task" in said
+        and said.rstrip().splitlines()[-1].startswith("train.py: ")
+    )

@@ -17,17 +17,41 @@ from legged_mw.rl.resume import beyond
 from legged_mw.rl.runs import checkpoints, save_whole
 
 EXACTLY = "exactly: worlds and generators go on where they were"
-THREE = ["--set", "runner.save_interval=1", "--max_iterations", "3", "--seed", "3", "--set", "cpu.update_threads=1", "--eager"]
+THREE = [
+    "--set",
+    "runner.save_interval=1",
+    "--max_iterations",
+    "3",
+    "--seed",
+    "3",
+    "--set",
+    "cpu.update_threads=1",
+    "--eager",
+]
 DELAYS = ["action_delay=[0, 2]", "observation_delay=[0, 2]", "delay_ms=[0.0, 12.0]", "encoder_offset=[-0.02, 0.02]"]
 TILES = ["--set", "terrain.num_rows=2", "--set", "terrain.num_cols=8"]
 TASKS = {  # what is trained -> flags; with symmetry, kicks, noise and episodes that end on the way
     "go1_rough": ["--task", "go1_rough", *TILES],
     "drawn worlds, delays, history": [
-        *("--task", "go1_flat_dr", "--set", "domain_rand.redraw_iterations=1", "--set", "observations.history={state: 3}"),
+        *(
+            "--task",
+            "go1_flat_dr",
+            "--set",
+            "domain_rand.redraw_iterations=1",
+            "--set",
+            "observations.history={state: 3}",
+        ),
         *(word for each in DELAYS for word in ("--set", f"domain_rand.{each}")),
     ],
     "curricula, memory": [
-        *("--set", "commands.curriculum=true", "--set", "perturbation.curriculum=true", "--set", "perturbation.push=true"),
+        *(
+            "--set",
+            "commands.curriculum=true",
+            "--set",
+            "perturbation.curriculum=true",
+            "--set",
+            "perturbation.push=true",
+        ),
         *("--set", "actor.class_name=RNNModel", "--set", "actor.rnn_hidden_dim=8", "--set", "cpu.rnn_hidden_dim=8"),
     ],
     "estimator": ["--task", "go1_flat_blind", "--set", "actor.estimator.targets=[base_lin_vel]"],
@@ -68,7 +92,9 @@ def interrupted(root: Path, *flags: str, after: int = 2) -> tuple[Path, Path]:
 
 def resume(root: Path, folder: Path, *flags: str) -> Result:
     task = flags[flags.index("--task") + 1] if "--task" in flags else "go1_flat"
-    return run("train", root, "--task", task, "--device", "cpu", "--eager", "--resume", "--load_run", str(folder), *flags)
+    return run(
+        "train", root, "--task", task, "--device", "cpu", "--eager", "--resume", "--load_run", str(folder), *flags
+    )
 
 
 @pytest.mark.parametrize("name", TASKS)

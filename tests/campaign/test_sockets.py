@@ -143,7 +143,9 @@ SPEC = mujoco.MjSpec.from_string(  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def answer(port: int, path: str = "/", **headers: str) -> tuple[int, str, Any]:
-    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers={k.replace("_", "-"): v for k, v in headers.items()})
+    request = urllib.request.Request(
+        f"http://127.0.0.1:{port}{path}", headers={k.replace("_", "-"): v for k, v in headers.items()}
+    )
     try:
         with urllib.request.urlopen(request, timeout=10) as got:
             return got.status, got.read().decode(), got.headers
@@ -158,8 +160,13 @@ def test_the_page_is_guarded_once_in_a_process_and_free_again_afterwards() -> No
     for turn in range(2):
         with closing(WebViewer(SPEC, Pilot([]), 1)) as page:
             now = np.zeros((1, 3))
-            page.show(Moment(0.0, np.array([[0, 0, 1, 1, 0, 0, 0.0]]), now[:, :0], now, now, np.ones((1, 0), dtype=bool)))
-            with pytest.raises(ViewError, match=r"this process serves http://localhost:\d+/ already, .* can be there once: close it first"):
+            page.show(
+                Moment(0.0, np.array([[0, 0, 1, 1, 0, 0, 0.0]]), now[:, :0], now, now, np.ones((1, 0), dtype=bool))
+            )
+            with pytest.raises(
+                ViewError,
+                match=r"this process serves http://localhost:\d+/ already, .* can be there once: close it first",
+            ):
                 WebViewer(SPEC, Pilot([]), 1)
             status, text, headers = answer(page.port)
             assert status == 200 and "canvas" in text
@@ -174,7 +181,14 @@ def test_the_page_is_guarded_once_in_a_process_and_free_again_afterwards() -> No
                 with pytest.raises(InvalidStatus, match="403"):
                     connect(url + path, origin=origin)  # pyright: ignore[reportArgumentType]
             with connect(f"{url}/state?sid=1", origin=own) as state:  # pyright: ignore[reportArgumentType]
-                for message in ("max_spectators=99999999999999999999", "theme=\x1b[31m", b"", bytes(63), b"\xff" * 64, "x" * 1000):
+                for message in (
+                    "max_spectators=99999999999999999999",
+                    "theme=\x1b[31m",
+                    b"",
+                    bytes(63),
+                    b"\xff" * 64,
+                    "x" * 1000,
+                ):
                     state.send(message)
                 with suppress(ConnectionClosed):
                     state.send(bytes(MOST + 1))
@@ -244,7 +258,9 @@ class Standing(Robot):
 def standing(contract: Contract, **changed: Any) -> Measurement:
     zeros = {name: np.zeros(3) for name in ("lin_vel", "ang_vel", "acceleration")}
     joints = {"joint_pos": np.array(contract.default_pose), "joint_vel": np.zeros(12), "joint_torque": np.zeros(12)}
-    return Measurement(**{**zeros, **joints, "gravity": np.array([0.0, 0.0, -1.0]), "foot_contact": np.zeros(4), **changed})
+    return Measurement(
+        **{**zeros, **joints, "gravity": np.array([0.0, 0.0, -1.0]), "foot_contact": np.zeros(4), **changed}
+    )
 
 
 GO1 = read_contract(POLICIES / "go1_flat")
@@ -301,10 +317,20 @@ def test_the_udp_server_obeys_one_client_that_it_can_answer(monkeypatch: pytest.
     server._socket.close()
     nobody = ("10.0.0.3", 0)
     before = [(0.1, targets(1), OTHER), (0.1, HELLO, nobody), (0.1, b"\x00", nobody), (9.0, targets(3), nobody)]
-    after = [(0.0, HELLO, CLIENT), (0.1, targets(1), OTHER), (0.1, targets(1), CLIENT), (0.1, udp.pack(udp.CLOSE, DIGEST, 1), OTHER)]
+    after = [
+        (0.0, HELLO, CLIENT),
+        (0.1, targets(1), OTHER),
+        (0.1, targets(1), CLIENT),
+        (0.1, udp.pack(udp.CLOSE, DIGEST, 1), OTHER),
+    ]
     server._socket = FakeSocket([*before, *after, *[(0.2, HELLO, CLIENT)] * 9], monkeypatch)
     assert server.serve(lambda _: None) == "10.0.0.1:5000 fell silent for 0.5 s" and len(robot.targets) == 1
-    assert server.dropped == {"before a hello": 2, "that cannot be answered": 2, "not of this link": 1, "from somebody else": 2}
+    assert server.dropped == {
+        "before a hello": 2,
+        "that cannot be answered": 2,
+        "not of this link": 1,
+        "from somebody else": 2,
+    }
 
 
 VALUES = sum(len(np.ravel(getattr(standing(GO1), name))) for name in QUANTITIES)
@@ -358,7 +384,9 @@ ABSURD = [
 @each("changed, says", ABSURD)
 def test_impossible_measurements_end_the_walk(changed: dict[str, Floats], says: str) -> None:
     """Also where every limit that can be switched off is off."""
-    limits = Limits.of(POLICIES / "go1_flat", GO1, asked=dict.fromkeys(("position", "speed", "tilt", "frozen", "age", "late"), "off"))
+    limits = Limits.of(
+        POLICIES / "go1_flat", GO1, asked=dict.fromkeys(("position", "speed", "tilt", "frozen", "age", "late"), "off")
+    )
     safety = Safety(GO1, replace(limits, low=np.full(12, -INF), high=np.full(12, INF)))
     assert safety.sensed(standing(GO1), Health(), 0.0) is None
     trip = safety.sensed(standing(GO1, **changed), Health(), 0.02)
@@ -470,7 +498,9 @@ def test_a_whole_state_that_cannot_be_ends_the_walk(parts: dict[str, Any], says:
     owner = FakeOwner()
     robot = UnitreeRobot(GO2, owner, Received(state, 1.0), clock=lambda: 1.0)
     owner.states.append(Received(changed(state, tick=tick(state) + 2, **parts), 1.0))
-    limits = Limits.of(POLICIES / "go2_flat", GO2, robot.limits, {"frozen": "off", "position": "off", "tilt": "off", "speed": "off"})
+    limits = Limits.of(
+        POLICIES / "go2_flat", GO2, robot.limits, {"frozen": "off", "position": "off", "tilt": "off", "speed": "off"}
+    )
     trip = Safety(GO2, limits).sensed(robot.read(), robot.health(), 0.0)
     assert trip is not None and says in trip.text
 
@@ -491,7 +521,11 @@ COMMANDS = [
     ("zeros", bytes(LAYOUTS["unitree_go", "LowCmd_"].size)),
     ("ones", b"\xff" * LAYOUTS["unitree_go", "LowCmd_"].size),
     ("not sealed", command(kp=20.0).body),
-    *((f"{name} is {value}", command(**{name: value}).seal()) for name in ("q", "dq", "tau", "kp", "kd") for value in (NAN, INF, 1e30)),
+    *(
+        (f"{name} is {value}", command(**{name: value}).seal())
+        for name in ("q", "dq", "tau", "kp", "kd")
+        for value in (NAN, INF, 1e30)
+    ),
 ]
 
 
@@ -517,14 +551,28 @@ def test_noise_of_a_remote_walks_nowhere(data: bytes) -> None:
     assert held is not None and not any(abs(getattr(held, stick)) > 1e-6 for stick in ("lx", "ly", "rx", "ry"))
 
 
-ANSWERS = ["[]", "{", '"x"', "{'name': 1}", '{"name": 5}', '{"name": ["\x1b[2J"]}', "[" * 100_000, "\ufffd", '{"name": {}}', "1e999"]
+ANSWERS = [
+    "[]",
+    "{",
+    '"x"',
+    "{'name': 1}",
+    '{"name": 5}',
+    '{"name": ["\x1b[2J"]}',
+    "[" * 100_000,
+    "\ufffd",
+    '{"name": {}}',
+    "1e999",
+]
 
 
 @pytest.mark.parametrize("data", ANSWERS, ids=[each[:9].encode("unicode_escape").decode() for each in ANSWERS])
 def test_a_motion_service_that_answers_anything(data: str, monkeypatch: pytest.MonkeyPatch) -> None:
     wire: Any = object.__new__(Wire)
     monkeypatch.setattr(Wire, "_ask", lambda *_: data)
-    with pytest.raises(RobotError, match=r"the robot's motion service answers .*, which does not say which program runs: nothing was sent"):
+    with pytest.raises(
+        RobotError,
+        match=r"the robot's motion service answers .*, which does not say which program runs: nothing was sent",
+    ):
         wire._program()
 
 
@@ -538,7 +586,9 @@ class FakeReader:
         body = self.bodies.popleft()
         if body == b"broken":
             raise IndexError("bytes that end too early")
-        return [SimpleNamespace(body=body, sample_info=SimpleNamespace(valid_data=body != b"gone", publication_handle=1))]
+        return [
+            SimpleNamespace(body=body, sample_info=SimpleNamespace(valid_data=body != b"gone", publication_handle=1))
+        ]
 
 
 def test_messages_of_another_size_are_counted() -> None:

@@ -23,7 +23,11 @@ PLAIN = "it must be a plain name such as wide_net, of 100 bytes at most"
 NAME = "cannot be the name of a folder below logs: "
 CODE = "import pathlib\npathlib.Path('pwned').touch()\nfrom configs.go1_flat import TASK\nTASK = TASK\n"
 CLEAR = "\x1b[2J\x1b]0;owned\x07"  # what a terminal would obey
-play, resume, check = (lambda *flags: program("play", *flags)), (lambda *f: program("train", "--resume", *f)), ("train", "--check")
+play, resume, check = (
+    (lambda *flags: program("play", *flags)),
+    (lambda *f: program("train", "--resume", *f)),
+    ("train", "--check"),
+)
 Given = Callable[[Path], object]
 
 
@@ -214,13 +218,17 @@ def given_run(root: Path, run: str = RUN) -> None:
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.id.encode("unicode_escape").decode()[:60])
 def test_strangers(case: Case, tmp_path: Path) -> None:
     given_run(tmp_path)
-    says = tuple(each.replace("ROOT", str(tmp_path)) for each in ([case.says] if isinstance(case.says, str) else case.says))
+    says = tuple(
+        each.replace("ROOT", str(tmp_path)) for each in ([case.says] if isinstance(case.says, str) else case.says)
+    )
     line = attack(case._replace(says=says), tmp_path)
     assert line[:-1].isprintable() and not list(tmp_path.rglob("pwned"))
 
 
-BEST, UNPACKED = "walker/best", "logs/walker/logs/go1_flat/run"  # an archive without logs; one that lies in our own logs
-WAYS = {  # what a run's config may name -> (the run, where the code lies, what the config says; the program, if not play)
+# an archive without logs; one that lies in our own logs
+BEST, UNPACKED = "walker/best", "logs/walker/logs/go1_flat/run"
+# what a run's config may name -> (the run, where the code lies, what the config says; the program, if not play)
+WAYS = {
     "beside the run": (BEST, "walker/code.py", "code.py"),
     "exported": (BEST, "walker/code.py", "code.py", "play", "--export", "ROOT/out", "--load_run"),
     "graded": (BEST, "walker/code.py", "code.py", "play", "--eval", "--load_run"),
@@ -259,7 +267,9 @@ def test_a_run_decides_no_code(way: str, tmp_path: Path) -> None:
     name, *flags = flags or ["play", "--load_run"]
     task = [] if "--task" in flags else ["--task", ""]
     is_file = stored.endswith(".py")
-    line = attack(Case(way, program(name, *task, *flags, folder), "somebody's code" if is_file else "no task"), tmp_path)
+    line = attack(
+        Case(way, program(name, *task, *flags, folder), "somebody's code" if is_file else "no task"), tmp_path
+    )
     assert not is_file or f"--task {shlex.quote(stored)}" in line
     assert not list(tmp_path.rglob("pwned"))
 
@@ -269,7 +279,9 @@ def test_a_file_that_is_named_runs_and_is_printed_first(tmp_path: Path, monkeypa
     (tmp_path / "code.py").write_text("print('runs')\n" + CODE)
     monkeypatch.chdir(tmp_path)
     done = run("train", tmp_path, "--task", "code.py", "--check", "--eager", "--num_envs", "1", "--device", "cpu")
-    assert done.code == 0 and done.out.splitlines()[:2] == ["task: code.py", "runs"] and (tmp_path / "pwned").exists(), done
+    assert (
+        done.code == 0 and done.out.splitlines()[:2] == ["task: code.py", "runs"] and (tmp_path / "pwned").exists()
+    ), done
     assert done.out.count("task: ") == 1
 
 

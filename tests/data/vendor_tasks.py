@@ -128,7 +128,14 @@ class A1StyleCfg(LeggedRobotCfg):
         armature = {"": 0.01}
 
     class init_state(LeggedRobotCfg.init_state):
-        default_joint_angles = {"FL_hip": 0.1, "RL_hip": 0.1, "FR_hip": -0.1, "RR_hip": -0.1, "thigh": 0.8, "calf": -1.5}
+        default_joint_angles = {
+            "FL_hip": 0.1,
+            "RL_hip": 0.1,
+            "FR_hip": -0.1,
+            "RR_hip": -0.1,
+            "thigh": 0.8,
+            "calf": -1.5,
+        }
 
     class control(LeggedRobotCfg.control):
         stiffness = {"": 20.0}

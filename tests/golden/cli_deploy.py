@@ -115,20 +115,39 @@ FAULTS = [
 
 
 def table() -> Table:
-    made = Table(lambda root: [(root / "folder").mkdir(), (root / "there.lmwlog").write_bytes(b"no"), (root / "empty.yaml").touch()])
+    made = Table(
+        lambda root: [
+            (root / "folder").mkdir(),
+            (root / "there.lmwlog").write_bytes(b"no"),
+            (root / "empty.yaml").touch(),
+        ]
+    )
     made.programs("deploy", FLAGS)
     commands, joints = command_table(load_task("go1_flat").cfg), ["FR_hip_joint", "FL_hip_joint"]
     for name, text in SCRIPTS.items():
         made.add(
-            f"script: {name}", lambda root: load_script("a.yaml", commands), lambda root, text=text: (root / "a.yaml").write_text(text)
+            f"script: {name}",
+            lambda root: load_script("a.yaml", commands),
+            lambda root, text=text: (root / "a.yaml").write_text(text),
         )
-    made.add("script: no commands", lambda root: load_script("a.yaml", ()), lambda root: (root / "a.yaml").write_text(SCRIPTS["too fast"]))
+    made.add(
+        "script: no commands",
+        lambda root: load_script("a.yaml", ()),
+        lambda root: (root / "a.yaml").write_text(SCRIPTS["too fast"]),
+    )
     for name, text in REMOTES.items():
         made.add(
-            f"remote: {name}", lambda root: handset.load_remote(Path("a.yaml")), lambda root, text=text: (root / "a.yaml").write_text(text)
+            f"remote: {name}",
+            lambda root: handset.load_remote(Path("a.yaml")),
+            lambda root, text=text: (root / "a.yaml").write_text(text),
         )
     made.calls({f"fault: {text}": lambda text=text: parse_faults([text], joints) for text in FAULTS})
-    made.calls({f"limit: {name} {value}": lambda name=name, value=value: safety._value(name, value, "here") for name, value in LIMITS})
+    made.calls(
+        {
+            f"limit: {name} {value}": lambda name=name, value=value: safety._value(name, value, "here")
+            for name, value in LIMITS
+        }
+    )
     return made
 
 

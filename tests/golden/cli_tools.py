@@ -25,7 +25,16 @@ ROBOT = [
     f"{GO1} --picture a.gif",
 ]
 ROBOT += [f"{GO1} --new a --out folder/there.xml", f"{GO1} --picture folder"]
-MOTION = ["", "walk.bvh", "none.csv", "none.npz", f"{WAVE} --out a.csv", f"{WAVE} --cut 0 99", f"{WAVE} --rate 0", f"{WAVE} --rate 0.01"]
+MOTION = [
+    "",
+    "walk.bvh",
+    "none.csv",
+    "none.npz",
+    f"{WAVE} --out a.csv",
+    f"{WAVE} --cut 0 99",
+    f"{WAVE} --rate 0",
+    f"{WAVE} --rate 0.01",
+]
 MOTION += [f"{WAVE} --task go1_flat", f"{WAVE} --lift nan", f"{WAVE} --task nosuch", "words.csv", "narrow.csv"]
 COMPARE = ["", "nosuch", " ".join("abcdefghijklmn"), "nosuch --over days", "a/../b"]
 SWEEP = ["", "--task go1_flat --resume", "--task go1_flat --seeds 1,x", "--task go1_flat --run_name a"]
@@ -33,7 +42,12 @@ SWEEP = ["", "--task go1_flat --resume", "--task go1_flat --seeds 1,x", "--task 
 
 def fill(root: Path) -> None:
     (root / "folder").mkdir()
-    for name, text in {"there.xml": "", "folder/there.xml": "", "words.csv": "a,b\nc,d\n", "narrow.csv": "1,2,3\n4,5,6\n"}.items():
+    for name, text in {
+        "there.xml": "",
+        "folder/there.xml": "",
+        "words.csv": "a,b\nc,d\n",
+        "narrow.csv": "1,2,3\n4,5,6\n",
+    }.items():
         (root / name).write_text(text)
 
 
@@ -57,5 +71,7 @@ def table() -> Table:
     made.programs("doctor", ["--x"])
     made.calls({"no program": legged_mw, "no such program": lambda: legged_mw("trian")})
     made.add("compare to a folder", lambda root: compare.write([], root / "folder"))
-    made.add("robot to a folder that is a file", lambda root: new.write(None, GO1, "a", root / "there.xml", True, False))  # type: ignore[arg-type]
+    made.add(
+        "robot to a folder that is a file", lambda root: new.write(None, GO1, "a", root / "there.xml", True, False)
+    )  # type: ignore[arg-type]
     return made

@@ -12,13 +12,31 @@ from golden.table import Run, Table, given_run, without
 BOTH = [
     ["--task", ""],
     *(["--task", name] for name in ("go1_falt", "dog.urdf", "dog/dog.py", "empty.py", "wrong.py", "bare.py")),
-    *(line.split() for line in ("--num_env 4", "--num_envs 0", "--num_envs many", "--seed x", "--checkpoint last", "--engine physx")),
+    *(
+        line.split()
+        for line in (
+            "--num_env 4",
+            "--num_envs 0",
+            "--num_envs many",
+            "--seed x",
+            "--checkpoint last",
+            "--engine physx",
+        )
+    ),
     *(["--device", name] for name in ("gpu", "cuda:99")),
     *(["--override", f"{name}.yaml"] for name in ("none", "field", "section", "value", "flat")),
     *(
         ["--set", item]
         for item in (
-            *("env.num_envs", "env.num_env=4", "env.num_envs=many", "reward.scales.pose=1", "env=4", "env.num_envs.x=4", "=3"),
+            *(
+                "env.num_envs",
+                "env.num_env=4",
+                "env.num_envs=many",
+                "reward.scales.pose=1",
+                "env=4",
+                "env.num_envs.x=4",
+                "=3",
+            ),
             *("terrain.mesh_type=plain", "perturbation.enable=true", "control.stiffness=35", "control.stiffness.hip=3"),
         )
     ),
@@ -38,21 +56,34 @@ SMALL = [*("--num_envs", "16", "--set", "actor.hidden_dims=[16, 16]", "--set", "
 CHECKED = [  # what shows only when robot, environment or learner is built
     *("asset.file=dog.xml", "asset.file=", "asset.file=/far/dog.xml"),
     *("asset.foot_names=[FR, FL, RR, RLL]", "asset.foot_names=[FR, FL, RR]", "asset.foot_names=[F*]"),
-    *("control.stiffness={hip: 30}", "init_state.default_joint_angles={joint: 0, wheel: 1}", "rewards.scales.torqes=-1"),
+    *(
+        "control.stiffness={hip: 30}",
+        "init_state.default_joint_angles={joint: 0, wheel: 1}",
+        "rewards.scales.torqes=-1",
+    ),
     *("algorithm.optimizer=adom", "obs_groups.actor=[stat]", "actor.class_name=os:system", "asset.imu_site=nose"),
     *("commands.keep_probability=[1]", "commands.units={hight: m}", "commands.default={lin_vel_z: 1}"),
     *("commands.default={lin_vel_x: 9}", "observations.leave_out={nosuch: [a]}", "observations.leave_out={state: [a]}"),
     *("observations.history={nosuch: 2}", "observations.history={state.nosuch: 2}"),
     *("asset.penalize_contacts_on=[nose]", "asset.colliders=[]", "asset.sense=[nosuch]"),
     *("symmetry.use_mirror_loss=true", "actor.concurrent.groups=[privileged]", "actor.concurrent.groups=[state]"),
-    *("actor.estimator.targets=[nosuch]", "actor.estimator.targets=[base_lin_vel, base_lin_vel]", "asset.foot_geoms={FX: [FR]}"),
+    *(
+        "actor.estimator.targets=[nosuch]",
+        "actor.estimator.targets=[base_lin_vel, base_lin_vel]",
+        "asset.foot_geoms={FX: [FR]}",
+    ),
     *("asset.foot_geoms={FR: []}", "domain_rand.redraw_at_reset=[nosuch]", "domain_rand.redraw_at_reset=[armature]"),
     *("falls.pull_on=nose", "sim.integrator=rk4", "asset.held_joints={neck: 0}", "distillation.teacher=x"),
     *("warm_start.policy=x", "rewards.scales.torques=.nan", "perturbation.body=nose", "control.actuator=network"),
 ]
 TWO = [
     ["actor.class_name=RNNModel", "algorithm.num_mini_batches=64"],
-    ["actor.class_name=RNNModel", "critic.class_name=RNNModel", "symmetry.use_data_augmentation=false", "symmetry.use_mirror_loss=true"],
+    [
+        "actor.class_name=RNNModel",
+        "critic.class_name=RNNModel",
+        "symmetry.use_data_augmentation=false",
+        "symmetry.use_mirror_loss=true",
+    ],
     ["actor.estimator.targets=[base_lin_vel]", "actor.class_name=RNNModel"],
     ["actor.estimator.targets=[base_lin_vel]", "actor.concurrent.groups=[privileged_state]"],
     ["control.actuator=network", "control.network=none.npz"],
@@ -83,21 +114,50 @@ TWO = [
 TRAIN = [
     *(f"--max_time={text}".split("|") for text in ("soon", "0", "-5", "1h30", "nan", "")),
     ["--picture", "a.png"],
-    *(line.split() for line in ("--load_run x", "--checkpoint 1", "--resume --init x", "--resume --teacher x", "--resume")),
-    *(line.split() for line in ("--max_iterations 0", "--check --picture a.gif", "--experiment_name ../a", "--run_name a/b --check")),
+    *(
+        line.split()
+        for line in ("--load_run x", "--checkpoint 1", "--resume --init x", "--resume --teacher x", "--resume")
+    ),
+    *(
+        line.split()
+        for line in (
+            "--max_iterations 0",
+            "--check --picture a.gif",
+            "--experiment_name ../a",
+            "--run_name a/b --check",
+        )
+    ),
     *(line.split() for line in ("--teacher nosuch", "--init nosuch", "--init go2_flat", "--load_run nosuch --resume")),
     *(line.split() for line in ("--resume --checkpoint 7 --load_run run", "--resume --load_run run")),
-    *(line.split() for line in ("--check --teacher go2_flat", "--check --init go1_rough", "--check --teacher go1_handstand")),
+    *(
+        line.split()
+        for line in ("--check --teacher go2_flat", "--check --init go1_rough", "--check --teacher go1_handstand")
+    ),
 ]
 PLAY = [
     *([f"--command={text}"] for text in ("", "fast", "nan,0,0", "1,0,0,0", "ang_vel_jaw=1", "9,0,0")),
-    *(line.split() for line in ("--time soon", "--commands none.yaml", "--commands a.yaml --command=0,0,0", "--viewer wbe")),
-    *(line.split() for line in ("--viewer web --video a.mp4", "--video a.avi", "--sheet a.jpg", "--port 99999", "--viewer window")),
     *(
         line.split()
-        for line in ("--eval --export out", "--compare x", "--ranges common", "--follow --eval", "--export out --set env.num_envs=3")
+        for line in ("--time soon", "--commands none.yaml", "--commands a.yaml --command=0,0,0", "--viewer wbe")
     ),
-    *(line.split() for line in ("--half", "--eval --viewer web", "--export", "--load_run nosuch", "--load_run shipped")),
+    *(
+        line.split()
+        for line in ("--viewer web --video a.mp4", "--video a.avi", "--sheet a.jpg", "--port 99999", "--viewer window")
+    ),
+    *(
+        line.split()
+        for line in (
+            "--eval --export out",
+            "--compare x",
+            "--ranges common",
+            "--follow --eval",
+            "--export out --set env.num_envs=3",
+        )
+    ),
+    *(
+        line.split()
+        for line in ("--half", "--eval --viewer web", "--export", "--load_run nosuch", "--load_run shipped")
+    ),
     *(line.split() for line in ("--experiment_name elsewhere --load_run -1", "--load_run run --checkpoint 7")),
     ["--video", ""],
     ["--load_run", "run", "--set", "actor.hidden_dims=[8, 16]"],
@@ -147,7 +207,10 @@ def table() -> Table:
         made.programs(program, BOTH)
     for items in [*([item] for item in CHECKED), *TWO]:
         made.programs("train", [["--check", *SMALL, *sets(items)]], name=f"check {' '.join(items)}")
-    made.add("check runner.logger=wandb", without("wandb", started("train", "--check", *SMALL, "--set", "runner.logger=wandb")))
+    made.add(
+        "check runner.logger=wandb",
+        without("wandb", started("train", "--check", *SMALL, "--set", "runner.logger=wandb")),
+    )
     made.programs("train", TRAIN, with_run())
     made.programs("play", PLAY, with_run())
     more = ["--resume", "--load_run", "run", "--max_iterations", "3"]
@@ -159,7 +222,9 @@ def table() -> Table:
         "another task": edited("task: go1_flat", "task: go2_flat"),
         "a task elsewhere": edited("task: go1_flat", "task: /far/away/dog.py"),
         "no checkpoint": with_run(lambda run: (run / "model_2.pt").unlink()),
-        "a checkpoint cut": with_run(lambda run: (run / "model_2.pt").write_bytes((run / "model_2.pt").read_bytes()[:-100])),
+        "a checkpoint cut": with_run(
+            lambda run: (run / "model_2.pt").write_bytes((run / "model_2.pt").read_bytes()[:-100])
+        ),
         "a checkpoint of text": with_run(lambda run: (run / "model_2.pt").write_bytes(b"no")),
         "a checkpoint of others": with_run(lambda run: torch.save({"weights": 3}, run / "model_2.pt")),
         "a checkpoint without weights": with_run(lambda run: torch.save({"actor_state_dict": {}}, run / "model_2.pt")),

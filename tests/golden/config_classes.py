@@ -58,7 +58,15 @@ VALUES = {  # path -> values of a wrong type
     "rewards.scales.torques": ["big"],
     "rewards.scales.brand_new": [True, None],
 }
-PATHS = ["env.num_env", "rewards.scale.torques", "num_envs", "env", "env.num_envs.x", "control.stiffness.hip", "rewards.scales._open"]
+PATHS = [
+    "env.num_env",
+    "rewards.scale.torques",
+    "num_envs",
+    "env",
+    "env.num_envs.x",
+    "control.stiffness.hip",
+    "rewards.scales._open",
+]
 PATHS += ["rewards.scales.a-b", "rewards.total", "", "env."]
 UPDATES = {
     "a field": {"env": {"num_env": 3}},
@@ -89,7 +97,11 @@ def table() -> Table:
     made.add("assigned: another field", lambda root: setattr(Go1().env, "num_env", 3))
     made.add("assigned: a section", lambda root: setattr(Go1(), "env", 3))
     made.add("assigned: another type", lambda root: setattr(Go1().env, "num_envs", "3"))
-    for path, value in {"perturbation.enable": True, "cpu.keep_probability": [0.5, 0.5, 0.5], "cpu.kick_curriculum": False}.items():
+    for path, value in {
+        "perturbation.enable": True,
+        "cpu.keep_probability": [0.5, 0.5, 0.5],
+        "cpu.kick_curriculum": False,
+    }.items():
         made.add(f"old name {path}", lambda root, path=path, value=value: load_task("go1_flat").set(path, str(value)))
         made.add(
             f"old name {path} in a file",

@@ -154,7 +154,11 @@ def table() -> Table:
     for name, (old, new) in IN_SCENE.items():
         made.add(f"scene: {name}", in_scene_too, in_scene(old, new))
     for name, change in NETWORKS.items():
-        made.add(f"network: {name}", lambda root: Network(root / "out", read_contract(root / "out")), theirs("go1_flat", change))
+        made.add(
+            f"network: {name}",
+            lambda root: Network(root / "out", read_contract(root / "out")),
+            theirs("go1_flat", change),
+        )
     for name, change in EXAMS.items():
         made.add(f"exam: {name}", rules, theirs("go1_flat", change))
     made.add("exam: no velocity", rules, theirs("go1_handstand"))
@@ -165,19 +169,30 @@ def table() -> Table:
     )
     for name, section in {"no such exam": {"kind": "jump"}, "no such field": {"kind": "handstand", "x": 3}}.items():
         made.add(
-            f"skill: {name}", lambda root: contract_skill(read_contract(root / "out")), theirs("go1_handstand", set_at("exam", section))
+            f"skill: {name}",
+            lambda root: contract_skill(read_contract(root / "out")),
+            theirs("go1_handstand", set_at("exam", section)),
         )
     made.add("no export", reads)
     made.add("another scene", reads, in_scene("<mujoco", "<!-- mine --><mujoco"))
-    made.add("another network", reads, lambda root: (theirs("go1_flat")(root), (root / "out/policy.onnx").write_bytes(b"no")))
+    made.add(
+        "another network", reads, lambda root: (theirs("go1_flat")(root), (root / "out/policy.onnx").write_bytes(b"no"))
+    )
     made.add(
         "another motion",
         lambda root: Follower(root / "out", read_contract(root / "out"), 1),
         lambda root: (theirs("g1_track")(root), [file.write_bytes(b"no") for file in (root / "out").glob("*.npz")]),
     )
-    for name, given in {"no motors": lambda root: None, "other motors": lambda root: (root / "motors.npz").write_bytes(b"no")}.items():
+    for name, given in {
+        "no motors": lambda root: None,
+        "other motors": lambda root: (root / "motors.npz").write_bytes(b"no"),
+    }.items():
         made.add(name, lambda root: make_network(root, Motors("network", digest="x"), 1, 12), given)
-    made.add("no terrain", lambda root: read_scene(root / "out", read_contract(root / "out"), "terrain.mjz"), theirs("go1_flat"))
+    made.add(
+        "no terrain",
+        lambda root: read_scene(root / "out", read_contract(root / "out"), "terrain.mjz"),
+        theirs("go1_flat"),
+    )
     made.add(
         "no feet for odometry",
         lambda root: Odometry(root / "out", read_contract(root / "out")),
@@ -190,7 +205,11 @@ def table() -> Table:
         lambda root: Safety(read_contract(root / "out"), limits(root)),
         theirs("go1_flat", set_at("action|origin", "speed")),
     )
-    made.add("a row of others", acts, theirs("go1_flat", lambda said: said["observation"][0].update(measured="sensors", sensors=["x"])))
+    made.add(
+        "a row of others",
+        acts,
+        theirs("go1_flat", lambda said: said["observation"][0].update(measured="sensors", sensors=["x"])),
+    )
     for name, write in {
         "of text": lambda file: file.write_bytes(b"PK"),
         "of two files": lambda file: zipped(file, "model.xml", "terrain.xml"),
@@ -203,5 +222,9 @@ def table() -> Table:
         )
     small = patched(in_scene_too, mjcf, MOST_BYTES=1000)
     made.add("scene: large", small, theirs("go1_flat"))
-    made.add("scene: a joint more", in_scene_too, in_scene("</worldbody>", '<body><joint name="tail"/><geom size="1"/></body></worldbody>'))
+    made.add(
+        "scene: a joint more",
+        in_scene_too,
+        in_scene("</worldbody>", '<body><joint name="tail"/><geom size="1"/></body></worldbody>'),
+    )
     return made

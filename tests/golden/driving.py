@@ -93,7 +93,9 @@ def another_body() -> None:
 
 
 def other_rows(machine: Any, *rows: str) -> None:
-    check_rows(replace(CONTRACT, rows=(*CONTRACT.rows, *(ContractRow(name, 3, "", "", 0.0, name) for name in rows))), machine)
+    check_rows(
+        replace(CONTRACT, rows=(*CONTRACT.rows, *(ContractRow(name, 3, "", "", 0.0, name) for name in rows))), machine
+    )
 
 
 def broken() -> bytes:
@@ -212,7 +214,9 @@ def table() -> Table:
             "rows: velocity": lambda: other_rows(GO2, "lin_vel"),
             "rows: velocity and feet of a G1": lambda: other_rows(G1, "lin_vel", "foot_contact"),
             **{
-                f"rows: {origin}s": lambda origin=origin: check_rows(replace(CONTRACT, action=CONTRACT.action._replace(origin=origin)), GO2)
+                f"rows: {origin}s": lambda origin=origin: check_rows(
+                    replace(CONTRACT, action=CONTRACT.action._replace(origin=origin)), GO2
+                )
                 for origin in ("torque", "speed")
             },
             "wire: silent": lambda: after(late=0.5),
@@ -222,36 +226,50 @@ def table() -> Table:
             "wire: targets of NaN": lambda: robot().write(np.full(12, np.nan)),
             "wire: another commander": lambda: Direct(SimpleNamespace(other_commander=lambda: True)).receive(),
             "wire: no robot": lambda: wired(receive=lambda: None, _nobody=lambda seconds: "no robot").prepare(),
-            "wire: taken": lambda: wired(receive=lambda: 1, _release=lambda _: None, other_commander=lambda: True).prepare(),
+            "wire: taken": lambda: wired(
+                receive=lambda: 1, _release=lambda _: None, other_commander=lambda: True
+            ).prepare(),
             "wire: no program lets go": lambda: wired(
                 _requests=SimpleNamespace(get_matched_subscriptions=lambda: True),
                 _program=lambda: "ai",
                 _ask=lambda _: "",
             )._release(False),
             **{
-                f"wire: the motion service answers {name}": lambda answer=answer: wired(_ask=lambda _: answer)._program()
+                f"wire: the motion service answers {name}": lambda answer=answer: wired(
+                    _ask=lambda _: answer
+                )._program()
                 for name, answer in ANSWERS.items()
             },
             "wire: the motion service is silent": lambda: patched(
-                lambda root: wired(_requests=SimpleNamespace(write=lambda _: None), _answers=None)._ask(1), link, _taken=lost
+                lambda root: wired(_requests=SimpleNamespace(write=lambda _: None), _answers=None)._ask(1),
+                link,
+                _taken=lost,
             )(Path()),
             "join: another interface": lambda: join("eth1", 0),
             "join: another domain": lambda: join("lo", 233),
             "join: another interface before": lambda: join("lo", 1, _joined={1: ("eth0", None)}),
-            "join: wrong types": lambda: join("eth0", 0, wrong_hash=lambda: "unitree_go LowCmd_ as 00, not 52", version=lambda _: "0.0"),
+            "join: wrong types": lambda: join(
+                "eth0", 0, wrong_hash=lambda: "unitree_go LowCmd_ as 00, not 52", version=lambda _: "0.0"
+            ),
             "join: DDS says no": busy,
-            "no cyclonedds": lambda: patched(lambda root: need_dds(), sys.modules[need_dds.__module__], find_spec=lambda _: None)(Path()),
+            "no cyclonedds": lambda: patched(
+                lambda root: need_dds(), sys.modules[need_dds.__module__], find_spec=lambda _: None
+            )(Path()),
             "no onnxruntime": lambda: without("onnxruntime", lambda root: Network(GO2_FLAT, CONTRACT))(Path()),
             "no gamepad": lambda: Gamepad(Path("js9"), CONTRACT.commands),
             "no file descriptor": lambda: StopFile(999_999),
-            "states without damp": lambda: driven(Plain(GO2_FLAT, CONTRACT), Controller(GO2_FLAT, CONTRACT), Script({}), 0.1),  # type: ignore[arg-type]
+            "states without damp": lambda: driven(
+                Plain(GO2_FLAT, CONTRACT), Controller(GO2_FLAT, CONTRACT), Script({}), 0.1
+            ),  # type: ignore[arg-type]
             "states of torques": lambda: driven(
                 Watched(GO2_FLAT, CONTRACT),
                 Controller(GO2_FLAT, replace(CONTRACT, action=CONTRACT.action._replace(origin="torque"))),
                 Script({}),
                 0.1,
             ),
-            "a joint too fast": lambda: walk(lambda step, m: replace(m, joint_vel=m.joint_vel + (99.0 if step == 2 else 0.0))),
+            "a joint too fast": lambda: walk(
+                lambda step, m: replace(m, joint_vel=m.joint_vel + (99.0 if step == 2 else 0.0))
+            ),
             "a measurement of NaN": lambda: walk(lambda step, m: replace(m, ang_vel=np.full(3, np.nan))),
         }
     )
@@ -261,10 +279,14 @@ def table() -> Table:
     made.add("log: text", lambda root: read_log(Path("a")), lambda root: (root / "a").write_bytes(b"no log"))
     made.add("log: no step", lambda root: read_log(Path("walk.lmwlog")), with_log)
     made.add("log: it is there", with_log, with_log)
-    made.add("log: no folder", lambda root: Log(root / "no/a", CONTRACT, GO2_FLAT, ""), lambda root: (root / "no").touch())
+    made.add(
+        "log: no folder", lambda root: Log(root / "no/a", CONTRACT, GO2_FLAT, ""), lambda root: (root / "no").touch()
+    )
     made.add("replay: too short", lambda root: replay.replay(Path("walk.lmwlog"), None), given_log(3.0))
     made.add(
-        "replay: another network", lambda root: replay.replay(Path("walk.lmwlog"), ROOT / "resources/policies/go1_flat"), given_log(3.0)
+        "replay: another network",
+        lambda root: replay.replay(Path("walk.lmwlog"), ROOT / "resources/policies/go1_flat"),
+        given_log(3.0),
     )
     made.add("log: another format", lambda root: read_log(Path("a")), other_format)
     return made

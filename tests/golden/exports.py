@@ -29,7 +29,10 @@ from legged_mw.utils.task import load_task
 
 class Grouped(LeggedRobot):
     def observation_rows(self) -> dict[str, list[Row | str]]:
-        return {"state": super().observation_rows()["state"], "policy": [Row("state", self.obs_buf["state"], noise=0.1)]}  # type: ignore[dict-item]
+        return {
+            "state": super().observation_rows()["state"],
+            "policy": [Row("state", self.obs_buf["state"], noise=0.1)],
+        }  # type: ignore[dict-item]
 
 
 def exports(env_class: Any = None, **patches: Any) -> Run:
@@ -57,11 +60,21 @@ def scene(**changes: Any) -> None:
         spec.add_hfield(name="hills", file="hills.png")
     pose = made.default_dof_pos.tolist()
     imu = changes.get("imu", "imu")
-    standalone(type(made.robot)(**{**vars(made.robot), "spec": spec}), imu=imu, qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose)
+    standalone(
+        type(made.robot)(**{**vars(made.robot), "spec": spec}), imu=imu, qpos=[0, 0, 0.3, 1, 0, 0, 0, *pose], ctrl=pose
+    )
 
 
 def slopes() -> None:
-    many: Any = {"levels": 1, "columns": 1, "tile": 24.0, "cell": 0.05, "border": 1.0, "difficulty": (1.0, 1.0), "seed": 1}
+    many: Any = {
+        "levels": 1,
+        "columns": 1,
+        "tile": 24.0,
+        "cell": 0.05,
+        "border": 1.0,
+        "difficulty": (1.0, 1.0),
+        "seed": 1,
+    }
     xml = (ROOT / "resources/policies/go1_flat/scene.xml").read_text()
     among_steps(xml, make_terrain(proportions={"stepping_stones": 1.0}, **many), [0.0, 0.0, 0.3])
 
@@ -84,7 +97,9 @@ def table() -> Table:
     made.add("a law in code", exports(Springs))
     for kind in (OtherAngles, OtherMemory, OtherScale, OtherTargets, OtherVelocity):
         made.add(f"{kind.__name__}", exports(kind))
-    made.calls({"a picture of heights": lambda: scene(hfield=True), "slopes": slopes, "another IMU": lambda: scene(imu="nose")})
+    made.calls(
+        {"a picture of heights": lambda: scene(hfield=True), "slopes": slopes, "another IMU": lambda: scene(imu="nose")}
+    )
     made.add("a run that is trained", locked, lock)
     alone: Any = SimpleNamespace(source=SimpleNamespace(checkpoint=Path("policy.onnx")))
     student: Any = torch.nn.ModuleDict({"teacher": torch.nn.Linear(1, 1)})

@@ -37,7 +37,11 @@ MORE: dict[str, Any] = {
 
 @cache
 def runner() -> Runner:
-    return campaign.runner.__wrapped__() if hasattr(campaign.runner, "__wrapped__") else campaign.runner.__pytest_wrapped__.obj()  # type: ignore[attr-defined]
+    return (
+        campaign.runner.__wrapped__()
+        if hasattr(campaign.runner, "__wrapped__")
+        else campaign.runner.__pytest_wrapped__.obj()
+    )  # type: ignore[attr-defined]
 
 
 def spoilt(change: Any) -> Run:
@@ -59,7 +63,9 @@ def rewritten(change: Any) -> Run:
 
 
 def archive(read: Any, change: dict[str, Any]) -> Run:
-    content = (campaign.CLIP if read is read_clip else campaign.MOTOR) | {name: np.asarray(value) for name, value in change.items()}
+    content = (campaign.CLIP if read is read_clip else campaign.MOTOR) | {
+        name: np.asarray(value) for name, value in change.items()
+    }
     return lambda root: np.savez(root / "file.npz", allow_pickle=False, **content)
 
 
@@ -88,7 +94,9 @@ def table() -> Table:
     for name, change, *_ in [*campaign.CONTENTS, *MORE.items()]:
         made.add(f"checkpoint, {name}", lambda root: runner().load(str(root / "model_5.pt")), spoilt(change))
     for name, change, *_ in campaign.BYTES:
-        made.add(f"checkpoint of bytes, {name}", lambda root: load_tensors(root / "model_5.pt", "cpu"), rewritten(change))
+        made.add(
+            f"checkpoint of bytes, {name}", lambda root: load_tensors(root / "model_5.pt", "cpu"), rewritten(change)
+        )
     made.campaign("folder", campaign.FOLDERS)
     for name, read, change, *_ in campaign.ARRAYS:
         run = patched(lambda root, read=read: read(root / "file.npz"), arrays, MOST_BYTES=1 << 16)
@@ -108,10 +116,14 @@ def table() -> Table:
         lambda root: (root / "policy.onnx").write_bytes(b"no"),
     )
     made.add(
-        "parameters of another network", lambda root: network.read_parameters(root / "out/policy.onnx", actor()), campaign.NETWORKS[0][1]
+        "parameters of another network",
+        lambda root: network.read_parameters(root / "out/policy.onnx", actor()),
+        campaign.NETWORKS[0][1],
     )
     made.add(
-        "an export that is a folder's file", lambda root: files.writable("a", "--export", folder=True), lambda root: (root / "a").touch()
+        "an export that is a folder's file",
+        lambda root: files.writable("a", "--export", folder=True),
+        lambda root: (root / "a").touch(),
     )
     for name in ("", "a\0b", "x" * 300, "folder", "there/a"):
         made.add(
@@ -129,5 +141,9 @@ def table() -> Table:
     for name in ("..", "a/b"):
         made.add(f"an experiment {name!r}", lambda root, name=name: files.check_name(name, "the experiment's name"))
     made.add("a thousand runs", gone_on)
-    made.add("an export on its way", patched(lambda root: files.finish_moving(root / "out"), files.os, replace=refuse), on_its_way)
+    made.add(
+        "an export on its way",
+        patched(lambda root: files.finish_moving(root / "out"), files.os, replace=refuse),
+        on_its_way,
+    )
     return made

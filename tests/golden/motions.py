@@ -46,7 +46,9 @@ def bodies(**change: Any) -> Run:
         held = {"fps": [50], "joint_pos": whole.joint_pos[::100], "body_pos_w": [data.xpos[1:] for data in poses]}
         held |= {"body_quat_w": [data.xquat[1:] for data in poses]}
         held |= {key: change_it(held[key]) for key, change_it in change.items() if callable(change_it)}
-        np.savez(root / "a.npz", **{key: np.array(value) for key, value in held.items() if change.get(key, 1) is not None})
+        np.savez(
+            root / "a.npz", **{key: np.array(value) for key, value in held.items() if change.get(key, 1) is not None}
+        )
 
     return given
 

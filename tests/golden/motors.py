@@ -35,7 +35,9 @@ ARRAYS = {
     "another activation": lambda: changed_arrays(activation="swish"),
     "frames backwards": lambda: changed_arrays(frames=np.array([2, 1])),
     "no frames": lambda: changed_arrays(frames=np.array([])),
-    "a memory that does not join": lambda: changed_arrays(weight_ih_l0=np.zeros((32, 2)), weight_hh_l0=np.zeros((32, 8))),
+    "a memory that does not join": lambda: changed_arrays(
+        weight_ih_l0=np.zeros((32, 2)), weight_hh_l0=np.zeros((32, 8))
+    ),
     "two scales": lambda: changed_arrays(torque_scale=np.ones(2)),
     "NaN": lambda: changed_arrays(bias1=np.full(30, np.nan)),
 }
@@ -66,7 +68,9 @@ def table() -> Table:
     made = Table()
     for name, make in ARRAYS.items():
         made.add(f"file with {name}", lambda root: read_network(Path("net.npz")), saved(make))
-    made.add("file of text", lambda root: read_network(Path("net.pt")), lambda root: (root / "net.pt").write_bytes(b"PK no"))
+    made.add(
+        "file of text", lambda root: read_network(Path("net.pt")), lambda root: (root / "net.pt").write_bytes(b"PK no")
+    )
     made.add(
         "weights without code",
         lambda root: actuator_net.convert(Path("net.pt")),
@@ -77,11 +81,20 @@ def table() -> Table:
         "frames of others": (mlp()[0], ("--frames", "0", "1")),
         "two values": (nn.Linear(2, 2), ()),
     }.items():
-        made.add(f"torchscript of {name}", lambda root, flags=flags: actuator_net.main(["net.pt", "net.npz", *flags]), scripted(module))
+        made.add(
+            f"torchscript of {name}",
+            lambda root, flags=flags: actuator_net.main(["net.pt", "net.npz", *flags]),
+            scripted(module),
+        )
     made.add(
         "another network than in training",
         lambda root: make_env(
-            1, {"control.actuator": "network", "control.network": "net.npz", "control.network_digest": {"net.npz": "0" * 64}}
+            1,
+            {
+                "control.actuator": "network",
+                "control.network": "net.npz",
+                "control.network_digest": {"net.npz": "0" * 64},
+            },
         ),
         saved(lambda: mlp()[1].to_arrays()),
     )

@@ -144,6 +144,8 @@ def table() -> Table:
         made.add(" ".join(flags)[:80], with_4_gb(program("train", "--check", *small, *flags)))
     for section, fields in STRANGERS:
         made.add(
-            f"a stranger's {section}", with_4_gb(program("play", "--load_run", "ROOT/theirs", "--viewer", "none")), theirs(section, fields)
+            f"a stranger's {section}",
+            with_4_gb(program("play", "--load_run", "ROOT/theirs", "--viewer", "none")),
+            theirs(section, fields),
         )
     return made

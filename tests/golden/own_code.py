@@ -24,7 +24,9 @@ HEAVY = {  # a reward that a CUDA graph cannot record
     "a helper's mask": "self.rew_buf.masked_select(self.rew_buf > 0).sum() + self.rew_buf",
 }
 METHODS = {
-    "a buffer bound anew": method("def _update_state(self):\n    super()._update_state()\n    self.rew_buf = self.rew_buf * 1"),
+    "a buffer bound anew": method(
+        "def _update_state(self):\n    super()._update_state()\n    self.rew_buf = self.rew_buf * 1"
+    ),
     "a number that changes": method(
         "def _update_state(self):\n    super()._update_state()\n    self.count = getattr(self, 'count', 0) + 1"
     ),
@@ -33,7 +35,9 @@ METHODS = {
     "an old name": method("def _observation_rows(self):\n    return {}"),
     "a row twice": rows("mine.append(Row('dof_pos', torch.zeros(4, 12)))"),
     "a group of its own noise": rows("table['mine'] = ['state', Row('y', torch.zeros(4, 1))]"),
-    "torques of a sum": method("def _compute_torques(self, actions):\n    return super()._compute_torques(actions).sum(-1, keepdim=True)"),
+    "torques of a sum": method(
+        "def _compute_torques(self, actions):\n    return super()._compute_torques(actions).sum(-1, keepdim=True)"
+    ),
     "no torques": method("def _compute_torques(self, actions):\n    return None"),
     "torques that divide": method("def _compute_torques(self, actions):\n    return actions / (actions - actions)"),
     "a row that must not move": rows("mine.append(Row('x', self.dof_pos.clone()))"),

@@ -18,8 +18,12 @@ TEXTS = {
     "no joint": '<mujoco><worldbody><body name="rock"><freejoint/><geom size="1"/></body></worldbody></mujoco>',
     "a joint without a name": TOY.replace('<joint name="hip"', "<joint").format("", "", ""),
     "a ball": TOY.format('</body><body name="arm"><joint name="ball" type="ball"/><geom size="0.1"/>', "", ""),
-    "a mesh of mass": TOY.format('<geom type="mesh" mesh="hull"/>', "", '<asset><mesh name="hull" file="hull.stl"/></asset>'),
-    "a mesh that touches": TOY.format('<geom type="mesh" mesh="hull" mass="0"/>', "", '<asset><mesh name="hull" file="hull.stl"/></asset>'),
+    "a mesh of mass": TOY.format(
+        '<geom type="mesh" mesh="hull"/>', "", '<asset><mesh name="hull" file="hull.stl"/></asset>'
+    ),
+    "a mesh that touches": TOY.format(
+        '<geom type="mesh" mesh="hull" mass="0"/>', "", '<asset><mesh name="hull" file="hull.stl"/></asset>'
+    ),
 }
 URDF = """<robot name="mini"><link name="base">{}<inertial><mass value="1"/>
 <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
@@ -27,7 +31,9 @@ URDFS = {
     "xacro": '<robot xmlns:xacro="http://www.ros.org/wiki/xacro" name="a"><xacro:macro name="x"/></robot>',
     "not closed": '<robot name="mini"><link name="base"></robot>',
     "a shape of no size": URDF.format('<collision><geometry><sphere radius="0"/></geometry></collision>'),
-    "a mesh that is not there": URDF.format('<collision><geometry><mesh filename="package://a/b.dae"/></geometry></collision>'),
+    "a mesh that is not there": URDF.format(
+        '<collision><geometry><mesh filename="package://a/b.dae"/></geometry></collision>'
+    ),
 }
 FIELDS = {  # of go1_flat
     "no joint": {"asset.armature": {"kneee": 0.1}},

@@ -47,10 +47,15 @@ TOYS: dict[str, tuple[dict[str, str], dict[str, Any]]] = {
         {},
     ),
     "a body without a geom": (
-        {"inside": '<body name="tail"><joint name="tail_hip"/><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/></body>'},
+        {
+            "inside": '<body name="tail"><joint name="tail_hip"/><inertial mass="1" pos="0 0 0" diaginertia="1 1 1"/></body>'
+        },
         {"contact_geoms": ["tail"]},
     ),
-    "a site of another geom": ({"inside": SOLES}, {"sites": {"left_sole": ["left_heal"]}, "velocity_sites": ["left_sole"]}),
+    "a site of another geom": (
+        {"inside": SOLES},
+        {"sites": {"left_sole": ["left_heal"]}, "velocity_sites": ["left_sole"]},
+    ),
     "a site of no geom": (
         {"inside": SOLES},
         {"sites": {"left_sole": []}, "velocity_sites": ["left_sole"], "damping": {"": 0.2}, "stiffness": {"": 1.0}},
@@ -95,12 +100,16 @@ def table() -> Table:
         made.add(f"Go1, {name}", lambda root, choice=choice: go1(**choice))
     for name, (parts, choice) in TOYS.items():
         made.add(
-            f"toy, {name}", lambda root, choice=choice: build_toy(Path("toy.xml"), **choice), lambda root, parts=parts: toy(root, **parts)
+            f"toy, {name}",
+            lambda root, choice=choice: build_toy(Path("toy.xml"), **choice),
+            lambda root, parts=parts: toy(root, **parts),
         )
     for name, (old, new) in MIRRORS.items():
         made.add(f"mirror, {name}", lambda root, old=old, new=new: partners(WAIST, old, new))
     two = " ".join(f'<joint name="{name}" axis="0 1 0" armature="1"/>' for name in "ab")
-    made.add("mirror, two joints in one place", lambda root: partners(WAIST, '<joint name="waist_pitch" axis="0 1 0"/>', two))
+    made.add(
+        "mirror, two joints in one place", lambda root: partners(WAIST, '<joint name="waist_pitch" axis="0 1 0"/>', two)
+    )
     made.add("mirror, a joint", lambda root: partners(GO1, 'pos="0.1881 0.04675 0"', 'pos="0.1881 0.05175 0"'))
     made.add("mirror, a site", lambda root: find_partners(dog(), ["imu"]))
     made.calls(
@@ -117,12 +126,22 @@ def table() -> Table:
     for field in ("body_mas", "body_parentid"):
         made.add(
             f"fields: {field}",
-            lambda root, field=field: make_simulation(dog().physics, 1, "cpu", engine="mujoco", nconmax=8, njmax=40, world_fields=[field]),
+            lambda root, field=field: make_simulation(
+                dog().physics, 1, "cpu", engine="mujoco", nconmax=8, njmax=40, world_fields=[field]
+            ),
         )
     wheel = WHEEL.format(half=0.2, offset=0.0, more="")
-    made.add("draft of a robot without feet", lambda root: draft(Path("a.xml")), lambda root: (root / "a.xml").write_text(wheel))
+    made.add(
+        "draft of a robot without feet",
+        lambda root: draft(Path("a.xml")),
+        lambda root: (root / "a.xml").write_text(wheel),
+    )
     for name, leg in SHAPES.items():
-        made.add(f"draft of {name}", lambda root: draft(Path("a.xml")), lambda root, leg=leg: (root / "a.xml").write_text(BARE.format(leg)))
+        made.add(
+            f"draft of {name}",
+            lambda root: draft(Path("a.xml")),
+            lambda root, leg=leg: (root / "a.xml").write_text(BARE.format(leg)),
+        )
     made.add("shapes: a height field", lambda root: spheres_on(mujoco.MjModel.from_xml_string(HILLS), 0, 0.1))
     made.add("joints: a pattern of none", lambda root: match_joints(["hip"], ["neck"], "held"))
     return made

@@ -50,7 +50,9 @@ class Table:
         self.add(function.__name__.replace("_", " ").strip(), function)
         return function
 
-    def programs(self, program_name: str, flags: Iterable[str | list[str]], given: Run = lambda root: None, name: str = "") -> None:
+    def programs(
+        self, program_name: str, flags: Iterable[str | list[str]], given: Run = lambda root: None, name: str = ""
+    ) -> None:
         """A case for each line of flags; ROOT stands for the folder, and the task of train and play is go1_flat if none is named."""
         for line in flags:
             words = line.split() if isinstance(line, str) else line
@@ -121,7 +123,13 @@ def meet(case: Case, root: Path, fill: Run) -> Met:
         fill(root)
         case.given(root)
         before = files(root)
-        with pytest.MonkeyPatch.context() as patch, limits(), stopped_at_work(), captured() as said, watched() as written:
+        with (
+            pytest.MonkeyPatch.context() as patch,
+            limits(),
+            stopped_at_work(),
+            captured() as said,
+            watched() as written,
+        ):
             for name in ("DISPLAY", "WAYLAND_DISPLAY"):
                 patch.delenv(name, raising=False)
             patch.setattr(torch.cuda, "device_count", lambda: 0)
@@ -129,13 +137,17 @@ def meet(case: Case, root: Path, fill: Run) -> Met:
             code = ended(run, root, "golden")
     assert code == 2, f"{case.id}: it was not refused: {said[0]}"
     assert said[0].endswith("\n") and said[0].count("\n") == 1, f"{case.id}: {said[0]}"
-    assert not (strange := [path for path in written if not path.is_relative_to(root.resolve())]), f"{case.id}: wrote {strange}"
+    assert not (strange := [path for path in written if not path.is_relative_to(root.resolve())]), (
+        f"{case.id}: wrote {strange}"
+    )
     assert files(root) == before, f"{case.id}: a file was changed"
     assert "it was not refused" not in said[0], f"{case.id}: {said[0]}"
     every = list(chain(caught[0]))
     reached.update(place for error in every for place in places(error))
     users = [error for error in every if isinstance(error, UserError)]
-    others = [error for error in every if not isinstance(error, SystemExit) and "argparse" not in type(error).__module__]
+    others = [
+        error for error in every if not isinstance(error, SystemExit) and "argparse" not in type(error).__module__
+    ]
     kind = type((users or others)[0]).__name__ if users or others else "usage"
     return Met(kind, plain(said[0], root).partition(": ")[2])
 
@@ -220,7 +232,15 @@ def raised(node: Any) -> str:
     if isinstance(node, ast.Raise) and node.exc is not None:
         what = node.exc.func if isinstance(node.exc, ast.Call) else node.exc
         name = ast.unparse(what)
-        return "" if name in ("SystemExit", "NotImplementedError", "KeyboardInterrupt", "AttributeError", "Unfit", "_Caught") else name
-    if isinstance(node, ast.Expr) and isinstance(node.value, ast.Call) and ast.unparse(node.value.func) in ("parser.error", "check.fail"):
+        return (
+            ""
+            if name in ("SystemExit", "NotImplementedError", "KeyboardInterrupt", "AttributeError", "Unfit", "_Caught")
+            else name
+        )
+    if (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Call)
+        and ast.unparse(node.value.func) in ("parser.error", "check.fail")
+    ):
         return "usage"
     return ""

@@ -33,7 +33,10 @@ from legged_mw.utils.task import LoadedTask, Task, load_task
 FIELDS: dict[str, dict[str, Any]] = {
     "no row of a group left": {
         "observations.leave_out": {
-            "state": [*("base_lin_vel", "base_ang_vel", "projected_gravity", "dof_pos"), *("dof_vel", "last_actions", "commands")]
+            "state": [
+                *("base_lin_vel", "base_ang_vel", "projected_gravity", "dof_pos"),
+                *("dof_vel", "last_actions", "commands"),
+            ]
         }
     },
     "a gait of three feet": {"gait.period": 0.5, "gait.offsets": [0.0, 0.5, 0.5]},
@@ -41,8 +44,15 @@ FIELDS: dict[str, dict[str, Any]] = {
     "a pull at the root": {"falls.pull": [1.0, 2.0], "falls.pull_on": ""},
     "a range of falls": {"domain_rand.enable": True, "domain_rand.redraw_at_reset": ["base_mass"]},
     "pushes of none": {"asset.penalize_contacts_on": [], **only_scales(collision=-1.0)},
-    "pushes on what never touches": {"asset.penalize_contacts_on": ["trunk_box"], "asset.colliders": ["FR"], **only_scales(collision=-1.0)},
-    "a mirror of joints that are not there": {"rewards.mirror_joints": [["FR", "XX"]], **only_scales(joint_mirror=-1.0)},
+    "pushes on what never touches": {
+        "asset.penalize_contacts_on": ["trunk_box"],
+        "asset.colliders": ["FR"],
+        **only_scales(collision=-1.0),
+    },
+    "a mirror of joints that are not there": {
+        "rewards.mirror_joints": [["FR", "XX"]],
+        **only_scales(joint_mirror=-1.0),
+    },
     "a mirror of unequal joints": {"rewards.mirror_joints": [["FR", "FL_hip"]], **only_scales(joint_mirror=-1.0)},
     "no mirror": {"rewards.mirror_joints": [], **only_scales(joint_mirror=-1.0)},
     "no highest speed": {"asset.joint_speed_limits": {}, **only_scales(dof_vel_limits=-1.0)},
@@ -135,18 +145,25 @@ def table() -> Table:
     for name in ("contact_forces", "self_contacts", "angular_momentum"):
         made.add(
             f"not sensed: {name}",
-            lambda root, name=name: make_env(1, QUIET, env_class=type("Fallen", (Fallen,), {"sensed": name})).step(torch.zeros(1, 12)),
+            lambda root, name=name: make_env(1, QUIET, env_class=type("Fallen", (Fallen,), {"sensed": name})).step(
+                torch.zeros(1, 12)
+            ),
         )
     for kind in (None, "fot", "privileged_state", "polar"):
         made.add(f"mirror of a row: {kind}", lambda root, kind=kind: mirrored(kind))
     for name, (change, value) in CHANGES.items():
-        made.add(f"teacher of another {name}", lambda root, change=change, value=value: other(change, value, test_teacher.seat_teacher))
+        made.add(
+            f"teacher of another {name}",
+            lambda root, change=change, value=value: other(change, value, test_teacher.seat_teacher),
+        )
     made.add("beginning of another pose", lambda root: other(*CHANGES["pose"], begins))
     made.add("beginning of another history", lambda root: other("observations.history", {"state.dof_pos": 2}, begins))
     for path, fields in LEARNERS.items():
         made.add(
             f"learner with {path}",
-            lambda root, fields=fields: check_values(*(lambda task: (task.cfg, task.train))(set_all(load_task("go1_flat"), fields))),
+            lambda root, fields=fields: check_values(
+                *(lambda task: (task.cfg, task.train))(set_all(load_task("go1_flat"), fields))
+            ),
         )
     made.calls(
         {
@@ -157,22 +174,36 @@ def table() -> Table:
             ),
             "mirror of a command": one_height,
             "mirror of an IMU without its gyro": lambda: mirror(
-                *(lambda e: (e, e.get_observations(), None))(make_env(2, {**QUIET, "observations.leave_out": {"state": ["base_ang_vel"]}}))
+                *(lambda e: (e, e.get_observations(), None))(
+                    make_env(2, {**QUIET, "observations.leave_out": {"state": ["base_ang_vel"]}})
+                )
             ),
             "mirror of histories": lambda: mirror(
-                *(lambda e: (e, e.get_observations(), None))(make_env(2, {**QUIET, "observations.history": {"state.base_lin_vel": 3}}))
+                *(lambda e: (e, e.get_observations(), None))(
+                    make_env(2, {**QUIET, "observations.history": {"state.base_lin_vel": 3}})
+                )
             ),
             "mirror of a body of one side": lambda: (
                 tracking(
                     worlds=1,
-                    **{"motion.bodies": ["pelvis", "torso_link", "left_knee_link"], "motion.end_bodies": [], "motion.anchor": "torso_link"},
+                    **{
+                        "motion.bodies": ["pelvis", "torso_link", "left_knee_link"],
+                        "motion.end_bodies": [],
+                        "motion.anchor": "torso_link",
+                    },
                 ).mirror
             ),
             "a warm-up of rsl-rl's own": lambda: learner({"warm_start.policy": "run", "algorithm.class_name": "PPO"}),
-            "an estimator of rsl-rl's own": lambda: learner({"actor.estimator.targets": ["base_lin_vel"], "algorithm.class_name": "PPO"}),
+            "an estimator of rsl-rl's own": lambda: learner(
+                {"actor.estimator.targets": ["base_lin_vel"], "algorithm.class_name": "PPO"}
+            ),
             "a teacher's class": lambda: learner({}, {"actor.class_name": "os:system"}),
-            "a teacher's estimate": lambda: learner({"distillation.teacher": "x"}, {"actor.estimator.targets": ["foot_height"]}),
-            "a bound without a record": lambda: learner({"algorithm.max_learning_rate": 0.02, "algorithm.optimizer": "sgd"}),
+            "a teacher's estimate": lambda: learner(
+                {"distillation.teacher": "x"}, {"actor.estimator.targets": ["foot_height"]}
+            ),
+            "a bound without a record": lambda: learner(
+                {"algorithm.max_learning_rate": 0.02, "algorithm.optimizer": "sgd"}
+            ),
             "a memory and a loss of mirrors": lambda: learner(
                 {
                     "actor.class_name": "RNNModel",
@@ -198,8 +229,16 @@ def table() -> Table:
         "a command outside": ("go1_flat", {"commands.default": {"lin_vel_x": 9.0}}),
     }.items():
         made.add(f"{task} with {name}", lambda root, task=task, fields=fields: make_env(1, fields, task=task))
-    made.add("rooms of no ground", lambda root: make_room(set_all(load_task("go1_rough"), {"terrain.terrain_proportions": {"flat": 0.0}})))
-    made.add("a rival of another task", lambda root: find_rival(load_task("go1_flat"), str(ROOT / "resources/policies/go2_flat")))
+    made.add(
+        "rooms of no ground",
+        lambda root: make_room(set_all(load_task("go1_rough"), {"terrain.terrain_proportions": {"flat": 0.0}})),
+    )
+    made.add(
+        "a rival of another task",
+        lambda root: find_rival(load_task("go1_flat"), str(ROOT / "resources/policies/go2_flat")),
+    )
     made.add("speeds of none", lambda root: ExamRules.from_mapping({"push_speeds": [], "ranges": {}}))
-    made.add("a command outside of its range", lambda root: parse_command("9", [Command("lin_vel_x", -1.0, 1.0, "m/s")]))
+    made.add(
+        "a command outside of its range", lambda root: parse_command("9", [Command("lin_vel_x", -1.0, 1.0, "m/s")])
+    )
     return made

@@ -46,7 +46,9 @@ def mac() -> None:
     def refuse(*_: object, **__: object) -> None:
         raise RuntimeError("`launch_passive` requires mjpython")
 
-    patched(patched(lambda root: NativeViewer(spec()), mujoco.viewer, launch_passive=refuse), sys, platform="darwin")(Path())
+    patched(patched(lambda root: NativeViewer(spec()), mujoco.viewer, launch_passive=refuse), sys, platform="darwin")(
+        Path()
+    )
 
 
 def taken(run: object = None) -> None:
@@ -91,11 +93,18 @@ def table() -> Table:
     made.add("a video of odd width", lambda root: VideoWriter(root / "a.mp4", 321, 240, fps=50))
     made.add(
         "no encoder",
-        patched(patched(lambda root: VideoWriter(root / "a.mp4", 320, 240, fps=50), av, codecs_available={"gif"}), av, __version__="0.0"),
+        patched(
+            patched(lambda root: VideoWriter(root / "a.mp4", 320, 240, fps=50), av, codecs_available={"gif"}),
+            av,
+            __version__="0.0",
+        ),
     )
     made.add("no PyAV", without("av", lambda root: VideoWriter(root / "a.mp4", 320, 240, fps=50)))
     egl = {**os.environ, "MUJOCO_GL": "egl"}
-    made.add("no OpenGL", patched(patched(lambda root: RobotRenderer(spec(), 64, 48), mujoco, Renderer=no_opengl), os, environ=egl))
+    made.add(
+        "no OpenGL",
+        patched(patched(lambda root: RobotRenderer(spec(), 64, 48), mujoco, Renderer=no_opengl), os, environ=egl),
+    )
     made.calls(
         {
             "a window without a display": lambda: window(False),
@@ -105,8 +114,12 @@ def table() -> Table:
             "web: a port of others": lambda: bound(Refusing, 80),
             "web: all ports in use": lambda: bound(Full, 0),
             "web: no such address": lambda: free_port("203.0.113.7"),
-            "web: none in this mujoco": lambda: patched(lambda root: WebViewer(spec(), None), web, missing=lambda: "there is none")(Path()),  # type: ignore[arg-type]
-            "web: another one": lambda: patched(lambda root: WebViewer(spec(), None), WebViewer, _serving="http://127.0.0.1:8080/")(Path()),  # type: ignore[arg-type]
+            "web: none in this mujoco": lambda: patched(
+                lambda root: WebViewer(spec(), None), web, missing=lambda: "there is none"
+            )(Path()),  # type: ignore[arg-type]
+            "web: another one": lambda: patched(
+                lambda root: WebViewer(spec(), None), WebViewer, _serving="http://127.0.0.1:8080/"
+            )(Path()),  # type: ignore[arg-type]
             "web: cannot be guarded": unguarded,
             "a command outside": lambda: launch.check_drive(
                 SimpleNamespace(commands=None, command="base_height=0.1"),  # type: ignore[arg-type]

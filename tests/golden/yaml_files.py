@@ -80,7 +80,9 @@ def write(root: Path, text: str | bytes, name: str = "x.yaml") -> None:
 def table() -> Table:
     made = Table()
     for name, text in TEXTS.items():
-        made.add(name, program("train", "--check", "--override", "ROOT/x.yaml"), lambda root, text=text: write(root, text))
+        made.add(
+            name, program("train", "--check", "--override", "ROOT/x.yaml"), lambda root, text=text: write(root, text)
+        )
     given = {
         "a link to a device": lambda root: (root / "x.yaml").symlink_to("/dev/zero"),
         "a pipe": lambda root: os.mkfifo(root / "x.yaml"),
@@ -91,6 +93,14 @@ def table() -> Table:
     for name, make in given.items():
         made.add(name, program("train", "--override", "ROOT/x.yaml"), make)
     made.programs("train", [["--override", name] for name in ("", "/dev/zero", "x" * 5000)])
-    sets = ("asset.colliders=[a", f"seed={'9' * 5000}", "runner.run_name=\udcff", "asset.colliders=&a [*a]", "seed=1:30")
-    made.programs("train", [["--set", value] for value in (*sets, f"asset.colliders={'[' * 5000}", "sim.dt=2024-13-45")])
+    sets = (
+        "asset.colliders=[a",
+        f"seed={'9' * 5000}",
+        "runner.run_name=\udcff",
+        "asset.colliders=&a [*a]",
+        "seed=1:30",
+    )
+    made.programs(
+        "train", [["--set", value] for value in (*sets, f"asset.colliders={'[' * 5000}", "sim.dt=2024-13-45")]
+    )
     return made

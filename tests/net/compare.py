@@ -36,17 +36,33 @@ import numpy as np
 sys.path[:0] = [str(Path(__file__).parent)]
 from recordings import ENGINES, RECORDINGS, first_steps, rollout  # noqa: E402
 
-Found = dict[str, dict[str, np.ndarray]]  # run -> quantity -> value; columns/QUANTITY and steps/QUANTITY name its last and first axis
+# run -> quantity -> value; columns/QUANTITY and steps/QUANTITY name its last and first axis
+Found = dict[str, dict[str, np.ndarray]]
 NO_STEP, NAMES = -9, ("columns/", "steps/")
 HERE = Path(__file__).resolve()
 REPOSITORY = HERE.parents[2]
-DECIDES = ("numpy", "torch", "mujoco", "mujoco-warp", "warp-lang", "rsl-rl-lib", "tensordict", "onnx", "onnxscript", "onnxruntime")
+DECIDES = (
+    "numpy",
+    "torch",
+    "mujoco",
+    "mujoco-warp",
+    "warp-lang",
+    "rsl-rl-lib",
+    "tensordict",
+    "onnx",
+    "onnxscript",
+    "onnxruntime",
+)
 
 # ---- what is found of a checkout, in a process whose sources are that checkout's -----------------------------------------------------
 
 
 def recordings(_: Path) -> Found:
-    return {f"{name} {engine}": _or_error(lambda n=name, e=engine: rollout(n, e)) for engine in ENGINES for name in RECORDINGS}
+    return {
+        f"{name} {engine}": _or_error(lambda n=name, e=engine: rollout(n, e))
+        for engine in ENGINES
+        for name in RECORDINGS
+    }
 
 
 def kept(_: Path) -> Found:
@@ -66,14 +82,27 @@ def exams(root: Path) -> Found:
 def _exam(folder: Path) -> dict[str, np.ndarray]:
     with tempfile.TemporaryDirectory() as scratch:
         out = Path(scratch) / "exam.json"
-        _run(lambda: runpy.run_module("legged_mw.deploy", run_name="__main__", alter_sys=True), str(folder), "--eval", "--out", str(out))
+        _run(
+            lambda: runpy.run_module("legged_mw.deploy", run_name="__main__", alter_sys=True),
+            str(folder),
+            "--eval",
+            "--out",
+            str(out),
+        )
         return {path: np.array(value) for path, value in _leaves(json.loads(out.read_text()))}
 
 
 # Few worlds, so that an iteration takes a second, and short episodes, so that some end in each; one thread, so that sums have one order.
 SMALL = [
     *("--device", "cpu", "--num_envs", "16", "--max_iterations", "2", "--set", "runner.num_steps_per_env=8"),
-    *("--set", "env.episode_length_s=0.3", "--set", "domain_rand.redraw_iterations=1", "--set", "perturbation.push_interval_s=0.2"),
+    *(
+        "--set",
+        "env.episode_length_s=0.3",
+        "--set",
+        "domain_rand.redraw_iterations=1",
+        "--set",
+        "perturbation.push_interval_s=0.2",
+    ),
     *(
         "--set",
         "sim.threads=1",
@@ -95,7 +124,14 @@ LEARNERS: dict[str, list[str]] = {
     "an estimator": ["go1_flat_blind", "--set", "actor.estimator.targets=[base_lin_vel]"],
     "a teacher beside": ["go1_rough_student", "--set", "actor.concurrent.groups=[privileged_state]"],
     "a student": ["go1_rough_student", "--teacher", "{root}/resources/policies/go1_rough_scan"],
-    "a warm start": ["go2_flat", "--init", "{root}/resources/policies/go2_flat", "--set", "warm_start.critic_warmup=1", *AS_SHIPPED],
+    "a warm start": [
+        "go2_flat",
+        "--init",
+        "{root}/resources/policies/go2_flat",
+        "--set",
+        "warm_start.critic_warmup=1",
+        *AS_SHIPPED,
+    ],
     "a mirror loss": ["go1_flat", "--set", "symmetry.use_mirror_loss=true", "--set", "symmetry.mirror_loss_coeff=1.0"],
     "bfloat16": ["go1_flat_fast"],
     "rsl-rl's PPO": ["go1_flat_dr", "--set", "algorithm.class_name=PPO"],
@@ -128,7 +164,9 @@ def exports(root: Path) -> Found:
     found: Found = {}
     for path in _tasks(root):
         ships = (root / "resources/policies" / path.stem / "policy.onnx").exists()
-        found[path.stem] = _or_error(lambda task=path.stem, ships=ships: _shipped_export(root, task) if ships else _new_export(root, task))
+        found[path.stem] = _or_error(
+            lambda task=path.stem, ships=ships: _shipped_export(root, task) if ships else _new_export(root, task)
+        )
     return found
 
 
@@ -240,12 +278,22 @@ def differences(a: Found, b: Found, tolerances: Mapping[str, float], most: int =
             continue
         names = [name for name in dict.fromkeys([*a[run], *b[run]]) if not name.startswith(NAMES)]
         found = [(*_difference(name, a[run], b[run]), name) for name in names]
-        more = [gap > tolerances.get(name, tolerances.get(name.split("/")[0], tolerances.get("", 0.0))) for _, gap, _, name in found]
+        more = [
+            gap > tolerances.get(name, tolerances.get(name.split("/")[0], tolerances.get("", 0.0)))
+            for _, gap, _, name in found
+        ]
         broken = "error" in a[run] or "error" in b[run]
         failed |= any(more) or broken
-        different = sorted((step, not over, text, name) for (step, gap, text, name), over in zip(found, more, strict=True) if gap)
-        lines.append(f"{run:28} {len(names) - len(different)} of {len(names)} equal{'  <--' if any(more) or broken else ''}")
-        lines += [f"    {name:30} {text}{'  (within its tolerance)' if within else ''}" for _, within, text, name in different[:most]]
+        different = sorted(
+            (step, not over, text, name) for (step, gap, text, name), over in zip(found, more, strict=True) if gap
+        )
+        lines.append(
+            f"{run:28} {len(names) - len(different)} of {len(names)} equal{'  <--' if any(more) or broken else ''}"
+        )
+        lines += [
+            f"    {name:30} {text}{'  (within its tolerance)' if within else ''}"
+            for _, within, text, name in different[:most]
+        ]
         lines += [f"    and {len(different) - most} more"] if len(different) > most else []
         lines += [f"    {a[run]['error']}"] if "error" in a[run] and not different else []
     return lines, failed
@@ -347,8 +395,14 @@ def _machine() -> str:
     """What decides numbers beside the checkout, in short."""
     versions = [f"{name} {metadata.version(name)}" for name in DECIDES]
     sources = [(HERE.parent / name).read_text() for name in ("compare.py", "recordings.py")]
-    cpu = Path("/proc/cpuinfo").read_text().partition("model name")[2].partition("\n")[0] if Path("/proc/cpuinfo").exists() else ""
-    return hashlib.sha256("\n".join([*versions, *sources, cpu, platform.platform(), sys.version]).encode()).hexdigest()[:12]
+    cpu = (
+        Path("/proc/cpuinfo").read_text().partition("model name")[2].partition("\n")[0]
+        if Path("/proc/cpuinfo").exists()
+        else ""
+    )
+    return hashlib.sha256("\n".join([*versions, *sources, cpu, platform.platform(), sys.version]).encode()).hexdigest()[
+        :12
+    ]
 
 
 def _git(*words: str) -> str:
@@ -373,7 +427,9 @@ def compare(a: str, b: str, parts: Sequence[str], tolerances: Mapping[str, float
             print(f"{part}\n" + "\n".join(f"  {line}" for line in lines), flush=True)
             differ += [part] if failed else []
         for letter, side in zip("AB", sides, strict=True):
-            print(f"{letter}: {side.name}{f' ({side.commit[:12]})' if side.commit else ''}, {side.cpu_seconds / 60:.1f} minutes of CPU")
+            print(
+                f"{letter}: {side.name}{f' ({side.commit[:12]})' if side.commit else ''}, {side.cpu_seconds / 60:.1f} minutes of CPU"
+            )
     print(f"A and B differ: {', '.join(differ)}" if differ else "A and B are alike")
     return bool(differ)
 
@@ -383,7 +439,9 @@ def main() -> int:
     parser.add_argument("sides", nargs="*", metavar="A B", help="a commit, a branch, or the folder of a checkout")
     named = [part for part in PARTS if part != "kept"]
     parser.add_argument("--only", action="append", choices=named, help="a part; may be repeated")
-    parser.add_argument("--tolerance", action="append", default=[], help="a number, or QUANTITY=NUMBER; may be repeated")
+    parser.add_argument(
+        "--tolerance", action="append", default=[], help="a number, or QUANTITY=NUMBER; may be repeated"
+    )
     parser.add_argument("--keep", metavar="FILE", type=Path)
     parser.add_argument("--part", choices=PARTS, help=argparse.SUPPRESS)
     parser.add_argument("--root", type=Path, help=argparse.SUPPRESS)

@@ -37,15 +37,27 @@ OFTEN: dict[str | tuple[str, ...], Any] = {
     "sim.threads": 1,
 }
 WALKING: dict[str, Any] = {
-    **{"commands.resampling_time": 0.2, "commands.change_probability": 0.8, "commands.keep_probability": [0.5, 0.4, 0.4]},
+    **{
+        "commands.resampling_time": 0.2,
+        "commands.change_probability": 0.8,
+        "commands.keep_probability": [0.5, 0.4, 0.4],
+    },
     **{"init_state.ang_vel_range": 3.0, "termination.max_tilt": 35.0, "rewards.soft_dof_pos_limit": 0.5},
 }
 DRAWN: dict[str, Any] = {
     **{"domain_rand.enable": True, "domain_rand.observe": True, "domain_rand.strength": [0.5, 1.1]},
-    **{"domain_rand.stiffness": [0.8, 1.2], "domain_rand.damping": [0.8, 1.2], "domain_rand.encoder_offset": [-0.05, 0.05]},
+    **{
+        "domain_rand.stiffness": [0.8, 1.2],
+        "domain_rand.damping": [0.8, 1.2],
+        "domain_rand.encoder_offset": [-0.05, 0.05],
+    },
 }
 CURVE: dict[str, Any] = {
-    **{"control.stall_torque": {"": 10.0}, "control.no_load_speed": {"": 20.0, "calf": 15.0}, "control.gear": {"": 2.0}},
+    **{
+        "control.stall_torque": {"": 10.0},
+        "control.no_load_speed": {"": 20.0, "calf": 15.0},
+        "control.gear": {"": 2.0},
+    },
     **{"domain_rand.stall_torque": [0.8, 1.2], "domain_rand.no_load_speed": [0.8, 1.2]},
 }
 TERRAIN: dict[str, Any] = {
@@ -57,21 +69,47 @@ TERRAIN: dict[str, Any] = {
 HEAP: dict[str, Any] = {
     **{"asset.colliders": ["*"], "asset.self_collisions": True, "asset.penalize_contacts_on": ["*_thigh*", "*_calf*"]},
     **{"asset.terminate_after_contacts_on": ["trunk*"], "sim.nconmax": 48, "sim.njmax": 240},
-    **{"init_state.dof_pos_range": [0.8, 1.2], "init_state.dof_pos_offset": [-0.9, 0.9], "init_state.dof_vel_range": 10.0},
+    **{
+        "init_state.dof_pos_range": [0.8, 1.2],
+        "init_state.dof_pos_offset": [-0.9, 0.9],
+        "init_state.dof_vel_range": 10.0,
+    },
     **{"init_state.ang_vel_range": 4.0, "termination.min_base_height": 0.1, "termination.max_tilt": 70.0},
 }
 # Terms that no task has, or none whose robot does what they count.
 TERMS = {
-    **{"alive": 0.2, "base_height": -2.0, "angular_momentum": -0.1, "hip_pos": -0.1, "joint_deviation": -0.1, "joint_mirror": -0.1},
+    **{
+        "alive": 0.2,
+        "base_height": -2.0,
+        "angular_momentum": -0.1,
+        "hip_pos": -0.1,
+        "joint_deviation": -0.1,
+        "joint_mirror": -0.1,
+    },
     **{"dof_vel": -1e-3, "dof_acc": -2.5e-7, "dof_vel_limits": -0.1, "fast_joints": -0.01, "torque_limits": -0.05},
-    **{"action_smoothness": -0.01, "collision": -0.5, "self_collision": -0.5, "feet_distance": -1.0, "feet_orientation": -0.5},
-    **{"air_time_variance": -1.0, "feet_contact_without_cmd": -0.2, "feet_impact_vel": -0.1, "feet_contact_forces": -0.01},
+    **{
+        "action_smoothness": -0.01,
+        "collision": -0.5,
+        "self_collision": -0.5,
+        "feet_distance": -1.0,
+        "feet_orientation": -0.5,
+    },
+    **{
+        "air_time_variance": -1.0,
+        "feet_contact_without_cmd": -0.2,
+        "feet_impact_vel": -0.1,
+        "feet_contact_forces": -0.01,
+    },
     **{"soft_landing": -1e-3, "feet_phase": 1.0, "contact_phase": 0.5},
 }
 ALL_TERMS: dict[str, Any] = {
     **{f"rewards.scales.{name}": scale for name, scale in TERMS.items()},
     **{"rewards.base_height_target": 0.28, "rewards.hip_joints": ["*_hip*"], "rewards.max_contact_force": 20.0},
-    **{"rewards.mirror_joints": [["FR_", "RL_"], ["FL_", "RR_"]], "rewards.min_air_time": 0.05, "rewards.tracking_sigma_end": 0.1},
+    **{
+        "rewards.mirror_joints": [["FR_", "RL_"], ["FL_", "RR_"]],
+        "rewards.min_air_time": 0.05,
+        "rewards.tracking_sigma_end": 0.1,
+    },
     **{"gait.period": 0.5, "gait.offsets": [0.0, 0.5, 0.5, 0.0], "rewards.min_command": 0.3},
 }
 TWO_FEET = {"rewards.scales.single_stance": 0.5, "rewards.scales.no_fly": 0.5, "rewards.min_feet_distance": 0.3}
@@ -88,10 +126,20 @@ RECORDINGS: dict[str, Recording] = {
         "go1_flat_dr",
         WALKING
         | DRAWN
-        | {"domain_rand.observation_delay": [0, 2], "domain_rand.action_delay": [0, 2], "domain_rand.contact_time": [0.01, 0.03]}
-        | {"commands.curriculum": True, "rewards.only_positive_rewards": True, "rewards.scales.alive": 1.0, "asset.effort": {"calf": 12.0}},
+        | {
+            "domain_rand.observation_delay": [0, 2],
+            "domain_rand.action_delay": [0, 2],
+            "domain_rand.contact_time": [0.01, 0.03],
+        }
+        | {
+            "commands.curriculum": True,
+            "rewards.only_positive_rewards": True,
+            "rewards.scales.alive": 1.0,
+            "asset.effort": {"calf": 12.0},
+        },
     ),
-    "go1_rough": Recording("go1_rough", WALKING | TERRAIN | {"rewards.scales.stumble": -0.5}),  # ground by what a robot can do, felt
+    # ground by what a robot can do, felt
+    "go1_rough": Recording("go1_rough", WALKING | TERRAIN | {"rewards.scales.stumble": -0.5}),
     "go2_rough_scan": Recording(  # ground by chance, seen
         "go2_rough_scan", WALKING | TERRAIN | {"terrain.curriculum": False, "init_state.pos_xy_range": 0.5}
     ),
@@ -105,14 +153,19 @@ RECORDINGS: dict[str, Recording] = {
     "go1_getup": Recording("go1_getup", {"env.episode_length_s": 0.3}),  # from the measured joints, on slopes
     "g1_getup": Recording("g1_getup", {"env.episode_length_s": 0.3}),  # pulled; 29 joints that all collide
     "go2_footstand": Recording("go2_footstand", {"control.action_origin": "targets", "control.action_scale": 0.3}),
-    "g1_track": Recording("g1_track", {"observations.leave_out": {}, "domain_rand.observe": True, "motion.hold_s": 0.1}),
+    "g1_track": Recording(
+        "g1_track", {"observations.leave_out": {}, "domain_rand.observe": True, "motion.hold_s": 0.1}
+    ),
     "g1_flat": Recording(
         "g1_flat", WALKING | {"domain_rand.delay_ms": [0.0, 30.0]} | TWO_FEET
     ),  # 29 joints; a gait clock; delays in milliseconds
     "g1_12dof_flat": Recording(  # a clock that begins at 0; a plane that leans
-        "g1_12dof_flat", WALKING | {"gait.random_start": False, "terrain.slope": 6.0, "observations.history": {"state": 2}}
+        "g1_12dof_flat",
+        WALKING | {"gait.random_start": False, "terrain.slope": 6.0, "observations.history": {"state": 2}},
     ),
-    "dc_motor": Recording("go1_flat_dr", WALKING | DRAWN | CURVE | {"control.actuator": "dc_motor", "domain_rand.delay_ms": [3.0, 25.0]}),
+    "dc_motor": Recording(
+        "go1_flat_dr", WALKING | DRAWN | CURVE | {"control.actuator": "dc_motor", "domain_rand.delay_ms": [3.0, 25.0]}
+    ),
     "torque": Recording(
         "go2_flat",
         WALKING
@@ -172,7 +225,12 @@ def _with_own_law(env_class: Any) -> Any:
 def _write_network(folder: Path) -> str:
     """A memory and two layers of numbers: errors and speeds of two frames to a torque."""
     drawn, units = np.random.default_rng(3), 4
-    shapes = {"weight_ih_l0": (4 * units, 4), "weight_hh_l0": (4 * units, units), "bias_ih_l0": (4 * units,), "bias_hh_l0": (4 * units,)}
+    shapes = {
+        "weight_ih_l0": (4 * units, 4),
+        "weight_hh_l0": (4 * units, units),
+        "bias_ih_l0": (4 * units,),
+        "bias_hh_l0": (4 * units,),
+    }
     shapes |= {"weight0": (6, units), "bias0": (6,), "weight1": (1, 6), "bias1": (1,)}
     arrays: dict[str, Any] = {name: drawn.normal(0.0, 0.6, shape).astype(np.float32) for name, shape in shapes.items()}
     scales = {"error_scale": 1.5, "speed_scale": -0.1, "torque_scale": 20.0}
@@ -180,7 +238,9 @@ def _write_network(folder: Path) -> str:
     return str(folder / "network.npz")
 
 
-def rollout(name: str, engine: str, change: Change | None = None, worlds: int = WORLDS, steps: int = STEPS) -> dict[str, np.ndarray]:
+def rollout(
+    name: str, engine: str, change: Change | None = None, worlds: int = WORLDS, steps: int = STEPS
+) -> dict[str, np.ndarray]:
     """Seeded random actions: ``obs/<group>`` (steps + 2, N, C): as built, after a reset, after each step; and all else by name.
 
     ``steps/<quantity>`` says of which step each value is, ``columns/<quantity>`` names its last axis, where the environment does.
@@ -200,13 +260,19 @@ def rollout(name: str, engine: str, change: Change | None = None, worlds: int = 
         obs, reward, done, extras = env.step(torch.randn(worlds, env.num_actions, generator=own))
         observed.append(obs)
         stepped.append((reward, done, extras["time_outs"], env.episode_length_buf.clone()))
-    taken = {f"obs/{group}": torch.stack([obs[group] for obs in observed]).numpy() for group in list(observed[0].keys())}
+    taken = {
+        f"obs/{group}": torch.stack([obs[group] for obs in observed]).numpy() for group in list(observed[0].keys())
+    }
     taken |= {f"steps/{quantity}": np.arange(-2, steps) for quantity in taken}
-    for quantity, values in zip(("reward", "done", "time_out", "episode_length"), zip(*stepped, strict=True), strict=True):
+    for quantity, values in zip(
+        ("reward", "done", "time_out", "episode_length"), zip(*stepped, strict=True), strict=True
+    ):
         taken[quantity], taken[f"steps/{quantity}"] = torch.stack(values).numpy(), np.arange(steps)
     said = env.name_statistics(env.take_statistics().tolist())
     taken |= {"statistics": np.array(list(said.values()), dtype=np.float32), "columns/statistics": np.array(list(said))}
-    taken |= {f"training_state/{quantity}": torch.as_tensor(value).numpy() for quantity, value in env.training_state().items()}
+    taken |= {
+        f"training_state/{quantity}": torch.as_tensor(value).numpy() for quantity, value in env.training_state().items()
+    }
     torch.set_num_threads(threads)
     return taken | _columns(env)
 
@@ -215,7 +281,10 @@ def _columns(env: Any) -> dict[str, np.ndarray]:
     """``columns/obs/<group>``: the row that each column is of, where the environment says so."""
     groups = getattr(getattr(env, "observations", None), "groups", {})
     table = {group: [(row.name, row.size) for row in rows] for group, rows in groups.items()}
-    return {f"columns/obs/{group}": np.array([f"{name}[{i}]" for name, size in rows for i in range(size)]) for group, rows in table.items()}
+    return {
+        f"columns/obs/{group}": np.array([f"{name}[{i}]" for name, size in rows for i in range(size)])
+        for group, rows in table.items()
+    }
 
 
 KEPT_STEPS = {"state": [0, 2, 9, 21], "privileged_state": [1, 20]}  # as built, after a reset, after each step
@@ -227,7 +296,11 @@ def first_steps(name: str, engine: str, change: Change | None = None) -> dict[st
     A difference lasts, and worlds weigh differently.
     """
     taken = rollout(name, engine, change)
-    kept = {quantity: value for quantity, value in taken.items() if not quantity.startswith(("training_state/", "episode_length"))}
+    kept = {
+        quantity: value
+        for quantity, value in taken.items()
+        if not quantity.startswith(("training_state/", "episode_length"))
+    }
     kept["ended"] = kept.pop("done").astype(np.uint8) + kept.pop("time_out")  # 1: failed, 2: timed out
     weights = np.cos(np.arange(1.0, WORLDS + 1.0))
     for group, steps in KEPT_STEPS.items():

@@ -133,9 +133,13 @@ class UnitreeRobot(Robot):
         self._listen()
         age = self._clock() - self._stamp
         if self._left_out and age > 2 * self.contract.period:
-            raise RobotError(f"{self._left_out} states in a row have a wrong checksum: the newest good one is {1000 * age:.0f} ms old")
+            raise RobotError(
+                f"{self._left_out} states in a row have a wrong checksum: the newest good one is {1000 * age:.0f} ms old"
+            )
         if age > TOO_OLD:
-            raise RobotError(f"the newest measurement is {1000 * age:.0f} ms old: the robot is silent, or the link is down")
+            raise RobotError(
+                f"the newest measurement is {1000 * age:.0f} ms old: the robot is silent, or the link is down"
+            )
         state, slots = self._state, self._slots
         w, x, y, z = (float(value) for value in state["imu_state.quaternion"])
         feet = np.zeros(len(self.contract.feet))
@@ -157,7 +161,9 @@ class UnitreeRobot(Robot):
         )
 
     def write(self, targets: Floats, *, stiffness: Floats | None = None, damping: Floats | None = None) -> None:
-        kp, kd = (own if given is None else given for own, given in zip(self._default, (stiffness, damping), strict=True))
+        kp, kd = (
+            own if given is None else given for own, given in zip(self._default, (stiffness, damping), strict=True)
+        )
         self._send(q=targets, kp=kp, kd=kd)
 
     def damp(self) -> None:
@@ -182,7 +188,9 @@ class UnitreeRobot(Robot):
             wrong = {i: f"it lost {n} messages in a period" for i, n in enumerate(self._lost - before) if n > LOST}
         else:
             temperatures = state["motor_state.temperature"].reshape(-1, 2)[slots].max(axis=1)
-            wrong = {i: f"error {state['motor_state.motorstate'][i]:#x}" for i in slots if state["motor_state.motorstate"][i]}
+            wrong = {
+                i: f"error {state['motor_state.motorstate'][i]:#x}" for i in slots if state["motor_state.motorstate"][i]
+            }
         faults = {name: wrong[i] for name, i in zip(self.contract.joints, slots, strict=True) if i in wrong}
         return Health(
             age_s=self._clock() - self._stamp,
@@ -209,7 +217,9 @@ class UnitreeRobot(Robot):
             raise RobotError(f"the robot's clock went back by {back:.1f} s: it was started again, or two robots answer")
         self._state, self._stamp, self._left_out = state, received.stamp, 0
         if (body := self._mode_machine) != self._body:
-            raise RobotError(f"mode_machine was {self._body} and is {body}: the robot has another body, or two robots answer")
+            raise RobotError(
+                f"mode_machine was {self._body} and is {body}: the robot has another body, or two robots answer"
+            )
 
     def _command(self, **parts: Floats) -> bytes:
         """A sealed command: ``parts`` (D,) of the joints, zero where not given."""
@@ -237,8 +247,12 @@ class UnitreeRobot(Robot):
 def check_rows(contract: Contract, machine: Machine, odometry: bool = False) -> None:
     """Refuse a policy that observes what this robot does not measure, or does not command angles. Raises RobotError."""
     if contract.action.origin in ("torque", "speed"):
-        raise RobotError(f"{CONTRACT_FILE}: the policy commands {contract.action.origin}s; a {machine.name} is driven by angles here")
-    measured = {*_MEASURED, *COMPUTED, *(["foot_contact"] if machine.feet else []), *([ROW] if odometry else [])} - {PLACE}
+        raise RobotError(
+            f"{CONTRACT_FILE}: the policy commands {contract.action.origin}s; a {machine.name} is driven by angles here"
+        )
+    measured = {*_MEASURED, *COMPUTED, *(["foot_contact"] if machine.feet else []), *([ROW] if odometry else [])} - {
+        PLACE
+    }
     if wrong := [row for row in contract.rows if row.measured not in measured]:
         estimated = "add --velocity odometry, or " if [row.measured for row in wrong] == [ROW] else ""
         raise RobotError(
@@ -247,7 +261,9 @@ def check_rows(contract: Contract, machine: Machine, odometry: bool = False) -> 
         )
 
 
-def connect(folder: Path, contract: Contract, interface: str, domain: int | None = None, odometry: bool = False) -> UnitreeRobot:
+def connect(
+    folder: Path, contract: Contract, interface: str, domain: int | None = None, odometry: bool = False
+) -> UnitreeRobot:
     """The robot on a network interface, its wire owned by a guard process. Raises RobotError with what is wrong."""
     need_dds()
     from legged_mw.deploy.unitree.guard import LATE, Guarded

@@ -106,10 +106,17 @@ class Layout:
 
 def _alignment(package: str, struct: str) -> int:
     """Size of a struct's widest number."""
-    return max(np.dtype(_DTYPES[f.type]).itemsize if f.type in _DTYPES else _alignment(package, f.type) for f in fields(package, struct))
+    return max(
+        np.dtype(_DTYPES[f.type]).itemsize if f.type in _DTYPES else _alignment(package, f.type)
+        for f in fields(package, struct)
+    )
 
 
-LAYOUTS = {(package, name): Layout(package, name) for package in ("unitree_go", "unitree_hg") for name in ("LowCmd_", "LowState_")}
+LAYOUTS = {
+    (package, name): Layout(package, name)
+    for package in ("unitree_go", "unitree_hg")
+    for name in ("LowCmd_", "LowState_")
+}
 
 
 class Message:

@@ -26,7 +26,8 @@ class Faults:
     loss: float = 0.0  # share of messages that are lost
     bad_crc: bool = False  # states with a wrong checksum
     frozen: bool = False  # the same state again and again
-    stuck: set[str] = field(default_factory=set)  # parts of the state, by their names in NAN, and joints whose encoders stay the same
+    # parts of the state, by their names in NAN, and joints whose encoders stay the same
+    stuck: set[str] = field(default_factory=set)
     silent: bool = False  # no states
     no_remote: bool = False  # the remote is off: 40 zeros
     clock_jump: float = 0.0  # [s] by which the robot's clock is ahead
@@ -54,7 +55,12 @@ class Kind(NamedTuple):
     unit: str = ""
 
 
-NAN = {"q": "motor_state.q", "dq": "motor_state.dq", "gyroscope": "imu_state.gyroscope", "quaternion": "imu_state.quaternion"}
+NAN = {
+    "q": "motor_state.q",
+    "dq": "motor_state.dq",
+    "gyroscope": "imu_state.gyroscope",
+    "quaternion": "imu_state.quaternion",
+}
 SWAPS = {"xy": [1, 0, 2], "xz": [2, 1, 0], "yz": [0, 2, 1]}
 KINDS = {
     "delay": Kind("delay_ms", 200.0, 0, 1000, "ms"),
@@ -107,7 +113,12 @@ def _parse(text: str, joints: Sequence[str]) -> Fault:
     if not 0.0 <= (seconds := _number(time or "0")) < math.inf:
         raise UserError(f"{where}: after @ stands when it begins, a number of seconds from 0")
     kind = KINDS[name]
-    return Fault(text, kind.field, getattr(Faults(), kind.field) if value == OFF else _value(name, kind, value, joints, where), seconds)
+    return Fault(
+        text,
+        kind.field,
+        getattr(Faults(), kind.field) if value == OFF else _value(name, kind, value, joints, where),
+        seconds,
+    )
 
 
 def _value(name: str, kind: Kind, value: str | None, joints: Sequence[str], where: str) -> Any:
@@ -124,7 +135,11 @@ def _value(name: str, kind: Kind, value: str | None, joints: Sequence[str], wher
     if kind.value is True:
         raise UserError(f"{where}: {name} has no value but {OFF}")
     if not kind.low <= (number := _number(value)) <= kind.high or math.isinf(number):
-        ends = "" if math.isinf(kind.low) else f" from {kind.low:g}" + ("" if math.isinf(kind.high) else f" to {kind.high:g}")
+        ends = (
+            ""
+            if math.isinf(kind.low)
+            else f" from {kind.low:g}" + ("" if math.isinf(kind.high) else f" to {kind.high:g}")
+        )
         raise UserError(f"{where}: {name} is a number{ends}{f' [{kind.unit}]' if kind.unit else ''}, or {OFF}")
     return number / 100 if name == "loss" else int(number) if isinstance(kind.value, int) else number
 
@@ -145,7 +160,9 @@ class Line:
     def put(self, now: float, body: bytes, faults: Faults) -> None:
         if faults.loss and self._rng.random() < faults.loss:
             return
-        delay = max(0.0, faults.delay_ms + (faults.jitter_ms * self._rng.standard_normal() if faults.jitter_ms else 0.0))
+        delay = max(
+            0.0, faults.delay_ms + (faults.jitter_ms * self._rng.standard_normal() if faults.jitter_ms else 0.0)
+        )
         self._count += 1
         heapq.heappush(self._queue, (now + delay / 1000, self._count, body))
 

@@ -31,8 +31,10 @@ from legged_mw.deploy.robot import RobotError
 from legged_mw.deploy.unitree import clock
 from legged_mw.deploy.unitree.codec import LAYOUTS
 
-LATE = 0.06  # [s] ours: three periods at 50 Hz without a command; docs/faults.md has what the joints then take to be damped
-STILL = 0.04  # [s] ours, between two turns of the guard: it was stopped, or this computer slept, and the policy's process damps
+# [s] ours: three periods at 50 Hz without a command; docs/faults.md has what the joints then take to be damped
+LATE = 0.06
+# [s] ours, between two turns of the guard: it was stopped, or this computer slept, and the policy's process damps
+STILL = 0.04
 REPEAT = 0.002  # [s] between two messages to the robot [unitree_sdk2's examples]
 AFTER = 1.0  # [s] ours: how long damping is sent before the wire is let go
 SIGN = 0.1  # [s] ours, for the guard to answer the last command; then the policy's process damps, too
@@ -42,7 +44,8 @@ GONE = "the guard of the wire is gone"
 DEAF = "the guard of the wire does not listen"
 INSTEAD = "this process damps the joints in its place"
 _TURN = 0.001  # [s] at most between two looks at the wire
-_BOARD = struct.Struct("<IddI512s")  # checksum of what follows, time of the guard's turn, stamp of the state, bytes of the text, text
+# checksum of what follows, time of the guard's turn, stamp of the state, bytes of the text, text
+_BOARD = struct.Struct("<IddI512s")
 _SUM = 4  # bytes of the checksum
 _LOOKS = 10  # at a board that is being written, before what it last said counts
 _FRAME = struct.Struct("<Bd")  # kind, stamp of the state that a command answers
@@ -110,7 +113,13 @@ class Guarded:
 
         Raises RobotError with the guard's error if it does not take the robot over.
         """
-        self._channel, self._board, self._commander, self.process, self._clock = channel, board, commander, process, clock
+        self._channel, self._board, self._commander, self.process, self._clock = (
+            channel,
+            board,
+            commander,
+            process,
+            clock,
+        )
         self._channel.settimeout(START)
         said = self._answer()
         if "error" in said or not said:
@@ -123,7 +132,16 @@ class Guarded:
         self.first = self.receive()
 
     @classmethod
-    def start(cls, package: str, interface: str, domain: int, *, lies_down: bool = False, late: float = LATE, find: float = 5.0) -> Guarded:
+    def start(
+        cls,
+        package: str,
+        interface: str,
+        domain: int,
+        *,
+        lies_down: bool = False,
+        late: float = LATE,
+        find: float = 5.0,
+    ) -> Guarded:
         """Start a guard, which takes the robot over (``lies_down`` as in ``link.Wire.prepare``).
 
         ``find``: [s] to wait for the robot's first state. Raises RobotError with the guard's error.
@@ -135,7 +153,14 @@ class Guarded:
             file.truncate(_BOARD.size + size)
             board, (channel, theirs) = Board(file.fileno(), size), socket.socketpair()
             with theirs:
-                settings = {"package": package, "interface": interface, "domain": domain, "late": late, "still": STILL, "find": find}
+                settings = {
+                    "package": package,
+                    "interface": interface,
+                    "domain": domain,
+                    "late": late,
+                    "still": STILL,
+                    "find": find,
+                }
                 settings |= {"lies_down": lies_down, "channel": theirs.fileno(), "board": file.fileno()}
                 program = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
                 process = subprocess.Popen(
@@ -162,7 +187,8 @@ class Guarded:
         elif self._moving and silent > STILL:
             self._damp_instead(f"the guard of the wire was silent for {1000 * silent:.0f} ms")
         if text or self._instead:
-            raise RobotError(known or text or self._instead)  # a guard that goes on takes this process for another program
+            # a guard that goes on takes this process for another program
+            raise RobotError(known or text or self._instead)
         if stamp == self._last:
             return None
         self._last = stamp
@@ -246,7 +272,14 @@ class Guard:
         clock: Callable[[], float] = clock,
         still: float = STILL,
     ) -> None:
-        self.wire, self.channel, self.board, self.late, self.clock, self.still = wire, channel, board, late, clock, still
+        self.wire, self.channel, self.board, self.late, self.clock, self.still = (
+            wire,
+            channel,
+            board,
+            late,
+            clock,
+            still,
+        )
         self._size = _FRAME.size + LAYOUTS[package, "LowCmd_"].size
         self._buffer, self._latencies = b"", deque[float](maxlen=1 << 16)
         self._command, self._damping = b"", b""  # the command that is repeated; the one that replaces it after a trip
@@ -344,7 +377,9 @@ class Guard:
     def _report(self) -> str:
         lines = [f"{self.wire.dropped} states of another size dropped"] if getattr(self.wire, "dropped", 0) else []
         if self._latencies:
-            lines.insert(0, f"from a measurement to its target: {Spread.of(self._latencies)} ({len(self._latencies)} targets)")
+            lines.insert(
+                0, f"from a measurement to its target: {Spread.of(self._latencies)} ({len(self._latencies)} targets)"
+            )
         return "; ".join(lines)
 
     def tell(self, what: dict[str, Any]) -> None:
@@ -354,7 +389,10 @@ class Guard:
 
 # Signals that do not end the guard: which nobody can catch, which end nothing, and those of its own errors, to which a handler would
 # return for ever.
-KEPT = {getattr(signal, f"SIG{name}") for name in ("KILL", "STOP", "CHLD", "CONT", "URG", "WINCH", "PIPE", "SEGV", "BUS", "FPE", "ILL")}
+KEPT = {
+    getattr(signal, f"SIG{name}")
+    for name in ("KILL", "STOP", "CHLD", "CONT", "URG", "WINCH", "PIPE", "SEGV", "BUS", "FPE", "ILL")
+}
 
 
 def _name(number: int) -> str:

@@ -26,7 +26,14 @@ STICKS = ("lx", "ly", "rx", "ry")
 HELD = 0.1  # [s] ours: how long a button is pressed
 _STEP = 0.1  # of a stick, a key
 # key -> stick and its change, buttons, or what is done with the hoist
-KEYS = {"w": ("ly", _STEP), "s": ("ly", -_STEP), "a": ("lx", -_STEP), "d": ("lx", _STEP), "q": ("rx", -_STEP), "e": ("rx", _STEP)}
+KEYS = {
+    "w": ("ly", _STEP),
+    "s": ("ly", -_STEP),
+    "a": ("lx", -_STEP),
+    "d": ("lx", _STEP),
+    "q": ("rx", -_STEP),
+    "e": ("rx", _STEP),
+}
 PRESSED = {"1": ("start",), "2": ("A",), "x": ("select",), "!": ("L2", "B")}
 KEYS_HELP = "keys: 1 start, 2 A (policy), x select (damping), ! L2+B (stop), w s a d q e sticks, space centres them, h hoist, r remote off"
 
@@ -63,7 +70,9 @@ def _entry(values: Any, where: str) -> Entry:
             raise ConfigError(f"{where}: {name} is {value!r}; a stick is a number from -1 to 1")
     if not isinstance(values.get("hoist", False), bool):
         raise ConfigError(f"{where}: hoist is {values['hoist']!r}; it is true or false")
-    return Entry(float(values["time"]), tuple(press) if isinstance(press, list) else (press,), sticks, values.get("hoist"))
+    return Entry(
+        float(values["time"]), tuple(press) if isinstance(press, list) else (press,), sticks, values.get("hoist")
+    )
 
 
 def _number(value: object) -> bool:

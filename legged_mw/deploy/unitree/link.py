@@ -37,7 +37,8 @@ _INTERFACE = "<General><Interfaces><NetworkInterface name='{name}' {multicast}/>
 # Loopback interfaces know no multicast, so the processes look for each other at 127.0.0.1, one port after the other.
 _LOCAL = "<Discovery><ParticipantIndex>auto</ParticipantIndex><MaxAutoParticipantIndex>30</MaxAutoParticipantIndex>"
 _LOCAL += "<Peers><Peer Address='127.0.0.1'/></Peers></Discovery>"
-_joined: dict[int, tuple[str, Any]] = {}  # domain -> interface, and what keeps it; a process may configure a domain only once
+# domain -> interface, and what keeps it; a process may configure a domain only once
+_joined: dict[int, tuple[str, Any]] = {}
 
 
 def default_domain(interface: str) -> int:
@@ -123,7 +124,9 @@ def _request(call: int) -> Any:
     """A call of one of the robot's services."""
     kinds = {name: TYPES["unitree_api", f"Request{name}_"] for name in ("", "Header", "Identity", "Lease", "Policy")}
     identity = kinds["Identity"](id=time.monotonic_ns(), api_id=call)
-    header = kinds["Header"](identity=identity, lease=kinds["Lease"](id=0), policy=kinds["Policy"](priority=0, noreply=False))
+    header = kinds["Header"](
+        identity=identity, lease=kinds["Lease"](id=0), policy=kinds["Policy"](priority=0, noreply=False)
+    )
     return kinds[""](header=header, parameter="{}", binary=[])
 
 
@@ -183,7 +186,8 @@ class Wire(Commander):
         self._answers = _reader(self._participant, MOTION[1], TYPES["unitree_api", "Response_"], depth=10)
         self._sport = _writer(self._participant, SPORT, TYPES["unitree_api", "Request_"])
         self.dropped = 0  # states of another size or encoding
-        self._robot, self._heard = 0, dict[int, float]()  # publisher of the robot's states; when each was heard last [s]
+        # publisher of the robot's states; when each was heard last [s]
+        self._robot, self._heard = 0, dict[int, float]()
 
     def receive(self) -> Received | None:
         """The newest state since the last call, with the moment of this call: ask often."""
@@ -246,7 +250,9 @@ class Wire(Commander):
         """Why no state came."""
         text = f"no robot: no {STATES} of {self.package} in {self._where} within {seconds:g} s"
         seen = BuiltinDataReader(self._participant, BuiltinTopicDcpsPublication)
-        kinds = sorted({s.type_name.partition("::")[0] for s in seen.take(100) if s and s.topic_name == STATES} - {self.package})
+        kinds = sorted(
+            {s.type_name.partition("::")[0] for s in seen.take(100) if s and s.topic_name == STATES} - {self.package}
+        )
         if kinds:
             there, here = "; ".join(known_motors(kind) for kind in kinds), known_motors(self.package)
             return f"{text}; the robot there speaks {', '.join(kinds)}: it is not the contract's. There: {there}. Here: {here}"
@@ -266,7 +272,9 @@ class Wire(Commander):
                 self._until(lambda: False, moment)
             self._ask(RELEASE_MODE)
             self._until(lambda: False, moment)
-        raise RobotError(f"the robot's own program '{name}' does not let go of the motors: end it with the remote (L2+A, then L2+R2)")
+        raise RobotError(
+            f"the robot's own program '{name}' does not let go of the motors: end it with the remote (L2+A, then L2+R2)"
+        )
 
     def _program(self) -> str:
         """The program that holds the motors; "" if none does."""
@@ -276,7 +284,9 @@ class Wire(Commander):
         except (ValueError, RecursionError):
             name = None
         if not isinstance(name, str):
-            raise RobotError(f"the robot's motion service answers {answer[:80]!r}, which does not say which program runs: {self._sent}")
+            raise RobotError(
+                f"the robot's motion service answers {answer[:80]!r}, which does not say which program runs: {self._sent}"
+            )
         return printable(name)
 
     def _ask(self, call: int, tries: int = 5) -> str:
@@ -289,7 +299,9 @@ class Wire(Commander):
             request = _request(call)
             asked.add(request.header.identity.id)
             self._requests.write(request)
-            if found := self._until(lambda: [a for a in _taken(self._answers, 10) if a.header.identity.id in asked], 1.0):
+            if found := self._until(
+                lambda: [a for a in _taken(self._answers, 10) if a.header.identity.id in asked], 1.0
+            ):
                 return found[0].data
         raise RobotError(f"the robot's motion service does not answer: {self._sent}; restart the robot")
 

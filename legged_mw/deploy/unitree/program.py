@@ -38,17 +38,25 @@ class Served:
 
     def text(self) -> str:
         record = self.record
-        lines = [f"{self.seconds:.1f} s simulated in {self.wall:.1f} s; {record.commands} commands taken, {record.refused} refused"]
+        lines = [
+            f"{self.seconds:.1f} s simulated in {self.wall:.1f} s; {record.commands} commands taken, {record.refused} refused"
+        ]
         for fault in self.faults:
             if (after := record.damped_after(fault.time)) is not None:
-                lines.append(f"{fault.text}: its motors damped {1000 * after:.0f} ms later, and nothing drove them again")
+                lines.append(
+                    f"{fault.text}: its motors damped {1000 * after:.0f} ms later, and nothing drove them again"
+                )
         if self.latencies:
             lines.append(f"from a state to the first command that answers it: {Spread.of(self.latencies)}")
         if record.watchdog:
             lines.append(f"the watchdog damped it {record.watchdog} times")
         tilt = math.degrees(math.acos(min(1.0, self.upright)))
         fell, (x, y, z) = self.upright < UPRIGHT, self.place
-        how = "it fell while its servos were on" if fell else f"with its servos on at most {tilt:.0f} degrees from upright"
+        how = (
+            "it fell while its servos were on"
+            if fell
+            else f"with its servos on at most {tilt:.0f} degrees from upright"
+        )
         if record.beyond:
             lines.append(f"a joint was {record.beyond:.3f} rad beyond its range at most")
         lines.append(f"{how}; at the end at {x:.1f}, {y:.1f} m, {z:.2f} m high")

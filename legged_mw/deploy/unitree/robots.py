@@ -61,7 +61,13 @@ GO2 = Machine(
 G1 = Machine(
     "g1",
     "unitree_hg",
-    _named([*_legs(("left", "right"), _G1_LEG), *_legs(("waist",), ("yaw", "roll", "pitch")), *_legs(("left", "right"), _G1_ARM)]),
+    _named(
+        [
+            *_legs(("left", "right"), _G1_LEG),
+            *_legs(("waist",), ("yaw", "roll", "pitch")),
+            *_legs(("left", "right"), _G1_ARM),
+        ]
+    ),
     cells=13,
 )
 H1 = Machine(
@@ -81,7 +87,10 @@ def machine_of(joints: Sequence[str]) -> Machine:
         if set(joints) == set(machine.motors):
             return machine
     nearest = max(MACHINES.values(), key=lambda m: (len(set(joints) & set(m.motors)), m.name))
-    only = [name for name in joints if name not in nearest.motors], [name for name in nearest.motors if name not in joints]
+    only = (
+        [name for name in joints if name not in nearest.motors],
+        [name for name in nearest.motors if name not in joints],
+    )
     raise RobotError(
         f"{CONTRACT_FILE} is of no robot that is known here ({', '.join(MACHINES)}); the nearest is {nearest.name}. "
         f"Only in the contract: {', '.join(only[0]) or 'none'}; only on {nearest.name}: {', '.join(only[1]) or 'none'}. "
@@ -96,7 +105,10 @@ def order(machine: Machine, joints: Sequence[str]) -> np.ndarray:
 
 def known_motors(package: str) -> str:
     """The robots that speak ``package``, and the joints of each."""
-    return "; ".join(f"{m.name} has {', '.join(m.motors)}" for m in MACHINES.values() if m.package == package) or f"{package} is not known"
+    return (
+        "; ".join(f"{m.name} has {', '.join(m.motors)}" for m in MACHINES.values() if m.package == package)
+        or f"{package} is not known"
+    )
 
 
 def check_slots(machine: Machine, answers: np.ndarray) -> None:
@@ -104,7 +116,9 @@ def check_slots(machine: Machine, answers: np.ndarray) -> None:
 
     Fewer motors are not noticed: not all simulators set all that a motor answers.
     """
-    if machine.package == "unitree_go" and (more := sorted({*np.flatnonzero(answers).tolist()} - {*machine.motors.values()})):
+    if machine.package == "unitree_go" and (
+        more := sorted({*np.flatnonzero(answers).tolist()} - {*machine.motors.values()})
+    ):
         raise RobotError(
             f"motors answer at {', '.join(map(str, more))}, where a {machine.name} has none: it is not the contract's robot. "
             f"Known are: {known_motors(machine.package)}"

@@ -28,7 +28,8 @@ from legged_mw.deploy.unitree.remote import encode
 from legged_mw.deploy.unitree.robots import Machine, machine_of, order
 
 STEP = 0.002  # [s]; robots send their state at 500 Hz
-POSITION_STOP, VELOCITY_STOP = 2.146e9, 16000.0  # in q and dq: no control of the position, of the velocity [unitree_sdk2]
+# in q and dq: no control of the position, of the velocity [unitree_sdk2]
+POSITION_STOP, VELOCITY_STOP = 2.146e9, 16000.0
 LOW_LEVEL = (0xFE, 0xEF, 0xFF)  # head and level_flag of unitree_go
 _MACHINE = {"g1": 5}  # mode_machine that a simulated one says
 _TOUCH = 60  # foot_force of a foot that touches the ground, in the robot's own unit; ours
@@ -36,7 +37,8 @@ _FULL = 4.1  # [V] of a full battery's cell
 _MOST = 1e10  # of any part, which NaN is not below; ours: above POSITION_STOP, and its square is a number
 _PARTS = ("q", "dq", "tau", "kp", "kd")  # of a motor's command
 _FAULT = 0x1  # motorstate of a motor with a fault
-_HOIST, _HOIST_DAMPING, _LOWERING = 12.0, 1.2, 1.0  # [weights/m], [weights s/m], [s] ours: a soft rope and how long it gives way
+# [weights/m], [weights s/m], [s] ours: a soft rope and how long it gives way
+_HOIST, _HOIST_DAMPING, _LOWERING = 12.0, 1.2, 1.0
 
 _HOOK = 0.2  # [m] ours: above the root, of a rope that it hangs from freely
 
@@ -49,9 +51,11 @@ class Record:
 
     commands: int = 0
     refused: int = 0  # commands of another size, with a wrong checksum, head or mode_machine, or that are not finite
-    why: dict[str, str] = field(default_factory=dict)  # what was wrong with the first command of each kind that was refused
+    # what was wrong with the first command of each kind that was refused
+    why: dict[str, str] = field(default_factory=dict)
     watchdog: int = 0  # times that it damped by itself
-    changes: deque[tuple[float, str]] = field(default_factory=lambda: deque([(0.0, LIMP)], maxlen=1000))  # [s], from when on they do what
+    # [s], from when on they do what
+    changes: deque[tuple[float, str]] = field(default_factory=lambda: deque([(0.0, LIMP)], maxlen=1000))
     beyond: float = 0.0  # [rad] by which a joint was outside its range at most
     fastest: float = 0.0  # [rad/s] of a joint at most
     outside: float = 0.0  # [rad] by which a target was outside its servo's range at most
@@ -92,15 +96,25 @@ class SimulatedUnitree:
         ``watchdog``: seconds without a command until it damps by itself.
         """
         self.machine: Machine = machine_of(contract.joints)
-        self.contract, self.end, self.faults, self.record, self._watchdog = contract, end, faults or Faults(), Record(), watchdog
+        self.contract, self.end, self.faults, self.record, self._watchdog = (
+            contract,
+            end,
+            faults or Faults(),
+            Record(),
+            watchdog,
+        )
         self._scene, self._lift = read_scene(folder, contract, whole=True), lift
         self.model, self._rng = self._scene.model, np.random.default_rng(seed)
         self._limits = limits_of(self.model, contract)
         self._make_motors()
         self.data, self.remote = mujoco.MjData(self.model), encode()
-        self._slots, self._state = order(self.machine, contract.joints), Message(LAYOUTS[self.machine.package, "LowState_"])
+        self._slots, self._state = (
+            order(self.machine, contract.joints),
+            Message(LAYOUTS[self.machine.package, "LowState_"]),
+        )
         self.reset()
-        self._hung = int(np.argmax(self.model.body_mass)) if lift else 1  # the body that the rope holds: of a G1 in the air its torso
+        # the body that the rope holds: of a G1 in the air its torso
+        self._hung = int(np.argmax(self.model.body_mass)) if lift else 1
         self._height, self._weight = float(self.data.xpos[self._hung, 2]), 9.81 * float(self.model.body_subtreemass[1])
         self.hoist = len(contract.feet) < 4 if hoist is None else hoist
         self._rope = 1.0 if self.hoist else 0.0  # share of the rope's force that is left
@@ -193,7 +207,11 @@ class SimulatedUnitree:
     def _take(self, command: Message) -> None:
         """Obey a command from now on, if it is one."""
         if self.machine.package == "unitree_go":
-            kind, said, wanted = "head and level_flag", (*map(int, command["head"]), int(command["level_flag"])), LOW_LEVEL
+            kind, said, wanted = (
+                "head and level_flag",
+                (*map(int, command["head"]), int(command["level_flag"])),
+                LOW_LEVEL,
+            )
         else:
             kind, said, wanted = "mode_machine", int(command["mode_machine"]), int(self._state["mode_machine"])
         wrong = [name for name in _PARTS if not (np.abs(command[f"motor_cmd.{name}"]) < _MOST).all()]
@@ -219,10 +237,14 @@ class SimulatedUnitree:
     def _obey(self, acted: dict[str, Floats]) -> None:
         """From now on."""
         self.acted, record, limits = acted, self.record, self._limits
-        torque = acted["tau"] + acted["kp"] * (acted["q"] - self.joint_pos) + acted["kd"] * (acted["dq"] - self.joint_vel)
+        torque = (
+            acted["tau"] + acted["kp"] * (acted["q"] - self.joint_pos) + acted["kd"] * (acted["dq"] - self.joint_vel)
+        )
         if (stiff := acted["kp"] > 0.0).any():
             record.asked = max(record.asked, float((np.abs(torque) / limits.motor).max()))
-            record.outside = max(record.outside, _outside(acted["q"][stiff], limits.lowest[stiff], limits.highest[stiff]))
+            record.outside = max(
+                record.outside, _outside(acted["q"][stiff], limits.lowest[stiff], limits.highest[stiff])
+            )
         record.drive(self.time, acted)
 
     def _plugs(self) -> tuple[Any, Any]:
@@ -239,7 +261,9 @@ class SimulatedUnitree:
             zero = np.zeros(len(acted["q"]))
             self._obey(acted := {**dict.fromkeys(_PARTS, zero), "kd": damped(self.contract)})
             self.record.watchdog += 1
-        law = np.stack([acted["tau"] + acted["kp"] * acted["q"] + acted["kd"] * acted["dq"], -acted["kp"], -acted["kd"]], axis=1)
+        law = np.stack(
+            [acted["tau"] + acted["kp"] * acted["q"] + acted["kd"] * acted["dq"], -acted["kp"], -acted["kd"]], axis=1
+        )
         law[[name in self.faults.dead_motors for name in self.contract.joints]] = 0.0
         self.model.actuator_biasprm[self._actuators, :3] = law
 
@@ -333,4 +357,8 @@ def _outside(values: Floats, low: Floats, high: Floats) -> float:
 def _roll_pitch_yaw(quaternion: Sequence[float] | Floats) -> list[float]:
     w, x, y, z = quaternion
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
-    return [math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)), pitch, math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))]
+    return [
+        math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        pitch,
+        math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    ]
