@@ -4,7 +4,7 @@ Sources: [M] mjlab: gains and action scales; [H] HoST, a G1 with 23 joints.
 """
 
 from configs.g1_flat import G1FlatCfg
-from legged_mw.envs.getup import Getup, GetupCfg, GetupCfgPPO
+from legged_mw.skills.getup import Getup, GetupCfg, GetupCfgPPO
 from legged_mw.utils.task import Task
 
 

@@ -4,7 +4,7 @@ Source [P]: MuJoCo Playground's Go1 footstand, which ends on the front legs' geo
 """
 
 from configs.go1_handstand import Go1HandstandCfg
-from legged_mw.envs.handstand import Handstand, HandstandCfgPPO
+from legged_mw.skills.handstand import Handstand, HandstandCfgPPO
 from legged_mw.utils.task import Task
 
 

@@ -4,7 +4,7 @@ Sources: [P] MuJoCo Playground's Go1 getup; the machine's figures are in go1.xml
 """
 
 from configs.go1_flat import Go1FlatCfg
-from legged_mw.envs.getup import Getup, GetupCfg, GetupCfgPPO
+from legged_mw.skills.getup import Getup, GetupCfg, GetupCfgPPO
 from legged_mw.utils.task import Task
 
 

@@ -4,7 +4,7 @@ Sources: [P] MuJoCo Playground's Go1 handstand; the machine's figures are in go1
 """
 
 from configs.go1_flat import Go1FlatCfg
-from legged_mw.envs.handstand import Handstand, HandstandCfg, HandstandCfgPPO
+from legged_mw.skills.handstand import Handstand, HandstandCfg, HandstandCfgPPO
 from legged_mw.utils.task import Task
 
 

@@ -2,7 +2,7 @@
 
 from configs.go1_footstand import Go1FootstandCfg
 from configs.go2_handstand import Go2HandstandCfg
-from legged_mw.envs.handstand import Handstand, HandstandCfgPPO
+from legged_mw.skills.handstand import Handstand, HandstandCfgPPO
 from legged_mw.utils.task import Task
 
 

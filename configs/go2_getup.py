@@ -1,7 +1,7 @@
 """Unitree Go2 gets up from any fall and stays standing; randomized worlds. The machine's figures are in go2.xml."""
 
 from configs.go2_flat import Go2FlatCfg
-from legged_mw.envs.getup import Getup, GetupCfg, GetupCfgPPO
+from legged_mw.skills.getup import Getup, GetupCfg, GetupCfgPPO
 from legged_mw.utils.task import Task
 
 

@@ -2,7 +2,7 @@
 
 from configs.go1_handstand import Go1HandstandCfg
 from configs.go2_flat import Go2FlatCfg
-from legged_mw.envs.handstand import Handstand, HandstandCfgPPO
+from legged_mw.skills.handstand import Handstand, HandstandCfgPPO
 from legged_mw.utils.task import Task
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from configs.g1_flat import G1FlatCfg
 from legged_mw import ROOT
-from legged_mw.utils.clip import (
+from legged_mw.skills.clip import (
     Clip,
     Floats,
     checked,

@@ -10,8 +10,8 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
-from legged_mw.rl.concurrent import ConcurrentModel
-from legged_mw.rl.estimator import EstimatingModel
+from legged_mw.rl.students.concurrent import ConcurrentModel
+from legged_mw.rl.students.estimator import EstimatingModel
 
 WORLDS, STEPS, ACTIONS = 32, 6, 4
 MODEL: type[MLPModel] = MLPModel

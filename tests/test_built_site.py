@@ -11,8 +11,8 @@ from mkdocs.commands.build import build
 from mkdocs.config import load_config
 
 from legged_mw import ROOT
-from legged_mw.envs.getup import Getup
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.skills.getup import Getup
 from website import gallery, pictures, reference
 from website.formula import formula
 

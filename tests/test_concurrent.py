@@ -23,11 +23,11 @@ from legged_mw.check.recordable import recordable
 from legged_mw.deploy.stage import DeployStage
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.rl.concurrent import ConcurrentModel, concurrent_settings, taught_worlds
 from legged_mw.rl.network import run_onnx
 from legged_mw.rl.policies import act, find_trained, load_policy
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner
+from legged_mw.rl.students.concurrent import ConcurrentModel, concurrent_settings, taught_worlds
 from legged_mw.rl.transfer import begin_with, load_teacher, seat_teacher
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask

@@ -12,7 +12,7 @@ from rsl_rl.algorithms import Distillation
 from rsl_rl.models import MLPModel, RNNModel
 
 from legged_mw.check.recordable import recordable
-from legged_mw.rl.distillation import GraphedDistillation
+from legged_mw.rl.students.distillation import GraphedDistillation
 
 VARIANTS: dict[str, dict[str, Any]] = {
     "steps in pairs": {"gradient_length": 2},

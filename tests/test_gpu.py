@@ -22,15 +22,15 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
 from legged_mw.envs.worlds import fuse_for, worlds_state
 from legged_mw.eval.training import TrainingExam
+from legged_mw.fast import contact_count, shortcuts
+from legged_mw.fast.fused import Fused
 from legged_mw.rl import layers
-from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.policies import Source, Trained
 from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.recurrent import memory_of
 from legged_mw.rl.runner import make_runner
+from legged_mw.rl.students.distillation import GraphedDistillation
+from legged_mw.rl.students.recurrent import memory_of
 from legged_mw.rl.transfer import seat_teacher
-from legged_mw.sim import contact_count, shortcuts
-from legged_mw.sim.fused import Fused
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils import quick_start
 from legged_mw.utils.task import load_task

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from legged_mw.check.recordable import recordable
 from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.recurrent import HiddenState, SequenceInput, step, unroll
+from legged_mw.rl.students.recurrent import HiddenState, SequenceInput, step, unroll
 from legged_mw.utils.config import ConfigError
 
 

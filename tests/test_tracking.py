@@ -13,14 +13,14 @@ from legged_mw.check.guard import check_recordable
 from legged_mw.deploy.exam import run_skill
 from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.envs.motion_reference import angle_between
-from legged_mw.envs.motion_tracking import MotionTracking
-from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
 from legged_mw.eval.perform import machine
 from legged_mw.eval.skill import PUSH_EVERY, Ground, Recording
 from legged_mw.eval.tracking import Tracking
 from legged_mw.rl.export import export
-from legged_mw.utils.clip import Clip, read_clip, save_clip
+from legged_mw.skills.clip import Clip, read_clip, save_clip
+from legged_mw.skills.motion_reference import angle_between
+from legged_mw.skills.motion_tracking import MotionTracking
+from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import quat_multiply, rotation_quat
 from legged_mw.utils.task import load_task

@@ -5,7 +5,7 @@ from __future__ import annotations
 from legged_mw.envs.domain_rand import active
 from legged_mw.envs.own_code import own_classes
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.estimator import find_targets
+from legged_mw.rl.students.estimator import find_targets
 from legged_mw.sim.room import count_room
 from legged_mw.utils.task import LoadedTask
 

@@ -15,7 +15,7 @@ from legged_mw.deploy.contract import SCENE_FILE, Contract, digest, part
 from legged_mw.deploy.motion import ATTITUDE, JOINT_POS, JOINT_VEL, MOTION_FILE, PLACE, POSITION, TURN
 from legged_mw.deploy.reader import ContractError, compile_scene
 from legged_mw.deploy.robot import Measurement
-from legged_mw.utils.clip import Clip, Floats, conjugate, heading, multiply, read_clip
+from legged_mw.skills.clip import Clip, Floats, conjugate, heading, multiply, read_clip
 
 
 class Follower:

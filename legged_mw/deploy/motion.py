@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from legged_mw.deploy.reader import Reader
 
-MOTION, MOTION_FILE = "motion", "motion.npz"  # the contract's section; the file, as legged_mw.utils.clip has it
+MOTION, MOTION_FILE = "motion", "motion.npz"  # the contract's section; the file, as legged_mw.skills.clip has it
 JOINT_POS, JOINT_VEL, PLACE, TURN = "reference_joint_pos", "reference_joint_vel", "anchor_pos", "anchor_ori"
 REFERENCE = (JOINT_POS, JOINT_VEL, PLACE, TURN)  # what the controller makes of it
 # in Measurement.others: of the root, (4,) w x y z, and (3,) [m], world frame

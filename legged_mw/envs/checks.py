@@ -12,9 +12,9 @@ from typing import Any
 
 from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, active
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
-from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
 from legged_mw.envs.own_code import own_classes, place_of
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
+from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
 from legged_mw.utils.bounds import Range
 from legged_mw.utils.commands import HEADING
 from legged_mw.utils.config import ConfigError, fit

@@ -329,7 +329,7 @@ class RobotTaskCfgPPO(Config):
             std_range: PositiveRange = [1e-6, 1e6]  # [R]
 
         class estimator:
-            """A network from what the actor reads to rows that it does not; the actor reads its estimate, too (rl/estimator.py)."""
+            """A network from what the actor reads to rows that it does not; the actor reads its estimate, too (students/estimator.py)."""
 
             # rows of the critic's groups: ["base_lin_vel", "foot_contact"]; empty: no estimator
             targets: list[str] = []
@@ -338,7 +338,7 @@ class RobotTaskCfgPPO(Config):
             learning_rate: Part = 1e-3  # fixed [HIMLoco]
 
         class concurrent:
-            """The actor reads its newest frame and a latent: a teacher's of ``groups``, or a student's of all frames (rl/concurrent.py)."""
+            """The actor reads its newest frame and a latent: a teacher's of ``groups``, or a student's of all frames (concurrent.py)."""
 
             # that the teacher's encoder reads: ["privileged_state"]; empty: no teacher [CTS, arXiv 2405.10830]
             groups: list[str] = []
@@ -382,9 +382,7 @@ class RobotTaskCfgPPO(Config):
             ""  # its run, checkpoint or export, or a task for its last or shipped policy (train.py --teacher)
         )
         init_std: Positive = 0.1  # of the student's noise while it learns; nothing changes it [Isaac Lab]
-        class_name: str = (
-            "legged_mw.rl.distillation:GraphedDistillation"  # or "Distillation": rsl-rl's own, same results, slower
-        )
+        class_name: str = "legged_mw.rl.students.distillation:GraphedDistillation"  # or "Distillation": rsl-rl's own, same results, slower
         num_learning_epochs: Few = 5  # [R 1; ours: docs/lab.md]
         gradient_length: Count = 4  # steps a gradient; it divides num_steps_per_env [ours: R 15 leaves 9 of 24 unused]
         learning_rate: Part = 1e-3  # [R]

@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.sim.fusion import fused
+from legged_mw.fast.fusion import fused
 from legged_mw.sim.graph import StepGraph
 from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
 from legged_mw.utils.config import Config

@@ -17,7 +17,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.eval import exam
 from legged_mw.eval.rollout import Policy
 from legged_mw.eval.rules import LEVELS
-from legged_mw.rl.recurrent import forget
+from legged_mw.rl.students.recurrent import forget
 from legged_mw.sim.terrain import KINDS, MEASURES, measure
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import LoadedTask

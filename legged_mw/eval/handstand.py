@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.eval.skill import Floats, Ground, Measure, Recording, Robot, Skill
-from legged_mw.utils.clip import rotate
+from legged_mw.skills.clip import rotate
 
 SEED, OFFSET = 30_000, 0.05  # of the starts; each joint is off by U(-OFFSET, OFFSET) [rad] [ours]
 WITHIN, HOLD = 3.0, 5.0  # [s] in which it must be up, and stay [ours]

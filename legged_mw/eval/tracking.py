@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.eval.skill import Floats, Ground, Measure, Recording, Robot, Skill
-from legged_mw.utils.clip import conjugate, from_rotation_vector, heading, multiply, rotate
+from legged_mw.skills.clip import conjugate, from_rotation_vector, heading, multiply, rotate
 
 JOINTS_OFF, HEADING_OFF, SPEED_OFF = 0.05, 0.1, 0.1  # [rad], [rad], [m/s] of a robot at the start, U(-off, off)
 # [BeyondMimic] of the anchor against its reference, beyond which a robot does not follow any more

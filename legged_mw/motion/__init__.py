@@ -1,1 +1,1 @@
-"""Reference motions: other programs' files in, checked, resampled, looked at. The format is in ``legged_mw.utils.clip``."""
+"""Reference motions: other programs' files in, checked, resampled, looked at. The format is in ``legged_mw.skills.clip``."""

@@ -11,9 +11,9 @@ from legged_mw.envs.loading import load_robot
 from legged_mw.motion.foreign import CSV_FPS, read_motion
 from legged_mw.motion.look import ClipStage, page
 from legged_mw.sim.model import RobotModel
+from legged_mw.skills.clip import Clip, ClipError, save_clip
 from legged_mw.utils.bounds import Positive
 from legged_mw.utils.cli import Parser, duration, number, one_line_errors
-from legged_mw.utils.clip import Clip, ClipError, save_clip
 from legged_mw.utils.errors import shown
 from legged_mw.utils.files import writable
 from legged_mw.utils.task import load_task

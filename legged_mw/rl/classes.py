@@ -15,9 +15,9 @@ from rsl_rl.modules import BetaDistribution, GaussianDistribution, Heteroscedast
 from rsl_rl.utils import resolve_class
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl import concurrent, estimator
-from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.ppo import GraphedPPO
+from legged_mw.rl.students import concurrent, estimator
+from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.utils.config import Config, ConfigError
 
 _NETWORKS = (MLPModel, CNNModel, RNNModel)

@@ -44,9 +44,7 @@ from legged_mw.envs.actuators import OWN as OWN_LAW
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.loading import motor_drive
-from legged_mw.envs.motion_tracking import MotionTracking
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.estimator import EstimatingModel, find_targets
 from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
 from legged_mw.rl.export_scene import Scene, among_steps, standalone
 from legged_mw.rl.network import (
@@ -62,12 +60,14 @@ from legged_mw.rl.network import (
     save_onnx,
 )
 from legged_mw.rl.policies import load_policy
-from legged_mw.rl.recurrent import states_of
 from legged_mw.rl.runs import CONFIG_FILE
+from legged_mw.rl.students.estimator import EstimatingModel, find_targets
+from legged_mw.rl.students.recurrent import states_of
 from legged_mw.sim.joints import CURVE
 from legged_mw.sim.model import ModelError
 from legged_mw.sim.terrain import LEVEL, make_terrain
-from legged_mw.utils.clip import save_clip
+from legged_mw.skills.clip import save_clip
+from legged_mw.skills.motion_tracking import MotionTracking
 from legged_mw.utils.config import save_yaml
 from legged_mw.utils.errors import shown
 from legged_mw.utils.files import STAGED, digest, find_file, finish_moving, flush, sweep

@@ -16,12 +16,12 @@ from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import Measurement
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.motion_tracking import MotionTracking
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.wording import say_overflow
 from legged_mw.rl.network import MEMORY_OUTPUT, run_onnx
 from legged_mw.rl.policies import act
-from legged_mw.rl.recurrent import forget, memory_of
+from legged_mw.rl.students.recurrent import forget, memory_of
+from legged_mw.skills.motion_tracking import MotionTracking
 from legged_mw.utils.errors import UserError
 
 STEPS = 32

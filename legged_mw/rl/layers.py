@@ -41,7 +41,7 @@ def kernels_for(x: Tensor) -> Any:
     """The module of kernels if ``x`` is where they are used, else None."""
     if x.device.type not in FUSED_ON:
         return None
-    from legged_mw.rl import kernels  # with warp, a second to import, and only for a GPU
+    from legged_mw.fast import kernels  # with warp, a second to import, and only for a GPU
 
     return kernels
 

@@ -16,8 +16,8 @@ import torch
 from rsl_rl.models import MLPModel, RNNModel
 from torch import Tensor, nn
 
-from legged_mw.rl.estimator import EstimatingModel
-from legged_mw.rl.recurrent import states_of, step
+from legged_mw.rl.students.estimator import EstimatingModel
+from legged_mw.rl.students.recurrent import states_of, step
 from legged_mw.utils.config import ConfigError
 
 INPUT, OUTPUT, MEMORY_INPUT, MEMORY_OUTPUT, ESTIMATE = "obs", "actions", "state_in", "state_out", "estimate"

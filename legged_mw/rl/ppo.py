@@ -24,12 +24,12 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from legged_mw.rl.adam import FlatAdam, make_recordable
-from legged_mw.rl.concurrent import ConcurrentModel
-from legged_mw.rl.estimator import EstimatingModel, RegressingModel, trained_parts
 from legged_mw.rl.layers import HalfWeights, elu_layers, kernels_for, run_mlp, sample, update_normalizer
 from legged_mw.rl.losses import own_std, policy_loss, value_loss
 from legged_mw.rl.recorded import Recorded, why_stock
-from legged_mw.rl.recurrent import HiddenStates, SequenceInput, check_recurrent, unroll
+from legged_mw.rl.students.concurrent import ConcurrentModel
+from legged_mw.rl.students.estimator import EstimatingModel, RegressingModel, trained_parts
+from legged_mw.rl.students.recurrent import HiddenStates, SequenceInput, check_recurrent, unroll
 from legged_mw.rl.undo import Undo
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.config import ConfigError

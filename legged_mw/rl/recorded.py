@@ -12,7 +12,7 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.rl.adam import make_recordable, plain_state
-from legged_mw.rl.recurrent import HiddenStates
+from legged_mw.rl.students.recurrent import HiddenStates
 
 
 class Recorded:

@@ -17,7 +17,7 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.worlds import everything, put_worlds, worlds_state
 from legged_mw.rl.checkpoint import damage
 from legged_mw.rl.ranks import Rank
-from legged_mw.rl.recurrent import HiddenStates
+from legged_mw.rl.students.recurrent import HiddenStates
 
 _MOST = 1e10  # what MuJoCo calls a state that has blown up: mjMAXVAL
 _FREE = ("rewards", "noise", "viewer", "exam", "termination")  # sections that may have changed: the worlds are the same

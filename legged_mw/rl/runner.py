@@ -22,7 +22,6 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.envs.wording import config_words
 from legged_mw.rl.checkpoint import check_resume
-from legged_mw.rl.estimator import RegressingModel
 from legged_mw.rl.health import Health
 from legged_mw.rl.keeping import Keeper, reason_of
 from legged_mw.rl.plan import Plan
@@ -34,6 +33,7 @@ from legged_mw.rl.report import Clock, Mark, Message, Report, console_rows, curv
 from legged_mw.rl.resume import random_state, set_random_state, take_worlds, worlds_content
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
 from legged_mw.rl.settings import rsl_rl_config
+from legged_mw.rl.students.estimator import RegressingModel
 from legged_mw.rl.threads import UpdateThreads
 from legged_mw.rl.transfer import TEACHER, adapt
 from legged_mw.rl.undo import Undo

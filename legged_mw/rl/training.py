@@ -24,7 +24,6 @@ from legged_mw.envs.checks import check_class, check_values
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.worlds import fuse_for
 from legged_mw.rl.classes import check_classes
-from legged_mw.rl.distillation import GraphedDistillation
 from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
 from legged_mw.rl.policies import Trained, find_trained
 from legged_mw.rl.ppo import MAX_RATE, GraphedPPO
@@ -32,6 +31,7 @@ from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stu
 from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
+from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.rl.transfer import TEACHER, begin_with, check_start, keep_teacher, load_teacher, seat_teacher
 from legged_mw.sim.device import device_facts
 from legged_mw.sim.engines import pick_engine

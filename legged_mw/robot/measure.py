@@ -22,11 +22,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from legged_mw.robot.vendor import tilt
 from legged_mw.sim.engines import make_simulation
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.pose import posed
 from legged_mw.sim.room import Room, count_room
-from legged_mw.sim.vendor import tilt
 
 FloatArray = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from xml.sax.saxutils import escape
 
 import mujoco
 
-from legged_mw.sim.meshes import path_of
-from legged_mw.sim.vendor import naming, read_robot
+from legged_mw.robot.meshes import path_of
+from legged_mw.robot.vendor import naming, read_robot
 from legged_mw.utils.mjcf import Source
 
 

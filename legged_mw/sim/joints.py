@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from legged_mw.robot.vendor import Loaded
 from legged_mw.sim.rigid import hold_joints, match_joints
 from legged_mw.sim.servos import Drive, Motor, Range, add_motors, set_efforts, set_joints
 from legged_mw.sim.tables import per_joint_all, some_joints
-from legged_mw.sim.vendor import Loaded
 
 _BEYOND = 1e-3  # [rad] that a pose may be beyond a range by rounding
 # tables of motors with a torque-speed curve, before a "`gear`": [N m], [rad/s]

@@ -16,6 +16,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from legged_mw.robot.vendor import Keyframe, Loaded, naming, read_robot
 from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND, Ground, add_ground, replace_level_pieces
 from legged_mw.sim.joints import Posed, pose_joints, set_machine
@@ -27,7 +28,6 @@ from legged_mw.sim.servos import Drive
 from legged_mw.sim.shapes import add_sites
 from legged_mw.sim.tables import per_joint as per_joint
 from legged_mw.sim.terrain import Terrain
-from legged_mw.sim.vendor import Keyframe, Loaded, naming, read_robot
 from legged_mw.utils.errors import unknown
 
 # option -> its values

@@ -33,7 +33,7 @@ from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.rl.runs import save_whole
-from legged_mw.utils.clip import read_clip
+from legged_mw.skills.clip import read_clip
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import UserError
 from legged_mw.utils.motor_network import NetworkMotors, read_network

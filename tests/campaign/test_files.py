@@ -31,8 +31,8 @@ from legged_mw.rl import runner as running
 from legged_mw.rl.checkpoint import sealed
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.runs import checkpoints, find_run, load_tensors, runs, save_whole
+from legged_mw.skills.clip import read_clip
 from legged_mw.utils import arrays
-from legged_mw.utils.clip import read_clip
 from legged_mw.utils.config import load_yaml, save_yaml
 from legged_mw.utils.files import digest
 from legged_mw.utils.motor_network import read_network

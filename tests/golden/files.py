@@ -19,8 +19,8 @@ from legged_mw.deploy.policy import Network
 from legged_mw.rl import network
 from legged_mw.rl.runner import Runner
 from legged_mw.rl.runs import find_checkpoint, find_run, load_tensors, new_run, save_whole
+from legged_mw.skills.clip import read_clip
 from legged_mw.utils import arrays, files
-from legged_mw.utils.clip import read_clip
 
 MORE: dict[str, Any] = {
     "networks without weights": set_at(ACTOR, {}),

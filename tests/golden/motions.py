@@ -14,7 +14,7 @@ from legged_mw.envs.loading import load_robot
 from legged_mw.motion.foreign import read_motion
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.pose import posed
-from legged_mw.utils.clip import Clip, read_clip, save_clip
+from legged_mw.skills.clip import Clip, read_clip, save_clip
 from legged_mw.utils.task import load_task
 
 WAVE = ROOT / "resources/motions/g1_wave.npz"

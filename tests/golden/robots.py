@@ -15,12 +15,12 @@ from test_symmetry import GO1, WAIST, load_robot, replaced
 from golden.table import Table
 from legged_mw.robot.draft import draft
 from legged_mw.sim.engines import make_simulation, pick_engine
-from legged_mw.sim.kinematics import Kinematics
 from legged_mw.sim.mirror import find_partners
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.rigid import match_joints
 from legged_mw.sim.shapes import spheres_on
 from legged_mw.sim.tables import per_joint
+from legged_mw.skills.kinematics import Kinematics
 
 CHOICES: dict[str, dict[str, Any]] = {  # of the Go1
     "gains of two keys": {"stiffness": {"joint": 35.0, "thigh": 2.0, "FR_hi": 20.0}},

@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from legged_mw.fast.trace import Call, Trace
 from legged_mw.utils.math import alike
-from legged_mw.utils.trace import Call, Trace
 
 _CLOSE, _STRAYS = 1e-3, 0.01  # of all that a step writes: rounding goes through physics, and may turn a comparison
 
@@ -42,7 +42,7 @@ def _fused(
     watched: Iterable[Tensor],
     put_back: Callable[[], None],
 ) -> Callable[[], None]:
-    from legged_mw.sim.fused import Fused  # it needs warp
+    from legged_mw.fast.fused import Fused  # it needs warp
 
     with (trace := _Recorder(memory, watched)):
         fn()

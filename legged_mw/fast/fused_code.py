@@ -13,8 +13,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from legged_mw.sim.fused_memory import TYPES, WORLD, Access, Code, Lines, Unfit, span_of, spread
-from legged_mw.utils.trace import Node
+from legged_mw.fast.fused_memory import TYPES, WORLD, Access, Code, Lines, Unfit, span_of, spread
+from legged_mw.fast.trace import Node
 
 SMALL = 64  # elements of a value that all worlds share: each thread computes it for itself
 

@@ -7,10 +7,10 @@ from typing import Annotated
 import torch
 from torch import Tensor
 
-from legged_mw.envs.pull import Pull
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.skill_config import SkillCfg
-from legged_mw.sim.settle import fallen
+from legged_mw.skills.pull import Pull
+from legged_mw.skills.settle import fallen
+from legged_mw.skills.skill_config import SkillCfg
 from legged_mw.utils.bounds import Count, Part, Share, Whole, above
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown

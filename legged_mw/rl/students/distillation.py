@@ -16,11 +16,11 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from legged_mw.rl.adam import make_recordable
-from legged_mw.rl.concurrent import ConcurrentModel
-from legged_mw.rl.estimator import EstimatingModel
 from legged_mw.rl.layers import run_mlp, sample, update_normalizer
 from legged_mw.rl.recorded import Recorded, why_stock
-from legged_mw.rl.recurrent import HiddenStates, step
+from legged_mw.rl.students.concurrent import ConcurrentModel
+from legged_mw.rl.students.estimator import EstimatingModel
+from legged_mw.rl.students.recurrent import HiddenStates, step
 from legged_mw.rl.undo import Undo
 from legged_mw.sim.graph import StepGraph
 

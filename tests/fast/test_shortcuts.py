@@ -12,7 +12,7 @@ import warp as wp
 from torch import Tensor
 from worlds import make_env
 
-from legged_mw.sim import contact_count, shortcuts
+from legged_mw.fast import contact_count, shortcuts
 from legged_mw.sim.warp_engine import WarpSimulation
 
 WORLDS = 6

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.skill_config import SkillCfg, SkillCfgPPO
+from legged_mw.skills.skill_config import SkillCfg, SkillCfgPPO
 from legged_mw.utils.bounds import Names, Positive, Sign
 from legged_mw.utils.config import ConfigError, fit
 from legged_mw.utils.errors import unknown

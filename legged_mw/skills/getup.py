@@ -8,9 +8,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from legged_mw.envs.falls import Falls, FallsCfg
 from legged_mw.envs.observations import Row
-from legged_mw.envs.skill_config import SkillCfgPPO
+from legged_mw.skills.falls import Falls, FallsCfg
+from legged_mw.skills.skill_config import SkillCfgPPO
 from legged_mw.utils.bounds import Seconds
 
 # cosine of the tilt (15 degrees), share of the standing height: it is up [ours: servos alone hold 0.92]

@@ -3,7 +3,7 @@
 The library launches each of its kernels through ``warp.launch`` or ``warp.launch_tiled``. While a substep runs or is recorded,
 these two pass over the kernels that are named here, and ``array.zero_`` over arrays that are zero anyway. So nothing of the
 library is edited or copied, and a kernel that is called otherwise one day is launched as before. ``KNOWN`` names the versions
-that were looked at; another's step runs whole. tests/test_shortcuts.py compares both.
+that were looked at; another's step runs whole. tests/fast/test_shortcuts.py compares both.
 
 What then holds what was there before: ``qacc_smooth`` and the factorized inertia, ``qfrc_constraint``, ``solver_niter``, the
 overflow bit ITERATIONS, states of constraint rows; in substeps without sensors also forces of constraint rows, places of sites,

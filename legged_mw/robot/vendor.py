@@ -16,11 +16,11 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
+from legged_mw.robot.meshes import compile_readable
+from legged_mw.robot.urdf import read_urdf
 from legged_mw.sim.errors import ModelError
-from legged_mw.sim.meshes import compile_readable
 from legged_mw.sim.names import give_way
 from legged_mw.sim.servos import Range, take_limits
-from legged_mw.sim.urdf import read_urdf
 from legged_mw.utils.mjcf import Source, check_model
 
 _SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)

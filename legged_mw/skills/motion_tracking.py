@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from legged_mw.envs.mirror import Block, body_blocks
-from legged_mw.envs.motion_reference import Reference, angle_between, load_clips
-from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.sim.kinematics import Bodies, Kinematics, product, rotate
+from legged_mw.skills.kinematics import Bodies, Kinematics, product, rotate
+from legged_mw.skills.motion_reference import Reference, angle_between, load_clips
+from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign, quat_multiply, rotation_quat
 

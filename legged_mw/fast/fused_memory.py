@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from legged_mw.utils.trace import View
+from legged_mw.fast.trace import View
 
 TYPES = {
     torch.float32: "float",

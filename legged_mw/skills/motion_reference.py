@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from legged_mw.envs.motion_tracking_config import MotionTrackingCfg
-from legged_mw.sim.kinematics import Bodies, Kinematics, product, rotate
-from legged_mw.utils.clip import Clip, read_clip
+from legged_mw.skills.clip import Clip, read_clip
+from legged_mw.skills.kinematics import Bodies, Kinematics, product, rotate
+from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
 from legged_mw.utils.files import find_file
 
 
