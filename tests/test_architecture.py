@@ -340,9 +340,9 @@ def test_functions_stay_readable(path: str) -> None:
 
 @pytest.mark.parametrize("task", ["go2_flat", "g1_flat", "g1_12dof_flat", "go2_rough", "go2_rough_scan", "g1_rough"])
 def test_a_robot_is_a_short_config(task: str) -> None:
-    """40 lines for its first task, 20 for a further one; go1_flat and go1_rough spell out each number."""
+    """50 lines for its first task, 20 for a further one; go1_flat and go1_rough spell out each number."""
     assert len((ROOT / f"configs/{task}.py").read_text().splitlines()) <= (
-        40 if task in ("go2_flat", "g1_flat") else 20
+        50 if task in ("go2_flat", "g1_flat") else 20
     )
 
 
