@@ -306,6 +306,7 @@ def test_play_says_what_it_changes(root: Path, first: Path, tmp_path: Path) -> N
         "commands.resampling_time": f"{commands['resampling_time']} -> 0.0",
         "env.episode_length_s": "0.4 -> 1000000.0",
         "env.num_envs": "16 -> 1",
+        "gait.random_start": "True -> False",
         "noise.level": f"{was['noise']['level']} -> 0.0",
         "perturbation.kick": "True -> False",
         "sim.ls_iterations": f"{was['sim']['ls_iterations']} -> 7",

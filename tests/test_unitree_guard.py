@@ -451,12 +451,10 @@ def test_a_guard_that_can_do_nothing_is_replaced(name: str, said: str, domain: i
         os.kill(pid := int(process.stdout.readline().split()[1]), getattr(signal, name))
         live(sim, lambda: sim.record.changes[-1][1] == DAMPED)
         if name == "SIGSTOP":
-            taken = sim.record.commands
             os.kill(pid, signal.SIGCONT)
-            live(sim, lambda: sim.record.commands > taken + 100)  # more than the policy's process sends
         live(sim, lambda: process.poll() is not None)
         errors = process.communicate()[1]
-    live(sim, lambda begun=sim.time: sim.time > begun + 0.2)
+    live(sim, lambda begun=sim.time: sim.time > begun + 2.0)  # longer than a guard that goes on sends
     assert sim.record.changes[-1][1] == DAMPED
     assert re.search(said, errors) and guard.INSTEAD in errors, errors
 
