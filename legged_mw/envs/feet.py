@@ -1,12 +1,20 @@
-"""Contacts with the ground, from what the simulator senses: of the feet, and those that are a fall or are penalised."""
+"""Feet and other parts on the ground: the contacts that the simulator senses, and the gait clock.
+
+The clock says where each foot is in its step, as a policy sees it and as rewards want it. Period and offsets are the config's.
+A world's phase runs from 0 to 1 in a period. Each foot's phase is that plus its offset. A foot stands in the first share of
+its phase (``gait.stance``) and swings in the rest. The clock rests at 0 while the robot is told to stand, and runs from 0 when
+it is told to move. ``legged_mw.deploy.gait`` keeps the same clock.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 
 import torch
 from torch import Tensor
 
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.sensors import CONTACT_FORCE
@@ -72,3 +80,61 @@ class FootContacts:
             torch.mm(self._counts, self._foot_of_geom, out=self.count)
         if self.forces is not None:
             torch.sum(self._geom_forces * self._against, dim=2, out=self.forces)
+
+
+class GaitClock:
+    """The clocks of N worlds with F feet; fixed tensors, written in place, as a recorded step needs them."""
+
+    def __init__(
+        self, cfg: type[LeggedRobotCfg.gait], feet: tuple[str, ...], num_envs: int, dt: float, device: str
+    ) -> None:
+        """``dt`` [s] is a control step. Raises ConfigError for offsets that are not one a foot."""
+        self.offsets = _offsets(cfg, feet)
+        self.stance, self._random_start = cfg.stance, cfg.random_start
+        self._share = dt / cfg.period  # of the period in a control step
+        self._shift = torch.tensor(self.offsets, device=device)  # (F,)
+        self.phase = torch.zeros(num_envs, device=device)  # (N,) share of the period, as last observed
+        self.running = torch.zeros(num_envs, dtype=torch.bool, device=device)  # (N,) as last observed: told to move
+        self.foot_phase = torch.zeros(num_envs, len(feet), device=device)  # (N, F) from 0 to 1
+        # sine of each foot's phase, then cosine; 0 at rest
+        self.row = torch.zeros(num_envs, 2 * len(feet), device=device)
+
+    def tick(self) -> None:
+        """A control step has passed: clocks that run go on."""
+        self.phase.add_(self.running, alpha=self._share).remainder_(1.0)
+
+    def restart(self, mask: Tensor) -> None:
+        """An episode begins where ``mask`` (N,) is true: anywhere in the period, so that each leg learns to lead."""
+        start = torch.rand_like(self.phase) if self._random_start else torch.zeros_like(self.phase)
+        self.phase.copy_(torch.where(mask, start, self.phase))
+        self.running.logical_or_(mask)  # whether it runs is for the command to say, in ``observe``
+
+    def observe(self, moving: Tensor) -> None:
+        """Fill ``row`` by the commands that are about to be seen; ``moving`` (N,) is where they say to move. Twice is as good as once."""
+        self.phase.masked_fill_(~moving, 0.0)
+        self.running.copy_(moving)
+        torch.add(self.phase[:, None], self._shift, out=self.foot_phase).remainder_(1.0)
+        angle = 2.0 * math.pi * self.foot_phase
+        self.row.copy_(torch.cat([torch.sin(angle), torch.cos(angle)], dim=1)).masked_fill_(~moving[:, None], 0.0)
+
+    def swing(self) -> Tensor:
+        """How far each foot is in its swing (N, F), from 0 to 1; 0 in stance and at rest."""
+        share = (self.foot_phase - self.stance).clamp(min=0.0) / (1.0 - self.stance)
+        return share.masked_fill(~self.running[:, None], 0.0)
+
+    def wants_contact(self) -> Tensor:
+        """Which feet should stand (N, F); all at rest."""
+        return (self.foot_phase < self.stance) | ~self.running[:, None]
+
+
+def _offsets(cfg: type[LeggedRobotCfg.gait], feet: tuple[str, ...]) -> list[float]:
+    """One a foot: the config's, or of two feet half a period apart."""
+    if cfg.offsets and len(cfg.offsets) == len(feet):
+        return list(cfg.offsets)
+    if not cfg.offsets and len(feet) == 2:
+        return [0.0, 0.5]
+    few = f"has {len(cfg.offsets)} numbers" if cfg.offsets else "is empty"
+    hint = ""
+    if len(feet) == 4:
+        hint = ", e.g. [0.0, 0.5, 0.5, 0.0]: a trot, where they are front right, front left, rear right, rear left"
+    raise ConfigError(f"gait.offsets {few}; write one share of the period a foot ({', '.join(feet)}){hint}")
