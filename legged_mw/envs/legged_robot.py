@@ -27,7 +27,7 @@ from legged_mw.sim.mirror import Partners, find_partners, opposites
 from legged_mw.sim.pose import upright
 from legged_mw.sim.sensors import CONTACT_FORCE
 from legged_mw.sim.terrain import PLATFORM, Terrain
-from legged_mw.utils.commands import VELOCITY, Command, command_table
+from legged_mw.utils.commands import VELOCITY, command_table
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign, maybe_any, quat_rotate, spread, wrap_to_pi, yaw_of
 
@@ -394,6 +394,13 @@ class LeggedRobot(RobotTask):
         ground = {"progress": 1, "asked": 1, "asked_speed": 1, "farthest": 1} if self.terrain else {}
         return {**super()._episode_columns(), "feet_air_time": feet, "swing_peak": feet, **ground}
 
+    feet_air_time: Tensor  # (N, F) since the last contact [s]
+    swing_peak: Tensor  # (N, F) highest foot position since the last contact [m]
+    progress: Tensor  # (N, 1) along the commands [m]; only on terrain, as the three below
+    asked: Tensor  # (N, 1) what the commands asked [m]
+    asked_speed: Tensor  # (N, 1) what the last one asked [m/s]
+    farthest: Tensor  # (N, 1) from the middle of the tile, along x or y [m]
+
     def _init_terrain(self) -> None:
         """Tiles and heights, where there is terrain, and the height scan's points (P,) each [m]."""
         cfg, terrain = self.cfg.terrain, self.terrain
@@ -410,7 +417,7 @@ class LeggedRobot(RobotTask):
 
     def _init_commands(self) -> None:
         cfg = self.cfg.commands
-        self.command_table: tuple[Command, ...] = command_table(self.cfg)
+        self.command_table = command_table(self.cfg)
         count, default = len(self.command_table), self._tensor([command.default for command in self.command_table])
         self.commands, self.command_timer = self._zeros(count), self._zeros(1)  # [unit of each]; [control steps]
         self.velocity_command = self.commands[:, :3]  # view: vx, vy [m/s], yaw rate [rad/s]
@@ -429,25 +436,7 @@ class LeggedRobot(RobotTask):
         if cfg.curriculum:
             self._set_command_ranges()
 
-    # columns of self._episode, (N, width)
-    feet_air_time: Tensor  # F, since the last contact [s]
-    swing_peak: Tensor  # F, highest foot position since the last contact [m]
-    progress: Tensor  # 1, along the commands [m]; only on terrain, as the three below
-    asked: Tensor  # 1, what the commands asked [m]
-    asked_speed: Tensor  # 1, what the last one asked [m/s]
-    farthest: Tensor  # 1, from the middle of the tile, along x or y [m]
-
     # ---- what reward terms need beside the state, where they are on ---------------------------------------------------
-
-    feet_contact_time: Tensor  # (N, F) since touch-down [s]; only with `single_stance` or `air_time_variance`
-    last_air_time: Tensor  # (N, F) of the last swing that ended [s]; only with `air_time_variance`
-    last_contact_time: Tensor  # (N, F) of the last stance that ended [s]; likewise
-    last_foot_vel_z: Tensor  # (N, F) of the step before [m/s]; only with `feet_impact_vel`
-    foot_bodies: Tensor  # (F,) index of each foot's body; only with `feet_orientation`
-    foot_up: Tensor  # (F, 3) the vertical in each foot's frame, in the default pose; likewise
-    neighbours: Tensor  # (2, pairs) feet to the left and to the right of each other; only with `feet_distance`
-
-    tracking_sigma: Tensor | float  # () [m^2/s^2, rad^2/s^2]; a number where it stays, which takes an operation less
 
     def anneal(self, done: float) -> None:
         """A training is ``done`` so far, from 0 to 1: ``tracking_sigma`` on its way to ``rewards.tracking_sigma_end``."""
@@ -459,16 +448,19 @@ class LeggedRobot(RobotTask):
     def _init_foot_rewards(self) -> None:
         """What terms need beside the state, where they are on."""
         sigma, changes = self.cfg.rewards.tracking_sigma, self.cfg.rewards.tracking_sigma_end > 0.0
-        self.tracking_sigma = torch.tensor(sigma, device=self.device) if changes else sigma
+        # () [m^2/s^2, rad^2/s^2]; a number where it stays, which takes an operation less
+        self.tracking_sigma: Tensor | float = torch.tensor(sigma, device=self.device) if changes else sigma
         on = self._active_scales()
         if not {"feet_orientation", "feet_distance"} & on.keys():
             return
         stands = upright(self.robot, self.default_dof_pos.tolist(), self.foot_names)
+        # (F, 3) the vertical in each foot's frame, in the default pose; (F,) index of each foot's body
         self.foot_up = torch.tensor(stands.up, dtype=torch.float, device=self.device)
         self.foot_bodies = torch.tensor(stands.bodies, dtype=torch.long, device=self.device)
         if "feet_distance" in on and self.num_feet > 1:
             other = [1, 0] if self.num_feet == 2 else self._partners().sites
             pairs = [(i, j) for i, j in enumerate(other) if stands.places[i, 1] > stands.places[j, 1]]
+            # (2, pairs) feet to the left and to the right of each other
             self.neighbours = torch.tensor(pairs, dtype=torch.long, device=self.device).view(-1, 2).T.contiguous()
 
     def _columns_for_rewards(self) -> dict[str, int]:
@@ -476,6 +468,11 @@ class LeggedRobot(RobotTask):
         wanted = {"single_stance": times[:1], "air_time_variance": times, "feet_impact_vel": ["last_foot_vel_z"]}
         names = [name for term in self._active_scales() for name in wanted.get(term, [])]
         return {**super()._columns_for_rewards(), **dict.fromkeys(names, len(self.foot_names))}
+
+    feet_contact_time: Tensor  # (N, F) since touch-down [s]; only with `single_stance` or `air_time_variance`
+    last_air_time: Tensor  # (N, F) of the last swing that ended [s]; only with `air_time_variance`
+    last_contact_time: Tensor  # (N, F) of the last stance that ended [s]; likewise
+    last_foot_vel_z: Tensor  # (N, F) of the step before [m/s]; only with `feet_impact_vel`
 
     def _sensed_on_demand(self) -> list[str]:
         row = [CONTACT_FORCE] if self.cfg.observations.contact_forces else []

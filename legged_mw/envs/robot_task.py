@@ -31,7 +31,6 @@ from legged_mw.envs.actuators import Actuators, TorqueLaw
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.domain_rand import DomainRand, world_fields
-from legged_mw.envs.feet import GroundContacts
 from legged_mw.envs.loading import load_robot, soft_limits, start_place
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
 from legged_mw.envs.observations import Observations, Row
@@ -64,6 +63,11 @@ class RobotTask(TorqueLaw, BaseTask):
 
     @in_config_words()
     def __init__(self, cfg: RobotTaskCfg, device: str, eager: bool = False) -> None:
+        """Each line needs those above it.
+
+        The robot is loaded on its ground, with the sensors that its terms read; draws need the simulation's fields; buffers are
+        views of the simulation; rows are buffers; each reward term is tried once, so all that it reads is there before.
+        """
         self.cfg = cfg
         check_values(cfg, law=self.motor_law)
         self.terrain = self._make_terrain()
@@ -152,10 +156,9 @@ class RobotTask(TorqueLaw, BaseTask):
         """(N,) each, by the field that it comes from."""
         tilt, low = math.cos(math.radians(self.cfg.termination.max_tilt)), self.cfg.termination.min_base_height
         rules = {"termination.max_tilt": self.projected_gravity[:, 2] > 1e-5 - tilt}  # at 180 degrees never
-        if len(self.contacts.terminating):
-            rules["asset.terminate_after_contacts_on"] = (
-                self.contact_count[:, self.contacts.terminating].amax(dim=1) > 0.0
-            )
+        if len(self.terminating_contacts):
+            touching = self.contact_count[:, self.terminating_contacts]
+            rules["asset.terminate_after_contacts_on"] = touching.amax(dim=1) > 0.0
         return {**rules, "termination.min_base_height": self.base_height < low} if low else rules
 
     def _timed_out(self) -> Tensor:
@@ -459,10 +462,38 @@ class RobotTask(TorqueLaw, BaseTask):
         self.root_body = self.robot.id("body", self.robot.root)
         # body frame [m]
         self.imu_pos = self._tensor(model.site_pos[self.robot.id("site", self.robot.imu)]).expand(n, 3)
-        self.contacts = GroundContacts(
-            self.robot, self.cfg.asset, self.contact_count, "collision" in self._active_scales()
-        )
+        self._init_contacts()
         self._init_robot_rewards()
+
+    def _init_contacts(self) -> None:
+        """What ``asset.terminate_after_contacts_on`` and ``asset.penalize_contacts_on`` mean: C sensed geoms, B penalised bodies."""
+        asset, robot = self.cfg.asset, self.robot
+        # columns of contact_count that are a fall
+        fall = self._contact_columns(asset.terminate_after_contacts_on, "terminate_after_contacts_on")
+        self.terminating_contacts = torch.tensor(fall, dtype=torch.long, device=self.device)
+        columns = self._contact_columns(asset.penalize_contacts_on, "penalize_contacts_on")
+        if "collision" in self._active_scales() and not columns:
+            raise ConfigError(
+                "rewards.scales.collision is on, but asset.penalize_contacts_on names nothing; name what should not touch"
+            )
+        geoms = {column: robot.id("geom", robot.contact_geoms[column]) for column in columns}
+        body = {column: int(robot.physics.geom_bodyid[geom]) for column, geom in geoms.items()}
+        bodies = sorted(set(body.values()))
+        table = torch.zeros(self.contact_count.shape[1], len(bodies))
+        for column in columns:
+            table[column, bodies.index(body[column])] = 1.0
+        self.penalized_contacts = table.to(self.device)  # (C, B) 1 where a geom is of a body
+
+    def _contact_columns(self, patterns: list[str], field: str) -> list[int]:
+        """Columns of contact_count. Raises ConfigError for a geom that never touches the ground."""
+        asset, robot = self.cfg.asset, self.robot
+        meant = robot.names.find(patterns, f"asset.{field}")
+        for name in meant:
+            if not robot.physics.geom_conaffinity[robot.id("geom", name)]:
+                raise ConfigError(
+                    f"asset.{field}: '{name}' never touches the ground; add it to asset.colliders: {asset.colliders}"
+                )
+        return [i for i, name in enumerate(robot.contact_geoms) if name in meant]
 
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
         return torch.zeros(self.num_envs, *shape, dtype=dtype, device=self.device)
@@ -471,6 +502,12 @@ class RobotTask(TorqueLaw, BaseTask):
         """What an episode remembers, as name -> width: attributes (N, width) that a reset clears."""
         sums = {"episode_sums": len(self._active_scales()), "episode_return": 1, "episode_steps": 1}
         return {"last_actions": self.num_actions, **sums, **self._columns_for_rewards()}
+
+    last_actions: Tensor  # (N, D)
+    last_last_actions: Tensor  # (N, D) a_(t-2); only with `action_smoothness`
+    episode_sums: Tensor  # (N, K) scale * term * dt summed over the episode
+    episode_return: Tensor  # (N, 1)
+    episode_steps: Tensor  # (N, 1) since the reset; episode_length_buf may start elsewhere
 
     def _init_ranges(self) -> None:
         """Config numbers as tensors: joints' tables and ranges of a reset."""
@@ -488,23 +525,7 @@ class RobotTask(TorqueLaw, BaseTask):
     def _tensor(self, values: object) -> Tensor:
         return torch.tensor(values, dtype=torch.float, device=self.device)
 
-    # declared for readers and type checkers; columns of self._episode, (N, width)
-    last_actions: Tensor  # D
-    episode_sums: Tensor  # K, scale * term * dt summed over the episode
-    episode_return: Tensor  # 1
-    episode_steps: Tensor  # 1, since the reset; episode_length_buf may start elsewhere
-
     # ---- what reward terms need beside the state, where they are on ---------------------------------------------------
-
-    _sensed: dict[str, Tensor]  # those of them that are
-
-    last_dof_vel: Tensor | None = None  # (N, D) of the step before [rad/s]; only with `dof_acc`
-    last_last_actions: Tensor  # (N, D) a_(t-2); only with `action_smoothness`
-    hips: Tensor  # indices of the joints that rewards.hip_joints means; only with `hip_pos`
-    mirror_pairs: Tensor  # (2, pairs) indices of the joints that rewards.mirror_joints means; only with `joint_mirror`
-    deviation_weights: Tensor  # (D,); only with `joint_deviation`
-    soft_effort: Tensor  # (2, D) lowest and highest torque [N m]; only with `torque_limits`
-    soft_speed: Tensor  # (D,) [rad/s]; only with `dof_vel_limits`
 
     def _active_scales(self) -> dict[str, float]:
         """Terms that are on, and their scales."""
@@ -560,11 +581,13 @@ class RobotTask(TorqueLaw, BaseTask):
                     f"asset.sense: {unknown('value or sensor', name, known, f'{type(self).__name__} and its file')}"
                 )
         spans = {name: robot.sensors.get(sensor) for name, sensor in self.ON_DEMAND.items()}
+        # values of ON_DEMAND that are sensed
         self._sensed = {name: self.sim.sensordata[:, span] for name, span in spans.items() if span}
+        self.last_dof_vel: Tensor | None = None  # (N, D) of the step before [rad/s]
         if "dof_acc" in on:
             self.last_dof_vel = torch.zeros_like(self.dof_vel)
         if "hip_pos" in on:
-            self.hips = self._joints_called(rewards.hip_joints, "hip_joints")
+            self.hips = self._joints_called(rewards.hip_joints, "hip_joints")  # indices
         if "joint_mirror" in on:
             pairs = [[self._joints_called([word], "mirror_joints") for word in pair] for pair in rewards.mirror_joints]
             for words, pair in zip(rewards.mirror_joints, pairs, strict=True):
@@ -572,20 +595,22 @@ class RobotTask(TorqueLaw, BaseTask):
                     raise ConfigError(
                         f"rewards.mirror_joints: {words} must be two names or patterns that mean as many joints"
                     )
+            # (2, pairs) indices of joints
             self.mirror_pairs = torch.cat([torch.stack(pair) for pair in pairs], dim=1) if pairs else torch.empty(0)
         if "joint_deviation" in on:
-            self.deviation_weights = self._row(robot.tables["rewards.deviation_weights"])
+            self.deviation_weights = self._row(robot.tables["rewards.deviation_weights"])  # (D,)
         if "torque_limits" in on:
             need(
                 bool(np.isfinite(robot.effort_range).any()),
                 "torque_limits",
                 "no joint has a force limit; write asset.effort",
             )
+            # (2, D) lowest and highest torque [N m]
             self.soft_effort = self._row(robot.effort_range.T * rewards.soft_torque_limit)
         if "dof_vel_limits" in on:
             needed = "no joint has a highest speed; write asset.joint_speed_limits"
             need(bool(np.isfinite(robot.speed_limits).any()), "dof_vel_limits", needed)
-            self.soft_speed = self._row(robot.speed_limits) * rewards.soft_dof_vel_limit
+            self.soft_speed = self._row(robot.speed_limits) * rewards.soft_dof_vel_limit  # (D,) [rad/s]
 
     def _row(self, values: object) -> Tensor:
         return torch.as_tensor(values, dtype=torch.float, device=self.device)
@@ -735,7 +760,7 @@ class RobotTask(TorqueLaw, BaseTask):
 
     def _reward_collision(self) -> Tensor:
         """How many bodies touch the ground that should not: ``asset.penalize_contacts_on``. [L]"""
-        return ((self.contact_count @ self.contacts.penalized) > 0.0).sum(dim=1).float()
+        return ((self.contact_count @ self.penalized_contacts) > 0.0).sum(dim=1).float()
 
     def _reward_self_collision(self) -> Tensor:
         """How many contacts the robot has with itself. [M; its G1 -1]"""
