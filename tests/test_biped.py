@@ -22,7 +22,7 @@ from legged_mw.check.guard import check_recordable
 from legged_mw.deploy.contract import ContractError, Gait, read_contract
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.robot import QUANTITIES, Measurement
-from legged_mw.envs.gait import GaitClock
+from legged_mw.envs.feet import GaitClock
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl import export as exporting
 from legged_mw.rl.export import ExportError, export

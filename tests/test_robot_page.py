@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from legged_mw import ROOT
-from legged_mw.envs.divergence import Divergence, Watch
+from legged_mw.envs.statistics import Divergence, Watch
 from legged_mw.robot import __main__ as program
 from legged_mw.robot import picture
 from legged_mw.robot.draft import Draft, as_env, draft, table

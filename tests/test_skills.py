@@ -194,7 +194,7 @@ def test_handstand_rewards_and_judge() -> None:
     seen.qpos[:, 0, 0] += np.linspace(0.0, 0.8, len(seen.qpos))  # 0.1 m/s
     found = skill.judge(here, seen)
     assert found["holds"] == 0.25 and found["up"] == 0.5 and found["drift"] == pytest.approx(0.5, abs=0.01)
-    ends = {env.robot.contact_geoms[i] for i in env.contacts.terminating.tolist()}
+    ends = {env.robot.contact_geoms[i] for i in env.terminating_contacts.tolist()}
     parts = ("hip_1", "hip_2", "thigh_1", "thigh_2", "thigh_3", "calf_1", "calf_2")
     assert ends == {"trunk_box", "trunk_left", "trunk_right"} | {
         f"{leg}_{part}" for leg in ("FR", "FL") for part in parts

@@ -8,7 +8,7 @@ import re
 import textwrap
 from collections.abc import Callable
 
-from legged_mw.envs.legged_rewards import PHASE_SIGMA
+from legged_mw.envs.legged_robot import PHASE_SIGMA
 
 SIGNS: dict[type, str] = {
     **{ast.Add: " + ", ast.Sub: " - ", ast.Mult: " · ", ast.Div: " / ", ast.MatMult: " @ "},

@@ -13,9 +13,10 @@ import tokenize
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
-from legged_mw import envs
+from legged_mw import envs, skills
 from legged_mw.deploy.contract import ROWS
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.utils.bounds import bounds_text
 from legged_mw.utils.config import Config, field_types, type_text
@@ -24,8 +25,8 @@ from website.formula import formula
 
 UNITS = {*["m", "rad", "s", "ms", "N", "kg", "W", "deg", "mm", "Hz", "pixel", "iterations"], "-", ""}
 TERMS: dict[str, str] = {  # a class with terms of its own -> heading; others come after these, by their names
-    "RobotRewards": "Of every task",
-    "LeggedRewards": "Of walking by command",
+    "RobotTask": "Of every task",
+    "LeggedRobot": "Of walking by command",
     "Getup": "Of getting up",
     "Handstand": "Of handstand and footstand",
     "MotionTracking": "Of following a motion",
@@ -105,9 +106,11 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def classes(headings: Mapping[str, str], wanted: Callable[[type], object]) -> list[tuple[str, Any]]:
-    """Heading and class of those in legged_mw/envs that are ``wanted``."""
+    """Heading and class of those in legged_mw/envs and legged_mw/skills that are ``wanted``."""
     modules = [
-        importlib.import_module(f"legged_mw.envs.{module.name}") for module in pkgutil.iter_modules(envs.__path__)
+        importlib.import_module(f"{package.__name__}.{module.name}")
+        for package in (envs, skills)
+        for module in pkgutil.iter_modules(package.__path__)
     ]
     found = {
         each.__name__: each for module in modules for each in vars(module).values() if _is_ours(each) and wanted(each)
@@ -117,7 +120,7 @@ def classes(headings: Mapping[str, str], wanted: Callable[[type], object]) -> li
 
 
 def _is_ours(each: object) -> bool:
-    return isinstance(each, type) and each.__module__.startswith("legged_mw.envs.")
+    return isinstance(each, type) and each.__module__.startswith(("legged_mw.envs.", "legged_mw.skills."))
 
 
 # ---- reward terms
@@ -154,7 +157,8 @@ def rewards() -> str:
 def default_scale(owner: type, name: str) -> str:
     """Of the config that stands with a class: a walking task's for terms that all tasks have."""
     named = {config.__name__: config for _, config in classes(CONFIGS, is_config)}
-    scales = named.get(f"{owner.__name__}Cfg", LeggedRobotCfg)().to_dict()["rewards"]["scales"]
+    config = LeggedRobotCfg if owner is RobotTask else named.get(f"{owner.__name__}Cfg", LeggedRobotCfg)
+    scales = config().to_dict()["rewards"]["scales"]
     return f"{scales[name]:g}" if scales.get(name) else "off"
 
 

@@ -26,7 +26,7 @@ from legged_mw.check.recordable import Births, Guard, recordable
 from legged_mw.envs.own_code import check_term, own_classes, place_of
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.envs.suspects import BOUND
+from legged_mw.envs.statistics import BOUND
 from legged_mw.envs.worlds import CONTAINERS, parts
 from legged_mw.utils.errors import NotRecordable, StepError, UserError, in_short, is_library, line_of, line_to_blame
 from legged_mw.utils.task import LoadedTask

@@ -26,7 +26,7 @@ HOOKS = (  # every step or reset needs what their parents do; hooks of commands 
     *("reset_envs", "_reset_robots", "_reset_task", "_update_curricula"),
 )
 WITHOUT = "# without super"  # a comment in the method: it is so on purpose
-# terms of robot_rewards.py and legged_rewards.py with a usual scale above 0, as all of a skill's own have; others cost
+# terms of RobotTask and LeggedRobot with a usual scale above 0, as all of a skill's own have; others cost
 PAYS = (
     *("alive", "pose", "tracking_lin_vel", "tracking_ang_vel", "feet_air_time", "feet_contact_without_cmd"),
     *("single_stance", "no_fly", "feet_phase", "contact_phase"),
@@ -180,7 +180,7 @@ def _unusual_signs(env_class: type, scales: Mapping[str, float]) -> Iterator[str
         method = getattr(env_class, f"_reward_{name}", None)
         if method is None or not method.__module__.startswith("legged_mw."):
             continue
-        pays = name in PAYS or method.__qualname__.partition(".")[0] not in ("RobotRewards", "LeggedRewards")
+        pays = name in PAYS or method.__qualname__.partition(".")[0] not in ("RobotTask", "LeggedRobot")
         if scale and pays != (scale > 0.0):
             usual = "above 0: it is what the robot should do" if pays else "below 0: it is what the robot should avoid"
             yield f"warning: rewards.scales.{name} is {scale:g}; its usual sign is {usual} (docs/tasks.md)"

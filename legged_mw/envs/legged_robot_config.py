@@ -81,7 +81,7 @@ class LeggedRobotCfg(RobotTaskCfg):
             heading: Range = [-3.14, 3.14]  # [rad], world; not seen by the policy, only for heading_command [L]
 
     class gait:
-        """A clock (legged_mw/envs/gait.py): where each foot is in its step, for the policy and the terms feet_phase, contact_phase."""
+        """A clock (legged_mw/envs/feet.py): where each foot is in its step, for the policy and the terms feet_phase, contact_phase."""
 
         period: Span = 0.0  # of a step of both legs [s]; 0: no clock [unitree_rl_gym: 0.8]
         # where each foot is when the clock is at 0, share of the period; empty: of two feet [0.0, 0.5]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from legged_mw.envs.delay import Delay
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.envs.suspects import Suspects
+from legged_mw.envs.statistics import Suspects
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 from legged_mw.utils.machine import require_memory

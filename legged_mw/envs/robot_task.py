@@ -2,18 +2,27 @@
 
 Everything under ``_step`` is recorded as one CUDA graph: fixed buffers, masks instead of index lists, no question to
 the host. Shapes: N environments, D joints, K reward terms. A reward is a method ``_reward_<name>``, switched on
-by a number of that name in ``cfg.rewards.scales``; it returns (N,) and only reads. The terms are in ``robot_rewards``.
-What the policy sees is a table of rows: ``robot_observations``.
+by a number of that name in ``cfg.rewards.scales``; it returns (N,) and only reads. The terms are at the end.
+What the policy sees is a table of rows, ``observation_rows``: the only place that states the layout.
 
 Freshness: ``qpos`` and ``qvel`` and all that is computed from them are current. What comes from sensors (contacts,
 places and velocities of sites, accelerometer, joint torque) is one simulation step old and zero in a world just reset.
+
+Sources of the terms: [P] MuJoCo Playground; [L] legged_gym; [U] unitree_rl_gym, which is legged_gym for Unitree's robots;
+[UL] unitree_rl_lab; [I] Isaac Lab; [M] mjlab; [HIM] HIMLoco.
 """
 
 from __future__ import annotations
 
+import inspect
 import math
-from functools import reduce
+from collections.abc import Iterator, Mapping
+from fnmatch import fnmatchcase
+from functools import cached_property, reduce
+from types import CodeType
+from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
@@ -21,21 +30,19 @@ from torch import Tensor
 from legged_mw.envs.actuators import Actuators, TorqueLaw
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.checks import check_values
-from legged_mw.envs.contacts import GroundContacts
-from legged_mw.envs.divergence import Divergence
 from legged_mw.envs.domain_rand import DomainRand, world_fields
 from legged_mw.envs.loading import load_robot, soft_limits, start_place
-from legged_mw.envs.observations import Observations
+from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
+from legged_mw.envs.observations import Observations, Row
 from legged_mw.envs.own_code import check_term, checked_rows
 from legged_mw.envs.perturbation import Perturbation
-from legged_mw.envs.robot_observations import RobotObservations
-from legged_mw.envs.robot_rewards import RobotRewards
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.envs.statistics import Statistics
-from legged_mw.envs.suspects import Suspects
+from legged_mw.envs.statistics import Divergence, Statistics, Suspects
 from legged_mw.envs.wording import in_config_words
 from legged_mw.sim.engines import make_simulation, pick_engine
+from legged_mw.sim.mirror import Partners, find_partners
 from legged_mw.sim.model import RobotModel
+from legged_mw.sim.sensors import ANGULAR_MOMENTUM, SELF_CONTACT
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
@@ -43,7 +50,7 @@ from legged_mw.utils.errors import unknown
 from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse, spread
 
 
-class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
+class RobotTask(TorqueLaw, BaseTask):
     """N robots in N worlds of their own, as one vectorized environment. A task is a subclass with its rewards and its rows."""
 
     cfg: RobotTaskCfg
@@ -51,8 +58,16 @@ class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
     command_table: tuple[Command, ...] = ()  # what a person can ask of the robot; nothing
     commands: Tensor  # (N, C), in the order of command_table; only where that is not empty
 
+    # what is sensed only where a term that is on reads it, or asset.sense names it -> its sensor
+    ON_DEMAND: ClassVar[Mapping[str, str]] = {"self_contacts": SELF_CONTACT, "angular_momentum": ANGULAR_MOMENTUM}
+
     @in_config_words()
     def __init__(self, cfg: RobotTaskCfg, device: str, eager: bool = False) -> None:
+        """Each line needs those above it.
+
+        The robot is loaded on its ground, with the sensors that its terms read; draws need the simulation's fields; buffers are
+        views of the simulation; rows are buffers; each reward term is tried once, so all that it reads is there before.
+        """
         self.cfg = cfg
         check_values(cfg, law=self.motor_law)
         self.terrain = self._make_terrain()
@@ -141,10 +156,9 @@ class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
         """(N,) each, by the field that it comes from."""
         tilt, low = math.cos(math.radians(self.cfg.termination.max_tilt)), self.cfg.termination.min_base_height
         rules = {"termination.max_tilt": self.projected_gravity[:, 2] > 1e-5 - tilt}  # at 180 degrees never
-        if len(self.contacts.terminating):
-            rules["asset.terminate_after_contacts_on"] = (
-                self.contact_count[:, self.contacts.terminating].amax(dim=1) > 0.0
-            )
+        if len(self.terminating_contacts):
+            touching = self.contact_count[:, self.terminating_contacts]
+            rules["asset.terminate_after_contacts_on"] = touching.amax(dim=1) > 0.0
         return {**rules, "termination.min_base_height": self.base_height < low} if low else rules
 
     def _timed_out(self) -> Tensor:
@@ -192,7 +206,6 @@ class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
     def anneal(self, done: float) -> None:
         """A training is ``done`` so far, from 0 to 1: kicks, and what the terms change with it."""
         self.perturbation.anneal(done)
-        super().anneal(done)
 
     def _reset_robots(self, mask: Tensor) -> None:
         """Root near its start with any heading and a small velocity, joints and servo targets at (or near) the default pose."""
@@ -249,6 +262,75 @@ class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
             lambda width: self.domain_rand.delay("observation_delay", width),
         )
         self.obs_buf = self.observations.buffers
+
+    def observation_rows(self) -> dict[str, list[Row | str]]:
+        """Rows of each group, in order; a name stands for a group above it. Asked once: values are buffers of the step."""
+        return {
+            "state": [*self._measured_rows()],
+            "privileged_state": ["state", *self._body_rows(), *self._disturbance_rows()],  # first the same noisy sample
+        }
+
+    def _measured_rows(self) -> list[Row]:
+        """What a robot measures or estimates of itself, with noise, and its last action."""
+        noise = self.cfg.noise.scales
+        return [
+            # at the IMU, body frame [m/s]
+            Row("base_lin_vel", self.base_lin_vel, noise.lin_vel, mirror="imu_velocity", measured=True),
+            # gyro, body frame [rad/s]
+            Row("base_ang_vel", self.base_ang_vel, noise.ang_vel, mirror="axial", measured=True),
+            # direction, body frame
+            Row("projected_gravity", self.projected_gravity, noise.gravity, mirror="polar", measured=True),
+            # minus the default pose [rad]
+            Row("dof_pos", self.joint_reading, noise.dof_pos, mirror="joint", measured=True),
+            Row("dof_vel", self.dof_vel, noise.dof_vel, mirror="joint", measured=True),  # [rad/s]
+            Row("last_actions", self.last_actions, mirror="joint"),  # a_t, clipped
+        ]
+
+    def _body_rows(self) -> list[Row]:
+        """The same without noise, and more, as only a simulator knows it."""
+        return [
+            Row("base_ang_vel", self.base_ang_vel, mirror="axial"),
+            Row("accelerometer", self.accelerometer, mirror="polar"),  # proper acceleration at the IMU [m/s^2]
+            Row("projected_gravity", self.projected_gravity, mirror="polar"),
+            Row("base_lin_vel", self.base_lin_vel, mirror="imu_velocity"),
+            # [rad/s]; the world mirrors about its own x-z plane
+            Row("base_ang_vel_world", self.base_ang_vel_world, mirror="axial"),
+            Row("dof_pos", self.dof_offset, mirror="joint"),
+            Row("dof_vel", self.dof_vel, mirror="joint"),
+            Row("torques", self.torques, mirror="joint"),  # [N m]
+        ]
+
+    def _disturbance_rows(self) -> list[Row]:
+        """Kicks, and with ``domain_rand.observe`` what was drawn, in the config's units."""
+        rand = self.domain_rand
+        drawn = [
+            Row(name, value, mirror=rand.mirrors[name])
+            for name, value in rand.values.items()
+            if self.cfg.domain_rand.observe
+        ]
+        return [
+            Row("kick_force", self.perturbation.kick_force, mirror="polar"),  # on the root, world frame [N]
+            Row("kick_active", self.perturbation.kick_active[:, None], mirror="scalar"),  # 0 or 1
+            *drawn,
+        ]
+
+    @cached_property
+    def mirror(self) -> Mirror:
+        """Observations and actions left for right, from the table; made when first asked for, and not for the step."""
+        return make_mirror(self.observations.groups, self._mirror_blocks(), self._mirror_reach(), self.device)
+
+    def _mirror_blocks(self) -> dict[str, Block]:
+        """Kinds of mirror image that rows may have, by name."""
+        partners = self._partners()
+        check_pose(self.robot.joint_names, self.default_dof_pos.tolist(), partners)
+        return robot_blocks(partners)
+
+    def _partners(self) -> Partners:
+        return find_partners(self.robot)
+
+    def _mirror_reach(self) -> float:
+        """[m] from the mirrored IMU to the IMU."""
+        return 2.0 * float(self.imu_pos[0, 1])
 
     # ---- reward -------------------------------------------------------------------------------------------------------
 
@@ -380,10 +462,38 @@ class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
         self.root_body = self.robot.id("body", self.robot.root)
         # body frame [m]
         self.imu_pos = self._tensor(model.site_pos[self.robot.id("site", self.robot.imu)]).expand(n, 3)
-        self.contacts = GroundContacts(
-            self.robot, self.cfg.asset, self.contact_count, "collision" in self._active_scales()
-        )
+        self._init_contacts()
         self._init_robot_rewards()
+
+    def _init_contacts(self) -> None:
+        """What ``asset.terminate_after_contacts_on`` and ``asset.penalize_contacts_on`` mean: C sensed geoms, B penalised bodies."""
+        asset, robot = self.cfg.asset, self.robot
+        # columns of contact_count that are a fall
+        fall = self._contact_columns(asset.terminate_after_contacts_on, "terminate_after_contacts_on")
+        self.terminating_contacts = torch.tensor(fall, dtype=torch.long, device=self.device)
+        columns = self._contact_columns(asset.penalize_contacts_on, "penalize_contacts_on")
+        if "collision" in self._active_scales() and not columns:
+            raise ConfigError(
+                "rewards.scales.collision is on, but asset.penalize_contacts_on names nothing; name what should not touch"
+            )
+        geoms = {column: robot.id("geom", robot.contact_geoms[column]) for column in columns}
+        body = {column: int(robot.physics.geom_bodyid[geom]) for column, geom in geoms.items()}
+        bodies = sorted(set(body.values()))
+        table = torch.zeros(self.contact_count.shape[1], len(bodies))
+        for column in columns:
+            table[column, bodies.index(body[column])] = 1.0
+        self.penalized_contacts = table.to(self.device)  # (C, B) 1 where a geom is of a body
+
+    def _contact_columns(self, patterns: list[str], field: str) -> list[int]:
+        """Columns of contact_count. Raises ConfigError for a geom that never touches the ground."""
+        asset, robot = self.cfg.asset, self.robot
+        meant = robot.names.find(patterns, f"asset.{field}")
+        for name in meant:
+            if not robot.physics.geom_conaffinity[robot.id("geom", name)]:
+                raise ConfigError(
+                    f"asset.{field}: '{name}' never touches the ground; add it to asset.colliders: {asset.colliders}"
+                )
+        return [i for i, name in enumerate(robot.contact_geoms) if name in meant]
 
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
         return torch.zeros(self.num_envs, *shape, dtype=dtype, device=self.device)
@@ -392,6 +502,12 @@ class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
         """What an episode remembers, as name -> width: attributes (N, width) that a reset clears."""
         sums = {"episode_sums": len(self._active_scales()), "episode_return": 1, "episode_steps": 1}
         return {"last_actions": self.num_actions, **sums, **self._columns_for_rewards()}
+
+    last_actions: Tensor  # (N, D)
+    last_last_actions: Tensor  # (N, D) a_(t-2); only with `action_smoothness`
+    episode_sums: Tensor  # (N, K) scale * term * dt summed over the episode
+    episode_return: Tensor  # (N, 1)
+    episode_steps: Tensor  # (N, 1) since the reset; episode_length_buf may start elsewhere
 
     def _init_ranges(self) -> None:
         """Config numbers as tensors: joints' tables and ranges of a reset."""
@@ -409,8 +525,264 @@ class RobotTask(TorqueLaw, RobotObservations, RobotRewards, BaseTask):
     def _tensor(self, values: object) -> Tensor:
         return torch.tensor(values, dtype=torch.float, device=self.device)
 
-    # declared for readers and type checkers; columns of self._episode, (N, width)
-    last_actions: Tensor  # D
-    episode_sums: Tensor  # K, scale * term * dt summed over the episode
-    episode_return: Tensor  # 1
-    episode_steps: Tensor  # 1, since the reset; episode_length_buf may start elsewhere
+    # ---- what reward terms need beside the state, where they are on ---------------------------------------------------
+
+    def _active_scales(self) -> dict[str, float]:
+        """Terms that are on, and their scales."""
+        return {name: float(scale) for name, scale in self.cfg.to_dict()["rewards"]["scales"].items() if scale}
+
+    def _sensed_on_demand(self) -> list[str]:
+        """Sensors of ``ON_DEMAND`` whose values a term that is on reads, and all that ``asset.sense`` names, of the file too."""
+        asked, read = self.cfg.asset.sense, self._names_in_terms()
+        values = [sensor for name, sensor in self.ON_DEMAND.items() if name in read or name in asked]
+        return [*values, *(name for name in asked if name not in self.ON_DEMAND)]
+
+    def _names_in_terms(self) -> set[str]:
+        """Names that the terms that are on read, and the methods that they name, also those of a parent, which ``super()`` calls."""
+        found, ahead = set[str](), [f"_reward_{name}" for name in self._active_scales()]
+        while ahead:
+            if (name := ahead.pop()) not in found:
+                found.add(name)
+                ahead += [word for kind in type(self).__mro__ for word in _names_in(vars(kind).get(name))]
+        return found
+
+    def _sensed_value(self, name: str) -> Tensor:
+        if name not in self._sensed:
+            raise ConfigError(
+                f"{name} is not sensed, for no reward term that is on names it; write asset.sense = ['{name}'] in the config"
+            )
+        return self._sensed[name]
+
+    def sensor(self, name: str) -> Tensor:
+        """(N, size) What the sensor called so in the robot's file measured in the last substep: a view, whose place is fixed."""
+        if name in self.robot.file_sensors and not self.robot.spec.sensor(name):
+            raise ConfigError(
+                f"sensor '{name}' of the robot's file was dropped; write asset.sense = ['{name}'] in the config"
+            )
+        return self.sim.sensordata[:, self.robot.columns(name)]
+
+    @property
+    def self_contacts(self) -> Tensor:
+        """(N, 1) How many contacts the robot has with itself."""
+        return self._sensed_value("self_contacts")
+
+    @property
+    def angular_momentum(self) -> Tensor:
+        """(N, 3) Of the whole robot about its centre of mass, world frame [kg m^2/s]."""
+        return self._sensed_value("angular_momentum")
+
+    def _init_robot_rewards(self) -> None:
+        """What terms need beside the state, where they are on."""
+        on, rewards, robot = self._active_scales(), self.cfg.rewards, self.robot
+        known = [*self.ON_DEMAND, *robot.file_sensors]
+        for name in self.cfg.asset.sense:
+            if name not in known:
+                raise ConfigError(
+                    f"asset.sense: {unknown('value or sensor', name, known, f'{type(self).__name__} and its file')}"
+                )
+        spans = {name: robot.sensors.get(sensor) for name, sensor in self.ON_DEMAND.items()}
+        # values of ON_DEMAND that are sensed
+        self._sensed = {name: self.sim.sensordata[:, span] for name, span in spans.items() if span}
+        self.last_dof_vel: Tensor | None = None  # (N, D) of the step before [rad/s]
+        if "dof_acc" in on:
+            self.last_dof_vel = torch.zeros_like(self.dof_vel)
+        if "hip_pos" in on:
+            self.hips = self._joints_called(rewards.hip_joints, "hip_joints")  # indices
+        if "joint_mirror" in on:
+            pairs = [[self._joints_called([word], "mirror_joints") for word in pair] for pair in rewards.mirror_joints]
+            for words, pair in zip(rewards.mirror_joints, pairs, strict=True):
+                if [len(joints) for joints in pair] != [len(pair[0])] * 2:
+                    raise ConfigError(
+                        f"rewards.mirror_joints: {words} must be two names or patterns that mean as many joints"
+                    )
+            # (2, pairs) indices of joints
+            self.mirror_pairs = torch.cat([torch.stack(pair) for pair in pairs], dim=1) if pairs else torch.empty(0)
+        if "joint_deviation" in on:
+            self.deviation_weights = self._row(robot.tables["rewards.deviation_weights"])  # (D,)
+        if "torque_limits" in on:
+            need(
+                bool(np.isfinite(robot.effort_range).any()),
+                "torque_limits",
+                "no joint has a force limit; write asset.effort",
+            )
+            # (2, D) lowest and highest torque [N m]
+            self.soft_effort = self._row(robot.effort_range.T * rewards.soft_torque_limit)
+        if "dof_vel_limits" in on:
+            needed = "no joint has a highest speed; write asset.joint_speed_limits"
+            need(bool(np.isfinite(robot.speed_limits).any()), "dof_vel_limits", needed)
+            self.soft_speed = self._row(robot.speed_limits) * rewards.soft_dof_vel_limit  # (D,) [rad/s]
+
+    def _row(self, values: object) -> Tensor:
+        return torch.as_tensor(values, dtype=torch.float, device=self.device)
+
+    def _columns_for_rewards(self) -> dict[str, int]:
+        """What an episode remembers for terms that are on: name -> width."""
+        return (
+            {"last_last_actions": len(self.robot.joint_names)} if "action_smoothness" in self._active_scales() else {}
+        )
+
+    def _joints_called(self, wanted: list[str], field: str) -> Tensor:
+        """Indices of the joints whose name fits one of ``wanted``, patterns or parts of names. Held joints are left out."""
+        names, held = self.robot.joint_names, self.robot.held
+        fits = {word: [name for name in (*names, *held) if fnmatchcase(name, word) or word in name] for word in wanted}
+        for word, found in fits.items():
+            if not found:
+                raise ConfigError(f"rewards.{field}: {unknown('joint', word, names, 'the robot')}")
+            if {*found} <= {*held}:
+                self.robot.overrides.append(f"rewards.{field}: '{word}' left out, as {', '.join(found)} are held")
+        indices = [i for i, name in enumerate(names) if any(name in found for found in fits.values())]
+        return torch.tensor(indices, dtype=torch.long, device=self.device)
+
+    def _remember_for_rewards(self) -> None:
+        """The end of a step: what the next one compares with. ``last_actions`` are still those of the step before."""
+        if "last_last_actions" in vars(self):
+            self.last_last_actions.copy_(self.last_actions)
+        if self.last_dof_vel is not None:
+            self.last_dof_vel.copy_(self.dof_vel)
+
+    def _forget_for_rewards(self, mask: Tensor) -> None:
+        """A new episode begins where ``mask`` (N,) is true: its first step compares with its start."""
+        if self.last_dof_vel is not None:
+            assign(self.last_dof_vel, mask, self.dof_vel)
+
+    # ---- the base
+
+    def _reward_alive(self) -> Tensor:
+        """1 in every step. [U 0.15, P]"""
+        return torch.ones_like(self.rew_buf)
+
+    def _reward_lin_vel_z(self) -> Tensor:
+        """Square of the vertical velocity at the IMU, world frame [m^2/s^2] (gravity points down: the same square). [P]"""
+        return (self.base_lin_vel * self.projected_gravity).sum(dim=1).square()
+
+    def _reward_ang_vel_xy(self) -> Tensor:
+        """Squared roll and pitch rates, world frame [rad^2/s^2]. [P]"""
+        return self.base_ang_vel_world[:, :2].square().sum(dim=1)
+
+    def _reward_orientation(self) -> Tensor:
+        """Tilt: gravity's share in the body's plane, equal to the xy share of the body's z axis in the world. [L, P]"""
+        return self.projected_gravity[:, :2].square().sum(dim=1)
+
+    def _reward_base_height(self) -> Tensor:
+        """Squared distance of the root's height above the ground under it from ``rewards.base_height_target`` [m^2]. [L; U -10]"""
+        target = self.cfg.rewards.base_height_target
+        need(
+            target > 0.0,
+            "base_height",
+            "rewards.base_height_target is 0; write the wanted height of the root above the ground [m]",
+        )
+        return (self.base_height - target).square()
+
+    def _reward_angular_momentum(self) -> Tensor:
+        """Squared angular momentum of the whole robot about its centre of mass [kg^2 m^4/s^2]. [M; its G1 -0.02]"""
+        return self.angular_momentum.square().sum(dim=1)
+
+    def _reward_termination(self) -> Tensor:
+        """A fall. [L, P]"""
+        return self.fell.float()
+
+    # ---- the joints
+
+    def _reward_dof_pos_limits(self) -> Tensor:
+        """What joints exceed the soft limits by [rad]. [L]"""
+        return (self.dof_pos - self.dof_pos.clamp(self.soft_lower, self.soft_upper)).abs().sum(dim=1)
+
+    def _reward_pose(self) -> Tensor:
+        """Staying near the default pose, each joint with its weight. [P]"""
+        return torch.exp(-(self.dof_offset.square() * self.pose_weights).sum(dim=1))
+
+    def _reward_hip_pos(self) -> Tensor:
+        """Squared distance of the joints that ``rewards.hip_joints`` means from the default pose [rad^2]. [U -1]"""
+        need(
+            bool(self.cfg.rewards.hip_joints),
+            "hip_pos",
+            "rewards.hip_joints is empty; write names of joints, parts of them or patterns",
+        )
+        return self.dof_offset.index_select(1, self.hips).square().sum(dim=1)
+
+    def _reward_joint_deviation(self) -> Tensor:
+        """Distance of the joints from the default pose [rad], each times its ``rewards.deviation_weights``. [I; its G1 -0.1 for hips]"""
+        return (self.dof_offset.abs() * self.deviation_weights).sum(dim=1)
+
+    def _reward_joint_mirror(self) -> Tensor:
+        """Squared difference of the angles of two legs' joints, mean over the pairs of ``rewards.mirror_joints`` [rad^2]. [UL]"""
+        pairs = self.cfg.rewards.mirror_joints
+        need(
+            bool(pairs),
+            "joint_mirror",
+            "rewards.mirror_joints is empty; write pairs of names or patterns, [['FR_*', 'RL_*'], ...]",
+        )
+        first, second = self.mirror_pairs
+        return (self.dof_pos.index_select(1, first) - self.dof_pos.index_select(1, second)).square().sum(dim=1) / len(
+            pairs
+        )
+
+    def _reward_dof_vel(self) -> Tensor:
+        """Squared joint velocities [rad^2/s^2]. [L; U -1e-3]"""
+        return self.dof_vel.square().sum(dim=1)
+
+    def _reward_dof_acc(self) -> Tensor:
+        """Squared joint accelerations: what the velocity changed by in a control step [rad^2/s^4]. [L, U -2.5e-7]"""
+        assert self.last_dof_vel is not None
+        return ((self.dof_vel - self.last_dof_vel) / self.dt).square().sum(dim=1)
+
+    def _reward_dof_vel_limits(self) -> Tensor:
+        """What joints exceed ``rewards.soft_dof_vel_limit`` of their highest speed by, at most 1 each [rad/s]. [L]"""
+        return (self.dof_vel.abs() - self.soft_speed).clamp(0.0, 1.0).sum(dim=1)
+
+    def _reward_fast_joints(self) -> Tensor:
+        """What joints are faster than a turn a second, squared [rad^2/s^2]. [P]"""
+        return (self.dof_vel.abs() - 2.0 * torch.pi).clamp(min=0.0).square().sum(dim=1)
+
+    def _reward_torque_limits(self) -> Tensor:
+        """What torques exceed ``rewards.soft_torque_limit`` of the servo's limit by [N m]. [L]"""
+        return (self.torques - self.torques.clamp(*self.soft_effort)).abs().sum(dim=1)
+
+    def _reward_torques(self) -> Tensor:
+        """2-norm plus 1-norm of the joint torques [N m] [P]; or the sum of their squares: ``rewards.torques_as`` [L]."""
+        if self.cfg.rewards.torques_as == "squares":
+            return self.torques.square().sum(dim=1)
+        return self.torques.square().sum(dim=1).sqrt() + self.torques.abs().sum(dim=1)
+
+    def _reward_action_rate(self) -> Tensor:
+        """Change of the clipped action, squared. [L]"""
+        return (self.actions - self.last_actions).square().sum(dim=1)
+
+    def _reward_action_smoothness(self) -> Tensor:
+        """Change of the change of the clipped action, squared. [HIM -0.01]"""
+        return (self.actions - 2.0 * self.last_actions + self.last_last_actions).square().sum(dim=1)
+
+    def _reward_energy(self) -> Tensor:
+        """Sum of |joint velocity * torque| [W]. [P]"""
+        return (self.dof_vel * self.torques).abs().sum(dim=1)
+
+    # ---- contacts
+
+    def _reward_collision(self) -> Tensor:
+        """How many bodies touch the ground that should not: ``asset.penalize_contacts_on``. [L]"""
+        return ((self.contact_count @ self.penalized_contacts) > 0.0).sum(dim=1).float()
+
+    def _reward_self_collision(self) -> Tensor:
+        """How many contacts the robot has with itself. [M; its G1 -1]"""
+        need(
+            self.cfg.asset.self_collisions,
+            "self_collision",
+            "asset.self_collisions is False, so that parts pass through one another",
+        )
+        return self.self_contacts[:, 0].clone()
+
+
+def _names_in(method: Any) -> Iterator[str]:
+    """Names in the code of a method or a property, and in what is written inside of it."""
+    method = getattr(method, "fget", None) or getattr(method, "func", method)
+    codes = [getattr(inspect.unwrap(getattr(method, "__func__", method)), "__code__", None)]
+    for code in codes:
+        if code:
+            yield from code.co_names
+            codes += [each for each in code.co_consts if isinstance(each, CodeType)]
+
+
+def need(given: bool, term: str, what: str) -> None:
+    """Refuse a term that is on without what it needs; terms are tried once before training."""
+    if not given:
+        raise ConfigError(f"rewards.scales.{term} is on, but {what}")

@@ -362,7 +362,7 @@ def _motion(env: RobotTask, folder: Path) -> Motion | None:
 
 def _ends(env: RobotTask) -> Ends:
     """The task's rule for a fall."""
-    rule, geoms = env.cfg.termination, [env.robot.contact_geoms[i] for i in env.contacts.terminating.tolist()]
+    rule, geoms = env.cfg.termination, [env.robot.contact_geoms[i] for i in env.terminating_contacts.tolist()]
     tilt = rule.max_tilt if rule.max_tilt < 180.0 else None
     return Ends(tilt, rule.min_base_height or None, tuple(geoms), own_ends(type(env)))
 

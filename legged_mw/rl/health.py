@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from legged_mw.envs.divergence import SHARE
-from legged_mw.envs.suspects import BOUND
+from legged_mw.envs.statistics import BOUND, SHARE
 
 IN_A_ROW = 3  # ours: iterations; one bad value is an accident, and the next rollout is another
 

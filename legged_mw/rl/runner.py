@@ -17,9 +17,9 @@ from rsl_rl.runners import OnPolicyRunner
 from torch import Tensor, nn
 
 from legged_mw import ROOT
-from legged_mw.envs.divergence import Watch
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
+from legged_mw.envs.statistics import Watch
 from legged_mw.envs.wording import config_words
 from legged_mw.rl.checkpoint import check_resume
 from legged_mw.rl.health import Health

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from legged_mw.envs.suspects import BOUND
+from legged_mw.envs.statistics import BOUND
 
 
 class Undo:

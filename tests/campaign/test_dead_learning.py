@@ -19,7 +19,7 @@ from torch import nn
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Observations
-from legged_mw.envs.suspects import Suspects
+from legged_mw.envs.statistics import Suspects
 from legged_mw.rl import ppo
 from legged_mw.rl.health import Health
 from legged_mw.rl.losses import value_loss

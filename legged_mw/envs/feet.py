@@ -1,5 +1,6 @@
-"""The gait clock: where each foot is in its step, as a policy sees it and as rewards want it. Period and offsets are the config's.
+"""Feet: their contacts with the ground, from what the simulator senses, and the gait clock.
 
+The clock says where each foot is in its step, as a policy sees it and as rewards want it. Period and offsets are the config's.
 A world's phase runs from 0 to 1 in a period. Each foot's phase is that plus its offset. A foot stands in the first share of
 its phase (``gait.stance``) and swings in the rest. The clock rests at 0 while the robot is told to stand, and runs from 0 when
 it is told to move. ``legged_mw.deploy.gait`` keeps the same clock.
@@ -8,12 +9,42 @@ it is told to move. ``legged_mw.deploy.gait`` keeps the same clock.
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 
 import torch
 from torch import Tensor
 
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.sim.model import RobotModel
+from legged_mw.sim.sensors import CONTACT_FORCE
 from legged_mw.utils.config import ConfigError
+
+
+class FootContacts:
+    """How many contacts each of F feet has with the ground, and the force on it where that is sensed; a foot may have several geoms."""
+
+    forces: Tensor | None = None  # (N, F, 3) of the ground on the foot, world frame [N]; only where something reads it
+
+    def __init__(self, robot: RobotModel, feet: Collection[tuple[str, ...]], sensed: Tensor, count: Tensor) -> None:
+        """``feet`` are the geoms of each, the first columns of ``count`` (N, C); ``sensed`` are all sensors."""
+        geoms = list(dict.fromkeys(geom for each in feet for geom in each))  # G
+        table = torch.tensor([[float(geom in each) for each in feet] for geom in geoms], device=count.device)  # (G, F)
+        self._foot_of_geom = table if [(geom,) for geom in geoms] != [*feet] else None
+        self._counts = count[:, : len(geoms)]
+        self.count = self._counts if self._foot_of_geom is None else count.new_zeros(len(count), len(feet))  # (N, F)
+        if CONTACT_FORCE in robot.sensors:
+            # (N, C, 4): count, force on the ground
+            columns = sensed[:, robot.sensors[CONTACT_FORCE]].unflatten(1, (-1, 4))
+            # (N, 1, G, 3), (F, G, 1)
+            self._geom_forces, self._against = columns[:, None, : len(geoms), 1:], -table.T[..., None]
+            self.forces = count.new_zeros(len(count), len(feet), 3)
+
+    def update(self) -> None:
+        """After a step: what its last substep sensed."""
+        if self._foot_of_geom is not None:
+            torch.mm(self._counts, self._foot_of_geom, out=self.count)
+        if self.forces is not None:
+            torch.sum(self._geom_forces * self._against, dim=2, out=self.forces)
 
 
 class GaitClock:
