@@ -20,8 +20,8 @@ from legged_mw.check.describe import describe
 from legged_mw.check.recordable import recordable
 from legged_mw.deploy.contract import ContractError, read_contract
 from legged_mw.deploy.simulated import Fleet
-from legged_mw.envs.delay import SubstepDelay
 from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.envs.motors import SubstepDelay
 from legged_mw.rl import export as exporting
 from legged_mw.rl.export import export
 from legged_mw.rl.runner import make_runner
@@ -252,10 +252,9 @@ def tried(file: str, engine: str, steps: int = 6) -> tuple[list[Tensor], list[Te
         targets = torch.randn(2, 12)
         env.dof_pos.copy_(torch.randn(2, 12))
         env.dof_vel.copy_(3.0 * torch.randn(2, 12))
-        network(targets)
+        torques.append(network(targets))
         errors.append(targets - env.dof_pos)
         speeds.append(env.dof_vel.clone())
-        torques.append(env.sim.ctrl.clone())
         if step == 2:
             network.reset(torch.tensor([False, True]))
     return errors, speeds, torques

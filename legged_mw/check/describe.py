@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from legged_mw.envs.domain_rand import active
+from legged_mw.envs.motors import round_delay
 from legged_mw.envs.own_code import own_classes
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.students.estimator import find_targets
@@ -72,7 +73,7 @@ def _motors(env: RobotTask) -> str:
     if "delay_ms" not in env.domain_rand.values:
         return text
     span, step = env.cfg.domain_rand.delay_ms, 1e3 * env.cfg.sim.dt
-    low, high = (env.domain_rand.rounded_delay(end) for end in span)
+    low, high = (round_delay(end, step) for end in span)
     asked = ", ".join(f"{end:g}" for end in span)
     rounded = f"domain_rand.delay_ms [{asked}] to the nearest simulation step, of {step:g} ms"
     return f"{text}; what they are told takes {low:g} to {high:g} ms: {rounded}"

@@ -4,19 +4,27 @@
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from legged_mw.deploy.reader import ContractError, Reader
 from legged_mw.utils.files import digest
-from legged_mw.utils.motor_network import NetworkMotors, read_network
+from legged_mw.utils.mjcf import DC_CONSTANT, DC_DAMPING, DC_RESISTANCE, DC_STIFFNESS
+from legged_mw.utils.motor_network import Floats, MotorNetwork, read_network
 
 MOTORS, MOTORS_FILE = "motors", "motors.npz"
 LAWS = ("servo", "dc_motor", "torque", "network")  # docs/motors.md
-_RESISTANCE, _CONSTANT, _STIFFNESS, _DAMPING = 0, 1, 4, 6  # places in actuator_gainprm of MuJoCo's DC motor
+_ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {
+    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
+    "relu": lambda x: np.maximum(x, 0),
+    "softsign": lambda x: x / (1 + np.abs(x)),
+    "tanh": np.tanh,
+}
 
 
 class Motors(NamedTuple):
@@ -44,16 +52,16 @@ class Motors(NamedTuple):
         if self.law == "servo":
             found = {"stiffness": prm[:, 0], "damping": model.dof_damping[dofs].reshape(len(dofs), -1)[:, 0]}
         elif self.law == "dc_motor":
-            found = {"stiffness": prm[:, _STIFFNESS], "damping": prm[:, _DAMPING]}
+            found = {"stiffness": prm[:, DC_STIFFNESS], "damping": prm[:, DC_DAMPING]}
         if self.stall_torque:
-            constant, resistance = np.maximum(prm[:, _CONSTANT], 1e-12), np.maximum(prm[:, _RESISTANCE], 1e-12)
+            constant, resistance = np.maximum(prm[:, DC_CONSTANT], 1e-12), np.maximum(prm[:, DC_RESISTANCE], 1e-12)
             found |= {"motors: stall_torque": constant / resistance, "motors: no_load_speed": 1.0 / constant}
         return found
 
     def limp(self, batch: Any) -> None:
         """Switch the motors of ``batch``, which are no servos, off: what is left is damping, if there is any."""
         if self.law == "dc_motor":
-            batch.expand("actuator_gainprm")[:, :, _STIFFNESS] = 0.0
+            batch.expand("actuator_gainprm")[:, :, DC_STIFFNESS] = 0.0
         else:
             batch.expand("actuator_gear")[:] = 0.0
 
@@ -83,3 +91,40 @@ def make_network(folder: Path, motors: Motors, count: int, joints: int) -> Netwo
             f"{MOTORS_FILE} is not the file that policy.yaml was written for: its SHA-256 differs; export the policy again"
         )
     return NetworkMotors(read_network(folder / MOTORS_FILE), count, joints)
+
+
+class NetworkMotors:
+    """The motors of N robots with D joints: ``torque`` is called once a simulation step."""
+
+    def __init__(self, network: MotorNetwork, robots: int, joints: int) -> None:
+        self.network = network
+        # newest first; errors, speeds, scaled
+        self._past = np.zeros((network.frames[-1] + 1, 2, robots, joints), dtype=np.float32)
+        # h and c of each layer
+        self._memory = [np.zeros((2, robots, joints, units), dtype=np.float32) for units in network.hidden]
+
+    def reset(self, which: Any = slice(None)) -> None:
+        """The robots ``which`` (indices or a mask) begin again: nothing was ever off its target."""
+        for memory in (self._past, *self._memory):
+            memory[(slice(None), slice(None), which) if memory is self._past else (slice(None), which)] = 0.0
+
+    def torque(self, error: NDArray[Any], speed: NDArray[Any]) -> Floats:
+        """Torques (N, D) [N m] from target minus angle [rad] and speed [rad/s], (N, D) each."""
+        net, past = self.network, self._past
+        past[1:] = past[:-1].copy()
+        past[0] = net.error_scale * error, net.speed_scale * speed
+        x = np.moveaxis(past[list(net.frames)], (0, 1), (-2, -1) if net.in_turns else (-1, -2))
+        x = x.reshape(*error.shape, -1)
+        for memory, (w_x, w_h, b_x, b_h) in zip(self._memory, net.recurrent, strict=True):
+            i, f, g, o = np.split(x @ w_x.T + b_x + memory[0] @ w_h.T + b_h, 4, axis=-1)
+            memory[1] = _sigmoid(f) * memory[1] + _sigmoid(i) * np.tanh(g)
+            x = memory[0] = _sigmoid(o) * np.tanh(memory[1])
+        for layer, (weight, bias) in enumerate(net.linear):
+            x = x @ weight.T + bias
+            if layer < len(net.linear) - 1:
+                x = _ACTIVATIONS[net.activation](x)
+        return net.torque_scale * x[..., 0]
+
+
+def _sigmoid(x: Floats) -> Floats:
+    return 1 / (1 + np.exp(-np.clip(x, -80.0, 80.0)))

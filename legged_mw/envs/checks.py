@@ -12,6 +12,7 @@ from typing import Any
 
 from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, active
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.envs.motors import check_motors
 from legged_mw.envs.own_code import own_classes, place_of
 from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
 from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
@@ -36,7 +37,7 @@ PAYS = (
 def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None, law: str = "") -> None:
     """Raise ConfigError at the first value that cannot work; ``law`` of the motors is ``control.actuator``, unless said otherwise."""
     _check_redraws(cfg, law)
-    _check_motors(cfg)
+    check_motors(cfg)
     step = cfg.sim.dt * cfg.control.decimation
     if cfg.env.episode_length_s < step:
         raise ConfigError(
@@ -99,34 +100,6 @@ def _check_tracking(cfg: MotionTrackingCfg) -> None:
         raise ConfigError(
             "motion.clips is empty; name a clip, as python -m legged_mw.motion FILE --out CLIP.npz writes it"
         )
-
-
-def _check_motors(cfg: RobotTaskCfg) -> None:
-    control, curve = cfg.control, cfg.control.stall_torque or cfg.control.no_load_speed
-    if control.actuator == "network" and not control.network:
-        raise ConfigError(
-            "control.actuator is 'network', but control.network names no file of weights (docs/motors.md)"
-        )
-    if control.actuator != "dc_motor" and control.action_origin == "speed":
-        raise ConfigError(
-            f"control.action_origin is 'speed', but control.actuator is {control.actuator!r}: only a 'dc_motor' is driven by a "
-            "speed: name that one, or leave action_origin out"
-        )
-    if control.actuator == "torque" and control.action_origin != "default":
-        raise ConfigError(
-            f"control.action_origin is {control.action_origin!r}, an origin of angles, but under control.actuator 'torque' an action is a "
-            "torque: leave action_origin out"
-        )
-    for name, unit in (("stall_torque", "N m"), ("no_load_speed", "rad/s")):
-        if not getattr(control, name) and (control.actuator == "dc_motor" or (control.actuator != "servo" and curve)):
-            raise ConfigError(
-                f"control.actuator is {control.actuator!r} with a torque-speed curve, but control.{name} is empty: fill the table [{unit}] "
-                "a joint, '' for all (docs/motors.md)"
-            )
-        if cfg.domain_rand.enable and getattr(cfg.domain_rand, name) not in ([], [1.0, 1.0]) and not curve:
-            raise ConfigError(
-                f"domain_rand.{name} is a factor on control.{name}, which is empty: fill it, or leave the range out ([])"
-            )
 
 
 def _check_redraws(cfg: RobotTaskCfg, law: str) -> None:

@@ -10,18 +10,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from legged_mw.envs.delay import Delay, SubstepDelay
-from legged_mw.envs.loading import has_curve
+from legged_mw.envs.motors import FACTORS, factor_fields, round_delay
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.sim.model import RobotModel
+from legged_mw.sim.servos import scaled_gains
 from legged_mw.sim.simulation import CONSTANTS_READ, GRAVITY, Simulation
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.machine import require_memory
 from legged_mw.utils.math import assign
 
 
@@ -32,7 +31,7 @@ class Kind(NamedTuple):
     # that changes nothing; None: the number is itself the first one of the field, in the ground's geoms
     neutral: float | None
     mirror: str  # its mirror image, a kind of envs/mirror.py
-    fields: tuple[str, ...] = ()  # of the model, that it writes
+    fields: tuple[str, ...] = ()  # of the model, that it writes; of motors as their law has it: motors.factor_fields
     whole: bool = False  # whole numbers, both ends included
 
 
@@ -44,18 +43,13 @@ KINDS: dict[str, Kind] = {
     "friction": Kind("world", None, "scalar", ("geom_friction",)),
     "contact_time": Kind("world", None, "scalar", ("geom_solref",)),
     "frictionloss": Kind("joint", 1.0, "joint_factor", ("dof_frictionloss",)),
-    "stiffness": Kind("joint", 1.0, "joint_factor", ("actuator_gainprm", "actuator_biasprm")),
-    "damping": Kind("joint", 1.0, "joint_factor", ("dof_damping",)),
-    "strength": Kind("joint", 1.0, "joint_factor", ("actuator_forcerange",)),
-    "stall_torque": Kind("joint", 1.0, "joint_factor", ("actuator_gainprm",)),
-    "no_load_speed": Kind("joint", 1.0, "joint_factor", ("actuator_gainprm",)),
+    **{name: Kind("joint", 1.0, "joint_factor") for name in FACTORS},
     "encoder_offset": Kind("joint", 0.0, "joint"),
     "action_delay": Kind("world", 0.0, "scalar", whole=True),
     "delay_ms": Kind("world", 0.0, "scalar"),
     "observation_delay": Kind("world", 0.0, "scalar", whole=True),
     "slope": Kind("world", 0.0, "scalar", (GRAVITY,)),
 }
-_RESISTANCE, _CONSTANT, _STIFFNESS, _DAMPING = 0, 1, 4, 6  # places in actuator_gainprm of MuJoCo's DC motor
 # Constants of the model depend on them: derived once they are drawn, never within a recorded step.
 ONLY_AT_START = tuple(name for name, kind in KINDS.items() if {*kind.fields} & {*CONSTANTS_READ})
 
@@ -65,20 +59,11 @@ def active(cfg: RobotTaskCfg, law: str = "") -> dict[str, tuple[Kind, float, flo
 
     ``law`` is ``control.actuator``, unless said otherwise.
     """
-    rand, law = cfg.domain_rand, law or cfg.control.actuator
+    rand, motors = cfg.domain_rand, factor_fields(cfg, law or cfg.control.actuator)
     if not rand.enable:
         return {}
-    lacks = {"stiffness", "damping"} if law in ("torque", "network") else set()
-    lacks |= {"stiffness"} if cfg.control.action_origin == "speed" else set()
-    lacks |= set() if has_curve(cfg, law) else {"stall_torque", "no_load_speed"}
-    given = {name: (kind, getattr(rand, name)) for name, kind in KINDS.items() if name not in lacks}
-    if law not in ("servo", "torque", "network"):
-        fields = ("actuator_gainprm",) if law == "dc_motor" else ()  # else a law in code reads them
-        given |= {
-            name: (KINDS[name]._replace(fields=fields), given[name][1])
-            for name in ("stiffness", "damping")
-            if name in given
-        }
+    kinds = KINDS | {name: KINDS[name]._replace(fields=fields) for name, fields in motors.items()}
+    given = {name: (kind, getattr(rand, name)) for name, kind in kinds.items() if name in motors or name not in FACTORS}
     given |= {field: (Kind("world", 1.0, "scalar", (field,)), span) for field, span in rand.model_factors.items()}
     return {
         name: (kind, span[0], span[1])
@@ -99,7 +84,7 @@ class DomainRand:
     """The draws of N worlds and what they write. ``values[name]`` (N, width): the numbers drawn, in the config's units."""
 
     def __init__(self, cfg: RobotTaskCfg, robot: RobotModel, sim: Simulation, law: str = "") -> None:
-        self._substep_ms, self._has_curves = 1e3 * cfg.sim.dt, "`stall_torque`" in robot.tables
+        self._substep_ms, self._curves = 1e3 * cfg.sim.dt, "`stall_torque`" in robot.tables
         self._sim, self._mask = sim, torch.ones(sim.num_envs, dtype=torch.bool, device=sim.device)
         kinds = active(cfg, law)
         again = [name for name in kinds if name in cfg.domain_rand.redraw_at_reset]
@@ -132,35 +117,6 @@ class DomainRand:
         writers = {name: self._writer(name, field) for name in order for field in kinds[name][0].fields[:1]}
         self._writers = list(dict.fromkeys(writers.values()))
         self._writers_again = list(dict.fromkeys(writers[name] for name in again if name in writers))
-        self._ends = {name: list(kinds[name][1:]) for name in order}
-
-    def delay(self, name: str, width: int, start: float | None = None) -> Delay | None:
-        """The delay line of ``action_delay`` or ``observation_delay``, or None if the config has none."""
-        if name not in self.values:
-            return None
-        self._require_memory(name, self._ends[name][1] + 1, width)
-        return Delay(self.values[name], int(self._ends[name][1]), width, start)
-
-    def substep_delay(self, substeps: int, width: int) -> SubstepDelay | None:
-        """The delay line of ``delay_ms``, for control steps of ``substeps``."""
-        if "delay_ms" not in self.values:
-            return None
-        longest = self.rounded_delay(self._ends["delay_ms"][1])
-        self._require_memory("delay_ms", longest / self._substep_ms / substeps + 1, width)
-        return SubstepDelay(self.values["delay_ms"], self._substep_ms, longest, substeps, width)
-
-    def _require_memory(self, name: str, frames: float, width: int) -> None:
-        need = 4 * frames * len(self._mask) * width
-        require_memory(
-            need,
-            self._sim.device,
-            f"domain_rand.{name} = {self._ends[name]}",
-            "every step of it keeps a frame of each world",
-        )
-
-    def rounded_delay(self, delay: Any) -> Any:
-        """[ms], a number or a tensor, to the nearest whole number of simulation steps, a half up."""
-        return (delay / self._substep_ms + 0.5) // 1.0 * self._substep_ms
 
     def redraw(self) -> None:
         """Draw everything again in every world, and what the model derives from it. Not for inside a recorded step."""
@@ -187,7 +143,7 @@ class DomainRand:
         for name, drawn in self.values.items():
             column = drawn.storage_offset()
             if name == "delay_ms" and column >= first:
-                fresh[:, column - first] = self.rounded_delay(fresh[:, column - first])
+                fresh[:, column - first] = round_delay(fresh[:, column - first], self._substep_ms)
             if name in self._whole and column >= first:
                 low, high = self._low[column], self._high[column]
                 fresh[:, column - first] = (low + share[:, column - first] * (high - low + 1.0)).floor_().minimum(high)
@@ -199,7 +155,7 @@ class DomainRand:
         special = {
             "body_mass": self._write_masses,
             "body_ipos": self._write_com,
-            "actuator_gainprm": self._write_motors if self._has_curves else self._write_stiffness,
+            "actuator_gainprm": self._write_gains,
             GRAVITY: self._write_gravity,
         }
         if name in KINDS and field in special:
@@ -239,24 +195,10 @@ class DomainRand:
             self._nominal["body_ipos"][:, self._root] + self.values["base_com"],
         )
 
-    def _write_stiffness(self, mask: Tensor) -> None:
-        for field, place in (("actuator_gainprm", 0), ("actuator_biasprm", 1)):
-            assign(
-                self._sim.field(field)[:, :, place], mask, self._nominal[field][:, :, place] * self.values["stiffness"]
-            )
-
-    def _write_motors(self, mask: Tensor) -> None:
-        """Gains and curve of MuJoCo's DC motor: its no-load speed is 1 over its constant, its stall torque constant over resistance."""
-        gains, one = (
-            self._nominal["actuator_gainprm"].repeat(self._sim.num_envs, 1, 1),
-            torch.ones((), device=self._draws.device),
-        )
-        speed, stall = (self.values.get(name, one) for name in ("no_load_speed", "stall_torque"))
-        gains[:, :, _CONSTANT] /= speed
-        gains[:, :, _RESISTANCE] /= speed * stall
-        for place, name in ((_STIFFNESS, "stiffness"), (_DAMPING, "damping")):
-            gains[:, :, place] *= self.values.get(name, one)
-        assign(self._sim.field("actuator_gainprm"), mask, gains)
+    def _write_gains(self, mask: Tensor) -> None:
+        """Of motors, and their torque-speed curve."""
+        for field, place, gains in scaled_gains(self._nominal, self.values, self._curves):
+            assign(self._sim.field(field)[:, :, place], mask, gains)
 
     def _write_gravity(self, mask: Tensor) -> None:
         """Downhill along x, which is any direction for robots with any heading."""

@@ -7,22 +7,15 @@ from collections.abc import Collection, Mapping, Sequence
 import torch
 from torch import Tensor
 
+from legged_mw.envs.motors import motor_curves, motor_drive, motor_gains
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.wording import config_words
 from legged_mw.sim.joints import PARTIAL
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
 from legged_mw.sim.pose import standing_height
-from legged_mw.sim.servos import Drive
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.files import find_file
-
-CURVE = ("stall_torque", "no_load_speed", "gear")  # tables of a torque-speed curve, in section `control`
-
-
-def has_curve(cfg: RobotTaskCfg, law: str) -> bool:
-    """Whether motors of ``law`` have a torque-speed curve: ``dc_motor`` must, a servo never has one, others may."""
-    return law == "dc_motor" or (law != "servo" and bool(cfg.control.stall_torque or cfg.control.no_load_speed))
 
 
 def load_robot(
@@ -35,8 +28,8 @@ def load_robot(
     more_sensors: Collection[str] = (),
 ) -> RobotModel:
     """The robot of ``asset.file``, with what the config says of its joints, contacts and sensors, and motors of ``law``."""
-    asset, scale, control, drive = cfg.asset, cfg.control.action_scale, cfg.control, motor_drive(cfg, law)
-    none = {"": 0.0} if law in ("torque", "network") else {}
+    asset, scale = cfg.asset, cfg.control.action_scale
+    stiffness, damping = motor_gains(cfg, law)
     if not asset.file:
         raise ConfigError("asset.file is empty; name the robot's MJCF or URDF, e.g. 'resources/robots/go1/go1.xml'")
     robot = build_model(
@@ -45,8 +38,8 @@ def load_robot(
         ground=Ground(
             cfg.terrain.friction, cfg.terrain.condim, terrain, boxes=engine == "mujoco", slope=cfg.terrain.slope
         ),
-        stiffness={"": 0.0} if drive == "speed" else control.stiffness or none,
-        damping=control.damping or none,
+        stiffness=stiffness,
+        damping=damping,
         colliders=asset.colliders,
         self_collisions=asset.self_collisions,
         contact_geoms=contact_geoms,
@@ -57,23 +50,16 @@ def load_robot(
         tables={
             "control.action_scale": scale if isinstance(scale, Mapping) else {"": scale},
             "rewards.pose_weights": cfg.rewards.pose_weights,
-            **({f"`{name}`": getattr(control, name) for name in CURVE} if has_curve(cfg, law) else {}),
+            **motor_curves(cfg, law),
             "rewards.deviation_weights": cfg.rewards.deviation_weights,
         },
         held_joints=asset.held_joints,
         partial={name: getattr(asset, name) for name in PARTIAL},
         more_sensors=more_sensors,
-        drive=drive,
+        drive=motor_drive(cfg, law),
     )
     robot.overrides[:] = [config_words(line) for line in robot.overrides]
     return robot
-
-
-def motor_drive(cfg: RobotTaskCfg, law: str) -> Drive:
-    """What drives the simulated motors under ``law``."""
-    if law not in ("servo", "dc_motor"):
-        return "torque"
-    return "speed" if cfg.control.action_origin == "speed" else "angle"
 
 
 def start_place(cfg: RobotTaskCfg, robot: RobotModel, colliders: Sequence[str]) -> list[float]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from legged_mw.envs.delay import Delay
+from legged_mw.envs.motors import Delay
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import Suspects
 from legged_mw.utils.config import ConfigError

@@ -27,12 +27,12 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from legged_mw.envs.actuators import Actuators, TorqueLaw
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.checks import check_values
 from legged_mw.envs.domain_rand import DomainRand, world_fields
 from legged_mw.envs.loading import load_robot, soft_limits, start_place
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
+from legged_mw.envs.motors import Actuators, make_delay, own_law
 from legged_mw.envs.observations import Observations, Row
 from legged_mw.envs.own_code import check_term, checked_rows
 from legged_mw.envs.perturbation import Perturbation
@@ -50,7 +50,7 @@ from legged_mw.utils.errors import unknown
 from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse, spread
 
 
-class RobotTask(TorqueLaw, BaseTask):
+class RobotTask(BaseTask):
     """N robots in N worlds of their own, as one vectorized environment. A task is a subclass with its rewards and its rows."""
 
     cfg: RobotTaskCfg
@@ -116,6 +116,31 @@ class RobotTask(TorqueLaw, BaseTask):
     def _apply_actions(self) -> None:
         """Motor commands from the actions."""
         self.actuators.apply(self.actions)
+
+    def _compute_torques(self, actions: Tensor) -> Tensor:
+        """Torques (N, D) [N m] from ``actions`` (N, D), clipped and delayed; held to the force limits afterwards.
+
+        The motors have the law ``control.actuator``; an override is a law of its own (envs/motors.py), called before every simulation
+        step and recorded with it. This one is legged_gym's position law.
+        """
+        target = self.default_dof_pos + self.actuators.scale * actions
+        return self.p_gains * (target - self.dof_pos) - self.d_gains * self.dof_vel
+
+    @property
+    def motor_law(self) -> str:
+        """``control.actuator``, or "own" of a class with a ``_compute_torques`` of its own."""
+        overridden = type(self)._compute_torques is not RobotTask._compute_torques
+        return own_law(self.cfg, type(self).__name__) if overridden else self.cfg.control.actuator
+
+    @property
+    def p_gains(self) -> Tensor:
+        """``control.stiffness`` as drawn, (D,) or (N, D) [N m/rad]."""
+        return self.actuators.gain("stiffness")
+
+    @property
+    def d_gains(self) -> Tensor:
+        """``control.damping`` as drawn, (D,) or (N, D) [N m s/rad]."""
+        return self.actuators.gain("damping")
 
     def _update_state(self) -> None:
         """All that termination and rewards read, computed once."""
@@ -259,7 +284,7 @@ class RobotTask(TorqueLaw, BaseTask):
             self.cfg.noise.level,
             self.num_envs,
             self.device,
-            lambda width: self.domain_rand.delay("observation_delay", width),
+            lambda width: make_delay(self.cfg, "observation_delay", self.domain_rand.values, width),
         )
         self.obs_buf = self.observations.buffers
 
@@ -446,7 +471,8 @@ class RobotTask(TorqueLaw, BaseTask):
         self.accelerometer = sim.sensordata[:, spans["accelerometer"]]  # view (N, 3) [m/s^2]
         self.base_lin_vel, self.projected_gravity, self.base_ang_vel_world = (self._zeros(3) for _ in range(3))
         self.dof_offset = self._zeros(self.num_actions)  # joint position minus default [rad]
-        self.actuators = Actuators(self, self.robot, sim, self.domain_rand)
+        law, drawn = self.motor_law, self.domain_rand.values
+        self.actuators = Actuators(self.cfg, law, self.robot, sim, drawn, self.default_dof_pos, self._compute_torques)
         exact = self.actuators.encoder_offset is None
         self.joint_reading = self.dof_offset if exact else self._zeros(self.num_actions)  # the same, as measured
         self.base_height = self.root_pos[:, 2]  # of the root above the ground under it [m]

@@ -40,10 +40,10 @@ from legged_mw.deploy.estimate import Estimated
 from legged_mw.deploy.memory import Memory
 from legged_mw.deploy.motion import MOTION_FILE, Motion
 from legged_mw.deploy.motors import MOTORS_FILE, Motors
-from legged_mw.envs.actuators import OWN as OWN_LAW
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
-from legged_mw.envs.loading import motor_drive
+from legged_mw.envs.motors import OWN as OWN_LAW
+from legged_mw.envs.motors import motor_drive
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.export_replay import ExportError, own_ends, record, replay
 from legged_mw.rl.export_scene import Scene, among_steps, standalone
@@ -63,8 +63,8 @@ from legged_mw.rl.policies import load_policy
 from legged_mw.rl.runs import CONFIG_FILE
 from legged_mw.rl.students.estimator import EstimatingModel, find_targets
 from legged_mw.rl.students.recurrent import states_of
-from legged_mw.sim.joints import CURVE
 from legged_mw.sim.model import ModelError
+from legged_mw.sim.servos import CURVE
 from legged_mw.sim.terrain import LEVEL, make_terrain
 from legged_mw.skills.clip import save_clip
 from legged_mw.skills.motion_tracking import MotionTracking

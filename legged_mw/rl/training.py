@@ -19,8 +19,8 @@ from typing import Any, NamedTuple
 import torch
 from rsl_rl.algorithms import Distillation
 
-from legged_mw.envs.actuators import note_network
 from legged_mw.envs.checks import check_class, check_values
+from legged_mw.envs.motors import note_network
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.worlds import fuse_for
 from legged_mw.rl.classes import check_classes

@@ -19,10 +19,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from legged_mw.envs.motors import NetworkLaw
 from legged_mw.utils.cli import number, one_line_errors
 from legged_mw.utils.errors import UserError
 from legged_mw.utils.files import writable
-from legged_mw.utils.motor_network import ACTIVATIONS, MotorNetwork, NetworkMotors
+from legged_mw.utils.motor_network import ACTIVATIONS, MotorNetwork
 
 _STEPS, _JOINTS = 12, 64  # of the comparison
 _TOLERANCE = 1e-4  # of the largest torque
@@ -110,9 +111,12 @@ def _fit(network: MotorNetwork, states: Any, wanted: Any) -> tuple[MotorNetwork,
         scaled = replace(
             network, error_scale=network.error_scale * factors[0], speed_scale=network.speed_scale * factors[1]
         )
-        motors = NetworkMotors(scaled, 1, _JOINTS)
-        torques = np.array([motors.torque(error[None], speed[None])[0] for error, speed in states])
-        return scaled, torques
+        angle, speed = torch.zeros(1, _JOINTS), torch.zeros(1, _JOINTS)
+        law, torques = NetworkLaw(scaled, angle, speed), []
+        for now in torch.from_numpy(states):
+            speed.copy_(now[1:])
+            torques.append(law(now[:1]).numpy()[0])
+        return scaled, np.array(torques)
 
     def left(logs: Any) -> tuple[MotorNetwork, Any]:
         """With the best factor on the torque, which is linear."""

@@ -12,12 +12,10 @@ import numpy as np
 
 from legged_mw.robot.vendor import Loaded
 from legged_mw.sim.rigid import hold_joints, match_joints
-from legged_mw.sim.servos import Drive, Motor, Range, add_motors, set_efforts, set_joints
+from legged_mw.sim.servos import CURVE, Drive, Motor, Range, add_motors, curves_at_joints, set_efforts, set_joints
 from legged_mw.sim.tables import per_joint_all, some_joints
 
 _BEYOND = 1e-3  # [rad] that a pose may be beyond a range by rounding
-# tables of motors with a torque-speed curve, before a "`gear`": [N m], [rad/s]
-CURVE = ("`stall_torque`", "`no_load_speed`")
 PARTIAL = ("effort", "armature", "frictionloss", "joint_speed_limits")  # tables that need not name every joint
 
 
@@ -63,10 +61,7 @@ def pose_joints(
             robot.notes.append(
                 f"warning: `pose`: {name} stands at {angle:g} rad, beyond its range from {low:g} to {high:g} rad"
             )
-    for name, gear in zip(CURVE, (1.0, -1.0), strict=True):  # a motor's torque grows by its gear, its speed shrinks
-        if name in values and "`gear`" in values:
-            values[name] = [value * ratio**gear for value, ratio in zip(values[name], values["`gear`"], strict=True)]
-    return Posed(model, moving, welded, angles, ranges, values)
+    return Posed(model, moving, welded, angles, ranges, values | curves_at_joints(values))
 
 
 def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> list[Range]:

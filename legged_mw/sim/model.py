@@ -129,7 +129,7 @@ def build_model(
     # of PARTIAL, as for some_joints: what the caller knows better than the file
     partial: Mapping[str, Mapping[str, float]] | None = None,
     more_sensors: Collection[str] = (),  # what else is sensed: names of sensors.py, or of the file's own sensors
-    drive: Drive = "angle",  # what `ctrl` means; with joints.CURVE in `tables` motors have torque-speed curves
+    drive: Drive = "angle",  # what `ctrl` means; with servos.CURVE in `tables` motors have torque-speed curves
 ) -> RobotModel:
     """Compile the MJCF or URDF at ``file`` for stepping."""
     robot = read_robot(file, more_sensors)

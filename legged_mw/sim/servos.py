@@ -5,15 +5,20 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import mujoco
 import numpy as np
+from torch import Tensor
+
+from legged_mw.utils.mjcf import DC_CONSTANT, DC_DAMPING, DC_RESISTANCE, DC_STIFFNESS
 
 Range = tuple[float, float]
 # what ctrl is: an angle that the motor turns to [rad], a speed [rad/s], or its torque [N m]
 Drive = Literal["angle", "speed", "torque"]
+# tables of motors with a torque-speed curve, before a "`gear`": [N m], [rad/s]
+CURVE = ("`stall_torque`", "`no_load_speed`")
 _JOINTS = (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
 _INPUTS = {"angle": 1, "speed": 2, "torque": 4}  # of a DC motor: bits "pos", "vel" and "ff" of its input signature
 _NEVER, _ALWAYS = mujoco.mjtLimited.mjLIMITED_FALSE, mujoco.mjtLimited.mjLIMITED_TRUE
@@ -51,6 +56,37 @@ def _force(actuator: mujoco.MjsActuator) -> np.ndarray | None:
     if is_motor and _limited(actuator.ctrllimited, actuator.ctrlrange):
         return actuator.ctrlrange * actuator.gear[0] * actuator.gainprm[0]
     return None
+
+
+def curves_at_joints(tables: Mapping[str, list[float]]) -> dict[str, list[float]]:
+    """Those of CURVE that ``tables`` has, at the joint: a motor's torque grows by its gear, its speed shrinks."""
+    gears = tables.get("`gear`", [])
+    powers = {name: power for name, power in zip(CURVE, (1.0, -1.0), strict=True) if name in tables and gears}
+    return {
+        name: [value * gear**power for value, gear in zip(tables[name], gears, strict=True)]
+        for name, power in powers.items()
+    }
+
+
+def scaled_gains(
+    nominal: Mapping[str, Tensor], factors: Mapping[str, Tensor], curves: bool
+) -> Iterator[tuple[str, int, Tensor]]:
+    """Model field, place in it and its values (N, D): the gains of motors, ``nominal`` fields (1, D, ...) times ``factors`` (N, D).
+
+    Of MuJoCo's DC motor, which those with ``curves`` are, the no-load speed is 1 over its constant, the stall torque constant over
+    resistance.
+    """
+    field = "actuator_gainprm"
+    gains = nominal[field]
+    if not curves:
+        yield field, 0, gains[:, :, 0] * factors["stiffness"]
+        yield "actuator_biasprm", 1, nominal["actuator_biasprm"][:, :, 1] * factors["stiffness"]
+        return
+    speed, stall = factors.get("no_load_speed", 1.0), factors.get("stall_torque", 1.0)
+    yield field, DC_CONSTANT, gains[:, :, DC_CONSTANT] / speed
+    yield field, DC_RESISTANCE, gains[:, :, DC_RESISTANCE] / (speed * stall)
+    yield field, DC_STIFFNESS, gains[:, :, DC_STIFFNESS] * factors.get("stiffness", 1.0)
+    yield field, DC_DAMPING, gains[:, :, DC_DAMPING] * factors.get("damping", 1.0)
 
 
 class Motor(NamedTuple):

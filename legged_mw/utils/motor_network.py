@@ -1,11 +1,11 @@
 """A motor as a small network of numbers: from how far a joint is off its target and how fast it turns, lately, to its torque.
 
-The same network serves each joint. It is read from an .npz without running code, and evaluated here in numpy.
+The same network serves each joint. It is read from an .npz without running code; envs/motors.py and deploy/motors.py evaluate it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,7 @@ from legged_mw.utils.arrays import read_arrays
 from legged_mw.utils.errors import UserError, unknown
 
 Floats = NDArray[Any]  # float32
-ACTIVATIONS: dict[str, Callable[[Floats], Floats]] = {
-    "elu": lambda x: np.where(x > 0, x, np.expm1(np.minimum(x, 0))),
-    "relu": lambda x: np.maximum(x, 0),
-    "softsign": lambda x: x / (1 + np.abs(x)),
-    "tanh": np.tanh,
-}
+ACTIVATIONS = ("elu", "relu", "softsign", "tanh")
 _RECURRENT = ("weight_ih", "weight_hh", "bias_ih", "bias_hh")
 _SCALES = ("error_scale", "speed_scale", "torque_scale")
 
@@ -131,40 +126,3 @@ def _take(arrays: Mapping[str, Any], name: str, *shape: int) -> Floats:
     if not np.isfinite(value).all():
         raise ValueError(f"array '{name}' has values that are not finite")
     return value
-
-
-class NetworkMotors:
-    """The motors of N robots with D joints: ``torque`` is called once a simulation step."""
-
-    def __init__(self, network: MotorNetwork, robots: int, joints: int) -> None:
-        self.network = network
-        # newest first; errors, speeds, scaled
-        self._past = np.zeros((network.frames[-1] + 1, 2, robots, joints), dtype=np.float32)
-        # h and c of each layer
-        self._memory = [np.zeros((2, robots, joints, units), dtype=np.float32) for units in network.hidden]
-
-    def reset(self, which: Any = slice(None)) -> None:
-        """The robots ``which`` (indices or a mask) begin again: nothing was ever off its target."""
-        for memory in (self._past, *self._memory):
-            memory[(slice(None), slice(None), which) if memory is self._past else (slice(None), which)] = 0.0
-
-    def torque(self, error: NDArray[Any], speed: NDArray[Any]) -> Floats:
-        """Torques (N, D) [N m] from target minus angle [rad] and speed [rad/s], (N, D) each."""
-        net, past = self.network, self._past
-        past[1:] = past[:-1].copy()
-        past[0] = net.error_scale * error, net.speed_scale * speed
-        x = np.moveaxis(past[list(net.frames)], (0, 1), (-2, -1) if net.in_turns else (-1, -2))
-        x = x.reshape(*error.shape, -1)
-        for memory, (w_x, w_h, b_x, b_h) in zip(self._memory, net.recurrent, strict=True):
-            i, f, g, o = np.split(x @ w_x.T + b_x + memory[0] @ w_h.T + b_h, 4, axis=-1)
-            memory[1] = _sigmoid(f) * memory[1] + _sigmoid(i) * np.tanh(g)
-            x = memory[0] = _sigmoid(o) * np.tanh(memory[1])
-        for layer, (weight, bias) in enumerate(net.linear):
-            x = x @ weight.T + bias
-            if layer < len(net.linear) - 1:
-                x = ACTIVATIONS[net.activation](x)
-        return net.torque_scale * x[..., 0]
-
-
-def _sigmoid(x: Floats) -> Floats:
-    return 1 / (1 + np.exp(-np.clip(x, -80.0, 80.0)))

@@ -29,6 +29,7 @@ from hypothesis import strategies as st
 
 from legged_mw import ROOT
 from legged_mw.deploy.contract import checksum, edits, read_contract
+from legged_mw.deploy.motors import NetworkMotors
 from legged_mw.deploy.policy import Controller
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.rl.runner import Runner, make_runner
@@ -36,7 +37,7 @@ from legged_mw.rl.runs import save_whole
 from legged_mw.skills.clip import read_clip
 from legged_mw.utils.config import load_yaml
 from legged_mw.utils.errors import UserError
-from legged_mw.utils.motor_network import NetworkMotors, read_network
+from legged_mw.utils.motor_network import read_network
 from legged_mw.utils.task import load_task
 
 EXAMPLES, SLOW = 50, 2.0  # of a round; [s]
