@@ -12,9 +12,10 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
+from legged_mw.envs.contacts import FootContacts
 from legged_mw.envs.gait import GaitClock
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
-from legged_mw.envs.robot_rewards import RobotRewards, need
+from legged_mw.envs.robot_rewards import RobotRewards, need, not_sensed
 from legged_mw.sim.mirror import Partners
 from legged_mw.sim.pose import upright
 from legged_mw.sim.sensors import CONTACT_FORCE
@@ -43,8 +44,12 @@ class LeggedRewards(RobotRewards):
     feet_air_time: Tensor  # (N, F) [s]
     swing_peak: Tensor  # (N, F) [m]
     gait: GaitClock | None
+    feet: FootContacts
 
-    ON_DEMAND: ClassVar[Mapping[str, str]] = {**RobotRewards.ON_DEMAND, "contact_forces": CONTACT_FORCE}
+    SENSED_FOR: ClassVar[Mapping[str, str]] = {
+        **RobotRewards.SENSED_FOR,
+        **dict.fromkeys(("feet_contact_forces", "soft_landing", "stumble"), CONTACT_FORCE),
+    }
 
     feet_contact_time: Tensor  # (N, F) since touch-down [s]; only with `single_stance` or `air_time_variance`
     last_air_time: Tensor  # (N, F) of the last swing that ended [s]; only with `air_time_variance`
@@ -89,12 +94,14 @@ class LeggedRewards(RobotRewards):
 
     def _sensed_on_demand(self) -> list[str]:
         row = [CONTACT_FORCE] if self.cfg.observations.contact_forces else []
-        return list(dict.fromkeys([*super()._sensed_on_demand(), *row]))
+        return [*super()._sensed_on_demand(), *row]
 
     @property
     def contact_forces(self) -> Tensor:
         """(N, F, 3) Force of the ground on each foot in the last substep, world frame [N]; 0 in a world just reset."""
-        return self._sensed_value("contact_forces")
+        if self.feet.forces is None:
+            raise not_sensed("contact_forces")
+        return self.feet.forces
 
     def _time_contacts(self) -> None:
         """How long feet stood and swung, where a term that is on reads it; ``feet_air_time`` has this step's already."""

@@ -369,8 +369,6 @@ class LeggedRobot(LeggedRewards, RobotTask):
         self.foot_sites = torch.tensor([self.robot.id("site", name) for name in self.foot_names], device=self.device)
         self.foot_pos = self._zeros(feet, 3)  # [m, world]
         self.feet = FootContacts(self.robot, self.foot_geoms.values(), self.sim.sensordata, self.contact_count)
-        if self.feet.forces is not None:
-            self._sensed["contact_forces"] = self.feet.forces  # not the columns of the sensors
         self.foot_contact, self.first_contact = (self._zeros(feet, dtype=torch.bool) for _ in range(2))
         self.foot_speed = self._zeros(feet)  # horizontal [m/s]
         self._init_terrain()

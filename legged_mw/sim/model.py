@@ -172,7 +172,7 @@ def _compile(
         physics=physics,
         root=robot.root,
         joint_names=tuple(posed.joints),
-        sensors=sensor_spans(physics, len(touching), len(velocity_sites), bool(imu), more_sensors),
+        sensors=sensor_spans(physics, touching, velocity_sites, imu, more_sensors),
         spec=whole,
         names=names,
         contact_geoms=touching,

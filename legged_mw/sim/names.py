@@ -16,7 +16,7 @@ from legged_mw.utils.errors import unknown
 
 _SCENE = r"(floor|ground|around|relief|sky)(/.*)?"  # what is added around a robot, by sim.ground and to be looked at
 _SENSED = (
-    r"(contact|linvel|accelerometer|velocimeter|gyro|up|jointpos|jointvel|torque)/.*|self_contact|angular_momentum"
+    r"(contact|linvel|accelerometer|velocimeter|gyro|up|jointpos|jointvel|torque)/.*|self_contacts|angular_momentum"
 )
 _OURS = {"geoms": _SCENE, "hfields": _SCENE, "materials": _SCENE, "textures": _SCENE, "sensors": _SENSED}
 
