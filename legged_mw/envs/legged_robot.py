@@ -17,12 +17,12 @@ from legged_mw.envs.mirror import NO_MIRROR, Block, command_block, foot_blocks, 
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.terrain import Tiles, build_terrain
-from legged_mw.sim.errors import ModelError
 from legged_mw.sim.height_map import make_height_map
 from legged_mw.sim.mirror import Partners, find_partners, opposites
 from legged_mw.sim.terrain import PLATFORM, Terrain
 from legged_mw.utils.commands import VELOCITY, Command, command_table
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import ModelError
 from legged_mw.utils.math import assign, maybe_any, spread, wrap_to_pi, yaw_of
 
 

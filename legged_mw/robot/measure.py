@@ -22,10 +22,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.robot.vendor import tilt
 from legged_mw.sim.engines import make_simulation
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.pose import posed
+from legged_mw.sim.robot_file import tilt
 from legged_mw.sim.room import Room, count_room
 
 FloatArray = NDArray[np.float64]

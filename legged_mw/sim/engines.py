@@ -8,11 +8,10 @@ from collections.abc import Sequence
 
 import mujoco
 
-from legged_mw.sim.errors import EngineError
 from legged_mw.sim.room import count_room
 from legged_mw.sim.simulation import Simulation
 from legged_mw.sim.terrain import Terrain
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import EngineError, unknown
 from legged_mw.utils.machine import in_bytes, require_memory
 
 ENGINES = ("auto", "mujoco_warp", "mujoco")

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from legged_mw.robot.vendor import Loaded
 from legged_mw.sim.rigid import hold_joints, match_joints
+from legged_mw.sim.robot_file import RobotFile
 from legged_mw.sim.servos import Drive, Motor, Range, add_motors, set_efforts, set_joints
 from legged_mw.sim.tables import per_joint_all, some_joints
 
@@ -35,7 +35,7 @@ class Posed:
 
 
 def pose_joints(
-    robot: Loaded, tables: Mapping[str, Mapping[str, float]], pose: Mapping[str, float] | None, held: Sequence[str]
+    robot: RobotFile, tables: Mapping[str, Mapping[str, float]], pose: Mapping[str, float] | None, held: Sequence[str]
 ) -> Posed:
     """Weld the ``held`` joints, and give the others their numbers from ``tables``, what -> table.
 
@@ -75,7 +75,7 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> list[Range]:
 
 
 def set_machine(
-    robot: Loaded, partial: Mapping[str, Mapping[str, float]], posed: Posed, drive: Drive
+    robot: RobotFile, partial: Mapping[str, Mapping[str, float]], posed: Posed, drive: Drive
 ) -> tuple[float, ...]:
     """Motors with their force limits, armature and dry friction; what ``partial`` (of PARTIAL) says wins over the file.
 

@@ -16,19 +16,18 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from legged_mw.robot.vendor import Keyframe, Loaded, naming, read_robot
-from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND, Ground, add_ground, replace_level_pieces
 from legged_mw.sim.joints import Posed, pose_joints, set_machine
 from legged_mw.sim.names import Names, name_geoms
 from legged_mw.sim.rigid import fuse_fixed, sensed_site
+from legged_mw.sim.robot_file import Keyframe, RobotFile, naming, read_plain
 from legged_mw.sim.self_contact import leave_out_neighbours
 from legged_mw.sim.sensors import add_more_sensors, add_sensors, sensor_spans
 from legged_mw.sim.servos import Drive
 from legged_mw.sim.shapes import add_sites
 from legged_mw.sim.tables import per_joint as per_joint
 from legged_mw.sim.terrain import Terrain
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import ModelError, unknown
 
 # option -> its values
 _CHOICES = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone, "solver": mujoco.mjtSolver}
@@ -132,7 +131,7 @@ def build_model(
     drive: Drive = "angle",  # what `ctrl` means; with joints.CURVE in `tables` motors have torque-speed curves
 ) -> RobotModel:
     """Compile the MJCF or URDF at ``file`` for stepping."""
-    robot = read_robot(file, more_sensors)
+    robot = read_file(file, more_sensors)
     spec, notes = robot.spec, robot.notes
     with naming(file):
         posed = pose_joints(robot, {"`stiffness`": stiffness, "`damping`": damping, **tables}, pose, held_joints)
@@ -151,8 +150,18 @@ def build_model(
         return _compile(robot, posed, names, ground, made, touching, velocity_sites, imu, speeds, more_sensors)
 
 
+def read_file(file: Path, wanted: Collection[str] = ()) -> RobotFile:
+    """The robot in ``file``; its own sensors called as ``wanted`` are kept. Raises ModelError for what is no robot."""
+    robot = read_plain(file)
+    if robot is None:
+        from legged_mw.robot.vendor import read_robot  # this file is not plain
+
+        robot = read_robot(file, wanted)
+    return robot
+
+
 def _compile(
-    robot: Loaded,
+    robot: RobotFile,
     posed: Posed,
     names: Names,
     ground: Ground,

@@ -8,9 +8,8 @@ from collections.abc import Callable, Collection, Sequence
 
 import mujoco
 
-from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import ModelError, unknown
 
 SELF_CONTACT = "self_contacts"  # how many contacts the robot has with itself
 ANGULAR_MOMENTUM = "angular_momentum"  # of the whole robot about its centre of mass, world frame [kg m^2/s]
