@@ -17,7 +17,7 @@ from legged_mw.envs.gait import GaitClock
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_rewards import RobotRewards, need, not_sensed
 from legged_mw.sim.mirror import Partners
-from legged_mw.sim.pose import upright
+from legged_mw.sim.model import upright
 from legged_mw.sim.sensors import CONTACT_FORCE
 from legged_mw.utils.math import quat_rotate, yaw_of
 

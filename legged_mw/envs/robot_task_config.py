@@ -270,7 +270,7 @@ class RobotTaskCfg(Config):
         # implicitfast: joint damping is stable however large [P: euler]
         integrator: Literal["euler", "implicitfast"] = "euler"
         fuse: bool = True  # a recorded step's small operations go together in few kernels, equal to float32 rounding [ours: docs/lab.md]
-        nconmax: Whole = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model, as --check says [ours: sim/room.py]
+        nconmax: Whole = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model; see --check [ours: sim/capacity.py]
         njmax: Whole = (
             0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
         )
