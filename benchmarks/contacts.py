@@ -17,8 +17,8 @@ from step import timed
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.worlds import fuse_for
+from legged_mw.sim.capacity import count_capacity
 from legged_mw.sim.engines import ENGINES, pick_engine
-from legged_mw.sim.room import count_room
 from legged_mw.utils.cli import pick_device
 from legged_mw.utils.task import load_task
 
@@ -81,7 +81,7 @@ def main() -> None:
     first = statistics.median(next(iter(times.values())))
     for what, env in envs.items():
         model, sim, step = env.robot.physics, env.cfg.sim, statistics.median(times[what])
-        room = count_room(model, env.terrain is not None)
+        room = count_capacity(model, env.terrain is not None)
         geoms = int((model.geom_conaffinity & 1).sum())
         line = f"{what:<24}{geoms:>7}{sim.nconmax or room.contacts:>9}{sim.njmax or room.rows:>7}{step * 1e3:>11.2f}{step / first:>7.2f}"
         print(f"{line}{int(env.sim.overflowed_worlds()):>10}", flush=True)

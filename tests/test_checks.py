@@ -19,10 +19,9 @@ from legged_mw import ROOT
 from legged_mw.envs.checks import PAYS, WITHOUT, check_class, check_values
 from legged_mw.rl.health import Health
 from legged_mw.robot.page import doubts
-from legged_mw.sim.errors import ModelError
 from legged_mw.utils.bounds import bare, bounds_text
 from legged_mw.utils.config import ConfigError, field_types
-from legged_mw.utils.errors import StepError, in_short
+from legged_mw.utils.errors import ModelError, StepError, in_short
 from legged_mw.utils.renamed import LEGGED_GYM_METHODS, LEGGED_GYM_TENSORS
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -25,7 +25,7 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl.export import export
 from legged_mw.sim.engines import make_simulation
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
-from legged_mw.sim.sensors import ANGULAR_MOMENTUM, CONTACT_FORCE, SELF_CONTACT
+from legged_mw.sim.sensors import ANGULAR_MOMENTUM, CONTACT_FORCE, SELF_CONTACT, SENSORS
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.task import load_task
 
@@ -159,36 +159,33 @@ def test_a_foot_of_several_geoms_is_their_sum() -> None:
 # ---- on demand
 
 
-def test_a_term_that_is_on_has_what_it_reads_sensed() -> None:
+def test_a_term_that_is_on_has_what_it_needs_sensed() -> None:
     class Mine(LeggedRobot):
+        SENSED_FOR: ClassVar[Mapping[str, str]] = {**LeggedRobot.SENSED_FOR, "mine": CONTACT_FORCE}
+
         def _reward_mine(self) -> Tensor:
             return self.contact_forces[..., 2].sum(dim=1)
-
-    env = make_env(1, {**QUIET, "rewards.scales.mine": 1.0}, env_class=Mine)
-    assert env.robot.sensors.keys() == {"contact", "linvel", "accelerometer", CONTACT_FORCE}
-    assert env.contact_forces.shape == (1, 4, 3)
-    off = make_env(1, QUIET, env_class=Mine)
-    assert CONTACT_FORCE not in off.robot.sensors and off.feet.forces is None and not off._sensed
-
-
-def test_a_term_may_read_it_by_a_helper_or_its_parents_term() -> None:
-    class Mine(LeggedRobot):
-        @property
-        def heaviest(self) -> Tensor:
-            return self._loads().amax(dim=1)
-
-        def _loads(self) -> Tensor:
-            return torch.stack([(lambda foot: self.contact_forces[:, foot, 2])(foot) for foot in range(4)], dim=1)
-
-        def _reward_mine(self) -> Tensor:
-            return self.heaviest
 
         def _reward_stumble(self) -> Tensor:
             return super()._reward_stumble().clone()
 
     for name in ("mine", "stumble"):
-        assert CONTACT_FORCE in make_env(1, {**QUIET, f"rewards.scales.{name}": 1.0}, env_class=Mine).robot.sensors
-    assert CONTACT_FORCE not in make_env(1, QUIET, env_class=Mine).robot.sensors
+        env = make_env(1, {**QUIET, f"rewards.scales.{name}": 1.0}, env_class=Mine)
+        assert env.robot.sensors.keys() == {"contact", "linvel", "accelerometer", CONTACT_FORCE}
+        assert env.contact_forces.shape == (1, 4, 3)
+    off = make_env(1, QUIET, env_class=Mine)
+    assert CONTACT_FORCE not in off.robot.sensors and off.feet.forces is None
+
+
+def test_a_sensor_of_ones_own_is_a_row_of_the_table(monkeypatch: pytest.MonkeyPatch) -> None:
+    def add(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
+        kind, body = mujoco.mjtSensor.mjSENS_SUBTREECOM, mujoco.mjtObj.mjOBJ_BODY
+        spec.add_sensor(name="middle", type=kind, objtype=body, objname=root)
+
+    monkeypatch.setitem(SENSORS, "middle", add)
+    env = make_env(2, {**QUIET, "asset.sense": ["middle"]})
+    env.step(torch.zeros(2, 12))
+    assert env.sensor("middle").shape == (2, 3) and (env.sensor("middle")[:, 2] > 0.2).all()
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -220,9 +217,7 @@ def test_what_is_not_sensed_says_how_to_get_it(name: str) -> None:
         def _fallen(self) -> Tensor:
             return super()._fallen() | (getattr(self, name).flatten(1).abs().amax(dim=1) > 1e6)
 
-    error = (
-        f"{name} is not sensed, for no reward term that is on names it; write asset.sense = ['{name}'] in the config"
-    )
+    error = f"{name} is not sensed; write asset.sense = ['{name}'] in the config"
     with pytest.raises(ConfigError) as raised:
         make_env(1, QUIET, env_class=Fallen).step(torch.zeros(1, 12))
     assert str(raised.value) == error

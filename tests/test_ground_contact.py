@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import torch
 
-from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND
 from legged_mw.sim.ground_contact import HeightLookup, probes
 from legged_mw.sim.height_map import HeightMap
 from legged_mw.sim.terrain import Terrain, make_terrain
 from legged_mw.sim.warp_engine import WarpSimulation
+from legged_mw.utils.errors import ModelError
 
 RADIUS = 0.023  # [m] of a Go1's foot
 # a mesh of half these sizes [m]

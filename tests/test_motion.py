@@ -16,11 +16,11 @@ from legged_mw.envs.loading import load_robot
 from legged_mw.motion.__main__ import feet_of, main
 from legged_mw.motion.foreign import breadth_first, read_motion
 from legged_mw.motion.look import page
-from legged_mw.sim.errors import ModelError
+from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.pose import posed
 from legged_mw.skills.clip import Clip, ClipError, checked, from_rotation_vector, read_clip, save_clip
 from legged_mw.skills.kinematics import Kinematics
+from legged_mw.utils.errors import ModelError
 from legged_mw.utils.task import load_task
 
 CLIPS = sorted((ROOT / "resources/motions").glob("*.npz"))

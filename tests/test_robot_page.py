@@ -24,10 +24,9 @@ from legged_mw.robot.new import config_text, write
 from legged_mw.robot.page import page
 from legged_mw.robot.picture import HEIGHT, WIDTH, Label, _columns
 from legged_mw.robot.suggest import family, suggest
-from legged_mw.sim.errors import ModelError
 from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
 from legged_mw.utils.cli import one_line_errors
-from legged_mw.utils.errors import UserError
+from legged_mw.utils.errors import ModelError, UserError
 from legged_mw.utils.task import load_task
 from tests.program import SMALL, refused, run
 

@@ -14,9 +14,9 @@ from worlds import make_env
 from legged_mw import ROOT
 from legged_mw.check.describe import describe
 from legged_mw.envs.wording import config_words
+from legged_mw.sim.capacity import count_capacity
 from legged_mw.sim.engines import make_simulation
 from legged_mw.sim.model import Ground, Solver, build_model
-from legged_mw.sim.room import count_room
 from legged_mw.utils.task import load_task
 
 GO1, G1 = (ROOT / f"resources/robots/{name}/{name}.xml" for name in ("go1", "g1"))
@@ -61,27 +61,30 @@ BALL, STICK, BRICK = (
     ],
 )
 def test_rows_by_hand(model: mujoco.MjModel, contacts: int, rows: int) -> None:
-    room = count_room(model, terrain=False)
+    room = count_capacity(model, terrain=False)
     assert room[:2] == (max(contacts, 8), rows) and f" a contact with the ground ({contacts})" in room.why
 
 
 def test_parts_that_may_touch_one_another_want_more() -> None:
-    room, alone = count_room(walker(BRICK * 4, own=True), terrain=False), count_room(walker(BRICK * 4), terrain=False)
+    room, alone = (
+        count_capacity(walker(BRICK * 4, own=True), terrain=False),
+        count_capacity(walker(BRICK * 4), terrain=False),
+    )
     assert (room.contacts, room.rows) == (alone.contacts + 2 * 4, alone.rows + 4 * 4)  # nine geoms
     assert room.why == "2 dry friction, 2 limits, 4 a contact with the ground (33), 4 a contact of its own (4)"
 
 
 def test_terrain_wants_more() -> None:
     """A sphere in a corner touches twice; a capsule of 20 cm along its probes."""
-    assert count_room(walker(BALL), terrain=True).rows > 4 + 4 * 2 * 2
-    stick = count_room(walker(STICK), terrain=True)
+    assert count_capacity(walker(BALL), terrain=True).rows > 4 + 4 * 2 * 2
+    stick = count_capacity(walker(STICK), terrain=True)
     assert 4 + 4 * 2 * 3 < stick.rows < 4 + 4 * 2 * 8
 
 
 @pytest.mark.parametrize(("task", "counted"), [("go1_flat", (8, 40)), ("go1_rough", (8, 56))])
 def test_the_go1_gets_what_was_found_by_hand(task: str, counted: tuple[int, int]) -> None:
     env = make_env(1, {"terrain.num_rows": 1, "terrain.num_cols": 8} if task == "go1_rough" else None, task=task)
-    assert count_room(env.robot.physics, env.terrain is not None)[:2] == counted
+    assert count_capacity(env.robot.physics, env.terrain is not None)[:2] == counted
     assert (env.cfg.sim.nconmax, env.cfg.sim.njmax) == counted  # and still says so
 
 
@@ -97,7 +100,7 @@ def test_robots_that_thrash_find_room(file: Path, own: bool) -> None:
         file, solver=Solver(), ground=Ground(), colliders=["*"], self_collisions=own, **gains, **nothing
     )
     model, draw = robot.physics, np.random.default_rng(0)
-    data, room, most = mujoco.MjData(model), count_room(model, terrain=False), np.zeros(2)
+    data, room, most = mujoco.MjData(model), count_capacity(model, terrain=False), np.zeros(2)
     ends = np.where(model.jnt_limited[1:, None], model.jnt_range[1:], [-1.0, 1.0]).T
     for step in range(1500):
         if step % 300 == 0:

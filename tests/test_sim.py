@@ -15,11 +15,12 @@ from mujoco_warp import OverflowType
 from legged_mw import ROOT
 from legged_mw.drawing.scene import visual_model
 from legged_mw.sim.engines import make_simulation, pick_engine
-from legged_mw.sim.errors import EngineError, ModelError
 from legged_mw.sim.ground import GROUND, Ground
+from legged_mw.sim.joints import per_joint
 from legged_mw.sim.mirror import find_partners
-from legged_mw.sim.model import RobotModel, Solver, build_model, per_joint
+from legged_mw.sim.model import RobotModel, Solver, build_model
 from legged_mw.sim.simulation import Simulation
+from legged_mw.utils.errors import EngineError, ModelError
 
 GO1 = ROOT / "resources/robots/go1/go1.xml"
 FEET = ["FR", "FL", "RR", "RL"]

@@ -31,8 +31,8 @@ from legged_mw.rl.export import Exported, export
 from legged_mw.rl.policies import act, load_policy
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.symmetry import mirror
-from legged_mw.sim.errors import ModelError
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import ModelError
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
 # the numbers of others: built in test_skills

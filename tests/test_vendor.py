@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import struct
+import subprocess
+import sys
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,9 +26,11 @@ from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.loading import start_place
 from legged_mw.rl.export_scene import standalone
-from legged_mw.sim.errors import ModelError
-from legged_mw.sim.model import RobotModel
+from legged_mw.robot.vendor import read_robot
+from legged_mw.sim.model import RobotModel, read_file
+from legged_mw.sim.robot_file import read_plain
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import ModelError
 from legged_mw.view.video import save_png
 
 EXACT = {"sim.iterations": 100, "sim.ls_iterations": 50}
@@ -809,3 +813,40 @@ def test_a_training_says_its_warnings_once(tmp_path: Path) -> None:
     assert result.code == 0, result.err
     text = "warning: nothing limits the force of FR_calf_joint, FL_calf_joint, RR_calf_joint, RL_calf_joint: these servos are "
     assert result.out.count(text + "stronger than any motor; set asset.effort\n") == 1
+
+
+STEPS_WITHOUT = """
+import sys
+sys.modules["legged_mw.robot"] = None  # an import of it fails
+import torch
+from legged_mw.utils.task import load_task
+for name in ("go1_flat", "g1_flat"):
+    task = load_task(name)
+    task.set("env.num_envs", 2)
+    env = task.env_class(task.cfg, "cpu")
+    env.step(torch.zeros(2, env.num_actions))
+"""
+
+
+def test_a_plain_mjcf_is_loaded_without_the_package_for_others() -> None:
+    subprocess.run([sys.executable, "-c", STEPS_WITHOUT], check=True, cwd=ROOT)
+
+
+def test_a_file_is_plain_or_read_by_the_package(tmp_path: Path) -> None:
+    for file in (ROOT / "resources/robots").glob("*/*.xml"):
+        plain, other = read_plain(file), read_robot(file)
+        assert plain and plain.spec.to_xml() == other.spec.to_xml()
+        assert (plain.notes, plain.limits, plain.keyframe) == (other.notes, other.limits, other.keyframe)
+    text = (ROOT / "resources/robots/go1/go1.xml").read_text()
+    for more in (
+        "<sensor><gyro name='g' site='imu'/></sensor>",
+        "<actuator><motor joint='FR_hip_joint'/></actuator>",
+        "<worldbody><light/></worldbody>",
+        "<worldbody><geom type='plane' size='1 1 1'/></worldbody>",
+        "<compiler inertiafromgeom='true'/>",
+        "<default><geom friction='2'/></default>",
+        "<asset><material name='floor'/></asset>",
+    ):
+        (tmp_path / "go1.xml").write_text(text.replace("</mujoco>", f"{more}</mujoco>"))
+        assert read_plain(tmp_path / "go1.xml") is None
+        assert read_file(tmp_path / "go1.xml").root == "trunk"

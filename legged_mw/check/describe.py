@@ -7,7 +7,7 @@ from legged_mw.envs.motors import round_delay
 from legged_mw.envs.own_code import own_classes
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.students.estimator import find_targets
-from legged_mw.sim.room import count_room
+from legged_mw.sim.capacity import count_capacity
 from legged_mw.utils.task import LoadedTask
 
 
@@ -89,7 +89,7 @@ def _randomized(env: RobotTask) -> str:
 
 def _room(env: RobotTask) -> str:
     """What mujoco-warp allocates a world, and where the numbers come from."""
-    room, sim = count_room(env.robot.physics, env.terrain is not None), env.cfg.sim
+    room, sim = count_capacity(env.robot.physics, env.terrain is not None), env.cfg.sim
     asked, counted = (sim.nconmax or room.contacts, sim.njmax or room.rows), (room.contacts, room.rows)
     source = (
         f"the model: {room.why}"

@@ -11,8 +11,8 @@ import numpy as np
 
 from legged_mw.drawing.relief import add_relief, add_squares
 from legged_mw.sim.ground import GROUND, Ground, add_ground
+from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.pose import posed
 from legged_mw.sim.terrain import Terrain
 
 GROUND_MATERIAL = "ground"  # of the floor

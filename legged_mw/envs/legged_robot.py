@@ -19,16 +19,16 @@ from legged_mw.envs.feet import FootContacts, GaitClock
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.mirror import NO_MIRROR, Block, command_block, foot_blocks, scan_block
 from legged_mw.envs.observations import Row
-from legged_mw.envs.robot_task import RobotTask, need
+from legged_mw.envs.robot_task import RobotTask, need, not_sensed
 from legged_mw.envs.terrain import Tiles, build_terrain
-from legged_mw.sim.errors import ModelError
 from legged_mw.sim.height_map import make_height_map
 from legged_mw.sim.mirror import Partners, find_partners, opposites
-from legged_mw.sim.pose import upright
+from legged_mw.sim.model import upright
 from legged_mw.sim.sensors import CONTACT_FORCE
 from legged_mw.sim.terrain import PLATFORM, Terrain
 from legged_mw.utils.commands import VELOCITY, command_table
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import ModelError
 from legged_mw.utils.math import assign, maybe_any, quat_rotate, spread, wrap_to_pi, yaw_of
 
 PHASE_SIGMA = 0.01  # [m^2] of feet_phase: 0.1 m beside the wanted height leave a share of 1/e [P]
@@ -39,7 +39,10 @@ class LeggedRobot(RobotTask):
 
     cfg: LeggedRobotCfg
     exam = "walking"
-    ON_DEMAND: ClassVar[Mapping[str, str]] = {**RobotTask.ON_DEMAND, "contact_forces": CONTACT_FORCE}
+    SENSED_FOR: ClassVar[Mapping[str, str]] = {
+        **RobotTask.SENSED_FOR,
+        **dict.fromkeys(("feet_contact_forces", "soft_landing", "stumble"), CONTACT_FORCE),
+    }
 
     # ---- the step -------------------------------------------------------------------------------------------------
 
@@ -378,8 +381,6 @@ class LeggedRobot(RobotTask):
         self.foot_sites = torch.tensor([self.robot.id("site", name) for name in self.foot_names], device=self.device)
         self.foot_pos = self._zeros(feet, 3)  # [m, world]
         self.feet = FootContacts(self.robot, self.foot_geoms.values(), self.sim.sensordata, self.contact_count)
-        if self.feet.forces is not None:
-            self._sensed["contact_forces"] = self.feet.forces  # not the columns of the sensors
         self.foot_contact, self.first_contact = (self._zeros(feet, dtype=torch.bool) for _ in range(2))
         self.foot_speed = self._zeros(feet)  # horizontal [m/s]
         self._init_terrain()
@@ -476,12 +477,14 @@ class LeggedRobot(RobotTask):
 
     def _sensed_on_demand(self) -> list[str]:
         row = [CONTACT_FORCE] if self.cfg.observations.contact_forces else []
-        return list(dict.fromkeys([*super()._sensed_on_demand(), *row]))
+        return [*super()._sensed_on_demand(), *row]
 
     @property
     def contact_forces(self) -> Tensor:
         """(N, F, 3) Force of the ground on each foot in the last substep, world frame [N]; 0 in a world just reset."""
-        return self._sensed_value("contact_forces")
+        if self.feet.forces is None:
+            raise not_sensed("contact_forces")
+        return self.feet.forces
 
     def _time_contacts(self) -> None:
         """How long feet stood and swung, where a term that is on reads it; ``feet_air_time`` has this step's already."""

@@ -11,8 +11,7 @@ from legged_mw.envs.motors import motor_curves, motor_drive, motor_gains
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.wording import config_words
 from legged_mw.sim.joints import PARTIAL
-from legged_mw.sim.model import Ground, RobotModel, Solver, build_model
-from legged_mw.sim.pose import standing_height
+from legged_mw.sim.model import Ground, RobotModel, Solver, build_model, standing_height
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.files import find_file

@@ -14,13 +14,11 @@ Sources of the terms: [P] MuJoCo Playground; [L] legged_gym; [U] unitree_rl_gym,
 
 from __future__ import annotations
 
-import inspect
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from fnmatch import fnmatchcase
 from functools import cached_property, reduce
-from types import CodeType
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -42,7 +40,7 @@ from legged_mw.envs.wording import in_config_words
 from legged_mw.sim.engines import make_simulation, pick_engine
 from legged_mw.sim.mirror import Partners, find_partners
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.sensors import ANGULAR_MOMENTUM, SELF_CONTACT
+from legged_mw.sim.sensors import ANGULAR_MOMENTUM, SELF_CONTACT, SENSORS
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
@@ -58,8 +56,8 @@ class RobotTask(BaseTask):
     command_table: tuple[Command, ...] = ()  # what a person can ask of the robot; nothing
     commands: Tensor  # (N, C), in the order of command_table; only where that is not empty
 
-    # what is sensed only where a term that is on reads it, or asset.sense names it -> its sensor
-    ON_DEMAND: ClassVar[Mapping[str, str]] = {"self_contacts": SELF_CONTACT, "angular_momentum": ANGULAR_MOMENTUM}
+    # term -> what is sensed for it where it is on; `asset.sense` names more
+    SENSED_FOR: ClassVar[Mapping[str, str]] = {"self_collision": SELF_CONTACT, "angular_momentum": ANGULAR_MOMENTUM}
 
     @in_config_words()
     def __init__(self, cfg: RobotTaskCfg, device: str, eager: bool = False) -> None:
@@ -558,29 +556,16 @@ class RobotTask(BaseTask):
         return {name: float(scale) for name, scale in self.cfg.to_dict()["rewards"]["scales"].items() if scale}
 
     def _sensed_on_demand(self) -> list[str]:
-        """Sensors of ``ON_DEMAND`` whose values a term that is on reads, and all that ``asset.sense`` names, of the file too."""
-        asked, read = self.cfg.asset.sense, self._names_in_terms()
-        values = [sensor for name, sensor in self.ON_DEMAND.items() if name in read or name in asked]
-        return [*values, *(name for name in asked if name not in self.ON_DEMAND)]
-
-    def _names_in_terms(self) -> set[str]:
-        """Names that the terms that are on read, and the methods that they name, also those of a parent, which ``super()`` calls."""
-        found, ahead = set[str](), [f"_reward_{name}" for name in self._active_scales()]
-        while ahead:
-            if (name := ahead.pop()) not in found:
-                found.add(name)
-                ahead += [word for kind in type(self).__mro__ for word in _names_in(vars(kind).get(name))]
-        return found
-
-    def _sensed_value(self, name: str) -> Tensor:
-        if name not in self._sensed:
-            raise ConfigError(
-                f"{name} is not sensed, for no reward term that is on names it; write asset.sense = ['{name}'] in the config"
-            )
-        return self._sensed[name]
+        """Sensors that terms that are on need, and those that ``asset.sense`` names: of ``SENSORS``, or of the robot's file."""
+        needed = [sensor for term, sensor in self.SENSED_FOR.items() if term in self._active_scales()]
+        return [*needed, *self.cfg.asset.sense]
 
     def sensor(self, name: str) -> Tensor:
-        """(N, size) What the sensor called so in the robot's file measured in the last substep: a view, whose place is fixed."""
+        """(N, size) What a sensor of ``SENSORS`` or of the robot's file measured in the last substep: a view, whose place is fixed."""
+        if name in SENSORS:
+            if name not in self.robot.sensors:
+                raise not_sensed(name)
+            return self.sim.sensordata[:, self.robot.sensors[name]]
         if name in self.robot.file_sensors and not self.robot.spec.sensor(name):
             raise ConfigError(
                 f"sensor '{name}' of the robot's file was dropped; write asset.sense = ['{name}'] in the config"
@@ -590,25 +575,22 @@ class RobotTask(BaseTask):
     @property
     def self_contacts(self) -> Tensor:
         """(N, 1) How many contacts the robot has with itself."""
-        return self._sensed_value("self_contacts")
+        return self.sensor(SELF_CONTACT)
 
     @property
     def angular_momentum(self) -> Tensor:
         """(N, 3) Of the whole robot about its centre of mass, world frame [kg m^2/s]."""
-        return self._sensed_value("angular_momentum")
+        return self.sensor(ANGULAR_MOMENTUM)
 
     def _init_robot_rewards(self) -> None:
         """What terms need beside the state, where they are on."""
         on, rewards, robot = self._active_scales(), self.cfg.rewards, self.robot
-        known = [*self.ON_DEMAND, *robot.file_sensors]
+        known = [*SENSORS, *robot.file_sensors]
         for name in self.cfg.asset.sense:
             if name not in known:
                 raise ConfigError(
                     f"asset.sense: {unknown('value or sensor', name, known, f'{type(self).__name__} and its file')}"
                 )
-        spans = {name: robot.sensors.get(sensor) for name, sensor in self.ON_DEMAND.items()}
-        # values of ON_DEMAND that are sensed
-        self._sensed = {name: self.sim.sensordata[:, span] for name, span in spans.items() if span}
         self.last_dof_vel: Tensor | None = None  # (N, D) of the step before [rad/s]
         if "dof_acc" in on:
             self.last_dof_vel = torch.zeros_like(self.dof_vel)
@@ -798,17 +780,12 @@ class RobotTask(BaseTask):
         return self.self_contacts[:, 0].clone()
 
 
-def _names_in(method: Any) -> Iterator[str]:
-    """Names in the code of a method or a property, and in what is written inside of it."""
-    method = getattr(method, "fget", None) or getattr(method, "func", method)
-    codes = [getattr(inspect.unwrap(getattr(method, "__func__", method)), "__code__", None)]
-    for code in codes:
-        if code:
-            yield from code.co_names
-            codes += [each for each in code.co_consts if isinstance(each, CodeType)]
-
-
 def need(given: bool, term: str, what: str) -> None:
     """Refuse a term that is on without what it needs; terms are tried once before training."""
     if not given:
         raise ConfigError(f"rewards.scales.{term} is on, but {what}")
+
+
+def not_sensed(name: str) -> ConfigError:
+    """What reads ``name``, which nothing asked for."""
+    return ConfigError(f"{name} is not sensed; write asset.sense = ['{name}'] in the config")

@@ -90,7 +90,7 @@ class RobotTaskCfg(Config):
         self_collisions: bool = False  # among the colliders
         penalize_contacts_on: list[str] = []  # likewise, colliders: `collision` counts their bodies on the ground [L]
         terminate_after_contacts_on: list[str] = []  # likewise: to touch the ground with one of these is a fall [L]
-        # what code of yours reads outside of reward terms: contact_forces, self_contacts, angular_momentum, sensors of the file by name
+        # what code of yours reads: contact_forces, self_contacts, angular_momentum, sensors of the file by name
         sense: list[str] = []
         # names or patterns: welded at their default angle, so that they are no joints any more
         held_joints: list[str] = []
@@ -270,7 +270,7 @@ class RobotTaskCfg(Config):
         # implicitfast: joint damping is stable however large [P: euler]
         integrator: Literal["euler", "implicitfast"] = "euler"
         fuse: bool = True  # a recorded step's small operations go together in few kernels, equal to float32 rounding [ours: docs/lab.md]
-        nconmax: Whole = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model, as --check says [ours: sim/room.py]
+        nconmax: Whole = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model; see --check [ours: sim/capacity.py]
         njmax: Whole = (
             0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
         )

@@ -17,8 +17,8 @@ from legged_mw.eval.page import Column
 from legged_mw.eval.peers import best_of
 from legged_mw.eval.rollout import Policy, Record, Signal, roll_out
 from legged_mw.eval.trials import NAMES, STEPS_AT, Plan, make_plan
+from legged_mw.sim.joints import family
 from legged_mw.sim.servos import CURVE
-from legged_mw.sim.tables import family
 from legged_mw.utils.task import LoadedTask
 
 GAIT_SECONDS = ESTIMATE_SECONDS = 2.0  # of each command, that the gait diagram and the estimate's picture show

@@ -11,8 +11,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.pose import posed
 from legged_mw.skills.clip import KEYS, Clip, ClipError, checked, clip_of
 from legged_mw.utils.arrays import read_arrays
 

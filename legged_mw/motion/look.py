@@ -11,7 +11,7 @@ import numpy as np
 
 from legged_mw.drawing.scene import visual_spec
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.shapes import SPACING, spheres_on
+from legged_mw.sim.surface_points import SPACING, spheres_on
 from legged_mw.skills.clip import Clip, Floats
 from legged_mw.utils.commands import Command
 from legged_mw.view.stage import BoolArray, FloatArray

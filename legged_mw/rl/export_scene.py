@@ -16,10 +16,10 @@ import numpy as np
 from legged_mw.drawing.relief import STEEP_LIGHT
 from legged_mw.drawing.scene import dressed
 from legged_mw.rl.export_meshes import shorten
-from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND, MOST_BOXES, Box, add_ground_box, as_boxes, feel_all_ground
 from legged_mw.sim.model import RobotModel
 from legged_mw.sim.terrain import Terrain
+from legged_mw.utils.errors import ModelError
 
 AROUND = 1000.0  # [m] of level ground around tiles of steps, more than a robot walks
 HOME = "home"  # the keyframe: the pose to start in, and the servos holding it

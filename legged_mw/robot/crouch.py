@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legged_mw.robot.feet import Foot
+from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.pose import posed
 
 # ours: the knee's angle about the axis to the left [rad]; a quadruped leans its thighs back (Go1 0.9 and -1.8), a biped forwards
 KNEE = {2: 0.6}

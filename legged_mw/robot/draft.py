@@ -25,11 +25,10 @@ from legged_mw.robot.feet import Foot, guess_feet
 from legged_mw.robot.measure import Joint, mass_matrices, stand_as_statue, stand_on_servos, what_joints_bear
 from legged_mw.robot.suggest import Gains, suggest
 from legged_mw.robot.vendor import read_robot
-from legged_mw.sim.errors import ModelError
-from legged_mw.sim.model import RobotModel
-from legged_mw.sim.pose import posed, standing_height
-from legged_mw.sim.tables import family, per_joint
+from legged_mw.sim.joints import family, per_joint, posed
+from legged_mw.sim.model import RobotModel, standing_height
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import ModelError
 
 LOW = 0.33  # [m] a root that stands lower than this cannot swing its feet as high as others
 # times the suggested gains: beyond 2 it is another robot than vendors publish gains for [ours]

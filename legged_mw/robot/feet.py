@@ -10,11 +10,10 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.sim.errors import ModelError
+from legged_mw.sim.joints import family, posed
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.pose import posed
-from legged_mw.sim.shapes import surfaces
-from legged_mw.sim.tables import family
+from legged_mw.sim.surface_points import surfaces
+from legged_mw.utils.errors import ModelError
 
 # [m], and of the robot's height: ends of limbs that are so much higher than the lowest are feet too
 _SAME, _SAME_SHARE = 0.03, 0.08

@@ -22,11 +22,11 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.robot.vendor import tilt
+from legged_mw.sim.capacity import Capacity, count_capacity
 from legged_mw.sim.engines import make_simulation
+from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.pose import posed
-from legged_mw.sim.room import Room, count_room
+from legged_mw.sim.robot_file import tilt
 
 FloatArray = NDArray[np.float64]
 
@@ -119,7 +119,7 @@ class Health:
     stand: Stand
     dt: float  # substep [s]
     implicit: bool  # whether the integrator is implicitfast
-    room: Room  # for contacts and constraint rows on mujoco-warp
+    room: Capacity  # for contacts and constraint rows on mujoco-warp
 
 
 def measure(
@@ -144,7 +144,7 @@ def measure(
         stand=stand_on_servos(robot, angles, place, decimation),
         dt=float(model.opt.timestep),
         implicit=implicit,
-        room=count_room(model, terrain=rough),
+        room=count_capacity(model, terrain=rough),
     )
 
 

@@ -10,7 +10,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from legged_mw.sim.errors import ModelError
+from legged_mw.sim.robot_file import compile_copy
+from legged_mw.utils.errors import ModelError
 
 READABLE = (".stl", ".obj", ".msh")  # that MuJoCo has a reader for
 INSTEAD = 'give the geom a primitive shape, or let it not collide (contype="0" conaffinity="0")'
@@ -29,7 +30,7 @@ def compile_readable(spec: mujoco.MjSpec, where: str, notes: list[str]) -> mujoc
     Raises ModelError for a mesh that collides or gives a body its mass, ValueError for what else is wrong.
     """
     try:
-        return _compile(spec)
+        return compile_copy(spec)
     except ValueError:  # only then files are looked at: those of an attached model are not where the others are
         broken = {
             mesh.name: why_unreadable(path_of(spec, mesh)) or _read_error(spec, mesh)
@@ -40,14 +41,7 @@ def compile_readable(spec: mujoco.MjSpec, where: str, notes: list[str]) -> mujoc
             raise
     _drop(spec, broken, where, notes)
     _drop_pictures(spec, notes)
-    return _compile(spec)
-
-
-def _compile(spec: mujoco.MjSpec) -> mujoco.MjModel:
-    """Looks take most of the time, and only files can be wrong."""
-    copy = spec.copy()
-    copy.compiler.discardvisual = not any(item.file for item in (*spec.meshes, *spec.textures))
-    return copy.compile()
+    return compile_copy(spec)
 
 
 def _drop(spec: mujoco.MjSpec, reasons: Mapping[str, str], where: str, notes: list[str]) -> None:

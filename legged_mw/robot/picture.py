@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from legged_mw.drawing.scene import visual_spec
+from legged_mw.sim.joints import family
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.tables import family
 from legged_mw.view.feet import patch
 from legged_mw.view.overlay import connect, draw_disc
 from legged_mw.view.posed_robot import GROUPS_SHOWN, PosedRobots, boxes

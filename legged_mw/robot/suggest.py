@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from legged_mw.robot.measure import Joint
-from legged_mw.sim.tables import family
+from legged_mw.sim.joints import family
 
 FULL_EFFORT_AT = 1.0  # [rad]
 LOAD, SAG = 2.0, 0.4  # times the torque at rest, held within so much [rad]

@@ -1,16 +1,15 @@
 """A robot's file as its vendor wrote it, read for a simulation that brings its own ground, servos and sensors.
 
-Whatever is dropped, added or renamed is a line of ``Loaded.notes``. Host only; nothing is stepped.
+Whatever is dropped, added or renamed is a line of ``RobotFile.notes``. Host only; nothing is stepped.
 """
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
+import re
 import warnings
-from collections.abc import Collection, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Collection
 from pathlib import Path
 
 import mujoco
@@ -18,20 +17,16 @@ import numpy as np
 
 from legged_mw.robot.meshes import compile_readable
 from legged_mw.robot.urdf import read_urdf
-from legged_mw.sim.errors import ModelError
-from legged_mw.sim.names import give_way
-from legged_mw.sim.servos import Range, take_limits
+from legged_mw.sim.robot_file import SCALAR_JOINTS, SCENE, RobotFile, kind_of, naming, take_keyframe
+from legged_mw.sim.servos import take_limits
+from legged_mw.utils.errors import ModelError
 from legged_mw.utils.mjcf import Source, check_model
 
-_SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-_FREE = mujoco.mjtJoint.mjJNT_FREE
-_COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # of qpos; all other joints have one
 _ADDED = {  # what a default may say of what is added to the robot
     "geom": "type contype conaffinity condim priority friction solmix solref solimp margin gap rgba group density material",
     "site": "type size group rgba material",
     "actuator": "gaintype gainprm biastype biasprm dyntype dynprm gear ctrllimited ctrlrange forcelimited forcerange actlimited actrange",
 }
-_UPRIGHT = 0.5  # [degrees] of tilt that are rounding
 _KEPT_SENSORS = (
     "TOUCH",
     "FORCE",
@@ -45,86 +40,36 @@ _KEPT_SENSORS = (
     "PLUGIN",
     "TACTILE",
 )
+_SENSED = re.compile(
+    r"(contact|linvel|accelerometer|velocimeter|gyro|up|jointpos|jointvel|torque)/.*|self_contacts|angular_momentum"
+)
+_OURS = {"geoms": SCENE, "hfields": SCENE, "materials": SCENE, "textures": SCENE, "sensors": _SENSED}
 
 
-@dataclass(frozen=True)
-class Keyframe:
-    """A pose that the file holds."""
-
-    name: str
-    height: float | None  # of the upright root [m]; None: the file has no free joint, or tilts it
-    angles: dict[str, float]  # joint -> [rad]
-
-
-@dataclass(frozen=True)
-class Loaded:
-    """A robot alone: one root with a free joint, named joints, no actuators, of its own sensors those that feel contact or are wanted."""
-
-    spec: mujoco.MjSpec
-    model: mujoco.MjModel  # the same, compiled
-    where: str  # the file's name
-    notes: list[str]
-    limits: dict[str, Range]  # joint -> force [N m], of those that the file limits
-    speeds: dict[str, float]  # joint -> highest speed [rad/s], likewise
-    keyframe: Keyframe | None  # "home", or the only one
-    sensors: tuple[str, ...]  # names of the file's, kept or dropped
-
-    @property
-    def root(self) -> str:
-        """Name of the body that carries the free joint."""
-        return self.spec.joints[0].parent.name
-
-    @property
-    def joints(self) -> list[mujoco.MjsJoint]:
-        """The scalar joints, in order of qpos[7:]."""
-        return list(self.spec.joints)[1:]
-
-
-def read_robot(file: Path, wanted: Collection[str] = ()) -> Loaded:
+def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
     """Read an MJCF or URDF; keep its sensors called as ``wanted``. Raises ModelError for what is none, or cannot be a robot alone."""
     if not file.is_file():
-        raise ModelError(f"no {_kind(file)} at {file}")
+        raise ModelError(f"no {kind_of(file)} at {file}")
     where, notes = file.name, []
     with naming(file):
         source = Source(file)
         spec, speeds = read_urdf(source, notes) if source.root.tag == "robot" else (source.spec(), {})
         _infer_inertias(spec)
         limits = take_limits(spec, notes)
-        keyframe = _take_keyframe(spec, notes)
+        keyframe = take_keyframe(spec, notes)
         sensors = tuple(sensor.name for sensor in spec.sensors if sensor.name)
         _drop_sensors(spec, wanted, notes)
         _drop_world(spec, where, notes)
         _forget_defaults(spec)
         _free_root(spec, where, notes)
         _balance(spec, notes)
-        give_way(spec, notes)
+        _rename_clashes(spec, notes)
         with warnings.catch_warnings(record=True) as said:
             model = compile_readable(spec, where, notes)
         check_model(model)
         notes += [f"warning: {' '.join(str(each.message).split())}" for each in said]
     _check_joints(spec, where)
-    return Loaded(spec, model, where, notes, limits, speeds, keyframe, sensors)
-
-
-@contextmanager
-def naming(file: Path) -> Iterator[None]:
-    """MuJoCo's errors in one line, with the file's name."""
-    try:
-        yield
-    except ModelError:
-        raise
-    except (ValueError, RecursionError) as error:  # parsing does not see a name that is used twice, compiling does
-        why = (
-            "it is nested too deeply"
-            if isinstance(error, RecursionError)
-            else str(error).partition("The visual elements of the spec")[0]
-        )
-        raise ModelError(f"{file.name} is not a valid {_kind(file)}: {' '.join(why.split())}") from None
-
-
-def _kind(file: Path) -> str:
-    """What its name says that it is."""
-    return "URDF" if file.suffix == ".urdf" else "MJCF"
+    return RobotFile(spec, model, where, notes, limits, speeds, keyframe, sensors)
 
 
 def _infer_inertias(spec: mujoco.MjSpec) -> None:
@@ -136,44 +81,6 @@ def _infer_inertias(spec: mujoco.MjSpec) -> None:
         for body in spec.bodies[1:]:
             for name in ("explicitinertial", "mass", "ipos", "iquat", "inertia", "fullinertia"):
                 setattr(body, name, getattr(fresh, name))
-
-
-def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
-    """The keyframe "home", or the only one; none stays in the file, as it would have to fit the servos."""
-    keys, taken = list(spec.keys), None
-    chosen = next((key for key in keys if key.name == "home"), keys[0] if len(keys) == 1 else None)
-    qpos = list(chosen.qpos) if chosen else []
-    starts = np.cumsum([0, *(_COLUMNS.get(joint.type, 1) for joint in spec.joints)])
-    if chosen and len(qpos) == starts[-1]:
-        angles = {
-            joint.name: qpos[start]
-            for joint, start in zip(spec.joints, starts[:-1], strict=True)
-            if joint.type in _SCALAR_JOINTS
-        }
-        first = next(iter(spec.joints), None)
-        free = bool(first and first.type == _FREE)
-        lean = tilt(qpos[3:7]) if free else 0.0
-        taken = Keyframe(chosen.name, qpos[2] if free and lean < _UPRIGHT else None, angles)
-        notes.append(f"keyframe '{chosen.name}' read: pose and height of the root, where nothing else states them")
-        if lean > _UPRIGHT:
-            text = f"warning: keyframe '{chosen.name}' tilts the root by {lean:.0f} degrees; that and its height are not read, the root "
-            notes.append(f"{text}begins upright: state a pose for that by `pose`")
-    for key in keys:
-        if key is not chosen:
-            notes.append(f"keyframe '{key.name}' dropped")
-        elif not taken:
-            notes.append(
-                f"keyframe '{key.name}' dropped: its qpos has {len(qpos)} numbers, the joints of the file have {starts[-1]}"
-            )
-        spec.delete(key)
-    spec.nkey = 0
-    return taken
-
-
-def tilt(quat: Sequence[float] | np.ndarray) -> float:
-    """Between the root's z axis and the vertical [degrees]; ``quat`` wxyz."""
-    w, x, y, z = np.array(quat) / (np.linalg.norm(quat) or 1.0)
-    return float(np.degrees(np.arccos(np.clip(w * w - x * x - y * y + z * z, -1.0, 1.0))))
 
 
 def _drop_sensors(spec: mujoco.MjSpec, wanted: Collection[str], notes: list[str]) -> None:
@@ -263,7 +170,7 @@ def _free_root(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
         root.add_freejoint()
         notes.append(f"free joint added to '{root.name}'")
     first = root.joints[0]
-    if first.type != _FREE:
+    if first.type != mujoco.mjtJoint.mjJNT_FREE:
         raise ModelError(
             f"{where}: the first joint must be the root body's free joint; it is {first.name or 'one without a name'}"
         )
@@ -295,9 +202,38 @@ def _balance(spec: mujoco.MjSpec, notes: list[str]) -> None:
             )
 
 
+def _rename_clashes(spec: mujoco.MjSpec, notes: list[str]) -> None:
+    """Rename what the file calls as we call something of our own."""
+    renamed: dict[str, dict[str, str]] = {}
+    for kind, ours in _OURS.items():
+        taken, new = {thing.name for thing in getattr(spec, kind)}, renamed.setdefault(kind, {})
+        for thing in [thing for thing in getattr(spec, kind) if ours.fullmatch(thing.name)]:
+            name = f"robot_{thing.name}"
+            while name in taken:
+                name = f"{name}_"
+            taken.add(name)
+            new[thing.name] = thing.name = name
+    for kind, names in renamed.items():
+        notes += [
+            f"{kind.removesuffix('s')} '{old}' is called '{new}': the first name is one of ours"
+            for old, new in names.items()
+        ]
+    for thing in (*spec.geoms, *spec.sites, *spec.meshes, *spec.skins, *spec.tendons):
+        thing.material = renamed["materials"].get(thing.material, thing.material)
+    for geom in spec.geoms:
+        geom.hfieldname = renamed["hfields"].get(geom.hfieldname, geom.hfieldname)
+    for material in spec.materials:
+        material.textures = [renamed["textures"].get(name, name) for name in material.textures]
+    for sensor in spec.sensors:
+        for what in ("obj", "ref"):
+            if getattr(sensor, f"{what}type") == mujoco.mjtObj.mjOBJ_GEOM:
+                name = getattr(sensor, f"{what}name")
+                setattr(sensor, f"{what}name", renamed["geoms"].get(name, name))
+
+
 def _check_joints(spec: mujoco.MjSpec, where: str) -> None:
     if len(joints := list(spec.joints)[1:]) == 0:
         raise ModelError(f"{where} has no hinge or slide joint, so nothing of it can be moved")
     for joint in joints:
-        if joint.type not in _SCALAR_JOINTS or not joint.name:
+        if joint.type not in SCALAR_JOINTS or not joint.name:
             raise ModelError(f"{where}: joint '{joint.name}' must be a named hinge or slide joint")

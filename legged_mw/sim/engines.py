@@ -8,11 +8,10 @@ from collections.abc import Sequence
 
 import mujoco
 
-from legged_mw.sim.errors import EngineError
-from legged_mw.sim.room import count_room
+from legged_mw.sim.capacity import count_capacity
 from legged_mw.sim.simulation import Simulation
 from legged_mw.sim.terrain import Terrain
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import EngineError, unknown
 from legged_mw.utils.machine import in_bytes, require_memory
 
 ENGINES = ("auto", "mujoco_warp", "mujoco")
@@ -52,7 +51,7 @@ def make_simulation(
     ``terrain`` is what the model's height field was made from: mujoco-warp gets contacts of our own with it
     (``sim/ground_contact.py``), MuJoCo's own engine those of the model.
 
-    ``nconmax`` and ``njmax`` are the contacts and constraint rows a world has room for, 0: what ``room.count_room`` finds;
+    ``nconmax`` and ``njmax`` are the contacts and constraint rows a world has room for, 0: what ``capacity.count_capacity`` finds;
     MuJoCo's own engine allocates as it needs and leaves them aside. ``threads`` are those of MuJoCo's own engine, 0: one a
     core. ``world_fields`` names model fields that get a value per world (see ``field``). ``eager`` switches mujoco-warp's
     replay on a CPU off.
@@ -60,7 +59,7 @@ def make_simulation(
     kind = pick_engine(engine, device)
     world, room = _SHARE[kind] * mujoco.MjData(model).nbuffer, ""
     if kind == "mujoco_warp":
-        counted = count_room(model, terrain is not None)
+        counted = count_capacity(model, terrain is not None)
         nconmax, njmax = nconmax or counted.contacts, njmax or counted.rows
         world += 4 * (njmax * (model.nv + 10) + nconmax * 30)
         room = f" with `nconmax` = {nconmax}, `njmax` = {njmax}"

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from legged_mw.fast.trace import not_traced
 from legged_mw.sim.ground import PROBE_SPACING
-from legged_mw.sim.shapes import spheres_on
+from legged_mw.sim.surface_points import spheres_on
 from legged_mw.sim.terrain import Terrain
 
 wp.set_module_options({"enable_backward": False})

@@ -1,26 +1,95 @@
-"""The joints of a robot that was read: which move, in which pose they stand, and their servos, limits and friction."""
+"""The joints of a robot: tables of numbers a joint, which joints move, the pose that they stand in, and their motors.
+
+A table is key -> number. A joint's value is that of its exact name, else of the longest key that is part of its name, else of "".
+"""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
-from legged_mw.robot.vendor import Loaded
-from legged_mw.sim.rigid import hold_joints, match_joints
+from legged_mw.sim.fixed_bodies import hold_joints, match_joints
+from legged_mw.sim.robot_file import RobotFile
 from legged_mw.sim.servos import CURVE, Drive, Motor, Range, add_motors, curves_at_joints, set_efforts, set_joints
-from legged_mw.sim.tables import per_joint_all, some_joints
+from legged_mw.utils.errors import ModelError, unknown
 
 _BEYOND = 1e-3  # [rad] that a pose may be beyond a range by rounding
 PARTIAL = ("effort", "armature", "frictionloss", "joint_speed_limits")  # tables that need not name every joint
 
+_UPRIGHT = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)  # place and attitude of a root
+_NO_KIND = {"joint", "l", "r", "left", "right", "fl", "fr", "rl", "rr", "lf", "rf", "lh", "rh", "hl", "hr", "bl", "br"}
+_NO_KIND |= {"front", "rear", "hind", "back"}
+
+
+# ---- tables
+
+
+def some_joints(
+    table: Mapping[str, float], joints: Sequence[str], what: str, spare: Sequence[str] = ()
+) -> dict[str, float]:
+    """Joint -> value, of those ``joints`` that a key fits: a key fits if it is the joint's name or a part of it.
+
+    Raises ModelError for a key without a joint, and for two keys that fit a joint equally well. A key may fit one in ``spare`` instead.
+    """
+    for key in table:
+        if key and not any(key in joint for joint in (*joints, *spare)):
+            raise ModelError(
+                f"{what}: {unknown('joint', key, joints, 'the MJCF')} (a key may be a part of a joint's name)"
+            )
+    found = {}
+    for joint in joints:
+        fitting = sorted((key for key in table if key in joint), key=len)
+        if not fitting:
+            continue
+        *others, best = fitting
+        if others and len(others[-1]) == len(best):
+            raise ModelError(
+                f"{what}: '{others[-1]}' and '{best}' fit joint '{joint}' equally well; add the key '{joint}'"
+            )
+        found[joint] = float(table[best])
+    return found
+
+
+def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str, spare: Sequence[str] = ()) -> list[float]:
+    """Values (D,) for ``joints``. Raises ModelError for joints without a key, and as ``some_joints`` does."""
+    found = some_joints(table, joints, what, spare)
+    if without := [joint for joint in joints if joint not in found]:
+        raise ModelError(
+            f"{what}: no value for {', '.join(without)}: none of {list(table)} is a part of these names; add keys, or '' for all others"
+        )
+    return list(found.values())
+
+
+def per_joint_all(
+    tables: Mapping[str, Mapping[str, float]], joints: Sequence[str], spare: Sequence[str] = ()
+) -> dict[str, list[float]]:
+    """``per_joint`` of several tables, by what they are; the error is about all of them at once."""
+    values, wrong = dict[str, list[float]](), []
+    for what, table in tables.items():
+        try:
+            values[what] = per_joint(table, joints, what, spare)
+        except ModelError as error:
+            wrong.append(str(error))
+    if wrong:
+        raise ModelError("; ".join(wrong))
+    return values
+
+
+def family(name: str) -> str:
+    """A joint's name without its side and the word joint: "hip" of "FR_hip_joint"; the whole name, if nothing is left."""
+    return "_".join(part for part in name.split("_") if part.lower() not in _NO_KIND) or name
+
+
+# ---- pose and motors
+
 
 @dataclass(frozen=True)
-class Posed:
+class PosedRobot:
     """D joints that move, and what holds the others."""
 
     model: mujoco.MjModel  # the robot alone, compiled, its held joints welded
@@ -33,8 +102,8 @@ class Posed:
 
 
 def pose_joints(
-    robot: Loaded, tables: Mapping[str, Mapping[str, float]], pose: Mapping[str, float] | None, held: Sequence[str]
-) -> Posed:
+    robot: RobotFile, tables: Mapping[str, Mapping[str, float]], pose: Mapping[str, float] | None, held: Sequence[str]
+) -> PosedRobot:
     """Weld the ``held`` joints, and give the others their numbers from ``tables``, what -> table.
 
     The pose is the caller's, then the keyframe's; where both are silent 0 for a held joint, and for all of them if ``pose`` is None.
@@ -61,7 +130,7 @@ def pose_joints(
             robot.notes.append(
                 f"warning: `pose`: {name} stands at {angle:g} rad, beyond its range from {low:g} to {high:g} rad"
             )
-    return Posed(model, moving, welded, angles, ranges, values | curves_at_joints(values))
+    return PosedRobot(model, moving, welded, angles, ranges, values | curves_at_joints(values))
 
 
 def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> list[Range]:
@@ -70,7 +139,7 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> list[Range]:
 
 
 def set_machine(
-    robot: Loaded, partial: Mapping[str, Mapping[str, float]], posed: Posed, drive: Drive
+    robot: RobotFile, partial: Mapping[str, Mapping[str, float]], posed: PosedRobot, drive: Drive
 ) -> tuple[float, ...]:
     """Motors with their force limits, armature and dry friction; what ``partial`` (of PARTIAL) says wins over the file.
 
@@ -87,3 +156,11 @@ def set_machine(
         | said["joint_speed_limits"]
     )
     return tuple(speeds.get(name, np.inf) for name in posed.joints)
+
+
+def posed(model: mujoco.MjModel, joints: Iterable[float], root: Iterable[float] = _UPRIGHT) -> mujoco.MjData:
+    """Places of bodies, geoms and sites with the joints at the angles ``joints`` (D,) [rad] and the ``root`` (7,) there."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = [*root, *joints]
+    mujoco.mj_kinematics(model, data)
+    return data

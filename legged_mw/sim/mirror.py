@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
-from legged_mw.sim.errors import ModelError
+from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.pose import posed
+from legged_mw.utils.errors import ModelError
 
 # a place, a velocity, a force; what turns (an axis, an angular velocity) is axial: -POLAR
 POLAR = np.array([1.0, -1.0, 1.0])

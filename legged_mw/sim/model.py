@@ -12,23 +12,21 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
 
-from legged_mw.robot.vendor import Keyframe, Loaded, naming, read_robot
-from legged_mw.sim.errors import ModelError
+from legged_mw.sim.fixed_bodies import fuse_fixed, sensed_site
+from legged_mw.sim.geom_names import Names, name_geoms
 from legged_mw.sim.ground import GROUND, Ground, add_ground, replace_level_pieces
-from legged_mw.sim.joints import Posed, pose_joints, set_machine
-from legged_mw.sim.names import Names, name_geoms
-from legged_mw.sim.rigid import fuse_fixed, sensed_site
-from legged_mw.sim.self_contact import leave_out_neighbours
+from legged_mw.sim.joints import PosedRobot, pose_joints, posed, set_machine
+from legged_mw.sim.robot_file import Keyframe, RobotFile, naming, read_plain
 from legged_mw.sim.sensors import add_more_sensors, add_sensors, sensor_spans
 from legged_mw.sim.servos import Drive
-from legged_mw.sim.shapes import add_sites
-from legged_mw.sim.tables import per_joint as per_joint
+from legged_mw.sim.surface_points import add_sites, surfaces
 from legged_mw.sim.terrain import Terrain
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import ModelError, unknown
 
 # option -> its values
 _CHOICES = {"integrator": mujoco.mjtIntegrator, "cone": mujoco.mjtCone, "solver": mujoco.mjtSolver}
@@ -119,7 +117,7 @@ def build_model(
     contact_geoms: Sequence[str],  # sensed: number of contacts with the ground; likewise, each geom once
     velocity_sites: Sequence[str],  # sensed: linear velocity, world frame [m/s]
     imu_site: str
-    | None,  # sensed: proper acceleration in the root's axes [m/s^2]; as for rigid.sensed_site; None: not at all
+    | None,  # sensed: proper acceleration in the root's axes [m/s^2]; as for fixed_bodies.sensed_site; None: not at all
     # name -> geoms, likewise; a site that the MJCF lacks is made there
     sites: Mapping[str, Sequence[str]] | None = None,
     # as for per_joint: angles [rad]; where it is silent the keyframe's; None without one: all 0
@@ -132,7 +130,7 @@ def build_model(
     drive: Drive = "angle",  # what `ctrl` means; with servos.CURVE in `tables` motors have torque-speed curves
 ) -> RobotModel:
     """Compile the MJCF or URDF at ``file`` for stepping."""
-    robot = read_robot(file, more_sensors)
+    robot = read_file(file, more_sensors)
     spec, notes = robot.spec, robot.notes
     with naming(file):
         posed = pose_joints(robot, {"`stiffness`": stiffness, "`damping`": damping, **tables}, pose, held_joints)
@@ -143,7 +141,7 @@ def build_model(
         add_ground(spec, ground, notes)
         _set_collisions(spec, names.find(colliders, "`colliders`", colliding=True), self_collisions, notes)
         if self_collisions:
-            leave_out_neighbours(spec, posed.joints, posed.angles, notes)
+            _leave_out_neighbours(spec, posed.joints, posed.angles, notes)
         speeds = set_machine(robot, partial or {}, posed, drive)
         made = {name: names.find(geoms, f"`sites`: '{name}'") for name, geoms in (sites or {}).items()}
         add_sites(spec, made, posed.angles, robot.where, notes)
@@ -151,9 +149,19 @@ def build_model(
         return _compile(robot, posed, names, ground, made, touching, velocity_sites, imu, speeds, more_sensors)
 
 
+def read_file(file: Path, wanted: Collection[str] = ()) -> RobotFile:
+    """The robot in ``file``; its own sensors called as ``wanted`` are kept. Raises ModelError for what is no robot."""
+    robot = read_plain(file)
+    if robot is None:
+        from legged_mw.robot.vendor import read_robot  # this file is not plain
+
+        robot = read_robot(file, wanted)
+    return robot
+
+
 def _compile(
-    robot: Loaded,
-    posed: Posed,
+    robot: RobotFile,
+    posed: PosedRobot,
     names: Names,
     ground: Ground,
     site_geoms: dict[str, tuple[str, ...]],
@@ -172,7 +180,7 @@ def _compile(
         physics=physics,
         root=robot.root,
         joint_names=tuple(posed.joints),
-        sensors=sensor_spans(physics, len(touching), len(velocity_sites), bool(imu), more_sensors),
+        sensors=sensor_spans(physics, touching, velocity_sites, imu, more_sensors),
         spec=whole,
         names=names,
         contact_geoms=touching,
@@ -251,3 +259,56 @@ def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisio
             off.append(geom.name)
     if off:
         notes.append(f"collisions off: {', '.join(off)}")
+
+
+def _leave_out_neighbours(
+    spec: mujoco.MjSpec, joints: Sequence[str], angles: Sequence[float], notes: list[str]
+) -> None:
+    """Exclude the pairs of bodies that overlap with ``joints`` at ``angles`` [rad]: they would push against each other for good.
+
+    Bodies that a joint joins are left out by MuJoCo itself.
+    """
+    for geom in [geom for geom in spec.geoms if geom.contype]:  # an exclusion needs names
+        geom.parent.name = geom.parent.name or f"body_of_{geom.name}"
+    copy = spec.copy()
+    copy.delete(copy.geom(GROUND))
+    model = copy.compile()
+    data = mujoco.MjData(model)
+    for name, angle in zip(joints, angles, strict=True):
+        data.qpos[model.joint(name).qposadr[0]] = angle
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_collision(model, data)
+    touching = {tuple(sorted(int(model.geom_bodyid[geom]) for geom in contact.geom)) for contact in data.contact}
+    pairs = [tuple(model.body(body).name for body in pair) for pair in sorted(touching)]
+    for first, second in pairs:
+        spec.add_exclude(bodyname1=first, bodyname2=second)
+    notes.append("self-collisions: bodies that a joint joins pass through one another")
+    if pairs:
+        overlapping = ", ".join(f"'{first}' and '{second}'" for first, second in pairs)
+        notes.append(f"self-collisions left out, as they overlap in the pose: {overlapping}")
+
+
+# ---- how it stands
+
+
+class Upright(NamedTuple):
+    """S sites of a robot whose root is upright at the world's origin, and the bodies that they are on."""
+
+    places: np.ndarray  # (S, 3) of the sites in the root's frame [m]
+    bodies: np.ndarray  # (S,) index of each site's body
+    up: np.ndarray  # (S, 3) the vertical in the frame of each site's body
+
+
+def upright(robot: RobotModel, joints: Sequence[float], sites: Sequence[str]) -> Upright:
+    """``sites`` with the joints at the angles ``joints`` (D,) [rad]."""
+    model, data = robot.physics, posed(robot.physics, joints)
+    where = [robot.id("site", name) for name in sites]
+    bodies = model.site_bodyid[where]
+    return Upright(data.site_xpos[where].copy(), bodies.copy(), data.xmat[bodies].reshape(-1, 3, 3)[:, 2].copy())
+
+
+def standing_height(robot: RobotModel, geoms: Sequence[str], joints: Sequence[float]) -> float:
+    """How high the root is above a plane that the lowest of ``geoms`` touches, upright, with the joints at ``joints`` (D,) [m]."""
+    points = surfaces(robot.physics, posed(robot.physics, joints), geoms)
+    return -float(min(places[:, 2].min() for places in points.values()))

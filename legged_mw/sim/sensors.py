@@ -4,21 +4,43 @@
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 
 import mujoco
-import numpy as np
 
-from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import ModelError, unknown
 
-# What is sensed only where it is asked for, each as the span of its name. The first widens the sensors of "contact".
-CONTACT_FORCE = "contact_force"  # of each contact geom: the net force on the ground, world frame [N]
-SELF_CONTACT = "self_contact"  # how many contacts the robot has with itself
+SELF_CONTACT = "self_contacts"  # how many contacts the robot has with itself
 ANGULAR_MOMENTUM = "angular_momentum"  # of the whole robot about its centre of mass, world frame [kg m^2/s]
+CONTACT_FORCE = "contact_forces"  # of each contact geom: the net force on the ground, world frame [N]
 _FOUND, _FORCE = (1 << int(getattr(mujoco.mjtConDataField, f"mjCONDATA_{name}")) for name in ("FOUND", "FORCE"))
 _NET = 3  # the contact sensor's reduction: all contacts as one, in the world's frame
+
+
+def _sense_self_contacts(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
+    tree = mujoco.mjtObj.mjOBJ_XBODY
+    itself = {"objtype": tree, "objname": root, "reftype": tree, "refname": root, "intprm": [_FOUND, 0, 1]}
+    spec.add_sensor(name=SELF_CONTACT, type=mujoco.mjtSensor.mjSENS_CONTACT, **itself)
+
+
+def _sense_angular_momentum(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
+    momentum, body = mujoco.mjtSensor.mjSENS_SUBTREEANGMOM, mujoco.mjtObj.mjOBJ_BODY
+    spec.add_sensor(name=ANGULAR_MOMENTUM, type=momentum, objtype=body, objname=root)
+
+
+def _sense_contact_forces(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str]) -> None:
+    """The sensors of "contact" sense the force too, so that contacts are searched once."""
+    for name in contact_geoms:
+        spec.sensor(f"contact/{name}").intprm[:3] = [_FOUND | _FORCE, _NET, 1]
+
+
+# What is sensed only where it is asked for: name -> what adds a sensor of that name, given the root and the contact geoms.
+SENSORS: dict[str, Callable[[mujoco.MjSpec, str, Sequence[str]], None]] = {
+    SELF_CONTACT: _sense_self_contacts,
+    ANGULAR_MOMENTUM: _sense_angular_momentum,
+    CONTACT_FORCE: _sense_contact_forces,
+}
 
 
 def add_sensors(
@@ -49,29 +71,35 @@ def add_sensors(
 
 
 def add_more_sensors(spec: mujoco.MjSpec, root: str, contact_geoms: Sequence[str], more: Collection[str]) -> None:
-    """What of ``more`` is asked for, behind what ``add_sensors`` added. Both engines compute it, once a step."""
-    if CONTACT_FORCE in more:
-        for name in contact_geoms:  # one sensor senses both, so that contacts are searched once
-            spec.sensor(f"contact/{name}").intprm[:3] = [_FOUND | _FORCE, _NET, 1]
-    tree = mujoco.mjtObj.mjOBJ_XBODY
-    if SELF_CONTACT in more:
-        itself = {"objtype": tree, "objname": root, "reftype": tree, "refname": root, "intprm": [_FOUND, 0, 1]}
-        spec.add_sensor(name=SELF_CONTACT, type=mujoco.mjtSensor.mjSENS_CONTACT, **itself)
-    if ANGULAR_MOMENTUM in more:
-        momentum = mujoco.mjtSensor.mjSENS_SUBTREEANGMOM
-        spec.add_sensor(name=ANGULAR_MOMENTUM, type=momentum, objtype=mujoco.mjtObj.mjOBJ_BODY, objname=root)
+    """Those of ``SENSORS`` that ``more`` names, behind what ``add_sensors`` added. Both engines compute them once a step."""
+    for name, add in SENSORS.items():
+        if name in more:
+            add(spec, root, contact_geoms)
 
 
 def sensor_spans(
-    mj: mujoco.MjModel, contacts: int, velocities: int, imu: bool, more: Collection[str]
+    model: mujoco.MjModel,
+    contact_geoms: Sequence[str],
+    velocity_sites: Sequence[str],
+    imu: str,
+    more: Collection[str],
 ) -> dict[str, slice]:
-    """Columns of sensordata, by group. The sensors that were added last lie last."""
-    wide = 4 if CONTACT_FORCE in more else 1  # columns a contact geom: contacts found, and their force
-    sizes = {"contact": wide * contacts, "linvel": 3 * velocities, "accelerometer": 3 if imu else 0}
-    sizes |= {name: size for name, size in ((SELF_CONTACT, 1), (ANGULAR_MOMENTUM, 3)) if name in more}
-    ends = mj.nsensordata - sum(sizes.values()) + np.cumsum(list(sizes.values()))
-    spans = {name: slice(int(end) - size, int(end)) for (name, size), end in zip(sizes.items(), ends, strict=True)}
+    """Columns of sensordata, by group."""
+    spans = {
+        "contact": _columns(model, [f"contact/{name}" for name in contact_geoms]),
+        "linvel": _columns(model, [f"linvel/{name}" for name in velocity_sites]),
+        "accelerometer": _columns(model, [f"accelerometer/{imu}"] if imu else []),
+    }
+    spans |= {name: _columns(model, [name]) for name in SENSORS if name in more and name != CONTACT_FORCE}
     if CONTACT_FORCE in more:
         spans[CONTACT_FORCE] = spans["contact"]  # (contacts, 4), whose first column is the count
-        spans["contact"] = slice(spans["contact"].start, spans["contact"].stop, wide)
+        spans["contact"] = slice(spans["contact"].start, spans["contact"].stop, 4)
     return spans
+
+
+def _columns(model: mujoco.MjModel, sensors: Sequence[str]) -> slice:
+    """Those of ``sensors``, which lie one behind the other."""
+    if not sensors:
+        return slice(0, 0)
+    first, last = (model.sensor(name).id for name in (sensors[0], sensors[-1]))
+    return slice(int(model.sensor_adr[first]), int(model.sensor_adr[last] + model.sensor_dim[last]))

@@ -7,8 +7,7 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from legged_mw.sim.errors import ModelError
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import ModelError, unknown
 
 # Model fields that others are derived from, and those others: they need a value per world as soon as one of the former has.
 CONSTANTS_READ = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "qpos0")

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.sim.errors import ModelError
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import ModelError, unknown
 
 Heights = NDArray[np.float64]
 STEP = (0.06, 0.195)  # [m] of stairs at difficulty 0 and 1 [legged_gym: 0.05, 0.23; ours: for a leg of 0.43]

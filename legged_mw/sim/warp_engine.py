@@ -21,12 +21,11 @@ from torch import Tensor
 from legged_mw.fast.contact_count import count_contacts
 from legged_mw.fast.shortcuts import Shortcuts
 from legged_mw.fast.trace import not_traced
-from legged_mw.sim.errors import ModelError
 from legged_mw.sim.ground import GROUND
 from legged_mw.sim.ground_contact import touch_ground
 from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ, GRAVITY, Simulation
 from legged_mw.sim.terrain import Terrain
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import ModelError, unknown
 
 wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it loads; a first run would drown in it
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from legged_mw.sim.errors import ModelError
+from legged_mw.utils.errors import ModelError
 
 
 class Bodies(NamedTuple):

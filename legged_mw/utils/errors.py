@@ -25,6 +25,17 @@ class ConfigError(UserError, TypeError):
     """A field or file of a config: which one, where that was written, what exists, what to write."""
 
 
+class ModelError(UserError, ValueError):
+    """A name or number asked of a robot's model that does not fit its file. In the text stand the called function's
+
+    parameters in `backticks`, for a caller to write its own words there.
+    """
+
+
+class EngineError(UserError, ValueError):
+    """An engine that does not exist, or cannot step where it was asked to."""
+
+
 class StepError(UserError):
     """A task's step goes wrong in the user's code: ``what`` is wrong and what to write instead, and ``where`` it stands."""
 

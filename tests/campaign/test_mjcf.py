@@ -19,7 +19,8 @@ from legged_mw.deploy.simulated import read_scene
 from legged_mw.drawing.scene import visual_model
 from legged_mw.rl.export_scene import standalone
 from legged_mw.robot.vendor import read_robot
-from legged_mw.sim.errors import ModelError
+from legged_mw.sim.model import read_file
+from legged_mw.utils.errors import ModelError
 from legged_mw.utils.mjcf import Source, write_archive
 from legged_mw.utils.task import load_task
 
@@ -37,7 +38,7 @@ def given(text: str | bytes, name: str = "robot.xml") -> Callable[[Path], object
 
 
 def reads(name: str = "robot.xml") -> Callable[[Path], object]:
-    return lambda root: read_robot(root / name)
+    return lambda root: read_file(root / name)
 
 
 def first(pattern: str, new: str) -> str:

@@ -12,8 +12,8 @@ from golden.table import Run, Table
 from legged_mw import ROOT
 from legged_mw.envs.loading import load_robot
 from legged_mw.motion.foreign import read_motion
+from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.pose import posed
 from legged_mw.skills.clip import Clip, read_clip, save_clip
 from legged_mw.utils.task import load_task
 

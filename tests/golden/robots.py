@@ -15,11 +15,11 @@ from test_symmetry import GO1, WAIST, load_robot, replaced
 from golden.table import Table
 from legged_mw.robot.draft import draft
 from legged_mw.sim.engines import make_simulation, pick_engine
+from legged_mw.sim.fixed_bodies import match_joints
+from legged_mw.sim.joints import per_joint
 from legged_mw.sim.mirror import find_partners
 from legged_mw.sim.model import RobotModel
-from legged_mw.sim.rigid import match_joints
-from legged_mw.sim.shapes import spheres_on
-from legged_mw.sim.tables import per_joint
+from legged_mw.sim.surface_points import spheres_on
 from legged_mw.skills.kinematics import Kinematics
 
 CHOICES: dict[str, dict[str, Any]] = {  # of the Go1

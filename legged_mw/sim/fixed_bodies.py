@@ -10,8 +10,7 @@ from fnmatch import fnmatchcase
 import mujoco
 import numpy as np
 
-from legged_mw.sim.errors import ModelError
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import ModelError, unknown
 
 ALIGNED = 1e-4  # [rad] less is no turn
 IMU = "imu"  # name of the site that is taken, or made, where none is asked for

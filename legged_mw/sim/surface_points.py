@@ -12,7 +12,7 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.sim.errors import ModelError
+from legged_mw.utils.errors import ModelError
 
 SPACING = 0.01  # [m] between points on a shape whose lowest one is looked for
 LEVEL = 0.001  # [m] points so little above the lowest one are as low: a flat side has its site in the middle

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.sim.ground import GROUND, PROBE_SPACING
-from legged_mw.sim.shapes import spheres_on
+from legged_mw.sim.surface_points import spheres_on
 
 _TYPE, _EQUALITY = mujoco.mjtGeom, mujoco.mjtEq
 # Contacts of one geom with a plane, as mujoco-warp 4.0.0's collision_primitive.py writes them.
@@ -24,7 +24,7 @@ _LEAST = 8  # contacts, which cost little: worlds share the room of all, rows th
 _REST = 0.25  # ours: share of the contacts of links between the root and the last ones, which rarely touch all at once
 
 
-class Room(NamedTuple):
+class Capacity(NamedTuple):
     """Room of a world, and what it was counted from."""
 
     contacts: int
@@ -32,7 +32,7 @@ class Room(NamedTuple):
     why: str
 
 
-def count_room(model: mujoco.MjModel, terrain: bool) -> Room:
+def count_capacity(model: mujoco.MjModel, terrain: bool) -> Capacity:
     """The room that ``model`` needs on its plane, or on ``terrain``.
 
     The last links of each limb touch with all they have, the others with a quarter of it. Every joint with dry friction or
@@ -52,7 +52,7 @@ def count_room(model: mujoco.MjModel, terrain: bool) -> Room:
     rows = sum(parts.values()) + on_ground * each + own * _ROWS[3]
     why = [f"{count} {name}" for name, count in parts.items() if count]
     why += [f"{each} a contact with the ground ({on_ground})", *([f"4 a contact of its own ({own})"] if own else [])]
-    return Room(max(on_ground + 2 * own, _LEAST), rows, ", ".join(why))
+    return Capacity(max(on_ground + 2 * own, _LEAST), rows, ", ".join(why))
 
 
 def _last_links(model: mujoco.MjModel, bodies: set[int]) -> set[int]:

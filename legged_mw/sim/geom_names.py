@@ -4,21 +4,13 @@
 # (mujoco ships no type stubs)
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 
 import mujoco
 
-from legged_mw.sim.errors import ModelError
-from legged_mw.utils.errors import unknown
-
-_SCENE = r"(floor|ground|around|relief|sky)(/.*)?"  # what is added around a robot, by sim.ground and to be looked at
-_SENSED = (
-    r"(contact|linvel|accelerometer|velocimeter|gyro|up|jointpos|jointvel|torque)/.*|self_contact|angular_momentum"
-)
-_OURS = {"geoms": _SCENE, "hfields": _SCENE, "materials": _SCENE, "textures": _SCENE, "sensors": _SENSED}
+from legged_mw.utils.errors import ModelError, unknown
 
 
 @dataclass(frozen=True)
@@ -55,35 +47,6 @@ class Names:
                 )
             found |= dict.fromkeys(hits)
         return tuple(found)
-
-
-def give_way(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Give another name to what the file calls as we call something of our own."""
-    renamed: dict[str, dict[str, str]] = {}
-    for kind, ours in _OURS.items():
-        taken, new = {thing.name for thing in getattr(spec, kind)}, renamed.setdefault(kind, {})
-        for thing in [thing for thing in getattr(spec, kind) if re.fullmatch(ours, thing.name)]:
-            name = f"robot_{thing.name}"
-            while name in taken:
-                name = f"{name}_"
-            taken.add(name)
-            new[thing.name] = thing.name = name
-    for kind, names in renamed.items():
-        notes += [
-            f"{kind.removesuffix('s')} '{old}' is called '{new}': the first name is one of ours"
-            for old, new in names.items()
-        ]
-    for thing in (*spec.geoms, *spec.sites, *spec.meshes, *spec.skins, *spec.tendons):
-        thing.material = renamed["materials"].get(thing.material, thing.material)
-    for geom in spec.geoms:
-        geom.hfieldname = renamed["hfields"].get(geom.hfieldname, geom.hfieldname)
-    for material in spec.materials:
-        material.textures = [renamed["textures"].get(name, name) for name in material.textures]
-    for sensor in spec.sensors:
-        for what in ("obj", "ref"):
-            if getattr(sensor, f"{what}type") == mujoco.mjtObj.mjOBJ_GEOM:
-                name = getattr(sensor, f"{what}name")
-                setattr(sensor, f"{what}name", renamed["geoms"].get(name, name))
 
 
 def name_geoms(spec: mujoco.MjSpec, where: str, notes: list[str]) -> Names:

@@ -1,0 +1,178 @@
+"""A robot's file, read. A plain MJCF, as those in ``resources/robots`` are, is read here; ``legged_mw.robot`` reads all others.
+
+Host only; nothing is stepped.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (mujoco ships no type stubs)
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import mujoco
+import numpy as np
+
+from legged_mw.sim.servos import Range, take_limits
+from legged_mw.utils.errors import ModelError
+from legged_mw.utils.mjcf import Source, check_model
+
+# What a plain MJCF consists of. It has one body, with a free joint, and what else it has nobody needs to mend.
+_SECTIONS = {"compiler", "option", "default", "asset", "worldbody", "keyframe"}
+_IN_COMPILER = {"angle", "autolimits"}
+_IN_DEFAULT = {"default", "joint"}  # of its main class, which is that of what we add, too
+_IN_BODY = {"body", "freejoint", "joint", "inertial", "geom", "site"}
+# names of what is added around a robot: by sim.ground, and to be looked at
+SCENE = re.compile(r"(floor|ground|around|relief|sky)(/.*)?")
+
+SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+_FREE = mujoco.mjtJoint.mjJNT_FREE
+_COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # of qpos; all other joints have one
+_UPRIGHT = 0.5  # [degrees] of tilt that are rounding
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """A pose that the file holds."""
+
+    name: str
+    height: float | None  # of the upright root [m]; None: the file has no free joint, or tilts it
+    angles: dict[str, float]  # joint -> [rad]
+
+
+@dataclass(frozen=True)
+class RobotFile:
+    """A robot alone: one root with a free joint, named joints, no actuators, of its own sensors those that feel contact or are wanted."""
+
+    spec: mujoco.MjSpec
+    model: mujoco.MjModel  # the same, compiled
+    where: str  # the file's name
+    notes: list[str]  # what was dropped, added or renamed, a line each
+    limits: dict[str, Range]  # joint -> force [N m], of those that the file limits
+    speeds: dict[str, float]  # joint -> highest speed [rad/s], likewise
+    keyframe: Keyframe | None  # "home", or the only one
+    sensors: tuple[str, ...] = ()  # names of the file's, kept or dropped
+
+    @property
+    def root(self) -> str:
+        """Name of the body that carries the free joint."""
+        return self.spec.joints[0].parent.name
+
+    @property
+    def joints(self) -> list[mujoco.MjsJoint]:
+        """The scalar joints, in order of qpos[7:]."""
+        return list(self.spec.joints)[1:]
+
+
+def read_plain(file: Path) -> RobotFile | None:
+    """Read a plain MJCF. None: the file is none, and ``legged_mw.robot.vendor`` reads it or says what is wrong."""
+    if not file.is_file():
+        return None
+    with naming(file):
+        source, notes = Source(file), list[str]()
+        if not _is_plain(source):
+            return None
+        spec = source.spec()
+        limits, keyframe = take_limits(spec, notes), take_keyframe(spec, notes)
+        joints = list(spec.joints)[1:]
+        if not joints or not all(joint.type in SCALAR_JOINTS and joint.name for joint in joints):
+            return None
+        try:
+            with warnings.catch_warnings(record=True) as said:
+                model = compile_copy(spec)
+        except ValueError:
+            return None
+        check_model(model)
+    return None if said else RobotFile(spec, model, file.name, notes, limits, {}, keyframe)
+
+
+def _is_plain(source: Source) -> bool:
+    """By what its elements are."""
+    root, bodies = source.root, source.root.findall("worldbody/*")
+    if root.tag != "mujoco" or len(bodies) != 1 or not bodies[0].get("name") or source.named:
+        return False
+    return (
+        _tags(root) <= _SECTIONS
+        and {name for compiler in root.findall("compiler") for name in compiler.attrib} <= _IN_COMPILER
+        and all(_tags(default) <= _IN_DEFAULT for default in root.findall("default"))
+        and bodies[0].find("freejoint") is not None
+        and {element.tag for element in bodies[0].iter()} <= _IN_BODY
+        and len(root.findall("keyframe/key")) <= 1
+        and root.find("asset/texture[@type='skybox']") is None
+        and not any(SCENE.fullmatch(element.get("name", "")) for element in root.iter())
+    )
+
+
+def _tags(element: Element) -> set[str]:
+    return {child.tag for child in element}
+
+
+def compile_copy(spec: mujoco.MjSpec) -> mujoco.MjModel:
+    """Compile ``spec``, looks only where they come from files: they take most of the time, and only files can be wrong."""
+    copy = spec.copy()
+    copy.compiler.discardvisual = not any(item.file for item in (*spec.meshes, *spec.textures))
+    return copy.compile()
+
+
+@contextmanager
+def naming(file: Path) -> Iterator[None]:
+    """MuJoCo's errors in one line, with the file's name."""
+    try:
+        yield
+    except ModelError:
+        raise
+    except (ValueError, RecursionError) as error:  # parsing does not see a name that is used twice, compiling does
+        why = (
+            "it is nested too deeply"
+            if isinstance(error, RecursionError)
+            else str(error).partition("The visual elements of the spec")[0]
+        )
+        raise ModelError(f"{file.name} is not a valid {kind_of(file)}: {' '.join(why.split())}") from None
+
+
+def kind_of(file: Path) -> str:
+    """What its name says that it is."""
+    return "URDF" if file.suffix == ".urdf" else "MJCF"
+
+
+def take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
+    """The keyframe "home", or the only one; none stays in the file, as it would have to fit the servos."""
+    keys, taken = list(spec.keys), None
+    chosen = next((key for key in keys if key.name == "home"), keys[0] if len(keys) == 1 else None)
+    qpos = list(chosen.qpos) if chosen else []
+    starts = np.cumsum([0, *(_COLUMNS.get(joint.type, 1) for joint in spec.joints)])
+    if chosen and len(qpos) == starts[-1]:
+        angles = {
+            joint.name: qpos[start]
+            for joint, start in zip(spec.joints, starts[:-1], strict=True)
+            if joint.type in SCALAR_JOINTS
+        }
+        first = next(iter(spec.joints), None)
+        free = bool(first and first.type == _FREE)
+        lean = tilt(qpos[3:7]) if free else 0.0
+        taken = Keyframe(chosen.name, qpos[2] if free and lean < _UPRIGHT else None, angles)
+        notes.append(f"keyframe '{chosen.name}' read: pose and height of the root, where nothing else states them")
+        if lean > _UPRIGHT:
+            text = f"warning: keyframe '{chosen.name}' tilts the root by {lean:.0f} degrees; that and its height are not read, the root "
+            notes.append(f"{text}begins upright: state a pose for that by `pose`")
+    for key in keys:
+        if key is not chosen:
+            notes.append(f"keyframe '{key.name}' dropped")
+        elif not taken:
+            notes.append(
+                f"keyframe '{key.name}' dropped: its qpos has {len(qpos)} numbers, the joints of the file have {starts[-1]}"
+            )
+        spec.delete(key)
+    spec.nkey = 0
+    return taken
+
+
+def tilt(quat: Sequence[float] | np.ndarray) -> float:
+    """Between the root's z axis and the vertical [degrees]; ``quat`` wxyz."""
+    w, x, y, z = np.array(quat) / (np.linalg.norm(quat) or 1.0)
+    return float(np.degrees(np.arccos(np.clip(w * w - x * x - y * y + z * z, -1.0, 1.0))))
