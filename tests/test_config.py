@@ -698,7 +698,7 @@ def test_on_a_cpu_rewards_stay_those_of_a_task_that_subclasses_another(name: str
 
 FAST = """from configs.go1_flat import {base}
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
+from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.utils.task import Task
 
 
@@ -737,7 +737,8 @@ def test_a_folder_configs_beside_the_task_wins(no_configs: None, tmp_path: Path,
         "from configs.go1_rough import Go1FlatDrCfg as Theirs\n\nclass MyCfg(Theirs):\n    pass\n"
     )
     (tmp_path / "configs/go1_flat_dr.py").write_text(
-        "from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO\n\n"
+        "from legged_mw.envs.legged_robot_config import LeggedRobotCfg\n"
+        "from legged_mw.rl.learner_config import LeggedRobotCfgPPO\n\n"
         "class Go1FlatDrCfg(LeggedRobotCfg):\n    class noise(LeggedRobotCfg.noise):\n        level = 0.25\n\n"
         "class Go1FlatDrCfgPPO(LeggedRobotCfgPPO):\n    pass\n"
     )
