@@ -1,8 +1,8 @@
 """g1_flat with the legs alone: waist and arms are held, as on Unitree's G1 with 12 joints."""
 
+from configs.base import BipedCfgPPO
 from configs.g1_flat import G1FlatCfg
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.sim_to_real_config import BipedCfgPPO
 from legged_mw.utils.task import Task
 
 

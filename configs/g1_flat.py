@@ -1,7 +1,7 @@
 """Unitree G1 with 29 joints follows a joystick on flat ground without knowing its velocity; randomized worlds, kicks and pushes."""
 
+from configs.base import BipedCfg, BipedCfgPPO
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.sim_to_real_config import BipedCfg, BipedCfgPPO
 from legged_mw.utils.task import Task
 
 

@@ -1,8 +1,8 @@
 """Unitree G1 follows a joystick over slopes and low stairs that it does not see, without knowing its velocity."""
 
+from configs.base import BipedRoughCfg, BipedRoughCfgPPO
 from configs.g1_flat import G1FlatCfg
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.sim_to_real_config import BipedRoughCfg, BipedRoughCfgPPO
 from legged_mw.utils.task import Task
 
 

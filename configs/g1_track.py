@@ -4,7 +4,7 @@
 """
 
 from configs.g1_flat import G1FlatCfg
-from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
+from legged_mw.rl.learner_config import RobotTaskCfgPPO
 from legged_mw.skills.motion_tracking import MotionTracking
 from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
 from legged_mw.utils.task import Task

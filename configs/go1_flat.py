@@ -4,7 +4,8 @@ Sources: [P] MuJoCo Playground's joystick task for this robot; the machine's fig
 """
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.utils.task import Task
 
 

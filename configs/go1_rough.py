@@ -3,9 +3,9 @@
 Sources: [P] MuJoCo Playground's rough task for this robot; [L] legged_gym's terrain and curriculum; [ours] docs/terrain.md.
 """
 
+from configs.base import SimToRealRoughCfg
 from configs.go1_flat_dr import Go1FlatDrCfg, Go1FlatDrCfgPPO
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.sim_to_real_config import SimToRealRoughCfg
 from legged_mw.utils.task import Task
 
 

@@ -1,7 +1,7 @@
 """Unitree Go2 follows a joystick on flat ground without knowing its velocity; randomized worlds, kicks and pushes."""
 
+from configs.base import SimToRealCfg, SimToRealCfgPPO
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.sim_to_real_config import SimToRealCfg, SimToRealCfgPPO
 from legged_mw.utils.task import Task
 
 

@@ -1,8 +1,8 @@
 """Unitree Go2 follows a joystick over slopes, stairs and blocks that it does not see, without knowing its velocity."""
 
+from configs.base import SimToRealRoughCfg, SimToRealRoughCfgPPO
 from configs.go2_flat import Go2FlatCfg
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.sim_to_real_config import SimToRealRoughCfg, SimToRealRoughCfgPPO
 from legged_mw.utils.task import Task
 
 

@@ -1,8 +1,8 @@
 """go2_rough with eyes: the policy sees the height of the ground on a grid around it, with noise."""
 
+from configs.base import SimToRealRoughCfgPPO
 from configs.go2_rough import Go2RoughCfg
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.sim_to_real_config import SimToRealRoughCfgPPO
 from legged_mw.utils.task import Task
 
 

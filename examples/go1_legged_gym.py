@@ -10,8 +10,9 @@ import torch
 from torch import Tensor
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.observations import Row
+from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.utils.task import Task
 
 

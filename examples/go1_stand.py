@@ -2,7 +2,8 @@
 
 from configs.go1_flat import Go1FlatCfg
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.rl.learner_config import RobotTaskCfgPPO
 from legged_mw.utils.task import Task
 
 

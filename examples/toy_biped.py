@@ -1,7 +1,8 @@
 """A made-up biped with three joints a leg and feet of two boxes: a robot of one's own, that does not see its joint angles."""
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.utils.task import Task
 
 

@@ -192,11 +192,51 @@ def test_two_parents() -> None:
             pass
 
     assert (Both().env.num_envs, Both().env.run_name) == (8192, "wide")
+
+    class Neither(Go1, Wide):
+        pass
+
+    assert Neither().to_dict() == Both().to_dict()
     with pytest.raises(ConfigError):
 
-        class Neither(Go1, Wide):
+        class OneAlone(Go1, Wide):
             class env(Go1.env):
                 pass
+
+
+def test_sections_of_two_parents_are_joined_at_any_depth() -> None:
+    class Robot(Base):
+        class control(Base.control):
+            stiffness = {"": 20.0}
+
+        class rewards(Base.rewards):
+            class scales(Base.rewards.scales):
+                torques = -0.5
+
+    class Skill(Base):
+        class control(Base.control):
+            stiffness = {"": 1.0}
+            control_type = "T"
+
+        class rewards(Base.rewards):
+            class scales(Base.rewards.scales):
+                termination = -7.0
+                alive = 1.0
+
+    class Task(Robot, Skill):
+        pass
+
+    class Own(Robot, Skill):
+        class control(Robot.control, Skill.control):
+            stiffness = {"": 3.0}
+
+    cfg, scales = Task(), Task().to_dict()["rewards"]["scales"]
+    assert (cfg.control.stiffness, cfg.control.control_type) == ({"": 20.0}, "T")  # the first parent's word is the last
+    assert scales == {"torques": -0.5, "termination": -7.0, "alive": 1.0}
+    assert (Own().control.stiffness, Own().control.control_type) == ({"": 3.0}, "T")
+    assert list(cfg.to_dict()["control"]) == list(Base().to_dict()["control"])
+    with pytest.raises(ConfigError):
+        cfg.control.stifness = {}  # type: ignore[attr-defined]
 
 
 def test_methods_and_private_names_are_not_fields() -> None:
@@ -698,7 +738,7 @@ def test_on_a_cpu_rewards_stay_those_of_a_task_that_subclasses_another(name: str
 
 FAST = """from configs.go1_flat import {base}
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
+from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.utils.task import Task
 
 
@@ -737,7 +777,8 @@ def test_a_folder_configs_beside_the_task_wins(no_configs: None, tmp_path: Path,
         "from configs.go1_rough import Go1FlatDrCfg as Theirs\n\nclass MyCfg(Theirs):\n    pass\n"
     )
     (tmp_path / "configs/go1_flat_dr.py").write_text(
-        "from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO\n\n"
+        "from legged_mw.envs.legged_robot_config import LeggedRobotCfg\n"
+        "from legged_mw.rl.learner_config import LeggedRobotCfgPPO\n\n"
         "class Go1FlatDrCfg(LeggedRobotCfg):\n    class noise(LeggedRobotCfg.noise):\n        level = 0.25\n\n"
         "class Go1FlatDrCfgPPO(LeggedRobotCfgPPO):\n    pass\n"
     )

@@ -19,12 +19,12 @@ from test_ppo import VARIANTS, update
 from test_recurrent import IMAGES, NETWORKS, share_memory
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
 from legged_mw.envs.worlds import fuse_for, worlds_state
 from legged_mw.eval.training import TrainingExam
 from legged_mw.fast import contact_count, shortcuts
 from legged_mw.fast.fused import Fused
 from legged_mw.rl import layers
+from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.rl.policies import Source, Trained
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.runner import make_runner

@@ -94,7 +94,8 @@ def test_for_a_real_robot(
     )
     text = (
         config.read_text()
-        .replace("legged_robot_config", "sim_to_real_config")
+        .replace("legged_mw.envs.legged_robot_config", "configs.base")
+        .replace("legged_mw.rl.learner_config", "configs.base")
         .replace("LeggedRobotCfg", "SimToRealCfg")
     )
     text = re.sub(r"    class observations.*\n.*leave_out.*\n", "", text)
@@ -110,7 +111,7 @@ def test_for_a_real_robot(
 
 def check_rough(folder: Path) -> None:
     """The class on the page for rough ground, beside the flat task: what rough ground changes, and what the robot states."""
-    heads = "from legged_mw.envs.sim_to_real_config import SimToRealRoughCfg, SimToRealRoughCfgPPO\nfrom mine_flat import MineFlatCfg\n"
+    heads = "from configs.base import SimToRealRoughCfg, SimToRealRoughCfgPPO\nfrom mine_flat import MineFlatCfg\n"
     heads += "from legged_mw.envs.legged_robot import LeggedRobot\nfrom legged_mw.utils.task import Task\n\n"
     [body] = re.findall(r"```text\n(class MineRoughCfg.*?)```", PAGE.read_text(), re.DOTALL)
     (folder / "mine_rough.py").write_text(

@@ -13,11 +13,13 @@ import tokenize
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
+from configs import base
 from legged_mw import envs, skills
 from legged_mw.deploy.contract import ROWS
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.rl import learner_config
 from legged_mw.utils.bounds import bounds_text
 from legged_mw.utils.config import Config, field_types, type_text
 from legged_mw.utils.task import load_task
@@ -106,21 +108,20 @@ def table(head: Iterable[str], rows: Iterable[Iterable[str]]) -> str:
 
 
 def classes(headings: Mapping[str, str], wanted: Callable[[type], object]) -> list[tuple[str, Any]]:
-    """Heading and class of those in legged_mw/envs and legged_mw/skills that are ``wanted``."""
+    """Heading and class of those that are ``wanted``, of environments, skills, presets and the learner's config."""
     modules = [
-        importlib.import_module(f"{package.__name__}.{module.name}")
-        for package in (envs, skills)
-        for module in pkgutil.iter_modules(package.__path__)
+        *(
+            importlib.import_module(f"{package.__name__}.{module.name}")
+            for package in (envs, skills)
+            for module in pkgutil.iter_modules(package.__path__)
+        ),
+        *(base, learner_config),
     ]
-    found = {
-        each.__name__: each for module in modules for each in vars(module).values() if _is_ours(each) and wanted(each)
-    }
+    mine = {module.__name__ for module in modules}
+    classes_there = [each for module in modules for each in vars(module).values() if isinstance(each, type)]
+    found = {each.__name__: each for each in classes_there if each.__module__ in mine and wanted(each)}
     order = [*(name for name in headings if name in found), *sorted(found.keys() - headings.keys())]
     return [(headings.get(name, f"`{name}`"), found[name]) for name in order]
-
-
-def _is_ours(each: object) -> bool:
-    return isinstance(each, type) and each.__module__.startswith(("legged_mw.envs.", "legged_mw.skills."))
 
 
 # ---- reward terms
@@ -175,10 +176,12 @@ def _scales() -> str:
 
 
 def row_comments() -> dict[str, Said]:
-    """What stands behind a row where the code makes it."""
+    """What stands behind a row where the code makes it, or in a line above."""
     said: dict[str, Said] = {}
     for _, owner in classes({}, lambda each: "observation_rows" in dir(each)):
         for name, comment in re.findall(r'Row\("(\w+)",[^\n]*?\)?,?  # ([^\n]*)', inspect.getsource(owner)):
+            said.setdefault(name, read_comment(comment))
+        for comment, name in re.findall(r'\n *# ([^\n]*)\n[^\n#]*Row\("(\w+)"', inspect.getsource(owner)):
             said.setdefault(name, read_comment(comment))
     for path, field in fields(RobotTaskCfg).items():
         if path.startswith("domain_rand."):

@@ -14,7 +14,7 @@ from legged_mw.envs.domain_rand import KINDS, ONLY_AT_START, active
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.motors import check_motors
 from legged_mw.envs.own_code import own_classes, place_of
-from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
+from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
 from legged_mw.utils.bounds import Range
 from legged_mw.utils.commands import HEADING
@@ -34,7 +34,7 @@ PAYS = (
 )
 
 
-def check_values(cfg: RobotTaskCfg, train: RobotTaskCfgPPO | None = None, law: str = "") -> None:
+def check_values(cfg: RobotTaskCfg, train: Any = None, law: str = "") -> None:
     """Raise ConfigError at the first value that cannot work; ``law`` of the motors is ``control.actuator``, unless said otherwise."""
     _check_redraws(cfg, law)
     check_motors(cfg)

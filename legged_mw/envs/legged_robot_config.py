@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
+from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.utils.bounds import (
     THREE,
     Bound,
@@ -170,13 +170,3 @@ class LeggedRobotCfg(RobotTaskCfg):
         peer: str = (
             ""  # the robot (go1, go2, g1) whose published policies of legged_mw/eval/peers.py stand beside; empty: none
         )
-
-
-class LeggedRobotCfgPPO(RobotTaskCfgPPO):
-    """The learner of a walking task."""
-
-    class cpu(RobotTaskCfgPPO.cpu):
-        overrides = {
-            "commands.keep_probability": [0.7, 0.25, 0.5],  # to turn on the spot is rare otherwise, and learned last
-            "perturbation.curriculum": True,  # the strongest kicks keep a beginner from learning to walk
-        }

@@ -1,12 +1,12 @@
-"""Every field of RobotTask and of its training, once, typed, with unit and source. Tasks override these in configs/.
+"""Every field of RobotTask, once, typed, with unit and source. Tasks override these in configs/.
 
-Sources: [P] MuJoCo Playground's Go1 joystick task and its learner settings; [L] legged_gym; [R] rsl-rl's defaults;
-[ours] with the reason. A field that turns one of our departures back into Playground's behaviour says so.
+Sources: [P] MuJoCo Playground's Go1 joystick task; [L] legged_gym; [ours] with the reason.
+A field that turns one of our departures back into Playground's behaviour says so.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from legged_mw.utils.bounds import (
     PAIR,
@@ -21,7 +21,6 @@ from legged_mw.utils.bounds import (
     Frictions,
     Gain,
     Height,
-    Iterations,
     Names,
     NonNegative,
     Offsets,
@@ -32,11 +31,9 @@ from legged_mw.utils.bounds import (
     Range,
     Scale,
     Seconds,
-    Seed,
-    Share,
     Shares,
-    Sizes,
     Speed,
+    Threads,
     Whole,
     WholeDelays,
     above,
@@ -44,7 +41,6 @@ from legged_mw.utils.bounds import (
     or_empty,
 )
 from legged_mw.utils.config import Config
-from legged_mw.utils.files import MOST_LETTERS, wrong_name
 
 Place = Annotated[list[Annotated[float, at_least(-1000, 1000, "m")]], or_empty(THREE)]
 Camera = Annotated[
@@ -59,14 +55,6 @@ Slope = Annotated[float, at_least(-60, 60, "degrees")]
 Slopes = Annotated[list[Slope], or_empty(PAIR)]
 TimeStep = Annotated[float, at_least(1e-4, 0.1, "s")]
 Pixels = Annotated[int, at_least(1, 8192)]
-Threads = Annotated[int, at_least(0, 1024)]
-FolderPart = Annotated[
-    str, Bound(f"a plain name such as wide_net, of {MOST_LETTERS} bytes at most", lambda v: not wrong_name(v))
-]
-# [R]
-Activation = Literal[
-    "elu", "selu", "relu", "crelu", "lrelu", "tanh", "sigmoid", "softplus", "gelu", "swish", "mish", "identity"
-]
 
 
 class RobotTaskCfg(Config):
@@ -281,150 +269,3 @@ class RobotTaskCfg(Config):
         # place of the camera "track", from the robot, world axes [m]; empty: by its size, Go1's is 0.9 -1.1 0.6
         camera: Camera = []
         fps: Few = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
-
-
-class RobotTaskCfgPPO(Config):
-    """The learner. Keys below actor, critic and algorithm are rsl-rl's own and pass through untranslated.
-
-    What is marked [ours] was found by measurement: docs/lab.md.
-    """
-
-    seed: Seed = 1
-
-    class runner:
-        num_steps_per_env: Count = 24  # control steps a world between two updates [P]
-        max_iterations: Count = 300  # [ours: a robot of one's own shows something by then]
-        save_interval: Count = 50  # [iterations] between checkpoints
-        keep_checkpoints: Whole = 0  # newest ones that stay; 0: all [ours]
-        exam_interval: Whole = (
-            200  # [iterations] between small exams, and one at the end; 0, or over max_iterations: none [ours]
-        )
-        experiment_name: str = ""  # folder below logs/; empty: the task's name
-        run_name: FolderPart = ""  # appended to the run folder's time stamp
-        logger: Literal["tensorboard", "wandb"] = "tensorboard"
-        wandb_project: str = "legged_mw"
-        export: bool = True  # a finished training writes <run folder>/export/, as play.py --export does [ours]
-        # of the networks on a GPU: highest is float32, high TF32; with bf16 the hidden layers of a plain MLP of ELUs learn and act in
-        # bfloat16, on a CPU too, and what else there is (memory, estimator, concurrent student, other activations) in TF32
-        matmul_precision: Literal["highest", "high", "bf16"] = "high"
-
-    class obs_groups:
-        actor: list[str] = ["state"]
-        critic: list[str] = ["privileged_state"]
-
-    class actor:
-        class_name: str = "MLPModel"  # or "RNNModel": a GRU or LSTM before the MLP, a memory (docs/training.md)
-        hidden_dims: Sizes = [512, 256, 128]  # [P]
-        activation: Activation = "elu"  # [P]
-        obs_normalization: bool = True  # [P]
-        # of RNNModel alone, as the next two [ours: three quarters of an LSTM's work; R lstm]
-        rnn_type: Literal["gru", "lstm"] = "gru"
-        rnn_hidden_dim: Count = 256  # values that a layer remembers [R]
-        rnn_num_layers: Few = 1  # [R]
-
-        class distribution_cfg:
-            class_name: str = "GaussianDistribution"
-            init_std: Positive = 0.6  # [ours: from 1.0 it thrashes, from 0.4 it may stand for good]
-            std_type: Literal["scalar", "log"] = "scalar"  # [R]
-            std_range: PositiveRange = [1e-6, 1e6]  # [R]
-
-        class estimator:
-            """A network from what the actor reads to rows that it does not; the actor reads its estimate, too (students/estimator.py)."""
-
-            # rows of the critic's groups: ["base_lin_vel", "foot_contact"]; empty: no estimator
-            targets: list[str] = []
-            hidden_dims: Sizes = [256, 128]  # [genesis_lr's explicit estimator of a Go2]
-            activation: Activation = "elu"
-            learning_rate: Part = 1e-3  # fixed [HIMLoco]
-
-        class concurrent:
-            """The actor reads its newest frame and a latent: a teacher's of ``groups``, or a student's of all frames (concurrent.py)."""
-
-            # that the teacher's encoder reads: ["privileged_state"]; empty: no teacher [CTS, arXiv 2405.10830]
-            groups: list[str] = []
-            teacher_share: Part = 0.75  # of the worlds, that act by the teacher's latent [CTS]
-            latent_dim: Count = 32  # values of a latent, whose length is 1 [go2_rl_gym]
-            hidden_dims: Sizes = [512, 256]  # of both encoders [go2_rl_gym]
-            activation: Activation = "elu"
-            learning_rate: Part = 1e-3  # of the student's encoder, fixed [go2_rl_gym]
-
-    class critic:
-        class_name: str = "MLPModel"
-        hidden_dims: Sizes = [512, 256, 128]  # [P]
-        activation: Activation = "elu"  # [P]
-        obs_normalization: bool = True  # [P]
-        rnn_type: Literal["gru", "lstm"] = "gru"  # as the actor's
-        rnn_hidden_dim: Count = 256
-        rnn_num_layers: Few = 1
-
-    class algorithm:
-        class_name: str = "legged_mw.rl.ppo:GraphedPPO"  # or "PPO": rsl-rl's own, same results, slower on a GPU
-        num_learning_epochs: Few = 5  # [P]
-        num_mini_batches: Count = 4  # [P]
-        clip_param: Positive = 0.2  # [P]
-        gamma: Share = 0.99  # [P]
-        lam: Share = 0.95  # [P]
-        value_loss_coef: NonNegative = 1.0  # [P]
-        entropy_coef: NonNegative = 0.005  # [ours; P 0.001]
-        learning_rate: Part = 1e-3  # at the start [R; P 3e-4]
-        max_grad_norm: Positive = 1.0  # [P]
-        optimizer: str = "adam"  # [P]
-        use_clipped_value_loss: bool = True  # [P]
-        schedule: Literal["adaptive", "fixed"] = "adaptive"  # fixed: `learning_rate` throughout [R; P fixed]
-        desired_kl: Positive = 0.01  # between updates, for the adaptive schedule [R]
-        max_learning_rate: Part = 1e-2  # that the adaptive schedule goes up to [R]; for a memory 1e-3: docs/training.md
-        normalize_advantage_per_mini_batch: bool = False  # [R]
-
-    class distillation:
-        """Takes the place of `algorithm` where there is a teacher: the actor learns to act like it. After init_std rsl-rl's own keys."""
-
-        teacher: str = (
-            ""  # its run, checkpoint or export, or a task for its last or shipped policy (train.py --teacher)
-        )
-        init_std: Positive = 0.1  # of the student's noise while it learns; nothing changes it [Isaac Lab]
-        class_name: str = "legged_mw.rl.students.distillation:GraphedDistillation"  # or "Distillation": rsl-rl's own, same results, slower
-        num_learning_epochs: Few = 5  # [R 1; ours: docs/lab.md]
-        gradient_length: Count = 4  # steps a gradient; it divides num_steps_per_env [ours: R 15 leaves 9 of 24 unused]
-        learning_rate: Part = 1e-3  # [R]
-        max_grad_norm: NonNegative = 1.0  # 0: no bound [R none; ours: as in PPO]
-        loss_type: Literal["mse", "huber"] = "mse"  # [R]
-        optimizer: str = "adam"  # [R]
-
-    class warm_start:
-        """Training that begins with the actor of another run: `train.py --init`."""
-
-        policy: str = ""  # the run, checkpoint or export, or a task for its last or shipped policy
-        init_std: Positive = 0.2  # of exploration at the start [ours: less than from nothing, as it can walk]
-        critic_warmup: Iterations = (
-            20  # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
-        )
-
-    class anneal:
-        """What a number of `algorithm` goes to, in a straight line over max_iterations or --max_time; 0: it stays [ours]."""
-
-        entropy_coef: NonNegative = 0.0
-        desired_kl: NonNegative = 0.0
-
-    class cpu:
-        """What train.py takes on a CPU instead, before the command line has its say [ours: docs/lab.md]."""
-
-        enable: bool = True
-        envs_per_core: Count = 256  # worlds; the task's own number, if that is less
-        num_steps_per_env: Count = 16
-        num_learning_epochs: Few = 5
-        num_mini_batches: Count = 4
-        desired_kl: Positive = 0.02
-        hidden_dims: Sizes = [128, 64, 32]  # of actor and critic
-        rnn_hidden_dim: Count = 64  # likewise
-        max_iterations: Count = 2600
-        overrides: dict[str, Any] = {}  # any field of the task: dotted path -> value
-        update_threads: Threads = (
-            0  # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one
-        )
-
-    class symmetry:
-        """Left-right symmetry in the update, as in Mittal et al. 2024. Rows of observations say how they mirror: envs/mirror.py."""
-
-        use_data_augmentation: bool = False  # learn from the mirror image of every sample too: twice the batch [R]
-        use_mirror_loss: bool = False  # pull the mean action in the mirrored state to the mirrored mean action [R]
-        mirror_loss_coeff: NonNegative = 0.0  # weight of that pull, mean square over actions [-] [R]

@@ -18,12 +18,12 @@ from torch import Tensor, nn
 
 from legged_mw import ROOT
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.envs.statistics import Watch
 from legged_mw.envs.wording import config_words
 from legged_mw.rl.checkpoint import check_resume
 from legged_mw.rl.health import Health
 from legged_mw.rl.keeping import Keeper, reason_of
+from legged_mw.rl.learner_config import RobotTaskCfgPPO
 from legged_mw.rl.plan import Plan
 from legged_mw.rl.policies import acting
 from legged_mw.rl.ppo import GraphedPPO

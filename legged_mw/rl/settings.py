@@ -9,8 +9,8 @@ from typing import Any
 from rsl_rl.algorithms import PPO
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
 from legged_mw.rl.classes import actor_settings, check_classes, network_section, spellings
+from legged_mw.rl.learner_config import RobotTaskCfgPPO
 from legged_mw.rl.ppo import MAX_RATE
 from legged_mw.utils.config import ConfigError
 

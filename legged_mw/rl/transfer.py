@@ -12,7 +12,7 @@ from rsl_rl.models import MLPModel
 from legged_mw.envs.observations import Observations, Row
 from legged_mw.envs.other_task import class_in, differences, in_words, observe_as
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.robot_task_config import RobotTaskCfgPPO
+from legged_mw.rl.learner_config import RobotTaskCfgPPO
 from legged_mw.rl.network import LEARNING_ONLY
 from legged_mw.rl.policies import NETWORK_FILE, Trained, read_actor
 from legged_mw.rl.runs import CONFIG_FILE, checkpoints

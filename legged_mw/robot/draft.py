@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from legged_mw import ROOT
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.robot_task_config import RobotTaskCfg
-from legged_mw.envs.sim_to_real_config import BipedCfg, BipedCfgPPO
+from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.robot.crouch import bent, pose_weights
 from legged_mw.robot.feet import Foot, guess_feet
 from legged_mw.robot.measure import Joint, mass_matrices, stand_as_statue, stand_on_servos, what_joints_bear
@@ -29,6 +30,7 @@ from legged_mw.sim.joints import family, per_joint, posed
 from legged_mw.sim.model import RobotModel, standing_height
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import ModelError
+from legged_mw.utils.task_module import import_task
 
 LOW = 0.33  # [m] a root that stands lower than this cannot swing its feet as high as others
 # times the suggested gains: beyond 2 it is another robot than vendors publish gains for [ours]
@@ -129,7 +131,10 @@ def as_env(found: Draft, file: Path) -> LeggedRobot:
 
 def parents(found: Draft) -> tuple[type[LeggedRobotCfg], type[LeggedRobotCfgPPO]]:
     """What the task subclasses."""
-    return (BipedCfg, BipedCfgPPO) if len(found.feet) == 2 else (LeggedRobotCfg, LeggedRobotCfgPPO)
+    if len(found.feet) == 2:
+        presets = import_task(ROOT / "configs/base.py")
+        return presets.BipedCfg, presets.BipedCfgPPO
+    return LeggedRobotCfg, LeggedRobotCfgPPO
 
 
 def has_mirror(env: LeggedRobot) -> bool:

@@ -18,9 +18,7 @@ WIDTH = 140  # [columns] of a line of the config
 
 _HEAD = '''"""{title} ({legs}, {joints} joints; {file}) follows a joystick on flat ground. Check what is marked LOOK."""
 
-from legged_mw.envs.legged_robot import LeggedRobot
-from {module} import {cfg}, {train}
-from legged_mw.utils.task import Task
+{imports}
 
 
 class {name}FlatCfg({cfg}):
@@ -88,7 +86,7 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
     legs = {2: "biped", 4: "quadruped"}.get(feet, f"{feet} feet")
     title = "".join(part.capitalize() for part in name.split("_"))
     base, train = (parent.__name__ for parent in parents(found))
-    names = {"module": parents(found)[0].__module__, "cfg": base, "train": train}
+    names = {"imports": _imports(found), "cfg": base}
     lines = [
         _HEAD.format(title=name, joints=len(found.joints), legs=legs, file=file.name, name=title, **names).rstrip("\n")
     ]
@@ -127,6 +125,17 @@ def config_text(found: Draft, file: Path, name: str, mirrors: bool = False) -> s
         ]
     lines += ["", ""]
     return "\n".join([*lines, f"TASK = Task(LeggedRobot, {title}FlatCfg, {title}FlatCfgPPO)", ""])
+
+
+def _imports(found: Draft) -> str:
+    """What the file imports, sorted."""
+    cfg, train = parents(found)
+    lines = ["from legged_mw.envs.legged_robot import LeggedRobot", "from legged_mw.utils.task import Task"]
+    if cfg.__module__ == train.__module__:
+        lines += [f"from {cfg.__module__} import {cfg.__name__}, {train.__name__}"]
+    else:
+        lines += [f"from {parent.__module__} import {parent.__name__}" for parent in (cfg, train)]
+    return "\n".join(sorted(lines))
 
 
 def _force_limits(found: Draft) -> list[str]:

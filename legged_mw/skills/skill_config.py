@@ -5,7 +5,8 @@ Source [P]: MuJoCo Playground's Go1 getup, handstand and footstand (commit d5e6b
 
 from __future__ import annotations
 
-from legged_mw.envs.robot_task_config import RobotTaskCfg, RobotTaskCfgPPO
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.rl.learner_config import RobotTaskCfgPPO
 
 
 class SkillCfg(RobotTaskCfg):

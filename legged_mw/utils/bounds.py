@@ -73,6 +73,7 @@ Count = Annotated[int, at_least(1)]
 Whole = Annotated[int, at_least(0)]
 Few = Annotated[int, at_least(1, 1000)]  # of what is repeated in a loop, where more would never end
 Iterations = Annotated[int, at_least(0, 1_000_000)]
+Threads = Annotated[int, at_least(0, 1024)]
 Seed = Annotated[int, Bound("a whole number below 2^63", lambda value: abs(value) < 2**63)]
 
 Names = Annotated[list[str], SOME]

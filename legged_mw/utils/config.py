@@ -96,11 +96,13 @@ def _check(cls: type, name: str, known: dict[str, Any]) -> Any:
 
 
 def _check_section(cls: type, name: str, section: type, inherited: Any) -> type:
-    """`section`, if it extends every section of this name that the parents of `cls` have."""
+    """`section`, if it extends every section of this name that the parents of `cls` have; these joined, if `cls` writes none."""
     path = f"{_path(cls)}.{name}"
     if inherited is not None and not _is_section(inherited):
         raise ConfigError(f"{path} is a field ({type_text(inherited)}), not a section; write `{name} = ...`")
     theirs = [_schema(base)[name] for base in cls.__bases__ if name in _schema(base)]
+    if name not in vars(cls):
+        return _joined(cls, name, theirs)
     for dropped in theirs:
         if not issubclass(section, dropped):
             extends = ", ".join(_path(base) for base in section.__bases__ if base is not object) or "no section"
@@ -109,6 +111,23 @@ def _check_section(cls: type, name: str, section: type, inherited: Any) -> type:
                 f"write `class {name}({_parents(cls, name)}):`"
             )
     return section
+
+
+def _joined(cls: type, name: str, sections: list[type]) -> type:
+    """The section of a class that does not write it: all that its parents' `sections` write, the first one's word before the next's."""
+    last = [kind for kind in dict.fromkeys(sections) if not _is_extended(kind, sections)]
+    if len(last) == 1:
+        section = last[0]
+    else:
+        names = {"__module__": cls.__module__, "__qualname__": f"{cls.__qualname__}.{name}"}
+        section = type(name, tuple(last), names)
+    if section is not getattr(cls, name):
+        setattr(cls, name, section)
+    return section
+
+
+def _is_extended(section: type, others: list[type]) -> bool:
+    return any(other is not section and issubclass(other, section) for other in others)
 
 
 def _declared_type(cls: type, name: str, inherited: Any) -> Any:
@@ -358,9 +377,10 @@ class Config:
     """Base of every configuration: nested plain classes are its sections, their attributes its fields.
 
     `name: type = value` declares a field; in a subclass a bare `name = value` overrides it, and `class env(Parent.env):`
-    a section. A section with `_open = True` takes any new bare `name = number` too; `_only = True` in a subclass of that sets
-    to 0 what it does not write itself. All is checked when the class statement runs, and whenever a field is set. An
-    instance owns a copy of every default.
+    a section. A class of several parents has all that they write in the sections that it does not write itself; of two words
+    the first parent's wins. A section with `_open = True` takes any new bare `name = number` too; `_only = True` in a subclass
+    of that sets to 0 what it does not write itself. All is checked when the class statement runs, and whenever a field is set.
+    An instance owns a copy of every default.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:

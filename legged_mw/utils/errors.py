@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from types import CodeType
 
-from legged_mw.utils.renamed import LEGGED_GYM_TENSORS
+from legged_mw.utils.renamed import LEGGED_GYM_TENSORS, MOVED
 
 _LIBRARIES = {"torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl", "legged_mw.check"}
 _STANDARD = sysconfig.get_paths()["stdlib"]
@@ -98,13 +98,15 @@ def users_fault(error: BaseException) -> str:
 
 
 def in_short(error: BaseException) -> str:
-    """An error in one line: its type and what it says, without end; of an attribute that does not exist what does."""
+    """An error in one line: its type and what it says, without end; of a name that does not exist what does."""
     text = " ".join(f"{error}".split())
     return f"{type(error).__name__}: {text[:400]}{_instead(error)}" if text else type(error).__name__
 
 
 def _instead(error: BaseException) -> str:
-    """What stands for an attribute of legged_gym's here, or the nearest name; ''."""
+    """Where an import of ours is now, what stands for an attribute of legged_gym's here, or the nearest name; ''."""
+    if isinstance(error, ImportError):
+        return next((f"; it is in {place} now" for name, place in MOVED.items() if f"'{name}'" in str(error)), "")
     if not isinstance(error, AttributeError) or not error.name or error.obj is None:
         return ""
     if hasattr(type(error.obj), "observation_rows") and (here := LEGGED_GYM_TENSORS.get(error.name)):

@@ -1,4 +1,4 @@
-"""Names that were others once: fields of ours, whose old runs still load; and what legged_gym calls differently."""
+"""Names that were others once: fields of ours, whose old runs still load; what tasks import; what legged_gym calls differently."""
 
 from __future__ import annotations
 
@@ -11,6 +11,18 @@ RENAMED: dict[str, tuple[str, ...]] = {
     "perturbation.enable": ("perturbation", "kick"),
     "cpu.keep_probability": ("cpu", "overrides", "commands.keep_probability"),
     "cpu.kick_curriculum": ("cpu", "overrides", "perturbation.curriculum"),
+}
+
+# A module that a task may have imported, or a class of one -> the module where it is now.
+MOVED: dict[str, str] = {
+    "RobotTaskCfgPPO": "legged_mw.rl.learner_config",
+    "LeggedRobotCfgPPO": "legged_mw.rl.learner_config",
+    "legged_mw.envs.sim_to_real_config": "configs.base",
+    "legged_mw.envs.getup": "legged_mw.skills.getup",
+    "legged_mw.envs.handstand": "legged_mw.skills.handstand",
+    "legged_mw.envs.motion_tracking": "legged_mw.skills.motion_tracking",
+    "legged_mw.envs.motion_tracking_config": "legged_mw.skills.motion_tracking_config",
+    "legged_mw.envs.skill_config": "legged_mw.skills.skill_config",
 }
 
 # What a class ported from legged_gym may define, which nothing here calls, or read, which is not here -> what is. docs/from_legged_gym.md

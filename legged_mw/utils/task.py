@@ -17,6 +17,7 @@ from legged_mw.utils.renamed import with_new_names
 from legged_mw.utils.task_module import import_task
 
 _ENDS = "must end with TASK = Task(Env, Cfg, CfgPPO)"
+PRESETS = "base"  # configs/base.py: what tasks extend, no task
 ROBOT_FILES = (".xml", ".mjcf", ".urdf")
 
 
@@ -159,7 +160,8 @@ def somebodys(stored: str) -> str:
 
 def task_names() -> list[str]:
     """Names that ``--task`` knows without a path."""
-    return sorted(path.stem for path in (ROOT / "configs").glob("*.py") if not path.stem.startswith("_"))
+    names = [path.stem for path in (ROOT / "configs").glob("*.py") if not path.stem.startswith("_")]
+    return sorted(name for name in names if name != PRESETS)
 
 
 def list_tasks() -> str:

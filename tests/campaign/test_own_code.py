@@ -51,6 +51,16 @@ FILES: list[tuple[str, str, tuple[str, ...]]] = [
     ),
     ("a name that is not in there", "from legged_mw.envs import legged_robots", (f"mine.py:{FIRST}: ImportError: ",)),
     (
+        "a module that has moved",
+        "from legged_mw.envs.sim_to_real_config import BipedCfg",
+        (f"mine.py:{FIRST}: ModuleNotFoundError: ", "; it is in configs.base now"),
+    ),
+    (
+        "a class that has moved",
+        "from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO",
+        (f"mine.py:{FIRST}: ImportError: ", "; it is in legged_mw.rl.learner_config now"),
+    ),
+    (
         "a name that is none",
         "TASK = Task(Dog, Cfg, CfgPPO)",
         (f"mine.py:{FIRST}: NameError: name 'Dog' is not defined",),

@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.utils.task import LoadedTask, Task
 
 HERE = Path(__file__).parent

@@ -1,12 +1,13 @@
 """What tasks for real robots share: no measured velocity, randomized worlds, kicks and pushes, and a learner that suits.
 
-Config classes only: a robot's own names and numbers are in configs/. Sources: [I] Isaac Lab's G1 task, [M] mjlab's velocity
+Config classes only: a robot's own names and numbers are in configs/robots/. Sources: [I] Isaac Lab's G1 task, [M] mjlab's velocity
 task, [G] MuJoCo Playground's G1 joystick task, [P] its Go1 tasks, [U] unitree_rl_gym's G1; [ours] is measured: docs/lab.md.
 """
 
 from __future__ import annotations
 
-from legged_mw.envs.legged_robot_config import LeggedRobotCfg, LeggedRobotCfgPPO
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 
 
 class SimToRealCfg(LeggedRobotCfg):
