@@ -171,10 +171,12 @@ def _scales() -> str:
 
 
 def row_comments() -> dict[str, Said]:
-    """What stands behind a row where the code makes it."""
+    """What stands behind a row where the code makes it, or in a line above."""
     said: dict[str, Said] = {}
     for _, owner in classes({}, lambda each: "observation_rows" in dir(each)):
         for name, comment in re.findall(r'Row\("(\w+)",[^\n]*?\)?,?  # ([^\n]*)', inspect.getsource(owner)):
+            said.setdefault(name, read_comment(comment))
+        for comment, name in re.findall(r'\n *# ([^\n]*)\n[^\n#]*Row\("(\w+)"', inspect.getsource(owner)):
             said.setdefault(name, read_comment(comment))
     for path, field in fields(RobotTaskCfg).items():
         if path.startswith("domain_rand."):
