@@ -1,0 +1,119 @@
+"""What must be opened to understand one thing: the table in docs/concepts.md, held against the files in which code runs."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+
+from legged_mw import ROOT
+from legged_mw.utils.task import load_task
+
+PACKAGE = str(ROOT / "legged_mw")
+TITLE = "## What to open"
+
+
+class Concept(NamedTuple):
+    read: list[str]  # files, in reading order
+    leaves: dict[str, str]  # file -> why it need not be read
+
+
+def table() -> dict[str, Concept]:
+    section = (ROOT / "docs/concepts.md").read_text(encoding="utf-8").split(TITLE)[1].split("\n## ")[0]
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in section.splitlines() if line[:1] == "|"]
+    found = {}
+    for name, read, leaves in rows[2:]:
+        why = dict(re.findall(r"`([\w/]+)`: ([^;]+)", leaves))
+        found[name] = Concept(re.findall(r"`([\w/]+)`", read), why)
+    return found
+
+
+def make(**changes: Any) -> Any:
+    task = load_task("go1_flat")
+    plain = {"env.num_envs": 4, "sim.engine": "mujoco", "sim.fuse": False}
+    for path, value in (plain | changes).items():
+        task.set(path, value)
+    return task.env_class(task.cfg, "cpu")
+
+
+def a_step() -> Callable[[], object]:
+    """In which every episode ends and begins."""
+    env = make()
+    env.episode_length_buf = torch.full_like(env.episode_length_buf, 10**6)
+    return lambda: env.step(torch.zeros(4, 12))
+
+
+def a_reward() -> Callable[[], object]:
+    return make()._reward_feet_air_time
+
+
+def a_torque() -> Callable[[], object]:
+    """Of a law in code, from an action to a substep."""
+    env = make(
+        **{"control.actuator": "dc_motor", "control.stall_torque": {"": 30.0}, "control.no_load_speed": {"": 30.0}}
+    )
+
+    def act() -> None:
+        env.actuators.apply(env.actions)
+        env.sim.step(1, before=env.actuators.before)
+
+    return act
+
+
+def rows() -> Callable[[], object]:
+    return make().compute_observations
+
+
+# concept -> how it is run, most files to read, most files in which code runs
+BUDGETS: dict[str, tuple[Callable[[], Callable[[], object]], int, int]] = {
+    "one step of walking": (a_step, 8, 15),
+    "a reward": (a_reward, 2, 4),
+    "a motor's torque": (a_torque, 2, 6),
+    "a row of observations": (rows, 2, 6),
+}
+
+
+def touched(run: Callable[[], object]) -> set[str]:
+    """Files of the package, without ``.py``, whose functions are called."""
+    seen = set[str]()
+
+    def look(frame: FrameType, event: str, _: object) -> None:
+        if event == "call" and frame.f_code.co_filename.startswith(PACKAGE):
+            seen.add(str(Path(frame.f_code.co_filename).relative_to(PACKAGE).with_suffix("")))
+
+    sys.setprofile(look)
+    try:
+        run()
+    finally:
+        sys.setprofile(None)
+    return seen
+
+
+@pytest.mark.parametrize("name", BUDGETS)
+def test_what_runs_is_listed(name: str) -> None:
+    concept, (prepare, most_read, most_touched) = table()[name], BUDGETS[name]
+    found = touched(prepare())
+    assert found <= {*concept.read, *concept.leaves}, "list these in docs/concepts.md, with the reason"
+    assert len(concept.read) <= most_read and len(found) <= most_touched
+    assert found & {*concept.read} and {*concept.leaves} <= found
+
+
+def test_files_of_the_table_exist() -> None:
+    concepts = table()
+    assert concepts.keys() == BUDGETS.keys()
+    files = [file for concept in concepts.values() for file in (*concept.read, *concept.leaves)]
+    assert [file for file in files if not Path(PACKAGE, f"{file}.py").exists()] == []
+
+
+def test_a_file_that_is_not_listed_is_found() -> None:
+    def run() -> None:
+        table()
+        load_task("go1_flat")
+
+    assert "utils/task" in touched(run)
