@@ -22,6 +22,7 @@ from legged_mw.deploy.contract import ContractError, read_contract
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.motors import SubstepDelay
+from legged_mw.envs.worlds import put_worlds, worlds_state
 from legged_mw.rl import export as exporting
 from legged_mw.rl.export import export
 from legged_mw.rl.runner import make_runner
@@ -327,6 +328,16 @@ def test_a_network_in_the_step_hears_delayed_targets_by_its_encoders(engine: str
     )
     assert torch.equal(network.actuators.encoder_offset, servo.actuators.encoder_offset)  # type: ignore[arg-type]
     torch.testing.assert_close(walk(network, 5, guarded=engine == "mujoco_warp"), walk(servo, 5), atol=5e-4, rtol=0)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_what_a_network_remembers_is_kept(engine: str, tmp_path: Path) -> None:
+    """An environment goes on from the worlds of another, bit for bit."""
+    fields = {**QUIET, "control.actuator": "network", "control.network": save(mlp(torque_scale=20.0)[1], tmp_path)}
+    env, other = (make_env(2, {**fields, "sim.engine": engine}) for _ in range(2))
+    walk(env, 3)
+    assert put_worlds(other, worlds_state(env)) == ""
+    assert torch.equal(walk(env, 3), walk(other, 3))
 
 
 class Anydrive(nn.Module):

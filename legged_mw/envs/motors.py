@@ -263,8 +263,9 @@ class NetworkLaw:
 
     def __init__(self, network: MotorNetwork, angle: Tensor, speed: Tensor) -> None:
         """Joint angles [rad] and speeds [rad/s] (N, D) are read at each call."""
-        self._network, self._angle, self._speed = network, angle, speed
-        robots, joints = angle.shape
+        self._angle, self._speed, (robots, joints) = angle, speed, angle.shape
+        self._activation, self._in_turns = network.activation, network.in_turns
+        self._scales = network.error_scale, network.speed_scale, network.torque_scale
 
         def tensor(weights: Any) -> Tensor:
             return torch.tensor(weights, device=angle.device)
@@ -279,17 +280,17 @@ class NetworkLaw:
 
     def __call__(self, targets: Tensor) -> Tensor:
         """Torques (N, D) [N m] from ``targets`` (N, D) [rad]."""
-        network, past = self._network, self._past
+        past, (error_scale, speed_scale, torque_scale) = self._past, self._scales
         past[1:] = past[:-1].clone()
-        past[0, 0] = network.error_scale * (targets - self._angle)
-        past[0, 1] = network.speed_scale * self._speed
+        past[0, 0] = error_scale * (targets - self._angle)
+        past[0, 1] = speed_scale * self._speed
         frames = past.index_select(0, self._frames).permute(2, 3, 1, 0)  # (N, D, 2, F)
-        x = (frames.mT if network.in_turns else frames).flatten(2).flatten(0, 1)  # (N D, 2 F)
+        x = (frames.mT if self._in_turns else frames).flatten(2).flatten(0, 1)  # (N D, 2 F)
         precision = torch.get_float32_matmul_precision()
         torch.set_float32_matmul_precision("highest")
         torque = self._evaluate(x)
         torch.set_float32_matmul_precision(precision)
-        return (network.torque_scale * torque).view_as(targets)
+        return (torque_scale * torque).view_as(targets)
 
     def _evaluate(self, x: Tensor) -> Tensor:
         for memory, weights in zip(self._memory, self._recurrent, strict=True):
@@ -298,7 +299,7 @@ class NetworkLaw:
         for layer, (weight, bias) in enumerate(self._linear):
             x = torch.nn.functional.linear(x, weight, bias)
             if layer < len(self._linear) - 1:
-                x = _ACTIVATIONS[self._network.activation](x)
+                x = _ACTIVATIONS[self._activation](x)
         return x
 
     def reset(self, mask: Tensor) -> None:
