@@ -1,4 +1,4 @@
-"""What does not move within a robot: joints that are held, links that are fused, and a sensor's place in the root's axes."""
+"""Bodies that do not move against others: joints are welded, fixed links are fused, the IMU gets a site on the root."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -25,7 +25,7 @@ def match_joints(joints: Sequence[str], patterns: Sequence[str], what: str) -> l
 
 
 def hold_joints(spec: mujoco.MjSpec, model: mujoco.MjModel, angles: Mapping[str, float], notes: list[str]) -> None:
-    """Weld each joint at its angle [rad]: the body stands turned, and the joint is gone. ``model`` is ``spec`` compiled."""
+    """Weld each joint at its angle [rad]: turn its body, delete the joint. ``model`` is ``spec`` compiled."""
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     for name, angle in angles.items():
@@ -58,14 +58,14 @@ def _pose_in_parent(model: mujoco.MjModel, data: mujoco.MjData, body: str) -> tu
 
 
 def _place(body: mujoco.MjsBody, place: np.ndarray, quat: np.ndarray) -> None:
-    """Put ``body`` there in its parent, however its orientation and frame were written."""
+    """Set the pose of ``body`` in its parent, whichever frame and orientation attribute the file used."""
     body.set_frame(body.parent.add_frame())
     body.pos, body.quat = place, quat
     body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
 def fuse_fixed(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Bodies without a joint become part of what carries them: fewer bodies to step, and each is a link that moves."""
+    """Fuse bodies without a joint into the link that carries them: fewer bodies to step."""
     fixed: dict[str, list[str]] = {}
     for body in spec.bodies:
         carrier = body
@@ -83,11 +83,11 @@ def fuse_fixed(spec: mujoco.MjSpec, notes: list[str]) -> None:
 
 
 def sensed_site(spec: mujoco.MjSpec, model: mujoco.MjModel, root: str, asked: str, where: str, notes: list[str]) -> str:
-    """Name of a site on the root with the root's axes: the one ``asked`` for, or a new one at its place.
+    """Name of a site on the root with the root's axes: ``asked``, or a new one at its place.
 
-    What is asked for may be turned, may be on any body that does not move against the root, and may be a body, which means its origin.
-    Empty: "imu"; if there is none, or only one that moves against the root, a new one at the root's origin. ``model`` is ``spec``
-    compiled. Raises ModelError for a site that there is not, or that moves.
+    ``asked`` is a site or a body (its origin) that does not move against the root; it may be turned. Empty means the site "imu",
+    or the root's origin if there is no such site or it moves. ``model`` is ``spec`` compiled. Raises ModelError if ``asked``
+    does not exist or moves.
     """
     name, is_site = asked or IMU, spec.site(asked or IMU) is not None
     if asked and not is_site and spec.body(name) is None:
