@@ -17,11 +17,13 @@ import numpy as np
 
 from legged_mw.robot.meshes import compile_readable
 from legged_mw.robot.urdf import read_urdf
-from legged_mw.sim.robot_file import SCALAR_JOINTS, SCENE, RobotFile, kind_of, naming, take_keyframe
+from legged_mw.sim.robot_file import SCALAR_JOINTS, SCENE, UPRIGHT, Keyframe, RobotFile, kind_of, naming, tilt
 from legged_mw.sim.servos import take_limits
 from legged_mw.utils.errors import ModelError
 from legged_mw.utils.mjcf import Source, check_model
 
+_FREE = mujoco.mjtJoint.mjJNT_FREE
+_COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # of qpos; all other joints have one
 _ADDED = {  # attributes of defaults that would apply to what is added to the robot
     "geom": "type contype conaffinity condim priority friction solmix solref solimp margin gap rgba group density material",
     "site": "type size group rgba material",
@@ -44,7 +46,7 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
         spec, speeds = read_urdf(source, notes) if source.root.tag == "robot" else (source.spec(), {})
         _infer_inertias(spec)
         limits = take_limits(spec, notes)
-        keyframe = take_keyframe(spec, notes)
+        keyframe = _take_keyframe(spec, notes)
         sensors = tuple(sensor.name for sensor in spec.sensors if sensor.name)
         _drop_sensors(spec, wanted, notes)
         _drop_world(spec, where, notes)
@@ -69,6 +71,38 @@ def _infer_inertias(spec: mujoco.MjSpec) -> None:
         for body in spec.bodies[1:]:
             for name in ("explicitinertial", "mass", "ipos", "iquat", "inertia", "fullinertia"):
                 setattr(body, name, getattr(fresh, name))
+
+
+def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
+    """The keyframe "home", or the only one; none stays in the file, as it would have to fit the servos."""
+    keys, taken = list(spec.keys), None
+    chosen = next((key for key in keys if key.name == "home"), keys[0] if len(keys) == 1 else None)
+    qpos = list(chosen.qpos) if chosen else []
+    starts = np.cumsum([0, *(_COLUMNS.get(joint.type, 1) for joint in spec.joints)])
+    if chosen and len(qpos) == starts[-1]:
+        angles = {
+            joint.name: qpos[start]
+            for joint, start in zip(spec.joints, starts[:-1], strict=True)
+            if joint.type in SCALAR_JOINTS
+        }
+        first = next(iter(spec.joints), None)
+        free = bool(first and first.type == _FREE)
+        lean = tilt(qpos[3:7]) if free else 0.0
+        taken = Keyframe(chosen.name, qpos[2] if free and lean < UPRIGHT else None, angles)
+        notes.append(f"keyframe '{chosen.name}' read: pose and height of the root, where nothing else states them")
+        if lean > UPRIGHT:
+            text = f"warning: keyframe '{chosen.name}' tilts the root by {lean:.0f} degrees; that and its height are not read, the root "
+            notes.append(f"{text}begins upright: state a pose for that by `pose`")
+    for key in keys:
+        if key is not chosen:
+            notes.append(f"keyframe '{key.name}' dropped")
+        elif not taken:
+            notes.append(
+                f"keyframe '{key.name}' dropped: its qpos has {len(qpos)} numbers, the joints of the file have {starts[-1]}"
+            )
+        spec.delete(key)
+    spec.nkey = 0
+    return taken
 
 
 def _drop_sensors(spec: mujoco.MjSpec, wanted: Collection[str], notes: list[str]) -> None:
@@ -158,7 +192,7 @@ def _free_root(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
         root.add_freejoint()
         notes.append(f"free joint added to '{root.name}'")
     first = root.joints[0]
-    if first.type != mujoco.mjtJoint.mjJNT_FREE:
+    if first.type != _FREE:
         raise ModelError(
             f"{where}: the first joint must be the root body's free joint; it is {first.name or 'one without a name'}"
         )
