@@ -89,38 +89,41 @@ def sensed_site(spec: mujoco.MjSpec, model: mujoco.MjModel, root: str, asked: st
     or the root's origin if there is no such site or it moves. ``model`` is ``spec`` compiled. Raises ModelError if ``asked``
     does not exist or moves.
     """
-    name, is_site = asked or IMU, spec.site(asked or IMU) is not None
-    if asked and not is_site and spec.body(name) is None:
+    name = asked or IMU
+    is_site = spec.site(name) is not None
+    if not asked and not is_site:
+        return _add_site(spec, root, name, np.zeros(3), f"at the origin of '{root}'", notes)
+    if not is_site and spec.body(name) is None:
         known = [thing.name for thing in (*spec.sites, *spec.bodies) if thing.name and thing.name != "world"]
         raise ModelError(f"`imu_site`: {unknown('site or body', name, known, where)}")
-    made, place, why = name, np.zeros(3), f"at the origin of '{root}'"
-    if asked or is_site:
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        base, there = data.body(root), data.site(name) if is_site else data.body(name)
-        body = model.body(model.site_bodyid[there.id] if is_site else there.id)
-        axes = base.xmat.reshape(3, 3).T
-        if beyond := _what_moves(model, root, body.id):
-            if asked:
-                raise ModelError(
-                    f"`imu_site`: '{name}' is on {beyond}, so what it senses is not the root's; take a site or body that is fixed to the "
-                    "root, or hold that joint by `held_joints`"
-                )
-            made, why = f"{name}_root", f"{why}: '{name}' is on {beyond}; `imu_site` may name another"
-        elif (
-            is_site
-            and body.name == root
-            and np.allclose(axes @ there.xmat.reshape(3, 3), np.eye(3), rtol=0.0, atol=ALIGNED)
-        ):
-            return name
-        else:
-            made, place = f"{name}_aligned" if is_site else name, axes @ (there.xpos - base.xpos)
-            why = f"at the place of '{name}' on '{body.name}', with the axes of the root '{root}'"
-    while spec.site(made):
-        made += "_"
-    spec.body(root).add_site(name=made, pos=place, group=3)
-    notes.append(f"site '{made}' made {why}")
-    return made
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    base, there = data.body(root), data.site(name) if is_site else data.body(name)
+    body = model.body(model.site_bodyid[there.id] if is_site else there.id)
+    if beyond := _what_moves(model, root, body.id):
+        if asked:
+            raise ModelError(
+                f"`imu_site`: '{name}' is on {beyond}, so what it senses is not the root's; take a site or body that is fixed to the "
+                "root, or hold that joint by `held_joints`"
+            )
+        why = f"at the origin of '{root}': '{name}' is on {beyond}; `imu_site` may name another"
+        return _add_site(spec, root, f"{name}_root", np.zeros(3), why, notes)
+    axes = base.xmat.reshape(3, 3).T
+    turn = axes @ there.xmat.reshape(3, 3)
+    if is_site and body.name == root and np.allclose(turn, np.eye(3), rtol=0.0, atol=ALIGNED):
+        return name
+    why = f"at the place of '{name}' on '{body.name}', with the axes of the root '{root}'"
+    made = f"{name}_aligned" if is_site else name
+    return _add_site(spec, root, made, axes @ (there.xpos - base.xpos), why, notes)
+
+
+def _add_site(spec: mujoco.MjSpec, root: str, name: str, place: np.ndarray, why: str, notes: list[str]) -> str:
+    """Add a site to the root at ``place`` [m, root frame], and return its name."""
+    while spec.site(name):
+        name += "_"
+    spec.body(root).add_site(name=name, pos=place, group=3)
+    notes.append(f"site '{name}' made {why}")
+    return name
 
 
 def _what_moves(model: mujoco.MjModel, root: str, body: int) -> str:
