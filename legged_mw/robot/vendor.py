@@ -1,6 +1,6 @@
-"""A robot's file as its vendor wrote it, read for a simulation that brings its own ground, servos and sensors.
+"""Any robot's file, unedited: a vendor's MJCF or URDF becomes a ``RobotFile``, as sim/ reads a plain MJCF.
 
-Whatever is dropped, added or renamed is a line of ``RobotFile.notes``. Host only; nothing is stepped.
+``RobotFile.notes`` lists what is dropped, added or renamed. Host only; nothing is stepped.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -17,29 +17,19 @@ import numpy as np
 
 from legged_mw.robot.meshes import compile_readable
 from legged_mw.robot.urdf import read_urdf
-from legged_mw.sim.robot_file import SCALAR_JOINTS, SCENE, RobotFile, kind_of, naming, take_keyframe
+from legged_mw.sim.robot_file import SCALAR_JOINTS, SCENE, UPRIGHT, Keyframe, RobotFile, kind_of, naming, tilt
 from legged_mw.sim.servos import take_limits
 from legged_mw.utils.errors import ModelError
 from legged_mw.utils.mjcf import Source, check_model
 
-_ADDED = {  # what a default may say of what is added to the robot
+_FREE = mujoco.mjtJoint.mjJNT_FREE
+_COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # of qpos; all other joints have one
+_ADDED = {  # attributes of defaults that would apply to what is added to the robot
     "geom": "type contype conaffinity condim priority friction solmix solref solimp margin gap rgba group density material",
     "site": "type size group rgba material",
     "actuator": "gaintype gainprm biastype biasprm dyntype dynprm gear ctrllimited ctrlrange forcelimited forcerange actlimited actrange",
 }
-_KEPT_SENSORS = (
-    "TOUCH",
-    "FORCE",
-    "TORQUE",
-    "RANGEFINDER",
-    "CONTACT",
-    "GEOMDIST",
-    "GEOMNORMAL",
-    "GEOMFROMTO",
-    "USER",
-    "PLUGIN",
-    "TACTILE",
-)
+_KEPT_SENSORS = "TOUCH FORCE TORQUE RANGEFINDER CONTACT GEOMDIST GEOMNORMAL GEOMFROMTO USER PLUGIN TACTILE"
 _SENSED = re.compile(
     r"(contact|linvel|accelerometer|velocimeter|gyro|up|jointpos|jointvel|torque)/.*|self_contacts|angular_momentum"
 )
@@ -56,7 +46,7 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
         spec, speeds = read_urdf(source, notes) if source.root.tag == "robot" else (source.spec(), {})
         _infer_inertias(spec)
         limits = take_limits(spec, notes)
-        keyframe = take_keyframe(spec, notes)
+        keyframe = _take_keyframe(spec, notes)
         sensors = tuple(sensor.name for sensor in spec.sensors if sensor.name)
         _drop_sensors(spec, wanted, notes)
         _drop_world(spec, where, notes)
@@ -73,7 +63,7 @@ def read_robot(file: Path, wanted: Collection[str] = ()) -> RobotFile:
 
 
 def _infer_inertias(spec: mujoco.MjSpec) -> None:
-    """Where all inertias are to come from geoms, whatever is written: the same in words that let looks be left out later."""
+    """Where the file takes all inertias from geoms, delete those that it writes: then looks can be left out later."""
     kinds = mujoco.mjtInertiaFromGeom
     if spec.compiler.inertiafromgeom == kinds.mjINERTIAFROMGEOM_TRUE:
         spec.compiler.inertiafromgeom = kinds.mjINERTIAFROMGEOM_AUTO
@@ -83,9 +73,41 @@ def _infer_inertias(spec: mujoco.MjSpec) -> None:
                 setattr(body, name, getattr(fresh, name))
 
 
+def _take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
+    """The keyframe "home", or the only one; none stays in the file, as it would have to fit the servos."""
+    keys, taken = list(spec.keys), None
+    chosen = next((key for key in keys if key.name == "home"), keys[0] if len(keys) == 1 else None)
+    qpos = list(chosen.qpos) if chosen else []
+    starts = np.cumsum([0, *(_COLUMNS.get(joint.type, 1) for joint in spec.joints)])
+    if chosen and len(qpos) == starts[-1]:
+        angles = {
+            joint.name: qpos[start]
+            for joint, start in zip(spec.joints, starts[:-1], strict=True)
+            if joint.type in SCALAR_JOINTS
+        }
+        first = next(iter(spec.joints), None)
+        free = bool(first and first.type == _FREE)
+        lean = tilt(qpos[3:7]) if free else 0.0
+        taken = Keyframe(chosen.name, qpos[2] if free and lean < UPRIGHT else None, angles)
+        notes.append(f"keyframe '{chosen.name}' read: pose and height of the root, where nothing else states them")
+        if lean > UPRIGHT:
+            text = f"warning: keyframe '{chosen.name}' tilts the root by {lean:.0f} degrees; that and its height are not read, the root "
+            notes.append(f"{text}begins upright: state a pose for that by `pose`")
+    for key in keys:
+        if key is not chosen:
+            notes.append(f"keyframe '{key.name}' dropped")
+        elif not taken:
+            notes.append(
+                f"keyframe '{key.name}' dropped: its qpos has {len(qpos)} numbers, the joints of the file have {starts[-1]}"
+            )
+        spec.delete(key)
+    spec.nkey = 0
+    return taken
+
+
 def _drop_sensors(spec: mujoco.MjSpec, wanted: Collection[str], notes: list[str]) -> None:
-    """What the state tells needs no sensor. Those that feel contact stay, and those that are wanted."""
-    kept = {getattr(mujoco.mjtSensor, f"mjSENS_{name}", None) for name in _KEPT_SENSORS}
+    """Keep sensors that feel contact and those that are ``wanted``; the state tells the rest."""
+    kept = {getattr(mujoco.mjtSensor, f"mjSENS_{name}", None) for name in _KEPT_SENSORS.split()}
     if dropped := [sensor for sensor in spec.sensors if sensor.type not in kept and sensor.name not in wanted]:
         notes.append(
             f"sensors dropped, as nothing reads them: {', '.join(sensor.name or 'one without a name' for sensor in dropped)}"
@@ -95,7 +117,7 @@ def _drop_sensors(spec: mujoco.MjSpec, wanted: Collection[str], notes: list[str]
 
 
 def _drop_world(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
-    """Ground, things, lights, cameras and sky of the file; and what ties the robot to them."""
+    """Drop the file's ground, things, lights, cameras and sky, and what ties the robot to them."""
     for body in [body for body in spec.worldbody.bodies if not _has_joints(body) and _has_joints(spec.worldbody)]:
         notes.append(f"body '{body.name}' of the world dropped: it has no joint")
         spec.delete(body)
@@ -124,7 +146,7 @@ def _has_joints(body: mujoco.MjsBody) -> bool:
 
 
 def _drop_unused(spec: mujoco.MjSpec) -> None:
-    """What only the ground wore."""
+    """Delete height fields, materials and textures that only the ground used."""
     for hfield in [field for field in spec.hfields if field.name not in {geom.hfieldname for geom in spec.geoms}]:
         spec.delete(hfield)
     worn = {thing.material for thing in (*spec.geoms, *spec.sites, *spec.meshes, *spec.skins, *spec.tendons)}
@@ -136,7 +158,7 @@ def _drop_unused(spec: mujoco.MjSpec) -> None:
 
 
 def _drop_ties(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Explicit pairs of geoms, and whatever holds the robot to the world or to what was dropped."""
+    """Drop pairs of geoms, and whatever holds the robot to the world or to dropped things."""
     bodies, sites = {body.name for body in spec.bodies} - {"world"}, {site.name for site in spec.sites}
     for pair in list(spec.pairs):
         notes.append(f"contact pair of '{pair.geomname1}' and '{pair.geomname2}' dropped")
@@ -153,7 +175,7 @@ def _drop_ties(spec: mujoco.MjSpec, notes: list[str]) -> None:
 
 
 def _forget_defaults(spec: mujoco.MjSpec) -> None:
-    """The file's defaults are in its elements by now; what is added later starts from MuJoCo's own."""
+    """Reset the main defaults: the file's elements have them by now, and what is added later needs MuJoCo's own."""
     fresh = mujoco.MjSpec().default
     for kind, names in _ADDED.items():
         for name in names.split():
@@ -161,7 +183,7 @@ def _forget_defaults(spec: mujoco.MjSpec) -> None:
 
 
 def _free_root(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
-    """One free joint, at the root, that the air does not brake."""
+    """Give the root a name and one free joint without damping, friction or armature."""
     root = spec.worldbody.first_body()
     if not root.name:
         root.name = next(name for name in ("base", "root", "base_0") if spec.body(name) is None)
@@ -170,7 +192,7 @@ def _free_root(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
         root.add_freejoint()
         notes.append(f"free joint added to '{root.name}'")
     first = root.joints[0]
-    if first.type != mujoco.mjtJoint.mjJNT_FREE:
+    if first.type != _FREE:
         raise ModelError(
             f"{where}: the first joint must be the root body's free joint; it is {first.name or 'one without a name'}"
         )
@@ -184,7 +206,7 @@ def _free_root(spec: mujoco.MjSpec, where: str, notes: list[str]) -> None:
 
 
 def _balance(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Principal moments of a body obey A + B >= C; those that do not become their mean."""
+    """Let MuJoCo replace principal moments that violate A + B >= C by their mean, and say so."""
     for body in [body for body in spec.bodies if body.explicitinertial]:
         full = body.fullinertia
         if np.isnan(full[0]):

@@ -1,6 +1,6 @@
-"""How much room a world needs on mujoco-warp: contacts (``nconmax``) and constraint rows (``njmax``), counted from the model.
+"""How many contacts (``nconmax``) and constraint rows (``njmax``) a world needs on mujoco-warp, counted from the model.
 
-mujoco-warp allocates before it steps. Too little room drops contacts, which is reported; too many rows cost memory and time.
+mujoco-warp allocates them at the start. Too few: contacts are dropped and reported. Too many rows cost memory and time.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -25,7 +25,7 @@ _REST = 0.25  # ours: share of the contacts of links between the root and the la
 
 
 class Capacity(NamedTuple):
-    """Room of a world, and what it was counted from."""
+    """Contacts and rows of one world, and what they were counted from."""
 
     contacts: int
     rows: int
@@ -33,11 +33,11 @@ class Capacity(NamedTuple):
 
 
 def count_capacity(model: mujoco.MjModel, terrain: bool) -> Capacity:
-    """The room that ``model`` needs on its plane, or on ``terrain``.
+    """What ``model`` needs on its plane, or on ``terrain``.
 
-    The last links of each limb touch with all they have, the others with a quarter of it. Every joint with dry friction or
-    limits has a row of its own. Where parts of the robot may touch one another, half of them do, and as many more are near,
-    which takes the room of a contact too.
+    Assumed: the last link of a limb touches with all its contacts, other links with a quarter of theirs. Each joint with dry
+    friction or limits takes a row. If parts of the robot may touch one another, half of them do, and as many again are near,
+    which takes a contact too.
     """
     geoms = [geom for geom in range(model.ngeom) if model.geom_bodyid[geom] and model.geom_conaffinity[geom] & 1]
     last = _last_links(model, {int(model.geom_bodyid[geom]) for geom in geoms})
@@ -56,7 +56,7 @@ def count_capacity(model: mujoco.MjModel, terrain: bool) -> Capacity:
 
 
 def _last_links(model: mujoco.MjModel, bodies: set[int]) -> set[int]:
-    """Those of ``bodies`` that no other one of them hangs on."""
+    """Those of ``bodies`` that carry no other one of them."""
     above: set[int] = set()
     for body in bodies:
         while (body := int(model.body_parentid[body])) > 0:
@@ -65,7 +65,7 @@ def _last_links(model: mujoco.MjModel, bodies: set[int]) -> set[int]:
 
 
 def _contacts(model: mujoco.MjModel, geom: int, terrain: bool) -> int:
-    """The most contacts that ``geom`` has with the ground; on terrain a sphere in a corner has two, other shapes one a probe of a side."""
+    """The most contacts of ``geom`` with the ground. On terrain: two of a sphere, in a corner; of other shapes one a probe of one side."""
     kind = _TYPE(model.geom_type[geom])
     plane = _ON_PLANE.get(kind, 4)
     if not terrain:

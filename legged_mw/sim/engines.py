@@ -48,13 +48,11 @@ def make_simulation(
 ) -> Simulation:
     """Allocate ``num_envs`` worlds of ``model`` on ``device``.
 
-    ``terrain`` is what the model's height field was made from: mujoco-warp gets contacts of our own with it
-    (``sim/ground_contact.py``), MuJoCo's own engine those of the model.
-
-    ``nconmax`` and ``njmax`` are the contacts and constraint rows a world has room for, 0: what ``capacity.count_capacity`` finds;
-    MuJoCo's own engine allocates as it needs and leaves them aside. ``threads`` are those of MuJoCo's own engine, 0: one a
-    core. ``world_fields`` names model fields that get a value per world (see ``field``). ``eager`` switches mujoco-warp's
-    replay on a CPU off.
+    ``terrain`` is what the model's height field was made from: mujoco-warp has our own contacts with it
+    (``sim/ground_contact.py``), MuJoCo's own engine those of the model. ``nconmax`` and ``njmax`` are the contacts and
+    constraint rows of a world on mujoco-warp, 0: counted (``sim/capacity.py``). ``threads`` are those of MuJoCo's own engine,
+    0: one a core. ``world_fields`` names model fields that get a value per world (see ``field``). ``eager`` switches
+    mujoco-warp's replay on a CPU off.
     """
     kind = pick_engine(engine, device)
     world, room = _SHARE[kind] * mujoco.MjData(model).nbuffer, ""

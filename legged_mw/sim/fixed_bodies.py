@@ -1,4 +1,4 @@
-"""What does not move within a robot: joints that are held, links that are fused, and a sensor's place in the root's axes."""
+"""Bodies that do not move against others: joints are welded, fixed links are fused, the IMU gets a site on the root."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -25,7 +25,7 @@ def match_joints(joints: Sequence[str], patterns: Sequence[str], what: str) -> l
 
 
 def hold_joints(spec: mujoco.MjSpec, model: mujoco.MjModel, angles: Mapping[str, float], notes: list[str]) -> None:
-    """Weld each joint at its angle [rad]: the body stands turned, and the joint is gone. ``model`` is ``spec`` compiled."""
+    """Weld each joint at its angle [rad]: turn its body, delete the joint. ``model`` is ``spec`` compiled."""
     data = mujoco.MjData(model)
     data.qpos[:] = model.qpos0
     for name, angle in angles.items():
@@ -58,14 +58,14 @@ def _pose_in_parent(model: mujoco.MjModel, data: mujoco.MjData, body: str) -> tu
 
 
 def _place(body: mujoco.MjsBody, place: np.ndarray, quat: np.ndarray) -> None:
-    """Put ``body`` there in its parent, however its orientation and frame were written."""
+    """Set the pose of ``body`` in its parent, whichever frame and orientation attribute the file used."""
     body.set_frame(body.parent.add_frame())
     body.pos, body.quat = place, quat
     body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
 
 
 def fuse_fixed(spec: mujoco.MjSpec, notes: list[str]) -> None:
-    """Bodies without a joint become part of what carries them: fewer bodies to step, and each is a link that moves."""
+    """Fuse bodies without a joint into the link that carries them: fewer bodies to step."""
     fixed: dict[str, list[str]] = {}
     for body in spec.bodies:
         carrier = body
@@ -83,44 +83,47 @@ def fuse_fixed(spec: mujoco.MjSpec, notes: list[str]) -> None:
 
 
 def sensed_site(spec: mujoco.MjSpec, model: mujoco.MjModel, root: str, asked: str, where: str, notes: list[str]) -> str:
-    """Name of a site on the root with the root's axes: the one ``asked`` for, or a new one at its place.
+    """Name of a site on the root with the root's axes: ``asked``, or a new one at its place.
 
-    What is asked for may be turned, may be on any body that does not move against the root, and may be a body, which means its origin.
-    Empty: "imu"; if there is none, or only one that moves against the root, a new one at the root's origin. ``model`` is ``spec``
-    compiled. Raises ModelError for a site that there is not, or that moves.
+    ``asked`` is a site or a body (its origin) that does not move against the root; it may be turned. Empty means the site "imu",
+    or the root's origin if there is no such site or it moves. ``model`` is ``spec`` compiled. Raises ModelError if ``asked``
+    does not exist or moves.
     """
-    name, is_site = asked or IMU, spec.site(asked or IMU) is not None
-    if asked and not is_site and spec.body(name) is None:
+    name = asked or IMU
+    is_site = spec.site(name) is not None
+    if not asked and not is_site:
+        return _add_site(spec, root, name, np.zeros(3), f"at the origin of '{root}'", notes)
+    if not is_site and spec.body(name) is None:
         known = [thing.name for thing in (*spec.sites, *spec.bodies) if thing.name and thing.name != "world"]
         raise ModelError(f"`imu_site`: {unknown('site or body', name, known, where)}")
-    made, place, why = name, np.zeros(3), f"at the origin of '{root}'"
-    if asked or is_site:
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
-        base, there = data.body(root), data.site(name) if is_site else data.body(name)
-        body = model.body(model.site_bodyid[there.id] if is_site else there.id)
-        axes = base.xmat.reshape(3, 3).T
-        if beyond := _what_moves(model, root, body.id):
-            if asked:
-                raise ModelError(
-                    f"`imu_site`: '{name}' is on {beyond}, so what it senses is not the root's; take a site or body that is fixed to the "
-                    "root, or hold that joint by `held_joints`"
-                )
-            made, why = f"{name}_root", f"{why}: '{name}' is on {beyond}; `imu_site` may name another"
-        elif (
-            is_site
-            and body.name == root
-            and np.allclose(axes @ there.xmat.reshape(3, 3), np.eye(3), rtol=0.0, atol=ALIGNED)
-        ):
-            return name
-        else:
-            made, place = f"{name}_aligned" if is_site else name, axes @ (there.xpos - base.xpos)
-            why = f"at the place of '{name}' on '{body.name}', with the axes of the root '{root}'"
-    while spec.site(made):
-        made += "_"
-    spec.body(root).add_site(name=made, pos=place, group=3)
-    notes.append(f"site '{made}' made {why}")
-    return made
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    base, there = data.body(root), data.site(name) if is_site else data.body(name)
+    body = model.body(model.site_bodyid[there.id] if is_site else there.id)
+    if beyond := _what_moves(model, root, body.id):
+        if asked:
+            raise ModelError(
+                f"`imu_site`: '{name}' is on {beyond}, so what it senses is not the root's; take a site or body that is fixed to the "
+                "root, or hold that joint by `held_joints`"
+            )
+        why = f"at the origin of '{root}': '{name}' is on {beyond}; `imu_site` may name another"
+        return _add_site(spec, root, f"{name}_root", np.zeros(3), why, notes)
+    axes = base.xmat.reshape(3, 3).T
+    turn = axes @ there.xmat.reshape(3, 3)
+    if is_site and body.name == root and np.allclose(turn, np.eye(3), rtol=0.0, atol=ALIGNED):
+        return name
+    why = f"at the place of '{name}' on '{body.name}', with the axes of the root '{root}'"
+    made = f"{name}_aligned" if is_site else name
+    return _add_site(spec, root, made, axes @ (there.xpos - base.xpos), why, notes)
+
+
+def _add_site(spec: mujoco.MjSpec, root: str, name: str, place: np.ndarray, why: str, notes: list[str]) -> str:
+    """Add a site to the root at ``place`` [m, root frame], and return its name."""
+    while spec.site(name):
+        name += "_"
+    spec.body(root).add_site(name=name, pos=place, group=3)
+    notes.append(f"site '{name}' made {why}")
+    return name
 
 
 def _what_moves(model: mujoco.MjModel, root: str, body: int) -> str:

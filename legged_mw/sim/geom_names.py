@@ -1,4 +1,4 @@
-"""Which geoms a name means: a geom's own name, a body's for its geoms that collide, or a pattern with * and ? that fits some."""
+"""The geoms that a name means: one geom, all colliding geoms of a body, or those that a pattern with * and ? fits."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -14,8 +14,8 @@ from legged_mw.utils.errors import ModelError, unknown
 
 
 @dataclass(frozen=True)
-class Names:
-    """Geoms and bodies of a robot as its file has them: bodies that are fused later keep their names here."""
+class GeomNames:
+    """Geoms and bodies of a robot by the names in its file, also of bodies that are fused later."""
 
     where: str  # the file
     geoms: tuple[str, ...]  # all that have a name
@@ -24,9 +24,9 @@ class Names:
     bodies: dict[str, tuple[str, ...]]
 
     def find(self, patterns: Sequence[str], what: str, colliding: bool = False) -> tuple[str, ...]:
-        """The geoms that ``patterns`` mean, in their order, each once; ``colliding`` only looks at those that may touch.
+        """The geoms that ``patterns`` mean, each once, in the order of the patterns; with ``colliding`` only those that may touch.
 
-        A geom wins over a body of the same name. Raises ModelError, which begins with ``what`` asked for them.
+        A geom wins over a body of the same name. ``what`` names the caller's parameter in the text of a ModelError.
         """
         found: dict[str, None] = {}
         geoms = self.colliding if colliding else self.geoms
@@ -49,8 +49,8 @@ class Names:
         return tuple(found)
 
 
-def name_geoms(spec: mujoco.MjSpec, where: str, notes: list[str]) -> Names:
-    """Give what may touch a name, ``<body>_<number>``, so that it can be asked for; and take all names down."""
+def name_geoms(spec: mujoco.MjSpec, where: str, notes: list[str]) -> GeomNames:
+    """Call unnamed geoms that may touch ``<body>_<number>``, and list all names."""
     taken = {geom.name for geom in spec.geoms}
     for body in spec.bodies:
         for number, geom in enumerate(body.geoms):
@@ -66,7 +66,7 @@ def name_geoms(spec: mujoco.MjSpec, where: str, notes: list[str]) -> Names:
     bodies = {
         body.name: tuple(_own(body) or _fixed_to(body)) for body in spec.bodies if body.name and body.name != "world"
     }
-    return Names(
+    return GeomNames(
         where, tuple(geom.name for geom in named), tuple(geom.name for geom in named if _collides(geom)), bodies
     )
 

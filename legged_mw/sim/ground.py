@@ -65,9 +65,10 @@ def _fill_height_field(spec: mujoco.MjSpec, terrain: Terrain, heights: Heights) 
 
 
 def replace_level_pieces(spec: mujoco.MjSpec, terrain: Terrain, notes: list[str]) -> None:
-    """Sink the height field where boxes are exact: MuJoCo makes a tilted contact with every triangle that is near.
+    """Replace the level pieces of the height field by boxes, and sink the field under them.
 
-    A small sphere has up to a dozen contacts with what stays a height field, which few iterations leave far from solved.
+    MuJoCo makes a tilted contact with every triangle near a geom: a small sphere has up to a dozen on a height field, and few
+    iterations leave them far from solved.
     """
     boxes, heights, _ = as_boxes(terrain)
     _fill_height_field(spec, terrain, heights)
@@ -94,7 +95,7 @@ def add_ground_box(spec: mujoco.MjSpec, low: np.ndarray, high: np.ndarray) -> mu
 
 
 def feel_all_ground(spec: mujoco.MjSpec) -> None:
-    """Contact sensors that ask for the geom of the ground ask for all geoms of the world instead."""
+    """Let contact sensors of the ground's geom sense all geoms of the world instead."""
     for sensor in spec.sensors:
         if sensor.type == mujoco.mjtSensor.mjSENS_CONTACT and sensor.refname == GROUND:
             sensor.reftype, sensor.refname = mujoco.mjtObj.mjOBJ_BODY, "world"
@@ -112,7 +113,7 @@ class Box(NamedTuple):
 
 
 def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights, list[str]]:
-    """Tiles that are few level pieces as boxes, the heights of all else, sunk by 1 m under the boxes, and its kinds.
+    """Boxes for the tiles that are few level pieces; the heights, sunk by 1 m under the boxes; the kinds that stay a height field.
 
     Steps are upright there, midway between the vertices where the height field has a slope of one cell.
     """
@@ -138,7 +139,7 @@ def as_boxes(terrain: Terrain) -> tuple[list[Box], Heights, list[str]]:
 
 
 def _level_pieces(patch: Heights) -> list[tuple[tuple[int, int], tuple[int, int], float]]:
-    """Rectangles of vertices of one height: first row and the one after the last, columns likewise, height; too many: cut short."""
+    """Rectangles of vertices of one height, as (rows, columns, height), spans half open; it stops above MOST_BOXES."""
     taken = np.zeros(patch.shape, dtype=bool)
     pieces: list[tuple[tuple[int, int], tuple[int, int], float]] = []
     for row in range(patch.shape[0]):

@@ -58,11 +58,9 @@ def probes(model: mujoco.MjModel, ground: int) -> tuple[list[int], np.ndarray, l
 
 def _field(terrain: Terrain) -> Any:
     field = _Field()
-    field.heights, field.corner, field.per_cell = (
-        wp.array(terrain.heights, dtype=float),
-        wp.vec2(*terrain.corner),
-        1.0 / terrain.cell,
-    )
+    field.heights = wp.array(terrain.heights, dtype=float)
+    field.corner = wp.vec2(*terrain.corner)
+    field.per_cell = 1.0 / terrain.cell
     return field
 
 
@@ -330,22 +328,11 @@ def _touch(
         # else it is over a face, whose own normal is more exact than a difference of places
         if wp.dot(away, up) < 0.9999:
             normal = away
-    _write(
-        world, 0, geoms, depth, centre - normal * (radius + 0.5 * depth), normal, material, naconmax, contacts, nacon
-    )
+    place = centre - normal * (radius + 0.5 * depth)
+    _write(world, 0, geoms, depth, place, normal, material, naconmax, contacts, nacon)
     if above >= 0.0:  # from under the ground there is one way out
         other, face = _other_face(field, cells, centre, normal)
         depth = other - radius
         if depth < farthest:
-            _write(
-                world,
-                1,
-                geoms,
-                depth,
-                centre - face * (radius + 0.5 * depth),
-                face,
-                material,
-                naconmax,
-                contacts,
-                nacon,
-            )
+            place = centre - face * (radius + 0.5 * depth)
+            _write(world, 1, geoms, depth, place, face, material, naconmax, contacts, nacon)

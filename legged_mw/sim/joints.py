@@ -32,9 +32,9 @@ _NO_KIND |= {"front", "rear", "hind", "back"}
 def some_joints(
     table: Mapping[str, float], joints: Sequence[str], what: str, spare: Sequence[str] = ()
 ) -> dict[str, float]:
-    """Joint -> value, of those ``joints`` that a key fits: a key fits if it is the joint's name or a part of it.
+    """Joint -> value, for those of ``joints`` that a key fits. A key fits if it is the joint's name or a part of it.
 
-    Raises ModelError for a key without a joint, and for two keys that fit a joint equally well. A key may fit one in ``spare`` instead.
+    Raises ModelError for a key that fits no joint, also none of ``spare``, and for two keys that fit a joint equally well.
     """
     for key in table:
         if key and not any(key in joint for joint in (*joints, *spare)):
@@ -68,7 +68,7 @@ def per_joint(table: Mapping[str, float], joints: Sequence[str], what: str, spar
 def per_joint_all(
     tables: Mapping[str, Mapping[str, float]], joints: Sequence[str], spare: Sequence[str] = ()
 ) -> dict[str, list[float]]:
-    """``per_joint`` of several tables, by what they are; the error is about all of them at once."""
+    """``per_joint`` of several tables (name -> table); one error lists what is wrong with all of them."""
     values, wrong = dict[str, list[float]](), []
     for what, table in tables.items():
         try:
@@ -90,24 +90,24 @@ def family(name: str) -> str:
 
 @dataclass(frozen=True)
 class PosedRobot:
-    """D joints that move, and what holds the others."""
+    """The D joints that move, their pose and their numbers; the others are welded."""
 
     model: mujoco.MjModel  # the robot alone, compiled, its held joints welded
     joints: list[str]  # D
     held: list[str]
     angles: list[float]  # D, the pose [rad]
     ranges: list[Range]  # D [rad]; infinite where there is no limit
-    # D each: "`stiffness`" [N m/rad], "`damping`" [N m s/rad], CURVE at the joint, what else was asked
+    # D each: "`stiffness`" [N m/rad], "`damping`" [N m s/rad], CURVE at the joint, and the caller's other tables
     tables: dict[str, list[float]]
 
 
 def pose_joints(
     robot: RobotFile, tables: Mapping[str, Mapping[str, float]], pose: Mapping[str, float] | None, held: Sequence[str]
 ) -> PosedRobot:
-    """Weld the ``held`` joints, and give the others their numbers from ``tables``, what -> table.
+    """Weld the ``held`` joints, and give the others their numbers from ``tables`` (name -> table).
 
-    The pose is the caller's, then the keyframe's; where both are silent 0 for a held joint, and for all of them if ``pose`` is None.
-    Raises ModelError for joints that no key fits, of all tables at once.
+    A joint's angle comes from ``pose``, else from the keyframe, else it is 0 (held joints, or ``pose`` is None).
+    Raises ModelError for joints that no key fits.
     """
     every = [joint.name for joint in robot.joints]
     welded = match_joints(every, held, "`held_joints`")
@@ -117,7 +117,7 @@ def pose_joints(
     known = {**(robot.keyframe.angles if robot.keyframe else {}), **some_joints(pose or {}, every, "`pose`")}
     model = robot.model
     if welded:
-        # to 0
+        # the angle nearest to 0
         nearest = {name: float(np.clip(0.0, *span)) for name, span in zip(welded, _ranges(model, welded), strict=True)}
         hold_joints(robot.spec, model, {name: known.get(name, nearest[name]) for name in welded}, robot.notes)
         model = robot.spec.copy().compile()
@@ -141,7 +141,7 @@ def _ranges(model: mujoco.MjModel, joints: Sequence[str]) -> list[Range]:
 def set_machine(
     robot: RobotFile, partial: Mapping[str, Mapping[str, float]], posed: PosedRobot, drive: Drive
 ) -> tuple[float, ...]:
-    """Motors with their force limits, armature and dry friction; what ``partial`` (of PARTIAL) says wins over the file.
+    """Add motors with their force limits, armature and dry friction; ``partial`` (tables of PARTIAL) wins over the file.
 
     Returns the speed limits (D,) [rad/s], infinite where nothing states one.
     """
@@ -159,7 +159,7 @@ def set_machine(
 
 
 def posed(model: mujoco.MjModel, joints: Iterable[float], root: Iterable[float] = _UPRIGHT) -> mujoco.MjData:
-    """Places of bodies, geoms and sites with the joints at the angles ``joints`` (D,) [rad] and the ``root`` (7,) there."""
+    """Places of bodies, geoms and sites, with the joints at ``joints`` (D,) [rad] and the root at ``root`` (7,)."""
     data = mujoco.MjData(model)
     data.qpos[:] = [*root, *joints]
     mujoco.mj_kinematics(model, data)

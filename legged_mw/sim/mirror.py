@@ -1,7 +1,6 @@
-"""Left and right: which joint and which site takes whose place when a model is mirrored about its root's x-z plane.
+"""Left and right: the partner of each joint and site when a model is mirrored about its root's x-z plane.
 
-Geometry of a compiled model only; nothing is stepped. Inertia is not compared: a model that pairs up here may still
-carry a little more mass on one side.
+Geometry of a compiled model only; nothing is stepped. Masses are not compared: one side may be a little heavier.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -18,7 +17,7 @@ from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
 from legged_mw.utils.errors import ModelError
 
-# a place, a velocity, a force; what turns (an axis, an angular velocity) is axial: -POLAR
+# mirrors a place, a velocity or a force; axes and angular velocities are axial: -POLAR
 POLAR = np.array([1.0, -1.0, 1.0])
 TOLERANCE = 0.001  # [m] between a mirrored place and its partner's
 AXIS_TOLERANCE = 0.01  # [rad] between a mirrored axis and its partner's
@@ -26,7 +25,7 @@ AXIS_TOLERANCE = 0.01  # [rad] between a mirrored axis and its partner's
 
 @dataclass(frozen=True)
 class Partners:
-    """A mirrored state is ``q[..., joints] * signs`` and ``site[..., sites]``; doing it twice gives the state back."""
+    """A mirrored state is ``q[..., joints] * signs`` and ``site[..., sites]``; mirroring twice gives the state back."""
 
     joints: tuple[int, ...]  # D, in order of RobotModel.joint_names; a joint in the middle is its own partner
     signs: tuple[int, ...]  # D, +1 or -1: the direction of the mirrored joint seen along its partner's axis
@@ -71,7 +70,7 @@ def find_partners(robot: RobotModel, sites: Sequence[str] = (), tolerance: float
 
 
 def opposites(robot: RobotModel, name: str, tolerance: float = TOLERANCE) -> list[str]:
-    """Names of the sites, geoms and bodies where the mirror image of the one called ``name`` is; ``tolerance`` in [m]."""
+    """Names of the sites, geoms and bodies at the mirror image of the one called ``name``; ``tolerance`` in [m]."""
     model, found = robot.physics, []
     data = posed(model, np.zeros(len(robot.joint_names)))
     for kind, places in (("site", data.site_xpos), ("geom", data.geom_xpos), ("body", data.xpos)):

@@ -1,8 +1,8 @@
-"""From a robot's file to a compiled model: ground, servos and sensors are added here. Host only; nothing is stepped.
+"""From a robot's file to a compiled model, with ground, motors and sensors. Host only; nothing is stepped.
 
-The file states facts of the machine (mass, geometry, joint range, armature, friction, force limit); the caller's
-numbers state choices (gains, ground, what collides, what is sensed). Every name that a choice uses must match
-something in the file, and what a choice changes is recorded in ``RobotModel.overrides``.
+The file states facts of the machine (mass, geometry, joint range, armature, friction, force limit). The caller's
+numbers state choices (gains, ground, what collides, what is sensed). Every name in a choice must match something in the
+file. ``RobotModel.overrides`` lists what a choice changes.
 """
 
 # pyright: reportAttributeAccessIssue=false
@@ -18,7 +18,7 @@ import mujoco
 import numpy as np
 
 from legged_mw.sim.fixed_bodies import fuse_fixed, sensed_site
-from legged_mw.sim.geom_names import Names, name_geoms
+from legged_mw.sim.geom_names import GeomNames, name_geoms
 from legged_mw.sim.ground import GROUND, Ground, add_ground, replace_level_pieces
 from legged_mw.sim.joints import PosedRobot, pose_joints, posed, set_machine
 from legged_mw.sim.robot_file import Keyframe, RobotFile, naming, read_plain
@@ -53,7 +53,7 @@ class RobotModel:
     joint_names: tuple[str, ...]  # scalar joints, in order of qpos[7:], qvel[6:] and ctrl
     sensors: dict[str, slice]  # "contact", "linvel", "accelerometer", and what more was asked for -> span of sensordata
     spec: mujoco.MjSpec  # the same with visual geoms, without ``more_sensors``: to copy, never to change
-    names: Names  # of geoms and bodies, as a caller may ask for them
+    names: GeomNames  # of geoms and bodies
     contact_geoms: tuple[str, ...] = ()  # in order of the span "contact"
     site_geoms: dict[str, tuple[str, ...]] = field(default_factory=dict)  # of each site that was asked for with geoms
     terrain: Terrain | None = None  # None: the plane
@@ -89,7 +89,7 @@ class RobotModel:
         return slice(first, first + sum(name == GROUND or name.startswith(f"{GROUND}/") for name in names))
 
     def columns(self, sensor: str) -> slice:
-        """Of sensordata, those of the sensor called so."""
+        """Columns of sensordata of the sensor called so."""
         index = self.id("sensor", sensor)
         start = int(self.physics.sensor_adr[index])
         return slice(start, start + int(self.physics.sensor_dim[index]))
@@ -117,15 +117,13 @@ def build_model(
     contact_geoms: Sequence[str],  # sensed: number of contacts with the ground; likewise, each geom once
     velocity_sites: Sequence[str],  # sensed: linear velocity, world frame [m/s]
     imu_site: str
-    | None,  # sensed: proper acceleration in the root's axes [m/s^2]; as for fixed_bodies.sensed_site; None: not at all
-    # name -> geoms, likewise; a site that the MJCF lacks is made there
-    sites: Mapping[str, Sequence[str]] | None = None,
-    # as for per_joint: angles [rad]; where it is silent the keyframe's; None without one: all 0
-    pose: Mapping[str, float] | None = None,
+    | None,  # sensed: acceleration in the root's axes [m/s^2]; see fixed_bodies.sensed_site; None: not at all
+    sites: Mapping[str, Sequence[str]] | None = None,  # name -> geoms, likewise, for a site that the file lacks
+    pose: Mapping[str, float] | None = None,  # as for per_joint: angles [rad], before the keyframe's; None: those, or 0
     tables: Mapping[str, Mapping[str, float]] = {},  # what -> a table, as for per_joint: for ``RobotModel.tables``
     held_joints: Sequence[str] = (),  # names or patterns: welded at the pose
-    # of PARTIAL, as for some_joints: what the caller knows better than the file
-    partial: Mapping[str, Mapping[str, float]] | None = None,
+    partial: Mapping[str, Mapping[str, float]]
+    | None = None,  # tables of PARTIAL, as for some_joints: they win over the file
     more_sensors: Collection[str] = (),  # what else is sensed: names of sensors.py, or of the file's own sensors
     drive: Drive = "angle",  # what `ctrl` means; with servos.CURVE in `tables` motors have torque-speed curves
 ) -> RobotModel:
@@ -162,7 +160,7 @@ def read_file(file: Path, wanted: Collection[str] = ()) -> RobotFile:
 def _compile(
     robot: RobotFile,
     posed: PosedRobot,
-    names: Names,
+    names: GeomNames,
     ground: Ground,
     site_geoms: dict[str, tuple[str, ...]],
     touching: tuple[str, ...],
@@ -198,7 +196,7 @@ def _compile(
 
 
 def _compile_bare(spec: mujoco.MjSpec, ground: Ground, notes: list[str]) -> mujoco.MjModel:
-    """What is stepped: without visual geoms, lights and cameras."""
+    """Compile what is stepped: without visual geoms, lights and cameras."""
     spec.compiler.discardvisual = True
     for extra in [*spec.lights, *spec.cameras]:  # mujoco-warp would move lights in every step
         spec.delete(extra)
@@ -231,7 +229,7 @@ def _set_options(spec: mujoco.MjSpec, solver: Solver, notes: list[str]) -> None:
 
 
 def _option(name: str, value: float) -> str:
-    """A value of an option in MuJoCo's own words, as an MJCF has them."""
+    """A value of an option in the words of MJCF."""
     if name in _CHOICES:
         return _CHOICES[name](value).name.split("_")[1].lower()
     if name in _FLAGS:
@@ -245,7 +243,7 @@ def _option(name: str, value: float) -> str:
 
 
 def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisions: bool, notes: list[str]) -> None:
-    """Ground is contype 1. What may touch it has conaffinity 1; with self-collisions also bit 2 on both sides."""
+    """The ground is contype 1 and colliders have conaffinity 1; with self-collisions both have bit 2 too."""
     robot = [g for g in spec.geoms if g.name != GROUND and (g.contype or g.conaffinity)]
     off = []
     for geom in robot:
@@ -264,9 +262,9 @@ def _set_collisions(spec: mujoco.MjSpec, colliders: Sequence[str], self_collisio
 def _leave_out_neighbours(
     spec: mujoco.MjSpec, joints: Sequence[str], angles: Sequence[float], notes: list[str]
 ) -> None:
-    """Exclude the pairs of bodies that overlap with ``joints`` at ``angles`` [rad]: they would push against each other for good.
+    """Exclude pairs of bodies that overlap with ``joints`` at ``angles`` [rad]: they would always push against each other.
 
-    Bodies that a joint joins are left out by MuJoCo itself.
+    MuJoCo itself leaves out bodies that a joint joins.
     """
     for geom in [geom for geom in spec.geoms if geom.contype]:  # an exclusion needs names
         geom.parent.name = geom.parent.name or f"body_of_{geom.name}"
@@ -293,7 +291,7 @@ def _leave_out_neighbours(
 
 
 class Upright(NamedTuple):
-    """S sites of a robot whose root is upright at the world's origin, and the bodies that they are on."""
+    """S sites of a robot whose root is upright at the world's origin, and their bodies."""
 
     places: np.ndarray  # (S, 3) of the sites in the root's frame [m]
     bodies: np.ndarray  # (S,) index of each site's body
@@ -301,7 +299,7 @@ class Upright(NamedTuple):
 
 
 def upright(robot: RobotModel, joints: Sequence[float], sites: Sequence[str]) -> Upright:
-    """``sites`` with the joints at the angles ``joints`` (D,) [rad]."""
+    """The robot stands upright with its joints at ``joints`` (D,) [rad]: where ``sites`` are then."""
     model, data = robot.physics, posed(robot.physics, joints)
     where = [robot.id("site", name) for name in sites]
     bodies = model.site_bodyid[where]
@@ -309,6 +307,6 @@ def upright(robot: RobotModel, joints: Sequence[float], sites: Sequence[str]) ->
 
 
 def standing_height(robot: RobotModel, geoms: Sequence[str], joints: Sequence[float]) -> float:
-    """How high the root is above a plane that the lowest of ``geoms`` touches, upright, with the joints at ``joints`` (D,) [m]."""
+    """Height [m] of an upright root above the lowest point of ``geoms``, with the joints at ``joints`` (D,) [rad]."""
     points = surfaces(robot.physics, posed(robot.physics, joints), geoms)
     return -float(min(places[:, 2].min() for places in points.values()))

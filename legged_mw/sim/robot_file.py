@@ -31,9 +31,7 @@ _IN_BODY = {"body", "freejoint", "joint", "inertial", "geom", "site"}
 SCENE = re.compile(r"(floor|ground|around|relief|sky)(/.*)?")
 
 SCALAR_JOINTS = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-_FREE = mujoco.mjtJoint.mjJNT_FREE
-_COLUMNS = {_FREE: 7, mujoco.mjtJoint.mjJNT_BALL: 4}  # of qpos; all other joints have one
-_UPRIGHT = 0.5  # [degrees] of tilt that are rounding
+UPRIGHT = 0.5  # [degrees] of tilt that are rounding
 
 
 @dataclass(frozen=True)
@@ -77,11 +75,18 @@ def read_plain(file: Path) -> RobotFile | None:
         source, notes = Source(file), list[str]()
         if not _is_plain(source):
             return None
-        spec = source.spec()
-        limits, keyframe = take_limits(spec, notes), take_keyframe(spec, notes)
-        joints = list(spec.joints)[1:]
+        spec, keyframe = source.spec(), None
+        limits, joints = take_limits(spec, notes), list(spec.joints)[1:]
         if not joints or not all(joint.type in SCALAR_JOINTS and joint.name for joint in joints):
             return None
+        for key in list(spec.keys):  # which would have to fit the motors that are added
+            qpos, names = list(key.qpos), [joint.name for joint in joints]
+            if len(qpos) != 7 + len(names) or tilt(qpos[3:7]) > UPRIGHT:
+                return None
+            keyframe = Keyframe(key.name, qpos[2], dict(zip(names, qpos[7:], strict=True)))
+            notes.append(f"keyframe '{key.name}' read: pose and height of the root, where nothing else states them")
+            spec.delete(key)
+        spec.nkey = 0
         try:
             with warnings.catch_warnings(record=True) as said:
                 model = compile_copy(spec)
@@ -92,7 +97,7 @@ def read_plain(file: Path) -> RobotFile | None:
 
 
 def _is_plain(source: Source) -> bool:
-    """By what its elements are."""
+    """By its elements and attributes alone, before MuJoCo reads it."""
     root, bodies = source.root, source.root.findall("worldbody/*")
     if root.tag != "mujoco" or len(bodies) != 1 or not bodies[0].get("name") or source.named:
         return False
@@ -138,38 +143,6 @@ def naming(file: Path) -> Iterator[None]:
 def kind_of(file: Path) -> str:
     """What its name says that it is."""
     return "URDF" if file.suffix == ".urdf" else "MJCF"
-
-
-def take_keyframe(spec: mujoco.MjSpec, notes: list[str]) -> Keyframe | None:
-    """The keyframe "home", or the only one; none stays in the file, as it would have to fit the servos."""
-    keys, taken = list(spec.keys), None
-    chosen = next((key for key in keys if key.name == "home"), keys[0] if len(keys) == 1 else None)
-    qpos = list(chosen.qpos) if chosen else []
-    starts = np.cumsum([0, *(_COLUMNS.get(joint.type, 1) for joint in spec.joints)])
-    if chosen and len(qpos) == starts[-1]:
-        angles = {
-            joint.name: qpos[start]
-            for joint, start in zip(spec.joints, starts[:-1], strict=True)
-            if joint.type in SCALAR_JOINTS
-        }
-        first = next(iter(spec.joints), None)
-        free = bool(first and first.type == _FREE)
-        lean = tilt(qpos[3:7]) if free else 0.0
-        taken = Keyframe(chosen.name, qpos[2] if free and lean < _UPRIGHT else None, angles)
-        notes.append(f"keyframe '{chosen.name}' read: pose and height of the root, where nothing else states them")
-        if lean > _UPRIGHT:
-            text = f"warning: keyframe '{chosen.name}' tilts the root by {lean:.0f} degrees; that and its height are not read, the root "
-            notes.append(f"{text}begins upright: state a pose for that by `pose`")
-    for key in keys:
-        if key is not chosen:
-            notes.append(f"keyframe '{key.name}' dropped")
-        elif not taken:
-            notes.append(
-                f"keyframe '{key.name}' dropped: its qpos has {len(qpos)} numbers, the joints of the file have {starts[-1]}"
-            )
-        spec.delete(key)
-    spec.nkey = 0
-    return taken
 
 
 def tilt(quat: Sequence[float] | np.ndarray) -> float:

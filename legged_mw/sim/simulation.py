@@ -1,4 +1,4 @@
-"""What any physics engine promises to those above it: the seam, written once. Nothing above ``sim/`` knows which engine it talks to."""
+"""What every physics engine promises: the seam, written once. Nothing above ``sim/`` knows which engine it talks to."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from legged_mw.utils.errors import ModelError, unknown
 
-# Model fields that others are derived from, and those others: they need a value per world as soon as one of the former has.
+# If one of the first model fields has a value per world, the second ones, which MuJoCo derives from them, need one too.
 CONSTANTS_READ = ("body_mass", "body_inertia", "body_ipos", "body_iquat", "dof_armature", "qpos0")
 CONSTANTS = ("body_subtreemass", "body_invweight0", "dof_invweight0", "actuator_acc0")
 GRAVITY = "opt.gravity"  # (N, 3) [m/s^2], the one option that may differ between worlds
@@ -42,23 +42,23 @@ class Simulation(ABC):
 
     @abstractmethod
     def step(self, substeps: int = 1, before: Callable[[int], None] | None = None) -> None:
-        """Advance every world by ``substeps`` time steps, with ``ctrl`` and ``xfrc_applied`` as they stand.
+        """Advance every world by ``substeps`` time steps, with the present ``ctrl`` and ``xfrc_applied``.
 
         ``before(k)`` is called before substep k, with the state current, and may write ``ctrl``; on a GPU it must be recordable.
         """
 
     @abstractmethod
     def actuator_velocity(self) -> Tensor:
-        """(N, nu) speed [rad/s] that went into ``actuator_force``: of the same moment. Not for inside a recorded step.
+        """(N, nu) speed [rad/s] at the moment of ``actuator_force``. Not for inside a recorded step.
 
-        Ask for it before the steps that it is wanted of: MuJoCo's own engine fills it from then on.
+        Call it before the first step of interest: MuJoCo's own engine fills it from then on.
         """
 
     @abstractmethod
     def reset(self, mask: Tensor) -> None:
-        """Clear the worlds where ``mask`` (N,) bool is true; what is not state is zero until the next ``step``.
+        """Reset the worlds where ``mask`` (N,) bool is true to ``qpos0`` at rest; all that is not state is zero until the next ``step``.
 
-        State goes to the model's own ``qpos0``: write the wanted ``qpos``, ``qvel`` and ``ctrl`` after it.
+        Write the wanted ``qpos``, ``qvel`` and ``ctrl`` after it.
         """
 
     def field(self, name: str) -> Tensor:
@@ -71,21 +71,22 @@ class Simulation(ABC):
 
     @abstractmethod
     def memory(self) -> dict[str, Tensor]:
-        """All that the worlds' next steps depend on, and what was sensed last, by name; of the model as ``model.<field>``.
+        """All tensors that the next steps depend on, and what was sensed last, by name; model fields as ``model.<field>``.
 
-        To be copied, or to be written in place in worlds of the same model; then call ``set_constants`` where fields need it.
+        Copy them, or write them in place in worlds of the same model; then call ``set_constants`` if fields changed.
         """
 
     @abstractmethod
     def set_constants(self) -> None:
-        """Bring what the model derives from masses, inertias, armatures and zero angles up to date with what was written
-        into their fields, in every world. Slow, and not for inside a recorded step.
+        """Recompute in every world what the model derives from masses, inertias, armatures and zero angles.
+
+        Slow, and not for inside a recorded step.
         """
 
     @abstractmethod
     def overflowed_worlds(self) -> Tensor:
-        """How many worlds did not fit into the engine's buffers since construction, float (), on the device."""
+        """How many worlds overflowed the engine's buffers since construction, float (), on the device."""
 
     @abstractmethod
     def overflow_report(self) -> str:
-        """What did not fit since construction, a line, or '' if all did. Reads the device: not for inside a step."""
+        """A line about what overflowed since construction, or ''. Reads the device: not for inside a step."""

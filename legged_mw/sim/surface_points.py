@@ -1,4 +1,4 @@
-"""Collision shapes as points or spheres on them: for contacts with a height field, and for sites at the lowest point of a shape."""
+"""Points or spheres on the surface of collision shapes: for contacts with a height field, and to find the lowest point."""
 
 # pyright: reportAttributeAccessIssue=false
 # (mujoco ships no type stubs)
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from legged_mw.utils.errors import ModelError
 
-SPACING = 0.01  # [m] between points on a shape whose lowest one is looked for
+SPACING = 0.01  # [m] between points when the lowest one is looked for
 LEVEL = 0.001  # [m] points so little above the lowest one are as low: a flat side has its site in the middle
 Points = NDArray[np.float64]  # (P, 3) [m], in the geom's frame
 
@@ -65,7 +65,7 @@ def _on_ellipsoid(size: Points, spacing: float) -> list[tuple[float, ...]]:
 
 
 def _on_mesh(model: mujoco.MjModel, mesh: int, spacing: float) -> Points:
-    """Vertices of the convex hull that lie farthest out in 26 directions, and where a grid of lines along each axis meets the hull."""
+    """The convex hull's outermost vertices in 26 directions, and the points where a grid of lines along each axis meets it."""
     first, count = model.mesh_vertadr[mesh], model.mesh_vertnum[mesh]
     vertices, faces = model.mesh_vert[first : first + count].astype(float), model.mesh_face[model.mesh_faceadr[mesh] :]
     faces = faces[: model.mesh_facenum[mesh]]
@@ -118,15 +118,16 @@ _POINTS: dict[int, Callable[[Points, float], list[tuple[float, ...]]]] = {
 }
 
 
-# ---- sites that an MJCF lacks: at a geom, or at the lowest point of several ----
+# ---- sites that a file lacks: at a geom, or at the lowest point of several ----
 
 
 def add_sites(
     spec: mujoco.MjSpec, sites: Mapping[str, Sequence[str]], angles: Sequence[float], where: str, notes: list[str]
 ) -> None:
-    """Add each site (name -> geoms) that ``spec`` lacks; which point is the lowest is asked with the joints at ``angles`` (D,) [rad].
+    """Add each site (name -> geoms) that ``spec`` lacks.
 
-    One geom has its site in its middle. Several have it at the middle of their lowest points, on the body of the lowest one.
+    A site of one geom is in its middle. A site of several is at the middle of their lowest points, with the joints at ``angles``
+    (D,) [rad], on the body of the lowest geom.
     """
     missing = {name: geoms for name, geoms in sites.items() if spec.site(name) is None}
     if not missing:
