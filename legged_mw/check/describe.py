@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from legged_mw.check.own_class import own_classes
 from legged_mw.envs.domain_rand import active
-from legged_mw.envs.own_code import own_classes
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.students.estimator import find_targets
 from legged_mw.sim.room import count_room
