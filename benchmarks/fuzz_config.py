@@ -22,7 +22,6 @@ from typing import Any
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from legged_mw.envs.checks import check_values
 from legged_mw.utils.config import ConfigError, field_types, load_yaml, save_yaml
 from legged_mw.utils.task import LoadedTask, load_task, task_names
 
@@ -109,7 +108,8 @@ def take_over(loaded: dict[str, Any]) -> None:
         again = load_task(task.name)
         again.update(load_yaml(FOLDER / "again.yaml"), "again.yaml")
         assert again.to_dict() == task.to_dict()
-        check_values(task.cfg, task.train)
+        task.cfg.check()
+        task.train.check(task.cfg.env.num_envs)
         counts["passed"] += 1
     except ConfigError as error:
         one_line(error)
@@ -161,7 +161,8 @@ def fuzz_fields(path: str, value: Any, as_text: bool) -> None:
                     nested = {part: nested}
                 return take_over(nested)
             counts["set"] += 1
-            check_values(task.cfg, task.train)
+            task.cfg.check()
+            task.train.check(task.cfg.env.num_envs)
         except (ConfigError, ValueError) as error:
             if isinstance(error, ConfigError):
                 one_line(error)

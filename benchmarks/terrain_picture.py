@@ -19,7 +19,6 @@ import mujoco
 import numpy as np
 
 from legged_mw.drawing.scene import ground_model
-from legged_mw.envs.checks import check_values
 from legged_mw.envs.terrain import build_terrain
 from legged_mw.sim.terrain import KINDS, MEASURES, Terrain, measure
 from legged_mw.utils.cli import Parser, apply_overrides, one_line_errors
@@ -129,7 +128,7 @@ def ground(task: LoadedTask, everything: bool) -> Terrain:
     kinds = list(KINDS) if everything else [kind for kind, share in terrain.terrain_proportions.items() if share > 0]
     terrain.terrain_proportions = dict.fromkeys(reversed(kinds), 1.0)
     terrain.num_cols, terrain.border_size = len(kinds), 1.0
-    check_values(task.cfg)
+    task.cfg.check()
     built = build_terrain(task.cfg)
     assert built is not None
     return built

@@ -29,6 +29,7 @@ def train() -> None:
     if args.list:
         print(list_tasks())
         return
+    from legged_mw.check.own_class import check_class
     from legged_mw.eval.exams import find_exam
     from legged_mw.rl import training
     from legged_mw.rl.ranks import quiet, this_rank
@@ -36,6 +37,8 @@ def train() -> None:
     quiet(this_rank())  # from here on only the first of several processes prints
     find_exam(task := load_task(args.task, say=True))
     start, device = training.configure(task, args)
+    for line in check_class(task.env_class, task.cfg.to_dict()["rewards"]["scales"]):
+        print(line, flush=True)
     with training.say_compiling(task, device):
         _build_and_train(task, start, device, args)
 

@@ -114,7 +114,6 @@ NOT_YET = {
     "legged_mw/sim/ground_contact.py": ["legged_mw.fast"],
     "legged_mw/utils/math.py": ["legged_mw.fast"],
     "legged_mw/rl/layers.py": ["legged_mw.fast"],
-    "legged_mw/envs/checks.py": ["legged_mw.skills"],
     "legged_mw/rl/classes.py": ["legged_mw.rl.students"],
     "legged_mw/rl/training.py": ["legged_mw.rl.students"],
     "legged_mw/rl/ppo.py": ["legged_mw.rl.students"],

@@ -16,7 +16,7 @@ from program import SMALL, run
 from worlds import make_env
 
 from legged_mw import ROOT
-from legged_mw.envs.checks import PAYS, WITHOUT, check_class, check_values
+from legged_mw.check.own_class import PAYS, WITHOUT, check_class
 from legged_mw.rl.health import Health
 from legged_mw.robot.page import doubts
 from legged_mw.utils.bounds import bare, bounds_text
@@ -29,7 +29,8 @@ from legged_mw.utils.task import LoadedTask, load_task, task_names
 @pytest.mark.parametrize("name", task_names())
 def test_tasks_as_they_ship_pass(name: str) -> None:
     task = load_task(name)
-    check_values(task.cfg, task.train)
+    task.cfg.check()
+    task.train.check(task.cfg.env.num_envs)
 
 
 @pytest.mark.parametrize(
@@ -149,7 +150,8 @@ def test_where_in_a_table_or_list_is_named(path: str, value: Any, text: str) -> 
     task = load_task("go1_flat")
     with pytest.raises(ConfigError) as error:
         task.set(path, value)
-        check_values(task.cfg, task.train)
+        task.cfg.check()
+        task.train.check(task.cfg.env.num_envs)
     assert text in str(error.value)
 
 
@@ -166,7 +168,7 @@ def test_a_command_of_a_users_own_has_a_range() -> None:
     with pytest.raises(
         ConfigError, match=r"^commands.ranges.height is \[0.3, 0.2\]; it must be two numbers, the lower first$"
     ):
-        check_values(task.cfg)
+        task.cfg.check()
 
 
 def fields() -> list[tuple[LoadedTask, str, Any]]:
@@ -203,7 +205,7 @@ def test_no_number_is_cut_off_in_silence() -> None:
     task.set("commands.keep_probability", [0.9, 0.25, 0.5, 0.5])
     text = "^commands.keep_probability has 4 numbers, but there are 3 commands: lin_vel_x, lin_vel_y, ang_vel_yaw$"
     with pytest.raises(ConfigError, match=text):
-        check_values(task.cfg)
+        task.cfg.check()
 
 
 @pytest.mark.parametrize(
@@ -234,7 +236,8 @@ def test_fewer_samples_than_minibatches_are_named() -> None:
     task.set("runner.num_steps_per_env", 3)
     text = r"an iteration has 3 samples \(1 worlds x 3 steps\), fewer than algorithm.num_mini_batches = 4; raise"
     with pytest.raises(ConfigError, match=text):
-        check_values(task.cfg, task.train)
+        task.cfg.check()
+        task.train.check(task.cfg.env.num_envs)
 
 
 # ---- methods of a user's class ----

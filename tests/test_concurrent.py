@@ -21,7 +21,6 @@ from torch import Tensor, nn
 from legged_mw.check.describe import describe
 from legged_mw.check.recordable import recordable
 from legged_mw.deploy.stage import DeployStage
-from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.rl.network import run_onnx
 from legged_mw.rl.policies import act, find_trained, load_policy
@@ -228,7 +227,8 @@ def test_a_checkpoint_goes_on_bit_for_bit(tmp_path: Path) -> None:
 def test_what_cannot_be(changes: dict[str, Any], said: str) -> None:
     task = task_with(**{name if "." in name else f"actor.concurrent.{name}": value for name, value in changes.items()})
     with pytest.raises(ConfigError, match=f"actor.concurrent.{said}"):
-        check_values(task.cfg, task.train)
+        task.cfg.check()
+        task.train.check(task.cfg.env.num_envs)
         make_runner(LeggedRobot(task.cfg, "cpu"), task.train, None, "cpu")
 
 

@@ -17,7 +17,6 @@ from worlds import QUIET, changed, layout, make_env, snapshot
 
 from legged_mw import ROOT
 from legged_mw.check.recordable import recordable
-from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.rl.settings import rsl_rl_config
@@ -451,9 +450,11 @@ def test_weights_that_cannot_work() -> None:
     task.set("symmetry.mirror_loss_coeff", 0.0)
     task.set("symmetry.use_mirror_loss", True)
     with pytest.raises(ConfigError, match="^symmetry.use_mirror_loss is on, but symmetry.mirror_loss_coeff is 0"):
-        check_values(task.cfg, task.train)
+        task.cfg.check()
+        task.train.check(task.cfg.env.num_envs)
     task.set("symmetry.mirror_loss_coeff", 0.5)
-    check_values(task.cfg, task.train)
+    task.cfg.check()
+    task.train.check(task.cfg.env.num_envs)
 
 
 # ---- the learner

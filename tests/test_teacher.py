@@ -19,7 +19,6 @@ from worlds import layout, make_env
 from legged_mw.check.recordable import recordable
 from legged_mw.deploy import __main__ as deploy
 from legged_mw.deploy.contract import read_contract
-from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.policies import Source, Trained, find_trained, load_policy
@@ -469,10 +468,12 @@ def test_an_actor_of_other_rows_is_refused(env: LeggedRobot) -> None:
 def test_a_length_that_leaves_steps_unused_is_refused() -> None:
     task = load_task("go1_rough_student")
     task.set("distillation.teacher", "go1_rough_scan")
-    check_values(task.cfg, task.train)
+    task.cfg.check()
+    task.train.check(task.cfg.env.num_envs)
     task.set("distillation.gradient_length", 15)
     with pytest.raises(ConfigError, match="gradient_length is 15, .* 1, 2, 3, 4, 6, 8, 12, 24$"):
-        check_values(task.cfg, task.train)
+        task.cfg.check()
+        task.train.check(task.cfg.env.num_envs)
 
 
 def test_a_warm_up_needs_the_recorded_learner(env: LeggedRobot) -> None:

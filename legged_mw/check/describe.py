@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from legged_mw.check.own_class import own_classes
 from legged_mw.envs.domain_rand import active
 from legged_mw.envs.motors import round_delay
-from legged_mw.envs.own_code import own_classes
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.students.estimator import find_targets
 from legged_mw.sim.capacity import count_capacity

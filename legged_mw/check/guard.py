@@ -22,13 +22,22 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from legged_mw.check.own_class import own_classes
 from legged_mw.check.recordable import Births, Guard, recordable
-from legged_mw.envs.own_code import check_term, own_classes, place_of
-from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.robot_task import RobotTask, check_term
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import BOUND
 from legged_mw.envs.worlds import CONTAINERS, parts
-from legged_mw.utils.errors import NotRecordable, StepError, UserError, in_short, is_library, line_of, line_to_blame
+from legged_mw.utils.errors import (
+    NotRecordable,
+    StepError,
+    UserError,
+    in_short,
+    is_library,
+    line_of,
+    line_to_blame,
+    place_of,
+)
 from legged_mw.utils.task import LoadedTask
 
 _WORLDS, _STEPS = 4, 3

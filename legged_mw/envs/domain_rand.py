@@ -21,6 +21,7 @@ from legged_mw.sim.model import RobotModel
 from legged_mw.sim.servos import scaled_gains
 from legged_mw.sim.simulation import CONSTANTS_READ, GRAVITY, Simulation
 from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
 from legged_mw.utils.math import assign
 
 
@@ -78,6 +79,24 @@ def world_fields(cfg: RobotTaskCfg, law: str = "") -> list[str]:
     return list(
         dict.fromkeys([*(field for kind, _, _ in active(cfg, law).values() for field in kind.fields), *factors])
     )
+
+
+def check_draws(cfg: RobotTaskCfg, law: str = "") -> None:
+    """Raise ConfigError for a redraw that cannot be, and for two ranges that write one field; ``law`` as in ``active``."""
+    for name in cfg.domain_rand.redraw_at_reset:
+        if name in ONLY_AT_START:
+            raise ConfigError(
+                f"domain_rand.redraw_at_reset has '{name}', which constants of the model depend on: it can be drawn at the start, "
+                "and every domain_rand.redraw_iterations"
+            )
+        if name not in KINDS:
+            raise ConfigError(f"domain_rand.redraw_at_reset: {unknown('range', name, KINDS, 'domain_rand')}")
+    for name in cfg.domain_rand.model_factors:
+        writers = [kind for kind, (what, *_) in active(cfg, law).items() if kind != name and name in what.fields]
+        if writers:
+            raise ConfigError(
+                f"domain_rand.model_factors.{name}: domain_rand.{writers[0]} writes that field; leave one of them out ([])"
+            )
 
 
 class DomainRand:

@@ -26,6 +26,9 @@ from legged_mw.utils.bounds import (
     Whole,
     or_empty,
 )
+from legged_mw.utils.commands import HEADING
+from legged_mw.utils.config import ConfigError, fit
+from legged_mw.utils.errors import unknown
 
 Probabilities = Annotated[list[Share], Bound("three numbers, and more for further commands", lambda v: len(v) >= 3)]
 Stance = Annotated[float, Bound("above 0 and below 1", lambda v: 0 < v < 1)]
@@ -170,3 +173,28 @@ class LeggedRobotCfg(RobotTaskCfg):
         peer: str = (
             ""  # the robot (go1, go2, g1) whose published policies of legged_mw/eval/peers.py stand beside; empty: none
         )
+
+    def check(self) -> None:
+        super().check()
+        feet = self.asset.foot_names
+        if not feet or "*" in "".join(feet) or len({*feet}) < len(feet):
+            wanted = "a list of at least one name, one for each foot and each once (patterns are for foot_geoms)"
+            raise ConfigError(f"asset.foot_names is {feet!r}; it must be {wanted}")
+        for name, span in vars(self.commands.ranges).items():  # a task may have declared its own
+            fit(span, Range, f"commands.ranges.{name}")
+        names = [name for name in vars(self.commands.ranges) if name != HEADING]
+        if len(keep := self.commands.keep_probability) > len(names):
+            raise ConfigError(
+                f"commands.keep_probability has {len(keep)} numbers, but there are {len(names)} commands: {', '.join(names)}"
+            )
+        for foot in self.asset.foot_geoms:
+            if foot not in self.asset.foot_names:
+                raise ConfigError(
+                    f"asset.foot_geoms: {unknown('foot', foot, self.asset.foot_names, 'asset.foot_names')}"
+                )
+            if not self.asset.foot_geoms[foot]:
+                raise ConfigError(f"asset.foot_geoms: foot '{foot}' has no geom; name the geoms that touch the ground")
+        if self.commands.curriculum and not self.to_dict()["rewards"]["scales"].get("tracking_lin_vel", 0.0) > 0:
+            raise ConfigError(
+                "commands.curriculum goes by how well tracking_lin_vel is met: give rewards.scales.tracking_lin_vel a number above 0"
+            )

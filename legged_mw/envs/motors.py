@@ -85,35 +85,6 @@ def factor_fields(cfg: RobotTaskCfg, law: str) -> dict[str, tuple[str, ...]]:
     return fields
 
 
-def check_motors(cfg: RobotTaskCfg) -> None:
-    """Raise ConfigError for values of ``control`` that do not fit each other."""
-    control, curve = cfg.control, cfg.control.stall_torque or cfg.control.no_load_speed
-    if control.actuator == "network" and not control.network:
-        raise ConfigError(
-            "control.actuator is 'network', but control.network names no file of weights (docs/motors.md)"
-        )
-    if control.actuator != "dc_motor" and control.action_origin == "speed":
-        raise ConfigError(
-            f"control.action_origin is 'speed', but control.actuator is {control.actuator!r}: only a 'dc_motor' is driven by a "
-            "speed: name that one, or leave action_origin out"
-        )
-    if control.actuator == "torque" and control.action_origin != "default":
-        raise ConfigError(
-            f"control.action_origin is {control.action_origin!r}, an origin of angles, but under control.actuator 'torque' an action is a "
-            "torque: leave action_origin out"
-        )
-    for name, unit in (("stall_torque", "N m"), ("no_load_speed", "rad/s")):
-        if not getattr(control, name) and (control.actuator == "dc_motor" or (control.actuator != "servo" and curve)):
-            raise ConfigError(
-                f"control.actuator is {control.actuator!r} with a torque-speed curve, but control.{name} is empty: fill the table [{unit}] "
-                "a joint, '' for all (docs/motors.md)"
-            )
-        if cfg.domain_rand.enable and getattr(cfg.domain_rand, name) not in ([], [1.0, 1.0]) and not curve:
-            raise ConfigError(
-                f"domain_rand.{name} is a factor on control.{name}, which is empty: fill it, or leave the range out ([])"
-            )
-
-
 def note_network(cfg: RobotTaskCfg) -> None:
     """Write into the config which file its motors' network is; what a run was trained with stays."""
     control = cfg.control

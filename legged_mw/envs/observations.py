@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from legged_mw.envs.motors import Delay
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import Suspects
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import StepError, place_of, unknown
 from legged_mw.utils.machine import require_memory
 from legged_mw.utils.math import assign
 
@@ -48,6 +48,29 @@ class Row(NamedTuple):
                 f"observation row '{self.name}' has {size} columns and {len(self.scale)} scales; give one, or one a column"
             )
         return list(self.scale) if isinstance(self.scale, tuple) else [float(self.scale)] * size
+
+
+def checked_rows(make_rows: Callable[[], Any], count: int) -> Mapping[str, Any]:
+    """The table that the method ``observation_rows`` returns, if all of it is of the kind that it must be: ``count`` worlds a row.
+
+    Raises StepError with the method's place.
+    """
+    table, where = make_rows(), place_of(make_rows)
+    if not isinstance(table, Mapping) or not all(isinstance(rows, list | tuple) and rows for rows in table.values()):
+        raise StepError(f"must return group -> list of rows; it returned {type(table).__name__}", where)
+    for group, row in [(group, row) for group, rows in table.items() for row in rows if not isinstance(row, str)]:
+        if not isinstance(row, Row):
+            raise StepError(
+                f"group '{group}' holds {type(row).__name__}; write Row(name, value, ...), or the name of a group",
+                where,
+            )
+        value = row.value
+        if not isinstance(value, Tensor) or value.dim() != 2 or len(value) != count or not value.numel():
+            got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+            raise StepError(
+                f"row '{row.name}' of '{group}' is {got}; it must be a tensor ({count}, size), a row a world", where
+            )
+    return table
 
 
 class Observations:

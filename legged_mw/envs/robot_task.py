@@ -15,10 +15,10 @@ Sources of the terms: [P] MuJoCo Playground; [L] legged_gym; [U] unitree_rl_gym,
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from fnmatch import fnmatchcase
 from functools import cached_property, reduce
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -26,13 +26,11 @@ from tensordict import TensorDict
 from torch import Tensor
 
 from legged_mw.envs.base_task import BaseTask
-from legged_mw.envs.checks import check_values
-from legged_mw.envs.domain_rand import DomainRand, world_fields
+from legged_mw.envs.domain_rand import DomainRand, check_draws, world_fields
 from legged_mw.envs.loading import load_robot, soft_limits, start_place
 from legged_mw.envs.mirror import Block, Mirror, check_pose, make_mirror, robot_blocks
 from legged_mw.envs.motors import Actuators, make_delay, own_law
-from legged_mw.envs.observations import Observations, Row
-from legged_mw.envs.own_code import check_term, checked_rows
+from legged_mw.envs.observations import Observations, Row, checked_rows
 from legged_mw.envs.perturbation import Perturbation
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import Divergence, Statistics, Suspects
@@ -44,7 +42,7 @@ from legged_mw.sim.sensors import ANGULAR_MOMENTUM, SELF_CONTACT, SENSORS
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.commands import Command
 from legged_mw.utils.config import ConfigError
-from legged_mw.utils.errors import unknown
+from legged_mw.utils.errors import StepError, place_of, unknown
 from legged_mw.utils.math import assign, columns, maybe_any, quat_rotate, quat_rotate_inverse, spread
 
 
@@ -67,7 +65,9 @@ class RobotTask(BaseTask):
         views of the simulation; rows are buffers; each reward term is tried once, so all that it reads is there before.
         """
         self.cfg = cfg
-        check_values(cfg, law=self.motor_law)
+        law = self.motor_law
+        cfg.check()
+        check_draws(cfg, law)
         self.terrain = self._make_terrain()
         self.robot = self._load_robot(pick_engine(cfg.sim.engine, device))
         self.sim = make_simulation(
@@ -78,12 +78,12 @@ class RobotTask(BaseTask):
             nconmax=cfg.sim.nconmax,
             njmax=cfg.sim.njmax,
             threads=cfg.sim.threads,
-            world_fields=world_fields(cfg, self.motor_law),
+            world_fields=world_fields(cfg, law),
             terrain=self.terrain,
             eager=eager,
         )
         super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
-        self.domain_rand = DomainRand(cfg, self.robot, self.sim, self.motor_law)
+        self.domain_rand = DomainRand(cfg, self.robot, self.sim, law)
         self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
         self._init_ranges()
@@ -277,7 +277,7 @@ class RobotTask(BaseTask):
         if hasattr(self, "_observation_rows"):
             raise ConfigError(f"{type(self).__name__}._observation_rows: the method is now called observation_rows")
         self.observations = Observations(
-            checked_rows(self),
+            checked_rows(self.observation_rows, self.num_envs),
             self.cfg.observations,
             self.cfg.noise.level,
             self.num_envs,
@@ -778,6 +778,17 @@ class RobotTask(BaseTask):
             "asset.self_collisions is False, so that parts pass through one another",
         )
         return self.self_contacts[:, 0].clone()
+
+
+def check_term(method: Callable[[], Any], count: int) -> Tensor:
+    """What a reward method returns, if it is a number an environment. Raises StepError with the method's place."""
+    value = method()
+    if not isinstance(value, Tensor) or value.shape != (count,):
+        got = tuple(value.shape) if isinstance(value, Tensor) else type(value).__name__
+        raise StepError(
+            f"must return a tensor ({count},), one value an environment; it returned {got}", place_of(method)
+        )
+    return value
 
 
 def need(given: bool, term: str, what: str) -> None:

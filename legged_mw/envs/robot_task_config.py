@@ -40,7 +40,7 @@ from legged_mw.utils.bounds import (
     at_least,
     or_empty,
 )
-from legged_mw.utils.config import Config
+from legged_mw.utils.config import Config, ConfigError
 
 Place = Annotated[list[Annotated[float, at_least(-1000, 1000, "m")]], or_empty(THREE)]
 Camera = Annotated[
@@ -269,3 +269,40 @@ class RobotTaskCfg(Config):
         # place of the camera "track", from the robot, world axes [m]; empty: by its size, Go1's is 0.9 -1.1 0.6
         camera: Camera = []
         fps: Few = 25  # of videos [1/s]; the nearest rate that divides the control rate is taken
+
+    def check(self) -> None:
+        """Raise ConfigError at the first value that fits its field, but not the others. What a field alone may hold stands in its type."""
+        self._check_motors()
+        step = self.sim.dt * self.control.decimation
+        if self.env.episode_length_s < step:
+            raise ConfigError(
+                f"env.episode_length_s is {self.env.episode_length_s:g}, shorter than a control step of {step:g} s"
+            )
+
+    def _check_motors(self) -> None:
+        control, curve = self.control, self.control.stall_torque or self.control.no_load_speed
+        if control.actuator == "network" and not control.network:
+            raise ConfigError(
+                "control.actuator is 'network', but control.network names no file of weights (docs/motors.md)"
+            )
+        if control.actuator != "dc_motor" and control.action_origin == "speed":
+            raise ConfigError(
+                f"control.action_origin is 'speed', but control.actuator is {control.actuator!r}: only a 'dc_motor' is driven by a "
+                "speed: name that one, or leave action_origin out"
+            )
+        if control.actuator == "torque" and control.action_origin != "default":
+            raise ConfigError(
+                f"control.action_origin is {control.action_origin!r}, an origin of angles, but under control.actuator 'torque' "
+                "an action is a torque: leave action_origin out"
+            )
+        for name, unit in (("stall_torque", "N m"), ("no_load_speed", "rad/s")):
+            wanted = control.actuator == "dc_motor" or (control.actuator != "servo" and curve)
+            if wanted and not getattr(control, name):
+                raise ConfigError(
+                    f"control.actuator is {control.actuator!r} with a torque-speed curve, but control.{name} is empty: "
+                    f"fill the table [{unit}] a joint, '' for all (docs/motors.md)"
+                )
+            if self.domain_rand.enable and getattr(self.domain_rand, name) not in ([], [1.0, 1.0]) and not curve:
+                raise ConfigError(
+                    f"domain_rand.{name} is a factor on control.{name}, which is empty: fill it, or leave the range out ([])"
+                )

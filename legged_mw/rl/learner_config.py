@@ -22,7 +22,7 @@ from legged_mw.utils.bounds import (
     Threads,
     Whole,
 )
-from legged_mw.utils.config import Config
+from legged_mw.utils.config import Config, ConfigError
 from legged_mw.utils.files import MOST_LETTERS, wrong_name
 
 FolderPart = Annotated[
@@ -179,6 +179,26 @@ class RobotTaskCfgPPO(Config):
         use_data_augmentation: bool = False  # learn from the mirror image of every sample too: twice the batch [R]
         use_mirror_loss: bool = False  # pull the mean action in the mirrored state to the mirrored mean action [R]
         mirror_loss_coeff: NonNegative = 0.0  # weight of that pull, mean square over actions [-] [R]
+
+    def check(self, num_envs: int) -> None:
+        """Raise ConfigError at the first value that fits its field, but not the others, or not so many worlds."""
+        samples = num_envs * self.runner.num_steps_per_env
+        if samples < self.algorithm.num_mini_batches:
+            raise ConfigError(
+                f"an iteration has {samples} samples ({num_envs} worlds x {self.runner.num_steps_per_env} steps), fewer than "
+                f"algorithm.num_mini_batches = {self.algorithm.num_mini_batches}; raise one of the former or lower the latter"
+            )
+        steps, length = self.runner.num_steps_per_env, self.distillation.gradient_length
+        if self.distillation.teacher and steps % length:
+            divisors = ", ".join(str(i) for i in range(1, steps + 1) if steps % i == 0)
+            raise ConfigError(
+                f"distillation.gradient_length is {length}, which leaves {steps % length} of runner.num_steps_per_env = {steps} steps "
+                f"unused; take one of {divisors}"
+            )
+        if self.symmetry.use_mirror_loss and not self.symmetry.mirror_loss_coeff:
+            raise ConfigError(
+                "symmetry.use_mirror_loss is on, but symmetry.mirror_loss_coeff is 0: set the loss's weight, or switch it off"
+            )
 
 
 class LeggedRobotCfgPPO(RobotTaskCfgPPO):

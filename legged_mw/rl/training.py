@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 import torch
 from rsl_rl.algorithms import Distillation
 
-from legged_mw.envs.checks import check_class, check_values
 from legged_mw.envs.motors import note_network
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.worlds import fuse_for
@@ -86,9 +85,8 @@ def configure(task: LoadedTask, args: argparse.Namespace) -> tuple[Start, str]:
     _note_others(task, start)
     note_network(task.cfg)
     check_classes(task.train)
-    check_values(task.cfg, task.train)
-    warnings = check_class(task.env_class, task.cfg.to_dict()["rewards"]["scales"])
-    print("".join(f"{line}\n" for line in warnings), end="", flush=True)
+    task.cfg.check()
+    task.train.check(task.cfg.env.num_envs)
     if device != "cpu":
         torch.cuda.set_device(device)
     seed_everything(task.train.seed + rank.index)  # every rank its own worlds, commands and noise

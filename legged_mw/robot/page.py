@@ -9,12 +9,11 @@ from collections.abc import Sequence
 import torch
 
 from legged_mw.check.guard import nothing_changed, tiny_cfg
-from legged_mw.envs.own_code import place_of
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.ranks import this_rank
 from legged_mw.robot.measure import STAND_SECONDS, STAND_TILT, Health, Joint, Stand, measure
 from legged_mw.robot.suggest import Gains, suggest
-from legged_mw.utils.errors import in_short
+from legged_mw.utils.errors import in_short, place_of
 from legged_mw.utils.task import LoadedTask
 
 _GROWS = 1e-6  # more than 1 by so much, a mode grows; less is rounding of the root's

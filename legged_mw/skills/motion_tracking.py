@@ -15,16 +15,7 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.skills.kinematics import Bodies, Kinematics, product, rotate
 from legged_mw.skills.motion_reference import Reference, angle_between, load_clips
 from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
-from legged_mw.utils.config import ConfigError
 from legged_mw.utils.math import assign, quat_multiply, rotation_quat
-
-_BEGINNINGS = {  # of init_state, which an episode that begins in a clip does not read -> of motion, which it does
-    "pos_xy_range": "start_pos",
-    "yaw_range": "start_turn",
-    "lin_vel_range": "start_lin_vel",
-    "ang_vel_range": "start_ang_vel",
-    **dict.fromkeys(["dof_pos_range", "dof_pos_offset", "dof_vel_range"], "start_joints"),
-}
 
 
 class MotionTracking(RobotTask):
@@ -189,15 +180,6 @@ class MotionTracking(RobotTask):
         if "motion_failures" in state and state["motion_failures"].shape == self.reference.failures.shape:
             self.reference.failures.copy_(state["motion_failures"])
             self._reset_all()
-
-    def _init_ranges(self) -> None:
-        given, default = self.cfg.init_state, MotionTrackingCfg.init_state
-        if unread := [name for name in _BEGINNINGS if getattr(given, name) != getattr(default, name)]:
-            names, instead = ", ".join(unread), ", ".join(dict.fromkeys(_BEGINNINGS[name] for name in unread))
-            raise ConfigError(
-                f"init_state: {names}: not read here, as episodes begin in a motion; leave out, and write motion: {instead}"
-            )
-        super()._init_ranges()
 
     def _init_buffers(self) -> None:
         super()._init_buffers()

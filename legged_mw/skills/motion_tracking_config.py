@@ -7,6 +7,16 @@ from __future__ import annotations
 
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.utils.bounds import FileNames, NonNegative, NonNegativeVector, Part, Positive, Seconds, Span
+from legged_mw.utils.config import ConfigError
+from legged_mw.utils.errors import unknown
+
+_BEGINNINGS = {  # of init_state, which an episode that begins in a clip does not read -> of motion, which it does
+    "pos_xy_range": "start_pos",
+    "yaw_range": "start_turn",
+    "lin_vel_range": "start_lin_vel",
+    "ang_vel_range": "start_ang_vel",
+    **dict.fromkeys(["dof_pos_range", "dof_pos_offset", "dof_vel_range"], "start_joints"),
+}
 
 
 class MotionTrackingCfg(RobotTaskCfg):
@@ -66,3 +76,21 @@ class MotionTrackingCfg(RobotTaskCfg):
             lin_vel, dof_pos, dof_vel = 0.5, 0.01, 0.5
             anchor_pos: NonNegative = 0.25  # [m]
             anchor_ori: NonNegative = 0.05  # of an entry of the rotation matrix [-]
+
+    def check(self) -> None:
+        super().check()
+        motion = self.motion
+        for field, names in (("anchor", [motion.anchor]), ("end_bodies", motion.end_bodies)):
+            for name in names:
+                if name not in motion.bodies:
+                    raise ConfigError(f"motion.{field}: {unknown('body', name, motion.bodies, 'motion.bodies')}")
+        if not motion.clips:
+            raise ConfigError(
+                "motion.clips is empty; name a clip, as python -m legged_mw.motion FILE --out CLIP.npz writes it"
+            )
+        given, default = self.init_state, MotionTrackingCfg.init_state
+        if unread := [name for name in _BEGINNINGS if getattr(given, name) != getattr(default, name)]:
+            names, instead = ", ".join(unread), ", ".join(dict.fromkeys(_BEGINNINGS[name] for name in unread))
+            raise ConfigError(
+                f"init_state: {names}: not read here, as episodes begin in a motion; leave out, and write motion: {instead}"
+            )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import inspect
 import re
 import sysconfig
 import traceback
@@ -10,6 +11,7 @@ import unicodedata
 from collections.abc import Iterable
 from pathlib import Path
 from types import CodeType
+from typing import Any
 
 from legged_mw.utils.renamed import LEGGED_GYM_TENSORS, MOVED
 
@@ -59,6 +61,13 @@ def line_of(code: CodeType, line: int) -> str:
     path = Path(code.co_filename)
     shown = path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
     return f"{shown}:{line}, {code.co_qualname.rpartition('<locals>.')[2]}"
+
+
+def place_of(method: Any) -> str:
+    """Where a method is written."""
+    method = getattr(method, "func", method)  # of a partial
+    function = inspect.unwrap(getattr(method, "__func__", method))
+    return line_of(function.__code__, function.__code__.co_firstlineno)
 
 
 def is_library(module: str, file: str) -> bool:

@@ -16,7 +16,6 @@ from worlds import QUIET, make_env, only_scales
 
 from golden.table import Table
 from legged_mw import ROOT
-from legged_mw.envs.checks import check_values
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.mirror import Mirror
 from legged_mw.eval.crossing import make_room
@@ -161,8 +160,8 @@ def table() -> Table:
     for path, fields in LEARNERS.items():
         made.add(
             f"learner with {path}",
-            lambda root, fields=fields: check_values(
-                *(lambda task: (task.cfg, task.train))(set_all(load_task("go1_flat"), fields))
+            lambda root, fields=fields: (lambda task: (task.cfg.check(), task.train.check(task.cfg.env.num_envs)))(
+                set_all(load_task("go1_flat"), fields)
             ),
         )
     made.calls(

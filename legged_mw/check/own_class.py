@@ -1,0 +1,92 @@
+"""Methods of a user's class that do not fit ours: a hook that never calls its parent's, a name of legged_gym's that nothing calls.
+
+Also a reward term of ours whose scale has another sign than usual.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+from legged_mw.utils.errors import StepError, place_of
+from legged_mw.utils.renamed import LEGGED_GYM_METHODS
+
+HOOKS = (  # every step or reset needs what their parents do; hooks of commands may be replaced
+    *("_init_buffers", "_episode_columns", "_update_state", "_end_step", "compute_observations"),
+    *("reset_envs", "_reset_robots", "_reset_task", "_update_curricula"),
+)
+WITHOUT = "# without super"  # a comment in the method: it is so on purpose
+# terms of RobotTask and LeggedRobot with a usual scale above 0, as all of a skill's own have; others cost
+PAYS = (
+    *("alive", "pose", "tracking_lin_vel", "tracking_ang_vel", "feet_air_time", "feet_contact_without_cmd"),
+    *("single_stance", "no_fly", "feet_phase", "contact_phase"),
+)
+
+
+def own_classes(env_class: type) -> list[type]:
+    """The classes of an environment that are the user's, the child first."""
+    return [kind for kind in env_class.__mro__ if not kind.__module__.startswith("legged_mw.") and kind is not object]
+
+
+def check_class(env_class: type, scales: Mapping[str, float]) -> list[str]:
+    """Warnings on methods that nothing calls, and on ``scales`` of our terms. Raises StepError at a hook that never calls its parent's."""
+    for kind, name, method in _own(env_class):
+        source = _source(method)
+        if name not in HOOKS or re.search(rf"\.{name}\b", source) or WITHOUT in source or not source:
+            continue
+        if _does_something(env_class.__mro__[env_class.__mro__.index(kind) + 1 :], name):
+            arguments = ", ".join([*inspect.signature(method).parameters][1:])
+            call = f"super().{name}({arguments})"
+            what = f"never calls {call}, which every robot needs: call it first; if it is so on purpose, say {WITHOUT} in a comment there"
+            raise StepError(what, place_of(method))
+    lines = []
+    for kind, name, method in _own(env_class):
+        misspelt = re.fullmatch(r"_?rewards?_\w+", name) and not name.startswith("_reward_")
+        if (
+            hasattr(kind.__mro__[1], name)
+            or not (misspelt or name in LEGGED_GYM_METHODS)
+            or _is_called(env_class, name)
+        ):
+            continue
+        instead = "a reward's name begins with _reward_" if misspelt else f"{LEGGED_GYM_METHODS[name]} is what there is"
+        lines.append(f"warning: {place_of(method)}: nothing calls {name}; {instead}")
+    return [*lines, *_unusual_signs(env_class, scales)]
+
+
+def _unusual_signs(env_class: type, scales: Mapping[str, float]) -> Iterator[str]:
+    """Of terms that are ours."""
+    for name, scale in scales.items():
+        method = getattr(env_class, f"_reward_{name}", None)
+        if method is None or not method.__module__.startswith("legged_mw."):
+            continue
+        pays = name in PAYS or method.__qualname__.partition(".")[0] not in ("RobotTask", "LeggedRobot")
+        if scale and pays != (scale > 0.0):
+            usual = "above 0: it is what the robot should do" if pays else "below 0: it is what the robot should avoid"
+            yield f"warning: rewards.scales.{name} is {scale:g}; its usual sign is {usual} (docs/tasks.md)"
+
+
+def _own(env_class: type) -> Iterator[tuple[type, str, Callable[..., Any]]]:
+    """(class, name, method) of all methods that the user's classes write."""
+    for kind in own_classes(env_class):
+        yield from ((kind, name, value) for name, value in vars(kind).items() if inspect.isfunction(value))
+
+
+def _does_something(parents: tuple[type, ...], name: str) -> bool:
+    """Whether what the parents have under ``name`` is more than a docstring."""
+    method = next((vars(kind)[name] for kind in parents if name in vars(kind)), None)
+    return method is not None and bool(re.search(r"self\.|return", _source(method)))
+
+
+def _is_called(env_class: type, name: str) -> bool:
+    """Whether another method of the user's names it."""
+    return any(re.search(rf"\.{name}\b", _source(method)) for _, other, method in _own(env_class) if other != name)
+
+
+def _source(method: Any) -> str:
+    """What is written there; '' of what was typed at a prompt."""
+    try:
+        return inspect.getsource(inspect.unwrap(method))
+    except (OSError, TypeError):
+        return ""
