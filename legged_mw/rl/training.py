@@ -22,7 +22,6 @@ from rsl_rl.algorithms import Distillation
 from legged_mw.envs.actuators import note_network
 from legged_mw.envs.checks import check_class, check_values
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.worlds import fuse_for
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
 from legged_mw.rl.policies import Trained, find_trained
@@ -227,7 +226,7 @@ def train(
     whether all is done.
     """
     rank, runner = this_rank(), make_learner(task, env, start)
-    fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)  # last: it takes seconds
+    env.fuse(task.train.runner.max_iterations * task.train.runner.num_steps_per_env)  # last: it takes seconds
     runner.examine, runner.console.verbose, runner.deadline = examine, verbose, deadline
     with ExitStack() as held:
         left = _load(runner, task, start)  # before the lock: where it is refused, nothing was written
