@@ -13,6 +13,9 @@ RENAMED: dict[str, tuple[str, ...]] = {
     "cpu.kick_curriculum": ("cpu", "overrides", "perturbation.curriculum"),
 }
 
+# Old module of a class that the config of a run names -> its module now.
+MOVED: dict[str, str] = {"legged_mw.rl.distillation": "legged_mw.rl.students.distillation"}
+
 # What a class ported from legged_gym may define, which nothing here calls, or read, which is not here -> what is. docs/from_legged_gym.md
 LEGGED_GYM_METHODS: dict[str, str] = {
     "post_physics_step": "_step()",
@@ -51,7 +54,7 @@ def new_name(path: str) -> str:
 
 
 def with_new_names(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of a run's saved config in which every old name is replaced by the new one."""
+    """A copy of a run's saved config in which every old name of a field or a class's module is replaced by the new one."""
     config: dict[str, Any] = copy.deepcopy(dict(saved))
     for old, (*sections, name) in RENAMED.items():
         section, _, field = old.partition(".")
@@ -62,4 +65,9 @@ def with_new_names(saved: Mapping[str, Any]) -> dict[str, Any]:
             node = node.setdefault(key, {}) if isinstance(node, dict) else None
         if isinstance(node, dict):  # else the file is wrong there, and loading it says so
             node[name] = value
+    for section in config.values():
+        name = section.get("class_name") if isinstance(section, dict) else None
+        for old, new in MOVED.items():
+            if isinstance(name, str) and name.startswith((f"{old}:", f"{old}.")):
+                section["class_name"] = new + name[len(old) :]
     return config
