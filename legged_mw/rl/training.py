@@ -25,12 +25,12 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
 from legged_mw.rl.policies import Trained, find_trained
-from legged_mw.rl.ppo import MAX_RATE, GraphedPPO
+from legged_mw.rl.ppo import MAX_RATE
 from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stuck, rank_device, this_rank
+from legged_mw.rl.recorded import Recorded
 from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
-from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.rl.transfer import TEACHER, begin_with, check_start, keep_teacher, load_teacher, seat_teacher
 from legged_mw.sim.device import device_facts
 from legged_mw.sim.engines import pick_engine
@@ -348,7 +348,7 @@ def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
     try:
         with runner.console:
             runner.learn(iterations, bool(runner.begins_anew))
-        if isinstance(runner.alg, GraphedPPO | GraphedDistillation):
+        if isinstance(runner.alg, Recorded):
             runner.alg.release()
     except RuntimeError as error:
         lost = r"(closed|reset|aborted) by|connection (was )?(closed|reset|refused)|remote process|remoteerror"
