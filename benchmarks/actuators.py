@@ -26,7 +26,6 @@ from torch import Tensor
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from legged_mw.envs.domain_rand import KINDS
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.worlds import fuse_for
 from legged_mw.sim.engines import ENGINES, pick_engine
 from legged_mw.utils.cli import pick_device
 from legged_mw.utils.machine import usable_cores
@@ -88,7 +87,7 @@ def make_env(task_name: str, law: str, num_envs: int, device: str, engine: str, 
         env_class = Coded
     torch.manual_seed(0)
     env = env_class(task.cfg, device)
-    fuse_for(env, steps)
+    env.fuse(steps)
     return env
 
 

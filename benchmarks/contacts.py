@@ -16,7 +16,6 @@ import torch
 from step import timed
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.worlds import fuse_for
 from legged_mw.sim.capacity import count_capacity
 from legged_mw.sim.engines import ENGINES, pick_engine
 from legged_mw.utils.cli import pick_device
@@ -44,7 +43,7 @@ def make_env(task_name: str, num_envs: int, device: str, overrides: dict[str, An
     for path, value in {"env.num_envs": num_envs, **overrides}.items():
         task.set(path, value)
     env = task.env_class(task.cfg, device)
-    fuse_for(env, steps)
+    env.fuse(steps)
     return env  # type: ignore[return-value]
 
 

@@ -31,7 +31,6 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.worlds import fuse_for
 from legged_mw.sim.engines import ENGINES, pick_engine
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.cli import pick_device
@@ -120,7 +119,7 @@ def measure(task_name: str, engine: str, num_envs: int, device: str, calls: int,
     task.cfg.env.num_envs = num_envs
     task.set("sim.engine", engine)
     env = task.env_class(task.cfg, device, eager=eager)
-    fuse_for(env, steps=1_000_000)
+    env.fuse(steps=1_000_000)
     actions = 0.3 * torch.randn(num_envs, env.num_actions, device=device)
     with torch.inference_mode():  # as in training
         for _ in range(20):

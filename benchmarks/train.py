@@ -25,7 +25,6 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parent.parent))
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.worlds import fuse_for
 from legged_mw.rl.runner import Runner, make_runner
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.cli import apply_overrides, make_parser, pick_device, seed_everything
@@ -116,7 +115,7 @@ def run(args: argparse.Namespace, device: str, worlds: int | None, algorithm: st
     seed_everything(task.train.seed)
     with contextlib.redirect_stdout(io.StringIO()):
         env = task.env_class(task.cfg, device, eager=args.eager)
-        fuse_for(env, steps=1_000_000)
+        env.fuse(steps=1_000_000)
         runner = make_runner(env, task.train, None, device)
     times = measure(runner, args.iterations, args.rounds, args.eager)
     speed = env.num_envs * runner.cfg["num_steps_per_env"] / times.whole

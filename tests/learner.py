@@ -10,6 +10,7 @@ from rsl_rl.algorithms import PPO
 from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 
+from legged_mw.rl.classes import network_section
 from legged_mw.rl.students.concurrent import ConcurrentModel
 from legged_mw.rl.students.estimator import EstimatingModel
 
@@ -67,8 +68,10 @@ def make(
     more |= {} if concurrent is None else {"class_name": ConcurrentModel, "concurrent": {**CONCURRENT, **concurrent}}
     cfg = {
         "obs_groups": {"actor": ["state"], "critic": ["state", "privileged_state"]},
-        "actor": {**network, "distribution_cfg": distribution, **more, **(memory or {}).get("actor", {})},
-        "critic": network | (memory or {}).get("critic", {}),
+        "actor": network_section(
+            {**network, "distribution_cfg": distribution, **more, **(memory or {}).get("actor", {})}
+        ),
+        "critic": network_section(network | (memory or {}).get("critic", {})),
         "algorithm": {"class_name": kind, "rnd_cfg": None, "symmetry_cfg": None, **settings},
         "num_steps_per_env": STEPS,
         "multi_gpu": multi_gpu,

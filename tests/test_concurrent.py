@@ -12,7 +12,7 @@ import torch
 from learner import STEPS, WORLDS, collect, difference, make, parameters, share_experience
 from program import SMALL, refused, run, trained
 from rsl_rl.algorithms import PPO
-from rsl_rl.models import MLPModel, RNNModel
+from rsl_rl.models import MLPModel
 from tensordict import TensorDict
 from test_ppo import SYMMETRY, update
 from test_train import assert_resumes_exactly, load, small_task
@@ -48,7 +48,7 @@ def task_with(**changes: Any) -> LoadedTask:
     return task
 
 
-GRU = {"class_name": RNNModel, "rnn_type": "gru", "rnn_hidden_dim": 8, "rnn_num_layers": 1}
+GRU = {"class_name": "RNNModel", "rnn_type": "gru", "rnn_hidden_dim": 8, "rnn_num_layers": 1}
 
 
 # ---- learning

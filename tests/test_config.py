@@ -13,8 +13,11 @@ from typing import Any, Literal, Optional
 
 import pytest
 import yaml
+from rsl_rl.utils import resolve_callable
 
 from legged_mw import ROOT
+from legged_mw.rl.classes import check_classes
+from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.utils.config import Config, ConfigError, load_yaml, save_yaml
 from legged_mw.utils.renamed import RENAMED
 from legged_mw.utils.task import LoadedTask, Task, load_task
@@ -678,6 +681,19 @@ def test_every_shipped_policys_config_loads() -> None:
         task.update_from_run(saved, where="config.yaml")
         now = task.to_dict()["rewards"]
         assert now == {**now, **saved["rewards"], "scales": {**now["scales"], **saved["rewards"]["scales"]}}
+        check_classes(task.train)
+
+
+@pytest.mark.parametrize(
+    "old", ["legged_mw.rl.distillation:GraphedDistillation", "legged_mw.rl.distillation.GraphedDistillation"]
+)
+def test_a_class_of_an_old_run_is_found_where_it_moved_to(old: str) -> None:
+    task = load_task("go1_flat")
+    saved = task.to_dict()
+    saved["distillation"]["class_name"] = old
+    task.update_from_run(saved, where="config.yaml")
+    check_classes(task.train)
+    assert resolve_callable(task.train.distillation.class_name) is GraphedDistillation
 
 
 def test_a_wrong_section_of_an_old_run_is_named() -> None:

@@ -9,9 +9,10 @@ import pytest
 import torch
 from learner import ACTIONS, SIZES, STEPS, WORLDS, Env, difference, observations
 from rsl_rl.algorithms import Distillation
-from rsl_rl.models import MLPModel, RNNModel
+from rsl_rl.models import MLPModel
 
 from legged_mw.check.recordable import recordable
+from legged_mw.rl.classes import network_section
 from legged_mw.rl.students.distillation import GraphedDistillation
 
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -36,13 +37,13 @@ def make(
     """A learner whose networks come from a fixed seed; the teacher sees more than the student's "state". ``memory``: the student's."""
     torch.manual_seed(1)
     recurrent = (
-        {"class_name": RNNModel, "rnn_type": memory, "rnn_hidden_dim": 12, "rnn_num_layers": 2} if memory else {}
+        {"class_name": "RNNModel", "rnn_type": memory, "rnn_hidden_dim": 12, "rnn_num_layers": 2} if memory else {}
     )
     network = {"class_name": MLPModel, "hidden_dims": [32, 16], "activation": "elu", "obs_normalization": True}
     gaussian = {"class_name": "GaussianDistribution", "init_std": 0.1}
     cfg = {
         "obs_groups": {"student": ["state"], "teacher": [*sees]},
-        "student": {**network, **recurrent, "distribution_cfg": distribution or gaussian},
+        "student": network_section({**network, **recurrent, "distribution_cfg": distribution or gaussian}),
         "teacher": {**network, "distribution_cfg": dict(gaussian)},
         "algorithm": {"class_name": kind, **settings},
         "num_steps_per_env": STEPS,

@@ -18,6 +18,7 @@ from program import SMALL, run
 from torch.utils.tensorboard import SummaryWriter
 
 from legged_mw import ROOT, programs
+from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl import training
 from legged_mw.rl.runner import Runner
 from legged_mw.rl.runs import load_tensors, save_whole
@@ -211,7 +212,7 @@ def test_warm_trains_an_iteration(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     learned, fused = list[int](), list[int]()
     learn = Runner.learn
     monkeypatch.setattr(Runner, "learn", lambda self, count: (learned.append(self.env.num_envs), learn(self, count)))
-    monkeypatch.setattr(warm, "fuse_for", lambda env, steps: fused.append(env.num_envs))
+    monkeypatch.setattr(RobotTask, "fuse", lambda env, steps: fused.append(env.num_envs))
     monkeypatch.setattr(warm, "load_task", small_task)
     warm.warm("go1_flat", "cpu")
     assert learned == fused == [4 * usable_cores()] and capsys.readouterr().out == ""

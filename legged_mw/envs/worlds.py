@@ -6,7 +6,7 @@ Found, not listed, so that a task's own buffers are there too: whatever is writt
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from enum import Enum
 from pathlib import PurePath
 from types import BuiltinFunctionType, FunctionType, MethodType, ModuleType
@@ -18,7 +18,6 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.fast.fusion import fused
 from legged_mw.sim.graph import StepGraph
 from legged_mw.sim.simulation import CONSTANTS_READ, Simulation
 from legged_mw.utils.config import Config
@@ -42,7 +41,6 @@ _PLAIN = (
 )
 _OTHERS = (*_PLAIN, Config, ModuleType, FunctionType, BuiltinFunctionType, MethodType, Simulation, StepGraph)
 _LIBRARIES = ("torch", "numpy", "warp", "mujoco", "mujoco_warp", "tensordict", "rsl_rl")
-_WORTH_FUSING = 5_000  # control steps: kernels take a CPU seconds to compile, once a machine
 _FACTS = ("robot", "terrain", "clips")  # of the task, which no step changes
 _MODELS = ("MjModel", "MjSpec")  # nor these
 
@@ -73,27 +71,9 @@ def put_worlds(env: RobotTask, state: dict[str, Tensor]) -> str:
     return ""
 
 
-def fused_step(env: RobotTask) -> Callable[[], None]:
-    """The step of ``env`` fused, if that can be; no world moves and no number is drawn."""
-    state = env.sim.memory()
-    fields = [value for name, value in state.items() if name.startswith("model.")] if env.sim.engine == "mujoco" else []
-    return fused(env._step, env.num_envs, everything(env), fields)
-
-
 def everything(env: RobotTask) -> dict[str, Tensor]:
     """All memory that ``env`` reaches, by name: the simulation's, and whatever else it holds."""
     return _simulation(env) | {name: value for name, (value, _) in _memory(env).items()}
-
-
-def fuse_for(env: RobotTask, steps: int) -> None:
-    """Fuse the step of ``env``, which is to make so many ``steps``: on a CPU now, if that pays; on a GPU before it is recorded."""
-    if not env.cfg.sim.fuse or env.eager:
-        return
-    if str(env.device) != "cpu":
-        env._graph.better = lambda: fused_step(env)
-    elif steps >= _WORTH_FUSING:
-        with torch.inference_mode():
-            env._graph.improve(fused_step(env))
 
 
 def _words(value: Tensor | None) -> str:

@@ -8,10 +8,31 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.worlds import everything
 from legged_mw.fast.trace import Call, Trace
 from legged_mw.utils.math import alike
 
+_WORTH = 5_000  # control steps: kernels take a CPU seconds to compile, once a machine
 _CLOSE, _STRAYS = 1e-3, 0.01  # of all that a step writes: rounding goes through physics, and may turn a comparison
+
+
+def fuse(env: RobotTask, steps: int) -> None:
+    """Fuse the step of ``env``, which is to make so many ``steps``: on a CPU now, if that pays; on a GPU before it is recorded."""
+    if not env.cfg.sim.fuse or env.eager:
+        return
+    if str(env.device) != "cpu":
+        env._graph.better = lambda: fused_step(env)
+    elif steps >= _WORTH:
+        with torch.inference_mode():
+            env._graph.improve(fused_step(env))
+
+
+def fused_step(env: RobotTask) -> Callable[[], None]:
+    """The step of ``env`` fused, if that can be; no world moves and no number is drawn."""
+    state = env.sim.memory()
+    fields = [value for name, value in state.items() if name.startswith("model.")] if env.sim.engine == "mujoco" else []
+    return fused(env._step, env.num_envs, everything(env), fields)
 
 
 def fused(

@@ -23,6 +23,8 @@ import mujoco
 import mujoco_warp as mjw
 import warp as wp
 
+from legged_mw.fast.contact_count import count_contacts
+
 KNOWN = ("4.0.0",)  # of mujoco-warp
 _ALONE = threading.RLock()  # warp.launch is everybody's
 # of an iteration, of a solve: the last but for its end
@@ -103,6 +105,24 @@ class Shortcuts:
                 wp.array.zero_ = zero
                 for name, launch in whole.items():
                     setattr(wp, name, launch)
+
+
+class ShortStep:
+    """``mujoco_warp.step`` of one model with what is left out of it, and with contacts counted by a kernel of our own."""
+
+    def __init__(
+        self, mj: mujoco.MjModel, model: mjw.Model, data: mjw.Data, world_fields: Collection[str] = ()
+    ) -> None:
+        self._model, self._data = model, data
+        self.shortcuts = Shortcuts(mj, model, data, world_fields)
+        self._count = count_contacts(mj, model)
+
+    def __call__(self, sensed: bool, later: bool = False) -> None:
+        """One substep; see ``Shortcuts.__call__``."""
+        with self.shortcuts(sensed, later):
+            mjw.step(self._model, self._data)
+        if sensed:
+            self._count(self._data)
 
 
 class _Skip:

@@ -6,16 +6,14 @@ A trace is taken of one real call. What it did is known by addresses, so views c
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import wraps
-from typing import Any, NamedTuple, ParamSpec, TypeVar
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_flatten
 
-P = ParamSpec("P")
-R = TypeVar("R")
+from legged_mw.utils.opaque import traces
 
 
 class View(NamedTuple):
@@ -116,34 +114,20 @@ class Trace(TorchDispatchMode):
             self.steps.append(Call(run, tuple(blocks)))
         return result
 
+    def call_whole(self, method: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
+        """Run a method that is marked with ``not_traced``."""
+        if self._paused:
+            return method(*args, **kwargs)
+        return self.call(lambda: method(*args, **kwargs), _tensors((args, kwargs)))
+
     def __enter__(self) -> Trace:
-        _tracing.append(self)
+        traces.append(self)
         super().__enter__()
         return self
 
     def __exit__(self, *error: Any) -> None:
         super().__exit__(*error)
-        _tracing.remove(self)
-
-
-_tracing: list[Trace] = []
-
-
-def tracing() -> bool:
-    """Whether a trace is taken at the moment."""
-    return bool(_tracing)
-
-
-def not_traced(method: Callable[P, R]) -> Callable[P, R]:
-    """Of a method that a trace is not to look into: it is called anew each time."""
-
-    @wraps(method)
-    def wrapped(*args: Any, **kwargs: Any) -> Any:
-        if not _tracing or _tracing[-1]._paused:
-            return method(*args, **kwargs)
-        return _tracing[-1].call(lambda: method(*args, **kwargs), _tensors((args, kwargs)))
-
-    return wrapped
+        traces.remove(self)
 
 
 def _tensors(nested: Any) -> Iterator[Tensor]:

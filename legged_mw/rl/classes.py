@@ -12,23 +12,27 @@ from typing import Any
 from rsl_rl.algorithms import PPO, Distillation
 from rsl_rl.models import CNNModel, MLPModel, RNNModel
 from rsl_rl.modules import BetaDistribution, GaussianDistribution, HeteroscedasticGaussianDistribution
-from rsl_rl.utils import resolve_class
+from rsl_rl.utils import resolve_callable, resolve_class
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.rl.ppo import GraphedPPO
-from legged_mw.rl.students import concurrent, estimator
-from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.utils.config import Config, ConfigError
 
 _NETWORKS = (MLPModel, CNNModel, RNNModel)
 _DISTRIBUTIONS = (GaussianDistribution, HeteroscedasticGaussianDistribution)
-ALLOWED: dict[str, tuple[type, ...]] = {
+ALLOWED: dict[str, tuple[type | str, ...]] = {
     "actor.class_name": _NETWORKS,
     "critic.class_name": _NETWORKS,
     "actor.distribution_cfg.class_name": _DISTRIBUTIONS,
     "critic.distribution_cfg.class_name": _DISTRIBUTIONS,
-    "algorithm.class_name": (GraphedPPO, PPO),
-    "distillation.class_name": (GraphedDistillation, Distillation),
+    "algorithm.class_name": ("legged_mw.rl.ppo:GraphedPPO", PPO),
+    "distillation.class_name": ("legged_mw.rl.students.distillation:GraphedDistillation", Distillation),
+}
+_RECURRENT = "legged_mw.rl.students.recurrent:RecurrentModel"  # what an RNNModel is here
+# the field of the actor's section that asks for it -> the network, imported then
+_ESTIMATOR, _CONCURRENT = "actor.estimator.targets", "actor.concurrent.groups"
+_STUDENTS = {
+    _ESTIMATOR: "legged_mw.rl.students.estimator:EstimatingModel",
+    _CONCURRENT: "legged_mw.rl.students.concurrent:ConcurrentModel",
 }
 _IMPORTED = ("class_name", "data_augmentation_func")  # rsl-rl imports and calls what these keys name
 
@@ -56,26 +60,27 @@ def actor_settings(sections: dict[str, Any], env: RobotTask | None, learns: bool
     ``learns``: False for an actor that only acts, in worlds that may be without what the learner knew.
     """
     actor = {name: value for name, value in sections["actor"].items() if name not in ("estimator", "concurrent")}
-    estimates, taught = sections["actor"]["estimator"]["targets"], sections["actor"]["concurrent"]["groups"]
-    if not (estimates or taught):
+    parts = sections["actor"]
+    named = {_ESTIMATOR: parts["estimator"]["targets"], _CONCURRENT: parts["concurrent"]["groups"]}
+    asked = [field for field, names in named.items() if names]
+    if not asked:
         return actor
-    field = estimator.FIELD if estimates else concurrent.FIELD
-    if estimates and taught:
-        raise ConfigError(
-            f"{estimator.FIELD} and {concurrent.FIELD} are both set: the actor reads an estimate or a latent; empty one"
-        )
+    if len(asked) > 1:
+        raise ConfigError(f"{' and '.join(asked)} are both set: the actor reads an estimate or a latent; empty one")
     if actor["class_name"] != "MLPModel":
-        raise ConfigError(f"{field}: that goes with actor.class_name 'MLPModel', not '{actor['class_name']}'")
+        raise ConfigError(f"{asked[0]}: that goes with actor.class_name 'MLPModel', not '{actor['class_name']}'")
     assert env is not None
-    if estimates:
-        kind, part = estimator.EstimatingModel, {"estimator": estimator.estimator_settings(sections, env, learns)}
-    else:
-        kind, part = concurrent.ConcurrentModel, {"concurrent": concurrent.concurrent_settings(sections, env, learns)}
-    return {**actor, **part, "class_name": f"{kind.__module__}:{kind.__name__}"}
+    name = _STUDENTS[asked[0]]
+    return {**actor, **resolve_callable(name).settings(sections, env, learns), "class_name": name}  # type: ignore[attr-defined]
 
 
 def network_section(section: dict[str, Any]) -> dict[str, Any]:
-    """The section of a network without the fields of a memory, if its class has none. Imports the class: check it first."""
+    """The section of a network as rsl-rl takes it, without the fields of a memory if its class has none.
+
+    Imports the class: check it first.
+    """
+    if section["class_name"] in spellings(RNNModel):
+        section = {**section, "class_name": _RECURRENT}
     taken = inspect.signature(resolve_class(section)[0]).parameters
     return {name: value for name, value in section.items() if name in taken or not name.startswith("rnn_")}
 
@@ -92,9 +97,9 @@ def _check_distribution(section: dict[str, Any] | None, path: str) -> None:
             )
 
 
-def spellings(kind: type) -> list[str]:
-    """All names under which rsl-rl finds a class, the shortest first."""
-    module, name = kind.__module__, kind.__qualname__
+def spellings(kind: type | str) -> list[str]:
+    """All names under which rsl-rl finds a class, which may be written as ``module:name``, the shortest first."""
+    module, name = kind.split(":") if isinstance(kind, str) else (kind.__module__, kind.__qualname__)
     long = [f"{module}:{name}", f"{module}.{name}"]
     if not module.startswith("rsl_rl."):
         return long

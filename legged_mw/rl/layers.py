@@ -10,8 +10,10 @@ from rsl_rl.models import MLPModel
 from rsl_rl.modules import EmpiricalNormalization
 from torch import Tensor, nn
 
+from legged_mw.utils.opaque import fast
+
 Layers = list[tuple[Tensor, Tensor]]  # weight and bias of each
-FUSED_ON = ["cuda"]  # devices whose updates use the kernels of kernels.py
+FUSED_ON = ["cuda"]  # devices whose updates use the kernels of fast/kernels.py
 _SUM_ROWS = 128  # summed by a thread; the rest of the rows is summed side by side
 
 
@@ -38,12 +40,10 @@ class Linear(torch.autograd.Function):
 
 
 def kernels_for(x: Tensor) -> Any:
-    """The module of kernels if ``x`` is where they are used, else None."""
+    """The module of kernels if ``x`` is where they are used, else None, as without legged_mw/fast."""
     if x.device.type not in FUSED_ON:
         return None
-    from legged_mw.fast import kernels  # with warp, a second to import, and only for a GPU
-
-    return kernels
+    return fast("kernels")  # with warp, a second to import, and only for a GPU
 
 
 def sum_rows(x: Tensor) -> Tensor:

@@ -13,11 +13,9 @@ from typing import Any
 
 import numpy as np
 import torch
-from rsl_rl.models import MLPModel, RNNModel
+from rsl_rl.models import MLPModel
 from torch import Tensor, nn
 
-from legged_mw.rl.students.estimator import EstimatingModel
-from legged_mw.rl.students.recurrent import states_of, step
 from legged_mw.utils.config import ConfigError
 
 INPUT, OUTPUT, MEMORY_INPUT, MEMORY_OUTPUT, ESTIMATE = "obs", "actions", "state_in", "state_out", "estimate"
@@ -43,24 +41,17 @@ class ExportedPolicy(nn.Module):
 
     def __init__(self, policy: MLPModel, clip_actions: float) -> None:
         super().__init__()
-        self.policy, self.clip_actions = copy.deepcopy(policy).cpu(), clip_actions
-        self.inputs, self.outputs, self.examples = [INPUT], [OUTPUT], [torch.zeros(2, policy.obs_dim)]
-        if not isinstance(policy, RNNModel):
-            self.policy = self.policy.as_onnx(verbose=False)
-            self.outputs += [ESTIMATE] if isinstance(policy, EstimatingModel) else []
-            return
-        self.inputs, self.outputs = [INPUT, MEMORY_INPUT], [OUTPUT, MEMORY_OUTPUT]
-        self.examples.append(torch.zeros(2, *states_of(policy)))
+        self.policy, self.clip_actions = copy.deepcopy(policy).cpu().as_onnx(verbose=False), clip_actions
+        more: dict[str, Tensor] = getattr(self.policy, "inputs", {})
+        self.inputs, self.examples = [INPUT, *more], [torch.zeros(2, policy.obs_dim), *more.values()]
+        self.outputs = [OUTPUT, *getattr(self.policy, "outputs", [])]
 
     def forward(self, obs: Tensor, state_in: Tensor | None = None) -> Any:
-        policy, clip = self.policy, self.clip_actions
-        if ESTIMATE in self.outputs:
-            actions, estimate = policy(obs)
-            return actions.clamp(-clip, clip), estimate
-        if state_in is None:
-            return policy(obs).clamp(-clip, clip)
-        seen, state = step(policy.rnn.rnn, policy.obs_normalizer(obs), state_in.transpose(0, 1))
-        return policy.distribution.deterministic_output(policy.mlp(seen)).clamp(-clip, clip), state.transpose(0, 1)
+        clip = self.clip_actions
+        if len(self.outputs) == 1:
+            return self.policy(obs).clamp(-clip, clip)
+        actions, beside = self.policy(obs) if state_in is None else self.policy(obs, state_in)
+        return actions.clamp(-clip, clip), beside
 
 
 def run_onnx(

@@ -26,10 +26,7 @@ from torch import Tensor, nn
 from legged_mw.rl.adam import FlatAdam, make_recordable
 from legged_mw.rl.layers import HalfWeights, elu_layers, kernels_for, run_mlp, sample, update_normalizer
 from legged_mw.rl.losses import own_std, policy_loss, value_loss
-from legged_mw.rl.recorded import Recorded, why_stock
-from legged_mw.rl.students.concurrent import ConcurrentModel
-from legged_mw.rl.students.estimator import EstimatingModel, RegressingModel, trained_parts
-from legged_mw.rl.students.recurrent import HiddenStates, SequenceInput, check_recurrent, unroll
+from legged_mw.rl.recorded import Memories, Recorded, RegressingModel, Sequenced, trained_parts, why_stock
 from legged_mw.rl.undo import Undo
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.config import ConfigError
@@ -41,8 +38,8 @@ class Minibatch(NamedTuple):
     """Samples of an update, and what the networks see of them."""
 
     batch: RolloutStorage.Batch
-    actor_input: Tensor | SequenceInput  # (B, size), normalised; a sequence for a network with a memory
-    critic_input: Tensor | SequenceInput
+    actor_input: Tensor | Sequenced  # (B, size), normalised; a sequence for a network with a memory
+    critic_input: Tensor | Sequenced
     lesson: tuple[Tensor, ...] = ()  # what the actor's estimator learns from
 
 
@@ -69,7 +66,7 @@ class GraphedPPO(Recorded, PPO):
         reason = self._why_stock()
         self.graphed = reason is None
         if self._recurrent:
-            check_recurrent(storage.num_envs, self.num_mini_batches, symmetry, self.graphed)
+            _check_recurrent(storage.num_envs, self.num_mini_batches, symmetry, self.graphed)
             self.symmetry = Symmetry(**symmetry) if symmetry else None  # rsl-rl refuses mirror images here
         if reason:
             if self._bound:
@@ -98,7 +95,7 @@ class GraphedPPO(Recorded, PPO):
             return "rnd_cfg is set"
         if not {*map(id, self.actor.parameters())}.isdisjoint(map(id, self.critic.parameters())):
             return "the networks share parameters"
-        return why_stock(self, self.actor, {self.actor: (EstimatingModel, ConcurrentModel), self.critic: ()})
+        return why_stock(self, self.actor, self.critic, regressing=self.actor)
 
     def _begin(self) -> None:
         """Fixed tensors, and graphs that are not recorded yet."""
@@ -112,7 +109,7 @@ class GraphedPPO(Recorded, PPO):
         # of each transition
         self._worlds = torch.arange(st.num_envs, device=device).expand(st.num_transitions_per_env, -1)
         self._order = torch.zeros(self._share * self.num_mini_batches, dtype=torch.long, device=device)
-        self._memories = HiddenStates((self.actor, self.critic), st.num_envs, 2 if self.symmetry else 1, device)
+        self._memories = Memories((self.actor, self.critic), st.num_envs, 2 if self.symmetry else 1, device)
         self._advantages = torch.zeros_like(st.returns)
         more = ["symmetry"] if self.symmetry else []
         more += [self.actor.regression] if isinstance(self.actor, RegressingModel) else []
@@ -273,7 +270,7 @@ class GraphedPPO(Recorded, PPO):
         return Minibatch(batch, actor_input, critic_input, self.actor.lesson(batch.observations, take(self._worlds)))
 
     @torch.no_grad()
-    def _input(self, model: MLPModel, obs: Any, indices: Tensor) -> Tensor | SequenceInput:
+    def _input(self, model: MLPModel, obs: Any, indices: Tensor) -> Tensor | Sequenced:
         """What the network sees of observations, normalised, with columns of zeros up to a multiple of four or eight."""
         memory = self._memories.get(model)
         latent = memory.normalised(obs) if memory else model.get_latent(obs)
@@ -322,11 +319,11 @@ class GraphedPPO(Recorded, PPO):
                 gradients.append((parts[-1], torch.full_like(parts[-1], self.symmetry.mirror_loss_coeff)))
         return gradients, parts, loss.kl if self.desired_kl is not None and self.schedule == "adaptive" else None
 
-    def _forward(self, model: MLPModel, inputs: Tensor | SequenceInput) -> Tensor:
+    def _forward(self, model: MLPModel, inputs: Tensor | Sequenced) -> Tensor:
         """The network's output for normalised inputs (B, size), or over a sequence."""
-        if model in self._half:
-            return run_mlp(model.mlp, inputs, self._half[model].read())  # type: ignore[arg-type]
-        return run_mlp(model.mlp, unroll(model.rnn.rnn, inputs) if isinstance(inputs, SequenceInput) else inputs)  # type: ignore[attr-defined]
+        if not isinstance(inputs, Tensor):
+            return run_mlp(model.mlp, self._memories[model].unroll(inputs))
+        return run_mlp(model.mlp, inputs, self._half[model].read() if model in self._half else None)
 
     def _step(self, kl: Tensor | None) -> None:
         """Adapt the rate by ``kl``, clip each part's gradient, and step; with several ranks by their means."""
@@ -415,3 +412,17 @@ class GraphedPPO(Recorded, PPO):
         else:
             self._rate.fill_(float(rate))
             self._adam_rate.fill_(float(rate))
+
+
+def _check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | None, recorded: bool) -> None:
+    """Refuse what does not go with a memory. Raises ConfigError."""
+    if worlds < minibatches:
+        raise ConfigError(
+            f"algorithm.num_mini_batches is {minibatches}, but a recurrent network learns from whole worlds, and env.num_envs is {worlds}: "
+            "raise the latter or lower the former"
+        )
+    if symmetry and not (recorded and symmetry["use_data_augmentation"]):
+        raise ConfigError(
+            "a recurrent network needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, and for both this project's recorded "
+            "update; switch the former on, or both off"
+        )

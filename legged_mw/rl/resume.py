@@ -17,7 +17,7 @@ from legged_mw.envs.robot_task import RobotTask
 from legged_mw.envs.worlds import everything, put_worlds, worlds_state
 from legged_mw.rl.checkpoint import damage
 from legged_mw.rl.ranks import Rank
-from legged_mw.rl.students.recurrent import HiddenStates
+from legged_mw.rl.recorded import Memories
 
 _MOST = 1e10  # what MuJoCo calls a state that has blown up: mjMAXVAL
 _FREE = ("rewards", "noise", "viewer", "exam", "termination")  # sections that may have changed: the worlds are the same
@@ -111,7 +111,7 @@ def _kind(env: RobotTask) -> dict[str, Any]:
 
 def _memories(runner: Any, copy: bool = True) -> dict[str, Tensor]:
     """Hidden states of networks with a memory, by their place."""
-    states: HiddenStates | dict = getattr(runner.alg, "_memories", {})
+    states: Memories | dict = getattr(runner.alg, "_memories", {})
     return {str(i): state.now.cpu().clone() if copy else state.now for i, state in enumerate(states.values())}
 
 

@@ -29,11 +29,11 @@ from legged_mw.rl.policies import acting
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.progress import Console
 from legged_mw.rl.ranks import first_ranks, first_word, this_rank
+from legged_mw.rl.recorded import RegressingModel
 from legged_mw.rl.report import Clock, Mark, Message, Report, console_rows, curves, quiet_writers
 from legged_mw.rl.resume import random_state, set_random_state, take_worlds, worlds_content
 from legged_mw.rl.runs import check_fit, load_tensors, save_whole
 from legged_mw.rl.settings import rsl_rl_config
-from legged_mw.rl.students.estimator import RegressingModel
 from legged_mw.rl.threads import UpdateThreads
 from legged_mw.rl.transfer import TEACHER, adapt
 from legged_mw.rl.undo import Undo

@@ -21,16 +21,15 @@ from rsl_rl.algorithms import Distillation
 
 from legged_mw.envs.motors import note_network
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.worlds import fuse_for
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.keeping import LOCK_FILE, Keeper, RunLock, reason_of
 from legged_mw.rl.policies import Trained, find_trained
-from legged_mw.rl.ppo import MAX_RATE, GraphedPPO
+from legged_mw.rl.ppo import MAX_RATE
 from legged_mw.rl.ranks import Rank, first_ranks, leave_together, leave_when_stuck, rank_device, this_rank
+from legged_mw.rl.recorded import Recorded
 from legged_mw.rl.room import check_room
 from legged_mw.rl.runner import Runner, check_mirror, make_runner
 from legged_mw.rl.runs import CONFIG_FILE, experiment_folder, find_checkpoint, find_run, new_run
-from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.rl.transfer import TEACHER, begin_with, check_start, keep_teacher, load_teacher, seat_teacher
 from legged_mw.sim.device import device_facts
 from legged_mw.sim.engines import pick_engine
@@ -225,7 +224,7 @@ def train(
     whether all is done.
     """
     rank, runner = this_rank(), make_learner(task, env, start)
-    fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)  # last: it takes seconds
+    env.fuse(task.train.runner.max_iterations * task.train.runner.num_steps_per_env)  # last: it takes seconds
     runner.examine, runner.console.verbose, runner.deadline = examine, verbose, deadline
     with ExitStack() as held:
         left = _load(runner, task, start)  # before the lock: where it is refused, nothing was written
@@ -347,7 +346,7 @@ def _learn(runner: Runner, iterations: int, rank: Rank) -> None:
     try:
         with runner.console:
             runner.learn(iterations, bool(runner.begins_anew))
-        if isinstance(runner.alg, GraphedPPO | GraphedDistillation):
+        if isinstance(runner.alg, Recorded):
             runner.alg.release()
     except RuntimeError as error:
         lost = r"(closed|reset|aborted) by|connection (was )?(closed|reset|refused)|remote process|remoteerror"

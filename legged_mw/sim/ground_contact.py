@@ -26,10 +26,10 @@ from mujoco_warp._src.math import make_frame
 from mujoco_warp._src.types import Contact
 from torch import Tensor
 
-from legged_mw.fast.trace import not_traced
 from legged_mw.sim.ground import PROBE_SPACING
 from legged_mw.sim.surface_points import spheres_on
 from legged_mw.sim.terrain import Terrain
+from legged_mw.utils.opaque import not_traced
 
 wp.set_module_options({"enable_backward": False})
 

@@ -17,10 +17,10 @@ import torch
 from mujoco.batch import MODEL_FIELDS, Batch, SimulationError
 from torch import Tensor
 
-from legged_mw.fast.trace import not_traced
 from legged_mw.sim.simulation import GRAVITY, Simulation
 from legged_mw.utils.errors import ModelError, unknown
 from legged_mw.utils.machine import usable_cores
+from legged_mw.utils.opaque import not_traced
 
 _STATE, _WRITTEN = ("qpos", "qvel"), ("ctrl", "xfrc_applied")  # a step reads and writes the state, and reads the rest
 _READ = ("sensordata", "actuator_force", "site_xpos", "xquat")  # computed by a step

@@ -18,14 +18,12 @@ import warp as wp
 from mujoco_warp import OverflowType
 from torch import Tensor
 
-from legged_mw.fast.contact_count import count_contacts
-from legged_mw.fast.shortcuts import Shortcuts
-from legged_mw.fast.trace import not_traced
 from legged_mw.sim.ground import GROUND
 from legged_mw.sim.ground_contact import touch_ground
 from legged_mw.sim.simulation import CONSTANTS, CONSTANTS_READ, GRAVITY, Simulation
 from legged_mw.sim.terrain import Terrain
 from legged_mw.utils.errors import ModelError, unknown
+from legged_mw.utils.opaque import fast, not_traced
 
 wp.config.log_level = wp.LOG_WARNING  # it announces every kernel module that it loads; a first run would drown in it
 
@@ -86,8 +84,8 @@ class WarpSimulation(Simulation):
             option.warn_overflow = 0  # the bits are read, printing from a kernel is not free
             option.graph_conditional = option.iterations > _UNROLLED_ITERATIONS
             self._data = mjw.make_data(model, nworld=num_envs, nconmax=nconmax, njmax=njmax)
-            self._shortcuts = Shortcuts(model, self._model, self._data, world_fields)
-            self._count_contacts = count_contacts(model, self._model)
+            shortcuts = fast("shortcuts")
+            self._shorter = shortcuts.ShortStep(model, self._model, self._data, world_fields) if shortcuts else None
         for name in _STATE:
             setattr(self, name, wp.to_torch(getattr(self._data, name)))
         self._fields = {name: wp.to_torch(attrgetter(name)(self._model)) for name in world_fields}
@@ -161,11 +159,11 @@ class WarpSimulation(Simulation):
         for i in which:
             last = i == count - 1
             option.disableflags = flags if last else flags | mjw.DisableBit.SENSOR
-            with self._shortcuts(sensed=last, later=i != which[0]):
+            if self._shorter:
+                self._shorter(sensed=last, later=i != which[0])
+            else:
                 mjw.step(self._model, self._data)
         option.disableflags = flags
-        if which[-1] == count - 1:
-            self._count_contacts(self._data)
 
     def _run(self, name: str, fn) -> None:
         with wp.ScopedDevice(self._device):

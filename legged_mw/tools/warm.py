@@ -9,7 +9,6 @@ from io import StringIO
 import torch
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.worlds import fuse_for
 from legged_mw.eval.exams import make_exam
 from legged_mw.rl.layers import kernels_for
 from legged_mw.rl.runner import make_runner
@@ -50,7 +49,7 @@ def warm(name: str, device: str) -> None:
         task.fit_cpu(usable_cores())
         torch.set_num_threads(1)  # as train.py does
     env = task.env_class(task.cfg, device)
-    fuse_for(env, task.train.runner.max_iterations * task.train.runner.num_steps_per_env)
+    env.fuse(task.train.runner.max_iterations * task.train.runner.num_steps_per_env)
     exam = make_exam(task, env)
     if kernels := kernels_for(env.actions):
         kernels.load(device)

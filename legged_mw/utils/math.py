@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from legged_mw.fast.trace import tracing
+from legged_mw.utils.opaque import tracing
 
 
 def quat_rotate(q: Tensor, v: Tensor) -> Tensor:

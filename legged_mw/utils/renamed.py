@@ -15,6 +15,7 @@ RENAMED: dict[str, tuple[str, ...]] = {
 
 # A module that a task may have imported, or a class of one -> the module where it is now.
 MOVED: dict[str, str] = {
+    "legged_mw.rl.distillation": "legged_mw.rl.students.distillation",
     "RobotTaskCfgPPO": "legged_mw.rl.learner_config",
     "LeggedRobotCfgPPO": "legged_mw.rl.learner_config",
     "legged_mw.envs.sim_to_real_config": "configs.base",
@@ -63,7 +64,7 @@ def new_name(path: str) -> str:
 
 
 def with_new_names(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """A copy of a run's saved config in which every old name is replaced by the new one."""
+    """A copy of a run's saved config in which every old name of a field or a class's module is replaced by the new one."""
     config: dict[str, Any] = copy.deepcopy(dict(saved))
     for old, (*sections, name) in RENAMED.items():
         section, _, field = old.partition(".")
@@ -74,4 +75,9 @@ def with_new_names(saved: Mapping[str, Any]) -> dict[str, Any]:
             node = node.setdefault(key, {}) if isinstance(node, dict) else None
         if isinstance(node, dict):  # else the file is wrong there, and loading it says so
             node[name] = value
+    for section in config.values():
+        name = section.get("class_name") if isinstance(section, dict) else None
+        for old, new in MOVED.items():
+            if isinstance(name, str) and name.startswith((f"{old}:", f"{old}.")):
+                section["class_name"] = new + name[len(old) :]
     return config

@@ -10,11 +10,12 @@ import torch
 from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.worlds import everything, fused_step
+from legged_mw.envs.worlds import everything
 from legged_mw.fast.fused import Fused, Kernel, Region
 from legged_mw.fast.fusion import fused as fuse
-from legged_mw.fast.fusion import remember
-from legged_mw.fast.trace import Trace, not_traced, tracing
+from legged_mw.fast.fusion import fused_step, remember
+from legged_mw.fast.trace import Trace
+from legged_mw.utils.opaque import not_traced, tracing
 from legged_mw.utils.task import load_task
 
 N = 16

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.layers import run_mlp, update_normalizer
-from legged_mw.rl.students.estimator import RegressingModel
+from legged_mw.rl.recorded import RegressingModel
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
@@ -105,6 +105,10 @@ class ConcurrentModel(RegressingModel):
 
     def as_onnx(self, verbose: bool) -> nn.Module:
         return _OnnxStudent(self)
+
+    @staticmethod
+    def settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
+        return {"concurrent": concurrent_settings(sections, env, learns)}
 
 
 class _OnnxStudent(nn.Module):

@@ -17,10 +17,8 @@ from torch import Tensor, nn
 
 from legged_mw.rl.adam import make_recordable
 from legged_mw.rl.layers import run_mlp, sample, update_normalizer
-from legged_mw.rl.recorded import Recorded, why_stock
-from legged_mw.rl.students.concurrent import ConcurrentModel
-from legged_mw.rl.students.estimator import EstimatingModel
-from legged_mw.rl.students.recurrent import HiddenStates, step
+from legged_mw.rl.recorded import Memories, Recorded, why_stock
+from legged_mw.rl.students.recurrent import step
 from legged_mw.rl.undo import Undo
 from legged_mw.sim.graph import StepGraph
 
@@ -56,11 +54,11 @@ class GraphedDistillation(Recorded, Distillation):
         if self.storage.num_transitions_per_env % self.gradient_length:
             return f"gradient_length {self.gradient_length} does not divide a rollout of {self.storage.num_transitions_per_env} steps"
         # a teacher's estimator learns nothing
-        return why_stock(self, self.student, {self.student: (), self.teacher: (EstimatingModel, ConcurrentModel)})
+        return why_stock(self, self.student, self.teacher, regressing=self.teacher)
 
     def _begin(self) -> None:
         """Empty memories, and graphs that are not recorded yet."""
-        self._memories = HiddenStates((self.student, self.teacher), self.storage.num_envs, 1, str(self.device))
+        self._memories = Memories((self.student, self.teacher), self.storage.num_envs, 1, str(self.device))
         self._act_graph, self._update_graph = (StepGraph(fn, str(self.device)) for fn in (self._act, self._update))
 
     # ---- the rollout ----------------------------------------------------------------------------------------------

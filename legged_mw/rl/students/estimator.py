@@ -11,7 +11,6 @@ import copy
 from typing import Any, NamedTuple
 
 import torch
-from rsl_rl.models import MLPModel
 from rsl_rl.modules import MLP, EmpiricalNormalization
 from tensordict import TensorDict
 from torch import Tensor, nn
@@ -19,6 +18,8 @@ from torch import Tensor, nn
 from legged_mw.envs.observations import Row
 from legged_mw.envs.robot_task import RobotTask
 from legged_mw.rl.layers import run_mlp, update_normalizer
+from legged_mw.rl.network import ESTIMATE
+from legged_mw.rl.recorded import RegressingModel
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import unknown
 
@@ -43,37 +44,6 @@ class TargetNormalizer(EmpiricalNormalization):
 
     def inverse(self, y: Tensor) -> Tensor:
         return y * self._std.clamp(min=SMALLEST) + self._mean
-
-
-class RegressingModel(MLPModel):
-    """rsl-rl's MLPModel with an ``estimator``, which learns by regression; the network reads what it makes of the observations."""
-
-    field: str  # of the config, that asks for it
-    regression: str  # the name of the regression's loss
-    estimator: nn.Module
-    learning_rate: float  # of the estimator
-
-    def rollout_latent(self, obs: TensorDict) -> Tensor:
-        """What the network reads in a training's rollout, of all its worlds in order."""
-        return self.get_latent(obs)
-
-    def lesson(self, obs: TensorDict, worlds: Tensor) -> tuple[Tensor, ...]:
-        """What ``learn`` needs besides the latent; it stays the same over an update.
-
-        ``obs`` (S * B,) were seen in ``worlds`` (B,); S is 2 where mirror images come after them, else 1.
-        """
-        raise NotImplementedError
-
-    def learn(self, latent: Tensor, lesson: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-        """The network's output, and the loss () of the regression, which is of other parameters.
-
-        ``latent`` may have more columns, of zeros.
-        """
-        raise NotImplementedError
-
-    def update_regression_normalizer(self, obs: TensorDict, ranks: int) -> None:
-        """Update the normaliser of what the estimator learns from."""
-        raise NotImplementedError
 
 
 class EstimatingModel(RegressingModel):
@@ -145,6 +115,10 @@ class EstimatingModel(RegressingModel):
     def as_onnx(self, verbose: bool) -> nn.Module:
         return _OnnxEstimatingModel(self)
 
+    @staticmethod
+    def settings(sections: dict[str, Any], env: RobotTask, learns: bool) -> dict[str, Any]:
+        return {"estimator": estimator_settings(sections, env, learns)}
+
 
 def believed_velocity(policy: Any, obs: TensorDict) -> Tensor | None:
     """vx, vy (N, 2) [m/s] that ``policy`` believes of its robots; None if it does not estimate their velocity."""
@@ -154,6 +128,8 @@ def believed_velocity(policy: Any, obs: TensorDict) -> Tensor | None:
 
 class _OnnxEstimatingModel(nn.Module):
     """Observations (B, size) in their units -> mean actions (B, A), and the estimate (B, E) in the targets' units."""
+
+    outputs = [ESTIMATE]  # beside the actions
 
     def __init__(self, model: EstimatingModel) -> None:
         super().__init__()
@@ -168,15 +144,6 @@ class _OnnxEstimatingModel(nn.Module):
         estimate = self.estimator(seen)
         actions = self.deterministic_output(self.mlp(torch.cat([seen, estimate], dim=-1)))
         return actions, estimate * self.target_normalizer._std + self.target_normalizer._mean
-
-
-def trained_parts(actor: MLPModel, critic: MLPModel) -> tuple[list[list[nn.Parameter]], list[Tensor]]:
-    """Parameters whose gradients are clipped together: the policy's, the critic's, the estimator's if there is one; and its rate ()."""
-    if not isinstance(actor, RegressingModel):
-        return [[*actor.parameters()], [*critic.parameters()]], []
-    policy = [parameter for name, parameter in actor.named_parameters() if not name.startswith("estimator.")]
-    rate = torch.tensor(actor.learning_rate, dtype=torch.float32, device=policy[0].device)
-    return [policy, [*critic.parameters()], [*actor.estimator.parameters()]], [rate]
 
 
 # ---- what the config means ------------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ the same values and gradients. cuDNN cannot change a state on the way, so each s
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -16,7 +16,8 @@ from rsl_rl.models import MLPModel, RNNModel
 from torch import Tensor, nn
 
 from legged_mw.rl.layers import Linear, sum_rows
-from legged_mw.utils.config import ConfigError
+from legged_mw.rl.network import MEMORY_INPUT, MEMORY_OUTPUT
+from legged_mw.rl.recorded import RememberingModel, Sequenced
 
 
 class SequenceInput(NamedTuple):
@@ -66,38 +67,36 @@ class HiddenState:
             inputs.view(-1, len(keep), len(worlds), inputs.shape[1]), self.start.index_select(2, worlds), keep
         )
 
+    def unroll(self, sequence: Sequenced) -> Tensor:
+        """The outputs (S * T * B, H) over a sequence."""
+        return unroll(self._model.rnn.rnn, SequenceInput(*sequence))
 
-class HiddenStates(dict[nn.Module, HiddenState]):
-    """Those of the recurrent networks among a learner's ``models``."""
 
-    def __init__(self, models: Iterable[nn.Module], worlds: int, images: int, device: str) -> None:
-        super().__init__(
-            {model: HiddenState(model, worlds, images, device) for model in models if isinstance(model, RNNModel)}
+class RecurrentModel(RememberingModel):
+    """The RNNModel of a config: rsl-rl's network, with a memory for recorded learners and an export whose state goes in and out."""
+
+    def memory(self, worlds: int, images: int, device: str) -> HiddenState:
+        return HiddenState(self, worlds, images, device)
+
+    def as_onnx(self, verbose: bool) -> nn.Module:
+        return _OnnxRecurrentModel(self)
+
+
+class _OnnxRecurrentModel(nn.Module):
+    """Observations (B, size) in their units and states (B, states, H) -> mean actions (B, A) and the next states."""
+
+    outputs = [MEMORY_OUTPUT]  # beside the actions
+
+    def __init__(self, model: RecurrentModel) -> None:
+        super().__init__()
+        self.obs_normalizer, self.rnn, self.mlp, self.distribution = copy.deepcopy(
+            (model.obs_normalizer, model.rnn, model.mlp, model.distribution)
         )
+        self.inputs = {MEMORY_INPUT: torch.zeros(2, *states_of(model))}  # beside the observations: examples
 
-    def begin_rollout(self) -> None:
-        """Keep the present states as those that the rollout begins with."""
-        for state in self.values():
-            state.start.copy_(state.now)
-
-    def forget(self, ended: Tensor) -> None:
-        """All states become 0 where ``ended`` (N,)."""
-        for state in self.values():
-            state.forget(ended)
-
-
-def check_recurrent(worlds: int, minibatches: int, symmetry: dict[str, Any] | None, recorded: bool) -> None:
-    """Refuse what does not go with a memory. Raises ConfigError."""
-    if worlds < minibatches:
-        raise ConfigError(
-            f"algorithm.num_mini_batches is {minibatches}, but a recurrent network learns from whole worlds, and env.num_envs is {worlds}: "
-            "raise the latter or lower the former"
-        )
-    if symmetry and not (recorded and symmetry["use_data_augmentation"]):
-        raise ConfigError(
-            "a recurrent network needs symmetry.use_data_augmentation for symmetry.use_mirror_loss, and for both this project's recorded "
-            "update; switch the former on, or both off"
-        )
+    def forward(self, obs: Tensor, state_in: Tensor) -> tuple[Tensor, Tensor]:
+        seen, state = step(self.rnn.rnn, self.obs_normalizer(obs), state_in.transpose(0, 1))
+        return self.distribution.deterministic_output(self.mlp(seen)), state.transpose(0, 1)  # type: ignore[union-attr]
 
 
 def memory_of(policy: MLPModel, worlds: int) -> Tensor:
