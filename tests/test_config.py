@@ -774,13 +774,11 @@ def test_a_folder_configs_beside_the_task_wins(no_configs: None, tmp_path: Path,
     """Also if the task lies in it. What it has not comes from the package."""
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs/go1_flat.py").write_text(
-        "from configs.go1_rough import Go1FlatDrCfg as Theirs\n\nclass MyCfg(Theirs):\n    pass\n"
+        "from configs.go2_rough_scan import Go2RoughCfg as Theirs\n\nclass MyCfg(Theirs):\n    pass\n"
     )
-    (tmp_path / "configs/go1_flat_dr.py").write_text(
-        "from legged_mw.envs.legged_robot_config import LeggedRobotCfg\n"
-        "from legged_mw.rl.learner_config import LeggedRobotCfgPPO\n\n"
-        "class Go1FlatDrCfg(LeggedRobotCfg):\n    class noise(LeggedRobotCfg.noise):\n        level = 0.25\n\n"
-        "class Go1FlatDrCfgPPO(LeggedRobotCfgPPO):\n    pass\n"
+    (tmp_path / "configs/go2_rough.py").write_text(
+        "from legged_mw.envs.legged_robot_config import LeggedRobotCfg\n\n"
+        "class Go2RoughCfg(LeggedRobotCfg):\n    class noise(LeggedRobotCfg.noise):\n        level = 0.25\n"
     )
     file = tmp_path / ("configs/fast.py" if inside else "fast.py")
     file.write_text(FAST.format(base="MyCfg"))
