@@ -16,7 +16,7 @@ import yaml
 
 from legged_mw import ROOT
 from legged_mw.utils.config import Config, ConfigError, load_yaml, save_yaml
-from legged_mw.utils.renamed import RENAMED
+from legged_mw.utils.renamed import RENAMED, RENAMED_CLASSES
 from legged_mw.utils.task import LoadedTask, Task, load_task
 
 
@@ -684,6 +684,15 @@ def test_a_wrong_section_of_an_old_run_is_named() -> None:
     saved = {**load_task("go1_flat").to_dict(), "cpu": {"kick_curriculum": False, "overrides": 3}}
     with says("config.yaml: cpu.overrides"):
         load_task("go1_flat").update_from_run(saved, where="config.yaml")
+
+
+@pytest.mark.parametrize("old", RENAMED_CLASSES)
+def test_an_old_run_names_a_class_by_its_old_module(old: str) -> None:
+    task = load_task("go1_flat")
+    saved = task.to_dict()
+    saved["distillation"]["class_name"] = old
+    task.update_from_run(saved, where="config.yaml")
+    assert task.train.distillation.class_name == RENAMED_CLASSES[old]
 
 
 OLD_NAMES = {

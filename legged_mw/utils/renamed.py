@@ -13,6 +13,11 @@ RENAMED: dict[str, tuple[str, ...]] = {
     "cpu.kick_curriculum": ("cpu", "overrides", "perturbation.curriculum"),
 }
 
+# A class that an old run names in a field class_name -> its name now.
+RENAMED_CLASSES: dict[str, str] = {
+    "legged_mw.rl.distillation:GraphedDistillation": "legged_mw.rl.students.distillation:GraphedDistillation",
+}
+
 # A module that a task may have imported, or a class of one -> the module where it is now.
 MOVED: dict[str, str] = {
     "RobotTaskCfgPPO": "legged_mw.rl.learner_config",
@@ -74,4 +79,8 @@ def with_new_names(saved: Mapping[str, Any]) -> dict[str, Any]:
             node = node.setdefault(key, {}) if isinstance(node, dict) else None
         if isinstance(node, dict):  # else the file is wrong there, and loading it says so
             node[name] = value
+    for section in config.values():
+        name = str(section.get("class_name")) if isinstance(section, dict) else ""
+        if name in RENAMED_CLASSES:
+            section["class_name"] = RENAMED_CLASSES[name]
     return config
