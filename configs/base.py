@@ -1,13 +1,17 @@
-"""What tasks for real robots share: no measured velocity, randomized worlds, kicks and pushes, and a learner that suits.
+"""What tasks of different robots share: numbers for a real robot that walks, gets up, stands on two of four legs, follows a motion.
 
-Config classes only: a robot's own names and numbers are in configs/robots/. Sources: [I] Isaac Lab's G1 task, [M] mjlab's velocity
-task, [G] MuJoCo Playground's G1 joystick task, [P] its Go1 tasks, [U] unitree_rl_gym's G1; [ours] is measured: docs/lab.md.
+Config classes only; a robot's own names and numbers are in configs/robots/. Sources: [I] Isaac Lab's G1 task, [M] mjlab's velocity
+task, [G] MuJoCo Playground's G1 joystick task, [P] its Go1 tasks, [U] unitree_rl_gym's G1, [H] HoST, a G1 with 23 joints,
+[B] BeyondMimic; [ours] is measured: docs/lab.md.
 """
 
 from __future__ import annotations
 
 from legged_mw.envs.legged_robot_config import LeggedRobotCfg
-from legged_mw.rl.learner_config import LeggedRobotCfgPPO
+from legged_mw.rl.learner_config import LeggedRobotCfgPPO, RobotTaskCfgPPO
+from legged_mw.skills.getup import GetupCfg, GetupCfgPPO
+from legged_mw.skills.handstand import HandstandCfg
+from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
 
 
 class SimToRealCfg(LeggedRobotCfg):
@@ -203,3 +207,102 @@ class BipedRoughCfgPPO(BipedCfgPPO):
     class anneal(BipedCfgPPO.anneal):
         entropy_coef = 0.0001  # [ours]
         desired_kl = 0.0  # [ours: stays; with less the rate falls to 1e-5]
+
+
+class BipedGetupCfg(GetupCfg):
+    """Getting up on two legs, of a G1's size."""
+
+    class env(GetupCfg.env):
+        num_envs = 4096
+        episode_length_s = 10.0  # [s] [H]
+
+    class falls(GetupCfg.falls):
+        seconds = 1.5  # [s] [ours: it falls from higher]
+        pull = 0.8  # of its weight [H 0.6]
+
+    class control(GetupCfg.control):
+        action_origin = "default"  # [ours: its servos alone stand it up in the pull; docs/skills.md]
+
+    class rewards(GetupCfg.rewards):
+        class scales(GetupCfg.rewards.scales):
+            action_rate, action_smoothness = -0.002, -0.0004  # [ours: sums over 29 joints; a Go1 has 12]
+
+    class exam(GetupCfg.exam):
+        within = 6.0  # [s]
+
+
+class BipedGetupCfgPPO(GetupCfgPPO):
+    """Its learner."""
+
+    class runner(GetupCfgPPO.runner):
+        max_iterations = 4000
+
+    class algorithm(GetupCfgPPO.algorithm):
+        gamma = 0.99  # [ours: it takes seconds]
+        desired_kl, entropy_coef = 0.02, 0.005  # [ours: of 29 joints together], [M]
+
+
+class UnitreeHandstandCfg(HandstandCfg):
+    """A handstand on four legs that are called FR, FL, RR and RL: the front ones stand."""
+
+    class asset(HandstandCfg.asset):
+        penalize_contacts_on = ["RR*", "RL*"]
+
+    class exam(HandstandCfg.exam):
+        hands = ["FR", "FL"]
+
+    class rewards(HandstandCfg.rewards):
+        deviation_weights = {"": 0.0, "RR_": 1.0, "RL_": 1.0}  # the legs in the air [P]
+
+
+class UnitreeFootstandCfg(HandstandCfg):
+    """A footstand of such a robot: the rear ones stand. [P] ends on the front legs' geoms; here, as in a handstand, on those that stand."""
+
+    class asset(HandstandCfg.asset):
+        penalize_contacts_on = ["FR*", "FL*"]
+
+    class exam(HandstandCfg.exam):
+        nose, hands = 1.0, ["RR", "RL"]  # [-] [P]
+
+    class rewards(HandstandCfg.rewards):
+        deviation_weights = {"": 0.0, "FR_": 1.0, "FL_": 1.0}  # the legs in the air [P]
+
+
+class TrackingCfg(MotionTrackingCfg):
+    """Following a motion without knowing one's place or velocity, in randomized worlds."""
+
+    class env(MotionTrackingCfg.env):
+        num_envs = 8192
+
+    class observations(MotionTrackingCfg.observations):
+        leave_out = {"state": ["anchor_pos", "base_lin_vel"]}  # no sensor gives them [B, without state estimation]
+
+    class normalization(MotionTrackingCfg.normalization):
+        clip_actions = 10.0  # [ours: B has no bound, and a squat's knees are four scales from the default pose]
+
+    class domain_rand(MotionTrackingCfg.domain_rand):
+        enable = True
+        friction = [0.3, 1.2]  # [M]
+        base_com = [-0.05, 0.05]  # [m] [B: of the torso]
+        encoder_offset = [-0.01, 0.01]  # [rad] [B: of the default pose]
+        link_mass, base_mass, armature, frictionloss = [], [], [], []  # [B]
+
+    class perturbation(MotionTrackingCfg.perturbation):
+        push, push_interval_s, max_push_vel_xy = True, 2.0, 0.5  # [s], [m/s] [B: each 1 to 3 s]
+
+
+class TrackingCfgPPO(RobotTaskCfgPPO):
+    """The learner of one clip, of a humanoid."""
+
+    class algorithm(RobotTaskCfgPPO.algorithm):
+        desired_kl = 0.02  # [ours: of 29 joints together, as a walking G1's]
+
+    class runner(RobotTaskCfgPPO.runner):
+        max_iterations = 1400  # seven minutes on an H200
+
+    class actor(RobotTaskCfgPPO.actor):
+        hidden_dims = [224, 128, 64]  # [ours: one clip is learned by less than B's 512, 256, 128]
+
+        class distribution_cfg(RobotTaskCfgPPO.actor.distribution_cfg):
+            # [ours: with the 1.0 of B action_rate outweighs all of tracking at first, and it learns to fall soon]
+            init_std = 0.4

@@ -4,7 +4,8 @@ Sources: [P] MuJoCo Playground's rough task for this robot; [L] legged_gym's ter
 """
 
 from configs.base import SimToRealRoughCfg
-from configs.go1_flat_dr import Go1FlatDrCfg, Go1FlatDrCfgPPO
+from configs.go1_flat import Go1FlatCfgPPO
+from configs.go1_flat_dr import Go1FlatDrCfg
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.utils.task import Task
 
@@ -29,12 +30,12 @@ class Go1RoughCfg(Go1FlatDrCfg):
         curriculum = True  # [ours: it has enough to learn at the start]
 
 
-class Go1RoughCfgPPO(Go1FlatDrCfgPPO):
-    class runner(Go1FlatDrCfgPPO.runner):
+class Go1RoughCfgPPO(Go1FlatCfgPPO):
+    class runner(Go1FlatCfgPPO.runner):
         num_steps_per_env = 24  # [P, L]
         max_iterations = 2000  # 393 M steps [L 1500 of 98 k]
 
-    class algorithm(Go1FlatDrCfgPPO.algorithm):
+    class algorithm(Go1FlatCfgPPO.algorithm):
         gamma = 0.99  # [L, P]
 
 

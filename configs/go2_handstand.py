@@ -1,22 +1,17 @@
-"""Unitree Go2 stands up on its front legs and stays there; randomized worlds. The machine's figures are in go2.xml."""
+"""Unitree Go2 stands up on its front legs and stays there; randomized worlds."""
 
-from configs.go1_handstand import Go1HandstandCfg
-from configs.go2_flat import Go2FlatCfg
+from configs.base import UnitreeHandstandCfg
+from configs.robots.go2 import Go2
 from legged_mw.skills.handstand import Handstand, HandstandCfgPPO
 from legged_mw.utils.task import Task
 
 
-class Go2HandstandCfg(Go1HandstandCfg):
-    class asset(Go1HandstandCfg.asset):
-        file, imu_site = Go2FlatCfg.asset.file, Go2FlatCfg.asset.imu_site
-        joint_speed_limits = Go2FlatCfg.asset.joint_speed_limits
+class Go2HandstandCfg(Go2, UnitreeHandstandCfg):
+    class asset(Go2.asset, UnitreeHandstandCfg.asset):
         terminate_after_contacts_on = ["base", "F?_hip*", "F?_thigh*", "F?_calf*"]
 
-    class init_state(Go1HandstandCfg.init_state):
-        pos, default_joint_angles = Go2FlatCfg.init_state.pos, Go2FlatCfg.init_state.default_joint_angles
-
-    class control(Go1HandstandCfg.control):
-        stiffness, damping = Go2FlatCfg.control.stiffness, Go2FlatCfg.control.damping
+    class exam(UnitreeHandstandCfg.exam):
+        height = 0.55  # [m] [ours: as a Go1's]
 
 
 TASK = Task(Handstand, Go2HandstandCfg, HandstandCfgPPO)

@@ -1,29 +1,23 @@
 """Go1 holds its default pose against kicks: a task without commands, and without feet."""
 
-from configs.go1_flat import Go1FlatCfg
+from configs.robots.go1 import Go1
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.rl.learner_config import RobotTaskCfgPPO
 from legged_mw.utils.task import Task
 
 
-class Go1StandCfg(RobotTaskCfg):
-    class asset(RobotTaskCfg.asset):
-        file = Go1FlatCfg.asset.file
+class Go1StandCfg(Go1):
+    class asset(Go1.asset):
         colliders = ["FR", "FL", "RR", "RL"]
 
-    class init_state(RobotTaskCfg.init_state):
-        pos, default_joint_angles = Go1FlatCfg.init_state.pos, Go1FlatCfg.init_state.default_joint_angles
+    class init_state(Go1.init_state):
         lin_vel_range = ang_vel_range = 0.2  # [m/s], [rad/s]
 
-    class control(RobotTaskCfg.control):
-        stiffness, damping = Go1FlatCfg.control.stiffness, Go1FlatCfg.control.damping
-
-    class perturbation(RobotTaskCfg.perturbation):
+    class perturbation(Go1.perturbation):
         kick, velocity = True, [0.0, 4.0]  # [m/s]
 
-    class rewards(RobotTaskCfg.rewards):
-        class scales(RobotTaskCfg.rewards.scales):
+    class rewards(Go1.rewards):
+        class scales(Go1.rewards.scales):
             pose, orientation, termination, torques, action_rate = 1.0, -5.0, -1.0, -2e-4, -0.01
 
 

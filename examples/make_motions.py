@@ -20,7 +20,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from configs.g1_flat import G1FlatCfg
+from configs.robots.g1 import G1
 from legged_mw import ROOT
 from legged_mw.skills.clip import (
     Clip,
@@ -78,7 +78,7 @@ class Body:
     """The robot, posed frame by frame."""
 
     def __init__(self) -> None:
-        self.model = mujoco.MjModel.from_xml_path(str(ROOT / G1FlatCfg.asset.file))
+        self.model = mujoco.MjModel.from_xml_path(str(ROOT / G1.asset.file))
         self.data = mujoco.MjData(self.model)
         self.names = [self.model.joint(j).name for j in range(1, self.model.njnt)]
         task = load_task("g1_flat")

@@ -10,7 +10,11 @@ from fnmatch import fnmatch
 
 import pytest
 
+from configs.go1_handstand import Go1HandstandCfg
+from configs.robots.go2 import Go2
 from legged_mw import ROOT
+from legged_mw.skills.handstand import HandstandCfg
+from legged_mw.utils.task import load_task, task_names
 
 FILES = sorted(
     str(p.relative_to(ROOT))
@@ -18,6 +22,9 @@ FILES = sorted(
     for p in ROOT.glob(pattern)
 )
 MAX_FUNCTION = 60  # lines of one that reads as one story; a file is as long as its concept
+
+MAX_ROBOT, MAX_TASK = 60, 20  # lines of a file in configs/robots/ and in configs/
+SPELL_OUT = ("go1_flat", "go1_flat_fast", "go1_rough")  # tasks of more lines: each number, and where it is from
 
 # Imports run one way: train, play -> rl -> envs -> sim -> utils; configs -> envs, utils.
 LAYERS = ("utils", "sim", "envs", "rl")
@@ -242,6 +249,11 @@ def too_long(source: str) -> list[str]:
     return [f"{name}: {length} lines" for name, length in lines if length > MAX_FUNCTION]
 
 
+def robots_of(cfg: type) -> set[str]:
+    """The files of robots that a task's config extends."""
+    return {parent.__module__ for parent in cfg.__mro__ if within(parent.__module__, "configs.robots")}
+
+
 def words_of_others(source: str) -> list[str]:
     """What a source of sim/ says, in strings and names, that is not its to know."""
     found = []
@@ -394,12 +406,26 @@ def test_functions_stay_readable(path: str) -> None:
     assert ast.get_docstring(ast.parse(source)), "a module docstring says what lives here"
 
 
-@pytest.mark.parametrize("task", ["go2_flat", "g1_flat", "g1_12dof_flat", "go2_rough", "go2_rough_scan", "g1_rough"])
-def test_a_robot_is_a_short_config(task: str) -> None:
-    """50 lines for its first task, 20 for a further one; go1_flat and go1_rough spell out each number."""
-    assert len((ROOT / f"configs/{task}.py").read_text().splitlines()) <= (
-        50 if task in ("go2_flat", "g1_flat") else 20
-    )
+@pytest.mark.parametrize("path", [path for path in FILES if path.startswith("configs/robots/")])
+def test_a_robot_is_a_short_config(path: str) -> None:
+    assert len((ROOT / path).read_text().splitlines()) <= MAX_ROBOT
+
+
+@pytest.mark.parametrize("task", task_names())
+def test_a_task_is_one_robot_in_few_lines(task: str) -> None:
+    assert task in SPELL_OUT or len((ROOT / f"configs/{task}.py").read_text().splitlines()) <= MAX_TASK
+    assert len(robots_of(type(load_task(task).cfg))) == 1
+
+
+def test_a_task_of_two_robots_is_found() -> None:
+    class Heir(Go2, Go1HandstandCfg):
+        pass
+
+    class Own(Go2, HandstandCfg):
+        pass
+
+    assert robots_of(Heir) == {"configs.robots.go1", "configs.robots.go2"}
+    assert robots_of(Own) == {"configs.robots.go2"}
 
 
 def test_what_is_too_long_is_found() -> None:

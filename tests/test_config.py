@@ -19,7 +19,7 @@ from legged_mw import ROOT
 from legged_mw.rl.classes import check_classes
 from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.utils.config import Config, ConfigError, load_yaml, save_yaml
-from legged_mw.utils.renamed import RENAMED
+from legged_mw.utils.renamed import RENAMED, RENAMED_CLASSES
 from legged_mw.utils.task import LoadedTask, Task, load_task
 
 
@@ -702,6 +702,15 @@ def test_a_wrong_section_of_an_old_run_is_named() -> None:
         load_task("go1_flat").update_from_run(saved, where="config.yaml")
 
 
+@pytest.mark.parametrize("old", RENAMED_CLASSES)
+def test_an_old_run_names_a_class_by_its_old_module(old: str) -> None:
+    task = load_task("go1_flat")
+    saved = task.to_dict()
+    saved["distillation"]["class_name"] = old
+    task.update_from_run(saved, where="config.yaml")
+    assert task.train.distillation.class_name == RENAMED_CLASSES[old]
+
+
 OLD_NAMES = {
     "perturbation.enable": (True, "perturbation.kick"),
     "cpu.keep_probability": ([0.5, 0.5, 0.5], "cpu.overrides['commands.keep_probability']"),
@@ -790,13 +799,11 @@ def test_a_folder_configs_beside_the_task_wins(no_configs: None, tmp_path: Path,
     """Also if the task lies in it. What it has not comes from the package."""
     (tmp_path / "configs").mkdir()
     (tmp_path / "configs/go1_flat.py").write_text(
-        "from configs.go1_rough import Go1FlatDrCfg as Theirs\n\nclass MyCfg(Theirs):\n    pass\n"
+        "from configs.go2_rough_scan import Go2RoughCfg as Theirs\n\nclass MyCfg(Theirs):\n    pass\n"
     )
-    (tmp_path / "configs/go1_flat_dr.py").write_text(
-        "from legged_mw.envs.legged_robot_config import LeggedRobotCfg\n"
-        "from legged_mw.rl.learner_config import LeggedRobotCfgPPO\n\n"
-        "class Go1FlatDrCfg(LeggedRobotCfg):\n    class noise(LeggedRobotCfg.noise):\n        level = 0.25\n\n"
-        "class Go1FlatDrCfgPPO(LeggedRobotCfgPPO):\n    pass\n"
+    (tmp_path / "configs/go2_rough.py").write_text(
+        "from legged_mw.envs.legged_robot_config import LeggedRobotCfg\n\n"
+        "class Go2RoughCfg(LeggedRobotCfg):\n    class noise(LeggedRobotCfg.noise):\n        level = 0.25\n"
     )
     file = tmp_path / ("configs/fast.py" if inside else "fast.py")
     file.write_text(FAST.format(base="MyCfg"))

@@ -17,7 +17,7 @@ from packaging.requirements import Requirement
 
 from legged_mw import ROOT, programs
 
-CONFIGS = {path.name for path in (ROOT / "configs").glob("*.py")}
+CONFIGS = {path.relative_to(ROOT / "configs") for path in (ROOT / "configs").rglob("*.py")}
 
 
 @pytest.fixture(scope="module")
@@ -101,12 +101,14 @@ def test_what_is_installed_by_constraints_fits_the_ranges() -> None:
 def test_every_package_is_in_the_list() -> None:
     packages = {str(path.parent.relative_to(ROOT)).replace("/", ".") for path in ROOT.glob("legged_mw/**/__init__.py")}
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    assert set(settings["packages"]) == packages | {"legged_mw.configs", "legged_mw.resources"}
+    beside = {"legged_mw.configs", "legged_mw.configs.robots", "legged_mw.resources"}
+    assert set(settings["packages"]) == packages | beside
 
 
 def test_configs_robots_and_policies_are_inside(installed: Path) -> None:
     package = installed / "legged_mw"
-    assert {path.name for path in (package / "configs").iterdir()} == CONFIGS
+    inside = {path.relative_to(package / "configs") for path in (package / "configs").rglob("*") if path.is_file()}
+    assert inside == CONFIGS
     for folder in ("robots", "motions", "policies"):
         inside, here = package / "resources" / folder, ROOT / "resources" / folder
         ours = {path.relative_to(here) for path in here.rglob("*") if path.is_file()}

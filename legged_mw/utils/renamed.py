@@ -13,7 +13,7 @@ RENAMED: dict[str, tuple[str, ...]] = {
     "cpu.kick_curriculum": ("cpu", "overrides", "perturbation.curriculum"),
 }
 
-# A module that a task may have imported, or a class of one -> the module where it is now.
+# A module that a task or a run's config may name, or a class of one -> the module where it is now.
 MOVED: dict[str, str] = {
     "legged_mw.rl.distillation": "legged_mw.rl.students.distillation",
     "RobotTaskCfgPPO": "legged_mw.rl.learner_config",

@@ -1,0 +1,58 @@
+"""Unitree G1, a humanoid of 29 joints: in any task, and what walking and tracking add. Masses, motors and ranges are in g1.xml.
+
+Sources: [U] unitree_rl_gym; [M] mjlab, with gains from each rotor's inertia, at 10 Hz and a damping ratio of 2; [B] BeyondMimic; [ours].
+"""
+
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+from legged_mw.skills.motion_tracking_config import MotionTrackingCfg
+
+
+class G1(RobotTaskCfg):
+    class asset(RobotTaskCfg.asset):
+        file, imu_site = "resources/robots/g1/g1.xml", "imu_in_pelvis"
+
+    class init_state(RobotTaskCfg.init_state):
+        default_joint_angles = {"": 0.0, "hip_pitch": -0.1, "knee": 0.3, "ankle_pitch": -0.2, "elbow": 0.8,  # [rad] [U]
+                                "shoulder_pitch": 0.2, "left_shoulder_roll": 0.2, "right_shoulder_roll": -0.2}  # fmt: skip
+
+    class control(RobotTaskCfg.control):  # [M], by motor: 5020; 4010; 7520-14; 7520-22; two 5020
+        stiffness = {"": 14.25, "wrist_pitch": 16.78, "wrist_yaw": 16.78, "hip": 40.18, "waist_yaw": 40.18,  # [N m/rad]
+                     "hip_roll": 99.1, "knee": 99.1, "ankle": 28.5, "waist": 28.5}  # fmt: skip
+        damping = {"": 0.907, "wrist_pitch": 1.07, "wrist_yaw": 1.07, "hip": 2.56, "waist_yaw": 2.56,  # [N m s/rad]
+                   "hip_roll": 6.31, "knee": 6.31, "ankle": 1.81, "waist": 1.81}  # fmt: skip
+        action_scale = {"": 0.44, "wrist_pitch": 0.075, "wrist_yaw": 0.075, "hip": 0.55, "waist_yaw": 0.55,  # [rad]
+                        "hip_roll": 0.35, "knee": 0.35, "ankle": 0.44, "waist": 0.44}  # 4: the motors' torque  # fmt: skip
+        decimation = 4
+
+    class sim(RobotTaskCfg.sim):
+        dt, iterations, ls_iterations = 0.005, 3, 10  # [s] [M], [ours: soles slip with 1; docs/lab.md]
+
+
+class WalkingG1(G1, LeggedRobotCfg):
+    class asset(G1.asset, LeggedRobotCfg.asset):
+        foot_names = ["left_foot", "right_foot"]
+        foot_geoms = {"left_foot": ["left_foot[26]_collision"], "right_foot": ["right_foot[26]_collision"]}
+        colliders = ["*_foot[26]_collision"]  # the outer two of a sole's seven capsules [ours]
+
+    class rewards(LeggedRobotCfg.rewards):
+        pose_weights = {"": 0.3, "hip_pitch": 0.02, "knee": 0.02, "ankle": 0.05, "hip_roll": 0.5, "hip_yaw": 0.5,
+                        "waist": 1.0}  # [ours]  # fmt: skip
+
+    class exam(LeggedRobotCfg.exam):
+        peer = "g1"
+
+
+class TrackedG1(G1, MotionTrackingCfg):
+    class asset(G1.asset):
+        colliders = ["*_foot?_collision"]  # all seven capsules of a sole [ours: it stands on one foot]
+
+    class motion(MotionTrackingCfg.motion):  # [B]
+        bodies = [
+            *["pelvis", "left_hip_roll_link", "left_knee_link", "left_ankle_roll_link"],
+            *["right_hip_roll_link", "right_knee_link", "right_ankle_roll_link"],
+            *["torso_link", "left_shoulder_roll_link", "left_elbow_link", "left_wrist_yaw_link"],
+            *["right_shoulder_roll_link", "right_elbow_link", "right_wrist_yaw_link"],
+        ]
+        anchor = "torso_link"
+        end_bodies = ["left_ankle_roll_link", "right_ankle_roll_link", "left_wrist_yaw_link", "right_wrist_yaw_link"]

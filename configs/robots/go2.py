@@ -1,0 +1,42 @@
+"""Unitree Go2, four legs of 12 joints: in any task, and what walking adds. Masses, motors and ranges are in go2.xml.
+
+Sources: [U] Unitree's own training configs for this robot; [P] MuJoCo Playground's Go1; [ours] docs/lab.md.
+"""
+
+from legged_mw.envs.legged_robot_config import LeggedRobotCfg
+from legged_mw.envs.robot_task_config import RobotTaskCfg
+
+
+class Go2(RobotTaskCfg):
+    class asset(RobotTaskCfg.asset):
+        file = "resources/robots/go2/go2.xml"
+        joint_speed_limits = {"hip": 30.1, "thigh": 30.1, "calf": 15.7}  # [rad/s] [U]
+
+    class init_state(RobotTaskCfg.init_state):
+        pos = [0.0, 0.0, 0.33]  # [m]
+        default_joint_angles = {  # [rad] [U]
+            **{"R_hip": -0.1, "L_hip": 0.1, "thigh": 0.8},
+            **{"RR_thigh": 1.0, "RL_thigh": 1.0, "calf": -1.5},
+        }
+
+    class control(RobotTaskCfg.control):
+        stiffness = {"": 20.0}  # [N m/rad] [U]
+        damping = {"": 0.5}  # [N m s/rad] [U]
+
+
+class WalkingGo2(Go2, LeggedRobotCfg):
+    class asset(Go2.asset, LeggedRobotCfg.asset):
+        foot_names = ["FR", "FL", "RR", "RL"]
+        colliders = ["FR", "FL", "RR", "RL"]  # the feet alone touch the ground
+
+    class control(Go2.control):
+        action_scale = 0.25  # [rad] [U]
+
+    class normalization(LeggedRobotCfg.normalization):
+        clip_actions = 5.0  # [ours: 25 N m, what the motors have]
+
+    class rewards(LeggedRobotCfg.rewards):
+        pose_weights = {"hip": 1.0, "thigh": 1.0, "calf": 0.1}  # [P]
+
+    class exam(LeggedRobotCfg.exam):
+        peer = "go2"
