@@ -42,12 +42,13 @@ def train() -> None:
 
 def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.Namespace) -> None:
     from legged_mw.check.describe import describe
-    from legged_mw.check.guard import check_recordable
+    from legged_mw.check.guard import check_recordable, not_remembered
     from legged_mw.eval.exams import make_exam
     from legged_mw.rl import training
     from legged_mw.robot.page import doubts
 
-    env = training.build(task, start, device, args.eager, check_recordable)
+    check = not_remembered if args.eager else check_recordable
+    env = training.build(task, start, device, args.eager, check)
     wrong, odd = doubts(task)
     if args.check:
         training.make_learner(task, env, start)  # what it refuses is found now

@@ -59,7 +59,7 @@ ONLY_IN = {
         "legged_mw/programs.py",
     ],
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/studio.py"],  # young, and not on every platform
-    "legged_mw.check": ["legged_mw/check/*", "legged_mw/robot/page.py", "legged_mw/programs.py"],
+    "legged_mw.check": ["legged_mw/check/*", "legged_mw/fast/*", "legged_mw/robot/page.py", "legged_mw/programs.py"],
     "legged_mw.robot": ["legged_mw/robot/*", "legged_mw/programs.py"],
     "legged_mw.drawing": [
         "legged_mw/drawing/*",
@@ -106,7 +106,7 @@ NEVER_IN = {
 MAY_ALL_THE_SAME = ["legged_mw/view/env_stage.py", "legged_mw/view/playing.py"]
 # Imports that a step of the redrawing will remove.
 NOT_YET = {
-    "legged_mw/envs/worlds.py": ["legged_mw.fast"],
+    "legged_mw/envs/worlds.py": ["legged_mw.fast", "legged_mw.check"],
     "legged_mw/sim/mujoco_engine.py": ["legged_mw.fast"],
     "legged_mw/sim/warp_engine.py": ["legged_mw.fast"],
     "legged_mw/sim/ground_contact.py": ["legged_mw.fast"],

@@ -20,7 +20,8 @@ from test_recurrent import IMAGES, NETWORKS, share_memory
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
-from legged_mw.envs.worlds import fuse_for, worlds_state
+from legged_mw.envs.snapshot import take_snapshot
+from legged_mw.envs.worlds import fuse_for
 from legged_mw.eval.training import TrainingExam
 from legged_mw.fast import contact_count, shortcuts
 from legged_mw.fast.fused import Fused
@@ -624,10 +625,10 @@ def test_a_run_goes_on_in_the_worlds_that_it_left(tmp_path: Path) -> None:
     env, other = (task.env_class(task.cfg, DEVICE) for _ in range(2))
     runner = make_runner(env, task.train, tmp_path, DEVICE)
     runner.learn(6)
-    kept = worlds_state(env)
+    kept = take_snapshot(env)
     again = make_runner(other, task.train, None, DEVICE)
     again.load(str(tmp_path / "model_6.pt"))
-    restored = worlds_state(other)
+    restored = take_snapshot(other)
     assert again.begins_anew == "" and all(
         torch.equal(restored[name].nan_to_num(), value.nan_to_num()) for name, value in kept.items()
     )

@@ -93,6 +93,7 @@ class Actuators:
     with "speed" there is none, and targets are speeds [rad/s].
     """
 
+    written = ("targets", "_sent", "_delay", "_late", "_network")
     # what ``Simulation.step`` calls before each substep; None: nothing changes within a step
     before: Callable[[int], None] | None = None
 

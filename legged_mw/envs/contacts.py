@@ -50,6 +50,7 @@ class GroundContacts:
 class FootContacts:
     """How many contacts each of F feet has with the ground, and the force on it where that is sensed; a foot may have several geoms."""
 
+    written = ("count", "forces")
     forces: Tensor | None = None  # (N, F, 3) of the ground on the foot, world frame [N]; only where something reads it
 
     def __init__(self, robot: RobotModel, feet: Collection[tuple[str, ...]], sensed: Tensor, count: Tensor) -> None:

@@ -13,6 +13,8 @@ from legged_mw.utils.math import assign
 class Delay:
     """``delay(now)``, called once a step with a value (N, width), returns the value of d steps ago; each world has its own d."""
 
+    written = ("past", "_new")
+
     def __init__(self, steps: Tensor, longest: int, width: int, start: float | None = None) -> None:
         """``steps`` (N, 1) is read at each call. Before an episode the value was ``start``; None: the episode's first value."""
         self.steps, self.start = steps, start
@@ -42,6 +44,8 @@ class SubstepDelay:
     A command with a delay of d steps arrives before substep d of those that follow. 7 ms in steps of 4 ms, the nearest being
     d = 2: physics from t + 8 ms on uses what is sent at t.
     """
+
+    written = ("_past", "arriving")
 
     def __init__(self, delay: Tensor, step_ms: float, longest: float, substeps: int, width: int) -> None:
         """``delay`` (N, 1) [ms], whole steps of ``step_ms`` and at most ``longest``, is read at each call."""

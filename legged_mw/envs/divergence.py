@@ -22,6 +22,8 @@ JOINT, ACTION = "broken_by/", "broken_by_action"  # statistics: worlds so far th
 class Divergence:
     """Finds broken worlds and counts, since the start, the fastest joint of each."""
 
+    written = ("counts",)
+
     def __init__(self, sim: Simulation, actions: Tensor, joints: Sequence[str], max_speed: float) -> None:
         """``actions`` (N, A) as the step has them; ``max_speed`` of any degree of freedom that still counts as finite."""
         self._sim, self._actions, self._joints, self._max_speed = sim, actions, joints, max_speed

@@ -19,6 +19,8 @@ from legged_mw.utils.config import ConfigError
 class GaitClock:
     """The clocks of N worlds with F feet; fixed tensors, written in place, as a recorded step needs them."""
 
+    written = ("phase", "running", "foot_phase", "row")
+
     def __init__(
         self, cfg: type[LeggedRobotCfg.gait], feet: tuple[str, ...], num_envs: int, dt: float, device: str
     ) -> None:

@@ -53,6 +53,8 @@ class Row(NamedTuple):
 class Observations:
     """The observation groups of N worlds. ``groups`` are the rows of each, ``buffers[group]`` (N, size) what the policy sees."""
 
+    written = ("_parts",)
+
     def __init__(
         self,
         table: Mapping[str, Sequence[Row | str]],
@@ -142,6 +144,8 @@ class Observations:
 
 class _Group:
     """One group: how its rows become a buffer."""
+
+    written = ("fresh", "frame", "buffer", "delay", "suspects")
 
     def __init__(self, name: str, rows: list[Row], noise_level: float, num_envs: int, device: str) -> None:
         noise = [row.noise * noise_level for row in rows for _ in range(row.value.shape[1])]

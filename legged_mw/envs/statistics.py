@@ -15,6 +15,8 @@ Live = Mapping[str, Tensor]
 class Statistics:
     """Means over ended episodes, counts of episodes, and values as they stand. All travel as one vector, so that ranks can add theirs."""
 
+    written = ("_sums",)
+
     def __init__(self, means: Sequence[str], counts: Sequence[str], device: str) -> None:
         """``means`` are divided by the first of ``counts``, the number of episodes that ended."""
         self.means, self.counts, self.live = list(means), list(counts), dict[str, int]()

@@ -17,6 +17,8 @@ BOUND = 1e6
 class Suspects:
     """Looks at K values of N worlds, each of something that has a name."""
 
+    written = ("counts",)
+
     def __init__(self, names: Sequence[str], device: str) -> None:
         """``names`` of the K columns, in words that a user knows."""
         self.names = list(names)

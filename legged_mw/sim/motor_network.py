@@ -30,9 +30,12 @@ def make_motor_network(network: MotorNetwork, sim: Simulation) -> SimulatedNetwo
 
 
 class _OnHost:
+    written = ("_error", "_mask", "_memory")
+
     def __init__(self, network: MotorNetwork, sim: Simulation) -> None:
         joints = sim.ctrl.shape[1]
         self._motors = NetworkMotors(network, sim.num_envs, joints)
+        self._memory = [torch.from_numpy(each) for each in self._motors.memory]
         self._error, self._mask = torch.zeros_like(sim.ctrl), torch.zeros(sim.num_envs, dtype=torch.bool)
         self._angle, self._speed, self._ctrl = sim.qpos[:, -joints:], sim.qvel[:, -joints:].numpy(), sim.ctrl.numpy()
         self._arrays = self._error.numpy(), self._mask.numpy()  # the same memory

@@ -153,6 +153,8 @@ def _make_kernel(width: int) -> Any:
 class WarpNetwork:
     """``network`` on mujoco-warp, as ``motor_network.SimulatedNetwork`` promises."""
 
+    written = ("_past", "_memory")
+
     def __init__(self, network: MotorNetwork, sim: Simulation) -> None:
         robots, joints = sim.ctrl.shape
         sizes = [network.linear[0][0].shape[1], *(len(bias) for _, bias in network.linear)]

@@ -148,6 +148,11 @@ class NetworkMotors:
         for memory in (self._past, *self._memory):
             memory[(slice(None), slice(None), which) if memory is self._past else (slice(None), which)] = 0.0
 
+    @property
+    def memory(self) -> list[Floats]:
+        """All that ``torque`` writes."""
+        return [self._past, *self._memory]
+
     def torque(self, error: NDArray[Any], speed: NDArray[Any]) -> Floats:
         """Torques (N, D) [N m] from target minus angle [rad] and speed [rad/s], (N, D) each."""
         net, past = self.network, self._past
