@@ -1,7 +1,7 @@
 """Where the time goes from the command to the first iterations: python benchmarks/startup.py --task go1_flat
 
 A fresh process runs train.py, and each of its parts is timed; other flags are train.py's. Warm: the second of two runs, when kernels
-and files are cached. --plain leaves out what legged_mw/utils/quick_start.py does; --profile shows which functions the first iteration
+and files are cached. --plain leaves out what legged_mw/fast/quick_start.py does; --profile shows which functions the first iteration
 spends its time in, and which large packages were imported until then, and from where.
 """
 
@@ -91,7 +91,7 @@ def child(flags: list[str], device: str | None, plain: bool, profile: bool, star
     if profile:
         sys.meta_path.insert(0, importers)  # type: ignore[arg-type]
     from legged_mw import programs
-    from legged_mw.utils import quick_start
+    from legged_mw.fast import quick_start
 
     clock.done("interpreter, flags")
     if not plain:

@@ -112,6 +112,7 @@ NOT_YET = {
     "legged_mw/sim/ground_contact.py": ["legged_mw.fast"],
     "legged_mw/utils/math.py": ["legged_mw.fast"],
     "legged_mw/rl/layers.py": ["legged_mw.fast"],
+    "legged_mw/programs.py": ["legged_mw.fast"],
     "legged_mw/sim/model.py": ["legged_mw.robot"],
     "legged_mw/sim/joints.py": ["legged_mw.robot"],
     "legged_mw/envs/checks.py": ["legged_mw.skills"],

@@ -23,7 +23,7 @@ from legged_mw.envs.legged_robot_config import LeggedRobotCfgPPO
 from legged_mw.envs.snapshot import take_snapshot
 from legged_mw.envs.worlds import fuse_for
 from legged_mw.eval.training import TrainingExam
-from legged_mw.fast import contact_count, shortcuts
+from legged_mw.fast import contact_count, quick_start, shortcuts
 from legged_mw.fast.fused import Fused
 from legged_mw.rl import layers
 from legged_mw.rl.policies import Source, Trained
@@ -33,7 +33,6 @@ from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.rl.students.recurrent import memory_of
 from legged_mw.rl.transfer import seat_teacher
 from legged_mw.sim.graph import StepGraph
-from legged_mw.utils import quick_start
 from legged_mw.utils.task import load_task
 
 pytestmark = pytest.mark.gpu

@@ -570,7 +570,7 @@ NOT_TO_TRAIN = [
 WHAT_IS_THERE = """
 import os, sys
 from legged_mw import programs
-programs.quick_start.begin()  # as programs.train does, which is called too late for it here
+programs.start_quickly()  # as programs.train does, which is called too late for it here
 from legged_mw.rl.runner import Runner
 learn = Runner.learn
 def learn_once(self, *_):

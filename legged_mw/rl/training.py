@@ -39,8 +39,7 @@ from legged_mw.utils.cli import apply_overrides, command, pick_device, seed_ever
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import writable
-from legged_mw.utils.machine import usable_cores
-from legged_mw.utils.quick_start import settle
+from legged_mw.utils.machine import settle, usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
 
 STOPPED = 3  # exit code of a training that ended early and can go on

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 import re
@@ -19,6 +20,13 @@ def usable_cores() -> int:
     """CPU cores of this process: those it may run on, shared with the other processes that torchrun started here."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+
+
+def settle() -> None:
+    """All that stays is made: garbage that nobody collected while the program started is never looked through again."""
+    if not gc.isenabled():
+        gc.freeze()
+        gc.enable()
 
 
 def free_memory(device: str = "cpu") -> float:
