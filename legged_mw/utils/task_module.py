@@ -13,94 +13,79 @@ from types import ModuleType
 
 from legged_mw import ROOT
 
-# folders of `configs` -> its modules, kept while the name is another's
-_loaded: dict[tuple[str, ...], dict[str, ModuleType]] = {}
-_neighbours_of: dict[Path, dict[str, ModuleType]] = {}  # folder of a task -> the modules beside it that were imported
+_SHIPPED = (ROOT / "configs").resolve()
+_packages: dict[tuple[Path, ...], dict[str, ModuleType]] = {}  # folders of `configs` -> its modules, imported once
+_beside: dict[Path, dict[str, ModuleType]] = {}  # folder of a task -> the modules beside it, likewise
 
 
 def import_task(path: Path) -> ModuleType:
     """The module of a config file. Those in configs/ are imported by name, so that they can subclass one another."""
-    folder, shipped = path.resolve().parent, (ROOT / "configs").resolve()
-    if folder == shipped:
-        with _configs(shipped), _neighbours(folder):
-            return importlib.import_module(f"configs.{path.stem}")
+    folder = path.resolve().parent
+    beside = folder if folder.name == "configs" else folder / "configs"
+    places = (beside, _SHIPPED) if beside.is_dir() and beside != _SHIPPED else (_SHIPPED,)
+    have = [Path(place).resolve() for place in getattr(sys.modules.get("configs"), "__path__", ())]
+    names = {entry.stem for entry in folder.iterdir() if entry.suffix == ".py" or (entry / "__init__.py").is_file()}
+    package = set() if have == [*places] else {"configs"}
+    names = {name for name in names if _may_mean(name, folder)}
+    mine, beside_it = _packages.setdefault(places, {}), _beside.setdefault(folder, {})
+    with _named(package, mine, places), _named(names, beside_it):
+        if "configs" not in sys.modules:
+            sys.modules["configs"] = ModuleType("configs")
+            sys.modules["configs"].__path__ = [str(place) for place in places]
+        sys.path.insert(0, str(folder))
+        importlib.invalidate_caches()  # a file that was written a moment ago
+        try:
+            return importlib.import_module(f"configs.{path.stem}") if folder == _SHIPPED else _run(path)
+        finally:
+            sys.path.remove(str(folder))
+
+
+def _run(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"legged_mw_task_{path.stem}", path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # annotations are resolved through it
-    beside = folder if folder.name == "configs" else folder / "configs"
-    with _configs(*([beside] if beside.is_dir() else []), shipped), _neighbours(folder):
-        spec.loader.exec_module(module)
+    spec.loader.exec_module(module)
     return module
 
 
-@contextmanager
-def _neighbours(folder: Path) -> Iterator[None]:
-    """While a task is loaded, what lies in its ``folder`` can be imported by its bare name, and wins over another's of that name.
-
-    Afterwards the path is given back, and a name that is another's outside of tasks. Else a neighbour keeps its name until the
-    next task wants it, since a config may name a class by its module. Libraries, and what comes from the folder already, stay.
-    """
-    names = {entry.stem for entry in folder.iterdir() if entry.suffix == ".py" or (entry / "__init__.py").is_file()}
-    hidden = {
-        key: it
-        for name in names & sys.modules.keys()
-        if _may_be_hidden(name, folder)
-        for key, it in _take_out(name).items()
-    }
-    before = {name.partition(".")[0] for name in sys.modules}
-    mine = _neighbours_of.setdefault(folder, {})
-    sys.modules.update(mine)
-    sys.path.insert(0, str(folder))
-    importlib.invalidate_caches()  # a file that was written a moment ago
-    try:
-        yield
-    finally:
-        sys.path.remove(str(folder))
-        mine |= {key: it for key, it in sys.modules.items() if key.partition(".")[0] in names - before}
-        of_tasks = {id(it) for modules in _neighbours_of.values() for it in modules.values()}
-        strangers = {key: it for key, it in hidden.items() if id(it) not in of_tasks}
-        for name in {key.partition(".")[0] for key in strangers}:
-            _take_out(name)
-        sys.modules.update(strangers)
-
-
-def _may_be_hidden(name: str, folder: Path) -> bool:
-    """Whether the imported module ``name`` is one of a user's that lies elsewhere."""
+def _may_mean(name: str, folder: Path) -> bool:
+    """Whether ``name`` may be that of a neighbour in ``folder``: it is no library's, and not imported from there already."""
+    if name in sys.stdlib_module_names or name in ("__main__", "legged_mw", "configs"):
+        return False
+    if name not in sys.modules:
+        return True
     file = Path(getattr(sys.modules[name], "__file__", None) or folder / name).resolve()
-    library = (
-        name in sys.stdlib_module_names
-        or name in ("__main__", "legged_mw", "configs")
-        or {"site-packages", "dist-packages"} & {*file.parts}
-    )
-    return not library and not file.is_relative_to(folder)
+    return not {"site-packages", "dist-packages"} & {*file.parts} and not file.is_relative_to(folder)
 
 
 @contextmanager
-def _configs(*folders: Path) -> Iterator[None]:
-    """While a task is loaded, ``configs`` is the package of these folders; the first one that has a module wins.
+def _named(names: set[str], mine: dict[str, ModuleType], places: tuple[Path, ...] = ()) -> Iterator[None]:
+    """While a task is loaded, the modules called ``names`` are ``mine``, to which those are added that it imports.
 
-    Afterwards the name is given back if something else on the path has it.
+    Afterwards a name is given back to what had it outside of tasks, and ``configs`` to what else on the path has it. Other names
+    stay until the next task wants them, since a config may name a class by its module.
     """
-    places = [str(folder) for folder in folders]
-    before = _take_out("configs")
-    if before and [str(Path(place).resolve()) for place in before["configs"].__path__] == places:
-        sys.modules.update(before)
-        yield
-        return
-    package = ModuleType("configs")
-    package.__path__ = places
-    sys.modules.update(_loaded.get(tuple(places), {"configs": package}))
+    before = _take_out(names)
+    sys.modules.update(mine)
     try:
         yield
     finally:
-        other = PathFinder.find_spec("configs")
-        if before or (other and [*(other.submodule_search_locations or ())] != places):
-            _loaded[tuple(places)] = _take_out("configs")
-            sys.modules.update(before)
+        mine |= _take_out(names)
+        of_tasks = {id(module) for kept in (*_packages.values(), *_beside.values()) for module in kept.values()}
+        others = {name: module for name, module in before.items() if id(module) not in of_tasks}
+        theirs = {_top(name) for name in others}
+        found = PathFinder.find_spec("configs") if "configs" in names else None
+        if found and [*(found.submodule_search_locations or ())] != [str(place) for place in places]:
+            theirs.add("configs")
+        sys.modules.update({name: module for name, module in mine.items() if _top(name) not in theirs} | others)
 
 
-def _take_out(package: str) -> dict[str, ModuleType]:
-    """Remove a package and its modules from those that are imported; returns them."""
-    return {name: sys.modules.pop(name) for name in [*sys.modules] if name.partition(".")[0] == package}
+def _take_out(names: set[str]) -> dict[str, ModuleType]:
+    """Remove the modules and packages ``names`` from those that are imported; returns them."""
+    return {name: sys.modules.pop(name) for name in [*sys.modules] if _top(name) in names}
+
+
+def _top(name: str) -> str:
+    return name.partition(".")[0]
