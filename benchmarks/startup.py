@@ -1,7 +1,7 @@
 """Where the time goes from the command to the first iterations: python benchmarks/startup.py --task go1_flat
 
 A fresh process runs train.py, and each of its parts is timed; other flags are train.py's. Warm: the second of two runs, when kernels
-and files are cached. --plain leaves out what legged_mw/utils/quick_start.py does; --profile shows which functions the first iteration
+and files are cached. --plain leaves out what legged_mw/fast/quick_start.py does; --profile shows which functions the first iteration
 spends its time in, and which large packages were imported until then, and from where.
 """
 
@@ -91,7 +91,7 @@ def child(flags: list[str], device: str | None, plain: bool, profile: bool, star
     if profile:
         sys.meta_path.insert(0, importers)  # type: ignore[arg-type]
     from legged_mw import programs
-    from legged_mw.utils import quick_start
+    from legged_mw.fast import quick_start
 
     clock.done("interpreter, flags")
     if not plain:
@@ -157,12 +157,13 @@ def profile_learning(runner: Any, importers: Importers) -> Callable[[], None]:
 
 def look_into_steps(clock: Clock) -> None:
     """Time the first steps on a GPU: three run eagerly, the third is fused, the fourth is recorded."""
-    graph, fused, fusion = (import_module(f"legged_mw.sim.{name}") for name in ("graph", "fused", "fusion"))
+    graph = import_module("legged_mw.sim.graph")
+    fused, fusion = (import_module(f"legged_mw.fast.{name}") for name in ("fused", "fusion"))
     clock.after(fusion.Trace, "__exit__", PART + "two steps; a third, traced")
     clock.after(fused.Fused, "__init__", PART + "write the fused step's kernels")
     clock.after(fused.Fused, "compile", PART + "compile what is not cached")
     clock.after(fused.Fused, "verify", PART + "hold its parts against the original's")
-    clock.after(import_module("legged_mw.envs.worlds"), "fused", PART + "hold it against the original step")
+    clock.after(fusion, "fused", PART + "hold it against the original step")
     clock.after(graph.StepGraph, "_record", PART + "record it")
 
 

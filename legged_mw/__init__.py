@@ -4,7 +4,7 @@ import os
 import sys
 from pathlib import Path
 
-from legged_mw.utils.renderer import choose_renderer
+from legged_mw.utils.machine import choose_renderer
 
 _HERE = Path(__file__).resolve().parent
 # What holds configs/ and resources/: the clone, or the installed package, which has them inside.

@@ -14,9 +14,16 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from legged_mw.utils import quick_start
 from legged_mw.utils.cli import FEWER_WORLDS, fail, one_line_errors
+from legged_mw.utils.machine import settle
+from legged_mw.utils.opaque import fast
 from legged_mw.utils.task import LoadedTask, list_tasks, load_task
+
+
+def start_quickly(gpu: str | None = "cpu") -> None:
+    """What legged_mw/fast does before torch is imported, where that folder is; ``gpu``: the device that was asked for."""
+    if quick_start := fast("quick_start"):
+        quick_start.begin(gpu)
 
 
 @one_line_errors(fewer=FEWER_WORLDS)
@@ -25,7 +32,7 @@ def train() -> None:
     from legged_mw.rl import flags
 
     args = flags.parse(train.__doc__)
-    quick_start.begin("cpu" if args.list else args.device)
+    start_quickly("cpu" if args.list else args.device)
     if args.list:
         print(list_tasks())
         return
@@ -45,12 +52,13 @@ def train() -> None:
 
 def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.Namespace) -> None:
     from legged_mw.check.describe import describe
-    from legged_mw.check.guard import check_recordable
+    from legged_mw.check.guard import check_recordable, not_remembered
     from legged_mw.eval.exams import make_exam
     from legged_mw.rl import training
     from legged_mw.robot.page import doubts
 
-    env = training.build(task, start, device, args.eager, check_recordable)
+    check = not_remembered if args.eager else check_recordable
+    env = training.build(task, start, device, args.eager, check)
     wrong, odd = doubts(task)
     if args.check:
         training.make_learner(task, env, start)  # what it refuses is found now
@@ -78,7 +86,7 @@ def _build_and_train(task: LoadedTask, start: Any, device: str, args: argparse.N
 @one_line_errors(fewer=FEWER_WORLDS)
 def play() -> None:
     """Watch, grade or export a policy."""
-    quick_start.begin()
+    start_quickly()
     from legged_mw.eval import grading
     from legged_mw.rl.classes import check_classes
     from legged_mw.rl.policies import find_policy, find_rival, introduce, load_trained
@@ -88,7 +96,7 @@ def play() -> None:
     task = load_task(args.task, say=True)
     source = find_policy(task, args.load_run, args.checkpoint, args.experiment_name)
     trained = load_trained(args.task, source)
-    quick_start.settle()
+    settle()
     if args.eval:
         rivals = [find_rival(task, args.compare, args.experiment_name)] if args.compare is not None else []
         grading.grade([(source, trained), *((rival, load_trained(args.task, rival)) for rival in rivals)], args)

@@ -1,9 +1,10 @@
 """Shared by all tests: one torch thread; tests that need a GPU or a screen are left out where there is none."""
 
 # ruff: noqa: E402
-from legged_mw.utils import quick_start
+from legged_mw.programs import start_quickly
+from legged_mw.utils.machine import settle
 
-quick_start.begin()  # before torch, as train.py does
+start_quickly()  # before torch, as train.py does
 
 import signal
 from collections.abc import Iterator
@@ -37,7 +38,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: p
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    quick_start.settle()  # what is imported by now stays
+    settle()  # what is imported by now stays
 
 
 def pytest_configure(config: pytest.Config) -> None:

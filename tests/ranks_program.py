@@ -3,9 +3,10 @@
 # ruff: noqa: E402
 from __future__ import annotations
 
-from legged_mw.utils import quick_start
+from legged_mw.programs import start_quickly
+from legged_mw.utils.machine import settle
 
-quick_start.begin()  # before torch, as train.py does
+start_quickly()  # before torch, as train.py does
 
 import os
 import sys
@@ -22,7 +23,7 @@ from legged_mw.rl.runner import make_runner
 from legged_mw.utils.cli import seed_everything
 from legged_mw.utils.task import load_task
 
-quick_start.settle()
+settle()
 folder, dies_in, on_gpus = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3:] == ["gpus"]
 rank = this_rank()
 device = f"cuda:{rank.local}" if on_gpus else "cpu"

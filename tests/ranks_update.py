@@ -3,9 +3,10 @@
 # ruff: noqa: E402
 from __future__ import annotations
 
-from legged_mw.utils import quick_start
+from legged_mw.programs import start_quickly
+from legged_mw.utils.machine import settle
 
-quick_start.begin()  # before torch, as train.py does
+start_quickly()  # before torch, as train.py does
 
 import sys
 from pathlib import Path
@@ -17,7 +18,7 @@ from rsl_rl.algorithms import PPO
 from legged_mw.rl.ppo import GraphedPPO
 from legged_mw.rl.ranks import leave_together, this_rank
 
-quick_start.settle()
+settle()
 folder, rank, on_gpus = Path(sys.argv[1]), this_rank(), sys.argv[2:] == ["gpus"]
 device = f"cuda:{rank.local}" if on_gpus else "cpu"
 if on_gpus:

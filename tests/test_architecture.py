@@ -66,7 +66,7 @@ ONLY_IN = {
         "legged_mw/programs.py",
     ],
     "mujoco.studio": ["legged_mw/view/web.py", "legged_mw/view/studio.py"],  # young, and not on every platform
-    "legged_mw.check": ["legged_mw/check/*", "legged_mw/robot/page.py", "legged_mw/programs.py"],
+    "legged_mw.check": ["legged_mw/check/*", "legged_mw/fast/*", "legged_mw/robot/page.py", "legged_mw/programs.py"],
     "legged_mw.robot": ["legged_mw/robot/*", "legged_mw/programs.py"],
     "legged_mw.drawing": [
         "legged_mw/drawing/*",
@@ -114,8 +114,7 @@ MAY_ALL_THE_SAME = ["legged_mw/view/env_stage.py", "legged_mw/view/playing.py"]
 # The one door of the core to a package around it: "this file is not plain".
 HOOKS = {"legged_mw/sim/model.py": ["legged_mw.robot.vendor"]}
 # Imports that a step of the redrawing will remove.
-NOT_YET = {
-}
+NOT_YET = {}
 CONFIGS_MAY = [
     "legged_mw.envs",
     "legged_mw.rl.learner_config",

@@ -16,11 +16,12 @@ from torch import Tensor
 from worlds import QUIET, changed, layout, make_env, same, snapshot, tensors
 
 from legged_mw import ROOT
+from legged_mw.check.held import Lost, everything
 from legged_mw.check.recordable import recordable
 from legged_mw.envs.base_task import BaseTask
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
-from legged_mw.envs.worlds import everything, put_worlds, worlds_state
+from legged_mw.envs.snapshot import put_snapshot, take_snapshot
 from legged_mw.sim.model import ModelError
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import NotRecordable, StepError
@@ -63,6 +64,7 @@ def run_a_while(env: LeggedRobot, steps: int = 20, seed: int = 1) -> None:
 
 class _Slots:
     __slots__ = ("kept",)
+    written = ("kept",)
 
     def __init__(self, kept: Tensor) -> None:
         self.kept = kept
@@ -73,36 +75,67 @@ class _Holds(LeggedRobot):
 
     def _init_buffers(self) -> None:
         super()._init_buffers()
-        self.frames = deque([self._zeros(3)], maxlen=1)
-        self.slots, self.table = _Slots(self._zeros(3)), TensorDict({"robot": self._zeros(3)})
+        self.mine, self.frames = self.buffer(3, dtype=torch.long), deque([self.buffer(3)], maxlen=1)
+        self.slots, self.table = self.remember(_Slots(self._zeros(3))), TensorDict({"robot": self.buffer(3)})
         self.net = torch.nn.Sequential(torch.nn.BatchNorm1d(3)).requires_grad_(False)
+        self.remember(dict(self.net.named_buffers()))
 
     def own(self) -> dict[str, Tensor]:
-        return {"frames.0": self.frames[0], "slots.kept": self.slots.kept, "table.robot": self.table["robot"]} | {
-            "net._modules.0._buffers.running_mean": self.net[0].running_mean
+        return {"mine": self.mine, "frames.0": self.frames[0], "slots.kept": self.slots.kept} | {
+            "table.robot": self.table["robot"],
+            "net._modules.0._buffers.running_mean": self.net[0].running_mean,
         }
 
     def _end_step(self) -> None:
         super()._end_step()
         for value in self.own().values():
-            value.add_(1.0)
+            value.add_(1)
 
 
 def test_worlds_go_on_where_they_were_wherever_a_task_holds_its_buffers() -> None:
     one, two = (make_env(N, QUIET, env_class=_Holds) for _ in range(2))
+    lost = Lost(one)
     one.step(act(one))
-    assert put_worlds(two, worlds_state(one)) == ""
+    assert {"mine", "slots.kept", "feet.count", "observations._parts.state.frame"} <= one.remembered().keys()
+    assert lost.named() == "" and put_snapshot(two, take_snapshot(one)) == ""
     for name, value in one.own().items():
         assert (value == 1.0).all() and torch.equal(two.own()[name], value), name
         assert torch.equal(everything(one)[name], value.flatten()), name
 
 
-def test_worlds_do_not_go_on_where_a_task_holds_what_cannot_be_kept(quiet: LeggedRobot) -> None:
-    other, state = make_env(N, QUIET), worlds_state(quiet)
-    assert put_worlds(other, state) == ""
+def test_what_a_step_writes_and_no_resumed_run_would_have_is_named(quiet: LeggedRobot) -> None:
+    other, state = make_env(N, QUIET), take_snapshot(quiet)
+    assert put_snapshot(other, state) == ""
     for held in ({torch.zeros(N)}, torch.Generator(), np.random.default_rng(1), np.array([None])):
         vars(other)["mine"] = held
-        assert "mine" in put_worlds(other, state)
+        assert "mine" in Lost(other).named()
+    for held in (torch.zeros(N, 2), np.zeros(N), deque([torch.zeros(N)])):
+        vars(other)["mine"] = held
+        lost = Lost(other)
+        assert lost.named() == ""
+        (held[0] if isinstance(held, deque) else held)[:1] += 1.0
+        assert "mine" in lost.named()
+    vars(other)["mine"] = mine = torch.zeros(N, 2)
+    other.remember(mine[:, :1])
+    lost = Lost(other)
+    mine.zero_()
+    assert "self.mine" in lost.named()  # a half of it is remembered
+
+
+def test_a_snapshot_of_other_buffers_is_refused_and_changes_nothing(quiet: LeggedRobot) -> None:
+    other, state = make_env(N, QUIET), take_snapshot(quiet)
+    state["actions"].fill_(0.5)
+    for wrong, why in (
+        ({**state, "mine": torch.zeros(N)}, f"mine is float32 ({N},) there and missing here"),
+        (
+            {name: value for name, value in state.items() if name != "fell"},
+            f"fell is missing there and bool ({N},) here",
+        ),
+        ({**state, "fell": torch.zeros(N)}, f"fell is float32 ({N},) there and bool ({N},) here"),
+    ):
+        assert put_snapshot(other, wrong) == why
+    other.not_remembered = "self.mine is lost"
+    assert put_snapshot(other, state) == "self.mine is lost" and not other.actions.any()
 
 
 # ---- the recorded step

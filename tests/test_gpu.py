@@ -19,7 +19,7 @@ from test_ppo import VARIANTS, update
 from test_recurrent import IMAGES, NETWORKS, share_memory
 
 from legged_mw.envs.legged_robot import LeggedRobot
-from legged_mw.envs.worlds import worlds_state
+from legged_mw.envs.snapshot import take_snapshot
 from legged_mw.eval.training import TrainingExam
 from legged_mw.rl.learner_config import LeggedRobotCfgPPO
 from legged_mw.rl.policies import Source, Trained
@@ -29,15 +29,10 @@ from legged_mw.rl.students.distillation import GraphedDistillation
 from legged_mw.rl.students.recurrent import memory_of
 from legged_mw.rl.transfer import seat_teacher
 from legged_mw.sim.graph import StepGraph
-from legged_mw.utils import quick_start
 from legged_mw.utils.task import load_task
 
 pytestmark = pytest.mark.gpu
 DEVICE = "cuda:0"
-
-
-def test_the_gpu_opens_beside_the_imports() -> None:
-    assert quick_start.open_gpu(0) and not quick_start.open_gpu(torch.cuda.device_count())
 
 
 def make_env(eager: bool, task_name: str = "go1_flat", **overrides: object) -> LeggedRobot:
@@ -558,10 +553,10 @@ def test_a_run_goes_on_in_the_worlds_that_it_left(tmp_path: Path) -> None:
     env, other = (task.env_class(task.cfg, DEVICE) for _ in range(2))
     runner = make_runner(env, task.train, tmp_path, DEVICE)
     runner.learn(6)
-    kept = worlds_state(env)
+    kept = take_snapshot(env)
     again = make_runner(other, task.train, None, DEVICE)
     again.load(str(tmp_path / "model_6.pt"))
-    restored = worlds_state(other)
+    restored = take_snapshot(other)
     assert again.begins_anew == "" and all(
         torch.equal(restored[name].nan_to_num(), value.nan_to_num()) for name, value in kept.items()
     )

@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from legged_mw.check.guard import check_recordable
+from legged_mw.check.guard import check_recordable, not_remembered
 from legged_mw.check.recordable import recordable
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.config import ConfigError
@@ -480,6 +480,13 @@ ORDINARY = {
 @pytest.mark.parametrize(("body", "line"), ORDINARY.values(), ids=ORDINARY)
 def test_what_can_be_recorded_passes(tmp_path: Path, body: str, line: str) -> None:
     check_recordable(_task(tmp_path, body, line)[0])
+
+
+@pytest.mark.parametrize(("line", "lost"), [("moved.add_(1.0)", "moved"), ("past.add_(1.0)", "")])
+def test_what_a_resumed_run_would_not_have_is_named(tmp_path: Path, line: str, lost: str) -> None:
+    task, _ = _task(tmp_path, END_STEP, f"self.{line}")
+    text = f"self.{lost} is written by the step and not made by self.buffer()" if lost else ""
+    assert check_recordable(task) == not_remembered(task) == text
 
 
 def test_a_mistake_in_the_config_stays_what_it_is() -> None:

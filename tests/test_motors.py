@@ -22,7 +22,7 @@ from legged_mw.deploy.contract import ContractError, read_contract
 from legged_mw.deploy.simulated import Fleet
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.motors import SubstepDelay
-from legged_mw.envs.worlds import put_worlds, worlds_state
+from legged_mw.envs.snapshot import put_snapshot, take_snapshot
 from legged_mw.rl import export as exporting
 from legged_mw.rl.export import export
 from legged_mw.rl.runner import make_runner
@@ -336,7 +336,7 @@ def test_what_a_network_remembers_is_kept(engine: str, tmp_path: Path) -> None:
     fields = {**QUIET, "control.actuator": "network", "control.network": save(mlp(torque_scale=20.0)[1], tmp_path)}
     env, other = (make_env(2, {**fields, "sim.engine": engine}) for _ in range(2))
     walk(env, 3)
-    assert put_worlds(other, worlds_state(env)) == ""
+    assert put_snapshot(other, take_snapshot(env)) == ""
     assert torch.equal(walk(env, 3), walk(other, 3))
 
 

@@ -16,7 +16,10 @@ import pytest
 import torch
 from net import compare
 from net.compare import ENGINES, RECORDINGS, Found, differences, first_steps
-from recordings import Change  # found by net.compare
+from recordings import Change, make_env  # found by net.compare
+
+from legged_mw.check.held import Lost
+from legged_mw.envs.snapshot import put_snapshot, take_snapshot
 
 KEPT = Path(__file__).parent / "net" / "first_steps.npz"
 TOLERANCES = {"": 0.0, "obs": 1e-5, "reward": 1e-5, "statistics": 1e-4}
@@ -33,6 +36,26 @@ def test_first_steps_are_as_they_were(name: str, engine: str) -> None:
     run = f"{name} {engine}"
     lines, failed = differences({run: kept()[run]}, {run: first_steps(name, engine)}, TOLERANCES)
     assert not failed, "A: kept, B: now\n" + "\n".join(lines)
+
+
+@pytest.mark.parametrize("name", RECORDINGS)
+def test_a_snapshot_holds_all_that_a_step_writes(name: str, tmp_path: Path) -> None:
+    """Another environment, which has gone elsewhere, goes on as the first one did; and nothing written is left out."""
+    one, two = (make_env(name, "mujoco", tmp_path) for _ in range(2))
+    lost, actions = Lost(one), torch.randn(8, one.num_envs, one.num_actions)
+    for action in actions[:4]:
+        one.step(action)
+        two.step(-action)
+        two.anneal(0.3)
+    state, draws = take_snapshot(one), torch.get_rng_state()
+    wanted = [one.step(action)[:3] for action in actions[4:]]
+    assert put_snapshot(two, state) == ""
+    torch.set_rng_state(draws)
+    for action, (obs, reward, done) in zip(actions[4:], wanted, strict=True):
+        seen, earned, ended, _ = two.step(action)
+        assert torch.equal(earned, reward) and torch.equal(ended, done)
+        assert all(torch.equal(seen[group], value) for group, value in obs.items())
+    assert lost.named() == ""
 
 
 # ---- planted changes are found

@@ -25,7 +25,7 @@ from legged_mw.rl.runs import load_tensors, save_whole
 from legged_mw.sim.device import DeviceFacts, device_facts
 from legged_mw.tools import alongside, chart, completion, doctor, sweep, warm
 from legged_mw.tools.curves import read_run
-from legged_mw.utils import renderer
+from legged_mw.utils import machine
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.machine import usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
@@ -71,13 +71,13 @@ def test_a_renderer_that_does_not_work_is_replaced_in_one_line(
         if name not in present:
             raise OSError(name)
 
-    monkeypatch.setattr(renderer.ctypes, "CDLL", load)
+    monkeypatch.setattr(machine.ctypes, "CDLL", load)
     monkeypatch.setattr(sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM", "MUJOCO_GL"):
         monkeypatch.delenv(name, raising=False)
     if asked is not None:
         monkeypatch.setenv("MUJOCO_GL", asked)
-    assert renderer.choose_renderer() == line
+    assert machine.choose_renderer() == line
     assert os.environ.get("MUJOCO_GL") == chosen
 
 
@@ -571,7 +571,7 @@ NOT_TO_TRAIN = [
 WHAT_IS_THERE = """
 import os, sys
 from legged_mw import programs
-programs.quick_start.begin()  # as programs.train does, which is called too late for it here
+programs.start_quickly()  # as programs.train does, which is called too late for it here
 from legged_mw.rl.runner import Runner
 learn = Runner.learn
 def learn_once(self, *_):

@@ -13,7 +13,7 @@ import inspect
 import random
 import sys
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from operator import delitem, setitem
 from types import FrameType
 from typing import Any
@@ -22,12 +22,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from legged_mw.check.held import CONTAINERS, Lost, parts
 from legged_mw.check.own_class import own_classes
 from legged_mw.check.recordable import Births, Guard, recordable
 from legged_mw.envs.robot_task import RobotTask, check_term
 from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.envs.statistics import BOUND
-from legged_mw.envs.worlds import CONTAINERS, parts
 from legged_mw.utils.errors import (
     NotRecordable,
     StepError,
@@ -47,11 +47,12 @@ _DRAWN = "draws Python's or numpy's random numbers, but a replay repeats what wa
 Path = tuple[str | int, ...]  # attributes, keys and places that lead from the environment to what it holds
 
 
-def check_recordable(task: LoadedTask) -> None:
+def check_recordable(task: LoadedTask) -> str:
     """Run a few steps of a tiny environment of ``task`` on the CPU under the guard; takes less than a second.
 
     Raises StepError, one line with the user's file, line and method: for what a CUDA graph cannot record (NotRecordable), and
-    for a method that raises, or returns NaN or the wrong shape. Random numbers go on as if it had not been called.
+    for a method that raises, or returns NaN or the wrong shape. Random numbers go on as if it had not been called. Returns what
+    the step writes and a resumed run would not have, in words; ''.
     """
     guard = Guard()
     for kind in own_classes(task.env_class):
@@ -67,7 +68,9 @@ def check_recordable(task: LoadedTask) -> None:
                 if method := getattr(env.sim, name, None):
                     setattr(env.sim, name, _unwatched(method, guard))
             _check_rows(env)
+            lost = Lost(env)
             _check_steps(env, guard)
+            return lost.named()
         except StepError as error:
             raise type(error)(error.what, f"{task.name}: {error.where or line_to_blame(error)[0]}") from None
         except UserError:
@@ -82,6 +85,19 @@ def check_recordable(task: LoadedTask) -> None:
             )
             what = in_short(error) + doubt
             raise StepError(what, f"{task.name}: {where}".removesuffix(": ")) from error
+
+
+def not_remembered(task: LoadedTask) -> str:
+    """What ``check_recordable`` returns, of a step that is not recorded and may break its laws."""
+    with nothing_changed():
+        env = task.env_class(tiny_cfg(task.cfg), "cpu", True)
+        lost = Lost(env)
+        for _ in range(_STEPS):
+            _step(env)
+        env.anneal(0.5)
+        env.domain_rand.redraw()
+        env.load_training_state(env.training_state())
+        return lost.named()
 
 
 def tiny_cfg(cfg: RobotTaskCfg) -> RobotTaskCfg:
@@ -192,16 +208,12 @@ def _check_rows(env: RobotTask) -> None:
 
 
 def _check_steps(env: RobotTask, guard: Guard) -> None:
-    def step(watch: bool = True) -> None:
-        # every second episode ends
-        env.episode_length_buf = torch.arange(_WORLDS, device=env.device) % 2 * env.max_episode_length
-        actions = torch.rand(_WORLDS, env.num_actions, device=env.device).mul_(2.0).sub_(1.0)
-        with recordable(guard) if watch else nullcontext():
-            env.step(actions)
+    def step() -> None:
+        _step(env, recordable(guard))
 
     def first() -> None:
         env.anneal(0.0)
-        step(watch=False)
+        _step(env)
 
     # on a GPU the first steps are not recorded: what is made once, may be made there; what __init__ made must stay
     _check_kept(env, {path: value for path, value in _held(env) if isinstance(value, Tensor)}, first, alone=True)
@@ -223,6 +235,14 @@ def _check_steps(env: RobotTask, guard: Guard) -> None:
     # what a training calls between steps that are recorded by then
     for call in (lambda: env.anneal(0.5), env.domain_rand.redraw, lambda: env.load_training_state(state)):
         _check_kept(env, dict(_held(env)), call)
+
+
+def _step(env: RobotTask, watch: AbstractContextManager[Any] | None = None) -> None:
+    """A step with random actions in which every second episode ends."""
+    env.episode_length_buf = torch.arange(_WORLDS, device=env.device) % 2 * env.max_episode_length
+    actions = torch.rand(_WORLDS, env.num_actions, device=env.device).mul_(2.0).sub_(1.0)
+    with watch or nullcontext():
+        env.step(actions)
 
 
 def _check_kept(env: RobotTask, before: dict[Path, Any], step: Callable[[], None], alone: bool = False) -> None:

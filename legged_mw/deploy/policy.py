@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,6 @@ from legged_mw.deploy.follow import Follower
 from legged_mw.deploy.gait import GaitClock
 from legged_mw.deploy.robot import Measurement
 from legged_mw.utils.errors import UserError
-from legged_mw.utils.machine import contained
 
 Floats = NDArray[np.floating[Any]]
 _FIRST_SECONDS, _FIRST_ROOM = 10.0, 2 << 30  # of the first call: networks of robots take a thousandth of either
@@ -198,3 +200,45 @@ class Controller:
 
 def _side_by_side(frames: list[NDArray[np.float32]]) -> NDArray[np.float32]:
     return np.concatenate([frame.reshape(len(frame), -1) for frame in frames], axis=1)
+
+
+def contained(work: Callable[[], Any], seconds: float, room: int, stop: Callable[[], None] = lambda: None) -> Any:
+    """What ``work`` returns, or raises, within that time and ``room`` [byte] of new memory; for a call that a stranger's file decides.
+
+    Past its time it is asked to ``stop``, and a TimeoutError raised; if it does not, it is left behind. Memory is limited on Linux.
+    """
+    ended: Future[Any] = Future()
+
+    def run() -> None:
+        try:
+            ended.set_result(work())
+        except BaseException as error:
+            ended.set_exception(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    with limited_memory(room):
+        thread.start()
+        thread.join(seconds)
+        if late := thread.is_alive():
+            stop()
+            thread.join(1.0)
+    if late:
+        raise TimeoutError(f"it has not ended within {seconds:g} s")
+    return ended.result()
+
+
+@contextmanager
+def limited_memory(size: int) -> Iterator[None]:
+    """Meanwhile the process may take ``size`` [byte] more than it has."""
+    if not Path("/proc/self/statm").exists():
+        yield
+        return
+    import resource
+
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    most = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() + size
+    resource.setrlimit(resource.RLIMIT_AS, (most if soft == resource.RLIM_INFINITY else min(most, soft), hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from rsl_rl.env import VecEnv
@@ -11,6 +11,8 @@ from torch import Tensor
 
 from legged_mw.sim.graph import StepGraph
 from legged_mw.utils.opaque import fast
+
+Kept = TypeVar("Kept")
 
 
 class BaseTask(VecEnv):
@@ -23,16 +25,36 @@ class BaseTask(VecEnv):
     device: str
     obs_buf: dict[str, Tensor]  # group -> (N, size)
     max_episode_length: int  # [control steps]
+    not_remembered = (
+        ""  # what the step writes and no buffer is, in words: the guard of check/ finds it; '' if there is none
+    )
 
     def __init__(self, num_envs: int, num_actions: int, device: str, eager: bool = False) -> None:
         self.num_envs, self.num_actions, self.device, self.eager = num_envs, num_actions, device, eager
-        self.actions = torch.zeros(num_envs, num_actions, device=device)
-        self.rew_buf = torch.zeros(num_envs, device=device)
-        self.reset_buf = torch.zeros(num_envs, dtype=torch.bool, device=device)  # the episode ended in this step
-        # it ended by the clock, or off the terrain; no fall
-        self.time_out_buf = torch.zeros(num_envs, dtype=torch.bool, device=device)
-        self._episode_length_buf = torch.zeros(num_envs, dtype=torch.long, device=device)  # [control steps]
+        self._remembered: list[Any] = []
+        self.actions = self.buffer(num_actions)
+        self.rew_buf = self.buffer()
+        self.reset_buf = self.buffer(dtype=torch.bool)  # the episode ended in this step
+        self.time_out_buf = self.buffer(dtype=torch.bool)  # it ended by the clock, or off the terrain; no fall
+        self._episode_length_buf = self.buffer(dtype=torch.long)  # [control steps]
         self._graph = StepGraph(self._step, device, eager)
+
+    def buffer(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
+        """Zeros (N, *shape) for the step to write in place; a resumed run has them as they were."""
+        return self.remember(torch.zeros(self.num_envs, *shape, dtype=dtype, device=self.device))
+
+    def remember(self, kept: Kept) -> Kept:
+        """The same for a tensor of any shape, several in a list or dict, or an object that names its own in ``written``."""
+        self._remembered.append(kept)
+        return kept
+
+    def remembered(self) -> dict[str, Tensor]:
+        """All that was remembered, by the name of its attribute."""
+        names = {id(value): name for name, value in reversed(vars(self).items())}
+        found: dict[str, Tensor] = {}
+        for place, kept in enumerate(self._remembered):
+            found |= _tensors(names.get(id(kept), f"buffer {place}"), kept)
+        return found
 
     @property
     def episode_length_buf(self) -> Tensor:
@@ -82,3 +104,14 @@ class BaseTask(VecEnv):
 
     def _reset_all(self) -> None:
         raise NotImplementedError
+
+
+def _tensors(name: str, kept: Any) -> dict[str, Tensor]:
+    """The tensors of what was remembered as ``name``."""
+    if isinstance(kept, Tensor):
+        return {name: kept}
+    if isinstance(kept, dict | list | tuple):
+        parts = kept.items() if isinstance(kept, dict) else enumerate(kept)
+    else:
+        parts = ((each, getattr(kept, each)) for each in getattr(kept, "written", ()))
+    return {path: tensor for part, value in parts for path, tensor in _tensors(f"{name}.{part}", value).items()}

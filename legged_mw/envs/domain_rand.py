@@ -102,6 +102,8 @@ def check_draws(cfg: RobotTaskCfg, law: str = "") -> None:
 class DomainRand:
     """The draws of N worlds and what they write. ``values[name]`` (N, width): the numbers drawn, in the config's units."""
 
+    written = ("_draws", "gravity_dir")
+
     def __init__(self, cfg: RobotTaskCfg, robot: RobotModel, sim: Simulation, law: str = "") -> None:
         self._substep_ms, self._curves = 1e3 * cfg.sim.dt, "`stall_torque`" in robot.tables
         self._sim, self._mask = sim, torch.ones(sim.num_envs, dtype=torch.bool, device=sim.device)

@@ -23,6 +23,7 @@ from legged_mw.utils.config import ConfigError
 class FootContacts:
     """How many contacts each of F feet has with the ground, and the force on it where that is sensed; a foot may have several geoms."""
 
+    written = ("count", "forces")
     forces: Tensor | None = None  # (N, F, 3) of the ground on the foot, world frame [N]; only where something reads it
 
     def __init__(self, robot: RobotModel, feet: Collection[tuple[str, ...]], sensed: Tensor, count: Tensor) -> None:
@@ -49,6 +50,8 @@ class FootContacts:
 
 class GaitClock:
     """The clocks of N worlds with F feet; fixed tensors, written in place, as a recorded step needs them."""
+
+    written = ("phase", "running", "foot_phase", "row")
 
     def __init__(
         self, cfg: type[LeggedRobotCfg.gait], feet: tuple[str, ...], num_envs: int, dt: float, device: str

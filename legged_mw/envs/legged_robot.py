@@ -380,15 +380,19 @@ class LeggedRobot(RobotTask):
         self.foot_vel = self.sim.sensordata[:, self.robot.sensors["linvel"]].unflatten(1, (feet, 3))
         self.foot_sites = torch.tensor([self.robot.id("site", name) for name in self.foot_names], device=self.device)
         self.foot_pos = self._zeros(feet, 3)  # [m, world]
-        self.feet = FootContacts(self.robot, self.foot_geoms.values(), self.sim.sensordata, self.contact_count)
+        self.feet = self.remember(
+            FootContacts(self.robot, self.foot_geoms.values(), self.sim.sensordata, self.contact_count)
+        )
         self.foot_contact, self.first_contact = (self._zeros(feet, dtype=torch.bool) for _ in range(2))
         self.foot_speed = self._zeros(feet)  # horizontal [m/s]
         self._init_terrain()
         self.walked_off, self.moving = (self._zeros(dtype=torch.bool) for _ in range(2))
         self._init_commands()
         clock, names = self.cfg.gait, self.foot_names
-        self.gait = GaitClock(clock, names, self.num_envs, self.dt, self.device) if clock.period > 0.0 else None
+        gait = GaitClock(clock, names, self.num_envs, self.dt, self.device) if clock.period > 0.0 else None
+        self.gait = self.remember(gait)
         self._init_foot_rewards()
+        self.remember(self.tracking_sigma)
 
     def _episode_columns(self) -> dict[str, int]:
         feet = len(self.foot_names)
@@ -405,7 +409,7 @@ class LeggedRobot(RobotTask):
     def _init_terrain(self) -> None:
         """Tiles and heights, where there is terrain, and the height scan's points (P,) each [m]."""
         cfg, terrain = self.cfg.terrain, self.terrain
-        self.tiles = Tiles(self.cfg, terrain, self.num_envs, self.device) if terrain else None
+        self.tiles = self.remember(Tiles(self.cfg, terrain, self.num_envs, self.device)) if terrain else None
         self._height_at = make_height_map(terrain, self.device) if terrain else None
         # above the ground under each foot and under the root [m]
         self.foot_height = self._zeros(self.num_feet) if terrain else self.foot_pos[..., 2]
@@ -427,13 +431,15 @@ class LeggedRobot(RobotTask):
         self.full_command_ranges = self._tensor(
             [[command.low, command.high] for command in self.command_table]
         ).T.contiguous()
-        self.command_ranges = self.full_command_ranges.clone()
+        self.command_ranges = self.remember(self.full_command_ranges.clone())
         self._narrowest = default.expand(2, count)
         self.rest_command = self._tensor(
             [0.0 if command.name in VELOCITY else command.default for command in self.command_table]
         )
         self.keep_probability = self._tensor([*cfg.keep_probability, *[1.0] * (count - len(cfg.keep_probability))])
-        self.command_curriculum = self._tensor([cfg.curriculum_start if cfg.curriculum else 1.0, 0.0, 0.0])
+        self.command_curriculum = self.remember(
+            self._tensor([cfg.curriculum_start if cfg.curriculum else 1.0, 0.0, 0.0])
+        )
         if cfg.curriculum:
             self._set_command_ranges()
 

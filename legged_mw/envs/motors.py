@@ -114,6 +114,7 @@ class Actuators:
     with "speed" there is none, and targets are speeds [rad/s].
     """
 
+    written = ("targets", "_sent", "_delay", "_late", "_network")
     # what ``Simulation.step`` calls before each substep; None: nothing changes within a step
     before: Callable[[int], None] | None = None
 
@@ -232,6 +233,8 @@ class NetworkLaw:
     It computes in float32, however coarse the learner's matrix products are on a GPU (``runner.matmul_precision``).
     """
 
+    written = ("_past", "_memory")
+
     def __init__(self, network: MotorNetwork, angle: Tensor, speed: Tensor) -> None:
         """Joint angles [rad] and speeds [rad/s] (N, D) are read at each call."""
         self._angle, self._speed, (robots, joints) = angle, speed, angle.shape
@@ -286,6 +289,8 @@ class NetworkLaw:
 class Delay:
     """``delay(now)``, called once a step with a value (N, width), returns the value of d steps ago; each world has its own d."""
 
+    written = ("past", "_new")
+
     def __init__(self, steps: Tensor, longest: int, width: int, start: float | None = None) -> None:
         """``steps`` (N, 1) is read at each call. Before an episode the value was ``start``; None: the episode's first value."""
         self.steps, self.start = steps, start
@@ -315,6 +320,8 @@ class SubstepDelay:
     A command with a delay of d steps arrives before substep d of those that follow. 7 ms in steps of 4 ms, the nearest being
     d = 2: physics from t + 8 ms on uses what is sent at t.
     """
+
+    written = ("_past", "arriving")
 
     def __init__(self, delay: Tensor, step_ms: float, longest: float, substeps: int, width: int) -> None:
         """``delay`` (N, 1) [ms], whole steps of ``step_ms`` and at most ``longest``, is read at each call."""

@@ -76,6 +76,8 @@ def checked_rows(make_rows: Callable[[], Any], count: int) -> Mapping[str, Any]:
 class Observations:
     """The observation groups of N worlds. ``groups`` are the rows of each, ``buffers[group]`` (N, size) what the policy sees."""
 
+    written = ("_parts",)
+
     def __init__(
         self,
         table: Mapping[str, Sequence[Row | str]],
@@ -165,6 +167,8 @@ class Observations:
 
 class _Group:
     """One group: how its rows become a buffer."""
+
+    written = ("fresh", "frame", "buffer", "delay", "suspects")
 
     def __init__(self, name: str, rows: list[Row], noise_level: float, num_envs: int, device: str) -> None:
         noise = [row.noise * noise_level for row in rows for _ in range(row.value.shape[1])]

@@ -16,6 +16,8 @@ from legged_mw.utils.math import assign, maybe_any
 class Perturbation:
     """Kicks and pushes of the root in N worlds, as the section ``perturbation`` has them."""
 
+    written = ("_kick", "_clock", "kick_force", "kick_active", "kick_level", "growth", "_push_clock")
+
     def __init__(
         self, cfg: type[RobotTaskCfg.perturbation], sim: Simulation, root_body: int, mass: float, dt: float
     ) -> None:

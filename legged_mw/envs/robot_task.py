@@ -83,12 +83,14 @@ class RobotTask(BaseTask):
             eager=eager,
         )
         super().__init__(cfg.env.num_envs, len(self.robot.joint_names), device, eager)
-        self.domain_rand = DomainRand(cfg, self.robot, self.sim, law)
+        self.domain_rand = self.remember(DomainRand(cfg, self.robot, self.sim, law))
         self.dt = cfg.sim.dt * cfg.control.decimation  # [s] a control step
         self.max_episode_length = math.ceil(cfg.env.episode_length_s / self.dt)
         self._init_ranges()
         self._init_buffers()
-        self.perturbation = Perturbation(cfg.perturbation, self.sim, self.root_body, self.total_mass, self.dt)
+        self.perturbation = self.remember(
+            Perturbation(cfg.perturbation, self.sim, self.root_body, self.total_mass, self.dt)
+        )
         self._prepare_observations()
         self._prepare_reward_function()
         self.domain_rand.redraw()
@@ -276,13 +278,15 @@ class RobotTask(BaseTask):
     def _prepare_observations(self) -> None:
         if hasattr(self, "_observation_rows"):
             raise ConfigError(f"{type(self).__name__}._observation_rows: the method is now called observation_rows")
-        self.observations = Observations(
-            checked_rows(self.observation_rows, self.num_envs),
-            self.cfg.observations,
-            self.cfg.noise.level,
-            self.num_envs,
-            self.device,
-            lambda width: make_delay(self.cfg, "observation_delay", self.domain_rand.values, width),
+        self.observations = self.remember(
+            Observations(
+                checked_rows(self.observation_rows, self.num_envs),
+                self.cfg.observations,
+                self.cfg.noise.level,
+                self.num_envs,
+                self.device,
+                lambda width: make_delay(self.cfg, "observation_delay", self.domain_rand.values, width),
+            )
         )
         self.obs_buf = self.observations.buffers
 
@@ -393,12 +397,12 @@ class RobotTask(BaseTask):
             check_term(terms[name], self.num_envs)
         self._reward_terms = [terms[name] for name in self.reward_names]
         self.suspects = [
-            Suspects([f"reward term '{n}'" for n in self.reward_names], self.device),
+            self.remember(Suspects([f"reward term '{n}'" for n in self.reward_names], self.device)),
             *self.observations.suspects(),
         ]
         self.reward_scales = torch.tensor([scales[name] for name in self.reward_names], device=self.device) * self.dt
         means = [*(f"rew_{name}" for name in self.reward_names), "reward", "episode_length"]
-        self.statistics = Statistics(means, ["episodes", "fell", "broken"], self.device)
+        self.statistics = self.remember(Statistics(means, ["episodes", "fell", "broken"], self.device))
 
     # ---- statistics: summed on the device, read once an iteration ------------------------------------------------------------
 
@@ -470,14 +474,19 @@ class RobotTask(BaseTask):
         self.base_lin_vel, self.projected_gravity, self.base_ang_vel_world = (self._zeros(3) for _ in range(3))
         self.dof_offset = self._zeros(self.num_actions)  # joint position minus default [rad]
         law, drawn = self.motor_law, self.domain_rand.values
-        self.actuators = Actuators(self.cfg, law, self.robot, sim, drawn, self.default_dof_pos, self._compute_torques)
+        self.actuators = self.remember(
+            Actuators(self.cfg, law, self.robot, sim, drawn, self.default_dof_pos, self._compute_torques)
+        )
         exact = self.actuators.encoder_offset is None
         self.joint_reading = self.dof_offset if exact else self._zeros(self.num_actions)  # the same, as measured
         self.base_height = self.root_pos[:, 2]  # of the root above the ground under it [m]
         self.fell, self.broken = self._zeros(dtype=torch.bool), self._zeros(dtype=torch.bool)
-        self.divergence = Divergence(sim, self.actions, self.robot.joint_names, self.cfg.termination.max_speed)
+        self.divergence = self.remember(
+            Divergence(sim, self.actions, self.robot.joint_names, self.cfg.termination.max_speed)
+        )
         # one matrix, so that a reset clears it in one go
         self._episode, views = columns(n, device, **self._episode_columns())
+        self.remember(self._episode)
         for name, view in views.items():
             setattr(self, name, view)
         model = self.robot.physics
@@ -488,6 +497,7 @@ class RobotTask(BaseTask):
         self.imu_pos = self._tensor(model.site_pos[self.robot.id("site", self.robot.imu)]).expand(n, 3)
         self._init_contacts()
         self._init_robot_rewards()
+        self.remember(self.last_dof_vel)
 
     def _init_contacts(self) -> None:
         """What ``asset.terminate_after_contacts_on`` and ``asset.penalize_contacts_on`` mean: C sensed geoms, B penalised bodies."""
@@ -520,7 +530,7 @@ class RobotTask(BaseTask):
         return [i for i, name in enumerate(robot.contact_geoms) if name in meant]
 
     def _zeros(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
-        return torch.zeros(self.num_envs, *shape, dtype=dtype, device=self.device)
+        return self.buffer(*shape, dtype=dtype)
 
     def _episode_columns(self) -> dict[str, int]:
         """What an episode remembers, as name -> width: attributes (N, width) that a reset clears."""

@@ -28,6 +28,8 @@ JOINT, ACTION = "broken_by/", "broken_by_action"  # statistics: worlds so far th
 class Statistics:
     """Means over ended episodes, counts of episodes, and values as they stand. All travel as one vector, so that ranks can add theirs."""
 
+    written = ("_sums",)
+
     def __init__(self, means: Sequence[str], counts: Sequence[str], device: str) -> None:
         """``means`` are divided by the first of ``counts``, the number of episodes that ended."""
         self.means, self.counts, self.live = list(means), list(counts), dict[str, int]()
@@ -63,6 +65,8 @@ class Statistics:
 class Suspects:
     """Looks at K values of N worlds, each of something that has a name."""
 
+    written = ("counts",)
+
     def __init__(self, names: Sequence[str], device: str) -> None:
         """``names`` of the K columns, in words that a user knows."""
         self.names = list(names)
@@ -83,6 +87,8 @@ class Suspects:
 
 class Divergence:
     """Finds broken worlds and counts, since the start, the fastest joint of each."""
+
+    written = ("counts",)
 
     def __init__(self, sim: Simulation, actions: Tensor, joints: Sequence[str], max_speed: float) -> None:
         """``actions`` (N, A) as the step has them; ``max_speed`` of any degree of freedom that still counts as finite."""

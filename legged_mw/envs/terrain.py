@@ -37,6 +37,8 @@ def build_terrain(cfg: LeggedRobotCfg) -> Terrain | None:
 class Tiles:
     """The tiles of N worlds. Everything is a fixed tensor and written in place, as a recorded step needs it."""
 
+    written = ("levels", "origins")
+
     def __init__(self, cfg: LeggedRobotCfg, terrain: Terrain, num_envs: int, device: str) -> None:
         self.curriculum, self.size, self.num_levels = cfg.terrain.curriculum, terrain.tile, terrain.levels
         highest = min(cfg.terrain.max_init_terrain_level, terrain.levels - 1) if self.curriculum else terrain.levels - 1

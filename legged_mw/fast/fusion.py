@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from legged_mw.check.held import everything
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.worlds import everything
 from legged_mw.fast.trace import Call, Trace
 from legged_mw.utils.math import alike
 

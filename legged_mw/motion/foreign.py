@@ -14,7 +14,7 @@ import numpy as np
 from legged_mw.sim.joints import posed
 from legged_mw.sim.model import RobotModel
 from legged_mw.skills.clip import KEYS, Clip, ClipError, checked, clip_of
-from legged_mw.utils.arrays import read_arrays
+from legged_mw.utils.files import read_arrays
 
 CSV_FPS = 30.0  # of LAFAN1 as retargeted by Unitree
 APART = 0.02  # [m] between the bodies of a file and ours, at most

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.worlds import everything, put_worlds, worlds_state
+from legged_mw.envs.snapshot import memory, put_snapshot, take_snapshot
 from legged_mw.rl.checkpoint import damage
 from legged_mw.rl.ranks import Rank
 from legged_mw.rl.recorded import Memories
@@ -39,7 +39,7 @@ def worlds_content(runner: Any) -> dict[str, Any]:
     return {
         **_kind(runner.env),
         "random_state": random,
-        "worlds": worlds_state(runner.env),
+        "worlds": take_snapshot(runner.env),
         "memories": _memories(runner),
     }
 
@@ -66,9 +66,9 @@ def take_worlds(runner: Any, checkpoint: Path, rank: Rank, random: dict[str, Ten
     own = _memories(runner, copy=False)
     if own.keys() != memories.keys() or any(own[key].shape != memories[key].shape for key in own):
         return "the networks' memories are of another shape"
-    if name := beyond(worlds, everything(runner.env)) or beyond(memories, own):
+    if name := beyond(worlds, memory(runner.env)) or beyond(memories, own):
         return f"{file.name}: {name} is not finite, or beyond {_MOST:.0e}"
-    if reason := put_worlds(runner.env, worlds):
+    if reason := put_snapshot(runner.env, worlds):
         return reason
     with torch.inference_mode():
         for key, value in memories.items():

@@ -37,14 +37,14 @@ from legged_mw.utils.cli import apply_overrides, command, pick_device, seed_ever
 from legged_mw.utils.config import ConfigError, load_yaml, save_yaml
 from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import writable
-from legged_mw.utils.machine import usable_cores
-from legged_mw.utils.quick_start import settle
+from legged_mw.utils.machine import settle, usable_cores
 from legged_mw.utils.task import LoadedTask, load_task
 
 STOPPED = 3  # exit code of a training that ended early and can go on
 _STEPS_PER_CORE = 6500  # a second, in training with the section `cpu` as it is (docs/performance.md)
 
-Check = Callable[[LoadedTask], None]  # raises where the step cannot be recorded
+# raises where the step cannot be recorded; returns what it writes and a resumed run would not have
+Check = Callable[[LoadedTask], str]
 Examine = Callable[[Any], dict[str, float]]  # policy -> figures by name
 Begun = Callable[[Runner, Path], None]  # with the run folder
 Export = Callable[[LoadedTask, Path, Path], str]  # task, checkpoint, folder to write -> what was written, in words
@@ -178,11 +178,13 @@ def say_compiling(task: LoadedTask, device: str) -> AbstractContextManager[objec
     )
 
 
-def build(task: LoadedTask, start: Start, device: str, eager: bool, check_recordable: Check) -> Any:
+def build(task: LoadedTask, start: Start, device: str, eager: bool, check: Check) -> Any:
     """The environment, if its step can be recorded and learning can work in it. With ``eager`` nothing is recorded."""
-    if this_rank().leads and not eager:
-        check_recordable(task)
+    lost = check(task) if this_rank().leads and (start.run or not eager) else ""
     env = task.env_class(task.cfg, device, eager=eager)
+    env.not_remembered = lost
+    if lost:
+        print(f"note: {lost}; with --resume worlds begin anew", flush=True)
     check_mirror(env, task.train)
     check_room(task.train.to_dict(), env)
     if start.policy:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import shutil
+from collections.abc import Iterable, Sequence
+from inspect import getfile
 from pathlib import Path
 from typing import Any
 
@@ -10,19 +13,24 @@ import torch
 from rsl_rl.models import MLPModel
 
 from legged_mw.envs.observations import Observations, Row
-from legged_mw.envs.other_task import class_in, differences, in_words, observe_as
 from legged_mw.envs.robot_task import RobotTask
+from legged_mw.envs.robot_task_config import RobotTaskCfg
 from legged_mw.rl.learner_config import RobotTaskCfgPPO
 from legged_mw.rl.network import LEARNING_ONLY
 from legged_mw.rl.policies import NETWORK_FILE, Trained, read_actor
 from legged_mw.rl.runs import CONFIG_FILE, checkpoints
+from legged_mw.utils.commands import command_table
 from legged_mw.utils.config import ConfigError, save_yaml
-from legged_mw.utils.errors import shown
+from legged_mw.utils.errors import shown, unknown
 from legged_mw.utils.task import LoadedTask
 
 TEACHER = "teacher"  # the observation group that it reads, and its folder in a student's run
 # samples that an exported normalizer stands for, as the file does not say [ours: as most have seen]
 _EXPORTED_COUNT = 10**8
+
+# Fields that must be equal, since an action or a row means something else where they are not; those that a task has.
+_SAME = ("control.action_origin", "normalization.clip_actions", "gait.period", "gait.offsets")
+_SAME_SCAN = ("terrain.measured_points_x", "terrain.measured_points_y")
 
 
 def adapt(settings: dict[str, Any], cfg: RobotTaskCfgPPO, teacher: dict[str, Any] | None) -> dict[str, Any]:
@@ -58,7 +66,7 @@ def load_teacher(model: MLPModel, teacher: Trained, env: RobotTask) -> None:
         model.load_state_dict(read_actor(path, model, TEACHER))
     except ConfigError as error:
         rows = env.observations.groups[TEACHER]
-        raise ConfigError(f"{error}; it is shown {sum(row.size for row in rows)} values: {in_words(rows)}") from None
+        raise ConfigError(f"{error}; it is shown {sum(row.size for row in rows)} values: {_in_words(rows)}") from None
 
 
 def check_start(env: RobotTask, task: LoadedTask, policy: Trained) -> None:
@@ -67,7 +75,7 @@ def check_start(env: RobotTask, task: LoadedTask, policy: Trained) -> None:
     ours = [row for group in task.train.obs_groups.actor for row in env.observations.rows(group)]
     if [*map(_layout, theirs)] != [*map(_layout, ours)]:
         raise ConfigError(
-            f"{shown(policy.source.checkpoint)}: it reads {in_words(theirs)}; the actor of {task.name} reads {in_words(ours)}"
+            f"{shown(policy.source.checkpoint)}: it reads {_in_words(theirs)}; the actor of {task.name} reads {_in_words(ours)}"
         )
 
 
@@ -99,12 +107,12 @@ def keep_teacher(teacher: Trained, run: Path) -> None:
 
 def _observe(env: RobotTask, policy: Trained, who: str) -> Observations:
     """What the policy reads in ``env``, as the group TEACHER. Raises ConfigError if something means something else there."""
-    task, kind = policy.task, class_in(env, policy.task.env_class)
+    task, kind = policy.task, _class_in(env, policy.task.env_class)
     found = [f"its task is a {task.env_class.__name__}, whose rows a {type(env).__name__} does not have"]
     if kind:
         try:
-            seen = observe_as(env, kind, task.cfg, task.train.obs_groups.actor, TEACHER)
-            if not (found := differences(env, task.cfg, seen.rows(TEACHER))):
+            seen = _observe_as(env, kind, task.cfg, task.train.obs_groups.actor, TEACHER)
+            if not (found := _differences(env, task.cfg, seen.rows(TEACHER))):
                 return seen
         except ConfigError as error:  # a row of what is not sensed here
             found = [str(error)]
@@ -113,3 +121,108 @@ def _observe(env: RobotTask, policy: Trained, who: str) -> Observations:
 
 def _layout(row: Row) -> tuple[str, int, int, list[float]]:
     return row.name, row.value.shape[1], row.history, row.column_scales()
+
+
+# ---- a policy of another task in this one: what it reads here, and why its actions may mean something else --------------
+
+
+def _class_in(env: RobotTask, kind: type[RobotTask]) -> type[RobotTask] | None:
+    """``kind`` among the classes of ``env``; by its name and file, since a task's file may have been imported twice."""
+    return next(
+        (
+            each
+            for each in type(env).__mro__
+            if each.__qualname__ == kind.__qualname__ and getfile(each) == getfile(kind)
+        ),
+        None,
+    )
+
+
+def _observe_as(
+    env: RobotTask, kind: type[RobotTask], cfg: RobotTaskCfg, groups: Sequence[str], name: str
+) -> Observations:
+    """Observations of ``env`` as a ``kind`` with the config ``cfg`` has them; ``name`` is what a policy reads in ``groups``.
+
+    They are exact and not delayed: noise would only blur what is to be learned from the policy. Raises ConfigError for a
+    group that the table does not have.
+    """
+    table = kind.observation_rows(_as_on_a_plane(env, cfg))  # the rows go by the section noise and others
+    for group in groups:
+        if group not in table:
+            raise ConfigError(unknown("observation group", group, table, kind.__name__))
+    exact = {
+        group: [row if isinstance(row, str) else row._replace(noise=0.0) for row in rows]
+        for group, rows in table.items()
+    }
+    return Observations({**exact, name: [*groups]}, cfg.observations, 0.0, env.num_envs, env.device, lambda width: None)
+
+
+def _in_words(rows: Iterable[Row]) -> str:
+    """``base_ang_vel 3, dof_pos 12 x 5 frames``"""
+    return ", ".join(
+        f"{row.name} {row.value.shape[1]}" + (f" x {row.history} frames" if row.history > 1 else "") for row in rows
+    )
+
+
+def _differences(env: RobotTask, cfg: RobotTaskCfg, rows: Iterable[Row]) -> list[str]:
+    """What keeps a policy of the config ``cfg``, which reads ``rows``, from meaning the same in ``env``: a clause for each."""
+    kinds = [_field(each, "control.actuator") for each in (cfg, env.cfg)]
+    found = [_differ("control.actuator", *kinds)] if "torque" in kinds else []
+    there, here = (
+        ", ".join(command.name for command in table) or "none" for table in (command_table(cfg), env.command_table)
+    )
+    found.append(_differ("the list of commands", there, here))
+    if any(found):
+        return [text for text in found if text]
+    theirs, ours = _as_on_a_plane(env, cfg)._load_robot("mujoco"), env.robot
+    if theirs.joint_names != ours.joint_names:
+        return [
+            f"its robot is another one, with the joints {_few(theirs.joint_names)}; here they are {_few(ours.joint_names)}"
+        ]
+    found = [_joint("default angle", ours.joint_names, theirs.pose, ours.pose, " rad")]
+    there, here = (robot.tables["control.action_scale"] for robot in (theirs, ours))
+    found.append(_joint("control.action_scale", ours.joint_names, there, here, ""))
+    there, here = (f"{1.0 / (each.sim.dt * each.control.decimation):g} Hz" for each in (cfg, env.cfg))
+    found.append(_differ("the control rate", there, here))
+    found.append(_differ("asset.imu_site", theirs.imu, ours.imu))
+    scan = [row for row in rows if row.name == "height_scan"]
+    if scan and not scan[0].value.shape[1]:
+        found.append(
+            "it reads the height scan, which is off here: name a group in terrain.height_scan, such as privileged_state"
+        )
+    found += [
+        _differ(path, _field(cfg, path), _field(env.cfg, path)) for path in (*_SAME, *(_SAME_SCAN if scan else ()))
+    ]
+    return [text for text in found if text]
+
+
+def _as_on_a_plane(env: RobotTask, cfg: RobotTaskCfg) -> RobotTask:
+    """``env`` with another config, for what only reads it: the tensors are the same."""
+    other = copy.copy(env)
+    other.cfg, other.terrain = cfg, None
+    return other
+
+
+def _field(cfg: RobotTaskCfg, path: str) -> Any:
+    """A field by its path; None where the task has none of that name."""
+    value: Any = cfg
+    for name in path.split("."):
+        value = getattr(value, name, None)
+    return value
+
+
+def _differ(what: str, there: Any, here: Any) -> str:
+    return "" if there == here else f"{what} is {there} there and {here} here"
+
+
+def _joint(what: str, names: Sequence[str], there: Sequence[float], here: Sequence[float], unit: str) -> str:
+    """The first joint that differs."""
+    for name, theirs, ours in zip(names, there, here, strict=True):
+        if abs(theirs - ours) > 1e-6:
+            return f"{what} of joint {name} is {theirs:g}{unit} there and {ours:g}{unit} here"
+    return ""
+
+
+def _few(names: Sequence[str]) -> str:
+    """The first three names and how many there are."""
+    return f"{', '.join(names[:3])} ... ({len(names)})" if len(names) > 3 else ", ".join(names)

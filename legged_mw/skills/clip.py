@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from legged_mw.utils.arrays import read_arrays
 from legged_mw.utils.errors import UserError, unknown
+from legged_mw.utils.files import read_arrays
 
 Floats = NDArray[np.float64]
 FARTHEST = 1e4  # [m] or [rad] of what a robot does in a clip

@@ -68,7 +68,7 @@ class Getup(Falls):
     def _init_buffers(self) -> None:
         super()._init_buffers()
         self.up_height = 0.99 * self.start_place[2]  # [m] of the root, standing [P: 0.275 of 0.278]
-        self.upright = torch.zeros_like(self.rew_buf)  # (N,) cosine of the tilt
+        self.upright = self.buffer()  # (N,) cosine of the tilt
 
     def _refresh_base(self) -> None:
         super()._refresh_base()

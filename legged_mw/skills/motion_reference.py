@@ -16,6 +16,8 @@ from legged_mw.utils.files import find_file
 class Reference:
     """Clips one after another, each followed by its last frame, held. Every world has a frame that it is to reach in the step to come."""
 
+    written = ("frame", "failures", "_row", "wanted_pos", "wanted_rot")
+
     def __init__(
         self, clips: Sequence[Clip], kinematics: Kinematics, num_envs: int, device: str, *, held: int, bin_frames: int
     ) -> None:

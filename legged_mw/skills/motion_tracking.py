@@ -193,10 +193,10 @@ class MotionTracking(RobotTask):
         self.anchor_kinematics = Kinematics(self.robot.physics, [bodies[self.anchor]], self.device)
         self.clips = load_clips(self.cfg, self.robot.joint_names, 1.0 / self.dt)
         frames = {"held": round(motion.hold_s / self.dt), "bin_frames": round(motion.bin_s / self.dt)}
-        self.reference = Reference(self.clips, self.kinematics, self.num_envs, self.device, **frames)
+        self.reference = self.remember(Reference(self.clips, self.kinematics, self.num_envs, self.device, **frames))
         ranges = [*motion.start_pos, *motion.start_turn, *motion.start_lin_vel, *motion.start_ang_vel]
         self.start_range = self._tensor(ranges + [motion.start_joints] * self.num_actions)
-        self.body = Bodies(*(torch.zeros_like(part) for part in self.reference.bodies))
+        self.body = self.remember(Bodies(*(torch.zeros_like(part) for part in self.reference.bodies)))
         self.anchor_pos, self.anchor_ori, self.body_pos, self.body_ori = map(
             self._zeros, (3, 6, 3 * len(bodies), 6 * len(bodies))
         )

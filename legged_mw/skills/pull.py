@@ -17,6 +17,8 @@ class Pull:
     One that is up keeps it: else robots learn to lean in it rather than to stand without, and it never fades.
     """
 
+    written = ("level",)
+
     def __init__(self, sim: Simulation, body: int, gravity_dir: Tensor, force: float, fades: float) -> None:
         """``gravity_dir``: (N, 3) in the world, which leans where a slope was drawn. ``fades``: by how much the level falls when
         every world has ended an episode up."""

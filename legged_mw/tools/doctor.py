@@ -20,8 +20,7 @@ from packaging.requirements import Requirement
 
 from legged_mw import ROOT
 from legged_mw.utils.cli import Parser, pick_device, seed_everything
-from legged_mw.utils.machine import usable_cores
-from legged_mw.utils.renderer import gl_fault, has_display
+from legged_mw.utils.machine import gl_fault, has_display, usable_cores
 from legged_mw.utils.task import load_task, task_names
 
 SPEED_TASKS = ("go1_flat", "g1_flat", "go1_rough")

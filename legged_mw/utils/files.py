@@ -10,7 +10,8 @@ import shutil
 import stat
 import sys
 import tempfile
-from contextlib import suppress
+import zipfile
+from contextlib import nullcontext, suppress
 from pathlib import Path
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -20,6 +21,7 @@ from legged_mw.utils.errors import UserError, shown
 
 STAGED = ".export.new"  # in an export's folder: the files of a newer one, all of them, on the way to their places
 MOST_LETTERS = 100  # of a folder's name, in bytes: systems allow 255, and ours is put before or behind it
+MOST_UNPACKED = 1 << 30  # of all arrays in an .npz: hours of a robot's motion
 _FILES: WeakKeyDictionary[type, Path] = WeakKeyDictionary()  # class -> the Python file with its body
 
 
@@ -189,6 +191,22 @@ def _lives(process: int) -> bool:
     except OSError:  # it is another user's
         return True
     return True
+
+
+def read_arrays(file: Path) -> dict[str, Any]:
+    """What the .npz ``file`` holds. Raises ValueError for a file that is missing, damaged or something else. No code runs."""
+    import numpy as np  # here alone: the command line shares this file
+
+    try:
+        with zipfile.ZipFile(file) if zipfile.is_zipfile(file) else nullcontext() as parts:
+            if parts and (size := sum(part.file_size for part in parts.infolist())) > MOST_UNPACKED:
+                raise ValueError(f"it unpacks to {size >> 20} MiB; {MOST_UNPACKED >> 20} are the most")
+        with np.load(file, allow_pickle=False) as archive:
+            return dict(archive)
+    except TypeError:
+        raise ValueError("it is one array, no archive of them") from None
+    except Exception as error:  # numpy's, zipfile's and zlib's, by how it is broken
+        raise ValueError(" ".join(str(error).split())[:200]) from None
 
 
 def digest(file: Path) -> str:

@@ -1,24 +1,37 @@
-"""What this process may use of the machine it runs on, and what a call in it may take."""
+"""What this process may use of the machine it runs on: cores, memory, and what MuJoCo may draw through.
+
+The last is settled before mujoco is imported, which reads it then.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import gc
 import math
 import os
 import re
-import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future
-from contextlib import contextmanager
+import sys
 from pathlib import Path
-from typing import Any
 
 from legged_mw.utils.errors import UserError
+
+# name -> library, Debian's package
+_WITHOUT_SCREEN = {"egl": ("libEGL.so.1", "libegl1"), "osmesa": ("libOSMesa.so.8", "libosmesa6")}
+_ON_SCREEN = ("", "enable", "enabled", "on", "true", "1", "glfw", "glx", "cgl", "wgl")
+_OFF = ("disable", "disabled", "off", "false", "0")
 
 
 def usable_cores() -> int:
     """CPU cores of this process: those it may run on, shared with the other processes that torchrun started here."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // int(os.environ.get("LOCAL_WORLD_SIZE", "1")))
+
+
+def settle() -> None:
+    """All that stays is made: garbage that nobody collected while the program started is never looked through again."""
+    if not gc.isenabled():
+        gc.freeze()
+        gc.enable()
 
 
 def free_memory(device: str = "cpu") -> float:
@@ -60,43 +73,43 @@ def _read(path: str) -> str:
         return ""
 
 
-def contained(work: Callable[[], Any], seconds: float, room: int, stop: Callable[[], None] = lambda: None) -> Any:
-    """What ``work`` returns, or raises, within that time and ``room`` [byte] of new memory; for a call that a stranger's file decides.
+def has_display() -> bool:
+    """Whether a window could open here. Linux needs an X or Wayland display; other systems have one."""
+    return not sys.platform.startswith("linux") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
-    Past its time it is asked to ``stop``, and a TimeoutError raised; if it does not, it is left behind. Memory is limited on Linux.
-    """
-    ended: Future[Any] = Future()
 
-    def run() -> None:
+def gl_fault(name: str) -> str:
+    """Why MuJoCo cannot be imported with this MUJOCO_GL, and the remedy; "" if it can."""
+    name = name.lower().strip()
+    if name in _WITHOUT_SCREEN and sys.platform == "linux":
+        library, package = _WITHOUT_SCREEN[name]
         try:
-            ended.set_result(work())
-        except BaseException as error:
-            ended.set_exception(error)
-
-    thread = threading.Thread(target=run, daemon=True)
-    with limited_memory(room):
-        thread.start()
-        thread.join(seconds)
-        if late := thread.is_alive():
-            stop()
-            thread.join(1.0)
-    if late:
-        raise TimeoutError(f"it has not ended within {seconds:g} s")
-    return ended.result()
+            ctypes.CDLL(library)
+        except OSError:
+            return f"{library} is missing (apt install {package})"
+        platform = os.environ.get("PYOPENGL_PLATFORM", name).lower()
+        return "" if platform == name else f"PYOPENGL_PLATFORM={platform} contradicts it (unset that)"
+    return "" if name in _ON_SCREEN + _OFF else f"there are {', '.join(_WITHOUT_SCREEN)}, glfw and disable"
 
 
-@contextmanager
-def limited_memory(size: int) -> Iterator[None]:
-    """Meanwhile the process may take ``size`` [byte] more than it has."""
-    if not Path("/proc/self/statm").exists():
-        yield
-        return
-    import resource
+def choose_renderer() -> str:
+    """Let MuJoCo draw without a screen where it can: sets MUJOCO_GL. Returns a line if what the user set does not work.
 
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    most = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize() + size
-    resource.setrlimit(resource.RLIMIT_AS, (most if soft == resource.RLIM_INFINITY else min(most, soft), hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
+    MuJoCo fails at its import, in training too, where MUJOCO_GL names what is not there.
+    """
+    if sys.platform != "linux":
+        return ""
+    asked = os.environ.get("MUJOCO_GL")
+    fault = gl_fault(asked) if asked else ""
+    if not fault and (asked is not None or has_display()):
+        return ""
+    works = next((name for name in _WITHOUT_SCREEN if name != asked and not gl_fault(name)), None)
+    if works:
+        os.environ["MUJOCO_GL"] = works
+    elif fault:
+        os.environ["MUJOCO_GL"] = "glfw" if has_display() else "disable"
+    return (
+        f"MUJOCO_GL={asked} does not work here: {fault}; going on with MUJOCO_GL={os.environ['MUJOCO_GL']}"
+        if fault
+        else ""
+    )

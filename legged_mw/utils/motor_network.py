@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from legged_mw.utils.arrays import read_arrays
 from legged_mw.utils.errors import UserError, unknown
+from legged_mw.utils.files import read_arrays
 
 Floats = NDArray[Any]  # float32
 ACTIVATIONS = ("elu", "relu", "softsign", "tanh")

@@ -12,7 +12,7 @@ from typing import Any
 from legged_mw.utils.commands import Command, outside, parse_command
 from legged_mw.utils.errors import UserError, shown
 from legged_mw.utils.files import writable
-from legged_mw.utils.renderer import has_display
+from legged_mw.utils.machine import has_display
 from legged_mw.view import web
 from legged_mw.view.drive import CAMERAS, NO_COMMANDS, Pilot
 from legged_mw.view.native import NativeViewer

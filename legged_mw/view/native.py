@@ -12,7 +12,7 @@ from typing import Any
 
 import mujoco
 
-from legged_mw.utils.renderer import has_display
+from legged_mw.utils.machine import has_display
 from legged_mw.view.camera import RobotCamera
 from legged_mw.view.drive import BINDINGS, KEY_ACTION, Binding, Pilot
 from legged_mw.view.overlay import draw

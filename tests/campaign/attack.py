@@ -35,9 +35,9 @@ import pytest
 from program import files, stopped_at_work
 
 from legged_mw import programs
+from legged_mw.deploy.policy import limited_memory
 from legged_mw.rl import policies, runs
 from legged_mw.utils.cli import one_line_errors
-from legged_mw.utils.machine import limited_memory
 
 ROOM, SECONDS = 6 << 30, 60  # what an input may take before it counts as not refused: memory [byte], time [s]
 _EVENTS = {  # of Python's audit hooks: which arguments are paths, and whether what stood there is gone afterwards

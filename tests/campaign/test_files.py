@@ -32,7 +32,7 @@ from legged_mw.rl.checkpoint import sealed
 from legged_mw.rl.runner import make_runner
 from legged_mw.rl.runs import checkpoints, find_run, load_tensors, runs, save_whole
 from legged_mw.skills.clip import read_clip
-from legged_mw.utils import arrays
+from legged_mw.utils import files
 from legged_mw.utils.config import load_yaml, save_yaml
 from legged_mw.utils.files import digest
 from legged_mw.utils.motor_network import read_network
@@ -484,7 +484,7 @@ ARRAYS: list[tuple[str, Callable[[Path], Any], dict[str, Any], str]] = [
 def test_arrays(
     read: Callable[[Path], Any], change: dict[str, Any], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(arrays, "MOST_BYTES", 1 << 16)
+    monkeypatch.setattr(files, "MOST_UNPACKED", 1 << 16)
     content = (CLIP if read is read_clip else MOTOR) | {name: np.asarray(value) for name, value in change.items()}
     attack(
         Case(

@@ -109,6 +109,41 @@ def test_a_resumed_training_is_the_uninterrupted_one(name: str, tmp_path: Path) 
     assert_equal(resumed, uninterrupted)
 
 
+OWN_TASK = """
+import torch
+from configs.go1_flat import Go1FlatCfg, Go1FlatCfgPPO
+from legged_mw.envs.legged_robot import LeggedRobot
+from legged_mw.utils.task import Task
+
+
+class Mine(LeggedRobot):
+    def _init_buffers(self):
+        super()._init_buffers()
+        self.steps = {made}
+
+    def _end_step(self):
+        super()._end_step()
+        self.steps.add_(1.0)
+
+
+TASK = Task(Mine, Go1FlatCfg, Go1FlatCfgPPO)
+"""
+
+
+@pytest.mark.parametrize("eager", [[], ["--eager"]])
+@pytest.mark.parametrize("made", ["self.buffer()", "torch.zeros(self.num_envs, device=self.device)"])
+def test_a_buffer_of_a_users_own_goes_on_or_costs_the_word(made: str, eager: list[str], tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text(OWN_TASK.format(made=made))
+    task = ["--task", str(tmp_path / "mine.py"), "--device", "cpu", *eager]
+    first = run("train", tmp_path, *SMALL, *task, "--max_iterations", "1")
+    result = run("train", tmp_path, *task, "--resume", "--max_iterations", "2")
+    assert first.code == result.code == 0, (first, result)
+    lost = "self.steps is written by the step and not made by self.buffer()"
+    assert (EXACTLY in result.out) == (made == "self.buffer()") == (lost not in result.out)
+    assert (f"worlds begin anew ({lost})" in result.out) == (made != "self.buffer()")
+    assert (lost in first.out) == (made != "self.buffer()" and not eager)
+
+
 def test_a_number_of_a_users_task_may_be_below_zero() -> None:
     best = {"best_reward": torch.tensor([-3.0])}
     Checker(Path("model_1.pt")).task({"env": best}, best)

@@ -8,12 +8,16 @@ from learner import apart, collect, difference, make, parameters, share_experien
 from test_gpu import BIPED, DEVICE, RANDOMIZED, ROUGH, make_env, roll_out, without_constraints
 from test_ppo import VARIANTS, update
 
-from legged_mw.fast import contact_count, shortcuts
+from legged_mw.fast import contact_count, quick_start, shortcuts
 from legged_mw.fast.fused import Fused
 from legged_mw.rl import layers
 from legged_mw.rl.ppo import GraphedPPO
 
 pytestmark = pytest.mark.gpu
+
+
+def test_the_gpu_opens_beside_the_imports() -> None:
+    assert quick_start.open_gpu(0) and not quick_start.open_gpu(torch.cuda.device_count())
 
 
 @pytest.mark.parametrize(

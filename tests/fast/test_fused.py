@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from legged_mw.check.held import everything
 from legged_mw.envs.robot_task import RobotTask
-from legged_mw.envs.worlds import everything
 from legged_mw.fast.fused import Fused, Kernel, Region
 from legged_mw.fast.fusion import fused as fuse
 from legged_mw.fast.fusion import fused_step, remember

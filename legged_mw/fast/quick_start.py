@@ -6,6 +6,8 @@ asks it for anything else gets the compiler itself, with the marks made.
 
 ``Tensor.backward(gradient)`` compares two shapes by way of symbolic ones, which imports sympy, some 470 modules. A second stand-in
 compares shapes of plain numbers.
+
+Of a training of two iterations on a CPU the stand-ins take 6.7 s of CPU time to 3.7, garbage left alone another 0.9 (medians of six).
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ Marked = Callable[..., Any]
 
 
 def begin(gpu: str | None = "cpu") -> None:
-    """To be called first, before torch is imported. From here until ``settle`` no garbage is collected.
+    """To be called first, before torch is imported. From here until ``settle`` of utils/machine no garbage is collected.
 
     ``gpu`` is the device that was asked for: "cpu", "cuda:0", or None for the GPU of this process, if there is one.
     """
@@ -58,13 +60,6 @@ def open_gpu(index: int) -> bool:
         (cuda.cuDevicePrimaryCtxRetain, ctypes.byref(context), device),
     )
     return all(call(*args) == 0 for call, *args in calls)  # what fails is told by torch, which asks the same again
-
-
-def settle() -> None:
-    """All that stays is made: it is never looked through again, and what comes is collected as ever."""
-    if not gc.isenabled():
-        gc.freeze()
-        gc.enable()
 
 
 def put_off_compiler() -> bool:

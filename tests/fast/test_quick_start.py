@@ -1,4 +1,4 @@
-"""legged_mw/utils/quick_start.py: torch's compiler waits until somebody asks for it, and is then what it always was."""
+"""legged_mw/fast/quick_start.py: torch's compiler waits until somebody asks for it, and is then what it always was."""
 
 from __future__ import annotations
 
@@ -10,11 +10,13 @@ import pytest
 import torch
 
 from legged_mw import ROOT
-from legged_mw.utils import quick_start
+from legged_mw.fast import quick_start
+from legged_mw.utils.machine import settle
 
 ASKED_LATER = """
 import sys, gc
-from legged_mw.utils import quick_start
+from legged_mw.utils.machine import settle
+from legged_mw.fast import quick_start
 quick_start.begin()
 assert not gc.isenabled()
 import inspect, torch, tensordict
@@ -41,7 +43,7 @@ torch.distributed.init_process_group("gloo", **group)
 torch.distributed.destroy_process_group()
 later = sys.modules["torch._dynamo"]
 assert later is torch._dynamo and "torch._dynamo.eval_frame" not in sys.modules and "sympy" not in sys.modules
-quick_start.settle()
+settle()
 assert gc.isenabled() and gc.get_freeze_count() > 10_000
 
 marked = torch.optim.Optimizer.zero_grad.__wrapped__
@@ -72,7 +74,7 @@ def test_the_compiler_is_there_when_it_is_asked_for() -> None:
 
 SHAPES = """
 import sys
-from legged_mw.utils import quick_start
+from legged_mw.fast import quick_start
 quick_start.begin()
 import torch
 from torch.fx.experimental.symbolic_shapes import expect_true, sym_eq
@@ -108,7 +110,7 @@ def test_a_program_that_others_call_changes_nothing() -> None:
     before = sys.modules.get("torch._dynamo"), list(sys.meta_path), gc.get_freeze_count()
     quick_start.begin("cuda:0")
     assert gc.isenabled()
-    quick_start.settle()
+    settle()
     assert (sys.modules.get("torch._dynamo"), list(sys.meta_path), gc.get_freeze_count()) == before
 
 

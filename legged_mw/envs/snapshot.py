@@ -1,0 +1,46 @@
+"""Save and restore every tensor that an environment remembers, so that a resumed run goes on bit by bit.
+
+A list: what ``buffer`` and ``remember`` of the task were told, and the simulation's own memory.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from legged_mw.envs.robot_task import RobotTask
+from legged_mw.sim.simulation import CONSTANTS_READ
+
+
+def memory(env: RobotTask) -> dict[str, Tensor]:
+    """All that a resumed run has as it was, by name."""
+    return {f"sim.{name}": value for name, value in env.sim.memory().items()} | env.remembered()
+
+
+def take_snapshot(env: RobotTask) -> dict[str, Tensor]:
+    """Copies on the host of ``memory``."""
+    return {name: value.detach().to("cpu", copy=True) for name, value in memory(env).items()}
+
+
+def put_snapshot(env: RobotTask, state: dict[str, Tensor]) -> str:
+    """Put back what ``take_snapshot`` returned. Returns why that cannot be, and then nothing has changed; '' if it is done."""
+    own = memory(env)
+    if env.not_remembered:
+        return env.not_remembered
+    for name in {**state, **own}:
+        there, here = _words(state.get(name)), _words(own.get(name))
+        if there != here:
+            return f"{name} is {there} there and {here} here"
+    fields = [name for name in state if name.startswith("sim.model.")]
+    with torch.inference_mode():
+        for name in fields:
+            own[name].copy_(state[name])
+        if {name.removeprefix("sim.model.") for name in fields} & {*CONSTANTS_READ}:
+            env.sim.set_constants()  # before the rest: it may touch the state
+        for name in state.keys() - {*fields}:
+            own[name].copy_(state[name])
+    return ""
+
+
+def _words(value: Tensor | None) -> str:
+    return "missing" if value is None else f"{value.dtype} {(*value.shape,)}".removeprefix("torch.")
