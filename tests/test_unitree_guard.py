@@ -290,7 +290,9 @@ from legged_mw.deploy.robot import RobotError
 from legged_mw.deploy.unitree import client, clock, guard
 folder, domain, fault = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 contract = read_contract(folder)
-guard.LATE = guard.STILL = client.TOO_OLD = 60.0 if fault == "dies" else 2.0  # of its fault, not because this computer is busy
+# it damps for its fault, not because this computer is busy
+guard.LATE = guard.STILL = client.TOO_OLD = 60.0 if fault == "dies" else 4.0
+guard.Guarded.start.__func__.__kwdefaults__["find"] = 60.0
 robot = client.connect(folder, contract, "lo", domain)
 print("pid", robot._owner.process.pid, flush=True)
 begun = False
@@ -304,7 +306,7 @@ while True:
     except RobotError:
         if fault != "dies":
             raise
-    time.sleep(3.0 if fault == "late" and begun else 0.01)
+    time.sleep(6.0 if fault == "late" and begun else 0.01)
 """
 
 # The program on a computer that may be busy: nothing is late here, as what is late is tested above and in lockstep.
@@ -352,6 +354,12 @@ def policy(domain: int, fault: str = "") -> Iterator[subprocess.Popen[str]]:
         process.communicate()
 
 
+def driven(sim: SimulatedUnitree, process: subprocess.Popen[str]) -> None:
+    """Until the policy drives the robot."""
+    live(sim, lambda: sim.acted["kp"].any() or process.poll() is not None)
+    assert sim.acted["kp"].any(), process.communicate()[1]
+
+
 def second(domain: int, sim: SimulatedUnitree) -> str:
     """The error of another program's guard for the same robot."""
     said = list[str]()
@@ -384,7 +392,7 @@ def test_processes_of_a_policy_that_dies_hangs_or_is_late(fault: str, domain: in
     """The guard is another process: it damps on the simulated robot's own record, where there is no watchdog."""
     (number, said), sim = PROCESSES[fault], served(domain)
     with policy(domain, fault) as process:
-        live(sim, lambda: sim.acted["kp"].any())
+        driven(sim, process)
         if number == signal.SIGKILL:
             assert re.match(
                 "another program sends rt/lowcmd in domain .*: end it first; nothing was sent", second(domain, sim)
@@ -405,7 +413,7 @@ def test_processes_of_a_policy_that_dies_hangs_or_is_late(fault: str, domain: in
 def test_a_signal_damps_before_it_ends_the_guard(name: str, domain: int) -> None:
     sim = served(domain)
     with policy(domain) as process:
-        live(sim, lambda: sim.acted["kp"].any())
+        driven(sim, process)
         assert process.stdout
         os.kill(int(process.stdout.readline().split()[1]), getattr(signal, name))
         live(sim, lambda: sim.record.changes[-1][1] == DAMPED)
@@ -446,7 +454,7 @@ def test_a_guard_that_can_do_nothing_is_replaced(name: str, said: str, domain: i
     """The policy's process damps, with a publisher of its own. A guard that goes on damps, too: what waited for it is not obeyed."""
     sim = served(domain)
     with policy(domain) as process:
-        live(sim, lambda: sim.acted["kp"].any())
+        driven(sim, process)
         assert process.stdout
         os.kill(pid := int(process.stdout.readline().split()[1]), getattr(signal, name))
         live(sim, lambda: sim.record.changes[-1][1] == DAMPED)
