@@ -359,7 +359,7 @@ def test_the_import_rules_themselves(path: str, source: str, caught: bool) -> No
         # the config's default, the table of classes that a config may name, and where an old run's class is now
         (
             "legged_mw.rl.students",
-            ["legged_mw/envs/robot_task_config.py", "legged_mw/rl/classes.py", "legged_mw/utils/renamed.py"],
+            ["legged_mw/rl/classes.py", "legged_mw/rl/learner_config.py", "legged_mw/utils/renamed.py"],
         ),
     ],
 )

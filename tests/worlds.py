@@ -58,7 +58,8 @@ def tensors(env: LeggedRobot) -> dict[str, Tensor]:
         elif type(value).__module__.startswith("legged_mw.envs.") and value is not env:
             yield from walk(path, vars(value))
 
-    return dict(walk("env", vars(env))) | dict(walk("sim", vars(env.sim)))
+    own = {name: value for name, value in vars(env).items() if name != "_remembered"}  # which has them once more
+    return dict(walk("env", own)) | dict(walk("sim", vars(env.sim)))
 
 
 def snapshot(env: LeggedRobot) -> dict[str, Tensor]:

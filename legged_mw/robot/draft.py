@@ -30,7 +30,7 @@ from legged_mw.sim.joints import family, per_joint, posed
 from legged_mw.sim.model import RobotModel, standing_height
 from legged_mw.utils.config import ConfigError
 from legged_mw.utils.errors import ModelError
-from legged_mw.utils.task_module import import_task
+from legged_mw.utils.task import import_task
 
 LOW = 0.33  # [m] a root that stands lower than this cannot swing its feet as high as others
 # times the suggested gains: beyond 2 it is another robot than vendors publish gains for [ours]
