@@ -201,7 +201,7 @@ def load_task(name: str, say: bool = False) -> LoadedTask:
     if say and path.resolve().parent != _SHIPPED:
         print(f"task: {shown(path)}", flush=True)
     try:
-        module = _import_task(path)
+        module = import_task(path)
     except UserError:
         raise
     except SyntaxError as error:
@@ -245,7 +245,7 @@ def _check_task(task: Task, path: Path) -> None:
 # ---- importing a task's file: its neighbours by their names, `configs` as one package; `sys.path` is as it was before ----------
 
 
-def _import_task(path: Path) -> ModuleType:
+def import_task(path: Path) -> ModuleType:
     """The module of a config file. Those in configs/ are imported by name, so that they can subclass one another."""
     folder = path.resolve().parent
     beside = folder if folder.name == "configs" else folder / "configs"
