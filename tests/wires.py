@@ -8,6 +8,7 @@ import gc
 import itertools
 import os
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,7 +20,7 @@ from legged_mw.deploy.contract import Contract, read_contract
 from legged_mw.deploy.robot import Floats
 from legged_mw.deploy.safety import Limits, Safety
 from legged_mw.deploy.unitree.client import Direct, UnitreeRobot
-from legged_mw.deploy.unitree.link import RobotEnd, Wire
+from legged_mw.deploy.unitree.link import LEASE, RobotEnd, Wire
 from legged_mw.deploy.unitree.robots import machine_of
 from legged_mw.deploy.unitree.serve import STEP, SimulatedUnitree
 
@@ -31,17 +32,25 @@ _next = itertools.count(os.getpid())
 
 @contextlib.contextmanager
 def locked_domain() -> Iterator[int]:
-    """A domain that is locked meanwhile, and another one each time: a guard goes on for a second after it has damped."""
-    for number in (100 + each % 130 for each in itertools.islice(_next, 130)):
-        with (Path(tempfile.gettempdir()) / f"legged_mw-dds-{number}").open("w") as file:
+    """A domain that is locked meanwhile, and that nobody used for a while: what was killed there is counted until its lease is over."""
+    for number in (100 + each % 130 for each in _next):
+        with (Path(tempfile.gettempdir()) / f"legged_mw-dds-{number}").open("a") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except OSError:
+                time.sleep(0.05)
                 continue
-            yield number
-            gc.collect()  # participants leave with their last reference
+            used = os.fstat(file.fileno())
+            if used.st_size and time.time() - used.st_mtime < LEASE:
+                time.sleep(0.05)
+                continue
+            try:
+                yield number
+            finally:
+                gc.collect()  # participants leave with their last reference
+                file.truncate(0)
+                file.write("used")
             return
-    raise RuntimeError("no DDS domain is free")
 
 
 @pytest.fixture
