@@ -27,17 +27,20 @@ class Ends(NamedTuple):
     second: Callable[[], RobotEnd]
 
 
+def make_ends(task: str, domain: int) -> Ends:
+    contract = read_contract(POLICIES / task)
+    package = machine_of(contract.joints).package
+    sim = SimulatedUnitree(POLICIES / task, contract, RobotEnd(package, "lo", domain))
+    wires = [Wire(package, "lo", domain, wait=sim.step, clock=lambda: sim.time) for _ in range(2)]
+    wires[0].prepare(listen=0.1)
+    return Ends(sim, *wires, partial(RobotEnd, package, "lo", domain))
+
+
 @pytest.fixture(scope="module")
 def ends() -> Iterator[dict[str, Ends]]:
+    """No other name holds them: a robot that lives on would be a second one for whoever has the domain next."""
     with locked_domain() as domain:
-        made = {}
-        for task in ("go2_flat", "g1_flat"):
-            contract = read_contract(POLICIES / task)
-            package = machine_of(contract.joints).package
-            sim = SimulatedUnitree(POLICIES / task, contract, RobotEnd(package, "lo", domain))
-            wires = [Wire(package, "lo", domain, wait=sim.step, clock=lambda sim=sim: sim.time) for _ in range(2)]
-            wires[0].prepare(listen=0.1)
-            made[task] = Ends(sim, *wires, partial(RobotEnd, package, "lo", domain))
+        made = {task: make_ends(task, domain) for task in ("go2_flat", "g1_flat")}
         yield made
         made.clear()
 

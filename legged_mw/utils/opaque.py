@@ -8,8 +8,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache, wraps
 from importlib import import_module
-from importlib.util import find_spec
+from importlib.machinery import PathFinder
 from typing import Any, ParamSpec, TypeVar
+
+import legged_mw
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -35,7 +37,9 @@ def not_traced(method: Callable[P, R]) -> Callable[P, R]:
 @cache
 def fast(module: str) -> Any:
     """That module of legged_mw.fast, or None without the package. An error inside of the module is raised."""
-    package = find_spec("legged_mw.fast")
+    package = PathFinder.find_spec(
+        "legged_mw.fast", legged_mw.__path__
+    )  # in this project, wherever another is installed
     if package is None or package.origin is None:  # no folder, or one without source files
         return None
     return import_module(f"legged_mw.fast.{module}")
