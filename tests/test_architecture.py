@@ -113,8 +113,6 @@ NEVER_IN = {
 MAY_ALL_THE_SAME = ["legged_mw/view/env_stage.py", "legged_mw/view/playing.py"]
 # The one door of the core to a package around it: "this file is not plain".
 HOOKS = {"legged_mw/sim/model.py": ["legged_mw.robot.vendor"]}
-# Imports that a step of the redrawing will remove.
-NOT_YET = {}
 CONFIGS_MAY = [
     "legged_mw.envs",
     "legged_mw.rl.learner_config",
@@ -209,8 +207,8 @@ def violations(path: str, source: str) -> list[str]:
             never = not any(within(name, package) for package in CONFIGS_MAY)
         if path.startswith("legged_mw/deploy/"):
             never = not any(within(name, package) for package in DEPLOY_MAY)
-        later = any(within(name, package) for package in (*NOT_YET.get(path, ()), *HOOKS.get(path, ())))
-        if not later and (outside or never or against_the_layers(path, name)):
+        hook = any(within(name, package) for package in HOOKS.get(path, ()))
+        if not hook and (outside or never or against_the_layers(path, name)):
             wrong.append(name)
     return wrong
 

@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from legged_mw import ROOT
+from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.utils.task import load_task
 
 PACKAGE = str(ROOT / "legged_mw")
@@ -34,12 +35,18 @@ def table() -> dict[str, Concept]:
     return found
 
 
-def make(**changes: Any) -> Any:
+class OwnLaw(LeggedRobot):
+    """With legged_gym's law in code, in place of the servos."""
+
+    def _compute_torques(self, actions: torch.Tensor) -> torch.Tensor:
+        return super()._compute_torques(actions)
+
+
+def make(kind: type[LeggedRobot] = LeggedRobot) -> Any:
     task = load_task("go1_flat")
-    plain = {"env.num_envs": 4, "sim.engine": "mujoco", "sim.fuse": False}
-    for path, value in (plain | changes).items():
+    for path, value in {"env.num_envs": 4, "sim.engine": "mujoco", "sim.fuse": False}.items():
         task.set(path, value)
-    return task.env_class(task.cfg, "cpu")
+    return kind(task.cfg, "cpu")
 
 
 def a_step() -> Callable[[], object]:
@@ -55,9 +62,7 @@ def a_reward() -> Callable[[], object]:
 
 def a_torque() -> Callable[[], object]:
     """Of a law in code, from an action to a substep."""
-    env = make(
-        **{"control.actuator": "dc_motor", "control.stall_torque": {"": 30.0}, "control.no_load_speed": {"": 30.0}}
-    )
+    env = make(OwnLaw)
 
     def act() -> None:
         env.actuators.apply(env.actions)

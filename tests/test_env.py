@@ -13,7 +13,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from torch import Tensor
-from worlds import QUIET, changed, layout, make_env, same, snapshot, tensors
+from worlds import QUIET, STATE, changed, layout, make_env, same, snapshot, tensors
 
 from legged_mw import ROOT
 from legged_mw.check.held import Lost, everything
@@ -76,7 +76,7 @@ class _Holds(LeggedRobot):
     def _init_buffers(self) -> None:
         super()._init_buffers()
         self.mine, self.frames = self.buffer(3, dtype=torch.long), deque([self.buffer(3)], maxlen=1)
-        self.slots, self.table = self.remember(_Slots(self._zeros(3))), TensorDict({"robot": self.buffer(3)})
+        self.slots, self.table = self.remember(_Slots(self.buffer(3))), TensorDict({"robot": self.buffer(3)})
         self.net = torch.nn.Sequential(torch.nn.BatchNorm1d(3)).requires_grad_(False)
         self.remember(dict(self.net.named_buffers()))
 
@@ -369,15 +369,6 @@ def test_a_scale_of_zero_needs_no_method() -> None:
 
 # ---- observations
 
-STATE = {
-    "base_lin_vel": 3,
-    "base_ang_vel": 3,
-    "projected_gravity": 3,
-    "dof_pos": 12,
-    "dof_vel": 12,
-    "last_actions": 12,
-    "commands": 3,
-}
 PRIVILEGED = {
     "state": 48,
     "base_ang_vel": 3,

@@ -219,7 +219,7 @@ class Mine(LeggedRobot):
     def _init_buffers(self):
         super()._init_buffers()
         self.foot, self.rows = (torch.tensor(i, device=self.device) for i in (1, [0, 2]))
-        self.past, self.list, self.count = self._zeros(), [self._zeros()], 0
+        self.past, self.list, self.count = self.buffer(), [self.buffer()], 0
         self.parts, self.slots, self.view = Buffers(self.past), Slots(self.past), self.dof_pos[:, :3]
         self.frames = deque([self.past, self.parts.kept["past"]])
         self.moved, self.net = torch.zeros(self.num_envs).to(self.device), torch.nn.Linear(1, 1).to(self.device).requires_grad_(False)

@@ -5,26 +5,16 @@ from __future__ import annotations
 import pytest
 import torch
 from torch import Tensor
-from worlds import QUIET, layout, make_env
+from worlds import QUIET, STATE, layout, make_env
 
 from legged_mw.envs.legged_robot import LeggedRobot
 from legged_mw.envs.observations import Row
 from legged_mw.utils.config import ConfigError
 
-SIZES = {
-    "base_lin_vel": 3,
-    "base_ang_vel": 3,
-    "projected_gravity": 3,
-    "dof_pos": 12,
-    "dof_vel": 12,
-    "last_actions": 12,
-    "commands": 3,
-}
-
 
 def test_rows_left_out_are_gone_from_the_group_and_from_what_contains_it() -> None:
     env = make_env(3, {**QUIET, "observations.leave_out": {"state": ["base_lin_vel", "commands"]}})
-    left = {name: size for name, size in SIZES.items() if name not in ("base_lin_vel", "commands")}
+    left = {name: size for name, size in STATE.items() if name not in ("base_lin_vel", "commands")}
     assert layout(env)["state"] == left and env.obs_buf["state"].shape == (3, 42)
     assert layout(env)["privileged_state"]["state"] == 42 and "base_lin_vel" in layout(env)["privileged_state"]
     env.step(torch.randn(3, 12))
@@ -34,7 +24,7 @@ def test_rows_left_out_are_gone_from_the_group_and_from_what_contains_it() -> No
 
 def test_history_is_oldest_first_within_each_row_and_begins_filled() -> None:
     env = make_env(4, {**QUIET, "observations.history": {"state": 3}})
-    assert layout(env)["state"] == {name: 3 * size for name, size in SIZES.items()}
+    assert layout(env)["state"] == {name: 3 * size for name, size in STATE.items()}
     seen: list[Tensor] = []
     for step in range(5):
         if step == 3:
@@ -63,7 +53,7 @@ def test_history_of_one_row_holds_what_the_policy_saw_noise_and_delay_included()
             "domain_rand.observation_delay": [1, 1],
         },
     )
-    assert layout(env)["state"] == {**SIZES, "base_ang_vel": 6}
+    assert layout(env)["state"] == {**STATE, "base_ang_vel": 6}
     span, last = env.observations.span("state", "base_ang_vel"), None
     for _ in range(4):
         frames = env.step(torch.randn(2, 12))[0]["state"][:, span].unflatten(1, (2, 3))
@@ -77,11 +67,11 @@ def test_mirrored_history_is_the_history_of_the_mirrored() -> None:
     plain, env = make_env(2, QUIET), make_env(2, {**QUIET, "observations.history": {"state": 2}})
     frames = [torch.randn(2, 48) for _ in range(2)]
     rows = [
-        torch.cat([frame.split(list(SIZES.values()), dim=1)[i] for frame in frames], dim=1) for i in range(len(SIZES))
+        torch.cat([frame.split(list(STATE.values()), dim=1)[i] for frame in frames], dim=1) for i in range(len(STATE))
     ]
     images = [plain.mirror.observations["state"](frame) for frame in frames]
     expected = [
-        torch.cat([image.split(list(SIZES.values()), dim=1)[i] for image in images], dim=1) for i in range(len(SIZES))
+        torch.cat([image.split(list(STATE.values()), dim=1)[i] for image in images], dim=1) for i in range(len(STATE))
     ]
     x = torch.cat(rows, dim=1)
     image = env.mirror.observations["state"](x)
@@ -155,7 +145,7 @@ class _Old(LeggedRobot):
         ),
         ({"observations.history": {"state": 0}}, LeggedRobot, r"observations.history\['state'\] is 0; it must be 1"),
         (
-            {"observations.leave_out": {"state": [*SIZES]}},
+            {"observations.leave_out": {"state": [*STATE]}},
             LeggedRobot,
             "observations.leave_out: 'state' has no row left; leave one in",
         ),

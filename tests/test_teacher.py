@@ -315,7 +315,7 @@ from legged_mw.utils.task import Task
 class Mine(LeggedRobot):
     def observation_rows(self):
         rows = super().observation_rows()
-        rows["state"].append(Row("mine", self._zeros(2) + 7.0))
+        rows["state"].append(Row("mine", self.buffer(2) + 7.0))
         return rows
 
 TASK = Task(Mine, Go1FlatCfg, Go1FlatCfgPPO)

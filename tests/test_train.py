@@ -22,7 +22,7 @@ import onnx
 import onnxruntime
 import pytest
 import torch
-from program import SMALL, assert_equal, load, refused, run, trained
+from program import SMALL, Result, assert_equal, load, refused, run, trained
 from rsl_rl.runners import OnPolicyRunner
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tensordict import TensorDict
@@ -206,20 +206,14 @@ def test_resumed_run_goes_on_where_the_checkpoint_is(copied: Path, tmp_path: Pat
     assert all(len(values) == 1 for values in curves["Train/mean_reward"].values())
 
 
+def resumed(folder: Path, checkpoint: str, iterations: str) -> Result:
+    """The run in ``folder``, from a checkpoint up to so many iterations."""
+    task = ("--task", "go1_flat", "--device", "cpu")
+    return run("train", folder, *task, "--resume", "--checkpoint", checkpoint, "--max_iterations", iterations)
+
+
 def test_an_earlier_checkpoint_can_be_resumed(copied: Path, tmp_path: Path, starts: list[Start]) -> None:
-    result = run(
-        "train",
-        tmp_path,
-        "--task",
-        "go1_flat",
-        "--device",
-        "cpu",
-        "--resume",
-        "--checkpoint",
-        "2",
-        "--max_iterations",
-        "3",
-    )
+    result = resumed(tmp_path, "2", "3")
     assert result.code == 0, result.err
     assert re.findall(r"Learning iteration (\d+/\d+)", result.out) == ["3/3"]
     assert_equal(starts[0].alg["actor_state_dict"], load(copied / "model_2.pt")["actor_state_dict"])
@@ -229,19 +223,7 @@ def test_an_earlier_checkpoint_begins_a_run_of_its_own(copied: Path, tmp_path: P
     """In the old folder its later checkpoints would stand, of another branch, and -1 would pick them."""
     (copied / "model_7.pt").write_bytes((copied / "model_3.pt").read_bytes())
     before = sorted(path.name for path in copied.iterdir())
-    result = run(
-        "train",
-        tmp_path,
-        "--task",
-        "go1_flat",
-        "--device",
-        "cpu",
-        "--resume",
-        "--checkpoint",
-        "3",
-        "--max_iterations",
-        "4",
-    )
+    result = resumed(tmp_path, "3", "4")
     assert result.code == 0, result.err
     assert sorted(path.name for path in copied.iterdir()) == before
     (branch,) = set(copied.parent.iterdir()) - {copied}

@@ -13,6 +13,16 @@ from legged_mw.envs.observations import Row
 from legged_mw.utils.task import load_task
 
 QUIET = {"noise.level": 0.0, "commands.resampling_time": 0.0}  # nothing drawn within an episode
+# a row of the group `state` of go1_flat -> its size
+STATE = {
+    "base_lin_vel": 3,
+    "base_ang_vel": 3,
+    "projected_gravity": 3,
+    "dof_pos": 12,
+    "dof_vel": 12,
+    "last_actions": 12,
+    "commands": 3,
+}
 
 
 def make_env(

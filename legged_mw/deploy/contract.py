@@ -95,9 +95,8 @@ class Ends(NamedTuple):
     """What counts as a fall and ends a walk; nothing does where none of it is set."""
 
     max_tilt: float | None = None  # [deg] between the robot's z axis and the vertical
-    min_base_height: float | None = (
-        None  # [m] of the root above the ground; a real robot cannot judge it, a simulated one does
-    )
+    # [m] of the root above the ground; a real robot cannot judge it, a simulated one does
+    min_base_height: float | None = None
     falls_on: tuple[str, ...] = ()  # geoms that must not touch the ground; judged in simulation, too
     not_covered: tuple[str, ...] = ()  # methods of the task that ended its episodes, too; nobody judges those here
 

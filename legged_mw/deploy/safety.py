@@ -72,9 +72,8 @@ class Limits:
     step: float = 2.5  # [rad] between two targets of a joint [1.85]
     torque: float = 2.0  # [share of `motor`] that the servo would ask for [1.52]
     speed: float = 60.0  # [rad/s] of a joint [48]
-    tilt: float = (
-        60.0  # [deg] of the body, where the contract calls one up to 90 a fall; else what it calls a fall [30]
-    )
+    # [deg] of the body, where the contract calls one up to 90 a fall; else what it calls a fall [30]
+    tilt: float = 60.0
     temperature: float = 85.0  # [deg C] of a motor: below the 90 at which drives switch themselves off
     voltage: float = -OFF  # [V] of the battery, at least; a robot's class states its own
     age: float = 2.0  # [periods] of the newest measurement

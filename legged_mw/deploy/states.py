@@ -90,9 +90,8 @@ class Order(NamedTuple):
     """What the servos do in the next period."""
 
     state: str
-    targets: Floats | None = (
-        None  # (D,) [rad] as asked for, which limits judge and hold; None: limp in ZERO, damped in DAMPING
-    )
+    # (D,) [rad] as asked for, which limits judge and hold; None: limp in ZERO, damped in DAMPING
+    targets: Floats | None = None
     stiffness: Floats | None = None  # (D,); None: the contract's
     damping: Floats | None = None  # (D,); None: the contract's
 

@@ -25,9 +25,8 @@ class BaseTask(VecEnv):
     device: str
     obs_buf: dict[str, Tensor]  # group -> (N, size)
     max_episode_length: int  # [control steps]
-    not_remembered = (
-        ""  # what the step writes and no buffer is, in words: the guard of check/ finds it; '' if there is none
-    )
+    # what the step writes and no buffer is, in words: the guard of check/ finds it; '' if there is none
+    not_remembered = ""
 
     def __init__(self, num_envs: int, num_actions: int, device: str, eager: bool = False) -> None:
         self.num_envs, self.num_actions, self.device, self.eager = num_envs, num_actions, device, eager

@@ -379,20 +379,19 @@ class LeggedRobot(RobotTask):
         # view, world frame [m/s]
         self.foot_vel = self.sim.sensordata[:, self.robot.sensors["linvel"]].unflatten(1, (feet, 3))
         self.foot_sites = torch.tensor([self.robot.id("site", name) for name in self.foot_names], device=self.device)
-        self.foot_pos = self._zeros(feet, 3)  # [m, world]
+        self.foot_pos = self.buffer(feet, 3)  # [m, world]
         self.feet = self.remember(
             FootContacts(self.robot, self.foot_geoms.values(), self.sim.sensordata, self.contact_count)
         )
-        self.foot_contact, self.first_contact = (self._zeros(feet, dtype=torch.bool) for _ in range(2))
-        self.foot_speed = self._zeros(feet)  # horizontal [m/s]
+        self.foot_contact, self.first_contact = (self.buffer(feet, dtype=torch.bool) for _ in range(2))
+        self.foot_speed = self.buffer(feet)  # horizontal [m/s]
         self._init_terrain()
-        self.walked_off, self.moving = (self._zeros(dtype=torch.bool) for _ in range(2))
+        self.walked_off, self.moving = (self.buffer(dtype=torch.bool) for _ in range(2))
         self._init_commands()
         clock, names = self.cfg.gait, self.foot_names
         gait = GaitClock(clock, names, self.num_envs, self.dt, self.device) if clock.period > 0.0 else None
         self.gait = self.remember(gait)
         self._init_foot_rewards()
-        self.remember(self.tracking_sigma)
 
     def _episode_columns(self) -> dict[str, int]:
         feet = len(self.foot_names)
@@ -412,21 +411,21 @@ class LeggedRobot(RobotTask):
         self.tiles = self.remember(Tiles(self.cfg, terrain, self.num_envs, self.device)) if terrain else None
         self._height_at = make_height_map(terrain, self.device) if terrain else None
         # above the ground under each foot and under the root [m]
-        self.foot_height = self._zeros(self.num_feet) if terrain else self.foot_pos[..., 2]
-        self.base_height = self._zeros() if terrain else self.base_height
+        self.foot_height = self.buffer(self.num_feet) if terrain else self.foot_pos[..., 2]
+        self.base_height = self.buffer() if terrain else self.base_height
         grid = torch.cartesian_prod(torch.tensor(cfg.measured_points_x), torch.tensor(cfg.measured_points_y)).view(
             -1, 2
         )
         self.scan_points = grid.to(self.device, torch.float).unbind(dim=1)
-        self.height_scan = self._zeros(len(grid) if cfg.height_scan else 0)  # (N, P) [m]
+        self.height_scan = self.buffer(len(grid) if cfg.height_scan else 0)  # (N, P) [m]
 
     def _init_commands(self) -> None:
         cfg = self.cfg.commands
         self.command_table = command_table(self.cfg)
         count, default = len(self.command_table), self._tensor([command.default for command in self.command_table])
-        self.commands, self.command_timer = self._zeros(count), self._zeros(1)  # [unit of each]; [control steps]
+        self.commands, self.command_timer = self.buffer(count), self.buffer(1)  # [unit of each]; [control steps]
         self.velocity_command = self.commands[:, :3]  # view: vx, vy [m/s], yaw rate [rad/s]
-        self.heading = self._zeros()  # wanted, of the root's x axis in the world [rad]
+        self.heading = self.buffer()  # wanted, of the root's x axis in the world [rad]
         # (2, C)
         self.full_command_ranges = self._tensor(
             [[command.low, command.high] for command in self.command_table]
@@ -456,7 +455,9 @@ class LeggedRobot(RobotTask):
         """What terms need beside the state, where they are on."""
         sigma, changes = self.cfg.rewards.tracking_sigma, self.cfg.rewards.tracking_sigma_end > 0.0
         # () [m^2/s^2, rad^2/s^2]; a number where it stays, which takes an operation less
-        self.tracking_sigma: Tensor | float = torch.tensor(sigma, device=self.device) if changes else sigma
+        self.tracking_sigma: Tensor | float = sigma
+        if changes:
+            self.tracking_sigma = self.remember(torch.tensor(sigma, device=self.device))
         on = self._active_scales()
         if not {"feet_orientation", "feet_distance"} & on.keys():
             return

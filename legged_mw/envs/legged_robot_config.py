@@ -50,9 +50,8 @@ class LeggedRobotCfg(RobotTaskCfg):
 
     class observations(RobotTaskCfg.observations):
         foot_height: bool = False  # a row of `privileged_state`: each foot's height above the ground under it [m]
-        contact_forces: bool = (
-            False  # a row of `privileged_state`: the ground's force on each foot, world frame [N] [ours: off]
-        )
+        # a row of `privileged_state`: the ground's force on each foot, world frame [N] [ours: off]
+        contact_forces: bool = False
 
     class commands:
         resampling_time: Span = 5.0  # mean of an exponential timer, each world its own [s]; 0: never [P]
@@ -60,13 +59,11 @@ class LeggedRobotCfg(RobotTaskCfg):
         # of each command: that a changed one is not its default; beyond the list 1 [P]
         keep_probability: Probabilities = [0.9, 0.25, 0.5]
 
-        curriculum: bool = (
-            False  # begin with a share of the ranges, and widen it while the velocity is tracked well [L]
-        )
+        # begin with a share of the ranges, and widen it while the velocity is tracked well [L]
+        curriculum: bool = False
         curriculum_start: Part = 0.4  # that share [-] [ours]
-        curriculum_step: Part = (
-            0.1  # by which it grows, where worlds' last episodes have 0.8 of the best tracking_lin_vel [L, ours]
-        )
+        # by which it grows, where worlds' last episodes have 0.8 of the best tracking_lin_vel [L, ours]
+        curriculum_step: Part = 0.1
 
         heading_command: bool = False  # the yaw rate steers to a heading that is drawn in its place [L]
         heading_gain: Positive = 0.5  # yaw rate a heading error, within its range [1/s] [L]
@@ -90,15 +87,13 @@ class LeggedRobotCfg(RobotTaskCfg):
         # where each foot is when the clock is at 0, share of the period; empty: of two feet [0.0, 0.5]
         offsets: list[Share] = []
         stance: Stance = 0.55  # share of the period that a foot stands, from its phase 0 [unitree_rl_gym]
-        random_start: bool = (
-            True  # episodes begin anywhere in the period, so that each leg learns to lead; False: at 0, as deploy does
-        )
+        # episodes begin anywhere in the period, so that each leg learns to lead; False: at 0, as deploy does
+        random_start: bool = True
 
     class rewards(RobotTaskCfg.rewards):
         tracking_sigma: Positive = 0.25  # tracking = exp(-error^2 / sigma) [P, L]
-        tracking_sigma_end: NonNegative = (
-            0.0  # where it goes in a straight line over max_iterations; 0: it stays [ours]
-        )
+        # where it goes in a straight line over max_iterations; 0: it stays [ours]
+        tracking_sigma_end: NonNegative = 0.0
         swing_height: Swing = 0.1  # wanted height of a swinging foot [m] [P]
         min_air_time: NonNegative = 0.1  # a step that lasts less is penalised [s] [P]
         min_command: NonNegative = 0.01  # norm of (vx, vy, yaw rate) below which the command means stand [P]
@@ -136,9 +131,8 @@ class LeggedRobotCfg(RobotTaskCfg):
         num_rows: Count = 10  # levels of difficulty, along x [L]
         num_cols: Count = 20  # tiles side by side along y, each column of one kind [L]
         tile_size: Positive = 8.0  # edge of a tile [m] [L]
-        horizontal_scale: CellSize = (
-            0.05  # between two heights [m] [ours: L 0.1 makes a step of stairs a slope of 50 degrees]
-        )
+        # between two heights [m] [ours: L 0.1 makes a step of stairs a slope of 50 degrees]
+        horizontal_scale: CellSize = 0.05
         border_size: Border = 5.0  # flat ground around all tiles; a robot that leaves half of it behind starts again, timed out [m] [L 25]
         difficulty: ShareRange = [0.0, 1.0]  # of the first and the last row, from 0 to 1 [L]
         # kind (legged_mw/sim/terrain.py) -> share of the columns [ours]
@@ -148,9 +142,8 @@ class LeggedRobotCfg(RobotTaskCfg):
         }
         seed: Whole = 1  # of all that is random in it
         curriculum: bool = True  # levels by what a robot can do; False: a random one at each reset [L]
-        max_init_terrain_level: Whole = (
-            5  # highest level at the start of training; the last one, if there are fewer [L]
-        )
+        # highest level at the start of training; the last one, if there are fewer [L]
+        max_init_terrain_level: Whole = 5
         measured_points_x: Points = [i / 10 for i in range(-8, 9)]  # of the height scan, ahead of the root [m] [L]
         measured_points_y: Points = [i / 10 for i in range(-5, 6)]  # to its left [m] [L]
         height_scan: list[Literal["state", "privileged_state"]] = []  # groups of observations that get the row
@@ -170,9 +163,8 @@ class LeggedRobotCfg(RobotTaskCfg):
         # offset: of the mean velocity; empty: that on two feet, which sway, else error
         marks_of: Literal["", "error", "offset"] = ""
         push_mark: NonNegative = 0.0  # walks: all pushes of this speed are survived [m/s]; 0: 1 on two feet, else 2
-        peer: str = (
-            ""  # the robot (go1, go2, g1) whose published policies of legged_mw/eval/peers.py stand beside; empty: none
-        )
+        # the robot (go1, go2, g1) whose published policies of legged_mw/eval/peers.py stand beside; empty: none
+        peer: str = ""
 
     def check(self) -> None:
         super().check()

@@ -23,9 +23,8 @@ class Row(NamedTuple):
     name: str
     value: Tensor  # (N, size), a buffer that the step writes in place
     noise: float = 0.0  # half width of the uniform noise added to it, in the value's unit
-    mirror: str | None = (
-        None  # its mirror image, left for right: a kind of envs/mirror.py, or a group; None: not stated
-    )
+    # its mirror image, left for right: a kind of envs/mirror.py, or a group; None: not stated
+    mirror: str | None = None
     scale: float | tuple[float, ...] = 1.0  # a number, or one a column; the policy sees scale * (value + noise)
     measured: bool = False  # comes from a sensor, so that domain_rand.observation_delay applies to it
     # how a robot measures it, for the exported policy; legged_mw/deploy/contract.py knows the rows of RobotTask by their names

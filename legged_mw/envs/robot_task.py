@@ -471,16 +471,16 @@ class RobotTask(BaseTask):
         self.torques = sim.actuator_force  # view (N, D) [N m]
         self.contact_count = sim.sensordata[:, spans["contact"]]  # view (N, C), of robot.contact_geoms with the ground
         self.accelerometer = sim.sensordata[:, spans["accelerometer"]]  # view (N, 3) [m/s^2]
-        self.base_lin_vel, self.projected_gravity, self.base_ang_vel_world = (self._zeros(3) for _ in range(3))
-        self.dof_offset = self._zeros(self.num_actions)  # joint position minus default [rad]
+        self.base_lin_vel, self.projected_gravity, self.base_ang_vel_world = (self.buffer(3) for _ in range(3))
+        self.dof_offset = self.buffer(self.num_actions)  # joint position minus default [rad]
         law, drawn = self.motor_law, self.domain_rand.values
         self.actuators = self.remember(
             Actuators(self.cfg, law, self.robot, sim, drawn, self.default_dof_pos, self._compute_torques)
         )
         exact = self.actuators.encoder_offset is None
-        self.joint_reading = self.dof_offset if exact else self._zeros(self.num_actions)  # the same, as measured
+        self.joint_reading = self.dof_offset if exact else self.buffer(self.num_actions)  # the same, as measured
         self.base_height = self.root_pos[:, 2]  # of the root above the ground under it [m]
-        self.fell, self.broken = self._zeros(dtype=torch.bool), self._zeros(dtype=torch.bool)
+        self.fell, self.broken = self.buffer(dtype=torch.bool), self.buffer(dtype=torch.bool)
         self.divergence = self.remember(
             Divergence(sim, self.actions, self.robot.joint_names, self.cfg.termination.max_speed)
         )
@@ -497,7 +497,6 @@ class RobotTask(BaseTask):
         self.imu_pos = self._tensor(model.site_pos[self.robot.id("site", self.robot.imu)]).expand(n, 3)
         self._init_contacts()
         self._init_robot_rewards()
-        self.remember(self.last_dof_vel)
 
     def _init_contacts(self) -> None:
         """What ``asset.terminate_after_contacts_on`` and ``asset.penalize_contacts_on`` mean: C sensed geoms, B penalised bodies."""
@@ -528,9 +527,6 @@ class RobotTask(BaseTask):
                     f"asset.{field}: '{name}' never touches the ground; add it to asset.colliders: {asset.colliders}"
                 )
         return [i for i, name in enumerate(robot.contact_geoms) if name in meant]
-
-    def _zeros(self, *shape: int, dtype: torch.dtype = torch.float) -> Tensor:
-        return self.buffer(*shape, dtype=dtype)
 
     def _episode_columns(self) -> dict[str, int]:
         """What an episode remembers, as name -> width: attributes (N, width) that a reset clears."""
@@ -603,7 +599,7 @@ class RobotTask(BaseTask):
                 )
         self.last_dof_vel: Tensor | None = None  # (N, D) of the step before [rad/s]
         if "dof_acc" in on:
-            self.last_dof_vel = torch.zeros_like(self.dof_vel)
+            self.last_dof_vel = self.buffer(self.num_actions)
         if "hip_pos" in on:
             self.hips = self._joints_called(rewards.hip_joints, "hip_joints")  # indices
         if "joint_mirror" in on:

@@ -67,12 +67,10 @@ class RobotTaskCfg(Config):
         episode_length_s: Seconds = 20.0  # [s], then the episode times out [P]
 
     class asset:
-        file: str = (
-            ""  # MJCF or URDF, as its vendor wrote it; beside the file of the class that says so, or in the repository
-        )
-        imu_site: str = (
-            ""  # site, or body, that is fixed to the root; empty: "imu" if it is so, or else the root's origin [ours]
-        )
+        # MJCF or URDF, as its vendor wrote it; beside the file of the class that says so, or in the repository
+        file: str = ""
+        # site, or body, that is fixed to the root; empty: "imu" if it is so, or else the root's origin [ours]
+        imu_site: str = ""
         # names of geoms; of bodies, which mean their own geoms that collide; or patterns. Geoms that touch the ground:
         colliders: Names = ["*"]  # of those that collide in the file
         self_collisions: bool = False  # among the colliders
@@ -132,27 +130,23 @@ class RobotTaskCfg(Config):
     class termination:
         max_tilt: Tilt = 90.0  # [deg] between the root's z axis and the vertical; beyond it, it fell [P]
         min_base_height: Height = 0.0  # [m] of the root above the ground under it; lower, it fell; 0: anything [ours]
-        max_speed: Positive = (
-            1.0e4  # [m/s, rad/s] of any degree of freedom; beyond it the state counts as not finite [ours]
-        )
+        # [m/s, rad/s] of any degree of freedom; beyond it the state counts as not finite [ours]
+        max_speed: Positive = 1.0e4
 
     class rewards:
         only_positive_rewards: bool = True  # clip the sum at 0: without it the robot learns to stand still [P, L]
-        clip_termination: bool = (
-            False  # True: `termination` is inside that clip, where a fall costs nothing [P]; False [L]
-        )
+        # True: `termination` is inside that clip, where a fall costs nothing [P]; False [L]
+        clip_termination: bool = False
         max_reward: Positive = 10000.0  # upper clip of the sum, a step [P]
-        soft_dof_pos_limit: Part = (
-            0.95  # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
-        )
+        # share of a joint's range, about its middle [ours: P scales each bound, which can loosen it]
+        soft_dof_pos_limit: Part = 0.95
         pose_weights: dict[str, NonNegative] = {"": 1.0}  # table a joint: weight in `pose` [-]
         base_height_target: Height = 0.0  # of `base_height`: of the root above the ground under it [m]
         hip_joints: list[str] = []  # of `hip_pos`: joints' names, patterns, or parts of names
         mirror_joints: Pairs = []  # of `joint_mirror`: pairs of joints, likewise: [["FR_", "RL_"], ["FL_", "RR_"]]
         deviation_weights: dict[str, NonNegative] = {"": 1.0}  # table a joint: weight in `joint_deviation` [-]
-        soft_torque_limit: Positive = (
-            0.9  # share of the servo's force limit, of `torque_limits` [L: Cassie; L 1.0, which none exceeds]
-        )
+        # share of the servo's force limit, of `torque_limits` [L: Cassie; L 1.0, which none exceeds]
+        soft_torque_limit: Positive = 0.9
         soft_dof_vel_limit: Positive = 0.9  # share of asset.joint_speed_limits, of `dof_vel_limits` [L: Cassie; L 1.0]
         # `torques` is the 2-norm plus the 1-norm [P], or the sum of squares [L]
         torques_as: Literal["norms", "squares"] = "norms"
@@ -163,9 +157,8 @@ class RobotTaskCfg(Config):
             _open = True
 
     class normalization:
-        clip_actions: Positive = (
-            2.0  # the clipped action is applied, penalised, observed and exported [ours: P has no bound, and thrashes]
-        )
+        # the clipped action is applied, penalised, observed and exported [ours: P has no bound, and thrashes]
+        clip_actions: Positive = 2.0
 
     class noise:
         level: NonNegative = 1.0  # multiplies every scale; 0: no noise [P]
@@ -190,9 +183,8 @@ class RobotTaskCfg(Config):
         duration: PositiveRange = [0.05, 0.2]  # [s] [P]
         velocity: Kicks = [0.0, 3.0]  # dv in force = 0.5 sin(pi t / T) * mass * dv / T [m/s] [P]
         curriculum: bool = False  # a world's dv grows with the share of an episode that it survives, from 0 [ours]
-        curriculum_rate: Part = (
-            0.5  # by which share of the way it does, at the end of an episode, from above 0 to 1 [ours]
-        )
+        # by which share of the way it does, at the end of an episode, from above 0 to 1 [ours]
+        curriculum_rate: Part = 0.5
         # kicks grow from none to all between these shares of a training, [0.2, 0.5]; empty: all at once [ours]
         growth: Shares = []
         push: bool = False  # the root's horizontal velocity becomes a random one; beside kicks or alone [L]
@@ -237,17 +229,15 @@ class RobotTaskCfg(Config):
             ],
             *["encoder_offset", "action_delay", "delay_ms", "observation_delay", "slope"],
         ]
-        redraw_iterations: Whole = (
-            0  # draw everything again every so many iterations of training, and when it is resumed; 0: never
-        )
+        # draw everything again every so many iterations of training, and when it is resumed; 0: never
+        redraw_iterations: Whole = 0
         observe: bool = False  # rows in `privileged_state` with what was drawn
 
     class terrain:
         friction: NonNegative = 0.6  # sliding friction of the ground, which overrules the robot's [-] [P]
         condim: Literal[1, 3, 4, 6] = 3  # contact dimensions: 3 is sliding without torsion [P]
-        slope: Slope = (
-            0.0  # [deg] of the plane, downhill along x: gravity leans, the plane and heights above it stay as they are
-        )
+        # [deg] of the plane, downhill along x: gravity leans, the plane and heights above it stay as they are
+        slope: Slope = 0.0
 
     class sim:
         engine: Literal["auto", "mujoco_warp", "mujoco"] = "auto"  # auto: mujoco_warp on a GPU, MuJoCo's own on a CPU
@@ -259,9 +249,8 @@ class RobotTaskCfg(Config):
         integrator: Literal["euler", "implicitfast"] = "euler"
         fuse: bool = True  # a recorded step's small operations go together in few kernels, equal to float32 rounding [ours: docs/lab.md]
         nconmax: Whole = 0  # contacts a world has room for (mujoco_warp); 0: counted from the model; see --check [ours: sim/capacity.py]
-        njmax: Whole = (
-            0  # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
-        )
+        # likewise constraint rows: of dry friction, limits and contacts; too many cost memory and time
+        njmax: Whole = 0
 
     class viewer:
         width: Pixels = 1280  # [pixel]

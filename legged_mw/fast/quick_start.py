@@ -7,7 +7,7 @@ asks it for anything else gets the compiler itself, with the marks made.
 ``Tensor.backward(gradient)`` compares two shapes by way of symbolic ones, which imports sympy, some 470 modules. A second stand-in
 compares shapes of plain numbers.
 
-Of a training of two iterations on a CPU the stand-ins take 6.7 s of CPU time to 3.7, garbage left alone another 0.9 (medians of six).
+Of a training of two iterations on a CPU the stand-ins take 6.7 s of CPU time to 3.7, garbage left alone another 1.0 (medians of six).
 """
 
 from __future__ import annotations

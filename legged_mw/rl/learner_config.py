@@ -47,9 +47,8 @@ class RobotTaskCfgPPO(Config):
         max_iterations: Count = 300  # [ours: a robot of one's own shows something by then]
         save_interval: Count = 50  # [iterations] between checkpoints
         keep_checkpoints: Whole = 0  # newest ones that stay; 0: all [ours]
-        exam_interval: Whole = (
-            200  # [iterations] between small exams, and one at the end; 0, or over max_iterations: none [ours]
-        )
+        # [iterations] between small exams, and one at the end; 0, or over max_iterations: none [ours]
+        exam_interval: Whole = 200
         experiment_name: str = ""  # folder below logs/; empty: the task's name
         run_name: FolderPart = ""  # appended to the run folder's time stamp
         logger: Literal["tensorboard", "wandb"] = "tensorboard"
@@ -129,9 +128,8 @@ class RobotTaskCfgPPO(Config):
     class distillation:
         """Takes the place of `algorithm` where there is a teacher: the actor learns to act like it. After init_std rsl-rl's own keys."""
 
-        teacher: str = (
-            ""  # its run, checkpoint or export, or a task for its last or shipped policy (train.py --teacher)
-        )
+        # its run, checkpoint or export, or a task for its last or shipped policy (train.py --teacher)
+        teacher: str = ""
         init_std: Positive = 0.1  # of the student's noise while it learns; nothing changes it [Isaac Lab]
         class_name: str = "legged_mw.rl.students.distillation:GraphedDistillation"  # or "Distillation": rsl-rl's own, same results, slower
         num_learning_epochs: Few = 5  # [R 1; ours: docs/lab.md]
@@ -146,9 +144,8 @@ class RobotTaskCfgPPO(Config):
 
         policy: str = ""  # the run, checkpoint or export, or a task for its last or shipped policy
         init_std: Positive = 0.2  # of exploration at the start [ours: less than from nothing, as it can walk]
-        critic_warmup: Iterations = (
-            20  # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
-        )
+        # [iterations] at the start that the critic learns alone, which knows nothing yet [ours]
+        critic_warmup: Iterations = 20
 
     class anneal:
         """What a number of `algorithm` goes to, in a straight line over max_iterations or --max_time; 0: it stays [ours]."""
@@ -169,9 +166,8 @@ class RobotTaskCfgPPO(Config):
         rnn_hidden_dim: Count = 64  # likewise
         max_iterations: Count = 2600
         overrides: dict[str, Any] = {}  # any field of the task: dotted path -> value
-        update_threads: Threads = (
-            0  # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one
-        )
+        # of torch in an update; 0: one a core, or one alone where that is faster. All else runs on one
+        update_threads: Threads = 0
 
     class symmetry:
         """Left-right symmetry in the update, as in Mittal et al. 2024. Rows of observations say how they mirror: envs/mirror.py."""

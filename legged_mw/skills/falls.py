@@ -40,7 +40,7 @@ class Falls(RobotTask):
         falls = self.cfg.falls
         states = fallen(self.robot.physics, min(falls.states, 4 * self.num_envs), falls.seed, falls.seconds)
         self.fallen_qpos, self.fallen_qvel = (self._tensor(values) for values in states)  # (P, nq), (P, nv)
-        self.up = self._zeros(dtype=torch.bool)  # (N,) as high and upright as one that stands
+        self.up = self.buffer(dtype=torch.bool)  # (N,) as high and upright as one that stands
         self.pull = self.remember(
             Pull(self.sim, self._lifted(), self.gravity_dir, falls.pull * 9.81 * self.total_mass, falls.pull_fades)
         )

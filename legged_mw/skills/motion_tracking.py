@@ -198,5 +198,5 @@ class MotionTracking(RobotTask):
         self.start_range = self._tensor(ranges + [motion.start_joints] * self.num_actions)
         self.body = self.remember(Bodies(*(torch.zeros_like(part) for part in self.reference.bodies)))
         self.anchor_pos, self.anchor_ori, self.body_pos, self.body_ori = map(
-            self._zeros, (3, 6, 3 * len(bodies), 6 * len(bodies))
+            self.buffer, (3, 6, 3 * len(bodies), 6 * len(bodies))
         )

@@ -30,12 +30,10 @@ class MotionTrackingCfg(RobotTaskCfg):
         bodies: list[str] = []  # that are compared
         anchor: str = ""  # one of them, at which they are
         end_bodies: list[str] = []  # of them: far too high or low with one of these, it fell
-        random_start: bool = (
-            True  # episodes begin anywhere in the clips, by the bins below; False: at the first clip's first frame
-        )
-        hold_s: Span = (
-            1.0  # a clip's last frame is held for so long, then the episode times out [s] [ours: deploy holds it, too]
-        )
+        # episodes begin anywhere in the clips, by the bins below; False: at the first clip's first frame
+        random_start: bool = True
+        # a clip's last frame is held for so long, then the episode times out [s] [ours: deploy holds it, too]
+        hold_s: Span = 1.0
         bin_s: Seconds = 1.0  # length of a bin [s]
         failure_rate: Part = 0.001  # share of a step in the moving average of the failures in each bin
         uniform: Part = 0.1  # share of the episodes that begin in any bin [-] [ours: B's code adds it to the failures, where it is nothing]

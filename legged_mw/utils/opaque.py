@@ -37,9 +37,8 @@ def not_traced(method: Callable[P, R]) -> Callable[P, R]:
 @cache
 def fast(module: str) -> Any:
     """That module of legged_mw.fast, or None without the package. An error inside of the module is raised."""
-    package = PathFinder.find_spec(
-        "legged_mw.fast", legged_mw.__path__
-    )  # in this project, wherever another is installed
+    # in this project, wherever another is installed
+    package = PathFinder.find_spec("legged_mw.fast", legged_mw.__path__)
     if package is None or package.origin is None:  # no folder, or one without source files
         return None
     return import_module(f"legged_mw.fast.{module}")
