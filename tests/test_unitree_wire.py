@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import gc
 import importlib.util
 import subprocess
 import sys
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsParticipant
 
 from legged_mw import ROOT
 from legged_mw.deploy import __main__ as deploy
@@ -25,6 +27,7 @@ from legged_mw.deploy.unitree.robots import G1, GO2, H1, check_body, machine_of,
 from legged_mw.utils.cli import one_line_errors
 from legged_mw.utils.errors import UserError
 from tests.wires import POLICIES
+from tests.wires import domain as domain
 
 
 def test_types_are_announced_as_the_robots_announce_them() -> None:
@@ -51,6 +54,17 @@ def test_a_wrong_interface_or_domain(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(RobotError, match="--domain 233: a domain is a number from 0 to 232"):
         link.join("lo", 233)
     assert (link.default_domain("lo"), link.default_domain("eth0")) == (1, 0)
+
+
+def test_an_end_of_the_wire_leaves_though_a_cycle_held_it(domain: int) -> None:
+    """Else whoever has the domain next in this process counts two robots."""
+    end = link.RobotEnd("unitree_go", "lo", domain)
+    end.itself = end  # type: ignore[attr-defined]
+    del end
+    gc.collect()
+    participant = link.join("lo", domain)
+    there = [each for each in BuiltinDataReader(participant, BuiltinTopicDcpsParticipant).take(9) if each is not None]
+    assert [each.key for each in there] == [participant.guid]
 
 
 # ---- bytes

@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 from importlib.metadata import version
 from typing import Any, NamedTuple
+from weakref import finalize
 
 from cyclonedds.builtin import BuiltinDataReader, BuiltinTopicDcpsPublication
 from cyclonedds.core import DDSException
@@ -73,6 +74,13 @@ def join(interface: str, domain: int) -> Any:
         return DomainParticipant(domain)
     except DDSException as error:
         raise RobotError(f"cannot join DDS domain {domain} on {interface}: {str(error).splitlines()[0]}") from None
+
+
+def _joined_by(owner: object, interface: str, domain: int) -> Any:
+    """A participant that leaves with its owner: cyclonedds alone never lets one leave that the garbage collector finds in a cycle."""
+    participant = join(interface, domain)
+    finalize(owner, participant.__del__).atexit = False
+    return participant
 
 
 def claim(interface: str, domain: int, seconds: float) -> socket.socket | None:
@@ -143,7 +151,7 @@ class Commander:
     def __init__(self, package: str, interface: str, domain: int) -> None:
         self.package, self._where = package, f"domain {domain} on {interface}"
         self._wait, self.clock = lambda: time.sleep(0.001), clock
-        self._participant = join(interface, domain)
+        self._participant = _joined_by(self, interface, domain)
         self._sample = RAW[package, "LowCmd_"]
         self._out = _writer(self._participant, COMMANDS, self._sample)
 
@@ -310,7 +318,7 @@ class RobotEnd:
     """The robot's end of the wire, for a simulated one: states go out, commands and calls of the motion service come in."""
 
     def __init__(self, package: str, interface: str, domain: int) -> None:
-        self._participant = join(interface, domain)
+        self._participant = _joined_by(self, interface, domain)
         self._sample = RAW[package, "LowState_"]
         self._out = _writer(self._participant, STATES, self._sample)
         self._commands = _reader(self._participant, COMMANDS, RAW[package, "LowCmd_"])
